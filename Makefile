@@ -5,12 +5,13 @@ PYTHON ?= python3
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 
-.PHONY: help demo test check coverage bench faults simulate mutants clean
+.PHONY: help demo test everything check coverage bench faults simulate mutants clean
 
 help:
 	@echo "make demo      the whole job on a simulated cell; results in out/demo"
-	@echo "make test      all tests"
-	@echo "make check     format, lint, types, import contracts, all tests"
+	@echo "make test      the tests, in minutes"
+	@echo "make everything  these and the slow ones: long runs of daemons, demos, kills, fuzzing"
+	@echo "make check     format, lint, types, import contracts, the tests"
 	@echo "make coverage  all tests, and which lines of core and drivers they reach"
 	@echo "make bench     speed beside peers, in one run; figures in out/speed.json, out/fleet.json"
 	@echo "make faults    every fault on the real wire, and random ones; fills docs/reliability.md"
@@ -25,6 +26,9 @@ demo: .venv/.main
 SIDE_BY_SIDE := -n 2 --dist loadgroup
 
 test: .venv/.test
+	$(BIN)/python -m pytest $(SIDE_BY_SIDE) -m "not slow"
+
+everything: .venv/.test
 	$(BIN)/python -m pytest $(SIDE_BY_SIDE)
 
 check: .venv/.test
@@ -32,7 +36,7 @@ check: .venv/.test
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
-	$(BIN)/python -m pytest $(SIDE_BY_SIDE)
+	$(BIN)/python -m pytest $(SIDE_BY_SIDE) -m "not slow"
 
 # Compiled kernels run unseen: the tests that check them run once more, as plain Python.
 KERNEL_TESTS := $(addprefix tests/core/test_,kinematics.py statics.py equilibrium.py \

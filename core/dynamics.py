@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapbridge.core.effects import CATALOGUE, Term, acting
+from gapbridge.core.kernels import rigid
 from gapbridge.core.kernels.reference import Chain
 from gapbridge.core.model import Model
 from gapbridge.core.motion import Motion, Pieces
@@ -53,32 +54,15 @@ class Frames:
 def frames_of(chain: Chain, q: Array, qd: Array, qdd: Array) -> Frames:
     """Return the frames of a rigid chain at angles, speeds, accelerations (N, n each)."""
     count, n = q.shape
-    origin, acceleration = np.empty((count, n + 1, 3)), np.empty((count, n + 1, 3))
-    rotation = np.empty((count, n + 1, 3, 3))
-    omega, alpha = np.empty((count, n, 3)), np.empty((count, n, 3))
-    R = np.tile(np.eye(3), (count, 1, 1))
-    o, a = np.zeros((count, 3)), np.zeros((count, 3))
-    w, dw = np.zeros((count, 3)), np.zeros((count, 3))
-    for i in range(n + 1):
-        step = R @ chain.position[i]
-        o = o + step
-        a = a + np.cross(dw, step) + np.cross(w, np.cross(w, step))
-        R = R @ chain.rotation[i]
-        if i < n:
-            R = _turned(R, q[:, i])
-            axis = R[:, :, 2]
-            dw = dw + axis * qdd[:, i, None] + np.cross(w, axis) * qd[:, i, None]
-            w = w + axis * qd[:, i, None]
-            omega[:, i], alpha[:, i] = w, dw
-        origin[:, i], rotation[:, i], acceleration[:, i] = o, R, a
-    return Frames(origin, rotation, omega, alpha, acceleration)
-
-
-def _turned(R: Array, q: Array) -> Array:
-    """Return R Rz(q), row by row."""
-    c, s = np.cos(q)[:, None], np.sin(q)[:, None]
-    x, y, z = R[:, :, 0], R[:, :, 1], R[:, :, 2]
-    return np.stack([c * x + s * y, c * y - s * x, z], axis=-1)
+    found = Frames(
+        np.empty((count, n + 1, 3)), np.empty((count, n + 1, 3, 3)), np.empty((count, n, 3)),
+        np.empty((count, n, 3)), np.empty((count, n + 1, 3)),
+    )  # fmt: skip
+    rigid.frames_of_rows(
+        chain, np.stack([q, qd, qdd]), found.origin, found.rotation, found.omega, found.alpha,
+        found.acceleration,
+    )  # fmt: skip
+    return found
 
 
 def pieces_of(model: Model, motion: Motion) -> Pieces:
@@ -94,19 +78,19 @@ def pieces_of(model: Model, motion: Motion) -> Pieces:
     chain, rows = geometry.chain(), geometry.rows(motion.q, motion.loads)
     frames = frames_of(chain, rows.q, motion.qd, motion.qdd)
     n, count = model.arm.n, len(motion)
-    gravity, axis = chain.gravity, frames.rotation[:, :n, :, 2]
+    gravity = chain.gravity
     link_torque = np.zeros((count, n, n))
 
     def link_at(i: int, cog: Array) -> Array:
         """Return the torques (N, n) of one link with its centre of gravity at ``cog`` (3,)."""
-        R = frames.rotation[:, i]
-        point, acceleration = frames.at(i, R @ cog)
-        inertia = R @ model.arm.inertia[i] @ np.swapaxes(R, 1, 2)
-        omega, alpha = frames.omega[:, i], frames.alpha[:, i]
-        moment = _times(inertia, alpha) + np.cross(omega, _times(inertia, omega))
-        force = chain.mass[i] * (acceleration - gravity)
+        body = np.vstack([cog, [chain.mass[i], 0.0, 0.0], model.arm.inertia[i]])
+        point, force, moment = (np.empty((count, 3)) for _ in range(3))
+        rigid.taken_by_link(
+            i, body, gravity, frames.origin, frames.rotation, frames.omega, frames.alpha,
+            frames.acceleration, point, force, moment,
+        )  # fmt: skip
         torque = np.zeros((count, n))
-        torque[:, : i + 1] = _about_axes(frames, axis, i + 1, point, force, moment)
+        torque[:, : i + 1] = _about_axes(frames, i + 1, point, force, moment)
         return torque
 
     for i in range(n):
@@ -124,7 +108,7 @@ def pieces_of(model: Model, motion: Motion) -> Pieces:
         force = acceleration - gravity
         in_hand, _ = sensor.at(n, _times(sensor.rotation[:, n], cog))
         return (
-            _about_axes(frames, axis, n, place, force, nothing),
+            _about_axes(frames, n, place, force, nothing),
             _at_flange(sensor, in_hand, -force, nothing),
         )
 
@@ -135,8 +119,9 @@ def pieces_of(model: Model, motion: Motion) -> Pieces:
     payload_torque, payload_wrench = payload_from(np.zeros(3))
     return Pieces(
         link_torque=link_torque,
+        arm_torque=link_torque.sum(axis=1),
         payload_torque=payload_torque,
-        external_torque=-_about_axes(frames, axis, n, tcp, pull, couple),
+        external_torque=-_about_axes(frames, n, tcp, pull, couple),
         payload_wrench=payload_wrench,
         external_wrench=_at_flange(sensor, tcp_in_hand, pull, couple),
         payload_mass=rows.payload_mass,
@@ -161,13 +146,11 @@ def _times(matrix: Array, vector: Array) -> Array:
     return np.asarray(np.einsum("rij,rj->ri", matrix, vector))
 
 
-def _about_axes(
-    frames: Frames, axis: Array, joints: int, point: Array, force: Array, moment: Array
-) -> Array:
+def _about_axes(frames: Frames, joints: int, point: Array, force: Array, moment: Array) -> Array:
     """Return the torques (N, joints) that hold ``force`` at ``point`` and ``moment``."""
-    arm = point[:, None] - frames.origin[:, :joints]
-    whole = np.cross(arm, force[:, None]) + moment[:, None]
-    return np.asarray(np.einsum("rjk,rjk->rj", axis[:, :joints], whole))
+    torque = np.empty((len(point), joints))
+    rigid.about_axes(frames.origin, frames.rotation, point, force, moment, torque)
+    return torque
 
 
 def _at_flange(frames: Frames, point: Array, force: Array, moment: Array) -> Array:
@@ -191,7 +174,7 @@ def predict_torque(model: Model, motion: Motion, terms: Sequence[Term] = ()) -> 
     """Return the joint torques (N, n), Nm, that would be measured, with further ``terms``."""
     own = acting((*model.terms, *terms), "torque")
     motion, pieces = _carrying(model, motion, own)
-    torque: Array = pieces.link_torque.sum(axis=1) + pieces.external_torque
+    torque: Array = pieces.arm_torque + pieces.external_torque
     torque = torque + pieces.payload_mass[:, None] * pieces.payload_torque
     for term in own:
         effect = CATALOGUE[term.effect]

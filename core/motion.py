@@ -27,6 +27,7 @@ WINDOWS = (0.3, 0.1, 0.05, 0.025)  # s either side at most, tried in turn
 GAP = 4.0  # sampling steps without a row that end a stretch
 COPIES = 0.9  # share of repeated rows alike in every column that makes them copies of one cycle
 FEW_REPEATS = 0.01  # share of repeated timestamps that may simply be left out
+MOTION = "motion"  # among what is derived of a log once
 SMALLEST_MOTION = 1e-4  # rad/s, what counts as standing still at least
 
 
@@ -39,6 +40,7 @@ class Pieces:
     """
 
     link_torque: Array  # (N, n, n) Nm: [:, i, j] of link i+1's mass and inertia at joint j+1
+    arm_torque: Array  # (N, n) Nm of all links together
     payload_torque: Array  # (N, n) Nm per kg of payload at its declared centre of gravity
     external_torque: Array  # (N, n) Nm against the pull of the surroundings on the tool
     payload_wrench: Array  # (N, 6) N, Nm per kg of payload at its declared centre of gravity
@@ -112,13 +114,26 @@ def motion_of(log: Log) -> Motion:
     replaced by an even clock if they fit one (``time_finding`` reports). Raises LogError naming the
     row where time runs backwards or repeats in any other way.
     """
+    known: Motion | None = log.derived.get(MOTION)
+    if known is None:
+        known = log.derived[MOTION] = _motion_of(log)
+    return known
+
+
+def with_motion(log: Log, motion: Motion) -> Log:
+    """Return the log with its motion, derived beside rows before and after its own."""
+    log.derived[MOTION] = motion
+    return log
+
+
+def _motion_of(log: Log) -> Motion:
     q = log.require("actual_q", "target_q")
     time = log.require("timestamp") if log.has("timestamp") else None
     rows: Any = np.arange(len(q))
     t = np.zeros(len(q)) if time is None else time
     moving = time is not None and is_moving(time, q, log.get("actual_qd"))
     if time is not None:
-        _check_order(log, time)
+        check_order(log, time)
         if moving:
             rows, t, _ = _clock(log, time)
     still = np.full(q.shape[1], SMALLEST_MOTION)
@@ -159,7 +174,8 @@ def time_finding(log: Log) -> str | None:
     return _clock(log, time)[2]
 
 
-def _check_order(log: Log, time: Array) -> None:
+def check_order(log: Log, time: Array) -> None:
+    """Raise LogError where timestamps (N,) run backwards."""
     back = np.flatnonzero(np.diff(time) < 0)
     if len(back):
         row = int(back[0]) + 1

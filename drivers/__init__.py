@@ -10,14 +10,15 @@ from gapbridge.drivers.clock import SYSTEM, Clock
 
 if TYPE_CHECKING:
     from gapbridge.core.model import Model
-    from gapbridge.drivers.driver import Driver, DriverSettings
+    from gapbridge.drivers.driver import Driver
     from gapbridge.drivers.gate import GateBounds
+    from gapbridge.drivers.link_settings import DriverSettings
 
 DRIVERS: dict[str, str] = {
     "can": "gapbridge.drivers.can.driver:CanDriver",
     "canopen": "gapbridge.drivers.canopen.driver:CanopenDriver",
     "modbus": "gapbridge.drivers.modbus.driver:ModbusDriver",
-    "replay": "gapbridge.drivers.replay:ReplayDriver",
+    "replay": "gapbridge.drivers.replay.driver:ReplayDriver",
     "ur_rtde": "gapbridge.drivers.ur_rtde.driver:UrRtdeDriver",
 }
 """Driver name in a cell file -> ``module:Class``, imported when it is used."""

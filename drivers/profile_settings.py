@@ -8,7 +8,7 @@ from typing import ClassVar, Self
 from pydantic import Field
 
 from gapbridge.core.errors import InputError
-from gapbridge.drivers.driver import DriverSettings
+from gapbridge.drivers.link_settings import DriverSettings
 
 
 class ProfileSettings(DriverSettings):

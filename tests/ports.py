@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import os
+import secrets
 import socket
 
 _hosts = itertools.count(1)
@@ -16,7 +18,13 @@ def own_host() -> str:
 
 
 def free_port(host: str = "127.0.0.1") -> int:
-    """Return a TCP port that nobody listens on at ``host``, of the system's choice."""
-    with socket.socket() as probe:
-        probe.bind((host, 0))
-        return int(probe.getsockname()[1])
+    """Return a TCP port that nobody listens on at ``host``.
+
+    Below those that the system gives to connections: until it is listened on, one of them may
+    take a port of the system's choice.
+    """
+    while True:
+        port = secrets.choice(range(10240, 32768))
+        with contextlib.suppress(OSError), socket.socket() as probe:
+            probe.bind((host, port))
+            return port

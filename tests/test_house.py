@@ -149,6 +149,14 @@ def test_a_part_that_sets_attributes_of_another_is_noticed() -> None:
     assert not _attributes_set(ast.parse(code.format("self.x = 1")))
 
 
+def test_the_recorder_loads_nothing_that_compiles() -> None:
+    code = "import sys, gapbridge.bridge.recording.main; print('numba' in sys.modules)"
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=120
+    )
+    assert done.stdout == "False\n", done.stderr
+
+
 def test_what_the_package_states_is_there_and_nothing_else_is_imported_for_it() -> None:
     code = (
         "import sys, gapbridge; early = {m.split('.')[0] for m in sys.modules}\n"

@@ -10,6 +10,7 @@ import sys
 import time
 from pathlib import Path
 
+import pytest
 from lateness import LIMIT, NOTED, Witness
 
 HERE = Path(__file__).parent
@@ -56,6 +57,7 @@ def test_that_fails_without_a_clock():
 """
 
 
+@pytest.mark.slow
 def test_a_failure_counts_unless_the_machine_was_late_and_the_test_in_real_time(
     tmp_path: Path,
 ) -> None:

@@ -77,6 +77,8 @@ def run(seed: int, say: Any = None, plan: Sequence[tuple[float, str]] | None = N
             _judge_end(found, judge, person)
         finally:
             world.end()
+            for loop in found.loops:
+                loop.let_go()
             found.daemon._commands.close()
             found.daemon.page.close()
     outcome.violations, outcome.writes = judge.violations, judge.writes_noted

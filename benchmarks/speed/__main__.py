@@ -28,7 +28,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("out/speed.json"))
     parser.add_argument("--parts", default=",".join(PARTS), help=f"of {', '.join(PARTS)}")
     parser.add_argument("--rounds", type=int, default=15, help="turns of each side")
-    parser.add_argument("--rows", type=int, default=1_000_000, help="of the regressor and the fit")
+    parser.add_argument("--rows", type=int, default=1_000_000, help="of the fit")
     parser.add_argument("--poses", type=int, default=1000, help="of the calibrations")
     parser.add_argument("--seconds", type=float, default=60.0, help="of the daemon's loop")
     given = parser.parse_args()
@@ -60,7 +60,6 @@ def _measured(chosen: list[str], given: argparse.Namespace) -> Any:
     if "loop" in chosen:
         yield loop.loop(given.seconds)
     if "rows" in chosen:
-        yield rows.regressor(given.rows, few)
         yield rows.fit(given.rows, few)
     if "geometry" in chosen:
         yield geometry.linear(given.poses, max(given.rounds // 5, 1))

@@ -7,7 +7,8 @@ import time
 from gapbridge.bridge.cell.cell import Cell
 from gapbridge.bridge.cell.message import key_path
 from gapbridge.bridge.cell.plausibility import Findings
-from gapbridge.core.errors import CellError
+from gapbridge.core.errors import CellError, InvalidStateError, StaleStateError
+from gapbridge.core.state import RobotState
 from gapbridge.drivers import make_driver
 from gapbridge.drivers.driver import Driver
 
@@ -27,7 +28,7 @@ def live_findings(cell: Cell) -> Findings:
     errors: list[str] = []
     warnings: list[str] = []
     with driver:
-        state = driver.read_state()
+        state = whole_state(driver)
         for found in driver.differences(state):
             line = cell.document.line(found.keys)
             text = (
@@ -47,11 +48,25 @@ def live_findings(cell: Cell) -> Findings:
     return Findings(errors, warnings)
 
 
+def whole_state(driver: Driver) -> RobotState:
+    """Return a state; a torn or missing sample is read again, for two seconds.
+
+    Raises LinkError.
+    """
+    begun = time.monotonic()
+    while True:
+        try:
+            return driver.read_state()
+        except (InvalidStateError, StaleStateError):
+            if time.monotonic() - begun > LONGEST:
+                raise
+
+
 def _rate(driver: Driver) -> float:
     """Return how often states come, Hz."""
     begun = time.monotonic()
     count = 0
     while count < SAMPLES and time.monotonic() - begun < LONGEST:
-        driver.read_state()
+        whole_state(driver)
         count += 1
     return count / max(time.monotonic() - begun, 1e-6)

@@ -24,7 +24,7 @@ from gapbridge.drivers.addresses import is_loopback
 from gapbridge.drivers.can.settings import CanSettings
 from gapbridge.drivers.canopen.settings import CanopenSettings
 from gapbridge.drivers.modbus.settings import ModbusSettings
-from gapbridge.drivers.replay import ReplaySettings
+from gapbridge.drivers.replay.settings import ReplaySettings
 from gapbridge.drivers.ur_rtde.settings import UrRtdeSettings
 
 DEFAULT_DRIVER = "ur_rtde"

@@ -17,7 +17,7 @@ from gapbridge.bridge.cell.robot import calibration_of
 from gapbridge.core.errors import CellError
 from gapbridge.core.rotation import rotation_vector
 from gapbridge.drivers.addresses import is_loopback
-from gapbridge.drivers.driver import DriverSettings
+from gapbridge.drivers.link_settings import DriverSettings
 from gapbridge.drivers.simulated.ft_sensor.serving import served_sensor
 from gapbridge.drivers.simulated.server.arm_controller import ArmController, make_controller
 from gapbridge.drivers.simulated.server.protocol_server import ProtocolServer, serve_controller

@@ -101,6 +101,7 @@ class Daemon:
         self._lost_rows = 0
         self._refused = False  # writing was asked for and could not begin
         self._seen = False  # a state has been read, by this or a former loop
+        self._ends_at = float("inf")  # s, monotonic: when a run of given length is over
         self.restarts = 0
         self._loops = 0  # processes of the loop so far, those of a reload among them
         self._wait = settings.backoff[0]
@@ -255,7 +256,10 @@ class Daemon:
     # -- the run ----------------------------------------------------------------------------------
 
     def run(self, arm: bool = False, duration: float | None = None, by: str = "") -> RunSummary:
-        """Run until stopped; ``by`` says who or what has asked for arming. See run_cell."""
+        """Run until stopped; ``by`` says who or what has asked for arming. See run_cell.
+
+        ``duration``, s, counts from the first cycle of the run, whatever becomes of the controller.
+        """
         with ExitStack() as stack:
             arm = self._open(stack, arm, by)
             while not self._stopping.is_set():
@@ -325,6 +329,8 @@ class Daemon:
 
     def _tick(self) -> None:
         """Look after everything but the loop."""
+        if self._clock.monotonic() >= self._ends_at:
+            self._stopping.set()
         self._take()
         self._pass_on()
         if self.page.promote():
@@ -351,12 +357,12 @@ class Daemon:
                 self._clock.sleep(TICK)
                 self._tick()
                 if self.page.seen and first_cycle is None:
-                    first_cycle, self._seen = self._clock.monotonic(), True
+                    first_cycle = self._clock.monotonic()
+                    if duration is not None and not self._seen:
+                        self._ends_at = first_cycle + duration
+                    self._seen = True
                     self.manager.ready()
-                over = first_cycle is not None and (
-                    duration is not None and self._clock.monotonic() - first_cycle >= duration
-                )
-                if over or (self.page.ended and duration is None):
+                if self.page.ended and duration is None:
                     self._stopping.set()
                 if self._reload.step(self.state, self.phase, self.configuration):
                     self._commands.ask(Command.RAMP_OUT)  # by nobody's wish
@@ -438,7 +444,7 @@ class Daemon:
             self._refused |= event["cause"] == Cause.START_REFUSED
             if detail:
                 self._faults.append(text)
-        elif detail and kind not in ("granted", "summary", "request"):
+        elif detail and kind not in ("failure", "granted", "summary", "request"):  # a fault follows
             self._say(detail)
 
     def _after(self, loop: LoopProcess) -> None:

@@ -23,12 +23,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from gapbridge.bridge.daemon.rest_model import Place, RestModel
 from gapbridge.bridge.ipc.events import Event
-from gapbridge.core.dynamics import predict_torque, predict_wrench, with_pieces
-from gapbridge.core.loads import Loads
 from gapbridge.core.model import Model
-from gapbridge.core.motion import Motion
-from gapbridge.core.rotation import rotation_matrix
 
 Array = NDArray[np.float64]
 
@@ -54,7 +51,6 @@ LARGEST_SLIP = 0.05  # rad: what no slip makes is a force
 FORCE = 1.0  # N on top of that
 FORCE_SIGMAS = 8.0
 LASTING = 3  # rests in a row after which a force counts as the new state of things
-STEP = 1e-4  # rad, kg, kg m: of the differences
 TIPS = 0.1  # rad: poses closer than this are one to the test
 
 
@@ -92,18 +88,6 @@ class Force:
             "kind": "warning", "what": "unexpected_force", "size": self.size, "since": self.since,
             "detail": self.detail,
         }  # fmt: skip
-
-
-@dataclass
-class _Place:
-    """A pose that the program comes back to."""
-
-    q: Array  # (n,) rad
-    mass: float  # kg, declared
-    side: bytes  # from which each joint has come
-    predicted: Array  # (m,) readings of the rigid arm
-    slip: Array  # (m, n) change of the readings per rad of each joint's zero
-    free: Array  # (m, f) what a step of sensors' zeros and of the payload changes
 
 
 @dataclass(frozen=True)
@@ -154,7 +138,9 @@ class SlipWatch:
 
     def __init__(self, model: Model | None, slices: Mapping[str, slice], smallest: float) -> None:
         # bending is the same at each visit to a pose, and cancels
-        self._model = None if model is None or smallest <= 0.0 else model.without_terms()
+        self._model: RestModel | None = None
+        if model is not None and smallest > 0.0:
+            self._model = RestModel(model.without_terms())
         self._smallest = smallest
         names = (
             "actual_q", "ft_raw_wrench", "actual_TCP_force", "actual_current_as_torque", "payload",
@@ -170,7 +156,7 @@ class SlipWatch:
 
     def forget(self) -> None:
         """Learn anew: the arm is another from now on."""
-        self._places: list[_Place] = []
+        self._places: list[Place] = []
         self._rests: deque[_Rest] = deque(maxlen=KEPT)
         self._standing: _Standing | None = None
         self._touched = False  # a force has come or gone during this rest
@@ -217,9 +203,10 @@ class SlipWatch:
         """Report a force that comes or goes while the arm stands: nobody's zero, once a rest."""
         if self._touched or self._sigma is None:
             return []
+        assert self._model is not None
         n = self._n
         size = float(np.linalg.norm(_first_finite(change[n : n + 3], change[n + 6 : n + 9])))
-        self._touched = size > self._most(LARGEST_SLIP * 9.81 * self._payload(mean)[0])
+        self._touched = size > self._most(LARGEST_SLIP * 9.81 * self._model.payload(mean)[0])
         return [_force(size, now, "came or went while the arm stood still")] * self._touched
 
     def _most(self, slip: float) -> float:
@@ -232,10 +219,11 @@ class SlipWatch:
         standing = self._standing
         if standing is None or not standing.windows:
             return []
+        assert self._model is not None
         # the middle window: a touch that is shorter than half of the rest leaves no trace
         mean = _middle(standing.windows)
         place = self._place_of(mean)
-        rest = _Rest(place, standing.since, self._readings(mean, self._places[place]))
+        rest = _Rest(place, standing.since, self._model.readings(mean, self._places[place]))
         self._before = mean[: self._n]
         found = self._forces(rest)
         if self._odd:
@@ -273,8 +261,9 @@ class SlipWatch:
 
     def _place_of(self, mean: Array) -> int:
         """Return the number of the pose, a new one where it has not been seen yet."""
+        assert self._model is not None
         n = self._n
-        q, mass = mean[:n], self._payload(mean)[0]
+        q, mass = mean[:n], self._model.payload(mean)[0]
         way = np.zeros(n) if self._before is None else q - self._before
         side = np.where(np.abs(way) > TURNED, np.sign(way), 0).astype(np.int8).tobytes()
         for number, place in enumerate(self._places):
@@ -283,7 +272,7 @@ class SlipWatch:
                 return number
         if len(self._places) >= PLACES:
             self._forget_oldest()
-        self._places.append(_Place(q, mass, side, *self._columns(mean)))
+        self._places.append(Place(q, mass, side, *self._model.columns(mean)))
         return len(self._places) - 1
 
     def _forget_oldest(self) -> None:
@@ -297,64 +286,6 @@ class SlipWatch:
             if rest.place != oldest
         ]
         self._rests = deque(kept, maxlen=KEPT)
-
-    def _payload(self, mean: Array) -> tuple[float, Array]:
-        """Return mass, kg, and centre (3,), m, that the controller declares, or else the cell."""
-        assert self._model is not None
-        declared = mean[2 * self._n + 12 :]
-        if np.isfinite(declared).all():
-            return float(declared[0]), declared[1:]
-        return self._model.payload_mass, np.asarray(self._model.payload_cog)
-
-    def _readings(self, mean: Array, place: _Place) -> Array:
-        """Return what was measured less the model's (6 + n,): flange wrench, motor torques."""
-        n = self._n
-        wrench, at_tcp = mean[n : n + 6], mean[n + 6 : n + 12]
-        predicted = place.predicted + place.slip @ (mean[:n] - place.q)
-        if np.isfinite(wrench).all():
-            at_flange = wrench - predicted[:6]
-        else:  # the controller's own, its payload taken off: the flange feels what is left of it
-            at_flange = self._at_flange(mean[:n], at_tcp)
-        return np.concatenate([at_flange, mean[n + 12 : 2 * n + 12] - predicted[6:]])
-
-    def _at_flange(self, q: Array, at_tcp: Array) -> Array:
-        """Return a wrench (6,) at the TCP, base axes, as one at the flange in its own axes."""
-        assert self._model is not None
-        tool = self._model.tool_in_flange
-        flange_in_base = rotation_matrix(self._model.rigid_pose(q[None]).rotation_vector)[0]
-        flange_in_base = flange_in_base @ tool[:3, :3].T
-        force, torque = flange_in_base.T @ at_tcp[:3], flange_in_base.T @ at_tcp[3:]
-        return np.concatenate([force, torque + np.cross(tool[:3, 3], force)])
-
-    def _columns(self, mean: Array) -> tuple[Array, Array, Array]:
-        """Return readings, and how each joint's zero changes them, and what is no slip."""
-        n = self._n
-        mass, cog = self._payload(mean)
-        steps = STEP * np.vstack([np.eye(n), -np.eye(n), np.zeros(n)])
-        turned = self._predicted(mean[:n] + steps, mass, cog)
-        slip, here = (turned[:n] - turned[n:-1]).T / (2.0 * STEP), turned[-1]
-        moment = mass * cog
-        payload = [
-            (self._predicted(mean[None, :n], mass + STEP, (moment + m) / (mass + STEP))[0] - here)
-            / STEP
-            for m in STEP * np.vstack([np.zeros(3), np.eye(3)])
-        ]
-        payload[1:] = [column - payload[0] for column in payload[1:]]  # the moment's own
-        return here, slip, np.column_stack([np.eye(6 + n), *payload])
-
-    def _predicted(self, q: Array, mass: float, cog: Array) -> Array:
-        """Return the rigid arm's readings (N, 6 + n) at rest."""
-        assert self._model is not None
-        count, still = len(q), np.zeros(q.shape)
-        motion = Motion(
-            t=np.zeros(count), q=q, qd=still, qdd=still, target_q=None,
-            loads=Loads(np.full(count, mass), np.tile(cog, (count, 1))), rows=np.arange(count),
-            valid=np.ones(count, dtype=bool), stretch=np.zeros(count, dtype=np.int64), start=0.0,
-            moving=False, still=np.ones(self._n),
-        )  # fmt: skip
-        motion = with_pieces(self._model, motion)
-        wrench, torque = predict_wrench(self._model, motion), predict_torque(self._model, motion)
-        return np.hstack([wrench, torque])
 
     # -- the test ---------------------------------------------------------------------------------
 

@@ -43,7 +43,7 @@ from gapbridge.drivers import make_driver
 from gapbridge.drivers.clock import SYSTEM
 from gapbridge.drivers.driver import Driver
 from gapbridge.drivers.ft_sensor.joined import DriverWithSensor
-from gapbridge.drivers.replay import ReplayDriver
+from gapbridge.drivers.replay.driver import ReplayDriver
 
 _PR_SET_PDEATHSIG = 1
 LONGEST_WORDS = 1000  # of an event

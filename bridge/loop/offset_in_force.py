@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from gapbridge.bridge.cell.runtime_folder import runtime_folder
 from gapbridge.drivers.controller_address import address_of
-from gapbridge.drivers.driver import DriverSettings
+from gapbridge.drivers.link_settings import DriverSettings
 
 Vector = NDArray[np.float64]
 STAYED = 0.02  # rad: an arm that is farther from its last setpoint has been moved by somebody

@@ -23,7 +23,7 @@ from gapbridge.core.loads import Loads
 from gapbridge.core.model import Model
 from gapbridge.core.setpoint import Setpoint
 from gapbridge.core.state import RobotState
-from gapbridge.drivers.replay import Cycle, EndOfRecordingError, ReplayDriver
+from gapbridge.drivers.replay.driver import Cycle, EndOfRecordingError, ReplayDriver
 
 
 class _Followed(StrEnum):

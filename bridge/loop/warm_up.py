@@ -11,10 +11,13 @@ import numpy as np
 from gapbridge.bridge.loop.setpoint_stream import NominalStream
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.compensation import Compensator, correct
+from gapbridge.core.dynamics import with_pieces
 from gapbridge.core.estimation.pose_jacobian import pose_columns
 from gapbridge.core.kernels.factor import factor_blocks
 from gapbridge.core.limits import Limiter, Limits
+from gapbridge.core.log.log import Log
 from gapbridge.core.model import Model
+from gapbridge.core.motion import motion_of
 from gapbridge.drivers.offset_inverse import Nominal
 from gapbridge.drivers.ur_rtde.state import plausible
 
@@ -27,6 +30,7 @@ def warm_up() -> None:
     for rows in (q, np.repeat(q, 4, axis=0)):  # one by one, and in blocks
         model.predict(rows).rotation_vector  # noqa: B018 (compiled when asked for)
         model.linear_form(rows)
+    with_pieces(model, motion_of(Log("", {"actual_q": q}, n)))
     pose_columns(model, q, None, [(0, 0)], np.array([1e-9]))
     gap, factor = np.zeros((1, 3)), np.zeros((2 * n + 1, 2 * n + 1))
     factor_blocks(model.chain(), model.rows(q), gap, gap, 0, 0, 1, factor)

@@ -191,9 +191,13 @@ class _Patch:
         half = self.changes.of_joint(Kind.PLAY, joint) / 2
         if not half:
             return
-        friction = TAKEN_UP * self.scene.inertia_about(name, axis)
-        self._behind(name, "backlash", axis, half_range=half)
-        self.scene.rub_behind(name, f"{name}_backlash", friction)
+        largest = self.scene.largest_inertia(name)
+        friction = TAKEN_UP * largest
+        # MuJoCo scales limits and friction by the inertia at its zero pose, where that of an arm
+        # straight up is next to nothing about its first axis.
+        softer = min(self.scene.inertia_about(name, axis) / largest, 1.0)
+        self._behind(name, "backlash", axis, half_range=half, softer=softer)
+        self.scene.rub_behind(name, f"{name}_backlash", friction, softer)
         self.changed.append(
             f"joint {name}_backlash: +-{half:.6g} rad; tendon {name}_backlash_friction, "
             f"{friction:.3g} Nm, takes it up against the motion where no load does"

@@ -27,7 +27,8 @@ DAMPING = 0.3  # ratio of a further joint's damping to the critical one
 FOLDERS = ("meshdir", "texturedir", "assetdir")  # of <compiler>, relative to the file
 PLACED = ("pos", "quat", "axisangle", "xyaxes", "zaxis", "euler")
 WRAPPER_MASS = 1e-6  # kg: MuJoCo asks for more than none of a body that moves
-PLAY_SOLREF = (0.004, 1.0)
+SOLREF = (0.004, 1.0)  # of play and of what rubs over it
+POSES = 64  # in which a joint's inertia is looked at
 
 
 @dataclass(frozen=True)
@@ -40,6 +41,7 @@ class Hinge:
     stiffness: tuple[float, ...] = ()  # Nm/rad, Nm/rad2, ...: a polynomial in the angle
     inertia: float = 0.0  # kg m2 that swings on the spring, for its damping
     half_range: float = 0.0  # rad to each side, 0 where it is not limited
+    softer: float = 1.0  # how much softer the limits are than MuJoCo's own
 
     def element(self, timestep: float) -> ElementTree.Element:
         """Return the <joint>, every attribute written: a model's classes give others.
@@ -57,8 +59,14 @@ class Hinge:
         )  # fmt: skip
         if half:
             joint.set("range", numbers([-half, half]))
-            joint.set("solreflimit", numbers(PLAY_SOLREF))
+            joint.set("solreflimit", numbers(SOLREF))
+            joint.set("solimplimit", numbers(impedance(self.softer)))
         return joint
+
+
+def impedance(softer: float) -> tuple[float, ...]:
+    """Return MuJoCo's solimp, its own where ``softer`` is 1."""
+    return 1 - 0.1 * softer, 1 - 0.05 * softer, 1e-3, 0.5, 2.0
 
 
 class Scene:
@@ -93,7 +101,7 @@ class Scene:
         self._behind: dict[str, list[Hinge]] = {}  # by joint
         self._before: dict[str, tuple[str, list[Hinge]]] = {}  # by body: the body put before it
         self._explicit: set[str] = set()
-        self._rubbing: list[tuple[str, str, float]] = []
+        self._rubbing: list[tuple[str, str, float, float]] = []
 
     def hinges(self) -> list[str]:
         """Return the names of all hinges."""
@@ -151,15 +159,30 @@ class Scene:
     def inertia_about(self, joint: str, axis: Array, anchor: Array | None = None) -> float:
         """Return the inertia (kg m2) of all beyond a joint about an axis (world) at its anchor."""
         j = self.compiled.joint(joint).id
-        body = self.compiled.jnt_bodyid[j]
         anchor = self.data.xanchor[j] if anchor is None else anchor
+        return self._inertia(self.data, j, axis, anchor)
+
+    def largest_inertia(self, joint: str) -> float:
+        """Return the largest inertia (kg m2) of all beyond a joint about its axis, in any pose."""
+        j = self.compiled.joint(joint).id
+        moved = [self.compiled.joint(name).qposadr[0] for name in self.hinges()]
+        data = self.mujoco.MjData(self.compiled)
+        found = []
+        for q in np.random.default_rng(1).uniform(-np.pi, np.pi, (POSES, len(moved))):
+            data.qpos[moved] = q
+            self.mujoco.mj_kinematics(self.compiled, data)
+            found.append(self._inertia(data, j, data.xaxis[j], data.xanchor[j]))
+        return max(found)
+
+    def _inertia(self, data: Any, joint: int, axis: Array, anchor: Array) -> float:
+        body = self.compiled.jnt_bodyid[joint]
         total = 0.0
         for k in range(body, self.compiled.nbody):
             up = k
             while up > body:
                 up = self.compiled.body_parentid[up]
             if up == body:
-                away = np.cross(axis, self.data.xipos[k] - anchor)
+                away = np.cross(axis, data.xipos[k] - anchor)
                 total += self.compiled.body_mass[k] * float(away @ away)
         return total + ARMATURE
 
@@ -167,12 +190,12 @@ class Scene:
         """Put a hinge behind a joint and those put there before, in the joint's body."""
         self._behind.setdefault(joint, []).append(hinge)
 
-    def rub_behind(self, joint: str, further: str, friction: float) -> None:
+    def rub_behind(self, joint: str, further: str, friction: float, softer: float) -> None:
         """Let what turns by a joint and a further one behind it rub against what carries both.
 
         A tendon over both with ``friction`` (Nm).
         """
-        self._rubbing.append((joint, further, friction))
+        self._rubbing.append((joint, further, friction, softer))
 
     def put_before(self, body: Any, name: str, hinges: Sequence[Hinge]) -> None:
         """Put a body with hinges between a body and its parent."""
@@ -293,13 +316,16 @@ def _put_before(
     parent.insert(place, new)
 
 
-def _rub(root: ElementTree.Element, joint: str, further: str, friction: float) -> None:
+def _rub(
+    root: ElementTree.Element, joint: str, further: str, friction: float, softer: float
+) -> None:
     tendons = root.find("tendon")
     if tendons is None:
         tendons = ElementTree.SubElement(root, "tendon")
     fixed = ElementTree.SubElement(
         tendons, "fixed", name=f"{further}_friction", frictionloss=numbers(friction),
-        limited="false", stiffness="0", damping="0",
+        limited="false", stiffness="0", damping="0", solreffriction=numbers(SOLREF),
+        solimpfriction=numbers(impedance(softer)),
     )  # fmt: skip
     for name in (joint, further):
         ElementTree.SubElement(fixed, "joint", joint=name, coef="1")

@@ -19,7 +19,7 @@ def data_quality(material: Material) -> list[Block]:
     diagnosis = material.diagnosis
     rows = [
         [CHANNELS[c.channel], str(len(material.log)), str(c.samples),
-         str(int((~c.selection.kept).sum())),
+         str(len(c.outliers)),
          str(len(np.unique(c.selection.observation.groups)))]
         for c in diagnosis.channels
     ]  # fmt: skip
@@ -54,7 +54,8 @@ def _outliers(channel: ChannelDiagnosis, log: Log) -> list[Block]:
         [str(log.line(channel.selection.observation.rows[i])), with_unit(float(size[i]),
          channel.unit)] for i in worst
     ]  # fmt: skip
-    more = f" The {LISTED} largest of {len(outliers)}:" if len(outliers) > LISTED else ""
+    count = len(channel.outliers)
+    more = f" The {len(worst)} largest of {count}:" if count > len(worst) else ""
     return [
         Heading(f"Outliers: {CHANNELS[channel.channel]}"),
         Paragraph(

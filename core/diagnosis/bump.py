@@ -9,6 +9,7 @@ from gapbridge.core.diagnosis.criteria import SMOOTH_PENALTY
 from gapbridge.core.diagnosis.residual_structure import basis_of
 from gapbridge.core.diagnosis.selection.candidate import joint_quantity
 from gapbridge.core.diagnosis.selection.selection import Selection
+from gapbridge.core.estimation.nelder_mead import nelder_mead
 
 Array = NDArray[np.float64]
 PLACES, WIDTHS = 13, (0.05, 0.1, 0.2)  # where a bump is first looked for, in shares of the range
@@ -43,8 +44,6 @@ def bumps(selection: Selection) -> set[int]:
 
 def _best_bump(selection: Selection, i: int, rest: Array, y: Array) -> float:
     """Return what the best Gaussian bump in joint i's angle leaves of |y|^2."""
-    from scipy.optimize import minimize
-
     observation = selection.observation
     assert observation.joint_columns is not None
     joint = observation.joint_columns[:, :, i, None]
@@ -61,4 +60,4 @@ def _best_bump(selection: Selection, i: int, rest: Array, y: Array) -> float:
     tries = [np.array([low + s * span, np.log(w * span)])
              for s in np.linspace(0, 1, PLACES) for w in WIDTHS]  # fmt: skip
     best = min(tries, key=left)
-    return float(minimize(left, best, method="Nelder-Mead", options={"maxiter": 120}).fun)
+    return nelder_mead(left, best, 120)[1]

@@ -76,7 +76,9 @@ def _compared(
     unit = np.where(alive, 1 / np.where(alive, size, 1.0), 0.0)
     solution, *_ = np.linalg.lstsq(A * unit, unprojected.target, rcond=1e-9)
     left = unprojected.target - (A * unit) @ solution
-    variance = max(float(left @ left) / max(len(left) - A.shape[1], 1), space.floor)
+    variance = max(
+        float(left @ left) / max(len(left) * selection.rows_each - A.shape[1], 1), space.floor
+    )
     inverse = np.linalg.pinv((A * unit).T @ (A * unit), rcond=1e-10, hermitian=True)
     own_part = slice(0, split.shape[1])
     covariance = (inverse * variance * np.outer(unit, unit))[own_part, own_part]

@@ -20,20 +20,18 @@ VARIES = (
 # An accusation by itself
 OWN_SIGMAS = 3.0  # of at least one of its numbers: what an engineer calls a finding
 NEGLIGIBLE = 1e-3  # of its parameters' usual sizes: the tail of a servo is a dead band of 5e-9 rad
-GAIN = 0.0  # lower end of the held-out gain of a cause
-STAND_IN_GAIN = 0.02  # the same of a stand-in, in regions that its fit did not see
+STAND_IN_GAIN = 0.02  # lower end of a stand-in's held-out gain, in regions that its fit did not see
 HEAVIEST = 3.0  # times the largest declared payload (or the rated one): a load is not off by more
 # Geometry as a whole
 LENGTH, ANGLE = 5e-4, 1e-3  # m, rad: 1 sigma of machining and assembly
-SHARES = (0.2, 1.0)  # of them: a factory calibration leaves a fifth, a kit arm all of it
 FEW_LINKS = 3  # links whose first moments are off singly, from which all are tried as a whole
 CLOSED_SHARE = (
     1 / 3
-)  # of the gap in every part not fitted: the Motoman cube keeps 0.20 to 0.29, unknown
-# causes 0.42 at least in some part, nearly always all of the gap
+)  # of what is left in every part not fitted: the Motoman cube keeps 0.20 to 0.27, a UR5's grid
+# 0.18 to 0.21, unknown causes 0.42 at least in some part, nearly always all of the gap
 MIN_GEOMETRIC_CAUSES = 2  # geometric causes from which all links are tried as a whole
 # A residual with structure
-SURE_P = 0.002  # probability below which it is sure, times one more than the causes beside it
+SURE_P = 0.002  # probability below which it is sure: chance says so of one clean log in 500
 HINT_P = 0.05  # the same where the search needed an unnamed function or an accusation has fallen
 OVER_STATED_NOISE = 1.5  # times the stated noise: beyond, more than noise is left
 OVER_REPEAT_SCATTER = 1.6  # times the scatter of repeated poses
@@ -48,7 +46,6 @@ SAME_SPAN = 1e-4  # of a cause's squares left by another that does all it does: 
 # are what supports them as a whole, none was measured by itself
 ACCUSATION_PENALTY = 6.0  # score that every accusation pays: keeps clean logs clean
 SMOOTH_PENALTY = 18.0  # the same of an unnamed function beyond a named cause
-SINGLE_CAUSE_PREFERENCE = 10.0  # score by which one cause is preferred that does the work of three
 FAMILY_PENALTY = 4.0  # score that one kind of effect at two places may cost beyond two kinds
 NO_REVERSAL_PENALTY = 3.0  # of play in a log without reversals: it stands behind the offset
 MAX_LINES = 4  # periodic lines a joint may have: more are the Fourier series of something else

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,15 @@ from threadpoolctl import threadpool_limits
 from gapbridge.core.diagnosis.carrying import Carried, carried
 from gapbridge.core.diagnosis.channels import position, torque, tracking, wrench
 from gapbridge.core.diagnosis.channels.simulation import joined, predicted_by
-from gapbridge.core.diagnosis.every_row import on_every_row, still_accused, with_uncertain_terms
+from gapbridge.core.diagnosis.every_row.gap_sizes import gaps, sizes_of, streamed_sizes
+from gapbridge.core.diagnosis.every_row.long_recording import long_recording
+from gapbridge.core.diagnosis.every_row.refitted import (
+    on_every_row,
+    refitted,
+    still_accused,
+    with_uncertain_terms,
+)
+from gapbridge.core.diagnosis.every_row.streamed import RowSums, Streamed
 from gapbridge.core.diagnosis.generalisation import NOWHERE, Generalisation, generalisation
 from gapbridge.core.diagnosis.held_out import HeldOut
 from gapbridge.core.diagnosis.judgement import (
@@ -25,7 +34,11 @@ from gapbridge.core.diagnosis.judgement import (
 )
 from gapbridge.core.diagnosis.location import Where, locate
 from gapbridge.core.diagnosis.log_checks.units_and_clocks import check_units, findings
-from gapbridge.core.diagnosis.noise_floor import Floor, noise_floor, own_coordinates, whiteness
+from gapbridge.core.diagnosis.noise_floor import (
+    Floor,
+    noise_floor,
+    whiteness,
+)
 from gapbridge.core.diagnosis.observation import NotObservable, Observation, thinned
 from gapbridge.core.diagnosis.residual_structure import dependence
 from gapbridge.core.diagnosis.result import Cause, Considered, causes_of, considered_of
@@ -43,6 +56,7 @@ from gapbridge.core.ranges import outside_findings
 from gapbridge.core.sessions import session_of, sessions_in, with_sessions
 
 Array = NDArray[np.float64]
+Depends = tuple[tuple[str, float], ...]  # quantity, share
 Observe = Callable[[Model, Log, Metrology], Observation | NotObservable]
 
 CHANNELS: Mapping[str, Observe] = {
@@ -53,6 +67,7 @@ CHANNELS: Mapping[str, Observe] = {
 }
 
 
+ROUNDING = 1e-10  # m, N, rad, Nm: what is left below is the arithmetic's, and has no structure
 # samples that a diagnosis looks at: more cost time and add hardly anything
 MOST = {"position": 1200, "wrench": 300, "tracking": 300, "torque": 300}
 
@@ -77,11 +92,12 @@ class ChannelDiagnosis:
     p_value: float | None
     depends_on: tuple[tuple[str, float], ...]
     verdict: str
-    selection: Selection = field(repr=False)
+    selection: Selection = field(repr=False)  # of a long recording that of its excerpt
     judgement: Judgement = field(repr=False)
     gap: Array = field(repr=False)  # (N, k) measured - predicted, frame fitted
     remaining: Array = field(repr=False)  # (N, k) with the causes in the model
     held_out: Array | None = field(repr=False)  # (kept,) rms of each held-out sample
+    outliers: NDArray[np.int64] = field(repr=False)  # rows of the log that were excluded
     stand_ins: tuple[Cause, ...] = ()  # not proved, but useful where nothing was fitted
     along: tuple[Term, ...] = ()  # causes and stand-ins, fitted together
     elsewhere: Generalisation = NOWHERE  # new region, new session
@@ -140,28 +156,50 @@ def _diagnose(
     check_units(model, log)
     notes = _log_findings(model, log, metrology)
     observed: list[ChannelDiagnosis] = []
+    searched: list[tuple[_Searched, RowSums]] = []
     hidden: list[NotObservable] = []
     if simulated is not None:
         log = joined(log, simulated)
         observers = {name: predicted_by(name, o) for name, o in observers.items()}
-    for observe in observers.values():
-        seen = observe(model, log, metrology)
+    long = long_recording(log)
+    for name, observe in observers.items():
+        sampled = None if name == "position" else long
+        looked_at = log if sampled is None else sampled.excerpt
+        seen = observe(model, looked_at, metrology)
         if isinstance(seen, NotObservable):
             hidden.append(seen)
             continue
         whole = seen
         if len(seen.rows) > MOST[seen.channel]:
-            notes.append(
-                f"{seen.channel}: causes were searched on {MOST[seen.channel]} of "
-                f"{len(seen.rows)} rows, evenly taken; fitted and judged on all of them"
-            )
-            seen = _thinned(seen, model, log, metrology, observe)
+            seen = _thinned(seen, model, looked_at, metrology, observe)
         enough = _enough(seen)
         if enough is not None:
             notes.append(enough)
             hidden.append(NotObservable(seen.channel, ("more rows",)))
             continue
-        observed.append(_channel(seen, whole, model, withhold, progress))
+        if sampled is not None:
+            seen, whole = (replace(o, rows=sampled.rows[o.rows]) for o in (seen, whole))
+        found = _searched(seen, whole, model, withhold, progress)
+        if sampled is None:
+            observed.append(_decided(found, model, None))
+        else:
+            streamed = partial(_observed_in, observe, model, metrology)
+            found = found.without_columns()
+            searched.append((found, found.row_sums(streamed, model)))
+    if long is not None and searched:
+        if progress:
+            progress(f"all {len(log)} rows")
+        for block in long:
+            for _, sums in searched:
+                sums.add(long, block)
+        observed += [_decided(found, model, sums.streamed()) for found, sums in searched]
+    for channel in observed:
+        most = MOST[channel.channel]
+        if channel.samples > most:
+            notes.append(
+                f"{channel.channel}: causes were searched on {most} of {channel.samples} rows, "
+                "evenly taken; fitted and judged on all of them"
+            )
     if not observed:
         needs = "; ".join(f"{h.channel}: {', '.join(h.needs)}" for h in hidden)
         lacking = [need for h in hidden for need in h.needs if need in COLUMNS]
@@ -181,6 +219,37 @@ def _diagnose(
         with_found(model, _and_stand_ins(observed, terms)),
         log.session_names, log.one_clock,
     )  # fmt: skip
+
+
+def _observed_in(
+    observe: Observe, model: Model, metrology: Metrology, log: Log
+) -> Observation | NotObservable:
+    return observe(model, log, metrology)
+
+
+@dataclass(frozen=True)
+class _Searched:
+    """What a search in a channel's samples found, before more rows judge."""
+
+    seen: Observation
+    selection: Selection  # on all samples of the channel
+    more: bool  # these are more than were searched
+    verdict: Judgement
+    # on what the rest depends in the samples that were searched, beside some of the terms
+    depends: Callable[[Sequence[int]], Depends]
+    where: Where
+    considered: tuple[Considered, ...]
+    stood_in: dict[str, Any]
+
+    def without_columns(self) -> _Searched:
+        """Return the same without the columns of all candidates: 50 MB that no row asks for."""
+        known = self.verdict.depends_on or self.depends(self.verdict.accused)
+        return replace(self, depends=lambda _: known)
+
+    def row_sums(self, observe: Callable[[Log], Any], model: Model) -> RowSums:
+        """Return the sums over all rows of a long recording, at what was found."""
+        by_region = self.verdict.remainder is not None
+        return RowSums(self.selection, self.verdict.accused, observe, model.arm, by_region)
 
 
 def _log_findings(model: Model, log: Log, metrology: Metrology) -> list[str]:
@@ -261,10 +330,11 @@ def _enough(seen: Observation) -> str | None:
     return None
 
 
-def _channel(
+def _searched(
     seen: Observation, whole: Observation, model: Model, withhold: tuple[str, ...],
     progress: Callable[[str], None] | None,
-) -> ChannelDiagnosis:  # fmt: skip
+) -> _Searched:  # fmt: skip
+    """Return what a search in ``seen`` found, refitted on all samples of ``whole``."""
     searched = select(seen, model, withhold, progress)
     searched, verdict = judge_geometry(searched, judge(searched, HeldOut(searched)), model.arm)
     held = HeldOut(searched)
@@ -275,58 +345,81 @@ def _channel(
     chosen = [searched.term_index[p] for p in verdict.accused]
     where = locate(searched, gaps(searched, chosen)[0][searched.kept], chosen)
     selection = searched
-    if whole is not seen:
+    if len(whole.rows) > len(seen.rows):
         if progress:
             progress(f"{seen.channel}: all {len(whole.rows)} rows")
         verdict = with_uncertain_terms(verdict)
         selection = on_every_row(searched, verdict, whole, model)
-        held = HeldOut(selection)
-        selection, verdict = still_accused(selection, verdict, held, model)
-        chosen = [selection.term_index[p] for p in verdict.accused]
-    gap, remaining = gaps(selection, chosen)
-    k = own_coordinates(seen)
-    counted = k if seen.channel == "position" else gap.shape[1]  # a wrench's torques weighed
-    kept = selection.kept
-    causes = causes_of(selection, verdict, held, model.arm)
-    left = float(np.sqrt(np.mean((remaining[kept] * seen.weight)[:, :counted] ** 2)))
-    verdict, floor = _with_whiteness(verdict, selection, searched)
+
+    def follows(accused: Sequence[int]) -> Depends:
+        fitted = [searched.term_index[p] for p in accused]
+        basis = searched.nuisance_basis
+        return tuple(dependence(searched.space, basis, fitted, searched.groups))
+
+    more = selection is not searched
+    return _Searched(seen, selection, more, verdict, follows, where, considered, stood_in)
+
+
+def _decided(found: _Searched, model: Model, streamed: Streamed | None) -> ChannelDiagnosis:
+    """Return what all rows leave of what was found; ``streamed`` are those of a long recording."""
+    seen, shown, verdict = found.seen, found.selection, found.verdict
+    decided = shown if streamed is None else streamed.selection(verdict.accused)
+    held = HeldOut(decided)
+    if found.more or streamed is not None:
+        alone = partial(refitted, model) if streamed is None else streamed.alone
+        decided, verdict = still_accused(decided, verdict, held, alone)
+    if streamed is None:
+        shown = decided
+    else:
+        shown = replace(shown, terms=decided.terms, covariance=decided.covariance)
+    chosen = [decided.term_index[p] for p in verdict.accused]
+    gap, remaining = gaps(shown, chosen)
+    if streamed is None:
+        sizes = sizes_of(shown, gap, remaining)
+    else:
+        sizes = streamed_sizes(streamed, decided, verdict.accused)
+    causes = causes_of(decided, verdict, held, model.arm)
+    verdict, floor = _with_whiteness(verdict, shown, sizes.means, found.depends)
     held_rms = held.rms(chosen) if held.possible else None
-    gap_rms = float(np.sqrt(np.mean((gap[kept] * seen.weight)[:, :counted] ** 2)))
     if not causes:  # nothing was fitted but the frame, before as well as after
-        held_rms = gap_rms
+        held_rms = sizes.gap_rms
+    if sizes.left < ROUNDING:
+        verdict = replace(verdict, structured=False, depends_on=())
     structured = verdict.structured
     word = "explained" if causes else "no_gap"
     if structured:
         word = "partly_explained" if causes else "unexplained"
+    own = held if streamed is None else HeldOut(shown)
     return ChannelDiagnosis(
-        channel=seen.channel, unit=seen.unit, samples=len(gap), gap_rms=gap_rms,
-        gap_max=float(np.linalg.norm(gap[kept][:, :k], axis=1).max()),
-        noise_floor_rms=floor.rms, remaining_rms=left, remaining_rms_held_out=held_rms,
-        where=where, causes=causes, considered=considered,
-        unexplained_rms=_unexplained(left, floor.rms, verdict), structured=structured,
+        channel=seen.channel, unit=seen.unit, samples=sizes.samples, gap_rms=sizes.gap_rms,
+        gap_max=sizes.gap_max, noise_floor_rms=floor.rms, remaining_rms=sizes.left,
+        remaining_rms_held_out=held_rms, where=found.where, causes=causes,
+        considered=found.considered,
+        unexplained_rms=_unexplained(sizes.left, floor.rms, verdict), structured=structured,
         p_value=verdict.p_value, depends_on=verdict.depends_on, verdict=word,
-        selection=selection, judgement=verdict, gap=gap, remaining=remaining,
-        held_out=np.sqrt(held.squares(chosen)) if held.possible else None,
-        elsewhere=generalisation(selection, chosen), carried=carried(selection, chosen, model.arm),
-        noise_floor_source=floor.source, **stood_in,
+        selection=shown, judgement=verdict, gap=gap, remaining=remaining,
+        held_out=np.sqrt(own.squares(chosen)) if own.possible else None, outliers=sizes.outliers,
+        elsewhere=generalisation(decided, chosen), carried=carried(decided, chosen, model.arm),
+        noise_floor_source=floor.source, **found.stood_in,
     )  # fmt: skip
 
 
 def _with_whiteness(
-    verdict: Judgement, selection: Selection, searched: Selection
-) -> tuple[Judgement, Floor]:
+    verdict: Judgement, selection: Selection, means: Array | None,
+    depends: Callable[[Sequence[int]], Depends],
+) -> tuple[Judgement, Floor]:  # fmt: skip
     """Return the judgement with what all rows of a recording say of its residual, and the floor."""
     floor = noise_floor(selection, verdict.structured)
-    test = whiteness(selection, floor.rms)
+    test = whiteness(means, floor.rms)
     if test is None or test.white:
         return verdict, floor
     p_value = test.p_value if verdict.p_value is None else min(verdict.p_value, test.p_value)
-    depends = verdict.depends_on
-    if not depends:
-        fitted = [searched.term_index[p] for p in verdict.accused]
-        space, nuisance = searched.space, searched.nuisance_basis
-        depends = tuple(dependence(space, nuisance, fitted, searched.groups))
-    verdict = replace(verdict, structured=True, p_value=p_value, depends_on=depends)
+    verdict = replace(
+        verdict,
+        structured=True,
+        p_value=p_value,
+        depends_on=verdict.depends_on or depends(verdict.accused),
+    )
     return verdict, noise_floor(selection, True)
 
 
@@ -344,23 +437,6 @@ def _stood_in(
         "stand_ins": causes_of(along, notes, held, model.arm, verdict.stand_ins),
         "along": tuple(marked),
     }
-
-
-def gaps(selection: Selection, chosen: Sequence[int]) -> tuple[Array, Array]:
-    """Return the gap (N, k) without and with the chosen terms, the nuisance fitted each time."""
-    observation = selection.observation
-    at = dict(zip(selection.term_index, selection.terms, strict=True))
-    found = []
-    for terms in ([], [at[c] for c in chosen]):
-        gap = observation.measured - observation.predict(terms)
-        if observation.nuisance.shape[2]:
-            W = selection.noise.whitener
-            kept = selection.kept
-            A = (W @ observation.nuisance)[kept].reshape(-1, observation.nuisance.shape[2])
-            b = (W @ gap[..., None])[kept].ravel()
-            gap = gap - observation.nuisance @ np.linalg.lstsq(A, b, rcond=1e-12)[0]
-        found.append(gap)
-    return found[0], found[1]
 
 
 def _unexplained(left: float, floor: float | None, verdict: Judgement) -> float:
@@ -398,7 +474,7 @@ def _line_of(log: Log, row: int) -> str:
 
 def _channel_findings(channel: ChannelDiagnosis, log: Log) -> list[str]:
     notes = []
-    outliers = channel.selection.observation.rows[~channel.selection.kept]
+    outliers = channel.outliers
     if len(outliers):
         rows = ", ".join(_line_of(log, int(r)) for r in outliers[:8])
         notes.append(

@@ -60,7 +60,7 @@ class _Problem:
         self._k = observation.measured.shape[1]
         self._own = min(self._k, 3) if observation.channel == "position" else self._k
         self._weight = observation.weight[: self._own]
-        self._unwhiten = np.linalg.inv(selection.noise.whitener[kept])
+        self._unwhiten = selection.unwhitener()
         unprojected = selection.unprojected
         self._causes = unprojected.columns(selection.space, chosen)
         usual = [p.scale for c in chosen for p in selection.space.candidates[c].parameters]

@@ -42,7 +42,7 @@ class HeldOut:
         own = {"position": 3}.get(selection.observation.channel, k)
         # torques of a wrench count in N, as their noise compares: a cause may show in them alone
         self._weight = selection.observation.weight[: min(own, k)]
-        self._unwhiten = np.linalg.inv(selection.noise.whitener[selection.kept])
+        self._unwhiten = selection.unwhitener()
         self._k, self._own = k, min(own, k)
         names, group = np.unique(selection.observation.groups[selection.kept], return_inverse=True)
         self._group, self._groups = group, len(names)

@@ -12,14 +12,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import gammaincc
 
 from gapbridge.core.arm import Arm
 from gapbridge.core.diagnosis.bump import bumps
 from gapbridge.core.diagnosis.constancy import not_constant
 from gapbridge.core.diagnosis.criteria import (
     ENOUGH_REPEATS,
-    GAIN,
     HINT_P,
     NEGLIGIBLE,
     OVER_INSTRUMENT_SIGMA,
@@ -111,19 +109,21 @@ def judge(selection: Selection, held: HeldOut) -> Judgement:
 def judge_geometry(
     selection: Selection, judgement: Judgement, arm: Arm
 ) -> tuple[Selection, Judgement]:
-    """Return selection and judgement with all links' geometry accused, where no single link is.
+    """Return selection and judgement with all links' geometry accused, where one link is not it.
 
-    It has to close the gap in every part of the log, each predicted by a fit that did not see it.
+    What the accusations leave it has to close in every part of the log, each predicted by a fit
+    that did not see it.
     """
-    own = [selection.space.candidates[selection.term_index[p]] for p in judgement.accused]
-    fallen = [selection.space.candidates[selection.term_index[p]] for p, _ in judgement.withdrawn]
-    if any(c.effect.together for c in own) or not any(c.effect.together for c in fallen):
+    own = [selection.term_index[p] for p in judgement.accused]
+    found = [*own, *(selection.term_index[p] for p, _ in judgement.withdrawn)]
+    single = any(selection.space.candidates[c].effect.together for c in found)
+    if selection.block or not (single and judgement.structured):
         return selection, judgement
     try:
         whole = selection.with_all_links(arm)
     except InputError:  # no arm of such links stands
         return selection, judgement
-    if whole is None or not closes_everywhere(whole):
+    if whole is None or not closes_everywhere(whole, own):
         return selection, judgement
     again = judge(whole, HeldOut(whole))
     accused = {whole.term_index[p] for p in again.accused}
@@ -141,9 +141,7 @@ def _verdict(
     p_value = structure_p_value(space, nuisance, single)
     p_value = min(p_value, _too_much_left(whole))
     unnamed = any(not space.candidates[c].named for c in selection.found.chosen)
-    kinds = {space.candidates[c].family for c in stays}
-    # the more is accused, the less may be left
-    structured = p_value < (HINT_P if unnamed or fallen else SURE_P * (1 + len(kinds)))
+    structured = p_value < (HINT_P if unnamed or fallen else SURE_P)
     depends: tuple[tuple[str, float], ...] = ()
     if structured or not stays:
         depends = tuple(dependence(space, nuisance, single, selection.groups))
@@ -224,7 +222,7 @@ def _gainless(selection: Selection, stays: Sequence[int], held: HeldOut) -> list
             for kind, own in kinds.items()
         }
         worst = min(low, key=lambda kind: low[kind])
-        if low[worst] > GAIN:
+        if low[worst] > 0:
             break
         fallen += kinds[worst]
         left = [c for c in left if c not in kinds[worst]]
@@ -234,7 +232,8 @@ def _gainless(selection: Selection, stays: Sequence[int], held: HeldOut) -> list
 def _by_effect(selection: Selection, chosen: Sequence[int]) -> dict[str, list[int]]:
     kinds: dict[str, list[int]] = {}
     for c in chosen:
-        kinds.setdefault(selection.space.candidates[c].family, []).append(c)
+        whole = c in selection.block
+        kinds.setdefault("" if whole else selection.space.candidates[c].family, []).append(c)
     return kinds
 
 
@@ -289,6 +288,8 @@ def _too_much_left(selection: Selection) -> float:
         least, times = max(USUAL_REPEATABILITY, OVER_INSTRUMENT_SIGMA * observation.sigma) ** 2, 1.0
     if variance <= times**2 * least:
         return 1.0
+    from scipy.special import gammaincc  # a fifth of a second, only where too much is left
+
     return float(gammaincc(freedom / 2, freedom * variance / least / 2))
 
 

@@ -50,8 +50,9 @@ def noise_floor(selection: Selection, structured: bool) -> Floor:
     variance, freedom = repeat_variance(observation, selection.residual, selection.kept)
     if freedom >= ENOUGH_REPEATS:
         return Floor(float(np.sqrt(max(variance, observation.sigma**2))), "repeats")
-    if observation.instrument is not None:
-        measured = float(np.sqrt(np.mean(observation.instrument[:own] ** 2)))
+    instrument = observation.instrument and observation.instrument()
+    if instrument is not None:
+        measured = float(np.sqrt(np.mean(instrument[:own] ** 2)))
         floor = max(measured, observation.sigma)
         return Floor(floor or None, "neighbouring samples" if floor else "unknown")
     if not structured:
@@ -99,26 +100,30 @@ def repeat_variance(
     return float(np.sum(away**2)) / max(freedom, 1), freedom
 
 
-def whiteness(selection: Selection, floor: float | None) -> Whiteness | None:
+def whiteness(means: Array | None, floor: float | None) -> Whiteness | None:
     """Return whether the residual of a recording is white; None for poses, and short recordings.
 
-    A portmanteau test (Ljung and Box 1978) on means over BLOCK seconds, so that noise which a
-    sensor filters passes; the correlated part has to matter beside the floor, too.
+    ``means`` (B, k) are those of ``block_means``. A portmanteau test (Ljung and Box 1978) on means
+    over BLOCK seconds, so that noise which a sensor filters passes; the correlated part has to
+    matter beside the floor, too.
     """
+    if means is None or not floor or len(means) < FEWEST_BLOCKS:
+        return None
+    return _portmanteau(means - means.mean(axis=0), floor)
+
+
+def block_means(selection: Selection) -> Array | None:
+    """Return the mean (B, k) of the residual over every BLOCK seconds; None for poses."""
     observation = selection.observation
     t = observation.quantities.get("timestamp")
-    if not observation.order_in_time or t is None or not floor:
+    if not observation.order_in_time or t is None:
         return None
     kept, own = selection.kept, own_coordinates(observation)
     block = np.floor((t[kept] - t[kept][0]) / BLOCK).astype(np.int64)
     number = np.unique(block, return_inverse=True)[1].reshape(-1)
     count = np.bincount(number)
-    if len(count) < FEWEST_BLOCKS:
-        return None
     left = selection.residual[kept][:, :own]
-    mean = np.stack([np.bincount(number, left[:, j]) / count for j in range(own)], axis=1)
-    mean = mean - mean.mean(axis=0)
-    return _portmanteau(mean, floor)
+    return np.stack([np.bincount(number, left[:, j]) / count for j in range(own)], axis=1)
 
 
 def _portmanteau(mean: Array, floor: float) -> Whiteness:

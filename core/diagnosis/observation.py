@@ -53,7 +53,8 @@ class Observation:
     times: Array | None = None  # (N,) s or numbers of rows, where something may have stepped
     order_in_time: bool = False  # True: neighbours in time are correlated (a moving log)
     rebase: Callable[[Array], Observation] | None = None  # the same with the nuisance moved (p,)
-    instrument: Array | None = None  # (k,) 1 sigma measured by neighbouring samples of a recording
+    # 1 sigma (k,) measured by neighbouring samples, where a recording shows it
+    instrument: Callable[[], Array | None] | None = None
     fewer: Callable[[NDArray[np.int64]], Observation] | None = None  # of some samples only
     session: NDArray[np.int64] | None = None  # (N,) session of each sample; None: there is one
     nuisance_session: tuple[int, ...] = ()  # (p,) session of each nuisance column, where several

@@ -71,10 +71,10 @@ def links_withstand(selection: Selection) -> bool:
 
 
 def with_the_links(selection: Selection, stays: Sequence[int], fallen: Sequence[int]) -> list[int]:
-    """Return the joints' zeros and tool points, of those fallen, that stand with the links.
+    """Return the tool's point, where it fell, if it stands with the links.
 
-    Where all links are a cause these are numbers of the same geometry: none is sure beside unnamed
-    functions, so they are judged by what they do together in regions that their fit did not see.
+    Where all links are a cause it is one more number of the same geometry: not sure beside unnamed
+    functions, so it is judged by what it does in regions that its fit did not see.
     """
     space = selection.space
     own = [c for c in fallen if space.candidates[c].effect.beside_links]
@@ -86,8 +86,8 @@ def with_the_links(selection: Selection, stays: Sequence[int], fallen: Sequence[
     return own if gains else []
 
 
-def closes_everywhere(selection: Selection) -> bool:
-    """Return whether the geometry of all links closes the gap in every part of the log.
+def closes_everywhere(selection: Selection, accused: Sequence[int]) -> bool:
+    """Return whether all links' geometry closes, in every part of the log, what the accused leave.
 
     Each part is predicted by a fit that did not see it. What is no geometry at all reaches that in
     some part by chance, never in all.
@@ -97,7 +97,11 @@ def closes_everywhere(selection: Selection) -> bool:
     if not held.possible:
         return False
     count = np.bincount(part)
-    left, gap = (np.bincount(part, held.squares(c)) for c in (list(selection.block), ()))
+    candidates = selection.space.candidates
+    point = [c for c in selection.found.chosen if candidates[c].effect.beside_links]  # of the tool
+    left, gap = (
+        np.bincount(part, held.squares(c)) for c in ([*selection.block, *point], accused)
+    )  # fmt: skip
     alive = count > 0
     return bool(np.all(left[alive] < CLOSED_SHARE**2 * gap[alive]))
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from gapbridge.core.effects.effect import JointEffect, Parameter, Site, Term
-from gapbridge.core.effects.simulator import Kind, SimulatorChange
+from gapbridge.core.effects.simulator import Kind
 
 if TYPE_CHECKING:
     import numpy as np
@@ -29,16 +29,13 @@ class Backlash(JointEffect):
     label_words = "play of joint {joint}"
     by_approach = True
     channels = ("position",)
+    simulated_as = Kind.PLAY
     motion = "poses reached from both sides of the joint"
     instead = "add a joint about the same axis, limited to half the clearance on each side"
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return the whole clearance."""
         return (Parameter("", "rad", 3e-4, 0.0, 0.1),)
-
-    def simulator(self, term: Term, arm: Arm) -> tuple[SimulatorChange, ...]:
-        """Return it in a simulator's terms."""
-        return (SimulatorChange(Kind.PLAY, term.site.joint, term.values[0]),)
 
     def condition(
         self, term: Term, arm: Arm, rows: Rows, loads: Loads, q: NDArray[np.float64]

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, ClassVar
 
-from gapbridge.core.effects.effect import JointEffect, Parameter, Site, Term
+from gapbridge.core.effects.effect import Parameter, ServoEffect, Site, Term
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
     from gapbridge.core.arm import Arm
-    from gapbridge.core.motion import Motion
 
 
-class DeadBand(JointEffect):
+class DeadBand(ServoEffect):
     """The servo rests within w of its target and moves again only once it is further off.
 
     Coming from below it rests at target - w, from above at target + w; in motion it is play of half
@@ -31,7 +30,6 @@ class DeadBand(JointEffect):
     label_words = "dead band of servo {joint}"
     order = 70
     by_approach = True
-    channels = ("tracking",)
     motion = "the joint moved both ways, or poses reached from both sides"
     alike: ClassVar = {
         "latency": "motion at one speed each way",
@@ -43,20 +41,13 @@ class DeadBand(JointEffect):
         """Return the half width w."""
         return (Parameter("", "rad", 1e-3, 0.0, 0.2),)
 
-    def track(
-        self, term: Term, arm: Arm, q: NDArray[np.float64], motion: Motion
+    def follow(
+        self, term: Term, time: NDArray[np.float64], command: NDArray[np.float64], first: float
     ) -> NDArray[np.float64]:
         """Move the joint only where its target has left the band."""
-        if not motion.moving:
-            return super().track(term, arm, q, motion)
-        assert term.site.joint is not None
-        i, width = term.site.joint - 1, term.values[0]
-        from gapbridge.core.kernels.interpolation import played, stretches  # brings numba
+        from gapbridge.core.kernels.interpolation import played  # brings numba
 
-        result = q.copy()
-        for part in stretches(motion):
-            result[part, i] = played(q[part, i], width, float(motion.q[part.start, i]))
-        return result
+        return played(command, term.values[0], first)
 
     def settle(
         self,

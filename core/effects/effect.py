@@ -10,7 +10,7 @@ prediction.
 
 from __future__ import annotations
 
-from abc import ABC
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -18,9 +18,10 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from gapbridge.core.effects.simulator import Kind, SimulatorChange
+
 if TYPE_CHECKING:
     from gapbridge.core.arm import Arm
-    from gapbridge.core.effects.simulator import SimulatorChange
     from gapbridge.core.kernels.rates import ChainRate
     from gapbridge.core.kernels.reference import Chain, Rows
     from gapbridge.core.loads import Loads
@@ -86,6 +87,7 @@ class Effect(ABC):
     motion: ClassVar[str] = ""  # what a log must contain so that the effect shows
     alike: ClassVar[Mapping[str, str]] = {}  # another effect: the data on which it looks the same
     instead: ClassVar[str] = ""  # what people do where a simulator's model cannot hold it
+    simulated_as: ClassVar[Kind | None] = None  # what a simulator's model calls its first value
     of_the_arm: ClassVar[bool] = True  # False: of what measures, so that no model of an arm has it
 
     # how people read it
@@ -183,7 +185,9 @@ class Effect(ABC):
 
     def simulator(self, term: Term, arm: Arm) -> tuple[SimulatorChange, ...]:
         """Return what to change in a simulator's model, beside what ``shape`` changes."""
-        return ()
+        if self.simulated_as is None:
+            return ()
+        return (SimulatorChange(self.simulated_as, term.site.joint, term.values[0]),)
 
     def reported(self, arm: Arm, term: Term, covariance: Array | None) -> tuple[Reported, ...]:
         """Return the term's parameters as they are reported; ``covariance`` is (k, k) or None."""
@@ -211,6 +215,49 @@ class JointEffect(Effect):
         return tuple(Site(joint=i + 1) for i in range(arm.n))
 
 
+class TorqueEffect(JointEffect):
+    """What a joint's motor delivers more."""
+
+    channels = ("torque",)
+
+    def drive(self, term: Term, arm: Arm, torque: Array, motion: Motion) -> Array:
+        """Add it at the joint."""
+        assert term.site.joint is not None
+        result = torque.copy()
+        result[:, term.site.joint - 1] += self.added(term, term.site.joint - 1, motion)
+        return result
+
+    @abstractmethod
+    def added(self, term: Term, i: int, motion: Motion) -> Array:
+        """Return the torque (N,), Nm, that the motor of joint ``i`` (from 0) delivers more."""
+
+
+class ServoEffect(JointEffect):
+    """How a joint's servo follows its command in motion."""
+
+    channels = ("tracking",)
+
+    def track(self, term: Term, arm: Arm, q: Array, motion: Motion) -> Array:
+        """Let the joint follow, stretch by stretch."""
+        if not motion.moving:
+            return super().track(term, arm, q, motion)
+        assert term.site.joint is not None
+        from gapbridge.core.kernels.interpolation import stretches  # brings numba
+
+        i, result = term.site.joint - 1, q.copy()
+        for part in stretches(motion):
+            first = float(motion.q[part.start, i])
+            result[part, i] = self.follow(term, motion.t[part], q[part, i], first)
+        return result
+
+    @abstractmethod
+    def follow(self, term: Term, time: Array, command: Array, first: float) -> Array:
+        """Return where the joint stands (N,), rad, at ``time`` (N,), s, for its command (N,).
+
+        ``first`` is where it stood when the stretch began, rad.
+        """
+
+
 def rows_after(term: Term, loads: Loads) -> Any:
     """Return an index of the rows that are later than a term's moment; all where time is unknown.
 
@@ -227,3 +274,10 @@ def typical_moment(arm: Arm) -> float:
     reach = float(np.linalg.norm(arm.link_in_link[:, :3, 3], axis=1).sum())
     payload = arm.payload if np.isfinite(arm.payload) else 5.0
     return max(9.81 * (float(arm.mass.sum()) / 3 + payload) * max(reach, 0.1) / 2, 1.0)
+
+
+def joint_scale(arm: Arm, site: Site) -> float:
+    """Return a usual torque (Nm) of a joint: its rated effort, or what the arm's weight makes."""
+    assert site.joint is not None
+    effort = float(arm.limits.effort[site.joint - 1])
+    return effort if np.isfinite(effort) and effort > 0 else typical_moment(arm)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gapbridge.core.effects.effect import JointEffect, Parameter, Site, Term
-from gapbridge.core.effects.simulator import Kind, SimulatorChange
+from gapbridge.core.effects.simulator import Kind
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -34,15 +34,12 @@ class JointOffset(JointEffect):
     moved = "the zero of joint {joint} moved by {size}"
     beside_links = True
     channels = ("position",)
+    simulated_as = Kind.JOINT_ZERO
     motion = "poses that differ in the other joints"
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return the offset."""
         return (Parameter("", "rad", 1e-3, -0.5, 0.5),)
-
-    def simulator(self, term: Term, arm: Arm) -> tuple[SimulatorChange, ...]:
-        """Return it in a simulator's terms."""
-        return (SimulatorChange(Kind.JOINT_ZERO, term.site.joint, term.values[0]),)
 
     def angle_columns(self, site: Site, q: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return ones: the same turn at every angle."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, ClassVar
 
 from gapbridge.core.effects.effect import JointEffect, Parameter, Site, Term, rows_after
-from gapbridge.core.effects.simulator import Kind, SimulatorChange
+from gapbridge.core.effects.simulator import Kind
 
 if TYPE_CHECKING:
     import numpy as np
@@ -32,16 +32,13 @@ class JointSlip(JointEffect):
     label_words = "slip of joint {joint} {part}"
     at_moment = True
     channels = ("position",)
+    simulated_as = Kind.JOINT_ZERO  # the arm as it is since
     motion = "poses before and after the moment, that differ in the other joints"
     alike: ClassVar = {"joint_offset": "no pose before the moment"}
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return the step, and when it happened."""
         return (Parameter("", "rad", 1e-3, -1.0, 1.0), Parameter("time", "s", 1.0))
-
-    def simulator(self, term: Term, arm: Arm) -> tuple[SimulatorChange, ...]:
-        """Return it in a simulator's terms: the arm as it is since."""
-        return (SimulatorChange(Kind.JOINT_ZERO, term.site.joint, term.values[0]),)
 
     def condition(
         self, term: Term, arm: Arm, rows: Rows, loads: Loads, q: NDArray[np.float64]

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from gapbridge.core.effects.effect import JointEffect, Parameter, Site, Term
-from gapbridge.core.effects.simulator import Kind, SimulatorChange
+from gapbridge.core.effects.effect import Parameter, ServoEffect, Site, Term
+from gapbridge.core.effects.simulator import Kind
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
     from gapbridge.core.arm import Arm
-    from gapbridge.core.motion import Motion
 
 
-class Latency(JointEffect):
+class Latency(ServoEffect):
     """The joint does what it was commanded, but later: actual_q(t) = target_q(t - latency).
 
     Comes from communication, buffering, interpolation. A delay of the whole arm shows as the same
@@ -31,7 +30,7 @@ class Latency(JointEffect):
     title = "joint reacts late"
     order = 20
     delays = True
-    channels = ("tracking",)
+    simulated_as = Kind.DELAY
     needs = ("timestamp",)
     motion = "a recording of changing speeds of the joint"
     instead = "delay the command in the control loop"
@@ -40,22 +39,10 @@ class Latency(JointEffect):
         """Return the delay."""
         return (Parameter("", "s", 5e-3, 0.0, 2.0),)
 
-    def simulator(self, term: Term, arm: Arm) -> tuple[SimulatorChange, ...]:
-        """Return it in a simulator's terms."""
-        return (SimulatorChange(Kind.DELAY, term.site.joint, term.values[0]),)
-
-    def track(
-        self, term: Term, arm: Arm, q: NDArray[np.float64], motion: Motion
+    def follow(
+        self, term: Term, time: NDArray[np.float64], command: NDArray[np.float64], first: float
     ) -> NDArray[np.float64]:
         """Look the command up in the past."""
-        assert term.site.joint is not None
-        if not motion.moving:
-            return q
-        i = term.site.joint - 1
-        from gapbridge.core.kernels.interpolation import interpolate, stretches  # brings numba
+        from gapbridge.core.kernels.interpolation import interpolate  # brings numba
 
-        result = q.copy()
-        for part in stretches(motion):
-            time = motion.t[part]
-            result[part, i] = interpolate(time, q[part, i], time - term.values[0])
-        return result
+        return interpolate(time, command, time - term.values[0])

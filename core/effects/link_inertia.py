@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from gapbridge.core.effects.effect import JointEffect, Parameter, Site, Term
-from gapbridge.core.effects.simulator import Kind, SimulatorChange
+from gapbridge.core.effects.simulator import Kind
 
 if TYPE_CHECKING:
     import numpy as np
@@ -31,15 +31,12 @@ class LinkInertia(JointEffect):
     felt_by_all = True
     carried = True
     channels = ("torque",)
+    simulated_as = Kind.LINK_SCALE
     motion = "many poses, and accelerations of all joints up to the link"
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return the relative increase; joint i stands for link i, which it turns."""
         return (Parameter("", "", 0.05, -1.0, 20.0),)
-
-    def simulator(self, term: Term, arm: Arm) -> tuple[SimulatorChange, ...]:
-        """Return it in a simulator's terms."""
-        return (SimulatorChange(Kind.LINK_SCALE, term.site.joint, term.values[0]),)
 
     def drive(
         self, term: Term, arm: Arm, torque: NDArray[np.float64], motion: Motion

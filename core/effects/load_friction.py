@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from gapbridge.core.effects.effect import JointEffect, Parameter, Site, Term
+from gapbridge.core.effects.effect import Parameter, Site, Term, TorqueEffect
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from gapbridge.core.motion import Motion
 
 
-class LoadFriction(JointEffect):
+class LoadFriction(TorqueEffect):
     """The motor delivers a torque more that grows with the joint's load: + mu |tau_load| sign(qd).
 
     tau_load is the inverse dynamics of the rigid arm with payload and pull, without friction and
@@ -30,7 +30,6 @@ class LoadFriction(JointEffect):
     title = "friction grows with load"
     label_words = "load friction of joint {joint}"
     order = 53
-    channels = ("torque",)
     motion = "the joint moved both ways under loads that change"
     alike: ClassVar = {"coulomb_friction": "motion under one load"}
     instead = "friction by load in the control loop, or the simulator's actuator"
@@ -39,13 +38,7 @@ class LoadFriction(JointEffect):
         """Return the share of the load."""
         return (Parameter("", "", 0.05, 0.0, 5.0),)
 
-    def drive(
-        self, term: Term, arm: Arm, torque: NDArray[np.float64], motion: Motion
-    ) -> NDArray[np.float64]:
-        """Add the friction that the motor overcomes."""
-        assert term.site.joint is not None
+    def added(self, term: Term, i: int, motion: Motion) -> NDArray[np.float64]:
+        """Return the friction that the motor overcomes."""
         assert motion.load is not None
-        i = term.site.joint - 1
-        result = torque.copy()
-        result[:, i] += term.values[0] * np.abs(motion.load[:, i]) * motion.direction[:, i]
-        return result
+        return term.values[0] * np.abs(motion.load[:, i]) * motion.direction[:, i]

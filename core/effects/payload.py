@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from gapbridge.core.effects.effect import Effect, Parameter, Site, Term
-from gapbridge.core.effects.simulator import Kind, SimulatorChange
+from gapbridge.core.effects.simulator import Kind
 
 if TYPE_CHECKING:
     import numpy as np
@@ -35,16 +35,13 @@ class Payload(Effect):
     corrects = "payload"
     moved = "the load differs from what was declared by {size}"
     channels = ("position", "wrench", "torque")
+    simulated_as = Kind.PAYLOAD
     motion = "poses that change how the load pulls"
     instead = "change the load's mass where it is modelled"
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return the extra mass."""
         return (Parameter("", "kg", 1.0),)
-
-    def simulator(self, term: Term, arm: Arm) -> tuple[SimulatorChange, ...]:
-        """Return it in a simulator's terms."""
-        return (SimulatorChange(Kind.PAYLOAD, term.site.joint, term.values[0]),)
 
     def condition(
         self, term: Term, arm: Arm, rows: Rows, loads: Loads, q: NDArray[np.float64]

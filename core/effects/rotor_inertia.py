@@ -6,9 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gapbridge.core.effects.coulomb_friction import joint_scale
-from gapbridge.core.effects.effect import JointEffect, Parameter, Site, Term
-from gapbridge.core.effects.simulator import Kind, SimulatorChange
+from gapbridge.core.effects.effect import Parameter, Site, Term, TorqueEffect, joint_scale
+from gapbridge.core.effects.simulator import Kind
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -17,7 +16,7 @@ if TYPE_CHECKING:
     from gapbridge.core.motion import Motion
 
 
-class RotorInertia(JointEffect):
+class RotorInertia(TorqueEffect):
     """The motor turns an inertia of its own, seen at the joint: + I qdd of that joint alone.
 
     The rotor's inertia times the square of the gear ratio; often as large as the arm's own and
@@ -29,7 +28,7 @@ class RotorInertia(JointEffect):
     identifier = "rotor_inertia"
     title = "motor inertia is missing"
     order = 30
-    channels = ("torque",)
+    simulated_as = Kind.ARMATURE
     motion = "accelerations of the joint, at several poses of those beyond"
     instead = "set the joint's armature where the simulator has it"
 
@@ -38,16 +37,6 @@ class RotorInertia(JointEffect):
         scale = max(1e-2 * joint_scale(arm, site), 1e-3)
         return (Parameter("", "kg m2", scale, 0.0, np.inf),)
 
-    def simulator(self, term: Term, arm: Arm) -> tuple[SimulatorChange, ...]:
-        """Return it in a simulator's terms."""
-        return (SimulatorChange(Kind.ARMATURE, term.site.joint, term.values[0]),)
-
-    def drive(
-        self, term: Term, arm: Arm, torque: NDArray[np.float64], motion: Motion
-    ) -> NDArray[np.float64]:
-        """Add what accelerates the rotor."""
-        assert term.site.joint is not None
-        i = term.site.joint - 1
-        result = torque.copy()
-        result[:, i] += term.values[0] * motion.qdd[:, i]
-        return result
+    def added(self, term: Term, i: int, motion: Motion) -> NDArray[np.float64]:
+        """Return what accelerates the rotor."""
+        return term.values[0] * motion.qdd[:, i]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, ClassVar
 
 from gapbridge.core.effects.effect import JointEffect, Parameter, Site, Term, typical_moment
-from gapbridge.core.effects.simulator import Kind, SimulatorChange
+from gapbridge.core.effects.simulator import Kind
 
 if TYPE_CHECKING:
     import numpy as np
@@ -31,16 +31,13 @@ class ServoDroop(JointEffect):
     label_words = "droop of servo {joint} per torque"
     order = 60
     channels = ("tracking",)
+    simulated_as = Kind.SERVO_COMPLIANCE
     motion = "poses, payloads or pulls that change the torque that the joint holds"
     alike: ClassVar = {"dead_band": "one torque at each joint, reached from one side"}
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return the droop per torque."""
         return (Parameter("", "rad/Nm", 5e-3 / typical_moment(arm), 0.0, 1.0),)
-
-    def simulator(self, term: Term, arm: Arm) -> tuple[SimulatorChange, ...]:
-        """Return it in a simulator's terms."""
-        return (SimulatorChange(Kind.SERVO_COMPLIANCE, term.site.joint, term.values[0]),)
 
     def settle(
         self,

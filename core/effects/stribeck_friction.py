@@ -6,8 +6,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from gapbridge.core.effects.coulomb_friction import joint_scale
-from gapbridge.core.effects.effect import JointEffect, Parameter, Site, Term
+from gapbridge.core.effects.effect import Parameter, Site, Term, TorqueEffect, joint_scale
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -18,7 +17,7 @@ if TYPE_CHECKING:
 SLOWEST = 1e-4  # rad/s
 
 
-class StribeckFriction(JointEffect):
+class StribeckFriction(TorqueEffect):
     """The motor delivers more at low speed: + (F_s - F_c) exp(-(qd / v_s)^2) sign(qd).
 
     Above the Coulomb friction, which it comes on top of; v_s is the speed at which a film of grease
@@ -31,7 +30,6 @@ class StribeckFriction(JointEffect):
     title = "friction is higher at low speed"
     label_words = "breakaway friction of joint {joint} {part}"
     order = 54
-    channels = ("torque",)
     motion = "the joint moved both ways, slowly and fast"
     alike: ClassVar = {"coulomb_friction": "motion at one low speed"}
     instead = "friction by speed in the control loop, or the simulator's actuator"
@@ -44,13 +42,8 @@ class StribeckFriction(JointEffect):
             Parameter("velocity", "rad/s", 0.05, 0.0, 10.0),
         )
 
-    def drive(
-        self, term: Term, arm: Arm, torque: NDArray[np.float64], motion: Motion
-    ) -> NDArray[np.float64]:
-        """Add the friction that the motor overcomes."""
-        assert term.site.joint is not None
-        i, speed = term.site.joint - 1, max(abs(term.values[1]), SLOWEST)
-        result = torque.copy()
+    def added(self, term: Term, i: int, motion: Motion) -> NDArray[np.float64]:
+        """Return the friction that the motor overcomes."""
+        speed = max(abs(term.values[1]), SLOWEST)
         fading = np.exp(-((motion.qd[:, i] / speed) ** 2))
-        result[:, i] += term.values[0] * fading * motion.direction[:, i]
-        return result
+        return term.values[0] * fading * motion.direction[:, i]

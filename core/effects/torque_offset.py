@@ -4,18 +4,18 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, ClassVar
 
-from gapbridge.core.effects.coulomb_friction import joint_scale
-from gapbridge.core.effects.effect import JointEffect, Parameter, Site, Term
+import numpy as np
+
+from gapbridge.core.effects.effect import Parameter, Site, Term, TorqueEffect, joint_scale
 
 if TYPE_CHECKING:
-    import numpy as np
     from numpy.typing import NDArray
 
     from gapbridge.core.arm import Arm
     from gapbridge.core.motion import Motion
 
 
-class TorqueOffset(JointEffect):
+class TorqueOffset(TorqueEffect):
     """The measured torque of a joint is a constant too much: measured = torque + offset.
 
     Comes from the zero of a current or torque sensor, and from friction that differs by direction:
@@ -29,7 +29,6 @@ class TorqueOffset(JointEffect):
     title = "torque reading's zero is off"
     label_words = "zero of the torque of joint {joint}"
     order = 95
-    channels = ("torque",)
     motion = "the joint moved both ways, at poses that change its weight"
     alike: ClassVar = {
         "coulomb_friction": "motion of the joint one way only",
@@ -41,11 +40,6 @@ class TorqueOffset(JointEffect):
         """Return the offset."""
         return (Parameter("", "Nm", 0.02 * joint_scale(arm, site)),)
 
-    def drive(
-        self, term: Term, arm: Arm, torque: NDArray[np.float64], motion: Motion
-    ) -> NDArray[np.float64]:
-        """Add the offset."""
-        assert term.site.joint is not None
-        result = torque.copy()
-        result[:, term.site.joint - 1] += term.values[0]
-        return result
+    def added(self, term: Term, i: int, motion: Motion) -> NDArray[np.float64]:
+        """Return the offset."""
+        return np.full(len(motion.q), term.values[0])

@@ -6,9 +6,8 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from gapbridge.core.effects.coulomb_friction import joint_scale
-from gapbridge.core.effects.effect import JointEffect, Parameter, Site, Term
-from gapbridge.core.effects.simulator import Kind, SimulatorChange
+from gapbridge.core.effects.effect import Parameter, Site, Term, TorqueEffect, joint_scale
+from gapbridge.core.effects.simulator import Kind
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -17,7 +16,7 @@ if TYPE_CHECKING:
     from gapbridge.core.motion import Motion
 
 
-class ViscousFriction(JointEffect):
+class ViscousFriction(TorqueEffect):
     """The motor delivers a torque more that grows with speed: + c qd.
 
     Comes from grease and damping; colder joints have more. Needs several speeds, else it is the
@@ -28,7 +27,7 @@ class ViscousFriction(JointEffect):
     identifier = "viscous_friction"
     title = "friction grows with speed"
     order = 51
-    channels = ("torque",)
+    simulated_as = Kind.DAMPING
     motion = "the joint moved at several speeds"
     alike: ClassVar = {"coulomb_friction": "motion at one speed"}
 
@@ -36,16 +35,6 @@ class ViscousFriction(JointEffect):
         """Return the coefficient."""
         return (Parameter("", "Nm s/rad", 0.03 * joint_scale(arm, site), 0.0, np.inf),)
 
-    def simulator(self, term: Term, arm: Arm) -> tuple[SimulatorChange, ...]:
-        """Return it in a simulator's terms."""
-        return (SimulatorChange(Kind.DAMPING, term.site.joint, term.values[0]),)
-
-    def drive(
-        self, term: Term, arm: Arm, torque: NDArray[np.float64], motion: Motion
-    ) -> NDArray[np.float64]:
-        """Add the friction that the motor overcomes."""
-        assert term.site.joint is not None
-        i = term.site.joint - 1
-        result = torque.copy()
-        result[:, i] += term.values[0] * motion.qd[:, i]
-        return result
+    def added(self, term: Term, i: int, motion: Motion) -> NDArray[np.float64]:
+        """Return the friction that the motor overcomes."""
+        return term.values[0] * motion.qd[:, i]

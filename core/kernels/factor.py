@@ -1,4 +1,4 @@
-"""The regressor of many rows, in blocks of lanes, and its R factor without ever storing it."""
+"""The R factor of many rows' regressor, in blocks of lanes, without ever storing it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from gapbridge.core.kernels.layout import (
     U,
 )
 from gapbridge.core.kernels.reference import JIT
-from gapbridge.core.kernels.sums import add_products, fold
+from gapbridge.core.kernels.sums import fold
 
 NUISANCES = 9  # instrument's frame (6), tool point (3)
 
@@ -147,52 +147,4 @@ def factor_blocks(chain, rows, gap, per_cell, nuisances, first, last, R):  # typ
         _cells(per_cell, gap, r, last, width, X, columns - 1, cells)
         _weigh(X, cells, columns, size)
         fold(R, X, columns, size)
-    return -1
-
-
-@njit(**JIT)
-def normal_blocks(chain, rows, gap, first, last, G):  # type: ignore[no-untyped-def]
-    """Add rows first..last of [flexibilities | gap]'s products to G (k, k), lower tiles.
-
-    k is 2n + 1, rounded up to a multiple of four. Returns as ``factor_blocks``.
-    """
-    n, width, columns = chain.mass.shape[0], gap.shape[1], G.shape[0]
-    size = width * LANES
-    w, v = lanes_of(n)
-    X = np.zeros(columns * size)
-    deflected = bends(chain)
-    for r in range(first, last, LANES):
-        if not (gather(chain, rows, r, w, v) and settle(chain, w, v, deflected)):
-            return r
-        flexibility_columns(w, v, X, 0, n, width)
-        if r + LANES > last:
-            for c in range(2 * n * width):
-                X[c * LANES + last - r : (c + 1) * LANES] = 0.0
-        for j in range(width):
-            for k in range(LANES):
-                X[(2 * n * width + j) * LANES + k] = gap[r + k, j] if r + k < last else 0.0
-        add_products(G, X, columns, size)
-    return -1
-
-
-@njit(**JIT)
-def regressor_blocks(chain, rows, first, last, A):  # type: ignore[no-untyped-def]
-    """Write the regressor of rows first..last into A (2n, width, N): column after column.
-
-    Returns the first row of a block that core.kernels.reference must solve, or -1.
-    """
-    n, width = chain.mass.shape[0], A.shape[1]
-    w, v = lanes_of(n)
-    X = np.empty(2 * n * width * LANES)
-    deflected = bends(chain)
-    for r in range(first, last, LANES):
-        if not (gather(chain, rows, r, w, v) and settle(chain, w, v, deflected)):
-            return r
-        flexibility_columns(w, v, X, 0, n, width)
-        count = min(LANES, last - r)
-        for c in range(2 * n):
-            for j in range(width):
-                a = (c * width + j) * LANES
-                for k in range(count):
-                    A[c, j, r + k] = X[a + k]
     return -1

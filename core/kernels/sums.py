@@ -1,4 +1,4 @@
-"""What a block of columns adds to a triangular factor, or to a normal matrix."""
+"""What a block of columns adds to a triangular factor."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import numpy as np
 from numba import njit
 
 from gapbridge.core.kernels.layout import SUMS, U
-from gapbridge.core.kernels.reference import JIT
 
 
 @njit(**SUMS)
@@ -74,59 +73,3 @@ def fold(R, X, columns, size):  # type: ignore[no-untyped-def]
         while c < columns:
             R[j, c] = _reflect(X, a, c * size, size, lead, share, R[j, c])
             c += 1
-
-
-@njit(**SUMS)
-def _tile(G, X, i, j, size):  # type: ignore[no-untyped-def]
-    """Add the products of four columns from i with four from j to G."""
-    a, b = i * size, j * size
-    g00 = g01 = g02 = g03 = g10 = g11 = g12 = g13 = 0.0
-    g20 = g21 = g22 = g23 = g30 = g31 = g32 = g33 = 0.0
-    for k in range(size):
-        x0, x1 = X[U(a + k)], X[U(a + size + k)]
-        x2, x3 = X[U(a + 2 * size + k)], X[U(a + 3 * size + k)]
-        y0, y1 = X[U(b + k)], X[U(b + size + k)]
-        y2, y3 = X[U(b + 2 * size + k)], X[U(b + 3 * size + k)]
-        g00 += x0 * y0
-        g01 += x0 * y1
-        g02 += x0 * y2
-        g03 += x0 * y3
-        g10 += x1 * y0
-        g11 += x1 * y1
-        g12 += x1 * y2
-        g13 += x1 * y3
-        g20 += x2 * y0
-        g21 += x2 * y1
-        g22 += x2 * y2
-        g23 += x2 * y3
-        g30 += x3 * y0
-        g31 += x3 * y1
-        g32 += x3 * y2
-        g33 += x3 * y3
-    G[i, j] += g00
-    G[i, j + 1] += g01
-    G[i, j + 2] += g02
-    G[i, j + 3] += g03
-    G[i + 1, j] += g10
-    G[i + 1, j + 1] += g11
-    G[i + 1, j + 2] += g12
-    G[i + 1, j + 3] += g13
-    G[i + 2, j] += g20
-    G[i + 2, j + 1] += g21
-    G[i + 2, j + 2] += g22
-    G[i + 2, j + 3] += g23
-    G[i + 3, j] += g30
-    G[i + 3, j + 1] += g31
-    G[i + 3, j + 2] += g32
-    G[i + 3, j + 3] += g33
-
-
-@njit(**JIT)
-def add_products(G, X, columns, size):  # type: ignore[no-untyped-def]
-    """Add X'X to G (columns, columns), tile by tile; ``columns`` is a multiple of four.
-
-    On and below the diagonal's tiles only.
-    """
-    for i in range(0, columns, 4):
-        for j in range(0, i + 4, 4):
-            _tile(G, X, i, j, size)

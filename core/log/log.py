@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import gzip
 import zlib
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,7 @@ from gapbridge.core.log.columns import (
     wanted_of,
     written,
 )
-from gapbridge.core.log.parquet_tables import parquet_tables
+from gapbridge.core.log.parquet_tables import ParquetColumns
 
 Array = NDArray[np.float64]
 GZIP = b"\x1f\x8b"
@@ -47,6 +48,8 @@ class Log:
     session_names: tuple[str, ...] = ()  # of several sessions; column session holds their index
     numbers: NDArray[np.int64] | None = None  # (N,) of the rows of several sessions, from 1
     one_clock: bool = True  # False: timestamps of later sessions were shifted behind the first's
+    # what several readers derive of these rows, once (``motion_of``); other rows begin anew
+    derived: dict[str, Any] = field(init=False, repr=False, compare=False, default_factory=dict)
 
     def __len__(self) -> int:
         return len(next(iter(self.columns.values())))
@@ -160,17 +163,19 @@ def read_log(path: Path | str, n: int) -> Log:
     if not is_file(path):
         raise LogError(f"{path}: file not found, expected a CSV or Parquet log")
     if path.suffix.lower() in (".parquet", ".pq"):
-        names, table = next(parquet_tables(path))
-        lines = None
+        file = ParquetColumns(path)
+        names, lines, rows = file.names, None, file.rows
+        read: Callable[[int], Array] = file.column
     else:
         names, table, lines = _read_csv(path)
-    if not len(table):
+        rows, read = len(table), partial(_column, table)
+    if not rows:
         raise LogError(f"{path}: found no data rows, expected at least one")
-    columns = table_columns(path, [names[i] for i in wanted_of(names)], table, n)
+    columns = grouped(path, [names[i] for i in wanted_of(names)], read, rows, n)
     if not columns:
         raise LogError(f"{path}: columns: found none that a log may hold{nearest(names)}")
     unknown = tuple(name for name in names if not is_known(name))
-    counted = None if lines is None else np.arange(len(table)) + 1
+    counted = None if lines is None else np.arange(rows) + 1
     return Log(str(path), columns, n, unknown=unknown, lines=lines, numbers=counted)
 
 
@@ -261,8 +266,19 @@ def cell_number(path: Path, row: int, name: str, cell: str, delimiter: str) -> f
         ) from None
 
 
+def _column(table: Array, position: int) -> Array:
+    return np.asarray(table[:, position])
+
+
 def table_columns(path: Path, names: Sequence[str], table: Array, n: int) -> dict[str, Array]:
-    """Return columns (N,) or (N, k) of a table (N, names), grouped by name.
+    """Return columns (N,) or (N, k) of a table (N, names), as ``grouped`` does."""
+    return grouped(path, names, partial(_column, table), len(table), n)
+
+
+def grouped(
+    path: Path, names: Sequence[str], column: Callable[[int], Array], rows: int, n: int
+) -> dict[str, Array]:
+    """Return columns (rows,) or (rows, k) by name; ``column`` gives that of one of the ``names``.
 
     Raises LogError where a vector has a gap in its indices, or not its length.
     """
@@ -272,7 +288,7 @@ def table_columns(path: Path, names: Sequence[str], table: Array, n: int) -> dic
         if COLUMNS.get(name) == 0:
             if name in columns:
                 raise LogError(f"{path}: column {name}: found twice, expected once")
-            columns[name] = table[:, position].copy()  # a view would keep the whole table
+            columns[name] = column(position).copy()  # a view would keep the whole table
             continue
         match = INDEXED.match(name)
         if match and COLUMNS.get(match[1], 0) != 0:
@@ -291,5 +307,7 @@ def table_columns(path: Path, names: Sequence[str], table: Array, n: int) -> dic
                 )
             if index not in indices:
                 raise LogError(f"{path}: column {name}_{index}: not found, expected {what}")
-        columns[name] = np.ascontiguousarray(table[:, [indices[k] for k in range(expected)]])
+        columns[name] = np.empty((rows, expected))
+        for k in range(expected):
+            columns[name][:, k] = column(indices[k])
     return columns

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -20,36 +21,69 @@ Array = NDArray[np.float64]
 BUFFER = 1 << 18  # bytes of each column that are read ahead
 
 
-def parquet_tables(path: Path, rows: int | None = None) -> Iterator[tuple[list[str], Array]]:
-    """Yield the names of all columns, and those that a log may hold (rows, known columns).
+class ParquetColumns:
+    """The columns of a Parquet file that a log may hold, read when asked for; NaN: missing.
 
-    ``rows`` at a time; None: all at once. A missing number is NaN. The tables are Fortran-ordered:
-    each column lies in one place. Raises LogError where the file cannot be read, or a column is
-    none of numbers.
+    Raises LogError where the file cannot be read, or a column is none of numbers.
     """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        with _named(path):
+            self._file = _opened(path)
+        self.names: list[str] = list(self._file.schema_arrow.names)
+        self.wanted = [self.names[i] for i in wanted_of(self.names)]
+        self.rows = int(self._file.metadata.num_rows)
+        _check_types(path, self._file.schema_arrow, self.wanted)
+
+    def column(self, position: int) -> Array:
+        """Return one of the wanted columns (N,)."""
+        import pyarrow
+
+        with _named(self._path):
+            name = self.wanted[position]
+            values = _numbers(self._file.read([name], use_threads=False), name)
+            pyarrow.default_memory_pool().release_unused()
+            return values
+
+    def tables(self, rows: int) -> Iterator[Array]:
+        """Yield the wanted columns (rows, wanted), so many rows at a time.
+
+        Fortran-ordered: each column lies in one place.
+        """
+        import pyarrow
+
+        with _named(self._path):
+            for part in self._file.iter_batches(rows, columns=self.wanted, use_threads=False):
+                table = np.empty((part.num_rows, len(self.wanted)), order="F")
+                for k, name in enumerate(self.wanted):
+                    table[:, k] = _numbers(part, name)
+                yield table
+            pyarrow.default_memory_pool().release_unused()
+
+
+def _opened(path: Path) -> pyarrow.parquet.ParquetFile:
     import pyarrow  # only where there is Parquet
     from pyarrow.parquet import ParquetFile
 
+    given = pyarrow.BufferReader(read_bytes(path)) if is_given() else path
+    # not ahead of what is asked for: whole columns would be
+    return ParquetFile(given, buffer_size=BUFFER, pre_buffer=False)
+
+
+def _numbers(part: pyarrow.Table | pyarrow.RecordBatch, name: str) -> Array:
+    import pyarrow
+
+    column = part.column(name).cast(pyarrow.float64())
+    return np.asarray(column.to_numpy(zero_copy_only=False))
+
+
+@contextmanager
+def _named(path: Path) -> Iterator[None]:
+    import pyarrow
+
     try:
-        given = pyarrow.BufferReader(read_bytes(path)) if is_given() else path
-        # not ahead of what is asked for: whole columns would be
-        file = ParquetFile(given, buffer_size=BUFFER, pre_buffer=False)
-        names = list(file.schema_arrow.names)
-        wanted = [names[i] for i in wanted_of(names)]
-        _check_types(path, file.schema_arrow, wanted)
-        parts = (
-            [file.read(wanted)]
-            if rows is None
-            else file.iter_batches(rows, columns=wanted, use_threads=False)
-        )
-        for part in parts:
-            table = np.empty((part.num_rows, len(wanted)), order="F")
-            for k, name in enumerate(wanted):
-                table[:, k] = (
-                    part.column(name).cast(pyarrow.float64()).to_numpy(zero_copy_only=False)
-                )
-            yield names, table
-        pyarrow.default_memory_pool().release_unused()
+        yield
     except (pyarrow.ArrowException, OSError) as error:
         raise LogError(f"{path}: found no readable Parquet file ({error})") from None
 

@@ -26,7 +26,7 @@ from gapbridge.core.log.log import (
     read_log,
     table_columns,
 )
-from gapbridge.core.log.parquet_tables import parquet_tables
+from gapbridge.core.log.parquet_tables import ParquetColumns
 
 Array = NDArray[np.float64]
 # names of all columns, values of the known ones (rows, known columns), lines where not in sequence
@@ -98,7 +98,8 @@ def _tables(path: Path, rows: int) -> Iterator[Table]:
     if not path.is_file():
         raise LogError(f"{path}: file not found, expected a CSV or Parquet log")
     if path.suffix.lower() in PARQUET:
-        return ((names, table, None) for names, table in parquet_tables(path, rows))
+        columns = ParquetColumns(path)
+        return ((columns.names, table, None) for table in columns.tables(rows))
     if path.suffix.lower() == RECORDING:
         return _recording(path)
     with path.open("rb") as file:

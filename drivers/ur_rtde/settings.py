@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import Field, field_validator
 
-from gapbridge.drivers.driver import DriverSettings
+from gapbridge.drivers.link_settings import DriverSettings
 
 
 class UrRtdeSettings(DriverSettings):

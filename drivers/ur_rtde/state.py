@@ -99,6 +99,11 @@ class StateReader:
                 optional = [
                     m for m in names if m in reported and (m == "payload" or _is_optional(m))
                 ]
+                if "Could not connect" in str(error):
+                    raise LinkError(
+                        f"could not connect to {settings.host}, port 30004: is this the "
+                        "controller's address, and does it run?"
+                    ) from None
                 if not optional:
                     raise LinkError(f"{settings.host}: {_first_line(error)}") from None
                 names = [name for name in names if name not in optional]
@@ -138,13 +143,18 @@ class StateReader:
         return self._now() - self._changed
 
     def read(self) -> RobotState:
-        """Wait for a sample with a new timestamp. Raises StaleStateError, InvalidStateError."""
+        """Wait for a sample with a new timestamp. Raises StaleStateError, InvalidStateError.
+
+        Waits a cycle at least: whoever asks again and again where nobody answers takes no core.
+        """
         receive = self._receive
         if receive is None:
             raise LinkError(f"{self._settings.host}: found no connection, expected connect() first")
+        cycle = self._now() + 1.0 / self._settings.rate
+        until = max(self._changed + self._settings.state_timeout, cycle)
         timestamp = receive.getTimestamp()
         while timestamp == self._last:
-            if self._now() - self._changed > self._settings.state_timeout:
+            if self._now() > until:
                 raise StaleStateError(
                     f"{self._settings.host}: the controller's clock has stood still at "
                     f"{timestamp:.3f} s for {self.age:.3f} s"

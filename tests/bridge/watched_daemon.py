@@ -13,7 +13,7 @@ import httpx
 import numpy as np
 import psutil
 from daemon_cell import Robot, wait_for
-from watched_feed import free_port
+from ports import free_port
 
 
 class Watched:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import math
-import socket
 import subprocess
 import threading
 import time
@@ -15,6 +14,7 @@ from typing import Any, Self
 import httpx
 import numpy as np
 from numpy.typing import NDArray
+from ports import free_port
 
 from gapbridge.bridge.cell import load_cell
 from gapbridge.bridge.cell.daemon_settings import DaemonSettings
@@ -31,12 +31,6 @@ compliance: {axial: [1e-6, 3e-6, 4e-6, 1e-5, 1e-5, 1e-5], radial: [1e-7, 1e-7, 1
 link: {host: 127.0.0.2}
 """
 HOME = np.array([0.3, -1.4, 1.9, -1.2, -1.57, 0.2])
-
-
-def free_port() -> int:
-    with socket.socket() as s:
-        s.bind(("127.0.0.1", 0))
-        return int(s.getsockname()[1])
 
 
 class Feed:

@@ -155,4 +155,4 @@ def test_what_no_simulator_holds_says_what_to_do_instead(name):
     effect = CATALOGUE[name]
     in_chain = type(effect).shape is not Effect.shape
     asked = type(effect).simulator is not Effect.simulator
-    assert in_chain or asked or effect.instead
+    assert in_chain or asked or effect.simulated_as or effect.instead

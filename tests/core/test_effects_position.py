@@ -14,6 +14,7 @@ from gapbridge.core.model import Model
 
 DH = {"ur10e": builtin_rows("ur10e")["dh"], "seven": SEVEN}
 TOOL = np.array([0.03, -0.05, 0.18])
+TURN = Rotation.from_euler("xyz", [0.4, -0.3, 0.8])
 GRAVITY = np.array([0.4, -0.3, -9.8])
 POSITION = [name for name, member in CATALOGUE.items() if "position" in member.channels]
 POSES = 8
@@ -22,7 +23,7 @@ ARMS = pytest.mark.parametrize("name", DH)
 
 def model_of(name, soft=0.0):
     tool = np.eye(4)
-    tool[:3, 3] = TOOL
+    tool[:3, :3], tool[:3, 3] = TURN.as_matrix(), TOOL
     model = Model(arm_from_dh(DH[name]), tool, gravity=GRAVITY)
     n = model.arm.n
     return model.with_compliance([soft] * n, [0.5 * soft] * n)
@@ -42,7 +43,7 @@ def case(name, q, loads, r, soft=0.0, changed=()):
     n = len(DH[name])
     given = {
         "dh": DH[name], "q": q[r], "axial": np.full(n, soft), "radial": np.full(n, 0.5 * soft),
-        "tool_position": TOOL, "tool_rotation": Rotation.identity(),
+        "tool_position": TOOL, "tool_rotation": TURN,
         "payload": loads.payload_mass[r], "payload_cog": loads.payload_cog[r],
         "wrench": loads.wrench[r], "gravity": GRAVITY,
     } | dict(changed)  # fmt: skip
@@ -138,7 +139,7 @@ def test_the_tool_frame_moves_and_turns_the_tcp_in_flange_axes(name):
     agree(
         name, [Term("tool_frame", Site(), (*shift, *turn))],
         lambda q, loads, r: {"tool_position": TOOL + shift,
-                             "tool_rotation": Rotation.from_rotvec(turn)},
+                             "tool_rotation": Rotation.from_rotvec(turn) * TURN},
     )  # fmt: skip
 
 
@@ -250,7 +251,9 @@ def test_a_soft_base_tilts_the_whole_arm_under_its_moment(name):
 
         turn = Rotation.from_rotvec([*root(left, np.zeros(2), tol=1e-14).x, 0])
         np.testing.assert_allclose(poses.position[r], turn.apply(tcp), atol=1e-10)
-        np.testing.assert_allclose(poses.rotation[r], turn.as_matrix() @ flange, atol=1e-10)
+        np.testing.assert_allclose(
+            poses.rotation[r], turn.as_matrix() @ flange @ TURN.as_matrix(), atol=1e-10
+        )
 
 
 @ARMS

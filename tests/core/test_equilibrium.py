@@ -52,6 +52,7 @@ def test_predicted_poses_agree_with_an_independent_solution_on_60_cases():
     assert turn.max() < 1e-9
 
 
+@pytest.mark.slow
 def test_predicted_poses_agree_with_an_independent_solution_on_1000_cases():
     position, turn = compare(1000, 2)
     assert position.max() < 1e-7

@@ -68,6 +68,7 @@ def assert_allowed(limiter: Limiter, before: tuple[Array, Array], dt: float) -> 
     assert (np.abs(limiter._delta) <= own.joint_offset * TINY).all()
 
 
+@pytest.mark.slow
 @settings(max_examples=300, deadline=None)
 @given(st.lists(cycle, min_size=1, max_size=15))
 def test_nothing_leaves_that_is_outside_envelope_rates_or_joint_limits(rows: list[Any]) -> None:

@@ -13,7 +13,8 @@ from gapbridge.core.arm import Arm, builtin_arm
 from gapbridge.core.errors import LinkError
 from gapbridge.core.model import Model
 from gapbridge.drivers import DRIVERS, make_driver
-from gapbridge.drivers.driver import Driver, DriverSettings
+from gapbridge.drivers.driver import Driver
+from gapbridge.drivers.link_settings import DriverSettings
 
 
 @pytest.fixture

@@ -50,6 +50,7 @@ def test_a_fault_is_detected_and_answered(rigs: Rigs, name: str, key: str) -> No
         assert rig.found.violated == before, rig.found.violations[before:]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "key"), ALONE, ids=[f"{n}-{k}" for n, k in ALONE])
 def test_a_fault_with_a_rig_of_its_own_is_answered(tmp_path: Path, name: str, key: str) -> None:
     judge(run_alone(ROW[key], quiet_link(name), tmp_path))

@@ -48,6 +48,7 @@ def test_it_only_reads_unless_motion_is_allowed(tmp_path: Path) -> None:
         served.wait(10.0)
 
 
+@pytest.mark.slow
 def test_a_cell_that_cannot_be_used_is_reported_in_a_line(tmp_path: Path) -> None:
     cell = tmp_path / "cell.yaml"
     cell.write_text("robot: {model: ur10e}\nlink: {driver: modbus, profile: nobody}\n")

@@ -55,13 +55,6 @@ class Cpp:
         parts = (rows.q, rows.payload_mass, rows.payload_cog, rows.wrench)
         return [ctypes.c_void_p(part.ctypes.data) for part in parts]
 
-    def regressor(self, rows: Rows, A: Array) -> None:
-        """Write the regressor (12, 3, N); N is a multiple of eight."""
-        self._library.regressor(
-            self._arm, *self._pointers(rows), ctypes.c_long(len(rows.q)),
-            ctypes.c_void_p(A.ctypes.data),
-        )  # fmt: skip
-
     def normal(self, rows: Rows, gap: Array, G: Array) -> None:
         """Add the products of [regressor | gap] to G (13, 13), lower triangle."""
         self._library.normal(

@@ -1,5 +1,5 @@
-// The regressor of a six-axis arm in C++, eight rows side by side (vector extensions of GCC and
-// clang), its fused normal equations, and one setpoint to first order. Written by hand as a peer.
+// Fused normal equations of the regressor of a six-axis arm in C++, eight rows side by side (vector
+// extensions of GCC and clang), and one setpoint to first order. Written by hand as a peer.
 #include <cmath>
 #include <cstring>
 
@@ -117,21 +117,6 @@ static inline void gathered(const double *q, const double *m, const double *cog,
 }
 
 extern "C" {
-
-// A (2n, 3, count); count a multiple of eight
-void regressor(Arm arm, const double *q, const double *m, const double *cog, const double *w,
-               long count, double *A) {
-    for (long r = 0; r < count; r += 8) {
-        v8 Q[n], M, C[3], W[6], X[2 * n][3];
-        gathered(q, m, cog, w, r, Q, M, C, W);
-        Solved<v8> t;
-        solve(arm, Q, M, C, W, t);
-        columns(t, X);
-        for (int c = 0; c < 2 * n; c++)
-            for (int j = 0; j < 3; j++)
-                std::memcpy(A + (c * 3 + j) * count + r, &X[c][j], sizeof(v8));
-    }
-}
 
 // G (13, 13) grows by [A | gap]'[A | gap], lower triangle
 void normal(Arm arm, const double *q, const double *m, const double *cog, const double *w,

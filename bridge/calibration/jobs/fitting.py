@@ -101,8 +101,8 @@ def _table(found: Calibration) -> Table:
     )  # fmt: skip
     table.add_column("parameter", no_wrap=True)
     for name in ("value", "±", "planned ±"):
-        table.add_column(name, justify="right", no_wrap=True)
-    table.add_column("", no_wrap=True)
+        table.add_column(name, justify="right", no_wrap=name != "±")
+    table.add_column("")
     for e in found.estimates:
         unit, factor = TOLD_IN.get(e.unit, (e.unit, 1.0))
         planned = "" if e.expected_std is None else figure(e.expected_std * factor)

@@ -10,8 +10,10 @@ import click
 import numpy as np
 from pydantic import ValidationError
 
+from gapbridge import drivers
 from gapbridge.bridge.cell import load_cell
 from gapbridge.bridge.cell.first_cell import Asked, first_cell
+from gapbridge.bridge.cell.live import whole_state
 from gapbridge.bridge.cell.sections import link_settings
 from gapbridge.bridge.document.output_file import require_writable, write_text
 from gapbridge.core.arm import builtin_arm
@@ -71,7 +73,12 @@ def init(
 def _link(host: str, driver: str, profile: str | None, port: int | None) -> dict[str, Any]:
     """Return the keys of section ``link``. Raises InputError."""
     if driver != "ur_rtde" and profile is None:
-        raise InputError(f"--profile: found nothing with --driver {driver}, expected its map")
+        folder = Path(drivers.__file__).parent / driver / "profiles"
+        known = ", ".join(sorted(path.stem for path in folder.glob("*.yaml")))
+        raise InputError(
+            f"--profile: found nothing with --driver {driver}, expected its map: one of {known}, "
+            "or a file (docs/porting.md)"
+        )
     link: dict[str, Any] = {"driver": driver}
     if profile is not None and driver != "ur_rtde":
         link["profile"] = profile
@@ -106,7 +113,7 @@ def _read(link: dict[str, Any], model: str | None, urdf: Path | None) -> Control
     arm = arm_from_urdf(urdf) if urdf is not None else builtin_arm(str(model))
     settings = link_settings(**link).located(Path.cwd())
     with make_driver(settings, Model(arm=arm)) as driver:
-        return driver.facts(driver.read_state())
+        return driver.facts(whole_state(driver))
 
 
 def _beside(urdf: Path, out: Path) -> str:

@@ -67,7 +67,11 @@ def convert(source: Path, out: Path, cell: Path | None, **given: Any) -> None:
         if not source.exists():
             raise LogError(f"{source}: not found, expected a file or folder")
         listed = "; ".join(one.title for one in SOURCES)
-        raise LogError(f"{source}: found no known kind of recording, expected one of: {listed}")
+        plain = source.name.lower().endswith((".csv", ".csv.gz", *PARQUET))
+        also = "; a file with columns such as actual_q_0 is a log as it stands" if plain else ""
+        raise LogError(
+            f"{source}: found no known kind of recording, expected one of: {listed}{also}"
+        )
     if out.suffix.lower() not in (".csv", *PARQUET):
         raise InputError(
             f"--out {out}: found {out.suffix or 'no suffix'}, expected .csv or .parquet"

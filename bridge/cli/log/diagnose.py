@@ -28,7 +28,7 @@ from gapbridge.core.diagnosis.diagnosis import Diagnosis
 from gapbridge.core.diagnosis.diagnosis import diagnose as diagnose_log
 from gapbridge.core.diagnosis.document import document
 from gapbridge.core.effects import effect_named
-from gapbridge.core.errors import InputError
+from gapbridge.core.errors import InputError, LogError
 from gapbridge.core.log.log import Log
 from gapbridge.core.metrology import Metrology
 from gapbridge.core.ranges import range_of
@@ -146,7 +146,7 @@ def _diagnose(
         return diagnose_log(cell.model, log, metrology, withhold=withhold, progress=emit, **extra)
     except InputError as error:
         text = str(error)
-        raise type(error)(text if text.startswith(log.path) else f"{log.path}: {text}") from None
+        raise LogError(text if text.startswith(log.path) else f"{log.path}: {text}") from None
 
 
 def _check_effects(names: tuple[str, ...]) -> None:

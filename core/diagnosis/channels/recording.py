@@ -13,7 +13,7 @@ from gapbridge.core.motion import Motion
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
-MOST_SAMPLES = 30_000  # rows judged of a long log, evenly picked: what memory holds
+MOST_SAMPLES = 30_000  # poses at rest, evenly picked: what memory holds
 STRETCHES = 24  # conditions of a recording: even stretches of time
 FEWEST_CONDITIONS = 5
 SMALLEST_TORQUE = 1e-3  # Nm

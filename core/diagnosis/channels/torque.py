@@ -34,8 +34,8 @@ def observe(model: Model, log: Log, metrology: Metrology) -> Observation | NotOb
     """Return the torque channel of a log (Nm, one coordinate a joint), or what it lacks.
 
     Rows without derivatives (edges, gaps), with a torque that is not finite, or in which a joint
-    turns round, so that nobody knows the sign of its friction, are left out; of long logs at most
-    30,000 rows are taken, evenly, after the derivatives. An arm whose links have no mass has no
+    turns round, so that nobody knows the sign of its friction, are left out; of more than
+    30,000 poses at rest so many are taken, evenly. An arm whose links have no mass has no
     torques to compare with. Raises LogError where the log holds something unusable.
     """
     measured = log.get("actual_current_as_torque")
@@ -77,7 +77,7 @@ def _observed(
         order_in_time=motion.moving,
         friction=motion.direction if motion.moving else None,
         unnamed=lambda: unnamed_pulls(model, motion, "torque"),
-        instrument=instrument_noise(measured[whole.rows], whole),
+        instrument=lambda: instrument_noise(measured[whole.rows], whole),
         fewer=lambda take: _observed(model, log, measured, whole, rows[take]),
         session=session_of(log)[motion.rows] if log.session_names else None,
     )

@@ -37,7 +37,7 @@ LEADS = 4.0  # times the delay: what is left out where it is longer
 def observe(model: Model, log: Log, metrology: Metrology) -> Observation | NotObservable:
     """Return the tracking channel of a log (rad, one coordinate a joint), or what it lacks.
 
-    Delays are predicted on every row; of long logs at most 30,000 rows are compared, evenly. The
+    Delays are predicted on every row; of more than 30,000 poses at rest so many are compared. The
     start of each stretch is left out, because the commands before it are unknown. ``sigma`` is the
     encoder's step over the root of 12. Raises LogError where the log holds something unusable.
     """
@@ -68,7 +68,7 @@ def _observed(model: Model, log: Log, motion: Motion, rows: Index) -> Observatio
         axes=joint_axes(n),
         joint_columns=own_joints(len(part), n),
         order_in_time=motion.moving,
-        instrument=instrument_noise(motion.q - target, motion),
+        instrument=lambda: instrument_noise(motion.q - target, motion),
         fewer=lambda take: _observed(model, log, motion, rows[take]),
         session=session_of(log)[part.rows] if log.session_names else None,
     )

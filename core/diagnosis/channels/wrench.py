@@ -35,8 +35,8 @@ def observe(model: Model, log: Log, metrology: Metrology) -> Observation | NotOb
     """Return the wrench channel of a log (N), or what it lacks.
 
     Torques are weighed by the ratio of the noise of forces to that of torques. Rows without
-    derivatives and rows whose wrench is not finite are left out; of long logs at most 30,000 rows
-    are taken, evenly, after the derivatives. Raises LogError where the log holds something
+    derivatives and rows whose wrench is not finite are left out; of more than 30,000
+    poses at rest so many are taken, evenly. Raises LogError where the log holds something
     unusable.
     """
     measured = log.get("ft_raw_wrench")
@@ -79,7 +79,7 @@ def _observed(
         axes=AXES,
         order_in_time=motion.moving,
         unnamed=lambda: unnamed_pulls(model, motion, "wrench"),
-        instrument=instrument_noise(measured[whole.rows], whole),
+        instrument=lambda: instrument_noise(measured[whole.rows], whole),
         fewer=lambda take: _observed(model, log, measured, whole, rows[take]),
         session=session_of(log)[motion.rows] if log.session_names else None,
     )

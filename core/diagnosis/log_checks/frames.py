@@ -11,7 +11,12 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from gapbridge.core.diagnosis.log_checks.kinematics import best_order, inverted, other_models
+from gapbridge.core.diagnosis.log_checks.kinematics import (
+    best_order,
+    inverted,
+    measured_point,
+    other_models,
+)
 from gapbridge.core.errors import InputError
 from gapbridge.core.estimation.registration import register_robustly
 from gapbridge.core.log.log import Log
@@ -106,6 +111,9 @@ def _mistakes(
             yield f"they look like {unit}, expected m", model, q[rows], seen / factor
     for what, other in other_models(model):
         yield what, other, q[rows], seen
+    point = measured_point(model, q[rows], seen)
+    if point is not None:
+        yield point[0], point[1], q[rows], seen
     order = best_order(model, q[rows], seen)
     if order is not None:
         yield order[0], model, order[1], seen

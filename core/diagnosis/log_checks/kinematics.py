@@ -22,6 +22,10 @@ Array = NDArray[np.float64]
 MANY = 6  # joints up to which all orders are tried: 720
 SCREENED = 24  # rows that an order is judged on before all are
 NEAR = 1e-6  # m, rad: frames that are standard DH rows
+POINTED = 12  # rows from which nine numbers, point and frame, are determined
+STEPS = 10  # of Gauss-Newton
+OUTLYING = 5.0  # times the median distance: a row left out the second time
+FARTHEST = 2.0  # m from the flange: no tool is longer
 
 
 def other_models(model: Model) -> Iterator[tuple[str, Model]]:
@@ -58,6 +62,55 @@ def other_models(model: Model) -> Iterator[tuple[str, Model]]:
             f"lengths of the DH rows look like {unit}, expected m",
             replace(model, arm=_standard(model.arm, changed)),
         )
+
+
+def measured_point(model: Model, q: Array, seen: Array) -> tuple[str, Model] | None:
+    """Return where on the flange the measured positions (N, 3) lie, in words, and that model.
+
+    The point and the instrument's frame are found together (Gauss-Newton, twice: the second time
+    without outliers). None where there are too few rows to tell.
+    """
+    if len(q) < POINTED:
+        return None
+    bare = replace(model, tool_in_flange=np.eye(4))
+    flange = bare.rigid_pose(q)
+    kept, point = np.ones(len(q), bool), np.zeros(3)
+    for _ in range(2):
+        point, left = _point_on_flange(flange.position[kept], flange.rotation[kept], seen[kept])
+        if np.linalg.norm(point) > FARTHEST:
+            return None
+        kept[kept] = left <= OUTLYING * np.median(left)
+        if kept.sum() < POINTED:
+            return None
+    tool = model.tool_in_flange.copy()
+    declared = tool[:3, 3].copy()
+    tool[:3, 3] = point
+    where = f"the measured point lies at {_millimetres(point)} mm in the flange's frame"
+    missing = "the cell declares no tool (tool.tcp)"
+    said = f"tool.tcp says {_millimetres(declared)}" if np.any(declared) else missing
+    return f"{where}, {said}", replace(model, tool_in_flange=tool)
+
+
+def _point_on_flange(position: Array, rotation: Array, seen: Array) -> tuple[Array, Array]:
+    """Return the point (3,) in the flange, m, and each row's distance (N,) left over."""
+    point = np.zeros(3)
+    for _ in range(STEPS):
+        there = position + rotation @ point
+        found = register(seen, there).in_base(seen)
+        apart = (found - there).ravel()
+        turn = np.zeros((len(found), 3, 3))  # columns: a small turn of the instrument's frame
+        for k, axis in enumerate(np.eye(3)):
+            turn[:, :, k] = np.cross(axis, found)
+        shift = np.broadcast_to(np.eye(3), turn.shape)
+        columns = np.concatenate([rotation, -turn, -shift], axis=2).reshape(-1, 9)
+        point = point + np.linalg.lstsq(columns, apart, rcond=1e-6)[0][:3]
+    there = position + rotation @ point
+    left = np.linalg.norm(register(seen, there).in_base(seen) - there, axis=1)
+    return point, np.asarray(left)
+
+
+def _millimetres(point: Array) -> str:
+    return "(" + ", ".join(f"{1e3 * x:.0f}" for x in point) + ")"
 
 
 def best_order(model: Model, q: Array, seen: Array) -> tuple[str, Array] | None:

@@ -28,6 +28,7 @@ HOT = 200.0  # °C: no joint gets there; kelvin do
 WARM = 95.0  # °C: arms stop before; Fahrenheit do not
 FULL_TURN = 2 * np.pi + 0.3  # rad: rotation vectors end there
 FEW_POSES = 15
+AT_ONCE = 1000  # rows
 
 
 def check_units(model: Model, log: Log) -> None:
@@ -209,7 +210,13 @@ def _poses(log: Log) -> list[str]:
     q = log.get("actual_q") if log.has("actual_q") else log.get("target_q")
     if q is None or not np.isfinite(q).all():
         return []
-    count = len(np.unique(np.round(q, 4), axis=0))
+    few, rows = q[:0], 0
+    while len(few) < FEW_POSES:  # of a long log as few rows as it takes
+        if rows >= len(q):
+            break
+        more = q[rows : rows + AT_ONCE]
+        few, rows = np.unique(np.vstack([few, np.round(more, 4)]), axis=0), rows + AT_ONCE
+    count = len(few)
     if count >= FEW_POSES:
         return []
     return [

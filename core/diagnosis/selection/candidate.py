@@ -54,11 +54,6 @@ class Candidate:
         return CATALOGUE.get(self.family, UNNAMED)
 
     @property
-    def gives_way(self) -> bool:
-        """Return whether more of this may take the arm to where it finds no equilibrium."""
-        return self.effect.softens or self.effect.adds_mass
-
-    @property
     def turns_its_joint(self) -> bool:
         """Return whether this turns a joint by the joint's own angle alone."""
         own = Effect.angle_columns

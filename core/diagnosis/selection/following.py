@@ -31,28 +31,42 @@ def exact_columns(observation: Observation, candidate: Candidate, base: Sequence
         return named_columns(observation, candidate, base)
     if len(candidate.parameters) > 1:
         return named_columns(observation, candidate, ())
-    inside = [
-        t.values[0] for t in base
-        if t.site.joint == candidate.site.joint and _alike(t, candidate)
-    ]  # fmt: skip
-    # what else moves the joint stays: play of a joint that lags is not that of one that does not
-    others = [
-        t for t in base
-        if t.site.joint == candidate.site.joint and not _alike(t, candidate)
-    ]  # fmt: skip
-    nothing = observation.predict(others)
+    return chord_columns(observation, candidate, base, chord_value(observation, candidate, base))
+
+
+def chord_value(observation: Observation, candidate: Candidate, base: Sequence[Term]) -> float:
+    """Return up to which value a candidate's chord goes: what its joint has, or asks for."""
+    inside = [t.values[0] for t in base if _of_joint(t, candidate) and _alike(t, candidate)]
+    parameter = candidate.parameters[0]
     if inside:
         value = float(np.sum(inside))
     else:
+        others = _others(candidate, base)
         slope = named_columns(observation, candidate, others)[..., 0]
-        gap = observation.measured - nothing
+        gap = observation.measured - observation.predict(others)
         value = float(np.sum(slope * gap) / max(float(np.sum(slope**2)), 1e-300))
-    parameter = candidate.parameters[0]
-    value = min(max(value, parameter.lower), parameter.upper)
-    if abs(value) < SHORTEST * parameter.scale:
+    return min(max(value, parameter.lower), parameter.upper)
+
+
+def chord_columns(
+    observation: Observation, candidate: Candidate, base: Sequence[Term], value: float
+) -> Array:
+    """Return the columns (N, k, 1) of a chord from nothing to ``value``."""
+    others = _others(candidate, base)
+    if abs(value) < SHORTEST * candidate.parameters[0].scale:
         return named_columns(observation, candidate, others)
+    nothing = observation.predict(others)
     moved = observation.predict([*others, candidate.term(np.array([value]))]) - nothing
     return np.asarray(moved / value)[..., None]
+
+
+def _others(candidate: Candidate, base: Sequence[Term]) -> list[Term]:
+    """Return what else moves the joint: play of one that lags is not that of one that does not."""
+    return [t for t in base if _of_joint(t, candidate) and not _alike(t, candidate)]
+
+
+def _of_joint(term: Term, candidate: Candidate) -> bool:
+    return term.site.joint == candidate.site.joint
 
 
 def _alike(term: Term, candidate: Candidate) -> bool:

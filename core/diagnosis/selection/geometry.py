@@ -22,7 +22,6 @@ from gapbridge.core.diagnosis.criteria import (
     FEW_LINKS,
     LENGTH,
     MIN_GEOMETRIC_CAUSES,
-    SHARES,
 )
 from gapbridge.core.diagnosis.selection.candidate import Candidate
 from gapbridge.core.diagnosis.selection.local_search import pruned
@@ -34,14 +33,21 @@ NEVER = 1e9  # a penalty that no fit is worth
 
 
 def link_candidates(space: SampleSpace) -> tuple[int, ...]:
-    """Return the candidates of all links' geometry."""
-    return tuple(c for c, k in enumerate(space.candidates) if k.effect.together)
+    """Return the candidates of all links' geometry, the joints' zeros among them.
+
+    A zero is the angle in a link's DH row; in an arm whose links are all off, so are they.
+    """
+    links = [c for c, k in enumerate(space.candidates) if k.effect.together]
+    zeros = [
+        c for c, k in enumerate(space.candidates) if k.effect.beside_links and k.site.joint
+    ]  # fmt: skip
+    return (*links, *zeros) if links else ()
 
 
-def prior(candidate: Candidate, share: float = 1.0) -> Array:
-    """Return 1 sigma (d,) of each number of a link; ``share`` is that of an engineer's size."""
+def prior(candidate: Candidate) -> Array:
+    """Return 1 sigma (d,) of each number of a link, of an engineer's size."""
     usual = {"m": LENGTH, "rad": ANGLE}
-    return np.array([share * usual.get(p.unit, p.scale) for p in candidate.parameters])
+    return np.array([usual.get(p.unit, p.scale) for p in candidate.parameters])
 
 
 @dataclass(frozen=True)
@@ -94,14 +100,11 @@ def with_links(
     moments = [c for c in best.chosen if c in block and _of_mass(space.candidates[c])]
     if len(block) < 2 or (_of_mass(space.candidates[block[0]]) and len(moments) < FEW_LINKS):
         return space, best, {}
-    tried = []
-    for share in SHARES:
-        sigma = {c: prior(space.candidates[c], share) for c in block}
-        links = links_of(space, sigma)
-        tried.append((_beside_set(space, best, links, block) + links.penalty, sigma, links))
-    score, sigma, links = min(tried, key=lambda t: t[0])
+    sigma = {c: prior(space.candidates[c]) for c in block}
+    links = links_of(space, sigma)
+    score = _beside_set(space, best, links, block) + links.penalty
     families = {c.family for c in space.candidates if c.named}
-    tries = 2 * float(np.log(len(families) * len(SHARES))) + ACCUSATION_PENALTY
+    tries = 2 * float(np.log(len(families))) + ACCUSATION_PENALTY
     kin = [c for c in best.chosen if _geometric(space.candidates[c])]
     if len(kin) < MIN_GEOMETRIC_CAUSES and score + tries >= best.score:
         return space, best, {}

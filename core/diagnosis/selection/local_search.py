@@ -1,4 +1,4 @@
-"""Sets near a set: terms dropped, swapped, merged, or taken as one unknown."""
+"""Sets near a set: terms dropped, swapped, merged, or joined by an unknown."""
 
 from __future__ import annotations
 
@@ -8,12 +8,11 @@ from numpy.typing import NDArray
 from gapbridge.core.diagnosis.criteria import FAMILY_PENALTY
 from gapbridge.core.diagnosis.selection.forward import (
     additions,
-    exclusive,
     grow,
     joining,
     projected,
 )
-from gapbridge.core.diagnosis.selection.problem import CandidateFit, SampleSpace, fit, gains
+from gapbridge.core.diagnosis.selection.problem import CandidateFit, SampleSpace, fit
 
 Array = NDArray[np.float64]
 MERGED = 9  # terms up to which every pair is tried against one
@@ -151,58 +150,3 @@ def with_fewest_families(space: SampleSpace, found: CandidateFit) -> CandidateFi
                 rest = tuple(o for o in found.chosen if o != c)
                 return with_fewest_families(space, fit(space, (*rest, other)))
     return found
-
-
-def as_periodic_lines(space: SampleSpace, found: CandidateFit) -> CandidateFit:
-    """Return the set with smooth functions of a joint's own angle as periodic lines.
-
-    A few lines together look smooth, and each alone is dearer than one smooth function.
-    """
-    for c in found.chosen:
-        candidate = space.candidates[c]
-        if not candidate.by_own_angle:
-            continue
-        joint = candidate.target.removeprefix("joint_")
-        rest = tuple(o for o in found.chosen if o != c)
-        found = min([found, *_lines(space, rest, int(joint))], key=lambda f: f.score)
-    return found
-
-
-def as_smooth_function(space: SampleSpace, found: CandidateFit) -> list[CandidateFit]:
-    """Return sets with all that a joint does by its own angle as one smooth function."""
-    sets = []
-    joints = {space.candidates[c].site.joint for c in found.chosen}
-    for joint in joints - {None}:
-        own = {
-            c for c in found.chosen
-            if space.candidates[c].site.joint == joint and space.candidates[c].turns_its_joint
-        }  # fmt: skip
-        if len(own) < 2:
-            continue
-        rest = tuple(c for c in found.chosen if c not in own)
-        for c, candidate in enumerate(space.candidates):
-            if candidate.by_own_angle and candidate.target == f"joint_{joint}":
-                sets.append(fit(space, (*rest, c)))
-    return sorted(sets, key=lambda f: f.score)[:4]
-
-
-def _lines(space: SampleSpace, rest: tuple[int, ...], joint: int) -> list[CandidateFit]:
-    """Return the best sets of up to three lines of a joint beside ``rest``."""
-    own = [
-        k
-        for k, candidate in enumerate(space.candidates)
-        if candidate.periodic and candidate.site.joint == joint
-    ]
-    grown: list[CandidateFit] = []
-    sets = [rest]
-    for _ in range(3):
-        step: list[CandidateFit] = []
-        for chosen in sets:
-            state = projected(space, chosen)
-            gain, _ = gains(space, state.r, state.basis)
-            ranked = sorted(own, key=lambda k: -gain[k])[:6]
-            step += [fit(space, (*chosen, k)) for k in ranked if not exclusive(space, chosen, k)]
-        step.sort(key=lambda f: f.score)
-        grown += step
-        sets = [f.chosen for f in step[:5]]
-    return grown

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapbridge.core.diagnosis.observation import Observation
+from gapbridge.core.estimation.nelder_mead import nelder_mead
 
 Array = NDArray[np.float64]
 LARGE_SAMPLE = 150  # samples from which every coordinate is taken to scatter alike
@@ -59,8 +60,6 @@ def estimate_noise(
         scale = np.array([max(float(np.mean(r[:, block == b] ** 2)), 1e-30) for b in range(count)])
         scale[0] = max(scale[0], known)
         return _noise(observation, block, scale, 0.0)
-    from scipy.optimize import minimize  # a quarter of a second, only where it is looked for
-
     lever = J[use] @ np.swapaxes(J[use], 1, 2)
     size = np.sqrt(np.mean(np.einsum("nii->ni", lever)[:, block == 0]))
     identity = np.stack([np.diag((block == b).astype(float)) for b in range(count)])
@@ -73,9 +72,8 @@ def estimate_noise(
         return float(np.sum(log_size + inner))
 
     start = np.log(np.concatenate([spread * 0.7, [0.7 * spread[0] / max(size, 1e-12)]]))
-    best = minimize(surprise, start, method="Nelder-Mead",
-                    options={"maxiter": 80 * len(start), "xatol": 0.02, "fatol": 0.05})  # fmt: skip
-    variance = np.exp(2 * np.clip(best.x, -60, 20))
+    best, _ = nelder_mead(surprise, start, 80 * len(start), 0.02, 0.05)
+    variance = np.exp(2 * np.clip(best, -60, 20))
     return _noise(observation, block, _floored(variance[:count], known), float(variance[-1]))
 
 

@@ -8,15 +8,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtri, stdtrit
 
 from gapbridge.core.arm import Arm
 from gapbridge.core.diagnosis.criteria import OWN_SIGMAS, PRIOR_REACH
+from gapbridge.core.diagnosis.observation import Observation
 from gapbridge.core.diagnosis.selection.candidate import Candidate, angle_columns
 from gapbridge.core.diagnosis.selection.problem import CandidateFit, SampleSpace
 from gapbridge.core.diagnosis.selection.state import SelectionState, flat
 from gapbridge.core.effects import Term
-from gapbridge.core.errors import InputError
+from gapbridge.core.errors import EquilibriumError, InputError
 
 Array = NDArray[np.float64]
 REFITS = 8
@@ -53,13 +53,14 @@ def refit(
     these are wider than those of white noise: what is unknown is not the same everywhere.
     """
     index = (*(c for c in found.chosen if space.candidates[c].named), *links)
-    freed = {c: _freed(state.arm, space.candidates[c]) for c in index}
+    freed = {c: freed_of(state.arm, space.candidates[c]) for c in index}
     smooth = [c for c in found.chosen if not space.candidates[c].named]
     x = [
         np.array(space.candidates[c].term(v).values)[: len(freed[c].parameters)]
         for c, v in zip(found.chosen, found.values, strict=True)
         if c in index
     ] + [np.zeros(len(space.candidates[c].parameters)) for c in links]
+    x = _standing(state, freed, index, x)
     usual = [links[c] if c in links else _wide(freed[c]) for c in index]
     extra = space.columns(smooth)
     if remainder is not None:
@@ -71,7 +72,7 @@ def refit(
         blocks = []
         for k, c in enumerate(index):
             others = terms[:k] + terms[k + 1 :]
-            blocks.append(flat(_slope(state, freed[c], x[k], others), state))
+            blocks.append(flat(slope(state.observation, freed[c], x[k], others), state))
         nuisance = flat(observation.nuisance, state)
         A = np.hstack([*blocks, extra, nuisance])
         b = flat(gap[..., None], state)[:, 0]
@@ -96,20 +97,72 @@ def refit(
             break
     residual_ss = float(np.sum((b - A @ step) ** 2))
     variance = max(residual_ss / max(len(b) - A.shape[1], 1), space.floor)
-    whole = np.vstack([A, pull]) * unit
-    inverse = np.linalg.pinv(whole.T @ whole, rcond=1e-13, hermitian=True)
-    spread = inverse * np.outer(unit, unit) * variance
-    if remainder is not None and len(index):
-        right = np.concatenate([b, towards])
-        spread = _cluster_covariance(spread, whole, right, unit, remainder.region)
-    begin = np.concatenate([[0], np.cumsum(sizes)]).astype(int)
-    covariance = [spread[i:j, i:j] for i, j in itertools.pairwise(begin)]
+    whole, right = np.vstack([A, pull]) * unit, np.concatenate([b, towards])
+    region = None if remainder is None or not len(index) else remainder.region
+    covariance = _covariances(whole, right, unit, variance, sizes, region)
     terms = tuple(freed[c].term(v) for c, v in zip(index, x, strict=True))
     gap = state.observation.measured - state.observation.predict(terms)
     nuisance = state.observation.nuisance
     if nuisance.shape[2]:
         gap = gap - nuisance @ _along(extra, flat(nuisance, state), gap, state)
     return terms, index, tuple(covariance), gap
+
+
+def _standing(
+    state: SelectionState, freed: dict[int, Candidate], index: tuple[int, ...], x: list[Array]
+) -> list[Array]:
+    """Return start values (d,) of each term: nominal ones where no arm of the linear ones stands.
+
+    Linear values of flexibilities may be such that the arm would buckle under its load.
+    """
+    try:
+        state.observation.predict([freed[c].term(v) for c, v in zip(index, x, strict=True)])
+    except EquilibriumError:
+        return [_within(freed[c], np.zeros(len(v))) for c, v in zip(index, x, strict=True)]
+    return x
+
+
+@dataclass(frozen=True)
+class Reduced:
+    """Whitened rows of a regression, of as many as there were those that hold the same sums."""
+
+    A: Array  # (m, p) slopes at the values at hand
+    b: Array  # (m,) gap
+    region: NDArray[np.int64] | None  # (m,) region of each row, where scatter is judged by regions
+    count: float  # rows that there were
+
+
+def step_on(
+    rows: Reduced, freed: list[Candidate], x: list[Array], floor: float
+) -> tuple[list[Array], list[Array]]:
+    """Return values (d,) and covariances (d, d) of terms after one step from ``x``, near there."""
+    usual, index = [_wide(c) for c in freed], tuple(range(len(x)))
+    pull, towards = _pull(usual, x, rows.A.shape[1], None, 0)
+    whole, right = np.vstack([rows.A, pull]), np.concatenate([rows.b, towards])
+    unit = 1 / np.sqrt(np.einsum("ij,ij->j", whole, whole))
+    by_index = dict(enumerate(freed))
+    step = _step(whole, right, unit, by_index, index, x)
+    sizes = [len(v) for v in x]
+    values = [
+        _within(c, v + part)
+        for c, v, part in zip(freed, x, np.split(step, np.cumsum(sizes)[:-1]), strict=True)
+    ]
+    left = float(np.sum((rows.b - rows.A @ step) ** 2))
+    variance = max(left / max(rows.count - rows.A.shape[1], 1), floor)
+    return values, _covariances(whole * unit, right, unit, variance, sizes, rows.region)
+
+
+def _covariances(
+    whole: Array, right: Array, unit: Array, variance: float, sizes: list[int],
+    region: NDArray[np.int64] | None,
+) -> list[Array]:  # fmt: skip
+    """Return the covariance (d, d) of each term; ``whole`` (m, p) are the rows times ``unit``."""
+    inverse = np.linalg.pinv(whole.T @ whole, rcond=1e-13, hermitian=True)
+    spread = inverse * np.outer(unit, unit) * variance
+    if region is not None:
+        spread = _cluster_covariance(spread, whole, right, unit, region)
+    begin = np.concatenate([[0], np.cumsum(sizes)]).astype(int)
+    return [spread[i:j, i:j] for i, j in itertools.pairwise(begin)]
 
 
 def _cluster_covariance(
@@ -130,6 +183,8 @@ def _cluster_covariance(
         inverse = np.linalg.pinv(rest, rcond=1e-12, hermitian=True)
         without[k] = unit * (inverse @ (g - A[out].T @ b[out]))
     away = without - without.mean(axis=0)
+    from scipy.special import ndtri, stdtrit  # a fifth of a second, only beside the unknown
+
     # few regions: as wide as a normal distribution of the same 95 % interval
     few = float(stdtrit(max(len(names) - 1, 1), 0.975) / ndtri(0.975))
     scatter = few**2 * (len(names) - 1) / len(names) * away.T @ away
@@ -231,7 +286,7 @@ def _share(
     return 0.0
 
 
-def _freed(arm: Arm, candidate: Candidate) -> Candidate:
+def freed_of(arm: Arm, candidate: Candidate) -> Candidate:
     """Return the candidate with what its columns held fixed (a softening) fitted too."""
     if not (candidate.effect.curved or candidate.effect.shapes):
         return candidate
@@ -239,19 +294,22 @@ def _freed(arm: Arm, candidate: Candidate) -> Candidate:
     return replace(candidate, parameters=parameters, fixed=(None,) * len(parameters), curve=None)
 
 
-def _slope(
-    state: SelectionState, candidate: Candidate, x: Array, others: tuple[Term, ...]
+def slope(
+    observation: Observation, candidate: Candidate, x: Array, others: tuple[Term, ...]
 ) -> Array:
     """Return d prediction / d parameter (N, k, d) at the term's present values."""
-    by_angle = angle_columns(state.observation, candidate)
+    by_angle = angle_columns(observation, candidate)
     if by_angle is not None:
         return by_angle
     columns = []
     for k, parameter in enumerate(candidate.parameters):
         h = np.zeros(len(x))
         h[k] = 1e-2 * parameter.scale
-        ahead = state.observation.predict([*others, candidate.term(x + h)])
-        behind = state.observation.predict([*others, candidate.term(x - h)])
+        try:
+            ahead = observation.predict([*others, candidate.term(x + h)])
+            behind = observation.predict([*others, candidate.term(x - h)])
+        except EquilibriumError:  # on the edge of buckling: the prior alone leads back
+            ahead = behind = observation.measured
         columns.append((ahead - behind) / (2 * h[k]))
     return np.stack(columns, axis=-1)
 

@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from gapbridge.core.diagnosis.criteria import LARGE_SAMPLE, SINGLE_CAUSE_PREFERENCE
+from gapbridge.core.diagnosis.criteria import LARGE_SAMPLE
 from gapbridge.core.diagnosis.selection.candidate import Candidate
 from gapbridge.core.diagnosis.selection.forward import (
     DEPTH,
@@ -23,8 +23,6 @@ from gapbridge.core.diagnosis.selection.forward import (
     projected,
 )
 from gapbridge.core.diagnosis.selection.local_search import (
-    as_periodic_lines,
-    as_smooth_function,
     grown,
     improve,
     joined_sets,
@@ -73,20 +71,11 @@ def search(space: SampleSpace, depth: int = DEPTH, base: Sequence[int] = ()) -> 
     if base:
         again = improve(space, fit(space, tuple(base)), named_only=True)
         named = min([named, again], key=lambda f: f.score)
-    joined = [*joined_sets(space, named), *as_smooth_function(space, named)]
-    simplest = min([named, *joined], key=lambda f: _counted(f, named))
-    if _counted(simplest, named) >= named.score:
+    simplest = min([named, *joined_sets(space, named)], key=lambda f: f.score)
+    if simplest is named:
         return named
-    whole = improve(space, as_periodic_lines(space, beam_search(space, depth)[0]))
-    better = improve(space, simplest)
-    return min([named, whole, better, simplest], key=lambda f: _counted(f, named))
-
-
-def _counted(found: CandidateFit, named: CandidateFit) -> float:
-    """Return the score for a choice against ``named``: one unknown beats many accomplices."""
-    return found.score - (
-        SINGLE_CAUSE_PREFERENCE if len(found.chosen) <= len(named.chosen) - 2 else 0.0
-    )
+    whole, better = (improve(space, f) for f in (beam_search(space, depth)[0], simplest))
+    return min([named, whole, better], key=lambda f: f.score)
 
 
 def _deep_search(space: SampleSpace, base: Sequence[int]) -> CandidateFit:
@@ -104,8 +93,7 @@ def _deep_search(space: SampleSpace, base: Sequence[int]) -> CandidateFit:
     nearest = min([found, *beside], key=lambda f: f.score)
     if nearest.score < found.score:
         return nearest  # no named cause goes for an unknown beside them
-    sets = [found, *joined_sets(space, found), *as_smooth_function(space, found)]
-    return min(sets, key=lambda f: _counted(f, found))
+    return min([found, *joined_sets(space, found)], key=lambda f: f.score)
 
 
 def screened(space: SampleSpace, base: Sequence[int] = ()) -> NDArray[np.int64]:

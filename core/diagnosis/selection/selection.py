@@ -51,14 +51,12 @@ from gapbridge.core.diagnosis.selection.state import (
 )
 from gapbridge.core.diagnosis.selection.stiffness_curves import with_straight_stiffness
 from gapbridge.core.effects import Site, Term
-from gapbridge.core.errors import InputError
 from gapbridge.core.load_bounds import LoadBounds
 from gapbridge.core.model import Model
 
 Array = NDArray[np.float64]
 ROUNDS = 8
 NOTHING = 1e-4  # worth of a value: a thirtieth of its sigma
-FORBIDDEN = 1e9  # a penalty that no fit is worth
 
 
 @dataclass(frozen=True)
@@ -78,6 +76,12 @@ class Selection:
     unprojected: UnprojectedRows  # the space before the nuisance was projected out
     prior: dict[int, Array] = field(default_factory=dict)  # 1 sigma (d,) of the numbers of each
     # link's candidate, where the geometry of all links is a cause
+    rows_each: float = 1.0  # rows of the log that each sample stands for, squares added up
+
+    def unwhitener(self) -> Array:
+        """Return what makes whitened kept samples (n, k, k) those of one row, channel unit."""
+        whitener = self.noise.whitener[self.kept]
+        return np.asarray(np.linalg.inv(whitener) / np.sqrt(self.rows_each))
 
     @property
     def nuisance_basis(self) -> Array:
@@ -223,14 +227,8 @@ def select(
             )
         near, best, links = with_links(space, best, inside)
         counted, whitened_by = state.kept.copy(), state.noise
-        framed = state.observation
-        try:
-            exact = _exactly(near, best, state)
-            terms, index, covariance, residual = refit(state, space, exact, links)
-        except InputError:  # absurd flexibilities: the arm would buckle
-            state.observation = framed  # not the frame that went astray with them
-            best = _without_compliance(near, best, [c for c in inside if c not in links])
-            terms, index, covariance, residual = refit(state, space, best, links)
+        exact = _exactly(near, best, state)
+        terms, index, covariance, residual = refit(state, space, exact, links)
         straight = with_straight_stiffness(space, best.chosen, index, terms, covariance)
         if straight is not None:
             best = pruned(near, fit(near, straight))
@@ -269,14 +267,6 @@ def select(
         state.observation, space, found, terms, index, covariance, counted, whitened_by,
         residual, base, unprojected, links,
     )  # fmt: skip
-
-
-def _without_compliance(space: SampleSpace, best: CandidateFit, inside: list[int]) -> CandidateFit:
-    """Return the best set without anything that gives way: what was found makes no arm."""
-    gives_way = np.array([c.gives_way for c in space.candidates])
-    stiff = replace(space, penalty=np.where(gives_way, FORBIDDEN, space.penalty))
-    start = {*inside, *best.chosen} - {int(c) for c in np.flatnonzero(gives_way)}
-    return screened_search(stiff, base=sorted(start))
 
 
 def _exactly(space: SampleSpace, best: CandidateFit, state: SelectionState) -> CandidateFit:

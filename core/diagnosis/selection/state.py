@@ -69,8 +69,7 @@ def sample_space(
     X = np.empty((int(state.kept.sum()) * observation.measured.shape[1], int(start[-1])))
     for c, block in enumerate([*columns, *(s for _, s in smooth)]):
         X[:, start[c] : start[c + 1]] = flat(block, state)
-    delays = all(CATALOGUE[term.effect].delays for term in base)
-    chords = observation.channel == "tracking" and delays  # from nothing: nothing to put back
+    chords = chords_only(observation, base)
     gap = (observation.measured - observation.predict(() if chords else base))[..., None]
     # what the terms already in the model explain is put back, in the linear form at hand
     for term in () if chords else base:
@@ -93,6 +92,12 @@ def sample_space(
         KNOWN_SHARE if observation.sigma_is_whole else state.noise.floor_share,
     )  # fmt: skip
     return space, UnprojectedRows(nuisance, target, Q, taken)
+
+
+def chords_only(observation: Observation, base: Sequence[Term]) -> bool:
+    """Return whether all columns are chords from nothing: no term's part is to be put back."""
+    delays = all(CATALOGUE[term.effect].delays for term in base)
+    return observation.channel == "tracking" and delays
 
 
 def _sizes(X: Array) -> Array:

@@ -13,6 +13,8 @@ UR_JOINTS = (
     "shoulder_pan_joint", "shoulder_lift_joint", "elbow_joint",
     "wrist_1_joint", "wrist_2_joint", "wrist_3_joint",
 )  # fmt: skip
+SO_JOINTS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll")
+FINGERS = 2  # numbered joints beside an arm's that a gripper may have
 NUMBERED = re.compile(r"(.*?)(\d+)(\D*)$")
 
 
@@ -23,12 +25,12 @@ def order_joints(
 
     ``found``: the names in the source (more than the arm's, where a gripper is among them);
     ``arm_joints``: those of the arm, () where unknown; ``chosen``: what the user says. Without
-    either, names that are a UR's, or one stem with numbers from 0 or 1 on, say their order
-    themselves. Raises LogError where the names do not.
+    either, names that are a UR's or an SO-101's, or one stem with numbers from 0 or 1 on, say their
+    order themselves. Raises LogError where the names do not.
     """
     if chosen:
         return tuple(_one(path, name, found) for name in chosen)
-    for names in (tuple(arm_joints), UR_JOINTS):
+    for names in (tuple(arm_joints), UR_JOINTS, SO_JOINTS):
         if matched := _matched(names, found):
             return matched
     if numbered := _numbered(found, len(arm_joints)):
@@ -76,4 +78,6 @@ def _numbered(found: Sequence[str], count: int) -> tuple[str, ...]:
         and max(numbers) - min(numbers) + 1 == len(numbers)
         and (len(numbers) == count if count else len(numbers) >= 2)
     ]
-    return tuple(whole[0]) if len(whole) == 1 else ()
+    whole.sort(key=len, reverse=True)
+    alone = len(whole) == 1 or (len(whole) > 1 and len(whole[1]) <= FINGERS < len(whole[0]))
+    return tuple(whole[0]) if alone else ()

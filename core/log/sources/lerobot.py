@@ -53,8 +53,9 @@ class LeRobot(Source):
         notes = [
             f"timestamp is the frame's number over {fps:g} Hz, not measured: a latency below "
             f"{1e3 / fps:.0f} ms cannot be given",
-            f"{episodes} episodes in a row, {PAUSE:g} s between two",
         ]
+        if episodes > 1:
+            notes.append(f"{episodes} episodes in a row, {PAUSE:g} s between two")
         if options.calibration is not None:
             notes.append("a joint's zero is the middle of its calibrated range, not the model's")
         return Converted(columns, order, tuple(notes))
@@ -93,19 +94,21 @@ def _table(path: Path, episode: int | None) -> dict[str, Array]:
     if not files:
         raise LogError(f"{path / 'data'}: found no chunk-*/*.parquet, expected the frames")
     parts: list[dict[str, Array]] = []
+    last = 0
     for file in files:
         try:
             frame = parquet.read_table(file, columns=wanted)
         except (pyarrow.ArrowException, OSError) as error:
             raise LogError(f"{file}: found no readable frames ({error})") from None
         if episode is not None:
+            last = max(last, *frame["episode_index"].to_pylist())
             frame = frame.filter(pyarrow.compute.equal(frame["episode_index"], episode))
         if frame.num_rows:
             parts.append({
                 name: np.array(frame[name].to_pylist(), dtype=float) for name in wanted
             })  # fmt: skip
     if not parts:
-        raise LogError(f"{path}: --episode: found no episode {episode}, expected one that it has")
+        raise LogError(f"{path}: --episode: found no episode {episode}, expected 0 to {last}")
     return {name: np.concatenate([part[name] for part in parts]) for name in wanted}
 
 

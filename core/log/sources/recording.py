@@ -36,7 +36,10 @@ class Recording(Source):
         n = len(arm_joints) or _joints(path)
         pieces = [piece for file in files_of(path) for piece in LogPieces(file, n)]
         if not pieces:
-            raise LogError(f"{path}: found no cycles, expected a recording of the daemon")
+            raise LogError(
+                f"{path}: found no cycles, expected a recording of gapbridge run, or an MCAP file "
+                "with ROS 2 messages"
+            )
         names = set.intersection(*(set(piece.columns) for piece in pieces)) - {"approach"}
         columns = {name: np.concatenate([p.columns[name] for p in pieces]) for name in names}
         return Converted(columns, tuple(f"joint_{i + 1}" for i in range(n)))

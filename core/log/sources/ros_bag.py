@@ -42,6 +42,7 @@ LAYOUTS = (  # of the controller's state by ROS distribution: points, then point
     (("desired", "actual", "error"), ()),  # before Humble
 )  # fmt: skip
 WRENCHES = ("ft_raw_wrench", "actual_TCP_force")
+MOST_TOPICS = 8  # named where none will do
 
 
 @dataclass
@@ -78,10 +79,12 @@ class RosBag(Source):
                 topic = _topic(path, bag, role, options, notes)
                 if topic:
                     samples[role] = _collect(path, bag, topic)
+            topics = sorted({f"{c.topic} ({_type(c.msgtype)})" for c in bag.connections})
         if not samples.keys() & {"joints", "controller"}:
             raise LogError(
-                f"{path}: topics: found no JointState and no JointTrajectoryControllerState, "
-                "expected one of them"
+                f"{path}: topics: found {', '.join(topics[:MOST_TOPICS]) or 'none'}"
+                f"{', ...' if len(topics) > MOST_TOPICS else ''}, expected a JointState or a "
+                "JointTrajectoryControllerState among them"
             )
         notes += [
             f"{one.topic}: {one.received} of {len(one.time)} messages have no stamp in their "

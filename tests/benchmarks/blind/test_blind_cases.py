@@ -20,6 +20,7 @@ def read(folder):
     return rows[0], np.array(rows[1:], dtype=float)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ALL)
 def test_every_kind_can_be_drawn_and_its_folder_shows_nothing(kind, tmp_path):
     label = make_case(kind, 11, tmp_path)

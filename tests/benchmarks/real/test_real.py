@@ -145,6 +145,7 @@ def test_sets_that_are_not_there_are_skipped_by_name(tmp_path):
     assert "panda: skipped, no clone of github.com/" in done.output
 
 
+@pytest.mark.slow
 def test_a_log_of_weight_alone_is_judged_beside_least_squares(tmp_path):
     from click.testing import CliRunner
 

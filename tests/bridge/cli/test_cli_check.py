@@ -193,6 +193,18 @@ def test_init_overwrites_nothing_and_needs_a_controller(host: str, tmp_path: Pat
     assert not (tmp_path / "new.yaml").exists()
 
 
+def test_a_controller_that_is_not_there_is_named_with_its_port(tmp_path: Path) -> None:
+    answer = gapbridge("check", cell(tmp_path, "127.9.9.9", "0.18"), "--live")
+    assert answer.code == 1
+    assert "error: could not connect to 127.9.9.9, port 30004" in answer.err
+
+
+def test_init_without_a_profile_names_those_that_are_shipped(tmp_path: Path) -> None:
+    line = refused("init", "127.9.9.9", "--driver", "modbus", "--out", tmp_path / "new.yaml")
+    assert "--profile" in line
+    assert "doosan, elite_ec, igus" in line
+
+
 def test_a_cell_with_another_tcp_does_not_arm(host: str, tmp_path: Path) -> None:
     more = f"compliance: {{axial: {[1e-5] * 6}}}\nrecording: {{folder: out}}\n"
     path = cell(tmp_path, host, "0.25", more)

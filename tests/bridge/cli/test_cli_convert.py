@@ -33,6 +33,7 @@ def recording(tmp_path: Path) -> Path:
     rows = np.hstack([np.arange(8)[:, None] * 0.1, q, np.full((8, 1), 7)])
     text = "\n".join([" ".join(names), *(" ".join(f"{v:.17g}" for v in row) for row in rows)])
     (tmp_path / "robot.csv").write_text(text + "\n")
+    (tmp_path / "plain.csv").write_text(text.replace(" ", ",") + "\n")
     return tmp_path / "robot.csv"
 
 
@@ -70,6 +71,7 @@ def test_predictions_under_a_parquet_name_are_parquet(recording: Path) -> None:
     [
         (["nowhere.bag", "--out", "log.csv"], "nowhere.bag: not found"),
         (["cell.yaml", "--out", "log.csv"], "found no known kind of recording"),
+        (["plain.csv", "--out", "log.csv"], "actual_q_0 is a log as it stands"),
         (["robot.csv", "--out", "log.txt"], "expected .csv or .parquet"),
         (["robot.csv", "--out", "log.csv", "--topic", "joint=x"], "--topic: found 'joint=x'"),
         (["robot.csv", "--out", "robot.csv"], "found the output to be the input"),

@@ -170,6 +170,18 @@ def test_a_simulators_log_reaches_the_diagnosis_row_by_row(
     )
 
 
+def test_a_gap_of_rounding_is_none(tmp_path: Path) -> None:
+    q, loads = poses_and_loads(40)
+    given = measured(SOFT, q, loads)
+    simulated = log_in(tmp_path, given, "sim.csv")
+    for i in range(3):
+        given[f"measured_position_{i}"] = given[f"measured_position_{i}"] + 1e-12 * q[:, i] ** 2
+    log, out = log_in(tmp_path, columns_of(q, loads) | given), tmp_path / "found.json"
+    cell = cell_in(tmp_path)
+    assert gapbridge("diagnose", log, "--cell", cell, "--sim", simulated, "--json", out).code == 0
+    assert json.loads(out.read_text())["verdict"] == "no_gap"
+
+
 def spoilt(table: dict[str, Array], name: str, change: Callable[[Array], Array]) -> None:
     """Change the column, or the columns ``name_0..``, in place."""
     for key in [k for k in table if k == name or k.rpartition("_")[0] == name]:
@@ -218,6 +230,15 @@ def test_unusable_values_are_refused_by_name(tmp_path: Path, mistake: str) -> No
     line = refused("diagnose", log_in(tmp_path, table), "--cell", cell_in(tmp_path))
     for word in ["log.csv", *words]:
         assert word in line
+
+
+def test_a_load_under_which_the_arm_would_buckle_is_refused_by_its_row(tmp_path: Path) -> None:
+    table = full_table()
+    table["actual_TCP_force_2"] = np.where(np.arange(40) == 16, 1e9, 0.0)
+    table |= {f"actual_TCP_force_{i}": np.zeros(40) for i in (0, 1, 3, 4, 5)}
+    cell = cell_in(tmp_path, CELL + "compliance: {axial: [1.0e-5, 1.0e-5, 1.0e-5, 0, 0, 0]}\n")
+    line = refused("diagnose", log_in(tmp_path, table), "--cell", cell)
+    assert "log.csv: row 17: the arm finds no equilibrium" in line
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 
 import numpy as np
+import pytest
 from daemon_cell import Robot, Run, offsets, wait_for
 
 from gapbridge.bridge.cell.run_settings import read_configuration
@@ -57,6 +58,7 @@ def test_a_loop_that_is_started_anew_runs_the_cell_that_runs_not_the_edited_one(
     assert abs(second - first) < 0.1 * first
 
 
+@pytest.mark.slow
 def test_a_loop_reads_none_of_the_files_that_a_cell_names_from_the_disk(tmp_path: Path) -> None:
     """The files are gone while the loop is started anew, and it runs on."""
     with Robot(tmp_path) as robot:

@@ -180,6 +180,7 @@ def test_a_fault_waits_for_a_person_and_arming_is_refused_until_then(robot: Robo
         assert ask(cell, "status")["latched"] == ""
 
 
+@pytest.mark.slow
 def test_a_latched_fault_outlives_the_loop_that_found_it(robot: Robot) -> None:
     with Run(robot.cell(PATIENT), arm=True) as run:
         run.wait(State.COMPENSATING)
@@ -196,6 +197,7 @@ def test_a_latched_fault_outlives_the_loop_that_found_it(robot: Robot) -> None:
         run.wait(State.OBSERVING, 5.0)
 
 
+@pytest.mark.slow
 def test_a_daemon_that_only_observes_cannot_be_armed(robot: Robot) -> None:
     cell = robot.cell(PATIENT)
     with Run(cell, observe=True) as run:
@@ -238,6 +240,7 @@ def test_the_same_cell_has_the_same_name_from_everywhere(
     assert cell_key(tmp_path / "cell.yaml") != cell_key(tmp_path / "a" / "cell.yaml")
 
 
+@pytest.mark.slow
 def test_a_disarming_between_two_loops_is_kept_and_answered_by_the_next(robot: Robot) -> None:
     cell = robot.cell(PATIENT)
     with Run(cell, arm=True) as run:

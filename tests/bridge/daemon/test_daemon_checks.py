@@ -30,6 +30,7 @@ def robot(tmp_path: Path) -> Iterator[Robot]:
         yield found
 
 
+@pytest.mark.slow
 def test_an_offset_that_stands_at_its_limit_ends_the_compensation(robot: Robot) -> None:
     cell = robot.cell(PATIENT, limits="{offset: 0.0002}")
     with Run(cell, arm=True) as run:
@@ -49,6 +50,7 @@ def test_an_offset_that_stands_at_its_limit_ends_the_compensation(robot: Robot) 
     assert moved[-1] == 0.0
 
 
+@pytest.mark.slow
 def test_a_loop_that_was_suspended_begins_anew_and_observes(robot: Robot) -> None:
     with Run(robot.cell(PATIENT), arm=True) as run:
         run.wait(State.COMPENSATING)
@@ -92,6 +94,7 @@ def nothing_left(run: Run) -> None:
     assert not run.cycles()["written"].any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("times", [1000.0, 0.0])
 def test_a_model_that_is_no_use_is_reported_and_does_not_arm(robot: Robot, times: float) -> None:
     cell = robot.cell(PATIENT)
@@ -124,6 +127,7 @@ def script(robot: Robot, line: str) -> None:
         time.sleep(0.2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("line", "cause"),
     [
@@ -155,6 +159,7 @@ def test_what_a_person_changes_in_the_controller_during_a_run_is_held_and_not_co
     assert moved[-1] == 0.0
 
 
+@pytest.mark.slow
 def test_a_rate_above_the_controllers_is_refused_by_name(robot: Robot) -> None:
     with Run(robot.cell(", rate: 1000"), arm=True) as run:
         wait_for(lambda: any("link.rate" in line for line in run.output), 30.0, "a refusal")
@@ -163,6 +168,7 @@ def test_a_rate_above_the_controllers_is_refused_by_name(robot: Robot) -> None:
     assert "link.rate: found 1000 Hz, expected at most 500 Hz" in output
 
 
+@pytest.mark.slow
 def test_a_hiccup_while_observing_leaves_no_fault_and_arming_works(robot: Robot) -> None:
     with Run(robot.cell()) as run:
         run.wait(State.OBSERVING)

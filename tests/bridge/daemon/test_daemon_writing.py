@@ -30,6 +30,7 @@ def wanted_position(robot: Robot, cell: Path) -> np.ndarray:
     return model.rigid_pose(np.array([robot.settings.start_q])).position[0]
 
 
+@pytest.mark.slow
 def test_observing_computes_and_records_and_writes_nothing(robot: Robot) -> None:
     before = robot.truth()
     with Run(robot.cell(), observe=True, duration=1.0) as run:
@@ -46,6 +47,7 @@ def test_observing_computes_and_records_and_writes_nothing(robot: Robot) -> None
     assert np.abs(cycles["corrected_q_1"] - cycles["nominal_q_1"]).max() > 1e-5
 
 
+@pytest.mark.slow
 def test_an_observer_cannot_be_armed(robot: Robot) -> None:
     with Run(robot.cell(), observe=True) as run:
         run.wait(State.OBSERVING)
@@ -78,6 +80,7 @@ def test_compensation_brings_the_tcp_to_where_it_was_wanted_without_a_jump(robot
     assert robot.truth()["largest_servo_step"] < 1e-4
 
 
+@pytest.mark.slow
 def test_after_a_run_the_arm_is_where_it_was_and_no_program_is_left(robot: Robot) -> None:
     with Run(robot.cell(), arm=True) as run:
         run.wait(State.COMPENSATING)
@@ -89,6 +92,7 @@ def test_after_a_run_the_arm_is_where_it_was_and_no_program_is_left(robot: Robot
     assert robot.controller.log().strip().endswith("program rtde_control ended")
 
 
+@pytest.mark.slow
 def test_a_person_arms_and_disarms_while_it_runs(robot: Robot) -> None:
     with Run(robot.cell()) as run:
         run.wait(State.OBSERVING)
@@ -102,6 +106,7 @@ def test_a_person_arms_and_disarms_while_it_runs(robot: Robot) -> None:
     assert summary.state == "observing"
 
 
+@pytest.mark.slow
 def test_a_robot_program_is_not_ended_to_arm(robot: Robot) -> None:
     with socket.create_connection((robot.host, 30003), timeout=5) as upload:
         upload.sendall(b"def own_work():\n  sleep(30)\nend\n")
@@ -114,6 +119,7 @@ def test_a_robot_program_is_not_ended_to_arm(robot: Robot) -> None:
     assert "own_work ended" not in robot.controller.log()
 
 
+@pytest.mark.slow
 def test_a_recording_is_exported_as_a_log_and_has_the_events(robot: Robot) -> None:
     cell = robot.cell()
     with Run(cell, arm=True, duration=1.0) as run:
@@ -175,6 +181,7 @@ def test_offset_mode_corrects_under_the_robots_own_program(robot: Robot) -> None
     program.close()
 
 
+@pytest.mark.slow
 def test_offset_mode_needs_the_robots_program(robot: Robot) -> None:
     with Run(robot.cell(link=", mode: offset"), arm=True, duration=0.5) as run:
         summary = run.join()
@@ -191,6 +198,7 @@ def trajectory(path: Path, start: tuple[float, ...], way: float, seconds: float)
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
+@pytest.mark.slow
 def test_a_trajectory_is_followed_to_its_end_and_the_run_ends_there(robot: Robot) -> None:
     trajectory(robot.folder / "way.csv", robot.settings.start_q, 0.2, 1.5)
     cell = robot.cell(setpoints="{source: trajectory, file: way.csv}")
@@ -202,6 +210,7 @@ def test_a_trajectory_is_followed_to_its_end_and_the_run_ends_there(robot: Robot
     assert cycles["actual_q_0"][-1] == pytest.approx(0.2, abs=1e-3)
 
 
+@pytest.mark.slow
 def test_a_trajectory_that_begins_elsewhere_is_refused_and_nothing_moves(robot: Robot) -> None:
     away = (0.5, *robot.settings.start_q[1:])
     trajectory(robot.folder / "way.csv", away, 0.2, 1.0)
@@ -214,6 +223,7 @@ def test_a_trajectory_that_begins_elsewhere_is_refused_and_nothing_moves(robot: 
     assert robot.truth()["true_tcp"] == before
 
 
+@pytest.mark.slow
 def test_a_planner_moves_the_arm_and_its_silence_is_a_smooth_hold(robot: Robot) -> None:
     cell = robot.cell(setpoints="{source: planner, socket: planner.sock}")
     start = np.array(robot.settings.start_q)

@@ -95,6 +95,7 @@ def test_the_same_controller_is_known_by_its_address(
     assert found == same
 
 
+@pytest.mark.slow
 def test_two_daemons_on_one_robot_the_second_leaves_with_two(robot: Robot) -> None:
     cell = robot.cell()
     with Run(cell) as run:

@@ -34,6 +34,7 @@ def configured(run: Run) -> dict[str, Any]:
     return found
 
 
+@pytest.mark.slow
 def test_a_wrong_cell_changes_nothing_and_everything_wrong_is_reported(robot: Robot) -> None:
     cell = robot.cell(PATIENT)
     with Run(cell, arm=True) as run:
@@ -53,6 +54,7 @@ def test_a_wrong_cell_changes_nothing_and_everything_wrong_is_reported(robot: Ro
         assert run.end().restarts == 0
 
 
+@pytest.mark.slow
 def test_another_robot_or_another_arm_needs_a_new_start(robot: Robot) -> None:
     cell = robot.cell(PATIENT)
     with Run(cell) as run:
@@ -65,6 +67,7 @@ def test_another_robot_or_another_arm_needs_a_new_start(robot: Robot) -> None:
         assert run.daemon.settings.link.host == robot.host  # type: ignore[union-attr]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("arms", [False, True])
 def test_a_changed_cell_is_ramped_out_of_and_into(robot: Robot, arms: bool) -> None:
     section = "{arm: true}" if arms else "{arm: false}"
@@ -93,6 +96,7 @@ def test_a_changed_cell_is_ramped_out_of_and_into(robot: Robot, arms: bool) -> N
     assert (moved[second].max() > 4e-4) == arms
 
 
+@pytest.mark.slow
 def test_a_reload_while_observing_takes_effect_at_once(robot: Robot) -> None:
     cell = robot.cell(PATIENT)
     with Run(cell) as run:

@@ -77,6 +77,7 @@ def test_an_abstract_socket_is_reached_too(monkeypatch: pytest.MonkeyPatch) -> N
     listener.socket.close()
 
 
+@pytest.mark.slow
 def test_the_daemon_reports_ready_alive_reloading_and_stopping_in_this_order(
     listener: Listener, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -102,6 +103,7 @@ def test_the_daemon_reports_ready_alive_reloading_and_stopping_in_this_order(
     assert "the cell file was read again" in out
 
 
+@pytest.mark.slow
 def test_a_daemon_that_stands_still_gives_no_sign_of_life(
     listener: Listener, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 from daemon_cell import Robot, Run, wait_for
-from watched_feed import free_port
+from ports import free_port
 
 from gapbridge.bridge.daemon import sides as daemon_sides
 from gapbridge.bridge.ipc.control_client import ask

@@ -198,6 +198,7 @@ def test_the_demo_shows_on_every_link_what_it_states(name: str, shown: dict[str,
     assert "bending drawn" in (out / "report.html").read_text()
 
 
+@pytest.mark.slow
 def test_a_demo_that_is_killed_leaves_no_controller_behind(tmp_path: Path) -> None:
     script = (
         "import sys, time; from pathlib import Path\n"

@@ -8,6 +8,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from on_a_phone import CHROMIUM, faults_on_a_phone
 from rich.console import Console
 
 from gapbridge.bridge.cell import load_cell
@@ -366,6 +367,18 @@ def test_three_rounds_of_visits_and_the_truth_are_shown(
     assert "+1 ± 0.003 mm" in html
     assert whole.summary()["tcp_error_mm"]["fitted"]["rms"] > 0
     assert whole.summary()["hidden"]["tool_frame_x"] == 1e-3
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no chromium on this machine")
+def test_nothing_of_the_report_is_cut_off_on_a_phone(result: Result, tmp_path: Path) -> None:
+    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    whole = replace(
+        result, explained=result.compensated, hidden=bent(x=1e-3, y=0.0, z=0.0),
+        accused=(accused(("tool_frame_x", 1.001e-3, 3e-6)),),
+    )  # fmt: skip
+    path = tmp_path / "report.html"
+    path.write_text(page(whole, "verdict: explained\n" + "x" * 100), encoding="utf-8")
+    assert faults_on_a_phone(playwright, path) == []
 
 
 def test_a_recording_without_states_is_a_run_to_be_repeated():

@@ -14,8 +14,14 @@ from gapbridge.core.log.log import Log
 
 
 def count_rows(cell: Cell, log: Log, options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the rows of the log and who has read it."""
+    """Return the rows of the log and who has read it, once ``others`` processes have come."""
     time.sleep(options.get("pause", 0.0))
+    if "present" in options:
+        present = Path(str(options["present"]))
+        (present / str(os.getpid())).touch()
+        until = time.monotonic() + 60.0
+        while len(list(present.iterdir())) < options["others"] and time.monotonic() < until:
+            time.sleep(0.01)
     return {"rows": len(log), "process": os.getpid()}
 
 

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from on_a_phone import CHROMIUM, faults_on_a_phone
 from pyarrow import parquet
 
 from gapbridge.bridge.cell import load_cell
@@ -110,6 +111,13 @@ def test_a_second_run_does_nothing_anew_and_comes_to_the_same(fitted: Any) -> No
     assert "local process" not in answer.out
     assert (folder / "out" / "fit.jsonl").read_bytes() == begin
     assert rows_of(folder / "out" / "results.parquet") == before
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no chromium on this machine")
+def test_nothing_of_the_report_is_cut_off_on_a_phone(fitted: Any) -> None:
+    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    folder, _ = fitted
+    assert faults_on_a_phone(playwright, folder / "out" / "report.html") == []
 
 
 def test_the_report_needs_nothing_else_and_names_the_skipped_log(fitted: Any) -> None:

@@ -15,7 +15,9 @@ from tests.bridge.fleet.jobs import count_rows, fail, kill_itself
 
 def test_every_session_is_done_once_by_both_processes(tmp_path: Path) -> None:
     names = [f"arm{i}/s" for i in range(12)]
-    tasks = tasks_in(tmp_path, names, count_rows, {"pause": 0.05})
+    present = tmp_path / "present"
+    present.mkdir()
+    tasks = tasks_in(tmp_path, names, count_rows, {"present": str(present), "others": 2})
     with LocalWorkers(2) as workers:
         outcomes = list(workers.run(tasks))
     assert sorted(o.session for o in outcomes) == sorted(names)

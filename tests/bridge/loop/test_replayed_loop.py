@@ -100,6 +100,7 @@ def assert_same_bits(found: dict[str, Any], expected: dict[str, Any], rows: int)
             assert not len(first), (name, len(first), first[:5], expected["state"][first[:5]])
 
 
+@pytest.mark.slow
 def test_a_run_with_writing_and_two_loops_is_replayed_bit_for_bit(robot: Robot) -> None:
     cell = robot.cell(limits="{offset: 0.0004, ramp_time: 0.7}")  # the envelope is touched
     loops = Loops(cell, "run-then", arm=True)

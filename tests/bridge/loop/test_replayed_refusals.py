@@ -27,7 +27,8 @@ from gapbridge.core.model import Model
 from gapbridge.core.setpoint import Setpoint
 from gapbridge.core.state import RobotState
 from gapbridge.drivers.driver import Driver
-from gapbridge.drivers.replay import ReplayDriver, ReplaySettings
+from gapbridge.drivers.replay.driver import ReplayDriver
+from gapbridge.drivers.replay.settings import ReplaySettings
 
 N = 6
 CELL = """\

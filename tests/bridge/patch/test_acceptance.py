@@ -16,8 +16,6 @@ from benchmarks.patch.arms import written_arms
 from benchmarks.patch.cases import cases
 from benchmarks.patch.run import run
 
-pytestmark = pytest.mark.slow
-
 
 @pytest.mark.parametrize(
     ("name", "effect"),

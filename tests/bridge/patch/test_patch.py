@@ -7,7 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.patch.arms import BASE_AT, BASE_TURN, UR_JOINTS, frame_turns, mjcf, urdf
+from benchmarks.patch.arms import (
+    BASE_AT,
+    BASE_TURN,
+    UR_JOINTS,
+    frame_turns,
+    mjcf,
+    urdf,
+    written_arms,
+)
 from gapbridge.bridge.patch import PatchOptions, changes_of, format_of
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.effects import Site, Term
@@ -242,3 +250,28 @@ def test_what_is_no_model_is_one_line(tmp_path: Path, name: str, text: str, outp
     with pytest.raises(InputError, match=output) as error:
         format_of(tmp_path / name).patch(tmp_path / name, changes_of(NOMINAL), PatchOptions(), [])
     assert "\n" not in str(error.value)
+
+
+def test_play_of_an_arm_that_stands_straight_up_is_taken_up_against_the_motion(
+    tmp_path: Path,
+) -> None:
+    arm = written_arms()["seven"]
+    model = Model(arm.arm, TOOL).with_terms((Term("backlash", Site(1), (0.002,)),))
+    written = mjcf(arm.arm, arm.joints, kp=4e4, kv=1200.0, load=4.0)
+    text, _, _ = patched(tmp_path / "arm.xml", written, model, "tcp")
+    compiled = mujoco.MjModel.from_xml_string(text)
+    data = mujoco.MjData(compiled)
+    at = [compiled.joint(name).qposadr[0] for name in arm.joints]
+    play = compiled.joint(f"{arm.joints[0]}_backlash").qposadr[0]
+    rng = np.random.default_rng(3)
+    for q in rng.uniform(-1.4, 1.4, (4, 7)):
+        approach = rng.choice([-1.0, 1.0], 7)
+        mujoco.mj_resetData(compiled, data)
+        begin = q - 0.08 * approach
+        data.qpos[at], data.ctrl[:] = begin, begin
+        mujoco.mj_step(compiled, data, nstep=500)
+        for s in np.linspace(0, 1, 2000):
+            data.ctrl[:] = begin + (q - begin) * s**3 * (10 - 15 * s + 6 * s * s)
+            mujoco.mj_step(compiled, data)
+        mujoco.mj_step(compiled, data, nstep=3000)
+        assert data.qpos[play] == pytest.approx(-0.001 * approach[0], rel=0.02)

@@ -149,6 +149,7 @@ def kill_at_random_moments(recording: Recording, publisher: Publisher, times: in
     assert recording.numbers() == list(range(count))
 
 
+@pytest.mark.slow
 def test_killed_at_random_moments_it_goes_on_from_the_ring_and_nothing_is_lost(
     recording: Recording, publisher: Publisher
 ) -> None:
@@ -173,6 +174,7 @@ def test_stalled_for_a_while_it_loses_nothing(recording: Recording, publisher: P
     assert recording.numbers() == list(range(count))
 
 
+@pytest.mark.slow
 def test_a_daemon_that_is_gone_without_an_end_is_outlived_until_the_loop_has_stopped(
     recording: Recording, publisher: Publisher
 ) -> None:

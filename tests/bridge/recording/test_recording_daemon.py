@@ -30,6 +30,7 @@ def recorder_pid(run: Run) -> int | None:
     return run.daemon.sides.status()["recorder"]["pid"]
 
 
+@pytest.mark.slow
 def test_a_recorder_that_is_killed_amidst_a_run_loses_nothing(robot: Robot) -> None:
     with Run(robot.cell(), arm=True) as run:
         run.wait(State.COMPENSATING)
@@ -51,6 +52,7 @@ def test_a_recorder_that_is_killed_amidst_a_run_loses_nothing(robot: Robot) -> N
     assert sum("ended with -9" in line for line in run.output) == 2
 
 
+@pytest.mark.slow
 def test_a_full_disk_pauses_the_recording_and_not_the_run(robot: Robot) -> None:
     with Run(robot.cell(), arm=True) as run:
         run.wait(State.COMPENSATING)
@@ -73,6 +75,7 @@ def test_a_full_disk_pauses_the_recording_and_not_the_run(robot: Robot) -> None:
     assert np.array_equal(numbers, np.arange(len(numbers)))  # the ring held what was missing
 
 
+@pytest.mark.slow
 def test_what_was_recorded_is_diagnosed(robot: Robot) -> None:
     with Run(robot.cell(), arm=True, duration=3.0) as run:
         run.join()
@@ -88,6 +91,7 @@ def test_what_was_recorded_is_diagnosed(robot: Robot) -> None:
     assert "tracking" in channels, out
 
 
+@pytest.mark.slow
 def test_the_daemon_runs_on_a_recording_and_makes_the_same_offsets(robot: Robot) -> None:
     with Run(robot.cell(), arm=True, duration=1.5) as run:
         run.join()
@@ -139,6 +143,7 @@ def kill_daemons(robot: Robot, times: int) -> None:
             assert columns["received"][-1] > killed - 1.0
 
 
+@pytest.mark.slow
 def test_a_daemon_that_is_killed_leaves_a_whole_recording(robot: Robot) -> None:
     kill_daemons(robot, 1)
     assert only_recording(robot.folder / "recordings")

@@ -15,7 +15,7 @@ from gapbridge.core.arm import builtin_arm
 from gapbridge.core.errors import LogError
 from gapbridge.core.model import Model
 from gapbridge.drivers import make_driver
-from gapbridge.drivers.replay import EndOfRecordingError, ReplayDriver
+from gapbridge.drivers.replay.driver import EndOfRecordingError, ReplayDriver
 
 MODEL = Model(builtin_arm("ur5e"))
 

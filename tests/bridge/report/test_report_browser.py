@@ -5,6 +5,7 @@ import shutil
 from contextlib import contextmanager
 
 import pytest
+from on_a_phone import CUT
 from report_cases import CASES, diagnosed
 
 from gapbridge.bridge.report import write_report
@@ -92,6 +93,7 @@ def test_the_arm_is_drawn_and_can_be_turned(browser, explained):
 def test_a_report_opened_on_a_phone_is_no_wider_than_it(browser, explained):
     with opened(browser, explained, 390, 740) as (page, _, complaints):
         assert page.evaluate("document.documentElement.scrollWidth") <= 390
+        assert page.evaluate(CUT) == []
         assert complaints == []
 
 

@@ -160,6 +160,7 @@ def test_nothing_older_than_tls_1_2_is_spoken(tmp_path):
     assert context.minimum_version == ssl.TLSVersion.TLSv1_2
 
 
+@pytest.mark.slow
 def test_the_processes_listen_where_they_are_configured_and_nowhere_else(plain, guarded, metrics):
     for feed in (plain, guarded, metrics):
         found = psutil.Process(feed.side.pid).net_connections("inet")

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from daemon_cell import Robot, Run
-from watched_feed import free_port
+from ports import free_port
 
 from gapbridge.bridge.cell.sections import SetpointSettings
 from gapbridge.bridge.loop.supervisor import State

@@ -136,6 +136,7 @@ def test_registers_that_are_not_there_are_refused(source: ModbusSource) -> None:
     assert plc.client.read_input_registers(60, 5) is None
 
 
+@pytest.mark.slow
 def test_a_taken_port_is_one_line(source: ModbusSource) -> None:
     settings = SetpointSettings(source="modbus", port=source.port)
     with pytest.raises(RunError, match="cannot listen on"):
@@ -176,6 +177,7 @@ def test_neither_side_can_write_what_is_the_others() -> None:
         os.close(again)
 
 
+@pytest.mark.slow
 def test_the_arm_goes_where_the_plc_says_and_the_plc_hears_of_it(tmp_path: Path) -> None:
     with Robot(tmp_path) as robot:
         start = np.array(robot.settings.start_q)

@@ -6,6 +6,7 @@ import time
 from contextlib import contextmanager
 
 import pytest
+from on_a_phone import CUT
 from watched_feed import Feed
 
 from gapbridge.bridge.ipc.shared_memory import Phase
@@ -212,6 +213,7 @@ def test_it_fits_a_phone(browser, feed, theme):
         live(page)
         page.wait_for_timeout(500)
         assert page.evaluate("document.documentElement.scrollWidth") <= PHONE["width"]
+        assert page.evaluate(CUT) == []
         buttons = page.locator("button")
         for i in range(buttons.count()):
             assert buttons.nth(i).bounding_box()["height"] >= 40
@@ -221,6 +223,26 @@ def test_it_fits_a_phone(browser, feed, theme):
         assert complaints == []
 
 
+def test_the_wheel_scrolls_the_page_over_the_arm_until_it_is_clicked(browser, feed):
+    with opened(browser, feed) as (page, _, complaints):
+        live(page)
+        arm = page.locator("#arm")
+        arm.scroll_into_view_if_needed()
+        page.wait_for_timeout(500)
+        box = arm.bounding_box()
+        page.mouse.move(box["x"] + 100, box["y"] + 60)
+        before = page.evaluate("scrollY")
+        page.mouse.wheel(0, 80)
+        page.wait_for_timeout(500)
+        assert page.evaluate("scrollY") == before + 80
+        page.mouse.click(box["x"] + 100, box["y"] + 60)
+        page.mouse.wheel(0, 80)
+        page.wait_for_timeout(500)
+        assert page.evaluate("scrollY") == before + 80
+        assert complaints == []
+
+
+@pytest.mark.slow
 def test_a_cell_that_was_read_again_shows_its_envelope(browser, tmp_path):
     with Feed(tmp_path, "web") as feed:
         feed.wait("status")

@@ -42,6 +42,7 @@ def session(
     return readings_of(arm_with(KIND, truth), laid, instrument, rng), parameters
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("poses", "effects"), [(4, DEFAULT), (8, EFFECTS), (14, EFFECTS)])
 def test_an_arm_without_further_effects_is_offered_none(
     poses: int, effects: tuple[str, ...]

@@ -170,25 +170,50 @@ def test_all_links_are_accused_where_they_close_the_gap_everywhere(links):
 @pytest.mark.parametrize("effect", ["cross_coupling", "backlash"])
 def test_links_that_close_no_gap_are_not_accused(effect):
     whole, judgement = fallen(small.diagnosed(effect).channels[0].selection)
-    assert not closes_everywhere(replace(whole, found=replace(whole.found, chosen=())))
+    assert not closes_everywhere(whole, ())
     found, again = judge_geometry(replace(whole, prior={}), judgement, small.model_of().arm)
     assert again is judgement
     assert not found.block
 
 
-def test_a_joint_zero_goes_with_the_links_where_it_helps_elsewhere(links):
-    whole, _ = fallen(links)
-    zero = [c for c, k in enumerate(whole.space.candidates) if k.family == "joint_offset"]
-    lines = [c for c, k in enumerate(whole.space.candidates) if k.periodic][:1]
-    assert with_the_links(whole, (), zero) == []  # there is none
+def test_a_tool_point_goes_with_the_links_where_it_helps_elsewhere():
+    session = small.session_of(0)
+    off = np.array([2e-3, -1e-3, 3e-3])
+    real = replace(small.NOMINAL, rows=STRETCHED, tool_position=small.TOOL + off)
+    log = small.log_of(session, small.readings(real, session))
+    seen = diagnose(small.model_of(), log, Metrology(registered=True, sigma=small.SIGMA))
+    whole, _ = fallen(seen.channels[0].selection)
+    own = whole.space.candidates
+    point = [c for c, k in enumerate(own) if k.family == "tool_frame"]
+    lines = [c for c, k in enumerate(own) if k.periodic][:1]
+    assert with_the_links(whole, (), [*point, *lines]) == point
+    assert with_the_links(whole, point, lines) == []
+    assert with_the_links(replace(whole, prior={}), (), point) == []  # no links are a cause
+
+
+@pytest.fixture(scope="module")
+def beside_a_single_link():
+    """Return the selection of an arm all off, zeros too, and a judgement that accuses one link."""
     session = small.session_of(0)
     real = replace(small.REAL["joint_offset"], rows=STRETCHED)
     log = small.log_of(session, small.readings(real, session))
-    seen = diagnose(small.model_of(), log, Metrology(registered=True, sigma=small.SIGMA))
-    both, _ = fallen(seen.channels[0].selection)
-    second = [c for c in zero if both.space.candidates[c].site.joint == 2]
-    assert with_the_links(both, (), [*second, *lines]) == second
-    assert with_the_links(replace(both, prior={}), (), second) == []  # no links are a cause
+    found = diagnose(small.model_of(), log, Metrology(registered=True, sigma=small.SIGMA))
+    whole, _ = fallen(found.channels[0].selection)
+    one = next(p for p, c in enumerate(whole.term_index)
+               if whole.space.candidates[c].family == "link_geometry")  # fmt: skip
+    return replace(whole, prior={}), Judgement((one,), True, 0.0, (), {}, ())
+
+
+def test_all_links_and_zeros_stand_for_the_one_that_leaves_much(beside_a_single_link):
+    alone, judgement = beside_a_single_link
+    found, again = judge_geometry(alone, judgement, small.model_of().arm)
+    assert {found.terms[p].effect for p in again.accused} == {"link_geometry", "joint_offset"}
+
+
+def test_a_link_beside_which_nothing_is_left_stays_the_only_one(beside_a_single_link):
+    alone, judgement = beside_a_single_link
+    enough = replace(judgement, structured=False)
+    assert judge_geometry(alone, enough, small.model_of().arm) == (alone, enough)
 
 
 def test_a_value_far_below_its_usual_size_is_no_accusation():

@@ -23,6 +23,7 @@ def seventy_poses(tmp_path_factory):
     return cell, read_log(folder / "log.csv", cell.arm.n)
 
 
+@pytest.mark.slow
 def test_seventy_poses_with_rotations_need_few_copies_of_their_columns(seventy_poses):
     cell, log = seventy_poses
     tracemalloc.start()

@@ -9,7 +9,7 @@ from benchmarks.speed.peers import plain
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.kernels import many, threads
 from gapbridge.core.kernels import reference as kernel
-from gapbridge.core.kernels.factor import factor_blocks, normal_blocks, regressor_blocks
+from gapbridge.core.kernels.factor import factor_blocks
 from gapbridge.core.kernels.layout import LANES
 from gapbridge.core.kernels.predict import linear_blocks, predict_blocks
 from gapbridge.core.kernels.reference import Chain, Rows
@@ -99,19 +99,6 @@ def test_the_factor_without_stored_rows_is_that_of_the_stored_ones(width):
     found = np.linalg.solve(R[:12, :12], R[:12, 12])
     expected = np.linalg.lstsq(stored[:, :12], stored[:, 12], rcond=None)[0]
     np.testing.assert_allclose(found, expected, rtol=1e-9)
-
-
-def test_products_and_regressor_are_those_of_the_stored_rows():
-    chain, rows = case(stiff=True)
-    gap = np.random.default_rng(1).normal(0, 1e-3, (COUNT, 3))
-    G, A = np.zeros((16, 16)), np.zeros((12, 3, COUNT))
-    assert normal_blocks(chain, rows, gap, 0, COUNT, G) == -1
-    assert regressor_blocks(chain, rows, 0, COUNT, A) == -1
-    expected = plain.solve(chain, rows).regressor[:, :3]
-    np.testing.assert_allclose(A.transpose(2, 1, 0), expected, atol=1e-12 * np.abs(A).max())
-    stored = np.concatenate([expected, gap[..., None]], axis=2).reshape(-1, 13)
-    products = np.tril(stored.T @ stored)
-    np.testing.assert_allclose(np.tril(G)[:13, :13], products, atol=1e-12 * products.max())
 
 
 def test_threads_and_rows_that_do_not_settle_change_nothing(monkeypatch):

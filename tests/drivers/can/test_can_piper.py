@@ -95,6 +95,7 @@ def test_the_vendors_client_reads_and_commands_our_arm_and_we_notice_it(served, 
         assert np.abs(joints_of(vendor) - goal).max() < 1e-4
 
 
+@pytest.mark.slow
 def test_simulate_serves_the_cell_to_another_process(tmp_path):
     cell = tmp_path / "cell.yaml"
     text = CELL.read_text().replace("127.0.0.2", HOST).replace("piper.urdf", "p.urdf")

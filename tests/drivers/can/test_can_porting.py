@@ -10,7 +10,7 @@ from ports import free_port, own_host
 
 from gapbridge.drivers.can.driver import CanDriver
 from gapbridge.drivers.can.settings import CanSettings
-from gapbridge.drivers.driver import DriverSettings
+from gapbridge.drivers.link_settings import DriverSettings
 from gapbridge.drivers.simulated.can.server import make_servers
 from gapbridge.drivers.simulated.server.arm_controller import make_controller
 from gapbridge.drivers.simulated.server.protocol_server import ServerThread

@@ -62,6 +62,7 @@ def test_the_keys_of_the_page_are_the_links(profile: Path) -> None:
     assert CanopenSettings(**keys).located(profile.parent).profile_path == profile
 
 
+@pytest.mark.slow
 def test_a_simulated_cell_is_run_from_end_to_end(tmp_path: Path) -> None:
     """Two processes and a bus between them: simulate serves drives, run reads and records."""
     with socket.create_server(("127.0.0.1", 0)) as probe, socket.create_server(("", 0)) as other:

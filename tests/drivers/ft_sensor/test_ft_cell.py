@@ -130,6 +130,7 @@ READ_BOTH = """
 """
 
 
+@pytest.mark.slow
 def test_beside_a_simulated_ur_the_sensor_reads_what_the_arms_own_reads(tmp_path: Path) -> None:
     cell = cell_in(tmp_path, "robotous_rft")
     with simulated(cell):
@@ -146,6 +147,7 @@ def test_beside_a_simulated_ur_the_sensor_reads_what_the_arms_own_reads(tmp_path
     assert change[3:] == pytest.approx((0, 0, 0.5), abs=0.05)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", sorted(SECTIONS))
 def test_run_observes_and_records_the_sensors_wrench(tmp_path: Path, kind: str) -> None:
     cell = cell_in(tmp_path, kind)
@@ -166,6 +168,7 @@ def test_run_observes_and_records_the_sensors_wrench(tmp_path: Path, kind: str) 
     assert torque == pytest.approx(np.cross(COG, weight), abs=0.02)
 
 
+@pytest.mark.slow
 def test_arm_and_sensor_share_one_can_bus(tmp_path: Path) -> None:
     cell = cell_in(tmp_path, "robotous_rft")
     text = cell.read_text(encoding="utf-8").replace(
@@ -186,6 +189,7 @@ def test_arm_and_sensor_share_one_can_bus(tmp_path: Path) -> None:
     assert weight == pytest.approx(MASS * 9.80665, abs=0.15)
 
 
+@pytest.mark.slow
 def test_a_run_without_the_sensor_reports_which_and_ends(tmp_path: Path) -> None:
     with_sensor = cell_in(tmp_path, "robotous_rft")
     text = with_sensor.read_text(encoding="utf-8")

@@ -64,6 +64,7 @@ def test_a_silent_sensor_is_seen_and_its_return_is_observed(
     assert np.abs(raw - WEIGHT).max() <= 0.02  # not one cycle with another wrench
 
 
+@pytest.mark.slow
 def test_a_sensor_lost_while_writing_ends_the_writing_until_a_person_arms_again(
     robot: Robot, sensor: RobotousNode
 ) -> None:
@@ -93,6 +94,7 @@ def test_overload_stops_the_writing(robot: Robot, sensor: RobotousNode) -> None:
     assert any("overload" in line for line in run.output), run.output
 
 
+@pytest.mark.slow
 def test_a_lost_sensor_drops_the_force_and_the_angles_stay_corrected(
     robot: Robot, sensor: RobotousNode
 ) -> None:

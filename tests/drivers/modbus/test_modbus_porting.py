@@ -87,6 +87,7 @@ def test_a_cell_with_a_map_of_the_users_is_served_and_run(profile: Path) -> None
         served.wait(10.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("link", "words"),
     [

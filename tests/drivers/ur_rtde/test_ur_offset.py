@@ -33,6 +33,7 @@ def run(host: str, body: str, **link: object) -> dict[str, object]:
     return run_driver(host, ARMED + dedent(body), mode="offset", **link)
 
 
+@pytest.mark.slow
 def test_an_offset_moves_the_tcp_and_is_taken_out_of_the_nominal_joints(
     offset_robot: SimulatedController, bench: Bench
 ) -> None:
@@ -89,6 +90,7 @@ def test_the_nominal_joints_are_the_robots_own_while_it_moves(
     assert out["spread"] < 1e-5  # type: ignore[operator]
 
 
+@pytest.mark.slow
 def test_without_a_heartbeat_the_robots_program_goes_to_zero_and_on(
     offset_robot: SimulatedController,
 ) -> None:
@@ -153,6 +155,7 @@ def test_rates_that_are_too_small_to_be_sent_are_refused() -> None:
         registers.rates(1e-5, 0.1)
 
 
+@pytest.mark.slow
 def test_a_program_that_takes_no_rates_is_refused_when_arming(
     offset_robot: SimulatedController,
 ) -> None:
@@ -188,6 +191,7 @@ def test_a_wrong_checksum_moves_nothing_and_is_reported(offset_robot: SimulatedC
     assert out["applied"] == [0] * 6
 
 
+@pytest.mark.slow
 def test_a_stopped_program_is_noticed(offset_robot: SimulatedController) -> None:
     out = run(
         offset_robot.host,
@@ -208,6 +212,7 @@ def test_a_stopped_program_is_noticed(offset_robot: SimulatedController) -> None
     assert str(out["error"]).startswith("WriteError: ")
 
 
+@pytest.mark.slow
 def test_arming_needs_the_robots_program(controller: SimulatedController) -> None:
     out = run_driver(
         controller.host,
@@ -220,6 +225,7 @@ def test_arming_needs_the_robots_program(controller: SimulatedController) -> Non
     assert "gapbridge_offset.script" in out["error"]
 
 
+@pytest.mark.slow
 def test_another_tcp_in_the_controller_is_refused(offset_robot: SimulatedController) -> None:
     out = run_driver(
         offset_robot.host,
@@ -268,6 +274,7 @@ def test_the_shipped_program_is_whole() -> None:
     assert "gb_turn_step_most = 0.0002" in text
 
 
+@pytest.mark.slow
 def test_registers_that_another_client_holds_are_refused_in_one_line(
     offset_robot: SimulatedController,
 ) -> None:

@@ -28,6 +28,7 @@ def run(host: str, body: str, **link: object) -> dict[str, object]:
     return run_driver(host, ARMED + dedent(body), **link)
 
 
+@pytest.mark.slow
 def test_the_plant_follows_the_setpoints_and_stands_still_before(
     controller: SimulatedController, bench: Bench
 ) -> None:
@@ -59,6 +60,7 @@ def test_the_plant_follows_the_setpoints_and_stands_still_before(
     assert out["runtime"] == 1
 
 
+@pytest.mark.slow
 def test_arming_again_after_a_release_works(controller: SimulatedController) -> None:
     out = run(
         controller.host,
@@ -75,6 +77,7 @@ def test_arming_again_after_a_release_works(controller: SimulatedController) -> 
     assert out["moved"] == pytest.approx([0.02] * 6, abs=2e-3)
 
 
+@pytest.mark.slow
 def test_a_protective_stop_refuses_the_next_setpoint(controller: SimulatedController) -> None:
     out = run(
         controller.host,
@@ -94,6 +97,7 @@ def test_a_protective_stop_refuses_the_next_setpoint(controller: SimulatedContro
     assert "safety_mode: found 3" in str(out["rearm"])
 
 
+@pytest.mark.slow
 def test_the_robots_watchdog_ends_the_stream_when_the_client_falls_silent(
     controller: SimulatedController,
 ) -> None:
@@ -114,6 +118,7 @@ def test_the_robots_watchdog_ends_the_stream_when_the_client_falls_silent(
     assert "WriteError" in str(out["error"])
 
 
+@pytest.mark.slow
 def test_setpoints_that_do_not_arrive_are_noticed(controller: SimulatedController) -> None:
     out = run(
         controller.host,
@@ -136,6 +141,7 @@ def test_setpoints_that_do_not_arrive_are_noticed(controller: SimulatedControlle
     assert out["after"] < 2.0  # type: ignore[operator]
 
 
+@pytest.mark.slow
 def test_a_running_program_is_not_ended_by_arming(offset_robot: SimulatedController) -> None:
     out = run_driver(
         offset_robot.host,
@@ -149,6 +155,7 @@ def test_a_running_program_is_not_ended_by_arming(offset_robot: SimulatedControl
     assert out["runtime"] == 2
 
 
+@pytest.mark.slow
 def test_writing_needs_arming_and_reading_first(controller: SimulatedController) -> None:
     out = run_driver(
         controller.host,
@@ -167,6 +174,7 @@ def test_writing_needs_arming_and_reading_first(controller: SimulatedController)
     assert "expected arm() first" in out["unarmed"]
 
 
+@pytest.mark.slow
 def test_a_robot_that_another_client_controls_is_refused_in_one_line(
     controller: SimulatedController,
 ) -> None:
@@ -187,6 +195,7 @@ def test_a_robot_that_another_client_controls_is_refused_in_one_line(
     assert "\n" not in out["error"]
 
 
+@pytest.mark.slow
 def test_an_emergency_stop_ends_the_stream_and_arming_is_refused(
     controller: SimulatedController,
 ) -> None:

@@ -51,6 +51,7 @@ class DashboardServer:
             "close safety popup": lambda: "closing safety popup",
             "close popup": lambda: "closing popup",
             "restart safety": self._restart_safety,
+            "savelog": lambda: "Log saved to disk",
             "help": lambda: "Commands: " + ", ".join(sorted(self._plain)),
         }
 

@@ -17,6 +17,7 @@ from gapbridge.drivers.simulated.ur.controller import Controller
 EVERY = 50  # cycles of 2 ms between two states: 10 Hz
 STATE, MESSAGE, VERSION = 16, 20, 3
 MODE, KINEMATICS, CONFIGURATION = 0, 5, 6
+ROBOT_TYPES = {"ur5": 1, "ur10": 2, "ur3": 3, "ur16": 4, "ur20": 7, "ur30": 8}
 CALIBRATED = 2  # calibration status: linearised
 BUILT = b"01-01-2024, 00:00:00"
 
@@ -89,7 +90,18 @@ def _configuration(controller: Controller, rows: Rows) -> bytes:
     return _part(
         CONFIGURATION,
         struct.pack(
-            ">12d12d5d24d4i", *bounds, *speeds, *general, *a, *d, *alpha, *theta, 0, 0, 0, 0
+            ">12d12d5d24d4i",
+            *bounds,
+            *speeds,
+            *general,
+            *a,
+            *d,
+            *alpha,
+            *theta,
+            0,
+            0,
+            ROBOT_TYPES.get(arm.name.rstrip("e"), 0),
+            0,
         ),
     )
 

@@ -221,6 +221,7 @@ def test_what_bears_weight_is_not_blamed_for_one_another(plant, recorded, effect
     assert not torque.causes
 
 
+@pytest.mark.slow
 def test_first_moments_of_all_links_are_found_as_a_whole(plant, recorded, monkeypatch):
     """Centres of gravity centimetres off everywhere: none is sure, together they predict."""
     _, q, qd, qdd, _ = recorded

@@ -59,12 +59,26 @@ def test_the_arm_itself_is_not_suspected() -> None:
         (with_rows(offset=-1.0), None, "offset of the DH rows looks turned round in sign"),
         (with_rows(a=1 / 0.0254, d=1 / 0.0254), None, "lengths of the DH rows look like inches"),
         (replace(TRUE, tool_in_flange=transform(TOOL[:3, :3], -TOOL[:3, 3])), None, "tool.tcp"),
+        (Model(TRUE.arm), None, "lies at (20, -50, 180) mm in the flange's frame, the cell decl"),
+        (
+            replace(TRUE, tool_in_flange=transform(TOOL[:3, :3], TOOL[:3, 3] + [0.1, 0.0, 0.0])),
+            None,
+            "lies at (20, -50, 180) mm in the flange's frame, tool.tcp says (120, -50, 180)",
+        ),
     ],
 )
 def test_what_fits_is_named(model: Model, order: list[int] | None, phrase: str) -> None:
     (line,) = reported(model, Q if order is None else Q[:, order])
     assert "do not follow the arm" in line
     assert phrase in line
+
+
+def test_outliers_hide_no_missing_tool() -> None:
+    position = TRUE.rigid_pose(Q).position @ INSTRUMENT[:3, :3].T + INSTRUMENT[:3, 3]
+    position[[3, 17, 30]] += 0.5
+    columns = {"actual_q": Q, "measured_position": position}
+    (line,) = frame_findings(Model(TRUE.arm), Log("arm.csv", columns, 6), Metrology())
+    assert "lies at (20, -50, 180) mm" in line
 
 
 def test_another_arm_is_reported_without_a_guess() -> None:

@@ -25,8 +25,11 @@ SESSION = small.session_of(0)
 LARGE_SAMPLE = 0.06  # rad: its square times the reach is a millimetre
 
 
-def refitted(position, effects, registered=True, left=None):
-    """Return the terms, deviations and residual of a refit of these effects (effect, joint)."""
+def refitted(position, effects, registered=True, left=None, start=None):
+    """Return the terms, deviations and residual of a refit of these effects (effect, joint).
+
+    ``start`` are values to begin from instead of the linear ones.
+    """
     metrology = Metrology(registered=registered, sigma=small.SIGMA)
     seen = observe(MODEL, small.log_of(SESSION, position), metrology)
     assert isinstance(seen, Observation)
@@ -39,7 +42,8 @@ def refitted(position, effects, registered=True, left=None):
     columns = [named_columns(seen, c, ()) for c in wanted]
     space, *_ = sample_space(state, columns, (), [])
     found = fit(space, tuple(range(len(wanted))))
-    terms, _, covariance, residual = refit(state, space, found)
+    begin = found if start is None else replace(found, values=start)
+    terms, _, covariance, residual = refit(state, space, begin)
     spread = [np.sqrt(np.diag(c)) for c in covariance]
     return found, terms, spread, residual
 
@@ -62,6 +66,14 @@ def test_a_large_offset_is_found_exactly_where_a_line_is_far_off(angle, joint):
     assert np.abs(residual).max() < 1e-9
     if abs(angle) > 0.02:
         assert abs(found.values[0][0] - angle) > 1e-6  # the line alone
+
+
+def test_a_flexibility_is_refitted_from_nominal_where_no_arm_of_its_linear_value_stands():
+    soft = replace(small.NOMINAL, axial=np.array([0.0, 2e-5, 0.0]))
+    start = (np.array([0.1]),)  # rad/Nm: the arm would turn over
+    _, (term,), _, residual = refitted(exact(soft), [("axial_compliance", 2)], start=start)
+    assert term.values[0] == pytest.approx(2e-5, rel=1e-6)
+    assert np.abs(residual).max() < 1e-9
 
 
 def test_effects_that_meet_in_one_joint_are_refitted_together():

@@ -85,7 +85,7 @@ def test_one_episode_can_be_taken(dataset: Path) -> None:
     options = SourceOptions(units="rad", episode=1)
     found = source_of(dataset).read(dataset, JOINTS, options)
     assert np.allclose(found.columns["actual_q"][:, 0], numbers(1)[JOINTS[0]])
-    with pytest.raises(LogError, match="no episode 7"):
+    with pytest.raises(LogError, match="no episode 7, expected 0 to 1"):
         source_of(dataset).read(dataset, JOINTS, SourceOptions(units="rad", episode=7))
 
 

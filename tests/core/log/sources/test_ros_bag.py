@@ -253,6 +253,13 @@ def test_a_controller_state_is_read_from_a_bag_without_definitions(
     assert np.allclose(found.columns["target_q"], expected + 0.001)
 
 
+def test_a_bag_without_joints_names_the_topics_that_it_has(bag: Any, tmp_path: Path) -> None:
+    with bag.writer:
+        bag.pose(0)
+    with pytest.raises(LogError, match=r"found /tracker/pose \(.*PoseStamped\), expected a JointS"):
+        source_of(tmp_path / "bag").read(tmp_path / "bag", (), SourceOptions())
+
+
 def test_a_ros_1_bag_is_read(tmp_path: Path) -> None:
     store = get_typestore(Stores.ROS1_NOETIC)
     types = store.types
@@ -286,6 +293,18 @@ def test_names_say_their_order_by_a_prefix_or_a_number() -> None:
     panda = [f"panda_joint{i}" for i in (3, 1, 7, 2, 5, 4, 6)] + ["panda_finger_joint1"]
     arm = tuple(f"joint_{i + 1}" for i in range(7))
     assert order_joints(path, panda, arm, ()) == tuple(f"panda_joint{i}" for i in range(1, 8))
+
+
+def test_an_arm_alone_says_its_order_beside_its_gripper() -> None:
+    path, panda = Path("bag"), [f"panda_joint{i}" for i in range(1, 8)]
+    fingers = ["panda_finger_joint1", "panda_finger_joint2"]
+    assert order_joints(path, [*fingers, *panda[::-1]], (), ()) == tuple(panda)
+    lerobot = ["gripper.pos", "wrist_roll.pos", "wrist_flex.pos", "elbow_flex.pos",
+               "shoulder_lift.pos", "shoulder_pan.pos"]  # fmt: skip
+    assert order_joints(path, lerobot, (), ()) == tuple(lerobot[:0:-1])
+    second = [f"other_joint{i}" for i in range(1, 7)]
+    with pytest.raises(LogError, match="--joints"):
+        order_joints(path, [*panda, *second], (), ())
 
 
 def test_two_arms_in_one_bag_have_to_be_chosen_between() -> None:

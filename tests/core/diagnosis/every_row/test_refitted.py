@@ -3,14 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 import small_arm as small
 
-from gapbridge.core.diagnosis.every_row import on_every_row, still_accused, with_uncertain_terms
+from gapbridge.core.diagnosis.every_row.refitted import (
+    on_every_row,
+    refitted,
+    still_accused,
+    with_uncertain_terms,
+)
 from gapbridge.core.diagnosis.held_out import HeldOut
 from gapbridge.core.diagnosis.judgement import VAGUE, judge
+
+ALONE = partial(refitted, small.model_of())
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +44,7 @@ def test_what_was_too_vague_on_some_rows_is_accused_where_all_rows_are_sure(sear
     asked = with_uncertain_terms(withdrawn_as_vague(judgement, position))
     assert asked.vague == (position,)
     whole, held = on_all(selection, asked)
-    _, decided = still_accused(whole, asked, held, small.model_of())
+    _, decided = still_accused(whole, asked, held, ALONE)
     assert position in decided.accused
     assert position not in dict(decided.withdrawn)
 
@@ -50,8 +58,8 @@ def test_what_is_vague_on_all_rows_too_is_withdrawn(searched):
     value = np.array(whole.terms[position].values[: len(covariance[position])])
     covariance[position] = np.diag((value / 4.0) ** 2)  # enough for a word, not for an accusation
     unsure = replace(whole, covariance=tuple(covariance))
-    _, decided = still_accused(unsure, asked, held, small.model_of())
+    _, decided = still_accused(unsure, asked, held, ALONE)
     assert position not in decided.accused
     assert dict(decided.withdrawn)[position] == VAGUE
-    _, kept = still_accused(unsure, judgement, held, small.model_of())
+    _, kept = still_accused(unsure, judgement, held, ALONE)
     assert position in kept.accused  # what some rows were sure of is not asked again

@@ -6,7 +6,7 @@ found, and their rivals, fit into memory for every row. There values, ties and g
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -31,6 +31,7 @@ from gapbridge.core.effects import Term
 from gapbridge.core.model import Model
 
 Array = NDArray[np.float64]
+Alone = Callable[[Selection, Sequence[int]], Selection]
 MOST_RIVALS = 12  # of all causes together
 
 
@@ -92,38 +93,39 @@ def _shaped_as(candidate: Candidate, term: Term) -> Candidate:
 
 
 def still_accused(
-    selection: Selection, judgement: Judgement, held: HeldOut, model: Model
+    selection: Selection, judgement: Judgement, held: HeldOut, alone: Alone
 ) -> tuple[Selection, Judgement]:
     """Return what all rows leave accused: effects that shrink the gap where nothing was fitted.
 
     The weakest goes first; of what was vague before, it has to be sure now. Ties that all rows
-    decide are none any more.
+    decide are none any more. ``alone`` refits some of the selection's terms.
     """
-    selection, judgement = _sure(selection, judgement, model)
+    selection, judgement = _sure(selection, judgement, alone)
     accused, withdrawn = list(judgement.accused), list(judgement.withdrawn)
     while accused and held.possible:
-        effects = dict.fromkeys(selection.terms[p].effect for p in accused)
+        kinds: dict[str, list[int]] = {}
+        for p in accused:
+            kind = "" if p in selection.prior else selection.terms[p].effect
+            kinds.setdefault(kind, []).append(p)
         gain = {
-            effect: held.shrink(
-                accused, [p for p in accused if selection.terms[p].effect != effect]
-            ).interval[0]
-            for effect in effects
+            kind: held.shrink(accused, [p for p in accused if p not in own]).interval[0]
+            for kind, own in kinds.items()
         }
-        weakest = min(gain, key=lambda effect: gain[effect])
+        weakest = min(gain, key=lambda kind: gain[kind])
         if gain[weakest] > 0:
             break
-        gone = [p for p in accused if selection.terms[p].effect == weakest]
+        gone = kinds[weakest]
         accused = [p for p in accused if p not in gone]
         withdrawn += [(p, "over all rows the gap does not shrink by it") for p in gone]
     if tuple(accused) != judgement.accused:
-        selection = _alone(selection, accused, model)
+        selection = alone(selection, accused)
     ties = {p: _ties(selection, p) for p in accused if p not in selection.prior}
     return selection, replace(
         judgement, accused=tuple(accused), withdrawn=tuple(withdrawn), ties=ties
     )
 
 
-def _sure(selection: Selection, judgement: Judgement, model: Model) -> tuple[Selection, Judgement]:
+def _sure(selection: Selection, judgement: Judgement, alone: Alone) -> tuple[Selection, Judgement]:
     """Return what stays of effects that were vague on some rows: values that are many sigmas."""
     accused, withdrawn, vague = list(judgement.accused), list(judgement.withdrawn), judgement.vague
     least = (SIGMAS / OWN_SIGMAS) ** 2
@@ -136,10 +138,10 @@ def _sure(selection: Selection, judgement: Judgement, model: Model) -> tuple[Sel
             return selection, replace(judgement, accused=tuple(accused), withdrawn=tuple(withdrawn))
         accused.remove(weakest)
         withdrawn.append((weakest, VAGUE))
-        selection = _alone(selection, accused, model)
+        selection = alone(selection, accused)
 
 
-def _alone(selection: Selection, accused: Sequence[int], model: Model) -> Selection:
+def refitted(model: Model, selection: Selection, accused: Sequence[int]) -> Selection:
     """Return the selection on all rows with some of its terms refitted as all there is."""
     whole = refitted_alone(selection, model.arm, accused)
     links = {p: own for p, own in selection.prior.items() if p in accused}

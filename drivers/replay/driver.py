@@ -8,18 +8,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, Literal, Self
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 
 from gapbridge.core.errors import LinkError, LogError
 from gapbridge.core.setpoint import Setpoint
 from gapbridge.core.state import RobotState
 from gapbridge.drivers.clock import SYSTEM, Clock
-from gapbridge.drivers.driver import Driver, DriverSettings
+from gapbridge.drivers.driver import Driver
+from gapbridge.drivers.replay.settings import ReplaySettings
 
 if TYPE_CHECKING:
     from gapbridge.core.model import Model
@@ -35,30 +34,6 @@ LONGEST_PAUSE = 1.0  # s: longer gaps of a recording are not waited for
 
 class EndOfRecordingError(LinkError):
     """The recording has come to its end."""
-
-
-class ReplaySettings(DriverSettings):
-    """Section ``link`` of a cell that runs on a recording."""
-
-    driver: Literal["replay"] = "replay"
-    file: Path = Field(
-        description="a recording: one file, or a whole run (its name without -001.mcap)"
-    )
-    speed: float = Field(1.0, gt=0.0, le=100.0, description="times as fast as it was")
-
-    def located(self, folder: Path) -> Self:
-        """Return the settings with the recording's path made whole.
-
-        Raises InputError where there is none.
-        """
-        from gapbridge.core.log.mcap_reading import files_of
-
-        path = (folder / self.file).resolve()
-        try:
-            files_of(path)
-        except LogError as error:
-            raise LogError(f"link.file: {error}") from None
-        return self.model_copy(update={"file": path})
 
 
 @dataclass(frozen=True, slots=True)

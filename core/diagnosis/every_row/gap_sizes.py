@@ -1,0 +1,76 @@
+"""How large a channel's gap is, nothing fitted and with the causes in the model."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gapbridge.core.diagnosis.every_row.streamed import Streamed
+from gapbridge.core.diagnosis.noise_floor import block_means, own_coordinates
+from gapbridge.core.diagnosis.observation import Observation
+from gapbridge.core.diagnosis.selection.selection import Selection
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """How large a channel's gap is over all rows that are no outliers, in the channel's unit."""
+
+    samples: int  # outliers too
+    gap_rms: float
+    gap_max: float
+    left: float  # rms with the causes in the model
+    outliers: NDArray[np.int64]  # rows of the log
+    means: Array | None  # (bins, k) of what is left, over time
+
+
+def _counted(observation: Observation) -> int:
+    """Return how many coordinates count in an rms: a wrench's torques weighed."""
+    k = observation.measured.shape[1]
+    return own_coordinates(observation) if observation.channel == "position" else k
+
+
+def sizes_of(selection: Selection, gap: Array, remaining: Array) -> Sizes:
+    """Return the sizes of a gap (N, k) and of what remains of it, in a selection's samples."""
+    observation, kept = selection.observation, selection.kept
+    counted, own = _counted(observation), own_coordinates(observation)
+
+    def rms(values: Array) -> float:
+        return float(np.sqrt(np.mean((values[kept] * observation.weight)[:, :counted] ** 2)))
+
+    return Sizes(
+        len(gap), rms(gap), float(np.linalg.norm(gap[kept][:, :own], axis=1).max()),
+        rms(remaining), observation.rows[~kept], block_means(selection),
+    )  # fmt: skip
+
+
+def streamed_sizes(streamed: Streamed, decided: Selection, accused: Sequence[int]) -> Sizes:
+    """Return the sizes over all rows of a long recording, under the ``accused`` terms."""
+    weight, gap = decided.observation.weight, streamed.gap
+    squares, means = streamed.left(decided, accused)
+
+    def rms(values: Array) -> float:
+        return float(np.sqrt(np.sum(values * weight**2) / (gap.kept * len(weight))))
+
+    return Sizes(gap.samples, rms(gap.squares), gap.largest, rms(squares), gap.outliers, means)
+
+
+def gaps(selection: Selection, chosen: Sequence[int]) -> tuple[Array, Array]:
+    """Return the gap (N, k) without and with the chosen terms, the nuisance fitted each time."""
+    observation = selection.observation
+    at = dict(zip(selection.term_index, selection.terms, strict=True))
+    found = []
+    for terms in ([], [at[c] for c in chosen]):
+        gap = observation.measured - observation.predict(terms)
+        if observation.nuisance.shape[2]:
+            W = selection.noise.whitener
+            kept = selection.kept
+            A = (W @ observation.nuisance)[kept].reshape(-1, observation.nuisance.shape[2])
+            b = (W @ gap[..., None])[kept].ravel()
+            gap = gap - observation.nuisance @ np.linalg.lstsq(A, b, rcond=1e-12)[0]
+        found.append(gap)
+    return found[0], found[1]

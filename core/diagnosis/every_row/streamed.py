@@ -1,0 +1,336 @@
+"""Every row of a long recording judges, block by block: sums take the place of rows.
+
+What a fit and its judgement ask of rows are sums of products of their columns, coordinate by
+coordinate and block by block of time. From these come as many rows as there are columns, with the
+same sums: the sample space of all rows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gapbridge.core.arm import Arm
+from gapbridge.core.diagnosis.channels.recording import STRETCHES
+from gapbridge.core.diagnosis.criteria import OUTLIER_SHARE, OUTLIER_SIGMA
+from gapbridge.core.diagnosis.every_row.long_recording import Block, LongRecording
+from gapbridge.core.diagnosis.noise_floor import BLOCK, own_coordinates
+from gapbridge.core.diagnosis.observation import NotObservable, Observation
+from gapbridge.core.diagnosis.regions import REGIONS
+from gapbridge.core.diagnosis.selection.candidate import Candidate, named_columns
+from gapbridge.core.diagnosis.selection.following import chord_columns, chord_value
+from gapbridge.core.diagnosis.selection.noise import Noise
+from gapbridge.core.diagnosis.selection.problem import SampleSpace, fit, penalties
+from gapbridge.core.diagnosis.selection.refit import Reduced, freed_of, slope, step_on
+from gapbridge.core.diagnosis.selection.selection import Selection
+from gapbridge.core.diagnosis.selection.state import UnprojectedRows, chords_only, locate
+from gapbridge.core.effects import Term
+from gapbridge.core.log.log import Log
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+Observe = Callable[[Log], Observation | NotObservable]
+
+
+@dataclass(frozen=True)
+class Gap:
+    """The gap over all rows that are no outliers, per coordinate of the channel."""
+
+    samples: int  # outliers too
+    squares: Array  # (k,) sum of squares, nothing fitted
+    largest: float  # length of its own coordinates
+    outliers: Index  # rows of the log
+
+    @property
+    def kept(self) -> int:
+        """Return how many rows are no outliers."""
+        return self.samples - len(self.outliers)
+
+
+class Columns:
+    """What a block's rows are made into: columns of candidates, target, slopes of terms, gap."""
+
+    def __init__(self, selection: Selection, accused: Sequence[int], arm: Arm) -> None:
+        self.candidates = selection.space.candidates
+        self.accused = tuple(accused)
+        self.terms = tuple(selection.terms[p] for p in accused)
+        self.freed = [freed_of(arm, self.candidates[p]) for p in accused]
+        self.x = [
+            np.array(term.values)[: len(c.parameters)]
+            for term, c in zip(self.terms, self.freed, strict=True)
+        ]
+        observation = selection.observation
+        self._chords = [
+            chord_value(observation, c, self.terms)
+            if observation.channel == "tracking" and len(c.parameters) == 1 else None
+            for c in self.candidates
+        ]  # fmt: skip
+        self._from_nothing = chords_only(observation, self.terms)
+        self.start = selection.space.start
+        self.slopes = int(self.start[-1]) + 1 + np.arange(sum(len(x) for x in self.x))
+
+    @property
+    def width(self) -> int:
+        """Return how many columns there are."""
+        return int(self.start[-1]) + 2 + len(self.slopes)
+
+    def of(self, seen: Observation, bare: Array, gap: Array) -> Array:
+        """Return the columns (N, k, width) of an observation; ``bare`` is its gap without terms."""
+        own = [
+            self._candidate(seen, c, chord)
+            for c, chord in zip(self.candidates, self._chords, strict=True)
+        ]
+        target = bare
+        if not self._from_nothing:  # the terms' part is put back, in the linear form at hand
+            target = gap
+            for term in self.terms:
+                c, x = locate(list(self.candidates), term)
+                target = target + own[c] @ x
+        slopes = [
+            slope(seen, c, x, self.terms[:i] + self.terms[i + 1 :])
+            for i, (c, x) in enumerate(zip(self.freed, self.x, strict=True))
+        ]
+        return np.concatenate([*own, target[..., None], *slopes, gap[..., None]], axis=2)
+
+    def _candidate(self, seen: Observation, c: Candidate, chord: float | None) -> Array:
+        if chord is not None:
+            return chord_columns(seen, c, self.terms, chord)
+        return named_columns(seen, c, () if seen.channel == "tracking" else self.terms)
+
+
+@dataclass(frozen=True)
+class Streamed:
+    """The sums over all rows of a recording, and what they say of terms near those at hand."""
+
+    excerpt: Selection
+    columns: Columns
+    sums: Array  # (B, k, width, width) of each block and coordinate, whitened
+    time: Array  # (B,) s, of each block
+    session: Index  # (B,)
+    row: Index  # (B,) first row of each block in the log
+    gap: Gap
+    means: Array  # (bins, k, slopes + 1): slopes and gap over every BLOCK seconds, whitened
+    white: Array  # (k,) one over 1 sigma of each coordinate
+    by_region: bool  # something unknown is left: covariances are those of regions
+
+    def selection(self, accused: Sequence[int]) -> Selection:
+        """Return the selection of some of the terms on all rows, fitted as all there is."""
+        terms, covariance = list(self.excerpt.terms), list(self.excerpt.covariance)
+        values, spread = self._fitted(accused)
+        freed = dict(zip(self.columns.accused, self.columns.freed, strict=True))
+        for p, value, own in zip(accused, values, spread, strict=True):
+            terms[p], covariance[p] = freed[p].term(value), own
+        space, raw = self._space()
+        observation, noise = self._samples()
+        return Selection(
+            observation, space, fit(space, tuple(accused)), tuple(terms),
+            tuple(range(len(terms))), tuple(covariance),
+            np.ones(len(observation.rows), dtype=bool), noise, observation.measured,
+            self.columns.terms, raw, rows_each=self.gap.kept / len(observation.rows),
+        )  # fmt: skip
+
+    def alone(self, _: Selection, accused: Sequence[int]) -> Selection:
+        """Return the selection of some of the terms; another selection's space is the same."""
+        return self.selection(accused)
+
+    def left(self, selection: Selection, accused: Sequence[int]) -> tuple[Array, Array]:
+        """Return what terms leave: squares (k,) summed over rows, means (bins, k) over time."""
+        mix = self._mix(accused)
+        freed = dict(zip(self.columns.accused, self.columns.freed, strict=True))
+        x = dict(zip(self.columns.accused, self.columns.x, strict=True))
+        moved = [
+            np.array(selection.terms[p].values)[: len(freed[p].parameters)] - x[p] for p in accused
+        ]
+        away = mix @ np.concatenate([*(-m for m in moved), [1.0]])
+        at = [*self.columns.slopes, self.columns.width - 1]
+        sums = self.sums.sum(axis=0)[:, at][:, :, at]
+        squares = np.einsum("i,kij,j->k", away, sums, away) / self.white**2
+        own = own_coordinates(self.excerpt.observation)
+        return np.maximum(squares, 0.0), (self.means @ away / self.white)[:, :own]
+
+    def _mix(self, accused: Sequence[int]) -> Array:
+        """Return slopes and gap of some terms alone (slopes + 1, d + 1): others put back."""
+        size = len(self.columns.slopes) + 1
+        kept, gap, at = [], np.zeros(size), 0
+        gap[-1] = 1.0
+        for p, x in zip(self.columns.accused, self.columns.x, strict=True):
+            if p in accused:
+                kept.append((p, np.eye(size)[:, at : at + len(x)]))
+            else:
+                gap[at : at + len(x)] = x
+            at += len(x)
+        order = dict(kept)
+        return np.hstack([*(order[p] for p in accused), gap[:, None]])
+
+    def _fitted(self, accused: Sequence[int]) -> tuple[list[Array], list[Array]]:
+        if not accused:
+            return [], []
+        mix, at = self._mix(accused), [*self.columns.slopes, self.columns.width - 1]
+        span = max(float(np.ptp(self.time)), 1e-9)
+        part = ((self.time - self.time.min()) / span * REGIONS).astype(np.int64)
+        part = np.minimum(part, REGIONS - 1) if self.by_region else np.zeros_like(part)
+        names = np.unique(part)
+        sums = np.stack([self.sums[part == name].sum(axis=(0, 1)) for name in names])
+        rows = rows_of(mix.T @ sums[:, at][:, :, at] @ mix)
+        flat = rows.reshape(-1, rows.shape[2])
+        known = dict(zip(self.columns.accused, range(len(self.columns.accused)), strict=True))
+        return step_on(
+            Reduced(
+                flat[:, :-1], flat[:, -1],
+                np.repeat(names, rows.shape[1]) if self.by_region else None,
+                float(self.gap.kept * len(self.white)),
+            ),
+            [self.columns.freed[known[p]] for p in accused],
+            [self.columns.x[known[p]] for p in accused],
+            self.excerpt.space.floor,
+        )  # fmt: skip
+
+    def _space(self) -> tuple[SampleSpace, UnprojectedRows]:
+        """Return the sample space of all rows, as rows with the same sums."""
+        target = int(self.columns.start[-1])
+        rows = rows_of(self.sums[:, :, : target + 1, : target + 1])
+        flat = rows.transpose(0, 2, 1, 3).reshape(-1, target + 1)  # coordinates side by side
+        X, y = np.ascontiguousarray(flat[:, :target]), flat[:, target]
+        space, freedom = self.excerpt.space, float(self.gap.kept * len(self.white))
+        extra = space.penalty - penalties(space.candidates, space.freedom)
+        nothing = np.zeros((len(y), 0))
+        return (
+            replace(
+                space, y=y, X=X, freedom=freedom,
+                penalty=penalties(space.candidates, freedom) + extra,
+            ),
+            UnprojectedRows(nothing, y, nothing, np.zeros((0, target))),
+        )  # fmt: skip
+
+    def _samples(self) -> tuple[Observation, Noise]:
+        """Return the samples that stand for the rows: so many to a block."""
+        each, k = int(self.columns.start[-1]) + 1, len(self.white)
+        span = max(float(np.ptp(self.time)), 1e-9)
+        stretch = ((self.time - self.time.min()) / span * STRETCHES).astype(np.int64)
+        samples = each * len(self.time)
+        whole = self.excerpt.observation
+        observation = replace(
+            whole,
+            measured=np.zeros((samples, k)),
+            nuisance=np.zeros((samples, k, 0)),
+            quantities={"timestamp": np.repeat(self.time, each)},
+            groups=np.repeat(np.minimum(stretch, STRETCHES - 1), each),
+            rows=np.repeat(self.row, each),
+            session=None if whole.session is None else np.repeat(self.session, each),
+            joint_columns=None, friction=None, times=None, fewer=None, unnamed=tuple,
+        )  # fmt: skip
+        whitener = np.broadcast_to(np.diag(self.white), (samples, k, k))
+        return observation, replace(self.excerpt.noise, whitener=whitener)
+
+
+def rows_of(sums: Array) -> Array:
+    """Return rows (..., p, p) with the sums of products (..., p, p): R with R^T R as given."""
+    size = np.sqrt(np.maximum(np.einsum("...ii->...i", sums), 0.0))
+    unit = np.where(size > 0, 1 / np.where(size > 0, size, 1.0), 0.0)
+    value, V = np.linalg.eigh(sums * unit[..., :, None] * unit[..., None, :])
+    root = np.sqrt(np.maximum(value, 0.0))[..., :, None]
+    return np.asarray(root * np.swapaxes(V, -1, -2) * size[..., None, :])
+
+
+class RowSums:
+    """The sums over all rows of a recording, at the accused terms of its excerpt, block by block.
+
+    ``observe`` gives the channel in a block; covariances are those of regions where ``by_region``.
+    """
+
+    def __init__(
+        self, selection: Selection, accused: Sequence[int], observe: Observe, arm: Arm,
+        by_region: bool,
+    ) -> None:  # fmt: skip
+        self._selection, self._observe, self._by_region = selection, observe, by_region
+        self._columns = Columns(selection, accused, arm)
+        self._white = np.asarray(np.diag(selection.noise.whitener[0]))
+        self._limit = _limit(selection, self._columns.terms, self._white)
+        self._own = own_coordinates(selection.observation)
+        self._blocks: list[tuple[Array, float, int, int]] = []
+        self._outliers: list[Index] = []
+        self._means = _Means(self._columns)
+        self._samples, self._squares, self._largest = 0, np.zeros(len(self._white)), 0.0
+
+    def add(self, recording: LongRecording, block: Block) -> None:
+        """Add the rows of a block."""
+        seen = self._observe(block.log)
+        if isinstance(seen, NotObservable):
+            return
+        inside = seen.rows + block.first >= block.begin
+        rows = seen.rows[inside] + block.first
+        if not len(rows):
+            return
+        bare = seen.measured - seen.predict(())
+        terms = self._columns.terms
+        gap = seen.measured - seen.predict(terms) if terms else bare
+        whole = self._columns.of(seen, bare, gap)[inside] * self._white[:, None]
+        kept = np.sqrt(np.mean(whole[:, :, -1] ** 2, axis=1)) <= self._limit
+        whole, bare = whole[kept], bare[inside][kept]
+        self._samples += len(rows)
+        self._outliers.append(rows[~kept])
+        if not len(bare):
+            return
+        self._squares += np.einsum("ij,ij->j", bare, bare)
+        farthest = float(np.linalg.norm(bare[:, : self._own], axis=1).max())
+        self._largest = max(self._largest, farthest)
+        time = recording.log.columns["timestamp"][rows[kept]]
+        self._means.add(time, whole)
+        by_coordinate = np.ascontiguousarray(whole.transpose(1, 0, 2))
+        sums = by_coordinate.transpose(0, 2, 1) @ by_coordinate
+        self._blocks.append(
+            (sums, float(time.mean()), _session(recording, block), int(rows[0]))
+        )  # fmt: skip
+
+    def streamed(self) -> Streamed:
+        """Return what all blocks come to."""
+        sums, time, session, first = zip(*self._blocks, strict=True)
+        gap = Gap(self._samples, self._squares, self._largest, np.concatenate(self._outliers))
+        return Streamed(
+            self._selection, self._columns, np.stack(sums), np.array(time), np.array(session),
+            np.array(first), gap, self._means.whole(), self._white, self._by_region,
+        )  # fmt: skip
+
+
+def _session(recording: LongRecording, block: Block) -> int:
+    named = bool(recording.log.session_names)
+    return int(recording.log.columns["session"][block.begin]) if named else 0
+
+
+def _limit(selection: Selection, terms: Sequence[Term], white: Array) -> float:
+    """Return the whitened distance from which a row is an outlier; few are, or none is."""
+    observation = selection.observation
+    left = (observation.measured - observation.predict(terms)) * white
+    distance = np.sqrt(np.mean(left**2, axis=1))
+    usual = float(np.sqrt(np.median(left**2) / 0.4549))
+    return max(OUTLIER_SIGMA * usual, float(np.quantile(distance, 1 - OUTLIER_SHARE)))
+
+
+class _Means:
+    """Means of slopes and gap over every BLOCK seconds."""
+
+    def __init__(self, columns: Columns) -> None:
+        self._at = [*columns.slopes, columns.width - 1]
+        self._start: float | None = None
+        self._parts: list[tuple[Index, Array, Array]] = []
+
+    def add(self, time: Array, columns: Array) -> None:
+        """Add rows in order of time (N,)."""
+        if self._start is None:
+            self._start = float(time[0])
+        number = np.floor((time - self._start) / BLOCK).astype(np.int64)
+        begins = np.flatnonzero(np.diff(number, prepend=number[0] - 1))
+        sums = np.add.reduceat(columns[:, :, self._at], begins, axis=0)
+        self._parts.append((number[begins], sums, np.diff(begins, append=len(number))))
+
+    def whole(self) -> Array:
+        """Return the means (bins, k, slopes + 1)."""
+        number, sums, count = (
+            np.concatenate([part[i] for part in self._parts]) for i in range(3)
+        )  # fmt: skip
+        begins = np.flatnonzero(np.diff(number, prepend=number[0] - 1))
+        total = np.add.reduceat(sums, begins, axis=0)
+        return np.asarray(total / np.add.reduceat(count, begins)[:, None, None])

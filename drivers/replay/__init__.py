@@ -1,0 +1,1 @@
+"""A recording of the daemon as a controller."""

@@ -1,0 +1,37 @@
+"""What ``check --live`` and ``init`` read of a controller whose samples are not all whole."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from gapbridge.bridge.cell import live
+from gapbridge.core.errors import InvalidStateError, LinkError, StaleStateError
+
+
+class Bus:
+    """Raises what it is given, then answers."""
+
+    def __init__(self, *errors: Exception) -> None:
+        self.errors = list(errors)
+
+    def read_state(self) -> Any:
+        if self.errors:
+            raise self.errors.pop(0)
+        return "state"
+
+
+def test_a_torn_and_a_late_sample_are_read_again() -> None:
+    assert live.whole_state(Bus(InvalidStateError("torn"), StaleStateError("late"))) == "state"
+
+
+def test_a_broken_link_is_not_waited_for() -> None:
+    with pytest.raises(LinkError, match="cut"):
+        live.whole_state(Bus(LinkError("cut")))
+
+
+def test_a_bus_that_is_never_whole_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(live, "LONGEST", 0.0)
+    with pytest.raises(InvalidStateError):
+        live.whole_state(Bus(*[InvalidStateError("torn")] * 100_000))
