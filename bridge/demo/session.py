@@ -107,15 +107,16 @@ class Session:
                     parts.append(ended.found)
                     left = left[len(ended.found) :]
                 fruitless = 0 if ended.found is not None or ended.stalled else fruitless + 1
+                if ended.broke or len(left):
+                    self._require_stall(ended, fruitless, latest)
+                    self._tell(
+                        f"  this machine stood still ({ended.broke}); {len(poses) - len(left)} of "
+                        f"{len(poses)} visits are done, going on{self._slow(ended.broke)}"
+                    )
+                    self._clock.sleep(0.0 if ended.found is not None else PAUSE)
+                    bench.go(self._link.home)  # the next run begins there
                 if not len(left):
                     return parts[0] if len(parts) == 1 else joined(parts)
-                self._require_stall(ended, fruitless, latest)
-                self._tell(
-                    f"  this machine stood still ({ended.broke}); {len(poses) - len(left)} of "
-                    f"{len(poses)} visits are done, going on{self._slow(ended.broke)}"
-                )
-                self._clock.sleep(0.0 if ended.found is not None else PAUSE)
-                bench.go(self._link.home)
                 longest = self._link.prepare(self._folder, left)
         finally:
             bench.close()

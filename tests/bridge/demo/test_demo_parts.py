@@ -247,6 +247,9 @@ class Hall:
 
     home = HOME
 
+    def __init__(self) -> None:
+        self.gone: list[np.ndarray] = []
+
     def declared(self, cell, load):
         return cell
 
@@ -258,7 +261,8 @@ class Hall:
 
     def hang(self, load): ...
 
-    def go(self, q): ...
+    def go(self, q):
+        self.gone.append(q)
 
     def close(self): ...
 
@@ -302,6 +306,15 @@ def test_a_run_that_a_stall_ended_goes_on_with_the_visits_that_are_left():
     ]  # fmt: skip
 
 
+def test_a_run_that_a_stall_ended_on_its_way_home_leaves_the_arm_there():
+    session = Scripted((5, "state stale", False))
+    assert len(five_visits(session)) == 5
+    assert session._link.gone == [HOME]
+    session = Scripted((5, "", False))
+    assert len(five_visits(session)) == 5
+    assert session._link.gone == []
+
+
 def test_runs_that_come_no_farther_on_a_machine_that_keeps_time_are_a_failure():
     behind = "setpoint refused: joint 4 is 0.0833 rad behind (limits.following)"
     session = Scripted((1, behind, False), *[(0, behind, False)] * 9)
@@ -314,7 +327,7 @@ def test_runs_that_come_no_farther_on_a_machine_that_keeps_time_are_a_failure():
 
 @pytest.mark.parametrize("broke", ["offset saturated", "correction no number", "zero moved", ""])
 def test_a_run_that_no_stall_ended_is_a_failure_at_once(broke):
-    session = Scripted((3, broke, False))
+    session = Scripted((5 if broke else 3, broke, False))
     with pytest.raises(RunError, match=broke or "before its last visit"):
         five_visits(session)
     assert session.asked == [5]
