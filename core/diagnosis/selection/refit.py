@@ -20,6 +20,7 @@ from gapbridge.core.errors import EquilibriumError, InputError
 
 Array = NDArray[np.float64]
 REFITS = 8
+ROUNDING = 1e-6  # of a sigma: regions whose values scatter less than that are alike
 NO_PRIOR: Mapping[int, Array] = {}
 
 
@@ -189,8 +190,9 @@ def _cluster_covariance(
     few = float(stdtrit(max(len(names) - 1, 1), 0.975) / ndtri(0.975))
     scatter = few**2 * (len(names) - 1) / len(names) * away.T @ away
     wide, narrow = np.sqrt(np.diag(scatter)), np.sqrt(np.maximum(np.diag(white), 0.0))
-    share = np.maximum(narrow / np.maximum(wide, 1e-300), 1.0)
-    return np.asarray(scatter * np.outer(share, share))
+    flat = wide < ROUNDING * narrow  # the same in all regions: rows that repeat to the last digit
+    share = np.maximum(narrow / np.where(flat, np.inf, wide), 1.0)
+    return np.asarray(scatter * np.outer(share, share) + np.diag(np.where(flat, narrow**2, 0.0)))
 
 
 def worth(term: Term, spread: Array) -> float:

@@ -53,3 +53,19 @@ def test_structure_is_never_nothing(plant):
     assert channel.structured
     assert channel.noise_floor_rms is None
     assert 0 < channel.unexplained_rms < channel.remaining_rms
+
+
+def test_a_sensor_that_says_one_thing_for_ever_is_answered(plant):
+    """A mocked sensor repeats itself to the last digit: no part of the log differs from another."""
+    rows = np.ones((40, 1))
+    log = truth.log_of(
+        N, timestamp=np.arange(40) * 0.1, actual_q=rows * truth.poses(N, 1, 5),
+        ft_raw_wrench=rows * [1.0, -2.0, -21.1, 0.1, 0.05, 0.0],
+        payload=2.0 * rows[:, 0], payload_cog=rows * [0.0, 0.0, 0.05],
+    )  # fmt: skip
+    with np.errstate(divide="raise", over="raise", invalid="raise"):
+        found = diagnose(plant.model(0.0), log)
+    channel = next(c for c in found.channels if c.channel == "wrench")
+    assert {"ft_bias"} == {c.effect for c in channel.causes}
+    assert np.isfinite(channel.causes[0].relative_deviation).all()
+    assert channel.remaining_rms < 1e-9
