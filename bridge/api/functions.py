@@ -103,8 +103,8 @@ def diagnose(
     simulator, row by row, whose values are the prediction.
     """
     from gapbridge.bridge.api.found_spread import accused, intervals_applied, spread_of
+    from gapbridge.bridge.document.diagnosis_json import document
     from gapbridge.core.diagnosis.diagnosis import diagnose as diagnose_log
-    from gapbridge.core.diagnosis.document import document
     from gapbridge.core.effects import effect_named
     from gapbridge.core.log.alignment import aligned
 

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from gapbridge.bridge.cell import Cell
+from gapbridge.bridge.document.diagnosis_json import document
 from gapbridge.core.diagnosis.diagnosis import diagnose
-from gapbridge.core.diagnosis.document import document
 from gapbridge.core.log.log import Log
 
 EPOCH = 1.0e9  # s: timestamps beyond count from 1970, those below from some start

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from gapbridge.bridge.document.blocks import Block, Bullets, Heading, Paragraph, Table
+from gapbridge.bridge.document.findings import finding_text
 from gapbridge.bridge.document.provenance import origin_blocks
 from gapbridge.bridge.report.labels import CHANNELS, with_unit
 from gapbridge.bridge.report.material import Material, own_coordinates, per_sample
@@ -27,7 +28,7 @@ def data_quality(material: Material) -> list[Block]:
              "different poses or stretches of time")  # fmt: skip
     blocks: list[Block] = [Table(heads, rows), Heading("Findings")]
     blocks.append(
-        Bullets(diagnosis.findings) if diagnosis.findings
+        Bullets(tuple(finding_text(f) for f in diagnosis.findings)) if diagnosis.findings
         else Paragraph("No check of the log found anything odd.")
     )  # fmt: skip
     for channel in diagnosis.channels:

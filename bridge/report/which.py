@@ -15,6 +15,7 @@ from gapbridge.bridge.document.blocks import (
     Table,
 )
 from gapbridge.bridge.document.drawing import EDGE
+from gapbridge.bridge.document.findings import considered_text
 from gapbridge.bridge.report.labels import effect_title, joint_list, likelihood, listed, percent
 from gapbridge.bridge.report.material import Material, channel_heading
 from gapbridge.core.diagnosis.diagnosis import ChannelDiagnosis
@@ -75,7 +76,7 @@ def _considered(considered: Considered, tied: bool, beside: bool) -> list[Cell]:
         why = "would explain these data as well as the cause named above"
     elif considered.outcome is Outcome.WITHDRAWN:
         verdict = Badge("withdrawn", DOUBTFUL)
-        why = f"looked like a cause, but is not accused: {considered.reason}"
+        why = f"looked like a cause, but is not accused: {considered_text(considered)}"
     else:
         verdict = Badge("no", QUIET)
         others = ", beside the causes found," if beside else ""

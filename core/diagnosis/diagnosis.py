@@ -23,6 +23,16 @@ from gapbridge.core.diagnosis.every_row.refitted import (
     with_uncertain_terms,
 )
 from gapbridge.core.diagnosis.every_row.streamed import RowSums, Streamed
+from gapbridge.core.diagnosis.finding import (
+    ChannelFinding,
+    Fact,
+    Finding,
+    NotAccused,
+    Outliers,
+    Slip,
+    Thinned,
+    TooFewRows,
+)
 from gapbridge.core.diagnosis.generalisation import NOWHERE, Generalisation, generalisation
 from gapbridge.core.diagnosis.held_out import HeldOut
 from gapbridge.core.diagnosis.judgement import (
@@ -43,7 +53,7 @@ from gapbridge.core.diagnosis.observation import NotObservable, Observation, thi
 from gapbridge.core.diagnosis.residual_structure import dependence
 from gapbridge.core.diagnosis.result import Cause, Considered, causes_of, considered_of
 from gapbridge.core.diagnosis.rigid_suspicion import softness_findings
-from gapbridge.core.diagnosis.selection.moments import slip_sentences
+from gapbridge.core.diagnosis.selection.moments import slips
 from gapbridge.core.diagnosis.selection.selection import Selection, refitted_alone, select
 from gapbridge.core.diagnosis.separation import Measurement, next_measurements
 from gapbridge.core.effects import CATALOGUE, Term, flexibility_effects
@@ -113,7 +123,7 @@ class Diagnosis:
     channels: tuple[ChannelDiagnosis, ...]
     not_observable: tuple[NotObservable, ...]
     next_measurements: tuple[Measurement, ...]
-    findings: tuple[str, ...]
+    findings: tuple[Finding, ...]
     model: Model = field(repr=False)  # with the causes in it
     with_stand_ins: Model = field(repr=False)  # with the stand-ins too, fitted along
     sessions: tuple[str, ...] = ()  # names, where there are several
@@ -154,7 +164,7 @@ def _diagnose(
     simulated: Log | None,
 ) -> Diagnosis:  # fmt: skip
     check_units(model, log)
-    notes = _log_findings(model, log, metrology)
+    notes: list[Finding] = [*_log_findings(model, log, metrology)]
     observed: list[ChannelDiagnosis] = []
     searched: list[tuple[_Searched, RowSums]] = []
     hidden: list[NotObservable] = []
@@ -172,9 +182,8 @@ def _diagnose(
         whole = seen
         if len(seen.rows) > MOST[seen.channel]:
             seen = _thinned(seen, model, looked_at, metrology, observe)
-        enough = _enough(seen)
-        if enough is not None:
-            notes.append(enough)
+        if _too_few(seen):
+            notes.append(ChannelFinding(seen.channel, TooFewRows(len(seen.rows))))
             hidden.append(NotObservable(seen.channel, ("more rows",)))
             continue
         if sampled is not None:
@@ -196,17 +205,14 @@ def _diagnose(
     for channel in observed:
         most = MOST[channel.channel]
         if channel.samples > most:
-            notes.append(
-                f"{channel.channel}: causes were searched on {most} of {channel.samples} rows, "
-                "evenly taken; fitted and judged on all of them"
-            )
+            notes.append(ChannelFinding(channel.channel, Thinned(most, channel.samples)))
     if not observed:
         needs = "; ".join(f"{h.channel}: {', '.join(h.needs)}" for h in hidden)
         lacking = [need for h in hidden for need in h.needs if need in COLUMNS]
         hint = misspelt(log.unknown, lacking, log.n)
         raise LogError(f"{log.path}: found no channel to diagnose, expected one of: {needs}{hint}")
     for channel in observed:
-        notes += _channel_findings(channel, log)
+        notes += [ChannelFinding(channel.channel, fact) for fact in _facts(channel, log)]
         soft = {*flexibility_effects().values()} - {*withhold}
         if simulated is None and len(soft) == 2 and _lacks_much(channel):
             notes += softness_findings(model, log, metrology)
@@ -322,12 +328,10 @@ def _lacks_much(channel: ChannelDiagnosis) -> bool:
     return channel.channel == "position" and channel.verdict in ("unexplained", "partly_explained")
 
 
-def _enough(seen: Observation) -> str | None:
-    """Return why there are too few samples, or None."""
+def _too_few(seen: Observation) -> bool:
+    """Return whether there are too few samples for a diagnosis."""
     N, k, p = seen.nuisance.shape
-    if N * k < p + 6 or len(np.unique(seen.groups)) < 4:
-        return f"{seen.channel}: {N} usable row(s) are too few for a diagnosis"
-    return None
+    return N * k < p + 6 or len(np.unique(seen.groups)) < 4
 
 
 def _searched(
@@ -465,32 +469,24 @@ def _overall(channels: Sequence[ChannelDiagnosis]) -> str:
     return "unexplained"
 
 
-def _line_of(log: Log, row: int) -> str:
+def _line_of(log: Log, row: int) -> tuple[int, str]:
     """Return the line of a row in its file; of several sessions with the session's name."""
-    if not log.session_names:
-        return str(log.line(row))
-    return f"{log.line(row)} of {log.session_names[int(session_of(log)[row])]}"
+    name = log.session_names[int(session_of(log)[row])] if log.session_names else ""
+    return log.line(row), name
 
 
-def _channel_findings(channel: ChannelDiagnosis, log: Log) -> list[str]:
-    notes = []
-    outliers = channel.outliers
-    if len(outliers):
-        rows = ", ".join(_line_of(log, int(r)) for r in outliers[:8])
-        notes.append(
-            f"{channel.channel}: {len(outliers)} outlier(s) excluded (row {rows}"
-            f"{', ...' if len(outliers) > 8 else ''} of the file)"
-        )
-    for position_, reason in channel.judgement.withdrawn:
-        term = channel.selection.terms[position_]
-        joint = f" of joint {term.site.joint}" if term.site.joint else ""
-        notes.append(f"{channel.channel}: {term.effect}{joint} is not accused: {reason}")
-        if position_ in channel.judgement.stand_ins:
-            notes[-1] += "; poses not fitted gain by it: a stand-in"
+def _facts(channel: ChannelDiagnosis, log: Log) -> list[Fact]:
+    """Return what a channel's diagnosis has to report beside its figures."""
+    facts: list[Fact] = []
+    if len(channel.outliers):
+        facts.append(Outliers(tuple(_line_of(log, int(row)) for row in channel.outliers)))
+    selection, judgement = channel.selection, channel.judgement
+    for position_, reason in judgement.withdrawn:
+        stand_in = position_ in judgement.stand_ins
+        facts.append(NotAccused(selection.terms[position_], reason, stand_in))
     terms = [term for cause in channel.causes for term in cause.terms]
-    whole = channel.verdict == "explained"
-    sentences = slip_sentences(terms, channel.selection.observation, whole)
-    notes += [f"{channel.channel}: {sentence}" for sentence in sentences]
-    for cause in channel.causes:
-        notes += [f"{channel.channel}: {note}" for note in cause.notes]
-    return notes
+    seen, alone = selection.observation, channel.verdict == "explained"
+    timed = "timestamp" in seen.quantities
+    for term, before, after in slips(terms, seen.times):
+        facts.append(Slip(term, before, after, timed, alone))
+    return facts + [note for cause in channel.causes for note in cause.notes]

@@ -7,7 +7,7 @@ did not see. That something else is left takes nothing back; it is said.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -29,6 +29,7 @@ from gapbridge.core.diagnosis.criteria import (
     TIE_SCORE,
     USUAL_REPEATABILITY,
 )
+from gapbridge.core.diagnosis.finding import Check, Withdrawal
 from gapbridge.core.diagnosis.held_out import HeldOut
 from gapbridge.core.diagnosis.regions import parts
 from gapbridge.core.diagnosis.remainder import (
@@ -51,8 +52,8 @@ from gapbridge.core.diagnosis.selection.stiffness_curves import without_curvatur
 from gapbridge.core.errors import InputError
 
 Array = NDArray[np.float64]
-VAGUE = "its value may as well be none"
-BESIDE = "it does not keep its value beside the unknown that is left"
+VAGUE = Withdrawal(Check.SIGNIFICANT)
+BESIDE = Withdrawal(Check.STABLE_VALUE)
 
 
 @dataclass(frozen=True)
@@ -66,7 +67,8 @@ class Judgement:
         tuple[str, float], ...
     ]  # quantity, held-out share of what is not accounted for
     ties: dict[int, tuple[str, ...]]  # position -> effects that would do as well
-    withdrawn: tuple[tuple[int, str], ...]  # position, reason
+    # position, reason; text only from ``every_row``
+    withdrawn: tuple[tuple[int, Withdrawal | str], ...]
     remainder: Remainder | None = None  # unnamed functions that account for what is left
     vague: tuple[int, ...] = ()  # positions that some rows leave vague: all rows decide
     stand_ins: tuple[
@@ -76,14 +78,14 @@ class Judgement:
 
 def judge(selection: Selection, held: HeldOut) -> Judgement:
     """Return the judgement of a selection."""
-    withdrawn: dict[int, str] = {}  # candidate -> reason
+    withdrawn: dict[int, Withdrawal] = {}  # by candidate
     whole = selection
     if selection.block and not links_withstand(selection):
         withdrawn |= dict.fromkeys(selection.block, BESIDE)
         selection = selection.without_links()
     for position, reason in _no_value(selection).items():
         withdrawn[selection.term_index[position]] = reason
-    withdrawn |= dict.fromkeys(bumps(selection), "one localised shape does as well")
+    withdrawn |= dict.fromkeys(bumps(selection), Withdrawal(Check.NOT_LOCALISED))
     believed = [
         c for c in selection.term_index if c not in withdrawn and c not in selection.block
     ]  # fmt: skip
@@ -91,15 +93,15 @@ def judge(selection: Selection, held: HeldOut) -> Judgement:
     stays += with_the_links(selection, stays, [c for c in believed if c not in stays])
     withdrawn |= {c: BESIDE for c in believed if c not in stays}
     for c, quantity in not_constant(selection, stays, remainder.columns).items():
-        withdrawn[c] = f"its value is no constant: it goes by {quantity}"
+        withdrawn[c] = Withdrawal(Check.CONSTANT, quantity)
         stays.remove(c)
     for c in _without_companion(selection, stays):
-        withdrawn[c] = "no load is declared, and none is accused"
+        withdrawn[c] = Withdrawal(Check.COMPANION)
         stays.remove(c)
     fallen = bool(withdrawn)
     stays = [*stays, *selection.block]
     for c in _gainless(selection, stays, held):
-        withdrawn[c] = "it does not shrink the gap on samples that its fit did not see"
+        withdrawn[c] = Withdrawal(Check.HELD_OUT_GAIN)
         stays.remove(c)
     judgement = _verdict(whole, selection, stays, withdrawn, fallen)
     unknown = judgement.structured or remainder.columns.shape[1] > 0
@@ -131,8 +133,8 @@ def judge_geometry(
 
 
 def _verdict(
-    whole: Selection, selection: Selection, stays: list[int], withdrawn: dict[int, str],
-    fallen: bool,
+    whole: Selection, selection: Selection, stays: list[int],
+    withdrawn: Mapping[int, Withdrawal], fallen: bool,
 ) -> Judgement:  # fmt: skip
     """Return the judgement of what stays of a whole selection, and whether structure is left."""
     place = {c: p for p, c in enumerate(whole.term_index)}
@@ -153,11 +155,10 @@ def _verdict(
     )  # fmt: skip
 
 
-def _no_value(selection: Selection) -> dict[int, str]:
+def _no_value(selection: Selection) -> dict[int, Withdrawal]:
     """Return positions of terms that only a bound holds, or whose value may as well be none."""
     found = dict.fromkeys(
-        without_curvature(selection.terms, selection.covariance),
-        "its curve cannot be distinguished from a straight line",
+        without_curvature(selection.terms, selection.covariance), Withdrawal(Check.CURVED)
     )
     for position, (c, term) in enumerate(zip(selection.term_index, selection.terms, strict=True)):
         if c in selection.block:
@@ -167,14 +168,14 @@ def _no_value(selection: Selection) -> dict[int, str]:
             min(abs(v - p.lower), abs(v - p.upper)) < 1e-6 * p.scale
             for p, v in zip(candidate.parameters, term.values, strict=False)
         ):
-            found[position] = "its value stands on its bound"
+            found[position] = Withdrawal(Check.INSIDE_BOUNDS)
         if worth(term, spread) < 1:
             found[position] = VAGUE
         usual = [p.scale for p in candidate.parameters]
         if candidate.curve is None and all(
             abs(v) < NEGLIGIBLE * size for v, size in zip(term.values, usual, strict=False)
         ):
-            found[position] = "its value is too small to matter"
+            found[position] = Withdrawal(Check.USUAL_SIZE)
     return found
 
 

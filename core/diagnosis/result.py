@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from gapbridge.core.arm import Arm
 from gapbridge.core.diagnosis.criteria import UNDETERMINED
+from gapbridge.core.diagnosis.finding import ParameterNote, ParameterState, Withdrawal
 from gapbridge.core.diagnosis.held_out import HeldOut, Shrink
 from gapbridge.core.diagnosis.judgement import Judgement
 from gapbridge.core.diagnosis.selection.forward import joining
@@ -35,7 +36,7 @@ class Cause:
     indistinguishable_from: tuple[str, ...]
     terms: tuple[Term, ...]
     relative_deviation: tuple[float, ...]  # per term: least sigma over value
-    notes: tuple[str, ...] = ()
+    notes: tuple[ParameterNote, ...] = ()
 
 
 class Outcome(Enum):
@@ -48,15 +49,19 @@ class Outcome(Enum):
 
 @dataclass(frozen=True)
 class Considered:
-    """One effect of the catalogue that is not accused; ``needs``: what would excite it."""
+    """One effect of the catalogue that is not accused."""
 
     effect: str
     shrink_alone: float | None
     probability: float
-    excited: bool
-    reason: str
     outcome: Outcome
-    needs: str = ""
+    needs: str = ""  # NOT_EXCITED: what would excite it
+    withdrawal: Withdrawal | str | None = None  # WITHDRAWN: the check that it failed
+
+    @property
+    def excited(self) -> bool:
+        """Return whether the log can show the effect."""
+        return self.outcome is not Outcome.NOT_EXCITED
 
 
 def causes_of(
@@ -88,7 +93,7 @@ def _cause(
     shrink = held.shrink(everything, rest) if held.possible else None
     alone = held.shrink(sorted(own), ()).shrink if held.possible else None
     listed: list[Reported] = []
-    notes: list[str] = []
+    notes: list[ParameterNote] = []
     relative = []
     for p in positions:
         term, covariance = selection.terms[p], selection.covariance[p]
@@ -96,7 +101,7 @@ def _cause(
         value, deviation = np.array(term.values), np.sqrt(np.maximum(np.diag(covariance), 0))
         size = np.abs(value[: len(deviation)])
         relative.append(float(np.min(deviation / np.maximum(size, 1e-300))))
-        notes += _at_bounds(effect, term, arm) + _not_shown(effect, term, deviation, arm)
+        notes += _at_bounds(effect, term, arm) + _not_identifiable(effect, term, deviation, arm)
     joints = sorted({t.site.joint for t in (selection.terms[p] for p in positions)
                      if t.site.joint is not None})  # fmt: skip
     ties = tuple(dict.fromkeys(n for p in positions for n in judgement.ties.get(p, ())))
@@ -107,26 +112,29 @@ def _cause(
     )  # fmt: skip
 
 
-def _at_bounds(effect: str, term: Term, arm: Arm) -> list[str]:
+def _at_bounds(effect: str, term: Term, arm: Arm) -> list[ParameterNote]:
     notes = []
     for parameter, value in zip(
         CATALOGUE[effect].parameters(arm, term.site), term.values, strict=True
     ):
         if value in (parameter.lower, parameter.upper):
             name = CATALOGUE[effect].label(term.site, parameter)
-            notes.append(f"{name} stands on its bound ({value:g} {parameter.unit})")
+            notes.append(ParameterNote(ParameterState.ON_BOUND, name, value, parameter.unit))
     return notes
 
 
-def _not_shown(effect: str, term: Term, deviation: Array, arm: Arm) -> list[str]:
-    """Return a note on each parameter that these data leave open ; nothing is hidden."""
+def _not_identifiable(
+    effect: str, term: Term, deviation: Array, arm: Arm
+) -> list[ParameterNote]:  # fmt: skip
+    """Return a note on each parameter that these data leave open; nothing is hidden."""
     notes = []
-    for parameter, spread in zip(
-        CATALOGUE[effect].parameters(arm, term.site), deviation, strict=False
+    for parameter, value, spread in zip(
+        CATALOGUE[effect].parameters(arm, term.site), term.values, deviation, strict=False
     ):
         if spread == 0 or spread > UNDETERMINED * parameter.scale:
             name = CATALOGUE[effect].label(term.site, parameter)
-            notes.append(f"{name} is not identifiable from these data: others can stand in for it")
+            state = ParameterState.NOT_IDENTIFIABLE
+            notes.append(ParameterNote(state, name, value, parameter.unit))
     return notes
 
 
@@ -166,15 +174,16 @@ def considered_of(
         excited = any(_shown(selection, c) for c in own)
         if not own or not excited:
             needs = effect.motion or ", ".join(effect.needs)
-            listed.append(Considered(identifier, None, 0.0, False, f"not excited; needs {needs}",
-                                   Outcome.NOT_EXCITED, needs))  # fmt: skip
+            listed.append(Considered(identifier, None, 0.0, Outcome.NOT_EXCITED, needs))
             continue
         alone = held.shrink(own, ()).shrink if held.possible and len(own) < 40 else None
         better = min(_score_with(selection, base, c) for c in own)
         odds = float(np.exp(-0.5 * min(max(better - base.score, -700.0), 700.0)))
-        reason = reasons.get(identifier, "does not pay for its parameters beside what is found")
-        outcome = Outcome.WITHDRAWN if identifier in reasons else Outcome.NOT_NEEDED
-        listed.append(Considered(identifier, alone, odds / (1 + odds), True, reason, outcome))
+        withdrawal = reasons.get(identifier)
+        outcome = Outcome.NOT_NEEDED if withdrawal is None else Outcome.WITHDRAWN
+        listed.append(
+            Considered(identifier, alone, odds / (1 + odds), outcome, withdrawal=withdrawal)
+        )
     return tuple(listed)
 
 

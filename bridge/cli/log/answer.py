@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from gapbridge.bridge.document.findings import finding_text
 from gapbridge.core.diagnosis.diagnosis import ChannelDiagnosis, Diagnosis
 from gapbridge.core.diagnosis.result import Cause
 from gapbridge.core.diagnosis.separation import Measurement
@@ -33,7 +34,7 @@ def answer(diagnosis: Diagnosis) -> str:
     for hidden in diagnosis.not_observable:
         lines.append(f"{hidden.channel}: not observable here; needs {', '.join(hidden.needs)}")
     if diagnosis.findings:
-        lines += ["", *(f"note: {finding}" for finding in diagnosis.findings)]
+        lines += ["", *(f"note: {finding_text(finding)}" for finding in diagnosis.findings)]
     if diagnosis.next_measurements:
         lines += ["", "worth measuring next:"]
         lines += [f"  {_measurement(m)}" for m in diagnosis.next_measurements[:SHOWN]]

@@ -22,11 +22,11 @@ from gapbridge.bridge.cli.options import (
     warn_outside,
 )
 from gapbridge.bridge.cli.progress import status
+from gapbridge.bridge.document.diagnosis_json import document
 from gapbridge.bridge.document.output_file import FOLDER_MODE, require_writable, write_text
 from gapbridge.bridge.document.provenance import fitted, provenance
 from gapbridge.core.diagnosis.diagnosis import Diagnosis
 from gapbridge.core.diagnosis.diagnosis import diagnose as diagnose_log
-from gapbridge.core.diagnosis.document import document
 from gapbridge.core.effects import effect_named
 from gapbridge.core.errors import InputError, LogError
 from gapbridge.core.log.log import Log

@@ -10,13 +10,11 @@ not, nor hidden behind it. Source: Hinkley, Biometrika 57 (1970) 1.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from datetime import UTC, datetime
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gapbridge.core.arm import Arm
-from gapbridge.core.diagnosis.observation import Observation
 from gapbridge.core.diagnosis.selection.candidate import Candidate
 from gapbridge.core.diagnosis.selection.state import SelectionState, flat
 from gapbridge.core.effects import CATALOGUE, Effect, Site, Term
@@ -26,7 +24,6 @@ Pair = tuple[Candidate, Array]
 PRIOR = 5.0  # usual sizes: 1 sigma of what else may be there
 FREE = 1e6  # usual sizes of a nuisance: nothing is known of it
 MOMENTS = 3  # of a site that the search looks at
-SINCE_1970 = 1e9  # s: from here on a timestamp is a date
 FEWEST = 3  # rows on either side of a moment
 
 
@@ -162,32 +159,3 @@ def slips(terms: Sequence[Term], times: Array | None) -> list[tuple[Term, float,
             k = int(np.searchsorted(times, term.values[-1], side="right"))
             found.append((term, float(times[max(k - 1, 0)]), float(times[min(k, len(times) - 1)])))
     return found
-
-
-def slip_sentences(terms: Sequence[Term], observation: Observation, whole: bool) -> list[str]:
-    """Return a sentence on each term that steps: what moved, how far, and between which rows.
-
-    ``whole``: nothing else remains, so that the model holds on both sides.
-    """
-    sentences = []
-    for term, before, after in slips(terms, observation.times):
-        effect, joint = CATALOGUE[term.effect], term.site.joint
-        what = "the target on the tool" if joint is None else f"the zero of joint {joint}"
-        size = float(np.linalg.norm(term.values[:-1]))
-        if joint is None:
-            far = f"{1e3 * size:.3g} mm"
-        else:
-            far = f"{1e3 * term.values[0]:.3g} mrad ({np.degrees(term.values[0]):.3g} deg)"
-        when = f"{_clock(before)} and {_clock(after)}"
-        if "timestamp" not in observation.quantities:
-            when = f"rows {before:g} and {after:g} of the log"
-        rest = "; before and after it nothing else changed" if whole else ""
-        sentences.append(f"{effect.identifier}: {what} moved by {far} between {when}{rest}")
-    return sentences
-
-
-def _clock(time: float) -> str:
-    """Return a time of day (UTC) for seconds since 1970, else seconds."""
-    if time < SINCE_1970:
-        return f"{time:.7g} s"
-    return datetime.fromtimestamp(time, tz=UTC).strftime("%H:%M:%S")

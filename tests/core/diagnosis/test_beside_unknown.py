@@ -14,6 +14,7 @@ from gapbridge.core.diagnosis.channels.position import observe as observe_positi
 from gapbridge.core.diagnosis.channels.wrench import observe
 from gapbridge.core.diagnosis.criteria import NEGLIGIBLE
 from gapbridge.core.diagnosis.diagnosis import diagnose
+from gapbridge.core.diagnosis.finding import Check, Withdrawal
 from gapbridge.core.diagnosis.held_out import HeldOut
 from gapbridge.core.diagnosis.judgement import Judgement, judge, judge_geometry, still_sure
 from gapbridge.core.diagnosis.remainder import closes_everywhere, with_the_links
@@ -227,7 +228,7 @@ def test_a_value_far_below_its_usual_size_is_no_accusation():
         )  # fmt: skip
         judged = judge(small_one, HeldOut(found))
         assert (len(judged.accused) == 1) is stays
-        assert stays or judged.withdrawn == ((0, "its value is too small to matter"),)
+        assert stays or judged.withdrawn == ((0, Withdrawal(Check.USUAL_SIZE)),)
 
 
 def test_what_is_no_longer_sure_beside_the_unknown_is_taken_back():

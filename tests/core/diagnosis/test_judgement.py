@@ -11,10 +11,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from benchmarks.blind.session import Plan
+from gapbridge.bridge.document.findings import considered_text
 from gapbridge.core.diagnosis.diagnosis import diagnose
+from gapbridge.core.diagnosis.finding import (
+    Check,
+    NotAccused,
+    ParameterNote,
+    ParameterState,
+    Withdrawal,
+)
 from gapbridge.core.diagnosis.held_out import HeldOut
 from gapbridge.core.diagnosis.judgement import judge, pure_error
-from gapbridge.core.diagnosis.result import causes_of, considered_of, probability
+from gapbridge.core.diagnosis.result import Outcome, causes_of, considered_of, probability
 from gapbridge.core.effects import CATALOGUE
 from gapbridge.core.metrology import Metrology
 
@@ -34,7 +42,7 @@ def test_every_effect_of_the_catalogue_is_a_cause_or_reported_why_not(effect):
     assert accused.isdisjoint(considered)
     of_the_channel = {k for k, e in CATALOGUE.items() if "position" in e.channels}
     assert accused | set(considered) == of_the_channel
-    assert all(c.reason for c in channel.considered)
+    assert all(considered_text(c) for c in channel.considered)
     assert all(0 <= c.probability <= 1 for c in channel.considered)
 
 
@@ -56,8 +64,12 @@ def test_an_accusation_beside_a_leftover_is_withdrawn_and_reported_so():
     assert channel.judgement.accused == ()
     for position, reason in channel.judgement.withdrawn:
         effect = channel.selection.terms[position].effect
-        assert any(effect in reported and reason in reported for reported in found.findings)
-        assert next(c for c in channel.considered if c.effect == effect).reason == reason
+        facts = [finding.fact for finding in found.findings if not isinstance(finding, str)]
+        assert any(
+            isinstance(f, NotAccused) and (f.term.effect, f.reason) == (effect, reason)
+            for f in facts
+        )
+        assert next(c for c in channel.considered if c.effect == effect).withdrawal == reason
     assert found.model.terms == small.model_of().terms  # nothing withdrawn reaches the model
 
 
@@ -84,9 +96,7 @@ def test_what_does_not_shrink_the_gap_of_unseen_samples_is_withdrawn():
     assert len(kept.accused) == 1
     left = judge(selection, HeldOut(noise))
     assert left.accused == ()
-    assert [why for _, why in left.withdrawn] == [
-        "it does not shrink the gap on samples that its fit did not see"
-    ]
+    assert [why for _, why in left.withdrawn] == [Withdrawal(Check.HELD_OUT_GAIN)]
 
 
 def test_a_value_on_its_bound_is_no_accusation():
@@ -99,7 +109,7 @@ def test_a_value_on_its_bound_is_no_accusation():
     space = replace(selection.space, candidates=tuple(candidates))
     judged = judge(replace(selection, space=space), HeldOut(selection))
     assert judged.accused == ()
-    assert [why for _, why in judged.withdrawn] == ["its value stands on its bound"]
+    assert [why for _, why in judged.withdrawn] == [Withdrawal(Check.INSIDE_BOUNDS)]
 
 
 @pytest.mark.parametrize(("sigmas", "stays"), [(0.5, False), (40.0, True)])
@@ -187,16 +197,18 @@ def test_a_parameter_on_its_bound_is_reported():
     selection = channel.selection
     (term,) = selection.terms
     flat = replace(selection, terms=(term.with_values(np.zeros(1)),))
-    for chosen, phrase in ((selection, []), (flat, ["backlash_2 stands on its bound (0 rad)"])):
+    note = ParameterNote(ParameterState.ON_BOUND, "backlash_2", 0.0, "rad")
+    for chosen, notes in ((selection, ()), (flat, (note,))):
         (cause,) = causes_of(chosen, channel.judgement, HeldOut(chosen), small.model_of().arm)
-        assert list(cause.notes) == phrase
+        assert cause.notes == notes
 
 
 def test_what_a_log_cannot_show_reports_what_it_needs():
     rigid = {c.effect: c for c in channel_of("none").considered}
     payload = rigid["payload"]  # positions of a rigid model do not show it
     assert (payload.excited, payload.probability, payload.shrink_alone) == (False, 0.0, None)
-    assert payload.reason.startswith("not excited; needs ")
+    assert payload.outcome is Outcome.NOT_EXCITED
+    assert payload.needs
     assert rigid["joint_offset"].excited
     channel = channel_of("none")
     held = HeldOut(channel.selection)

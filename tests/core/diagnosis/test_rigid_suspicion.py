@@ -9,6 +9,7 @@ import pytest
 
 from benchmarks.fleet.simulating import TYPE, Habits, TrueArm, columns, write_type_cell
 from gapbridge.bridge.cell import load_cell
+from gapbridge.bridge.document.findings import finding_text
 from gapbridge.core.diagnosis.diagnosis import diagnose
 from gapbridge.core.diagnosis.rigid_suspicion import softness_findings
 from gapbridge.core.estimation.identification import identify_compliance
@@ -61,7 +62,7 @@ def test_nothing_is_reported_where_no_fit_can_be_made(rigid: Model) -> None:
 def test_what_is_withheld_is_not_offered(rigid: Model) -> None:
     found = diagnose(rigid, log_of(TYPE), FREE, withhold=("axial_compliance", "radial_compliance"))
     assert found.verdict != "no_gap"
-    assert not any("gapbridge fit" in line for line in found.findings)
+    assert not any("gapbridge fit" in finding_text(f) for f in found.findings)
 
 
 def test_fit_and_diagnosis_exclude_the_same_outliers_and_do_not_undo_each_other(

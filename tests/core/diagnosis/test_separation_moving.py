@@ -6,9 +6,9 @@ import moving_truth as truth
 import numpy as np
 import pytest
 
+from gapbridge.bridge.document.diagnosis_json import document
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.diagnosis.diagnosis import diagnose
-from gapbridge.core.diagnosis.document import document
 from gapbridge.core.model import Model
 
 N = 6

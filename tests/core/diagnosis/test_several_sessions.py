@@ -13,9 +13,9 @@ import pytest
 import small_arm as small
 
 from benchmarks.blind.mechanics import turn
+from gapbridge.bridge.document.diagnosis_json import document
 from gapbridge.core.diagnosis.carrying import carried
 from gapbridge.core.diagnosis.diagnosis import diagnose
-from gapbridge.core.diagnosis.document import document
 from gapbridge.core.errors import LogError
 from gapbridge.core.estimation.identification import identify_compliance
 from gapbridge.core.metrology import Metrology

@@ -7,6 +7,7 @@ import re
 import numpy as np
 import pytest
 
+from gapbridge.bridge.document.findings import finding_text
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.diagnosis.diagnosis import ChannelDiagnosis, diagnose
 from gapbridge.core.effects import Site, Term
@@ -46,7 +47,7 @@ def sampled(terms: list[Term], count: int = 70, seed: int = 0, clock: bool = Tru
 def position(log: Log) -> tuple[ChannelDiagnosis, tuple[str, ...]]:
     found = diagnose(MODEL, log, Metrology(registered=False, sigma=2e-5))
     (channel,) = [c for c in found.channels if c.channel == "position"]
-    return channel, found.findings
+    return channel, tuple(finding_text(f) for f in found.findings)
 
 
 @pytest.mark.parametrize("clock", [True, False])
@@ -149,4 +150,4 @@ def test_a_joint_that_holds_the_same_all_the_time_shows_no_droop_and_the_motion_
     (channel,) = diagnose(upright, log).channels
     (droop,) = [c for c in channel.considered if c.effect == "servo_droop"]
     assert not droop.excited
-    assert "change the torque that the joint holds" in droop.reason
+    assert "change the torque that the joint holds" in droop.needs

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import re
-
 from gapbridge.bridge.calibration.report.figures import degrees
 from gapbridge.bridge.calibration.report.material import Material
 from gapbridge.bridge.document.axes import plain
@@ -19,6 +17,7 @@ from gapbridge.bridge.document.blocks import (
     Table,
     Verdict,
 )
+from gapbridge.bridge.document.findings import finding_text
 from gapbridge.bridge.report.answer import one_line, sentences
 from gapbridge.bridge.report.labels import CHANNELS, effect_title, listed
 from gapbridge.bridge.report.material import chosen_channel
@@ -42,13 +41,10 @@ def residual(material: Material) -> list[Block]:
     others = [ch for ch in c.diagnosis.channels if ch is not main]
     blocks += [Paragraph(f"{CHANNELS[ch.channel]}: {one_line(ch)}") for ch in others]
     if c.diagnosis.findings:
-        blocks.append(Bullets(tuple(_finding(f) for f in c.diagnosis.findings)))
+        blocks.append(
+            Bullets(tuple(sentence(finding_text(f, rows=False)) for f in c.diagnosis.findings))
+        )
     return [*blocks, *([] if c.complete else _next(c.diagnosis))]
-
-
-def _finding(text: str) -> str:
-    """Return a finding without the rows of a file that nobody has."""
-    return sentence(re.sub(r" \(row [^)]*of the file\)", "", text))
 
 
 def _next(diagnosis: Diagnosis) -> list[Block]:

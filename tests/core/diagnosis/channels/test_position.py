@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import small_arm as small
 
-from gapbridge.core.diagnosis.document import document
+from gapbridge.bridge.document.diagnosis_json import document
 from gapbridge.core.errors import LogError
 from gapbridge.core.metrology import Metrology
 from gapbridge.core.model import Model

@@ -7,6 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from gapbridge.bridge.document.findings import finding_text
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.diagnosis.diagnosis import diagnose
 from gapbridge.core.diagnosis.every_row import long_recording as blocks
@@ -95,7 +96,7 @@ def test_an_outlier_outside_the_excerpt_is_excluded_and_named(both):
     _, found = both
     torque = next(c for c in found.channels if c.channel == "torque")
     assert 4321 in torque.outliers
-    assert any("row 4323" in text for text in found.findings)
+    assert any("row 4323" in finding_text(f) for f in found.findings)
 
 
 def test_rows_from_sums_have_the_same_sums():

@@ -7,6 +7,7 @@ import pytest
 import small_arm as small
 
 from gapbridge.core.diagnosis.diagnosis import diagnose
+from gapbridge.core.diagnosis.finding import ChannelFinding, Outliers
 from gapbridge.core.metrology import Metrology
 
 REGISTERED = Metrology(registered=True, sigma=small.SIGMA)
@@ -31,8 +32,8 @@ def test_glitches_become_no_cause_and_are_reported_with_their_rows(effect, regis
     assert [c.effect for c in channel.causes] == ([] if effect == "none" else [effect])
     assert not channel.structured
     assert set(np.flatnonzero(~channel.selection.kept)) == set(GLITCHES)
-    (reported,) = [f for f in found.findings if "outlier" in f]
-    assert "2 outlier(s) excluded (row 13, 42 of the file)" in reported
+    (reported,) = [f for f in found.findings if not isinstance(f, str)]
+    assert reported == ChannelFinding("position", Outliers(((13, ""), (42, ""))))
     assert channel.remaining_rms_held_out == pytest.approx(small.FLOOR, rel=0.2)
     assert channel.gap_max < 2e-3  # the glitches are no part of the gap
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from gapbridge.bridge.document.findings import considered_text, finding_text
 from gapbridge.core.diagnosis.carrying import Carried
 from gapbridge.core.diagnosis.diagnosis import ChannelDiagnosis, Diagnosis
 from gapbridge.core.diagnosis.result import Cause
@@ -34,7 +35,7 @@ def document(diagnosis: Diagnosis) -> dict[str, Any]:
             }
             for m in diagnosis.next_measurements
         ],
-        "findings": list(diagnosis.findings),
+        "findings": [finding_text(f) for f in diagnosis.findings],
         "sessions": list(diagnosis.sessions),
     }
     cleaned: dict[str, Any] = _finite(values)
@@ -73,7 +74,7 @@ def _channel(c: ChannelDiagnosis, diagnosis: Diagnosis) -> dict[str, Any]:
                 "shrink_alone": k.shrink_alone,
                 "probability": k.probability,
                 "excited": k.excited,
-                "reason": k.reason,
+                "reason": considered_text(k),
             }
             for k in c.considered
         ],

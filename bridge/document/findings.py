@@ -1,0 +1,123 @@
+"""The words for what a diagnosis reports beside its figures, and for why an effect is no cause."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+
+import numpy as np
+
+from gapbridge.core.diagnosis.finding import (
+    Check,
+    Fact,
+    Finding,
+    NotAccused,
+    Outliers,
+    ParameterNote,
+    ParameterState,
+    Slip,
+    Thinned,
+    TooFewRows,
+    Withdrawal,
+)
+from gapbridge.core.diagnosis.result import Considered, Outcome
+
+SINCE_1970 = 1e9  # s: from here on a timestamp is a date
+SHOWN = 8  # rows of outliers
+WITHDRAWN = {
+    Check.CURVED: "its curve cannot be distinguished from a straight line",
+    Check.INSIDE_BOUNDS: "its value stands on its bound",
+    Check.SIGNIFICANT: "its value may as well be none",
+    Check.USUAL_SIZE: "its value is too small to matter",
+    Check.NOT_LOCALISED: "one localised shape does as well",
+    Check.STABLE_VALUE: "it does not keep its value beside the unknown that is left",
+    Check.CONSTANT: "its value is no constant: it goes by {quantity}",
+    Check.COMPANION: "no load is declared, and none is accused",
+    Check.HELD_OUT_GAIN: "it does not shrink the gap on samples that its fit did not see",
+    Check.ALL_ROWS_GAIN: "over all rows the gap does not shrink by it",
+}
+
+
+def finding_text(finding: Finding, *, rows: bool = True) -> str:
+    """Return a finding as a sentence; without ``rows`` it names no lines of a file."""
+    if isinstance(finding, str):
+        return finding
+    return f"{finding.channel}: {_fact(finding.fact, rows)}"
+
+
+def withdrawal_text(reason: Withdrawal | str) -> str:
+    """Return why a term was withdrawn."""
+    if isinstance(reason, str):
+        return reason
+    return WITHDRAWN[reason.failed].format(quantity=reason.quantity)
+
+
+def considered_text(considered: Considered) -> str:
+    """Return why an effect is not accused."""
+    if considered.outcome is Outcome.NOT_EXCITED:
+        return f"not excited; needs {considered.needs}"
+    if considered.withdrawal is None:
+        return "does not pay for its parameters beside what is found"
+    return withdrawal_text(considered.withdrawal)
+
+
+def _fact(fact: Fact, rows: bool) -> str:
+    match fact:
+        case TooFewRows():
+            return f"{fact.rows} usable row(s) are too few for a diagnosis"
+        case Thinned():
+            return (
+                f"causes were searched on {fact.searched} of {fact.rows} rows, evenly taken; "
+                "fitted and judged on all of them"
+            )
+        case Outliers():
+            return _outliers(fact, rows)
+        case NotAccused():
+            return _not_accused(fact)
+        case Slip():
+            return _slip(fact)
+        case ParameterNote():
+            return _parameter(fact)
+
+
+def _outliers(outliers: Outliers, rows: bool) -> str:
+    text = f"{len(outliers.lines)} outlier(s) excluded"
+    if not rows:
+        return text
+    named = (f"{line} of {session}" if session else str(line) for line, session in outliers.lines)
+    shown = ", ".join(list(named)[:SHOWN])
+    return f"{text} (row {shown}{', ...' if len(outliers.lines) > SHOWN else ''} of the file)"
+
+
+def _not_accused(found: NotAccused) -> str:
+    term = found.term
+    joint = f" of joint {term.site.joint}" if term.site.joint else ""
+    rest = "; poses not fitted gain by it: a stand-in" if found.stand_in else ""
+    return f"{term.effect}{joint} is not accused: {withdrawal_text(found.reason)}{rest}"
+
+
+def _slip(slip: Slip) -> str:
+    """Return what moved, how far, and between which rows."""
+    term, joint = slip.term, slip.term.site.joint
+    what = "the target on the tool" if joint is None else f"the zero of joint {joint}"
+    if joint is None:
+        far = f"{1e3 * float(np.linalg.norm(term.values[:-1])):.3g} mm"
+    else:
+        far = f"{1e3 * term.values[0]:.3g} mrad ({np.degrees(term.values[0]):.3g} deg)"
+    when = f"rows {slip.before:g} and {slip.after:g} of the log"
+    if slip.timed:
+        when = f"{_clock(slip.before)} and {_clock(slip.after)}"
+    rest = "; before and after it nothing else changed" if slip.alone else ""
+    return f"{term.effect}: {what} moved by {far} between {when}{rest}"
+
+
+def _clock(time: float) -> str:
+    """Return a time of day (UTC) for seconds since 1970, else seconds."""
+    if time < SINCE_1970:
+        return f"{time:.7g} s"
+    return datetime.fromtimestamp(time, tz=UTC).strftime("%H:%M:%S")
+
+
+def _parameter(note: ParameterNote) -> str:
+    if note.state is ParameterState.ON_BOUND:
+        return f"{note.name} stands on its bound ({note.value:g} {note.unit})"
+    return f"{note.name} is not identifiable from these data: others can stand in for it"

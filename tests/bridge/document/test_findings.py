@@ -1,0 +1,92 @@
+"""Words for findings: every check has its sentence, and each fact is worded with its numbers."""
+
+from __future__ import annotations
+
+import pytest
+
+from gapbridge.bridge.document.findings import (
+    WITHDRAWN,
+    considered_text,
+    finding_text,
+    withdrawal_text,
+)
+from gapbridge.core.diagnosis.finding import (
+    ChannelFinding,
+    Check,
+    NotAccused,
+    Outliers,
+    ParameterNote,
+    ParameterState,
+    Slip,
+    Thinned,
+    TooFewRows,
+    Withdrawal,
+)
+from gapbridge.core.diagnosis.result import Considered, Outcome
+from gapbridge.core.effects import Site, Term
+
+PLAY = Term("backlash", Site(2), (9e-4,))
+BOUND = Withdrawal(Check.INSIDE_BOUNDS)
+
+
+def test_every_check_has_a_sentence_of_its_own() -> None:
+    assert set(WITHDRAWN) == set(Check)
+    assert len(set(WITHDRAWN.values())) == len(Check)
+
+
+def test_a_value_that_is_no_constant_names_what_it_goes_by() -> None:
+    text = withdrawal_text(Withdrawal(Check.CONSTANT, "actual_q_2"))
+    assert text == "its value is no constant: it goes by actual_q_2"
+
+
+@pytest.mark.parametrize(
+    ("fact", "text"),
+    [
+        (TooFewRows(3), "3 usable row(s) are too few for a diagnosis"),
+        (Thinned(60, 200), "causes were searched on 60 of 200 rows, evenly taken; fitted and "
+                           "judged on all of them"),
+        (Outliers(((13, ""), (42, ""))), "2 outlier(s) excluded (row 13, 42 of the file)"),
+        (Outliers(tuple((row, "b.csv") for row in range(2, 11))),
+         "9 outlier(s) excluded (row 2 of b.csv, 3 of b.csv, 4 of b.csv, 5 of b.csv, 6 of b.csv, "
+         "7 of b.csv, 8 of b.csv, 9 of b.csv, ... of the file)"),
+        (NotAccused(PLAY, BOUND, stand_in=False),
+         "backlash of joint 2 is not accused: its value stands on its bound"),
+        (NotAccused(Term("tool_frame", Site(), (1e-3,)), BOUND, stand_in=True),
+         "tool_frame is not accused: its value stands on its bound; poses not fitted gain by it: "
+         "a stand-in"),
+        (Slip(Term("joint_slip", Site(3), (2e-3, 1.7e9)), 1.7e9, 1.7e9 + 40, True, True),
+         "joint_slip: the zero of joint 3 moved by 2 mrad (0.115 deg) between 22:13:20 and "
+         "22:14:00; before and after it nothing else changed"),
+        (Slip(Term("joint_slip", Site(3), (2e-3, 42.5)), 42, 43, False, False),
+         "joint_slip: the zero of joint 3 moved by 2 mrad (0.115 deg) between rows 42 and 43 of "
+         "the log"),
+        (Slip(Term("target_slip", Site(), (3e-4, 4e-4, 0.0, 7.5)), 7, 8, True, False),
+         "target_slip: the target on the tool moved by 0.5 mm between 7 s and 8 s"),
+        (ParameterNote(ParameterState.ON_BOUND, "backlash_2", 0.0, "rad"),
+         "backlash_2 stands on its bound (0 rad)"),
+        (ParameterNote(ParameterState.NOT_IDENTIFIABLE, "backlash_2", 1e-4, "rad"),
+         "backlash_2 is not identifiable from these data: others can stand in for it"),
+    ],
+)  # fmt: skip
+def test_a_fact_is_worded_with_its_numbers(fact, text) -> None:
+    assert finding_text(ChannelFinding("position", fact)) == f"position: {text}"
+
+
+def test_without_rows_no_line_of_a_file_is_named() -> None:
+    finding = ChannelFinding("position", Outliers(((13, ""), (42, ""))))
+    assert finding_text(finding, rows=False) == "position: 2 outlier(s) excluded"
+
+
+@pytest.mark.parametrize(
+    ("considered", "text"),
+    [
+        (Considered("payload", None, 0.0, Outcome.NOT_EXCITED, "a payload"),
+         "not excited; needs a payload"),
+        (Considered("payload", 0.1, 0.2, Outcome.NOT_NEEDED),
+         "does not pay for its parameters beside what is found"),
+        (Considered("backlash", 0.1, 0.2, Outcome.WITHDRAWN, withdrawal=BOUND),
+         "its value stands on its bound"),
+    ],
+)  # fmt: skip
+def test_why_an_effect_is_no_cause(considered, text) -> None:
+    assert considered_text(considered) == text
