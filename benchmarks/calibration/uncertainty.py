@@ -31,7 +31,7 @@ from benchmarks.calibration.laid_out import (
     readings_of,
 )
 from gapbridge.core.calibration.budget.budget import Stated, budget
-from gapbridge.core.calibration.fit import calibrate
+from gapbridge.core.calibration.fit import fit_session, judged
 from gapbridge.core.calibration.observables import make_observable
 from gapbridge.core.calibration.parameters import Parameters
 from gapbridge.core.metrology import Metrology
@@ -63,7 +63,7 @@ def run(arm: str, repeats: str, seed: int) -> Outcome:
     instrument = instrument_for(kind, layout, rng)
     readings = readings_of(real, lay_out(kind, layout, rng), instrument, rng)
     metrology = Metrology(True, layout.sigma)
-    found = calibrate(model, readings, parameters, metrology, diagnose=False)
+    found = judged(model, fit_session(readings, parameters, metrology), diagnose=False)
     given = budget(found, Stated())
     # the arm alone: it comes to rest as it repeats, seen by an instrument without noise
     visits = lay_out(kind, replace(layout, held_out=AWAY), rng)

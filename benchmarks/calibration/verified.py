@@ -31,7 +31,7 @@ from benchmarks.blind.mechanics import Array, RealArm, stand
 from benchmarks.blind.session import Plan
 from benchmarks.calibration.drawings import model_of
 from benchmarks.calibration.laid_out import draw_values, with_values
-from gapbridge.core.calibration.fit import calibrate
+from gapbridge.core.calibration.fit import fit_session, judged
 from gapbridge.core.calibration.observables import make_observable
 from gapbridge.core.calibration.parameters import DEFAULT, ORDERS, Parameters
 from gapbridge.core.calibration.readings import Readings
@@ -108,7 +108,9 @@ def run(arm: str, effect: str, seed: int, asked: bool = False) -> Outcome:
 
     def fit() -> Calibration:
         parameters = Parameters.of(model, (*chosen, *DEFAULT), observable=how, pulls=True)
-        return calibrate(model, readings, parameters, metrology, observable=how, diagnose=False)
+        return judged(
+            model, fit_session(readings, parameters, metrology, observable=how), diagnose=False
+        )
 
     found = fit()
     for _ in range(REFITS if asked else 0):

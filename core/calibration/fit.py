@@ -52,32 +52,6 @@ class SessionFit:
         return estimates_of(self.parameters, self.rest, expected)
 
 
-def calibrate(  # noqa: PLR0913 (the public call: what is left out has its default)
-    model: Model,
-    readings: Readings,
-    parameters: Parameters,
-    metrology: Metrology | None = None,
-    *,
-    observable: Observable | None = None,
-    expected: Expectation | None = None,
-    diagnose: bool = True,
-    progress: Progress | None = None,
-) -> Calibration:
-    """Return the calibration of an arm from a session's readings.
-
-    ``parameters`` say what is to be found (``Parameters.of(model, ...)``), ``metrology`` what is
-    known of the instrument; ``observable`` may be left out for kinds without options. Readings
-    marked as held out are never fitted. ``expected`` is the plan's promise, reported beside what
-    came.
-    ``diagnose`` runs the diagnosis on the residual (positions and poses), which takes seconds.
-    Raises ExcitationError where the readings are too few, InputError where they do not fit the arm.
-    """
-    fit = fit_session(
-        readings, parameters, metrology, observable=observable, progress=progress
-    )  # fmt: skip
-    return judged(model, fit, expected=expected, diagnose=diagnose, progress=progress)
-
-
 def fit_session(
     readings: Readings,
     parameters: Parameters,

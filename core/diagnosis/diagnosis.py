@@ -207,10 +207,7 @@ def _diagnose(
         if channel.samples > most:
             notes.append(ChannelFinding(channel.channel, Thinned(most, channel.samples)))
     if not observed:
-        needs = "; ".join(f"{h.channel}: {', '.join(h.needs)}" for h in hidden)
-        lacking = [need for h in hidden for need in h.needs if need in COLUMNS]
-        hint = misspelt(log.unknown, lacking, log.n)
-        raise LogError(f"{log.path}: found no channel to diagnose, expected one of: {needs}{hint}")
+        raise _no_channel(log, hidden)
     for channel in observed:
         notes += [ChannelFinding(channel.channel, fact) for fact in _facts(channel, log)]
         soft = {*flexibility_effects().values()} - {*withhold}
@@ -225,6 +222,13 @@ def _diagnose(
         with_found(model, _and_stand_ins(observed, terms)),
         log.session_names, log.one_clock,
     )  # fmt: skip
+
+
+def _no_channel(log: Log, hidden: Sequence[NotObservable]) -> LogError:
+    needs = "; ".join(f"{h.channel}: {', '.join(h.needs)}" for h in hidden)
+    lacking = [need for h in hidden for need in h.needs if need in COLUMNS]
+    hint = misspelt(log.unknown, lacking, log.n)
+    return LogError(f"{log.path}: found no channel to diagnose, expected one of: {needs}{hint}")
 
 
 def _observed_in(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -82,12 +82,9 @@ def diagnose(
     logs: tuple[Path, ...],
     cell: Path,
     remounted: bool,
-    out: Path | None,
-    json_file: Path | None,
-    new_cell: Path | None,
-    stand_ins: bool,
     withhold: tuple[str, ...],
     sim: Path | None,
+    **given: Any,
 ) -> None:
     """Diagnose the sim-to-real gap of a log, or of several sessions of one arm.
 
@@ -103,38 +100,57 @@ def diagnose(
 
     Example: gapbridge diagnose log.csv --cell cell.yaml --out out/diagnosis --apply better.yaml
     """
-    if stand_ins and new_cell is None:
+    output = _Output(**given)
+    if output.stand_ins and output.new_cell is None:
         raise InputError("--stand-ins: found no --apply, expected the cell to write")
-    given = open_cell(cell)
-    rows = open_logs(logs, given)
-    warn_outside(rows, given)
+    opened = open_cell(cell)
+    rows = open_logs(logs, opened)
+    warn_outside(rows, opened)
     _check_effects(withhold)
-    simulated = None if sim is None else open_simulated(sim, given, rows)
-    inputs = [*logs, cell, *([sim] if sim else [])]
-    for file in (json_file, new_cell):
-        if file is not None:
-            require_writable(file, *inputs)
-    if out is not None:
-        _folder(out)
+    simulated = None if sim is None else open_simulated(sim, opened, rows)
+    output.require_writable(*logs, cell, *([sim] if sim else []))
     with status("diagnosing") as emit:
-        metrology = replace(given.metrology, remounted=remounted)
-        found = _diagnose(given, rows, metrology, withhold, simulated, emit)
+        metrology = replace(opened.metrology, remounted=remounted)
+        found = _diagnose(opened, rows, metrology, withhold, simulated, emit)
     click.echo(answer(found))
     origin = provenance({"log": logs, "cell": [cell], "sim": [sim] if sim else []})
-    reported = document(found) | {"provenance": origin}
-    if json_file is not None:
-        write_text(json_file, _json(reported))
-    if new_cell is not None:
-        applied = found.with_stand_ins if stand_ins else found.model
-        spread = spread_of(found).beside(given.spread)
-        intervals = given.intervals | intervals_applied(found, stand_ins=stand_ins)
-        causes = accused(found, given.accused)
-        written_by = fitted(origin, range_of(rows), spread, intervals, causes)
-        save_cell(given, new_cell, applied, {"provenance": written_by})
-    written = [] if out is None else _write_folder(out, reported, found, given, rows)
-    for file in (*written, json_file, new_cell):
-        if file is not None:
-            click.echo(f"{file}: written")
+    for file in output.write(found, opened, rows, origin):
+        click.echo(f"{file}: written")
+
+
+@dataclass(frozen=True)
+class _Output:
+    """What is written, and where."""
+
+    out: Path | None
+    json_file: Path | None
+    new_cell: Path | None
+    stand_ins: bool
+
+    def require_writable(self, *inputs: Path) -> None:
+        """Make the folder; raise InputError where a file cannot be written, or is an input."""
+        for file in (self.json_file, self.new_cell):
+            if file is not None:
+                require_writable(file, *inputs)
+        if self.out is not None:
+            _folder(self.out)
+
+    def write(
+        self, found: Diagnosis, cell: Cell, log: Log, origin: dict[str, Any]
+    ) -> list[Path]:  # fmt: skip
+        """Write what was asked for and return its files."""
+        reported = document(found) | {"provenance": origin}
+        if self.json_file is not None:
+            write_text(self.json_file, _json(reported))
+        if self.new_cell is not None:
+            applied = found.with_stand_ins if self.stand_ins else found.model
+            spread = spread_of(found).beside(cell.spread)
+            intervals = cell.intervals | intervals_applied(found, stand_ins=self.stand_ins)
+            causes = accused(found, cell.accused)
+            written_by = fitted(origin, range_of(log), spread, intervals, causes)
+            save_cell(cell, self.new_cell, applied, {"provenance": written_by})
+        folder = [] if self.out is None else _write_folder(self.out, reported, found, cell, log)
+        return [*folder, *(f for f in (self.json_file, self.new_cell) if f is not None)]
 
 
 def _diagnose(

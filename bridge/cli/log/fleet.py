@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -67,6 +68,19 @@ def shared(command: Callable[..., None]) -> Callable[..., None]:
     return command
 
 
+@dataclass(frozen=True)
+class FleetOptions:
+    """The options that the commands of a fleet share."""
+
+    logs: tuple[str, ...]
+    cell: str
+    pattern: str | None
+    out: Path
+    fresh: bool
+    workers: int | None
+    scheduler: str | None
+
+
 @fleet.command()
 @shared
 @click.option("--withhold", multiple=True, metavar="EFFECT", help="Take an effect out.")
@@ -81,10 +95,11 @@ def diagnose(withhold: tuple[str, ...], **given: Any) -> None:
     """
     for name in withhold:
         effect_named(name)
-    done, found = _run("diagnose", diagnosing.work, {"withhold": list(withhold)}, **given)
+    options = FleetOptions(**given)
+    done, found = _run("diagnose", diagnosing.work, {"withhold": list(withhold)}, options)
     from gapbridge.bridge.fleet.output import write_diagnosed
 
-    _reported(done, found, *write_diagnosed(done, found, given["out"]))
+    _reported(done, found, *write_diagnosed(done, found, options.out))
 
 
 @fleet.command()
@@ -103,30 +118,32 @@ def fit(cells: Path | None, **given: Any) -> None:
     """
     if cells is not None:
         require_folder(cells, "--apply")
-    done, found = _run("fit", fitting.work, {}, **given)
+    options = FleetOptions(**given)
+    done, found = _run("fit", fitting.work, {}, options)
     from gapbridge.bridge.fleet.output import write_fitted
 
-    _reported(done, found, *write_fitted(done, found, given["out"], cells))
+    _reported(done, found, *write_fitted(done, found, options.out, cells))
 
 
 def _run(
-    name: str, work: Work, options: Mapping[str, Any], *, logs: tuple[str, ...], cell: str,
-    pattern: str | None, out: Path, fresh: bool, workers: int | None, scheduler: str | None,
+    name: str, work: Work, extra: Mapping[str, Any], options: FleetOptions
 ) -> tuple[Done, Found]:  # fmt: skip
+    """Do a work on all sessions; ``extra`` are options of the work itself."""
+    workers, scheduler = options.workers, options.scheduler
     if workers is not None and scheduler is not None:
         raise InputError("--workers: found beside --scheduler, expected one of them")
-    found = find_sessions(logs, pattern, without=out)
-    cells = cell_source(cell, found.folder)
+    found = find_sessions(options.logs, options.pattern, without=options.out)
+    cells = cell_source(options.cell, found.folder)
     for warning in cells.warnings():
         click.echo(f"warning: {warning}", err=True)
-    require_folder(out, "--out")
-    tasks, bad = tasks_of(found.sessions, cells, work, options)
+    require_folder(options.out, "--out")
+    tasks, bad = tasks_of(found.sessions, cells, work, extra)
     count = min(workers or os.cpu_count() or 1, max(len(tasks), 1))
     chosen: Workers = DaskWorkers(scheduler) if scheduler else LocalWorkers(count)
     for outcome in bad:
         _skipped(outcome)
     with (
-        Journal(out / f"{name}.jsonl", fresh=fresh) as journal,
+        Journal(options.out / f"{name}.jsonl", fresh=options.fresh) as journal,
         progress(f"{name}: sessions", len(tasks)) as advance,
     ):
 

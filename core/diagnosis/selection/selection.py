@@ -182,17 +182,10 @@ def select(
     progress: Callable[[str], None] | None = None,
 ) -> Selection:
     """Return the best explanation of an observation by named effects and smooth functions."""
-    arm = model.arm
-    rotation = observation.measured.shape[1] > 3
     base: tuple[Term, ...] = ()
-    turns = [
-        float(np.ptp(observation.quantities.get(joint_quantity(observation, i), np.zeros(1))))
-        / (2 * np.pi)
-        for i in range(arm.n)
-    ]
     kept = np.ones(len(observation.rows), dtype=bool)
     first = estimate_noise(observation, observation.measured - observation.predict(()), kept)
-    state = SelectionState(observation, arm, [], first, kept)
+    state = SelectionState(observation, model.arm, [], first, kept)
     found: CandidateFit | None = None
     space: SampleSpace | None = None
     near: SampleSpace | None = None  # the same, beside the links where their geometry is a cause
@@ -202,16 +195,10 @@ def select(
     for turn in range(ROUNDS):
         if progress:
             progress(f"{observation.channel}: round {turn + 1}")
-        state.candidates = [
-            with_what_it_needs(observation, _bounded(c, model, observation))
-            for c in named_candidates(arm, observation.channel, withheld, rotation, base, turns)
-            if _has_what_it_needs(c, observation) and (c.family, c.site) not in none
-        ]
-        space, near, columns = (
-            None,
-            None,
-            [],
-        )  # the last round's, as large as the new ones: not both at a time
+        named = _named_candidates(observation, model, withheld, base)
+        state.candidates = [c for c in named if (c.family, c.site) not in none]
+        # the last round's are as large as the new ones: not both at a time
+        space, near, columns = None, None, []
         columns = [exact_columns(state.observation, c, base) for c in state.candidates]
         if turn == 0:
             mark_outliers(state, columns)
@@ -256,17 +243,41 @@ def select(
     assert space is not None and near is not None and found is not None
     if len(space.y) >= LARGE_SAMPLE and any(not space.candidates[c].named for c in found.chosen):
         state.kept, state.noise = counted.copy(), whitened_by
-        # what goes into a model has to predict without the unnamed function beside it
-        named = [c for c in found.chosen if space.candidates[c].named]
-        # nor may it stand where a named cause would without it: friction of the same joint
-        alone = fit(near, named)
-        alone = pruned(near, grown(near, alone, named_only=True))
+        alone, found = _named_alone(near, found)
         terms, index, covariance, residual = refit(state, space, alone, links)
-        found = fit(near, (*alone.chosen, *(c for c in found.chosen if c not in named)))
     return Selection(
         state.observation, space, found, terms, index, covariance, counted, whitened_by,
         residual, base, unprojected, links,
     )  # fmt: skip
+
+
+def _named_candidates(
+    observation: Observation, model: Model, withheld: Iterable[str], base: tuple[Term, ...]
+) -> list[Candidate]:
+    """Return the named candidates that the observation can show, bounded, at a model's terms."""
+    turns = [
+        float(np.ptp(observation.quantities.get(joint_quantity(observation, i), np.zeros(1))))
+        / (2 * np.pi)
+        for i in range(model.arm.n)
+    ]
+    rotation = observation.measured.shape[1] > 3
+    return [
+        with_what_it_needs(observation, _bounded(c, model, observation))
+        for c in named_candidates(model.arm, observation.channel, withheld, rotation, base, turns)
+        if _has_what_it_needs(c, observation)
+    ]
+
+
+def _named_alone(space: SampleSpace, found: CandidateFit) -> tuple[CandidateFit, CandidateFit]:
+    """Return the named part of a set, as it stands without the unnamed functions, and with them.
+
+    What goes into a model has to predict without the unnamed function beside it, nor may that
+    stand where a named cause would without it: friction of the same joint.
+    """
+    named = [c for c in found.chosen if space.candidates[c].named]
+    alone = pruned(space, grown(space, fit(space, named), named_only=True))
+    rest = (c for c in found.chosen if c not in named)
+    return alone, fit(space, (*alone.chosen, *rest))
 
 
 def _exactly(space: SampleSpace, best: CandidateFit, state: SelectionState) -> CandidateFit:

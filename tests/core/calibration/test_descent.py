@@ -18,7 +18,7 @@ from benchmarks.calibration.laid_out import (
     readings_of,
     with_values,
 )
-from gapbridge.core.calibration.fit import calibrate
+from gapbridge.core.calibration.fit import fit_session, judged
 from gapbridge.core.calibration.observables import make_observable
 from gapbridge.core.calibration.parameters import DEFAULT, Parameters
 from gapbridge.core.calibration.problem import bounds_of
@@ -65,7 +65,7 @@ def test_a_payload_beside_flexibilities_is_found_and_does_not_run_away(
 ) -> None:
     readings = _session(parameters, 2.5)
     metrology = Metrology(registered=False, sigma=LAYOUT.sigma)
-    found = calibrate(model, readings, parameters, metrology, diagnose=False)
+    found = judged(model, fit_session(readings, parameters, metrology), diagnose=False)
     payload = next(e for e in found.estimates if e.name == "payload")
     assert payload.interval[0] < 2.5 < payload.interval[1]
     assert found.held_out_after.rms < 1.5 * np.sqrt(3) * found.noise
@@ -78,7 +78,7 @@ def test_what_one_load_cannot_show_is_reported_and_harms_no_prediction(
     readings = _session(parameters, 1.0)
     one = readings[np.flatnonzero(readings.load == 0)]
     metrology = Metrology(registered=False, sigma=LAYOUT.sigma)
-    found = calibrate(model, one, parameters, metrology, diagnose=False)
+    found = judged(model, fit_session(one, parameters, metrology), diagnose=False)
     payload = next(e for e in found.estimates if e.name == "payload")
     assert payload.interval[0] < 1.0 < payload.interval[1]
     assert not payload.shown or payload.std > 0.2

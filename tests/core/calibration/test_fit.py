@@ -19,7 +19,7 @@ from benchmarks.calibration.laid_out import (
     lay_out,
     readings_of,
 )
-from gapbridge.core.calibration.fit import calibrate
+from gapbridge.core.calibration.fit import fit_session, judged
 from gapbridge.core.calibration.observables import make_observable
 from gapbridge.core.calibration.parameters import DEFAULT, Parameters
 from gapbridge.core.calibration.readings import Readings
@@ -62,12 +62,12 @@ def session(parameters: Parameters) -> tuple[Readings, dict[str, float], Instrum
 def found(
     model: Model, parameters: Parameters, session: tuple[Readings, dict[str, float], Instrument]
 ) -> Calibration:
-    return calibrate(model, session[0], parameters, METROLOGY, diagnose=False)
+    return judged(model, fit_session(session[0], parameters, METROLOGY), diagnose=False)
 
 
 def test_without_noise_the_truth_is_found(model: Model, parameters: Parameters) -> None:
     readings, truth, _ = _session(parameters, 0, exact=True)
-    exact = calibrate(model, readings, parameters, METROLOGY, diagnose=False)
+    exact = judged(model, fit_session(readings, parameters, METROLOGY), diagnose=False)
     off = [abs(e.value - truth[e.name]) for e in exact.estimates]
     assert np.max(np.array(off) / parameters.scales) < 0.02
     assert exact.held_out_after.max < 1e-6 < 1e-3 < exact.held_out_before.rms
@@ -93,8 +93,8 @@ def test_an_instrument_that_moved_leaves_some_poses_to_verify_in_one_place_only(
     readings = session[0]
     held, second = readings.held_out, np.zeros(len(readings), dtype=np.int64)
     second[np.flatnonzero(held if verified == "after it" else ~held)[-6:]] = 1
-    some = calibrate(
-        model, replace(readings, station=second), parameters, METROLOGY, diagnose=False
+    some = judged(
+        model, fit_session(replace(readings, station=second), parameters, METROLOGY), diagnose=False
     )
     assert len(some.stations) == 2
     np.testing.assert_allclose(some.stations[1].position, some.stations[0].position, atol=2e-3)
@@ -117,7 +117,7 @@ def test_intervals_hold_the_truth_in_95_of_100(model: Model, parameters: Paramet
     held = []
     for seed in range(2, 8):
         readings, truth, _ = _session(parameters, seed)
-        some = calibrate(model, readings, parameters, METROLOGY, diagnose=False)
+        some = judged(model, fit_session(readings, parameters, METROLOGY), diagnose=False)
         held += [e.interval[0] <= truth[e.name] <= e.interval[1] for e in some.estimates if e.shown]
     assert 0.89 < np.mean(held) < 0.99  # six sessions; the benchmark takes 500
 
@@ -131,7 +131,9 @@ def test_held_out_readings_never_touch_the_fit(
     readings = session[0]
     value = readings.value.copy()
     value[readings.held_out] += 0.05
-    spoilt = calibrate(model, replace(readings, value=value), parameters, METROLOGY, diagnose=False)
+    spoilt = judged(
+        model, fit_session(replace(readings, value=value), parameters, METROLOGY), diagnose=False
+    )
     assert [e.value for e in spoilt.estimates] == [e.value for e in found.estimates]
     assert not spoilt.complete
     assert "held-out" in " ".join(spoilt.notes)
@@ -146,8 +148,8 @@ def test_outlier_readings_are_listed_and_change_little(
     readings = session[0]
     value = readings.value.copy()
     value[[4, 30]] += [[0.0, 3e-4, 0.0], [0.02, 0.0, 0.01]]
-    outlier = calibrate(
-        model, replace(readings, value=value), parameters, METROLOGY, diagnose=False
+    outlier = judged(
+        model, fit_session(replace(readings, value=value), parameters, METROLOGY), diagnose=False
     )
     assert list(outlier.outliers) == [4, 30]
     off = [
@@ -165,7 +167,7 @@ def test_flexibilities_stay_at_zero_or_above(model: Model, parameters: Parameter
     }
     laid, instrument = lay_out(KIND, LAYOUT, rng), instrument_for(KIND, LAYOUT, rng)
     readings = readings_of(arm_with(KIND, truth), laid, instrument, rng)
-    stiff = calibrate(model, readings, parameters, METROLOGY, diagnose=False)
+    stiff = judged(model, fit_session(readings, parameters, METROLOGY), diagnose=False)
     soft = [e for e in stiff.estimates if "compliance" in e.name]
     assert all(e.value >= 0 for e in soft)
     assert any(e.on_bound for e in soft)
@@ -184,8 +186,8 @@ def test_a_load_that_was_wrongly_declared_leaves_differences_at_odds_or_shows_he
     session = replace(laid.session, payload_mass=laid.session.payload_mass * np.where(heavy, 0, 1))
     readings = readings_of(real, replace(laid, session=session), instrument, rng)
     declared = replace(readings.loads, payload_mass=laid.session.payload_mass)
-    wrong = calibrate(
-        model, replace(readings, loads=declared), parameters, METROLOGY, diagnose=False
+    wrong = judged(
+        model, fit_session(replace(readings, loads=declared), parameters, METROLOGY), diagnose=False
     )
     assert not wrong.complete or "disagree" in " ".join(wrong.notes)
 
@@ -201,12 +203,12 @@ def test_what_is_left_to_be_added_is_named_and_then_completes_it(
     real = backlash(3, 8e-4).apply(arm_with(KIND, truth))
     readings = readings_of(real, replace(laid, session=came), instrument, rng)
     readings = replace(readings, loads=replace(readings.loads, approach=approach))
-    found = calibrate(model, readings, parameters, METROLOGY, diagnose=False)
+    found = judged(model, fit_session(readings, parameters, METROLOGY), diagnose=False)
     assert not found.complete
     assert found.missing_effects == ("backlash_3",)
     names = (*DEFAULT, *found.missing_effects)
     more = Parameters.of(model, names, observable=make_observable("position"))
-    whole = calibrate(model, readings, more, METROLOGY, diagnose=False)
+    whole = judged(model, fit_session(readings, more, METROLOGY), diagnose=False)
     assert whole.complete
     assert whole.missing_effects == ()
     play = next(e for e in whole.estimates if e.name == "backlash_3")
@@ -223,8 +225,8 @@ def test_a_place_that_too_few_fitted_poses_determine_takes_those_to_verify_as_we
     poses = np.unique(readings.pose[~readings.held_out])[:alone]
     second = np.isin(readings.pose, poses).astype(np.int64)
     second[np.flatnonzero(readings.held_out)[-4:]] = 1
-    some = calibrate(
-        model, replace(readings, station=second), parameters, METROLOGY, diagnose=False
+    some = judged(
+        model, fit_session(replace(readings, station=second), parameters, METROLOGY), diagnose=False
     )
     assert any("4 reading(s) to verify were fitted" in note for note in some.notes) == fitted
     assert len(some.held_out_after.rows) == readings.held_out.sum() - 4 * fitted
@@ -234,7 +236,7 @@ def test_a_place_that_too_few_fitted_poses_determine_takes_those_to_verify_as_we
 def test_the_diagnosis_finds_nothing_in_what_a_complete_calibration_leaves(
     model: Model, parameters: Parameters, session: tuple[Readings, dict[str, float], Instrument]
 ) -> None:
-    whole = calibrate(model, session[0], parameters, METROLOGY)
+    whole = judged(model, fit_session(session[0], parameters, METROLOGY))
     assert whole.complete
     assert whole.diagnosis is not None
     assert whole.diagnosis.verdict == "no_gap"
@@ -248,7 +250,7 @@ def test_two_places_of_the_instrument_each_have_their_frame(
     value = readings.value.copy()
     value[second] = value[second] @ np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]]) + [1, 2, 3]
     moved = replace(readings, value=value, station=second.astype(np.int64))
-    both = calibrate(model, moved, parameters, METROLOGY, diagnose=False)
+    both = judged(model, fit_session(moved, parameters, METROLOGY), diagnose=False)
     assert len(both.stations) == 2
     assert both.held_out_after.rms < 1e-4
 
@@ -257,7 +259,7 @@ def test_too_few_readings_are_refused(
     model: Model, parameters: Parameters, session: tuple[Readings, dict[str, float], Instrument]
 ) -> None:
     with pytest.raises(ExcitationError, match="measure more poses"):
-        calibrate(model, session[0][np.arange(8)], parameters, METROLOGY)
+        judged(model, fit_session(session[0][np.arange(8)], parameters, METROLOGY))
 
 
 def test_only_held_out_readings_are_refused(
@@ -265,4 +267,4 @@ def test_only_held_out_readings_are_refused(
 ) -> None:
     away = session[0][session[0].held_out]
     with pytest.raises(ExcitationError, match="all are held out"):
-        calibrate(model, away, parameters, METROLOGY)
+        judged(model, fit_session(away, parameters, METROLOGY))

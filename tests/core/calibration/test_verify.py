@@ -23,7 +23,7 @@ from benchmarks.calibration.laid_out import (
     with_values,
 )
 from gapbridge.core.calibration.accuracy_baseline import baseline_in, document_of
-from gapbridge.core.calibration.fit import calibrate
+from gapbridge.core.calibration.fit import fit_session, judged
 from gapbridge.core.calibration.observables import make_observable
 from gapbridge.core.calibration.parameters import Parameters
 from gapbridge.core.calibration.readings import Readings
@@ -47,7 +47,7 @@ def calibrated() -> Calibrated:
     real = arm_with(KIND, draw_values(KIND, parameters.names, rng))
     instrument = instrument_for(KIND, LAYOUT, rng)
     readings = readings_of(real, lay_out(KIND, LAYOUT, rng), instrument, rng)
-    found = calibrate(model, readings, parameters, METROLOGY, diagnose=False)
+    found = judged(model, fit_session(readings, parameters, METROLOGY), diagnose=False)
     document = json.loads(json.dumps(document_of(found, METROLOGY.sigma)))
     return found, document, real, instrument
 

@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 
 from gapbridge.core.arm import builtin_arm
-from gapbridge.core.calibration.fit import calibrate
+from gapbridge.core.calibration.fit import fit_session, judged
 from gapbridge.core.calibration.observables import make_observable
 from gapbridge.core.calibration.observables.foreseen import empty_readings, foreseen, somewhere
 from gapbridge.core.calibration.parameters import Parameters
@@ -52,6 +52,6 @@ def calibration_of(kind: str) -> Calibration:
     )  # fmt: skip
     parameters = Parameters.of(nominal, EFFECTS, observable=observable)
     metrology = Metrology(sigma=SIGMA)
-    return calibrate(
-        nominal, readings, parameters, metrology, observable=observable, diagnose=False
+    return judged(
+        nominal, fit_session(readings, parameters, metrology, observable=observable), diagnose=False
     )
