@@ -69,7 +69,7 @@ def loads_of(cell: Cell) -> tuple[Payload, ...]:
     return tuple(Payload(e.mass, _three(e.cog), e.name) for e in entries)
 
 
-def planned(cell: Cell, options: SessionOptions, tell: Callable[[str, float], None]) -> Plan:
+def planned(cell: Cell, options: SessionOptions, emit: Callable[[str, float], None]) -> Plan:
     """Return the plan of a whole session. Raises InputError where there can be none."""
     given, instrument = cell.calibration, options.instrument
     space = space_of(cell, instrument.measures)
@@ -87,7 +87,7 @@ def planned(cell: Cell, options: SessionOptions, tell: Callable[[str, float], No
             sigma=float(np.hypot(instrument.sigma or cell.metrology.sigma,
                                  cell.metrology.repeatability or REPEATABILITY)),
         ),
-        tell,
+        emit,
     )  # fmt: skip
 
 

@@ -139,11 +139,11 @@ def _begin(job: Job, joints: JointSource) -> Array:
 def _make_plan(job: Job, joints: JointSource) -> None:
     prompt, session = job.prompt, job.session
     begin = _begin(job, joints) if job.from_here else None
-    with prompt.waiting("planning") as tell:
-        plan = job.plan(begin, lambda text, share: tell(f"planning: {text} ({share:.0%})"))
+    with prompt.waiting("planning") as emit:
+        plan = job.plan(begin, lambda text, share: emit(f"planning: {text} ({share:.0%})"))
     session.keep_plan(plan)
     write_poses(plan, job.folder / "poses.csv")
-    job.tell_plan(plan)
+    job.report_plan(plan)
 
 
 def _tell_old_plan(job: Job) -> None:
@@ -151,7 +151,7 @@ def _tell_old_plan(job: Job) -> None:
     if job.options.poses is not None:
         job.prompt.warn("this session has its plan: --poses counts for a new one")
     if job.options.plan_only and job.session.plan is not None:
-        job.tell_plan(job.session.plan)
+        job.report_plan(job.session.plan)
 
 
 def _tell_resumed(prompt: Prompt, session: Session, folder: Path) -> None:
@@ -178,7 +178,7 @@ def _measure(job: Job, joints: JointSource, instrument: AnyInstrument) -> None:
             f"{job.cell.path}: calibration.joints: found 'planned' with an instrument of kind "
             f"{options.instrument.kind!r}, expected 'link' or 'typed': the joints are the reading"
         )
-    prompt.say(f"instrument: {instrument.name}; joints: {_told(joints, options)}")
+    prompt.say(f"instrument: {instrument.name}; joints: {_joints_text(joints, options)}")
     prompt.say("at every question: Enter goes on, `undo`, `back`, `skip`, `quit`, `?`")
     positioning = Positioning(prompt, job.session, joints, instrument, _clear(job), given)
     sigma = metrology_of(job.cell, options.instrument).sigma
@@ -192,7 +192,7 @@ def _clear(job: Job) -> Callable[[Array], Array]:
     return lambda q: np.asarray(space.clear(q), dtype=float)
 
 
-def _told(joints: JointSource, options: SessionOptions) -> str:
+def _joints_text(joints: JointSource, options: SessionOptions) -> str:
     if joints.watches:
         return "from the controller" + (", which Gapbridge drives" if options.move else "")
     return "as planned" if isinstance(joints, PlannedJoints) else "typed in degrees"

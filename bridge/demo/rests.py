@@ -69,7 +69,7 @@ def rests_so_far(
     if "timestamp" not in recording:
         return None, "the recording holds no state of the arm, expected one of each cycle"
     if load is not None and "payload" not in recording:
-        recording = {**recording, **_told(load, len(recording["timestamp"]))}
+        recording = {**recording, **_declared(load, len(recording["timestamp"]))}
     spans = _spans(recording, settling)
     rows: list[tuple[Array, ...]] = []
     lacking = ""
@@ -88,7 +88,7 @@ def rests_so_far(
     return Rests(*(np.array(column) for column in zip(*rows, strict=True))), lacking
 
 
-def _told(load: Load, count: int) -> dict[str, Array]:
+def _declared(load: Load, count: int) -> dict[str, Array]:
     """Return the columns of a load that stayed the same for ``count`` rows."""
     return {
         "payload": np.full(count, load.mass),

@@ -28,7 +28,7 @@ class ServedCell:
             sys.executable, "-m", "gapbridge", "simulate", str(cell), "--seed", str(seed),
         ]  # fmt: skip
         self._process: subprocess.Popen[str] | None = None
-        self._told: list[str] = []
+        self._lines: list[str] = []
 
     def __enter__(self) -> Self:
         """Start it and wait until it serves. Raises LinkError, with its last words."""
@@ -50,7 +50,7 @@ class ServedCell:
                 return self
             if not line:
                 self._stop()
-                last = self._told[-1] if self._told else "no message"
+                last = self._lines[-1] if self._lines else "no message"
                 raise LinkError(f"the simulated controller did not start: {last}")
 
     def _read(self, lines: queue.Queue[str]) -> None:
@@ -58,7 +58,7 @@ class ServedCell:
         assert self._process is not None
         assert self._process.stdout is not None
         for line in self._process.stdout:
-            self._told = [*self._told[-20:], line.strip()]
+            self._lines = [*self._lines[-20:], line.strip()]
             lines.put(line)
         lines.put("")
 

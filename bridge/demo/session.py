@@ -75,11 +75,11 @@ class Session:
     """Runs of the daemon on one simulated cell, one after the other."""
 
     def __init__(
-        self, link: DemoLink, folder: Path, tell: Callable[[str], None], clock: Clock = SYSTEM
+        self, link: DemoLink, folder: Path, emit: Callable[[str], None], clock: Clock = SYSTEM
     ) -> None:
         self._link = link
         self._folder = folder
-        self._tell = tell
+        self._emit = emit
         self._clock = clock
         self._runs: list[RunSummary] = []
         self._slower = 1
@@ -109,7 +109,7 @@ class Session:
                 fruitless = 0 if ended.found is not None or ended.stalled else fruitless + 1
                 if ended.broke or len(left):
                     self._require_stall(ended, fruitless, latest)
-                    self._tell(
+                    self._emit(
                         f"  this machine stood still ({ended.broke}); {len(poses) - len(left)} of "
                         f"{len(poses)} visits are done, going on{self._slow(ended.broke)}"
                     )

@@ -53,7 +53,7 @@ def run(
     bad: Sequence[Outcome],
     workers: Workers,
     journal: Journal,
-    tell: Callable[[Outcome], None],
+    emit: Callable[[Outcome], None],
 ) -> Done:
     """Do all tasks that the journal does not know; every outcome is in the journal as it comes."""
     begin = time.perf_counter()
@@ -65,14 +65,14 @@ def run(
             left.append(task)
         else:
             outcomes[task.session] = before
-            tell(before)
+            emit(before)
     resumed = len(tasks) - len(left)
     if left:
         with workers:
             for found in workers.run(left):
                 journal.add(found)
                 outcomes[found.session] = found
-                tell(found)
+                emit(found)
     ordered = sorted(outcomes.values(), key=lambda o: natural(o.session))
     return Done(tuple(ordered), resumed, time.perf_counter() - begin, workers.words())
 

@@ -1,8 +1,8 @@
 """Levenberg and Marquardt's steps of a calibration: none is taken that makes the fit worse.
 
 A payload times a flexibility bends the arm: such products make Gauss and Newton's full steps
-overshoot. Each step is tried against the exact prediction; one that does not keep what it promises
-is shortened, most along what the readings hardly separate (columns scaled to length one,
+overshoot. Each step is tried against the exact prediction; one that gains less than
+predicted is shortened, most along what the readings hardly separate (columns scaled to length one,
 Marquardt, J. SIAM 11 (1963) 431). Derivatives are computed anew where they predict too much.
 """
 
@@ -102,7 +102,7 @@ def _stepped(
 ) -> tuple[FitState, float, bool]:
     """Return the standing after steps with the same derivatives, and the damping.
 
-    Last comes whether the derivatives promised too much.
+    Last comes whether the derivatives predicted too much.
     """
     layout, bounds = problem.observable.layout(problem.readings), problem.bounds
     free = np.ones(len(at.values), dtype=bool)
@@ -142,15 +142,15 @@ def _kept(
     """Return the actual over the predicted decrease of a step; 1 where none is predicted."""
     before = float(at.system.left @ at.system.left) + problem.prior(at.values)
     rest = at.system.left - at.system.J @ step - at.system.F @ shift
-    promised = before - float(rest @ rest) - problem.prior(trial[0])
+    predicted = before - float(rest @ rest) - problem.prior(trial[0])
     left = problem.left(*trial)
     if left is None:
         return -1.0
     found = before - cost(left, noise, at.weights) - problem.prior(trial[0])
     tiny = NOTHING * (1 + before)
-    if abs(promised) < tiny and abs(found) < tiny:
+    if abs(predicted) < tiny and abs(found) < tiny:
         return 1.0
-    return found / promised if promised > 0 else -1.0
+    return found / predicted if predicted > 0 else -1.0
 
 
 def _sizes(step: Array, covariance: Array) -> float:

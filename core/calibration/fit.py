@@ -170,17 +170,17 @@ def estimates_of(
     parameters: Parameters, rest: ConvergedFit, expected: Expectation | None
 ) -> tuple[Estimate, ...]:
     """Return the parameters as they are reported, beside what was ``expected`` of them."""
-    promised = {} if expected is None else dict(
+    planned = {} if expected is None else dict(
         zip(expected.names, expected.std, strict=True)
     )  # fmt: skip
     std = np.sqrt(np.diag(rest.covariance))
     estimates = []
     for i, name in enumerate(parameters.names):
-        promise = promised.get(name)
+        planned_std = planned.get(name)
         estimates.append(
             Estimate(
                 name, float(rest.values[i]), float(std[i]), parameters.units[i],
-                None if promise is None else float(promise),
+                None if planned_std is None else float(planned_std),
                 shown=bool(std[i] < TELLING * parameters.scales[i]),
                 on_bound=bool(rest.stuck[i]), freedom=rest.freedom,
             )

@@ -49,7 +49,7 @@ def verdict_words(holds: bool, errors: Errors, ratio: float, chance: float, move
     """Return the verification in one sentence."""
     text = (
         f"{len(errors.rows)} poses are {1e3 * errors.rms:.3f} mm rms off, {ratio:.2f} times what "
-        "the calibration promised"
+        "the calibration predicted"
     )
     if holds:
         return f"the calibration holds: {text}"

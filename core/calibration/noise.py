@@ -151,10 +151,10 @@ def estimated(
     shapes = [s[use] for s in noise.shapes]
     t = 2 * np.log(noise.sizes)
     for _ in range(ROUNDS):
-        slope, curve = _likelihood(t, shapes, X, y, precision)
-        slope = slope - (t - known.middle) / known.width**2
+        score, curve = _likelihood(t, shapes, X, y, precision)
+        score = score - (t - known.middle) / known.width**2
         curve = curve + np.diag(1 / known.width**2)
-        step = np.clip(np.linalg.solve(curve, slope), -1.5, 1.5)
+        step = np.clip(np.linalg.solve(curve, score), -1.5, 1.5)
         t = t + step
         if np.abs(step).max() < SETTLED:
             break
@@ -164,7 +164,7 @@ def estimated(
 def _likelihood(
     t: Array, shapes: list[Array], X: Array, y: Array, precision: Array
 ) -> tuple[Array, Array]:
-    """Return slope (c,) and Fisher's information (c, c) of the likelihood by log(variance)."""
+    """Return score (c,) and Fisher's information (c, c) of the likelihood by log(variance)."""
     N, k, p = X.shape
     V = sum(np.exp(one) * shape for one, shape in zip(t, shapes, strict=True))
     W = np.linalg.inv(np.linalg.cholesky(V))
@@ -181,12 +181,12 @@ def _likelihood(
              for one, shape in zip(t, shapes, strict=True)]  # fmt: skip
     PV = [np.einsum("anb,nbc->anc", P.reshape(N * k, N, k), part).reshape(N * k, N * k)
           for part in parts]  # fmt: skip
-    slope = np.empty(len(parts))
+    score = np.empty(len(parts))
     curve = np.empty((len(parts), len(parts)))
     for c, part in enumerate(parts):
         block = Py.reshape(N, k)
         inside = float(np.einsum("na,nab,nb->", block, part, block))
-        slope[c] = 0.5 * (inside - float(np.trace(PV[c])))
+        score[c] = 0.5 * (inside - float(np.trace(PV[c])))
         for d in range(c + 1):
             curve[c, d] = curve[d, c] = 0.5 * float(np.sum(PV[c] * PV[d].T))
-    return slope, curve
+    return score, curve

@@ -127,7 +127,7 @@ class Parameters:
         return replace(self.nominal, terms=(*terms, *new))
 
     def model_with_all(self, values: Array) -> tuple[Model, list[tuple[int, int]]]:
-        """Return ``model(values)`` with the terms of zeros, which have slopes nevertheless.
+        """Return ``model(values)`` with the terms of zeros, which have derivatives nevertheless.
 
         And where each parameter (p) stands in it: number of the term, number of the value.
         """

@@ -96,7 +96,7 @@ def calibrate_payload(model: Model, q: Array, wrench: Array) -> PayloadCalibrati
     flat, value = columns.reshape(-1, 10), wrench.reshape(-1)
     unit = np.tile(np.repeat([0, 1], 3), len(q))  # forces and torques have a noise of their own
     fit = weighed(flat, value, unit, row=np.repeat(np.arange(len(q)), 6))
-    covariance, cog = _told(fit.values, fit.covariance)
+    covariance, cog = _about_centre(fit.values, fit.covariance)
     mass = float(fit.values[0])
     values = np.concatenate([[mass], cog, fit.values[4:]])
     std = np.sqrt(np.diag(covariance))
@@ -139,7 +139,7 @@ def _require_turning(columns: Array, count: int) -> None:
         )
 
 
-def _told(values: Array, covariance: Array) -> tuple[Array, Array]:
+def _about_centre(values: Array, covariance: Array) -> tuple[Array, Array]:
     """Return the covariance in terms of the centre of gravity itself, and that centre."""
     mass, moment = float(values[0]), values[1:4]
     if abs(mass) < LIGHT * np.sqrt(covariance[0, 0]):

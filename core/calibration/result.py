@@ -24,7 +24,7 @@ class Estimate:
     value: float
     std: float  # 1 sigma
     unit: str
-    expected_std: float | None = None  # what the plan had promised
+    expected_std: float | None = None  # what the plan predicted
     shown: bool = True  # False: the data do not determine it; it stands where it stood
     on_bound: bool = False
     freedom: float = np.inf  # degrees of freedom behind std: few make the interval wider

@@ -134,7 +134,7 @@ def remaining_of(
         return f"{', '.join(left)} is left to be added"
     if diagnosis is not None and diagnosis.verdict != "no_gap":
         return "structure is left that no effect of the catalogue explains"
-    return f"held-out poses are {np.sqrt(remainder.ratio):.1f} times as far off as promised"
+    return f"held-out poses are {np.sqrt(remainder.ratio):.1f} times as far off as predicted"
 
 
 def unsupported(estimates: tuple[Estimate, ...], names: tuple[str, ...]) -> tuple[str, ...]:

@@ -1,6 +1,6 @@
 """Does a calibration still hold? A few poses, measured again months later.
 
-What the readings leave over is held against what the calibration promised of them: its parameters'
+What the readings leave over is held against what the calibration predicted: its parameters'
 uncertainty, the noise of instrument and arm. Where that is broken, the simple things that may have
 moved since compete: the tool, one joint's zero, the load, the instrument, one bad reading.
 """
@@ -54,8 +54,8 @@ class Verification:
     holds: bool
     verdict: str  # one sentence
     errors: Errors  # of each reading, the instrument's place fitted where nobody registered it
-    promised: Array  # (M,) m, 1 sigma (3D) that the calibration promised of each error
-    ratio: float  # rms of the errors over what was promised, the numbers fitted counted
+    predicted: Array  # (M,) m, 1 sigma (3D) that the calibration predicted of each error
+    ratio: float  # rms of the errors over what was predicted, the numbers fitted counted
     chance: float  # of so large a ratio if the calibration holds
     moved: Suspect | None  # what explains the change, where one thing does
     suspects: tuple[Suspect, ...]  # others that explain it as well
@@ -135,7 +135,7 @@ def _task(
     model: Model, how: Observable, readings: Readings, nuisance: Nuisance,
     baseline: AccuracyBaseline, parameters: Parameters, metrology: Metrology,
 ) -> tuple[_Task, Array]:  # fmt: skip
-    """Return the whitened problem, and what was promised of each error (N,)."""
+    """Return the whitened problem, and what was predicted of each error (N,)."""
     at = np.zeros(len(parameters))
     J, F = how.columns(parameters, at, readings, nuisance)
     noise, _ = presumed(model, readings, how, nuisance, metrology)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapbridge.core.diagnosis.residual_structure import basis_of, dependence
+from gapbridge.core.diagnosis.selection.candidate import joint_target
 from gapbridge.core.diagnosis.selection.selection import Selection
 
 Array = NDArray[np.float64]
@@ -45,9 +46,13 @@ def locate(selection: Selection, gap: Array, accused: Sequence[int]) -> Where:
                 # what of the gap points along this part: parts of one gap then add up
                 shares[joint] = shares.get(joint, 0.0) + float(part @ space.y) / total
     else:
+        columns = selection.observation.joint_columns
+        joints = {} if columns is None else {
+            joint_target(j): j for j in range(1, columns.shape[2] + 1)
+        }  # fmt: skip
         for c, candidate in enumerate(space.candidates):
-            if candidate.quantity and candidate.target.startswith("joint_"):
-                joint = int(candidate.target.removeprefix("joint_"))
+            joint = joints.get(candidate.target)
+            if candidate.quantity and joint is not None:
                 basis = basis_of(space.X[:, space.start[c] : space.start[c + 1]])
                 share = float(np.sum((basis.T @ space.y) ** 2)) / total
                 shares[joint] = max(shares.get(joint, 0.0), share)

@@ -28,7 +28,7 @@ from gapbridge.core.diagnosis.held_out import HeldOut
 from gapbridge.core.diagnosis.observation import Observation
 from gapbridge.core.diagnosis.regions import parts, regions
 from gapbridge.core.diagnosis.residual_structure import basis_of
-from gapbridge.core.diagnosis.selection.candidate import Candidate, carrying
+from gapbridge.core.diagnosis.selection.candidate import Candidate, carrying, joint_target
 from gapbridge.core.diagnosis.selection.problem import gains
 from gapbridge.core.diagnosis.selection.refit import Remainder
 from gapbridge.core.diagnosis.selection.selection import Selection
@@ -310,7 +310,7 @@ def _unnamed(candidate: Candidate, observation: Observation) -> bool:
     if candidate.named:
         return False
     stem, _, index = candidate.quantity.rpartition("_")
-    own = index.isdigit() and candidate.target.endswith(f"_{int(index) + 1}")
+    own = index.isdigit() and candidate.target == joint_target(int(index) + 1)
     if observation.channel in ("torque", "tracking"):
         droop = observation.channel == "tracking"
         held = droop and candidate.target == carrying(candidate.quantity)

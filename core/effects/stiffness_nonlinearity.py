@@ -75,9 +75,9 @@ class StiffnessNonlinearity(JointEffect):
         moment = float(1 / np.sqrt(softening)) if softening > 0 else float("inf")
         spread: list[float | None] = [None, None]
         if covariance is not None:
-            slope = 0.5 * moment**3 if np.isfinite(moment) else float("inf")
+            derivative = 0.5 * moment**3 if np.isfinite(moment) else float("inf")
             deviation = np.sqrt(np.maximum(np.diag(covariance), 0))
-            spread = [float(deviation[0]), float(deviation[1] * slope)]
+            spread = [float(deviation[0]), float(deviation[1] * derivative)]
         base = f"{self.identifier}_{term.site.joint}"
         return (
             Reported(f"{base}_compliance", c, spread[0], "rad/Nm"),

@@ -124,7 +124,7 @@ def _steps_once(model: Model, loads: Loads) -> bool:
 def _swept(
     chain: Chain, rows: Rows, entries: tuple[Entries, Entries], jacobian: Array, converged: float
 ) -> Poses | None:
-    """Write the slopes (3 or 6, p, N) and return the poses; None where the sweep cannot."""
+    """Write the derivatives (3 or 6, p, N) and return the poses; None where the sweep cannot."""
     if bool(chain.flexibility.any()) or bool(getattr(config, "DISABLE_JIT", 0)):
         return None
     count = len(rows.q)

@@ -35,18 +35,18 @@ REFITS = 3  # times at most that the readings may ask for more
 
 
 def baseline_beside(cell: Path) -> Path:
-    """Return where a calibrated cell's promise is kept."""
+    """Return where a calibrated cell's accuracy baseline is kept."""
     return cell.with_name(f"{cell.stem}.promise.json")
 
 
 class WholeJob(Job):
     """Plan, measure, fit, verify, report, and a new cell."""
 
-    def plan(self, begin: Array | None, tell: Callable[[str, float], None]) -> Plan:
+    def plan(self, begin: Array | None, emit: Callable[[str, float], None]) -> Plan:
         """Return the most informative poses."""
-        return planned(self.cell, self.options, tell)
+        return planned(self.cell, self.options, emit)
 
-    def tell_plan(self, plan: Plan) -> None:
+    def report_plan(self, plan: Plan) -> None:
         """Say how many stops there are, and what n poses buy."""
         prompt, minutes = self.prompt, self.cell.calibration.minutes_per_load
         fit = sum(not p.held_out and not p.repeat for p in plan.poses)

@@ -34,11 +34,11 @@ def fitted(
     kind, places = options.instrument.measures, session.places
     observable = observable_of(cell, options.instrument, places)
     metrology = metrology_of(cell, options.instrument, places)
-    with prompt.waiting("fitting") as tell:
+    with prompt.waiting("fitting") as emit:
         parameters = Parameters.of(cell.model, (*effects_of(cell), *more), observable=observable)
         return fit_session(
             session.all_readings(kind), parameters, metrology, observable=observable,
-            progress=lambda text: tell(f"fitting: {text}"),
+            progress=lambda text: emit(f"fitting: {text}"),
         )  # fmt: skip
 
 
@@ -52,11 +52,11 @@ def calibration_of(
 ) -> Calibration:
     """Return the fit judged on the held-out poses: the one look at them."""
     assert session.plan is not None
-    with prompt.waiting("verifying") as tell:
+    with prompt.waiting("verifying") as emit:
         return judged(
             cell.model, fit, declined=declined, expected=session.plan.expected,
             diagnose=options.instrument.measures in DIAGNOSED,
-            progress=lambda text: tell(f"verifying: {text}"),
+            progress=lambda text: emit(f"verifying: {text}"),
         )  # fmt: skip
 
 

@@ -48,11 +48,11 @@ class Job(ABC):
         return self.session.journal.path.parent
 
     @abstractmethod
-    def plan(self, begin: Array | None, tell: Callable[[str, float], None]) -> Plan:
+    def plan(self, begin: Array | None, emit: Callable[[str, float], None]) -> Plan:
         """Return the plan. Raises InputError where there can be none."""
 
     @abstractmethod
-    def tell_plan(self, plan: Plan) -> None:
+    def report_plan(self, plan: Plan) -> None:
         """Say what is planned, and what it will determine."""
 
     def instrument(self, around: Surroundings) -> AnyInstrument:

@@ -40,7 +40,7 @@ class PayloadJob(Job):
             )
         super().__init__(cell, options, prompt, session)
 
-    def plan(self, begin: Array | None, tell: Callable[[str, float], None]) -> Plan:
+    def plan(self, begin: Array | None, emit: Callable[[str, float], None]) -> Plan:
         """Return orientations of the flange around where the arm stands."""
         assert begin is not None
         own = self.cell.file.payload
@@ -55,7 +55,7 @@ class PayloadJob(Job):
         )
         return bare_plan((load,), poses, expected=expected)
 
-    def tell_plan(self, plan: Plan) -> None:
+    def report_plan(self, plan: Plan) -> None:
         """Say how many orientations there are, and how well they will determine the load."""
         rows = zip(plan.expected.names, plan.expected.units, plan.expected.std, strict=True)
         spreads = ", ".join(f"{n} ±{figure(s)} {u}" for n, u, s in list(rows)[:4])

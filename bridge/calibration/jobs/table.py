@@ -18,7 +18,7 @@ JOBS: dict[str, str] = {
     "payload": "gapbridge.bridge.calibration.jobs.payload:PayloadJob",
     "tool": "gapbridge.bridge.calibration.jobs.tool:ToolJob",
 }
-"""Order.kind -> ``module:Class``, imported on use."""
+"""SessionOptions.kind -> ``module:Class``, imported on use."""
 
 
 def make_job(cell: Cell, options: SessionOptions, prompt: Prompt, session: Session) -> Job:

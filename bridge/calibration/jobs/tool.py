@@ -44,7 +44,7 @@ class ToolJob(Job):
             )
         super().__init__(cell, options, prompt, session)
 
-    def plan(self, begin: Array | None, tell: Callable[[str, float], None]) -> Plan:
+    def plan(self, begin: Array | None, emit: Callable[[str, float], None]) -> Plan:
         """Return orientations about where the tip is now."""
         assert begin is not None
         found = plan_tool(
@@ -54,7 +54,7 @@ class ToolJob(Job):
         poses = [PlannedPose(i, q, 0, free) for i, q in enumerate(found.poses)]
         return bare_plan(loads_of(self.cell)[:1], poses, found.bought)
 
-    def tell_plan(self, plan: Plan) -> None:
+    def report_plan(self, plan: Plan) -> None:
         """Say how many touches there are, and how well they will determine the tip."""
         expected = f"; expected ±{millimetres(plan.bought[-1][1])}" if plan.bought else ""
         self.prompt.say(f"plan: the tip onto one fixed point {len(plan.poses)} times{expected}")

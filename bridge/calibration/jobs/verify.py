@@ -37,8 +37,8 @@ POSES = 10
 class VerifyJob(Job):
     """Poses all over the workspace, under each load; nothing is fitted but the instrument."""
 
-    def _promise(self) -> dict[str, Any]:
-        """Return what the calibration has promised. Raises InputError where nobody knows."""
+    def _baseline(self) -> dict[str, Any]:
+        """Return the calibration's accuracy baseline. Raises InputError where nobody knows."""
         path = baseline_beside(self.cell.path)
         try:
             found = json.loads(path.read_text(encoding="utf-8"))
@@ -47,28 +47,28 @@ class VerifyJob(Job):
                 "no such file" if isinstance(error, FileNotFoundError) else "none that can be read"
             )
             raise InputError(
-                f"{path}: found {why}, expected the promise that `gapbridge calibrate` writes "
-                "beside a calibrated cell"
+                f"{path}: found {why}, expected the accuracy baseline that "
+                "`gapbridge calibrate` writes beside a calibrated cell"
             ) from None
         if not isinstance(found, dict):
-            raise InputError(f"{path}: found no mapping, expected a calibration's promise")
+            raise InputError(f"{path}: found no mapping, expected an accuracy baseline")
         return found
 
-    def plan(self, begin: Array | None, tell: Callable[[str, float], None]) -> Plan:
+    def plan(self, begin: Array | None, emit: Callable[[str, float], None]) -> Plan:
         """Return poses far from each other."""
-        promise = baseline_in(self._promise())
-        if promise.kind != self.options.instrument.measures:
+        baseline = baseline_in(self._baseline())
+        if baseline.kind != self.options.instrument.measures:
             raise InputError(
-                f"{baseline_beside(self.cell.path)}: found a calibration by {promise.kind}, "
+                f"{baseline_beside(self.cell.path)}: found a calibration by {baseline.kind}, "
                 f"expected one by {self.options.instrument.measures}: verify it as it was made"
             )
         loads = tuple(sorted(loads_of(self.cell), key=lambda load: load.mass))
-        space = with_loads(space_of(self.cell, promise.kind), loads)
+        space = with_loads(space_of(self.cell, baseline.kind), loads)
         space = replace(space, places=space.places[:1])  # a few poses from one place
         observable = observable_of(self.cell, self.options.instrument)
-        tell("looking for poses", 0.2)
+        emit("looking for poses", 0.2)
         found = candidates_of(
-            promise.parameters(self.cell.model), observable, loads, space, self.options.seed
+            baseline.parameters(self.cell.model), observable, loads, space, self.options.seed
         )
         count = min(self.options.poses or POSES, len(found.q))
         chosen = _far_apart(self.cell.model.rigid_pose(found.q).position, count)
@@ -84,7 +84,7 @@ class VerifyJob(Job):
             ]
         return bare_plan(loads, poses)
 
-    def tell_plan(self, plan: Plan) -> None:
+    def report_plan(self, plan: Plan) -> None:
         """Say how many stops there are."""
         left = seconds_left(self.session, self.cell.calibration.minutes_per_load)
         self.prompt.say(f"plan: {len(plan.poses)} poses, {duration(left)}")
@@ -97,11 +97,11 @@ class VerifyJob(Job):
         readings = self.session.all_readings(options.instrument.measures)
         with prompt.waiting("comparing"):
             found = verify(
-                self.cell.model, readings, self._promise(), metrology,
+                self.cell.model, readings, self._baseline(), metrology,
                 observable=observable_of(self.cell, options.instrument, places),
             )  # fmt: skip
         prompt.say()
-        self._tell(found)
+        self._report(found)
         write_log(readings, metrology.registered, folder / "readings.csv")
         from gapbridge.bridge.calibration.jobs.facts import session_facts
         from gapbridge.bridge.calibration.report import VerificationMaterial, write_report
@@ -113,12 +113,12 @@ class VerifyJob(Job):
         others = [other.name for other in found.suspects]
         self.session.add("ended", holds=found.holds, moved=moved, or_else=others)
 
-    def _tell(self, found: Verification) -> None:
+    def _report(self, found: Verification) -> None:
         prompt = self.prompt
         prompt.say(found.verdict, "bold green" if found.holds else "bold red")
         prompt.say(
             f"  errors {millimetres(found.errors.mean)} in the mean, "
-            f"{millimetres(found.errors.max)} at most; {found.ratio:.2f} times what was promised"
+            f"{millimetres(found.errors.max)} at most; {found.ratio:.2f} times what was predicted"
         )
         for estimate in () if found.moved is None else found.moved.estimates:
             prompt.say(
@@ -126,7 +126,7 @@ class VerifyJob(Job):
                 f"± {parameter(estimate.std, estimate.unit)}"
             )
         for other in found.suspects:
-            prompt.say(f"  these readings cannot tell it from: {moved_words(other, ())}")
+            prompt.say(f"  these readings cannot distinguish it from: {moved_words(other, ())}")
         for note in found.notes:
             prompt.say(f"  note: {note}")
 

@@ -102,7 +102,7 @@ class Measuring:
         self.sigma, self._samples = sigma, samples
 
     def lead(self) -> None:
-        """Go on until no stop is left. Raises Word where the person wants to end."""
+        """Go on until no stop is left. Raises SessionCommand where the person wants to end."""
         while (stop := self.session.next) is not None:
             try:
                 self._put(self.session.stops[stop].station)

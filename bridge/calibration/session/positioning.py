@@ -197,11 +197,11 @@ class Positioning:
     def _jogged(self, pose: PlannedPose) -> JointSample | None:
         """Wait until the arm rests at the pose, or a person says that it stands well."""
         question = "  measured as soon as it rests there (Enter: where it is now)"
-        heard = self.prompt.ask_unless(question, lambda: self.joints.arrived(pose))
-        if isinstance(heard, JointSample):
-            return heard
-        if heard:
-            self.prompt.say(f"  found {heard!r}, expected Enter, or a word of the session (`?`)")
+        typed = self.prompt.ask_unless(question, lambda: self.joints.arrived(pose))
+        if isinstance(typed, JointSample):
+            return typed
+        if typed:
+            self.prompt.say(f"  found {typed!r}, expected Enter, or a word of the session (`?`)")
             return None
         now = self.joints.now()
         if now is None:

@@ -56,9 +56,9 @@ class Prompt:
         self.say(f"! {text}", "bold yellow")
 
     def ask(self, question: str) -> str:
-        """Return what is typed; raises Word for a word of the session, InputEnded at the end."""
+        """Return what is typed; raises SessionCommand for a command, InputEnded at the end."""
         while True:
-            line = self._heard(question, lambda: None)
+            line = self._read(question, lambda: None)
             assert isinstance(line, str)
             if not self._is_help(line):
                 return self._answer(line)
@@ -66,11 +66,11 @@ class Prompt:
     def ask_unless(self, question: str, look: Callable[[], T | None]) -> str | T:
         """Return what is typed, or what ``look`` finds meanwhile, whichever comes first."""
         while True:
-            heard = self._heard(question, look)
-            if not isinstance(heard, str):
-                return heard
-            if not self._is_help(heard):
-                return self._answer(heard)
+            typed = self._read(question, look)
+            if not isinstance(typed, str):
+                return typed
+            if not self._is_help(typed):
+                return self._answer(typed)
 
     def enter(self, question: str) -> None:
         """Return on Enter alone; any other answer is asked again."""
@@ -107,7 +107,7 @@ class Prompt:
         with Status(text, console=self.console, refresh_per_second=4) as shown:
             yield lambda text: shown.update(text)
 
-    def _heard(self, question: str, look: Callable[[], T | None]) -> str | T:
+    def _read(self, question: str, look: Callable[[], T | None]) -> str | T:
         if early := self._typed.flush():
             self.say(f"  dropped what was typed before the question: {early}", "yellow")
         self.console.print(f"{question} > ", end="", markup=False, style="bold")

@@ -73,13 +73,13 @@ class LocalWorkers(Workers):
                     _give(worker, left.popleft())
             if not left and not any(w.tasks for w in self._workers):
                 return
-            for found in self._heard():
+            for found in self._received():
                 if isinstance(found, Outcome):
                     yield found
                 else:
                     left.appendleft(found)
 
-    def _heard(self) -> Iterator[Outcome | Task]:
+    def _received(self) -> Iterator[Outcome | Task]:
         """Wait; give outcomes, and tasks whose process has died and that are to be done again."""
         by_pipe = {worker.pipe: worker for worker in self._workers}
         for pipe in wait(list(by_pipe)):
@@ -88,7 +88,7 @@ class LocalWorkers(Workers):
             try:
                 message = pipe.recv()
             except (EOFError, OSError):
-                yield from self._buried(worker)
+                yield from self._replaced(worker)
                 continue
             if message == READY:
                 worker.ready, self._stillborn = True, 0
@@ -96,7 +96,7 @@ class LocalWorkers(Workers):
             worker.tasks.popleft()
             yield message
 
-    def _buried(self, worker: _Worker) -> Iterator[Outcome | Task]:
+    def _replaced(self, worker: _Worker) -> Iterator[Outcome | Task]:
         worker.pipe.close()
         worker.process.join()
         if not worker.ready:

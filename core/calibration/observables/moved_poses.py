@@ -18,6 +18,6 @@ SHARE = 0.01  # of a parameter's usual size, as the step of a difference
 
 
 def moved_poses(parameters: Parameters, values: Array, readings: Readings) -> PoseColumns:
-    """Return the TCP poses of the readings at ``values`` (p,), and their slopes (6, p, N)."""
+    """Return the TCP poses of the readings at ``values`` (p,), and their derivatives (6, p, N)."""
     model, chosen = parameters.model_with_all(values)
     return pose_columns(model, readings.q, readings.loads, chosen, SHARE * parameters.scales)

@@ -103,7 +103,7 @@ class Observable(ABC):
     def jacobian(self, poses: Poses, readings: Readings, nuisance: Nuisance) -> Array:
         """Return how the gap changes (N, k, 6) with the TCP's shift and turn, base axes.
 
-        By differences, which cost no prediction; members whose slopes are plain say them.
+        By differences, which cost no prediction; members with plain derivatives return those.
         """
         found = np.empty((len(readings), self.equations, 6))
         for axis in range(3):

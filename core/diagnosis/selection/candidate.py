@@ -69,11 +69,6 @@ class Candidate:
         """Return whether this is an unnamed cause that goes by no column of the log."""
         return not self.named and not self.quantity
 
-    @property
-    def by_own_angle(self) -> bool:
-        """Return whether this is a smooth function of the very joint that it moves."""
-        return bool(self.target) and self.target == own_target(self.quantity)
-
     def term(self, x: Array) -> Term:
         """Return the term with fitted values ``x`` (d,)."""
         if self.curve is not None:
@@ -83,16 +78,21 @@ class Candidate:
         return Term(self.family, self.site, values)
 
 
+def joint_target(joint: int) -> str:
+    """Return the name under which smooth candidates move a joint (from 1)."""
+    return f"joint_{joint}"
+
+
 def own_target(quantity: str) -> str:
     """Return the joint whose angle the quantity is, as smooth targets are named ('' if none)."""
     stem, _, index = quantity.rpartition("_")
-    return f"joint_{int(index) + 1}" if stem in ("actual_q", "target_q") else ""
+    return joint_target(int(index) + 1) if stem in ("actual_q", "target_q") else ""
 
 
 def carrying(quantity: str) -> str:
     """Return the joint that holds the torque of a quantity, as own_target ('' if none)."""
     stem, _, index = quantity.rpartition("_")
-    return f"joint_{int(index) + 1}" if stem == HELD else ""
+    return joint_target(int(index) + 1) if stem == HELD else ""
 
 
 def named_candidates(

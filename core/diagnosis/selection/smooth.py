@@ -10,7 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapbridge.core.diagnosis.observation import Observation
-from gapbridge.core.diagnosis.selection.candidate import Candidate, carrying, own_target
+from gapbridge.core.diagnosis.selection.candidate import (
+    Candidate,
+    carrying,
+    joint_target,
+    own_target,
+)
 from gapbridge.core.effects import Parameter, Site
 
 Array = NDArray[np.float64]
@@ -85,7 +90,7 @@ def targets(observation: Observation) -> dict[str, Array]:
     if J is None:
         return {axis: np.tile(np.eye(k)[:, i : i + 1], (N, 1, 1))
                 for i, axis in enumerate(observation.axes)}  # fmt: skip
-    found = {f"joint_{i + 1}": J[:, :, i : i + 1] for i in range(J.shape[2])}
+    found = {joint_target(i + 1): J[:, :, i : i + 1] for i in range(J.shape[2])}
     if observation.channel != "position":  # each coordinate is a joint
         return found
     shift = np.zeros((N, k, 3))

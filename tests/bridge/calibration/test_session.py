@@ -63,8 +63,8 @@ def test_a_session_ends_with_a_cell_that_knows_the_arm(clean: tuple[Path, Played
     assert axial[1] == pytest.approx(AXIAL[1], rel=0.15)
     for name in ("calibration.html", "calibration.pdf", "readings.csv", "promise.json"):
         assert (folder / "s" / name).stat().st_size > 500
-    promise = json.loads((folder / "new.promise.json").read_text())
-    assert [file["role"] for file in promise["provenance"]["files"]] == ["log", "cell"]
+    baseline = json.loads((folder / "new.promise.json").read_text())
+    assert [file["role"] for file in baseline["provenance"]["files"]] == ["log", "cell"]
     assert "\ncompliance:" not in (folder / "cell.yaml").read_text()
 
 
@@ -166,7 +166,7 @@ def test_an_ended_input_and_quit_end_in_order_and_show_how_to_go_on(tmp_path: Pa
         (["--instrument", "typd"], {}, "--instrument: found 'typd', expected one of typed"),
         (["--instrument", "typed,unit=km"], {}, "--instrument typed: unit"),
         (["--move"], {}, "calibration.joints: found 'planned' with --move, expected 'link'"),
-        (["--verify"], {}, "expected the promise that `gapbridge calibrate` writes"),
+        (["--verify"], {}, "expected the accuracy baseline that `gapbridge calibrate` writes"),
         (["--payload-only"], {}, "link: found nothing"),
         (["--verify", "--tool-only"], {}, "more than one of"),
         ([], {"held_out": 7}, "calibration.held_out: found 7"),

@@ -1,4 +1,4 @@
-"""Verification months later: does the promise hold, and if not, what moved."""
+"""Verification months later: does the accuracy baseline hold, and if not, what moved."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ def test_a_zero_that_the_calibration_left_open_may_be_off_by_as_much(
     stated = verify(found.model, readings, baseline, METROLOGY)
     vague = verify(found.model, readings, replace(baseline, covariance=covariance), METROLOGY)
     assert vague.holds and not stated.holds
-    assert np.all(vague.promised > stated.promised)
+    assert np.all(vague.predicted > stated.predicted)
 
 
 def test_a_tool_that_was_deflected_is_named(calibrated: Calibrated) -> None:

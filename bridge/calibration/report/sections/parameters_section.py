@@ -1,4 +1,4 @@
-"""The parameters: values with intervals, what the plan had promised, what cannot be separated."""
+"""The parameters: values with intervals, what the plan predicted, what cannot be separated."""
 
 from __future__ import annotations
 

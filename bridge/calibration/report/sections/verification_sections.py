@@ -49,7 +49,7 @@ def holds(material: VerificationMaterial) -> list[Block]:
     """Return the verdict, the large figures and how it was judged."""
     v = material.verification
     badge = Badge("Still holds", GOOD) if v.holds else Badge("No longer holds", BAD)
-    predicted = float(np.sqrt(np.mean(v.promised**2)))
+    predicted = float(np.sqrt(np.mean(v.predicted**2)))
     tiles = Tiles((
         Tile("error now, rms", mm(v.errors.rms), f"at most {mm(v.errors.max)}"),
         Tile("predicted, rms", mm(predicted), "uncertainty, arm and instrument"),
@@ -77,10 +77,10 @@ def poses(material: VerificationMaterial) -> list[Block]:
     rows: list[list[Cell]] = []
     for i, row in enumerate(v.errors.rows):
         q = "–" if readings is None else degrees(readings.q[row])
-        within = v.errors.norm[i] <= TWICE * v.promised[i]
+        within = v.errors.norm[i] <= TWICE * v.predicted[i]
         rows.append([
             str(int(row) + 1), q, ",  ".join(fixed(x * 1e3, 3) for x in v.errors.vector[i]),
-            mm(float(v.errors.norm[i])), mm(float(v.promised[i])),
+            mm(float(v.errors.norm[i])), mm(float(v.predicted[i])),
             Badge("within", GOOD) if within else Badge("beyond", BAD),
         ])  # fmt: skip
     heads = ("no.", "joint angles, degrees", "error along the axes, mm", "error",
@@ -93,9 +93,9 @@ def _picture(v: Verification) -> Drawing:
     labels = [str(int(row) + 1) for row in v.errors.rows]
     step = max(1, len(labels) // 20)
     labels = [name if i % step == 0 else "" for i, name in enumerate(labels)]
-    values = [*v.errors.norm * 1e3, *TWICE * v.promised * 1e3]
+    values = [*v.errors.norm * 1e3, *TWICE * v.predicted * 1e3]
     chart = Chart("Error and prediction", named("reading", labels), scale("mm", values), width=560)
-    for i, (error, predicted) in enumerate(zip(v.errors.norm, v.promised, strict=True)):
+    for i, (error, predicted) in enumerate(zip(v.errors.norm, v.predicted, strict=True)):
         chart.column(i, float(error) * 1e3, AFTER, 0.55)
         most = TWICE * float(predicted) * 1e3
         chart.line([i - 0.4, i + 0.4], [most, most], EDGE, width=2.2)

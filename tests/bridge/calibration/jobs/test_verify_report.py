@@ -25,20 +25,20 @@ def suspect(joint: int, value: float) -> Suspect:
 def said(*others: Suspect) -> list[str]:
     found = Verification(
         holds=False, verdict="the zero of joint 4 moved by 10 mrad",
-        errors=Errors(np.full((5, 3), 1e-3), np.arange(5)), promised=np.full(5, 1e-4), ratio=9.0,
+        errors=Errors(np.full((5, 3), 1e-3), np.arange(5)), predicted=np.full(5, 1e-4), ratio=9.0,
         chance=1e-9, moved=suspect(4, 0.01), suspects=others, stations=(), notes=(),
     )  # fmt: skip
     job = VerifyJob.__new__(VerifyJob)
     job.prompt = heard = Heard()  # type: ignore[assignment]
-    job._tell(found)
+    job._report(found)
     return heard.lines
 
 
 def test_other_joints_that_explain_as_much_are_named_with_their_size() -> None:
     lines = said(suspect(3, -0.02))
-    (line,) = [line for line in lines if "cannot tell" in line]
+    (line,) = [line for line in lines if "cannot distinguish" in line]
     assert "the zero of joint 3 moved by 20 mrad" in line
 
 
 def test_where_the_readings_decide_nothing_else_is_named() -> None:
-    assert not any("cannot tell" in line for line in said())
+    assert not any("cannot distinguish" in line for line in said())
