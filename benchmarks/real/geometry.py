@@ -39,17 +39,12 @@ def free_numbers(links: tuple[Link, ...]) -> list[tuple[int, int]]:
 
 def registered(p: Array, measured: Array) -> Array:
     """Return points (N, 3) turned and moved onto measured ones (least squares, Umeyama)."""
-    a, b = p - p.mean(axis=0), measured - measured.mean(axis=0)
-    U, _, Vt = np.linalg.svd(a.T @ b)
-    R = (U @ np.diag([1, 1, np.sign(np.linalg.det(U @ Vt))]) @ Vt).T
-    return np.asarray(a @ R.T + measured.mean(axis=0))
+    return np.asarray((p - p.mean(axis=0)) @ _turn(p, measured).T + measured.mean(axis=0))
 
 
 def placed(p: Array, measured: Array, fitted: NDArray[np.bool_]) -> Array:
     """Return points (N, 3) in the frame that registers the fitted rows."""
-    a, b = p[fitted], measured[fitted]
-    U, _, Vt = np.linalg.svd((a - a.mean(axis=0)).T @ (b - b.mean(axis=0)))
-    R = (U @ np.diag([1, 1, np.sign(np.linalg.det(U @ Vt))]) @ Vt).T
+    a, b, R = p[fitted], measured[fitted], _turn(p[fitted], measured[fitted])
     return np.asarray((p - a.mean(axis=0)) @ R.T + b.mean(axis=0))
 
 
@@ -122,11 +117,32 @@ def _column(
     shift = points(links, q, moved, session) - p
     out = np.empty_like(p)
     for own in frames:
-        a, b = p[own] - p[own].mean(axis=0), measured[own] - measured[own].mean(axis=0)
-        U, _, Vt = np.linalg.svd(a.T @ b)
-        R = (U @ np.diag([1, 1, np.sign(np.linalg.det(U @ Vt))]) @ Vt).T
-        out[own] = shift[own] @ R.T
+        out[own] = shift[own] @ _turn(p[own], measured[own]).T
     return np.asarray(out.ravel() / 1e-5)
+
+
+def tool_step(p: Array, R: Array, measured: Array, steps: int = 8) -> Array:
+    """Return how far (3,), in the tool's own axes, the target sits from predicted poses.
+
+    ``p`` (N, 3) and ``R`` (N, 3, 3) are the predicted poses; the frame of ``measured`` (N, 3) is
+    fitted along.
+    """
+    t = np.zeros(3)
+    for _ in range(steps):
+        at = p + R @ t
+        placed_, turn = registered(at, measured), _turn(at, measured)
+        J = np.zeros((len(p), 3, 9))
+        J[:, :, :3], J[:, :, 3:6] = turn @ R, np.eye(3)
+        for k in range(3):
+            J[:, :, 6 + k] = np.cross(np.eye(3)[k], placed_ - placed_.mean(axis=0))
+        t += np.linalg.lstsq(J.reshape(-1, 9), (measured - placed_).ravel(), rcond=1e-10)[0][:3]
+    return t
+
+
+def _turn(p: Array, measured: Array) -> Array:
+    """Return the rotation (3, 3) that turns points (N, 3) onto measured ones (Umeyama)."""
+    U, _, Vt = np.linalg.svd((p - p.mean(axis=0)).T @ (measured - measured.mean(axis=0)))
+    return np.asarray((U @ np.diag([1, 1, np.sign(np.linalg.det(U @ Vt))]) @ Vt).T)
 
 
 def rough_tool(links: tuple[Link, ...], q: Array, measured: Array) -> Array:

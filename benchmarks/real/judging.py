@@ -19,9 +19,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from benchmarks.real import rivals
 from benchmarks.real.absurd import absurdities
+from benchmarks.real.geometry import tool_step
 from benchmarks.real.sets import HELD_BACK, PUBLISHED, REMOUNTED, SPLIT
 from benchmarks.real.table import Mask, Table, copy_cell, halves, read_cell, read_table
 
@@ -93,7 +95,7 @@ class Program:
 
 def judge_log(folder: Path, program: Program) -> list[Outcome]:
     """Return the outcomes of one log: four fifths fitted, one fifth judged."""
-    table = read_table(folder / "log.csv")
+    table = read_table(folder / "log.csv").with_approach()
     fitted, judged = halves(table)
     return _judge(folder.name, folder / "cell.yaml", (table, fitted), (table, judged), program)
 
@@ -128,7 +130,7 @@ def _judge(
             after = program.diagnosis(place / "test.csv", better)
         out = []
         for channel in channels:
-            left, published = _judged(name, channel, program, place, test, after)
+            left, published = _judged(name, channel, program, place, train, test, after)
             rival = _rival(channel, cell, cell_file.parent, train, test, place, program)
             out.append(_outcome(name, reported[channel], train, left, rival, published, seconds))
     return out
@@ -142,21 +144,35 @@ def _knows(program: Program) -> bool:
 
 
 def _judged(
-    name: str, channel: str, program: Program, place: Path, test: Table,
+    name: str, channel: str, program: Program, place: Path, train: Table, test: Table,
     after: dict[str, dict[str, Any]],
 ) -> tuple[float, tuple[float, float, str] | None]:  # fmt: skip
     if channel != "position":
         return float(after[channel]["gap_rms"]) if channel in after else float("nan"), None
-    program("predict", place / "test.csv", "--cell", place / "better.yaml",
-            "--out", place / "predicted.csv")  # fmt: skip
-    predicted = read_table(place / "predicted.csv").get("predicted_position")
-    assert predicted is not None
+    predicted, turned = _predicted(program, place, "test")
+    if name in REMOUNTED:  # as the rival: each session's tool point as the fitted rows have it
+        p, R = _predicted(program, place, "train")
+        for s in np.unique(rivals.sessions(test)):
+            own, judged = rivals.sessions(train) == s, rivals.sessions(test) == s
+            measured = train.get("measured_position")
+            assert measured is not None
+            predicted[judged] += turned[judged] @ tool_step(p[own], R[own], measured[own])
     left = rivals.left_of(predicted, test)
     theirs = PUBLISHED.get(name)
     if theirs is None:
         return _rms(left), None
     length = float(np.linalg.norm(left, axis=1).mean())
     return _rms(left), (length, theirs.mean_length, theirs.what)
+
+
+def _predicted(program: Program, place: Path, rows: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return the positions (N, 3) and rotations (N, 3, 3) that the written cell predicts."""
+    program("predict", place / f"{rows}.csv", "--cell", place / "better.yaml",
+            "--out", place / "predicted.csv")  # fmt: skip
+    table = read_table(place / "predicted.csv")
+    position, rotation = table.get("predicted_position"), table.get("predicted_rotation")
+    assert position is not None and rotation is not None
+    return position, Rotation.from_rotvec(rotation).as_matrix()
 
 
 def _rival(

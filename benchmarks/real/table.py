@@ -79,6 +79,26 @@ class Table:
             out[:, self.names.index(f"{name}_{k}")] = values[:, k]
         return Table(self.names, out)
 
+    def with_approach(self) -> Table:
+        """Return a table of poses with the sign of each joint's last motion beside every row.
+
+        Rows that are left out of a log would take their neighbours' last motions with them.
+        """
+        if self.moving or self.get("approach_0") is not None:
+            return self
+        q = self.joints()
+        moved = np.sign(np.diff(q, axis=0, prepend=q[:1]))
+        session = self.get("session")
+        begins = np.zeros(len(q), dtype=bool)
+        if session is not None:  # what came before a session is not known
+            begins = np.diff(session, prepend=session[0]) != 0
+        moved[begins] = 0.0
+        for row in range(1, len(q)):
+            still = (moved[row] == 0) & ~begins[row]
+            moved[row, still] = moved[row - 1, still]
+        names = (f"approach_{k}" for k in range(q.shape[1]))
+        return Table((*self.names, *names), np.hstack([self.values, moved]))
+
     def write(self, path: Path) -> None:
         """Write the table as CSV; nan as an empty field."""
         with path.open("w", newline="", encoding="utf-8") as file:

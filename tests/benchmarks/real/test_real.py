@@ -15,6 +15,7 @@ from benchmarks.real.geometry import (
     points,
     registered,
     rough_turn,
+    tool_step,
 )
 from benchmarks.real.table import Table, halves, read_table
 
@@ -180,3 +181,19 @@ def test_the_turn_of_a_probe_on_its_flange_is_found():
     p = (at + turned @ tool) @ frame.T + [1.0, 2.0, 0.5] + rng.normal(0, 1e-4, (40, 3))
     found = rough_turn(arms.IIWA7, q, tool, p, frame @ turned @ mounted.as_matrix())
     assert np.allclose(found, [0.02, 0, -0.39], atol=1e-9)
+
+
+def test_last_motions_are_those_of_the_whole_log():
+    q = np.array([[0.0, 1.0], [0.1, 1.0], [0.1, 0.9], [0.0, 0.9], [0.2, 0.9]])
+    log = table(timestamp=np.arange(5) * 10.0, session=[0, 0, 0, 1, 1], actual_q=q)
+    found = log.with_approach().rows(np.array([False, False, True, True, True]))
+    assert found.get("approach").tolist() == [[1, -1], [0, 0], [1, 0]]
+
+
+def test_a_target_mounted_anew_is_found_from_predicted_poses():
+    q, tool = poses(40), np.array([0.01, -0.02, 0.11])
+    at, R = arms.flange(arms.UR10, q)
+    turn = Rotation.from_rotvec([0.3, -0.2, 1.0]).as_matrix()
+    measured = (at + R @ tool) @ turn.T + [1, 2, 3]
+    nominal = at + R @ np.array([0, 0, 0.1])
+    assert np.abs(tool_step(nominal, R, measured) - (tool - [0, 0, 0.1])).max() < 1e-9
