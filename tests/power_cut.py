@@ -87,7 +87,7 @@ def _node(found: os.stat_result) -> Node:
 def _place() -> Place:
     """Return who has asked: the innermost frames of the product, to its outermost caller.
 
-    A function that only syncs is told apart by who calls it.
+    A function that only syncs is distinguished by who calls it.
     """
     frame = sys._getframe(2)
     if frame.f_code.co_name == "sync_folder" and frame.f_back is not None:

@@ -180,8 +180,8 @@ def write_static(
     metrology: dict[str, float | bool] = {
         "registered": bench.instrument.registered, "sigma": bench.instrument.sigma,
     }  # fmt: skip
-    tells = bool(rng.random() < 0.25)
-    if tells:
+    stated = bool(rng.random() < 0.25)
+    if stated:
         extra = float(np.sqrt(bench.floor**2 - bench.instrument.sigma**2))
         metrology["repeatability"] = float(f"{extra:.3g}")
     load = (float(session.payload_mass[0]), session.payload_cog[0])
@@ -191,6 +191,6 @@ def write_static(
         "rotations": rotation is not None,
         "compliant": bool(np.any(bench.nominal.axial)),
         "approach_written": bench.plan.approach_written,
-        "repeatability_given": tells,
+        "repeatability_given": stated,
         "poses": len(session.q),
     }

@@ -56,7 +56,7 @@ def duration(seconds: float) -> str:
     return f"about {int(minutes // 60)} h {round(minutes % 60 / 5) * 5:02d} min"
 
 
-TOLD_IN = {"m": ("mm", 1e3), "rad": ("mrad", 1e3), "rad/Nm": ("µrad/Nm", 1e6)}
+SHOWN_IN = {"m": ("mm", 1e3), "rad": ("mrad", 1e3), "rad/Nm": ("µrad/Nm", 1e6)}
 
 
 def figure(value: float) -> str:
@@ -68,5 +68,5 @@ def figure(value: float) -> str:
 
 def parameter(value: float, unit: str) -> str:
     """Return a value as it is reported, m as mm, rad as mrad."""
-    shown, factor = TOLD_IN.get(unit, (unit, 1.0))
+    shown, factor = SHOWN_IN.get(unit, (unit, 1.0))
     return f"{figure(value * factor)} {shown}"

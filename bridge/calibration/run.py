@@ -53,8 +53,8 @@ def run_session(cell: Cell, options: SessionOptions) -> None:
         prompt.note = lambda text: session.add("note", text=text)
         try:
             _lead(cell, options, prompt, session)
-        except SessionCommand as word:
-            if word.word == "undo" and session.taken:  # at the last question
+        except SessionCommand as command:
+            if command.name == "undo" and session.taken:  # at the last question
                 session.add("undo", stop=session.taken[-1].stop)
                 prompt.say(
                     f"took back the last reading; stop {(session.next or 0) + 1} is to be measured"
@@ -78,7 +78,7 @@ def _lead(cell: Cell, options: SessionOptions, prompt: Prompt, session: Session)
     job = make_job(cell, options, prompt, session)
     if session.begun:
         check_begun(session.begun, cell, options, folder)
-        _tell_resumed(prompt, session, folder)
+        _report_resumed(prompt, session, folder)
     else:
         session.add("begun", **begun_entry(cell, options))
         prompt.say(f"new session in {folder}")
@@ -99,7 +99,7 @@ def _lead(cell: Cell, options: SessionOptions, prompt: Prompt, session: Session)
         if session.plan is None:
             _make_plan(job, joints)
         else:
-            _tell_old_plan(job)
+            _report_old_plan(job)
         if options.plan_only:
             prompt.say(f"every stop with its joints: {folder / 'poses.csv'}")
             prompt.say(f"go on with: {_command(cell, options, session)}")
@@ -146,7 +146,7 @@ def _make_plan(job: Job, joints: JointSource) -> None:
     job.report_plan(plan)
 
 
-def _tell_old_plan(job: Job) -> None:
+def _report_old_plan(job: Job) -> None:
     """Report the plan of an earlier call where it is asked for, and that it stays."""
     if job.options.poses is not None:
         job.prompt.warn("this session has its plan: --poses counts for a new one")
@@ -154,7 +154,7 @@ def _tell_old_plan(job: Job) -> None:
         job.report_plan(job.session.plan)
 
 
-def _tell_resumed(prompt: Prompt, session: Session, folder: Path) -> None:
+def _report_resumed(prompt: Prompt, session: Session, folder: Path) -> None:
     count = len(session.stops)
     done = count - session.left
     prompt.say(f"going on with the session in {folder}: {done} of {count} stops are measured")
@@ -205,7 +205,7 @@ def _how_to_go_on(cell: Cell, options: SessionOptions, session: Session) -> str:
 
 
 def _command(cell: Cell, options: SessionOptions, session: Session) -> str:
-    words = [
+    parts = [
         "gapbridge",
         "calibrate",
         str(cell.path),
@@ -213,7 +213,7 @@ def _command(cell: Cell, options: SessionOptions, session: Session) -> str:
         str(session.journal.path.parent),
     ]
     flags = {"verify": "--verify", "payload": "--payload-only", "tool": "--tool-only"}
-    words += [flags[options.kind]] if options.kind in flags else []
-    words += ["--move"] if options.move else []
-    words += ["--apply", str(options.new_cell)] if options.new_cell else []
-    return shlex.join(words)
+    parts += [flags[options.kind]] if options.kind in flags else []
+    parts += ["--move"] if options.move else []
+    parts += ["--apply", str(options.new_cell)] if options.new_cell else []
+    return shlex.join(parts)

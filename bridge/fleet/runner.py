@@ -74,7 +74,7 @@ def run(
                 outcomes[found.session] = found
                 emit(found)
     ordered = sorted(outcomes.values(), key=lambda o: natural(o.session))
-    return Done(tuple(ordered), resumed, time.perf_counter() - begin, workers.words())
+    return Done(tuple(ordered), resumed, time.perf_counter() - begin, workers.description())
 
 
 def _key(session: Session, cell: Path, work: Work, options: Mapping[str, Any]) -> str:

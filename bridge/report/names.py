@@ -22,7 +22,8 @@ PARTS = {
 
 def patterns() -> dict[str, str]:
     """Return how parameters are named in words, by the beginning of their public name."""
-    return {name: e.label_words for name, e in CATALOGUE.items() if e.label_words} | OF_SESSIONS
+    templates = {name: e.label_template for name, e in CATALOGUE.items()}
+    return {name: text for name, text in templates.items() if text} | OF_SESSIONS
 
 
 def effect_of(name: str) -> str:

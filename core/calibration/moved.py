@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 FACTORS = {"m": (1e3, "mm"), "rad": (1e3, "mrad"), "kg": (1.0, "kg")}
 
 
-def moved_words(moved: Suspect | None, suspects: Sequence[Suspect]) -> str:
+def moved_text(moved: Suspect | None, suspects: Sequence[Suspect]) -> str:
     """Return what moved, and by how much."""
     if moved is None:
         if not suspects:
@@ -45,7 +45,7 @@ def _size(estimates: Sequence[Estimate]) -> str:
     return " and ".join(words) or "little"
 
 
-def verdict_words(holds: bool, errors: Errors, ratio: float, chance: float, moved: str) -> str:
+def verdict_text(holds: bool, errors: Errors, ratio: float, chance: float, moved: str) -> str:
     """Return the verification in one sentence."""
     text = (
         f"{len(errors.rows)} poses are {1e3 * errors.rms:.3f} mm rms off, {ratio:.2f} times what "

@@ -21,7 +21,7 @@ from gapbridge.core.estimation.linear_system import Bounds, Mask, System, poster
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
-DOUBT = 1e-3  # chance below which differences and everything together count as at odds
+AT_ODDS = 1e-3  # chance below which differences and everything together count as at odds
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from gapbridge.core.calibration.parameters import Parameters
 from gapbridge.core.calibration.problem import Problem
 from gapbridge.core.calibration.remainder import Remainder
 from gapbridge.core.calibration.result import Errors, Estimate
-from gapbridge.core.calibration.staging import DOUBT
+from gapbridge.core.calibration.staging import AT_ODDS
 from gapbridge.core.diagnosis.diagnosis import Diagnosis
 
 Array = NDArray[np.float64]
@@ -82,7 +82,7 @@ def notes_of(
     if len(remainder.outliers):
         rows = ", ".join(str(int(r) + 1) for r in remainder.outliers)
         notes.append(f"held-out reading(s) far beyond the predicted spread: row {rows}")
-    if odds is not None and odds < DOUBT:
+    if odds is not None and odds < AT_ODDS:
         notes.append(
             "what differs between loads and all readings together disagree on the flexibilities: "
             "something else changes with the load, or came between the loads (a wrong payload, a "

@@ -17,7 +17,7 @@ from scipy.stats import chi2
 from scipy.stats import f as fisher
 
 from gapbridge.core.calibration.accuracy_baseline import AccuracyBaseline, baseline_in
-from gapbridge.core.calibration.moved import moved_words, verdict_words
+from gapbridge.core.calibration.moved import moved_text, verdict_text
 from gapbridge.core.calibration.noise import presumed
 from gapbridge.core.calibration.observables import make_observable
 from gapbridge.core.calibration.observables.nuisance import Nuisance
@@ -124,7 +124,7 @@ def verify(
     moved = suspects[0] if suspects and suspects[0].chance > BROKEN else None
     errors = Errors(left[:, :3], np.arange(len(readings)))
     return Verification(
-        holds, verdict_words(holds, errors, ratio, chance, moved_words(moved, suspects)),
+        holds, verdict_text(holds, errors, ratio, chance, moved_text(moved, suspects)),
         errors, spread, ratio, chance, moved,
         tuple(s for s in suspects[1:] if moved and s.left < moved.left + BESIDE),
         nuisance.stations, _notes(baseline, metrology, freedom),

@@ -394,9 +394,9 @@ def _decided(found: _Searched, model: Model, streamed: Streamed | None) -> Chann
     if sizes.left < ROUNDING:
         verdict = replace(verdict, structured=False, depends_on=())
     structured = verdict.structured
-    word = "explained" if causes else "no_gap"
+    named = "explained" if causes else "no_gap"
     if structured:
-        word = "partly_explained" if causes else "unexplained"
+        named = "partly_explained" if causes else "unexplained"
     own = held if streamed is None else HeldOut(shown)
     return ChannelDiagnosis(
         channel=seen.channel, unit=seen.unit, samples=sizes.samples, gap_rms=sizes.gap_rms,
@@ -404,7 +404,7 @@ def _decided(found: _Searched, model: Model, streamed: Streamed | None) -> Chann
         remaining_rms_held_out=held_rms, where=found.where, causes=causes,
         considered=found.considered,
         unexplained_rms=_unexplained(sizes.left, floor.rms, verdict), structured=structured,
-        p_value=verdict.p_value, depends_on=verdict.depends_on, verdict=word,
+        p_value=verdict.p_value, depends_on=verdict.depends_on, verdict=named,
         selection=shown, judgement=verdict, gap=gap, remaining=remaining,
         held_out=np.sqrt(own.squares(chosen)) if own.possible else None, outliers=sizes.outliers,
         elsewhere=generalisation(decided, chosen), carried=carried(decided, chosen, model.arm),
@@ -463,10 +463,10 @@ def _unexplained(left: float, floor: float | None, verdict: Judgement) -> float:
 
 
 def _overall(channels: Sequence[ChannelDiagnosis]) -> str:
-    words = {c.verdict for c in channels}
-    if words == {"no_gap"}:
+    verdicts = {c.verdict for c in channels}
+    if verdicts == {"no_gap"}:
         return "no_gap"
-    if words <= {"no_gap", "explained"}:
+    if verdicts <= {"no_gap", "explained"}:
         return "explained"
     if any(c.causes for c in channels):
         return "partly_explained"

@@ -22,7 +22,7 @@ class AxialCompliance(JointEffect):
 
     identifier = "axial_compliance"
     title = "joint twists under load"
-    label_words = "twist of joint {joint} per torque"
+    label_template = "twist of joint {joint} per torque"
     calibrated = 4
     softens = True
     flexibility = "axial"

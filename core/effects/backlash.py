@@ -26,7 +26,7 @@ class Backlash(JointEffect):
 
     identifier = "backlash"
     title = "play in the joint"
-    label_words = "play of joint {joint}"
+    label_template = "play of joint {joint}"
     by_approach = True
     channels = ("position",)
     simulated_as = Kind.PLAY

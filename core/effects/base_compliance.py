@@ -23,7 +23,7 @@ class BaseCompliance(Effect):
 
     identifier = "base_compliance"
     title = "foundation gives way"
-    label_words = "yielding of the foundation about {part}"
+    label_template = "yielding of the foundation about {part}"
     softens = True
     channels = ("position",)
     motion = "poses and payloads that change the moment on the base, in all directions around it"

@@ -27,7 +27,7 @@ class DeadBand(ServoEffect):
 
     identifier = "dead_band"
     title = "servo stops before its target"
-    label_words = "dead band of servo {joint}"
+    label_template = "dead band of servo {joint}"
     order = 70
     by_approach = True
     motion = "the joint moved both ways, or poses reached from both sides"

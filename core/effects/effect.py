@@ -92,7 +92,7 @@ class Effect(ABC):
 
     # how people read it
     title: ClassVar[str] = ""  # in plain words; left out: the identifier without underscores
-    label_words: ClassVar[str] = ""  # of one parameter, with {joint} and {part}
+    label_template: ClassVar[str] = ""  # of one parameter, with {joint} and {part}
     moved: ClassVar[str] = ""  # report of a verification that found it alone; '': not looked for
 
     # how it acts

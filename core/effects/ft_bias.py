@@ -30,7 +30,7 @@ class FtBias(Effect):
 
     identifier = "ft_bias"
     title = "force sensor zero is off"
-    label_words = "sensor zero of {part}"
+    label_template = "sensor zero of {part}"
     order = 80
     corrects = "sensor zero"
     channels = ("wrench",)

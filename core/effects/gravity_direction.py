@@ -24,7 +24,7 @@ class GravityDirection(Effect):
 
     identifier = "gravity_direction"
     title = "base is not level"
-    label_words = "tilt of the base about {part}"
+    label_template = "tilt of the base about {part}"
     needs_softness = True
     channels = ("position",)
     motion = "a compliant model and poses all around the base"

@@ -29,7 +29,7 @@ class JointOffset(JointEffect):
 
     identifier = "joint_offset"
     title = "joint zero is off"
-    label_words = "zero of joint {joint}"
+    label_template = "zero of joint {joint}"
     calibrated = 2
     moved = "the zero of joint {joint} moved by {size}"
     beside_links = True

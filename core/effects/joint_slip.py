@@ -29,7 +29,7 @@ class JointSlip(JointEffect):
 
     identifier = "joint_slip"
     title = "joint zero has slipped"
-    label_words = "slip of joint {joint} {part}"
+    label_template = "slip of joint {joint} {part}"
     at_moment = True
     channels = ("position",)
     simulated_as = Kind.JOINT_ZERO  # the arm as it is since

@@ -30,7 +30,7 @@ class LinkCog(JointEffect):
 
     identifier = "link_cog"
     title = "link's centre of gravity is elsewhere"
-    label_words = "first moment {part} of link {joint}"
+    label_template = "first moment {part} of link {joint}"
     order = 22
     carried = True
     felt_by_all = True

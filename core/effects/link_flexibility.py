@@ -24,7 +24,7 @@ class LinkFlexibility(Effect):
 
     identifier = "link_flexibility"
     title = "link bends under load"
-    label_words = "bending of link {joint}"
+    label_template = "bending of link {joint}"
     softens = True
     channels = ("position",)
     motion = "payloads or pulls in several directions, so that force and moment on the link differ"

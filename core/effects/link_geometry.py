@@ -71,7 +71,7 @@ class LinkGeometry(Effect):
     identifier = "link_geometry"
     together = True
     title = "link measures differ"
-    label_words = "{part} of link {joint}"
+    label_template = "{part} of link {joint}"
     calibrated = 3
     channels = ("position",)
     motion = "poses that differ in the joint before the link"

@@ -28,7 +28,7 @@ class LoadFriction(TorqueEffect):
 
     identifier = "load_friction"
     title = "friction grows with load"
-    label_words = "load friction of joint {joint}"
+    label_template = "load friction of joint {joint}"
     order = 53
     motion = "the joint moved both ways under loads that change"
     alike: ClassVar = {"coulomb_friction": "motion under one load"}

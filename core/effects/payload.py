@@ -26,7 +26,7 @@ class Payload(Effect):
 
     identifier = "payload"
     title = "load weighs more or less than declared"
-    label_words = "mass of the load beyond the declared one"
+    label_template = "mass of the load beyond the declared one"
     order = 10
     needs_softness = True
     adds_mass = True

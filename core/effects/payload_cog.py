@@ -31,7 +31,7 @@ class PayloadCog(Effect):
 
     identifier = "payload_cog"
     title = "load's centre of gravity is elsewhere"
-    label_words = "centre of gravity {part}"
+    label_template = "centre of gravity {part}"
     order = 12
     needs_softness = True
     carried = True

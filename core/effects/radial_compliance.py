@@ -21,7 +21,7 @@ class RadialCompliance(JointEffect):
 
     identifier = "radial_compliance"
     title = "joint tilts under load"
-    label_words = "tilt of joint {joint} per moment"
+    label_template = "tilt of joint {joint} per moment"
     calibrated = 5
     softens = True
     flexibility = "radial"

@@ -28,7 +28,7 @@ class ServoDroop(JointEffect):
 
     identifier = "servo_droop"
     title = "servo gives way under load"
-    label_words = "droop of servo {joint} per torque"
+    label_template = "droop of servo {joint} per torque"
     order = 60
     channels = ("tracking",)
     simulated_as = Kind.SERVO_COMPLIANCE

@@ -34,7 +34,7 @@ class StiffnessNonlinearity(JointEffect):
 
     identifier = "stiffness_nonlinearity"
     title = "joint stiffens under load"
-    label_words = "stiffening of joint {joint} ({part})"
+    label_template = "stiffening of joint {joint} ({part})"
     softens = True
     curved = True
     contains = "axial_compliance"

@@ -28,7 +28,7 @@ class StribeckFriction(TorqueEffect):
 
     identifier = "stribeck_friction"
     title = "friction is higher at low speed"
-    label_words = "breakaway friction of joint {joint} {part}"
+    label_template = "breakaway friction of joint {joint} {part}"
     order = 54
     motion = "the joint moved both ways, slowly and fast"
     alike: ClassVar = {"coulomb_friction": "motion at one low speed"}

@@ -30,7 +30,7 @@ class TargetSlip(Effect):
 
     identifier = "target_slip"
     title = "target has slipped on the tool"
-    label_words = "slip of the target {part}"
+    label_template = "slip of the target {part}"
     at_moment = True
     channels = ("position",)
     motion = "poses before and after the moment, that differ in the orientation of the flange"

@@ -25,7 +25,7 @@ class ThermalDrift(Effect):
 
     identifier = "thermal_drift"
     title = "links grow as they warm up"
-    label_words = "growth of link {joint} with warmth"
+    label_template = "growth of link {joint} with warmth"
     channels = ("position",)
     needs = ("joint_temperatures",)
     motion = "joint temperatures that change by several degrees"

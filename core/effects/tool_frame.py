@@ -24,7 +24,7 @@ class ToolFrame(Effect):
 
     identifier = "tool_frame"
     title = "tool (TCP) sits elsewhere"
-    label_words = "tool {part}"
+    label_template = "tool {part}"
     calibrated = 1
     corrects = "tool"
     moved = "the tool moved by {size}: run the short session for the tool"

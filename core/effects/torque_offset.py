@@ -27,7 +27,7 @@ class TorqueOffset(TorqueEffect):
 
     identifier = "torque_offset"
     title = "torque reading's zero is off"
-    label_words = "zero of the torque of joint {joint}"
+    label_template = "zero of the torque of joint {joint}"
     order = 95
     motion = "the joint moved both ways, at poses that change its weight"
     alike: ClassVar = {

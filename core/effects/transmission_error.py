@@ -29,7 +29,7 @@ class TransmissionError(JointEffect):
 
     identifier = "transmission_error"
     title = "periodic gear error"
-    label_words = "gear error of joint {joint} ({part})"
+    label_template = "gear error of joint {joint} ({part})"
     periodic = True
     channels = ("position",)
     motion = "many different angles of the joint"

@@ -1,4 +1,4 @@
-"""The list of mistakes: each stands in a file of the product as it is, and is told from it."""
+"""The list of mistakes: each stands in a file of the product as it is, and a test notices it."""
 
 from __future__ import annotations
 

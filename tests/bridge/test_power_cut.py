@@ -74,7 +74,7 @@ def fleet(folder: Path, cut: Callable[[], Path]) -> None:
 
 
 class _Later(Clock):
-    """A clock that goes on when it is told to."""
+    """A clock that goes on when it is set to."""
 
     def __init__(self) -> None:
         super().__init__()

@@ -31,7 +31,7 @@ def numbers(text: str, count: int, unit: str = "") -> list[float]:
         if unit and reported != unit and reported not in RADIANS:
             raise ReadingError(f"found {written}, expected {unit}: the unit declared for it")
     plain = _UNIT.sub(" ", plain)
-    message = _words(plain, count)
+    message = _tokens(plain, count)
     found = []
     for word in message:
         try:
@@ -46,7 +46,7 @@ def numbers(text: str, count: int, unit: str = "") -> list[float]:
     return found
 
 
-def _words(text: str, count: int) -> list[str]:
+def _tokens(text: str, count: int) -> list[str]:
     for separator in (r";", r"\t+", r"\s+(?!$)"):
         parts = [p.strip() for p in re.split(separator, text.strip()) if p.strip()]
         if len(parts) == count and all(p.count(",") <= 1 for p in parts):

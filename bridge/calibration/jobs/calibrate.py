@@ -12,7 +12,7 @@ from gapbridge.bridge.calibration.format import duration, load_text, millimetres
 from gapbridge.bridge.calibration.jobs.fitting import (
     calibration_of,
     fitted,
-    tell_calibration,
+    report_calibration,
 )
 from gapbridge.bridge.calibration.jobs.job import Job, write_document
 from gapbridge.bridge.calibration.jobs.log_of import write_log
@@ -57,7 +57,7 @@ class WholeJob(Job):
             f"{len(plan.poses)} stops, "
             f"{duration(seconds_left(self.session, minutes) + plan.travel)}"
         )
-        self._tell_places(plan)
+        self._report_places(plan)
         used = {p.load for p in plan.poses}
         for i, load in enumerate(plan.loads):
             needless = "" if i in used else " (not needed: it would add nothing)"
@@ -68,13 +68,13 @@ class WholeJob(Job):
         )
         spreads = ", ".join(f"{n}: {millimetres(s)}" for n, s in plan.bought)
         prompt.say(f"  what n poses buy: {spreads}")
-        weak = _hardly_told(plan)
+        weak = _poorly_determined(plan)
         if weak:
             prompt.say(f"  these poses hardly determine: {', '.join(weak)}")
         for note in plan.notes:
             prompt.say(f"  note: {note}")
 
-    def _tell_places(self, plan: Plan) -> None:
+    def _report_places(self, plan: Plan) -> None:
         """Say where the instrument stands in turn, where it is carried about."""
         given = self.cell.calibration
         for i, at in enumerate(
@@ -110,7 +110,7 @@ class WholeJob(Job):
             further = fitted(self.cell, self.options, self.prompt, self.session, names)
             while unfit := unsupported(further.estimates(), names):
                 for name in unfit:
-                    self._tell_fallen(name, further)
+                    self._report_declined(name, further)
                 fallen += unfit
                 names = tuple(name for name in names if name not in fallen)
                 if names == asked:
@@ -122,7 +122,7 @@ class WholeJob(Job):
             fit, asked = further, names
         return fit, fallen
 
-    def _tell_fallen(self, name: str, fit: SessionFit) -> None:
+    def _report_declined(self, name: str, fit: SessionFit) -> None:
         own = [e for e in fit.estimates() if e.name == name or e.name.startswith(f"{name}_")]
         values = ", ".join(f"{e.name} = {parameter(e.value, e.unit)} ± {parameter(e.std, e.unit)}"
                            for e in own)  # fmt: skip
@@ -134,7 +134,7 @@ class WholeJob(Job):
         prompt.say()
         fit, fallen = self._chosen(fitted(self.cell, options, prompt, self.session))
         found = calibration_of(self.cell, options, prompt, self.session, fit, fallen)
-        tell_calibration(prompt, found)
+        report_calibration(prompt, found)
         metrology = metrology_of(self.cell, options.instrument, self.session.places)
         write_log(found.readings, metrology.registered, folder / "readings.csv")
         origin = provenance({"log": [folder / "readings.csv"], "cell": [self.cell.path]})
@@ -174,7 +174,7 @@ def worse_than_before(before: Errors, after: Errors) -> str | None:
     )
 
 
-def _hardly_told(plan: Plan) -> list[str]:
+def _poorly_determined(plan: Plan) -> list[str]:
     """Return the parameters whose expected spread is no less than their usual size."""
     expected = plan.expected
     rows = zip(expected.names, expected.units, expected.std, expected.prior, strict=True)

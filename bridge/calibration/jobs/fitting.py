@@ -6,7 +6,7 @@ import numpy as np
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
-from gapbridge.bridge.calibration.format import TOLD_IN, figure, millimetres
+from gapbridge.bridge.calibration.format import SHOWN_IN, figure, millimetres
 from gapbridge.bridge.calibration.options import SessionOptions
 from gapbridge.bridge.calibration.planning import effects_of, metrology_of, observable_of
 from gapbridge.bridge.calibration.session.prompt import Prompt
@@ -16,7 +16,7 @@ from gapbridge.core.calibration.fit import SessionFit, fit_session, judged
 from gapbridge.core.calibration.parameters import Parameters
 from gapbridge.core.calibration.result import Calibration, Errors
 
-LEAST_TOLD = 2e-6  # m: a repeatability below this is none that was seen
+LEAST_SEEN = 2e-6  # m: a repeatability below this is none that was seen
 DIAGNOSED = ("position", "pose")  # kinds whose remainder the diagnosis can judge
 
 
@@ -60,7 +60,7 @@ def calibration_of(
         )  # fmt: skip
 
 
-def tell_calibration(prompt: Prompt, found: Calibration) -> None:
+def report_calibration(prompt: Prompt, found: Calibration) -> None:
     """Say what a fit has found, how far it carries, and what stays unknown."""
     prompt.say(found.verdict, "bold green" if found.complete else "bold yellow")
     pairs = (
@@ -74,7 +74,7 @@ def tell_calibration(prompt: Prompt, found: Calibration) -> None:
     if np.isfinite(found.noise_floor):
         noise += f", instrument and arm alone {millimetres(found.noise_floor)}"
     if np.isfinite(found.repeatability):
-        small = found.repeatability < LEAST_TOLD
+        small = found.repeatability < LEAST_SEEN
         noise += ", the arm repeats " + (
             "better than the instrument reports" if small
             else f"to {millimetres(found.repeatability)}"
@@ -104,7 +104,7 @@ def _table(found: Calibration) -> Table:
         table.add_column(name, justify="right", no_wrap=name != "±")
     table.add_column("")
     for e in found.estimates:
-        unit, factor = TOLD_IN.get(e.unit, (e.unit, 1.0))
+        unit, factor = SHOWN_IN.get(e.unit, (e.unit, 1.0))
         planned = "" if e.expected_std is None else figure(e.expected_std * factor)
         spread = figure(e.std * factor) if e.shown else "not identifiable"
         bound = " (bound)" if e.on_bound else ""

@@ -23,7 +23,7 @@ from gapbridge.bridge.calibration.planning import (
 )
 from gapbridge.bridge.calibration.session.progress import seconds_left
 from gapbridge.core.calibration.accuracy_baseline import baseline_in
-from gapbridge.core.calibration.moved import moved_words
+from gapbridge.core.calibration.moved import moved_text
 from gapbridge.core.calibration.plan import Plan, PlannedPose
 from gapbridge.core.calibration.verify import Verification, verify
 from gapbridge.core.errors import InputError
@@ -126,7 +126,7 @@ class VerifyJob(Job):
                 f"± {parameter(estimate.std, estimate.unit)}"
             )
         for other in found.suspects:
-            prompt.say(f"  these readings cannot distinguish it from: {moved_words(other, ())}")
+            prompt.say(f"  these readings cannot distinguish it from: {moved_text(other, ())}")
         for note in found.notes:
             prompt.say(f"  note: {note}")
 

@@ -22,7 +22,7 @@ LOOSE, SHARE = 0.05, 0.1  # m, and share of a distance, by which an uncalibrated
 BALLS, BALLS_SHARE = 1e-3, 0.01  # the same for two balls, which no arm moves against each other
 
 
-def first_doubt(before: Readings, new: Readings, tip: Array) -> tuple[float, float, str] | None:
+def early_check(before: Readings, new: Readings, tip: Array) -> tuple[float, float, str] | None:
     """Return how far a reading is off (m), how far it may be, and why it is doubted; None: not.
 
     ``new`` is one reading, ``tip`` (N + 1, 3) m where the cell's model has the TCP at those
@@ -50,11 +50,11 @@ def _points(before: Readings, value: Array, tip: Array) -> tuple[float, float, s
         meant = float(np.linalg.norm(tip[-1] - tip[i]))
         allowed = LOOSE + SHARE * meant
         if abs(apart - meant) > allowed:
-            words = (
+            reason = (
                 f"it is {1e3 * apart:.1f} mm from an earlier reading here; the joints put the two "
                 f"{1e3 * meant:.0f} mm apart"
             )
-            return abs(apart - meant), allowed, words
+            return abs(apart - meant), allowed, reason
     return None
 
 
@@ -65,11 +65,11 @@ def _distances(before: Readings, value: float, tip: Array) -> tuple[float, float
         meant = float(np.linalg.norm(tip[-1] - tip[i]))
         change, allowed = abs(value - float(earlier)), meant + LOOSE + SHARE * meant
         if change > allowed:
-            words = (
+            reason = (
                 f"it differs by {1e3 * change:.1f} mm from an earlier reading; the joints put the "
                 f"two {1e3 * meant:.0f} mm apart"
             )
-            return change, allowed, words
+            return change, allowed, reason
     return None
 
 
@@ -81,12 +81,12 @@ def _balls(before: Readings, value: Array) -> tuple[float, float, str] | None:
         apart = float(np.linalg.norm(earlier))
         allowed = BALLS + BALLS_SHARE * apart
         if abs(far - apart) > allowed:
-            words = f"the balls are {1e3 * far:.1f} mm apart, {1e3 * apart:.1f} mm before"
-            return abs(far - apart), allowed, words
+            reason = f"the balls are {1e3 * far:.1f} mm apart, {1e3 * apart:.1f} mm before"
+            return abs(far - apart), allowed, reason
     return None
 
 
 def _off(far: float, limit: float, where: str) -> tuple[float, float, str]:
     side = "at least" if far < limit else "at most"
-    words = f"{1e3 * far:.3f} mm {where}, expected {side} {1e3 * limit:.0f} mm"
-    return abs(far - limit), 0.0, words
+    reason = f"{1e3 * far:.3f} mm {where}, expected {side} {1e3 * limit:.0f} mm"
+    return abs(far - limit), 0.0, reason

@@ -112,8 +112,8 @@ class Measuring:
                     header(self.session, stop, self.positioning.minutes_per_load), "bold"
                 )
                 self._stop(stop)
-            except SessionCommand as word:
-                self._word(word, stop)
+            except SessionCommand as command:
+                self._run_command(command, stop)
 
     def _put(self, place: int) -> None:
         """Have the instrument where the plan has it: a place of its own, as after a knock."""
@@ -142,7 +142,7 @@ class Measuring:
                 self._keep(taken, verdict)
                 return
             taken_again = before is not None and np.linalg.norm((taken.value - before)[:3]) < SAME
-            chosen = self._doubt(verdict, bool(taken_again))
+            chosen = self._resolve(verdict, bool(taken_again))
             if chosen:
                 if chosen == "take" and verdict.instead is not None:
                     taken = replace(taken, value=verdict.instead)
@@ -201,29 +201,29 @@ class Measuring:
         )  # fmt: skip
         limit = max(SHAKY * self.sigma, SHAKIEST)
         if captured.spread > limit:
-            words = (
+            reason = (
                 f"the samples scatter by {millimetres(captured.spread)}: the tool swings, or the "
                 "beam is disturbed"
             )
-            return replace(verdict, doubted=True, reasons=(words, *verdict.reasons))
+            return replace(verdict, doubted=True, reasons=(reason, *verdict.reasons))
         return verdict
 
     def _keep(self, taken: Reading, verdict: Verdict) -> None:
         self.session.add("reading", **{**taken.entry(), "off": verdict.off})
         weighs = self.instrument.needs_wrench
-        words = [f"  kept  {force(taken.raw_wrench) if weighs else point(taken.value)}"]
+        parts = [f"  kept  {force(taken.raw_wrench) if weighs else point(taken.value)}"]
         if taken.samples > 1:
-            words.append(f"mean of {taken.samples}, ±{millimetres(taken.scatter)}")
+            parts.append(f"mean of {taken.samples}, ±{millimetres(taken.scatter)}")
         if np.isfinite(verdict.off):
-            words.append(
+            parts.append(
                 f"{millimetres(verdict.off)} from where it was expected "
                 f"(up to {millimetres(verdict.allowed)})"
             )
         if taken.doubted:
-            words.append("doubtful")
-        self.prompt.say(" · ".join(words), "green" if not taken.doubted else "yellow")
+            parts.append("doubtful")
+        self.prompt.say(" · ".join(parts), "green" if not taken.doubted else "yellow")
 
-    def _doubt(self, verdict: Verdict, same: bool) -> str:
+    def _resolve(self, verdict: Verdict, same: bool) -> str:
         """Report what looks wrong; returns ``""`` (measure again), ``take`` or ``keep``."""
         if verdict.off > verdict.allowed:
             self.prompt.warn(
@@ -249,19 +249,19 @@ class Measuring:
         answers["back"] = "measure an earlier pose again: has the instrument or the target moved?"
         return self.prompt.choose("  what now", answers)
 
-    def _word(self, word: SessionCommand, stop: int) -> None:
-        """Do what a word of the session asks for."""
-        if word.word == "undo":
+    def _run_command(self, command: SessionCommand, stop: int) -> None:
+        """Do what a command of the session asks for."""
+        if command.name == "undo":
             self._undo()
-        elif word.word == "skip":
+        elif command.name == "skip":
             self.session.add("skip", stop=stop)
             self.prompt.say(f"  stop {stop + 1} is left out")
-        elif word.word == "back":
+        elif command.name == "back":
             self._look_back()
-        elif word.word in ("moved", "slipped"):
-            self.mark_moved(word.word)
+        elif command.name in ("moved", "slipped"):
+            self.mark_moved(command.name)
         else:
-            raise word
+            raise command
 
     def _undo(self) -> None:
         if not self.session.taken:

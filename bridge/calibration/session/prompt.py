@@ -30,9 +30,9 @@ _SHORT = {"u": "undo", "b": "back", "q": "quit", "exit": "quit", "h": "?", "help
 class SessionCommand(Exception):  # noqa: N818 - an answer, no failure
     """A person typed one of WORDS instead of an answer."""
 
-    def __init__(self, word: str, rest: str = "") -> None:
-        super().__init__(word)
-        self.word, self.rest = word, rest
+    def __init__(self, name: str, rest: str = "") -> None:
+        super().__init__(name)
+        self.name, self.rest = name, rest
 
 
 class InputEnded(Exception):  # noqa: N818
@@ -148,8 +148,8 @@ class Prompt:
         return line
 
 
-def _either(words: list[str]) -> str:
-    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} or {words[-1]}"
+def _either(choices: list[str]) -> str:
+    return choices[0] if len(choices) == 1 else f"{', '.join(choices[:-1])} or {choices[-1]}"
 
 
 class _Lines:

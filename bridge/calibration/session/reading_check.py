@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
-from gapbridge.bridge.calibration.session.first_readings import first_doubt
+from gapbridge.bridge.calibration.session.first_readings import early_check
 from gapbridge.core.calibration.observables import make_observable
 from gapbridge.core.calibration.observables.nuisance import Nuisance
 from gapbridge.core.calibration.observables.observable import Observable
@@ -42,9 +42,9 @@ EXCHANGED = ((1, 0, 2), (2, 1, 0), (0, 2, 1), (1, 2, 0), (2, 0, 1))
 RARE = 1e-5  # chance with which a good reading is doubted
 USUAL = 3.0  # usual sizes: 1 sigma at which parameters are held
 ROUNDS = 3
-CALM = 4.0  # noises: a reading that is off by more counts the less
+INLIER = 4.0  # noises: a reading that is off by more counts the less
 STEP = 1e-5  # rad
-DOUBT = 12.0  # degrees of freedom by which the noise is held at what was thought of it
+PRIOR_FREEDOM = 12.0  # degrees of freedom by which the noise is held at what was thought of it
 AXES = "xyz"
 
 
@@ -95,7 +95,7 @@ class FittedSoFar:
             poses = parameters.model(values).predict(before.q, before.loads)
             left = observable.gap(poses, before, nuisance).ravel() / scale
             F = observable.nuisance_columns(poses, before, nuisance)
-            root = np.repeat(_calm(left.reshape(count, k)), k)
+            root = np.repeat(_weights(left.reshape(count, k)), k)
             A, left = np.hstack([J, F]) / scale[:, None] * root[:, None], left * root
             covariance = _inverse(A, prior, held)
             pull = A.T @ left - prior * np.concatenate([values, np.zeros(layout.size)])
@@ -193,13 +193,13 @@ def _inverse(A: Array, prior: Array, held: Array) -> Array:
 def _quieter(left: Array, A: Array, covariance: Array) -> float:
     """Return by which share the noise is other than thought; with few readings, hardly."""
     freedom = len(left) - float(np.einsum("ij,jk,ik->", A, covariance, A))
-    square = (float(left @ left) + DOUBT) / (max(freedom, 0.0) + DOUBT)
+    square = (float(left @ left) + PRIOR_FREEDOM) / (max(freedom, 0.0) + PRIOR_FREEDOM)
     return float(np.clip(np.sqrt(square), 0.5, 2.0))
 
 
-def _calm(left: Array) -> Array:
+def _weights(left: Array) -> Array:
     """Return weights' roots (N,) for residuals (N, k) in units of the noise."""
-    return np.asarray(1 / np.sqrt(1 + (np.linalg.norm(left, axis=1) / CALM) ** 2))
+    return np.asarray(1 / np.sqrt(1 + (np.linalg.norm(left, axis=1) / INLIER) ** 2))
 
 
 class ReadingCheck:
@@ -241,20 +241,20 @@ class ReadingCheck:
     def _first(self, before: Readings, new: Readings) -> Verdict:
         """Return what reach, and the readings before it, say of one of the first readings."""
         tip = np.concatenate([self.poses(before).position, self.poses(new).position])
-        doubt = first_doubt(before, new, tip)
-        if doubt is None:
+        failed = early_check(before, new, tip)
+        if failed is None:
             return NOTHING
-        reasons = [doubt[2]]
+        reasons = [failed[2]]
         instead: Array | None = None
-        for factor, words in UNITS.items():
+        for factor, reason in UNITS.items():
             value = new.value.copy()
             value[:, :3] *= factor
-            if first_doubt(before, replace(new, value=value), tip) is None and len(before):
-                reasons.append(words)
+            if early_check(before, replace(new, value=value), tip) is None and len(before):
+                reasons.append(reason)
                 instead = value[0]
         if not len(before):
             reasons.append("is the unit right?")
-        return Verdict(doubt[0], doubt[1], True, tuple(reasons), instead)
+        return Verdict(failed[0], failed[1], True, tuple(reasons), instead)
 
     def shift(self, old: Readings, new: Readings, before: Readings) -> Array:
         """Return how far a pose's reading has gone (k,), m, base axes where they are known.
@@ -293,15 +293,15 @@ class ReadingCheck:
         reasons: list[str] = []
         instead: Array | None = None
         value = new.value[0]
-        for factor, words in UNITS.items():
+        for factor, reason in UNITS.items():
             changed = value.copy()
             changed[:3] *= factor
             if self._fits(state, new, changed):
-                reasons.append(words)
+                reasons.append(reason)
                 instead = changed
-        for other, words in self._others(value) if typed or len(value) >= 3 else ():
+        for other, reason in self._others(value) if typed or len(value) >= 3 else ():
             if self._fits(state, new, other):
-                reasons.append(words)
+                reasons.append(reason)
         if typed and not reasons:
             reasons += state.alone(new)
         reasons += self._other_loads(state, new)

@@ -61,7 +61,7 @@ def diff(before: Path, after: Path, log: Path | None, seed: int, as_json: bool) 
             click.echo(_line(change))
     for part in several:
         click.echo(f"{_words(part, one, other)}{_by_itself(part.moved)}")
-    _tell_origin(other)
+    _print_origin(other)
     click.echo(_in_space(shift, "the log" if log else "the workspace"))
 
 
@@ -155,7 +155,7 @@ def _own_name(part: Part, value: Reported) -> str:
     return value.name.removeprefix(f"{part.name}{joint}_")
 
 
-def _tell_origin(cell: Cell) -> None:
+def _print_origin(cell: Cell) -> None:
     origin = cell.file.provenance
     if origin is not None and origin.command:
         logs = ", ".join(file.name for file in origin.files if file.role == "log")

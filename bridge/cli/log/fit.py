@@ -89,8 +89,8 @@ def _identified(
                 ranges.append(range_of(piece))
                 yield piece
 
-        with status("fitting") as tell_step:
-            found = identify_streamed(cell.model, read_once(), metrology, progress=tell_step)
+        with status("fitting") as emit:
+            found = identify_streamed(cell.model, read_once(), metrology, progress=emit)
         return found, merged(ranges)
     rows = open_logs(paths, cell)
     with progress("fitting"):

@@ -34,7 +34,7 @@ class DaskWorkers(Workers):
         self._client: Client | None = None
         self._run = uuid.uuid4().hex[:12]
 
-    def words(self) -> str:
+    def description(self) -> str:
         """Return which cluster it is."""
         return f"the Dask cluster at {self.address}"
 

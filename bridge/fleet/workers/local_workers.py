@@ -46,7 +46,7 @@ class LocalWorkers(Workers):
         self._stillborn = 0
         self._deaths: dict[str, int] = {}
 
-    def words(self) -> str:
+    def description(self) -> str:
         """Return how many there are."""
         return f"{self.count} local process{'es' if self.count > 1 else ''}"
 

@@ -34,5 +34,5 @@ class Workers(ABC):
         """Stop what was started here, at once."""
 
     @abstractmethod
-    def words(self) -> str:
+    def description(self) -> str:
         """Return who they are, for people."""

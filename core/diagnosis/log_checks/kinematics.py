@@ -132,7 +132,7 @@ def best_order(model: Model, q: Array, seen: Array) -> tuple[str, Array] | None:
             best, chosen = left, order
     if chosen == tuple(range(n)):
         return None
-    return _in_words(chosen), q[:, chosen]
+    return _order_text(chosen), q[:, chosen]
 
 
 def _orders(n: int) -> Iterator[tuple[int, ...]]:
@@ -154,7 +154,7 @@ def _exchanged(order: tuple[int, ...], i: int, j: int) -> tuple[int, ...]:
     return tuple(swapped)
 
 
-def _in_words(order: tuple[int, ...]) -> str:
+def _order_text(order: tuple[int, ...]) -> str:
     """Return what is wrong with the order: ``order[i]`` is the column that is joint i + 1."""
     n = len(order)
     moved = [i for i in range(n) if order[i] != i]

@@ -50,7 +50,7 @@ def exclusive(space: SampleSpace, chosen: Sequence[int], new: int) -> bool:
     return False
 
 
-def grow(space: SampleSpace, state: State, new: int, score: float) -> State:
+def forward_step(space: SampleSpace, state: State, new: int, score: float) -> State:
     """Return the state with one more term."""
     block = _without(state.basis, space.X[:, space.start[new] : space.start[new + 1]])
     U = _directions(block)
@@ -129,7 +129,7 @@ def beam_search(
             if np.isfinite(found.score):
                 checked.append((found.score, s, c))
         checked.sort()
-        states = [grow(space, states[s], c, score) for score, s, c in checked[:beam]]
+        states = [forward_step(space, states[s], c, score) for score, s, c in checked[:beam]]
         if not states:
             break
         waited = 0 if states[0].score < best - 1e-9 else waited + 1

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from gapbridge.core.diagnosis.criteria import FAMILY_PENALTY
 from gapbridge.core.diagnosis.selection.forward import (
     additions,
-    grow,
+    forward_step,
     joining,
     projected,
 )
@@ -99,11 +99,13 @@ def joined_sets(space: SampleSpace, found: CandidateFit) -> list[CandidateFit]:
     new = sorted(joiners - set(found.chosen))
     sets = [pruned(space, fit(space, (*found.chosen, c))) for c in new]
     if found.chosen:
-        sets += [grown(space, fit(space, (c,))) for c in sorted(unnamed)]
+        sets += [forward_selected(space, fit(space, (c,))) for c in sorted(unnamed)]
     return sets
 
 
-def grown(space: SampleSpace, found: CandidateFit, named_only: bool = False) -> CandidateFit:
+def forward_selected(
+    space: SampleSpace, found: CandidateFit, named_only: bool = False
+) -> CandidateFit:
     """Return the set with the best terms added one by one as long as that pays."""
     state = projected(space, found.chosen)
     for _ in range(GROWTH):
@@ -113,7 +115,7 @@ def grown(space: SampleSpace, found: CandidateFit, named_only: bool = False) -> 
         better = fit(space, (*found.chosen, nearest[0][1]))
         if better.score >= found.score:
             break
-        state, found = grow(space, state, nearest[0][1], better.score), better
+        state, found = forward_step(space, state, nearest[0][1], better.score), better
     return found
 
 

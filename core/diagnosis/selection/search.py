@@ -23,7 +23,7 @@ from gapbridge.core.diagnosis.selection.forward import (
     projected,
 )
 from gapbridge.core.diagnosis.selection.local_search import (
-    grown,
+    forward_selected,
     improve,
     joined_sets,
     pruned,
@@ -87,7 +87,7 @@ def _deep_search(space: SampleSpace, base: Sequence[int]) -> CandidateFit:
     found = beam_search(space, DEEP, beam=1, named_only=True)[0]
     found = pruned(space, found)
     if base:
-        again = grown(space, pruned(space, fit(space, tuple(base))), named_only=True)
+        again = forward_selected(space, pruned(space, fit(space, tuple(base))), named_only=True)
         found = min([found, pruned(space, again)], key=lambda f: f.score)
     beside = [fit(space, (*found.chosen, c)) for _, c in joining(space, found.chosen, 4)]
     nearest = min([found, *beside], key=lambda f: f.score)

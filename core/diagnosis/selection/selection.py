@@ -30,7 +30,7 @@ from gapbridge.core.diagnosis.selection.geometry import (
     prior,
     with_links,
 )
-from gapbridge.core.diagnosis.selection.local_search import grown, pruned
+from gapbridge.core.diagnosis.selection.local_search import forward_selected, pruned
 from gapbridge.core.diagnosis.selection.moments import step_candidates
 from gapbridge.core.diagnosis.selection.noise import Noise, estimate_noise
 from gapbridge.core.diagnosis.selection.outliers import (
@@ -275,7 +275,7 @@ def _named_alone(space: SampleSpace, found: CandidateFit) -> tuple[CandidateFit,
     stand where a named cause would without it: friction of the same joint.
     """
     named = [c for c in found.chosen if space.candidates[c].named]
-    alone = pruned(space, grown(space, fit(space, named), named_only=True))
+    alone = pruned(space, forward_selected(space, fit(space, named), named_only=True))
     rest = (c for c in found.chosen if c not in named)
     return alone, fit(space, (*alone.chosen, *rest))
 

@@ -65,9 +65,9 @@ def test_the_standard_deviation_is_what_predictions_miss(folder: Path) -> None:
     true = write_log(folder, "b.csv", 600, 2, wide=0.6)
     out = folder / "b_out.csv"
     assert run("predict", folder / "b.csv", "--cell", folder / "new.yaml", "--out", out) == 0
-    told = read(out)
-    off = np.stack([told[f"predicted_position_{i}"] - true[:, i] for i in range(3)])
-    std = np.stack([told[f"predicted_position_std_{i}"] for i in range(3)])
+    predicted = read(out)
+    off = np.stack([predicted[f"predicted_position_{i}"] - true[:, i] for i in range(3)])
+    std = np.stack([predicted[f"predicted_position_std_{i}"] for i in range(3)])
     # one fit: its few errors are shared by all rows, so that the ratio scatters by a half
     assert 0.4 < np.sqrt(np.mean((off / std) ** 2)) < 2.0
     assert np.corrcoef(np.abs(off).ravel(), std.ravel())[0, 1] > 0.2
@@ -104,12 +104,12 @@ def test_channels_are_predicted_beside_the_pose(folder: Path) -> None:
     out = folder / "channels.csv"
     arguments = ("predict", folder / "fit.csv", "--cell", folder / "new.yaml", "--out", out)
     assert run(*arguments, "--channels") == 0
-    told, log = read(out), read(folder / "fit.csv")
-    weight = np.sqrt(sum(told[f"predicted_wrench_{i}"] ** 2 for i in range(3)))
+    predicted, log = read(out), read(folder / "fit.csv")
+    weight = np.sqrt(sum(predicted[f"predicted_wrench_{i}"] ** 2 for i in range(3)))
     np.testing.assert_allclose(weight, log["payload"] * 9.80665, rtol=1e-9)
     for i in range(6):
-        np.testing.assert_allclose(told[f"predicted_q_{i}"], log[f"target_q_{i}"])
-    assert np.abs(told["predicted_torque_1"]).max() > 20.0  # Nm, the shoulder holds the arm
+        np.testing.assert_allclose(predicted[f"predicted_q_{i}"], log[f"target_q_{i}"])
+    assert np.abs(predicted["predicted_torque_1"]).max() > 20.0  # Nm, the shoulder holds the arm
 
 
 def test_what_a_channel_lacks_is_said(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -226,7 +226,7 @@ class Slow(Session):
 
 
 class Scripted(Session):
-    """A machine whose runs end as they are told: visits done, why it broke off, a stall seen."""
+    """A machine whose runs end as scripted: visits done, why it broke off, a stall seen."""
 
     def __init__(self, *script: tuple[int, str, bool]) -> None:
         self.reported: list[str] = []
@@ -366,9 +366,9 @@ def test_every_accusation_is_held_to_the_truth() -> None:
 def test_three_rounds_of_visits_and_the_truth_are_shown(
     result: Result, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    told = accused(("tool_frame_x", 1.001e-3, 3e-6))
+    known = accused(("tool_frame_x", 1.001e-3, 3e-6))
     whole = replace(
-        result, explained=result.compensated, hidden=bent(x=1e-3, y=0.0, z=0.0), accused=(told,)
+        result, explained=result.compensated, hidden=bent(x=1e-3, y=0.0, z=0.0), accused=(known,)
     )
     show(whole, Console(width=140))
     said = capsys.readouterr().out

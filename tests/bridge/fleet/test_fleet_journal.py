@@ -69,7 +69,7 @@ class Here(Workers):
 
     def stop(self) -> None: ...
 
-    def words(self) -> str:
+    def description(self) -> str:
         return "this process"
 
     def run(self, tasks: Iterable[Task]) -> Iterator[Outcome]:

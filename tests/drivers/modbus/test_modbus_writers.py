@@ -20,7 +20,7 @@ NOTHING = np.zeros(6)
 
 
 class ByHand:
-    """A clock that goes on where it is told to, and where somebody sleeps."""
+    """A clock that goes on where it is set to, and where somebody sleeps."""
 
     def __init__(self) -> None:
         self.now = 100.0

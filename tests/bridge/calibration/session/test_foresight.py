@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gapbridge.bridge.calibration.session.first_readings import first_doubt
+from gapbridge.bridge.calibration.session.first_readings import early_check
 from gapbridge.bridge.calibration.session.reading_check import ReadingCheck, Verdict
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.calibration.parameters import DEFAULT
@@ -165,10 +165,10 @@ def test_two_balls_keep_their_distance_and_a_gauge_moves_no_farther_than_the_arm
     tip = NOMINAL.predict(readings.q, readings.loads).position
     balls = replace(readings, kind="relative", value=np.array([[0.2, 0, 0], [0, 0.21, 0]]))
     one, two = balls[np.array([0])], balls[np.array([1])]
-    assert first_doubt(one, two, tip) is not None
-    assert first_doubt(one, replace(two, value=np.array([[0, 0.2002, 0]])), tip) is None
+    assert early_check(one, two, tip) is not None
+    assert early_check(one, replace(two, value=np.array([[0, 0.2002, 0]])), tip) is None
     far = float(np.linalg.norm(tip[1] - tip[0]))
     gauge = replace(readings, kind="distance", value=np.array([[1.0], [1.0 + 2 * far + 0.1]]))
-    assert first_doubt(gauge[np.array([0])], gauge[np.array([1])], tip) is not None
+    assert early_check(gauge[np.array([0])], gauge[np.array([1])], tip) is not None
     near = replace(gauge, value=np.array([[1.0], [1.0 + 0.5 * far]]))
-    assert first_doubt(near[np.array([0])], near[np.array([1])], tip) is None
+    assert early_check(near[np.array([0])], near[np.array([1])], tip) is None

@@ -10,7 +10,7 @@ import toy_space as toy
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gapbridge.core.diagnosis.selection.forward import grow, joining, projected
+from gapbridge.core.diagnosis.selection.forward import forward_step, joining, projected
 from gapbridge.core.diagnosis.selection.problem import fit, gains, penalties
 
 FAMILIES = [toy.named("a", 1, 1), toy.named("a", 1, 2), toy.named("b", 3), toy.named("c", 2),
@@ -68,7 +68,7 @@ def test_growing_term_by_term_comes_to_the_joint_fit(seed, chosen):
     space = toy.random_space(seed, FAMILIES, planted=(0,))
     state = projected(space, ())
     for c in chosen:
-        state = grow(space, state, c, 0.0)
+        state = forward_step(space, state, c, 0.0)
     assert state.rss == pytest.approx(fit(space, chosen).rss)
     assert projected(space, chosen).rss == pytest.approx(state.rss)
     assert np.allclose(space.columns(chosen).T @ state.r, 0, atol=1e-8)
