@@ -3,9 +3,9 @@
     python -m benchmarks.speed.commands [--rows 1000000] [--repeats 3] [--only predict]
 
 A simulated UR10e at random poses under three payloads, measured to 30 um, one of 500 an outlier.
-Prints the table of docs/performance.md: the least of the repeats' CPU times, the largest memory; one
-thread. Beside other work CPU times grow; the ratio to the first row, measured in the same run, grows
-less.
+Prints the table of docs/performance.md: the least of the repeats' CPU times, the largest memory;
+one thread. Beside other work CPU times grow; the ratio to the first row, measured in the same run,
+grows less.
 """
 
 from __future__ import annotations
