@@ -31,6 +31,9 @@ def main() -> None:
     parser.add_argument("--rows", type=int, default=1_000_000, help="of the fit")
     parser.add_argument("--poses", type=int, default=1000, help="of the calibrations")
     parser.add_argument("--seconds", type=float, default=60.0, help="of the daemon's loop")
+    parser.add_argument(
+        "--growth", default=",".join(growth.KINDS), help=f"by what, of {', '.join(growth.KINDS)}"
+    )
     given = parser.parse_args()
     chosen = given.parts.split(",")
     if unknown := set(chosen) - set(PARTS):
@@ -44,7 +47,7 @@ def main() -> None:
             measured["rows"].append(_short(made))
             _write(given.out, measured)
         if "growth" in chosen:
-            measured["growth"] = growth.growth()
+            measured["growth"] = growth.growth(given.growth.split(","))
     measured["load_average_after"] = os.getloadavg()[0]
     _write(given.out, measured)
     print(f"figures in {given.out}")

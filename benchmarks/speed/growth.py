@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from gapbridge.core.kernels.reference import Chain, Rows
 from gapbridge.core.kernels.single import correct
 
 ROWS = (10, 100, 1_000, 10_000, 100_000)
+KINDS = ("rows", "joints", "effects", "poses")
 JOINTS = (2, 3, 4, 5, 6, 7, 8, 10, 12)
 
 
@@ -34,12 +35,15 @@ def _each(call: Callable[[], object], least: float = 0.02) -> float:
     return float(np.median(found))
 
 
-def growth() -> dict[str, Any]:
+def growth(kinds: Sequence[str] = KINDS) -> dict[str, Any]:
     """Return CPU times by number of rows, of joints, and of a diagnosis' effects and poses."""
-    return {
-        "rows": [_rows(count) for count in ROWS], "joints": [_joints(n) for n in JOINTS],
-        "effects": diagnosis_growth.by_effects(), "poses": diagnosis_growth.by_poses(),
-    }  # fmt: skip
+    measure: dict[str, Callable[[], list[dict[str, float]]]] = {
+        "rows": lambda: [_rows(count) for count in ROWS],
+        "joints": lambda: [_joints(n) for n in JOINTS],
+        "effects": diagnosis_growth.by_effects,
+        "poses": diagnosis_growth.by_poses,
+    }
+    return {kind: measure[kind]() for kind in kinds}
 
 
 def _rows(count: int) -> dict[str, float]:

@@ -14,15 +14,15 @@ BLUE, ORANGE, GREEN = "#2563a8", "#c2571a", "#3a7d44"
 
 
 def main() -> None:
-    """Write one SVG per kind of growth."""
+    """Write one SVG per kind of growth that was measured."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.speed.plots")
     parser.add_argument("figures", type=Path, nargs="?", default=Path("out/speed.json"))
     parser.add_argument("--fleet", type=Path, help="figures of `benchmarks.fleet growth --json`")
     parser.add_argument("--out", type=Path, default=Path("docs/images"))
     given = parser.parse_args()
     found = json.loads(given.figures.read_text(encoding="utf-8"))["growth"]
-    drawn = {"speed_rows": _rows, "speed_joints": _joints, "speed_effects": _effects,
-             "speed_poses": _poses}  # fmt: skip
+    every = {"rows": _rows, "joints": _joints, "effects": _effects, "poses": _poses}
+    drawn = {f"speed_{kind}": draw for kind, draw in every.items() if kind in found}
     if given.fleet is not None:
         found |= json.loads(given.fleet.read_text(encoding="utf-8"))
         drawn["speed_arms"] = _arms

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapbridge.core.diagnosis.observation import Observation
+from gapbridge.core.estimation.regions import k_means
 
 REGIONS = 24  # of joint space, or stretches of time
 PARTS = 8  # left out in turn, each of several regions that lie scattered
@@ -34,9 +35,7 @@ def regions(observation: Observation, kept: NDArray[np.bool_]) -> NDArray[np.int
     names = [q for q in observation.quantities if q.startswith(("actual_q_", "target_q_"))]
     if not names:
         return np.asarray(conditions)
-    from scipy.cluster.vq import kmeans2
-
     poses = np.stack([observation.quantities[q][kept] for q in names], axis=1)
     count = min(REGIONS, max(4, (int(conditions.max()) + 1) // 3))
-    found = kmeans2(poses, count, minit="++", seed=0, iter=30)[1]
+    found = k_means(poses, count, seed=0, rounds=30)
     return np.asarray(np.unique(found, return_inverse=True)[1].reshape(-1))

@@ -110,7 +110,7 @@ def settle(chain, w, v, deflected):  # type: ignore[no-untyped-def]
     Returns whether all lanes have settled.
     """
     n = chain.mass.shape[0]
-    tilts = np.any(chain.base_compliance != 0.0)
+    tilts = _tilts(chain)
     if tilts:
         _level(w)
     if deflected:
@@ -180,4 +180,15 @@ def _settled(w, v, n):  # type: ignore[no-untyped-def]
 @njit(**JIT)
 def bends(chain):  # type: ignore[no-untyped-def]
     """Return whether anything in the chain bends; links that do are core.kernels.reference's."""
-    return np.any(chain.compliance != 0.0) or np.any(chain.base_compliance != 0.0)
+    for i in range(chain.mass.shape[0]):
+        for k in range(3):
+            if chain.compliance[i, k] != 0.0:
+                return True
+    return _tilts(chain)
+
+
+@njit(**JIT)
+def _tilts(chain):  # type: ignore[no-untyped-def]
+    """Return whether the base tilts (np.any would bring scipy.linalg into each process)."""
+    c = chain.base_compliance
+    return c[0] != 0.0 or c[1] != 0.0 or c[2] != 0.0

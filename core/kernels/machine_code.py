@@ -14,7 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from numba import config
-from numba.core import caching, event
+from numba.core import caching, dispatcher, event
+from numba.core.runtime.nrt import rtsys
 
 from gapbridge.core.kernels import compiling
 
@@ -80,6 +81,22 @@ class UserWide(_OfAllSources, caching.UserWideCacheLocator):
     """In the user's own cache, where the sources' folder cannot be written to."""
 
 
+class Kept(caching.FunctionCache):
+    """The machine code of one function, kept from process to process."""
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """Return the machine code for a signature, or None where there is none.
+
+        Numba first makes itself ready to compile (and imports scipy.linalg for that): 0.3 s in
+        each process. What is only loaded needs the functions that count references alone; what
+        then has to be compiled makes itself ready by itself.
+        """
+        if not isinstance(self._impl.locator, _OfAllSources):
+            return super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
+        rtsys.initialize(target_context)
+        return self._load_overload(sig, target_context)  # type: ignore[no-untyped-call]
+
+
 class _Compiling(event.Listener):
     """Hears of each function that numba compiles rather than loads."""
 
@@ -101,6 +118,8 @@ def keep_by_all_sources() -> None:
     if ours[0] in settings.CACHE_LOCATOR_CLASSES:
         return
     event.register("numba:compile", _Compiling())  # type: ignore[no-untyped-call]
+    kept: Any = dispatcher
+    kept.FunctionCache = Kept
     names = [f"{name}CacheLocator" for name in USUAL]
     others = settings.CACHE_LOCATOR_CLASSES or ",".join(
         f"{caching.__name__}.{name}" for name in names if hasattr(caching, name)

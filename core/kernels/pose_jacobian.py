@@ -212,7 +212,10 @@ def _slopes(chain, w, v, u, B, push, turned, axis, turning, links, loads):  # ty
 @njit(**JIT)
 def _linked(used, n):  # type: ignore[no-untyped-def]
     """Return whether a parameter moves a link's geometry."""
-    return np.any(used < 6 * (n + 1))
+    found = False
+    for slot in used:
+        found = found or slot < 6 * (n + 1)
+    return found
 
 
 @njit(**JIT)

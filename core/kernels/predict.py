@@ -82,6 +82,6 @@ def _one_by_one(chain, rows, first, last, position, rotation):  # type: ignore[n
     for r in range(first, last):
         if kernel.equilibrium(chain, rows, r, shape) < 0 and bad < 0:
             bad = r
-        position[r] = shape.tcp_position
-        rotation[r] = shape.tcp_rotation
+        kernel.copy_vector(shape.tcp_position, position[r])
+        kernel.copy_matrix(shape.tcp_rotation, rotation[r])
     return bad

@@ -98,6 +98,25 @@ def _turn(x, y, z, out):  # type: ignore[no-untyped-def]
     out[2, 2] = 1.0 - second * (x * x + y * y)
 
 
+@njit(inline="always", **JIT)
+def copy_vector(a, out):  # type: ignore[no-untyped-def]
+    """Copy a vector (3,).
+
+    ``out[:] = a`` looks whether the two overlap in memory, and brings the text of its error with
+    it, which each process that loads the machine code pays for.
+    """
+    for i in range(3):
+        out[i] = a[i]
+
+
+@njit(inline="always", **JIT)
+def copy_matrix(A, out):  # type: ignore[no-untyped-def]
+    """Copy a matrix (N, 3), as ``copy_vector`` does a vector."""
+    for i in range(A.shape[0]):
+        for j in range(3):
+            out[i, j] = A[i, j]
+
+
 @njit(**JIT)
 def place(chain, rows, r, shape, base_rotation, A, B):  # type: ignore[no-untyped-def]
     """Place all frames for the present bending (exact finite rotations)."""
@@ -120,10 +139,10 @@ def place(chain, rows, r, shape, base_rotation, A, B):  # type: ignore[no-untype
             t = shape.tip[i - 1]
             _turn(t[3], t[4], t[5], B)
             _times(A, B, shape.rotation[i])
-            A[:, :] = shape.rotation[i]
+            copy_matrix(shape.rotation[i], A)
         _times(A, chain.rotation[i], B)
         if i == n:
-            shape.rotation[n] = B
+            copy_matrix(B, shape.rotation[n])
             break
         c, s = np.cos(rows.q[r, i]), np.sin(rows.q[r, i])
         for k in range(3):
@@ -132,7 +151,7 @@ def place(chain, rows, r, shape, base_rotation, A, B):  # type: ignore[no-untype
             shape.axis[i, k] = B[k, 2]
         _turn(shape.bend[i, 0], shape.bend[i, 1], shape.bend[i, 2], A)
         _times(B, A, shape.rotation[i])
-        A[:, :] = shape.rotation[i]
+        copy_matrix(shape.rotation[i], A)
     for k in range(3):
         R = shape.rotation[n]
         p = chain.tool_position
@@ -173,11 +192,11 @@ def _load(chain, rows, r, shape, base_rotation, total):  # type: ignore[no-untyp
         o[1] + R[1, 0] * c[0] + R[1, 1] * c[1] + R[1, 2] * c[2],
         o[2] + R[2, 0] * c[0] + R[2, 1] * c[1] + R[2, 2] * c[2],
     )  # fmt: skip
-    change = 0.0
+    change, link = 0.0, np.empty((3, 3))
     for i in range(n - 1, -1, -1):
         R, o = shape.rotation[i], shape.origin[i]
         if i < n - 1 and chain.flexibility[i] != 0.0:
-            change = max(change, _flex(chain, rows, r, shape, i, total))
+            change = max(change, _flex(chain, rows, r, shape, i, total, link))
         c, m = chain.cog[i], chain.mass[i]
         _add_load(
             total, m * g[0], m * g[1], m * g[2],
@@ -204,10 +223,13 @@ def _load(chain, rows, r, shape, base_rotation, total):  # type: ignore[no-untyp
 
 
 @njit(**JIT)
-def _flex(chain, rows, r, shape, i, total):  # type: ignore[no-untyped-def]
-    """Bend link i as a cantilever loaded at its far end; returns the largest change."""
+def _flex(chain, rows, r, shape, i, total, link):  # type: ignore[no-untyped-def]
+    """Bend link i as a cantilever loaded at its far end; returns the largest change.
+
+    ``link`` (3, 3) is a buffer: force, moment and direction in the link's axes.
+    """
     R, o = shape.rotation[i], shape.origin[i + 1]
-    f, M, u = np.empty(3), np.empty(3), np.empty(3)
+    f, M, u = link[0], link[1], link[2]
     length = 0.0
     mx = total[3] - (o[1] * total[2] - o[2] * total[1])
     my = total[4] - (o[2] * total[0] - o[0] * total[2])
@@ -238,6 +260,11 @@ def _flex(chain, rows, r, shape, i, total):  # type: ignore[no-untyped-def]
     return change
 
 
+@njit(inline="always", **JIT)
+def _sum(total):  # type: ignore[no-untyped-def]
+    return total[0] + total[1] + total[2] + total[3] + total[4] + total[5]
+
+
 @njit(**JIT)
 def equilibrium(chain, rows, r, shape):  # type: ignore[no-untyped-def]
     """Solve the deflected shape of row r to equilibrium; returns the iterations it took.
@@ -251,7 +278,7 @@ def equilibrium(chain, rows, r, shape):  # type: ignore[no-untyped-def]
         place(chain, rows, r, shape, base_rotation, A, B)
         change = _load(chain, rows, r, shape, base_rotation, total)
         # a change that is not a number would pass for none
-        if change < TOLERANCE and np.isfinite(total.sum()):
+        if change < TOLERANCE and np.isfinite(_sum(total)):
             return step + 1
     shape.bend[:, :] = 0.0  # what cannot be solved must not spoil the next row
     shape.tip[:, :] = 0.0
@@ -270,8 +297,8 @@ def predict_rows(chain, rows, position, rotation):  # type: ignore[no-untyped-de
     for r in range(rows.q.shape[0]):
         if equilibrium(chain, rows, r, shape) < 0 and bad < 0:
             bad = r
-        position[r] = shape.tcp_position
-        rotation[r] = shape.tcp_rotation
+        copy_vector(shape.tcp_position, position[r])
+        copy_matrix(shape.tcp_rotation, rotation[r])
     return bad
 
 
@@ -306,7 +333,7 @@ def regressor_rows(chain, rows, A, jacobians, moments):  # type: ignore[no-untyp
         if equilibrium(chain, rows, r, shape) < 0 and bad < 0:
             bad = r
         jacobian(shape, jacobians[r])
-        moments[r] = shape.moment
+        copy_matrix(shape.moment, moments[r])
         p = shape.tcp_position
         for i in range(n):
             z, M, o = shape.rotation[i][:, 2], shape.moment[i], shape.origin[i]

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from gapbridge.core.kernels.reference import JIT
+from gapbridge.core.kernels.reference import JIT, copy_matrix, copy_vector
 
 
 @njit(inline="always", **JIT)
@@ -51,7 +51,7 @@ def frames_of_rows(  # type: ignore[no-untyped-def]
                         + R[j, 1] * chain.rotation[i, 1, k]
                         + R[j, 2] * chain.rotation[i, 2, k]
                     )
-            R[:] = frame
+            copy_matrix(frame, R)
             if i < n:
                 c, s = np.cos(motion[0, r, i]), np.sin(motion[0, r, i])
                 axis = frame[:, 2]
@@ -63,8 +63,11 @@ def frames_of_rows(  # type: ignore[no-untyped-def]
                 for j in range(3):
                     dw[j] += axis[j] * motion[2, r, i] + turn[j] * motion[1, r, i]
                     w[j] += axis[j] * motion[1, r, i]
-                omega[r, i], alpha[r, i] = w, dw
-            origin[r, i], rotation[r, i], acceleration[r, i] = o, R, a
+                copy_vector(w, omega[r, i])
+                copy_vector(dw, alpha[r, i])
+            copy_vector(o, origin[r, i])
+            copy_matrix(R, rotation[r, i])
+            copy_vector(a, acceleration[r, i])
 
 
 @njit(**JIT)
@@ -120,4 +123,4 @@ def taken_by_link(  # type: ignore[no-untyped-def]
         _turned(R, spun, away)
         _turned(R, taken, own)
         _plus_cross(w, away, own)
-        moment[r] = own
+        copy_vector(own, moment[r])

@@ -92,8 +92,6 @@ def _integrated(
 
     For any two columns a and b the inner product is then a b - (C a)(C b).
     """
-    from scipy.linalg import solve_triangular  # takes its time, and only steps need it
-
     observation = state.observation
     blocks, prior = [observation.nuisance], [np.full(observation.nuisance.shape[2], FREE)]
     for candidate, block in zip(state.candidates, columns, strict=True):
@@ -107,9 +105,8 @@ def _integrated(
         np.sqrt(np.mean(A[:, : observation.nuisance.shape[2]] ** 2, axis=0)), 1e-300
     )
     A = A * spread
-    # the root of A'A + 1 by QR: squared, wide priors would leave nothing of the narrow ones
-    root = np.linalg.qr(np.vstack([A, np.eye(A.shape[1])]), mode="r")
-    C = solve_triangular(root, A.T, trans="T")
+    # R'R = A'A + 1 by QR: squared, wide priors would leave nothing of the narrow ones; R'C = A'
+    C = np.linalg.qr(np.vstack([A, np.eye(A.shape[1])]))[0][: len(A)].T
     gap = flat((observation.measured - observation.predict(base))[..., None], state)[:, 0]
     return gap, C
 

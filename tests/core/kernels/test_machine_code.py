@@ -128,3 +128,42 @@ def test_each_compiled_function_of_ours_is_kept_so() -> None:
 def test_functions_of_other_libraries_are_left_alone() -> None:
     assert machine_code.InTree.from_function(Package.run, np.__file__) is None
     assert machine_code.InTree.from_function(Package.run, machine_code.__file__) is not None
+
+
+def test_what_is_loaded_does_not_make_numba_ready_to_compile(package: Package) -> None:
+    """Numba would import scipy.linalg for that: 0.3 s in each process."""
+    path = package.core / "correction.py"
+    path.write_text(path.read_text() + "import sys\nprint('scipy.linalg' in sys.modules)\n")
+    assert package.run().split() == ["3.0", "0", "True"]
+    assert package.run().split() == ["3.0", "1", "False"]
+
+
+def test_what_was_loaded_goes_into_what_is_compiled_then(package: Package) -> None:
+    path = package.core / "correction.py"
+    more = "from gapbridge.core.kernels.reference import statics\nprint(statics(2.0))\n"
+    path.write_text(more + path.read_text())
+    assert package.run().split() == ["4.0", "3.0", "0"]
+    path.write_text(path.read_text().replace("+ 1.0", "+ 2.0"))
+    assert package.run().split() == ["4.0", "4.0", "0"]  # the one loaded, the other compiled
+
+
+PREDICTION = """\
+import sys
+import numpy as np
+from gapbridge.core.arm import builtin_arm
+from gapbridge.core.model import Model
+model = Model(builtin_arm("ur10e")).with_compliance(np.full(6, 1e-5), np.full(6, 1e-5))
+model.predict(np.zeros((70, 6)))
+print(sorted({name for name in ("scipy.linalg", "numba.np.arraymath", "numba.np.linalg")
+              if name in sys.modules}))
+"""
+
+
+def test_a_prediction_needs_no_linear_algebra_of_scipy() -> None:
+    """Each function of numpy's that a kernel calls may bring what takes long to import."""
+    for _ in range(2):  # the first may compile
+        done = subprocess.run(
+            [sys.executable, "-c", PREDICTION], text=True, capture_output=True, timeout=200,
+            check=True,
+        )  # fmt: skip
+    assert done.stdout.strip() == "[]"
