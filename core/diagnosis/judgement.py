@@ -98,7 +98,7 @@ def judge(selection: Selection, held: HeldOut) -> Judgement:
         stays.remove(c)
     fallen = bool(withdrawn)
     stays = [*stays, *selection.block]
-    for c in _gainless(selection, stays, held):
+    for c in gainless(selection, stays, held):
         withdrawn[c] = "it does not shrink the gap on samples that its fit did not see"
         stays.remove(c)
     judgement = _verdict(whole, selection, stays, withdrawn, fallen)
@@ -145,7 +145,7 @@ def _verdict(
     depends: tuple[tuple[str, float], ...] = ()
     if structured or not stays:
         depends = tuple(dependence(space, nuisance, single, selection.groups))
-    ties = _ties(space, selection.found, single)
+    ties = ties_of(space, selection.found, single)
     return Judgement(
         tuple(place[c] for c in stays), structured, p_value, depends,
         {place[c]: names for c, names in ties.items()},
@@ -210,7 +210,7 @@ def _without_companion(selection: Selection, stays: Sequence[int]) -> list[int]:
     return [c for c in stays if own[c].beside not in families]
 
 
-def _gainless(selection: Selection, stays: Sequence[int], held: HeldOut) -> list[int]:
+def gainless(selection: Selection, stays: Sequence[int], held: HeldOut) -> list[int]:
     """Return the candidates of effects that do not shrink the held-out gap, the weakest first."""
     if not held.possible:
         return list(stays)
@@ -307,7 +307,7 @@ def pure_error(left: Array, groups: NDArray[np.int64]) -> tuple[float, int]:
     return total / max(freedom, 1), freedom
 
 
-def _ties(
+def ties_of(
     space: SampleSpace, found: CandidateFit, accused: Sequence[int]
 ) -> dict[int, tuple[str, ...]]:
     """Return the effects that would do as well as each accused one, at its place."""
