@@ -44,10 +44,8 @@ def finding_text(finding: Finding, *, rows: bool = True) -> str:
     return f"{finding.channel}: {_fact(finding.fact, rows)}"
 
 
-def withdrawal_text(reason: Withdrawal | str) -> str:
+def withdrawal_text(reason: Withdrawal) -> str:
     """Return why a term was withdrawn."""
-    if isinstance(reason, str):
-        return reason
     return WITHDRAWN[reason.failed].format(quantity=reason.quantity)
 
 

@@ -24,6 +24,8 @@ STAND_IN_GAIN = 0.02  # lower end of a stand-in's held-out gain, in regions that
 HEAVIEST = 3.0  # times the largest declared payload (or the rated one): a load is not off by more
 # Geometry as a whole
 LENGTH, ANGLE = 5e-4, 1e-3  # m, rad: 1 sigma of machining and assembly
+TIMES_MACHINED = (1.0, 2.0, 4.0, 8.0)  # times these, the most likely: a WAM's grid and a UR5's say
+# 4, the Motoman cube 8; at 1 the WAM is pulled to nominal by as much as it gains
 FEW_LINKS = 3  # links whose first moments are off singly, from which all are tried as a whole
 CLOSED_SHARE = (
     1 / 3

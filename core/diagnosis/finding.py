@@ -75,7 +75,7 @@ class NotAccused:
     """A term that was selected and withdrawn; ``stand_in``: poses not fitted gain by it."""
 
     term: Term
-    reason: Withdrawal | str  # text only from ``every_row``
+    reason: Withdrawal
     stand_in: bool
 
 

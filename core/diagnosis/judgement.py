@@ -67,8 +67,7 @@ class Judgement:
         tuple[str, float], ...
     ]  # quantity, held-out share of what is not accounted for
     ties: dict[int, tuple[str, ...]]  # position -> effects that would do as well
-    # position, reason; text only from ``every_row``
-    withdrawn: tuple[tuple[int, Withdrawal | str], ...]
+    withdrawn: tuple[tuple[int, Withdrawal], ...]  # position, reason
     remainder: Remainder | None = None  # unnamed functions that account for what is left
     vague: tuple[int, ...] = ()  # positions that some rows leave vague: all rows decide
     stand_ins: tuple[
@@ -100,7 +99,7 @@ def judge(selection: Selection, held: HeldOut) -> Judgement:
         stays.remove(c)
     fallen = bool(withdrawn)
     stays = [*stays, *selection.block]
-    for c in _gainless(selection, stays, held):
+    for c in gainless(selection, stays, held):
         withdrawn[c] = Withdrawal(Check.HELD_OUT_GAIN)
         stays.remove(c)
     judgement = _verdict(whole, selection, stays, withdrawn, fallen)
@@ -147,7 +146,7 @@ def _verdict(
     depends: tuple[tuple[str, float], ...] = ()
     if structured or not stays:
         depends = tuple(dependence(space, nuisance, single, selection.groups))
-    ties = _ties(space, selection.found, single)
+    ties = ties_of(space, selection.found, single)
     return Judgement(
         tuple(place[c] for c in stays), structured, p_value, depends,
         {place[c]: names for c, names in ties.items()},
@@ -183,24 +182,27 @@ def still_sure(selection: Selection, judgement: Judgement, arm: Arm) -> tuple[Se
     """Return what is accused refitted as all there is, and its judgement.
 
     Beside the unknown, and over the regions of the log, a value may be less sure than it was, and a
-    stiffness curve straight.
+    stiffness curve straight. Of what is accused as a whole one term at least must be sure by
+    itself: else the data show none of its numbers.
     """
     while True:
         found = refitted_alone(selection, arm, judgement.accused, judgement.remainder)
-        single = [p for p in judgement.accused if found.term_index[p] not in found.block]
         straight = {
             p for p in without_curvature(found.terms, found.covariance) if judgement.remainder
         }
-        share = [
-            0.0 if p in straight else worth(found.terms[p], found.covariance[p]) for p in single
-        ]
-        if min(share, default=1.0) >= 1:
+        share = {
+            p: 0.0 if p in straight else worth(found.terms[p], found.covariance[p])
+            for p in judgement.accused
+        }
+        whole = tuple(p for p in judgement.accused if found.term_index[p] in found.block)
+        kinds = [(p,) for p in judgement.accused if p not in whole] + ([whole] if whole else [])
+        weakest = min(kinds, key=lambda kind: max(share[p] for p in kind), default=())
+        if not weakest or max(share[p] for p in weakest) >= 1:
             return found, judgement
-        weakest = single[int(np.argmin(share))]
         judgement = replace(
-            judgement, accused=tuple(p for p in judgement.accused if p != weakest),
-            withdrawn=(*judgement.withdrawn, (weakest, BESIDE)), structured=True,
-            ties={p: names for p, names in judgement.ties.items() if p != weakest},
+            judgement, accused=tuple(p for p in judgement.accused if p not in weakest),
+            withdrawn=(*judgement.withdrawn, *((p, BESIDE) for p in weakest)), structured=True,
+            ties={p: names for p, names in judgement.ties.items() if p not in weakest},
         )  # fmt: skip
 
 
@@ -211,7 +213,7 @@ def _without_companion(selection: Selection, stays: Sequence[int]) -> list[int]:
     return [c for c in stays if own[c].beside not in families]
 
 
-def _gainless(selection: Selection, stays: Sequence[int], held: HeldOut) -> list[int]:
+def gainless(selection: Selection, stays: Sequence[int], held: HeldOut) -> list[int]:
     """Return the candidates of effects that do not shrink the held-out gap, the weakest first."""
     if not held.possible:
         return list(stays)
@@ -308,7 +310,7 @@ def pure_error(left: Array, groups: NDArray[np.int64]) -> tuple[float, int]:
     return total / max(freedom, 1), freedom
 
 
-def _ties(
+def ties_of(
     space: SampleSpace, found: CandidateFit, accused: Sequence[int]
 ) -> dict[int, tuple[str, ...]]:
     """Return the effects that would do as well as each accused one, at its place."""

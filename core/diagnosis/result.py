@@ -56,7 +56,7 @@ class Considered:
     probability: float
     outcome: Outcome
     needs: str = ""  # NOT_EXCITED: what would excite it
-    withdrawal: Withdrawal | str | None = None  # WITHDRAWN: the check that it failed
+    withdrawal: Withdrawal | None = None  # WITHDRAWN: the check that it failed
 
     @property
     def excited(self) -> bool:

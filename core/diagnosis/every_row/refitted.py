@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapbridge.core.diagnosis.criteria import OWN_SIGMAS, SIGMAS, TIE_SCORE
+from gapbridge.core.diagnosis.finding import Check, Withdrawal
 from gapbridge.core.diagnosis.held_out import HeldOut
-from gapbridge.core.diagnosis.judgement import VAGUE, Judgement
+from gapbridge.core.diagnosis.judgement import VAGUE, Judgement, gainless, ties_of
 from gapbridge.core.diagnosis.observation import Observation
 from gapbridge.core.diagnosis.regions import regions
 from gapbridge.core.diagnosis.selection.candidate import Candidate
@@ -33,6 +34,7 @@ from gapbridge.core.model import Model
 Array = NDArray[np.float64]
 Alone = Callable[[Selection, Sequence[int]], Selection]
 MOST_RIVALS = 12  # of all causes together
+GAINLESS = Withdrawal(Check.ALL_ROWS_GAIN)
 
 
 def with_uncertain_terms(judgement: Judgement) -> Judgement:
@@ -101,28 +103,15 @@ def still_accused(
     decide are none any more. ``alone`` refits some of the selection's terms.
     """
     selection, judgement = _sure(selection, judgement, alone)
-    accused, withdrawn = list(judgement.accused), list(judgement.withdrawn)
-    while accused and held.possible:
-        kinds: dict[str, list[int]] = {}
-        for p in accused:
-            kind = "" if p in selection.prior else selection.terms[p].effect
-            kinds.setdefault(kind, []).append(p)
-        gain = {
-            kind: held.shrink(accused, [p for p in accused if p not in own]).interval[0]
-            for kind, own in kinds.items()
-        }
-        weakest = min(gain, key=lambda kind: gain[kind])
-        if gain[weakest] > 0:
-            break
-        gone = kinds[weakest]
-        accused = [p for p in accused if p not in gone]
-        withdrawn += [(p, "over all rows the gap does not shrink by it") for p in gone]
-    if tuple(accused) != judgement.accused:
+    # in the space of all rows a term's position is its candidate
+    fallen = gainless(selection, judgement.accused, held) if held.possible else []
+    accused = tuple(p for p in judgement.accused if p not in fallen)
+    withdrawn = (*judgement.withdrawn, *((p, GAINLESS) for p in fallen))
+    if fallen:
         selection = alone(selection, accused)
-    ties = {p: _ties(selection, p) for p in accused if p not in selection.prior}
-    return selection, replace(
-        judgement, accused=tuple(accused), withdrawn=tuple(withdrawn), ties=ties
-    )
+    single = [p for p in accused if p not in selection.prior]
+    ties = ties_of(selection.working, selection.found, single)
+    return selection, replace(judgement, accused=accused, withdrawn=withdrawn, ties=ties)
 
 
 def _sure(selection: Selection, judgement: Judgement, alone: Alone) -> tuple[Selection, Judgement]:
@@ -148,15 +137,6 @@ def refitted(model: Model, selection: Selection, accused: Sequence[int]) -> Sele
     whole = replace(whole, prior=links)
     single = tuple(p for p in accused if p not in links)
     return replace(whole, found=fit(whole.working, single))
-
-
-def _ties(selection: Selection, position: int) -> tuple[str, ...]:
-    own = selection.terms[position].effect
-    names = (
-        selection.space.candidates[other].family
-        for _, other in rivals(selection.working, selection.found, position, TIE_SCORE)
-    )
-    return tuple(dict.fromkeys(name for name in names if name != own))
 
 
 def _rivals(selection: Selection, accused: Sequence[int]) -> list[Candidate]:

@@ -22,6 +22,7 @@ from gapbridge.core.diagnosis.criteria import (
     FEW_LINKS,
     LENGTH,
     MIN_GEOMETRIC_CAUSES,
+    TIMES_MACHINED,
 )
 from gapbridge.core.diagnosis.selection.candidate import Candidate
 from gapbridge.core.diagnosis.selection.local_search import pruned
@@ -44,10 +45,24 @@ def link_candidates(space: SampleSpace) -> tuple[int, ...]:
     return (*links, *zeros) if links else ()
 
 
-def prior(candidate: Candidate) -> Array:
-    """Return 1 sigma (d,) of each number of a link, of an engineer's size."""
+def prior(space: SampleSpace, block: Sequence[int], rest: Sequence[int]) -> dict[int, Array]:
+    """Return 1 sigma (d,) of each number of the links beside a set of other candidates.
+
+    An engineer's size times the power of two under which the gap is most likely: arms differ in
+    how well their links are known (empirical Bayes; MacKay, Neural Computation 4 (1992) 415).
+    """
     usual = {"m": LENGTH, "rad": ANGLE}
-    return np.array([usual.get(p.unit, p.scale) for p in candidate.parameters])
+    size = {
+        c: np.array([usual.get(p.unit, p.scale) for p in space.candidates[c].parameters])
+        for c in block
+    }
+
+    def score(times: float) -> float:
+        links = links_of(space, {c: times * own for c, own in size.items()})
+        return _beside_set(space, rest, links) + links.penalty
+
+    times = min(TIMES_MACHINED, key=score)
+    return {c: times * own for c, own in size.items()}
 
 
 @dataclass(frozen=True)
@@ -100,9 +115,10 @@ def with_links(
     moments = [c for c in best.chosen if c in block and _of_mass(space.candidates[c])]
     if len(block) < 2 or (_of_mass(space.candidates[block[0]]) and len(moments) < FEW_LINKS):
         return space, best, {}
-    sigma = {c: prior(space.candidates[c]) for c in block}
+    rest = [c for c in best.chosen if c not in block]
+    sigma = prior(space, block, rest)
     links = links_of(space, sigma)
-    score = _beside_set(space, best, links, block) + links.penalty
+    score = _beside_set(space, rest, links) + links.penalty
     families = {c.family for c in space.candidates if c.named}
     tries = 2 * float(np.log(len(families))) + ACCUSATION_PENALTY
     kin = [c for c in best.chosen if _geometric(space.candidates[c])]
@@ -113,7 +129,6 @@ def with_links(
     other = screened_search(space, base=start, beside=lambda p: links.beside(p, link_candidates(p)))
     near = links.beside(space, block)
     # a search goes its own way, and of a long log seldom the best: what was found stands beside too
-    rest = [c for c in best.chosen if c not in block]
     other = min([other, pruned(near, fit(near, rest))], key=lambda f: f.score)
     if other.score + links.penalty + tries < best.score:
         return near, other, sigma
@@ -130,11 +145,8 @@ def _of_mass(candidate: Candidate) -> bool:
     return any(p.unit == "kg m" for p in candidate.parameters)
 
 
-def _beside_set(
-    space: SampleSpace, best: CandidateFit, links: Links, block: Sequence[int]
-) -> float:
+def _beside_set(space: SampleSpace, rest: Sequence[int], links: Links) -> float:
     """Return the score of a set beside the links, the penalty of these left out."""
-    rest = [c for c in best.chosen if c not in block]
     A, y = links.whitened(space.columns(rest)), links.whitened(space.y)
     rss = float(np.sum((y - A @ np.linalg.lstsq(A, y, rcond=1e-9)[0]) ** 2))
-    return float(space.misfit(np.array(rss)) + space.penalty[rest].sum())
+    return float(space.misfit(np.array(rss)) + space.penalty[list(rest)].sum())

@@ -148,9 +148,9 @@ class Selection:
         space, block = self.space, link_candidates(self.space)
         if len(block) < 2:
             return None
-        sigma = {c: prior(space.candidates[c]) for c in block}
-        near = links_of(space, sigma).beside(space, block)
         chosen = [c for c in self.found.chosen if c not in block]
+        sigma = prior(space, block, chosen)
+        near = links_of(space, sigma).beside(space, block)
         found = pruned(near, fit(near, chosen))
         state = SelectionState(self.observation, arm, [], self.noise, self.kept)
         terms, index, covariance, residual = refit(state, space, found, sigma)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from hypothesis import strategies as st
 
 from benchmarks.blind.session import Plan
 from gapbridge.bridge.document.findings import considered_text
+from gapbridge.core.diagnosis import judgement as judging
 from gapbridge.core.diagnosis.diagnosis import diagnose
 from gapbridge.core.diagnosis.finding import (
     Check,
@@ -21,9 +23,9 @@ from gapbridge.core.diagnosis.finding import (
     Withdrawal,
 )
 from gapbridge.core.diagnosis.held_out import HeldOut
-from gapbridge.core.diagnosis.judgement import judge, pure_error
+from gapbridge.core.diagnosis.judgement import Judgement, judge, pure_error, still_sure
 from gapbridge.core.diagnosis.result import Outcome, causes_of, considered_of, probability
-from gapbridge.core.effects import CATALOGUE
+from gapbridge.core.effects import CATALOGUE, Site, Term
 from gapbridge.core.metrology import Metrology
 
 LOGS = ("none", "backlash", "tool_frame", "cross_coupling", "thermal_drift")
@@ -222,3 +224,25 @@ def test_what_a_log_cannot_show_reports_what_it_needs():
     found = diagnose(small.model_of(), without, Metrology(registered=True, sigma=small.SIGMA))
     thermal = {c.effect: c for c in found.channels[0].considered}["thermal_drift"]
     assert (thermal.excited, thermal.shrink_alone) == (False, None)
+
+
+@pytest.mark.parametrize(("third", "stays"), [(2.9e-4, (0,)), (3.1e-4, (0, 1, 2))])
+def test_links_as_a_whole_stand_only_where_one_of_them_is_sure(monkeypatch, third, stays):
+    """A block moves the gap by sums of numbers none of which the data show: three sessions did."""
+    terms = (
+        Term("joint_offset", Site(1), (1.0,)),
+        Term("link_geometry", Site(2), (2e-4, 2e-4, 2e-4)),
+        Term("link_geometry", Site(3), (third, third, third)),
+    )
+    found = SimpleNamespace(
+        terms=terms, covariance=[np.eye(1), *[1e-8 * np.eye(3)] * 2], term_index=(7, 8, 9),
+        block=(8, 9),
+    )  # fmt: skip
+    found.covariance[0] = found.covariance[0] * 1e-4
+    monkeypatch.setattr(judging, "refitted_alone", lambda *_: found)
+    given = Judgement((0, 1, 2), False, None, (), {}, ())
+    selection, judgement = still_sure(found, given, None)
+    assert selection is found
+    assert judgement.accused == stays
+    assert {p for p, _ in judgement.withdrawn} == {0, 1, 2} - {*stays}
+    assert judgement.structured == (stays == (0,))

@@ -53,3 +53,21 @@ def test_links_that_pay_less_than_the_set_are_no_cause(singles):
     assert near is space
     assert found.score == -1e9
     assert links == {}
+
+
+@pytest.mark.parametrize(("times", "least", "most"), [(1.0, 1.0, 2.0), (6.0, 4.0, 8.0)])
+def test_the_size_of_the_links_errors_is_the_most_likely_one(singles, times, least, most):
+    space, _ = singles
+    block = geometry.link_candidates(space)
+    rng = np.random.default_rng(0)
+    found = []
+    for _ in range(20):
+        drawn = sum(
+            space.columns([c])[:, k] * rng.normal() * times * {"m": 5e-4, "rad": 1e-3}[p.unit]
+            for c in block
+            for k, p in enumerate(space.candidates[c].parameters)
+        )
+        noisy = replace(space, y=drawn + rng.normal(size=len(space.y)))
+        sigma = geometry.prior(noisy, block, ())
+        found.append(float(max(sigma[block[0]]) / 1e-3))
+    assert least <= np.median(found) <= most
