@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import functools
+import os
 import resource
 import signal
-from collections.abc import Iterator
+import traceback
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -20,21 +23,34 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(recorder_module, "RETRY_EVERY", 0.0)
 
 
-@pytest.fixture
-def limited() -> Iterator[None]:
-    """Have writes beyond a size refused by the system, as a full disk refuses them."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-    yield
-    resource.setrlimit(resource.RLIMIT_FSIZE, before)
-    signal.signal(signal.SIGXFSZ, handler)
+def in_a_process_of_its_own(test: Callable[[Path], None]) -> Callable[[Path], None]:
+    """Run a test in a fork: what the system refuses there, it refuses to nobody else."""
+
+    @functools.wraps(test)
+    def apart(tmp_path: Path) -> None:
+        child = os.fork()
+        if child == 0:
+            try:
+                signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+                test(tmp_path)
+            except BaseException:
+                allow(resource.RLIM_INFINITY)
+                (tmp_path / "failure").write_text(traceback.format_exc(), encoding="utf-8")
+                os._exit(1)
+            os._exit(0)
+        _, status = os.waitpid(child, 0)
+        failure = tmp_path / "failure"
+        assert status == 0, failure.read_text(encoding="utf-8") if failure.exists() else status
+
+    return apart
 
 
 def allow(size: int) -> None:
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, resource.getrlimit(resource.RLIMIT_FSIZE)[1]))
 
 
-@pytest.mark.usefixtures("quick", "limited")
+@pytest.mark.usefixtures("quick")
+@in_a_process_of_its_own
 def test_a_write_that_fails_in_its_middle_loses_nothing_that_the_ring_holds(
     tmp_path: Path,
 ) -> None:
@@ -61,7 +77,8 @@ def test_a_write_that_fails_in_its_middle_loses_nothing_that_the_ring_holds(
     assert recorder.lost == 0
 
 
-@pytest.mark.usefixtures("quick", "limited")
+@pytest.mark.usefixtures("quick")
+@in_a_process_of_its_own
 def test_a_disk_that_stays_full_is_reported_once_and_what_is_lost_is_counted(
     tmp_path: Path,
 ) -> None:
