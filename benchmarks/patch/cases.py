@@ -191,7 +191,7 @@ def cases(arm: WrittenArm) -> tuple[Case, ...]:
              put=_longer(link, 1.5e-3)),
         Case("tool_frame", STATIC, None, 1.2e-3, "x", put=_tool),
         Case("axial_compliance", STATIC, 2, 2.5e-5, put=_axial(2, 2.5e-5)),
-        # of joint 1 it is the give of the base itself, which no log tells from it
+        # that of joint 1 is the same motion as the compliance of the base
         Case("radial_compliance", STATIC, 2, 2e-5, put=_radial(2, 2e-5)),
         Case("stiffness_nonlinearity", STATIC, 2, 4e-5, "compliance",
              stiffening=(4e-5, 500.0 if arm.n == 6 else 175.0)),
