@@ -183,11 +183,17 @@ def _rival(
         return _rms(rivals.position_left(cell, train, test))
     if channel == "tracking":
         return _rms(rivals.tracking_left(train, test))
-    if channel == "torque":
-        return _rms(rivals.torque_left(cell, folder, train, test))
-    rivals.wrench_corrected(cell, train, test).write(place / "corrected.csv")
+    if channel == "torque":  # on the rows that the program judges
+        program("predict", place / "test.csv", "--cell", place / "cell.yaml", "--channels",
+                "--out", place / "nominal.csv")  # fmt: skip
+        nominal = read_table(place / "nominal.csv").get("predicted_torque")
+        assert nominal is not None
+        corrected = rivals.torque_corrected(cell, folder, train, test, nominal)
+    else:
+        corrected = rivals.wrench_corrected(cell, train, test)
+    corrected.write(place / "corrected.csv")
     seen = program.diagnosis(place / "corrected.csv", place / "cell.yaml")
-    return float(seen["wrench"]["gap_rms"])
+    return float(seen[channel]["gap_rms"])
 
 
 def _outcome(

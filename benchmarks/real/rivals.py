@@ -95,8 +95,13 @@ def _following(table: Table, delay: Array) -> tuple[Array, Array]:
     return (actual - wanted)[began], speed[began]
 
 
-def torque_left(cell: dict[str, Any], folder: Path, fitted: Table, judged: Table) -> Array:
-    """Return what base parameters and friction, fitted, leave of judged torques (N, n)."""
+def torque_corrected(
+    cell: dict[str, Any], folder: Path, fitted: Table, judged: Table, nominal: Array
+) -> Table:
+    """Return the judged log with what base parameters and friction leave as its torques' gap.
+
+    ``nominal`` (N, n) are the torques that the cell predicts. Rows at the edges have no torque.
+    """
     import pinocchio as pin  # of the test extra
 
     model = _pinocchio(cell, folder, pin)
@@ -111,7 +116,11 @@ def torque_left(cell: dict[str, Any], folder: Path, fitted: Table, judged: Table
         values = np.linalg.lstsq(scaled / size, b * weight, rcond=1e-6)[0] / size
         spread = np.maximum(np.std((b - A @ values).reshape(-1, n), axis=0), 1e-9)
     A, b = _torque_rows(model, pin, judged, 1)
-    return np.asarray((b - A @ values).reshape(-1, n))
+    left = (b - A @ values).reshape(-1, n)
+    edge = (len(judged) - len(left)) // 2
+    measured = np.full_like(nominal, np.nan)
+    measured[edge : len(judged) - edge] = nominal[edge : len(judged) - edge] + left
+    return judged.replaced("actual_current_as_torque", measured)
 
 
 def _pinocchio(cell: dict[str, Any], folder: Path, pin: Any) -> Any:

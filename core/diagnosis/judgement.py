@@ -182,8 +182,8 @@ def still_sure(selection: Selection, judgement: Judgement, arm: Arm) -> tuple[Se
     """Return what is accused refitted as all there is, and its judgement.
 
     Beside the unknown, and over the regions of the log, a value may be less sure than it was, and a
-    stiffness curve straight. Of what is accused as a whole one term at least must be sure by
-    itself: else the data show none of its numbers.
+    stiffness curve straight. Of the links, accused as a whole, one term at least must be sure by
+    itself: else the data show none of their numbers.
     """
     while True:
         found = refitted_alone(selection, arm, judgement.accused, judgement.remainder)
@@ -194,14 +194,16 @@ def still_sure(selection: Selection, judgement: Judgement, arm: Arm) -> tuple[Se
             p: 0.0 if p in straight else worth(found.terms[p], found.covariance[p])
             for p in judgement.accused
         }
-        whole = tuple(p for p in judgement.accused if found.term_index[p] in found.block)
+        whole = tuple(p for p in judgement.accused if found.as_a_whole(p))
         kinds = [(p,) for p in judgement.accused if p not in whole] + ([whole] if whole else [])
         weakest = min(kinds, key=lambda kind: max(share[p] for p in kind), default=())
         if not weakest or max(share[p] for p in weakest) >= 1:
             return found, judgement
+        # of friction beside the links more rows may still be sure
+        reason = VAGUE if found.term_index[weakest[0]] in found.block else BESIDE
         judgement = replace(
             judgement, accused=tuple(p for p in judgement.accused if p not in weakest),
-            withdrawn=(*judgement.withdrawn, *((p, BESIDE) for p in weakest)), structured=True,
+            withdrawn=(*judgement.withdrawn, *((p, reason) for p in weakest)), structured=True,
             ties={p: names for p, names in judgement.ties.items() if p not in weakest},
         )  # fmt: skip
 

@@ -108,7 +108,8 @@ class Effect(ABC):
     adds_mass: ClassVar[bool] = False  # True: kg beyond the declared payload
     scales_reading: ClassVar[bool] = False  # True: the sensor reads zero where nothing acts
     together: ClassVar[bool] = False  # True: small at all places of a real arm, found as a whole
-    beside_links: ClassVar[bool] = False  # True: a zero or a point that links' geometry goes with
+    # True: goes with the links: a zero or a point with their geometry, friction with their masses
+    beside_links: ClassVar[bool] = False
     shown_by: ClassVar[Term | None] = None  # what has to be there for its values to show at all
     felt_by_all: ClassVar[bool] = False  # True: one cause moves coordinates of many joints
 

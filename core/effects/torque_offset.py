@@ -29,6 +29,7 @@ class TorqueOffset(TorqueEffect):
     title = "torque reading's zero is off"
     label_template = "zero of the torque of joint {joint}"
     order = 95
+    beside_links = True
     motion = "the joint moved both ways, at poses that change its weight"
     alike: ClassVar = {
         "coulomb_friction": "motion of the joint one way only",

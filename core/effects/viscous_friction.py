@@ -28,6 +28,7 @@ class ViscousFriction(TorqueEffect):
     title = "friction grows with speed"
     order = 51
     simulated_as = Kind.DAMPING
+    beside_links = True
     motion = "the joint moved at several speeds"
     alike: ClassVar = {"coulomb_friction": "motion at one speed"}
 

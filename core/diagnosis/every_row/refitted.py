@@ -115,15 +115,20 @@ def still_accused(
 
 
 def _sure(selection: Selection, judgement: Judgement, alone: Alone) -> tuple[Selection, Judgement]:
-    """Return what stays of effects that were vague on some rows: values that are many sigmas."""
-    accused, withdrawn, vague = list(judgement.accused), list(judgement.withdrawn), judgement.vague
-    least = (SIGMAS / OWN_SIGMAS) ** 2
+    """Return what stays: values that are many sigmas of effects that were vague on some rows.
+
+    What goes with the links has to be sure by itself, vague or not.
+    """
+    accused, withdrawn = list(judgement.accused), list(judgement.withdrawn)
+    least = dict.fromkeys(judgement.vague, (SIGMAS / OWN_SIGMAS) ** 2)
+    least |= {p: 1.0 for p in selection.prior if not selection.as_a_whole(p)}
     while True:
         sure = {
-            p: worth(selection.terms[p], selection.covariance[p]) for p in vague if p in accused
-        }
+            p: worth(selection.terms[p], selection.covariance[p]) / least[p]
+            for p in accused if p in least
+        }  # fmt: skip
         weakest = min(sure, key=lambda p: sure[p], default=None)
-        if weakest is None or sure[weakest] >= least:
+        if weakest is None or sure[weakest] >= 1:
             return selection, replace(judgement, accused=tuple(accused), withdrawn=tuple(withdrawn))
         accused.remove(weakest)
         withdrawn.append((weakest, VAGUE))

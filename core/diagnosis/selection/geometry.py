@@ -1,7 +1,8 @@
 """All links as one cause: many small numbers, none of which stands out alone.
 
-The geometry of the links in positions; their first moments in torques, of which only combinations
-show (base parameters; Gautier, Khalil, IEEE Trans. Robotics and Automation 6 (1990) 368).
+The geometry of the links in positions; in torques their first moments, of which only combinations
+show (base parameters; Gautier, Khalil, IEEE Trans. Robotics and Automation 6 (1990) 368), with the
+friction and the zero that every joint of a real arm has.
 
 The numbers have a prior (a normal one of an engineer's size), so that what the data do not show
 stays nominal. To a search it is then one more source of correlated noise: the sample space is
@@ -33,16 +34,18 @@ Array = NDArray[np.float64]
 NEVER = 1e9  # a penalty that no fit is worth
 
 
-def link_candidates(space: SampleSpace) -> tuple[int, ...]:
-    """Return the candidates of all links' geometry, the joints' zeros among them.
+def link_candidates(space: SampleSpace, joints: bool = True) -> tuple[int, ...]:
+    """Return the candidates of all links, and with ``joints`` what of these goes with them.
 
-    A zero is the angle in a link's DH row; in an arm whose links are all off, so are they.
+    A joint's zero is the angle in a link's DH row; in an arm whose links are all off, so are they.
+    With the links' first moments go friction and the torques' zeros.
     """
     links = [c for c, k in enumerate(space.candidates) if k.effect.together]
-    zeros = [
-        c for c, k in enumerate(space.candidates) if k.effect.beside_links and k.site.joint
+    beside = [
+        c for c, k in enumerate(space.candidates)
+        if joints and k.effect.beside_links and k.site.joint
     ]  # fmt: skip
-    return (*links, *zeros) if links else ()
+    return (*links, *beside) if links else ()
 
 
 def prior(space: SampleSpace, block: Sequence[int], rest: Sequence[int]) -> dict[int, Array]:
@@ -111,28 +114,64 @@ def with_links(
     prior is returned (empty where they are no cause). A search beside them pays where they do so
     beside that set, or where it holds several geometric causes.
     """
-    block = link_candidates(space)
-    moments = [c for c in best.chosen if c in block and _of_mass(space.candidates[c])]
-    if len(block) < 2 or (_of_mass(space.candidates[block[0]]) and len(moments) < FEW_LINKS):
+    tried = [_Block.of(space, best, joints) for joints in _forms(space, best)]
+    if not tried:
         return space, best, {}
-    rest = [c for c in best.chosen if c not in block]
-    sigma = prior(space, block, rest)
-    links = links_of(space, sigma)
-    score = _beside_set(space, rest, links) + links.penalty
+    block = min(tried, key=lambda b: b.score)
+    sigma, links, rest, score = block.sigma, block.links, block.rest, block.score
     families = {c.family for c in space.candidates if c.named}
     tries = 2 * float(np.log(len(families))) + ACCUSATION_PENALTY
     kin = [c for c in best.chosen if _geometric(space.candidates[c])]
     if len(kin) < MIN_GEOMETRIC_CAUSES and score + tries >= best.score:
         return space, best, {}
-    start = sorted({*base, *best.chosen} - set(block))
+    start = sorted({*base, *best.chosen} - set(sigma))
     start = [c for c in start if space.candidates[c].named]
-    other = screened_search(space, base=start, beside=lambda p: links.beside(p, link_candidates(p)))
-    near = links.beside(space, block)
+    other = screened_search(
+        space, base=start, beside=lambda p: links.beside(p, link_candidates(p, block.joints))
+    )
+    near = links.beside(space, sigma)
     # a search goes its own way, and of a long log seldom the best: what was found stands beside too
     other = min([other, pruned(near, fit(near, rest))], key=lambda f: f.score)
     if other.score + links.penalty + tries < best.score:
         return near, other, sigma
     return space, best, {}
+
+
+@dataclass(frozen=True)
+class _Block:
+    """The links as a whole beside what else a set holds, with or without their joints' own."""
+
+    joints: bool
+    rest: list[int]  # of the set
+    sigma: dict[int, Array]
+    links: Links
+    score: float
+
+    @classmethod
+    def of(cls, space: SampleSpace, best: CandidateFit, joints: bool) -> _Block:
+        block = link_candidates(space, joints)
+        rest = [c for c in best.chosen if c not in block]
+        sigma = prior(space, block, rest)
+        links = links_of(space, sigma)
+        return cls(joints, rest, sigma, links, _beside_set(space, rest, links) + links.penalty)
+
+
+def _forms(space: SampleSpace, best: CandidateFit) -> list[bool]:
+    """Return the forms in which the links may be a cause: with what goes with them, or without.
+
+    Geometry goes with the joints' zeros. First moments can well be off singly: they are tried where
+    several are, or where several joints rub.
+    """
+    links, block = link_candidates(space, joints=False), link_candidates(space)
+    if len(block) < 2:
+        return []
+    if not _of_mass(space.candidates[links[0]]):
+        return [True]
+    few = {
+        joints: len({space.candidates[c].site.joint for c in best.chosen if c in own}) < FEW_LINKS
+        for joints, own in ((False, links), (True, block))
+    }
+    return [joints for joints in few if not few[joints]]
 
 
 def _geometric(candidate: Candidate) -> bool:

@@ -93,6 +93,12 @@ class Selection:
         """Return the candidates of all links, where their geometry is a cause as a whole."""
         return tuple(self.prior)
 
+    def as_a_whole(self, position: int) -> bool:
+        """Return whether a term is of the links, accused as a whole (their friction is not)."""
+        c = self.term_index[position]
+        links = self.space.candidates[c].effect.together
+        return c in self.prior and (links or self.observation.channel == "position")
+
     @cached_property
     def links(self) -> Links | None:
         """Return the links' geometry as a whole, where it is a cause."""

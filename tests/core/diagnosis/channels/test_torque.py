@@ -245,3 +245,34 @@ def test_first_moments_of_all_links_are_found_as_a_whole(plant, recorded, monkey
     assert channel.gap_rms > 1.5 * NOISE
     moments = [np.array(t.values) for c in channel.causes for t in c.terms]
     assert max(np.abs(m).max() for m in moments) < 0.5  # kg m
+
+
+@pytest.mark.slow
+def test_friction_of_all_joints_goes_with_the_links_and_each_that_is_named_is_sure(
+    plant, recorded, monkeypatch
+):
+    """A real arm: every joint rubs, every centre of gravity is off; one zero is, and is named."""
+    _, q, qd, qdd, _ = recorded
+    nominal = type(plant).pinocchio
+
+    def shifted(self, *arguments, **more):
+        model = nominal(self, *arguments, **more)
+        rng = np.random.default_rng(5)
+        for i in range(1, N + 1):
+            old = model.inertias[i]
+            lever = old.lever + rng.normal(0, 0.01, 3)
+            model.inertias[i] = pin.Inertia(old.mass, lever, old.inertia)
+        return model
+
+    monkeypatch.setattr(type(plant), "pinocchio", shifted)
+    torque = plant.dynamics(q, qd, qdd, payload=2.0)[0] + 0.1 * FRICTION * np.sign(qd) + 0.2 * qd
+    torque[:, 3] += 0.3
+    found = diagnose(plant.model(2.0), log_of(recorded, torque), METROLOGY)
+    (channel,) = [c for c in found.channels if c.channel == "torque"]
+    causes = {c.effect: c for c in channel.causes}
+    assert set(causes) == {"link_cog", "coulomb_friction", "viscous_friction", "torque_offset"}
+    assert causes["coulomb_friction"].joints == causes["viscous_friction"].joints
+    assert causes["torque_offset"].joints == (4,)
+    rub = {t.site.joint: t.values[0] for t in causes["coulomb_friction"].terms}
+    assert [rub[j + 1] for j in range(N)] == pytest.approx(0.1 * FRICTION, abs=0.06)
+    assert channel.remaining_rms_held_out < 1.02 * NOISE
