@@ -19,6 +19,7 @@ from gapbridge.core.log.alignment import aligned
 from gapbridge.core.log.log import Log
 from gapbridge.core.metrology import Metrology
 from gapbridge.core.model import Model
+from gapbridge.core.motion import motion_of, with_motion
 
 Array = NDArray[np.float64]
 Observe = Callable[[Model, Log, Metrology], Observation | NotObservable]
@@ -67,11 +68,14 @@ def predicted_by(channel: str, observe: Observe) -> Observe:
 def _behind(log: Log, channel: str, values: Array | None) -> Log:
     """Return the log of a tracking channel with the simulator's encoders as its command.
 
-    A delay or lag that is sought comes behind the simulated servo's own: filters in a row.
+    A delay or lag that is sought comes behind the simulated servo's own: filters in a row. The
+    motion stays that of the log: a block of a long one cannot derive it from its own rows.
     """
     if channel != "tracking" or values is None or not log.has("target_q"):
         return log
-    return replace(log, columns={**log.columns, "target_q": values})
+    motion = motion_of(log)
+    behind = replace(log, columns={**log.columns, "target_q": values})
+    return with_motion(behind, replace(motion, target_q=values[motion.rows]))
 
 
 def _with_prediction(seen: Observation, values: Array) -> Observation:

@@ -10,8 +10,9 @@ import small_arm as small
 
 from gapbridge.core.diagnosis.channels import torque, tracking
 from gapbridge.core.diagnosis.channels.position import observe
-from gapbridge.core.diagnosis.channels.simulation import SHOWN_BY, joined, predicted_by
+from gapbridge.core.diagnosis.channels.simulation import SHOWN_BY, Observe, joined, predicted_by
 from gapbridge.core.diagnosis.diagnosis import diagnose
+from gapbridge.core.diagnosis.every_row import long_recording
 from gapbridge.core.effects import Site, Term
 from gapbridge.core.errors import LogError
 from gapbridge.core.log.log import Log
@@ -149,3 +150,28 @@ def test_a_delay_is_sought_behind_the_simulators_own_servo():
     found = seen.predict([Term("latency", Site(1), (late,))])[:, 0]
     assert np.abs(found - shifted(own + late)[seen.rows, 0]).max() < 2e-4
     assert np.abs(shifted(own)[seen.rows, 0] - shifted(own + late)[seen.rows, 0]).max() > 1e-2
+
+
+def test_a_block_of_a_long_log_keeps_its_motion_behind_the_simulator(monkeypatch):
+    """Cycles recorded twice, all in one block: too many there, few in the whole recording."""
+    monkeypatch.setattr(long_recording, "WHOLE", 3000)
+    count = 6000
+    t = np.arange(count) * 5e-3
+    t[1000:1040:2] = t[1001:1041:2]
+    target = 0.3 * np.sin(2 * np.pi * (0.4 * t[:, None] + np.array([0.0, 0.3, 0.6])))
+    q = target + np.random.default_rng(0).normal(0, 1e-5, target.shape)
+    log = Log("log.csv", {"timestamp": t, "target_q": target, "actual_q": q}, 3)
+    behind = joined(log, Log("sim.csv", {"actual_q": target}, 3))
+    observe = predicted_by("tracking", tracking.observe)
+
+    def rows_of(log: Log, observe: Observe) -> list[int]:
+        long = long_recording.long_recording(log)
+        assert long is not None
+        return [
+            int(row) + block.first
+            for block in long
+            for row in observe(small.model_of(), block.log, METROLOGY).rows
+            if row + block.first >= block.begin
+        ]
+
+    assert rows_of(behind, observe) == rows_of(log, tracking.observe)
