@@ -33,7 +33,7 @@ class ControllerFacts:
     tcp: Array | None = None  # (4, 4) TCP in the flange frame
     payload: float | None = None  # kg
     payload_cog: Array | None = None  # (3,) m, flange frame
-    gravity: Array | None = None  # (3,) m/s2 in base; its sign is not known
+    gravity: Array | None = None  # (3,) m/s2 in base, towards the earth
     rate: float | None = None  # Hz, most cycles per second
     lower: Array | None = None  # (n,) rad
     upper: Array | None = None  # (n,) rad
@@ -129,10 +129,12 @@ def _load(facts: ControllerFacts, model: Model) -> Iterator[Difference]:
         )  # fmt: skip
     given = facts.gravity
     if given is not None and np.linalg.norm(given) > 1.0:
-        apart = min(float(np.linalg.norm(sign * given - model.gravity)) for sign in (1.0, -1.0))
-        if apart > TILTED:
-            given_text = ", ".join(f"{v:.4g}" for v in given)
+        apart = np.abs(given - model.gravity)
+        if np.linalg.norm(apart) > TILTED:
+            given_text = ", ".join(f"{v + 0.0:.4g}" for v in given)
+            # the base of a URDF may have other horizontal axes than the controller's
+            sure = not model.arm.joint_names or bool(apart[2] > TILTED)
             yield Difference(
                 ("gravity",), f"[{', '.join(f'{v:g}' for v in model.gravity)}]",
-                f"along [{given_text}], as the controller has it (either sign)",
+                f"[{given_text}], as the arm is mounted in the controller", sure=sure,
             )  # fmt: skip

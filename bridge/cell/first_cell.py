@@ -110,9 +110,7 @@ def _payload(facts: ControllerFacts) -> Iterator[str]:
 def _rest(facts: ControllerFacts, asked: Asked) -> Iterator[str]:
     gravity = facts.gravity
     if gravity is not None and np.linalg.norm(gravity) > 1.0:
-        down = -gravity if gravity[2] > 0 else gravity
-        note = "m/s2 in base; of a ceiling, turn the sign" if abs(gravity[2]) > 5 else "m/s2"
-        yield f"gravity: {_list(down)}  # {note}"
+        yield f"gravity: {_list(gravity)}  # m/s2 in base, as the arm is mounted in the controller"
     else:
         yield "gravity: [0.0, 0.0, -9.80665]  # m/s2 in base; turn it for a wall or a ceiling"
     yield from ("", "metrology:", "  registered: false  # an instrument's frame is estimated along")

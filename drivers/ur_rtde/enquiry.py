@@ -75,7 +75,8 @@ def enquire(host: str, rtde_port: int = RTDE, primary_port: int = PRIMARY) -> Co
         tcp=None if tcp is None else transform(rotation_matrix(tcp[3:]), tcp[:3]),
         payload=None if "payload" not in fields else float(fields["payload"][0]),
         payload_cog=fields.get("payload_cog"),
-        gravity=fields.get("target_gravity"),
+        # UR's gravity is what holds the arm up: set_gravity([0, 0, 9.82]) where it stands upright
+        gravity=None if "target_gravity" not in fields else -fields["target_gravity"],
         rate=500.0 if version[0] >= 5 else 125.0,
         lower=None if limits is None else limits[:, 0],
         upper=None if limits is None else limits[:, 1],

@@ -155,6 +155,7 @@ class Controller:
         memory["actual_q"], memory["actual_qd"] = self.plant.q, self.plant.qd
         memory["payload"], memory["payload_cog"] = declared.payload_mass, declared.payload_cog
         memory["payload_inertia"] = declared.payload_inertia
+        memory["target_gravity"] = declared.gravity
         memory["tcp_offset"] = declared.tcp
         self.sensors.update(self.target_q, dt)
 

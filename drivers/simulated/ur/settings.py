@@ -115,6 +115,8 @@ def make_controller(settings: ServerSettings) -> Controller:
         declared.set_tcp(settings.plant.tcp)
         declared.payload_mass = settings.plant.payload_mass
         declared.payload_cog = settings.plant.payload_cog
+        x, y, z = settings.plant.gravity
+        declared.gravity = (-x, -y, -z)
     return Controller(Plant(settings.arm, settings.plant, settings.start_q), declared)
 
 

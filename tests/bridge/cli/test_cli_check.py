@@ -15,6 +15,7 @@ from gapbridge.bridge.cell import load_cell
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.model import Model
 from gapbridge.core.plausibility import flange_in_first
+from gapbridge.drivers.controller_facts import ControllerFacts, differences
 from gapbridge.drivers.simulated.ur.process import SimulatedController
 from gapbridge.drivers.simulated.ur.settings import announced_rows
 from gapbridge.drivers.ur_rtde.enquiry import enquire
@@ -150,6 +151,7 @@ def test_the_controller_reports_what_it_is(host: str) -> None:
     assert facts.tcp is not None
     np.testing.assert_allclose(facts.payload_cog, [0, 0, 0.06])
     np.testing.assert_allclose(facts.tcp[:3, 3], [0, 0, 0.18])
+    np.testing.assert_allclose(facts.gravity, [0, 0, -9.80665])
     for key, values in DELTAS.items():
         np.testing.assert_allclose(facts.calibration[key], values, atol=1e-12)
     arm = builtin_arm("ur10e")
@@ -180,6 +182,26 @@ def test_live_passes_the_controllers_own_cell(host: str, tmp_path: Path) -> None
         flange_in_first(found.arm, q), flange_in_first(builtin_arm("ur10e", DELTAS), q), atol=1e-9
     )
     assert "# " in path.read_text()
+
+
+def test_an_arm_that_hangs_is_no_arm_that_stands(tmp_path: Path) -> None:
+    """UR's gravity is what holds the arm up: set_gravity([0, 0, 9.82]) where it stands upright."""
+    path = tmp_path / "hanging.yaml"
+    with SimulatedController(plant(gravity=(0.0, 0.0, 9.80665))) as running:
+        assert gapbridge("init", running.host, "--out", path).code == 0
+        np.testing.assert_allclose(load_cell(path).model.gravity, [0, 0, 9.80665])
+        assert gapbridge("check", path, "--live").code == 0
+        standing = gapbridge("check", cell(tmp_path, running.host), "--live")
+    assert standing.code == 2
+    assert "gravity: found [0, 0, -9.80665], expected [0, 0, 9.807]" in standing.err
+
+
+def test_gravity_across_the_base_of_a_urdf_only_warns() -> None:
+    """Its horizontal axes are the author's choice: half a turn apart in UR's own models."""
+    model = Model(arm=replace(builtin_arm("ur10e"), joint_names=tuple("abcdef")))
+    for gravity, sure in (([0.0, 6.9, -6.9], True), ([1.0, 0.0, -9.75], False)):
+        (found,) = differences(ControllerFacts(n=6, gravity=np.array(gravity)), model)
+        assert (found.keys, found.sure) == (("gravity",), sure)
 
 
 def test_init_overwrites_nothing_and_needs_a_controller(host: str, tmp_path: Path) -> None:
