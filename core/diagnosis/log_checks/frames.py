@@ -117,11 +117,10 @@ def _mistakes(
     order = best_order(model, q[rows], seen)
     if order is not None:
         yield order[0], model, order[1], seen
-    if turned is not None and np.isfinite(turned[rows]).all():
-        yield (
-            "they look inverted: the base seen from the tool", model, q[rows],
-            inverted(seen, turned[rows]),
-        )  # fmt: skip
+    found = None if turned is None else turned[rows]
+    if found is None or not np.isfinite(found).all():
+        found = rotation_vector(np.swapaxes(model.rigid_pose(q[rows]).rotation, 1, 2))
+    yield ("they look inverted: the base seen from the tool", model, q[rows], inverted(seen, found))
 
 
 def _size(position: Array) -> float:

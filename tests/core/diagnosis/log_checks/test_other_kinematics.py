@@ -47,6 +47,13 @@ def test_the_arm_itself_is_not_suspected() -> None:
     assert reported(TRUE, Q) == []
 
 
+def test_a_point_of_the_cell_seen_from_the_tool_is_named_without_rotations() -> None:
+    poses = TRUE.rigid_pose(Q)
+    seen = np.einsum("nji,nj->ni", poses.rotation, np.array([1.5, 0.2, 0.4]) - poses.position)
+    (note,) = reported(TRUE, Q, measured_position=seen)
+    assert "they look inverted: the base seen from the tool: then 0.0 mm" in note
+
+
 @pytest.mark.parametrize(
     ("model", "order", "phrase"),
     [
