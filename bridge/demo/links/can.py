@@ -52,7 +52,7 @@ class CanLink(ControllerLink):
             Load("1.4 kg", 1.4, (0.01, 0.0, 0.09)),
             Load("1.2 kg at the side", 1.2, (-0.04, 0.03, 0.07)),
         ),
-        calibrate=13,
+        calibrate=13, test=2, visits=2,
     )  # fmt: skip
 
     def __init__(self, out: Path, seed: int) -> None:
