@@ -28,6 +28,8 @@ GAP = 4.0  # sampling steps without a row that end a stretch
 COPIES = 0.9  # share of repeated rows alike in every column that makes them copies of one cycle
 FEW_REPEATS = 0.01  # share of repeated timestamps that may simply be left out
 MOTION = "motion"  # among what is derived of a log once
+EDGE = 128  # rows either side that derivatives need
+LEAD = 0.5  # s before a row that delays look back to
 SMALLEST_MOTION = 1e-4  # rad/s, what counts as standing still at least
 
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,10 +11,11 @@ from numpy.typing import NDArray
 from gapbridge.core.dynamics import predict_torque, predict_tracking, predict_wrench, with_pieces
 from gapbridge.core.log.log import Log
 from gapbridge.core.model import Model
-from gapbridge.core.motion import Motion, motion_of
+from gapbridge.core.motion import EDGE, LEAD, Motion, motion_of, with_motion
 
 Array = NDArray[np.float64]
 NO_MASSES = "masses of the links (in the cell's robot)"
+ROWS = 20_000  # predicted at a time
 
 
 def predicted_channels(model: Model, log: Log) -> tuple[dict[str, Array], dict[str, str]]:
@@ -39,6 +41,55 @@ def predicted_channels(model: Model, log: Log) -> tuple[dict[str, Array], dict[s
         every = np.ones(len(motion), dtype=bool)
         found["predicted_q"] = _spread(predict_tracking, model, motion, len(log), every)
     return found, lacking
+
+
+def in_context(pieces: Iterable[Log], rows: int = ROWS) -> Iterator[tuple[Log, slice]]:
+    """Yield the pieces of one recording with the rows around that their channels depend on.
+
+    Each comes as a log, and which rows of it are its own: those before and after are there for
+    derivatives, and for delays that look back. What is not longer than ``rows`` comes as a whole.
+    """
+    held: Log | None = None
+    done, start = 0, None  # rows of what is held that were given; s
+    for piece in pieces:
+        if start is None and piece.has("timestamp"):
+            start = float(piece.columns["timestamp"][0])
+        if held is not None and set(held.columns) != set(piece.columns):
+            yield _from(held, start), slice(done, len(held))
+            held, done = None, 0
+        held = piece if held is None else _joined(held, piece)
+        while len(held) - done > rows + EDGE:
+            end = done + rows
+            yield _from(held.select(slice(0, end + EDGE)), start), slice(done, end)
+            first = max(end - _rows_before(held), 0)
+            held, done = held.select(slice(first, None)), end - first
+    if held is not None:
+        yield _from(held, start), slice(done, len(held))
+
+
+def _joined(log: Log, further: Log) -> Log:
+    """Return a log with the rows that follow it."""
+    whole = slice(None)
+    one, other = log.select(whole), further.select(whole)  # each row with its line
+    assert one.lines is not None
+    assert other.lines is not None
+    return replace(
+        one, lines=np.concatenate([one.lines, other.lines]),
+        columns={n: np.concatenate([v, other.columns[n]]) for n, v in one.columns.items()},
+        numbers=None if one.numbers is None or other.numbers is None
+        else np.concatenate([one.numbers, other.numbers]),
+    )  # fmt: skip
+
+
+def _rows_before(log: Log) -> int:
+    time = log.get("timestamp")
+    step = 0.0 if time is None else float(np.median(np.diff(time)))
+    return EDGE + (int(np.ceil(LEAD / step)) if step > 0 else 0)
+
+
+def _from(log: Log, start: float | None) -> Log:
+    """Return a part of a recording that knows when the recording begins."""
+    return log if start is None else with_motion(log, replace(motion_of(log), start=start))
 
 
 def _spread(

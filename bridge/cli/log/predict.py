@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from operator import itemgetter
 from pathlib import Path
 
@@ -13,7 +14,6 @@ from numpy.typing import NDArray
 from gapbridge.bridge.api.functions import predict as predicted
 from gapbridge.bridge.api.records import Predicted
 from gapbridge.bridge.cell import Cell
-from gapbridge.bridge.cell.opened_log import open_log
 from gapbridge.bridge.cli.log.large_log import pieces_of
 from gapbridge.bridge.cli.options import (
     cell_option,
@@ -25,6 +25,7 @@ from gapbridge.bridge.cli.options import (
 from gapbridge.bridge.cli.progress import progress
 from gapbridge.bridge.document.output_file import require_writable, writing_table
 from gapbridge.core.log.log import Log
+from gapbridge.core.predicted_channels import in_context, predicted_channels
 
 Array = NDArray[np.float64]
 SHOWN = 8  # rows named at most
@@ -56,18 +57,28 @@ def predict(log: Path, cell: Path, out: Path, channels: bool) -> None:
     """
     given = open_cell(cell)
     require_writable(out, log, cell)
-    # channels take derivatives along the whole log
-    pieces = [open_log(log, given)] if channels else pieces_of(log, given)
     summary = _Summary()
     with writing_table(out) as append, progress("predicting") as advance:
-        for piece in looked_over(pieces, given):
-            found = predicted(given, piece, channels=channels)
+        for piece, found in _predicted(given, log, channels):
             append(*_table(found))
             summary.add(piece, found)
             advance(len(piece))
     click.echo(f"{out}: {summary.rows} predicted poses")
     for text in summary.lines(given):
         click.echo(text)
+
+
+def _predicted(cell: Cell, log: Path, channels: bool) -> Iterator[tuple[Log, Predicted]]:
+    """Yield the pieces of a log with what is predicted of them."""
+    pieces = looked_over(pieces_of(log, cell), cell)
+    if not channels:
+        yield from ((piece, predicted(cell, piece)) for piece in pieces)
+        return
+    for around, own in in_context(pieces):
+        piece = around.select(own)
+        further, lacking = predicted_channels(cell.model, around)
+        further = {name: values[own] for name, values in further.items()}
+        yield piece, replace(predicted(cell, piece), channels=further, lacking=lacking)
 
 
 def _table(found: Predicted) -> tuple[list[str], Array]:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapbridge.core.log.log import Log
-from gapbridge.core.motion import check_order, is_moving, motion_of, with_motion
+from gapbridge.core.motion import EDGE, LEAD, check_order, is_moving, motion_of, with_motion
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -25,8 +25,6 @@ WINDOWS = 12  # at least
 DERIVED = 32_768  # rows whose derivatives are taken at a time
 BLOCK = 4096  # rows judged at a time: what the processor's cache holds
 BLOCKS = 120  # at least: conditions, regions and their borders are made of blocks
-EDGE = 128  # rows either side that derivatives need
-LEAD = 0.5  # s before a block that delays look back to
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,55 @@
+"""Channels predicted piece by piece are those of the whole recording."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from gapbridge.core.arm import builtin_arm
+from gapbridge.core.effects import Site, Term
+from gapbridge.core.log.log import Log
+from gapbridge.core.model import Model
+from gapbridge.core.predicted_channels import in_context, predicted_channels
+
+RATE, COUNT = 250.0, 6000
+MODEL = Model(
+    builtin_arm("ur10e"),
+    terms=(Term("latency", Site(2), (0.02,)), Term("ft_drift", Site(), (0.1, 0, 0, 0, 0, 0))),
+)
+
+
+@pytest.fixture(scope="module")
+def log() -> Log:
+    t = 7.0 + np.arange(COUNT) / RATE
+    t[3000:] += 2.0  # a pause
+    q = np.array([0, -1.5, 1.5, -1.5, -1.5, 0]) + 0.3 * np.sin(t[:, None] + np.arange(6.0))
+    return Log("log.csv", {"timestamp": t, "target_q": q, "actual_q": q}, 6)
+
+
+def ragged(log: Log) -> Iterator[Log]:
+    for begin in range(0, len(log), 700):
+        yield log.select(slice(begin, min(begin + 700, len(log))))
+
+
+def test_every_row_comes_once_with_its_line_and_predicted_as_in_the_whole(log: Log) -> None:
+    whole, _ = predicted_channels(MODEL, log)
+    lines, parts = [], []
+    for around, own in in_context(ragged(log), 900):
+        found, lacking = predicted_channels(MODEL, around)
+        assert not lacking
+        lines += [around.line(row) for row in range(len(around))[own]]
+        parts.append({name: values[own] for name, values in found.items()})
+    assert lines == [log.line(row) for row in range(len(log))]
+    assert len(parts) == 7
+    for short, atol in (("torque", 0.02), ("wrench", 1e-3), ("q", 1e-12)):
+        name = f"predicted_{short}"
+        values = np.concatenate([part[name] for part in parts])
+        np.testing.assert_array_equal(np.isnan(values), np.isnan(whole[name]))
+        np.testing.assert_allclose(values, whole[name], rtol=0, atol=atol)
+
+
+def test_a_short_log_comes_as_a_whole(log: Log) -> None:
+    ((around, own),) = in_context(ragged(log), COUNT)
+    assert (len(around), own) == (COUNT, slice(0, COUNT))
