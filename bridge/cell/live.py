@@ -11,6 +11,8 @@ from gapbridge.core.errors import CellError, InvalidStateError, StaleStateError
 from gapbridge.core.state import RobotState
 from gapbridge.drivers import make_driver
 from gapbridge.drivers.driver import Driver
+from gapbridge.drivers.ur_rtde.enquiry import require_listening
+from gapbridge.drivers.ur_rtde.settings import UrRtdeSettings
 
 SAMPLES, LONGEST = 50, 2.0  # states, s
 SLOW = 0.8  # share of the rate asked for that must come
@@ -24,6 +26,8 @@ def live_findings(cell: Cell) -> Findings:
     link = cell.link
     if link is None:
         raise CellError(f"{cell.path}: link: found nothing, expected the controller's address")
+    if isinstance(link, UrRtdeSettings):
+        require_listening(link.host)
     driver = make_driver(link, cell.model)
     errors: list[str] = []
     warnings: list[str] = []

@@ -26,6 +26,7 @@ from gapbridge.core.plausibility import (
     reach,
     urdf_oddities,
 )
+from gapbridge.drivers.ur_rtde.settings import UrRtdeSettings
 
 STANDARD = 9.80665  # m/s2
 SENSIBLE_GRAVITY, EARTH = 1.5, 0.1  # m/s2 beside the standard: no place, no place on the ground
@@ -34,6 +35,7 @@ COLD, HOT = (-60.0, -20.0), (150.0, 60.0)  # °C: never, hardly
 SOFTEST, SOFT = 1.0, 0.01  # rad/Nm: no joint, few joints
 CALIBRATED, MUCH = 0.1, 0.02  # m at the flange: no factory calibration, few
 HEAVIEST_LOAD, HEAVY_LOAD = 3000.0, 300.0  # kg, where the arm's rating is not known
+UR_JOINTS = 6
 DISPLACED = 2.0  # times the reach, and a metre: no tool is that long
 
 
@@ -73,6 +75,10 @@ def oddities(file: CellFile, document: Document, arm: Arm) -> Iterator[Oddity]:
                     ("compliance", key, i), f"{value:g}", "rad/Nm (a stiffness, in Nm/rad?)"
                     if value > SOFTEST else "at most 0.01 rad/Nm", sure=value > SOFTEST,
                 )  # fmt: skip
+    if isinstance(file.link, UrRtdeSettings) and arm.n != UR_JOINTS:
+        yield Oddity(
+            ("link",), f"driver ur_rtde with an arm of {arm.n} joints", f"{UR_JOINTS}: a UR's"
+        )
     if file.ft_sensor is not None:
         mounted = file.ft_sensor.sensor_in_flange
         yield from _length(("ft_sensor", "sensor_in_flange", "xyz"), mounted.xyz, far, "")

@@ -85,6 +85,17 @@ def enquire(host: str, rtde_port: int = RTDE, primary_port: int = PRIMARY) -> Co
     )
 
 
+def require_listening(host: str, port: int = RTDE) -> None:
+    """Raise LinkError where nobody listens: ur_rtde would print lines of its own."""
+    try:
+        socket.create_connection((host, port), TIMEOUT).close()
+    except OSError:
+        raise LinkError(
+            f"could not connect to {host}, port {port}: is this the controller's address, and "
+            "does it run?"
+        ) from None
+
+
 def nominal_rows(model: str) -> Array:
     """Return (6, 4) theta, a, d, alpha of a built-in arm."""
     rows = builtin_rows(model)["dh"]

@@ -141,7 +141,8 @@ def _known_text(facts: ControllerFacts) -> str:
     """Return in words what the controller has said."""
     names = {
         "model": facts.model, "factory calibration": facts.calibration or None, "TCP": facts.tcp,
-        "payload": facts.payload, "joint limits": facts.lower, "rate": facts.rate,
+        "payload": facts.payload, "gravity": facts.gravity, "joint limits": facts.lower,
+        "rate": facts.rate,
     }  # fmt: skip
     known = [name for name, value in names.items() if value is not None]
     missing = [name for name, value in names.items() if value is None]

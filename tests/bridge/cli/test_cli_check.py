@@ -215,10 +215,20 @@ def test_init_overwrites_nothing_and_needs_a_controller(host: str, tmp_path: Pat
     assert not (tmp_path / "new.yaml").exists()
 
 
+def test_an_arm_that_no_ur_can_be_is_refused_with_its_line(tmp_path: Path) -> None:
+    path = tmp_path / "cell.yaml"
+    path.write_text(CRAIG.rsplit("    -", 1)[0] + "link: {host: 127.0.0.2}\n")
+    assert (
+        f"error: {path}, line 8: link: found driver ur_rtde with an arm of 5 joints, expected 6"
+        in gapbridge("check", path).err
+    )
+
+
 def test_a_controller_that_is_not_there_is_named_with_its_port(tmp_path: Path) -> None:
     answer = gapbridge("check", cell(tmp_path, "127.9.9.9", "0.18"), "--live")
     assert answer.code == 1
-    assert "error: could not connect to 127.9.9.9, port 30004" in answer.err
+    (line,) = answer.err.splitlines()
+    assert line.startswith("error: could not connect to 127.9.9.9, port 30004")
 
 
 def test_init_without_a_profile_names_those_that_are_shipped(tmp_path: Path) -> None:
