@@ -3,7 +3,7 @@
     python -m benchmarks.evidence.transcript --out docs/transcript.md
 
 Runs the commands that it prints, one after the other, against ``gapbridge simulate``, and plays the
-person beside the arm: says yes, hangs the plate on the flange. Takes three minutes or so.
+person beside the arm: says yes, hangs the plate on the flange. Takes five minutes or so.
 """
 
 from __future__ import annotations
@@ -99,7 +99,8 @@ class Session:
             if "as soon as it rests" not in question:
                 child.send(self._answer(new, question) + "\r")
         child.close()
-        self._show(arguments, shown + CONTROL.sub("", child.before or ""))
+        shown += CONTROL.sub("", child.before or "")
+        self._show(arguments, shown)
         if child.exitstatus:
             raise SystemExit(f"gapbridge {arguments}: ended with {child.exitstatus}\n{shown}")
 

@@ -32,6 +32,8 @@ WITHDRAWN = {
     Check.STABLE_VALUE: "it does not keep its value beside the unknown that is left",
     Check.CONSTANT: "its value is no constant: it goes by {quantity}",
     Check.COMPANION: "no load is declared, and none is accused",
+    Check.SEPARATED: "the flange hardly turns against gravity here, so that it may as well be "
+    "{quantity}",
     Check.HELD_OUT_GAIN: "it does not shrink the gap on samples that its fit did not see",
     Check.ALL_ROWS_GAIN: "over all rows the gap does not shrink by it",
 }

@@ -19,6 +19,7 @@ class Check(Enum):
     STABLE_VALUE = auto()  # it keeps its value beside unnamed functions for what is left
     CONSTANT = auto()  # its value does not go by a quantity of the log
     COMPANION = auto()  # what shows it is declared, or accused beside it
+    SEPARATED = auto()  # the log does not show that it is no load: the flange turns
     HELD_OUT_GAIN = auto()  # it shrinks the gap on samples that its fit did not see
     ALL_ROWS_GAIN = auto()  # the same over all rows of the log
 
@@ -28,7 +29,7 @@ class Withdrawal:
     """Why a selected term is not accused."""
 
     failed: Check
-    quantity: str = ""  # CONSTANT: what the value goes by
+    quantity: str = ""  # CONSTANT: what the value goes by; SEPARATED: what it may be instead
 
 
 class ParameterState(Enum):

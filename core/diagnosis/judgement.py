@@ -31,7 +31,7 @@ from gapbridge.core.diagnosis.criteria import (
 )
 from gapbridge.core.diagnosis.finding import Check, Withdrawal
 from gapbridge.core.diagnosis.held_out import HeldOut
-from gapbridge.core.diagnosis.regions import parts
+from gapbridge.core.diagnosis.regions import one_place, parts
 from gapbridge.core.diagnosis.remainder import (
     closes_everywhere,
     links_withstand,
@@ -85,6 +85,8 @@ def judge(selection: Selection, held: HeldOut) -> Judgement:
     for position, reason in _no_value(selection).items():
         withdrawn[selection.term_index[position]] = reason
     withdrawn |= dict.fromkeys(bumps(selection), Withdrawal(Check.NOT_LOCALISED))
+    for c, loads in _like_a_load(selection).items():
+        withdrawn.setdefault(c, Withdrawal(Check.SEPARATED, loads))
     believed = [
         c for c in selection.term_index if c not in withdrawn and c not in selection.block
     ]  # fmt: skip
@@ -215,6 +217,29 @@ def _without_companion(selection: Selection, stays: Sequence[int]) -> list[int]:
     return [c for c in stays if own[c].beside not in families]
 
 
+def _like_a_load(selection: Selection) -> dict[int, str]:
+    """Return the constants of a sensor of which a load's weight is one, too, and which load's.
+
+    As long as the flange does not turn against gravity a weight is a constant reading.
+    """
+    space, found = selection.working, {}
+    for c in selection.term_index:
+        if not space.candidates[c].effect.any_constant:
+            continue
+        U = basis_of(space.columns([c]))
+        alike = []
+        for other, candidate in enumerate(space.candidates):
+            if not candidate.effect.carried:
+                continue
+            x = space.columns([other])
+            whole = float(np.sum(x**2))
+            if whole > 0 and float(np.sum((x - U @ (U.T @ x)) ** 2)) < SAME_SPAN * whole:
+                alike.append(candidate.family)
+        if alike:
+            found[c] = " or ".join(dict.fromkeys(alike))
+    return found
+
+
 def gainless(selection: Selection, stays: Sequence[int], held: HeldOut) -> list[int]:
     """Return the candidates of effects that do not shrink the held-out gap, the weakest first."""
     if not held.possible:
@@ -248,9 +273,11 @@ def with_stand_ins(selection: Selection, judgement: Judgement) -> Judgement:
     Terms go one by one, the least useful first, until each of those left gains.
     """
     index, none = selection.term_index, _no_value(selection)
-    useful = [p for p, _ in judgement.withdrawn if p not in none]
+    useful = [
+        p for p, why in judgement.withdrawn if p not in none and why.failed is not Check.SEPARATED
+    ]
     held = HeldOut(selection, parts=parts(selection.observation, selection.kept))
-    if not (useful and held.possible):
+    if not (useful and held.possible) or one_place(selection.observation):
         return judgement
     chosen = [*judgement.accused, *useful]
     units = _units(selection, useful)

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from gapbridge.core.diagnosis.observation import Observation
 from gapbridge.core.estimation.regions import k_means
 
+SAME_PLACE = 0.01  # rad that no joint leaves: one pose, whatever the encoders report
 REGIONS = 24  # of joint space, or stretches of time
 PARTS = 8  # left out in turn, each of several regions that lie scattered
 
@@ -23,6 +24,15 @@ def parts(observation: Observation, kept: NDArray[np.bool_]) -> NDArray[np.int64
         return np.asarray(region % PARTS)
     order = np.random.default_rng(0).permutation(int(region.max()) + 1)
     return np.asarray(order[region] % PARTS)
+
+
+def one_place(observation: Observation) -> bool:
+    """Return whether a channel was seen at one pose under one load: nothing new was left out."""
+    return not any(
+        name.startswith(("payload", "actual_TCP_force", "session"))
+        or (name.startswith(("actual_q_", "target_q_")) and np.ptp(values) > SAME_PLACE)
+        for name, values in observation.quantities.items()
+    )
 
 
 def regions(observation: Observation, kept: NDArray[np.bool_]) -> NDArray[np.int64]:

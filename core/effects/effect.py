@@ -107,6 +107,7 @@ class Effect(ABC):
     carried: ClassVar[bool] = False  # True: a load on the joints, which friction may grow with
     adds_mass: ClassVar[bool] = False  # True: kg beyond the declared payload
     scales_reading: ClassVar[bool] = False  # True: the sensor reads zero where nothing acts
+    any_constant: ClassVar[bool] = False  # True: any reading that stays the same is of its form
     together: ClassVar[bool] = False  # True: small at all places of a real arm, found as a whole
     # True: goes with the links: a zero or a point with their geometry, friction with their masses
     beside_links: ClassVar[bool] = False

@@ -23,7 +23,7 @@ class FtBias(Effect):
 
     Comes from mounting strain, temperature, an old zero. Shows the same at every pose, while the
     weight of a payload turns with the flange: poses that turn the flange separate it from a
-    payload; sessions of some length from a drift.
+    payload, and from one pose it is not named; sessions of some length separate it from a drift.
     Source: Hollerbach, Khalil, Gautier, "Model Identification", Springer Handbook of
     Robotics (2016), ch. 6.
     """
@@ -32,6 +32,7 @@ class FtBias(Effect):
     title = "force sensor zero is off"
     label_template = "sensor zero of {part}"
     order = 80
+    any_constant = True
     corrects = "sensor zero"
     channels = ("wrench",)
     motion = "poses that turn the flange by tens of degrees against gravity"

@@ -29,7 +29,11 @@ def k_means(points: Array, count: int, seed: int, rounds: int) -> NDArray[np.int
     chosen = int(rng.randint(len(points), dtype=np.int64))
     for i in range(count):
         if i > 0:
-            share = nearest / nearest.sum()
+            whole = nearest.sum()
+            if whole == 0.0:  # fewer places than centres
+                centres[i:] = points[0]
+                break
+            share = nearest / whole
             chosen = int(np.searchsorted(share.cumsum(), rng.uniform()))
         centres[i] = points[chosen]
         nearest = np.minimum(nearest, np.sum((points - centres[i]) ** 2, axis=1))

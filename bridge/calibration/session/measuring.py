@@ -225,7 +225,9 @@ class Measuring:
 
     def _resolve(self, verdict: Verdict, same: bool) -> str:
         """Report what looks wrong; returns ``""`` (measure again), ``take`` or ``keep``."""
-        if verdict.off > verdict.allowed:
+        if verdict.off > verdict.allowed == 0.0:  # no place of it can be right
+            self.prompt.warn("no reading of this instrument can be so")
+        elif verdict.off > verdict.allowed:
             self.prompt.warn(
                 f"{millimetres(verdict.off)} from where it was expected; a good reading is within "
                 f"{millimetres(verdict.allowed)}"

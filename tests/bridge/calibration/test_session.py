@@ -121,6 +121,18 @@ def test_mistakes_on_the_way_leave_the_same_calibration(
     _same_within_intervals(clean[0] / "s", tmp_path / "s")
 
 
+def test_the_first_reading_in_another_unit_is_held_to_no_expected_place(tmp_path: Path) -> None:
+    cell = write_cell(tmp_path)
+    play(cell, "--plan-only", "--session", tmp_path / "s")
+    plan = plan_in(tmp_path / "s")
+    lines = ["", typed(positions(plan)[0], 1e-3), "", "quit"]
+    played = play(cell, "--session", tmp_path / "s", lines=lines)
+    assert "no reading of this instrument can be so" in played.out
+    assert "is the unit right?" in played.out
+    assert "from where it was expected" not in played.out
+    assert not _kept(tmp_path)
+
+
 def hung(load: list[int], stop: int) -> list[str]:
     """Return Enter where another load is hung before a stop."""
     return [""] if stop == 0 or load[stop] != load[stop - 1] else []

@@ -66,6 +66,6 @@ def test_a_sensor_that_says_one_thing_for_ever_is_answered(plant):
     with np.errstate(divide="raise", over="raise", invalid="raise"):
         found = diagnose(plant.model(0.0), log)
     channel = next(c for c in found.channels if c.channel == "wrench")
-    assert {"ft_bias"} == {c.effect for c in channel.causes}
-    assert np.isfinite(channel.causes[0].relative_deviation).all()
-    assert channel.remaining_rms < 1e-9
+    assert not channel.causes  # from one pose it may be a weight as well
+    assert channel.verdict == "unexplained"
+    assert np.isfinite([channel.gap_rms, channel.remaining_rms, channel.unexplained_rms]).all()

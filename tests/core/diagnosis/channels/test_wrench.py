@@ -8,6 +8,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from gapbridge.core.diagnosis.channels.wrench import observe, torque_weight
+from gapbridge.core.diagnosis.diagnosis import diagnose
+from gapbridge.core.diagnosis.finding import ChannelFinding, Check, NotAccused
 from gapbridge.core.diagnosis.observation import NotObservable
 from gapbridge.core.effects import Site, Term
 from gapbridge.core.metrology import Metrology
@@ -142,3 +144,37 @@ def test_what_is_missing_is_named(plant):
     assert observe(plant.model(), truth.log_of(N, actual_q=q), METROLOGY) == NotObservable(
         "wrench", ("ft_raw_wrench",)
     )
+
+
+def named_at(plant, q, step, wrench, **withhold):
+    """Return the effects named, the wrench channel and the notes of readings at poses (rows, N)."""
+    rng = np.random.default_rng(2)
+    log = truth.log_of(
+        N, timestamp=np.arange(len(q)) * step, actual_q=q + rng.normal(0, 1e-5, q.shape),
+        ft_raw_wrench=wrench + rng.normal(0, 1, wrench.shape) * NOISE,
+    )  # fmt: skip
+    found = diagnose(plant.model(2.0), log, METROLOGY, **withhold)
+    (channel,) = [c for c in found.channels if c.channel == "wrench"]
+    return {cause.effect for cause in channel.causes}, channel, found.findings
+
+
+@pytest.mark.parametrize(("rows", "step"), [(60, 20.0), (500, 0.01)], ids=["at rest", "recorded"])
+def test_from_one_pose_neither_a_sensors_zero_nor_a_weight_is_named(plant, rows: int, step: float):
+    q = np.tile(truth.poses(N, 1, 3), (rows, 1))
+    weight = plant.dynamics(q, 0 * q, 0 * q, payload=2.0)[1]
+    for wrench in (weight + BIAS, 1.2 * weight):
+        named, channel, _ = named_at(plant, q, step, wrench)
+        assert not named
+        assert not channel.stand_ins
+    named, _, notes = named_at(plant, q, step, weight + BIAS, withhold=("ft_gain",))
+    assert not named
+    facts = [note.fact for note in notes if isinstance(note, ChannelFinding)]
+    (why,) = [fact.reason for fact in facts if isinstance(fact, NotAccused)]
+    assert (why.failed, why.quantity) == (Check.SEPARATED, "payload or payload_cog")
+
+
+def test_poses_that_turn_the_flange_separate_a_sensors_zero_from_a_weight(plant):
+    q = truth.poses(N, 60, 3)
+    weight = plant.dynamics(q, 0 * q, 0 * q, payload=2.0)[1]
+    assert named_at(plant, q, 20.0, weight + BIAS)[0] == {"ft_bias"}
+    assert named_at(plant, q, 20.0, 1.2 * weight)[0] == {"payload"}
