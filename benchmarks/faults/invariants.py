@@ -66,13 +66,13 @@ class Found:
     oldest_state: float = 0.0  # s, behind a write
     violations: list[str] = field(default_factory=list)
     violated: int = 0
-    recent: deque[str] = field(default_factory=lambda: deque(maxlen=10))
+    recent: deque[Fresh | Write] = field(default_factory=lambda: deque(maxlen=10))
 
     def add(self, message: str) -> None:
         """Note a violation, the first few with what went over the wire just before."""
         self.violated += 1
         if len(self.violations) < LONGEST_LIST:
-            before = "; ".join(self.recent) if self.violated < 5 else ""
+            before = "; ".join(map(_brief, self.recent)) if self.violated < 5 else ""
             self.violations.append(f"{message} [{before}]" if before else message)
 
 
@@ -125,8 +125,7 @@ class Checker:
     def take(self, seen: Sequence[Fresh | Write]) -> None:
         """Check what the tap has seen next."""
         for item in seen:
-            what = "state" if isinstance(item, Fresh) else item.kind
-            self.found.recent.append(f"{item.time:.3f} {what} in {item.state}")
+            self.found.recent.append(item)
             if item.state in WRITING:
                 self._last_writing = max(self._last_writing, item.time)
             elif item.early - self._last_writing > GRACE:
@@ -335,6 +334,11 @@ class Checker:
         if math.isfinite(fresh.stamp):
             return fresh.stamp, fresh.stamp
         return fresh.early, write.time
+
+
+def _brief(item: Fresh | Write) -> str:
+    what = "state" if isinstance(item, Fresh) else item.kind
+    return f"{item.time:.3f} {what} in {item.state}"
 
 
 def _apart(a: Numbers, b: Numbers) -> tuple[float, float]:

@@ -131,7 +131,7 @@ class Tally:
         self.steps += len(gaps)
         self.span += float(gaps.sum())
         bits = rows[:, s["clamped"].start].astype(np.int64)
-        for bit in range(len(CLAMPS)):
+        for bit in range(len(CLAMPS)) if bits.any() else ():
             self.clamped[bit] += int((bits >> bit & 1).sum())
         self.age.add(age)
         self.age_written.add(age[written])

@@ -98,9 +98,10 @@ def vector_registers(entry: Vector, values: Sequence[float]) -> dict[int, int]:
 
 def _place(found: dict[int, int], entry: Vector, counts: Sequence[float]) -> None:
     coding = entry.coding
-    for address, count in zip(addresses(entry, len(counts)), counts, strict=True):
-        for k, word in enumerate(coding.encode([count])):
-            found[address + k] = word
+    words, size = coding.encode(counts), coding.words
+    for i, address in enumerate(addresses(entry, len(counts))):
+        for k in range(size):
+            found[address + k] = words[i * size + k]
 
 
 def runs(registers: dict[int, int]) -> list[tuple[int, list[int]]]:

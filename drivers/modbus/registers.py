@@ -6,6 +6,7 @@ longer number differs from controller to controller.
 
 from __future__ import annotations
 
+import functools
 import math
 import struct
 from collections.abc import Sequence
@@ -51,6 +52,21 @@ def wire_of(words: Sequence[int]) -> bytes:
     return struct.pack(f">{len(words)}H", *words)
 
 
+@functools.cache
+def _limits(name: TypeName) -> tuple[float, float]:
+    bits = 16 * WORDS[name]
+    if name == "bit":
+        return 0.0, 1.0
+    if name.startswith("f"):
+        most = 3.4e38 if name == "f32" else 1.7e308
+        return -most, most
+    if name.startswith("sm"):
+        return -(2.0 ** (bits - 1) - 1), 2.0 ** (bits - 1) - 1
+    if name.startswith("i"):
+        return -(2.0 ** (bits - 1)), 2.0 ** (bits - 1) - 1
+    return 0.0, 2.0**bits - 1
+
+
 @dataclass(frozen=True, slots=True)
 class Coding:
     """How numbers of one kind lie in registers."""
@@ -66,17 +82,7 @@ class Coding:
     @property
     def limits(self) -> tuple[float, float]:
         """Return the smallest and the largest count that fits; floats: their range."""
-        bits = 16 * self.words
-        if self.type == "bit":
-            return 0.0, 1.0
-        if self.type.startswith("f"):
-            most = 3.4e38 if self.type == "f32" else 1.7e308
-            return -most, most
-        if self.type.startswith("sm"):
-            return -(2.0 ** (bits - 1) - 1), 2.0 ** (bits - 1) - 1
-        if self.type.startswith("i"):
-            return -(2.0 ** (bits - 1)), 2.0 ** (bits - 1) - 1
-        return 0.0, 2.0**bits - 1
+        return _limits(self.type)
 
     def decode(self, registers: Sequence[int]) -> Sequence[float]:
         """Return the numbers in registers (words a number), as counts."""

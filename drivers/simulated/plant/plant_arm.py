@@ -79,12 +79,24 @@ class PlantArm:
 
     def flange(self, q: Sequence[float]) -> Frame:
         """Return the flange of the rigid arm in base."""
-        rotation, origin = IDENTITY, (0.0, 0.0, 0.0)
+        # ``frames`` written out: this runs a few times in every cycle of every controller
+        r0, r1, r2, r3, r4, r5, r6, r7, r8 = IDENTITY
+        x = y = z = 0.0
         for link, angle in zip(self.links, q, strict=False):
-            origin = add(origin, rotate(rotation, link.origin))
-            rotation = turn_z(compose(rotation, link.rotation), angle)
-        last = self.links[-1]
-        return Frame(compose(rotation, last.rotation), add(origin, rotate(rotation, last.origin)))
+            u, v, w = link.origin
+            x += r0 * u + r1 * v + r2 * w
+            y += r3 * u + r4 * v + r5 * w
+            z += r6 * u + r7 * v + r8 * w
+            b0, b1, b2, b3, b4, b5, b6, b7, b8 = link.rotation
+            c, s = math.cos(angle), math.sin(angle)
+            e, f = r0 * b0 + r1 * b3 + r2 * b6, r0 * b1 + r1 * b4 + r2 * b7
+            r0, r1, r2 = e * c + f * s, f * c - e * s, r0 * b2 + r1 * b5 + r2 * b8
+            e, f = r3 * b0 + r4 * b3 + r5 * b6, r3 * b1 + r4 * b4 + r5 * b7
+            r3, r4, r5 = e * c + f * s, f * c - e * s, r3 * b2 + r4 * b5 + r5 * b8
+            e, f = r6 * b0 + r7 * b3 + r8 * b6, r6 * b1 + r7 * b4 + r8 * b7
+            r6, r7, r8 = e * c + f * s, f * c - e * s, r6 * b2 + r7 * b5 + r8 * b8
+        rotation = (r0, r1, r2, r3, r4, r5, r6, r7, r8)
+        return place(Frame(rotation, (x, y, z)), self.links[-1])
 
 
 def _vector3(values: Sequence[float]) -> Vector3:

@@ -2,25 +2,18 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
+import contextlib
 from pathlib import Path
 
 import numpy as np
 import pytest
+from cli_runs import gapbridge
 from pyarrow import parquet
 
 CELL = """
 robot: {model: ur5e}
 metrology: {registered: true, sigma: 2.0e-5}
 """
-
-
-def gapbridge(*arguments: object) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "gapbridge", *map(str, arguments)], capture_output=True, text=True,
-        timeout=120, check=False,
-    )  # fmt: skip
 
 
 @pytest.fixture
@@ -41,8 +34,8 @@ def recording(tmp_path: Path) -> Path:
 def test_a_recording_becomes_a_log(recording: Path, suffix: str) -> None:
     out = recording.with_name(f"log{suffix}")
     done = gapbridge("convert", recording, "--cell", recording.with_name("cell.yaml"), "--out", out)
-    assert done.returncode == 0, done.stderr
-    assert "8 rows" in done.stdout
+    assert done.code == 0, done.err
+    assert "8 rows" in done.out
     if suffix == ".csv":
         assert out.read_text().startswith("timestamp,actual_q_0,")
     else:
@@ -54,7 +47,7 @@ def test_predict_takes_the_source_itself(recording: Path) -> None:
     gapbridge("convert", recording, "--cell", cell, "--out", folder / "log.csv")
     for given, out in ((recording, "a.csv"), (folder / "log.csv", "b.csv")):
         done = gapbridge("predict", given, "--cell", cell, "--out", folder / out)
-        assert done.returncode == 0, done.stderr
+        assert done.code == 0, done.err
     assert (folder / "a.csv").read_text() == (folder / "b.csv").read_text()
 
 
@@ -62,7 +55,7 @@ def test_predictions_under_a_parquet_name_are_parquet(recording: Path) -> None:
     out = recording.with_name("predicted.parquet")
     done = gapbridge("predict", recording, "--cell", recording.with_name("cell.yaml"),
                      "--out", out)  # fmt: skip
-    assert done.returncode == 0, done.stderr
+    assert done.code == 0, done.err
     assert parquet.read_table(out).column_names[0] == "predicted_position_0"
 
 
@@ -80,10 +73,8 @@ def test_predictions_under_a_parquet_name_are_parquet(recording: Path) -> None:
 def test_what_cannot_be_converted_is_one_line(
     recording: Path, arguments: list[str], output: str
 ) -> None:
-    done = subprocess.run(
-        [sys.executable, "-m", "gapbridge", "convert", *arguments], capture_output=True, text=True,
-        timeout=120, check=False, cwd=recording.parent,
-    )  # fmt: skip
-    assert done.returncode == 2
-    assert output in done.stderr
-    assert len(done.stderr.strip().splitlines()) == 1
+    with contextlib.chdir(recording.parent):
+        done = gapbridge("convert", *arguments)
+    assert done.code == 2
+    assert output in done.err
+    assert len(done.err.strip().splitlines()) == 1

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.compensation import Compensator
@@ -49,6 +50,7 @@ def rests(arm: Plant, setpoints: np.ndarray) -> np.ndarray:
     return np.round(np.array(found) / 1.7e-5) * 1.7e-5
 
 
+@pytest.mark.slow
 def test_droop_is_found_and_setpoints_bring_the_joints_where_they_were_wanted() -> None:
     nominal = Model(ARM, payload_mass=LOAD, payload_cog=np.array(COG))
     before = rests(plant(), POSES)

@@ -16,13 +16,15 @@ from benchmarks.patch.arms import written_arms
 from benchmarks.patch.cases import cases
 from benchmarks.patch.run import run
 
+SLOW = pytest.mark.slow
+
 
 @pytest.mark.parametrize(
     ("name", "effect"),
     [
         ("ur10e", "joint_offset"),  # poses
-        ("seven", "axial_compliance"),  # a further joint with a spring
-        ("ur10e", "coulomb_friction"),  # a motion, of which a search takes some rows
+        pytest.param("seven", "axial_compliance", marks=SLOW),  # a further joint with a spring
+        pytest.param("ur10e", "coulomb_friction", marks=SLOW),  # a motion; a search takes rows
     ],
 )
 def test_a_gap_is_named_patched_and_gone(tmp_path: Path, name: str, effect: str) -> None:

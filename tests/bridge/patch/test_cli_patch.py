@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
+import contextlib
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import numpy as np
 import pytest
+from cli_runs import Answer, gapbridge
 
 from benchmarks.patch.arms import UR_JOINTS, mjcf, urdf
 from gapbridge.core.arm import builtin_arm
@@ -44,17 +44,15 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def patch(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "gapbridge", "patch", *arguments, "--cell", "cell.yaml"],
-        capture_output=True, text=True, timeout=120, check=False, cwd=folder,
-    )  # fmt: skip
+def patch(folder: Path, *arguments: str) -> Answer:
+    with contextlib.chdir(folder):
+        return gapbridge("patch", *arguments, "--cell", "cell.yaml")
 
 
 @pytest.mark.parametrize("model", ["arm.xml", "arm.urdf"])
 def test_a_tie_is_a_comment_with_both_candidates(folder: Path, model: str) -> None:
     done = patch(folder, model, "--out", f"out{Path(model).suffix}")
-    assert done.returncode == 0, done.stderr
+    assert done.code == 0, done.err
     text = (folder / f"out{Path(model).suffix}").read_text()
     comment = text[text.index("<!--") : text.index("-->", text.index("Patched"))]
     tied = [line for line in comment.splitlines() if "tie:" in line]
@@ -63,12 +61,12 @@ def test_a_tie_is_a_comment_with_both_candidates(folder: Path, model: str) -> No
     assert "link_flexibility" in tied[0]
     assert "latency_4" in tied[1]
     assert "tracking_lag" in tied[1]
-    assert done.stdout.count("tie:") == 2
+    assert done.out.count("tie:") == 2
 
 
 def test_what_was_not_accused_is_never_written(folder: Path) -> None:
     done = patch(folder, "arm.xml", "--out", "out.xml")
-    assert "not held: viscous_friction of joint 2: a stand-in, not accused" in done.stdout
+    assert "not held: viscous_friction of joint 2: a stand-in, not accused" in done.out
     compiled = mujoco.MjModel.from_xml_path(str(folder / "out.xml"))
     assert np.ravel(compiled.dof_damping[compiled.joint(UR_JOINTS[1]).dofadr[0]])[0] == 0
 
@@ -95,7 +93,7 @@ def test_bounds_free_what_was_accused_alone(folder: Path) -> None:
     import yaml
 
     done = patch(folder, "arm.xml", "--out", "out.xml", "--parameters", "bounds.yaml")
-    assert done.returncode == 0, done.stderr
+    assert done.code == 0, done.err
     found = yaml.safe_load((folder / "bounds.yaml").read_text())
     free = {name for name, state in found.items() if not state["frozen"]}
     assert free == {"axial_compliance_2", "joint_offset_3", "latency_4"}
@@ -109,7 +107,7 @@ def test_bounds_free_what_was_accused_alone(folder: Path) -> None:
 
 def test_modifiers_bring_the_patched_model_to_any_value_within_bounds(folder: Path) -> None:
     done = patch(folder, "arm.xml", "--out", "out.xml", "--parameters", "bounds.py")
-    assert done.returncode == 0, done.stderr
+    assert done.code == 0, done.err
     module = loaded(folder / "bounds.py")
 
     def model(**values: float) -> Any:
@@ -162,9 +160,9 @@ def test_bounds_that_cannot_be_written_are_one_line(
     folder: Path, arguments: list[str], output: str
 ) -> None:
     done = patch(folder, *arguments)
-    assert done.returncode == 2
-    assert output in done.stderr
-    assert len(done.stderr.strip().splitlines()) == 1
+    assert done.code == 2
+    assert output in done.err
+    assert len(done.err.strip().splitlines()) == 1
     assert not (folder / arguments[2]).exists()
 
 
@@ -172,7 +170,7 @@ def test_further_joints_take_nothing_from_a_models_classes(folder: Path) -> None
     text = (folder / "arm.xml").read_text().replace("<worldbody>", f"{CLASSES}<worldbody>")
     (folder / "arm.xml").write_text(text)
     done = patch(folder, "arm.xml", "--out", "out.xml")
-    assert done.returncode == 0, done.stderr
+    assert done.code == 0, done.err
     compiled = mujoco.MjModel.from_xml_path(str(folder / "out.xml"))
     spring = compiled.joint(f"{UR_JOINTS[1]}_axial_compliance")
     assert compiled.jnt_limited[spring.id] == 0
@@ -195,5 +193,5 @@ def test_meshes_are_found_from_another_folder(folder: Path) -> None:
     (folder / "arm.xml").write_text(text)
     (folder / "deep" / "er").mkdir(parents=True)
     done = patch(folder, "arm.xml", "--out", "deep/er/out.xml")
-    assert done.returncode == 0, done.stderr
+    assert done.code == 0, done.err
     assert mujoco.MjModel.from_xml_path(str(folder / "deep" / "er" / "out.xml")).nmesh == 1

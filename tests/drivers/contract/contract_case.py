@@ -60,7 +60,7 @@ class Case(ABC):
     clocked = False
     force: float | None = None
     writes: str | None = "joints"
-    state_timeout = 0.5
+    state_timeout = 0.3
     n = 6
 
     def __init__(self) -> None:

@@ -89,7 +89,7 @@ def check_angles(case: Case, driver: Driver) -> None:
     controller = case.controller
     start = controller.q
     goal = tuple(
-        min(max(q + (0.3 + 0.05 * i) * (-1) ** i, lo + 0.01), hi - 0.01)
+        min(max(q + (0.1 + 0.02 * i) * (-1) ** i, lo + 0.01), hi - 0.01)
         for i, (q, lo, hi) in enumerate(
             zip(start, controller.plant.arm.lower, controller.plant.arm.upper, strict=True)
         )
@@ -107,8 +107,6 @@ def check_angles(case: Case, driver: Driver) -> None:
             fastest = max(fastest, float(np.abs(state.actual_qd).max()))
         if max(map(abs, controller.qd)) < 1e-6 and np.allclose(controller.q, goal, atol=1e-6):
             break
-    for _ in range(3):
-        state = next_state(driver)
     wait_for(
         lambda: bool(np.abs(next_state(driver).actual_q - goal).max() <= case.resolution * 1.01),
         2.0, "the joints that the plant has come to",
@@ -139,7 +137,9 @@ def check_offset(case: Case, driver: Driver) -> None:
         return list(gap(bare, tcp_in_base(arm, controller.q, tool)))
 
     driver.arm(next_state(driver))
-    stream(driver, lambda state, q: setpoint_of(state, q, q, OFFSET), 1.0)
+    there = pytest.approx(OFFSET, abs=2e-6)
+    stream(driver, lambda state, q: setpoint_of(state, q, q, OFFSET), 3.0, lambda: moved() == there)
+    stream(driver, lambda state, q: setpoint_of(state, q, q, OFFSET), 0.2)  # and no further
     assert moved() == pytest.approx(OFFSET, abs=2e-6)
     nominal = driver.nominal_q(next_state(driver))
     assert np.abs(nominal - controller.own_q).max() <= case.resolution + 2e-5
