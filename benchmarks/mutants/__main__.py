@@ -12,7 +12,7 @@ from pathlib import Path
 
 import click
 
-from benchmarks.mutants.mutant import read_mutants
+from benchmarks.mutants.mutant import Mutant, read_mutants
 from benchmarks.mutants.trial import Trial, Verdict
 from gapbridge.core.errors import InputError
 
@@ -21,16 +21,24 @@ from gapbridge.core.errors import InputError
 @click.option("--only", default="", help="Those whose file, text or list has this in it.")
 @click.option("--part", default="1/1", help="K/N: every N-th from the K-th, for N runs beside.")
 @click.option("--out", type=click.Path(path_type=Path), help="JSON lines, one a mutant.")
-def main(only: str, part: str, out: Path | None) -> None:
+@click.option("--resume", is_flag=True, help="Skip what OUT says was noticed.")
+def main(only: str, part: str, out: Path | None, resume: bool) -> None:
     """Make each listed mistake in a copy of the checkout and run the tests that must notice it.
 
     A test counts only where it passes without the mistake. Exit 1 where one goes unnoticed.
     """
+    if resume and out is None:
+        raise InputError("--resume: expected --out, the file to go on with")
     mutants = [m for m in read_mutants() if only in m.file or only in m.what]
     mutants = mutants[_part(part)]
     if not mutants:
         raise InputError(f"--only, --part: found no mutant with {only!r} in part {part}")
-    begun, verdicts = time.monotonic(), []
+    if out is not None:
+        out.parent.mkdir(parents=True, exist_ok=True)
+    begun = time.monotonic()
+    verdicts = noticed_in(out, mutants) if resume and out is not None else []
+    done = {verdict.mutant for verdict in verdicts}
+    mutants = [mutant for mutant in mutants if mutant not in done]
     with tempfile.TemporaryDirectory() as folder:
         trial = Trial(Path(folder))
         for number, mutant in enumerate(mutants, 1):
@@ -45,6 +53,19 @@ def main(only: str, part: str, out: Path | None) -> None:
     click.echo("\n".join(["", *table(verdicts), f"{time.monotonic() - begun:.0f} s"]))
     if not all(v.killed for v in verdicts):
         raise SystemExit(1)
+
+
+def noticed_in(out: Path, mutants: list[Mutant]) -> list[Verdict]:
+    """Return what a file of an earlier run says of these mutants, as far as each was noticed."""
+    if not out.exists():
+        return []
+    found = {}
+    for line in out.read_text(encoding="utf-8").splitlines():
+        record = json.loads(line)
+        mutant = Mutant(**{**record["mutant"], "tests": tuple(record["mutant"]["tests"])})
+        if record["killed"] and mutant in mutants:
+            found[mutant] = Verdict(mutant, True, record["detail"])
+    return list(found.values())
 
 
 def _part(given: str) -> slice:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import ast
+import json
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
 
-from benchmarks.mutants.__main__ import table
+from benchmarks.mutants.__main__ import noticed_in, table
 from benchmarks.mutants.mutant import Mutant, read_mutants
 from benchmarks.mutants.trial import Verdict
 from gapbridge.core.errors import InputError
@@ -43,3 +45,13 @@ def test_the_table_counts_by_folder() -> None:
     lines = table([Verdict(one, True, ""), Verdict(one, False, ""), Verdict(other, True, "")])
     assert "| core | 2 | 1 (50 %) |" in lines
     assert lines[-1] == "| all | 3 | 2 (67 %) |"
+
+
+def test_a_run_goes_on_with_what_was_noticed_before(tmp_path: Path) -> None:
+    mutants = [Mutant("m", "core/a.py", "x", str(i), ("tests",)) for i in range(3)]
+    verdicts = [Verdict(mutants[0], True, "FAILED one"), Verdict(mutants[1], False, "2 passed")]
+    out = tmp_path / "out.jsonl"
+    assert noticed_in(out, mutants) == []
+    out.write_text("".join(json.dumps(asdict(v)) + "\n" for v in verdicts), encoding="utf-8")
+    assert noticed_in(out, mutants) == verdicts[:1]
+    assert noticed_in(out, mutants[1:]) == []  # its text or its tests are others now
