@@ -31,14 +31,11 @@ TAKING = {"Term", "effect_named", "joints"}  # calls whose first argument is one
 
 def _named(text: object) -> str | None:
     """Return the effect that a text is the name of, or of a parameter of."""
-    if not isinstance(text, str):
+    if not isinstance(text, str) or " " in text:
         return None
     if text in CATALOGUE:
         return text
-    return next(
-        (e for e in CATALOGUE if e not in SHARED and text.startswith(f"{e}_") and " " not in text),
-        None,
-    )
+    return next((e for e in CATALOGUE if e not in SHARED and text.startswith(f"{e}_")), None)
 
 
 def _texts(node: ast.AST) -> Iterator[str]:
