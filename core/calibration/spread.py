@@ -20,6 +20,7 @@ Array = NDArray[np.float64]
 STEP = 1e-3  # share of a parameter's usual size, where a derivative of the TCP is a difference
 CONVERGED = 1e-7  # m/rad: a standard deviation need not be known better
 BLOCK = 20_000  # rows at a time, so that memory does not grow with them
+FEW = 2048  # the same of products with the covariance
 
 
 @dataclass(frozen=True)
@@ -99,10 +100,16 @@ class Spread:
             except EquilibriumError as error:
                 raise EquilibriumError(begin + error.row) from None
             position[rows], rotation[rows] = found.poses.position, found.poses.rotation
-            for k, J in enumerate(found.jacobian):
+            self._spread_of(found.jacobian, std[rows])
+        return Poses(position, rotation), std
+
+    def _spread_of(self, jacobian: Array, std: Array) -> None:
+        """Write 1 sigma (N, 3) of positions that change by ``jacobian`` (3, p, N)."""
+        for begin in range(0, len(std), FEW):  # temporaries that stay in the processor's cache
+            rows = slice(begin, begin + FEW)
+            for k, J in enumerate(jacobian[:, :, rows]):
                 square = np.sum(J * (self.covariance @ J), axis=0)
                 std[rows, k] = np.sqrt(np.maximum(square, 0.0))
-        return Poses(position, rotation), std
 
 
 def parameters_named(model: Model, names: Sequence[str], where: str) -> Parameters:

@@ -57,11 +57,9 @@ def _spread(linear: Linear, kept: Mask, sigma: float) -> Array:
 
 def _root(linear: Linear, kept: Mask, sigma: float) -> Array:
     """Return a root (k, k) of the kept ones' covariance in units of the prior's variance."""
-    from scipy.linalg import solve_triangular  # a tenth of a second, only where something is fitted
-
     size = int(kept.sum())
     R = np.linalg.qr(np.vstack([linear.matrix[:, kept] * sigma, np.eye(size)]), mode="r")
-    return np.asarray(solve_triangular(R, np.eye(size)))
+    return np.linalg.solve(R, np.eye(size))
 
 
 def _cost(

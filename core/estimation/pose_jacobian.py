@@ -88,10 +88,13 @@ def _row_rates(
     model: Model, q: Array, loads: Loads, values: Sequence[Value], steps: Array
 ) -> tuple[Entries, Mask]:
     """Return how the rows change, rates (entries, N), and whether slots can say it (p,)."""
-    n, bare = model.arm.n, model.without_terms().rows(q, loads)
-    terms, own = model.conditions(), Effect.condition
-    starts, found_slots, found = [0], [], []
+    n, terms, own = model.arm.n, model.conditions(), Effect.condition
     first_order_ok = np.ones(len(values), dtype=bool)
+    if not terms:  # nothing changes the rows: copies of them all would be for nothing
+        nothing = np.zeros(len(values) + 1, dtype=np.int64)
+        return (nothing, np.zeros(0, dtype=np.int64), np.zeros((0, len(q)))), first_order_ok
+    bare = model.without_terms().rows(q, loads)
+    starts, found_slots, found = [0], [], []
     for c, (t, k) in enumerate(values):
         if type(CATALOGUE[model.terms[t].effect]).condition is not own:
             ends = []

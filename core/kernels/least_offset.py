@@ -9,6 +9,7 @@ from gapbridge.core.kernels.reference import JIT
 
 LARGEST_OFFSET = 0.1  # rad: joint offset (norm) beyond which the correction is damped
 REGULAR = 1e-4  # smallest over largest pivot from which elimination is as good as eigenvalues
+SWEEPS = 30  # of rotations; six by six takes five to nine
 
 
 @njit(**JIT)
@@ -76,21 +77,69 @@ def _eliminated(G, y):  # type: ignore[no-untyped-def]
 @njit(**JIT)
 def _damped(J, G, right, offset):  # type: ignore[no-untyped-def]
     """Write the solution by eigenvalues, with as little damping as keeps it short."""
-    wide = J.shape[1] > 6
-    s, V = np.linalg.eigh(G)  # s: the squared singular values
-    y = V.T @ right
-    damping = 1e-14 * max(s[-1], 1e-12)
+    wide, size = J.shape[1] > 6, G.shape[0]
+    V = np.eye(size)
+    _diagonalised(G, V)
+    y, s, most = np.zeros(size), np.empty(size), 1e-12  # s: the squared singular values
+    for i in range(size):
+        s[i] = max(G[i, i], 0.0)
+        most = max(most, s[i])
+        for k in range(size):
+            y[i] += V[k, i] * right[k]
+    damping = 1e-14 * most
     for _ in range(60):
         square = 0.0
-        for i in range(s.shape[0]):
-            part = y[i] / (max(s[i], 0.0) + damping)
-            square += part * part * (max(s[i], 0.0) if wide else 1.0)
+        for i in range(size):
+            part = y[i] / (s[i] + damping)
+            square += part * part * (s[i] if wide else 1.0)
         if square <= LARGEST_OFFSET * LARGEST_OFFSET:
             break
         damping *= 3.0
-    for i in range(s.shape[0]):
-        y[i] /= max(s[i], 0.0) + damping
-    _written(J, V @ y, offset)
+    found = np.zeros(size)
+    for i in range(size):
+        for k in range(size):
+            found[k] += V[k, i] * (y[i] / (s[i] + damping))
+    _written(J, found, offset)
+
+
+@njit(**JIT)
+def _diagonalised(G, V):  # type: ignore[no-untyped-def]
+    """Turn G (n, n) into its eigenvalues on the diagonal, and V's columns with it.
+
+    Jacobi's rotations, cyclic. Source: Golub, Van Loan, "Matrix Computations", 8.5. numpy's eigh
+    would have numba import scipy.linalg at the first singular pose: 0.2 s, in a live loop too.
+    """
+    n = G.shape[0]
+    for _ in range(SWEEPS):
+        off = whole = 0.0
+        for i in range(n):
+            whole += G[i, i] * G[i, i]
+            for j in range(i):
+                off += G[i, j] * G[i, j]
+        if not off > 1e-32 * whole:
+            return
+        for p in range(n - 1):
+            for q in range(p + 1, n):
+                if G[p, q] != 0.0:
+                    _rotated(G, V, p, q)
+
+
+@njit(**JIT)
+def _rotated(G, V, p, q):  # type: ignore[no-untyped-def]
+    """Take G[p, q] to zero by one rotation."""
+    tau = 0.5 * (G[q, q] - G[p, p]) / G[p, q]
+    t = (1.0 if tau >= 0.0 else -1.0) / (abs(tau) + np.sqrt(1.0 + tau * tau))
+    c = 1.0 / np.sqrt(1.0 + t * t)
+    s = t * c
+    for k in range(G.shape[0]):
+        a, b = G[k, p], G[k, q]
+        G[k, p], G[k, q] = c * a - s * b, s * a + c * b
+    for k in range(G.shape[0]):
+        a, b = G[p, k], G[q, k]
+        G[p, k], G[q, k] = c * a - s * b, s * a + c * b
+    for k in range(G.shape[0]):
+        a, b = V[k, p], V[k, q]
+        V[k, p], V[k, q] = c * a - s * b, s * a + c * b
 
 
 @njit(**JIT)

@@ -84,15 +84,15 @@ class Log:
 
     def _check_finite(self, name: str) -> None:
         values = self.columns[name]
+        if np.isfinite(values).all():
+            return
         flat = values.reshape(len(values), -1)
-        bad = np.argwhere(~np.isfinite(flat))
-        if len(bad):
-            row, column = (int(v) for v in bad[0])
-            label = name if values.ndim == 1 else f"{name}_{column}"
-            raise LogError(
-                f"{self.path}: row {self.line(row)}, column {label}: found "
-                f"{flat[row, column]}, expected a finite number"
-            )
+        row, column = (int(v) for v in np.argwhere(~np.isfinite(flat))[0])
+        label = name if values.ndim == 1 else f"{name}_{column}"
+        raise LogError(
+            f"{self.path}: row {self.line(row)}, column {label}: found "
+            f"{flat[row, column]}, expected a finite number"
+        )
 
     def loads(self, motions: bool = True) -> Loads:
         """Return what acts on the arm, row by row; ``motions`` False: without ``approach``."""
