@@ -16,15 +16,16 @@ from gapbridge.core.log.log import Log
 from gapbridge.core.model import Model
 from gapbridge.core.motion import motion_of
 
+AXIAL = np.array([8, 9, 10, 20, 25, 30]) * 1e-6  # rad/Nm
+RADIAL = np.array([2, 3, 2, 5, 5, 9]) * 1e-6
+
 
 def write_log(path: Path, rows: int) -> None:
     """Write a log of ``rows`` measured poses."""
     rng = np.random.default_rng(1)
     tool = np.eye(4)
     tool[2, 3] = 0.1
-    model = Model(builtin_arm("ur10e"), tool).with_compliance(
-        np.array([8, 9, 10, 20, 25, 30]) * 1e-6, np.array([2, 3, 2, 5, 5, 9]) * 1e-6
-    )
+    model = Model(builtin_arm("ur10e"), tool).with_compliance(AXIAL, RADIAL)
     q, mass = rng.uniform(-2, 2, (rows, 6)), rng.choice([0.0, 3.0, 6.0], rows)
     cog = np.tile([0.0, 0.0, 0.1], (rows, 1))
     position = model.predict(q, Loads(mass, cog)).position + rng.normal(0, 3e-5, (rows, 3))

@@ -38,12 +38,15 @@ class Row:
     memory: float | None = None  # MB
 
 
-def cost(arguments: list[str], repeats: int) -> tuple[float, float]:
-    """Return CPU time (s) and memory (MB) of Python. Raises SystemExit where it fails."""
+def cost(arguments: list[str], repeats: int, *, warm: bool = False) -> tuple[float, float]:
+    """Return CPU time (s) and memory (MB) of Python; ``warm``: it ran before.
+
+    Raises SystemExit where it fails.
+    """
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "GAPBRIDGE_THREADS": "1"}
     environment.pop("PYTHONDONTWRITEBYTECODE", None)
     found = []
-    for _ in range(repeats + 1):  # the first compiles what has never been
+    for _ in range(repeats + (not warm)):  # the first compiles what has never been
         process = subprocess.Popen(
             [sys.executable, *arguments], env=environment,
             stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
@@ -52,7 +55,7 @@ def cost(arguments: list[str], repeats: int) -> tuple[float, float]:
         if status:
             raise SystemExit(f"python {' '.join(arguments)}: ended with {status}")
         found.append((used.ru_utime + used.ru_stime, used.ru_maxrss / 1024))
-    return min(cpu for cpu, _ in found[1:]), max(memory for _, memory in found)
+    return min(cpu for cpu, _ in found[-repeats:]), max(memory for _, memory in found[-repeats:])
 
 
 def rows_of(folder: Path, rows: int) -> list[Row]:

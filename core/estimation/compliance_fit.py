@@ -32,6 +32,7 @@ NUISANCE_ROUNDS = 20
 CONVERGED = 1e-8  # relative step at which a fit has converged
 RANK = 1e-10  # singular values of the nuisances below this share are rounding
 OUTLIER = 5.0  # standard deviations beyond which a reading counts as an outlier
+AT_ONCE = 2000  # rows of one decomposition; of 60,000 by 22 columns it takes 9 ms, whole 24 ms
 
 
 @dataclass(frozen=True)
@@ -267,13 +268,22 @@ def _round(now: Fit, data: Data, kept: Mask, prior: tuple[Array, float], nonnega
     width = gap.shape[1]
     per_cell = per_cell_of(weights, scale, width)
     form = regressor(model, data, now.frame)[:, :width]
-    A = (form * per_cell[..., None]).reshape(-1, 2 * n)
-    b = (gap * per_cell).ravel()
-    F = np.zeros((len(b), 0))
+    columns = [form, gap[..., None]]
     if data.nuisances:
-        F = nuisance_columns(model, poses, width, data) * per_cell[..., None]
-        F = F.reshape(len(b), -1)
-    return stepped(now, (F, A, b), weights, kept, prior, nonnegative=nonnegative)
+        columns.insert(0, nuisance_columns(model, poses, width, data))
+    whole = np.concatenate(columns, axis=2) * per_cell[..., None]
+    # one R factor for all that follows, of rows that stay in the processor's cache
+    R = r_factor(whole.reshape(gap.size, -1))
+    problem = (R[:, : -2 * n - 1], R[:, -2 * n - 1 : -1], R[:, -1])
+    return stepped(now, problem, weights, kept, prior, nonnegative=nonnegative)
+
+
+def r_factor(rows: Array) -> Array:
+    """Return the R factor of rows (M, k), a few thousand of them at a time."""
+    R = rows[:0]
+    for begin in range(0, len(rows), AT_ONCE):
+        R = np.linalg.qr(np.vstack([R, rows[begin : begin + AT_ONCE]]), mode="r")
+    return R
 
 
 def regressor(model: Model, data: Data, frame: Registration | Placements) -> Array:

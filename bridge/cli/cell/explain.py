@@ -6,7 +6,6 @@ import inspect
 
 import click
 
-from gapbridge.core.arm import builtin_arm
 from gapbridge.core.effects import CATALOGUE, CHANNELS, Effect, effect_named, ties_of
 
 
@@ -30,6 +29,8 @@ def explain(effect: str | None) -> None:
 
 def explanation(effect: Effect) -> str:
     """Return what a person should know of an effect: its docstring, needs and parameters."""
+    from gapbridge.core.arm import builtin_arm  # the list has no need of it
+
     arm = builtin_arm("ur10e")
     sites = effect.sites(arm)
     channels = ", ".join(f"{name} ({CHANNELS[name]})" for name in effect.channels)
