@@ -282,7 +282,7 @@ def r_factor(rows: Array) -> Array:
     """Return the R factor of rows (M, k), a few thousand of them at a time."""
     R = rows[:0]
     for begin in range(0, len(rows), AT_ONCE):
-        R = np.linalg.qr(np.vstack([R, rows[begin : begin + AT_ONCE]]), mode="r")
+        R = np.asarray(np.linalg.qr(np.vstack([R, rows[begin : begin + AT_ONCE]]), mode="r"))
     return R
 
 

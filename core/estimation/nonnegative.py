@@ -15,7 +15,7 @@ ROUNDS = 100  # times the unknowns; each that counts ends with a smaller sum of 
 
 def nonnegative_least_squares(A: Array, b: Array) -> Array:
     """Return the x >= 0 (k,) of least |A x - b| for A (m, k) of full rank, m >= k."""
-    R = np.linalg.qr(np.column_stack([A, b]), mode="r")
+    R = np.asarray(np.linalg.qr(np.column_stack([A, b]), mode="r"))
     A, b, k = R[:, :-1], R[:, -1], A.shape[1]
     x, free, refused = np.zeros(k), np.zeros(k, dtype=bool), np.zeros(k, dtype=bool)
     least = 10 * len(A) * np.finfo(float).eps * float(np.linalg.norm(A, axis=0).max(initial=0.0))
