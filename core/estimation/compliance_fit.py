@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapbridge.core.effects import CATALOGUE
-from gapbridge.core.estimation.nonnegative import nonnegative_least_squares
 from gapbridge.core.estimation.registration import (
     IDENTITY,
     Registration,
@@ -348,7 +347,9 @@ def solve(
         [linear.right - linear.matrix[:, ~kept] @ now[~kept], centre[kept] / sigma]
     )
     if nonnegative:
-        found[kept] = nonnegative_least_squares(rows, right) * unit
+        from scipy.optimize import nnls  # a quarter of a second, only where something is fitted
+
+        found[kept] = nnls(rows, right, maxiter=100 * len(unit))[0] * unit
     else:
         found[kept] = np.linalg.lstsq(rows, right, rcond=1e-12)[0] * unit
     return found
