@@ -36,7 +36,7 @@ def observe(model: Model, log: Log, metrology: Metrology) -> Observation | NotOb
     Rows without derivatives (edges, gaps), with a torque that is not finite, or in which a joint
     turns round, so that nobody knows the sign of its friction, are left out; of more than
     30,000 poses at rest so many are taken, evenly. An arm whose links have no mass has no
-    torques to compare with. Raises LogError where the log holds something unusable.
+    torques to compare with, nor have columns that never change. Raises LogError where the log holds something unusable.
     """
     measured = log.get("actual_current_as_torque")
     lacking = _lacking(model, log)
@@ -47,6 +47,9 @@ def observe(model: Model, log: Log, metrology: Metrology) -> Observation | NotOb
     rows = subsampled(whole.valid & finite & _steady(whole))
     if not len(rows):
         return NotObservable("torque", ("actual_current_as_torque",))
+    known = measured[np.isfinite(measured).all(axis=1)]
+    if len(known) > 1 and (known == known[0]).all():
+        return NotObservable("torque", ("actual_current_as_torque that changes",))
     return _observed(model, log, measured, whole, rows)
 
 

@@ -44,6 +44,11 @@ def log_of(recorded, torque, seed=0, **more):
     )  # fmt: skip
 
 
+def silent(recorded):
+    t, q, qd, *_ = recorded
+    return truth.log_of(N, timestamp=t, actual_q=q, actual_qd=qd, actual_current_as_torque=0 * q)
+
+
 def term(effect, joint=None):
     return Term(effect, Site(joint), (0.0,))
 
@@ -181,6 +186,12 @@ def test_what_is_missing_is_named(plant):
     assert none == NotObservable("torque", ("actual_current_as_torque",))
     blind = observe(plant.model(), truth.log_of(N, actual_current_as_torque=q), METROLOGY)
     assert blind == NotObservable("torque", ("actual_q",))
+
+
+def test_columns_that_never_change_are_no_torques(recorded, plant):
+    """A recorder writes zeros where a controller gives nothing: no cause is to be found there."""
+    dead = observe(plant.model(2.0), silent(recorded), METROLOGY)
+    assert dead == NotObservable("torque", ("actual_current_as_torque that changes",))
 
 
 def faded(plant, recorded):
