@@ -182,7 +182,7 @@ def _of_payload(w, v, B, push, turned, n, g, gravity):  # type: ignore[no-untype
 
 
 @njit(**JIT)
-def _slopes(chain, w, v, u, B, push, turned, axis, turning, links, loads):  # type: ignore[no-untyped-def]
+def _derivatives(chain, w, v, u, B, push, turned, axis, turning, links, loads):  # type: ignore[no-untyped-def]
     """Write the slots of one coordinate; those of links, and of tool and weights, where wanted."""
     n = chain.mass.shape[0]
     gravity = 6 * (n + 2) + 4 * n
@@ -282,6 +282,6 @@ def jacobian_blocks(chain, rows, rates, varying, first, last, position, rotation
             axis, turning = coordinate % 3, coordinate >= 3
             if not solve(w, v, u, s, n, axis, turning, deflected, converged):
                 return r
-            _slopes(chain, w, v, u, B, push, turned, axis, turning, links, loads)
+            _derivatives(chain, w, v, u, B, push, turned, axis, turning, links, loads)
             _columns(B, rates, varying, r, count, J[coordinate], column)
     return -1

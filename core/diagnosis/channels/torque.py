@@ -36,7 +36,8 @@ def observe(model: Model, log: Log, metrology: Metrology) -> Observation | NotOb
     Rows without derivatives (edges, gaps), with a torque that is not finite, or in which a joint
     turns round, so that nobody knows the sign of its friction, are left out; of more than
     30,000 poses at rest so many are taken, evenly. An arm whose links have no mass has no
-    torques to compare with, nor have columns that never change. Raises LogError where the log holds something unusable.
+    torques to compare with, nor are columns that never change any. Raises LogError where the log
+    holds something unusable.
     """
     measured = log.get("actual_current_as_torque")
     lacking = _lacking(model, log)

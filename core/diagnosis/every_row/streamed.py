@@ -24,7 +24,7 @@ from gapbridge.core.diagnosis.selection.candidate import Candidate, named_column
 from gapbridge.core.diagnosis.selection.following import chord_columns, chord_value
 from gapbridge.core.diagnosis.selection.noise import Noise
 from gapbridge.core.diagnosis.selection.problem import SampleSpace, fit, penalties
-from gapbridge.core.diagnosis.selection.refit import Reduced, freed_of, slope, step_on
+from gapbridge.core.diagnosis.selection.refit import Reduced, exact_jacobian, freed_of, step_on
 from gapbridge.core.diagnosis.selection.selection import Selection
 from gapbridge.core.diagnosis.selection.state import UnprojectedRows, chords_only, locate
 from gapbridge.core.effects import Term
@@ -51,7 +51,7 @@ class Gap:
 
 
 class Columns:
-    """What a block's rows are made into: columns of candidates, target, slopes of terms, gap."""
+    """What a block's rows are made into: candidates' columns, target, the terms' Jacobian, gap."""
 
     def __init__(self, selection: Selection, accused: Sequence[int], arm: Arm) -> None:
         self.candidates = selection.space.candidates
@@ -70,12 +70,12 @@ class Columns:
         ]  # fmt: skip
         self._from_nothing = chords_only(observation, self.terms)
         self.start = selection.space.start
-        self.slopes = int(self.start[-1]) + 1 + np.arange(sum(len(x) for x in self.x))
+        self.jacobian = int(self.start[-1]) + 1 + np.arange(sum(len(x) for x in self.x))
 
     @property
     def width(self) -> int:
         """Return how many columns there are."""
-        return int(self.start[-1]) + 2 + len(self.slopes)
+        return int(self.start[-1]) + 2 + len(self.jacobian)
 
     def of(self, seen: Observation, bare: Array, gap: Array) -> Array:
         """Return the columns (N, k, width) of an observation; ``bare`` is its gap without terms."""
@@ -89,11 +89,11 @@ class Columns:
             for term in self.terms:
                 c, x = locate(list(self.candidates), term)
                 target = target + own[c] @ x
-        slopes = [
-            slope(seen, c, x, self.terms[:i] + self.terms[i + 1 :])
+        jacobian = [
+            exact_jacobian(seen, c, x, self.terms[:i] + self.terms[i + 1 :])
             for i, (c, x) in enumerate(zip(self.freed, self.x, strict=True))
         ]
-        return np.concatenate([*own, target[..., None], *slopes, gap[..., None]], axis=2)
+        return np.concatenate([*own, target[..., None], *jacobian, gap[..., None]], axis=2)
 
     def _candidate(self, seen: Observation, c: Candidate, chord: float | None) -> Array:
         if chord is not None:
@@ -112,7 +112,7 @@ class Streamed:
     session: Index  # (B,)
     row: Index  # (B,) first row of each block in the log
     gap: Gap
-    means: Array  # (bins, k, slopes + 1): slopes and gap over every BLOCK seconds, whitened
+    means: Array  # (bins, k, p + 1): Jacobian and gap over every BLOCK seconds, whitened
     white: Array  # (k,) one over 1 sigma of each coordinate
     by_region: bool  # something unknown is left: covariances are those of regions
 
@@ -145,15 +145,15 @@ class Streamed:
             np.array(selection.terms[p].values)[: len(freed[p].parameters)] - x[p] for p in accused
         ]
         away = mix @ np.concatenate([*(-m for m in moved), [1.0]])
-        at = [*self.columns.slopes, self.columns.width - 1]
+        at = [*self.columns.jacobian, self.columns.width - 1]
         sums = self.sums.sum(axis=0)[:, at][:, :, at]
         squares = np.einsum("i,kij,j->k", away, sums, away) / self.white**2
         own = own_coordinates(self.excerpt.observation)
         return np.maximum(squares, 0.0), (self.means @ away / self.white)[:, :own]
 
     def _mix(self, accused: Sequence[int]) -> Array:
-        """Return slopes and gap of some terms alone (slopes + 1, d + 1): others put back."""
-        size = len(self.columns.slopes) + 1
+        """Return Jacobian and gap of some terms alone (p + 1, d + 1): others put back."""
+        size = len(self.columns.jacobian) + 1
         kept, gap, at = [], np.zeros(size), 0
         gap[-1] = 1.0
         for p, x in zip(self.columns.accused, self.columns.x, strict=True):
@@ -168,7 +168,7 @@ class Streamed:
     def _fitted(self, accused: Sequence[int]) -> tuple[list[Array], list[Array]]:
         if not accused:
             return [], []
-        mix, at = self._mix(accused), [*self.columns.slopes, self.columns.width - 1]
+        mix, at = self._mix(accused), [*self.columns.jacobian, self.columns.width - 1]
         span = max(float(np.ptp(self.time)), 1e-9)
         part = ((self.time - self.time.min()) / span * REGIONS).astype(np.int64)
         part = np.minimum(part, REGIONS - 1) if self.by_region else np.zeros_like(part)
@@ -310,10 +310,10 @@ def _limit(selection: Selection, terms: Sequence[Term], white: Array) -> float:
 
 
 class _Means:
-    """Means of slopes and gap over every BLOCK seconds."""
+    """Means of the Jacobian and the gap over every BLOCK seconds."""
 
     def __init__(self, columns: Columns) -> None:
-        self._at = [*columns.slopes, columns.width - 1]
+        self._at = [*columns.jacobian, columns.width - 1]
         self._start: float | None = None
         self._parts: list[tuple[Index, Array, Array]] = []
 
@@ -327,7 +327,7 @@ class _Means:
         self._parts.append((number[begins], sums, np.diff(begins, append=len(number))))
 
     def whole(self) -> Array:
-        """Return the means (bins, k, slopes + 1)."""
+        """Return the means (bins, k, p + 1)."""
         number, sums, count = (
             np.concatenate([part[i] for part in self._parts]) for i in range(3)
         )  # fmt: skip

@@ -1,7 +1,7 @@
-"""What makes encoders come late, or rest elsewhere, as it really acts, not only by its slope.
+"""What makes encoders come late, or rest elsewhere, as it really acts, not only to first order.
 
-To first order delay and lag both are the speed times the time, so that a search by slopes takes the
-one for the other, and what is then left looks like a third cause. Play has no slope at all.
+To first order delay and lag both are the speed times the time, so that a linear search takes the
+one for the other, and what is then left looks like a third cause. Play has no derivative at all.
 """
 
 from __future__ import annotations
@@ -42,9 +42,9 @@ def chord_value(observation: Observation, candidate: Candidate, base: Sequence[T
         value = float(np.sum(inside))
     else:
         others = _others(candidate, base)
-        slope = named_columns(observation, candidate, others)[..., 0]
+        column = named_columns(observation, candidate, others)[..., 0]
         gap = observation.measured - observation.predict(others)
-        value = float(np.sum(slope * gap) / max(float(np.sum(slope**2)), 1e-300))
+        value = float(np.sum(column * gap) / max(float(np.sum(column**2)), 1e-300))
     return min(max(value, parameter.lower), parameter.upper)
 
 

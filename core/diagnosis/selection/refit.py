@@ -73,7 +73,7 @@ def refit(
         blocks = []
         for k, c in enumerate(index):
             others = terms[:k] + terms[k + 1 :]
-            blocks.append(flat(slope(state.observation, freed[c], x[k], others), state))
+            blocks.append(flat(exact_jacobian(state.observation, freed[c], x[k], others), state))
         nuisance = flat(observation.nuisance, state)
         A = np.hstack([*blocks, extra, nuisance])
         b = flat(gap[..., None], state)[:, 0]
@@ -127,7 +127,7 @@ def _standing(
 class Reduced:
     """Whitened rows of a regression, of as many as there were those that hold the same sums."""
 
-    A: Array  # (m, p) slopes at the values at hand
+    A: Array  # (m, p) Jacobian at the values at hand
     b: Array  # (m,) gap
     region: NDArray[np.int64] | None  # (m,) region of each row, where scatter is judged by regions
     count: float  # rows that there were
@@ -296,7 +296,7 @@ def freed_of(arm: Arm, candidate: Candidate) -> Candidate:
     return replace(candidate, parameters=parameters, fixed=(None,) * len(parameters), curve=None)
 
 
-def slope(
+def exact_jacobian(
     observation: Observation, candidate: Candidate, x: Array, others: tuple[Term, ...]
 ) -> Array:
     """Return d prediction / d parameter (N, k, d) at the term's present values."""
