@@ -164,7 +164,8 @@ def _channel_label(kind: str, seed: int, case: ChannelCase) -> Label:
     causes = case.truth.causes(case.values)
     facts: dict[str, str | float | bool] = {"rows": len(case.gap) / len(case.truth.sigma)}
     if isinstance(case.cell, WrenchCell):
-        facts["settling_drift"] = case.cell.saturating and "ft_drift" in kind
+        drifts = any(c.effect == "ft_drift" for c in causes)
+        facts["settling_drift"] = case.cell.saturating and drifts
     return Label(
         kind=kind,
         seed=seed,

@@ -172,7 +172,10 @@ def draw_torque_cell(rng: Generator, seconds: float = 30.0) -> MovingCell:
         for j in joints:
             out = out + of("link_inertia", j) * links[j - 1]
             if ("link_cog", j) in values:
-                out = out + shifts.of_link(j - 1, values[("link_cog", j)])
+                moment = values[("link_cog", j)]
+                if kind.as_urdf:  # reported in the axes of the link as the file has it
+                    moment = shifts.places[j - 1].rotation.T @ moment
+                out = out + shifts.of_link(j - 1, moment)
         share = np.array([of("load_friction", j) for j in joints])
         break_away = np.array([of("stribeck_friction", j) for j in joints])
         offset = np.array([of("torque_offset", j) for j in joints])

@@ -17,6 +17,7 @@ from benchmarks.blind.label import Label
 NOWHERE = "not in the catalogue"
 EXPLAINED = ("clean", "known", "several", "many", "arm", "sessions", "laid_out")
 UNLIKE = 100.0  # chi-square from which on a tie reported is no tie
+NEAR = 0.02  # of a withheld effect's squares: what a near twin leaves, 14 % of its size
 
 
 @dataclass(frozen=True)
@@ -31,7 +32,8 @@ class CaseScore:
     put_in: tuple[str, ...]
     named: tuple[str, ...]
     outcome: str  # right | right_tie | tie_untold | abstained | missed | wrong | failed;
-    # mixed also: partly (some known effects) | unadmitted (the remainder passed over)
+    # mixed also: partly (some known effects) | unadmitted (the remainder passed over); withheld
+    # also: first_order (a near twin, or at the same joints with the rest admitted)
     false: tuple[str, ...] = ()  # effects accused that are neither true nor a true twin
     joints_right: bool | None = None
     owned_up: bool = False  # unexplained and structured
@@ -246,13 +248,18 @@ def _needless(
 
 
 def _unknown(label: Label, claims: tuple[Claim, ...], structured: bool) -> Verdict:
-    if claims:
-        if label.withhold and _same_data(
-            _true_claims(label), claims, Hidden(label.kind, label.seed)
-        ):
+    if not claims:
+        return Verdict("right" if structured else "missed")
+    if label.withhold:
+        truth, hidden = _true_claims(label), Hidden(label.kind, label.seed)
+        if _same_data(truth, claims, hidden):
             return Verdict("right_tie")
-        return Verdict("wrong", tuple(sorted(c.effect for c in claims)))
-    return Verdict("right" if structured else "missed")
+        joints = {j for c in truth for j in c.joints}
+        there = {j for c in claims for j in c.joints} <= joints
+        near = hidden.left_over(claims) < NEAR * hidden.left_over(())
+        if near or (structured and there):
+            return Verdict("first_order")
+    return Verdict("wrong", tuple(sorted(c.effect for c in claims)))
 
 
 def _depends(label: Label, unexplained: dict[str, Any]) -> bool | None:

@@ -52,14 +52,18 @@ def _of(scores: Sequence[CaseScore], *groups: str) -> list[CaseScore]:
 def criteria(scores: Sequence[CaseScore]) -> list[Criterion]:
     """Return the figures of the benchmark against their targets."""
     known, several = _of(scores, "known"), _of(scores, "several")
-    unknown, hard = _of(scores, "outside", "withheld"), _of(scores, "hard")
+    outside, withheld = _of(scores, "outside"), _of(scores, "withheld")
+    unknown, hard = [*outside, *withheld], _of(scores, "hard")
     out = [
         _criterion("one known effect: named, or its twin with the tie reported", 0.98, known),
         Criterion("its joints right", *_at(0.96, _share(
             s.joints_right for s in known if s.ok and s.joints_right is not None))),
         _criterion("two or three effects: exactly those", 0.93, several),
         _criterion("clean data: no accusation, no structure", 0.995, _of(scores, "clean")),
-        _criterion("outside the catalogue or withheld: owned up, nobody accused", 0.95, unknown),
+        _criterion("outside the catalogue: owned up, nobody accused", 0.93, outside),
+        Criterion("withheld: owned up, a twin named, or its first order with the rest admitted",
+                  *_at(0.95, _share(s.ok or s.outcome == "first_order" for s in withheld))),
+        _criterion("withheld: owned up, nobody accused but a twin", 0.95, withheld),
         Criterion("what it depends on, among the first three", *_at(0.85, _share(
             s.depends_right for s in unknown if s.depends_right is not None))),
         _criterion("hard data: right, or a tie reported", 0.90, hard),

@@ -133,6 +133,16 @@ def test_a_twin_may_be_named_for_a_withheld_effect(tmp_path):
     assert got.outcome == "right_tie"
 
 
+def test_the_first_order_of_a_withheld_effect_may_be_named_with_the_rest_admitted(tmp_path):
+    label = make_case("withheld:torque:load_friction", 3, tmp_path)
+    own = [cause("coulomb_friction", [j]) for j in label.causes[0].joints]
+    assert score(label, answer(label, own, structured=True)).outcome == "first_order"
+    assert score(label, answer(label, own)).outcome == "wrong"
+    others = set(range(1, 7)) - set(label.causes[0].joints)
+    elsewhere = [cause("coulomb_friction", [j]) for j in sorted(others)]
+    assert score(label, answer(label, elsewhere, structured=True)).outcome == "wrong"
+
+
 def test_play_that_is_never_reversed_is_an_offset_as_long_as_the_tie_is_reported(case):
     label = case("bad:no_reversals")
     joints = label.causes[0].joints
