@@ -2,6 +2,11 @@
 
 All of its messages must come within the profile's window, none twice, in order where the profile
 says so, and with the same count where they carry one. Everything else is dropped and counted.
+
+Where neither order nor count ties them together, the window alone does, and it is blind where
+frames are held up and then come in a burst (an adapter that stamps what it hands on, an arm that is
+late): with a frame lost, two cycles can fill one window. Such a sample shows in its order: what
+was lost comes last. Drifting nodes change their order too, but each keeps its own cadence.
 """
 
 from __future__ import annotations
@@ -17,6 +22,9 @@ from gapbridge.drivers.can.profile import CanProfile, Incoming, Key
 
 Vector = NDArray[np.float64]
 QUANTITIES = ("position", "velocity", "torque", "temperature")
+UNSTEADY = (
+    0.3  # periods: a frame waits for a cycle's six setpoint frames, 3.1 of 10 ms at 250 kbit/s
+)
 
 
 class Sample(NamedTuple):
@@ -49,6 +57,11 @@ class Assembler:
         self._first = 0.0  # s, bus clock
         self._began = 0.0  # s, monotonic
         self._count: float | None = None
+        self._tied = profile.ordered or profile.counted or bool(profile.request)
+        self._own: dict[Key, float] = {}  # s, bus clock: last frame of each message of the sample
+        self._steady = True  # all frames of the sample begun came a period after their own last one
+        self._order: list[Key] = []  # of the sample last given
+        self._given = -math.inf  # s, bus clock: that sample's last frame
         self.dropped: Counter[str] = Counter()  # reason -> frames or sets
         self.status: dict[tuple[Key, str], tuple[float, str, bool]] = {}
         self.enabled: dict[tuple[Key, str], bool] = {}
@@ -127,8 +140,10 @@ class Assembler:
             self._held.clear()
             return None
         if not self._held:
-            self._first, self._began = stamp, received
+            self._first, self._began, self._steady = stamp, received, True
         self._held[key] = values
+        since, self._own[key] = stamp - self._own.get(key, -math.inf), stamp
+        self._steady &= abs(since * profile.rate - 1.0) <= UNSTEADY
         if len(self._held) < len(self._members):
             return None
         held, self._held = self._held, {}
@@ -137,6 +152,9 @@ class Assembler:
                 self.dropped["repeated"] += 1
                 return None
             self._count = values[incoming.counter]
+        if not self._tied and self._doubtful(list(held), stamp):
+            self.dropped["out of order"] += 1
+            return None
         for member, found in held.items():
             self._read(profile.incoming[member], found)
         return self._sample(stamp, received)
@@ -152,6 +170,17 @@ class Assembler:
             return False
         count = values[counter]
         return any(v[counter] != count for v in self._held.values())
+
+    def _doubtful(self, order: list[Key], stamp: float) -> bool:
+        """Return whether a whole sample may be of two cycles: another order, off the cadence.
+
+        An order is forgotten with ``status_timeout``: after it the arm may have started anew.
+        """
+        remembered = 0.0 <= stamp - self._given <= self._profile.status_timeout
+        if remembered and order != self._order and not self._steady:
+            return True
+        self._order, self._given = order, stamp
+        return False
 
     def _sample(self, stamp: float, received: float) -> Sample:
         table = self._wire * self._scale + self._zero

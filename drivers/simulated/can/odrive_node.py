@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import struct
+import time
 
 from gapbridge.drivers.can.settings import CanSettings
 from gapbridge.drivers.simulated.can.nodes import CanNodes
@@ -13,7 +14,8 @@ TURN = 2.0 * math.pi
 IDLE, CLOSED_LOOP = 1, 8
 POSITION_CONTROL, PASSTHROUGH = 3, 1
 HEARTBEAT, ESTOP, SET_STATE, ENCODER, SET_MODE, INPUT_POSITION, CLEAR = 1, 2, 7, 9, 0xB, 0xC, 0x18
-ENCODER_EVERY, HEARTBEAT_EVERY = 3, 25  # cycles
+ENCODER_PERIOD = 0.010  # s
+HEARTBEAT_EVERY = 25  # cycles
 ESTOP_REQUESTED = 0x2000_0000
 
 
@@ -26,6 +28,7 @@ class OdriveNodes(CanNodes):
         self.mode = [(0, 0)] * controller.n
         self._target = list(controller.target_q)
         self._count = 0
+        self._due = 0.0  # s, monotonic: no encoder estimate leaves before
 
     def take(self, identifier: int, data: bytes, controller: ArmController) -> None:
         """Obey state, mode, position, e-stop and clear."""
@@ -59,12 +62,17 @@ class OdriveNodes(CanNodes):
             controller.command(self._target)
 
     def publish(self, controller: ArmController) -> None:
-        """Send encoder estimates and, more seldom, heartbeats."""
-        if self._count % ENCODER_EVERY == 0:
+        """Send encoder estimates and, more seldom, heartbeats.
+
+        A late estimate puts off the next: the firmware (CANSimple::service_stack) counts its period
+        from when the last one left, and never sends two at once to catch up.
+        """
+        if time.monotonic() >= self._due:
             self.begin_sample()
             rows = zip(self.wire(TURN), self.speeds(controller, TURN), strict=True)
             for node, (turns, speed) in enumerate(rows):
                 self.send(node << 5 | ENCODER, struct.pack("<ff", turns, speed))
+            self._due = time.monotonic() + ENCODER_PERIOD
         if self._count % HEARTBEAT_EVERY == 0:
             error = 0 if controller.can_move else ESTOP_REQUESTED
             for node, state in enumerate(self.state):

@@ -86,6 +86,52 @@ def test_whatever_gets_lost_doubled_swapped_or_late_no_two_cycles_mix(edits):
     assert firsts == sorted(set(firsts))
 
 
+ODRIVE = load_profile("odrive")
+NODES = range(6)
+
+
+def odrive_samples(frames):
+    """Feed (node, cycle that it says, bus clock in s); return the cycles of each sample."""
+    assembler, found = Assembler(ODRIVE), []
+    for node, k, stamp in frames:
+        data = struct.pack("<ff", k, 0.0)
+        sample = assembler.take((node << 5 | 9, False), data, stamp, stamp)
+        if sample is not None:
+            found.append([round(q / (2.0 * np.pi)) for q in sample.position])
+    return found, assembler
+
+
+@pytest.mark.parametrize("late", [0.0, 0.002, 0.006, 0.0095])
+@pytest.mark.parametrize("node", range(5))  # of the last one: six frames in a row, nothing shows
+def test_two_cycles_that_come_in_a_burst_are_not_one_sample(node, late):
+    """Cycle 3 comes late and lacks one node, which is the first that is heard of cycle 4."""
+    frames = []
+    for k in range(8):
+        lost = {3: [node], 4: range(node)}.get(k, [])
+        stamp = k * 0.01 + (late if k == 3 else 0.0)
+        frames += [(n, k, stamp + 1e-4 * n) for n in NODES if n not in lost]
+    found, assembler = odrive_samples(frames)
+    assert all(len(set(cycles)) == 1 for cycles in found), found
+    assert {0, 1, 2, 5, 6, 7} <= {cycles[0] for cycles in found}
+    assert assembler.broken
+
+
+def test_whole_cycles_that_come_in_a_burst_are_taken():
+    late = {3: 0.03, 4: 0.02, 5: 0.01}
+    frames = [(n, k, k * 0.01 + late.get(k, 0.0) + 1e-5 * n) for k in range(9) for n in NODES]
+    found, assembler = odrive_samples(frames)
+    assert found == [[k] * 6 for k in range(9)]
+    assert assembler.broken == 0
+
+
+def test_nodes_that_drift_past_each_other_lose_no_sample():
+    phases = [0.0002 + 0.0012 * n for n in NODES]
+    frames = [(n, k, k * (0.01 + 5e-7 * (n == 2)) + phases[n]) for k in range(5000) for n in NODES]
+    found, assembler = odrive_samples(sorted(frames, key=lambda frame: frame[2]))
+    assert len(found) >= 4998  # one goes where the last node passes the first: it begins the next
+    assert assembler.broken <= 1
+
+
 def test_equal_counts_tie_frames_together_and_a_repeated_sample_is_none():
     profile = load_profile(str(INVENTED))
     shoulder, hand = profile.sample
