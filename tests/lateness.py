@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import mmap
 import os
+import struct
 import subprocess
 import sys
 import time
@@ -14,23 +16,42 @@ LIMIT = 0.040  # s: what a state may be old (docs/reliability.md); a machine so 
 PROBE = 0.1  # s that it is watched before a test
 HOPELESS = 0.2  # s: so late within the probe, a test need not begin
 _WATCH = f"""
-import os, sys, time
+import mmap, os, signal, struct, sys, time
 parent = os.getppid()
 cores = sorted(os.sched_getaffinity(0))
-for core in cores[1:]:
+shared = mmap.mmap(int(sys.argv[1]), 8 * len(cores))
+slot = 0
+for k, core in enumerate(cores[1:], 1):
     if os.fork() == 0:
-        cores[0], parent = core, os.getppid()
+        cores[0], parent, slot = core, os.getppid(), k
         break
+def ended(*_):
+    if os.waitpid(-1, os.WNOHANG)[0]:  # not one that is only stopped
+        os._exit(1)
+if slot == 0:
+    signal.signal(signal.SIGCHLD, ended)
 try:
     os.sched_setaffinity(0, cores[:1])
 except OSError:
     pass
-while os.getppid() == parent:
-    due = time.time() + {EVERY}
-    time.sleep({EVERY})
-    late = time.time() - due
-    if late > {NOTED}:
-        os.write(1, b"%r %r\\n" % (due, late))
+os.set_blocking(1, False)
+due = time.time() + {EVERY}
+struct.pack_into("d", shared, 8 * slot, due)
+try:
+    os.write(1, b"\\n")
+    while os.getppid() == parent:
+        time.sleep({EVERY})
+        now = time.time()
+        if now - due > {NOTED}:
+            try:
+                os.write(1, b"%r %r\\n" % (due, now - due))
+            except BlockingIOError:
+                pass
+        due = now + {EVERY}
+        struct.pack_into("d", shared, 8 * slot, due)
+except BrokenPipeError:
+    pass
+os._exit(0)
 """
 
 
@@ -38,29 +59,40 @@ class Witness:
     """Processes that only sleep, one on each core, and note when they were woken late.
 
     A host may stop one of a virtual machine's cores while the others run: what slept on another
-    would not notice. They are as important as this process.
+    would not notice. They are as important as this process. When each is due stands in memory that
+    is shared: one that has not been woken yet is as late as it is overdue.
     """
 
     def __init__(self) -> None:
         self._process: subprocess.Popen[bytes] | None = None
+        self._due: mmap.mmap | None = None  # one double a core, s since 1970
         self._rest = b""
         self._late: list[tuple[float, float]] = []  # s since 1970: due; s: how late
 
     def start(self) -> None:
-        """Begin to watch; may be repeated."""
+        """Begin to watch, and return when each core is watched; may be repeated."""
         if self._process is not None:
             return
-        self._process = subprocess.Popen(
-            [sys.executable, "-S", "-E", "-c", _WATCH], stdout=subprocess.PIPE
-        )
+        cores = len(os.sched_getaffinity(0))
+        shared = os.memfd_create("lateness")
+        try:
+            os.ftruncate(shared, 8 * cores)
+            self._due = mmap.mmap(shared, 8 * cores)
+            command = [sys.executable, "-S", "-E", "-c", _WATCH, str(shared)]
+            self._process = subprocess.Popen(command, stdout=subprocess.PIPE, pass_fds=[shared])
+        finally:
+            os.close(shared)
         assert self._process.stdout is not None
+        for _ in range(cores):
+            assert os.read(self._process.stdout.fileno(), 1) == b"\n", "a watcher has ended"
         os.set_blocking(self._process.stdout.fileno(), False)
 
     def worst(self, since: float, until: float) -> float:
         """Return how late it was woken at worst between two moments (s since 1970), s."""
+        overdue = self._overdue()  # before what they noted: they note first, then are due anew
         self._read()
-        found = [late for due, late in self._late if due < until and due + late > since]
-        return max(found, default=0.0)
+        looks = [*self._late, *overdue]
+        return max((late for due, late in looks if due < until and due + late > since), default=0.0)
 
     def probe(self) -> float:
         """Watch for a moment; return how late it was woken at worst, s."""
@@ -68,6 +100,17 @@ class Witness:
         time.sleep(PROBE)
         late = time.time() - begun - PROBE  # this process is a witness too
         return max(late, self.worst(begun, time.time()))
+
+    def _overdue(self) -> list[tuple[float, float]]:
+        """Return when those are due that should have been woken, and how late they are, s.
+
+        Where one has ended all have, and excuse nothing: it is not the machine that is late.
+        """
+        if self._due is None or self._process is None or self._process.poll() is not None:
+            return []
+        now = time.time()
+        waiting = [(due, now - due) for (due,) in struct.iter_unpack("d", self._due)]
+        return [(due, late) for due, late in waiting if late > NOTED]
 
     def _read(self) -> None:
         if self._process is None or self._process.stdout is None:
@@ -84,7 +127,7 @@ class Witness:
 
     def stop(self) -> None:
         """End it."""
-        process, self._process = self._process, None
+        process, self._process, self._due = self._process, None, None
         if process is not None:
             process.kill()
             process.wait()
