@@ -10,6 +10,7 @@ from starlette.responses import PlainTextResponse
 
 from gapbridge.bridge.served import guard as guard_module
 from gapbridge.bridge.served.guard import WRONG_TOKEN_DELAY, Guard, cookie_name, cookie_of
+from gapbridge.bridge.served.protocol import LARGEST_HEAD
 from gapbridge.bridge.served.settings import ServedSettings
 
 TOKEN = "7d1f0c3a9b8e4f62a5d07c1e93b8462f"
@@ -52,6 +53,13 @@ def test_one_name_of_a_host_is_needed_and_no_more_are_taken() -> None:
     assert answer() == 421
     assert answer(HOST, HOST) == 421
     assert answer(HOST, (b"host", b"evil.example")) == 421
+
+
+def test_a_request_has_no_body_and_a_short_head() -> None:
+    assert answer(HOST, (b"content-length", b"0")) == 200
+    assert answer(HOST, (b"content-length", b"1")) == 413
+    assert answer(HOST, (b"transfer-encoding", b"chunked")) == 413
+    assert answer(HOST, (b"x", LARGEST_HEAD * b"a")) == 431
 
 
 @pytest.mark.parametrize("method", ["POST", "PUT", "DELETE", "PATCH", "OPTIONS", "TRACE"])

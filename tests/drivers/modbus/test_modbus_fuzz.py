@@ -106,6 +106,25 @@ def mutations(frame: bytes, random: np.random.Generator, count: int):
         yield bytes(data)
 
 
+def test_a_sample_whose_clock_moves_on_while_it_is_read_is_refused() -> None:
+    profile = read_profile(INVENTED)
+    compiled = compile_map(profile)
+    decoder = Decoder(profile, compiled)
+    holding = holding_of(profile)
+
+    def blocks() -> list[bytes]:
+        return [
+            wire_of([holding.get(a, 0) for a in range(b.first, b.first + b.count)])
+            for b in (*compiled.fast, *compiled.slow)
+        ]
+
+    clock = decoder.decode(blocks()).clock
+    assert clock is not None
+    holding[profile.clock.again + 1] += 1  # the low word of the clock behind the sample
+    with pytest.raises(InvalidStateError, match="which is torn"):
+        decoder.decode(blocks())
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("path", [*sorted(SHIPPED.glob("*.yaml")), INVENTED], ids=lambda p: p.stem)
 def test_random_registers_are_refused_or_plausible(path) -> None:
