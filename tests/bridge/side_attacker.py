@@ -69,6 +69,8 @@ def attack(daemon: int) -> dict[str, Any]:
         for entry in (Path("/proc") / str(pid) / "fd").iterdir():
             with contextlib.suppress(OSError):
                 link = os.readlink(entry)
+                if link.startswith("/memfd:lateness"):
+                    continue  # of the tests' own witness
                 if link.startswith("/memfd:"):
                     memories += 1
                     written += [f"{pid} {link} by {way}" for way in write_to_memory(str(entry))]

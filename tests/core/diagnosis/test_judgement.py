@@ -236,7 +236,7 @@ def test_links_as_a_whole_stand_only_where_one_of_them_is_sure(monkeypatch, thir
     )
     found = SimpleNamespace(
         terms=terms, covariance=[np.eye(1), *[1e-8 * np.eye(3)] * 2], term_index=(7, 8, 9),
-        block=(8, 9),
+        block=(8, 9), as_a_whole=lambda p: p > 0,
     )  # fmt: skip
     found.covariance[0] = found.covariance[0] * 1e-4
     monkeypatch.setattr(judging, "refitted_alone", lambda *_: found)

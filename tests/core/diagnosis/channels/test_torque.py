@@ -144,8 +144,7 @@ def test_joints_that_move_one_at_a_time_keep_their_rows(plant):
     wave = np.sin(2 * np.pi * 0.5 * t) ** 3 * 0.4
     turn = (t // 4).astype(int) % N
     q = np.where(turn[:, None] == np.arange(N), wave[:, None], 0.0)
-    torque = np.zeros_like(q)
-    log = truth.log_of(N, timestamp=t, actual_q=q, actual_current_as_torque=torque)
+    log = truth.log_of(N, timestamp=t, actual_q=q, actual_current_as_torque=q)
     seen = observe(plant.model(2.0), log, METROLOGY)
     assert len(seen.rows) > 2000
 
@@ -153,7 +152,7 @@ def test_joints_that_move_one_at_a_time_keep_their_rows(plant):
 def test_a_long_log_is_looked_at_whole_and_held_out_by_stretches_of_time(plant):
     t = np.arange(15000) / 500
     log = truth.log_of(N, timestamp=t, actual_q=COURSE.at(t),
-                       actual_current_as_torque=np.zeros((15000, N)),
+                       actual_current_as_torque=COURSE.at(t),
                        joint_temperatures=np.tile(t[:, None], N) + 20)  # fmt: skip
     begin = time.perf_counter()
     seen = observe(plant.model(2.0), log, METROLOGY)
