@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -17,6 +18,7 @@ SHARED = {"payload", "payload_cog", "joint_offset", "latency"}
 # what the demo has put into its plant, by the name that a diagnosis must find
 LABELS = {
     "bridge/patch/mjcf.py": {"backlash", "axial_compliance", "base_compliance"},
+    "bridge/patch/mjcf_scene.py": {"coulomb_friction"},  # any "..._friction"
     "bridge/patch/usd.py": {"backlash", "axial_compliance"},
     "bridge/demo/hidden.py": {
         "tool_frame",
@@ -36,6 +38,15 @@ def _named(text: object) -> str | None:
     if text in CATALOGUE:
         return text
     return next((e for e in CATALOGUE if e not in SHARED and text.startswith(f"{e}_")), None)
+
+
+def _composed(node: ast.JoinedStr) -> str | None:
+    """Return the effect that a formatted text can come to name: ``f"{kind}_compliance"``."""
+    parts = [p.value if isinstance(p, ast.Constant) else None for p in node.values]
+    if not any(isinstance(p, str) and len(p.strip("_ ")) > 5 for p in parts):
+        return None
+    pattern = re.compile("".join("[a-z0-9]+" if p is None else re.escape(str(p)) for p in parts))
+    return next((e for e in CATALOGUE if e not in SHARED and pattern.match(f"{e}_1")), None)
 
 
 def _texts(node: ast.AST) -> Iterator[str]:
@@ -75,6 +86,8 @@ def _found(source: str) -> list[str]:
             name = _named(node.value)
             if name and name not in SHARED:
                 found.append(name)
+        if isinstance(node, ast.JoinedStr) and (composed := _composed(node)):
+            found.append(composed)
         if isinstance(node, ast.ImportFrom) and (node.module or "").startswith(
             "gapbridge.core.effects."
         ):
@@ -99,6 +112,7 @@ def test_no_effect_is_named_outside_its_own_file_and_the_table() -> None:
 def test_the_search_finds_what_it_looks_for() -> None:
     assert _found('x = ("backlash", 1)') == ["backlash"]
     assert _found('x = "ft_bias_fx"') == ["ft_bias"]
+    assert _found('x = f"{kind}_compliance_{i}"') == ["axial_compliance"]
     assert _found('if term.effect == "payload": pass') == ["payload"]
     assert _found('kept = [t for t in terms if t.effect not in ("payload",)]') == ["payload"]
     assert _found("from gapbridge.core.effects.backlash import Backlash") == ["backlash"]

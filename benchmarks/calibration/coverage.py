@@ -30,6 +30,7 @@ from benchmarks.calibration.laid_out import (
 )
 from gapbridge.core.calibration.converged_fit import converged_fit
 from gapbridge.core.calibration.fit import estimates_of
+from gapbridge.core.calibration.identifiability import identifiable_parameters
 from gapbridge.core.calibration.observables import make_observable
 from gapbridge.core.calibration.parameters import Parameters
 from gapbridge.core.calibration.remainder import predicted
@@ -78,7 +79,7 @@ def settings() -> list[Setting]:
             how = make_observable(
                 "pose" if layout.pose_kind else "position", registered=layout.registered
             )
-            found.append(Setting(arm, name, model, Parameters.of(model, observable=how)))
+            found.append(Setting(arm, name, model, identifiable_parameters(model, observable=how)))
     return found
 
 

@@ -28,6 +28,7 @@ from threadpoolctl import threadpool_limits
 from benchmarks.calibration.best_possible import least_possible
 from benchmarks.calibration.random_cells import RandomCell, random_cell
 from benchmarks.calibration.repeated import Scatter, repeated_sessions
+from gapbridge.core.calibration.identifiability import identifiable_parameters
 from gapbridge.core.calibration.observables import Nuisance, Observable, make_observable
 from gapbridge.core.calibration.observables.foreseen import empty_readings
 from gapbridge.core.calibration.parameters import Parameters
@@ -89,7 +90,7 @@ def readings_of(planned: Plan, kind: str) -> Readings:
 
 def row_of(cell: RandomCell, observable: Observable, poses: int, sessions: int, seed: int) -> Row:
     """Return the figures of one cell."""
-    parameters = Parameters.of(cell.model, observable=observable)
+    parameters = identifiable_parameters(cell.model, observable=observable)
     begin = time.process_time()
     planned = plan(
         parameters, observable, cell.loads, cell.space,

@@ -36,6 +36,7 @@ from benchmarks.calibration.laid_out import (
 from benchmarks.calibration.urdf import urdf_of
 from gapbridge.bridge.cell import load_cell
 from gapbridge.core.calibration.fit import fit_session, judged
+from gapbridge.core.calibration.identifiability import identifiable_parameters
 from gapbridge.core.calibration.observables import make_observable
 from gapbridge.core.calibration.parameters import DEFAULT, Parameters
 from gapbridge.core.calibration.readings import Readings
@@ -117,7 +118,7 @@ def by_gapbridge(data: DataSet) -> tuple[float, float, int, str]:
     how = make_observable("position")
     bends = data.readings.loads.payload_mass is not None or bool(data.model.arm.mass.any())
     effects = DEFAULT if bends else ("tool_frame", "joint_offset", "link_geometry")
-    parameters = Parameters.of(data.model, effects, observable=how)
+    parameters = identifiable_parameters(data.model, effects, observable=how)
     found = judged(data.model, fit_session(data.readings, parameters, Metrology()), diagnose=False)
     seconds = time.process_time() - begun
     return _coordinate(found.held_out_after.vector), seconds, len(parameters), found.verdict

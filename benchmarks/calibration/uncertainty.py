@@ -32,8 +32,8 @@ from benchmarks.calibration.laid_out import (
 )
 from gapbridge.core.calibration.budget.budget import Stated, budget
 from gapbridge.core.calibration.fit import fit_session, judged
+from gapbridge.core.calibration.identifiability import identifiable_parameters
 from gapbridge.core.calibration.observables import make_observable
-from gapbridge.core.calibration.parameters import Parameters
 from gapbridge.core.metrology import Metrology
 
 REPEATED = {"few repeats": 3, "many repeats": 12}
@@ -58,7 +58,9 @@ def run(arm: str, repeats: str, seed: int) -> Outcome:
     rng = np.random.default_rng([seed, 4411])
     kind, layout = ARMS[arm], Layout(registered=True, repeated=REPEATED[repeats])
     model = model_of(real_arm(kind))
-    parameters = Parameters.of(model, observable=make_observable("position", registered=True))
+    parameters = identifiable_parameters(
+        model, observable=make_observable("position", registered=True)
+    )
     real = arm_with(kind, draw_values(kind, parameters.names, rng))
     instrument = instrument_for(kind, layout, rng)
     readings = readings_of(real, lay_out(kind, layout, rng), instrument, rng)

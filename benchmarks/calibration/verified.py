@@ -32,6 +32,7 @@ from benchmarks.blind.session import Plan
 from benchmarks.calibration.drawings import model_of
 from benchmarks.calibration.laid_out import draw_values, with_values
 from gapbridge.core.calibration.fit import fit_session, judged
+from gapbridge.core.calibration.identifiability import identifiable_parameters
 from gapbridge.core.calibration.observables import make_observable
 from gapbridge.core.calibration.parameters import DEFAULT, ORDERS, Parameters
 from gapbridge.core.calibration.readings import Readings
@@ -107,7 +108,7 @@ def run(arm: str, effect: str, seed: int, asked: bool = False) -> Outcome:
     chosen = () if asked else more
 
     def fit() -> Calibration:
-        parameters = Parameters.of(model, (*chosen, *DEFAULT), observable=how, pulls=True)
+        parameters = identifiable_parameters(model, (*chosen, *DEFAULT), observable=how, pulls=True)
         return judged(
             model, fit_session(readings, parameters, metrology, observable=how), diagnose=False
         )

@@ -13,6 +13,7 @@ from benchmarks.speed import task
 from benchmarks.speed.linear_fit import fit_linear
 from benchmarks.speed.peers.pinocchio_task import PinocchioTask
 from benchmarks.speed.sides import Side, compared, interleaved
+from gapbridge.core.calibration.identifiability import identifiable_parameters
 from gapbridge.core.calibration.observables import make_observable
 from gapbridge.core.calibration.observables.foreseen import empty_readings
 from gapbridge.core.calibration.parameters import Parameters
@@ -61,7 +62,7 @@ def whole(count: int, turns: int = 1) -> dict[str, Any]:
     """Return the row of the whole geometry with flexibilities: ``turns`` of each side."""
     model = task.rigid()
     observable = make_observable("position", registered=True)
-    parameters = Parameters.of(model, observable=observable, pulls=True)
+    parameters = identifiable_parameters(model, observable=observable, pulls=True)
     q, loads = task.rows(count)
     rng = np.random.default_rng(4)
     size = 0.3 * parameters.scales

@@ -6,9 +6,12 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
+
 from gapbridge.bridge.document.provenance import intervals_of
 from gapbridge.core.calibration.spread import Spread
 from gapbridge.core.diagnosis.diagnosis import Diagnosis
+from gapbridge.core.effects import flexibility_names
 from gapbridge.core.estimation.identification import Identification
 
 
@@ -64,10 +67,9 @@ def intervals_applied(
 
 def fit_intervals(found: Identification) -> dict[str, tuple[float, float]]:
     """Return the 95 % interval of each flexibility that a fit determines, by name, rad/Nm."""
-    both = (("axial", found.axial, found.std_axial), ("radial", found.radial, found.std_radial))
-    every = [
-        (f"{kind}_compliance_{i + 1}", float(values[i]), float(std[i]))
-        for kind, values, std in both
-        for i in range(len(values))
-    ]
-    return intervals_of(one for one, shown in zip(every, found.identifiable, strict=True) if shown)
+    values = np.concatenate([found.axial, found.radial])
+    stds = np.concatenate([found.std_axial, found.std_radial])
+    numbers = zip(
+        flexibility_names(len(values) // 2), values, stds, found.identifiable, strict=True
+    )
+    return intervals_of((name, float(v), float(std)) for name, v, std, shown in numbers if shown)

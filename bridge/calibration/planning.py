@@ -16,6 +16,7 @@ from gapbridge.bridge.cell.settings.calibration import (
     RangeEntry,
 )
 from gapbridge.bridge.cell.settings.instruments import Base
+from gapbridge.core.calibration.identifiability import identifiable_parameters
 from gapbridge.core.calibration.observables import Observable, make_observable
 from gapbridge.core.calibration.parameters import DEFAULT, Parameters
 from gapbridge.core.calibration.plan import Payload, Plan
@@ -50,7 +51,7 @@ def observable_of(cell: Cell, instrument: Base, places: int = 1) -> Observable:
 
 def parameters_of(cell: Cell, observable: Observable) -> Parameters:
     """Return what is to be found, without what such readings cannot show. Raises CellError."""
-    return Parameters.of(cell.model, effects_of(cell), observable=observable)
+    return identifiable_parameters(cell.model, effects_of(cell), observable=observable)
 
 
 def metrology_of(cell: Cell, instrument: Base, places: int = 1) -> Metrology:

@@ -7,7 +7,8 @@ from typing import Any
 
 from gapbridge.bridge.document.findings import considered_text, finding_text
 from gapbridge.core.diagnosis.carrying import Carried
-from gapbridge.core.diagnosis.diagnosis import ChannelDiagnosis, Diagnosis
+from gapbridge.core.diagnosis.channel_diagnosis import ChannelDiagnosis
+from gapbridge.core.diagnosis.diagnosis import Diagnosis
 from gapbridge.core.diagnosis.result import Cause
 from gapbridge.core.effects import CATALOGUE
 

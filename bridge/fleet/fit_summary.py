@@ -15,6 +15,7 @@ from gapbridge.bridge.fleet.arms import by_arm
 from gapbridge.bridge.fleet.drift import ChannelFigure, Drift, Figure, believed
 from gapbridge.bridge.fleet.outlying import Outlier
 from gapbridge.bridge.fleet.task import Outcome
+from gapbridge.core.effects import flexibility_names
 from gapbridge.core.estimation.hierarchical import ArmFit, Scatter, SessionFit, TypeFit, fit_type
 from gapbridge.core.estimation.hierarchical_evidence import Evidence
 
@@ -95,8 +96,7 @@ def _type(name: str, arms: dict[str, list[Outcome]]) -> FittedType:
     for i, (arm, own) in enumerate(arms.items()):
         found.append(FittedArm(arm, fit.arms[i], tuple(sessions[begin : begin + len(own)])))
         begin += len(own)
-    n = len(nominal) // 2
-    names = [f"{kind}_compliance_{j + 1}" for kind in ("axial", "radial") for j in range(n)]
+    names = flexibility_names(len(nominal) // 2)
     return FittedType(name, tuple(names), fit.scatter, tuple(found))
 
 

@@ -17,7 +17,7 @@ from gapbridge.bridge.document.drawing import (
 )
 from gapbridge.bridge.report.labels import CHANNELS, percent, with_unit
 from gapbridge.bridge.report.material import after, shares
-from gapbridge.core.diagnosis.diagnosis import ChannelDiagnosis
+from gapbridge.core.diagnosis.channel_diagnosis import ChannelDiagnosis
 
 CAPTION = (
     "Gap per coordinate (rms) before and after the found causes are put into the model, on "

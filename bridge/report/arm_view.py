@@ -16,7 +16,7 @@ from gapbridge.bridge.report.material import (
     per_sample,
     thinned,
 )
-from gapbridge.core.diagnosis.diagnosis import ChannelDiagnosis
+from gapbridge.core.diagnosis.channel_diagnosis import ChannelDiagnosis
 
 ARROWS = 250
 DRAWN = 4  # poses in which the arm is drawn

@@ -9,7 +9,7 @@ from gapbridge.bridge.document.findings import finding_text
 from gapbridge.bridge.document.provenance import origin_blocks
 from gapbridge.bridge.report.labels import CHANNELS, with_unit
 from gapbridge.bridge.report.material import Material, own_coordinates, per_sample
-from gapbridge.core.diagnosis.diagnosis import ChannelDiagnosis
+from gapbridge.core.diagnosis.channel_diagnosis import ChannelDiagnosis
 from gapbridge.core.log.log import Log
 
 LISTED = 20  # outliers listed a channel

@@ -18,7 +18,7 @@ from gapbridge.bridge.report.material import (
     shares,
     thinned,
 )
-from gapbridge.core.diagnosis.diagnosis import ChannelDiagnosis
+from gapbridge.core.diagnosis.channel_diagnosis import ChannelDiagnosis
 
 
 def how_far(material: Material) -> list[Block]:

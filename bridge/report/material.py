@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from gapbridge.bridge.document.blocks import Block, Heading
 from gapbridge.bridge.document.drawing import AFTER, BEFORE
 from gapbridge.bridge.report.labels import CHANNELS
-from gapbridge.core.diagnosis.diagnosis import ChannelDiagnosis, Diagnosis
+from gapbridge.core.diagnosis.channel_diagnosis import ChannelDiagnosis
+from gapbridge.core.diagnosis.diagnosis import Diagnosis
 from gapbridge.core.diagnosis.held_out import HeldOut
 from gapbridge.core.log.log import Log
 from gapbridge.core.model import Model

@@ -19,7 +19,7 @@ from gapbridge.bridge.report.material import (
     per_sample,
     thinned,
 )
-from gapbridge.core.diagnosis.diagnosis import ChannelDiagnosis
+from gapbridge.core.diagnosis.channel_diagnosis import ChannelDiagnosis
 
 MOST_QUANTITIES = 14
 STATED = 0.02  # share below which a dependence is not worth a line

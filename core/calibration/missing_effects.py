@@ -36,7 +36,7 @@ Candidate = tuple[Array, Array]  # columns (M, k), usual sizes (k,)
 class MissingEffect:
     """An effect that would explain a part of the residuals."""
 
-    name: str  # as Parameters.of takes it: backlash_3, thermal_drift
+    name: str  # as identifiable_parameters takes it: backlash_3, thermal_drift
     share: float  # of the residuals' squares on poses left out in folds that it takes off
 
 

@@ -1,9 +1,4 @@
-"""The parameters of a calibration: which effects at which sites are to be found.
-
-Those that no readings of the kind at hand can separate from the others are left out by rank, the
-rest are base parameters: they carry what the left-out ones would add (Gautier, Khalil, IEEE Trans.
-Robotics and Automation 6 (1990) 368).
-"""
+"""The parameters of a calibration: which effects at which sites are to be found."""
 
 from __future__ import annotations
 
@@ -13,8 +8,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from gapbridge.core.calibration.observables.observable import Observable
-from gapbridge.core.calibration.redundancy import Redundancy, redundancy
 from gapbridge.core.effects import CATALOGUE, Site, Term, effect_named
 from gapbridge.core.errors import InputError
 from gapbridge.core.model import Model
@@ -47,26 +40,6 @@ class Parameters:
     redundant: tuple[str, ...] = ()  # in words: what was left out, and what stands for it
 
     @classmethod
-    def of(
-        cls,
-        model: Model,
-        effects: Sequence[str] = DEFAULT,
-        *,
-        observable: Observable,
-        pulls: bool = False,
-        seed: int = 0,
-    ) -> Parameters:
-        """Return the parameters of some effects, redundant ones left out, earlier effects first.
-
-        ``effects`` are identifiers of the catalogue's position channel, for all sites or for one
-        joint (``backlash_2``). ``pulls``: the session pulls at the tool sideways too, not by
-        weights alone. Raises InputError for an effect that positions do not show.
-        """
-        every = cls.every(model, effects)
-        found = redundancy(every, observable, pulls=pulls, seed=seed)
-        return every.part(found)
-
-    @classmethod
     def every(cls, model: Model, effects: Sequence[str] = DEFAULT) -> Parameters:
         """Return all parameters of some effects, the redundant ones among them."""
         terms = tuple(_terms(model, effects))
@@ -93,19 +66,19 @@ class Parameters:
         """Return the number of parameters (p)."""
         return len(self.names)
 
-    def part(self, found: Redundancy) -> Parameters:
-        """Return the parameters that stay."""
-        kept = found.kept
+    def part(self, kept: Sequence[int], redundant: tuple[str, ...] = ()) -> Parameters:
+        """Return the parameters ``kept``; ``redundant``: the others, and what stands for them."""
+        rows = list(kept)
         return replace(
             self,
             place=tuple(self.place[i] for i in kept),
             names=tuple(self.names[i] for i in kept),
             units=tuple(self.units[i] for i in kept),
-            scales=self.scales[kept],
-            lower=self.lower[kept],
-            upper=self.upper[kept],
-            begin=self.begin[kept],
-            redundant=found.reasons,
+            scales=self.scales[rows],
+            lower=self.lower[rows],
+            upper=self.upper[rows],
+            begin=self.begin[rows],
+            redundant=redundant,
         )
 
     def model(self, values: Array) -> Model:

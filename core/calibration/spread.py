@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapbridge.core.calibration.parameters import Parameters
-from gapbridge.core.calibration.redundancy import Redundancy
-from gapbridge.core.effects import CATALOGUE, Term
+from gapbridge.core.effects import CATALOGUE, Term, flexibility_names
 from gapbridge.core.errors import EquilibriumError, InputError
 from gapbridge.core.estimation.pose_jacobian import pose_columns
 from gapbridge.core.loads import Loads
@@ -41,8 +40,7 @@ class Spread:
     @classmethod
     def of_fit(cls, shown: NDArray[np.bool_], covariance: Array) -> Spread:
         """Return the flexibilities that a fit has ``shown`` (2n,), axial then radial."""
-        n = len(shown) // 2
-        names = [f"{kind}_compliance_{j + 1}" for kind in ("axial", "radial") for j in range(n)]
+        names = flexibility_names(len(shown) // 2)
         rows = np.flatnonzero(shown)
         return cls(tuple(names[i] for i in rows), covariance[np.ix_(rows, rows)])
 
@@ -124,7 +122,7 @@ def parameters_named(model: Model, names: Sequence[str], where: str) -> Paramete
         raise InputError(
             f"{where}: found parameter {missing[0]!r}, expected one of this cell's arm"
         )
-    return every.part(Redundancy([at[name] for name in names], ()))
+    return every.part([at[name] for name in names])
 
 
 def effects_of(names: Sequence[str]) -> tuple[str, ...]:

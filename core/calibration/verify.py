@@ -17,7 +17,6 @@ from scipy.stats import chi2
 from scipy.stats import f as fisher
 
 from gapbridge.core.calibration.accuracy_baseline import AccuracyBaseline, baseline_in
-from gapbridge.core.calibration.moved import moved_text, verdict_text
 from gapbridge.core.calibration.noise import presumed
 from gapbridge.core.calibration.observables import make_observable
 from gapbridge.core.calibration.observables.nuisance import Nuisance
@@ -52,7 +51,6 @@ class Verification:
     """Whether a calibration still holds."""
 
     holds: bool
-    verdict: str  # one sentence
     errors: Errors  # of each reading, the instrument's place fitted where nobody registered it
     predicted: Array  # (M,) m, 1 sigma (3D) that the calibration predicted of each error
     ratio: float  # rms of the errors over what was predicted, the numbers fitted counted
@@ -124,8 +122,7 @@ def verify(
     moved = suspects[0] if suspects and suspects[0].chance > BROKEN else None
     errors = Errors(left[:, :3], np.arange(len(readings)))
     return Verification(
-        holds, verdict_text(holds, errors, ratio, chance, moved_text(moved, suspects)),
-        errors, spread, ratio, chance, moved,
+        holds, errors, spread, ratio, chance, moved,
         tuple(s for s in suspects[1:] if moved and s.left < moved.left + BESIDE),
         nuisance.stations, _notes(baseline, metrology, freedom),
     )  # fmt: skip

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from gapbridge.core.diagnosis.carrying import Carried, carried
+from gapbridge.core.diagnosis.carrying import carried
+from gapbridge.core.diagnosis.channel_diagnosis import ChannelDiagnosis
 from gapbridge.core.diagnosis.channels import position, torque, tracking, wrench
 from gapbridge.core.diagnosis.channels.simulation import joined, predicted_by
 from gapbridge.core.diagnosis.every_row.gap_sizes import gaps, sizes_of, streamed_sizes
@@ -33,7 +34,7 @@ from gapbridge.core.diagnosis.finding import (
     Thinned,
     TooFewRows,
 )
-from gapbridge.core.diagnosis.generalisation import NOWHERE, Generalisation, generalisation
+from gapbridge.core.diagnosis.generalisation import generalisation
 from gapbridge.core.diagnosis.held_out import HeldOut
 from gapbridge.core.diagnosis.judgement import (
     Judgement,
@@ -51,7 +52,7 @@ from gapbridge.core.diagnosis.noise_floor import (
 )
 from gapbridge.core.diagnosis.observation import NotObservable, Observation, thinned
 from gapbridge.core.diagnosis.residual_structure import dependence
-from gapbridge.core.diagnosis.result import Cause, Considered, causes_of, considered_of
+from gapbridge.core.diagnosis.result import Considered, causes_of, considered_of
 from gapbridge.core.diagnosis.rigid_suspicion import softness_findings
 from gapbridge.core.diagnosis.selection.moments import slips
 from gapbridge.core.diagnosis.selection.selection import Selection, refitted_alone, select
@@ -80,39 +81,6 @@ CHANNELS: Mapping[str, Observe] = {
 ROUNDING = 1e-10  # m, N, rad, Nm: what is left below is the arithmetic's, and has no structure
 # samples that a diagnosis looks at: more cost time and add hardly anything
 MOST = {"position": 1200, "wrench": 300, "tracking": 300, "torque": 300}
-
-
-@dataclass(frozen=True)
-class ChannelDiagnosis:
-    """What was found in one channel; figures per coordinate, in the channel's unit."""
-
-    channel: str
-    unit: str
-    samples: int
-    gap_rms: float
-    gap_max: float
-    noise_floor_rms: float | None
-    remaining_rms: float
-    remaining_rms_held_out: float | None
-    where: Where
-    causes: tuple[Cause, ...]
-    considered: tuple[Considered, ...]
-    unexplained_rms: float
-    structured: bool
-    p_value: float | None
-    depends_on: tuple[tuple[str, float], ...]
-    verdict: str
-    selection: Selection = field(repr=False)  # of a long recording that of its excerpt
-    judgement: Judgement = field(repr=False)
-    gap: Array = field(repr=False)  # (N, k) measured - predicted, frame fitted
-    remaining: Array = field(repr=False)  # (N, k) with the causes in the model
-    held_out: Array | None = field(repr=False)  # (kept,) rms of each held-out sample
-    outliers: NDArray[np.int64] = field(repr=False)  # rows of the log that were excluded
-    stand_ins: tuple[Cause, ...] = ()  # not proved, but useful where nothing was fitted
-    along: tuple[Term, ...] = ()  # causes and stand-ins, fitted together
-    elsewhere: Generalisation = NOWHERE  # new region, new session
-    noise_floor_source: str = "unknown"  # what measured it
-    carried: tuple[Carried, ...] = ()  # of causes, where several sessions show them
 
 
 @dataclass(frozen=True)

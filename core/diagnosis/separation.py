@@ -11,11 +11,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from gapbridge.core.diagnosis.channel_diagnosis import ChannelDiagnosis
 from gapbridge.core.diagnosis.criteria import TIE_SCORE
 from gapbridge.core.diagnosis.next_measurements import PREDICTED, Predict, Trials, draw_trials
 from gapbridge.core.diagnosis.selection.local_search import rivals
@@ -25,9 +25,6 @@ from gapbridge.core.errors import InputError
 from gapbridge.core.estimation.registration import frame_columns
 from gapbridge.core.log.log import Log
 from gapbridge.core.model import Model
-
-if TYPE_CHECKING:
-    from gapbridge.core.diagnosis.diagnosis import ChannelDiagnosis
 
 Array = NDArray[np.float64]
 EACH = 2  # measurements proposed per open question

@@ -95,6 +95,12 @@ def flexibility_effects() -> dict[str, str]:
     return {e.flexibility: name for name, e in CATALOGUE.items() if e.flexibility}
 
 
+def flexibility_names(n: int) -> list[str]:
+    """Return the names of the 2n linear flexibilities of an arm of n joints, axial then radial."""
+    named = flexibility_effects()
+    return [f"{named[kind]}_{i + 1}" for kind in ("axial", "radial") for i in range(n)]
+
+
 def correcting(what: str) -> tuple[str, ...]:
     """Return the effects that correct one thing a cell declares: "payload", "tool", ..."""
     return tuple(name for name, effect in CATALOGUE.items() if effect.corrects == what)
@@ -148,6 +154,7 @@ __all__ = [
     "correcting",
     "effect_named",
     "flexibility_effects",
+    "flexibility_names",
     "settling",
     "ties_of",
 ]

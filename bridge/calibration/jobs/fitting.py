@@ -13,7 +13,7 @@ from gapbridge.bridge.calibration.session.prompt import Prompt
 from gapbridge.bridge.calibration.session.session import Session
 from gapbridge.bridge.cell import Cell
 from gapbridge.core.calibration.fit import SessionFit, fit_session, judged
-from gapbridge.core.calibration.parameters import Parameters
+from gapbridge.core.calibration.identifiability import identifiable_parameters
 from gapbridge.core.calibration.result import Calibration, Errors
 
 LEAST_SEEN = 2e-6  # m: a repeatability below this is none that was seen
@@ -35,7 +35,9 @@ def fitted(
     observable = observable_of(cell, options.instrument, places)
     metrology = metrology_of(cell, options.instrument, places)
     with prompt.waiting("fitting") as emit:
-        parameters = Parameters.of(cell.model, (*effects_of(cell), *more), observable=observable)
+        parameters = identifiable_parameters(
+            cell.model, (*effects_of(cell), *more), observable=observable
+        )
         return fit_session(
             session.all_readings(kind), parameters, metrology, observable=observable,
             progress=lambda text: emit(f"fitting: {text}"),

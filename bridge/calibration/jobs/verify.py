@@ -22,8 +22,8 @@ from gapbridge.bridge.calibration.planning import (
     with_loads,
 )
 from gapbridge.bridge.calibration.session.progress import seconds_left
+from gapbridge.bridge.calibration.verdict import moved_text, verdict_text
 from gapbridge.core.calibration.accuracy_baseline import baseline_in
-from gapbridge.core.calibration.moved import moved_text
 from gapbridge.core.calibration.plan import Plan, PlannedPose
 from gapbridge.core.calibration.verify import Verification, verify
 from gapbridge.core.errors import InputError
@@ -115,7 +115,7 @@ class VerifyJob(Job):
 
     def _report(self, found: Verification) -> None:
         prompt = self.prompt
-        prompt.say(found.verdict, "bold green" if found.holds else "bold red")
+        prompt.say(verdict_text(found), "bold green" if found.holds else "bold red")
         prompt.say(
             f"  errors {millimetres(found.errors.mean)} in the mean, "
             f"{millimetres(found.errors.max)} at most; {found.ratio:.2f} times what was predicted"
@@ -126,7 +126,7 @@ class VerifyJob(Job):
                 f"± {parameter(estimate.std, estimate.unit)}"
             )
         for other in found.suspects:
-            prompt.say(f"  these readings cannot distinguish it from: {moved_text(other, ())}")
+            prompt.say(f"  these readings cannot distinguish it from: {moved_text(other)}")
         for note in found.notes:
             prompt.say(f"  note: {note}")
 

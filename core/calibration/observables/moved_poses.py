@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from numpy.typing import NDArray
 
+from gapbridge.core.calibration.parameters import Parameters
 from gapbridge.core.calibration.readings import Readings
 from gapbridge.core.estimation.pose_jacobian import PoseColumns, pose_columns
-
-if TYPE_CHECKING:
-    from gapbridge.core.calibration.parameters import Parameters
 
 Array = NDArray[np.float64]
 SHARE = 0.01  # of a parameter's usual size, as the step of a difference

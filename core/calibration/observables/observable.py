@@ -8,20 +8,18 @@ with those of the reading, so that every effect of the catalogue enters every ki
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gapbridge.core.calibration.observables.moved_poses import moved_poses
 from gapbridge.core.calibration.observables.nuisance import Layout, Nuisance
+from gapbridge.core.calibration.parameters import Parameters
 from gapbridge.core.calibration.readings import Readings
 from gapbridge.core.errors import ExcitationError
 from gapbridge.core.model import Model, Poses
 from gapbridge.core.rotation import one_rotation_matrix
-
-if TYPE_CHECKING:
-    from gapbridge.core.calibration.parameters import Parameters
 
 Array = NDArray[np.float64]
 STEP = 1e-5  # m and rad, of a nuisance: the gap is all but linear in it

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from gapbridge.core.arm import builtin_arm
+from gapbridge.core.calibration.identifiability import identifiable_parameters
 from gapbridge.core.calibration.observables import make_observable
 from gapbridge.core.calibration.observables.foreseen import empty_readings
 from gapbridge.core.calibration.parameters import Parameters
@@ -35,7 +36,7 @@ def small_space(model: Model, **given: object) -> Space:
 def small_parameters(model: Model) -> Parameters:
     """Return few parameters, for tests that need no more."""
     effects = ("tool_frame", "joint_offset", "axial_compliance")
-    return Parameters.of(model, effects, observable=POSITION)
+    return identifiable_parameters(model, effects, observable=POSITION)
 
 
 def readings_of(plan: Plan, kind: str = "position") -> Readings:

@@ -19,6 +19,7 @@ from benchmarks.calibration.laid_out import (
     with_values,
 )
 from gapbridge.core.calibration.fit import fit_session, judged
+from gapbridge.core.calibration.identifiability import identifiable_parameters
 from gapbridge.core.calibration.observables import make_observable
 from gapbridge.core.calibration.parameters import DEFAULT, Parameters
 from gapbridge.core.calibration.problem import bounds_of
@@ -45,7 +46,7 @@ def model() -> Model:
 
 @pytest.fixture(scope="module")
 def parameters(model: Model) -> Parameters:
-    return Parameters.of(model, ("payload", *DEFAULT), observable=POSITION)
+    return identifiable_parameters(model, ("payload", *DEFAULT), observable=POSITION)
 
 
 def _session(parameters: Parameters, extra: float) -> Readings:

@@ -20,6 +20,7 @@ from benchmarks.calibration.laid_out import (
     readings_of,
 )
 from gapbridge.core.calibration.fit import fit_session, judged
+from gapbridge.core.calibration.identifiability import identifiable_parameters
 from gapbridge.core.calibration.observables import make_observable
 from gapbridge.core.calibration.parameters import DEFAULT, Parameters
 from gapbridge.core.calibration.readings import Readings
@@ -40,7 +41,7 @@ def model() -> Model:
 
 @pytest.fixture(scope="module")
 def parameters(model: Model) -> Parameters:
-    return Parameters.of(model, observable=make_observable("position"))
+    return identifiable_parameters(model, observable=make_observable("position"))
 
 
 def _session(
@@ -207,7 +208,7 @@ def test_what_is_left_to_be_added_is_named_and_then_completes_it(
     assert not found.complete
     assert found.missing_effects == ("backlash_3",)
     names = (*DEFAULT, *found.missing_effects)
-    more = Parameters.of(model, names, observable=make_observable("position"))
+    more = identifiable_parameters(model, names, observable=make_observable("position"))
     whole = judged(model, fit_session(readings, more, METROLOGY), diagnose=False)
     assert whole.complete
     assert whole.missing_effects == ()

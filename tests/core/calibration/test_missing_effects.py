@@ -18,6 +18,7 @@ from benchmarks.calibration.laid_out import (
     readings_of,
 )
 from gapbridge.core.calibration.fit import fit_session
+from gapbridge.core.calibration.identifiability import identifiable_parameters
 from gapbridge.core.calibration.observables import make_observable
 from gapbridge.core.calibration.parameters import DEFAULT, Parameters
 from gapbridge.core.calibration.readings import Readings
@@ -35,7 +36,7 @@ def session(
     """Return a small session of an arm that has nothing but what is fitted."""
     layout = Layout(poses=poses, held_out=8, repeated=0)
     model = model_of(real_arm(KIND))
-    parameters = Parameters.of(model, effects, observable=make_observable("position"))
+    parameters = identifiable_parameters(model, effects, observable=make_observable("position"))
     rng = np.random.default_rng(seed)
     truth = draw_values(KIND, parameters.names, rng)
     laid, instrument = lay_out(KIND, layout, rng), instrument_for(KIND, layout, rng)

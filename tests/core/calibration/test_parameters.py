@@ -8,6 +8,7 @@ import pytest
 from benchmarks.blind.arms import ARMS
 from benchmarks.calibration.drawings import model_of, real_arm
 from gapbridge.core.arm import builtin_arm
+from gapbridge.core.calibration.identifiability import identifiable_parameters
 from gapbridge.core.calibration.observables import make_observable
 from gapbridge.core.calibration.parameters import DEFAULT, Parameters
 from gapbridge.core.effects import Site, Term
@@ -27,7 +28,7 @@ def model() -> Model:
 
 @pytest.fixture(scope="module")
 def parameters(model: Model) -> Parameters:
-    return Parameters.of(model, observable=POSITION)
+    return identifiable_parameters(model, observable=POSITION)
 
 
 def test_redundant_ones_are_left_out_and_named(parameters: Parameters) -> None:
@@ -49,11 +50,11 @@ def test_what_is_left_is_separated_by_readings(parameters: Parameters) -> None:
 
 
 def test_rank_of_the_kept_is_full_and_of_all_is_not_more(model: Model) -> None:
-    from gapbridge.core.calibration.redundancy import _anywhere
+    from gapbridge.core.calibration.identifiability import _anywhere
 
     observable = make_observable("pose")
     every = Parameters.every(model)
-    kept = Parameters.of(model, observable=observable)
+    kept = identifiable_parameters(model, observable=observable)
     readings, nuisance = _anywhere(model, observable, False, 5)
     ranks = []
     for parameters in (every, kept):
@@ -66,12 +67,14 @@ def test_rank_of_the_kept_is_full_and_of_all_is_not_more(model: Model) -> None:
 
 
 def test_a_registered_instrument_shows_the_first_joints_zero(model: Model) -> None:
-    registered = Parameters.of(model, observable=make_observable("position", registered=True))
+    registered = identifiable_parameters(
+        model, observable=make_observable("position", registered=True)
+    )
     assert "joint_offset_1" in registered.names
 
 
 def test_sideways_pulls_show_what_weights_do_not(model: Model) -> None:
-    pulled = Parameters.of(model, observable=POSITION, pulls=True)
+    pulled = identifiable_parameters(model, observable=POSITION, pulls=True)
     assert 1 in pulled.joints("axial_compliance")
 
 
@@ -81,7 +84,7 @@ def test_no_values_are_the_nominal_model(model: Model, parameters: Parameters) -
 
 def test_values_stand_beyond_what_the_model_already_has(model: Model) -> None:
     soft = model.with_terms([Term("axial_compliance", Site(2), (1e-5,))])
-    parameters = Parameters.of(soft, ("axial_compliance",), observable=POSITION)
+    parameters = identifiable_parameters(soft, ("axial_compliance",), observable=POSITION)
     i = parameters.names.index("axial_compliance_2")
     values = np.zeros(len(parameters))
     values[i] = 2e-5
@@ -97,7 +100,7 @@ def test_values_stand_beyond_what_the_model_already_has(model: Model) -> None:
 
 def test_effects_are_chosen_by_name_and_joint(model: Model) -> None:
     chosen = (*DEFAULT, "backlash_2", "transmission_error_3", "stiffness_nonlinearity_2")
-    parameters = Parameters.of(model, chosen, observable=POSITION)
+    parameters = identifiable_parameters(model, chosen, observable=POSITION)
     assert parameters.joints("backlash") == (2,)
     assert "transmission_error_3_order1_sine" in parameters.names
     assert "axial_compliance_2" not in parameters.names  # the stiffening joint holds it
@@ -114,14 +117,14 @@ def test_effects_are_chosen_by_name_and_joint(model: Model) -> None:
 )
 def test_unusable_effects_are_declined_in_one_line(model: Model, effect, expected) -> None:
     with pytest.raises(InputError, match=expected) as caught:
-        Parameters.of(model, (effect,), observable=POSITION)
+        identifiable_parameters(model, (effect,), observable=POSITION)
     assert "\n" not in str(caught.value)
 
 
 def test_a_base_that_gives_way_is_found_about_both_axes_wherever_it_is_named(model: Model) -> None:
     # the tilt of joint 1 is their sum; beside it one of them would have to fall below zero
     chosen = [(*DEFAULT, "base_compliance"), ("base_compliance", *DEFAULT)]
-    found = [Parameters.of(model, effects, observable=POSITION) for effects in chosen]
+    found = [identifiable_parameters(model, effects, observable=POSITION) for effects in chosen]
     assert set(found[0].names) == set(found[1].names)
     assert {"base_compliance_x", "base_compliance_y"} <= set(found[0].names)
     reported = dict(line.split(": ", 1) for line in found[0].redundant)
@@ -129,8 +132,11 @@ def test_a_base_that_gives_way_is_found_about_both_axes_wherever_it_is_named(mod
 
 
 def test_a_payload_is_a_parameter_of_an_arm_whose_softness_is_to_be_found(model: Model) -> None:
-    assert "payload" in Parameters.of(model, (*DEFAULT, "payload"), observable=POSITION).names
-    rigid = Parameters.of(model, ("joint_offset", "payload"), observable=POSITION)
+    assert (
+        "payload"
+        in identifiable_parameters(model, (*DEFAULT, "payload"), observable=POSITION).names
+    )
+    rigid = identifiable_parameters(model, ("joint_offset", "payload"), observable=POSITION)
     assert "payload" not in rigid.names
 
 
@@ -139,7 +145,7 @@ def test_a_heavy_arm_without_a_rating_is_judged_under_loads_that_it_carries() ->
     kind = ARMS["heavy210"]
     heavy = model_of(real_arm(kind, tool_position=np.array([0.0, 0.0, 0.6 * kind.tool])))
     registered = make_observable("position", registered=True)
-    found = Parameters.of(heavy, observable=registered, pulls=True)
+    found = identifiable_parameters(heavy, observable=registered, pulls=True)
     assert found.joints("radial_compliance") == (1, 2, 3, 4, 5, 6)
 
 
@@ -147,5 +153,5 @@ def test_where_a_wrist_stiffens_is_looked_for_at_the_wrists_own_moment() -> None
     # at the moment of the whole arm its softening would pass for nothing, and be left out
     heavy = model_of(real_arm(ARMS["heavy210"]))
     effects = (*DEFAULT, "stiffness_nonlinearity_5")
-    found = Parameters.of(heavy, effects, observable=POSITION, pulls=True)
+    found = identifiable_parameters(heavy, effects, observable=POSITION, pulls=True)
     assert "stiffness_nonlinearity_5_softening" in found.names

@@ -22,10 +22,11 @@ from benchmarks.calibration.laid_out import (
     readings_of,
     with_values,
 )
+from gapbridge.bridge.calibration.verdict import verdict_text
 from gapbridge.core.calibration.accuracy_baseline import baseline_in, document_of
 from gapbridge.core.calibration.fit import fit_session, judged
+from gapbridge.core.calibration.identifiability import identifiable_parameters
 from gapbridge.core.calibration.observables import make_observable
-from gapbridge.core.calibration.parameters import Parameters
 from gapbridge.core.calibration.readings import Readings
 from gapbridge.core.calibration.result import Calibration
 from gapbridge.core.calibration.spread import effects_of
@@ -43,7 +44,7 @@ Calibrated = tuple[Calibration, dict[str, Any], RealArm, Instrument]
 def calibrated() -> Calibrated:
     rng = np.random.default_rng(1)
     model = model_of(real_arm(KIND))
-    parameters = Parameters.of(model, observable=make_observable("position"))
+    parameters = identifiable_parameters(model, observable=make_observable("position"))
     real = arm_with(KIND, draw_values(KIND, parameters.names, rng))
     instrument = instrument_for(KIND, LAYOUT, rng)
     readings = readings_of(real, lay_out(KIND, LAYOUT, rng), instrument, rng)
@@ -79,7 +80,7 @@ def test_a_joint_whose_zero_moved_is_named_with_how_far(calibrated: Calibrated) 
     assert seen.moved.name == "joint_offset_3"
     low, high = seen.moved.estimates[0].interval
     assert low < 4e-4 < high
-    assert "joint 3" in seen.verdict
+    assert "joint 3" in verdict_text(seen)
 
 
 @pytest.mark.parametrize("size", [0.01, 0.05])
@@ -90,7 +91,7 @@ def test_a_zero_that_moved_far_is_named_all_the_same(calibrated: Calibrated, siz
     assert seen.moved is not None
     assert seen.moved.name == "joint_offset_5"
     assert abs(seen.moved.estimates[0].value - size) < 4.0 * seen.moved.estimates[0].std
-    assert "the zero of joint 5 moved by" in seen.verdict
+    assert "the zero of joint 5 moved by" in verdict_text(seen)
 
 
 def test_a_zero_that_the_calibration_left_open_may_be_off_by_as_much(
@@ -134,7 +135,7 @@ def test_what_no_single_change_explains_asks_for_a_new_calibration(calibrated: C
     seen = verify(found.model, _again(other, instrument, poses=6), document, METROLOGY)
     assert not seen.holds
     assert seen.moved is None
-    assert "calibrate anew" in seen.verdict
+    assert "calibrate anew" in verdict_text(seen)
 
 
 def test_a_registered_instrument_that_was_knocked_is_named(calibrated: Calibrated) -> None:

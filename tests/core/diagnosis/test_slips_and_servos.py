@@ -9,7 +9,8 @@ import pytest
 
 from gapbridge.bridge.document.findings import finding_text
 from gapbridge.core.arm import builtin_arm
-from gapbridge.core.diagnosis.diagnosis import ChannelDiagnosis, diagnose
+from gapbridge.core.diagnosis.channel_diagnosis import ChannelDiagnosis
+from gapbridge.core.diagnosis.diagnosis import diagnose
 from gapbridge.core.effects import Site, Term
 from gapbridge.core.loads import Loads
 from gapbridge.core.log.log import Log

@@ -16,6 +16,7 @@ from planned_cell import (
     small_space,
 )
 
+from gapbridge.core.calibration.identifiability import identifiable_parameters
 from gapbridge.core.calibration.observables import make_observable
 from gapbridge.core.calibration.parameters import Parameters
 from gapbridge.core.calibration.plan import Payload, Plan
@@ -132,7 +133,9 @@ def test_travel_counts(parameters: Parameters, space: Space) -> None:
 
 
 def test_joints_with_play_are_approached_from_both_sides(model: Model, space: Space) -> None:
-    loose = Parameters.of(model, ("tool_frame", "backlash_2", "backlash_3"), observable=POSITION)
+    loose = identifiable_parameters(
+        model, ("tool_frame", "backlash_2", "backlash_3"), observable=POSITION
+    )
     planned = plan(loose, POSITION, LOADS, space, poses=8, held_out=2, repeats=1)
     sides = np.array([p.approach for p in planned.poses])
     assert set(np.unique(sides[:, 1:3])) == {-1.0, 1.0}
@@ -145,7 +148,9 @@ def test_closures_are_planned_where_the_tip_touches(model: Model, kind: str) -> 
     observable = make_observable(kind)
     centre = np.array([0.45, 0.2, 0.35])
     space = small_space(model, places=[Place(tuple(centre))])
-    parameters = Parameters.of(model, ("tool_frame", "joint_offset"), observable=observable)
+    parameters = identifiable_parameters(
+        model, ("tool_frame", "joint_offset"), observable=observable
+    )
     planned = plan(parameters, observable, [Payload(0.0)], space, poses=15, held_out=2, repeats=1)
     tip = model.predict(np.array([p.q for p in planned.poses])).position
     wanted = 0.03 if kind == "sphere" else 0.0
@@ -155,7 +160,9 @@ def test_closures_are_planned_where_the_tip_touches(model: Model, kind: str) -> 
 def test_a_gauge_keeps_within_its_range(model: Model) -> None:
     observable = make_observable("distance")
     space = small_space(model, places=[Place((0.4, 0.2, 0.3), 0.15, 0.4)])
-    parameters = Parameters.of(model, ("tool_frame", "joint_offset"), observable=observable)
+    parameters = identifiable_parameters(
+        model, ("tool_frame", "joint_offset"), observable=observable
+    )
     planned = plan(parameters, observable, [Payload(0.0)], space, poses=20, held_out=0, repeats=0)
     tip = model.predict(np.array([p.q for p in planned.poses])).position
     long = np.linalg.norm(tip - [0.4, 0.2, 0.3], axis=1)
@@ -206,7 +213,7 @@ def test_where_nothing_is_seen_the_reason_is_reported(parameters: Parameters, sp
 
 def test_a_fixed_point_without_a_place_is_asked_for(model: Model) -> None:
     observable = make_observable("sphere")
-    parameters = Parameters.of(model, ("tool_frame",), observable=observable)
+    parameters = identifiable_parameters(model, ("tool_frame",), observable=observable)
     with pytest.raises(PlanError, match="places: found none, expected where in base"):
         plan(parameters, observable, LOADS, Space.of(model))
 

@@ -9,6 +9,7 @@ import pytest
 from planned_cell import LOADS, POSITION, SIGMA, readings_of, small_model, small_space
 
 from benchmarks.calibration.repeated import repeated_sessions
+from gapbridge.core.calibration.identifiability import identifiable_parameters
 from gapbridge.core.calibration.observables import Nuisance
 from gapbridge.core.calibration.parameters import Parameters
 from gapbridge.core.loads import Loads
@@ -27,7 +28,7 @@ def expectation(parameters, observable, readings, nuisance, sigma, reference):
 
 @pytest.fixture(scope="module")
 def parameters() -> Parameters:
-    return Parameters.of(small_model(), observable=POSITION)
+    return identifiable_parameters(small_model(), observable=POSITION)
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +71,9 @@ def test_twice_the_noise_is_twice_the_deviation(parameters, planned) -> None:
 
 def test_what_the_poses_do_not_show_is_infinite(planned) -> None:
     # temperatures stand still in a plan: nothing is learnt of the links' growth
-    warm = Parameters.of(small_model(), ("tool_frame", "thermal_drift"), observable=POSITION)
+    warm = identifiable_parameters(
+        small_model(), ("tool_frame", "thermal_drift"), observable=POSITION
+    )
     readings = replace(readings_of(planned), value=np.zeros((len(planned.poses), 3)))
     found = expectation(
         warm, POSITION, readings, Nuisance.zero(), SIGMA, (np.zeros((1, 6)), Loads())

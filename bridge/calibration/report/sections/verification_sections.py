@@ -10,6 +10,7 @@ from gapbridge.bridge.calibration.report.facts import SessionFacts
 from gapbridge.bridge.calibration.report.figures import degrees, fixed, mm
 from gapbridge.bridge.calibration.report.sections.parameters_section import estimates_table
 from gapbridge.bridge.calibration.report.sections.session_section import facts_blocks
+from gapbridge.bridge.calibration.verdict import verdict_text
 from gapbridge.bridge.document.axes import Chart, named, scale
 from gapbridge.bridge.document.blocks import (
     BAD,
@@ -61,7 +62,7 @@ def holds(material: VerificationMaterial) -> list[Block]:
         "would be. It counts as broken where so large an error would come by chance less than "
         "once in a thousand."
     )
-    return [Verdict(badge, sentence(v.verdict)), tiles, Paragraph(text, "note")]
+    return [Verdict(badge, sentence(verdict_text(v))), tiles, Paragraph(text, "note")]
 
 
 def facts(material: VerificationMaterial) -> list[Block]:

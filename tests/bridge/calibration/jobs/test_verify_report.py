@@ -24,8 +24,8 @@ def suspect(joint: int, value: float) -> Suspect:
 
 def said(*others: Suspect) -> list[str]:
     found = Verification(
-        holds=False, verdict="the zero of joint 4 moved by 10 mrad",
-        errors=Errors(np.full((5, 3), 1e-3), np.arange(5)), predicted=np.full(5, 1e-4), ratio=9.0,
+        holds=False, errors=Errors(np.full((5, 3), 1e-3), np.arange(5)),
+        predicted=np.full(5, 1e-4), ratio=9.0,
         chance=1e-9, moved=suspect(4, 0.01), suspects=others, stations=(), notes=(),
     )  # fmt: skip
     job = VerifyJob.__new__(VerifyJob)

@@ -12,8 +12,8 @@ import numpy as np
 from gapbridge.bridge.calibration.report import InstrumentFacts, SessionFacts
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.calibration.fit import fit_session, judged
+from gapbridge.core.calibration.identifiability import identifiable_parameters
 from gapbridge.core.calibration.observables import make_observable
-from gapbridge.core.calibration.parameters import Parameters
 from gapbridge.core.calibration.plan import Expectation, Payload, Plan, PlannedPose
 from gapbridge.core.calibration.readings import Readings
 from gapbridge.core.calibration.result import Calibration
@@ -84,7 +84,7 @@ def calibration(diagnose: bool = False) -> Calibration:
     tool = np.eye(4)
     tool[:3, 3] = 0.08, 0.0, 0.15
     nominal = Model(builtin_arm("ur10e"), tool_in_flange=tool)
-    parameters = Parameters.of(nominal, EFFECTS, observable=make_observable("position"))
+    parameters = identifiable_parameters(nominal, EFFECTS, observable=make_observable("position"))
     expected = Expectation(
         parameters.names, parameters.units, 0.02 * parameters.scales, parameters.prior, 2.1e-5,
         4.4e-5,

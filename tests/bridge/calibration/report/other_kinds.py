@@ -9,9 +9,9 @@ import numpy as np
 
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.calibration.fit import fit_session, judged
+from gapbridge.core.calibration.identifiability import identifiable_parameters
 from gapbridge.core.calibration.observables import make_observable
 from gapbridge.core.calibration.observables.foreseen import empty_readings, foreseen, somewhere
-from gapbridge.core.calibration.parameters import Parameters
 from gapbridge.core.calibration.result import Calibration
 from gapbridge.core.effects import Site, Term
 from gapbridge.core.loads import Loads
@@ -50,7 +50,7 @@ def calibration_of(kind: str) -> Calibration:
         readings, value=value, q=readings.q + rng.normal(0, 1.0, readings.q.shape) * hand,
         held_out=(readings.pose >= 10) & (readings.pose < 15),
     )  # fmt: skip
-    parameters = Parameters.of(nominal, EFFECTS, observable=observable)
+    parameters = identifiable_parameters(nominal, EFFECTS, observable=observable)
     metrology = Metrology(sigma=SIGMA)
     return judged(
         nominal, fit_session(readings, parameters, metrology, observable=observable), diagnose=False

@@ -9,6 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from gapbridge.core.arm import builtin_arm
+from gapbridge.core.calibration.identifiability import identifiable_parameters
 from gapbridge.core.calibration.observables import (
     OBSERVABLES,
     Nuisance,
@@ -18,7 +19,6 @@ from gapbridge.core.calibration.observables import (
     point_of,
 )
 from gapbridge.core.calibration.observables.foreseen import empty_readings, foreseen, somewhere
-from gapbridge.core.calibration.parameters import Parameters
 from gapbridge.core.calibration.readings import Readings
 from gapbridge.core.errors import ExcitationError, InputError
 from gapbridge.core.estimation.registration import Registration
@@ -74,7 +74,7 @@ def test_exact_readings_leave_no_residual_at_the_truth(model, kind, options) -> 
 def test_columns_foretell_how_the_residual_changes(model, kind, options) -> None:
     observable = make_observable(kind, **options)
     readings, nuisance = two_places(model, observable)
-    parameters = Parameters.of(model, observable=observable)
+    parameters = identifiable_parameters(model, observable=observable)
     random = np.random.default_rng(2)
     size = observable.layout(readings).size
     J, F = observable.columns(parameters, parameters.begin, readings, nuisance)

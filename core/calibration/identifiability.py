@@ -1,4 +1,8 @@
-"""Which parameters no readings can separate from the others, whatever the poses.
+"""Which parameters readings of one kind can identify at all, whatever the poses.
+
+Those that no readings of the kind at hand can separate from the others are left out by rank, the
+rest are base parameters: they carry what the left-out ones would add (Gautier, Khalil, IEEE Trans.
+Robotics and Automation 6 (1990) 368).
 
 Parameters are taken one after the other; one stays if it changes readings at random poses in a way
 that the frames of the instrument and those before it do not. What is the sum of others is taken
@@ -9,8 +13,7 @@ a flexibility below zero.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,13 +21,11 @@ from numpy.typing import NDArray
 from gapbridge.core.calibration.observables.foreseen import foreseen, somewhere
 from gapbridge.core.calibration.observables.nuisance import Nuisance
 from gapbridge.core.calibration.observables.observable import Observable
+from gapbridge.core.calibration.parameters import DEFAULT, Parameters
 from gapbridge.core.calibration.readings import Readings
 from gapbridge.core.effects import CATALOGUE
 from gapbridge.core.loads import Loads
 from gapbridge.core.model import Model
-
-if TYPE_CHECKING:
-    from gapbridge.core.calibration.parameters import Parameters
 
 Array = NDArray[np.float64]
 POSES = 120
@@ -34,19 +35,22 @@ MEMBER = 0.1  # share from which a parameter is named as one that stands for ano
 USUAL_PAYLOAD, CARRIED = 5.0, 0.2  # kg, share of its own mass: where the arm's rating is unknown
 
 
-@dataclass(frozen=True)
-class Redundancy:
-    """What stays, and why the rest does not."""
+def identifiable_parameters(
+    model: Model,
+    effects: Sequence[str] = DEFAULT,
+    *,
+    observable: Observable,
+    pulls: bool = False,
+    seed: int = 0,
+) -> Parameters:
+    """Return the parameters of some effects, redundant ones left out, earlier effects first.
 
-    kept: list[int]
-    reasons: tuple[str, ...]
-
-
-def redundancy(
-    parameters: Parameters, observable: Observable, *, pulls: bool, seed: int
-) -> Redundancy:
-    """Return which parameters readings of this kind can show at all."""
-    readings, nuisance = _anywhere(parameters.nominal, observable, pulls, seed)
+    ``effects`` are identifiers of the catalogue's position channel, for all sites or for one joint
+    (``backlash_2``). ``pulls``: the session pulls at the tool sideways too, not by weights alone.
+    Raises InputError for an effect that positions do not show.
+    """
+    parameters = Parameters.every(model, effects)
+    readings, nuisance = _anywhere(model, observable, pulls, seed)
     J, F = _columns(parameters, observable, readings, nuisance)
     weight = np.tile(1 / observable.sigmas, len(readings))[:, None]
     J, F = J * parameters.scales * weight, F * weight
@@ -67,7 +71,7 @@ def redundancy(
         else:
             names = [parameters.names[k] for k in kept]
             reasons.append(f"{parameters.names[i]}: {_stand_in(J[:, i], F, J[:, kept], names)}")
-    return Redundancy(sorted(kept), tuple(reasons))
+    return parameters.part(sorted(kept), tuple(reasons))
 
 
 def _turns(parameters: Parameters) -> list[int]:
