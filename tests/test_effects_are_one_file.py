@@ -115,5 +115,5 @@ def test_the_search_finds_what_it_looks_for() -> None:
     assert _found('x = f"{kind}_compliance_{i}"') == ["axial_compliance"]
     assert _found('if term.effect == "payload": pass') == ["payload"]
     assert _found('kept = [t for t in terms if t.effect not in ("payload",)]') == ["payload"]
-    assert _found("from gapbridge.core.effects.backlash import Backlash") == ["backlash"]
+    assert _found("from gapbridge.core.effects.position.backlash import Backlash") == ["backlash"]
     assert _found('"""What ``backlash`` is."""\nlog.get("payload")') == []

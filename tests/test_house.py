@@ -85,11 +85,11 @@ def test_every_import_of_ours_goes_through_the_one_package() -> None:
 
 
 def test_no_folder_is_flatter_than_a_table_of_contents() -> None:
-    """About twenty modules at most; the effects are one family, one file a member."""
+    """About twenty modules at most."""
     for top in ("core", "drivers", "bridge"):
         for folder in [ROOT / top, *(ROOT / top).rglob("*/")]:
             modules = [p.name for p in folder.glob("*.py") if p.name != "__init__.py"]
-            assert len(modules) <= 21 or folder == ROOT / "core" / "effects", (folder, len(modules))
+            assert len(modules) <= 21, (folder, len(modules))
 
 
 FOREIGN_ATTRIBUTES = {

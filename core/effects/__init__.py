@@ -1,44 +1,44 @@
-"""The catalogue of effects: one table, by channel."""
+"""The catalogue of effects: one table; each member is a file in its channel's folder."""
 
 from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable
 
-from gapbridge.core.effects.axial_compliance import AxialCompliance
-from gapbridge.core.effects.backlash import Backlash
-from gapbridge.core.effects.base_compliance import BaseCompliance
-from gapbridge.core.effects.coulomb_friction import CoulombFriction
-from gapbridge.core.effects.dead_band import DeadBand
 from gapbridge.core.effects.effect import CHANNELS, Effect, Parameter, Reported, Site, Term
-from gapbridge.core.effects.ft_bias import FtBias
-from gapbridge.core.effects.ft_drift import FtDrift
-from gapbridge.core.effects.ft_gain import FtGain
-from gapbridge.core.effects.ft_misalignment import FtMisalignment
-from gapbridge.core.effects.gravity_direction import GravityDirection
-from gapbridge.core.effects.joint_offset import JointOffset
-from gapbridge.core.effects.joint_slip import JointSlip
-from gapbridge.core.effects.latency import Latency
-from gapbridge.core.effects.link_cog import LinkCog
-from gapbridge.core.effects.link_flexibility import LinkFlexibility
-from gapbridge.core.effects.link_geometry import LinkGeometry
-from gapbridge.core.effects.link_inertia import LinkInertia
-from gapbridge.core.effects.load_friction import LoadFriction
-from gapbridge.core.effects.payload import Payload
-from gapbridge.core.effects.payload_cog import PayloadCog
-from gapbridge.core.effects.radial_compliance import RadialCompliance
-from gapbridge.core.effects.rotor_inertia import RotorInertia
-from gapbridge.core.effects.servo_droop import ServoDroop
-from gapbridge.core.effects.stiffness_nonlinearity import StiffnessNonlinearity
-from gapbridge.core.effects.stribeck_friction import StribeckFriction
-from gapbridge.core.effects.target_slip import TargetSlip
-from gapbridge.core.effects.thermal_drift import ThermalDrift
-from gapbridge.core.effects.tool_frame import ToolFrame
-from gapbridge.core.effects.torque_constant import TorqueConstant
-from gapbridge.core.effects.torque_offset import TorqueOffset
-from gapbridge.core.effects.tracking_lag import TrackingLag
-from gapbridge.core.effects.transmission_error import TransmissionError
-from gapbridge.core.effects.viscous_friction import ViscousFriction
+from gapbridge.core.effects.load.payload import Payload
+from gapbridge.core.effects.load.payload_cog import PayloadCog
+from gapbridge.core.effects.position.axial_compliance import AxialCompliance
+from gapbridge.core.effects.position.backlash import Backlash
+from gapbridge.core.effects.position.base_compliance import BaseCompliance
+from gapbridge.core.effects.position.gravity_direction import GravityDirection
+from gapbridge.core.effects.position.joint_offset import JointOffset
+from gapbridge.core.effects.position.joint_slip import JointSlip
+from gapbridge.core.effects.position.link_flexibility import LinkFlexibility
+from gapbridge.core.effects.position.link_geometry import LinkGeometry
+from gapbridge.core.effects.position.radial_compliance import RadialCompliance
+from gapbridge.core.effects.position.stiffness_nonlinearity import StiffnessNonlinearity
+from gapbridge.core.effects.position.target_slip import TargetSlip
+from gapbridge.core.effects.position.thermal_drift import ThermalDrift
+from gapbridge.core.effects.position.tool_frame import ToolFrame
+from gapbridge.core.effects.position.transmission_error import TransmissionError
+from gapbridge.core.effects.torque.coulomb_friction import CoulombFriction
+from gapbridge.core.effects.torque.link_cog import LinkCog
+from gapbridge.core.effects.torque.link_inertia import LinkInertia
+from gapbridge.core.effects.torque.load_friction import LoadFriction
+from gapbridge.core.effects.torque.rotor_inertia import RotorInertia
+from gapbridge.core.effects.torque.stribeck_friction import StribeckFriction
+from gapbridge.core.effects.torque.torque_constant import TorqueConstant
+from gapbridge.core.effects.torque.torque_offset import TorqueOffset
+from gapbridge.core.effects.torque.viscous_friction import ViscousFriction
+from gapbridge.core.effects.tracking.dead_band import DeadBand
+from gapbridge.core.effects.tracking.latency import Latency
+from gapbridge.core.effects.tracking.servo_droop import ServoDroop
+from gapbridge.core.effects.tracking.tracking_lag import TrackingLag
+from gapbridge.core.effects.wrench.ft_bias import FtBias
+from gapbridge.core.effects.wrench.ft_drift import FtDrift
+from gapbridge.core.effects.wrench.ft_gain import FtGain
+from gapbridge.core.effects.wrench.ft_misalignment import FtMisalignment
 from gapbridge.core.errors import InputError
 
 CATALOGUE: dict[str, Effect] = {

@@ -25,8 +25,9 @@ def test_name_file_class_and_identifier_are_one(name):
     member = CATALOGUE[name]
     phrase = "".join(word.capitalize() for word in name.split("_"))
     assert (member.identifier, type(member).__name__) == (name, phrase)
-    assert type(member).__module__ == f"gapbridge.core.effects.{name}"
-    module = importlib.import_module(f"gapbridge.core.effects.{name}")
+    folder = member.channels[0] if len(member.channels) == 1 else "load"
+    assert type(member).__module__ == f"gapbridge.core.effects.{folder}.{name}"
+    module = importlib.import_module(f"gapbridge.core.effects.{folder}.{name}")
     assert getattr(module, phrase) is type(member)
 
 

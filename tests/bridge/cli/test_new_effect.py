@@ -73,6 +73,7 @@ HOOKS = {
 PREDICT = {"wrench": predict_wrench, "tracking": predict_tracking, "torque": predict_torque}
 SETPOINT = ("tracking", "compensate")
 COLUMN = {"wrench": "ft_raw_wrench", "tracking": "actual_q", "torque": "actual_current_as_torque"}
+SHOWN_AT = {"wrench": "_5", "tracking": "_2", "torque": "_2"}
 NOISE = {"wrench": 0.05, "tracking": 2e-5, "torque": 0.05}
 LOADED = CELL + "payload: {mass: 4.0, cog: [0.0, 0.02, 0.1]}\n"
 
@@ -153,7 +154,26 @@ def test_it_is_explained_found_applied_and_predicted(channel: str, tmp_path: Pat
         changed = bool(np.abs(tables[0] - tables[1]).max() > 1e-6)
         # where encoders are known, what servos do plays no part in where the tool is
         assert changed is (channel == "position" or (channel, command) == SETPOINT)
+    if channel != "position":
+        _predicted(channel, log, (cell, new), tmp_path / "t.csv")
     _live(channel, before, after, truth)
+
+
+def _predicted(channel: str, log: Path, cells: tuple[Path, Path], out: Path) -> None:
+    """Check that what a channel shows is predicted down to the noise once the effect is known."""
+    head, table = read(log)
+    measured_there = table[:, head.index(COLUMN[channel] + SHOWN_AT[channel])]
+    rms = []
+    for cell in cells:
+        answer = gapbridge("predict", log, "--channels", "--cell", cell, "--out", out)
+        assert answer.code == 0, answer.err
+        head, table = read(out)
+        own = head.index(
+            f"predicted_{'q' if channel == 'tracking' else channel}{SHOWN_AT[channel]}"
+        )
+        rms.append(float(np.sqrt(np.nanmean((table[:, own] - measured_there) ** 2))))
+    assert rms[0] > 3 * NOISE[channel]
+    assert rms[1] < 1.5 * NOISE[channel]
 
 
 def _live(channel: str, before: Model, after: Model, truth: Model) -> None:

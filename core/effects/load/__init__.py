@@ -1,0 +1,1 @@
+"""Effects of a payload other than declared: in position, wrench and torque."""

@@ -1,0 +1,1 @@
+"""Effects on where the tool is."""

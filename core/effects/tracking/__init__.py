@@ -1,0 +1,1 @@
+"""Effects on how encoders follow their commands."""
