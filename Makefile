@@ -16,7 +16,7 @@ help:
 	@echo "make bench     speed beside peers, in one run; figures in out/speed.json, out/fleet.json"
 	@echo "make faults    every fault on the real wire, and random ones; fills docs/reliability.md"
 	@echo "make mutants   small mistakes put into the product one at a time, and which go unnoticed"
-	@echo "make simulate  whole runs with faults in simulated time; SEEDS=100000, FIRST=0"
+	@echo "make simulate  whole runs with faults in simulated time, on all cores; SEEDS=100000, FIRST=0"
 	@echo "make clean     remove .venv and everything that was made"
 
 demo: .venv/.main
@@ -62,7 +62,8 @@ faults: .venv/.test
 mutants: .venv/.test
 	$(BIN)/python -m benchmarks.mutants --out out/mutants.jsonl
 
-# SEEDS: how many runs. One of them again: .venv/bin/python -m benchmarks.simulation --seed N
+# SEEDS: how many runs; the same command again goes on where it was left (out/simulation.jsonl).
+# One of them again: .venv/bin/python -m benchmarks.simulation --seed N
 SEEDS ?= 2000
 FIRST ?= 0
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -56,7 +57,7 @@ class LoadBounds:
         """Return in words why a payload (kg; (3,) m, flange frame) cannot be; None: it can."""
         if not 0.0 <= mass <= self.mass:  # NaN is not
             return f"payload: found {mass:g} kg, expected 0 to {self.mass:g} kg ({self._why})"
-        moment, most = mass * float(np.linalg.norm(cog)), LEVER * self.mass
+        moment, most = mass * math.hypot(*cog.tolist()), LEVER * self.mass
         if not moment <= most:
             return (
                 f"payload_cog: found {mass:g} kg at {np.linalg.norm(cog):.3g} m ({moment:.3g} kg "
@@ -66,7 +67,8 @@ class LoadBounds:
 
     def doubt_wrench(self, wrench: Vector) -> str | None:
         """Return in words why a pull on the tool (6,) N, Nm cannot be; None: it can."""
-        force, torque = float(np.linalg.norm(wrench[:3])), float(np.linalg.norm(wrench[3:]))
+        numbers = wrench.tolist()
+        force, torque = math.hypot(*numbers[:3]), math.hypot(*numbers[3:])
         if not force <= self.force:
             return f"force: found {force:.4g} N, expected at most {self.force:.4g} N ({self._why})"
         if not torque <= self.torque:

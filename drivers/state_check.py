@@ -23,16 +23,18 @@ class JointCheck:
     """Checks joint angles against the arm's limits and against the sample before."""
 
     def __init__(self, arm: Arm, fastest: Vector | float = FASTEST) -> None:
-        self.lower: Vector = np.maximum(arm.limits.lower - BEYOND, -LARGEST_ANGLE)
-        self.upper: Vector = np.minimum(arm.limits.upper + BEYOND, LARGEST_ANGLE)
-        self.fastest: Vector = np.broadcast_to(np.asarray(fastest, float), self.lower.shape)
+        lower = np.maximum(arm.limits.lower - BEYOND, -LARGEST_ANGLE)
+        upper = np.minimum(arm.limits.upper + BEYOND, LARGEST_ANGLE)
+        # plain numbers: a few of them cost less than one call on arrays
+        self._range = [*zip(lower.tolist(), upper.tolist(), strict=True)]
+        self._speed = np.broadcast_to(np.asarray(fastest, float), lower.shape).tolist()
 
     def outside(self, q: Vector) -> str | None:
         """Return what is wrong with angles (n,) rad that no such arm can have; None: nothing."""
-        wrong = ~((q >= self.lower) & (q <= self.upper))  # NaN is not within
-        if not wrong.any():
+        within = [low <= v <= high for v, (low, high) in zip(q.tolist(), self._range, strict=True)]
+        if all(within):  # NaN is not within
             return None
-        joint = int(np.argmax(wrong))
+        joint = within.index(False)
         if not np.isfinite(q[joint]):
             return f"joint {joint + 1}: found {q[joint]:g}, expected a finite angle"
         return (
@@ -42,9 +44,9 @@ class JointCheck:
 
     def jumped(self, step: Vector, gap: float) -> str | None:
         """Return which joint cannot have moved by ``step`` (n,) rad in ``gap`` s; None: all can."""
-        way = np.abs(step)
-        most = self.fastest * gap + JITTER
-        if not (way > most).any():
+        way = [*map(abs, step.tolist())]
+        beyond = [v - (f * gap + JITTER) for v, f in zip(way, self._speed, strict=True)]
+        if not any(v > 0.0 for v in beyond):
             return None
-        joint = int(np.argmax(way - most))
+        joint = beyond.index(max(beyond))
         return f"joint {joint + 1}: found a step of {way[joint]:.4f} rad in {gap:.4f} s"

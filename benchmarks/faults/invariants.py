@@ -308,9 +308,10 @@ class Checker:
         if turn > b.rotation_rate * GAP * b.cycle * 1.001 + 2.0 * b.grain_rotation:
             found.add(f"step of {turn:.6f} rad at once")
         since, until = self._moments(write)
+        place, angle = offset[:3], offset[3:]
         for then, before in stream.recent:
             allowed = until - then + b.lag + b.burst
-            shift, turn = _apart(offset, before)
+            shift, turn = math.dist(place, before[:3]), math.dist(angle, before[3:])
             if shift > b.offset_rate * allowed * 1.001 + 2.0 * b.grain:
                 found.add(f"{1e3 * shift:.4f} mm within {1e3 * (until - then):.1f} ms")
                 break

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable
-from dataclasses import replace
 
 from benchmarks.faults.proxy import UP, Port
 from benchmarks.faults.splitting import Splitter
@@ -47,7 +46,7 @@ class Tap:
             earliest, time, connection, port, up, message, state = self._kept.popleft()
             for whole in (message,) if up else self._joined(connection, port, message):
                 seen = self._decoder.feed(time, connection, port, up, whole, state)
-                found += (replace(item, earliest=earliest) for item in seen)
+                found += (item._replace(earliest=earliest) for item in seen)
         return found
 
     def _joined(self, connection: int, port: str, piece: bytes) -> list[bytes]:

@@ -1,66 +1,164 @@
-"""``python -m benchmarks.simulation --seeds 100000``; one seed again: ``--seed 1234``."""
+"""``python -m benchmarks.simulation --seeds 100000``; one seed again: ``--seed 1234``.
+
+Seeds run on all cores. What each hundred of them came to is a line of ``--out``, with the commit:
+the same command again, at the same commit, goes on where it was left.
+"""
 
 from __future__ import annotations
 
 import argparse
 import json
+import multiprocessing
+import os
+import subprocess
 import sys
 import time
 from collections import Counter
+from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import Any
 
-from benchmarks.simulation.sequence import LINKS, Outcome, run
+from benchmarks.simulation.sequence import LINKS, run
 
+ROOT = Path(__file__).parents[2]
+RECORD = Path("out/simulation.jsonl")
+PART = 100  # seeds, of a line
 REPORT_EVERY = 60.0  # s
+Part = dict[str, Any]
 
 
 def main() -> int:
-    """Run seeds one after the other; returns 1 where an invariant did not hold."""
+    """Run seeds; returns 1 where an invariant did not hold."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.simulation", description=__doc__)
     parser.add_argument("--seeds", type=int, default=2000, help="how many")
     parser.add_argument("--first", type=int, default=0, help="the first of them")
     parser.add_argument("--seed", type=int, help="one seed, with all its events")
-    parser.add_argument("--minutes", type=float, default=1e9, help="begin no seed after")
-    parser.add_argument("--out", type=Path, help="JSON file of figures")
+    parser.add_argument("--minutes", type=float, default=1e9, help="end then, whatever is left")
+    parser.add_argument("--processes", type=int, help="side by side; left out: one a core")
+    parser.add_argument("--out", type=Path, default=RECORD, help="the record (%(default)s)")
     given = parser.parse_args()
     if given.seed is not None:
         outcome = run(given.seed, print)
         print(outcome)
         return int(bool(outcome.violations))
-    return many(given.first, given.seeds, 60.0 * given.minutes, given.out)
+    end = given.first + given.seeds
+    record = Record(given.out, commit())
+    done = [part for part in record.parts if given.first <= part["first"] and part["end"] <= end]
+    todo = [*missing(given.first, end, done)]
+    report(done)
+    begun = reported = time.monotonic()
+    before = sum(map(size, done))
+    with multiprocessing.Pool(given.processes) as pool:
+        for part in pool.imap_unordered(run_part, todo):
+            record.add(part)
+            done.append(part)
+            report([part])
+            now = time.monotonic()
+            if now - reported > REPORT_EVERY:
+                reported, count = now, sum(map(size, done))
+                left = (now - begun) / (count - before) * (given.seeds - count)
+                violated = sum(len(p["violated"]) for p in done)
+                print(
+                    f"{count} of {given.seeds} seeds, {violated} violated, {left / 60:.0f} min "
+                    "left", flush=True,
+                )  # fmt: skip
+            if now - begun > 60.0 * given.minutes:
+                break
+    print(json.dumps(figures(done)))
+    return int(any(part["violated"] for part in done))
 
 
-def many(first: int, count: int, limit: float, out: Path | None) -> int:
-    """Run many seeds, and print what they came to."""
-    begun, reported = time.monotonic(), time.monotonic()
-    done: Counter[str] = Counter()
-    faults = writes = violated = 0
-    oldest, simulated = dict.fromkeys(LINKS, 0.0), 0.0
-    for seed in range(first, first + count):
-        if time.monotonic() - begun > limit:
-            break
-        outcome: Outcome = run(seed)
-        done[outcome.link] += 1
-        faults, writes = faults + len(outcome.faults), writes + outcome.writes
+def run_part(seeds: range) -> Part:
+    """Run some seeds, and return what they came to."""
+    begun, by_link = time.process_time(), Counter[str]()
+    faults, oldest = Counter[str](), dict.fromkeys(LINKS, 0.0)
+    setpoints, simulated = 0, 0.0
+    violated: dict[str, str] = {}
+    for seed in seeds:
+        outcome = run(seed)
+        by_link[outcome.link] += 1
+        faults.update(words.split(" at ")[0].split(" (")[0] for words in outcome.faults)
+        setpoints += outcome.writes
         oldest[outcome.link] = max(oldest[outcome.link], outcome.oldest)
         simulated += outcome.seconds
         if outcome.violations:
-            violated += 1
-            print(f"{outcome}\n  again: python -m benchmarks.simulation --seed {seed}", flush=True)
-        if time.monotonic() - reported > REPORT_EVERY:
-            reported = time.monotonic()
-            print(
-                f"{done.total()} seeds, {violated} violated, {reported - begun:.0f} s", flush=True
-            )
-    figures = {
-        "first": first, "seeds": done.total(), "by_link": dict(done), "faults": faults,
-        "setpoints": writes, "violated": violated, "oldest_state_s": oldest,
-        "simulated_s": simulated, "took_s": time.monotonic() - begun,
+            violated[str(seed)] = str(outcome)
+    return {
+        "first": seeds.start, "end": seeds.stop, "by_link": dict(by_link), "faults": dict(faults),
+        "setpoints": setpoints, "oldest_state_s": oldest, "simulated_s": simulated,
+        "cpu_s": time.process_time() - begun, "violated": violated,
     }  # fmt: skip
-    print(json.dumps(figures))
-    if out is not None:
-        out.write_text(json.dumps(figures, indent=1), encoding="utf-8")
-    return int(violated > 0)
+
+
+def missing(first: int, end: int, done: Iterable[Part]) -> Iterator[range]:
+    """Return the seeds from ``first`` to ``end`` that no part has, in ranges of one part each."""
+    known = {seed for part in done for seed in range(part["first"], part["end"])}
+    left = [seed for seed in range(first, end) if seed not in known]
+    begin = 0
+    for i in range(1, len(left) + 1):
+        if i == len(left) or left[i] != left[i - 1] + 1 or i - begin == PART:
+            yield range(left[begin], left[i - 1] + 1)
+            begin = i
+
+
+def figures(parts: list[Part]) -> dict[str, Any]:
+    """Return the sum of parts."""
+    by_link, faults = Counter[str](), Counter[str]()
+    for part in parts:
+        by_link.update(part["by_link"])
+        faults.update(part["faults"])
+    return {
+        "seeds": sum(map(size, parts)), "by_link": dict(by_link),
+        "faults": faults.total(), "by_fault": dict(faults.most_common()),
+        "setpoints": sum(part["setpoints"] for part in parts),
+        "violated": sum(len(part["violated"]) for part in parts),
+        "oldest_state_s": {
+            link: max((part["oldest_state_s"][link] for part in parts), default=0.0)
+            for link in LINKS
+        },
+        "simulated_s": sum(part["simulated_s"] for part in parts),
+        "cpu_s": sum(part["cpu_s"] for part in parts),
+    }  # fmt: skip
+
+
+def size(part: Part) -> int:
+    """Return how many seeds a part has."""
+    return int(part["end"] - part["first"])
+
+
+def report(parts: Iterable[Part]) -> None:
+    """Print what did not hold, and how to run it again."""
+    for part in parts:
+        for seed, words in part["violated"].items():
+            print(f"{words}\n  again: python -m benchmarks.simulation --seed {seed}", flush=True)
+
+
+class Record:
+    """The lines of a file that are of this commit; it is added to."""
+
+    def __init__(self, path: Path, of: str) -> None:
+        self._path, self._commit = path, of
+        self.parts: list[Part] = []
+        for line in path.read_text(encoding="utf-8").splitlines() if path.exists() else ():
+            part = json.loads(line)
+            if part["commit"] == of and not of.endswith("dirty"):
+                self.parts.append(part)
+
+    def add(self, part: Part) -> None:
+        """Write one more line."""
+        self._path.parent.mkdir(parents=True, exist_ok=True)
+        line = json.dumps({"commit": self._commit, **part}) + "\n"
+        with open(self._path, "ab") as file:
+            file.write(line.encode())
+
+
+def commit() -> str:
+    """Return the commit that runs, ``-dirty`` where files differ from it."""
+    found = subprocess.run(
+        ["git", "describe", "--always", "--abbrev=12", "--dirty", "--exclude=*"],
+        cwd=ROOT, capture_output=True, text=True, env={**os.environ, "LC_ALL": "C"}, check=False,
+    )  # fmt: skip
+    return found.stdout.strip() or "unknown-dirty"
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@ from benchmarks.simulation.links import SimulatedLink
 from benchmarks.simulation.world import Process
 from gapbridge.core.errors import LinkError
 from gapbridge.core.state import RobotState
+from gapbridge.drivers.can import driver as can_driver
 from gapbridge.drivers.can.driver import CanDriver
 from gapbridge.drivers.driver import Driver
 from gapbridge.drivers.simulated.can.frame import Frame
@@ -100,8 +101,8 @@ class CanLink(SimulatedLink):
 
     def driver(self) -> Driver:
         """See SimulatedLink.driver."""
-        setting, link = self.setting, self
-        found = CanDriver(setting.cell.link, setting.cell.model, self.clock)  # type: ignore[arg-type]
+        link = self
+        found = self.setting.make_driver(can_driver, CanDriver, self.clock)
 
         def open_bus() -> None:
             link.clock.sleep(0.005)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import functools
+import itertools
 import math
 import shutil
 import tempfile
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from benchmarks.faults.invariants import Bounds
 from benchmarks.faults.links import LINKS as WIRED
@@ -20,6 +21,7 @@ from gapbridge.bridge.cell import Cell, load_cell
 from gapbridge.bridge.cell.run_settings import Configuration, configuration_for, settings_of
 from gapbridge.core.state import RobotState
 from gapbridge.drivers.driver import Driver
+from gapbridge.drivers.simulated.plant.kinematics import Joints
 from gapbridge.drivers.simulated.server.arm_controller import ArmController, make_controller
 from gapbridge.drivers.simulated.ur.settings import simulated_arm
 
@@ -28,15 +30,18 @@ PAYLOAD: dict[str, tuple[float, tuple[float, float, float]]] = {
 }
 UR_PAYLOAD = (5.0, (0.0, 0.0, 0.06))
 SIMULATED_RATE = {"ur_servoj": 125.0, "ur_offset": 125.0, "modbus": 50.0, "can": 100.0}  # Hz
+SENSED_EVERY = 4  # cycles
 RESTARTS = (0.05, 0.4)  # s: the daemon's backoff
 Saw = Callable[[Fresh | Write], None]
+AnyDriver = TypeVar("AnyDriver", bound=Driver)
 
 
 class Setting:
-    """What all runs of a link share: its cell, read once."""
+    """What all runs of a link share: its cell and its profile, read once."""
 
     def __init__(self, name: str) -> None:
         self.name = name
+        self._profile: Any = None
         self.wired = WIRED[name](SIMULATED_RATE[name])
         self._folder = tempfile.TemporaryDirectory(prefix="simulation-")
         path, _ = self.wired.write_cells(Path(self._folder.name), "127.0.0.9", "127.0.0.9", "")
@@ -53,11 +58,39 @@ class Setting:
             self.cell.arm, 11, self.wired.start_q, payload_mass=mass, payload_cog=cog, tcp=tcp
         )
 
+    def make_driver(self, module: Any, kind: type[AnyDriver], clock: SimulatedClock) -> AnyDriver:
+        """Return the driver of a new process; ``module`` is the one that reads its profile."""
+        read = module.read_profile
+
+        def read_once(*given: Any) -> Any:
+            if self._profile is None:
+                self._profile = read(*given)
+            return self._profile
+
+        module.read_profile = read_once
+        try:
+            made: Any = kind
+            found: AnyDriver = made(self.cell.link, self.cell.model, clock)
+        finally:
+            module.read_profile = read
+        return found
+
 
 @functools.cache
 def setting_of(name: str) -> Setting:
     """Return what all runs of a link share."""
     return Setting(name)
+
+
+def _sense_seldom(controller: ArmController) -> None:
+    """Have forces and poses be measured anew in some cycles only: they cost most of the arm."""
+    sense, cycles = controller.sensors.update, itertools.count(1)
+
+    def seldom(target_q: Joints, dt: float) -> None:
+        if next(cycles) % SENSED_EVERY == 0:
+            sense(target_q, SENSED_EVERY * dt)
+
+    controller.sensors.update = seldom  # type: ignore[method-assign]
 
 
 class SimulatedLink(ABC):
@@ -72,6 +105,7 @@ class SimulatedLink(ABC):
         self.world, self.clock, self.setting, self.saw = world, clock, setting, saw
         self.period = 1.0 / setting.wired.rate
         self.controller: ArmController = make_controller(*setting.arm, self.period)
+        _sense_seldom(self.controller)
         self.up: Wire[Any] = Wire(world, self._on_up)  # from the client
         self.down: Wire[Any] = Wire(world, self._on_down)
         self.pace = 1.0  # of the controller's clock
@@ -96,6 +130,8 @@ class SimulatedLink(ABC):
         process = self.world.current
         if process is not None:
             process.check()
+        if kind == "other":  # no part of what must hold
+            return
         self.saw(Write(self.world.now, kind, values, where, self.supervisor_state()))
 
     @property

@@ -15,12 +15,14 @@ from benchmarks.simulation.world import Process
 from gapbridge.core.errors import InvalidStateError, LinkError
 from gapbridge.core.state import RobotState
 from gapbridge.drivers.driver import Driver
+from gapbridge.drivers.modbus import driver as modbus_driver
 from gapbridge.drivers.modbus import encode
 from gapbridge.drivers.modbus.driver import ModbusDriver
 from gapbridge.drivers.modbus.profile import MAILBOX_WORDS
 from gapbridge.drivers.modbus.transport import Transport
 from gapbridge.drivers.simulated.modbus.programs import MailboxProgram
 from gapbridge.drivers.simulated.modbus.server import ModbusServer
+from gapbridge.drivers.simulated.server.arm_controller import ArmController
 
 ADDRESS_MISSING = 2  # exception code
 
@@ -102,6 +104,21 @@ class _Requests:
         self._answer = (number, answer)
 
 
+class _Server(ModbusServer):
+    """The simulated robot's, whose image of a cycle is laid out where somebody reads it."""
+
+    is_due = True
+
+    def _publish(self, controller: ArmController) -> None:
+        self.is_due = True
+
+    def lay_out(self, controller: ArmController) -> None:
+        """Lay out the last cycle's image."""
+        if self.is_due:
+            self.is_due = False
+            super()._publish(controller)
+
+
 class ModbusLink(SimulatedLink):
     """One controller with a Modbus server and the mailbox program."""
 
@@ -110,19 +127,18 @@ class ModbusLink(SimulatedLink):
         self.period = 0.008  # s: the server's, whatever the client's rate
         self.generation = 0
         self.waiting: tuple[Process, _Requests] | None = None
-        self._server: ModbusServer | None = None
+        self._server: _Server | None = None
         self._published = self.world.now
         self._image_sampled = self.world.now
         self._asked_image = self.world.now  # sampling time of the image last answered
 
     @property
-    def server(self) -> ModbusServer:
+    def server(self) -> _Server:
         """Return the simulated robot's side; nothing of it listens."""
         if self._server is None:
-            settings = self.setting.cell.link
-            driver = ModbusDriver(settings, self.setting.cell.model)  # type: ignore[arg-type]
-            self._server = ModbusServer(driver.profile, "127.0.0.9", 15020)
-            self._server._publish(self.controller)
+            driver = self.setting.make_driver(modbus_driver, ModbusDriver, self.clock)
+            self._server = _Server(driver.profile, "127.0.0.9", 15020)
+            self._server.lay_out(self.controller)
         return self._server
 
     @property
@@ -133,8 +149,7 @@ class ModbusLink(SimulatedLink):
 
     def driver(self) -> Driver:
         """See SimulatedLink.driver."""
-        setting = self.setting
-        found = ModbusDriver(setting.cell.link, setting.cell.model, self.clock)  # type: ignore[arg-type]
+        found = self.setting.make_driver(modbus_driver, ModbusDriver, self.clock)
         found.transport.__class__ = _Transport
         found.transport.link = self  # type: ignore[attr-defined]
         link, read = self, found.read_state
@@ -197,6 +212,7 @@ class ModbusLink(SimulatedLink):
             server._queue.append(("holding", address, words))
         else:
             first, count = struct.unpack_from(">HH", request, 1)
+        server.lay_out(self.controller)
         table = server._image["input" if function == 4 else "holding"]
         values = [table.get(a, 0) & 0xFFFF for a in range(first, first + count)]
         return struct.pack(f">BB{count}H", function, 2 * count, *values)

@@ -24,7 +24,7 @@ LINKS: dict[str, type[SimulatedLink]] = {
     "ur_servoj": UrLink, "ur_offset": UrLink, "modbus": ModbusLink, "can": CanLink,
 }  # fmt: skip
 MOST_FAULTS = 4
-FIRST, SPAN = 1.6, 1.2  # s: when faults begin, over what time they are spread
+CALM, SPAN, REST = 0.3, 0.8, 0.3  # s: until faults begin; over what time they are spread; after
 RECOVERY = 25.0  # s until a healed run compensates again
 ENDING = 8.0  # s until a stopped run is over
 LOOK = 0.02  # s
@@ -73,7 +73,7 @@ def run(seed: int, say: Any = None, plan: Sequence[tuple[float, str]] | None = N
         _listen(found, judge, say)
         person = Person(found, judge, draw, outcome, _planned(draw, name, plan))
         try:
-            world.run(BEGIN + FIRST + SPAN + 3 * RECOVERY, lambda: person.done)
+            world.run(BEGIN + 4 * RECOVERY, lambda: person.done)
             _judge_end(found, judge, person)
         finally:
             world.end()
@@ -130,7 +130,7 @@ class Person(Process):
         run, world, draw = self._of, self.world, self._draw
         self._wait_for(State.OBSERVING, RECOVERY)
         self._ask("arm")
-        begin = max(world.now, BEGIN + FIRST)
+        begin = world.now + draw.uniform(0.0, CALM)
         for moment, fault in self._plan:
             self._until(begin + moment)
             if self._over or not run.loops:
@@ -140,7 +140,7 @@ class Person(Process):
                 f"{fault.name} ({words}) at {world.now - BEGIN:.3f} s" if words
                 else f"{fault.name} at {world.now - BEGIN:.3f} s"
             )  # fmt: skip
-        self._until(begin + SPAN + draw.uniform(0.0, 1.0))
+        self._until(begin + SPAN + draw.expovariate(1.0 / REST))
         if not self._over:
             self._recover()
         asked = world.now

@@ -9,10 +9,18 @@ import types
 from collections.abc import Iterator
 from typing import Any
 
+import numpy as np
+
 from benchmarks.simulation.links import SimulatedLink
 from gapbridge.drivers.controller_facts import ControllerFacts
 from gapbridge.drivers.driver import Driver
-from gapbridge.drivers.simulated.plant.kinematics import offset_frame, solve, tcp_in_base
+from gapbridge.drivers.simulated.plant.kinematics import (
+    gap,
+    jacobian,
+    offset_frame,
+    solve,
+    tcp_in_base,
+)
 from gapbridge.drivers.simulated.server.arm_controller import ArmController
 from gapbridge.drivers.simulated.ur import modes
 from gapbridge.drivers.simulated.ur.programs.offset_program import (
@@ -69,6 +77,8 @@ class UrLink(SimulatedLink):
         self._registers: OffsetRegisters | None = None
         self._applied = NOTHING
         self._solved: Any = None
+        self._solves_at: Any = None  # rad: joints that ``_inverse`` is of
+        self._inverse: Any = None  # of the Jacobian
         self._kept_q: Any = None
 
     def driver(self) -> Driver:
@@ -182,8 +192,19 @@ class UrLink(SimulatedLink):
             return
         arm, tool = controller.plant.arm, controller.declared.tool
         wanted = offset_frame(tcp_in_base(arm, controller.own_q, tool), self._applied)
-        near = tuple(a + b for a, b in zip(controller.own_q, controller.joint_offset, strict=True))
-        found = solve(arm, wanted, near, tool, steps=20)
+        near = [a + b for a, b in zip(controller.own_q, controller.joint_offset, strict=True)]
+        if self._solves_at != controller.own_q:
+            self._solves_at = controller.own_q
+            self._inverse = np.linalg.pinv(jacobian(arm, near, tool))
+        found: Any = None
+        for _ in range(6):  # offsets are small: one Jacobian does for all
+            step = gap(tcp_in_base(arm, near, tool), wanted)
+            if max(map(abs, step)) < 1e-11:
+                found = near
+                break
+            near = [a + b for a, b in zip(near, (self._inverse @ step).tolist(), strict=True)]
+        else:
+            found = solve(arm, wanted, near, tool, steps=20)
         if found is not None:
             controller.offset_by([a - b for a, b in zip(found, controller.own_q, strict=True)])
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import heapq
 import itertools
+import math
 import random
 import sys
 import threading
@@ -39,6 +40,7 @@ class World:
         self.processes: list[Process] = []
         self._events: list[tuple[float, int, Callable[[], None]]] = []
         self._order = itertools.count()
+        self._until = BEGIN  # s: how far time passes now
 
     def at(self, time: float, act: Callable[[], None]) -> None:
         """Have something happen at a time (s), now at the earliest."""
@@ -59,12 +61,21 @@ class World:
 
     def run(self, until: float, over: Callable[[], bool] = lambda: False) -> None:
         """Let time pass up to ``until`` (s), or until ``over``."""
-        events = self._events
+        events, before = self._events, self._until
+        self._until = until
         while events and events[0][0] <= until and not over():
             self.now, _, act = heapq.heappop(events)
             act()
         if not over():
             self.now = max(self.now, until)
+        self._until = before
+
+    def pass_to(self, time: float) -> bool:
+        """Let time pass where nothing happens before ``time`` (s); return whether it has."""
+        if time > self._until or (self._events and self._events[0][0] <= time):
+            return False
+        self.now = max(self.now, time)
+        return True
 
     def end(self) -> None:
         """Give back what processes still hold."""
@@ -116,11 +127,14 @@ class Process:
     def sleep(self, seconds: float) -> None:
         """Wait; only from within."""
         self._ticket += 1
-        self.world.after(seconds, partial(self._resume, self._ticket))
-        parent = self._greenlet.parent
-        assert parent is not None
-        parent.switch()
-        self.check()
+        world = self.world
+        wakes = world.now + seconds
+        if wakes < self._frozen_until or not world.pass_to(wakes):
+            world.at(wakes, partial(self._resume, self._ticket))
+            parent = self._greenlet.parent
+            assert parent is not None
+            parent.switch()
+            self.check()
         if self._begin_tracing is not None:
             begin, self._begin_tracing = self._begin_tracing, None
             begin()
@@ -193,7 +207,8 @@ class SimulatedClock(Clock):
     def _sleep(self, seconds: float) -> None:
         process = self.world.current
         assert process is not None, "only processes wait"
-        process.sleep(max(seconds, 0.0) + self.world.random.expovariate(1.0 / SLACK))
+        late = -SLACK * math.log(1.0 - self.world.random.random())
+        process.sleep(max(seconds, 0.0) + late)
 
     def wait(self, event: threading.Event, seconds: float) -> bool:
         """Wait until an event is set, ``seconds`` at most; return whether it is."""

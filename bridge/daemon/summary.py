@@ -14,6 +14,7 @@ from gapbridge.core.limits import CLAMPS
 
 Array = NDArray[np.float64]
 UNIT = 1e-6  # s: bin of a histogram
+BATCH = 50  # looks at the cycles, whose rows are counted at once
 BINS = 50_000  # to 50 ms; what is beyond counts as the last
 
 
@@ -27,7 +28,7 @@ class Histogram:
     def add(self, values: Array) -> None:
         """Count durations (k,), s."""
         if len(values):
-            bins = np.clip(values / UNIT, 0, BINS - 1).astype(int)
+            bins = np.minimum(np.maximum(values / UNIT, 0.0), BINS - 1).astype(int)
             np.add.at(self._counts, bins, 1)
             self.largest = max(self.largest, float(values.max()))
 
@@ -111,11 +112,20 @@ class Tally:
     age: Histogram = field(default_factory=Histogram)
     age_written: Histogram = field(default_factory=Histogram)
     work: Histogram = field(default_factory=Histogram)
+    waiting: list[Array] = field(default_factory=list)  # rows that are not counted yet
 
     def add(self, rows: Array) -> None:
         """Count rows (k, width) of consecutive cycles."""
-        if not len(rows):
+        if len(rows):
+            self.waiting.append(rows)
+            if len(self.waiting) >= BATCH:
+                self._count()
+
+    def _count(self) -> None:
+        """Count what waits: a call on many rows costs as much as one on a few."""
+        if not self.waiting:
             return
+        rows, self.waiting = np.concatenate(self.waiting), []
         s = slices_of(self.n)
         written = rows[:, s["written"].start] > 0
         age, work = rows[:, s["age"].start], rows[:, s["duration"].start]
@@ -124,10 +134,13 @@ class Tally:
         self.missed += int(missed.sum())
         self.late += int((age > 1.0 / self.rate).sum())
         self.written += int(written.sum())
-        gaps = np.diff(rows[:, s["timestamp"].start], prepend=self.last_timestamp)
+        stamps = rows[:, s["timestamp"].start]
+        gaps = stamps.copy()
+        gaps[1:] -= stamps[:-1]
+        gaps[0] -= self.last_timestamp
         # a gap without cycles missed is a break: the loop armed, or was started anew
         gaps = gaps[np.abs(gaps - (missed + 1.0) / self.rate) < 0.5 / self.rate]
-        self.last_timestamp = float(rows[-1, s["timestamp"].start])
+        self.last_timestamp = float(stamps[-1])
         self.steps += len(gaps)
         self.span += float(gaps.sum())
         bits = rows[:, s["clamped"].start].astype(np.int64)
@@ -139,6 +152,7 @@ class Tally:
 
     def figures(self) -> dict[str, Any]:
         """Return the fields of RunSummary that are counted here."""
+        self._count()
         quantiles = {"p50": 0.5, "p99": 0.99}
         # a run that only observes has no setpoints; then every cycle stands for one
         ages = self.age_written if self.written else self.age

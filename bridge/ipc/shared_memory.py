@@ -13,6 +13,7 @@ Nothing is asked for through this memory: commands have their own (command_page.
 from __future__ import annotations
 
 import contextlib
+import functools
 import os
 import socket
 from enum import IntEnum
@@ -50,6 +51,7 @@ class Phase(IntEnum):
     ENDING = 4
 
 
+@functools.cache
 def slices_of(n: int) -> dict[str, slice]:
     """Return where each field of a cycle stands in its row: 1, n, 3 or 6 numbers, n joints."""
     found, at = {}, 0

@@ -46,15 +46,16 @@ class FrozenWatch:
     """
 
     def __init__(self) -> None:
-        self._q: Vector | None = None
+        self._q: list[float] | None = None
         self._target: Vector | None = None  # commanded when the joints were last seen to move
         self._since = 0.0  # s, controller clock: since when they should have moved
 
     def update(self, state: RobotState, commanded: Vector) -> str | None:
         """Return in words that the values are frozen, None where they are not."""
         q, now = state.actual_q, state.timestamp
-        if self._q is None or now < self._since or not np.array_equal(q, self._q):
-            self._q, self._target, self._since = q.copy(), commanded.copy(), now
+        joints = q.tolist()
+        if now < self._since or joints != self._q:
+            self._q, self._target, self._since = joints, commanded.copy(), now
             return None
         assert self._target is not None
         away = float(np.abs(commanded - self._target).max())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import operator
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,7 +22,7 @@ from gapbridge.drivers.state_check import FASTEST, LARGEST, JointCheck
 Vector = NDArray[np.float64]
 DRIFT = 5e-3  # s per s: how fast the bound follows a clock that drifts or stumbles
 HASTE = 1.5  # times its velocity limit: a joint that moved faster is a mistake
-_WRENCH = np.array([LARGEST["force"]] * 3 + [LARGEST["moment"]] * 3)
+_WRENCH = (LARGEST["force"],) * 3 + (LARGEST["moment"],) * 3
 INVALID_IN_A_ROW = 3  # states that cannot be believed, after which they count as silence
 OLD_IN_A_ROW = 2  # states too old to write by, after which they count as none
 SILENCE = 0.2  # s without a state: a fault
@@ -116,16 +117,16 @@ class SampleCheck:
     def doubt(self, state: RobotState) -> Doubt | None:
         """Return why a sample cannot be believed; None: it can, and is remembered."""
         q = state.actual_q
-        force = state.actual_TCP_force
-        sound = bool(np.isfinite(q).all() and np.isfinite(state.target_q).all())
-        sound = sound and bool(np.isfinite(state.actual_qd).all())
-        if not sound or not (state.sensor_lost or np.isfinite(force).all()):
+        force = state.actual_TCP_force.tolist()
+        # plain numbers: a few of them cost less than one call on arrays
+        numbers = q.tolist() + state.target_q.tolist() + state.actual_qd.tolist()
+        if not (math.isfinite(sum(numbers)) and (state.sensor_lost or math.isfinite(sum(force)))):
             return Doubt(Count.DROPPED_NOT_FINITE, "found a number that is not finite in the state")
         outside = self._joints.outside(q)
         if outside is not None:
             return Doubt(Count.DROPPED_IMPLAUSIBLE, outside)
-        if (np.abs(force) > _WRENCH).any():
-            return Doubt(Count.DROPPED_IMPLAUSIBLE, f"found a force of {np.abs(force).max():.3g}")
+        if any(map(operator.gt, map(abs, force), _WRENCH)):
+            return Doubt(Count.DROPPED_IMPLAUSIBLE, f"found a force of {max(map(abs, force)):.3g}")
         return self._doubt_motion(state)
 
     def _doubt_motion(self, state: RobotState) -> Doubt | None:

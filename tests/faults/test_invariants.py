@@ -100,7 +100,7 @@ def test_a_write_that_was_only_seen_late_is_judged_by_when_it_arrived(checker: C
     checker.take([late])
     checker.settle([(0.0, 20 * CYCLE + 0.001)])
     assert not checker.found.violations
-    checker.take([replace(late, time=22 * CYCLE)])
+    checker.take([late._replace(time=22 * CYCLE)])
     checker.settle([(0.0, 20 * CYCLE + 0.001)])
     assert "write in state 5" in violations(checker)
 

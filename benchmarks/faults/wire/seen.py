@@ -5,15 +5,13 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 Numbers = tuple[float, ...]
 Kind = Literal["offset", "joints", "release", "other", "broken", "forbidden"]
 
 
-@dataclass(frozen=True, slots=True)
-class Fresh:
+class Fresh(NamedTuple):
     """A state that the client can know from ``time`` on (s, monotonic), ``earliest`` at best.
 
     ``stamp``: the controller's clock, s, NaN where the wire has none. ``safe``: whether it may
@@ -36,8 +34,7 @@ class Fresh:
         return self.time if math.isnan(self.earliest) else self.earliest
 
 
-@dataclass(frozen=True, slots=True)
-class Write:
+class Write(NamedTuple):
     """Something that the client wrote.
 
     offset: ``values`` (6,) m and rad, in base. joints: ``values`` (n,) rad. other: part of a
