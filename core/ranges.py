@@ -75,13 +75,6 @@ class Outside:
         return reported
 
 
-def outside(log: Log, fitted: Range) -> list[str]:
-    """Return one sentence for each quantity of a log that lies outside what was fitted."""
-    found = Outside(fitted)
-    found.add(log)
-    return found.sentences()
-
-
 def outside_rows(log: Log, fitted: Range) -> NDArray[np.bool_]:
     """Return which rows (N,) lie outside what was fitted, in any quantity."""
     out = np.zeros(len(log), dtype=bool)

@@ -155,16 +155,6 @@ def _arm(
     return Arm(name, fixed, mass, cog, inertia, limits, joint_names=names, body_axes=axes)
 
 
-def _limit(text: str, key: str, label: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = np.nan
-    if np.isnan(value):
-        raise ArmError(f"{label}: {key}: found {text!r}, expected a number")
-    return value
-
-
 def _child(joint: ElementTree.Element) -> str:
     child = joint.find("child")
     return "" if child is None else str(child.get("link"))

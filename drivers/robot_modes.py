@@ -13,7 +13,9 @@ POWER_OFF, IDLE, RUNNING = 3, 5, 7  # robot_mode
 NORMAL, REDUCED, PROTECTIVE_STOP, EMERGENCY_STOP, FAULT = 1, 2, 3, 7, 9  # safety_mode
 STOPPED = 1 << 10
 
-Trouble = Literal["", "not_ready", "protective_stop", "emergency_stop", "fault"]
+
+Trouble = Literal["not_ready", "protective_stop", "emergency_stop", "fault"]
+"""What keeps a robot from moving, as profiles name it."""
 
 
 class Modes(NamedTuple):

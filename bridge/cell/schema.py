@@ -18,7 +18,6 @@ from gapbridge.bridge.cell.settings.web import WebSettings
 from gapbridge.drivers.ft_sensor.settings import AnyFtSensor
 
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
-Positive = Annotated[Number, Field(gt=0)]
 NotNegative = Annotated[Number, Field(ge=0)]
 Vector3 = Annotated[list[Number], Field(min_length=3, max_length=3)]
 

@@ -7,8 +7,8 @@ from typing import Any
 
 from gapbridge.bridge.cell import Cell
 from gapbridge.bridge.fleet.diagnosing import facts
-from gapbridge.core.estimation.compliance_fit import flexibilities
-from gapbridge.core.estimation.hierarchical_evidence import evidence, usual_flexibility
+from gapbridge.core.estimation.compliance_fit import flexibilities, usual_flexibility
+from gapbridge.core.estimation.hierarchical_evidence import evidence
 from gapbridge.core.log.log import Log
 
 

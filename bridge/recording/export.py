@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gapbridge.bridge.document.output_file import replacing_bytes
 from gapbridge.bridge.recording.finishing import finish_recording
@@ -23,7 +22,6 @@ from gapbridge.core.log.mcap_schema import ENUM_FIELD
 if TYPE_CHECKING:
     import pyarrow
 
-Array = NDArray[np.float64]
 BESIDE = ("nominal_q", "corrected_q", "offset", "written", "age", "residual", "clamped", "number")
 PARQUET = (".parquet", ".pq")
 GROUP = 20_000  # rows of a Parquet row group at least

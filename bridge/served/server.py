@@ -20,7 +20,6 @@ from gapbridge.core.errors import LinkError
 SEND_BUFFER = 64 * 1024  # bytes that the system holds for a client that is slow
 GONE = 20_000  # ms without a sign from the other side
 KEEP_ALIVE = 15  # s
-LOOK = 0.1  # s between two looks whether the daemon still lives
 
 
 class _Config(uvicorn.Config):

@@ -9,7 +9,6 @@ import sys
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gapbridge.bridge.cell.sections import SetpointSettings
 from gapbridge.bridge.setpoint_source.glide import GlidingSource
@@ -17,7 +16,6 @@ from gapbridge.bridge.setpoint_source.modbus_page import MOST_JOINTS, PlcPage
 from gapbridge.bridge.setpoint_source.source import SourceStatus
 from gapbridge.core.errors import InputError, RunError
 
-Vector = NDArray[np.float64]
 WRITTEN, LIMITED = 1, 2  # flags
 
 SERVER = "gapbridge.bridge.setpoint_source.modbus_server"  # module that the PLC talks to

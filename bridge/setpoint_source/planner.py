@@ -21,7 +21,6 @@ import stat
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gapbridge.bridge.cell.sections import SetpointSettings
 from gapbridge.bridge.ipc.control_socket import peer_of
@@ -29,7 +28,6 @@ from gapbridge.bridge.setpoint_source.glide import GlidingSource
 from gapbridge.core.errors import RunError
 from gapbridge.drivers.clock import SYSTEM
 
-Vector = NDArray[np.float64]
 LONGEST_LINE = 4096  # bytes
 MOST_BYTES = 16384  # read in one cycle
 MOST_LINES = 8  # taken in one cycle; what is left is taken in the next ones

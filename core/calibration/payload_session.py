@@ -25,7 +25,6 @@ AXES = ("fx", "fy", "fz", "mx", "my", "mz")
 (BIAS,) = correcting("sensor zero")
 NAMES = ("payload_mass", *(f"payload_cog_{k}" for k in "xyz"), *(f"{BIAS}_{k}" for k in AXES))
 UNITS = ("kg", "m", "m", "m", "N", "N", "N", "Nm", "Nm", "Nm")
-RANK = 1e-9
 LIGHT = 3.0  # standard deviations of its mass below which a load has no centre to speak of
 FEWEST = 3
 

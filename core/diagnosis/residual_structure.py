@@ -22,7 +22,6 @@ DRAWS = 1500
 AT_ONCE = 200  # directions: with all draws 2.4 MB
 FOLDS = 7
 ABOUT = 0.05  # held-out share within which two quantities say the same
-MOST = 3000  # samples beyond which the test takes every so many
 
 
 def basis_of(columns: Array) -> Array:

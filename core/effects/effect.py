@@ -112,7 +112,6 @@ class Effect(ABC):
     # True: goes with the links: a zero or a point with their geometry, friction with their masses
     beside_links: ClassVar[bool] = False
     shown_by: ClassVar[Term | None] = None  # what has to be there for its values to show at all
-    felt_by_all: ClassVar[bool] = False  # True: one cause moves coordinates of many joints
 
     # how it is found
     shapes: ClassVar[tuple[float, ...]] = ()  # last values that a search begins with

@@ -35,14 +35,14 @@ class Shown:
     reported: tuple[str, ...]  # what is not identifiable, or only in combination
 
 
-def choose(linear: Linear, prior: tuple[Array, float], nonnegative: bool) -> Mask:
+def choose(linear: Linear, prior: tuple[Array, float]) -> Mask:
     """Return the flexibilities (2n,) that the data show once the others are held."""
     kept = np.ones(len(prior[0]), dtype=bool)
     while kept.any():
         vague = np.flatnonzero(kept)[_spread(linear, kept, prior[1]) > VAGUE]
         if not len(vague):
             break
-        costs = np.array([_cost(linear, kept, int(i), prior, nonnegative) for i in vague])
+        costs = np.array([_cost(linear, kept, int(i), prior) for i in vague])
         cheap = costs <= costs.min() + max(1.0, 1e-9 * costs.min())
         # of those that are missed alike, the one that the data show least by itself
         alone = np.linalg.norm(linear.matrix[:, vague], axis=0)
@@ -62,13 +62,11 @@ def _root(linear: Linear, kept: Mask, sigma: float) -> Array:
     return np.linalg.solve(R, np.eye(size))
 
 
-def _cost(
-    linear: Linear, kept: Mask, held: int, prior: tuple[Array, float], nonnegative: bool
-) -> float:
+def _cost(linear: Linear, kept: Mask, held: int, prior: tuple[Array, float]) -> float:
     """Return the sum of squares of the best fit with one more flexibility held."""
     mask = kept.copy()
     mask[held] = False
-    found = solve(linear, mask, prior[0].copy(), prior, nonnegative)
+    found = solve(linear, mask, prior[0].copy(), prior)
     left = linear.matrix @ found - linear.right
     return float(left @ left + np.sum(((found - prior[0]) / prior[1]) ** 2))
 

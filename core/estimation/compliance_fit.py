@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapbridge.core.effects import CATALOGUE
+from gapbridge.core.effects.effect import typical_moment
 from gapbridge.core.estimation.registration import (
     IDENTITY,
     Registration,
@@ -122,6 +123,16 @@ def flexibilities(model: Model) -> Array:
     return found
 
 
+def usual_flexibility(model: Model) -> float:
+    """Return a usual flexibility (rad/Nm) of a joint of an arm of this size."""
+    return 1e-3 / typical_moment(model.arm)
+
+
+def prior_of(model: Model) -> tuple[Array, float]:
+    """Return the value (2n,) and the 1 sigma (rad/Nm) that weakly hold every flexibility."""
+    return flexibilities(model), 10 * usual_flexibility(model)
+
+
 def residual(model: Model, data: Data, frame: Registration | Placements) -> tuple[Array, Poses]:
     """Return measured minus predicted (N, 3 or 6) in base axes, and the predicted poses."""
     if isinstance(frame, Placements):
@@ -186,18 +197,7 @@ def fit_nuisances(model: Model, data: Data) -> Fit:
     if not data.nuisances:
         gap, _ = residual(model, data, IDENTITY)
         return Fit(model, IDENTITY, _robust_weights(gap)[0])
-    frame = _first_placements(model, data)
-    for _ in range(NUISANCE_ROUNDS):
-        gap, poses = residual(model, data, frame)
-        weights, scale = _robust_weights(gap)
-        per_cell = per_cell_of(weights, scale, gap.shape[1])
-        columns = nuisance_columns(model, poses, gap.shape[1], data) * per_cell[..., None]
-        flat = columns.reshape(gap.size, -1)
-        step = np.linalg.lstsq(flat, (gap * per_cell).ravel(), rcond=RANK)[0]
-        model, frame = moved(model, frame, step)
-        if np.abs(step).max() < CONVERGED:
-            break
-    return Fit(model, frame, weights)
+    return _placed(model, data, slice(None))
 
 
 def placed_gap(model: Model, data: Data) -> Array:
@@ -206,22 +206,26 @@ def placed_gap(model: Model, data: Data) -> Array:
     So is its tool point where it was remounted; nothing else of the model moves.
     """
     one = replace(data, session=np.zeros(len(data.q), dtype=np.int64), sessions=1)
-    frame = _first_placements(model, one)
     free = slice(0, one.nuisances if one.remounted else 6 * one.frames)
+    fit = _placed(model, one, free)
+    return residual(fit.model, one, fit.frame)[0]
+
+
+def _placed(model: Model, data: Data, free: slice) -> Fit:
+    """Return the fit of the nuisances ``free``, the others left where they are."""
+    frame = _first_placements(model, data)
     for _ in range(NUISANCE_ROUNDS):
-        gap, poses = residual(model, one, frame)
+        gap, poses = residual(model, data, frame)
         weights, scale = _robust_weights(gap)
         per_cell = per_cell_of(weights, scale, gap.shape[1])
-        columns = nuisance_columns(model, poses, gap.shape[1], one)[:, :, free]
+        columns = nuisance_columns(model, poses, gap.shape[1], data)[:, :, free]
+        step = np.zeros(data.nuisances)
         flat = (columns * per_cell[..., None]).reshape(gap.size, -1)
-        if not flat.shape[1]:
-            return gap
-        step = np.zeros(one.nuisances)
         step[free] = np.linalg.lstsq(flat, (gap * per_cell).ravel(), rcond=RANK)[0]
         model, frame = moved(model, frame, step)
-        if np.abs(step).max() < CONVERGED:
+        if np.abs(step).max(initial=0.0) < CONVERGED:
             break
-    return residual(model, one, frame)[0]
+    return Fit(model, frame, weights)
 
 
 def _first_placements(model: Model, data: Data) -> Registration | Placements:
@@ -238,13 +242,7 @@ def _first_placements(model: Model, data: Data) -> Registration | Placements:
 
 
 def fit_flexibilities(
-    begin: Fit,
-    data: Data,
-    kept: Mask,
-    prior: tuple[Array, float],
-    *,
-    nonnegative: bool,
-    rounds: int = ROUNDS,
+    begin: Fit, data: Data, kept: Mask, prior: tuple[Array, float], rounds: int = ROUNDS
 ) -> Fit:
     """Return the fit of the ``kept`` flexibilities (2n,), the others as they are in ``begin``.
 
@@ -253,13 +251,13 @@ def fit_flexibilities(
     now = begin
     for _ in range(rounds):
         before = now.flexibility
-        now = _round(now, data, kept, prior, nonnegative)
+        now = _round(now, data, kept, prior)
         if np.abs(now.flexibility - before).max() < CONVERGED * max(np.abs(before).max(), 1e-12):
             break
     return now
 
 
-def _round(now: Fit, data: Data, kept: Mask, prior: tuple[Array, float], nonnegative: bool) -> Fit:
+def _round(now: Fit, data: Data, kept: Mask, prior: tuple[Array, float]) -> Fit:
     """Take one step of Gauss and Newton."""
     model, n = now.model, now.model.arm.n
     gap, poses = residual(model, data, now.frame)
@@ -274,7 +272,7 @@ def _round(now: Fit, data: Data, kept: Mask, prior: tuple[Array, float], nonnega
     # one R factor for all that follows, of rows that stay in the processor's cache
     R = r_factor(whole.reshape(gap.size, -1))
     problem = (R[:, : -2 * n - 1], R[:, -2 * n - 1 : -1], R[:, -1])
-    return stepped(now, problem, weights, kept, prior, nonnegative=nonnegative)
+    return stepped(now, problem, weights, kept, prior)
 
 
 def r_factor(rows: Array) -> Array:
@@ -300,9 +298,12 @@ def regressor(model: Model, data: Data, frame: Registration | Placements) -> Arr
 
 
 def stepped(
-    now: Fit, problem: tuple[Array, Array, Array], weights: Array, kept: Mask,
-    prior: tuple[Array, float], *, nonnegative: bool,
-) -> Fit:  # fmt: skip
+    now: Fit,
+    problem: tuple[Array, Array, Array],
+    weights: Array,
+    kept: Mask,
+    prior: tuple[Array, float],
+) -> Fit:
     """Return the fit after one step of Gauss and Newton.
 
     ``problem``: columns of the nuisances (M, 0 or 9), of the flexibilities (M, 2n), and the gap
@@ -312,7 +313,7 @@ def stepped(
     model, frame, flexibility = now.model, now.frame, now.flexibility
     base = orthonormal(F) if F.shape[1] else F
     linear = _projected(A, b + A @ flexibility, base)
-    found = solve(linear, kept, flexibility, prior, nonnegative)
+    found = solve(linear, kept, flexibility, prior)
     if F.shape[1]:
         left = b - A @ (found - flexibility)
         model, frame = moved(model, frame, np.linalg.lstsq(F, left, rcond=RANK)[0])
@@ -327,12 +328,10 @@ def _projected(A: Array, b: Array, Q: Array) -> Linear:
     return Linear(R[:, :-1], R[:, -1])
 
 
-def solve(
-    linear: Linear, kept: Mask, now: Array, prior: tuple[Array, float], nonnegative: bool
-) -> Array:
+def solve(linear: Linear, kept: Mask, now: Array, prior: tuple[Array, float]) -> Array:
     """Return the flexibilities (2n,) that solve the problem; those not kept stay as they are.
 
-    One at its bound of zero is exactly zero.
+    None is below zero; one at that bound is exactly zero.
     """
     centre, sigma = prior
     found = now.copy()
@@ -346,12 +345,9 @@ def solve(
     right = np.concatenate(
         [linear.right - linear.matrix[:, ~kept] @ now[~kept], centre[kept] / sigma]
     )
-    if nonnegative:
-        from scipy.optimize import nnls  # a quarter of a second, only where something is fitted
+    from scipy.optimize import nnls  # a quarter of a second, only where something is fitted
 
-        found[kept] = nnls(rows, right, maxiter=100 * len(unit))[0] * unit
-    else:
-        found[kept] = np.linalg.lstsq(rows, right, rcond=1e-12)[0] * unit
+    found[kept] = nnls(rows, right, maxiter=100 * len(unit))[0] * unit
     return found
 
 

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gapbridge.core.effects.effect import typical_moment
 from gapbridge.core.errors import ExcitationError
 from gapbridge.core.estimation.compliance_fit import (
     OUTLIER,
@@ -19,15 +18,15 @@ from gapbridge.core.estimation.compliance_fit import (
     Fit,
     fit_flexibilities,
     fit_nuisances,
-    flexibilities,
     nuisance_columns,
     orthonormal,
+    prior_of,
     residual,
 )
+from gapbridge.core.estimation.identification import measured_rows
 from gapbridge.core.log.log import Log
 from gapbridge.core.metrology import Metrology
 from gapbridge.core.model import Model
-from gapbridge.core.rotation import rotation_matrix
 
 Array = NDArray[np.float64]
 FEWEST = 4  # poses, where nobody has registered the instrument: three place its frame and tool
@@ -59,39 +58,15 @@ def evidence(model: Model, log: Log, metrology: Metrology | None = None) -> Evid
     where columns are missing, ExcitationError where there are too few poses to say anything.
     """
     metrology = metrology or Metrology()
-    data = _measured(log, metrology)
-    usual = usual_flexibility(model)
-    everything = np.ones(2 * model.arm.n, dtype=bool)
-    before = fit_nuisances(model, data)
-    fit = fit_flexibilities(
-        before, data, everything, (flexibilities(model), 10 * usual), nonnegative=True
-    )
-    return _folded(fit, data, metrology)
-
-
-def _measured(log: Log, metrology: Metrology) -> Data:
-    """Return the rows that have a measured pose."""
-    q = log.require("actual_q", "target_q")
-    position = log.get("measured_position")
-    if position is None:
-        position = log.require("measured_position")
-    turn = log.get("measured_rotation")
-    good = np.isfinite(position).all(axis=1)
-    if turn is not None:
-        good &= np.isfinite(turn).all(axis=1)
+    data, used = measured_rows(log, metrology.registered)
     least = 1 if metrology.registered else FEWEST
-    if good.sum() < least:
+    if len(used) < least:
         raise ExcitationError(
-            f"found {int(good.sum())} row(s) with measured poses, expected at least {least}"
+            f"found {len(used)} row(s) with measured poses, expected at least {least}"
         )
-    rotation = None if turn is None else rotation_matrix(turn[good])
-    return Data(q[good], log.loads()[np.flatnonzero(good)], position[good], rotation,
-                metrology.registered)  # fmt: skip
-
-
-def usual_flexibility(model: Model) -> float:
-    """Return a usual flexibility (rad/Nm) of a joint of an arm of this size."""
-    return 1e-3 / typical_moment(model.arm)
+    everything = np.ones(2 * model.arm.n, dtype=bool)
+    fit = fit_flexibilities(fit_nuisances(model, data), data, everything, prior_of(model))
+    return _folded(fit, data, metrology)
 
 
 def _folded(fit: Fit, data: Data, metrology: Metrology) -> Evidence:

@@ -7,13 +7,11 @@ luck: what the data do not show stays at the model's value and is named (base_pa
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gapbridge.core.effects.effect import typical_moment
 from gapbridge.core.errors import ExcitationError, LogError
 from gapbridge.core.estimation import base_parameters
 from gapbridge.core.estimation.compliance_fit import (
@@ -23,10 +21,10 @@ from gapbridge.core.estimation.compliance_fit import (
     Placements,
     fit_flexibilities,
     fit_nuisances,
-    flexibilities,
     nuisance_columns,
     orthonormal,
     placed_gap,
+    prior_of,
     residual,
 )
 from gapbridge.core.estimation.regions import joint_regions
@@ -39,6 +37,7 @@ from gapbridge.core.sessions import session_of
 
 Array = NDArray[np.float64]
 FOLDS = 5
+SAME_POSE = 1e-3  # rad, of every joint
 LOOK = 3  # rounds of the fit of everything, from which the choice is made
 UNSEEN = float("nan")
 
@@ -77,55 +76,38 @@ class _Task:
     """How to fit: what the model says of the flexibilities, and how firmly."""
 
     prior: tuple[Array, float]  # (2n,) rad/Nm, 1 sigma rad/Nm
-    scale: float  # rad/Nm: what is known no better than a share of this is not shown
-    nonnegative: bool
 
     def run(self, before: Fit, data: Data) -> tuple[Fit, base_parameters.Shown]:
         """Fit everything, choose what the data show, fit that alone."""
         centre = self.prior[0]
         everything = np.ones(len(centre), dtype=bool)
-        look = fit_flexibilities(
-            before, data, everything, self.prior, nonnegative=self.nonnegative, rounds=LOOK
-        )
+        look = fit_flexibilities(before, data, everything, self.prior, rounds=LOOK)
         assert look.linear is not None
-        kept = base_parameters.choose(look.linear, (centre, self.scale), self.nonnegative)
+        kept = base_parameters.choose(look.linear, self.prior)
         values, n = np.where(kept, look.flexibility, centre), len(centre) // 2
         begin = Fit(look.model.with_compliance(values[:n], values[n:]), look.frame, look.weights)
-        fit = fit_flexibilities(begin, data, kept, self.prior, nonnegative=self.nonnegative)
+        fit = fit_flexibilities(begin, data, kept, self.prior)
         assert fit.linear is not None
-        return fit, base_parameters.what_is_shown(fit.linear, kept, self.scale)
+        return fit, base_parameters.what_is_shown(fit.linear, kept, self.prior[1])
 
 
 def identify_compliance(
-    model: Model,
-    log: Log,
-    metrology: Metrology | None = None,
-    *,
-    nonnegative: bool = True,
-    prior_std: float | None = None,
-    progress: Callable[[str], None] | None = None,
+    model: Model, log: Log, metrology: Metrology | None = None
 ) -> Identification:
     """Return the 2n joint flexibilities that best explain the measured TCP poses of ``log``.
 
-    ``prior_std`` (rad/Nm; default ten times a usual flexibility of an arm of this size; inf: none)
-    weakly holds each flexibility at the model's own value; one that the data do not know better
-    stays there exactly. ``nonnegative`` bounds every flexibility at zero. Where the metrology is
-    not registered, frame and tool point are estimated along. Raises LogError where needed columns
-    are missing, ExcitationError where nothing in the log makes the joints bend.
+    Each is weakly held at the model's own value, by ten usual flexibilities of an arm of this size;
+    one that the data do not know better stays there exactly. None is below zero. Where the
+    metrology is not registered, frame and tool point are estimated along. Raises LogError where
+    needed columns are missing, ExcitationError where nothing in the log makes the joints bend.
     """
     metrology = metrology or Metrology()
     data, used = data_of(log, metrology)
-    usual = 1e-2 / typical_moment(model.arm)
-    prior_std = usual if prior_std is None else prior_std
-    require_excitation(model, data, metrology, min(prior_std, usual))
-    centre = flexibilities(model)
-    scale = prior_std if np.isfinite(prior_std) else usual
-    task = _Task((centre, prior_std), scale, nonnegative)
-    emit = progress or (lambda text: None)
-    emit("fitting")
+    prior = prior_of(model)
+    require_excitation(model, data, metrology, prior[1])
+    task = _Task(prior)
     before = fit_nuisances(model, data)
     fit, shown = task.run(before, data)
-    emit("checking on held-out poses")
     inlier = fit.weights > 1e-6
     held_out = _held_out(model, data, task, inlier)
     found = _result(model, data, used, (before, fit), shown, held_out)
@@ -136,24 +118,29 @@ def identify_compliance(
     )
 
 
-def data_of(log: Log, metrology: Metrology, motions: bool = True) -> tuple[Data, NDArray[np.int64]]:
-    """Return the rows of a log that have measured poses, and which ones they are.
-
-    ``motions`` False: without the joints' last motions.
-    """
+def measured_rows(
+    log: Log, registered: bool, motions: bool = True
+) -> tuple[Data, NDArray[np.int64]]:
+    """Return the rows of a log that have measured poses as those of one session, and which."""
     q = log.require("actual_q", "target_q")
     measured = log.get("measured_position")
     if measured is None:
-        log.require("measured_position")
-    assert measured is not None
+        measured = log.require("measured_position")
     rotation = log.get("measured_rotation")
     good = np.isfinite(measured).all(axis=1)
     if rotation is not None:
         good &= np.isfinite(rotation).all(axis=1)
     used = np.flatnonzero(good)
     matrix = None if rotation is None else rotation_matrix(rotation[used])
-    loads = log.loads(motions)[used]
-    data = Data(q[used], loads, measured[used], matrix, metrology.registered)
+    return Data(q[used], log.loads(motions)[used], measured[used], matrix, registered), used
+
+
+def data_of(log: Log, metrology: Metrology, motions: bool = True) -> tuple[Data, NDArray[np.int64]]:
+    """Return the rows of a log that have measured poses, and which ones they are.
+
+    ``motions`` False: without the joints' last motions.
+    """
+    data, used = measured_rows(log, metrology.registered, motions)
     count = max(len(log.session_names), 1)
     if count > 1 or metrology.remounted:
         session = session_of(log)[used]
@@ -217,13 +204,13 @@ def _any_payload(model: Model, data: Data) -> bool:
     return bool(model.payload_mass > 0 if mass is None else (mass > 0).any())
 
 
-def pose_groups(q: Array, tolerance: float = 1e-3) -> NDArray[np.int64]:
-    """Return a number per row (N,): rows within ``tolerance`` (rad) of each other share one."""
+def pose_groups(q: Array) -> NDArray[np.int64]:
+    """Return a number per row (N,): rows within SAME_POSE of each other share one."""
     groups = np.full(len(q), -1)
     count = 0
     for row in range(len(q)):
         if groups[row] < 0:
-            close = (np.abs(q[row:] - q[row]).max(axis=1) < tolerance) & (groups[row:] < 0)
+            close = (np.abs(q[row:] - q[row]).max(axis=1) < SAME_POSE) & (groups[row:] < 0)
             groups[row:][close] = count
             count += 1
     return groups

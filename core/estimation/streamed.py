@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapbridge.core.effects import at_moment, by_approach
-from gapbridge.core.effects.effect import typical_moment
 from gapbridge.core.estimation import base_parameters, compliance_fit
 from gapbridge.core.estimation.compliance_fit import (
     CONVERGED,
@@ -24,7 +23,7 @@ from gapbridge.core.estimation.compliance_fit import (
     Fit,
     Linear,
     Mask,
-    flexibilities,
+    prior_of,
     residual,
     solve,
     stepped,
@@ -64,15 +63,11 @@ INLIER = 1e-6  # weight below which a row counts as an outlier
 @dataclass(frozen=True)
 class _Task:
     prior: tuple[Array, float]
-    scale: float
-    nonnegative: bool
 
     def on_sample(self, before: Fit, sample: Data) -> Fit:
         """Fit everything on the rows of the sample: where the passes over all rows begin."""
         everything = np.ones(len(self.prior[0]), dtype=bool)
-        fit = compliance_fit.fit_flexibilities(
-            before, sample, everything, self.prior, nonnegative=self.nonnegative
-        )
+        fit = compliance_fit.fit_flexibilities(before, sample, everything, self.prior)
         return Fit(fit.model, fit.frame, NONE)
 
     def run(self, begin: Fit, stream: Stream) -> _Found:
@@ -94,7 +89,7 @@ class _Task:
             if long and (change[kept] < ENOUGH * _spread(linear, kept)).all():
                 break
         assert kept is not None
-        shown = base_parameters.what_is_shown(linear, kept, self.scale)
+        shown = base_parameters.what_is_shown(linear, kept, self.prior[1])
         return _Found(now, noise, base, parts, shown)
 
     def step(
@@ -106,16 +101,13 @@ class _Task:
         """
         F, A, b = R[:, :nuisances], R[:, nuisances:-1], R[:, -1]
         centre, n = self.prior[0], at.model.arm.n
-        look = stepped(
-            at, (F, A, b), NONE, np.ones(len(centre), dtype=bool), self.prior,
-            nonnegative=self.nonnegative,
-        )  # fmt: skip
+        look = stepped(at, (F, A, b), NONE, np.ones(len(centre), dtype=bool), self.prior)
         linear = look.linear
         assert linear is not None
         if kept is None:
-            kept = base_parameters.choose(linear, (centre, self.scale), self.nonnegative)
+            kept = base_parameters.choose(linear, self.prior)
         begin = np.where(kept, at.flexibility, centre)
-        found = solve(linear, kept, begin, self.prior, self.nonnegative)
+        found = solve(linear, kept, begin, self.prior)
         moved = placed(at, b - A @ (found - at.flexibility), F)
         return (
             Fit(moved.model.with_compliance(found[:n], found[n:]), moved.frame, NONE),
@@ -145,34 +137,25 @@ def identify_streamed(
     model: Model,
     log: Iterable[Log],
     metrology: Metrology | None = None,
-    *,
-    nonnegative: bool = True,
-    prior_std: float | None = None,
-    held_out: bool = True,
     progress: Callable[[str], None] | None = None,
 ) -> Identification:
     """Return what ``identify_compliance`` does, for a log that comes in pieces.
 
-    ``log`` is iterated over once (core.log.pieces.LogPieces, or a list of logs). ``held_out`` False
-    spares the fits without a fold. Raises as ``identify_compliance``.
+    ``log`` is iterated over once (core.log.pieces.LogPieces, or a list of logs). Raises as
+    ``identify_compliance``.
     """
     metrology = metrology or Metrology()
     emit = progress or (lambda text: None)
     emit("reading")
     stream = _stream(log, metrology, model)
-    usual = 1e-2 / typical_moment(model.arm)
-    prior_std = usual if prior_std is None else prior_std
-    require_excitation(model, stream.sample, metrology, min(prior_std, usual))
-    scale = prior_std if np.isfinite(prior_std) else usual
-    task = _Task((flexibilities(model), prior_std), scale, nonnegative)
+    prior = prior_of(model)
+    require_excitation(model, stream.sample, metrology, prior[1])
+    task = _Task(prior)
     emit("fitting")
     before = _nuisances_alone(model, stream.sample)
     found = task.run(task.on_sample(before, stream.sample), stream)
-    unseen = (float("nan"), float("nan"))
-    if held_out:
-        emit("checking on held-out rows")
-        unseen = _held_out(model, stream, task, found)
-    return _result(model, stream, before, found, unseen)
+    emit("checking on held-out rows")
+    return _result(model, stream, before, found, _held_out(model, stream, task, found))
 
 
 def _nuisances_alone(model: Model, rows: Data) -> Fit:

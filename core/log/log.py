@@ -33,6 +33,7 @@ from gapbridge.core.log.parquet_tables import ParquetColumns
 
 Array = NDArray[np.float64]
 GZIP = b"\x1f\x8b"
+STILL = 1e-6  # rad: a smaller change between rows is no motion
 
 
 @dataclass(frozen=True)
@@ -143,11 +144,11 @@ class Log:
         return replace(self, columns=columns, lines=lines[rows], numbers=numbers)
 
 
-def last_motion(q: Array, dead_band: float = 1e-6) -> Array:
+def last_motion(q: Array) -> Array:
     """Return the sign (N, n) of the last change of each joint (rad) before each row."""
     sign = np.zeros(q.shape)
     change = np.diff(q, axis=0)
-    sign[1:] = np.where(np.abs(change) > dead_band, np.sign(change), 0)
+    sign[1:] = np.where(np.abs(change) > STILL, np.sign(change), 0)
     where = np.where(sign != 0, np.arange(len(q))[:, None], 0)
     last = np.maximum.accumulate(where, axis=0)
     return np.take_along_axis(sign, last, axis=0)

@@ -19,7 +19,6 @@ from gapbridge.core.log.mcap_layout import Layout, layout_in
 from gapbridge.core.log.mcap_schema import (
     CONFIGURATION,
     CYCLE_CHANNELS,
-    EVENTS,
     JSON_CHANNELS,
     LOG,
     LOOP,
@@ -70,16 +69,6 @@ def read_batches(path: Path) -> Iterator[Batch]:
     """
     for file in files_of(path):
         yield from _read_file(file)
-
-
-def read_documents(path: Path, channel: str = EVENTS) -> list[Document]:
-    """Return all JSON messages of a channel, in order. Raises LogError."""
-    return [
-        document
-        for batch in read_batches(path)
-        for topic, document in batch.documents
-        if topic == channel
-    ]
 
 
 def read_configuration(path: Path) -> Document:

@@ -6,9 +6,10 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from gapbridge.drivers.robot_modes import Trouble
+
 Number = Annotated[float, Field(allow_inf_nan=False)]
 Identifier = Annotated[int, Field(ge=0, le=0x1FFFFFFF)]
-Trouble = Literal["not_ready", "protective_stop", "emergency_stop", "fault"]
 
 
 class Section(BaseModel):

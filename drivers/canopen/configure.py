@@ -4,17 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from gapbridge.core.arm import Arm
 from gapbridge.core.errors import InputError, LinkError
 from gapbridge.drivers.canopen.master import Master
 from gapbridge.drivers.canopen.objects import PDO_COUNT, Address
 from gapbridge.drivers.canopen.pdo import PdoLayout
 from gapbridge.drivers.canopen.profile import CanopenProfile
-
-Vector = NDArray[np.float64]
 
 DEVICE_TYPE, SUPPORTED_MODES = Address(0x1000, 0), Address(0x6502, 0)
 SYNC_PERIOD, HEARTBEAT_TIME = Address(0x1006, 0), Address(0x1017, 0)

@@ -16,7 +16,8 @@ from gapbridge.drivers.modbus.encode import units_of
 from gapbridge.drivers.modbus.map import RegisterMap, place_in
 from gapbridge.drivers.modbus.profile import ECHO_WORDS, addresses, turns_of, vectors
 from gapbridge.drivers.modbus.registers import BIT_TABLES, UNITS, Coding, words_in
-from gapbridge.drivers.modbus.schema import Condition, Mailbox, Place, ProfileFile, Trouble, Vector
+from gapbridge.drivers.modbus.schema import Condition, Mailbox, Place, ProfileFile, Vector
+from gapbridge.drivers.robot_modes import Trouble
 from gapbridge.drivers.state_check import JITTER, LARGEST
 
 Array = NDArray[np.float64]

@@ -18,7 +18,6 @@ TypeName = Literal["bit", "i16", "u16", "i32", "u32", "i64", "u64", "f32", "f64"
 WordOrder = Literal["high_first", "low_first"]
 
 BIT_TABLES = ("coil", "discrete")
-WRITABLE_TABLES = ("coil", "holding")
 MOST_REGISTERS = 125  # that one request can read
 LAST_ADDRESS = 65535
 

@@ -7,11 +7,11 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from gapbridge.drivers.modbus.registers import LAST_ADDRESS, Coding, Table, TypeName, WordOrder
+from gapbridge.drivers.robot_modes import Trouble
 
 Number = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[Number, Field(gt=0)]
 Address = Annotated[int, Field(ge=0, le=LAST_ADDRESS, strict=True)]
-Trouble = Literal["not_ready", "protective_stop", "emergency_stop", "fault"]
 
 
 class Section(BaseModel):

@@ -12,7 +12,7 @@ from gapbridge.core.errors import LogError
 from gapbridge.core.log.log import Log
 from gapbridge.core.model import Model
 from gapbridge.core.motion import motion_of
-from gapbridge.core.ranges import merged, outside, range_of
+from gapbridge.core.ranges import Outside, merged, range_of
 from gapbridge.core.sessions import join_sessions, session_of, sessions_in, with_sessions
 
 MODEL = replace(
@@ -34,6 +34,12 @@ def moving(name: str, start: float = 0.0) -> Log:
     t = start + np.arange(400) * 0.01
     q = np.sin(t)[:, None] * np.linspace(0.2, 1, 6)
     return Log(name, {"timestamp": t, "actual_q": q, "target_q": q}, 6)
+
+
+def outside_of(log, fitted):
+    found = Outside(fitted)
+    found.add(log)
+    return found.sentences()
 
 
 def test_sessions_in_order_keep_their_clock_and_rows() -> None:
@@ -105,9 +111,9 @@ def test_what_does_not_belong_together_is_reported(logs: list[Log], phrase: list
 def test_rows_outside_what_was_fitted_are_named() -> None:
     fitted = range_of(poses(50, "a.csv", payload=np.linspace(0, 3, 50)))
     assert fitted["payload"] == (0.0, 3.0)
-    assert outside(poses(20, "b.csv", payload=np.full(20, 2.0)), fitted) == []
-    (reported,) = outside(poses(2, "b.csv", payload=[1.0, 9.0]), fitted)
+    assert outside_of(poses(20, "b.csv", payload=np.full(20, 2.0)), fitted) == []
+    (reported,) = outside_of(poses(2, "b.csv", payload=[1.0, 9.0]), fitted)
     for word in ("payload", "1 of 2 rows", "0 to 3 kg", "row 3", "9"):
         assert word in reported
     whole = merged([fitted, {"payload": (2.0, 10.0)}])
-    assert outside(poses(2, "b.csv", payload=[1.0, 9.0]), whole) == []
+    assert outside_of(poses(2, "b.csv", payload=[1.0, 9.0]), whole) == []

@@ -11,7 +11,6 @@ from gapbridge.core.calibration.budget.pose_accuracy import KINDS, repeats
 from gapbridge.core.calibration.budget.sensitivity import Sensitivities
 from gapbridge.core.calibration.result import Calibration
 
-Array = NDArray[np.float64]
 ALUMINIUM = 23e-6  # 1/K; steel grows half as much
 ENOUGH = 12  # degrees of freedom from which repeats alone determine the arm's scatter
 FAR = 8.0  # times the median error: a held-out reading beyond is a blunder

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from gapbridge.core.log.log import Log
 from gapbridge.core.motion import EDGE, LEAD, check_order, is_moving, motion_of, with_motion
 
-Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 WHOLE = 30_000  # rows of a recording that are looked at as a whole
 EXCERPT = 20_000  # rows of an excerpt

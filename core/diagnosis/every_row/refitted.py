@@ -10,7 +10,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gapbridge.core.diagnosis.criteria import OWN_SIGMAS, SIGMAS, TIE_SCORE
 from gapbridge.core.diagnosis.finding import Check, Withdrawal
@@ -31,7 +30,6 @@ from gapbridge.core.diagnosis.selection.state import SelectionState, sample_spac
 from gapbridge.core.effects import Term
 from gapbridge.core.model import Model
 
-Array = NDArray[np.float64]
 Alone = Callable[[Selection, Sequence[int]], Selection]
 MOST_RIVALS = 12  # of all causes together
 GAINLESS = Withdrawal(Check.ALL_ROWS_GAIN)

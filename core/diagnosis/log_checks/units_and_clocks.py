@@ -17,7 +17,6 @@ from gapbridge.core.metrology import Metrology
 from gapbridge.core.model import Model
 from gapbridge.core.motion import time_finding
 
-Array = NDArray[np.float64]
 TURNS = 25.0  # rad: joints do not turn further; degrees do
 LEAST_TURN = 7.0  # rad: a little more than one turn, which any encoder may say
 BEYOND = 1.5  # times a joint's limit: no joint stands there

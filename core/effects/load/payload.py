@@ -31,7 +31,6 @@ class Payload(Effect):
     needs_softness = True
     adds_mass = True
     carried = True
-    felt_by_all = True
     corrects = "payload"
     moved = "the load differs from what was declared by {size}"
     channels = ("position", "wrench", "torque")

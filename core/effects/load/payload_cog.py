@@ -35,7 +35,6 @@ class PayloadCog(Effect):
     order = 12
     needs_softness = True
     carried = True
-    felt_by_all = True
     shown_by = Term("payload", Site(), (1.0,))  # values are then first moments, of 1 kg
     corrects = "payload"
     channels = ("position", "wrench", "torque")

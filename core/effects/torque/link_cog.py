@@ -33,7 +33,6 @@ class LinkCog(JointEffect):
     label_template = "first moment {part} of link {joint}"
     order = 22
     carried = True
-    felt_by_all = True
     together = True
     channels = ("torque",)
     motion = "poses that turn the link against gravity, or its accelerations"

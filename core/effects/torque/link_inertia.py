@@ -28,7 +28,6 @@ class LinkInertia(JointEffect):
     identifier = "link_inertia"
     title = "link weighs more or less"
     order = 20
-    felt_by_all = True
     carried = True
     channels = ("torque",)
     simulated_as = Kind.LINK_SCALE

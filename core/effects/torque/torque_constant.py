@@ -25,7 +25,6 @@ class TorqueConstant(JointEffect):
     identifier = "torque_constant"
     title = "torque reading is scaled"
     order = 90
-    felt_by_all = True
     channels = ("torque",)
     motion = "a joint that carries torque, the more changing the better"
     alike: ClassVar = {"link_inertia": "a joint that carries one link alone"}

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gapbridge.core.errors import LogError
 from gapbridge.core.log.sources.joint_order import order_joints
@@ -22,7 +21,6 @@ from gapbridge.core.log.sources.source import Converted, Source, SourceOptions
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
 
-Array = NDArray[np.float64]
 TYPES = {  # role -> types of messages
     "joints": ("sensor_msgs/msg/JointState",),
     "controller": ("control_msgs/msg/JointTrajectoryControllerState",),

@@ -7,7 +7,8 @@ from collections.abc import Iterable, Sequence
 from gapbridge.drivers.modbus.encode import vector_registers
 from gapbridge.drivers.modbus.profile import addresses, spans, turns_of
 from gapbridge.drivers.modbus.registers import BIT_TABLES, UNITS, Table
-from gapbridge.drivers.modbus.schema import Clock, Condition, Place, ProfileFile, Trouble, Vector
+from gapbridge.drivers.modbus.schema import Clock, Condition, Place, ProfileFile, Vector
+from gapbridge.drivers.robot_modes import Trouble
 from gapbridge.drivers.simulated.server.arm_controller import ArmController
 
 Image = dict[Table, dict[int, int]]

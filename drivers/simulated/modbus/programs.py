@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
-from typing import Protocol
 
 from gapbridge.drivers.modbus import encode
 from gapbridge.drivers.modbus.profile import ECHO_WORDS, MAILBOX_WORDS, addresses
@@ -27,22 +26,6 @@ log = logging.getLogger("drivers.simulated")
 
 Read = Callable[[Table, int, int], list[int]]
 """Table, first address and count -> registers as clients have written them."""
-
-
-class RobotProgram(Protocol):
-    """What runs on the robot beside its own motion; stepped once per cycle."""
-
-    def wrote(
-        self, controller: ArmController, table: Table, address: int, values: Sequence[int]
-    ) -> None:
-        """Take note of a client's write."""
-
-    def cycle(self, controller: ArmController, read: Read) -> None:
-        """Act on what has been written."""
-
-    def registers(self, controller: ArmController) -> list[tuple[Table, int, int]]:
-        """Return table, address and register of the program's answers."""
-        ...
 
 
 class NoProgram:

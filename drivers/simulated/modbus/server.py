@@ -22,8 +22,9 @@ from gapbridge.core.errors import LinkError
 from gapbridge.drivers.modbus.map import compile_map
 from gapbridge.drivers.modbus.profile import read_profile
 from gapbridge.drivers.modbus.registers import BIT_TABLES, Table
-from gapbridge.drivers.modbus.schema import ProfileFile, Trouble
+from gapbridge.drivers.modbus.schema import ProfileFile
 from gapbridge.drivers.modbus.settings import ModbusSettings
+from gapbridge.drivers.robot_modes import Trouble
 from gapbridge.drivers.simulated.modbus import image
 from gapbridge.drivers.simulated.modbus.image import Image
 from gapbridge.drivers.simulated.modbus.programs import MailboxProgram, make_program

@@ -23,7 +23,6 @@ from gapbridge.drivers.simulated.plant.rotations import (
     subtract,
     to_vector,
     transpose,
-    unrotate,
 )
 
 Joints = tuple[float, ...]
@@ -38,11 +37,6 @@ def frame_of(pose: Sequence[float]) -> Frame:
 def pose_of(frame: Frame) -> Vector6:
     """Return the UR pose of a frame."""
     return (*frame.origin, *to_vector(frame.rotation))
-
-
-def inverse(frame: Frame) -> Frame:
-    """Return the inverse of a transform."""
-    return Frame(transpose(frame.rotation), scale(unrotate(frame.rotation, frame.origin), -1.0))
 
 
 def gap(here: Frame, there: Frame) -> Vector6:

@@ -6,7 +6,6 @@ One command a line, one line back; `help` lists them. None of it is known to the
 from __future__ import annotations
 
 import json
-import logging
 import math
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, Protocol
@@ -22,7 +21,6 @@ from gapbridge.drivers.simulated.server.connection import Connection
 if TYPE_CHECKING:
     from gapbridge.drivers.simulated.plant.plant_arm import Frame
 
-log = logging.getLogger("drivers.simulated")
 
 HEAVIEST = 200.0  # kg
 LONGEST_LINE = 1000  # characters

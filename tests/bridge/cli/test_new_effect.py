@@ -124,7 +124,6 @@ def log_of(channel: str, truth: Model, folder: Path) -> Path:
     return log_in(folder, columns | dict(zip(names(COLUMN[channel], 6), value.T, strict=True)))
 
 
-@pytest.mark.slow
 def test_it_is_explained_found_applied_and_predicted(channel: str, tmp_path: Path) -> None:
     truth, term = truth_of(channel)
     answer = gapbridge("explain", term.effect)

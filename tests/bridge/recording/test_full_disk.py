@@ -12,10 +12,10 @@ from pathlib import Path
 
 import pytest
 from recorded import Desk, publish
+from recorded_documents import read_documents
 from test_recorder import numbers
 
 from gapbridge.bridge.recording import recorder as recorder_module
-from gapbridge.core.log.mcap_reading import read_documents
 
 
 @pytest.fixture

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from jsonschema import Draft202012Validator, validate
 from mcap.reader import NonSeekingReader, SeekingReader
 from recorded import SESSION, Array, Desk, publish, same_bits
+from recorded_documents import read_documents
 
 from gapbridge.bridge.recording.folder import new_session, segments
 from gapbridge.core.errors import LogError
@@ -22,7 +23,6 @@ from gapbridge.core.log.mcap_reading import (
     read_batches,
     read_columns,
     read_configuration,
-    read_documents,
 )
 from gapbridge.core.log.mcap_records import chunk_offsets, is_whole
 

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from recorded import SESSION, N
+from recorded_documents import read_documents
 
 from gapbridge.bridge.cell.daemon_settings import DaemonSettings
 from gapbridge.bridge.cell.settings.recording import RecordingSettings
@@ -19,7 +20,7 @@ from gapbridge.bridge.ipc import side_process
 from gapbridge.bridge.ipc.shared_memory import SharedMemory
 from gapbridge.bridge.ipc.side_process import SideProcess
 from gapbridge.bridge.loop.supervisor import State
-from gapbridge.core.log.mcap_reading import read_columns, read_configuration, read_documents
+from gapbridge.core.log.mcap_reading import read_columns, read_configuration
 from gapbridge.core.log.mcap_records import is_whole
 
 RATE = 500.0

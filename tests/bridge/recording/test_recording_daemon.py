@@ -14,10 +14,11 @@ import numpy as np
 import pytest
 import yaml
 from daemon_cell import Robot, Run, gapbridge, only_recording, wait_for
+from recorded_documents import read_documents
 
 from gapbridge.bridge.loop.supervisor import State
 from gapbridge.bridge.recording.export import export
-from gapbridge.core.log.mcap_reading import read_columns, read_documents
+from gapbridge.core.log.mcap_reading import read_columns
 
 
 @pytest.fixture

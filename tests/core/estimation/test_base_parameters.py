@@ -15,8 +15,8 @@ def problem(columns, values):
     return Linear(columns / SIGMA, columns / SIGMA @ (np.asarray(values) * SIGMA))
 
 
-def chosen(linear, nonnegative=True):
-    kept = choose(linear, (np.zeros(4), SIGMA), nonnegative)
+def chosen(linear):
+    kept = choose(linear, (np.zeros(4), SIGMA))
     return kept, what_is_shown(linear, kept, SIGMA)
 
 

@@ -23,7 +23,6 @@ START = ord("S")
 PAUSE = ord("P")
 
 HEADER = struct.Struct(">HB")
-LONGEST_NAME_LIST = 2048
 
 
 class FrameError(ValueError):
