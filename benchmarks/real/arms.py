@@ -90,6 +90,15 @@ IRB120 = _links(
     (0, -H, 0),
     (0, 0, 0.072, pi),
 )
+# KUKA Quantec Ultra KR300, 200 kg at its flange; the rows of the data set, whose base looks down
+KR300 = _links(
+    (0.35, H, -0.675, 0, 395.4, (-0.353, 0.174, -0.004)),
+    (1.15, 0, -0.189, 0, 339.12, (-0.709, -0.001, 0.023)),
+    (0.041, -H, 0.189, H, 105.21, (-0.018, -0.018, -0.076)),
+    (0, H, -1.0, 0, 35.8, (0, 0.236, 0.001)),
+    (0, -H, 0, 0, 31.46, (0, -0.08, -0.009)),
+    (0, pi, -0.24, 0, 217.78, (0, 0, 0.08775)),
+)
 # three axes in one point: every attitude of a flange, where a data set gives attitudes, no joints
 WRIST = _links((0, -H, 0), (0, H, 0), (0, 0, 0))
 

@@ -16,6 +16,7 @@ import click
 import numpy as np
 import yaml
 from numpy.typing import NDArray
+from scipy.io import loadmat
 from scipy.spatial.transform import Rotation
 
 from benchmarks.real import arms
@@ -172,8 +173,6 @@ MOTOMAN = "UserData/Robots/Motoman/Dataset/leica_dataset/"
 
 def _motoman(name: str, tool: tuple[float, float, float] | None) -> Callable[[Path], Converted]:
     def make(folder: Path) -> Converted:
-        from scipy.io import loadmat
-
         raw = np.asarray(loadmat(folder / MOTOMAN / name)["dataset"], dtype=float)
         raw = raw[~np.isnan(raw[:, 19:22]).any(axis=1)]
         raw = raw[np.unique(raw[:, 0], return_index=True)[1]]  # as its authors: one row a pose
@@ -283,9 +282,82 @@ def _panda(folder: Path) -> Converted:
                      arms.panda_urdf())  # fmt: skip
 
 
+# -- Staubli TX40, torques; KUKA KR300, torques; UR5e, tracking ---------------------
+
+
+def _tx40(folder: Path) -> Converted:
+    place = folder / "examples/staubli_TX40"
+    ratio = np.array([32.0, 32.0, 45.0, -48.0, 45.0, 32.0])
+    to_joints, to_torques = np.diag(ratio), np.diag(ratio)
+    to_joints[5, 4] = to_torques[4, 5] = ratio[5]  # motor 6 turns with joint 5
+
+    def column(name: str) -> Array:
+        raw = np.loadtxt(place / f"data/{name}.csv", delimiter=",", skiprows=1)
+        return raw[:37_500].reshape(-1, 10, 6).mean(axis=1)
+
+    zero = np.array([0, -np.pi / 2, np.pi / 2, 0, 0, 0])
+    q = column("pos_read_data") @ np.linalg.inv(to_joints).T + zero
+    columns = {
+        "timestamp": np.arange(len(q)) * 2e-3,
+        "actual_q": q,
+        "actual_current_as_torque": column("curr_data") @ to_torques.T,
+    }
+    about = {
+        "robot": "Staubli TX40", "instrument": "motor angles and torques, 5 kHz, means of ten, "
+        "times the gears' ratios; motor 6 turns with joint 5",
+        "rows": "the motion, 7.5 s",
+        "model": "kinematics and inertials of the data set's own URDF",
+    }  # fmt: skip
+    urdf = (place / "urdf/tx40_mdh_modified.urdf").read_text(encoding="utf-8")
+    return Converted(columns, {"robot": {"urdf": "robot.urdf", "tip": "tool0"}}, about, urdf)
+
+
+def _kr300(name: str) -> Callable[[Path], Converted]:
+    def make(folder: Path) -> Converted:
+        place = folder / f"data/recorded_trajectories/2020-10-21 10s FF {name} 08ms/data.mat"
+        rec = loadmat(place, squeeze_me=True, struct_as_record=False)["rec"]
+        ratio = np.array([1798 / 7, 1872 / 7, 757 / 3, 221, 5032 / 21, 206793 / 1340])
+        columns = {
+            "timestamp": rec.time_cont,
+            "actual_q": np.deg2rad(rec.act_pos_mot_deg.T),
+            "actual_qd": np.deg2rad(rec.act_vel_mot_deg_per_s.T),
+            "actual_current_as_torque": rec.act_torque_abs_nm.T * ratio,
+        }
+        about = {
+            "robot": "KUKA Quantec Ultra KR300, 200 kg at its flange", "file": place.name,
+            "instrument": "motor angles, speeds and torques, 250 Hz, times the gears' ratios",
+            "targets": "left out: the motors of the wrist are coupled by a ratio that is not given",
+            "model": "masses and centres of gravity of the data set's own model; its hydraulic "
+            "counterbalance of joint 2 is in no model here",
+        }  # fmt: skip
+        return Converted(columns, _cell(arms.KR300, gravity=[0, 0, 9.80665]), about)
+
+    return make
+
+
+def _ur5e_motion(folder: Path) -> Converted:
+    raw = np.genfromtxt(folder / "UR5e_motion_full.csv", delimiter=",", names=True)
+
+    def vector(name: str) -> Array:
+        return np.column_stack([raw[f"{name}_{i}"] for i in range(6)])
+
+    columns = {
+        "timestamp": np.arange(len(raw)) * 8e-3,
+        "target_q": vector("tq"),
+        "actual_q": vector("q"),
+        "actual_qd": vector("qd"),
+    }
+    about = {
+        "robot": "Universal Robots UR5e", "instrument": "its controller, 125 Hz",
+        "timestamps": "written as whole seconds: 8 ms steps were put in",
+    }  # fmt: skip
+    return Converted(columns, {"robot": {"model": "ur5e"}}, about)
+
+
 UR10E_SET = ("shamilmamedov/dynamic_calibration", "11af40e7deb758ec080a175fed8fcdd6c99aca29")
 IIWA_SET = ("Zhangzhongqiu/robot-calibration", "be44742b3b312bde09d87d9d40e89d8a634ac83b")
 MOTOMAN_SET = ("ctu-vras/multirobot-calibration", "a20f0454732bc36f1d980ff08c3d30536b8b1b19")
+KR300_SET = ("JonasWeigand/Robot_Identification", "9e403c07d9dadbb391a9f3921e8d219f714636a8")
 UR10_SET = ("christianlandgraf/ipa-robot-accuracy", "507fba69bdaf6c43c2faf306e70a7e37c5e39b89")
 SOURCES: dict[str, Source] = {
     "ur10e_12harmonics": Source(*UR10E_SET, _ur10e("ur-20_02_10-30sec_12harm.csv", 635, 3510)),
@@ -309,6 +381,14 @@ SOURCES: dict[str, Source] = {
     "panda": Source(
         "marcocognetti/FrankaEmikaPandaDynModel",
         "24d85ce4e648e2e894c832bfeee9b16711eb1a1a", _panda),
+    "tx40": Source(
+        "thanhndv212/figaroh-examples", "c0b5c7f0fda10078be55104f9ee76ac106b7a5ee", _tx40),
+    "kr300_a": Source(*KR300_SET, _kr300("A")),
+    "kr300_b": Source(*KR300_SET, _kr300("B")),
+    "kr300_c": Source(*KR300_SET, _kr300("C")),
+    "ur5e_motion": Source(
+        "MingyuTang0728/Universal-Robots-Notts",
+        "3bfbff1de97d4b82fdbc0203a44d85b33b3dd2fa", _ur5e_motion),
 }  # fmt: skip
 
 

@@ -84,8 +84,8 @@ def tracking_left(fitted: Table, judged: Table) -> Array:
 
 def _following(table: Table, delay: Array) -> tuple[Array, Array]:
     """Return actual minus delayed target (N, n), and the delayed target's speed."""
-    time, target = table.time, _needed(table, "target_q")
-    actual = _needed(table, "actual_q")
+    time, first = np.unique(table.time, return_index=True)  # a log may repeat a row's time
+    target, actual = _needed(table, "target_q")[first], _needed(table, "actual_q")[first]
     wanted, speed = np.empty_like(target), np.empty_like(target)
     rate = np.gradient(target, time, axis=0)
     for j in range(target.shape[1]):

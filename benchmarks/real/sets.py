@@ -28,6 +28,8 @@ SPLIT = {
     "force_sensor_100": TUNE,
     "ur10e_12harmonics": TUNE, "ur10e_50s": TUNE, "ur10e_8harmonics": TUNE,
     "ur10e_point_to_point": HELD_BACK, "rad_ur3e_rtde": TUNE, "panda": TUNE,
+    "ur5e_motion": TUNE, "tx40": TUNE,
+    "kr300_a": HELD_BACK, "kr300_b": HELD_BACK, "kr300_c": HELD_BACK,
 }  # fmt: skip
 PUBLISHED = {
     "tsinghua_ur5_grid > tsinghua_ur5_random": Published(0.1549e-3, "hybrid MDH and ASTGCN"),
@@ -38,6 +40,7 @@ CARRIED = (
     ("ipa_ur10_a", "ipa_ur10_b"), ("ipa_ur10_a", "ur10_c"), ("ipa_ur10_a", "ur10_d"),
     ("tsinghua_ur5_grid", "tsinghua_ur5_random"), ("barrett_wam_grid", "barrett_wam_random"),
     ("ur10e_12harmonics", "ur10e_50s"), ("ur10e_12harmonics", "ur10e_point_to_point"),
+    ("kr300_a", "kr300_b"),
 )  # fmt: skip
 REMOUNTED = {"iiwa_three_loads"}  # logs whose sessions have a tool point of their own
 """Sets whose sessions were measured with the tool mounted anew."""

@@ -1,4 +1,9 @@
-"""Held-out gaps: what a set of terms is worth on samples that its fit did not see."""
+"""Held-out gaps: what a set of terms is worth on samples that its fit did not see.
+
+Where every joint is a coordinate with a noise of its own (torques, following errors), a cause is
+judged with each joint weighed by its floor, as a wrench's torques are: what a wrist of 0.1 Nm shows
+twenty times over would else be lost in the noise of a shoulder of 10 Nm.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +25,7 @@ TINY = 1e-13  # eigenvalue of unit columns below which a direction is none
 class Shrink:
     """How far a gap shrinks once terms are in the model, on held-out samples."""
 
-    gap_without: float  # rms per coordinate, others kept in
+    gap_without: float  # rms per coordinate, others kept in, each joint weighed by its floor
     gap_with: float
     shrink: float
     interval: tuple[float, float]  # 95 %, over conditions
@@ -43,6 +48,7 @@ class HeldOut:
         # torques of a wrench count in N, as their noise compares: a cause may show in them alone
         self._weight = selection.observation.weight[: min(own, k)]
         self._unwhiten = selection.unwhitener()
+        self._level = _level(selection)[: min(own, k)]
         self._k, self._own = k, min(own, k)
         names, group = np.unique(selection.observation.groups[selection.kept], return_inverse=True)
         self._group, self._groups = group, len(names)
@@ -58,11 +64,18 @@ class HeldOut:
 
     def squares(self, chosen: Sequence[int]) -> Array:
         """Return the mean square of each held-out sample's own coordinates (n,), channel unit."""
+        return np.asarray(np.mean(self._gap(chosen) ** 2, axis=1))
+
+    def _levelled(self, chosen: Sequence[int]) -> Array:
+        """Return the same (n,) with each joint weighed by its floor."""
+        return np.asarray(np.mean((self._gap(chosen) * self._level) ** 2, axis=1))
+
+    def _gap(self, chosen: Sequence[int]) -> Array:
+        """Return each held-out sample's own coordinates (n, own), channel unit."""
         key = tuple(sorted(chosen))
         if key not in self._known:
             left = self._left(key).reshape(-1, self._k, 1)
-            gap = (self._unwhiten @ left)[:, : self._own, 0] * self._weight
-            self._known[key] = np.mean(gap**2, axis=1)
+            self._known[key] = (self._unwhiten @ left)[:, : self._own, 0] * self._weight
         return self._known[key]
 
     def rms(self, chosen: Sequence[int]) -> float:
@@ -88,7 +101,7 @@ class HeldOut:
 
     def shrink(self, with_set: Sequence[int], without_set: Sequence[int]) -> Shrink:
         """Return how far the gap shrinks from one set to another, with its interval."""
-        after, before = self.squares(with_set), self.squares(without_set)
+        after, before = self._levelled(with_set), self._levelled(without_set)
         totals = np.zeros((2, self._groups))
         np.add.at(totals[0], self._group, after)
         np.add.at(totals[1], self._group, before)
@@ -97,8 +110,20 @@ class HeldOut:
         sums = totals[:, draw].sum(axis=2)
         ratio = 1 - np.sqrt(sums[0] / np.maximum(sums[1], 1e-300))
         low, high = np.quantile(ratio, [0.025, 0.975])
-        gap_with, gap_without = self.rms(with_set), self.rms(without_set)
+        gap_with, gap_without = (float(np.sqrt(np.mean(s))) for s in (after, before))
         return Shrink(
             gap_without, gap_with, 1 - gap_with / max(gap_without, 1e-300),
             (float(low), float(high)),
         )  # fmt: skip
+
+
+def _level(selection: Selection) -> Array:
+    """Return the weight (k,) of each coordinate: joints by their floors, so that noise stays as is.
+
+    One for coordinates that share one noise, and of a wrench, which has its own weights.
+    """
+    k = selection.observation.measured.shape[1]
+    sigma = selection.noise.block_sigma
+    if len(sigma) < k:
+        return np.ones(k)
+    return np.asarray(np.sqrt(np.mean(sigma**2)) / sigma)

@@ -44,6 +44,7 @@ from gapbridge.core.diagnosis.residual_structure import (
     structure_p_value,
 )
 from gapbridge.core.diagnosis.selection.candidate import Candidate
+from gapbridge.core.diagnosis.selection.following import delayed_by
 from gapbridge.core.diagnosis.selection.local_search import rivals
 from gapbridge.core.diagnosis.selection.problem import CandidateFit, SampleSpace
 from gapbridge.core.diagnosis.selection.refit import Remainder, worth
@@ -342,8 +343,13 @@ def pure_error(left: Array, groups: NDArray[np.int64]) -> tuple[float, int]:
 def ties_of(
     space: SampleSpace, found: CandidateFit, accused: Sequence[int]
 ) -> dict[int, tuple[str, ...]]:
-    """Return the effects that would do as well as each accused one, at its place."""
+    """Return the effects that would do as well as each accused one, at its place.
+
+    Another delay has to do so at all joints: they have one effect together.
+    """
     listed: dict[int, tuple[str, ...]] = {}
+    delayed = delayed_by(space, found)
+    as_well = {name for name, f in delayed.items() if f.score <= found.score + TIE_SCORE}
     for c in accused:
         own = space.candidates[c].family
         near = [other for _, other in rivals(space, found, c, TIE_SCORE)]
@@ -351,6 +357,8 @@ def ties_of(
         for other in [*near, *covering_effects(space, found, c)]:
             family = space.candidates[other].family
             if not space.candidates[other].named or family in (own, *names):
+                continue
+            if delayed and space.candidates[other].effect.delays and family not in as_well:
                 continue
             if space.candidates[other].effect.contains != own:  # a curve holds its line: no rival
                 names.append(family)

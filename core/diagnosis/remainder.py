@@ -29,6 +29,7 @@ from gapbridge.core.diagnosis.observation import Observation
 from gapbridge.core.diagnosis.regions import parts, regions
 from gapbridge.core.diagnosis.residual_structure import basis_of
 from gapbridge.core.diagnosis.selection.candidate import Candidate, carrying, joint_target
+from gapbridge.core.diagnosis.selection.following import as_one_delay
 from gapbridge.core.diagnosis.selection.problem import gains
 from gapbridge.core.diagnosis.selection.refit import Remainder
 from gapbridge.core.diagnosis.selection.selection import Selection
@@ -254,6 +255,7 @@ class _Beside:
         """Return values of unit columns, their covariance with scatter, and which are shown.
 
         The scatter is a jackknife over parts of the log: what only imitates differs among them.
+        Of delays each joint's stands beside the others'.
         """
         known = np.isfinite(sigma)
         prior = np.diag(1 / np.maximum(sigma, 1e-300))[known]  # rows that every part holds
@@ -279,7 +281,19 @@ class _Beside:
         without = np.array([solved(part != p)[0] for p in np.unique(self._part)])
         away = without - without.mean(axis=0)
         scatter = (len(without) - 1) / len(without) * away.T @ away
-        return value, inverse * max(rss / freedom, self.space.floor) + scatter, taken < SHOWN
+        spread, shown = inverse * max(rss / freedom, self.space.floor) + scatter, taken < SHOWN
+        candidates = [self.space.candidates[c] for c in accused]
+        begin = np.cumsum([0, *(len(k.parameters) for k in candidates)])
+        late = np.array(
+            [b for b, k in zip(begin, candidates, strict=False) if k.effect.delays], dtype=np.int64
+        )
+        length = np.linalg.norm(self.space.columns([c for c, k in zip(
+            accused, candidates, strict=True) if k.effect.delays]), axis=0)  # fmt: skip
+        known = np.where(shown[late], np.diag(spread)[late], np.inf)
+        x, variance = as_one_delay(value[late] / length, known / length**2)
+        value[late], shown[late] = x * length, np.isfinite(variance)
+        spread[late, late] = np.where(shown[late], variance * length**2, spread[late, late])
+        return value, spread, shown
 
     def beside_refit(self, accused: Sequence[int]) -> Remainder:
         """Return what stands beside the accused in their last refit."""

@@ -13,6 +13,7 @@ from gapbridge.core.arm import Arm
 from gapbridge.core.diagnosis.criteria import OWN_SIGMAS, PRIOR_REACH
 from gapbridge.core.diagnosis.observation import Observation
 from gapbridge.core.diagnosis.selection.candidate import Candidate, angle_columns
+from gapbridge.core.diagnosis.selection.following import as_one_delay
 from gapbridge.core.diagnosis.selection.problem import CandidateFit, SampleSpace
 from gapbridge.core.diagnosis.selection.state import SelectionState, flat
 from gapbridge.core.effects import Term
@@ -101,6 +102,7 @@ def refit(
     whole, right = np.vstack([A, pull]) * unit, np.concatenate([b, towards])
     region = None if remainder is None or not len(index) else remainder.region
     covariance = _covariances(whole, right, unit, variance, sizes, region)
+    x, covariance = _as_one_delay([freed[c] for c in index], x, covariance)
     terms = tuple(freed[c].term(v) for c, v in zip(index, x, strict=True))
     gap = state.observation.measured - state.observation.predict(terms)
     nuisance = state.observation.nuisance
@@ -150,7 +152,21 @@ def step_on(
     ]
     left = float(np.sum((rows.b - rows.A @ step) ** 2))
     variance = max(left / max(rows.count - rows.A.shape[1], 1), floor)
-    return values, _covariances(whole * unit, right, unit, variance, sizes, rows.region)
+    spread = _covariances(whole * unit, right, unit, variance, sizes, rows.region)
+    return _as_one_delay(freed, values, spread)
+
+
+def _as_one_delay(
+    freed: list[Candidate], x: list[Array], covariance: list[Array]
+) -> tuple[list[Array], list[Array]]:
+    """Return values (d,) and covariances (d, d) of terms, delays known by those of other joints."""
+    late = [k for k, c in enumerate(freed) if c.effect.delays]
+    variances = np.array([covariance[k][0, 0] for k in late])
+    values, variances = as_one_delay(np.array([x[k][0] for k in late]), variances)
+    x, covariance = list(x), list(covariance)
+    for k, value, own in zip(late, values, variances, strict=True):
+        x[k], covariance[k] = np.array([value]), np.array([[own]])
+    return x, covariance
 
 
 def _covariances(

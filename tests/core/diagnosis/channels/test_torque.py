@@ -286,3 +286,42 @@ def test_friction_of_all_joints_goes_with_the_links_and_each_that_is_named_is_su
     rub = {t.site.joint: t.values[0] for t in causes["coulomb_friction"].terms}
     assert [rub[j + 1] for j in range(N)] == pytest.approx(0.1 * FRICTION, abs=0.06)
     assert channel.remaining_rms_held_out < 1.02 * NOISE
+
+
+def test_a_wrists_cause_counts_against_the_wrists_noise(plant, recorded, monkeypatch):
+    """A centre of gravity 2 mm off: far above the wrist's noise, far below the shoulder's."""
+    t, q, qd, qdd, _ = recorded
+    model = plant.model(2.0)
+    monkeypatch.setattr(truth, "COG", truth.COG + np.array([2e-3, -1e-3, 1e-3]))
+    noise = np.array([10.0, 10.0, 5.0, 0.03, 0.03, 0.01])
+    rng = np.random.default_rng(4)
+    torque = plant.dynamics(q, qd, qdd, payload=2.0)[0] + rng.normal(0, noise, q.shape)
+    log = truth.log_of(
+        N, timestamp=t, actual_q=q, actual_qd=qd, actual_current_as_torque=torque
+    )  # fmt: skip
+    (channel,) = [c for c in diagnose(model, log, METROLOGY).channels if c.channel == "torque"]
+    (cause,) = channel.causes
+    assert cause.effect == "payload_cog"
+    assert cause.shrink.interval[0] > 0.1
+    assert cause.shrink.gap_with == pytest.approx(channel.remaining_rms_held_out, rel=0.05)
+    assert channel.gap_rms == pytest.approx(channel.remaining_rms, rel=1e-3)  # over all joints
+
+
+def test_a_light_links_shift_is_not_the_loads(plant, recorded, monkeypatch):
+    """Both are the same first moment; the moments of inertia go with the square of the shift."""
+    _, q, qd, qdd, _ = recorded
+    nominal = type(plant).pinocchio
+
+    def shifted(self, *arguments, **more):
+        model = nominal(self, *arguments, **more)
+        old = model.inertias[N]
+        lever = old.lever + np.array([0.1, -0.05, 0.05])
+        model.inertias[N] = pin.Inertia(old.mass, lever, old.inertia)
+        return model
+
+    monkeypatch.setattr(type(plant), "pinocchio", shifted)
+    torque = plant.dynamics(q, qd, qdd, payload=10.0)[0]
+    log = log_of(recorded, torque + np.random.default_rng(1).normal(0, 0.01, q.shape))
+    found = diagnose(plant.model(10.0), log, METROLOGY)
+    (channel,) = [c for c in found.channels if c.channel == "torque"]
+    assert [(c.effect, c.joints) for c in channel.causes] == [("link_cog", (N,))]

@@ -134,3 +134,30 @@ def test_a_delay_is_not_taken_for_a_lag_nor_a_lag_for_a_delay(effect):
     assert (cause.effect, cause.joints, cause.indistinguishable_from) == (effect, (3,), ())
     assert found.verdict == "explained"
     assert cause.parameters[0].value == pytest.approx(late, rel=0.01)
+
+
+def test_the_one_delay_of_a_controller_holds_at_a_joint_that_another_shakes():
+    """Joint 6 swings as joint 3 accelerates, thirty times as far as a delay of its own differs."""
+    t = times(125)
+    actual = COURSE.at(t - 0.012)
+    shaken = COURSE.at(t, 2)[:, 2] * np.cos(2 * COURSE.at(t)[:, 5])
+    actual[:, 5] += 0.02 * shaken / shaken.std()
+    found = diagnose(MODEL, log_of(actual, COURSE.at(t), t), METROLOGY)
+    (channel,) = [c for c in found.channels if c.channel == "tracking"]
+    (cause,) = channel.causes
+    assert (cause.effect, cause.joints) == ("latency", (1, 2, 3, 4, 5, 6))
+    value = {p.name: (p.value, p.std) for p in cause.parameters}
+    assert value["latency_6"][0] == pytest.approx(0.012, rel=0.1)
+    assert value["latency_6"][1] > 100 * value["latency_1"][1]
+    assert cause.indistinguishable_from == ()
+    assert channel.structured
+
+
+def test_delays_that_differ_are_each_joints_own():
+    t = times(125)
+    late = np.array([0.004, 0.009, 0.014, 0.02, 0.027, 0.035])
+    actual = np.column_stack([COURSE.at(t - late[j])[:, j] for j in range(N)])
+    found = diagnose(MODEL, log_of(actual, COURSE.at(t), t), METROLOGY)
+    (channel,) = [c for c in found.channels if c.channel == "tracking"]
+    (cause,) = channel.causes
+    assert [p.value for p in cause.parameters] == pytest.approx(list(late), rel=1e-2)
