@@ -32,7 +32,7 @@ class TorqueConstant(JointEffect):
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return the relative increase."""
-        return (Parameter("", "", 0.05, -0.95, 10.0),)
+        return (Parameter("", "", 0.05, -0.8, 1.0),)
 
     def drive(
         self, term: Term, arm: Arm, torque: NDArray[np.float64], motion: Motion
