@@ -119,11 +119,16 @@ class SimulatedLink(ABC):
 
     # -- what the client sees ---------------------------------------------------------------------
 
-    def see(self, fresh: tuple[float, Sequence[float], Sequence[float], bool]) -> None:
-        """Report a state that has reached the client: controller's clock, joints, target, safe."""
+    def see(
+        self, fresh: tuple[float, Sequence[float], Sequence[float], bool], bare: bool = False
+    ) -> None:
+        """Report a state that has reached the client: controller's clock, joints, target, safe.
+
+        ``bare``: the robot's program says in it that it applies no offset.
+        """
         stamp, q, target, safe = fresh
-        state = self.supervisor_state()
-        self.saw(Fresh(self.world.now, stamp, tuple(q), tuple(target), safe, True, state))
+        now, state = self.world.now, self.supervisor_state()
+        self.saw(Fresh(now, stamp, tuple(q), tuple(target), safe, True, state, bare=bare))
 
     def wrote(self, kind: Any, values: Numbers, where: str) -> None:
         """Report a write that leaves the client. Raises KilledError where that is dead."""

@@ -217,6 +217,12 @@ class ModbusLink(SimulatedLink):
         values = [table.get(a, 0) & 0xFFFF for a in range(first, first + count)]
         return struct.pack(f">BB{count}H", function, 2 * count, *values)
 
+    def _answers_bare(self) -> bool:
+        """Return whether the program says in the last image that it applies no offset."""
+        box: Any = self.server.profile.write
+        table, first = self.server._image[box.echo_table], box.echo_address + 2
+        return not any(table[first + i] for i in range(6))
+
     def _on_down(self, message: tuple[int, int, bytes, float]) -> None:
         number, generation, answer, sampled = message
         if self.waiting is None or generation != self.generation:
@@ -226,7 +232,7 @@ class ModbusLink(SimulatedLink):
         controller = self.controller
         if answer[:1] in (b"\x03", b"\x17"):
             safe = controller.can_move
-            self.see((math.nan, controller.q, controller.target_q, safe))
+            self.see((math.nan, controller.q, controller.target_q, safe), self._answers_bare())
         requests.take(number, answer)
         process.wake()
 

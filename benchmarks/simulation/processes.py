@@ -29,7 +29,7 @@ from gapbridge.core.state import RobotState
 from gapbridge.drivers.driver import Driver
 
 Vector = NDArray[np.float64]
-STARTING = (0.05, 0.3)  # s that a process takes until it runs
+STARTING = (0.02, 0.15)  # s that a process takes until it runs
 KILLED = -9
 COMPUTING = 1e-4  # s: of a cycle
 PLANNED, PLANNED_JOINT = 0.02, 0  # s between two setpoints of the planner; what it moves

@@ -28,6 +28,7 @@ CALM, SPAN, REST = 0.3, 0.8, 0.3  # s: until faults begin; over what time they a
 RECOVERY = 25.0  # s until a healed run compensates again
 ENDING = 8.0  # s until a stopped run is over
 LOOK = 0.02  # s
+ASKING = 0.1  # s between two attempts to arm again
 Plan = list[tuple[float, Fault]]
 
 
@@ -189,7 +190,7 @@ class Person(Process):
         for compensator in compensators:
             compensator.__dict__.pop("correct", None)
         while self.world.now < until and not self._over:
-            self.sleep(0.3)
+            self.sleep(ASKING)
             if run.daemon.state == State.COMPENSATING:
                 return
             run.link.heal()

@@ -31,7 +31,7 @@ from gapbridge.drivers.simulated.ur.programs.offset_program import (
 from gapbridge.drivers.ur_rtde import command, registers
 from gapbridge.drivers.ur_rtde.driver import UrRtdeDriver
 
-UPLOAD = 0.25  # s that uploading a script takes
+UPLOAD = 0.1  # s that uploading a script takes
 DEAD_AFTER = 0.3  # s of a broken connection until the library says so
 GETTERS = {
     "getActualQ": "actual_q", "getActualQd": "actual_qd", "getTargetQ": "target_q",
@@ -249,7 +249,8 @@ class UrLink(SimulatedLink):
         safe = packet["safety_mode"] in (1, 2) and packet["robot_mode"] == 7
         q = packet["actual_q"]
         if all(map(math.isfinite, q)):
-            self.see((packet["timestamp"], q, packet["target_q"], safe))
+            bare = self.offsets and not any(packet["doubles"].values())
+            self.see((packet["timestamp"], q, packet["target_q"], safe), bare)
 
     def _on_up(self, message: tuple[str, Any]) -> None:
         kind, value = message

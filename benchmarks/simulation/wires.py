@@ -56,10 +56,10 @@ class Wire(Generic[Message]):
             message = self.change(message)
         times = 2 if self.doubled and world.random.random() < self.doubled else 1
         for _ in range(times):
-            at = max(world.now, self.held_until) + self.delay
-            at += world.random.uniform(0.0, self.jitter)
+            now, held = world.now, self.held_until
+            at = (now if now > held else held) + self.delay + self.jitter * world.random.random()
             if self._ordered:
-                at = self._newest = max(at, self._newest)
+                at = self._newest = at if at > self._newest else self._newest
             world.at(at, partial(self._arrive, message, self._generation))
 
     def _arrive(self, message: Message, generation: int) -> None:

@@ -44,7 +44,8 @@ class World:
 
     def at(self, time: float, act: Callable[[], None]) -> None:
         """Have something happen at a time (s), now at the earliest."""
-        heapq.heappush(self._events, (max(time, self.now), next(self._order), act))
+        now = self.now
+        heapq.heappush(self._events, (time if time > now else now, next(self._order), act))
 
     def after(self, seconds: float, act: Callable[[], None]) -> None:
         """Have something happen in so many seconds."""
@@ -74,7 +75,8 @@ class World:
         """Let time pass where nothing happens before ``time`` (s); return whether it has."""
         if time > self._until or (self._events and self._events[0][0] <= time):
             return False
-        self.now = max(self.now, time)
+        if time > self.now:
+            self.now = time
         return True
 
     def end(self) -> None:
@@ -208,7 +210,7 @@ class SimulatedClock(Clock):
         process = self.world.current
         assert process is not None, "only processes wait"
         late = -SLACK * math.log(1.0 - self.world.random.random())
-        process.sleep(max(seconds, 0.0) + late)
+        process.sleep(seconds + late if seconds > 0.0 else late)
 
     def wait(self, event: threading.Event, seconds: float) -> bool:
         """Wait until an event is set, ``seconds`` at most; return whether it is."""

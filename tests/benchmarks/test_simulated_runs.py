@@ -102,6 +102,13 @@ def test_a_disarm_from_before_a_fault_does_not_acknowledge_it() -> None:
     assert not [str(o) for seed in range(12) if (o := run(seed, plan=plan)).violations]
 
 
+def test_a_program_that_applies_nothing_after_a_stop_may_be_armed_at_once() -> None:
+    """Seed 498: the robot had said so, and who judged counted on the offset's withdrawal."""
+    plan = [(0.75, "emergency stop")]
+    found = [run(seed, plan=plan) for seed in range(MODBUS, MODBUS + 20, len(LINKS))]
+    assert not [str(outcome) for outcome in found if outcome.violations]
+
+
 # -- each of the list is found where the product is broken -----------------------------------------
 
 
