@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from gapbridge.core.effects import CATALOGUE, settling
 from gapbridge.core.kernels import reference as kernel
 from gapbridge.core.kernels import single
+from gapbridge.core.kernels.correction import correct_blocks
 from gapbridge.core.kernels.least_offset import LARGEST_OFFSET as LARGEST_OFFSET
 from gapbridge.core.kernels.least_offset import smallest_offset
 from gapbridge.core.kernels.packed import (
@@ -32,10 +33,12 @@ from gapbridge.core.kernels.packed import (
 )
 from gapbridge.core.kernels.reference import JIT, Chain
 from gapbridge.core.kernels.single import LEVER, MAX_STEPS, SCRATCH, TOLERANCE
+from gapbridge.core.kernels.threads import in_ranges
 from gapbridge.core.loads import Loads
 from gapbridge.core.model import Model, Poses
 
 Array = NDArray[np.float64]
+Steps = NDArray[np.int64]
 NOTHING = Loads()
 LEADS = 2  # times that a servo's rest is looked at for the command that leads there
 
@@ -49,7 +52,7 @@ class Correction(NamedTuple):
     q: Array  # (N, n) rad
     offset_in_base: Array  # (N, 6) m, rad: rigid TCP pose at q minus that at nominal_q
     residual: Array | float  # (N,) m: distance of predicted and wanted pose (rotation x lever)
-    steps: NDArray[np.int64] | int  # (N,) Newton steps taken
+    steps: Steps | int  # (N,) Newton steps taken
 
 
 @njit(**JIT)
@@ -220,25 +223,40 @@ class Compensator:
         return Correction(q, moved, best, steps)
 
     def correct_rows(self, nominal_q: Array, loads: Loads) -> Correction:
-        """Return the corrected setpoints for ``nominal_q`` (N, n): ``correct``, row after row."""
+        """Return the corrected setpoints for ``nominal_q`` (N, n), as ``correct`` does."""
         n, count = self._n, len(nominal_q)
         nominal = np.ascontiguousarray(nominal_q, dtype=float)
         found, residual = np.empty((count, n + 6)), np.empty(count)
         steps = np.empty(count, dtype=np.int64)
         if self._plain:
-            given = (loads.payload_mass, loads.payload_cog, loads.wrench)
-            own = (self._mass, self._cog, self._wrench)
-            acting = [
-                o if g is None else np.ascontiguousarray(g, dtype=float)
-                for g, o in zip(given, own, strict=True)
-            ]
-            single.correct_rows(self._block, nominal, *acting, found, residual, steps)
+            self._plain_rows(nominal, loads, found, residual, steps)
         else:
             for r in range(count):
                 one = self.correct(nominal[r], loads[r : r + 1])
                 found[r, :n], found[r, n:] = one.q, one.offset_in_base
                 residual[r], steps[r] = one.residual, one.steps
         return Correction(found[:, :n], found[:, n:], residual, steps)
+
+    def _plain_rows(
+        self, nominal: Array, loads: Loads, found: Array, residual: Array, steps: Steps
+    ) -> None:
+        """Write the corrections of rows that nothing but the chain's bending changes.
+
+        In blocks; then, one after the other, those that the blocks leave: near singularities.
+        """
+        rows, chain = self.model.rows(nominal, loads), self.model.chain()
+        rigid = self.model.without_terms().chain()
+
+        def work(first: int, last: int) -> None:
+            correct_blocks(chain, rigid, rows, first, last, found, residual, steps)
+
+        in_ranges(work, len(nominal))
+        left = np.flatnonzero(steps == 0)
+        if len(left):
+            some = [part[left] for part in (*rows[:1], *rows[2:], found, residual, steps)]
+            single.correct_rows(self._block, *some)
+            for part, values in zip((found, residual, steps), some[-3:], strict=True):
+                part[left] = values
 
     def forget(self) -> None:
         """Begin the next correction from nothing, whatever was solved last."""
@@ -287,7 +305,7 @@ class Compensator:
 
 
 def correct(model: Model, nominal_q: Array, loads: Loads | None = None) -> Correction:
-    """Return the corrected setpoints of many rows (N, n): ``Compensator.correct`` row by row."""
+    """Return the corrected setpoints of many rows (N, n), as ``Compensator.correct`` does."""
     q = np.atleast_2d(np.asarray(nominal_q, dtype=float))
     # what slipped once has slipped: setpoints are for what comes
     return Compensator(model).correct_rows(q, replace(loads or Loads(), time=None))

@@ -17,7 +17,7 @@ from gapbridge.core.model import Model, Poses
 
 Array = NDArray[np.float64]
 STEP = 1e-3  # share of a parameter's usual size, where a derivative of the TCP is a difference
-CONVERGED = 1e-7  # m/rad: a standard deviation need not be known better
+CONVERGED = 1e-2  # m/rad: the next round would change a standard deviation by some 1e-5 of it
 BLOCK = 20_000  # rows at a time, so that memory does not grow with them
 FEW = 2048  # the same of products with the covariance
 

@@ -25,6 +25,7 @@ from gapbridge.core.estimation.compliance_fit import (
     orthonormal,
     placed_gap,
     prior_of,
+    r_factor,
     residual,
 )
 from gapbridge.core.estimation.regions import joint_regions
@@ -171,11 +172,13 @@ def require_excitation(model: Model, data: Data, metrology: Metrology, usual: fl
             f"found {len(data.q)} row(s) with measured positions, expected at least "
             f"{-(-unknown // 3)} to fit the compliance"
         )
-    form = model.linear_form(data.q, data.loads).regressor[:, :3].reshape(-1, 2 * n)
+    columns = [model.linear_form(data.q, data.loads).regressor[:, :3]]
     if data.nuisances:
         poses = model.predict(data.q, data.loads)
-        Q = orthonormal(nuisance_columns(model, poses, 3, data).reshape(len(form), -1))
-        form = form - Q @ (Q.T @ form)
+        columns.insert(0, nuisance_columns(model, poses, 3, data))
+    R = r_factor(np.concatenate(columns, axis=2).reshape(3 * len(data.q), -1))
+    Q = orthonormal(R[:, : -2 * n])
+    form = R[:, -2 * n :] - Q @ (Q.T @ R[:, -2 * n :])
     shown = np.linalg.norm(form, axis=0) * usual
     if not (shown > 3 * metrology.sigma).any():
         weightless = not model.arm.mass.any() and data.loads.wrench is None
@@ -188,10 +191,10 @@ def require_excitation(model: Model, data: Data, metrology: Metrology, usual: fl
             f"nothing in the log excites the compliance: {reason}; expected poses under different "
             "payloads (payload) or pulls (actual_TCP_force)"
         )
-    if len(form) - data.nuisances <= 2 * n:
+    if 3 * len(data.q) - data.nuisances <= 2 * n:
         size = np.linalg.svd(form, compute_uv=False) * usual
         determined = int((size > 3 * metrology.sigma).sum())
-        if len(form) - data.nuisances <= determined:
+        if 3 * len(data.q) - data.nuisances <= determined:
             raise ExcitationError(
                 f"found {len(data.q)} row(s) with measured positions for {determined} "
                 "flexibilities that they bend: nothing is left by which a fit could be judged; "

@@ -38,11 +38,13 @@ from gapbridge.core.estimation.identification import (
 from gapbridge.core.estimation.row_store import RowStore
 from gapbridge.core.estimation.streamed_fit import (
     FOLDS,
+    INLIER,
     NONE,
+    Pass,
     Piece,
     Stream,
-    factors,
     joined,
+    passed,
     placed,
     scale_of,
     stretches,
@@ -57,18 +59,24 @@ Rows = NDArray[np.int64]
 SAMPLE = 20_000  # rows kept at most, for the first guess and the look whether anything bends
 MANY_OUTLIERS = 100_000  # rows that are named at most
 ENOUGH = 0.2  # sigmas of a last step, which leaves some percent of itself, with many rows
-INLIER = 1e-6  # weight below which a row counts as an outlier
+NEAR = 1e-3  # relative step on the sample, which is only where the passes over all rows begin
 
 
 @dataclass(frozen=True)
 class _Task:
     prior: tuple[Array, float]
 
-    def on_sample(self, before: Fit, sample: Data) -> Fit:
+    def on_sample(self, before: Fit, stream: Stream) -> Fit:
         """Fit everything on the rows of the sample: where the passes over all rows begin."""
+        now, sample = before, stream.of_sample()
         everything = np.ones(len(self.prior[0]), dtype=bool)
-        fit = compliance_fit.fit_flexibilities(before, sample, everything, self.prior)
-        return Fit(fit.model, fit.frame, NONE)
+        for _ in range(ROUNDS):
+            R = joined(passed(now, scale_of(now, stream.sample), sample).factors)
+            base, now = now, self.step(now, R, stream.nuisances, everything)[0]
+            change = np.abs(now.flexibility - base.flexibility).max()
+            if change < NEAR * max(np.abs(now.flexibility).max(), 1e-12):
+                break
+        return now
 
     def run(self, begin: Fit, stream: Stream) -> _Found:
         """Choose what all rows show, and fit that alone.
@@ -80,8 +88,8 @@ class _Task:
         kept: Mask | None = None
         for _ in range(ROUNDS):
             noise = scale_of(now, stream.sample)
-            parts = factors(now, noise, stream)
-            found, kept, linear = self.step(now, joined(parts), stream.nuisances, kept)
+            rows = passed(now, noise, stream)
+            found, kept, linear = self.step(now, joined(rows.factors), stream.nuisances, kept)
             change = np.abs(found.flexibility - now.flexibility)
             base, now = now, found
             if change.max() < CONVERGED * max(np.abs(now.flexibility).max(), 1e-12):
@@ -90,7 +98,7 @@ class _Task:
                 break
         assert kept is not None
         shown = base_parameters.what_is_shown(linear, kept, self.prior[1])
-        return _Found(now, noise, base, parts, shown)
+        return _Found(now, noise, base, rows, shown)
 
     def step(
         self, at: Fit, R: Array, nuisances: int, kept: Mask | None = None
@@ -129,7 +137,7 @@ class _Found:
     fit: Fit
     noise: Array  # (2,) m, rad
     base: Fit  # one step before
-    parts: Array  # (FOLDS, k, k) R factors of each fold's rows at its shape
+    rows: Pass  # at its shape
     shown: base_parameters.Shown
 
 
@@ -153,9 +161,9 @@ def identify_streamed(
     task = _Task(prior)
     emit("fitting")
     before = _nuisances_alone(model, stream.sample)
-    found = task.run(task.on_sample(before, stream.sample), stream)
+    found = task.run(task.on_sample(before, stream), stream)
     emit("checking on held-out rows")
-    return _result(model, stream, before, found, _held_out(model, stream, task, found))
+    return _result(model, stream, before, found, _held_out(stream, task, before, found))
 
 
 def _nuisances_alone(model: Model, rows: Data) -> Fit:
@@ -193,7 +201,8 @@ def _stream(log: Iterable[Log], metrology: Metrology, model: Model) -> Stream:
     width = 3 if sample.rotation is None else 6
 
     def pieces() -> Iterator[Piece]:
-        return (Piece(data, rows) for data, rows in store)
+        for number, (data, rows) in enumerate(store):
+            yield Piece(data, rows, tuple(stretches(number, len(rows))))
 
     fold = np.concatenate(folds)
     return Stream(pieces, sample, fold, store.count, width, sample.nuisances)
@@ -219,22 +228,24 @@ def _joined(parts: list[Data]) -> Data:
     )
 
 
-def _held_out(model: Model, stream: Stream, task: _Task, found: _Found) -> tuple[float, float]:
+def _held_out(stream: Stream, task: _Task, before: Fit, found: _Found) -> tuple[float, float]:
     """Return the rms before and after over the sample's inliers that each fit did not see.
 
     Fits without a fold are one step from the fit to all rows, whose shape and weights they share.
     """
-    sums, cells = np.zeros(2), 0
+    sums, cells, nuisances = np.zeros(2), 0, stream.nuisances
     gap = residual(found.fit.model, stream.sample, found.fit.frame)[0]
     inlier = weights_at(gap, found.noise) > INLIER
+    placing = passed(before, scale_of(before, stream.sample), stream.of_sample()).factors
     for k in range(FOLDS):
-        rest, unseen = stream.fold != k, (stream.fold == k) & inlier
-        if not rest.any() or not unseen.any():
+        unseen = (stream.fold == k) & inlier
+        if not (stream.fold != k).any() or not unseen.any():
             continue
-        others = joined(np.delete(found.parts, k, axis=0))
+        R = joined(np.delete(placing, k, axis=0))
+        others = joined(np.delete(found.rows.factors, k, axis=0))
         fits = (
-            _nuisances_alone(model, stream.sample.part(rest)),
-            task.step(found.base, others, stream.nuisances)[0],
+            placed(before, R[:, -1], R[:, :nuisances]),
+            task.step(found.base, others, nuisances)[0],
         )
         judged = stream.sample.part(unseen)
         gaps = [residual(fit.model, judged, fit.frame)[0][:, :3] for fit in fits]
@@ -249,17 +260,18 @@ def _result(
 ) -> Identification:
     n, shown, after = model.arm.n, found.shown, found.fit
     kept = shown.kept
-    sums, inlier_cells, outliers = np.zeros(2), 0, list[Rows]()
-    for piece in stream.pieces():
-        gaps = [residual(one.model, piece.data, one.frame)[0] for one in (before, after)]
-        inlier = weights_at(gaps[1], found.noise) > INLIER
-        sums += [float(np.sum(gap[inlier, :3] ** 2)) for gap in gaps]
-        inlier_cells += 3 * int(inlier.sum())
+    # the last step is too small to be seen in what is left before it
+    square, inlier_rows, outliers = 0.0, 0, list[Rows]()
+    for piece, inlier in zip(stream.pieces(), found.rows.inlier, strict=True):
+        gap = residual(before.model, piece.data, before.frame)[0]
+        square += float(np.sum(gap[inlier, :3] ** 2))
+        inlier_rows += int(inlier.sum())
         outliers.append(piece.rows[~inlier])
     spent = np.array([stream.nuisances, stream.nuisances + int(kept.sum())])
-    gap_rms, remaining_rms = np.sqrt(sums / np.maximum(inlier_cells - spent, 1))
+    sums = np.array([square, found.rows.square])
+    gap_rms, remaining_rms = np.sqrt(sums / np.maximum(3 * inlier_rows - spent, 1))
     std, flexibility = np.sqrt(np.diag(shown.covariance)), after.flexibility
-    count = stream.count - inlier_cells // 3
+    count = stream.count - inlier_rows
     named = np.fromiter(islice((row for rows in outliers for row in rows), MANY_OUTLIERS), np.int64)
     return Identification(
         after.model, flexibility[:n], flexibility[n:], std[:n], std[n:], shown.covariance, kept,

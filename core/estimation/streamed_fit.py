@@ -8,7 +8,7 @@ What is noise and what an outlier the sample says, whose median stands for that 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,7 @@ from gapbridge.core.estimation.compliance_fit import (
     RANK,
     Data,
     Fit,
+    Mask,
     moved,
     noise_scale,
     nuisance_columns,
@@ -30,15 +31,26 @@ from gapbridge.core.model import Model
 
 Array = NDArray[np.float64]
 FOLDS = 5
+INLIER = 1e-6  # weight below which a row counts as an outlier
 NONE = np.zeros(0)  # weights of a fit whose rows nobody keeps
 
 
 @dataclass(frozen=True)
 class Piece:
-    """Some rows with measured poses, and where they stand in the log."""
+    """Some rows with measured poses, where they stand in the log, and in which folds."""
 
     data: Data
     rows: NDArray[np.int64]  # (k,) row in the log, from 0
+    folds: tuple[tuple[int, slice], ...]
+
+
+@dataclass(frozen=True)
+class Pass:
+    """What one pass over all rows has found at the shape of a fit."""
+
+    factors: Array  # (FOLDS, k, k) R factors of each fold's rows
+    inlier: list[Mask]  # piece by piece
+    square: float  # m2, sum over the inliers' gaps of position
 
 
 @dataclass(frozen=True)
@@ -51,6 +63,15 @@ class Stream:
     count: int  # rows with measured poses
     width: int  # numbers per row: 3, or 6 with rotations
     nuisances: int
+
+    def of_sample(self) -> Stream:
+        """Return the sample alone, a piece for each fold."""
+        rows = [np.flatnonzero(self.fold == k) for k in range(FOLDS)]
+        pieces = [
+            Piece(self.sample.part(own), own, ((k, slice(None)),))
+            for k, own in enumerate(rows) if len(own)
+        ]  # fmt: skip
+        return replace(self, pieces=lambda: iter(pieces), count=len(self.fold))
 
 
 def stretches(number: int, rows: int) -> Iterator[tuple[int, slice]]:
@@ -68,19 +89,22 @@ def scale_of(fit: Fit, sample: Data) -> Array:
     return noise_scale(float(np.median(gap[:, :3])), turned)
 
 
-def factors(fit: Fit, scale: Array, stream: Stream) -> Array:
-    """Return the R factors (FOLDS, k, k) of [nuisances | flexibilities | gap] of each fold's rows.
+def passed(fit: Fit, scale: Array, stream: Stream) -> Pass:
+    """Return the R factors of [nuisances | flexibilities | gap] of each fold's rows.
 
     Columns at the shape of ``fit``, rows weighed by the noise ``scale`` (2,).
     """
     k = stream.nuisances + 2 * fit.model.arm.n + 1
-    found = np.zeros((FOLDS, k, k))
-    for number, piece in enumerate(stream.pieces()):
+    found, inliers, square = np.zeros((FOLDS, k, k)), list[Mask](), 0.0
+    for piece in stream.pieces():
         gap, _ = residual(fit.model, piece.data, fit.frame)
-        cells = per_cell_of(weights_at(gap, scale), scale, stream.width)
-        for fold, rows in stretches(number, len(gap)):
+        weights = weights_at(gap, scale)
+        cells = per_cell_of(weights, scale, stream.width)
+        for fold, rows in piece.folds:
             add_rows(fit.model, piece.data.part(rows), gap[rows], cells[rows], found[fold])
-    return found
+        inliers.append(weights > INLIER)
+        square += float(np.sum(gap[inliers[-1], :3] ** 2))
+    return Pass(found, inliers, square)
 
 
 def placed(fit: Fit, left: Array, F: Array) -> Fit:

@@ -139,7 +139,7 @@ def factor_blocks(chain, rows, gap, per_cell, nuisances, first, last, R):  # typ
     X, cells = np.empty(columns * size), np.empty(size)
     deflected = bends(chain)
     for r in range(first, last, LANES):
-        if not (gather(chain, rows, r, w, v) and settle(chain, w, v, deflected)):
+        if not (gather(chain, rows, r, w, v) and settle(chain, w, v, deflected, False)):
             return r
         if nuisances:
             nuisance_columns(v, X, chain.tool_rotation, width)

@@ -104,28 +104,24 @@ def _spread(given, first, width, to, begin, apart):  # type: ignore[no-untyped-d
 
 
 @njit(**JIT)
-def settle(chain, w, v, deflected):  # type: ignore[no-untyped-def]
-    """Solve the lanes to equilibrium where ``bent``, else place and load the rigid arm once.
+def settle(chain, w, v, deflected, warm):  # type: ignore[no-untyped-def]
+    """Solve the lanes to equilibrium where ``deflected``, else place and load the rigid arm once.
 
-    Returns whether all lanes have settled.
+    ``warm``: from the bending that the lanes hold, not from the straight arm. Returns whether all
+    lanes have settled.
     """
     n = chain.mass.shape[0]
     tilts = _tilts(chain)
-    if tilts:
+    if not warm:
         _level(w)
-    if deflected:
-        _straighten(w, n)
+        if deflected:
+            _straighten(w, n)
     for i in range(n):
         sines(w, i + 1)
+    before = 0.0
     for step in range(MOST_ROUNDS):
-        if tilts and step:
-            _upright(w)
-            turn_joint(w, 0)
-        for i in range(n):
-            place_joint(w, i, chain.rotation[i], chain.position[i])
-            if deflected and step:
-                turn_joint(w, i + 1)
-        place_flange(w, v, n, chain)
+        turned = deflected and (warm or step > 0)
+        _place(chain, w, v, n, tilts and turned, turned)
         load_flange(w, v, n, chain.gravity)
         for i in range(n - 1, -1, -1):
             load_joint(w, i, chain.mass[i], chain.cog[i], chain.gravity)
@@ -135,10 +131,29 @@ def settle(chain, w, v, deflected):  # type: ignore[no-untyped-def]
             return True
         if tilts:
             bend_base(w, v, chain.base_compliance)
-        state = _settled(w, v, n)
-        if state != 0:
-            return state > 0
+        change = _change(w, v, n)
+        if change < 0.0:
+            return False
+        if change < TOLERANCE:
+            return True
+        if change * change < TOLERANCE * before:  # as it shrinks, the next is below the tolerance
+            _place(chain, w, v, n, tilts, True)
+            return True
+        before = change
     return False
+
+
+@njit(**JIT)
+def _place(chain, w, v, n, tilted, turned):  # type: ignore[no-untyped-def]
+    """Place everything from the base to the TCP; ``turned``: with the joints' bending."""
+    if tilted:
+        _upright(w)
+        turn_joint(w, 0)
+    for i in range(n):
+        place_joint(w, i, chain.rotation[i], chain.position[i])
+        if turned:
+            turn_joint(w, i + 1)
+    place_flange(w, v, n, chain)
 
 
 @njit(**FAST)
@@ -159,22 +174,25 @@ def _upright(w):  # type: ignore[no-untyped-def]
 
 
 @njit(**JIT)
-def _settled(w, v, n):  # type: ignore[no-untyped-def]
-    """Return 1: all lanes rest, 0: not yet, -1: a lane is no number, or bends too far."""
+def _change(w, v, n):  # type: ignore[no-untyped-def]
+    """Return how far a lane's bending has changed at most (rad).
+
+    -1 where a lane is no number, or bends too far.
+    """
     change, b = 0.0, RECORD * LANES
     for k in range(LANES):
         whole = 0.0
         for j in range(6):
             whole += w[b + (TOTAL + j) * LANES + k]
         if not np.isfinite(whole):
-            return -1
+            return -1.0
         change = max(change, v[CHANGE * LANES + k])
         for i in range(n + 1):
             a = i * RECORD * LANES + k
             x, y, z = w[a + BEND * LANES], w[a + (BEND + 1) * LANES], w[a + (BEND + 2) * LANES]
             if not x * x + y * y + z * z < STEEPEST:
-                return -1
-    return 1 if change < TOLERANCE else 0
+                return -1.0
+    return change
 
 
 @njit(**JIT)

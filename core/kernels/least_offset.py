@@ -8,7 +8,7 @@ from numba import njit
 from gapbridge.core.kernels.reference import JIT
 
 LARGEST_OFFSET = 0.1  # rad: joint offset (norm) beyond which the correction is damped
-REGULAR = 1e-4  # smallest over largest pivot from which elimination is as good as eigenvalues
+REGULAR = 1e-8  # smallest over largest pivot from which elimination is as good as eigenvalues
 SWEEPS = 30  # of rotations; six by six takes five to nine
 
 

@@ -269,7 +269,7 @@ def jacobian_blocks(chain, rows, rates, varying, first, last, position, rotation
     deflected = bends(chain)
     links, loads = _linked(rates[1], n), _loaded(rates[1], n) or _loaded(varying[1], n)
     for r in range(first, last, _L):
-        if not (gather(chain, rows, r, w, v) and settle(chain, w, v, deflected)):
+        if not (gather(chain, rows, r, w, v) and settle(chain, w, v, deflected, False)):
             return r
         count = min(_L, last - r)
         for k in range(count):

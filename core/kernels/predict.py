@@ -24,7 +24,7 @@ def predict_blocks(chain, rows, first, last, position, rotation):  # type: ignor
     deflected, bad = bends(chain), -1
     for r in range(first, last, LANES):
         end = min(r + LANES, last)
-        if not (gather(chain, rows, r, w, v) and settle(chain, w, v, deflected)):
+        if not (gather(chain, rows, r, w, v) and settle(chain, w, v, deflected, False)):
             found = _one_by_one(chain, rows, r, end, position, rotation)
             bad = found if bad < 0 else bad
             continue
@@ -47,7 +47,7 @@ def linear_blocks(chain, rows, first, last, A, jacobians, moments):  # type: ign
     X = np.empty(2 * n * 6 * LANES)
     deflected = bends(chain)
     for r in range(first, last, LANES):
-        if not (gather(chain, rows, r, w, v) and settle(chain, w, v, deflected)):
+        if not (gather(chain, rows, r, w, v) and settle(chain, w, v, deflected, False)):
             return r
         flexibility_columns(w, v, X, 0, n, 6)
         for k in range(min(LANES, last - r)):

@@ -191,12 +191,15 @@ def correct(b, nominal, mass, cog, wrench, found):  # type: ignore[no-untyped-de
 def correct_rows(b, nominal, mass, cog, wrench, found, residual, steps):  # type: ignore[no-untyped-def]
     """``correct`` row after row: nominal (N, n), found (N, n + 6), residual (N,), steps (N,).
 
-    A load of a single row counts for all.
+    Each from no offset: rows near singularities have little to do with the one before.
     """
+    n = nominal.shape[1]
+    c, size = sizes_of(n)
+    at = c + size + (RECORD + 6) * n + FLANGE
     for r in range(nominal.shape[0]):
-        m, c, w = min(r, len(mass) - 1), min(r, len(cog) - 1), min(r, len(wrench) - 1)
+        b[at : at + n] = 0.0
         residual[r], steps[r] = correct(
-            b, nominal[r], mass[m : m + 1], cog[c : c + 1], wrench[w : w + 1], found[r]
+            b, nominal[r], mass[r : r + 1], cog[r : r + 1], wrench[r : r + 1], found[r]
         )
 
 

@@ -166,17 +166,33 @@ def test_rows_at_once_are_the_rows_one_by_one(n):
         np.testing.assert_allclose(together.q[r], alone.q, atol=1e-7)
 
 
-def test_many_rows_are_what_one_compensator_says_row_after_row():
-    model, rng = MODELS[6], np.random.default_rng(8)
-    q = rng.uniform(-2, 2, (40, 6))
+@pytest.mark.parametrize("n", [6, 7])
+def test_blocks_of_rows_reach_what_one_setpoint_after_the_other_reaches(n):
+    model, rng, count = MODELS[n], np.random.default_rng(8), 150
+    q = rng.uniform(-2, 2, (count, n))
     q[7] = 0.0  # singular, and out of reach
-    for loads in (Loads(), Loads(payload_mass=rng.uniform(0, 9, 40), wrench=np.full((40, 6), 9.0))):
+    some = Loads(
+        payload_mass=rng.uniform(0, 9, count), wrench=rng.normal(size=(count, 6)) * 20,
+        payload_cog=rng.uniform(-0.1, 0.1, (count, 3)),
+    )  # fmt: skip
+    for loads in (Loads(), some):
         live, together = Compensator(model), correct(model, q, loads)
-        for r in range(len(q)):
-            alone = live.correct(q[r], loads[r : r + 1])
-            np.testing.assert_array_equal(together.q[r], alone.q)
-            np.testing.assert_array_equal(together.offset_in_base[r], alone.offset_in_base)
-            assert (together.residual[r], together.steps[r]) == (alone.residual, alone.steps)
+        alone = []
+        for r in range(count):
+            live.forget()
+            alone.append(live.correct(q[r], loads[r : r + 1]))
+        residual = np.array([one.residual for one in alone])
+        reached = residual < TOLERANCE
+        assert 0.9 * count < reached.sum() <= count - (n == 6)
+        np.testing.assert_array_equal(together.residual < TOLERANCE, reached)
+        # a nanometre that is left is more in the joints, the nearer to a singularity
+        atol = 1e-8 / smallest_singular_value(model, q)
+        for r in np.flatnonzero(reached):
+            np.testing.assert_allclose(together.q[r], alone[r].q, rtol=0, atol=atol[r])
+            np.testing.assert_allclose(
+                together.offset_in_base[r], alone[r].offset_in_base, rtol=0, atol=1e-8
+            )
+        np.testing.assert_allclose(together.residual[~reached], residual[~reached], rtol=0.5)
 
 
 BAD = {
