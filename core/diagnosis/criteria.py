@@ -70,6 +70,8 @@ KNOWN_SHARE = 0.7  # of a stated repeatability, which is an average: less is not
 NOT_WHITE = 0.001  # probability below which the residual of a recording is not white
 EXCESS = 0.5  # times the floor: a correlated part smaller than that changes no answer
 OUTLIER_SHARE = 0.1  # of the samples: more outliers than that are structure, not bad luck
+MOST_OUTLIERS = 1 / 3  # of the poses, excluded nevertheless: ten bad rows of 33, fitted, stood as
+# causes that are not there; their median shows the noise of the others up to there
 OUTLIER_SIGMA = 5.0  # from which on a sample is an outlier
 UNPREDICTED_SHARE = 0.5  # share of an outlier that may be left where something else explains it
 # Several sessions

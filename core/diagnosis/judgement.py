@@ -20,6 +20,7 @@ from gapbridge.core.diagnosis.criteria import (
     ENOUGH_REPEATS,
     HINT_P,
     NEGLIGIBLE,
+    OUTLIER_SHARE,
     OVER_INSTRUMENT_SIGMA,
     OVER_REPEAT_SCATTER,
     OVER_STATED_NOISE,
@@ -144,6 +145,8 @@ def _verdict(
     single = [c for c in stays if c not in selection.block]
     p_value = structure_p_value(space, nuisance, single)
     p_value = min(p_value, _too_much_left(whole))
+    if np.mean(~whole.kept) > OUTLIER_SHARE:  # no bad luck: something befalls the log
+        p_value = 0.0
     unnamed = any(not space.candidates[c].named for c in selection.found.chosen)
     structured = p_value < (HINT_P if unnamed or fallen else SURE_P)
     depends: tuple[tuple[str, float], ...] = ()

@@ -5,7 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from gapbridge.core.diagnosis.criteria import OUTLIER_SHARE, OUTLIER_SIGMA, UNPREDICTED_SHARE
+from gapbridge.core.diagnosis.criteria import (
+    MOST_OUTLIERS,
+    OUTLIER_SHARE,
+    OUTLIER_SIGMA,
+    UNPREDICTED_SHARE,
+)
 from gapbridge.core.diagnosis.selection.candidate import Candidate
 from gapbridge.core.diagnosis.selection.forward import joining
 from gapbridge.core.diagnosis.selection.noise import estimate_noise
@@ -71,10 +76,15 @@ def _distance(state: SelectionState, residual: Array) -> Array:
 
 
 def _keep(state: SelectionState, residual: Array) -> NDArray[np.bool_]:
-    """Return the samples to keep: all but the few farthest off, and only if they are few."""
+    """Return the samples to keep: all but the farthest off, of a recording only a few of them.
+
+    There what stands out is friction at rest or a delay rather than a bad reading.
+    """
     distance = _distance(state, residual)
     outliers = np.flatnonzero(distance > OUTLIER_SIGMA)
-    limit = int(np.ceil(OUTLIER_SHARE * len(residual)))
+    moving = state.observation.channel in ("torque", "tracking")
+    share = OUTLIER_SHARE if moving else MOST_OUTLIERS
+    limit = int(np.ceil(share * len(residual)))
     kept = np.ones(len(residual), dtype=bool)
     kept[outliers[np.argsort(-distance[outliers])][:limit]] = False
     return kept
