@@ -2,7 +2,9 @@
 
 The geometry of the links in positions; in torques their first moments, of which only combinations
 show (base parameters; Gautier, Khalil, IEEE Trans. Robotics and Automation 6 (1990) 368), with the
-friction and the zero that every joint of a real arm has.
+friction and the zero that every joint of a real arm has. So are the flexibilities of all joints:
+in a short log no tilt pays for itself, and one link that bends stands for several. They win as a
+whole; those that are sure are then judged one by one.
 
 The numbers have a prior (a normal one of an engineer's size), so that what the data do not show
 stays nominal. To a search it is then one more source of correlated noise: the sample space is
@@ -11,8 +13,9 @@ whitened by it, and log det of what it adds is the penalty (marginal likelihood)
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +26,7 @@ from gapbridge.core.diagnosis.criteria import (
     FEW_LINKS,
     LENGTH,
     MIN_GEOMETRIC_CAUSES,
+    OWN_SIGMAS,
     TIMES_MACHINED,
 )
 from gapbridge.core.diagnosis.selection.candidate import Candidate
@@ -31,7 +35,13 @@ from gapbridge.core.diagnosis.selection.problem import CandidateFit, SampleSpace
 from gapbridge.core.diagnosis.selection.search import screened_search
 
 Array = NDArray[np.float64]
+Members = Callable[[SampleSpace], tuple[int, ...]]
 NEVER = 1e9  # a penalty that no fit is worth
+
+
+def soft_candidates(space: SampleSpace) -> tuple[int, ...]:
+    """Return the flexibilities of all joints."""
+    return tuple(c for c, k in enumerate(space.candidates) if k.effect.flexibility)
 
 
 def link_candidates(space: SampleSpace, joints: bool = True) -> tuple[int, ...]:
@@ -112,9 +122,10 @@ def with_links(
 
     The space returned is the one in which the set was found; the links are in no set, and their
     prior is returned (empty where they are no cause). A search beside them pays where they do so
-    beside that set, or where it holds several geometric causes.
+    beside that set, or where it holds several geometric causes. Flexibilities are in the set, those
+    that are sure.
     """
-    tried = [_Block.of(space, best, joints) for joints in _forms(space, best)]
+    tried = [_Block.of(space, best, members) for members in _forms(space, best)]
     if not tried:
         return space, best, {}
     block = min(tried, key=lambda b: b.score)
@@ -126,52 +137,71 @@ def with_links(
         return space, best, {}
     start = sorted({*base, *best.chosen} - set(sigma))
     start = [c for c in start if space.candidates[c].named]
-    other = screened_search(
-        space, base=start, beside=lambda p: links.beside(p, link_candidates(p, block.joints))
-    )
+    other = screened_search(space, base=start, beside=lambda p: links.beside(p, block.members(p)))
     near = links.beside(space, sigma)
     # a search goes its own way, and of a long log seldom the best: what was found stands beside too
     other = min([other, pruned(near, fit(near, rest))], key=lambda f: f.score)
     if other.score + links.penalty + tries < best.score:
+        if block.members is soft_candidates:
+            return space, _sure(space, (*other.chosen, *sigma), set(sigma)), {}
         return near, other, sigma
     return space, best, {}
+
+
+def _sure(space: SampleSpace, chosen: Sequence[int], block: set[int]) -> CandidateFit:
+    """Return a set less those numbers of a block that are not sure, the weakest first."""
+    found = fit(space, chosen)
+    while True:
+        strength = {
+            c: float(x[0] / max(s[0], 1e-300))
+            for c, x, s in zip(found.chosen, found.values, found.deviations, strict=True)
+            if c in block
+        }
+        weakest = min(strength, key=lambda c: strength[c], default=None)
+        if weakest is None or strength[weakest] >= OWN_SIGMAS:
+            return found
+        found = fit(space, [c for c in found.chosen if c != weakest])
 
 
 @dataclass(frozen=True)
 class _Block:
     """The links as a whole beside what else a set holds, with or without their joints' own."""
 
-    joints: bool
+    members: Members
     rest: list[int]  # of the set
     sigma: dict[int, Array]
     links: Links
     score: float
 
     @classmethod
-    def of(cls, space: SampleSpace, best: CandidateFit, joints: bool) -> _Block:
-        block = link_candidates(space, joints)
+    def of(cls, space: SampleSpace, best: CandidateFit, members: Members) -> _Block:
+        block = members(space)
         rest = [c for c in best.chosen if c not in block]
         sigma = prior(space, block, rest)
         links = links_of(space, sigma)
-        return cls(joints, rest, sigma, links, _beside_set(space, rest, links) + links.penalty)
+        return cls(members, rest, sigma, links, _beside_set(space, rest, links) + links.penalty)
 
 
-def _forms(space: SampleSpace, best: CandidateFit) -> list[bool]:
-    """Return the forms in which the links may be a cause: with what goes with them, or without.
+def _forms(space: SampleSpace, best: CandidateFit) -> list[Members]:
+    """Return what may be a cause as a whole: the links, with what goes with them or without.
 
     Geometry goes with the joints' zeros. First moments can well be off singly: they are tried where
-    several are, or where several joints rub.
+    several are, or where several joints rub; and all joints' flexibilities where several bend.
     """
-    links, block = link_candidates(space, joints=False), link_candidates(space)
-    if len(block) < 2:
-        return []
-    if not _of_mass(space.candidates[links[0]]):
-        return [True]
-    few = {
-        joints: len({space.candidates[c].site.joint for c in best.chosen if c in own}) < FEW_LINKS
-        for joints, own in ((False, links), (True, block))
-    }
-    return [joints for joints in few if not few[joints]]
+    forms: list[Members] = [link_candidates, partial(link_candidates, joints=False)]
+    links = link_candidates(space)
+    if links and not _of_mass(space.candidates[links[0]]):
+        forms = [link_candidates]
+    else:
+        forms = [members for members in forms if _few_joints(space, best, members(space))]
+    if _few_joints(space, best, soft_candidates(space)):
+        forms.append(soft_candidates)
+    return [members for members in forms if len(members(space)) > 1]
+
+
+def _few_joints(space: SampleSpace, best: CandidateFit, block: Sequence[int]) -> bool:
+    """Return whether a set holds a few joints of a block."""
+    return len({space.candidates[c].site.joint for c in best.chosen if c in block}) >= FEW_LINKS
 
 
 def _geometric(candidate: Candidate) -> bool:
