@@ -113,23 +113,24 @@ def still_accused(
 
 
 def _sure(selection: Selection, judgement: Judgement, alone: Alone) -> tuple[Selection, Judgement]:
-    """Return what stays: values that are many sigmas of effects that were vague on some rows.
+    """Return what stays: values of three sigmas, of what was vague on some rows of many.
 
-    What goes with the links has to be sure by itself, vague or not.
+    Of the links, accused as a whole, one term at least has to be sure.
     """
     accused, withdrawn = list(judgement.accused), list(judgement.withdrawn)
     least = dict.fromkeys(judgement.vague, (SIGMAS / OWN_SIGMAS) ** 2)
-    least |= {p: 1.0 for p in selection.prior if not selection.as_a_whole(p)}
     while True:
         sure = {
-            p: worth(selection.terms[p], selection.covariance[p]) / least[p]
-            for p in accused if p in least
-        }  # fmt: skip
-        weakest = min(sure, key=lambda p: sure[p], default=None)
-        if weakest is None or sure[weakest] >= 1:
+            p: worth(selection.terms[p], selection.covariance[p]) / least.get(p, 1.0)
+            for p in accused
+        }
+        whole = [p for p in accused if selection.as_a_whole(p)]
+        kinds = [[p] for p in accused if p not in whole] + ([whole] if whole else [])
+        weakest = min(kinds, key=lambda kind: max(sure[p] for p in kind), default=[])
+        if not weakest or max(sure[p] for p in weakest) >= 1:
             return selection, replace(judgement, accused=tuple(accused), withdrawn=tuple(withdrawn))
-        accused.remove(weakest)
-        withdrawn.append((weakest, VAGUE))
+        accused = [p for p in accused if p not in weakest]
+        withdrawn += [(p, VAGUE) for p in weakest]
         selection = alone(selection, accused)
 
 

@@ -21,7 +21,7 @@ from gapbridge.core.errors import EquilibriumError, InputError
 
 Array = NDArray[np.float64]
 REFITS = 8
-ROUNDING = 1e-6  # of a sigma: regions whose values scatter less than that are alike
+LEAST = 1e-13  # of the largest eigenvalue of a covariance: what is less is rounding
 NO_PRIOR: Mapping[int, Array] = {}
 
 
@@ -205,10 +205,20 @@ def _cluster_covariance(
     # few regions: as wide as a normal distribution of the same 95 % interval
     few = float(stdtrit(max(len(names) - 1, 1), 0.975) / ndtri(0.975))
     scatter = few**2 * (len(names) - 1) / len(names) * away.T @ away
-    wide, narrow = np.sqrt(np.diag(scatter)), np.sqrt(np.maximum(np.diag(white), 0.0))
-    flat = wide < ROUNDING * narrow  # the same in all regions: rows that repeat to the last digit
-    share = np.maximum(narrow / np.where(flat, np.inf, wide), 1.0)
-    return np.asarray(scatter * np.outer(share, share) + np.diag(np.where(flat, narrow**2, 0.0)))
+    return _no_narrower(scatter, white)
+
+
+def _no_narrower(scatter: Array, white: Array) -> Array:
+    """Return a covariance (p, p) that is as wide as either of two, along every direction."""
+    size = np.sqrt(np.maximum(np.diag(white), 0.0))
+    unit = np.where(size > 0, 1 / np.where(size > 0, size, 1.0), 0.0)
+    value, V = np.linalg.eigh(white * np.outer(unit, unit))
+    root = np.sqrt(np.maximum(value, LEAST * value.max(initial=0.0)))
+    root = np.where(root > 0, root, 1.0)
+    inside = (V / root).T @ (scatter * np.outer(unit, unit)) @ (V / root)
+    share, U = np.linalg.eigh(inside)
+    half = size[:, None] * ((V * root) @ U)
+    return np.asarray((half * np.maximum(share, 1.0)) @ half.T)
 
 
 def worth(term: Term, spread: Array) -> float:
