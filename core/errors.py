@@ -24,6 +24,8 @@
 
 from __future__ import annotations
 
+from enum import StrEnum
+
 
 class GapbridgeError(Exception):
     """Base of everything that Gapbridge raises on purpose."""
@@ -79,8 +81,22 @@ class StaleStateError(LinkError):
     """The controller's own clock stood still for longer than allowed."""
 
 
+class Implausible(StrEnum):
+    """Why a state could not be believed; metrics and events have these names."""
+
+    TORN = "torn"  # or of the wrong length, or a wrong answer
+    NOT_FINITE = "not_finite"
+    VALUE = "implausible"  # out of the bounds of what an arm can have
+    STEP = "step"  # joints that cannot have moved that far
+    BACKWARDS = "backwards"  # the controller's clock
+
+
 class InvalidStateError(LinkError):
     """A state that is torn, not finite, of the wrong length or implausible."""
+
+    def __init__(self, message: str, reason: Implausible = Implausible.TORN) -> None:
+        super().__init__(message)
+        self.reason = reason
 
 
 class WriteError(LinkError):

@@ -1,8 +1,9 @@
 """What a driver is: four methods between a controller's wire and the loop.
 
 ``connect``, ``read_state``, ``write_setpoint`` and ``close`` are what every driver has; ``arm`` and
-``release`` stand around the writing. Whatever is written passes the gate (drivers/gate.py) here, in
-the base: a driver implements ``_send``, ``_make_ready`` and ``_let_go``, and cannot go around it.
+``release`` begin and end the writing. Whatever is read passes the check (drivers/state_check.py)
+and whatever is written the gate (drivers/gate.py) here, in the base: a driver implements
+``_read_state``, ``_send``, ``_make_ready`` and ``_let_go``, and cannot go around either.
 """
 
 from __future__ import annotations
@@ -20,9 +21,10 @@ from gapbridge.core.state import RobotState
 from gapbridge.drivers.clock import SYSTEM, Clock
 from gapbridge.drivers.controller_facts import ControllerFacts, Difference, differences
 from gapbridge.drivers.gate import Gate
+from gapbridge.drivers.state_check import FASTEST, SampleCheck
 
 Vector = NDArray[np.float64]
-GATED = ("write_setpoint", "arm", "release")  # of the base alone
+GATED = ("read_state", "write_setpoint", "arm", "release")  # of the base alone
 
 
 class Driver(ABC):
@@ -33,7 +35,12 @@ class Driver(ABC):
     """
 
     def __init__(
-        self, rate: float, model: Model, moves_arm: bool = True, clock: Clock = SYSTEM
+        self,
+        rate: float,
+        model: Model,
+        moves_arm: bool = True,
+        clock: Clock = SYSTEM,
+        fastest: float = FASTEST,
     ) -> None:
         self.clock = clock  # what its states are stamped by, and all who judge their age
         self._now = clock.monotonic
@@ -41,29 +48,48 @@ class Driver(ABC):
         self.n = model.arm.n  # joints
         self.moves_arm = moves_arm  # setpoints are the arm's motion; False: they ride on its own
         self.gate = Gate(rate, model, moves_arm, clock.monotonic)
+        self._check = SampleCheck(model.arm, fastest)  # rad/s that no joint can pass
         self._cell_model = model  # what the controller is compared with
 
     def __init_subclass__(cls, **keys: Any) -> None:
-        """Refuse a driver that goes around the gate. Raises TypeError."""
+        """Refuse a driver that goes around check or gate. Raises TypeError."""
         super().__init_subclass__(**keys)
         for name in GATED:
             if name in cls.__dict__:
                 raise TypeError(
-                    f"{cls.__name__}.{name}: found a driver's own, expected _send, _make_ready and "
-                    "_let_go: what is written passes the gate of the base"
+                    f"{cls.__name__}.{name}: found a driver's own, expected _read_state, _send, "
+                    "_make_ready and _let_go: the base checks what is read and what is written"
                 )
 
     @abstractmethod
     def connect(self) -> None:
         """Open the link for reading. Moves nothing. Raises LinkError."""
 
-    @abstractmethod
+    @final
     def read_state(self) -> RobotState:
         """Wait for the next sample of the controller and return it.
 
         Blocks until a sample with a new controller timestamp is there. Raises StaleStateError where
         none comes within the settings' timeout, InvalidStateError where it cannot be believed.
         """
+        state = self._read_state()
+        self._validate(state)
+        return state
+
+    @abstractmethod
+    def _read_state(self) -> RobotState:
+        """Do what ``read_state`` promises, up to the check; a torn sample is refused here."""
+
+    def _validate(self, state: RobotState) -> None:
+        """Compare a sample with the arm's limits and with the one before.
+
+        Raises InvalidStateError. A driver that remembers samples does it here, after this.
+        """
+        self._check.check(state)
+
+    def forget(self) -> None:
+        """Take the next sample without comparing it to the ones before."""
+        self._check.forget()
 
     @final
     def write_setpoint(self, setpoint: Setpoint) -> None:

@@ -1,52 +1,113 @@
-"""Whether a sample can be believed: one set of limits, one check, for all drivers and the loop."""
+"""Whether a sample can be believed: one set of limits and one check, for all drivers."""
 
 from __future__ import annotations
 
+from math import isfinite
+from operator import le
+
 import numpy as np
-from numpy.typing import NDArray
 
 from gapbridge.core.arm import Arm
+from gapbridge.core.errors import Implausible, InvalidStateError
+from gapbridge.core.state import RobotState
 
-Vector = NDArray[np.float64]
-FASTEST = 20.0  # rad/s: joints that move faster between two samples are a mistake
+FASTEST = 20.0  # rad/s, of a joint whose URDF gives no velocity limit
+HASTE = 1.5  # times its velocity limit: a joint that moved faster is a mistake
 JITTER = 0.01  # rad: of one reading
 BEYOND = 0.35  # rad past a joint limit: another arm, another zero, or other units
 LARGEST_ANGLE = 1e4  # rad, of a joint without limits
-LARGEST = {
-    "position": 20.0, "velocity": 60.0, "torque": 1e4, "temperature": 300.0, "force": 1e4,
-    "moment": 1e4, "current": 1e3,
+TARGET = 20.0  # rad: a target at least this large is a mistake, where the joint has limits
+FORCE, MOMENT = 1e4, 1e4  # N, Nm
+LARGEST: dict[str, float] = {
+    "actual_qd": 60.0, "joint_temperatures": 300.0, "actual_current_as_torque": 1e4,
+    "payload_cog": 10.0,
 }  # fmt: skip
-"""Largest plausible magnitudes, SI units; a position where the arm's limits are not at hand."""
+"""Largest plausible magnitudes of the other vectors of a RobotState, SI units."""
+WRENCH = [FORCE] * 3 + [MOMENT] * 3
+HEAVIEST = 1e3  # kg, of a payload
 
 
-class JointCheck:
-    """Checks joint angles against the arm's limits and against the sample before."""
+class SampleCheck:
+    """Checks each sample by itself and against the last one that was believed.
 
-    def __init__(self, arm: Arm, fastest: Vector | float = FASTEST) -> None:
-        lower = np.maximum(arm.limits.lower - BEYOND, -LARGEST_ANGLE)
-        upper = np.minimum(arm.limits.upper + BEYOND, LARGEST_ANGLE)
-        # plain numbers: a few of them cost less than one call on arrays
-        self._range = [*zip(lower.tolist(), upper.tolist(), strict=True)]
-        self._speed = np.broadcast_to(np.asarray(fastest, float), lower.shape).tolist()
+    In plain numbers: some dozens of them cost less than the calls on arrays.
+    """
 
-    def outside(self, q: Vector) -> str | None:
-        """Return what is wrong with angles (n,) rad that no such arm can have; None: nothing."""
-        within = [low <= v <= high for v, (low, high) in zip(q.tolist(), self._range, strict=True)]
-        if all(within):  # NaN is not within
+    def __init__(self, arm: Arm, fastest: float = FASTEST) -> None:
+        limits, speed = arm.limits, arm.limits.velocity
+        lower = np.maximum(limits.lower - BEYOND, -LARGEST_ANGLE)
+        upper = np.minimum(limits.upper + BEYOND, LARGEST_ANGLE)
+        fast = np.minimum(HASTE * np.where(np.isfinite(speed), speed, FASTEST), fastest)
+        self._fastest: list[float] = fast.tolist()
+        self._bounds: dict[str, tuple[list[float], list[float]]] = {
+            "actual_q": (lower.tolist(), upper.tolist()),
+            "target_q": (np.minimum(lower, -TARGET).tolist(), np.maximum(upper, TARGET).tolist()),
+            "actual_TCP_force": ([-v for v in WRENCH], WRENCH),
+            "ft_raw_wrench": ([-v for v in WRENCH], WRENCH),
+        }
+        for name, most in LARGEST.items():
+            count = 3 if name == "payload_cog" else arm.n
+            self._bounds[name] = ([-most] * count, [most] * count)
+        self._q: list[float] | None = None
+        self._timestamp = 0.0
+
+    def forget(self) -> None:
+        """Take the next sample without comparing it to the ones before."""
+        self._q = None
+
+    def check(self, state: RobotState) -> None:
+        """Remember a sample that can be believed. Raises InvalidStateError for one that cannot."""
+        q = state.actual_q.tolist()
+        wrong = self._wrong("actual_q", q)
+        if wrong is not None:
+            raise wrong
+        self._check_motion(q, state.timestamp)  # first: a velocity may be computed from the step
+        for name in self._bounds:
+            value = getattr(state, name)
+            wrong = None if value is None else self._wrong(name, value.tolist())
+            if wrong is None or (name == "actual_TCP_force" and _is_missing(state, wrong)):
+                continue
+            raise wrong
+        payload = state.payload
+        if payload is not None and not 0.0 <= payload <= HEAVIEST:
+            raise InvalidStateError(
+                f"payload: found {payload:g} kg, expected 0 to {HEAVIEST:g}", Implausible.VALUE
+            )
+        self._q, self._timestamp = q, state.timestamp
+
+    def _wrong(self, name: str, values: list[float]) -> InvalidStateError | None:
+        low, high = self._bounds[name]
+        if all(map(le, low, values)) and all(map(le, values, high)):  # NaN is neither
             return None
-        joint = within.index(False)
-        if not np.isfinite(q[joint]):
-            return f"joint {joint + 1}: found {q[joint]:g}, expected a finite angle"
-        return (
-            f"joint {joint + 1}: found {q[joint]:.4f} rad, far outside the arm's limits: another "
-            "arm, another zero, or other units"
-        )
+        i = next(i for i, v in enumerate(values) if not low[i] <= v <= high[i])
+        if not isfinite(values[i]):
+            return InvalidStateError(
+                f"{name}_{i}: found {values[i]:g}, expected a finite number",
+                Implausible.NOT_FINITE,
+            )
+        detail = f"{name}_{i}: found {values[i]:g}, expected {low[i]:g} to {high[i]:g}"
+        if name == "actual_q":
+            detail += ": another arm, another zero, or other units"
+        return InvalidStateError(detail, Implausible.VALUE)
 
-    def jumped(self, step: Vector, gap: float) -> str | None:
-        """Return which joint cannot have moved by ``step`` (n,) rad in ``gap`` s; None: all can."""
-        way = [*map(abs, step.tolist())]
-        beyond = [v - (f * gap + JITTER) for v, f in zip(way, self._speed, strict=True)]
-        if not any(v > 0.0 for v in beyond):
-            return None
-        joint = beyond.index(max(beyond))
-        return f"joint {joint + 1}: found a step of {way[joint]:.4f} rad in {gap:.4f} s"
+    def _check_motion(self, q: list[float], timestamp: float) -> None:
+        if self._q is None:
+            return
+        gap = timestamp - self._timestamp
+        if gap <= 0.0:
+            raise InvalidStateError(
+                f"the controller's clock went back by {-gap:.4f} s", Implausible.BACKWARDS
+            )
+        for i, (now, before, fast) in enumerate(zip(q, self._q, self._fastest, strict=True)):
+            most = fast * gap + JITTER
+            if abs(now - before) > most:
+                raise InvalidStateError(
+                    f"actual_q_{i}: found a step of {abs(now - before):.4f} rad in {gap:.4f} s, "
+                    f"expected at most {most:.4f}",
+                    Implausible.STEP,
+                )
+
+
+def _is_missing(state: RobotState, wrong: InvalidStateError) -> bool:
+    """Return whether a force is not there because its sensor is lost."""
+    return bool(state.sensor_lost) and wrong.reason is Implausible.NOT_FINITE

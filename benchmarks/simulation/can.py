@@ -112,7 +112,7 @@ class CanLink(SimulatedLink):
             found.reader.bus = link.bus = _Bus(link)
             found.reader._empty = link.world.now
 
-        read = found.read_state
+        read = found._read_state
 
         def read_state() -> RobotState:
             state = read()
@@ -120,7 +120,7 @@ class CanLink(SimulatedLink):
             return state
 
         found.reader.open = open_bus  # type: ignore[method-assign]
-        found.read_state = read_state  # type: ignore[method-assign]
+        found._read_state = read_state  # type: ignore[method-assign]
         return found
 
     def note(self, identifier: int, data: bytes) -> None:

@@ -152,14 +152,14 @@ class ModbusLink(SimulatedLink):
         found = self.setting.make_driver(modbus_driver, ModbusDriver, self.clock)
         found.transport.__class__ = _Transport
         found.transport.link = self  # type: ignore[attr-defined]
-        link, read = self, found.read_state
+        link, read = self, found._read_state
 
         def read_state() -> RobotState:
             state = read()
             link._sampled[state.received] = link._asked_image
             return state
 
-        found.read_state = read_state  # type: ignore[method-assign]
+        found._read_state = read_state  # type: ignore[method-assign]
         return found
 
     def key_of(self, state: RobotState) -> float:

@@ -47,10 +47,9 @@ def run_session(cell: Cell, options: SessionOptions) -> None:
     """Do what a person has asked for. Raises InputError, RunError; click's Exit after Ctrl-C."""
     folder = session_folder(cell, options)
     journal = Journal(folder)
-    prompt = Prompt()
     with journal:
         session = Session.of(journal)
-        prompt.note = lambda text: session.add("note", text=text)
+        prompt = Prompt(lambda text: session.add("note", text=text))
         try:
             _lead(cell, options, prompt, session)
         except SessionCommand as command:

@@ -188,7 +188,9 @@ class Daemon:
                 "missed": tally.missed,
                 "late": tally.late,
                 "written": tally.written,
-                "dropped": {reason: counted[count.label] for count, reason in DROPPED.items()},
+                "dropped": {
+                    reason.value: counted[count.label] for reason, count in DROPPED.items()
+                },
             },
             "counts": counted,
             "events": dict(self.event_log.counts),

@@ -141,7 +141,7 @@ def _check(
     seen.without.append(session.visit(cell, load, poses))
     console.print(f"checking {len(poses)} visits with {load.name}, with compensation")
     seen.compensated.append(session.visit(calibrated, load, poses))
-    seen.loads += [load.name] * len(poses)
+    seen.loads.extend([load.name] * len(poses))
 
 
 def free_address() -> str:

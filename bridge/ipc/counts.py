@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from enum import IntEnum
 
+from gapbridge.core.errors import Implausible
+
 
 class Count(IntEnum):
     """Places of the counters; the name in small letters is what people read."""
@@ -43,10 +45,10 @@ class Count(IntEnum):
 
 
 DROPPED = {
-    Count.DROPPED_TORN: "torn",
-    Count.DROPPED_NOT_FINITE: "not_finite",
-    Count.DROPPED_IMPLAUSIBLE: "implausible",
-    Count.DROPPED_STEP: "step",
-    Count.DROPPED_BACKWARDS: "backwards",
+    Implausible.TORN: Count.DROPPED_TORN,
+    Implausible.NOT_FINITE: Count.DROPPED_NOT_FINITE,
+    Implausible.VALUE: Count.DROPPED_IMPLAUSIBLE,
+    Implausible.STEP: Count.DROPPED_STEP,
+    Implausible.BACKWARDS: Count.DROPPED_BACKWARDS,
 }
-"""Counts of samples that could not be believed, and the reason as people and metrics have it."""
+"""Why a sample could not be believed -> where it is counted."""

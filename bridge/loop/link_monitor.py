@@ -3,33 +3,23 @@
 from __future__ import annotations
 
 import math
-import operator
-from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
-from gapbridge.bridge.ipc.counts import Count
+from gapbridge.bridge.ipc.counts import DROPPED, Count
 from gapbridge.bridge.loop.reports import Reports
 from gapbridge.bridge.loop.supervisor import Cause, Supervisor
-from gapbridge.core.arm import Arm
-from gapbridge.core.errors import InvalidStateError, LinkError, StaleStateError
+from gapbridge.core.errors import Implausible, InvalidStateError, LinkError, StaleStateError
 from gapbridge.core.state import RobotState
 from gapbridge.drivers.clock import SYSTEM, Clock
 from gapbridge.drivers.driver import Driver
-from gapbridge.drivers.state_check import FASTEST, LARGEST, JointCheck
 
-Vector = NDArray[np.float64]
 DRIFT = 5e-3  # s per s: how fast the bound follows a clock that drifts or stumbles
-HASTE = 1.5  # times its velocity limit: a joint that moved faster is a mistake
-_WRENCH = (LARGEST["force"],) * 3 + (LARGEST["moment"],) * 3
 INVALID_IN_A_ROW = 3  # states that cannot be believed, after which they count as silence
 OLD_IN_A_ROW = 2  # states too old to write by, after which they count as none
 SILENCE = 0.2  # s without a state: a fault
 LOST = 3.0  # s without a state: the link is lost
 LOST_AFTER_WRITING = 0.5  # s: the library's writing half does not survive a break
 SUSPENDED = 0.1  # s that a reading takes longer than it may: this process was stopped meanwhile
-TELL_EVERY = 1.0  # s between two events of samples dropped for the same reason
+REPORT_EVERY = 1.0  # s between two events of samples dropped for the same reason
 
 
 def hold_time(rate: float) -> float:
@@ -93,57 +83,6 @@ class ControllerClock:
         return state.timestamp + (self._lead or 0.0)
 
 
-@dataclass(frozen=True, slots=True)
-class Doubt:
-    """Why a sample was not believed."""
-
-    count: Count
-    words: str
-
-
-class SampleCheck:
-    """Checks each sample against the last one that was believed."""
-
-    def __init__(self, arm: Arm) -> None:
-        speed = arm.limits.velocity
-        self._joints = JointCheck(arm, HASTE * np.where(np.isfinite(speed), speed, FASTEST))
-        self._q: Vector | None = None
-        self._timestamp = 0.0
-
-    def forget(self) -> None:
-        """Take the next sample without comparing it to the ones before."""
-        self._q = None
-
-    def doubt(self, state: RobotState) -> Doubt | None:
-        """Return why a sample cannot be believed; None: it can, and is remembered."""
-        q = state.actual_q
-        force = state.actual_TCP_force.tolist()
-        # plain numbers: a few of them cost less than one call on arrays
-        numbers = q.tolist() + state.target_q.tolist() + state.actual_qd.tolist()
-        if not (math.isfinite(sum(numbers)) and (state.sensor_lost or math.isfinite(sum(force)))):
-            return Doubt(Count.DROPPED_NOT_FINITE, "found a number that is not finite in the state")
-        outside = self._joints.outside(q)
-        if outside is not None:
-            return Doubt(Count.DROPPED_IMPLAUSIBLE, outside)
-        if any(map(operator.gt, map(abs, force), _WRENCH)):
-            return Doubt(Count.DROPPED_IMPLAUSIBLE, f"found a force of {max(map(abs, force)):.3g}")
-        return self._doubt_motion(state)
-
-    def _doubt_motion(self, state: RobotState) -> Doubt | None:
-        before, gap = self._q, state.timestamp - self._timestamp
-        if before is not None:
-            if gap <= 0.0:
-                return Doubt(
-                    Count.DROPPED_BACKWARDS,
-                    f"the controller's clock went back by {-gap:.4f} s",
-                )
-            jumped = self._joints.jumped(state.actual_q - before, gap)
-            if jumped is not None:
-                return Doubt(Count.DROPPED_STEP, jumped)
-        self._q, self._timestamp = state.actual_q, state.timestamp
-        return None
-
-
 class LinkMonitor:
     """Takes states from a driver and notifies the supervisor when they fail to come.
 
@@ -153,7 +92,6 @@ class LinkMonitor:
     def __init__(
         self,
         driver: Driver,
-        arm: Arm,
         supervisor: Supervisor,
         reports: Reports,
         patience: float = 0.0,
@@ -163,11 +101,10 @@ class LinkMonitor:
         self.lost: str | None = None
         self._hold = hold_time(driver.rate)
         self._patience = max(patience, self._hold)  # s that one reading takes at most
-        self._check = SampleCheck(arm)
         self._invalid = self._old = 0
         self._left = 0.0  # s, monotonic: when the last reading ended
         self._stale = self._silent = False  # has been reported since the last believable state
-        self._told: dict[Count, float] = {}  # s, monotonic
+        self._reported: dict[Implausible, float] = {}  # s, monotonic
         self._heard = self._now()  # s, of the last believable state
         self._has_armed = False
 
@@ -195,14 +132,11 @@ class LinkMonitor:
             else:
                 self._stand_still(str(error))
         except InvalidStateError as error:
-            self.doubt(str(error))
+            self.drop(error)
         except LinkError as error:
             self.lost = str(error)
         else:
-            doubt = self._check.doubt(state)
-            if doubt is None:
-                return state
-            self.doubt(doubt.words, doubt.count)
+            return state
         return None
 
     def believe(self, expiry: float = math.inf) -> bool:
@@ -226,7 +160,6 @@ class LinkMonitor:
 
     def forget(self) -> None:
         """Take note that nobody asked for states meanwhile."""
-        self._check.forget()
         self._heard = self._left = self._now()
 
     def _stand_still(self, detail: str) -> None:
@@ -241,17 +174,19 @@ class LinkMonitor:
                 self._reports.emit({"kind": "link", "what": "stale", "detail": detail})
         self._fall_silent(detail)
 
-    def doubt(self, detail: str, reason: Count = Count.DROPPED_TORN) -> None:
+    def drop(self, error: InvalidStateError) -> None:
         """Drop a state that cannot be believed; several in a row end the compensation."""
-        self._reports.count(reason)
+        detail, reason = str(error), error.reason
+        count = DROPPED[reason]
+        self._reports.count(count)
         self._invalid += 1
         now = self._now()
-        if now - self._told.get(reason, -TELL_EVERY) >= TELL_EVERY:
-            self._told[reason] = now
-            self._reports.emit({"kind": "dropped", "what": reason.label, "detail": detail})
+        if now - self._reported.get(reason, -REPORT_EVERY) >= REPORT_EVERY:
+            self._reported[reason] = now
+            self._reports.emit({"kind": "dropped", "what": count.label, "detail": detail})
         if self._invalid >= INVALID_IN_A_ROW:
             self._supervisor.take(Cause.IMPLAUSIBLE, detail)
-            self._check.forget()  # the arm may well be there: judge what comes by itself
+            self._driver.forget()  # the arm may well be there: judge what comes by itself
         self._fall_silent(detail)
 
     def _fall_silent(self, detail: str) -> None:

@@ -93,7 +93,7 @@ class Loop:
         reports = Reports(page, tell)
         self._supervisor = Supervisor(reports.transition)
         patience = settings.link.state_timeout
-        self._watch = LinkMonitor(driver, model.arm, self._supervisor, reports, patience)
+        self._watch = LinkMonitor(driver, self._supervisor, reports, patience)
         self._checks = LoopChecks(
             driver.rate, self._supervisor, reports, patience, driver.moves_arm
         )
@@ -256,7 +256,7 @@ class Loop:
         try:
             own = self._driver.nominal_q(state)
         except InvalidStateError as error:
-            self._watch.doubt(str(error))
+            self._watch.drop(error)
             self._give_up(self._watch.lost)
             return
         missed = self._clock.take(state, self._supervisor.state.writes)

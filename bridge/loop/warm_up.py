@@ -19,7 +19,6 @@ from gapbridge.core.log.log import Log
 from gapbridge.core.model import Model
 from gapbridge.core.motion import motion_of
 from gapbridge.drivers.offset_inverse import Nominal
-from gapbridge.drivers.ur_rtde.state import plausible
 
 
 def warm_up() -> None:
@@ -37,7 +36,6 @@ def warm_up() -> None:
     corrected = correct(model, q)  # many rows, and one in the loop
     Compensator(model).correct(q[0])
     Nominal(model)
-    plausible(q[0], q[0], q[0], 0.0)
     NominalStream(np.ones(n))
     limits = Limits(np.full(n, -7.0), np.full(n, 7.0), np.full(n, 3.0))
     limiter = Limiter(limits, n)

@@ -27,9 +27,9 @@ AXES = ("x", "y", "z")
 class Families(Collector):
     """One scrape: all metrics of a daemon."""
 
-    def __init__(self, session: str, counts: Counts) -> None:
+    def __init__(self, session: str, counts: Counts, refused: Mapping[str, int]) -> None:
         self._session, self._counts = session, counts
-        self.refused: Mapping[str, int] = {}  # requests, by reason
+        self._refused = refused  # requests, by reason
 
     def collect(self) -> Iterator[Metric]:
         """Give all families."""
@@ -44,7 +44,7 @@ class Families(Collector):
         yield _counter(
             "gapbridge_requests_refused",
             "Requests for metrics that were refused.",
-            self.refused,
+            self._refused,
             "reason",
         )
 
@@ -148,7 +148,11 @@ class Families(Collector):
             transitions.add_metric([to, cause], float(times))
         yield transitions
         reported = _numbers(counts.status.get("counts"))
-        dropped = {r: reported.pop(c.label) for c, r in DROPPED.items() if c.label in reported}
+        dropped = {
+            reason.value: reported.pop(count.label)
+            for reason, count in DROPPED.items()
+            if count.label in reported
+        }
         yield _counter(
             "gapbridge_dropped_samples", "Samples that could not be believed.", dropped, "reason"
         )

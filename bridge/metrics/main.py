@@ -31,16 +31,14 @@ def run(order: Order) -> None:
     path = settings.token_file
     token = None if path is None else read_token(path, "metrics.token_file")
     counts = Counts(order.page, order.settings, order.extra.get("text"))
-    families = Families(order.session, counts)
     registry = CollectorRegistry(auto_describe=False)
-    registry.register(families)
 
     async def metrics(request: Request) -> Response:
         counts.turn(order.events.poll())
         return Response(generate_latest(registry), media_type=TEXT)
 
     guard = Guard(Starlette(routes=[Route("/metrics", metrics)]), settings, token)
-    families.refused = guard.refused
+    registry.register(Families(order.session, counts, guard.refused))
     serve(
         guard, settings, "metrics", lambda: order.events.closed,
         lambda: counts.turn(order.events.poll()), TURN,

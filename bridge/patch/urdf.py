@@ -20,7 +20,7 @@ from gapbridge.bridge.patch.model_format import (
 )
 from gapbridge.core.effects.simulator import Kind
 from gapbridge.core.errors import InputError
-from gapbridge.core.rotation import rpy_matrix, transform
+from gapbridge.core.rotation import roll_pitch_yaw, rpy_matrix, transform
 
 Array = NDArray[np.float64]
 TURNING = ("revolute", "continuous")
@@ -124,7 +124,7 @@ class _Document:
         parent = frames[self.end(joint, "parent")]
         origin = np.linalg.inv(parent) @ motion @ parent @ self.origin(joint)
         self.write("joint", joint, "origin",
-                   {"xyz": origin[:3, 3], "rpy": _roll_pitch_yaw(origin[:3, :3])})  # fmt: skip
+                   {"xyz": origin[:3, 3], "rpy": roll_pitch_yaw(origin[:3, :3])})  # fmt: skip
 
     def write(
         self, kind: str, name: str, tag: str, values: dict[str, Array | float], inside: str = ""
@@ -175,13 +175,6 @@ class _Document:
 def _without_comments(text: str) -> str:
     """Return the text with comments blanked out, so that places stay."""
     return re.sub(r"<!--.*?-->", lambda found: " " * len(found[0]), text, flags=re.DOTALL)
-
-
-def _roll_pitch_yaw(R: Array) -> Array:
-    """Return roll, pitch, yaw (3,) of a rotation: fixed axes x, y, z, as URDF has them."""
-    from scipy.spatial.transform import Rotation
-
-    return np.asarray(Rotation.from_matrix(R).as_euler("xyz"))
 
 
 def _dynamics(document: _Document, name: str, joint: int, changes: ModelChanges) -> list[str]:

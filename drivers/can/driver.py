@@ -50,7 +50,7 @@ class CanDriver(Driver):
         self.settings, self.profile = settings, profile
         self.reader = FrameReader(settings, profile, clock)
         self.writer = FrameWriter(settings, profile, clock)
-        self._builder = StateBuilder(profile, model.arm)
+        self._builder = StateBuilder(profile.n)
         self._armed_at: float | None = None  # s, monotonic
         self._given = -1.0  # s, received of the sample last returned
         self._slot = 0.0  # s, when an arm that must be asked is asked next
@@ -99,7 +99,7 @@ class CanDriver(Driver):
         with contextlib.suppress(WriteError):  # silence follows, and is reported
             self.writer.request()
 
-    def read_state(self) -> RobotState:
+    def _read_state(self) -> RobotState:
         """Return the newest complete sample that was not returned yet; see Driver.read_state."""
         sample = self._asked() if self.profile.request else self._awaited()
         self._given = sample.received
@@ -112,6 +112,11 @@ class CanDriver(Driver):
         trouble, _ = self.reader.trouble(armed)
         ready = not armed or not self.profile.enabled_values or self.reader.enabled
         return self._builder.build(sample, self._target(), trouble, ready)
+
+    def _validate(self, state: RobotState) -> None:
+        """See Driver._validate."""
+        super()._validate(state)
+        self._builder.remember()
 
     def _awaited(self) -> Sample:
         """Return the next sample of an arm that sends by itself; slower where we want fewer."""

@@ -67,7 +67,7 @@ class CanopenDriver(Driver):
         window = self.profile.file.sync_window or WINDOW * self._period
         self.rhythm = Rhythm(self.master, self.writer, self._period, window)
         self.power = Power(self.master, self.profile, self.writer, self.rhythm.exchange)
-        self._arm, self._builder = model.arm, StateBuilder(self.profile, model.arm)
+        self._arm, self._builder = model.arm, StateBuilder(self.profile)
         self._fresh_at = 0.0  # s, monotonic: of the last whole sample
         self._connected_at = 0.0
         self._armed_at: float | None = None  # s, monotonic
@@ -100,6 +100,7 @@ class CanopenDriver(Driver):
             raise
         self._connected_at = self._now()
         self._armed_at = None
+        self.forget()
         self._builder.forget()
 
     def _first_sample(self) -> None:
@@ -115,14 +116,14 @@ class CanopenDriver(Driver):
                     why = f"found no heartbeat in OPERATIONAL of nodes {silent}"
                 raise LinkError(f"{self.master.where}: {why}")
         try:
-            self._builder.build(found, None, False)
+            self._validate(self._builder.build(found, None, False))
         except InvalidStateError as error:
             raise LinkError(f"{self.settings.where()}: {error}") from None
         self._fresh_at = found.received
 
     # -- reading ----------------------------------------------------------------------------------
 
-    def read_state(self) -> RobotState:
+    def _read_state(self) -> RobotState:
         """Send one SYNC and return what all drives reported at it; see Driver.read_state.
 
         Raises InvalidStateError where a set is torn, LinkError where a drive has restarted.
@@ -133,7 +134,7 @@ class CanopenDriver(Driver):
             self._check_lives()
             if found is not None and not stray:
                 self._fresh_at = found.received
-                return self._believe(found)
+                return self._state(found)
             why = self.master.collector.why() if found is None else f"{stray} came without a SYNC"
             now = self._now()
             if now - self._fresh_at > self.settings.state_timeout:
@@ -161,7 +162,12 @@ class CanopenDriver(Driver):
                 f"{self.profile.heartbeat.lost_after:g} s{self.power.complaint(node)}"
             )
 
-    def _believe(self, found: SyncSet) -> RobotState:
+    def _validate(self, state: RobotState) -> None:
+        """See Driver._validate."""
+        super()._validate(state)
+        self._builder.remember(state)
+
+    def _state(self, found: SyncSet) -> RobotState:
         armed = self._armed_at is not None
         before = self._builder.last_q
         state = self._builder.build(found, self.writer.target if armed else None, armed)

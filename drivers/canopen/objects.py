@@ -56,7 +56,7 @@ MODES: dict[Mode, tuple[int, str]] = {
 """Mode -> its number in Modes of operation, and the object that takes its setpoints."""
 
 SYNC, NMT = 0x080, 0x000  # COB-IDs
-EMCY_BASE, HEARTBEAT_BASE, SDO_REQUEST_BASE, SDO_ANSWER_BASE = 0x080, 0x700, 0x600, 0x580
+HEARTBEAT_BASE, SDO_REQUEST_BASE = 0x700, 0x600
 TPDO_BASE, RPDO_BASE, PDO_STEP, PDO_COUNT = 0x180, 0x200, 0x100, 4
 
 ENABLE_INTERPOLATION = 0x10  # Controlword, interpolated position

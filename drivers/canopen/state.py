@@ -1,4 +1,4 @@
-"""One SYNC's TPDOs -> RobotState, or the reason why they cannot be believed."""
+"""One SYNC's TPDOs -> RobotState."""
 
 from __future__ import annotations
 
@@ -7,14 +7,11 @@ from collections import deque
 import numpy as np
 from numpy.typing import NDArray
 
-from gapbridge.core.arm import Arm
-from gapbridge.core.errors import InvalidStateError
 from gapbridge.core.state import RobotState
 from gapbridge.drivers.canopen.objects import MODE_ACTIVE, State, state_of
 from gapbridge.drivers.canopen.profile import CanopenProfile
 from gapbridge.drivers.canopen.sync_set import SyncSet
 from gapbridge.drivers.robot_modes import modes_of
-from gapbridge.drivers.state_check import JointCheck
 
 Vector = NDArray[np.float64]
 SPAN, OLDEST = 5, 0.1  # samples, s: what a velocity is reckoned from where drives report none
@@ -41,11 +38,10 @@ def not_following(profile: CanopenProfile, found: SyncSet) -> int | None:
 
 
 class StateBuilder:
-    """Makes states; remembers the sample before, for plausibility and for velocities."""
+    """Makes states; remembers the samples before, for velocities."""
 
-    def __init__(self, profile: CanopenProfile, arm: Arm) -> None:
+    def __init__(self, profile: CanopenProfile) -> None:
         self._profile = profile
-        self._joints = JointCheck(arm)
         self._rated = profile.rated_torque
         self._last: deque[tuple[float, Vector]] = deque(maxlen=SPAN)  # s of the SYNC, rad
 
@@ -55,32 +51,26 @@ class StateBuilder:
         return self._last[-1][1] if self._last else None
 
     def forget(self) -> None:
-        """Take the next sample without comparing it."""
+        """Take no velocity out of the next sample and those before."""
         self._last.clear()
 
+    def remember(self, state: RobotState) -> None:
+        """Take note of a state that can be believed."""
+        self._last.append((state.timestamp, state.actual_q))
+
     def build(self, found: SyncSet, target: Vector | None, armed: bool) -> RobotState:
-        """Return the state. Raises InvalidStateError.
+        """Return the state.
 
         ``target`` (n,) is what the drives were last commanded, rad. The time of the sample is that
         of its SYNC, at which all drives latched their positions.
         """
         q = positions(self._profile, found)
-        wrong = self._joints.outside(q)
-        if wrong is None and self._last:
-            synced, before = self._last[-1]
-            wrong = self._joints.jumped(q - before, found.synced - synced)
-            if wrong is not None:
-                self.forget()
-        if wrong is not None:
-            raise self._invalid(wrong)
-        qd = self._velocity(found, q)
-        self._last.append((found.synced, q))
         modes = modes_of([self._trouble(found, armed)])
         return RobotState(
             timestamp=found.synced,
             received=found.received,
             actual_q=q,
-            actual_qd=qd,
+            actual_qd=self._velocity(found, q),
             target_q=q if target is None else target,
             actual_TCP_force=np.zeros(6),
             actual_current_as_torque=self._torque(found),
@@ -121,6 +111,3 @@ class StateBuilder:
             return None
         reported = np.array([counts["Torque actual value"] for counts in found.counts], float)
         return reported * 1e-3 * self._rated * self._profile.direction
-
-    def _invalid(self, message: str) -> InvalidStateError:
-        return InvalidStateError(f"{self._profile.name}: {message}")

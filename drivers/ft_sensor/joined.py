@@ -48,7 +48,7 @@ class DriverWithSensor(Driver):
             self._arm.close()
             raise
 
-    def read_state(self) -> RobotState:
+    def _read_state(self) -> RobotState:
         """Return the arm's next sample with the sensor's wrench; see Driver.read_state.
 
         Where the sensor is silent, overloaded or not well, the state has no force and says why; or,
@@ -69,6 +69,11 @@ class DriverWithSensor(Driver):
             return state._replace(ft_raw_wrench=raw)
         force = self._tcp_force.of(raw, state)
         return state._replace(ft_raw_wrench=raw, actual_TCP_force=force)
+
+    def forget(self) -> None:
+        """See Driver.forget."""
+        super().forget()
+        self._arm.forget()
 
     def keep_alive(self) -> None:
         """See Driver.keep_alive."""

@@ -1,4 +1,4 @@
-"""Registers as they came over the wire -> one checked sample, SI; no socket, no clock."""
+"""Registers as they came over the wire -> one sample, SI; no socket, no clock."""
 
 from __future__ import annotations
 
@@ -18,18 +18,11 @@ from gapbridge.drivers.modbus.profile import ECHO_WORDS, addresses, turns_of, ve
 from gapbridge.drivers.modbus.registers import BIT_TABLES, UNITS, Coding, words_in
 from gapbridge.drivers.modbus.schema import Condition, Mailbox, Place, ProfileFile, Vector
 from gapbridge.drivers.robot_modes import Trouble
-from gapbridge.drivers.state_check import JITTER, LARGEST
 
 Array = NDArray[np.float64]
 Registers = Sequence[bytes]  # of each of RegisterMap.blocks, two bytes each, as on the wire
 Spot = tuple[int, int, Coding]  # a number's block and its first register there
 
-BOUNDS = {
-    "position": LARGEST["position"], "target": LARGEST["position"], "velocity": LARGEST["velocity"],
-    "joint_torque": LARGEST["torque"], "temperature": LARGEST["temperature"],
-    "force": LARGEST["force"], "moment": LARGEST["moment"], "echo": math.inf,
-}  # fmt: skip
-"""Largest plausible magnitudes, SI, by the profile's names."""
 TURN = 2.0 * math.pi
 
 
@@ -119,8 +112,7 @@ class Decoder:
     def decode(self, registers: Registers) -> Sample:
         """Return the sample in the registers of every block.
 
-        Raises InvalidStateError where a number is not finite or implausible, or where the sample
-        is torn.
+        Raises InvalidStateError where the sample is torn.
         """
         self._check_lengths(registers)
         clock = None if self._clock is None else _number(registers, self._clock)
@@ -170,13 +162,6 @@ class Decoder:
             turns = _picked(registers[field.turn_block], field.turn_indices)
             counts = field.turn_coding.decode(turns)
             values = [v + TURN * t for v, t in zip(values, counts, strict=True)]
-        bound = BOUNDS[field.name]
-        if not all(-bound <= v <= bound for v in values):  # NaN fails too
-            bad = next(i for i, v in enumerate(values) if not -bound <= v <= bound)
-            raise InvalidStateError(
-                f"{field.name} {bad + 1}: found {values[bad]:g}, expected a finite number within "
-                f"+-{bound:g}"
-            )
         return np.array(values)
 
 
@@ -208,20 +193,6 @@ def check_identity(profile: ProfileFile, compiled: RegisterMap, registers: Regis
         count = int(_number(registers, (*where, coding)))
         if not condition.fine(count):
             raise InvalidStateError(f"{_words(condition, count)}: not the profile's controller")
-
-
-def check_step(q: Array, before: Array, gap: float, fastest: Sequence[float]) -> None:
-    """Refuse joints that cannot have come there in ``gap`` s: a torn or a wrong sample.
-
-    ``fastest`` (n,) is in rad/s. Raises InvalidStateError.
-    """
-    # plain numbers: six of them cost an array more
-    joints = zip(q.tolist(), before.tolist(), fastest, strict=True)
-    for i, (now, then, speed) in enumerate(joints):
-        if abs(now - then) > speed * gap + JITTER:
-            raise InvalidStateError(
-                f"position {i + 1}: found a step of {abs(now - then):.4f} rad in {gap:.3f} s"
-            )
 
 
 def _number(registers: Registers, spot: Spot) -> float:

@@ -15,7 +15,7 @@ from gapbridge.core.setpoint import Setpoint
 from gapbridge.core.state import RobotState
 from gapbridge.drivers.clock import SYSTEM, Clock
 from gapbridge.drivers.driver import Driver
-from gapbridge.drivers.modbus.decode import Decoder, Sample, check_identity, check_step
+from gapbridge.drivers.modbus.decode import Decoder, Sample, check_identity
 from gapbridge.drivers.modbus.freshness import Freshness
 from gapbridge.drivers.modbus.map import compile_map
 from gapbridge.drivers.modbus.profile import read_profile
@@ -25,12 +25,10 @@ from gapbridge.drivers.modbus.transport import Transport
 from gapbridge.drivers.modbus.write import make_writer
 from gapbridge.drivers.offset_inverse import Nominal
 from gapbridge.drivers.robot_modes import NORMAL, REDUCED, RUNNING, modes_of
-from gapbridge.drivers.state_check import JointCheck
 
 Vector = NDArray[np.float64]
 SLOW_EVERY = 0.2  # s between two readings of conditions that lie apart
 LONGEST_ANSWER, LEAST_ANSWER = 4.0, 0.03  # cycles, s: an older answer is not fresh
-MARGIN = 2.0  # times the arm's own velocity limits: what no joint can pass
 
 
 class ModbusDriver(Driver):
@@ -38,7 +36,8 @@ class ModbusDriver(Driver):
 
     def __init__(self, settings: ModbusSettings, model: Model, clock: Clock = SYSTEM) -> None:
         self.profile = profile = read_profile(settings.profile_path, model.arm.n)
-        super().__init__(settings.rate, model, profile.write.mode != "mailbox", clock)
+        reads_targets = profile.write.mode == "mailbox"
+        super().__init__(settings.rate, model, not reads_targets, clock, profile.fastest)
         self.settings = settings
         self.map = compile_map(profile)
         device = profile.device_id if settings.device_id is None else settings.device_id
@@ -57,10 +56,7 @@ class ModbusDriver(Driver):
         self._due = 0.0  # s, monotonic: when the next reading is due
         self._fresh_at = 0.0  # s, monotonic: of the last new sample
         self._sample: Sample | None = None
-        self._q: Vector | None = None  # of the last sample that was believed
-        self._first: tuple[Vector, float] = (np.zeros(0), 0.0)  # what the first must agree with
-        fastest = np.minimum(profile.fastest, MARGIN * model.arm.limits.velocity)
-        self._fastest = fastest.tolist()
+        self._before: RobotState | None = None  # the last one that was believed
         self._longest_answer = max(LONGEST_ANSWER / self.rate, LEAST_ANSWER)  # s
         self._given = 0.0  # s, monotonic: when the last setpoint was given
         self._connected = False
@@ -78,16 +74,14 @@ class ModbusDriver(Driver):
             self._slow_at = 0.0
             blocks = self._read_blocks()
             with self._named():
-                sample = self._decoder.decode(blocks)
-                self._check_limits(sample.vectors["position"])
+                self._freshness.restart()
+                self._begin_with(self._decoder.decode(blocks))
         except InvalidStateError as error:
             self.transport.close()
             raise LinkError(str(error)) from None
         except LinkError:
             self.transport.close()
             raise
-        self._q, self._first = None, (sample.vectors["position"], self._now())
-        self._freshness.restart()
         self._connected = True
         self._due = self._fresh_at = self._now()
 
@@ -99,13 +93,20 @@ class ModbusDriver(Driver):
         except InvalidStateError as error:
             raise InvalidStateError(f"{self.transport.name}: {error}") from None
 
-    def _check_limits(self, q: Vector) -> None:
-        """Refuse joints where the arm cannot be: units, word order or signs are wrong."""
-        found = JointCheck(self._model.arm).outside(q)
-        if found is not None:
-            raise InvalidStateError(f"{found}: is the profile right?")
+    def _begin_with(self, sample: Sample) -> None:
+        """Take the sample of connecting: the first one that is read must agree with it.
 
-    def read_state(self) -> RobotState:
+        Raises InvalidStateError where the arm cannot be there: units, word order or signs are
+        wrong.
+        """
+        self._before = None
+        self.forget()
+        try:
+            self._validate(self._state(sample, self._now()))
+        except InvalidStateError as error:
+            raise InvalidStateError(f"{error}; is the profile right?") from None
+
+    def _read_state(self) -> RobotState:
         """Return the next new sample; see Driver.read_state."""
         if not self._connected:
             raise LinkError(f"{self.transport.name}: found no connection, expected connect() first")
@@ -120,7 +121,8 @@ class ModbusDriver(Driver):
             if sample is not None:
                 q = sample.vectors["position"]
                 if self._freshness.is_new(sample.clock, q, sample.vectors.get("velocity")):
-                    return self._believe(sample, received)
+                    self._sample = sample
+                    return self._state(sample, received)
             if received > limit:
                 raise StaleStateError(
                     f"{self.transport.name}: found no new sample for "
@@ -163,33 +165,20 @@ class ModbusDriver(Driver):
             found.append(self.transport.read(block))
         return found + self._slow
 
-    def _believe(self, sample: Sample, received: float) -> RobotState:
-        """Return the state of a sample. Raises InvalidStateError where it makes a leap.
+    def _validate(self, state: RobotState) -> None:
+        """See Driver._validate."""
+        super()._validate(state)
+        self._before, self._fresh_at = state, state.received
 
-        The first one is compared with the one that connecting has seen: one torn sample is never
-        where all others start from.
-        """
-        q = sample.vectors["position"]
-        known, since = (self._q, self._fresh_at) if self._q is not None else self._first
-        try:
-            check_step(q, known, received - since + self.profile.period, self._fastest)
-        except InvalidStateError as error:
-            if self._q is None:
-                self._first = (q, received)
-            raise InvalidStateError(f"{self.transport.name}: {error}") from None
-        timestamp = self._freshness.take(sample.clock, q, received)
-        state = self._state(sample, timestamp, received)
-        self._q = q
-        self._fresh_at, self._sample = received, sample
-        return state
-
-    def _state(self, sample: Sample, timestamp: float, received: float) -> RobotState:
-        found = sample.vectors
+    def _state(self, sample: Sample, received: float) -> RobotState:
+        found, before = sample.vectors, self._before
         q = found["position"]
+        timestamp = self._freshness.take(sample.clock, q, received)
         velocity = found.get("velocity")
         if velocity is None:
-            gap = received - self._fresh_at
-            velocity = (q - self._q) / gap if self._q is not None and gap > 0.0 else 0.0 * q
+            velocity = 0.0 * q
+            if before is not None and received > before.received:
+                velocity = (q - before.actual_q) / (received - before.received)
         sent = self._writer.target()
         target = found.get("target", q if sent is None else sent)
         force = np.zeros(6)

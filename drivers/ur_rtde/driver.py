@@ -52,7 +52,7 @@ class UrRtdeDriver(Driver):
         """Open the receiving side only: no program is touched, no input claimed."""
         self.reader.open()
 
-    def read_state(self) -> RobotState:
+    def _read_state(self) -> RobotState:
         """Return the next sample; see Driver.read_state."""
         self._state = self.reader.read()
         if isinstance(self._writer, OffsetWriter):

@@ -13,14 +13,11 @@ from itertools import chain
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from gapbridge.core.errors import InvalidStateError, LinkError, StaleStateError
-from gapbridge.core.kernels.reference import JIT
 from gapbridge.core.state import RobotState
 from gapbridge.drivers.clock import SYSTEM, Clock
-from gapbridge.drivers.state_check import FASTEST, JITTER, LARGEST
 from gapbridge.drivers.ur_rtde.registers import APPLIED, ECHO, PROGRAM
 from gapbridge.drivers.ur_rtde.settings import UrRtdeSettings
 
@@ -29,16 +26,16 @@ N = 6
 POLL = 200e-6  # s: best of the polls measured (age 0.33 ms, a sixth of a core)
 ATTEMPTS = 4
 
-# field of RobotState: (getter, size, largest plausible magnitude, whether a controller may lack it)
-_VECTORS: dict[str, tuple[str, int, float, bool]] = {
-    "actual_q": ("getActualQ", N, LARGEST["position"], False),
-    "actual_qd": ("getActualQd", N, LARGEST["velocity"], False),
-    "target_q": ("getTargetQ", N, LARGEST["position"], False),
-    "actual_TCP_force": ("getActualTCPForce", 6, LARGEST["force"], False),
-    "ft_raw_wrench": ("getFtRawWrench", 6, LARGEST["force"], True),
-    "joint_temperatures": ("getJointTemperatures", N, LARGEST["temperature"], True),
-    "actual_current": ("getActualCurrent", N, LARGEST["current"], True),
-    "payload_cog": ("getPayloadCog", 3, 10.0, True),
+# field of RobotState: (getter, size, whether a controller may lack it)
+_VECTORS: dict[str, tuple[str, int, bool]] = {
+    "actual_q": ("getActualQ", N, False),
+    "actual_qd": ("getActualQd", N, False),
+    "target_q": ("getTargetQ", N, False),
+    "actual_TCP_force": ("getActualTCPForce", 6, False),
+    "ft_raw_wrench": ("getFtRawWrench", 6, True),
+    "joint_temperatures": ("getJointTemperatures", N, True),
+    "actual_current": ("getActualCurrent", N, True),
+    "payload_cog": ("getPayloadCog", 3, True),
 }
 POSE = "actual_TCP_pose"  # read when it is asked for, not in every cycle
 _NAMES = (
@@ -47,17 +44,6 @@ _NAMES = (
     f"output_int_register_{ECHO}", f"output_int_register_{PROGRAM}",
     *(f"output_double_register_{i}" for i in APPLIED),
 )  # fmt: skip
-
-
-@njit(**JIT)
-def plausible(values, bounds, before, step):  # type: ignore[no-untyped-def]
-    """Return whether values are within bounds, and the first six (joints) near ``before``."""
-    fine = True
-    for i in range(values.shape[0]):
-        fine = fine and abs(values[i]) <= bounds[i]  # NaN is not either
-    for i in range(N):
-        fine = fine and abs(values[i] - before[i]) <= step
-    return fine
 
 
 class StateReader:
@@ -71,11 +57,9 @@ class StateReader:
         self._sizes: list[int] = []  # numbers of each field
         self._has_pose = False
         self._getters: list[Any] = []
-        self._bounds = np.empty(0)
         self._payload = True
         self._last = -1.0  # s, controller clock
         self._changed = 0.0  # s, monotonic: when that clock last moved
-        self._q: Vector | None = None
         self._registers = settings.mode == "offset"
         self.echo = 0
         self.program = 0
@@ -110,20 +94,16 @@ class StateReader:
         self._lay_out(names)
         if not self._receive.isConnected() or not self._receive.getTimestamp():
             raise LinkError(f"{settings.host}: the controller refused the RTDE session")
-        self._last, self._changed, self._q = -1.0, self._now(), None
+        self._last, self._changed = -1.0, self._now()
 
     def _lay_out(self, names: list[str]) -> None:
-        self._fields, self._sizes, self._getters, bounds, start = [], [], [], [], 0
-        for name, (getter, size, bound, _) in _VECTORS.items():
+        self._fields, self._sizes, self._getters, start = [], [], [], 0
+        for name, (getter, size, _) in _VECTORS.items():
             if name in names:
                 self._fields.append((name, slice(start, start + size)))
                 self._sizes.append(size)
                 self._getters.append(getattr(self._receive, getter))
-                bounds += [bound] * size
                 start += size
-        self._bounds = np.array(bounds)
-        # compiled here: the first sample must not wait for a compiler
-        plausible(self._bounds, self._bounds, self._bounds[:N], 0.0)
         self._payload, self._has_pose = "payload" in names, POSE in names
 
     def close(self) -> None:
@@ -161,17 +141,10 @@ class StateReader:
                 )
             self._sleep(POLL)
             timestamp = receive.getTimestamp()
-        backwards = timestamp < self._last
-        before, self._last, self._changed = self._last, timestamp, self._now()
-        if backwards:
-            self._q = None
-            raise InvalidStateError(
-                f"{self._settings.host}: the controller's clock went back from {before:.3f} to "
-                f"{timestamp:.3f} s: it was started anew"
-            )
-        return self._sample(timestamp, timestamp - before)
+        self._last, self._changed = timestamp, self._now()
+        return self._sample(timestamp)
 
-    def _sample(self, timestamp: float, gap: float) -> RobotState:
+    def _sample(self, timestamp: float) -> RobotState:
         """Return all fields of one cycle; reads again where a packet came in between."""
         receive = self._receive
         for _ in range(ATTEMPTS):
@@ -186,9 +159,8 @@ class StateReader:
                 self._read_registers()
             after = receive.getTimestamp()
             if after == timestamp:
-                return self._checked(timestamp, received, gap, rows, modes, payload)
+                return self._state(timestamp, received, rows, modes, payload)
             self.torn += 1
-            gap += after - timestamp
             timestamp = self._last = after
             self._changed = self._now()
         raise InvalidStateError(
@@ -203,36 +175,23 @@ class StateReader:
         for i, register in enumerate(APPLIED):
             self.applied[i] = receive.getOutputDoubleRegister(register)
 
-    def _checked(
+    def _state(
         self,
         timestamp: float,
         received: float,
-        gap: float,
         rows: list[list[float]],
         modes: tuple[int, int, int, int, float],
         payload: float | None,
     ) -> RobotState:
-        """Return the sample. Raises InvalidStateError where it cannot be believed."""
+        """Return the sample. Raises InvalidStateError where a vector has another length."""
         if [*map(len, rows)] != self._sizes:
             for (name, _), size, row in zip(self._fields, self._sizes, rows, strict=True):
                 if len(row) != size:
-                    raise self._invalid(f"{name}: found {len(row)} numbers, expected {size}")
+                    raise InvalidStateError(
+                        f"{self._settings.host}: {name}: found {len(row)} numbers, expected {size}"
+                    )
         values = np.array([*chain.from_iterable(rows)])
-        before = values if self._q is None else self._q
-        fine = plausible(values, self._bounds, before, FASTEST * gap + JITTER)
-        if not fine and not (np.abs(values) <= self._bounds).all():
-            bad = int(np.argmax(~(np.abs(values) <= self._bounds)))
-            name, where = next(f for f in self._fields if bad < f[1].stop)
-            raise self._invalid(
-                f"{name}_{bad - where.start}: found {values[bad]:g}, expected a finite number "
-                f"within +-{self._bounds[bad]:g}"
-            )
-        if payload is not None and not 0.0 <= payload <= 1e3:
-            raise self._invalid(f"payload: found {payload:g} kg, expected 0 to 1000")
         found: dict[str, Any] = {name: values[where] for name, where in self._fields}
-        if not fine:
-            self._check_motion(found["actual_q"], gap)
-        self._q = found["actual_q"]
         current, constants = found.pop("actual_current", None), self._settings.torque_constants
         if current is not None and constants is not None:
             found["actual_current_as_torque"] = current * constants
@@ -241,27 +200,6 @@ class StateReader:
             runtime_state=modes[2], safety_status_bits=modes[3], speed_scaling=modes[4],
             **found,
         )  # fmt: skip
-
-    def _check_motion(self, q: Vector, gap: float) -> None:
-        """Refuse joints that are where they cannot have come to since the last sample."""
-        before = self._q
-        if before is None:
-            return
-        way = [abs(now - then) for now, then in zip(q.tolist(), before.tolist(), strict=True)]
-        if max(way) > FASTEST * gap + JITTER:
-            self._q = None
-            joint = way.index(max(way))
-            raise self._invalid(
-                f"actual_q_{joint}: found a step of {way[joint]:.4f} rad in {gap:.4f} s"
-            )
-
-    def _invalid(self, message: str) -> InvalidStateError:
-        return InvalidStateError(f"{self._settings.host}: {message}")
-
-    def tcp_pose(self) -> Vector | None:
-        """Return the controller's own TCP pose (6,) in base, m and rotation vector, or None."""
-        found = self.joints_and_tcp()
-        return None if found is None else found[1]
 
     def joints_and_tcp(self) -> tuple[Vector, Vector] | None:
         """Return joints (6,) and the controller's own TCP pose (6,) of one sample, or None.
@@ -279,7 +217,7 @@ class StateReader:
 
 
 def _is_optional(name: str) -> bool:
-    return name == POSE or (name in _VECTORS and _VECTORS[name][3])
+    return name == POSE or (name in _VECTORS and _VECTORS[name][2])
 
 
 def _first_line(error: Exception) -> str:

@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 
 from gapbridge.core.arm import builtin_arm
+from gapbridge.core.errors import Implausible, InvalidStateError
+from gapbridge.core.state import RobotState
 from gapbridge.drivers.robot_modes import MODES, modes_of
 from gapbridge.drivers.simulated.ur.modes import SAFETY_BITS
-from gapbridge.drivers.state_check import BEYOND, FASTEST, JITTER, JointCheck
+from gapbridge.drivers.state_check import BEYOND, FASTEST, HASTE, JITTER, SampleCheck
 
 ARM = builtin_arm("ur10e")
 
@@ -27,18 +29,39 @@ def test_of_several_troubles_the_gravest_counts_and_no_bit_is_lost() -> None:
     assert modes_of([]) == MODES[""]
 
 
+def state(q: np.ndarray, at: float = 0.0) -> RobotState:
+    return RobotState(at, at, q, np.zeros(6), q, np.zeros(6))
+
+
 @pytest.mark.parametrize("angle", [np.nan, np.inf, -np.inf, 2 * np.pi + 2 * BEYOND])
 def test_an_angle_that_no_such_arm_has_is_named(angle: float) -> None:
     q = np.zeros(6)
-    check = JointCheck(ARM)
-    assert check.outside(q) is None
-    q[3] = angle
-    assert "joint 4" in str(check.outside(q))
+    check = SampleCheck(ARM)
+    check.check(state(q))
+    with pytest.raises(InvalidStateError, match="actual_q_3: found"):
+        check.check(state(np.array([0.0, 0.0, 0.0, angle, 0.0, 0.0]), 1.0))
 
 
-def test_a_step_that_no_joint_makes_is_named() -> None:
-    check, step = JointCheck(ARM), np.zeros(6)
-    step[1] = -0.9 * (FASTEST * 0.01 + JITTER)
-    assert check.jumped(step, 0.01) is None
-    step[1] *= 1.2
-    assert "joint 2: found a step" in str(check.jumped(step, 0.01))
+@pytest.mark.parametrize("field", ["joint_temperatures", "actual_current_as_torque", "payload_cog"])
+def test_every_vector_that_a_driver_reports_is_checked(field: str) -> None:
+    value = np.full(3 if field == "payload_cog" else 6, 0.01)
+    check = SampleCheck(ARM)
+    check.check(state(np.zeros(6))._replace(**{field: value}))
+    value[1] = 2e4
+    with pytest.raises(InvalidStateError, match=f"{field}_1: found 20000"):
+        check.check(state(np.zeros(6), 1.0)._replace(**{field: value}))
+    with pytest.raises(InvalidStateError, match="payload: found -1 kg"):
+        check.check(state(np.zeros(6), 1.0)._replace(payload=-1.0))
+
+
+@pytest.mark.parametrize("fastest", [0.5, FASTEST])
+def test_a_step_that_no_joint_makes_is_named(fastest: float) -> None:
+    check, q = SampleCheck(ARM, fastest), np.zeros(6)
+    check.check(state(q))
+    q[1] = -0.9 * (min(HASTE * ARM.limits.velocity[1], fastest) * 0.01 + JITTER)
+    check.check(state(q, 0.01))
+    check.forget()
+    check.check(state(np.zeros(6)))
+    with pytest.raises(InvalidStateError, match="actual_q_1: found a step") as caught:
+        check.check(state(1.2 * q, 0.01))
+    assert caught.value.reason == Implausible.STEP

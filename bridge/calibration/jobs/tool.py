@@ -6,7 +6,6 @@ from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from gapbridge.bridge.calibration.format import millimetres
 from gapbridge.bridge.calibration.instruments.instrument import AnyInstrument, Surroundings
@@ -23,6 +22,7 @@ from gapbridge.core.calibration.plan import Plan, PlannedPose
 from gapbridge.core.calibration.tool_session import calibrate_tool
 from gapbridge.core.errors import CellError
 from gapbridge.core.planning.tool_plan import plan_tool
+from gapbridge.core.rotation import roll_pitch_yaw
 
 Array = NDArray[np.float64]
 POSES = 6
@@ -81,11 +81,6 @@ class ToolJob(Job):
         applied = found.applied(model)
         tcp = {
             "xyz": [float(v) for v in applied.tool_in_flange[:3, 3]],
-            "rpy": [float(v) for v in _rpy(applied.tool_in_flange[:3, :3])],
+            "rpy": [float(v) for v in roll_pitch_yaw(applied.tool_in_flange[:3, :3])],
         }
         self.hand_over(applied, "the cell with this tool", {"tool": {"tcp": tcp}})
-
-
-def _rpy(matrix: Array) -> Array:
-    """Return roll, pitch and yaw (3,), rad, as URDF has them."""
-    return np.asarray(Rotation.from_matrix(matrix).as_euler("xyz"), dtype=float)

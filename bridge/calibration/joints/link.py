@@ -152,7 +152,6 @@ class LinkedJoints(JointSource):
             if time.monotonic() > until:
                 raise LinkError("the arm reports nothing, expected its joints")
             time.sleep(0.02)
-        run.ready = True
 
     def _require(self) -> WatchedRun:
         if self._run is None:

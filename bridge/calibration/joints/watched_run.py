@@ -26,7 +26,6 @@ class WatchedRun:
         self.slices = self.daemon.page.slices
         self.rows = np.empty((0, self.daemon.page.width))
         self.approach = np.zeros(self.daemon.page.n)
-        self.ready = False
         self._turned_at: Array | None = None
         self._reader: PageReader | None = self.daemon.page.reader()
         self._messages: list[str] = []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -64,17 +65,11 @@ At every question:
               help="Seed of the plan.")  # fmt: skip
 def calibrate(
     cell: Path,
-    folder: Path | None,
     instrument: str | None,
-    poses: int | None,
-    plan_only: bool,
-    move: bool,
-    new_cell: Path | None,
     verify: bool,
     payload_only: bool,
     tool_only: bool,
-    yes: bool,
-    seed: int,
+    **options: Any,
 ) -> None:
     """Lead a field calibration session; it can be resumed.
 
@@ -95,6 +90,7 @@ def calibrate(
     given = open_cell(cell)
     if verify + payload_only + tool_only > 1:
         raise click.UsageError("found more than one of --verify, --payload-only and --tool-only")
+    folder, new_cell = options["folder"], options["new_cell"]
     if folder is not None and folder.exists() and not folder.is_dir():
         raise click.UsageError(f"{folder}: found a file, expected a folder for --session")
     if new_cell is not None:
@@ -104,8 +100,4 @@ def calibrate(
     from gapbridge.bridge.calibration.run import run_session  # takes the numerical libraries along
 
     kind = "verify" if verify else "payload" if payload_only else "tool" if tool_only else "whole"
-    options = SessionOptions(
-        kind=kind, folder=folder, instrument=chosen, poses=poses, plan_only=plan_only, move=move,
-        new_cell=new_cell, yes=yes, seed=seed,
-    )  # fmt: skip
-    run_session(given, options)
+    run_session(given, SessionOptions(kind=kind, instrument=chosen, **options))

@@ -41,7 +41,6 @@ class AtiNode(SimulatedSensor):
         exact = (scale * RANGE / FULL)[:, None] * mixing
         self._matrix = exact.astype(np.float32)
         self._inverse = np.linalg.inv(self._matrix.astype(float)) * scale
-        self.answered = 0  # samples
 
     def open(self) -> None:
         """Open the bus."""
@@ -58,7 +57,6 @@ class AtiNode(SimulatedSensor):
         """Return the frames that answer a question; their ids count up from the operation."""
         if operation == 0x0:
             g = self.gauges()
-            self.answered += 1
             return [struct.pack(">H3h", self.status, g[0], g[2], g[4]),
                     struct.pack(">3h", g[1], g[3], g[5])]  # fmt: skip
         if operation == 0x2 and len(data) == 1 and data[0] < 6:

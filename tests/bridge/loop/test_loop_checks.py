@@ -10,7 +10,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gapbridge.bridge.ipc.counts import Count
 from gapbridge.bridge.ipc.shared_memory import SharedMemory
 from gapbridge.bridge.loop.checks import (
     DEGRADED,
@@ -21,16 +20,17 @@ from gapbridge.bridge.loop.checks import (
     OverrunWatch,
     SaturationWatch,
 )
-from gapbridge.bridge.loop.link_monitor import LinkMonitor, SampleCheck, hold_time
+from gapbridge.bridge.loop.link_monitor import LinkMonitor, hold_time
 from gapbridge.bridge.loop.reports import Reports
 from gapbridge.bridge.loop.supervisor import State, Supervisor
 from gapbridge.core.arm import builtin_arm
-from gapbridge.core.errors import InvalidStateError, StaleStateError
+from gapbridge.core.errors import Implausible, InvalidStateError, StaleStateError
 from gapbridge.core.limits import ENVELOPE, RATE
 from gapbridge.core.model import Model
 from gapbridge.core.state import RobotState
 from gapbridge.drivers.clock import SYSTEM, Clock
 from gapbridge.drivers.driver import Driver
+from gapbridge.drivers.state_check import SampleCheck
 
 ARM = builtin_arm("ur10e")
 Q = np.array([0.0, -1.5, 1.8, -1.87, -1.57, 0.0])
@@ -52,45 +52,45 @@ def changed(index: int, value: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    ("bad", "count"),
+    ("bad", "reason"),
     [
-        ({"q": changed(2, np.nan)}, Count.DROPPED_NOT_FINITE),
-        ({"q": changed(2, np.inf)}, Count.DROPPED_NOT_FINITE),
-        ({"target_q": changed(0, np.nan)}, Count.DROPPED_NOT_FINITE),
-        ({"actual_qd": changed(0, np.nan)}, Count.DROPPED_NOT_FINITE),
-        ({"actual_TCP_force": np.full(6, np.nan)}, Count.DROPPED_NOT_FINITE),
-        ({"actual_TCP_force": np.full(6, 1e5)}, Count.DROPPED_IMPLAUSIBLE),
-        ({"q": changed(1, 8.0)}, Count.DROPPED_IMPLAUSIBLE),
-        ({"q": changed(1, -1.4)}, Count.DROPPED_STEP),
+        ({"q": changed(2, np.nan)}, Implausible.NOT_FINITE),
+        ({"q": changed(2, np.inf)}, Implausible.NOT_FINITE),
+        ({"target_q": changed(0, np.nan)}, Implausible.NOT_FINITE),
+        ({"actual_qd": changed(0, np.nan)}, Implausible.NOT_FINITE),
+        ({"actual_TCP_force": np.full(6, np.nan)}, Implausible.NOT_FINITE),
+        ({"actual_TCP_force": np.full(6, 1e5)}, Implausible.VALUE),
+        ({"q": changed(1, 8.0)}, Implausible.VALUE),
+        ({"q": changed(1, -1.4)}, Implausible.STEP),
     ],
 )
 def test_a_sample_that_cannot_be_is_dropped_with_its_reason(
-    bad: dict[str, Any], count: Count
+    bad: dict[str, Any], reason: Implausible
 ) -> None:
     check = SampleCheck(ARM)
-    assert check.doubt(state(1.0)) is None
-    found = check.doubt(state(1.0 + T, **bad))
-    assert found is not None
-    assert found.count == count
-    assert check.doubt(state(1.0 + 2 * T)) is None  # the next good one is believed
+    check.check(state(1.0))
+    with pytest.raises(InvalidStateError) as caught:
+        check.check(state(1.0 + T, **bad))
+    assert caught.value.reason == reason
+    check.check(state(1.0 + 2 * T))  # the next good one is believed
 
 
 def test_a_clock_that_goes_back_is_no_sample_and_a_lost_force_is_no_reason_to_drop() -> None:
     check = SampleCheck(ARM)
-    assert check.doubt(state(1.0)) is None
-    back = check.doubt(state(0.9))
-    assert back is not None
-    assert back.count == Count.DROPPED_BACKWARDS
+    check.check(state(1.0))
+    with pytest.raises(InvalidStateError, match="clock went back") as caught:
+        check.check(state(0.9))
+    assert caught.value.reason == Implausible.BACKWARDS
     lost = state(1.1, actual_TCP_force=np.full(6, np.nan), sensor_lost="silent")
-    assert check.doubt(lost) is None
+    check.check(lost)
 
 
 @given(st.lists(st.floats(-1.0, 1.0), min_size=6, max_size=6), st.floats(1e-3, 0.2))
 def test_what_an_arm_can_do_is_never_dropped(share: list[float], gap: float) -> None:
     check = SampleCheck(ARM)
-    assert check.doubt(state(1.0)) is None
+    check.check(state(1.0))
     moved = Q + np.array(share) * ARM.limits.velocity * gap
-    assert check.doubt(state(1.0 + gap, moved)) is None
+    check.check(state(1.0 + gap, moved))
 
 
 # -- watches ---------------------------------------------------------------------------------------
@@ -222,7 +222,7 @@ class Scripted(Driver):
 
     def connect(self) -> None: ...
 
-    def read_state(self) -> RobotState:
+    def _read_state(self) -> RobotState:
         if isinstance(self.next, Exception):
             raise self.next
         self.next = self.next._replace(timestamp=self.next.timestamp + T)
@@ -243,7 +243,7 @@ def watched(
         clock.monotonic = lambda: now[0]
     driver, supervisor = Scripted(clock), Supervisor(lambda *_: None)
     supervisor.state = State.COMPENSATING
-    watch = LinkMonitor(driver, ARM, supervisor, Reports(page, events.append))
+    watch = LinkMonitor(driver, supervisor, Reports(page, events.append))
     return driver, supervisor, watch, events
 
 

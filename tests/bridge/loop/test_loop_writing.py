@@ -57,7 +57,7 @@ class Failing(Driver):
 
     def connect(self) -> None: ...
 
-    def read_state(self) -> RobotState:
+    def _read_state(self) -> RobotState:
         raise NotImplementedError
 
     def _send(self, setpoint: Setpoint) -> None:

@@ -56,7 +56,7 @@ class Scripted(Driver):
     def close(self) -> None:
         pass
 
-    def read_state(self) -> RobotState:
+    def _read_state(self) -> RobotState:
         k = next(self._count, None)
         if k is None:
             raise LinkError("the script has come to its end")

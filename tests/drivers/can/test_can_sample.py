@@ -12,6 +12,7 @@ from gapbridge.core.errors import InvalidStateError
 from gapbridge.drivers.can.assembler import Assembler
 from gapbridge.drivers.can.loading import load_profile
 from gapbridge.drivers.can.state import StateBuilder
+from gapbridge.drivers.state_check import SampleCheck
 
 PIPER = load_profile("piper")
 PERIOD = 0.005  # s
@@ -165,6 +166,19 @@ def stray_frames(random, number):
         yield (identifier, extended), data[k, : lengths[k]].tobytes()
 
 
+def checked(builder: StateBuilder):
+    """Return what makes a sample a state, as the driver's base does: made, checked, remembered."""
+    check = SampleCheck(builtin_arm("ur10e"))
+
+    def believed(sample):
+        state = builder.build(sample, None, "", ready=True)
+        check.check(state)
+        builder.remember()
+        return state
+
+    return believed
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(120)
 def test_stray_frames_raise_nothing_and_no_wrong_sample_is_taken_for_good():
@@ -174,7 +188,7 @@ def test_stray_frames_raise_nothing_and_no_wrong_sample_is_taken_for_good():
     two samples; one beside the true one makes a sample torn.
     """
     random = np.random.default_rng(7)
-    assembler, builder = Assembler(PIPER), StateBuilder(PIPER, builtin_arm("ur10e"))
+    assembler, believed = Assembler(PIPER), checked(StateBuilder(PIPER.n))
     stream = stray_frames(random, 200_000)
     good = wrong = refused = k = 0
     outlier = next(stream, None)
@@ -195,7 +209,7 @@ def test_stray_frames_raise_nothing_and_no_wrong_sample_is_taken_for_good():
             if sample is None:
                 continue
             try:
-                state = builder.build(sample, None, "", ready=True)
+                state = believed(sample)
             except InvalidStateError:
                 refused += 1
                 continue
@@ -220,14 +234,14 @@ def test_no_frame_of_any_length_and_content_raises_an_exception(name):
 
 
 def test_joints_that_no_arm_can_come_to_between_two_samples_are_refused():
-    builder = StateBuilder(PIPER, builtin_arm("ur10e"))
+    believed = checked(StateBuilder(PIPER.n))
 
     def state_of(q, at):
         assembler = Assembler(PIPER)
         for first in (1, 3, 5):
             key, data = joints_frame(first, q, q)
             sample = assembler.take((key, False), data, at, at)
-        return builder.build(sample, None, "", ready=True)
+        return believed(sample)
 
     state_of(0.5, 1.0)
     with pytest.raises(InvalidStateError, match=r"found a step of 0\.5000 rad in 0\.0050 s"):

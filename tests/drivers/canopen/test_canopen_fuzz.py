@@ -16,6 +16,7 @@ from gapbridge.drivers.canopen.profile import CanopenProfile, read_profile
 from gapbridge.drivers.canopen.settings import SHIPPED
 from gapbridge.drivers.canopen.state import StateBuilder
 from gapbridge.drivers.canopen.sync_set import SyncCollector
+from gapbridge.drivers.state_check import SampleCheck
 
 TOTAL = 1_000_000
 Q = np.array([0.3, -1.2, 1.1, -0.4, 1.5, -2.0])
@@ -68,7 +69,7 @@ def ruined(
 def test_a_million_frames_give_no_exception_and_no_wrong_sample() -> None:
     profile = read_profile(SHIPPED / "cia402.yaml")
     collector = SyncCollector(profile)
-    builder = StateBuilder(profile, builtin_arm("ur10e"))
+    builder, check = StateBuilder(profile), SampleCheck(builtin_arm("ur10e"))
     network = Network()
     for node in profile.nodes:
         network.add_node(node, profile.eds.dictionary(node))
@@ -95,8 +96,10 @@ def test_a_million_frames_give_no_exception_and_no_wrong_sample() -> None:
             assert not true, collector.why()
             continue
         builder.forget()
+        check.forget()
         try:
             state = builder.build(found, None, False)
+            check.check(state)
         except InvalidStateError:
             refused += 1
             continue
@@ -113,7 +116,7 @@ def test_random_payloads_are_refused_or_are_what_their_bytes_say() -> None:
     profile = read_profile(SHIPPED / "cia402.yaml")
     collector = SyncCollector(profile)
     arm = builtin_arm("ur10e")
-    builder = StateBuilder(profile, arm)
+    builder, check = StateBuilder(profile), SampleCheck(arm)
     random = np.random.default_rng(5)
     identifiers = [cob_id for cob_id, _ in good_frames(profile)]
     for _ in range(20_000):
@@ -125,8 +128,10 @@ def test_random_payloads_are_refused_or_are_what_their_bytes_say() -> None:
         found = collector.wait(0.0)
         assert found is not None
         builder.forget()
+        check.forget()
         try:
             state = builder.build(found, None, True)
+            check.check(state)
         except InvalidStateError:
             continue
         raw = [int.from_bytes(sent[0x180 + n][2:], "little", signed=True) for n in profile.nodes]

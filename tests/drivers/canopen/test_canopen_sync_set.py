@@ -10,8 +10,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gapbridge.core.arm import builtin_arm
-from gapbridge.core.errors import InvalidStateError
 from gapbridge.drivers.canopen.objects import Address
 from gapbridge.drivers.canopen.pdo import Entry, PdoLayout
 from gapbridge.drivers.canopen.profile import read_profile
@@ -131,7 +129,7 @@ def test_a_layout_agrees_with_the_canopen_library() -> None:
 @pytest.mark.parametrize("name", ["lwa4p", "cia402"])
 def test_speeds_are_the_drives_own_or_come_from_positions(name: str) -> None:
     profile = read_profile(SHIPPED / f"{name}.yaml")
-    builder = StateBuilder(profile, builtin_arm("ur10e"))
+    builder = StateBuilder(profile)
     speed = np.array([0.5, -0.5, 0.2, 0.0, -0.3, 1.0])
     reported = np.rint(speed * profile.counts_per_radian)
     for step in range(8):
@@ -143,12 +141,9 @@ def test_speeds_are_the_drives_own_or_come_from_positions(name: str) -> None:
             for q, v in zip(counts, reported, strict=True)
         ]  # fmt: skip
         state = builder.build(SyncSet(tuple(rows), synced, synced + 0.001), None, False)
+        builder.remember(state)
     assert state.actual_qd == pytest.approx(speed, abs=1e-3)
     assert state.timestamp == synced
-    jumped = profile.counts(speed * synced + 1.0)
-    leap = [{**row, "Position actual value": int(q)} for row, q in zip(rows, jumped, strict=True)]
-    with pytest.raises(InvalidStateError, match="found a step of"):
-        builder.build(SyncSet(tuple(leap), synced + 0.01, synced + 0.011), None, False)
 
 
 def test_layouts_compare_by_what_they_hold() -> None:

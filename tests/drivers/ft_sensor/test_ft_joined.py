@@ -56,7 +56,7 @@ class ControllerDriver(Driver):
     def connect(self) -> None:
         self.open, self._due = True, time.monotonic()
 
-    def read_state(self) -> RobotState:
+    def _read_state(self) -> RobotState:
         time.sleep(max(self._due - time.monotonic(), 0.0))
         self._due = max(self._due + PERIOD, time.monotonic())
         now = time.monotonic()

@@ -221,7 +221,7 @@ def test_a_map_with_the_wrong_word_order_is_reported_when_connecting(tmp_path: P
     path.write_text(text.replace("type: i32, word_order: low_first", "type: i32", 1))
     with ModbusCase("igus") as case:
         wrong = case.settings.model_copy(update={"profile": str(path)})
-        with pytest.raises(LinkError, match=r"position \d: found -?\d+"):
+        with pytest.raises(LinkError, match=r"actual_q_\d: found -?\d+"):
             ModbusDriver(wrong, case.model).connect()
 
 

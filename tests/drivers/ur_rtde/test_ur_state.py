@@ -31,7 +31,7 @@ def test_a_state_is_the_plants(controller: SimulatedController) -> None:
             out["gaps"] = np.diff([s.timestamp for s in states]).tolist()
             out["torque"] = s.actual_current_as_torque is None
             out["scaling"] = s.speed_scaling
-            out["tcp"] = driver.reader.tcp_pose().tolist()
+            out["tcp"] = driver.reader.joints_and_tcp()[1].tolist()
             out["age"] = min(
                 -driver.read_state().received + time.monotonic() for _ in range(50)
             )
@@ -227,7 +227,7 @@ def test_a_restarted_controller_is_noticed_by_its_clock(controller: SimulatedCon
         """
         driver.connect()
         read_for(20)
-        driver.reader._last += 1000.0
+        driver._check._timestamp += 1000.0
         out["error"] = error_of(driver.read_state)
         """,
     )
