@@ -164,5 +164,5 @@ def _kind_of(words: str) -> str:
 
 
 def as_markdown() -> str:
-    """Return the list as it stands in docs/reliability.md."""
+    """Return the list as it stands in docs/evidence/fault-method.md."""
     return "\n".join(f"- **{name}**: {words}" for name, words in INVARIANTS.items())

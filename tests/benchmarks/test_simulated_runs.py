@@ -34,7 +34,7 @@ from gapbridge.drivers.ur_rtde.command import OffsetWriter, ServoWriter
 from gapbridge.drivers.ur_rtde.driver import UrRtdeDriver
 from gapbridge.drivers.ur_rtde.state import StateReader
 
-DOCS = Path(__file__).parents[2] / "docs" / "reliability.md"
+DOCS = Path(__file__).parents[2] / "docs" / "evidence" / "fault-method.md"
 FIRST, SEEDS = 200, 2000  # in make test, in make everything
 PARTS = 8
 SERVOJ, OFFSET, MODBUS, CAN = range(4)  # seeds of each link
