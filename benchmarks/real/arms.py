@@ -99,6 +99,24 @@ KR300 = _links(
     (0, -H, 0, 0, 31.46, (0, -0.08, -0.009)),
     (0, pi, -0.24, 0, 217.78, (0, 0, 0.08775)),
 )
+# Staubli TX2-90L, product manual; the base's height is the frame's
+TX2_90L = _links(
+    (0.05, -H, 0),
+    (0.5, 0, 0, -H),
+    (0, H, 0.05, H),
+    (0, -H, 0.55),
+    (0, H, 0),
+    (0, 0, 0.1),
+)
+# Rokae, six axes: the rows of the data set
+ROKAE = _links(
+    (0.085, -H, 0.487),
+    (0.64, 0, 0, -H),
+    (0.205, -H, 0),
+    (0, H, 0.72),
+    (0, -H, 0),
+    (0, 0, 0.075, pi),
+)
 # three axes in one point: every attitude of a flange, where a data set gives attitudes, no joints
 WRIST = _links((0, -H, 0), (0, H, 0), (0, 0, 0))
 

@@ -7,6 +7,7 @@ None of these sets is part of this repository.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +22,7 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.real import arms
 from benchmarks.real.geometry import rough_tool, rough_turn
+from benchmarks.real.spreadsheet import read_sheet
 
 Array = NDArray[np.float64]
 Columns = dict[str, Array]
@@ -247,6 +249,83 @@ def _ur10(name: str) -> Callable[[Path], Converted]:
     return make
 
 
+# -- Staubli TX2-90L, IRB 120 again, Rokae: laser trackers ---------------------------------------
+
+
+def _poses(
+    links: tuple[arms.Link, ...], q: Array, position: Array, sigma: float, about: dict[str, Any],
+    point: Array | None = None, session: Array | None = None,
+) -> Converted:  # fmt: skip
+    """Return a log of measured poses; without a tool point the best for the nominal arm."""
+    if point is None:
+        first = slice(None) if session is None else session == session[0]
+        point = rough_tool(links, q[first], position[first])
+        about = about | {"tool": "the tool point is the best for the nominal arm, rounded to 1 mm"}
+    columns = {"timestamp": np.arange(len(q)) * 30.0, "actual_q": q, "measured_position": position}
+    columns |= {} if session is None else {"session": session}
+    about = about | {
+        "masses": "not known, left out",
+        "timestamps": "only the order is known: 30 s steps were put in",
+    }
+    return Converted(columns, _cell(links, tool=_tool(point), metrology=_tracker(sigma)), about)
+
+
+def _staubli(task: str) -> Callable[[Path], Converted]:
+    def make(folder: Path) -> Converted:
+        q, position = _staubli_rows(folder / "Data" / task)
+        # other tasks hold one attitude, in which no tool point shows: that of the calibration
+        point = rough_tool(arms.TX2_90L, *_staubli_rows(folder / "Data/Calibration"))
+        about = {
+            "robot": "Staubli TX2-90L, by its dimensions: the data set does not name it",
+            "instrument": "Leica laser tracker with T-Mac, position of the T-Mac's origin",
+            "data set": "HUST_NC_Robot, doi 10.17632/srxktn4752.1", "file": task,
+            "tool": "the point is the best for the nominal arm in the 40 poses for calibration, "
+            "rounded to 1 mm",
+        }  # fmt: skip
+        return _poses(arms.TX2_90L, q, position, 1e-5, about, point)
+
+    return make
+
+
+def _staubli_rows(place: Path) -> tuple[Array, Array]:
+    q = np.deg2rad(np.array(read_sheet(place / "theta.xlsx")[1:], dtype=float))
+    lines = (place / "Leica.csv").read_text(encoding="latin-1").splitlines()[1:]
+    return q, np.array([[float(x) for x in line.split(",")[:3]] for line in lines]) * 1e-3
+
+
+def _irb120_position_only(folder: Path) -> Converted:
+    from scipy.io import loadmat
+
+    place = folder / "MinimalPositionCalibration"
+
+    def read(name: str) -> Array:
+        return np.asarray(loadmat(place / f"{name}.mat")[name], dtype=float)
+
+    parts = [
+        (read("CaliJointAngles"), read("CaliPosition")[::3]),
+        (read("TestJointAngles"), read("TestPosition")),
+        (read("TestJointAngles2"), read("TestPosition2")),
+    ]
+    about = {
+        "robot": "ABB IRB 120 (Wu and others, IEEE T-ASE 12 (2015) 758)",
+        "instrument": "not named; 36 poses for calibration (the first of three points) and 10 and "
+        "30 test poses, with another point on the tool each",
+    }
+    session = np.repeat([0.0, 1.0, 2.0], [len(q) for q, _ in parts])
+    q, position = (np.vstack([part[k] for part in parts]) for k in (0, 1))
+    return _poses(arms.IRB120, np.deg2rad(q), position * 1e-3, 3e-5, about, session=session)
+
+
+def _rokae(folder: Path) -> Converted:
+    targets = (folder / "data/joint_angle.csv").read_text(encoding="utf-8")
+    found = re.findall(r"jointtarget \w+ = j:\{([^}]*)\}", targets)
+    q = np.deg2rad([[float(x) for x in row.split(",")[:6]] for row in found])
+    lines = (folder / "data/laser_pos.csv").read_text(encoding="utf-8").splitlines()
+    measured = np.array([line.split()[7:10] for line in lines if line.strip()], dtype=float)
+    about = {"robot": "Rokae, six axes", "instrument": "laser tracker; the measured columns"}
+    return _poses(arms.ROKAE, q, measured * 1e-3, 2e-5, about)
+
+
 # -- Panda, torques and tracking ---------------------------------------------------------------
 
 
@@ -359,6 +438,7 @@ IIWA_SET = ("Zhangzhongqiu/robot-calibration", "be44742b3b312bde09d87d9d40e89d8a
 MOTOMAN_SET = ("ctu-vras/multirobot-calibration", "a20f0454732bc36f1d980ff08c3d30536b8b1b19")
 KR300_SET = ("JonasWeigand/Robot_Identification", "9e403c07d9dadbb391a9f3921e8d219f714636a8")
 UR10_SET = ("christianlandgraf/ipa-robot-accuracy", "507fba69bdaf6c43c2faf306e70a7e37c5e39b89")
+STAUBLI_SET = ("ZhangTeng-Hust/ASTL", "e1ae9638bce784e778661322a89705a78514a006")
 SOURCES: dict[str, Source] = {
     "ur10e_12harmonics": Source(*UR10E_SET, _ur10e("ur-20_02_10-30sec_12harm.csv", 635, 3510)),
     "ur10e_8harmonics": Source(*UR10E_SET, _ur10e("ur-20_02_05-20sec_8harm.csv", 320, 2310)),
@@ -378,6 +458,16 @@ SOURCES: dict[str, Source] = {
         "188abd2d773b26dd32bafe50943c3ab0044a72d8", _irb120),
     "ur10_c": Source(*UR10_SET, _ur10("Series_C/measurements_random_poses.csv")),
     "ur10_d": Source(*UR10_SET, _ur10("Series_D/measurements_iso_cubes.csv")),
+    "tx2_calibration": Source(*STAUBLI_SET, _staubli("Calibration")),
+    "tx2_points": Source(*STAUBLI_SET, _staubli("POINTS")),
+    "tx2_line": Source(*STAUBLI_SET, _staubli("LINE")),
+    "tx2_curve": Source(*STAUBLI_SET, _staubli("CURVE")),
+    "tx2_surface": Source(*STAUBLI_SET, _staubli("SURFACE")),
+    "irb120_position_only": Source(
+        "drliaowu/Minimal_Robot_Calibration_Using_Position",
+        "376cb83006b7ae4ae3328761c406e22e78c4be06", _irb120_position_only),
+    "rokae_30": Source(
+        "dongjy-s/LM_PyTorch", "e87ba15f454ab23fbfa3e16db524f7557d80b56a", _rokae),
     "panda": Source(
         "marcocognetti/FrankaEmikaPandaDynModel",
         "24d85ce4e648e2e894c832bfeee9b16711eb1a1a", _panda),

@@ -25,6 +25,9 @@ SPLIT = {
     "barrett_wam_grid": TUNE, "barrett_wam_random": HELD_BACK,
     "iiwa_three_loads": TUNE, "iiwa_0kg": TUNE, "iiwa_month_before": HELD_BACK,
     "motoman_cube": TUNE, "motoman_wide": HELD_BACK, "irb120": HELD_BACK,
+    "tx2_calibration": HELD_BACK, "tx2_points": HELD_BACK, "tx2_line": HELD_BACK,
+    "tx2_curve": HELD_BACK, "tx2_surface": HELD_BACK, "irb120_position_only": HELD_BACK,
+    "rokae_30": HELD_BACK,
     "force_sensor_100": TUNE,
     "ur10e_12harmonics": TUNE, "ur10e_50s": TUNE, "ur10e_8harmonics": TUNE,
     "ur10e_point_to_point": HELD_BACK, "rad_ur3e_rtde": TUNE, "panda": TUNE,
@@ -42,5 +45,8 @@ CARRIED = (
     ("ur10e_12harmonics", "ur10e_50s"), ("ur10e_12harmonics", "ur10e_point_to_point"),
     ("kr300_a", "kr300_b"),
 )  # fmt: skip
-REMOUNTED = {"iiwa_three_loads"}  # logs whose sessions have a tool point of their own
+REMOUNTED = {
+    "iiwa_three_loads",
+    "irb120_position_only",
+}  # logs whose sessions have a tool point of their own
 """Sets whose sessions were measured with the tool mounted anew."""

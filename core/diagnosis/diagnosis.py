@@ -57,7 +57,7 @@ from gapbridge.core.diagnosis.rigid_suspicion import softness_findings
 from gapbridge.core.diagnosis.selection.moments import slips
 from gapbridge.core.diagnosis.selection.selection import Selection, refitted_alone, select
 from gapbridge.core.diagnosis.separation import Measurement, next_measurements
-from gapbridge.core.effects import CATALOGUE, Term, flexibility_effects
+from gapbridge.core.effects import CATALOGUE, Term, correcting, flexibility_effects
 from gapbridge.core.errors import LogError
 from gapbridge.core.log.columns import COLUMNS, misspelt
 from gapbridge.core.log.log import Log
@@ -123,6 +123,8 @@ def diagnose(
     with threadpool_limits(1, "blas"):
         metrology = metrology or Metrology()
         log = with_sessions(log, model)
+        if metrology.remounted:  # what each session has of its own is no effect that they share
+            withhold = (*withhold, *correcting("tool"))
         return _diagnose(model, log, metrology, tuple(withhold), progress, observers, simulated)
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from gapbridge.core.arm import Arm
 from gapbridge.core.diagnosis.criteria import OWN_SIGMAS, PRIOR_REACH
 from gapbridge.core.diagnosis.observation import Observation
-from gapbridge.core.diagnosis.selection.candidate import Candidate, angle_columns
+from gapbridge.core.diagnosis.selection.candidate import Candidate
 from gapbridge.core.diagnosis.selection.following import as_one_delay
 from gapbridge.core.diagnosis.selection.problem import CandidateFit, SampleSpace
 from gapbridge.core.diagnosis.selection.state import SelectionState, flat
@@ -86,7 +86,8 @@ def refit(
         sizes = [len(v) for v in x]
         cuts = np.cumsum([*sizes, extra.shape[1]])
         parts = np.split(step, cuts)
-        moved, share = 0.0, _share(state, freed, index, x, parts, A, b)
+        near = [links.get(c, np.inf) for c in index]
+        moved, share = 0.0, _share(state, freed, index, x, parts, near, A)
         for k in range(len(x)):
             x[k] = _within(freed[index[k]], x[k] + share * parts[k])
             scale = np.array([p.scale for p in freed[index[k]].parameters])
@@ -288,24 +289,29 @@ def _wide(candidate: Candidate) -> Array:
 
 def _share(
     state: SelectionState, freed: dict[int, Candidate], index: tuple[int, ...], x: list[Array],
-    parts: list[Array], A: Array, b: Array,
+    parts: list[Array], near: list[Array | float], A: Array,
 ) -> float:  # fmt: skip
-    """Return the share of a Gauss-Newton step to go: less than all where it would overshoot."""
+    """Return the share of a Gauss-Newton step to go: less than all where it would overshoot.
+
+    ``near`` is the prior 1 sigma of each term's numbers; inf: none that counts.
+    """
     if not index:
         return 1.0
     linear = A[:, sum(len(v) for v in x) :]  # smooth terms and nuisance, refitted for each trial
     Q = np.linalg.qr(linear)[0] if linear.shape[1] else linear
 
     def left(share: float) -> float:
-        terms = [freed[c].term(_within(freed[c], v + share * part))
+        ahead = [_within(freed[c], v + share * part)
                  for c, v, part in zip(index, x, parts, strict=False)]  # fmt: skip
+        terms = [freed[c].term(v) for c, v in zip(index, ahead, strict=True)]
         try:
             gap = state.observation.measured - state.observation.predict(terms)
         except InputError:
             return float("inf")
         r = flat(gap[..., None], state)[:, 0]
         r = r - Q @ (Q.T @ r)
-        return float(r @ r)
+        off = np.concatenate([v / size for v, size in zip(ahead, near, strict=True)])
+        return float(r @ r + off @ off)
 
     now = left(0.0)
     for share in (1.0, 0.5, 0.25, 0.1, 0.03):
@@ -326,9 +332,6 @@ def exact_jacobian(
     observation: Observation, candidate: Candidate, x: Array, others: tuple[Term, ...]
 ) -> Array:
     """Return d prediction / d parameter (N, k, d) at the term's present values."""
-    by_angle = angle_columns(observation, candidate)
-    if by_angle is not None:
-        return by_angle
     columns = []
     for k, parameter in enumerate(candidate.parameters):
         h = np.zeros(len(x))

@@ -326,15 +326,16 @@ def refitted_alone(
 
     Values that were fitted beside a withdrawn term are not those that stand without it. The
     ``remainder`` accounts for what is left: in a short log it would bias the values; a long one
-    averages over it, and its model has to predict without it.
+    averages over it, and its model has to predict without it. Beside all links it would take what
+    their prior holds back.
     """
     if not accused or (len(accused) == len(selection.terms) and remainder is None):
         return selection
-    if remainder is not None and len(selection.space.y) >= LARGE_SAMPLE:
-        remainder = remainder.scatter_alone()
-    state = SelectionState(selection.observation, arm, [], selection.noise, selection.kept)
     chosen = [selection.term_index[p] for p in accused]
     links = selection.prior if set(chosen) & set(selection.prior) else {}
+    if remainder is not None and (links or len(selection.space.y) >= LARGE_SAMPLE):
+        remainder = remainder.scatter_alone()
+    state = SelectionState(selection.observation, arm, [], selection.noise, selection.kept)
     space = selection.working if links else selection.space
     alone = fit(space, [c for c in chosen if c not in links])
     fitted, index, spread, residual = refit(state, selection.space, alone, links, remainder)
