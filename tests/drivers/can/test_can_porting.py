@@ -23,7 +23,7 @@ HALF = np.radians(0.005)
 
 @pytest.fixture
 def folder(tmp_path):
-    part = PAGE.read_text().split("## CAN: a new arm from data alone")[1].split("\n## ")[0]
+    part = PAGE.read_text().split("## CAN: an arm from its DBC")[1].split("\n## ")[0]
     (dbc,) = re.findall(r"```text\n(VERSION.*?)```", part, re.DOTALL)
     (profile,) = re.findall(r"```yaml\n(name: .*?)```", part, re.DOTALL)
     (tmp_path / "my_can_arm.dbc").write_text(dbc)
