@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field
 class DriverSettings(BaseModel):
     """What every link says, whatever the driver."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
     rate: float = Field(500.0, gt=0.0, le=1000.0, description="cycles per second asked for")
     state_timeout: float = Field(

@@ -25,7 +25,7 @@ class DaemonSettings(BaseModel):
     with a ``model``; tests replace it.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
     cell: Path = Field(description="the cell file; the loop's process takes its model from there")
     link: LinkSettings = Field(default_factory=UrRtdeSettings)

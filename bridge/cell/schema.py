@@ -25,7 +25,7 @@ Vector3 = Annotated[list[Number], Field(min_length=3, max_length=3)]
 class Section(BaseModel):
     """One mapping of the file: unknown keys and lax conversions are refused."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
 
 class DhRow(Section):

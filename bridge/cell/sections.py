@@ -47,18 +47,17 @@ LinkSettings = Annotated[
 ]
 """Section ``link``: the settings of the driver that it names (left out: ur_rtde)."""
 
-_LINK: TypeAdapter[LinkSettings] = TypeAdapter(LinkSettings)
-
 
 def link_settings(**keys: Any) -> LinkSettings:
     """Return the settings of a link from its keys, as a cell file has them.
 
     Raises pydantic's ValidationError.
     """
-    return _LINK.validate_python(keys)
+    adapter: TypeAdapter[LinkSettings] = TypeAdapter(LinkSettings)
+    return adapter.validate_python(keys)
 
 
-_FROZEN = ConfigDict(extra="forbid", frozen=True)
+_FROZEN = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
 
 class LimitSettings(BaseModel):

@@ -6,14 +6,15 @@ import hashlib
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from datetime import UTC, datetime
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from gapbridge.bridge.document.blocks import Block, Columns, Heading, Pairs, Table
 from gapbridge.core.calibration.spread import Spread
+
+if TYPE_CHECKING:
+    from gapbridge.bridge.document.blocks import Block
 
 BLOCK = 1 << 20  # bytes read at a time
 SIDE = 1.96  # sigmas on each side of a 95 % interval
@@ -46,6 +47,13 @@ def origin_line(origin: Mapping[str, Any]) -> str:
 
 def origin_blocks(origin: Mapping[str, Any]) -> list[Block]:
     """Return version, time, arguments and files with their SHA-256 as blocks; none for none."""
+    from gapbridge.bridge.document.blocks import (  # only where there is a report
+        Columns,
+        Heading,
+        Pairs,
+        Table,
+    )
+
     if not origin:
         return []
     arguments = ", ".join(f"{k} {_argument(v)}" for k, v in origin["arguments"].items())
@@ -96,6 +104,8 @@ def intervals_of(
 
 def installed_version() -> str:
     """Return the version of the package, or "unknown" where it is not installed."""
+    from importlib.metadata import PackageNotFoundError, version  # a hundredth of a second
+
     try:
         return version("gapbridge")
     except PackageNotFoundError:

@@ -14,7 +14,7 @@ GUARDS = ("certificate", "key", "token_file")
 class ServedSettings(BaseModel):
     """Where something is served. Elsewhere than on this machine only by TLS and with a token."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
     host: str = Field("127.0.0.1", description="an address of this machine, or localhost")
     port: int = Field(0, ge=0, le=65535, description="TCP port; 0: any that is free")

@@ -53,14 +53,29 @@ def _compiled() -> list[tuple[Path, bytes]]:
     return [(file, source) for file, source in sources if MARK in source]
 
 
+@cache
+def _is_ours(file: str) -> bool:
+    return any(folder in Path(file).resolve().parents for folder in OURS)
+
+
+_WRITABLE: set[str] = set()  # folders in which a file could be made
+
+
 class _OfAllSources:
     """Finds a place for machine code of our functions, and none for anybody else's."""
 
     @classmethod
     def from_function(cls, py_func: Any, py_file: str) -> Any:
-        if not any(folder in Path(py_file).resolve().parents for folder in OURS):
+        if not _is_ours(py_file):
             return None
         return super().from_function(py_func, py_file)  # type: ignore[misc]
+
+    def ensure_cache_path(self) -> None:
+        """Try once for each folder, not for each function, whether files can be made in it."""
+        path = self.get_cache_path()  # type: ignore[attr-defined]
+        if path not in _WRITABLE:
+            super().ensure_cache_path()  # type: ignore[misc]
+            _WRITABLE.add(path)
 
     def get_source_stamp(self) -> tuple[Any, bytes]:
         return super().get_source_stamp(), fingerprint()  # type: ignore[misc]

@@ -15,7 +15,7 @@ Identifier = Annotated[int, Field(ge=0, le=0x1FFFFFFF)]
 class Section(BaseModel):
     """One mapping of the file; unknown keys are refused."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
 
 class Quantity(Section):

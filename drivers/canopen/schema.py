@@ -18,7 +18,7 @@ ObjectName = Annotated[str | int, Field(union_mode="left_to_right")]
 class Section(BaseModel):
     """One mapping of the file; unknown keys are refused."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
 
 class Joint(Section):

@@ -16,7 +16,7 @@ STANDARD_IDS = 0x7FF
 class SensorFrame(BaseModel):
     """The sensor's frame in the flange frame."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
     xyz: Vector3 = Field((0.0, 0.0, 0.0), description="x, y, z in m")
     rpy: Vector3 = Field((0.0, 0.0, 0.0), description="rad, roll pitch yaw as in URDF")
@@ -25,7 +25,7 @@ class SensorFrame(BaseModel):
 class Overload(BaseModel):
     """What the sensor may carry; more is not believed. Left out: the sensor's own bits alone."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
     force: float | None = Field(None, gt=0.0, description="N, length of the force")
     torque: float | None = Field(None, gt=0.0, description="Nm, length of the torque")
@@ -34,7 +34,7 @@ class Overload(BaseModel):
 class FtSensorSettings(BaseModel):
     """What every sensor's section says. A zero that is off is the model's ``ft_bias``."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
     driver: str = Field(description="the kind of sensor")
     sensor_in_flange: SensorFrame = Field(SensorFrame(), description="how it is mounted")

@@ -17,7 +17,7 @@ Address = Annotated[int, Field(ge=0, le=LAST_ADDRESS, strict=True)]
 class Section(BaseModel):
     """One mapping of the file; unknown keys are refused."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
 
 class Place(Section):

@@ -17,7 +17,7 @@ FEWEST_HELD_OUT = 8  # poses kept out of the fit by which an accuracy can be dec
 
 
 class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
 
 class LoadEntry(_Section):

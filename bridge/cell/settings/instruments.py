@@ -21,7 +21,7 @@ Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 class Base(BaseModel):
     """What every instrument says."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
     sigma: Positive | None = Field(
         default=None, description="m, 1 sigma of one coordinate; default: metrology.sigma"

@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field
 class RecordingSettings(BaseModel):
     """Section ``recording``: where cycles are written to, and how much of them."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
     folder: Path | None = Field(
         Path("recordings"), description="the files of each run go here (MCAP); null: record nothing"

@@ -8,8 +8,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from gapbridge.core.diagnosis.log_checks.frames import frame_findings
-from gapbridge.core.diagnosis.log_checks.signs import sign_findings
 from gapbridge.core.errors import LogError
 from gapbridge.core.log.columns import COLUMNS, misspelt
 from gapbridge.core.log.log import Log
@@ -134,6 +132,10 @@ def findings(log: Log, model: Model | None = None, metrology: Metrology | None =
         notes.append("the joint temperatures look like Fahrenheit, expected °C")
     if model is None:
         return notes
+    # prediction checks units alone, and need not wait for these
+    from gapbridge.core.diagnosis.log_checks.frames import frame_findings
+    from gapbridge.core.diagnosis.log_checks.signs import sign_findings
+
     notes += [*_limits(model, log), *_poses(log)]
     if not still:
         notes += frame_findings(model, log, metrology or Metrology())

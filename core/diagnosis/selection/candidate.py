@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,28 +44,28 @@ class Candidate:
     target: str = ""  # and what it moves
     beside: str = ""  # family without which it shows nothing
 
-    @property
+    @cached_property
     def named(self) -> bool:
         """Return whether this is a member of the catalogue."""
         return self.family != "smooth"
 
-    @property
+    @cached_property
     def effect(self) -> Effect:
         """Return the member of the catalogue; of what is in none, an effect without attributes."""
         return CATALOGUE.get(self.family, UNNAMED)
 
-    @property
+    @cached_property
     def turns_its_joint(self) -> bool:
         """Return whether this turns a joint by the joint's own angle alone."""
         own = Effect.angle_columns
         return type(self.effect).angle_columns is not own
 
-    @property
+    @cached_property
     def periodic(self) -> bool:
         """Return whether this is one line of a periodic effect."""
         return self.effect.periodic
 
-    @property
+    @cached_property
     def of_no_quantity(self) -> bool:
         """Return whether this is an unnamed cause that goes by no column of the log."""
         return not self.named and not self.quantity
