@@ -17,7 +17,7 @@ from gapbridge.core.model import Model, Poses
 
 Array = NDArray[np.float64]
 STEP = 1e-3  # share of a parameter's usual size, where a derivative of the TCP is a difference
-CONVERGED = 1e-2  # m/rad: the next round would change a standard deviation by some 1e-5 of it
+FIRST_ORDER = np.inf  # m/rad: no second round of the adjoints, which would change some thousandths
 BLOCK = 20_000  # rows at a time, so that memory does not grow with them
 FEW = 2048  # the same of products with the covariance
 
@@ -93,7 +93,7 @@ class Spread:
             try:
                 found = pose_columns(
                     here, q[rows], None if loads is None else loads[rows], chosen,
-                    STEP * parameters.scales, coordinates=3, converged=CONVERGED,
+                    STEP * parameters.scales, coordinates=3, converged=FIRST_ORDER,
                 )  # fmt: skip
             except EquilibriumError as error:
                 raise EquilibriumError(begin + error.row) from None
@@ -106,7 +106,7 @@ class Spread:
         for begin in range(0, len(std), FEW):  # temporaries that stay in the processor's cache
             rows = slice(begin, begin + FEW)
             for k, J in enumerate(jacobian[:, :, rows]):
-                square = np.sum(J * (self.covariance @ J), axis=0)
+                square = np.einsum("pn,pn->n", J, self.covariance @ J)
                 std[rows, k] = np.sqrt(np.maximum(square, 0.0))
 
 

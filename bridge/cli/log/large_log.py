@@ -11,10 +11,11 @@ from gapbridge.bridge.cell.opened_log import check_log, open_log
 from gapbridge.core.effects import by_approach
 from gapbridge.core.errors import LogError
 from gapbridge.core.log.log import Log
-from gapbridge.core.log.pieces import PARQUET, LogPieces
+from gapbridge.core.log.pieces import PARQUET, ROWS, LogPieces
 from gapbridge.core.log.sources import source_of
 from gapbridge.core.log.sources.recording import Recording
 
+AT_ONCE = 65_536  # rows of a piece where nothing but the piece's own result is kept
 LARGE = 20_000  # rows from which a log is read in pieces
 BYTES = 8_000_000  # of a text file that holds about as many
 
@@ -26,6 +27,7 @@ class LargeLog:
     path: Path
     cell: Cell
     motions: bool = True  # see LogPieces
+    rows: int = ROWS  # of a piece
 
     def __iter__(self) -> Iterator[Log]:
         """Yield the pieces. Raises LogError, as ``open_log`` does."""
@@ -35,7 +37,7 @@ class LargeLog:
 
             files = files_of(self.path)
         for file in files:
-            for piece in LogPieces(file, self.cell.arm.n, motions=self.motions):
+            for piece in LogPieces(file, self.cell.arm.n, self.rows, self.motions):
                 check_log(piece, self.cell)
                 yield piece
 
@@ -46,7 +48,7 @@ def pieces_of(path: Path, cell: Cell) -> Iterable[Log]:
     Raises LogError, as ``open_log`` does.
     """
     if source_of(path) is None and is_large(path):
-        return LargeLog(path, cell, by_approach(cell.model.terms))
+        return LargeLog(path, cell, by_approach(cell.model.terms), AT_ONCE)
     return [open_log(path, cell)]
 
 

@@ -41,7 +41,7 @@ def test_a_large_log_gives_what_it_gives_in_one_piece(tmp_path, monkeypatch):
     assert whole.code == 0, whole.err
     monkeypatch.setattr(large_log, "LARGE", 500)
     monkeypatch.setattr(
-        large_log, "LogPieces", lambda path, n, motions=True: LogPieces(path, n, 200)
+        large_log, "LogPieces", lambda path, n, rows=0, motions=True: LogPieces(path, n, 200)
     )
     parts = gapbridge("fit", log, "--cell", cell, "--out", tmp_path / "parts.yaml")
     assert parts.code == 0, parts.err
@@ -70,7 +70,7 @@ def test_a_log_in_pieces_is_predicted_and_compensated_as_one(
         found.append((result.out.replace(name, ""), result.err, read_table(out)))
         monkeypatch.setattr(large_log, "LARGE", 500)
         monkeypatch.setattr(
-            large_log, "LogPieces", lambda path, n, motions=True: LogPieces(path, n, 200)
+            large_log, "LogPieces", lambda path, n, rows=0, motions=True: LogPieces(path, n, 200)
         )
     (said, warned, whole), (said_too, warned_too, parts) = found
     assert (said, warned) == (said_too, warned_too)
@@ -93,7 +93,7 @@ def test_a_row_without_equilibrium_is_named_by_its_line_in_any_piece(tmp_path, m
             assert not (tmp_path / "new.csv").exists()
         monkeypatch.setattr(large_log, "LARGE", 500)
         monkeypatch.setattr(
-            large_log, "LogPieces", lambda path, n, motions=True: LogPieces(path, n, 200)
+            large_log, "LogPieces", lambda path, n, rows=0, motions=True: LogPieces(path, n, 200)
         )
 
 
