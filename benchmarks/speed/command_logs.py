@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow
-from pyarrow import parquet
+from pyarrow import csv, parquet
 
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.dynamics import predict_torque, with_pieces
@@ -16,6 +16,7 @@ from gapbridge.core.log.log import Log
 from gapbridge.core.model import Model
 from gapbridge.core.motion import motion_of
 
+FEW = 1000  # rows up to which a log is written as CSV, too
 AXIAL = np.array([8, 9, 10, 20, 25, 30]) * 1e-6  # rad/Nm
 RADIAL = np.array([2, 3, 2, 5, 5, 9]) * 1e-6
 
@@ -35,6 +36,8 @@ def write_log(path: Path, rows: int) -> None:
     columns |= {f"payload_cog_{i}": cog[:, i] for i in range(3)}
     columns |= {f"measured_position_{i}": position[:, i] for i in range(3)}
     parquet.write_table(pyarrow.table(columns), path)
+    if rows <= FEW:
+        csv.write_csv(pyarrow.table(columns), path.with_suffix(".csv"))
 
 
 def write_moving_log(path: Path, rows: int) -> None:
