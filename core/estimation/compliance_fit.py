@@ -21,6 +21,8 @@ from gapbridge.core.estimation.registration import (
     frame_columns,
     register_robustly,
 )
+from gapbridge.core.kernels.factor import factor_blocks
+from gapbridge.core.kernels.threads import in_ranges
 from gapbridge.core.loads import Loads
 from gapbridge.core.model import Model, Poses
 from gapbridge.core.rotation import rotation_vector
@@ -30,6 +32,7 @@ Mask = NDArray[np.bool_]
 ROUNDS = 12
 NUISANCE_ROUNDS = 20
 CONVERGED = 1e-8  # relative step at which a fit has converged
+ROUNDING = 1e-14  # share of a product that is none
 RANK = 1e-10  # singular values of the nuisances below this share are rounding
 OUTLIER = 5.0  # standard deviations beyond which a reading counts as an outlier
 AT_ONCE = 2000  # rows of one decomposition; of 60,000 by 22 columns it takes 9 ms, whole 24 ms
@@ -262,17 +265,65 @@ def _round(now: Fit, data: Data, kept: Mask, prior: tuple[Array, float]) -> Fit:
     model, n = now.model, now.model.arm.n
     gap, poses = residual(model, data, now.frame)
     weights, scale = _robust_weights(gap)
-    width = gap.shape[1]
-    per_cell = per_cell_of(weights, scale, width)
-    form = regressor(model, data, now.frame)[:, :width]
-    columns = [form, gap[..., None]]
-    if data.nuisances:
-        columns.insert(0, nuisance_columns(model, poses, width, data))
-    whole = np.concatenate(columns, axis=2) * per_cell[..., None]
-    # one R factor for all that follows, of rows that stay in the processor's cache
-    R = r_factor(whole.reshape(gap.size, -1))
+    R = weighed(model, now.frame, data, (gap, per_cell_of(weights, scale, gap.shape[1])), poses)
     problem = (R[:, : -2 * n - 1], R[:, -2 * n - 1 : -1], R[:, -1])
     return stepped(now, problem, weights, kept, prior)
+
+
+def weighed(
+    model: Model, frame: Registration | Placements, data: Data, cells: tuple[Array, Array],
+    poses: Poses | None = None,
+) -> Array:  # fmt: skip
+    """Return the R factor of [nuisances | flexibilities | gap] at the model's shape.
+
+    ``cells``: gap and what each cell is multiplied by (N, width); ``poses``: as predicted.
+    """
+    gap, per_cell = cells
+    if data.session is None:
+        k = data.nuisances + 2 * model.arm.n + 1
+        R = np.zeros((k, k))
+        add_rows(model, data, gap, per_cell, R)
+        return R
+    width = gap.shape[1]
+    columns = [regressor(model, data, frame)[:, :width], gap[..., None]]
+    if data.nuisances:
+        poses = poses or model.predict(data.q, data.loads)
+        columns.insert(0, nuisance_columns(model, poses, width, data))
+    whole = np.concatenate(columns, axis=2) * per_cell[..., None]
+    # of rows that stay in the processor's cache
+    return r_factor(whole.reshape(gap.size, -1))
+
+
+def add_rows(model: Model, data: Data, gap: Array, cells: Array, R: Array) -> None:
+    """Fold rows into R: columns at the model's shape, ``gap`` and factors ``cells`` (N, width)."""
+    chain, rows = model.chain(), model.rows(data.q, data.loads)
+    nuisances, stopped = data.nuisances, [0]
+    if not chain.flexibility.any():
+        parts: list[Array] = []
+
+        def work(first: int, last: int) -> int:
+            own = np.zeros_like(R)
+            parts.append(own)
+            return int(factor_blocks(chain, rows, gap, cells, nuisances, first, last, own))
+
+        stopped = in_ranges(work, len(gap))
+        if max(stopped) < 0:
+            fold_rows(R, *parts)
+            return
+    # something bends too far for blocks, or the links themselves do: columns in memory
+    width = gap.shape[1]
+    columns = [model.linear_form(data.q, data.loads).regressor[:, :width], gap[..., None]]
+    if nuisances:
+        columns.insert(0, nuisance_columns(model, model.predict(data.q, data.loads), width))
+    stored = np.concatenate(columns, axis=2) * cells[..., None]
+    fold_rows(R, stored.reshape(-1, len(R)))
+
+
+def fold_rows(R: Array, *parts: Array) -> None:
+    """Fold further rows, or R factors of them, into R (k, k)."""
+    folded = np.linalg.qr(np.vstack([R, *parts]), mode="r")
+    R[:] = 0.0
+    R[: len(folded)] = folded
 
 
 def r_factor(rows: Array) -> Array:
@@ -345,10 +396,28 @@ def solve(linear: Linear, kept: Mask, now: Array, prior: tuple[Array, float]) ->
     right = np.concatenate(
         [linear.right - linear.matrix[:, ~kept] @ now[~kept], centre[kept] / sigma]
     )
-    from scipy.optimize import nnls  # a quarter of a second, only where something is fitted
-
-    found[kept] = nnls(rows, right, maxiter=100 * len(unit))[0] * unit
+    found[kept] = not_negative(rows, right) * unit
     return found
+
+
+def not_negative(rows: Array, right: Array) -> Array:
+    """Return the least squares solution of rows x = right with no x below zero.
+
+    Where x of all that stays positive meets the conditions of an optimum (Kuhn, Tucker 1951) it is
+    the solution; else scipy searches for it, whose import takes a quarter of a second.
+    """
+    free = np.ones(rows.shape[1], dtype=bool)
+    x = np.linalg.lstsq(rows, right, rcond=None)[0]
+    while free.any() and (x[free] < 0).any():
+        free &= x >= 0
+        x = np.zeros(len(free))
+        x[free] = np.linalg.lstsq(rows[:, free], right, rcond=None)[0]
+    gain = rows[:, ~free].T @ (right - rows @ x)
+    if (gain <= ROUNDING * np.linalg.norm(right) * np.linalg.norm(rows[:, ~free], axis=0)).all():
+        return np.asarray(x)
+    from scipy.optimize import nnls
+
+    return np.asarray(nnls(rows, right, maxiter=100 * rows.shape[1])[0])
 
 
 def moved(

@@ -21,15 +21,14 @@ from gapbridge.core.estimation.compliance_fit import (
     Placements,
     fit_flexibilities,
     fit_nuisances,
-    nuisance_columns,
     orthonormal,
     placed_gap,
     prior_of,
-    r_factor,
     residual,
+    weighed,
 )
 from gapbridge.core.estimation.regions import joint_regions
-from gapbridge.core.estimation.registration import Registration
+from gapbridge.core.estimation.registration import IDENTITY, Registration
 from gapbridge.core.log.log import Log
 from gapbridge.core.metrology import Metrology
 from gapbridge.core.model import Model
@@ -172,11 +171,8 @@ def require_excitation(model: Model, data: Data, metrology: Metrology, usual: fl
             f"found {len(data.q)} row(s) with measured positions, expected at least "
             f"{-(-unknown // 3)} to fit the compliance"
         )
-    columns = [model.linear_form(data.q, data.loads).regressor[:, :3]]
-    if data.nuisances:
-        poses = model.predict(data.q, data.loads)
-        columns.insert(0, nuisance_columns(model, poses, 3, data))
-    R = r_factor(np.concatenate(columns, axis=2).reshape(3 * len(data.q), -1))
+    nothing, all_alike = np.zeros((len(data.q), 3)), np.ones((len(data.q), 3))
+    R = weighed(model, IDENTITY, replace(data, rotation=None), (nothing, all_alike))[:, :-1]
     Q = orthonormal(R[:, : -2 * n])
     form = R[:, -2 * n :] - Q @ (Q.T @ R[:, -2 * n :])
     shown = np.linalg.norm(form, axis=0) * usual

@@ -18,16 +18,14 @@ from gapbridge.core.estimation.compliance_fit import (
     Data,
     Fit,
     Mask,
+    add_rows,
+    fold_rows,
     moved,
     noise_scale,
-    nuisance_columns,
     per_cell_of,
     residual,
     weights_at,
 )
-from gapbridge.core.kernels.factor import factor_blocks
-from gapbridge.core.kernels.threads import in_ranges
-from gapbridge.core.model import Model
 
 Array = NDArray[np.float64]
 FOLDS = 5
@@ -118,36 +116,5 @@ def placed(fit: Fit, left: Array, F: Array) -> Fit:
 def joined(factors: Array) -> Array:
     """Return the R factor (k, k) of all rows of several R factors (parts, k, k)."""
     R = np.zeros(factors.shape[1:])
-    _fold(R, *factors)
+    fold_rows(R, *factors)
     return R
-
-
-def add_rows(model: Model, data: Data, gap: Array, cells: Array, R: Array) -> None:
-    """Fold rows into R: columns at the model's shape, ``gap`` and factors ``cells`` (N, width)."""
-    chain, rows = model.chain(), model.rows(data.q, data.loads)
-    nuisances, stopped = data.nuisances, [0]
-    if not chain.flexibility.any():
-        parts: list[Array] = []
-
-        def work(first: int, last: int) -> int:
-            own = np.zeros_like(R)
-            parts.append(own)
-            return int(factor_blocks(chain, rows, gap, cells, nuisances, first, last, own))
-
-        stopped = in_ranges(work, len(gap))
-        if max(stopped) < 0:
-            _fold(R, *parts)
-            return
-    # something bends too far for blocks, or the links themselves do: columns in memory
-    width = gap.shape[1]
-    columns = [model.linear_form(data.q, data.loads).regressor[:, :width], gap[..., None]]
-    if nuisances:
-        columns.insert(0, nuisance_columns(model, model.predict(data.q, data.loads), width))
-    stored = np.concatenate(columns, axis=2) * cells[..., None]
-    _fold(R, stored.reshape(-1, len(R)))
-
-
-def _fold(R: Array, *parts: Array) -> None:
-    folded = np.linalg.qr(np.vstack([R, *parts]), mode="r")
-    R[:] = 0.0
-    R[: len(folded)] = folded
