@@ -94,10 +94,11 @@ class Selection:
         return tuple(self.prior)
 
     def as_a_whole(self, position: int) -> bool:
-        """Return whether a term is of the links, accused as a whole (their friction is not)."""
-        c = self.term_index[position]
-        links = self.space.candidates[c].effect.together
-        return c in self.prior and (links or self.observation.channel == "position")
+        """Return whether a term is of the links' geometry, accused as a whole.
+
+        Of first moments and friction each joint's has to be sure by itself.
+        """
+        return self.term_index[position] in self.prior and self.observation.channel == "position"
 
     @cached_property
     def links(self) -> Links | None:
@@ -332,7 +333,7 @@ def refitted_alone(
     if not accused or (len(accused) == len(selection.terms) and remainder is None):
         return selection
     chosen = [selection.term_index[p] for p in accused]
-    links = selection.prior if set(chosen) & set(selection.prior) else {}
+    links = {c: sigma for c, sigma in selection.prior.items() if c in chosen}
     if remainder is not None and (links or len(selection.space.y) >= LARGE_SAMPLE):
         remainder = remainder.scatter_alone()
     state = SelectionState(selection.observation, arm, [], selection.noise, selection.kept)

@@ -283,6 +283,9 @@ def test_friction_of_all_joints_goes_with_the_links_and_each_that_is_named_is_su
     assert set(causes) == {"link_cog", "coulomb_friction", "viscous_friction", "torque_offset"}
     assert causes["coulomb_friction"].joints == causes["viscous_friction"].joints
     assert causes["torque_offset"].joints == (4,)
+    sure = {p.name.split("_")[2] for p in causes["link_cog"].parameters
+            if abs(p.value) > 3 * p.std}  # fmt: skip
+    assert sure == {str(j) for j in causes["link_cog"].joints}
     rub = {t.site.joint: t.values[0] for t in causes["coulomb_friction"].terms}
     assert [rub[j + 1] for j in range(N)] == pytest.approx(0.1 * FRICTION, abs=0.06)
     assert channel.remaining_rms_held_out < 1.02 * NOISE
