@@ -48,6 +48,7 @@ class SampleCheck:
         for name, most in LARGEST.items():
             count = 3 if name == "payload_cog" else arm.n
             self._bounds[name] = ([-most] * count, [most] * count)
+        self._others = [name for name in self._bounds if name != "actual_q"]
         self._q: list[float] | None = None
         self._timestamp = 0.0
 
@@ -58,16 +59,13 @@ class SampleCheck:
     def check(self, state: RobotState) -> None:
         """Remember a sample that can be believed. Raises InvalidStateError for one that cannot."""
         q = state.actual_q.tolist()
-        wrong = self._wrong("actual_q", q)
-        if wrong is not None:
-            raise wrong
+        self._check_bounds("actual_q", q)
         self._check_motion(q, state.timestamp)  # first: a velocity may be computed from the step
-        for name in self._bounds:
+        for name in self._others:
             value = getattr(state, name)
-            wrong = None if value is None else self._wrong(name, value.tolist())
-            if wrong is None or (name == "actual_TCP_force" and _is_missing(state, wrong)):
+            if value is None or (name == "actual_TCP_force" and _force_is_missing(state)):
                 continue
-            raise wrong
+            self._check_bounds(name, value.tolist())
         payload = state.payload
         if payload is not None and not 0.0 <= payload <= HEAVIEST:
             raise InvalidStateError(
@@ -75,20 +73,20 @@ class SampleCheck:
             )
         self._q, self._timestamp = q, state.timestamp
 
-    def _wrong(self, name: str, values: list[float]) -> InvalidStateError | None:
+    def _check_bounds(self, name: str, values: list[float]) -> None:
         low, high = self._bounds[name]
         if all(map(le, low, values)) and all(map(le, values, high)):  # NaN is neither
-            return None
+            return
         i = next(i for i, v in enumerate(values) if not low[i] <= v <= high[i])
         if not isfinite(values[i]):
-            return InvalidStateError(
+            raise InvalidStateError(
                 f"{name}_{i}: found {values[i]:g}, expected a finite number",
                 Implausible.NOT_FINITE,
             )
         detail = f"{name}_{i}: found {values[i]:g}, expected {low[i]:g} to {high[i]:g}"
         if name == "actual_q":
             detail += ": another arm, another zero, or other units"
-        return InvalidStateError(detail, Implausible.VALUE)
+        raise InvalidStateError(detail, Implausible.VALUE)
 
     def _check_motion(self, q: list[float], timestamp: float) -> None:
         if self._q is None:
@@ -108,6 +106,6 @@ class SampleCheck:
                 )
 
 
-def _is_missing(state: RobotState, wrong: InvalidStateError) -> bool:
-    """Return whether a force is not there because its sensor is lost."""
-    return bool(state.sensor_lost) and wrong.reason is Implausible.NOT_FINITE
+def _force_is_missing(state: RobotState) -> bool:
+    """Return whether there is no force because its sensor is lost."""
+    return bool(state.sensor_lost) and not isfinite(sum(state.actual_TCP_force.tolist()))

@@ -244,11 +244,11 @@ def _never_stops(patch: Patch) -> None:
     patch.setattr(daemon_module, "STOP_MARGIN", 1e9)
 
 
-def _fails_at_doubt(patch: Patch) -> None:
-    def doubt(self: Any, detail: str, reason: Any = None) -> None:
-        raise KeyError(detail)
+def _fails_at_dropping(patch: Patch) -> None:
+    def drop(self: Any, error: Exception) -> None:
+        raise KeyError(str(error))
 
-    patch.setattr(LinkMonitor, "doubt", doubt)
+    patch.setattr(LinkMonitor, "drop", drop)
 
 
 def _records_too_little(patch: Patch) -> None:
@@ -279,7 +279,7 @@ BREAKS: list[tuple[str, int, list[tuple[float, str]], Break]] = [
     ("table", OFFSET, [(0.1, "disarm")], _leaves_the_table),
     ("taken", OFFSET, [(0.1, "protective stop")], _answers_at_once),
     ("ends", MODBUS, [], _never_stops),
-    ("crash", MODBUS, [(0.1, "corruption")], _fails_at_doubt),
+    ("crash", MODBUS, [(0.1, "corruption")], _fails_at_dropping),
     ("recorded", CAN, [], _records_too_little),
     ("recovers", CAN, [(0.1, "protective stop")], _keeps_faults),
 ]
