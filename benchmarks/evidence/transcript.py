@@ -105,7 +105,7 @@ class Session:
             raise SystemExit(f"gapbridge {arguments}: ended with {child.exitstatus}\n{shown}")
 
     def _answer(self, shown: str, question: str) -> str:
-        if "hangs there" in question:
+        if "it is mounted" in question:
             name = re.findall(r"load \d+ · ([^:\r\n]+):", shown)[-1]
             self._hang(*LOADS[name])
         return "yes" if "yes" in question else ""

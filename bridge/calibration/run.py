@@ -56,18 +56,18 @@ def run_session(cell: Cell, options: SessionOptions) -> None:
             if command.name == "undo" and session.taken:  # at the last question
                 session.add("undo", stop=session.taken[-1].stop)
                 prompt.say(
-                    f"took back the last reading; stop {(session.next or 0) + 1} is to be measured"
+                    f"discarded the last reading; stop {(session.next or 0) + 1} is to be measured"
                 )
-            prompt.say(_how_to_go_on(cell, options, session))
+            prompt.say(_how_to_resume(cell, options, session))
         except InputEnded:
             prompt.say()
-            prompt.say(f"the input ended; {_how_to_go_on(cell, options, session)}")
+            prompt.say(f"the input ended; {_how_to_resume(cell, options, session)}")
         except KeyboardInterrupt:
             prompt.say()
-            prompt.say(f"interrupted; {_how_to_go_on(cell, options, session)}")
+            prompt.say(f"interrupted; {_how_to_resume(cell, options, session)}")
             raise click.exceptions.Exit(1) from None
         except LinkError:
-            prompt.say(_how_to_go_on(cell, options, session))
+            prompt.say(_how_to_resume(cell, options, session))
             raise
 
 
@@ -100,8 +100,8 @@ def _lead(cell: Cell, options: SessionOptions, prompt: Prompt, session: Session)
         else:
             _report_old_plan(job)
         if options.plan_only:
-            prompt.say(f"every stop with its joints: {folder / 'poses.csv'}")
-            prompt.say(f"go on with: {_command(cell, options, session)}")
+            prompt.say(f"joints of every stop: {folder / 'poses.csv'}")
+            prompt.say(f"to measure: {_command(cell, options, session)}")
             return
         if session.next is not None:
             assert instrument is not None
@@ -148,7 +148,7 @@ def _make_plan(job: Job, joints: JointSource) -> None:
 def _report_old_plan(job: Job) -> None:
     """Report the plan of an earlier call where it is asked for, and that it stays."""
     if job.options.poses is not None:
-        job.prompt.warn("this session has its plan: --poses counts for a new one")
+        job.prompt.warn("this session already has a plan: --poses has no effect")
     if job.options.plan_only and job.session.plan is not None:
         job.report_plan(job.session.plan)
 
@@ -156,9 +156,9 @@ def _report_old_plan(job: Job) -> None:
 def _report_resumed(prompt: Prompt, session: Session, folder: Path) -> None:
     count = len(session.stops)
     done = count - session.left
-    prompt.say(f"going on with the session in {folder}: {done} of {count} stops are measured")
+    prompt.say(f"resuming the session in {folder}: {done} of {count} stops are measured")
     if session.journal.torn:
-        prompt.say("  the last line of its journal was torn by a break, before it counted")
+        prompt.say("  the last line of its journal was incomplete and is ignored")
     if session.taken:
         prompt.say(f"  the last reading kept: stop {session.taken[-1].stop + 1}")
     if session.mounted is not None and session.plan is not None and session.next is not None:
@@ -178,7 +178,7 @@ def _measure(job: Job, joints: JointSource, instrument: AnyInstrument) -> None:
             f"{options.instrument.kind!r}, expected 'link' or 'typed': the joints are the reading"
         )
     prompt.say(f"instrument: {instrument.name}; joints: {_joints_text(joints, options)}")
-    prompt.say("at every question: Enter goes on, `undo`, `back`, `skip`, `quit`, `?`")
+    prompt.say("at every question: Enter continues, `undo`, `back`, `skip`, `quit`, `?`")
     positioning = Positioning(prompt, job.session, joints, instrument, _clear(job), given)
     sigma = metrology_of(job.cell, options.instrument).sigma
     Measuring(
@@ -197,10 +197,10 @@ def _joints_text(joints: JointSource, options: SessionOptions) -> str:
     return "as planned" if isinstance(joints, PlannedJoints) else "typed in degrees"
 
 
-def _how_to_go_on(cell: Cell, options: SessionOptions, session: Session) -> str:
+def _how_to_resume(cell: Cell, options: SessionOptions, session: Session) -> str:
     done = len(session.stops) - session.left
     kept = f"{done} of {len(session.stops)} stops are measured and kept; " if session.stops else ""
-    return f"{kept}go on with: {_command(cell, options, session)}"
+    return f"{kept}to resume: {_command(cell, options, session)}"
 
 
 def _command(cell: Cell, options: SessionOptions, session: Session) -> str:

@@ -20,7 +20,7 @@ logs_argument = click.argument(
 remounted_option = click.option(
     "--remounted",
     is_flag=True,
-    help="The target was taken off between sessions: each has a tool point of its own.",
+    help="The target was taken off between sessions: each has its own tool point.",
 )
 cell_argument = click.argument("cell", type=click.Path(path_type=Path))
 cell_option = click.option(

@@ -5,39 +5,39 @@ from __future__ import annotations
 COMMANDS: dict[str, tuple[str, str]] = {
     "demo": (
         "gapbridge.bridge.cli.robot.demo:demo",
-        "Do the whole job on a simulated cell, no hardware.",
+        "Calibrate, compensate and diagnose a simulated cell.",
     ),
     "init": (
         "gapbridge.bridge.cli.cell.init:init",
-        "Write a cell from what a controller says of itself.",
+        "Write a cell file from what a controller reports.",
     ),
-    "check": ("gapbridge.bridge.cli.cell.check:check", "Say whether a cell is fit to be used."),
-    "diff": ("gapbridge.bridge.cli.cell.diff:diff", "Say what changed from one cell to another."),
+    "check": ("gapbridge.bridge.cli.cell.check:check", "Check a cell file for mistakes."),
+    "diff": ("gapbridge.bridge.cli.cell.diff:diff", "List the differences of two cells."),
     "simulate": (
         "gapbridge.bridge.cli.robot.simulate:simulate",
-        "Serve the simulated controller of a cell.",
+        "Run a simulated controller for a cell.",
     ),
     "run": ("gapbridge.bridge.cli.robot.run:run", "Run the on-cell daemon."),
     "status": (
         "gapbridge.bridge.cli.robot.status:status",
-        "Report what the daemon of a cell does.",
+        "Show what the daemon of a cell does.",
     ),
-    "arm": ("gapbridge.bridge.cli.robot.arm:arm", "Have the daemon of a cell write setpoints."),
+    "arm": ("gapbridge.bridge.cli.robot.arm:arm", "Make the daemon of a cell write setpoints."),
     "disarm": (
         "gapbridge.bridge.cli.robot.arm:disarm",
-        "Have the daemon of a cell ramp out and observe.",
+        "Make the daemon of a cell ramp out and observe.",
     ),
     "calibrate": (
         "gapbridge.bridge.cli.robot.calibrate:calibrate",
-        "Lead a field calibration session; it can be resumed.",
+        "Run a guided calibration session; it can be resumed.",
     ),
     "export": (
         "gapbridge.bridge.cli.log.export:export_recording",
-        "Turn a recording of the daemon into a log.",
+        "Convert a recording of the daemon to a log.",
     ),
     "convert": (
         "gapbridge.bridge.cli.log.convert:convert",
-        "Turn a recording of another program into a log.",
+        "Convert a recording of another program to a log.",
     ),
     "fit": ("gapbridge.bridge.cli.log.fit:fit", "Identify the compliance of a cell from a log."),
     "predict": (

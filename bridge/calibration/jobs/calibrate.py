@@ -47,7 +47,7 @@ class WholeJob(Job):
         return planned(self.cell, self.options, emit)
 
     def report_plan(self, plan: Plan) -> None:
-        """Say how many stops there are, and what n poses buy."""
+        """Print the number of stops, and the accuracy to expect of n poses."""
         prompt, minutes = self.prompt, self.cell.calibration.minutes_per_load
         fit = sum(not p.held_out and not p.repeat for p in plan.poses)
         held = sum(p.held_out for p in plan.poses)
@@ -67,10 +67,10 @@ class WholeJob(Job):
             f"over workspace and loads; {millimetres(plan.expected.tcp_std_worst)} at worst)"
         )
         spreads = ", ".join(f"{n}: {millimetres(s)}" for n, s in plan.bought)
-        prompt.say(f"  what n poses buy: {spreads}")
+        prompt.say(f"  expected accuracy by number of poses: {spreads}")
         weak = _poorly_determined(plan)
         if weak:
-            prompt.say(f"  these poses hardly determine: {', '.join(weak)}")
+            prompt.say(f"  poorly determined by these poses: {', '.join(weak)}")
         for note in plan.notes:
             prompt.say(f"  note: {note}")
 
@@ -90,7 +90,7 @@ class WholeJob(Job):
         shares = ", ".join(f"{effect.name} {100 * effect.share:.0f} %" for effect in missing)
         names = ", ".join(effect.name for effect in missing)
         self.prompt.say(
-            f"on poses left out of its fit in turn, this takes off what is left: {shares}"
+            f"on poses left out of the fit in turn, this reduces the remaining error: {shares}"
         )
         question = f"The fitted poses ask for {names} as well. Fit again with it?"
         return self.options.yes or self.prompt.confirm(question)
@@ -126,7 +126,7 @@ class WholeJob(Job):
         own = [e for e in fit.estimates() if e.name == name or e.name.startswith(f"{name}_")]
         values = ", ".join(f"{e.name} = {parameter(e.value, e.unit)} ± {parameter(e.std, e.unit)}"
                            for e in own)  # fmt: skip
-        self.prompt.warn(f"not fitted: {values} is not three of its sigmas from zero")
+        self.prompt.warn(f"not fitted: {values} is less than three standard deviations from zero")
 
     def finish(self) -> None:
         """Fit, show, report, and write the new cell once a person says yes."""

@@ -84,7 +84,7 @@ def report_calibration(prompt: Prompt, found: Calibration) -> None:
     prompt.say(noise)
     prompt.console.print(_table(found))
     for row in found.outliers:
-        prompt.say(f"  down-weighted as outlier: reading {int(row) + 1}")
+        prompt.say(f"  outlier, down-weighted: reading {int(row) + 1}")
     for line in found.notes:
         prompt.say(f"  note: {line}")
     if found.combinations:
@@ -93,7 +93,7 @@ def report_calibration(prompt: Prompt, found: Calibration) -> None:
 
 
 def _errors(errors: Errors) -> str:
-    return f"{millimetres(errors.mean)} in the mean, {millimetres(errors.max)} at most"
+    return f"{millimetres(errors.mean)} mean, {millimetres(errors.max)} at most"
 
 
 def _table(found: Calibration) -> Table:

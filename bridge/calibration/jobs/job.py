@@ -100,10 +100,10 @@ class Job(ABC):
         target = self.options.new_cell or _free(stem)
         known = f", replacing the one there of {_since(target)}" if target.exists() else ""
         prompt.say()
-        question = f"Write {what} to {target}{known}? {cell.path} stays as it is."
+        question = f"Write {what} to {target}{known}? {cell.path} is not changed."
         if not self.options.yes and not prompt.confirm(question):
             self.session.add("ended", applied=None)
-            prompt.say(f"nothing is applied; fit and report stay in {self.folder}")
+            prompt.say(f"nothing is applied; fit and report are kept in {self.folder}")
             return None
         require_writable(target, cell.path)
         origin = provenance({"log": [self.session.journal.path], "cell": [cell.path]})

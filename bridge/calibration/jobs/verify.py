@@ -117,7 +117,7 @@ class VerifyJob(Job):
         prompt = self.prompt
         prompt.say(verdict_text(found), "bold green" if found.holds else "bold red")
         prompt.say(
-            f"  errors {millimetres(found.errors.mean)} in the mean, "
+            f"  errors {millimetres(found.errors.mean)} mean, "
             f"{millimetres(found.errors.max)} at most; {found.ratio:.2f} times what was predicted"
         )
         for estimate in () if found.moved is None else found.moved.estimates:

@@ -226,7 +226,7 @@ class Measuring:
     def _resolve(self, verdict: Verdict, same: bool) -> str:
         """Report what looks wrong; returns ``""`` (measure again), ``take`` or ``keep``."""
         if verdict.off > verdict.allowed == 0.0:  # no place of it can be right
-            self.prompt.warn("no reading of this instrument can be so")
+            self.prompt.warn("this instrument cannot give such a reading")
         elif verdict.off > verdict.allowed:
             self.prompt.warn(
                 f"{millimetres(verdict.off)} from where it was expected; a good reading is within "
@@ -236,12 +236,12 @@ class Measuring:
             self.prompt.say(f"    {reason}", "yellow")
         if not verdict.reasons:
             self.prompt.say(
-                "    no plain reason: the instrument knocked? the target slipped? something in the "
-                "beam, or touching the tool?", "yellow",
+                "    no simple explanation: the instrument knocked? the target slipped? something "
+                "in the beam, or touching the tool?", "yellow",
             )  # fmt: skip
         if same:
             self.prompt.say(
-                "    the same as the time before, so it is no slip: `back` measures an earlier "
+                "    the same as before, so it is no typing error: `back` measures an earlier "
                 "pose again and reports what has moved", "yellow",
             )  # fmt: skip
         answers = {"": "measure this pose again"}
@@ -257,7 +257,7 @@ class Measuring:
             self._undo()
         elif command.name == "skip":
             self.session.add("skip", stop=stop)
-            self.prompt.say(f"  stop {stop + 1} is left out")
+            self.prompt.say(f"  stop {stop + 1} is skipped")
         elif command.name == "back":
             self._look_back()
         elif command.name in ("moved", "slipped"):
@@ -267,11 +267,11 @@ class Measuring:
 
     def _undo(self) -> None:
         if not self.session.taken:
-            self.prompt.say("  nothing to take back")
+            self.prompt.say("  no reading to discard")
             return
         last = self.session.taken[-1]
         self.session.add("undo", stop=last.stop)
-        self.prompt.say(f"  took back the reading of stop {last.stop + 1}")
+        self.prompt.say(f"  discarded the reading of stop {last.stop + 1}")
 
     def mark_moved(self, what: str, since: int | None = None) -> None:
         """Begin a new place of the instrument, or of the target, from a reading on."""
@@ -284,11 +284,11 @@ class Measuring:
         session.add("moved", station=station, target=target, since=since)
         if what == "moved":
             self.prompt.say(
-                f"  place {station + 1} of the instrument from here on; earlier readings stay good"
+                f"  place {station + 1} of the instrument from here on; earlier readings are kept"
             )
         else:
             self.prompt.say(
-                "  the target has a new place on the tool from here on; earlier readings stay good"
+                "  the target has a new place on the tool from here on; earlier readings are kept"
             )
 
     # -- `back`: earlier poses measured once more ------------------------------------------------
@@ -314,8 +314,8 @@ class Measuring:
             )
         if float(np.linalg.norm(seen[-1].shift)) < limit:
             prompt.say(
-                f"  as before, within {millimetres(limit)}: instrument and target stand where they "
-                "stood; measure the doubtful pose again"
+                f"  as before, within {millimetres(limit)}: instrument and target have not "
+                "moved; measure the doubtful pose again"
             )
             return
         self._decide(seen, limit, first)
@@ -356,7 +356,7 @@ class Measuring:
             what = "the instrument has moved" if likely == "moved" else "the target has slipped"
             prompt.say(
                 f"  {what}: that leaves {millimetres(stories[likely])} unexplained, "
-                f"the other story {millimetres(max(stories.values()))}"
+                f"the other explanation {millimetres(max(stories.values()))}"
             )
         else:
             prompt.say(

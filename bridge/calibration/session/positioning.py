@@ -96,7 +96,7 @@ class Positioning:
             f"place {number + 1} · {self._instrument.stands} at about ({at}) m in base",
             "bold cyan",
         )
-        self.prompt.enter("  Enter when it stands there")
+        self.prompt.enter("  Enter when it is there")
 
     def mount(self, load: int) -> None:
         """Have a load mounted, and ask whether the arm may be driven with it."""
@@ -106,11 +106,11 @@ class Positioning:
             left = sum(p.load == load for p in self.session.stops)
             self.prompt.say()
             self._driven = self.prompt.confirm(
-                f"The arm will be driven to {left} poses with load {load + 1}, at most "
-                f"{self._speed:g} rad/s. Keep clear, a hand at the stop button. Drive it?"
+                f"The arm will be moved to {left} poses with load {load + 1}, at most "
+                f"{self._speed:g} rad/s. Keep clear, a hand at the stop button. Move it?"
             )
             if not self._driven:
-                self.prompt.say("  not driven: jog it, as the stops are shown")
+                self.prompt.say("  not moved: jog it to each stop as shown")
             self._asked = load
 
     def _hang(self, load: int) -> None:
@@ -119,10 +119,10 @@ class Positioning:
         self.prompt.say()
         self.prompt.say(f"load {load + 1} · {load_text(what)}", "bold cyan")
         if self._instrument.needs_wrench:
-            self.prompt.say("  it hangs on the flange, and nothing touches it?")
+            self.prompt.say("  is it on the flange, with nothing touching it?")
         else:
-            self.prompt.say("  hang it on the flange, and enter its mass and centre")
-        self.prompt.enter("  Enter when it hangs there")
+            self.prompt.say("  mount it on the flange, and enter its mass and centre")
+        self.prompt.enter("  Enter when it is mounted")
         self.session.add("mounted", load=load)
 
     def bring(self, pose: PlannedPose) -> JointSample | None:
@@ -149,7 +149,7 @@ class Positioning:
                     self.joints.drive(pose, via)
             except RunError as error:
                 self.prompt.warn(str(error))
-                if self.prompt.confirm("  Drive on from where it stands?"):
+                if self.prompt.confirm("  Continue from here?"):
                     via = self._way(pose)
                     continue
                 self.prompt.say("  jog it to this pose, or `quit` and look at the arm")
@@ -170,12 +170,12 @@ class Positioning:
         via = route(self._clear, begin, pose.q, known)
         if via is None:
             self.prompt.warn(
-                "no way to this pose is known to be free: jog the arm there, or `skip`"
+                "no collision-free path to this pose was found: jog the arm there, or `skip`"
             )
             self.prompt.say(f"  {degrees(pose.q)}")
         elif via:
             self.prompt.say(
-                f"  going round by {len(via)} other pose{'s'[: len(via) > 1]} of the plan"
+                f"  moving through {len(via)} other pose{'s'[: len(via) > 1]} of the plan"
             )
         return via
 
@@ -184,7 +184,7 @@ class Positioning:
             try:
                 if not self.joints.watches:
                     if isinstance(self.joints, PlannedJoints) and not self._instrument.waits:
-                        self.prompt.enter("  Enter when it stands there")
+                        self.prompt.enter("  Enter when it is there")
                     return self.joints.stand(pose)
                 found = self.joints.arrived(pose)
                 if found is None:
@@ -201,7 +201,7 @@ class Positioning:
         if isinstance(typed, JointSample):
             return typed
         if typed:
-            self.prompt.say(f"  found {typed!r}, expected Enter, or a word of the session (`?`)")
+            self.prompt.say(f"  found {typed!r}, expected Enter, or a command of the session (`?`)")
             return None
         now = self.joints.now()
         if now is None:
@@ -210,7 +210,7 @@ class Positioning:
         if apart.max() > FAR:
             joint = int(apart.argmax())
             far = f"  J{joint + 1} is {np.degrees(apart[joint]):.1f}° away."
-            if not self.prompt.confirm(f"{far} Measure here all the same?"):
+            if not self.prompt.confirm(f"{far} Measure here anyway?"):
                 return None
         return self.joints.stand(pose)
 
@@ -224,14 +224,14 @@ class Positioning:
         if believed is not None and abs(believed - meant) > HEAVY * max(1.0, meant):
             self._warned.add(pose.load)
             self.prompt.warn(
-                f"the controller believes that {believed:g} kg hang on the flange, the plan "
-                f"{meant:g} kg: is the right load mounted, and the controller informed?"
+                f"the controller's payload is {believed:g} kg, the plan's "
+                f"{meant:g} kg: is the right load mounted, and set in the controller?"
             )
-            self.prompt.enter("  Enter when it is put right")
+            self.prompt.enter("  Enter when it is corrected")
         elif stand.wrench is not None and np.linalg.norm(stand.wrench[:3]) > PULL:
             self._warned.add(pose.load)
             self.prompt.warn(
-                f"the controller feels {np.linalg.norm(stand.wrench[:3]):.0f} N at the tool: is "
+                f"the controller measures {np.linalg.norm(stand.wrench[:3]):.0f} N at the tool: is "
                 "the right load mounted, and nothing touching it?"
             )
-            self.prompt.enter("  Enter when it is put right")
+            self.prompt.enter("  Enter when it is corrected")

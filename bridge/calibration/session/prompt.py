@@ -16,14 +16,16 @@ from rich.status import Status
 T = TypeVar("T")
 LOOK = 0.1  # s between two looks at what is waited for
 COMMANDS = {
-    "undo": "take the last reading back and measure that pose again",
+    "undo": "discard the last reading and measure that pose again",
     "back": "measure an earlier pose again: has the instrument or the target moved?",
-    "moved": "the instrument stands elsewhere from the next reading on",
-    "slipped": "the target sits elsewhere on the tool from the next reading on",
-    "skip": "leave this pose out",
+    "moved": "the instrument has been moved: new frame from the next reading on",
+    "slipped": "the target has moved on the tool: from the next reading on",
+    "skip": "skip this pose",
     "note": "write a note into the journal: note TEXT",
-    "quit": "end here; the same command goes on later",
+    "quit": "stop here; rerun the command to resume",
 }
+ENTER = "continue: the load is mounted, the arm is in place, measure"
+HELP = "list these commands"
 _SHORT = {"u": "undo", "b": "back", "q": "quit", "exit": "quit", "h": "?", "help": "?"}
 
 
@@ -75,7 +77,7 @@ class Prompt:
     def enter(self, question: str) -> None:
         """Return on Enter alone; any other answer is asked again."""
         while answer := self.ask(question):
-            self.say(f"found {answer!r}, expected Enter, or a word of the session (`?`)")
+            self.say(f"found {answer!r}, expected Enter, or a command of the session (`?`)")
 
     def confirm(self, question: str) -> bool:
         """Return whether a person says yes; asks until it is yes or no."""
@@ -109,7 +111,7 @@ class Prompt:
 
     def _read(self, question: str, look: Callable[[], T | None]) -> str | T:
         if early := self._typed.flush():
-            self.say(f"  dropped what was typed before the question: {early}", "yellow")
+            self.say(f"  discarded input typed before the question: {early}", "yellow")
         self.console.print(f"{question} > ", end="", markup=False, style="bold")
         self.console.file.flush()
         while True:
@@ -129,7 +131,7 @@ class Prompt:
         word, _, rest = line.partition(" ")
         word = _SHORT.get(word.lower(), word.lower())
         if word == "?":
-            self.say("  Enter    go on")
+            self.say(f"  Enter    {ENTER}")
             for name, text in COMMANDS.items():
                 self.say(f"  {name:<8} {text}")
             return True

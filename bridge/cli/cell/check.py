@@ -27,14 +27,14 @@ from gapbridge.core.errors import InputError
     help="Hold the arm against measured poses too: order and signs of joints, DH rows, frames.",
 )
 def check(cell: Path, live: bool, logs: tuple[Path, ...]) -> None:
-    """Say whether a cell is fit to be used: everything that is wrong or odd in it, with its line.
+    """Check a cell file for mistakes, and report each with its line.
 
-    Units by their size (m, rad, kg, °C), reach, masses, limits; what cannot be meant is an error,
-    what is only odd a warning. With --live also the controller's TCP, payload, gravity, geometry
-    and rate beside the cell's. With --log also whether the arm is the one that was measured; where
-    it is not, each mistake that people make is tried (modified DH rows, a sign, inches, the order
-    of joints, frames), and the one that fits is named. Exits 0 where the cell is fit, 2 where it is
-    not.
+    Checks units by plausible magnitude (m, rad, kg, °C), reach, masses and limits; an impossible
+    value is an error, an unusual one a warning. With --live also compares TCP, payload, gravity,
+    geometry and rate with the controller. With --log also compares the arm with measured poses; if
+    they do not agree, common mistakes are tried (modified DH rows, a sign, inches, the order of
+    joints, frames), and the one that explains them is reported. Exits with 0 if there is no error,
+    2 otherwise.
 
     Example: gapbridge check config/ur10e_simulated.yaml --live
     """

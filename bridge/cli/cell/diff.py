@@ -31,11 +31,11 @@ MODEL = (*FIELDS, "compliance", "effect")  # beginnings of keys that are parts o
 @click.option("--seed", type=click.IntRange(min=0), default=0, help="Of the random poses.")
 @click.option("--json", "as_json", is_flag=True, help="As JSON, SI units.")
 def diff(before: Path, after: Path, log: Path | None, seed: int, as_json: bool) -> None:
-    """Say what changed from one cell to another, in words and in millimetres over the workspace.
+    """List the differences of two cells, and how far each moves the TCP.
 
-    The predicted TCP is compared over 200 random poses within the joint limits, under each cell's
-    own payload, or over the poses and loads of a log: each change by itself, the one that moves it
-    farthest first, and all together.
+    The predicted TCP is compared over 200 random poses within the joint limits, with each cell's
+    own payload, or over the poses and loads of a log: each difference alone, the largest first, and
+    all together.
 
     Example: gapbridge diff cell.yaml calibrated.yaml
     """

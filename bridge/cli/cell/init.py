@@ -39,7 +39,7 @@ from gapbridge.drivers.ur_rtde.enquiry import enquire
     "address of a socketcand server.",
 )
 @click.option(
-    "--profile", help="modbus, can, canopen: the map of the controller (docs/porting.md)."
+    "--profile", help="modbus, can, canopen: the profile of the controller (docs/porting.md)."
 )
 @click.option("--port", type=click.IntRange(1, 65535), help="modbus, socketcand: its port.")
 @click.option("--model", help="A built-in arm, where the controller does not say which it moves.")
@@ -48,11 +48,11 @@ def init(
     host: str, out: Path, driver: str, profile: str | None, port: int | None,
     model: str | None, urdf: Path | None,
 ) -> None:  # fmt: skip
-    """Write a cell from what a controller says of itself; reads only, moves nothing.
+    """Write a cell file from what a controller reports; never moves the arm.
 
-    A UR controller says its model, factory calibration, TCP, payload, joint limits and rate (RTDE
-    and the primary interface); others what their profile reads. What is not said stands in the
-    cell with a comment that asks for it.
+    A UR controller reports its model, factory calibration, TCP, payload, joint limits and rate
+    (RTDE and the primary interface); others what their profile reads. Values that are not reported
+    are left in the cell with a comment that asks for them.
 
     Example: gapbridge init 192.168.0.10 --out cell.yaml
     """

@@ -39,14 +39,14 @@ def patch(
 ) -> None:
     """Write a cell's effects into a simulator's model.
 
-    MODEL is an MJCF (.xml), URDF or USD model of the cell's nominal arm. Geometry, offsets,
-    tool, masses, friction, damping, armature, delay, lag, gain, flexibility and play go where the
-    format holds them; what it cannot hold is listed with what people do instead. What the diagnosis
-    could not distinguish is written as a comment with both candidates. MODEL itself stays as it is;
-    of USD a stronger layer is written over it.
+    MODEL is an MJCF (.xml), URDF or USD model of the cell's nominal arm. Geometry, offsets, tool,
+    masses, friction, damping, armature, delay, lag, gain, flexibility and backlash are written if
+    the format can represent them; the others are listed with the usual workaround. Effects that the
+    diagnosis could not distinguish are written as a comment with both candidates. MODEL is not
+    changed; for USD the output is a stronger layer.
 
-    --parameters also writes the effects as bounds for MuJoCo's own system identification: free
-    within three standard deviations what was accused, frozen what else the cell has.
+    --parameters also writes bounds for MuJoCo's system identification: effects found by the
+    diagnosis are free within three standard deviations, the others of the cell are fixed.
 
     Example: gapbridge patch ur10e.xml --cell better.yaml --out ur10e_real.xml --tcp attachment_site
     """

@@ -32,9 +32,9 @@ MISSED = 1e-6  # m: a corrected setpoint that leaves more than this is reported
 def compensate(log: Path, cell: Path, out: Path) -> None:
     """Correct the setpoint of every row of a log.
 
-    Setpoints come from target_q (where there is none, from actual_q). The wanted pose is the rigid,
-    effect-free arm's at the setpoint; the corrected setpoint is the one whose predicted real pose
-    is that. Writes corrected_q_0..n-1 (rad).
+    Setpoints are taken from target_q (if missing, from actual_q). The intended pose is that of the
+    rigid arm without effects at the setpoint; the corrected setpoint is the one whose predicted
+    real pose equals it. Writes corrected_q_0..n-1 (rad).
 
     Example: gapbridge compensate log.csv --cell cell.yaml --out corrected.csv
     """

@@ -52,13 +52,13 @@ ROLES = tuple(TYPES)
 )
 @click.option("--episode", type=click.IntRange(0), help="One episode of a LeRobot dataset.")
 def convert(source: Path, out: Path, cell: Path | None, **given: Any) -> None:
-    """Turn a recording of another program into a log.
+    """Convert a recording of another program to a log.
 
     SOURCE is a ROS 1 or ROS 2 bag (JointState, JointTrajectoryControllerState, WrenchStamped,
-    PoseStamped or TransformStamped of a tracker; topics found by their type), an MCAP file with
+    PoseStamped or TransformStamped of a tracker; topics are found by their type), an MCAP file with
     ROS 2 messages, a LeRobot dataset, libfranka's CSV, the file of UR's RTDE recorder, or a
     recording of `gapbridge run`. Joints are ordered by name, never by position; times are those of
-    the headers. What the source does not say is reported.
+    the headers. Missing information is reported.
 
     Example: gapbridge convert bag/ --cell cell.yaml --out log.csv
     """

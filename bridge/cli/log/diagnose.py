@@ -70,7 +70,7 @@ if TYPE_CHECKING:
     "--withhold",
     multiple=True,
     metavar="EFFECT",
-    help="Take an effect out of the catalogue; may be given several times.",
+    help="Remove an effect from the catalogue; may be given several times.",
 )
 @click.option(
     "--sim",
@@ -88,15 +88,16 @@ def diagnose(
 ) -> None:
     """Diagnose the sim-to-real gap of a log, or of several sessions of one arm.
 
-    Says in plain sentences where it lies, what causes it and how far it shrinks. An effect is named
-    only where it shrinks the gap on poses that its fit did not see; what the catalogue does not
-    explain is said, with what it depends on. Several logs (or a column session in one) are sessions
-    that share the effects; each has a frame of its own, and with --remounted a tool point.
+    Reports where the gap is, which effects cause it, and how far it shrinks with them in the model.
+    A cause is named only if it shrinks the gap on poses not used in its fit; what the catalogue
+    does not explain is reported with the quantities it depends on. Several logs (or a column
+    session in one) are sessions that share the effects; each has its own instrument frame, with
+    --remounted also its own tool point.
 
-    With --sim the prediction is your simulator's: its log has the simulated TCP in base as
-    measured_position_0..2 or actual_TCP_pose_0..5 (and ft_raw_wrench, actual_q, torques as far as
-    it goes), a row for each row of LOG: by timestamp, else one by one. Rows of another pose are
-    refused.
+    With --sim the prediction is taken from your simulator: a log with the simulated TCP in base as
+    measured_position_0..2 or actual_TCP_pose_0..5 (and optionally ft_raw_wrench, actual_q,
+    torques), with a row for each row of LOG: matched by timestamp, or else by row number. Rows of
+    another pose are refused.
 
     Example: gapbridge diagnose log.csv --cell cell.yaml --out out/diagnosis --apply better.yaml
     """

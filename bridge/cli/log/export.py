@@ -28,12 +28,12 @@ from gapbridge.core.log.mcap_reading import SUFFIX, files_of, read_configuration
 def export_recording(
     recording: Path, out: Path | None, start: str | None, stop: str | None, cell_out: Path | None
 ) -> None:
-    """Turn a recording of the daemon into a log that fit and diagnose take.
+    """Convert a recording of the daemon to a log for fit and diagnose.
 
-    RECORDING is one file (run-20260131-140500-001.mcap) or a run as a whole
-    (run-20260131-140500). T is seconds from its beginning (negative: before its end) or a time like
-    2026-01-31T14:05:00. Beside the log's columns stand nominal_q, corrected_q, offset (of the TCP
-    in base, m and rad), written and state.
+    RECORDING is one file (run-20260131-140500-001.mcap) or a whole run (run-20260131-140500). T is
+    in seconds from the start (negative: before the end) or a time like 2026-01-31T14:05:00. The log
+    also has the columns nominal_q, corrected_q, offset (of the TCP in base, m and rad), written and
+    state.
 
     Example: gapbridge export recordings/run-20260131-140500 --out log.csv --from 10 --to 70
     """

@@ -44,15 +44,15 @@ from gapbridge.core.ranges import merged, range_of
 def fit(logs: tuple[Path, ...], cell: Path, remounted: bool, out: Path) -> None:
     """Identify the compliance of a cell from a log, or from several sessions of one arm.
 
-    Least squares on measured TCP poses (measured_position, and measured_rotation where the log has
-    it) under different payloads or pulls. Effects that are in the cell stay in it. Writes NEW_CELL:
-    the same cell with the flexibilities found; what the log does not show stays as it is in the
-    cell, and is reported. Where the metrology is not registered, its frame and the tool point are
-    estimated along, before as well as after, and not written. Declines, with the reason, where
-    nothing in the log excites the compliance. A log of more than 20,000 rows is read in pieces,
-    so that memory does not grow with it; so is a recording of the daemon (.mcap). Several logs (or
-    a column session in one) are sessions: each has a frame of its own, and with --remounted a tool
-    point, and all share the flexibilities.
+    Least squares on measured TCP poses (measured_position, and measured_rotation if the log has it)
+    under different payloads or forces. Effects of the cell are kept. Writes NEW_CELL: the same cell
+    with the identified flexibilities; those that the log does not determine keep the value of the
+    cell, and are reported. If the instrument is not registered, its frame and the tool point are
+    estimated too, but not written. Declines, with the reason, if nothing in the log excites the
+    compliance. A log of more than 20,000 rows, or a recording of the daemon (.mcap), is read in
+    pieces, so that memory does not grow with it. Several logs (or a column session in one) are
+    sessions: each has its own instrument frame, with --remounted also its own tool point, and all
+    share the flexibilities.
 
     Example: gapbridge fit log.csv --cell cell.yaml --out calibrated.yaml
     """

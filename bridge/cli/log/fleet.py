@@ -47,14 +47,14 @@ def shared(command: Callable[..., None]) -> Callable[..., None]:
         ),
         click.option(
             "--arm", "pattern", metavar="REGEX",
-            help="Finds the arm in a log's path below DIR. Default: the first folder, or the "
-            "file's name up to its first underscore.",
+            help="Matches the arm's name in a log's path below DIR. Default: the first folder, "
+            "or the file's name up to its first underscore.",
         ),
         click.option(
             "--out", type=click.Path(path_type=Path), default=OUT, show_default=True,
-            metavar="DIR", help="Folder of the results; a run that was broken off goes on there.",
+            metavar="DIR", help="Folder of the results; an interrupted run is resumed there.",
         ),
-        click.option("--fresh", is_flag=True, help="Do all anew, whatever is in the folder."),
+        click.option("--fresh", is_flag=True, help="Start over, ignoring earlier results."),
         click.option(
             "--workers", type=click.IntRange(1), metavar="N", default=None,
             help="Local processes.  [default: one a processor]",
@@ -83,13 +83,15 @@ class FleetOptions:
 
 @fleet.command()
 @shared
-@click.option("--withhold", multiple=True, metavar="EFFECT", help="Take an effect out.")
+@click.option(
+    "--withhold", multiple=True, metavar="EFFECT", help="Remove an effect from the catalogue."
+)
 def diagnose(withhold: tuple[str, ...], **given: Any) -> None:
-    """Diagnose every log: which effects recur, which arms drift, what stands out.
+    """Diagnose every log: which effects recur, which arms drift, which are unusual.
 
     Writes results.parquet (a row per session and parameter), sessions.parquet and report.html. A
-    log that cannot be used is reported and skipped. Sessions are kept as they are done: a run that
-    was broken off goes on where it stood.
+    log that cannot be used is reported and skipped. Results are saved as they finish: rerun the
+    command to resume.
 
     Example: gapbridge fleet diagnose 'logs/*/2026-*.csv' --cell arms.csv --workers 8
     """
@@ -111,7 +113,7 @@ def diagnose(withhold: tuple[str, ...], **given: Any) -> None:
 def fit(cells: Path | None, **given: Any) -> None:
     """Fit the compliance of all arms together: type, arm, session.
 
-    An arm with few poses borrows from the others of its type where its own data say little.
+    An arm with few poses benefits from the others of its type where its own data are weak.
     Writes results.parquet, sessions.parquet and report.html.
 
     Example: gapbridge fleet fit logs --cell beside --out out/fit --apply out/cells

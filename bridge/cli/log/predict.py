@@ -41,17 +41,16 @@ SHOWN = 8  # rows named at most
 def predict(log: Path, cell: Path, out: Path, channels: bool) -> None:
     """Predict the TCP pose of every row of a log.
 
-    Joints come from actual_q (where there is none, from target_q, less what the servos are known to
-    give way), loads from the payload,
-    payload_cog, actual_TCP_force, joint_temperatures and approach columns. Writes
+    Joints are taken from actual_q (if missing, from target_q minus the droop of the servos), loads
+    from the columns payload, payload_cog, actual_TCP_force, joint_temperatures and approach. Writes
     predicted_position_0..2 (m) and predicted_rotation_0..2 (rotation vector, rad), in base.
 
-    Where the cell keeps what was fitted (written by fit, calibrate and --apply): its standard
-    deviation predicted_position_std_0..2 (m, base axes: the parameters' part, without noise and
-    without what no effect explains), and outside_fitted, 1 in rows outside the joints, loads and
-    temperatures that were fitted. With --channels also predicted_torque_0..n-1 (Nm, beside
-    actual_current_as_torque), predicted_wrench_0..5 (N, Nm, beside ft_raw_wrench) and
-    predicted_q_0..n-1 (rad, beside actual_q); nan where a row has no acceleration.
+    If the cell was written by fit, calibrate or --apply, also writes the standard deviation
+    predicted_position_std_0..2 (m, base axes: due to the parameters, without noise and unexplained
+    errors) and outside_fitted (1 in rows outside the joints, loads and temperatures of the fit).
+    With --channels also predicted_torque_0..n-1 (Nm, as actual_current_as_torque),
+    predicted_wrench_0..5 (N, Nm, as ft_raw_wrench) and predicted_q_0..n-1 (rad, as actual_q); nan
+    in rows without acceleration.
 
     Example: gapbridge predict log.csv --cell cell.yaml --out predicted.csv
     """

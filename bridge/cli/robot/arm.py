@@ -13,9 +13,9 @@ from gapbridge.bridge.ipc.control_client import ask
 @click.command()
 @cell_argument
 def arm(cell: Path) -> None:
-    """Have the daemon of a cell write setpoints, and wait until it does.
+    """Make the daemon of a cell write setpoints, and wait until it does.
 
-    Goes over a local socket that only the daemon's own user can open; never over the network.
+    Uses a local socket that only the daemon's own user can open; never the network.
 
     Example: gapbridge arm config/ur10e_simulated.yaml
     """
@@ -25,7 +25,7 @@ def arm(cell: Path) -> None:
 @click.command()
 @cell_argument
 def disarm(cell: Path) -> None:
-    """Have the daemon of a cell ramp out and observe; in a fault, acknowledge it.
+    """Make the daemon of a cell ramp out and observe; in a fault, acknowledge it.
 
     Example: gapbridge disarm config/ur10e_simulated.yaml
     """

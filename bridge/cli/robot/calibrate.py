@@ -8,21 +8,13 @@ from typing import Any
 import click
 
 from gapbridge.bridge.calibration.instruments.choice import instrument_settings
+from gapbridge.bridge.calibration.session.prompt import COMMANDS, ENTER, HELP
 from gapbridge.bridge.cli.options import cell_argument, open_cell
 from gapbridge.bridge.document.output_file import require_writable
 
-EPILOG = """\b
-At every question:
-  Enter   go on: it is mounted, the arm stands there, measure
-  undo    take the last reading back and measure that pose again
-  back    measure an earlier pose again: has the instrument or the target moved?
-  moved   the instrument stands elsewhere from now on
-  slipped the target sits elsewhere on the tool from now on
-  skip    leave this pose out
-  note    write a note into the journal: note TEXT
-  quit    end here; the same command goes on later
-  ?       these words
-"""
+EPILOG = "\b\nAt every question:\n" + "\n".join(
+    f"  {name:<8}{text}" for name, text in [("Enter", ENTER), *COMMANDS.items(), ("?", HELP)]
+)
 
 
 @click.command(epilog=EPILOG)
@@ -39,26 +31,34 @@ At every question:
     metavar="KIND[,KEY=VALUE...]",
     help="Measure with this instead of the cell's calibration.instrument.",
 )
-@click.option("--poses", type=click.IntRange(min=6), help="Poses to fit, instead of the cell's.")
-@click.option("--plan-only", is_flag=True, help="Plan, say what n poses buy, and end.")
 @click.option(
-    "--move", is_flag=True, help="Drive the arm, after a yes for each load; default: you jog it."
+    "--poses", type=click.IntRange(min=6), help="Number of poses to fit, instead of the cell's."
+)
+@click.option("--plan-only", is_flag=True, help="Plan, report the expected accuracy, and exit.")
+@click.option(
+    "--move",
+    is_flag=True,
+    help="Move the arm, after a confirmation for each load; default: you jog it.",
 )
 @click.option(
     "--apply",
     "new_cell",
     type=click.Path(path_type=Path),
     metavar="NEW_CELL",
-    help="Where the calibrated cell is written, once you say yes; the old one is kept.",
+    help="Where to write the calibrated cell, after confirmation; the old one is kept.",
 )
-@click.option("--verify", is_flag=True, help="Measure a few poses: does the calibration hold?")
+@click.option(
+    "--verify",
+    is_flag=True,
+    help="Measure a few poses to verify that the calibration is still valid.",
+)
 @click.option(
     "--payload-only",
     is_flag=True,
-    help="Find mass and centre of what the arm carries, and the bias of its sensor.",
+    help="Identify mass and centre of gravity of the payload, and the bias of the sensor.",
 )
 @click.option(
-    "--tool-only", is_flag=True, help="Find the tip of a new tool, brought onto one fixed point."
+    "--tool-only", is_flag=True, help="Identify the TCP of a new tool by touching one fixed point."
 )
 @click.option("--yes", is_flag=True, help="Write the new cell without asking. Never moves the arm.")
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True,
@@ -71,15 +71,15 @@ def calibrate(
     tool_only: bool,
     **options: Any,
 ) -> None:
-    """Lead a field calibration session; it can be resumed.
+    """Run a guided calibration session; it can be resumed.
 
-    From an unknown arm to a cell that compensates: plans the poses, says what to mount and where to
-    put the arm, waits until it stands, reads the instrument, checks each reading at once, and keeps
-    it on disk before the next step; the same command goes on after a break, a power cut or Ctrl-C.
-    At the end it fits, verifies on poses that the fit did not see, writes a report, and asks before
-    it writes a new cell. The arm moves only with --move, and then only after a yes for each load.
+    Plans the poses, says what to mount and where to move the arm, waits until it rests, reads the
+    instrument, checks each reading at once, and saves it before the next step. After a power
+    failure or Ctrl-C, rerun the command to resume. At the end it fits, verifies the result on
+    poses not used in the fit, writes a report, and asks before it writes a new cell. The arm moves
+    only with --move, and then only after a confirmation for each load.
 
-    Section `calibration` of the cell says which instrument and loads there are.
+    The section `calibration` of the cell defines the instrument and the loads.
 
     Example: gapbridge calibrate cell.yaml --plan-only
 

@@ -32,14 +32,14 @@ from gapbridge.core.errors import InputError
     help="Driver by which the simulated cell is reached: ur_rtde, can or modbus.",
 )
 def demo(seed: int, out: Path, link: str) -> None:  # fmt: skip
-    """Do the whole job on a simulated cell, no hardware needed.
+    """Calibrate, compensate and diagnose a simulated cell; no hardware needed.
 
-    Connect, measure, calibrate, compensate, diagnose, report: over the real protocol, against a
-    simulated controller whose flexibilities are drawn from the seed and hidden. A UR10e over RTDE,
-    a soft AgileX PiPER on CAN, or a UR10e whose own program moves it, over Modbus. The UR10e over
-    RTDE has a bent tool too, which no fit of flexibilities knows: the diagnosis has to name it, it
-    is applied, and the same poses are visited again. The demo fails where the diagnosis accuses
-    anything that the simulated arm does not have.
+    Connects over the real protocol to a simulated controller whose true flexibilities are drawn
+    from the seed and hidden, measures poses, fits, compensates, diagnoses, and writes a report: a
+    UR10e over RTDE, a compliant AgileX PiPER on CAN, or a UR10e that is moved by its own program,
+    over Modbus. The arm also has a bent tool, which the fit of flexibilities does not model: the
+    diagnosis must identify it, and the test poses are measured again with it in the model. The demo
+    fails if the diagnosis names a cause that the simulated arm does not have.
 
     Example: gapbridge demo --seed 3
     Example: gapbridge demo --link can --out out/demo_can

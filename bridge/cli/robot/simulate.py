@@ -16,11 +16,11 @@ from gapbridge.bridge.cli.options import cell_argument, open_cell
 @click.option("--host", help="Loopback address to serve at, instead of the cell's.")
 @click.option("--seed", type=click.IntRange(min=0), help="Seed of the hidden plant.")
 def simulate(cell: Path, host: str | None, seed: int | None) -> None:
-    """Serve the simulated controller of a cell over its real protocol until stopped.
+    """Run a simulated controller for a cell, on its real protocol, until stopped.
 
-    The arm behind it bends by hidden flexibilities that are drawn from the seed. A bench port
-    (30100) stands for the people and the laser tracker around the cell: `measure`, `payload`,
-    `wrench`, `help`. Ends on SIGINT and SIGTERM.
+    The simulated arm bends with hidden flexibilities that are drawn from the seed. A control port
+    (30100) acts for people and the laser tracker in the cell: `measure`, `payload`, `wrench`,
+    `help`. Ends on SIGINT and SIGTERM.
 
     Example: gapbridge simulate config/ur10e_simulated.yaml
     """

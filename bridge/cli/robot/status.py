@@ -15,7 +15,7 @@ from gapbridge.bridge.ipc.control_client import ask, running
 @click.argument("cell", type=click.Path(path_type=Path), required=False)
 @click.option("--json", "as_json", is_flag=True, help="Print the whole status document.")
 def status(cell: Path | None, as_json: bool) -> None:
-    """Report what the daemon of a cell does; without CELL, what all of this user's daemons do.
+    """Show what the daemon of a cell does; without CELL, all daemons of this user.
 
     Example: gapbridge status config/ur10e_simulated.yaml --json
     """

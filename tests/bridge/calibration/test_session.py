@@ -107,7 +107,7 @@ def test_mistakes_on_the_way_leave_the_same_calibration(
     assert "metres taken for millimetres" in played.out
     assert "y alone is off" in played.out
     assert "found 2 numbers" in played.out
-    assert "go on with: gapbridge calibrate" in played.out
+    assert "to resume: gapbridge calibrate" in played.out
     assert len(_kept(tmp_path)) == 7
     last = next(k for k in range(9, len(load)) if len(set(load[k - 3 : k + 1])) == 1)
     second = [*script_from(load, good, 7, last), *hung(load, last), typed(after[last]), "back"]
@@ -116,7 +116,7 @@ def test_mistakes_on_the_way_leave_the_same_calibration(
     played = play(cell, "--session", tmp_path / "s", "--apply", tmp_path / "new.yaml", lines=second)
     assert played.code == 0, played.err + played.out[-2000:]
     assert "the instrument has moved" in played.out
-    assert "going on with the session" in played.out
+    assert "resuming the session" in played.out
     assert remaining(tmp_path / "new.yaml", tmp_path / "s").max() < 1.2e-4
     _same_within_intervals(clean[0] / "s", tmp_path / "s")
 
@@ -127,7 +127,7 @@ def test_the_first_reading_in_another_unit_is_held_to_no_expected_place(tmp_path
     plan = plan_in(tmp_path / "s")
     lines = ["", typed(positions(plan)[0], 1e-3), "", "quit"]
     played = play(cell, "--session", tmp_path / "s", lines=lines)
-    assert "no reading of this instrument can be so" in played.out
+    assert "this instrument cannot give such a reading" in played.out
     assert "is the unit right?" in played.out
     assert "from where it was expected" not in played.out
     assert not _kept(tmp_path)
@@ -165,10 +165,10 @@ def test_an_ended_input_and_quit_end_in_order_and_show_how_to_go_on(tmp_path: Pa
     value = typed(positions(plan_in(tmp_path / "s"))[0])
     played = play(cell, "--session", tmp_path / "s", lines=["", "?", value, "quit"])
     assert played.code == 0
-    assert "take the last reading back" in played.out
-    assert "1 of 24 stops are measured and kept; go on with: gapbridge calibrate" in played.out
+    assert "discard the last reading" in played.out
+    assert "1 of 24 stops are measured and kept; to resume: gapbridge calibrate" in played.out
     played = play(cell, "--session", tmp_path / "s", lines=["skip"])
-    assert "stop 2 is left out" in played.out
+    assert "stop 2 is skipped" in played.out
     assert "the input ended" in played.out
 
 

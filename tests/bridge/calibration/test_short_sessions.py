@@ -55,12 +55,12 @@ def test_payload_only_weighs_what_hangs_there(served: BenchHand, tmp_path: Path)
     served.hands.hang(*LOAD, emit=False)  # the controller believes in nothing of the kind
     with Terminal(cell, "--payload-only", "--session", tmp_path / "s", "--apply", new) as terminal:
         shown = lead(terminal, {
-            "hangs there": "",
+            "it is mounted": "",
             "rests there": lambda t: served.jog(last_pose(t.shown)),
             "[yes/no]": "yes",
         })  # fmt: skip
         assert terminal.code == 0, shown[-2000:]
-    assert "believes" not in shown
+    assert "the controller's payload is" not in shown
     payload = load_cell(new).file.payload
     assert payload.mass == pytest.approx(LOAD[0], abs=0.1)
     np.testing.assert_allclose(payload.cog, LOAD[1], atol=5e-3)
@@ -81,7 +81,7 @@ def test_tool_only_finds_the_tip_by_touching_one_point(served: BenchHand, tmp_pa
 
     with Terminal(cell, "--tool-only", "--session", tmp_path / "s", "--apply", new) as terminal:
         shown = lead(terminal, {
-            "hangs there": "", "tip on the point": seated, "[yes/no]": "yes",
+            "it is mounted": "", "tip on the point": seated, "[yes/no]": "yes",
         })  # fmt: skip
         assert terminal.code == 0, shown[-2000:]
     found = load_cell(new).model.tool_in_flange[:3, 3]

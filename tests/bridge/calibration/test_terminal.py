@@ -61,7 +61,7 @@ class Person:
 
     def answer(self, terminal: Terminal, question: str) -> str | None:
         """Return what is typed; None: nothing, the arm is jogged instead."""
-        if "hangs there" in question:
+        if "it is mounted" in question:
             second = terminal.shown.rfind("9.5 kg, centre") > terminal.shown.rfind("1.5 kg, centre")
             self.hands.hang(*LOADS[second])
             return ""
@@ -129,7 +129,7 @@ def test_a_person_with_mistakes_and_a_power_cut_ends_with_a_valid_cell(tmp_path:
     assert "is the unit right?" in first
     assert "alone is off" in first
     assert "the instrument has moved" in first
-    assert "going on with the session" in terminal.shown
+    assert "resuming the session" in terminal.shown
     axial = load_cell(new).model.compliance()[0]
     true = load_cell(cell)
     from gapbridge.bridge.cell.simulation import server_settings
@@ -147,25 +147,25 @@ def test_the_arm_is_driven_after_a_yes_and_ctrl_c_shows_how_to_go_on(tmp_path: P
     cell.write_text(cell.read_text().replace("floor: 0.1", "floor: -1.0"), encoding="utf-8")
     hands = Hands(host)
     with ServedCell(cell, 3), Terminal(cell, "--session", tmp_path / "s", "--move") as terminal:
-        assert "hangs there" in str(terminal.question())
+        assert "it is mounted" in str(terminal.question())
         heavy = terminal.shown.rfind("· 9.5 kg") > terminal.shown.rfind("· 1.5 kg")
         hands.hang(*LOADS[heavy])
         before = hands.bench("truth")
         terminal.type("")
-        assert "Drive it?" in str(terminal.question())
+        assert "Move it?" in str(terminal.question())
         assert hands.bench("truth").split('"true_tcp"')[0] == before.split('"true_tcp"')[0]
         terminal.type("yes")
         broken = 0
         while terminal.shown.count("  kept  ") < 1:
             terminal.watch()
-            if terminal.shown.count("Drive on") > broken:  # the machine missed deadlines
+            if terminal.shown.count("Continue from here") > broken:  # the machine missed deadlines
                 broken += 1
                 terminal.type("yes")
         terminal.signal(signal.SIGINT)
         shown = terminal.rest()
         assert terminal.code == 1
     assert "interrupted" in shown
-    assert "go on with: gapbridge calibrate" in shown
+    assert "to resume: gapbridge calibrate" in shown
     kept = [e for e in read_entries(tmp_path / "s" / FILE) if e["kind"] == "reading"]
     assert kept
     assert all(e["samples"] == 10 for e in kept)

@@ -42,14 +42,12 @@ def test_what_was_typed_before_a_question_does_not_answer_it(
     time.sleep(0.1)
     typed_later(keyboard, "no")
     assert not Prompt().confirm("Write the cell?")
-    assert (
-        "dropped what was typed before the question: yes ⏎ 1.0 2.0 3.0" in capsys.readouterr().out
-    )
+    assert "discarded input typed before the question: yes ⏎ 1.0 2.0 3.0" in capsys.readouterr().out
 
 
 def test_enter_is_enter_and_nothing_else(keyboard: int, capsys: pytest.CaptureFixture[str]) -> None:
     typed_later(keyboard, "no", "wait", "")
-    Prompt().enter("Enter when it hangs there")
+    Prompt().enter("Enter when it is mounted")
     said = capsys.readouterr().out
     assert "found 'no', expected Enter" in said
     assert "found 'wait', expected Enter" in said
@@ -58,4 +56,4 @@ def test_enter_is_enter_and_nothing_else(keyboard: int, capsys: pytest.CaptureFi
 def test_words_of_the_session_work_where_enter_is_asked(keyboard: int) -> None:
     typed_later(keyboard, "undo")
     with pytest.raises(SessionCommand, match="undo"):
-        Prompt().enter("Enter when it hangs there")
+        Prompt().enter("Enter when it is mounted")
