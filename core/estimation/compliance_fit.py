@@ -245,17 +245,19 @@ def _first_placements(model: Model, data: Data) -> Registration | Placements:
 
 
 def fit_flexibilities(
-    begin: Fit, data: Data, kept: Mask, prior: tuple[Array, float], rounds: int = ROUNDS
-) -> Fit:
+    begin: Fit, data: Data, kept: Mask, prior: tuple[Array, float], rounds: int = ROUNDS,
+    converged: float = CONVERGED,
+) -> Fit:  # fmt: skip
     """Return the fit of the ``kept`` flexibilities (2n,), the others as they are in ``begin``.
 
-    ``prior`` is the value (2n,) and the 1 sigma (rad/Nm) that weakly hold every flexibility.
+    ``prior`` is the value (2n,) and the 1 sigma (rad/Nm) that weakly hold every flexibility;
+    ``converged`` the relative step at which it ends.
     """
     now = begin
     for _ in range(rounds):
         before = now.flexibility
         now = _round(now, data, kept, prior)
-        if np.abs(now.flexibility - before).max() < CONVERGED * max(np.abs(before).max(), 1e-12):
+        if np.abs(now.flexibility - before).max() < converged * max(np.abs(before).max(), 1e-12):
             break
     return now
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from gapbridge.core.errors import ExcitationError, LogError
 from gapbridge.core.estimation import base_parameters
 from gapbridge.core.estimation.compliance_fit import (
+    CONVERGED,
     Data,
     Fit,
     Mask,
@@ -38,6 +39,7 @@ from gapbridge.core.sessions import session_of
 Array = NDArray[np.float64]
 FOLDS = 5
 SAME_POSE = 1e-3  # rad, of every joint
+NEAR = 1e-4  # relative step at which a fit has converged that is only judged by
 LOOK = 3  # rounds of the fit of everything, from which the choice is made
 UNSEEN = float("nan")
 
@@ -76,17 +78,18 @@ class _Task:
     """How to fit: what the model says of the flexibilities, and how firmly."""
 
     prior: tuple[Array, float]  # (2n,) rad/Nm, 1 sigma rad/Nm
+    converged: float = CONVERGED  # relative step
 
     def run(self, before: Fit, data: Data) -> tuple[Fit, base_parameters.Shown]:
         """Fit everything, choose what the data show, fit that alone."""
         centre = self.prior[0]
         everything = np.ones(len(centre), dtype=bool)
-        look = fit_flexibilities(before, data, everything, self.prior, rounds=LOOK)
+        look = fit_flexibilities(before, data, everything, self.prior, LOOK, self.converged)
         assert look.linear is not None
         kept = base_parameters.choose(look.linear, self.prior)
         values, n = np.where(kept, look.flexibility, centre), len(centre) // 2
         begin = Fit(look.model.with_compliance(values[:n], values[n:]), look.frame, look.weights)
-        fit = fit_flexibilities(begin, data, kept, self.prior)
+        fit = fit_flexibilities(begin, data, kept, self.prior, converged=self.converged)
         assert fit.linear is not None
         return fit, base_parameters.what_is_shown(fit.linear, kept, self.prior[1])
 
@@ -109,12 +112,13 @@ def identify_compliance(
     before = fit_nuisances(model, data)
     fit, shown = task.run(before, data)
     inlier = fit.weights > 1e-6
-    held_out = _held_out(model, data, task, inlier)
+    rest = replace(task, converged=NEAR)  # fits that lack some rows begin at the fit to all
+    held_out = _held_out(model, data, rest, fit, inlier)
     found = _result(model, data, used, (before, fit), shown, held_out)
     return replace(
         found,
-        remaining_rms_new_region=_in_new_regions(model, data, task, inlier),
-        remaining_rms_new_session=_in_new_sessions(model, data, task, inlier),
+        remaining_rms_new_region=_in_new_regions(data, rest, fit, inlier),
+        remaining_rms_new_session=_in_new_sessions(data, rest, fit, inlier),
     )
 
 
@@ -215,7 +219,9 @@ def pose_groups(q: Array) -> NDArray[np.int64]:
     return groups
 
 
-def _held_out(model: Model, data: Data, task: _Task, inlier: Mask) -> tuple[float, float]:
+def _held_out(
+    model: Model, data: Data, task: _Task, whole: Fit, inlier: Mask
+) -> tuple[float, float]:
     """Return the rms before and after over inlier rows of poses left out; nan: too few poses."""
     groups = pose_groups(data.q[:2000]) if len(data.q) <= 2000 else np.arange(len(data.q))
     poses = int(groups.max()) + 1
@@ -228,12 +234,12 @@ def _held_out(model: Model, data: Data, task: _Task, inlier: Mask) -> tuple[floa
         if not len(unseen.q):
             continue
         before = fit_nuisances(model, seen)
-        for fit, gaps in zip((before, task.run(before, seen)[0]), left, strict=True):
+        for fit, gaps in zip((before, task.run(whole, seen)[0]), left, strict=True):
             gaps.append(residual(fit.model, unseen, fit.frame)[0][:, :3])
     return _rms(np.vstack(left[0])), _rms(np.vstack(left[1]))
 
 
-def _in_new_regions(model: Model, data: Data, task: _Task, inlier: Mask) -> float:
+def _in_new_regions(data: Data, task: _Task, whole: Fit, inlier: Mask) -> float:
     """Return the rms over inlier rows of regions of joint space left out; nan: too few poses."""
     if len(np.unique(np.round(data.q, 3), axis=0)) < 2 * FOLDS:
         return UNSEEN
@@ -244,7 +250,7 @@ def _in_new_regions(model: Model, data: Data, task: _Task, inlier: Mask) -> floa
             judged &= np.isin(data.session, _placed_sessions(seen))
         if not judged.any() or 3 * len(seen.q) <= data.nuisances + 2:
             continue
-        fit = task.run(fit_nuisances(model, seen), seen)[0]
+        fit = task.run(whole, seen)[0]
         left.append(residual(fit.model, data.part(judged), fit.frame)[0][:, :3])
     return _rms(np.vstack(left)) if len(left) > 1 else UNSEEN
 
@@ -255,7 +261,7 @@ def _placed_sessions(data: Data) -> list[int]:
     return [s for s in range(data.sessions) if 3 * int((data.session == s).sum()) >= 12]
 
 
-def _in_new_sessions(model: Model, data: Data, task: _Task, inlier: Mask) -> float:
+def _in_new_sessions(data: Data, task: _Task, whole: Fit, inlier: Mask) -> float:
     """Return the rms over inlier rows of sessions left out, each registered on itself; nan: one."""
     if data.session is None or data.sessions < 2:
         return UNSEEN
@@ -265,7 +271,7 @@ def _in_new_sessions(model: Model, data: Data, task: _Task, inlier: Mask) -> flo
         if not (rest.any() and own.any()):
             continue
         others = data.part(rest)
-        fit = task.run(fit_nuisances(model, others), others)[0]
+        fit = task.run(whole, others)[0]
         left.append(placed_gap(fit.model, data.part(own))[:, :3])
     return _rms(np.vstack(left)) if left else UNSEEN
 
