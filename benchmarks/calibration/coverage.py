@@ -30,10 +30,10 @@ from benchmarks.calibration.laid_out import (
 )
 from gapbridge.core.calibration.converged_fit import converged_fit
 from gapbridge.core.calibration.fit import estimates_of
+from gapbridge.core.calibration.held_out_check import predicted
 from gapbridge.core.calibration.identifiability import identifiable_parameters
 from gapbridge.core.calibration.observables import make_observable
 from gapbridge.core.calibration.parameters import Parameters
-from gapbridge.core.calibration.remainder import predicted
 from gapbridge.core.metrology import Metrology
 from gapbridge.core.model import Model
 

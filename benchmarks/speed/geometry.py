@@ -15,7 +15,7 @@ from benchmarks.speed.peers.pinocchio_task import PinocchioTask
 from benchmarks.speed.sides import Side, compared, interleaved
 from gapbridge.core.calibration.identifiability import identifiable_parameters
 from gapbridge.core.calibration.observables import make_observable
-from gapbridge.core.calibration.observables.foreseen import empty_readings
+from gapbridge.core.calibration.observables.predicted_readings import empty_readings
 from gapbridge.core.calibration.parameters import Parameters
 from gapbridge.core.kernels import reference as kernel
 from gapbridge.core.loads import Loads

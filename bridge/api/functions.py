@@ -18,9 +18,9 @@ from gapbridge.core.calibration.spread import Spread
 from gapbridge.core.compensation import correct
 from gapbridge.core.effects import by_approach
 from gapbridge.core.errors import EquilibriumError, InputError
+from gapbridge.core.fitted_range import outside_rows, range_of
 from gapbridge.core.log.log import Log
 from gapbridge.core.predicted_channels import predicted_channels
-from gapbridge.core.ranges import outside_rows, range_of
 from gapbridge.core.sessions import join_sessions
 
 __all__ = ["compensate", "diagnose", "fit", "load_cell", "predict", "read_log"]

@@ -17,8 +17,8 @@ from gapbridge.bridge.cell.sections import SetpointSettings
 from gapbridge.bridge.served.credentials import check_credentials, read_token
 from gapbridge.core.errors import CellError, InputError
 from gapbridge.core.files import read_bytes, recorded
+from gapbridge.core.fitted_range import Range
 from gapbridge.core.model import Model
-from gapbridge.core.ranges import Range
 
 
 @dataclass(frozen=True)

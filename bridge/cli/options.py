@@ -9,8 +9,8 @@ import click
 
 from gapbridge.bridge.cell import Cell, load_cell
 from gapbridge.bridge.cell.opened_log import open_log
+from gapbridge.core.fitted_range import Outside
 from gapbridge.core.log.log import Log
-from gapbridge.core.ranges import Outside
 from gapbridge.core.sessions import join_sessions
 
 log_argument = click.argument("log", type=click.Path(path_type=Path))

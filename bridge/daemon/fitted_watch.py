@@ -11,8 +11,8 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from gapbridge.core.fitted_range import UNITS, Range, beyond, stem_of
 from gapbridge.core.log.columns import label
-from gapbridge.core.ranges import UNITS, Range, beyond, stem_of
 
 Array = NDArray[np.float64]
 WATCHED = ("actual_q", "payload", "joint_temperatures", "actual_TCP_force")

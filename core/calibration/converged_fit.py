@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gapbridge.core.calibration.descent import FitState, descended, fit_state
+from gapbridge.core.calibration.levenberg_marquardt import FitState, converge, fit_state
 from gapbridge.core.calibration.noise import Noise, estimated, presumed
 from gapbridge.core.calibration.observables.nuisance import Nuisance
 from gapbridge.core.calibration.observables.observable import Observable
@@ -42,7 +42,7 @@ class ConvergedFit:
     @property
     def freedom(self) -> float:
         """Return the degrees of freedom left."""
-        width = len(self.system.left) / max(len(self.weights), 1)
+        width = len(self.system.residual) / max(len(self.weights), 1)
         return max(float(self.weights.sum()) * width - self.spent, 1.0)
 
     @property
@@ -72,11 +72,11 @@ def converged_fit(
     problem = Problem(parameters, observable, readings, bounds, stages, known)
     progress("fitting, look 1")
     at = _staged(problem, fit_state(problem, values, nuisance, noise), noise)
-    at = descended(problem, at, noise)
+    at = converge(problem, at, noise)
     for look in range(NOISES):  # the noise is determined by what is left once the fit is at rest
         progress(f"fitting, look {look + 2}")
         before, noise = noise, _noise(problem, at, noise)
-        at = descended(problem, at, noise)
+        at = converge(problem, at, noise)
         if np.abs(noise.sizes / before.sizes - 1).max() < SAME:
             break
     return problem, ConvergedFit(
@@ -86,16 +86,16 @@ def converged_fit(
 
 
 def _staged(problem: Problem, at: FitState, noise: Noise) -> FitState:
-    """Return the standing after the stages, where they lead down."""
+    """Return the state after the stages, where they lead down."""
     k = problem.observable.equations
     root = np.sqrt(at.weights)
     step = staged_step(at.system, problem.stages, at.values, problem.bounds, k, root)
     values = np.clip(at.values + step, problem.bounds.lower, problem.bounds.upper)
-    if problem.left(values, at.nuisance) is None:
+    if problem.residual(values, at.nuisance) is None:
         return at
     poses = problem.parameters.model(values).predict(problem.readings.q, problem.readings.loads)
     nuisance = problem.observable.refined(poses, problem.readings, at.nuisance)
-    here, there = (problem.left(*p) for p in ((at.values, at.nuisance), (values, nuisance)))
+    here, there = (problem.residual(*p) for p in ((at.values, at.nuisance), (values, nuisance)))
     if here is None or there is None:
         return at
     gain = cost(here, noise, at.weights) - cost(there, noise, at.weights)
@@ -107,11 +107,11 @@ def _staged(problem: Problem, at: FitState, noise: Noise) -> FitState:
 def _noise(problem: Problem, at: FitState, noise: Noise) -> Noise:
     """Return the noise that the residual implies."""
     J, F = at.columns
-    left = problem.left(at.values, at.nuisance)
-    assert left is not None
+    residual = problem.residual(at.values, at.nuisance)
+    assert residual is not None
     off = at.values - problem.bounds.begin
     precision = np.concatenate([problem.bounds.held**-2.0, np.zeros(F.shape[1])])
     return estimated(
-        noise, problem.known, left + (J @ off).reshape(left.shape), np.hstack([J, F]),
+        noise, problem.known, residual + (J @ off).reshape(residual.shape), np.hstack([J, F]),
         precision, np.asarray(at.weights > OUTLIER),
     )  # fmt: skip

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from gapbridge.core.calibration.converged_fit import ConvergedFit, converged_fit
+from gapbridge.core.calibration.held_out_check import check_held_out, diagnosed, repeatability_of
 from gapbridge.core.calibration.missing_effects import MissingEffect, missing_effects
 from gapbridge.core.calibration.noise import Noise
 from gapbridge.core.calibration.observables import make_observable
@@ -19,7 +20,6 @@ from gapbridge.core.calibration.parameters import Parameters
 from gapbridge.core.calibration.plan import Expectation
 from gapbridge.core.calibration.problem import Problem
 from gapbridge.core.calibration.readings import Readings
-from gapbridge.core.calibration.remainder import carried, diagnosed, repeatability_of
 from gapbridge.core.calibration.result import Calibration, Errors, Estimate
 from gapbridge.core.calibration.staging import at_odds
 from gapbridge.core.calibration.summary import combinations, notes_of, remaining_of, verdict_of
@@ -101,7 +101,7 @@ def judged(
     with threadpool_limits(1, "blas"):
         report("judging")
         found = parameters.model(rest.values)
-        remainder = carried(problem, rest, found, readings, fit.metrology)
+        remainder = check_held_out(problem, rest, found, readings, fit.metrology)
         diagnosis = diagnosed(found, readings, rest, fit.metrology, report) if diagnose else None
     estimates = fit.estimates(expected)
     shown = np.array([e.shown for e in estimates], dtype=bool)

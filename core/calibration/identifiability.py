@@ -18,9 +18,12 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from gapbridge.core.calibration.observables.foreseen import foreseen, somewhere
 from gapbridge.core.calibration.observables.nuisance import Nuisance
 from gapbridge.core.calibration.observables.observable import Observable
+from gapbridge.core.calibration.observables.predicted_readings import (
+    predicted_readings,
+    usual_nuisance,
+)
 from gapbridge.core.calibration.parameters import DEFAULT, Parameters
 from gapbridge.core.calibration.readings import Readings
 from gapbridge.core.effects import CATALOGUE
@@ -135,5 +138,5 @@ def _anywhere(
         observable.kind, q, np.zeros((POSES, observable.width)), np.full(POSES, np.nan), loads,
         zeros, zeros, target, np.zeros(POSES, dtype=bool), np.arange(POSES),
     )  # fmt: skip
-    nuisance = somewhere(model, observable, readings, seed)
-    return foreseen(observable, model, readings, nuisance), nuisance
+    nuisance = usual_nuisance(model, observable, readings, seed)
+    return predicted_readings(observable, model, readings, nuisance), nuisance

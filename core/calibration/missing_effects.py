@@ -47,7 +47,7 @@ def missing_effects(problem: Problem, rest: ConvergedFit) -> tuple[MissingEffect
     known = np.hstack([rest.system.J, rest.system.F])
     found: list[MissingEffect] = []
     for _ in range(MOST):
-        likely = _likely(tried, known, rest.system.left, found)
+        likely = _likely(tried, known, rest.system.residual, found)
         gains = [(name, folds.gain(tried[name])) for name in likely]
         held = [MissingEffect(name, gain) for name, gain in gains if gain >= SMALL]
         if not held:
@@ -59,11 +59,11 @@ def missing_effects(problem: Problem, rest: ConvergedFit) -> tuple[MissingEffect
 
 
 def _likely(
-    tried: dict[str, Candidate], known: Array, left: Array, found: list[MissingEffect]
+    tried: dict[str, Candidate], known: Array, residual: Array, found: list[MissingEffect]
 ) -> list[str]:
     """Return the effects that are far likelier than nothing, their number paid for."""
     Q = _orthonormal(known)
-    free = left - Q @ (Q.T @ left)
+    free = residual - Q @ (Q.T @ residual)
     whole = max(float(free @ free), 1e-300)
     likely = []
     for name, (columns, _) in tried.items():
@@ -72,7 +72,7 @@ def _likely(
         own = columns - Q @ (Q.T @ columns)
         seen = np.linalg.norm(own, axis=0) > SHOWN * np.linalg.norm(columns, axis=0)
         own = _orthonormal(own[:, seen])
-        spare = len(left) - Q.shape[1] - own.shape[1]
+        spare = len(residual) - Q.shape[1] - own.shape[1]
         if not own.shape[1] or spare < 1:
             continue
         taken = float(np.sum((own.T @ free) ** 2)) / whole
@@ -87,7 +87,7 @@ class _Folds:
     """The fit's linear system with its poses left out in turn."""
 
     A: Array  # (M, c) columns of parameters and instrument, divided by their usual sizes
-    left: Array  # (M,)
+    residual: Array  # (M,)
     ridge: Array  # (c,) how firmly each number is held at zero
     pull: Array  # (c,) of the priors, towards where each began
     pose: NDArray[np.int64]  # (M,) number of each row's pose
@@ -105,13 +105,13 @@ class _Folds:
         pose = np.repeat(pose_groups(problem.readings.q), problem.observable.equations)
         count = int(pose.max()) + 1
         order = np.random.default_rng(0).permutation(count) % FOLDS
-        return cls(A, system.left, ridge, pull, pose, order[pose])
+        return cls(A, system.residual, ridge, pull, pose, order[pose])
 
     def beside(self, candidate: Candidate) -> _Folds:
         """Return the folds of the fit with a further effect in it."""
         columns, sizes = candidate
         return _Folds(
-            np.hstack([self.A, columns * HELD * sizes]), self.left,
+            np.hstack([self.A, columns * HELD * sizes]), self.residual,
             np.concatenate([self.ridge, np.ones(len(sizes))]),
             np.concatenate([self.pull, np.zeros(len(sizes))]), self.pose, self.fold,
         )  # fmt: skip
@@ -135,14 +135,14 @@ class _Folds:
         """Return what each row misses (M,) where its pose was left out of the fit."""
         G, g = (
             self.A.T @ self.A + np.diag(self.ridge),
-            self.A.T @ self.left + self.ridge * self.pull,
+            self.A.T @ self.residual + self.ridge * self.pull,
         )
-        out = np.empty(len(self.left))
+        out = np.empty(len(self.residual))
         for fold in np.unique(self.fold):
             own = self.fold == fold
-            A, left = self.A[own], self.left[own]
-            x = np.linalg.lstsq(G - A.T @ A, g - A.T @ left, rcond=1e-14)[0]
-            out[own] = left - A @ x
+            A, residual = self.A[own], self.residual[own]
+            x = np.linalg.lstsq(G - A.T @ A, g - A.T @ residual, rcond=1e-14)[0]
+            out[own] = residual - A @ x
         return out
 
 

@@ -132,22 +132,22 @@ def _shakiness(readings: Readings) -> Array:
 def estimated(
     noise: Noise,
     known: Known,
-    left: Array,
+    residual: Array,
     columns: Array,
     precision: Array,
     kept: NDArray[np.bool_],
 ) -> Noise:
-    """Return the noise under which ``left`` (N, k) is most likely, around what is ``known``.
+    """Return the noise under which ``residual`` (N, k) is most likely, around what is ``known``.
 
     ``columns`` (N*k, p) are what was fitted, ``precision`` (p,) the inverse variances that held
-    each number around zero, 0 for those that were free; ``left`` is what remains with all of them
-    at zero. ``kept`` (N,) bool leaves outliers out.
+    each number around zero, 0 for those that were free; ``residual`` is what remains with all of
+    them at zero. ``kept`` (N,) bool leaves outliers out.
     """
-    N, k = left.shape
+    N, k = residual.shape
     use = np.flatnonzero(kept)
     if len(use) > ENOUGH:
         use = use[np.linspace(0, len(use) - 1, ENOUGH).astype(int)]
-    X, y = columns.reshape(N, k, -1)[use], left[use]
+    X, y = columns.reshape(N, k, -1)[use], residual[use]
     shapes = [s[use] for s in noise.shapes]
     t = 2 * np.log(noise.sizes)
     for _ in range(ROUNDS):

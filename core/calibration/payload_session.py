@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from gapbridge.core.calibration.result import Estimate
 from gapbridge.core.effects import CATALOGUE, Site, Term, acting, correcting
 from gapbridge.core.errors import ExcitationError, InputError
-from gapbridge.core.estimation.robust import weighed
+from gapbridge.core.estimation.robust import robust_fit
 from gapbridge.core.log.log import Log
 from gapbridge.core.model import Model
 from gapbridge.core.motion import Motion, motion_of
@@ -94,7 +94,7 @@ def calibrate_payload(model: Model, q: Array, wrench: Array) -> PayloadCalibrati
     _require_turning(columns, len(q))
     flat, value = columns.reshape(-1, 10), wrench.reshape(-1)
     unit = np.tile(np.repeat([0, 1], 3), len(q))  # forces and torques have a noise of their own
-    fit = weighed(flat, value, unit, row=np.repeat(np.arange(len(q)), 6))
+    fit = robust_fit(flat, value, unit, row=np.repeat(np.arange(len(q)), 6))
     covariance, cog = _about_centre(fit.values, fit.covariance)
     mass = float(fit.values[0])
     values = np.concatenate([[mass], cog, fit.values[4:]])

@@ -33,7 +33,7 @@ class Problem:
     stages: Stages
     known: Known
 
-    def left(self, values: Array, nuisance: Nuisance) -> Array | None:
+    def residual(self, values: Array, nuisance: Nuisance) -> Array | None:
         """Return measured minus predicted (N, k), m; None where the arm finds no equilibrium."""
         try:
             model = self.parameters.model(values)
@@ -74,29 +74,29 @@ def require_enough(parameters: Parameters, observable: Observable, readings: Rea
         )
 
 
-def weighed_system(
-    left: Array, noise: Noise, columns: tuple[Array, Array], share: Array | None = None
+def weighted_system(
+    residual: Array, noise: Noise, columns: tuple[Array, Array], share: Array | None = None
 ) -> tuple[System, Array]:
-    """Return the system of ``left`` (N, k) divided by the noise and weighed, and the weights (N,).
+    """Return the system of ``residual`` (N, k) divided by the noise, weighted; the weights (N,).
 
     ``share`` (N,) are the numbers that the fit spent on each reading, so that small residuals of
     readings with much influence are not taken for inliers.
     """
-    N, k = left.shape
+    N, k = residual.shape
     W = noise.whitener
     J, F = ((W @ c.reshape(N, k, -1)).reshape(N * k, -1) for c in columns)
-    e = (W @ left[..., None])[..., 0]
+    e = (W @ residual[..., None])[..., 0]
     cells = np.full(N, float(k)) if share is None else np.maximum(k - share, 0.3 * k)
     square = np.sum(e**2, axis=1)
     # while much is still to be found, what remains is larger than the noise: its middle counts
     usual = max(float(np.median(square / cells)) / _middle(k), 1.0)
     weights = weights_of(scaled_length(square / usual, cells))
-    return System(J, F, e.ravel()).weighed(np.repeat(np.sqrt(weights), k)), weights
+    return System(J, F, e.ravel()).weighted(np.repeat(np.sqrt(weights), k)), weights
 
 
-def cost(left: Array, noise: Noise, weights: Array) -> float:
-    """Return the weighed sum of squares of ``left`` (N, k) in units of the noise."""
-    e = (noise.whitener @ left[..., None])[..., 0]
+def cost(residual: Array, noise: Noise, weights: Array) -> float:
+    """Return the weighed sum of squares of ``residual`` (N, k) in units of the noise."""
+    e = (noise.whitener @ residual[..., None])[..., 0]
     return float(np.sum(weights * np.sum(e**2, axis=1)))
 
 

@@ -70,7 +70,7 @@ def differences(system: System, group: Index, width: int, root: Array) -> System
     _, number = np.unique(own, return_inverse=True)
     number = number.reshape(-1)
     square = np.bincount(number, w**2)
-    whole = np.column_stack([system.J, system.F, system.left])
+    whole = np.column_stack([system.J, system.F, system.residual])
     cells = whole.reshape(len(group), width, -1)[kept]
     sums = np.zeros((len(square), *cells.shape[1:]))
     np.add.at(sums, number, cells * w[:, None, None])
@@ -89,8 +89,8 @@ def staged_step(
         return np.zeros(len(at))
     apart = differences(system, stages.group, width, root)
     bending, _, _ = solve(apart, at, bounds, stages.elastic)
-    left = System(system.J, system.F, system.left - system.J @ bending)
-    geometry, _, _ = solve(left, at + bending, bounds, ~stages.elastic)
+    rest = System(system.J, system.F, system.residual - system.J @ bending)
+    geometry, _, _ = solve(rest, at + bending, bounds, ~stages.elastic)
     return bending + geometry
 
 
@@ -114,7 +114,7 @@ def at_odds(
     alone, _, _ = solve(apart, bounds.begin, free, mine)
     together, _, _ = solve(system, bounds.begin, free, np.ones_like(mine))
     off = alone - together
-    part = System(apart.J[:, mine], apart.F, apart.left)
+    part = System(apart.J[:, mine], apart.F, apart.residual)
     narrow = Bounds(bounds.lower[mine], bounds.upper[mine], bounds.held[mine], bounds.begin[mine])
     variance = posterior(part, narrow)[0] - covariance[np.ix_(mine, mine)]
     scale = 1 / bounds.held[mine]

@@ -6,10 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapbridge.core.calibration.converged_fit import ConvergedFit
+from gapbridge.core.calibration.held_out_check import HeldOutCheck
 from gapbridge.core.calibration.missing_effects import MissingEffect
 from gapbridge.core.calibration.parameters import Parameters
 from gapbridge.core.calibration.problem import Problem
-from gapbridge.core.calibration.remainder import Remainder
 from gapbridge.core.calibration.result import Errors, Estimate
 from gapbridge.core.calibration.staging import AT_ODDS
 from gapbridge.core.diagnosis.diagnosis import Diagnosis
@@ -63,7 +63,7 @@ def _company(correlation: Array, i: int) -> list[int]:
 
 
 def notes_of(
-    problem: Problem, rest: ConvergedFit, remainder: Remainder, odds: float | None,
+    problem: Problem, rest: ConvergedFit, remainder: HeldOutCheck, odds: float | None,
     estimates: tuple[Estimate, ...],
 ) -> tuple[str, ...]:  # fmt: skip
     """Return what deserves a second look."""
@@ -113,7 +113,7 @@ def verdict_of(
 
 
 def remaining_of(
-    remainder: Remainder, diagnosis: Diagnosis | None, complete: bool,
+    remainder: HeldOutCheck, diagnosis: Diagnosis | None, complete: bool,
     missing: tuple[MissingEffect, ...], converged: bool,
 ) -> str:  # fmt: skip
     """Return what is left: one statement, which every section of a report repeats."""

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from gapbridge.core.calibration.result import Estimate
 from gapbridge.core.effects import correcting
 from gapbridge.core.errors import ExcitationError, InputError
-from gapbridge.core.estimation.robust import Weighed, weighed
+from gapbridge.core.estimation.robust import RobustFit, robust_fit
 from gapbridge.core.loads import Loads
 from gapbridge.core.model import Model
 
@@ -117,7 +117,7 @@ def _points(position: Array, rotation: Array, tcp: Array) -> Array:
 
 def _fitted(
     position: Array, rotation: Array, values: Array, distance: float
-) -> tuple[Array, Weighed]:
+) -> tuple[Array, RobustFit]:
     """Return tool and point (6,), and the weighed fit at rest."""
     count = len(position)
     columns = touch_columns(rotation)
@@ -125,8 +125,10 @@ def _fitted(
     row = np.repeat(np.arange(count), cells)
     unit = np.zeros(count * cells, dtype=np.int64)
     if distance:  # tip near the point alone: the first look ignores the balls' size
-        values = values + weighed(*_flat(columns, position, rotation, values), *_all(count)).values
-    fit: Weighed | None = None
+        values = (
+            values + robust_fit(*_flat(columns, position, rotation, values), *_all(count)).values
+        )
+    fit: RobustFit | None = None
     for _ in range(ROUNDS):
         apart = position + rotation @ values[:3] - values[3:]
         A, b = columns.reshape(-1, 6), -apart.ravel()
@@ -135,7 +137,7 @@ def _fitted(
             A = np.einsum("ni,nij->nj", apart / length[:, None], columns)
             b = distance - length
         _require_turning(A, count)
-        fit = weighed(A, b, unit, row)
+        fit = robust_fit(A, b, unit, row)
         values = values + fit.values
         if np.abs(fit.values).max() < SETTLED:
             break

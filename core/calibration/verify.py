@@ -43,7 +43,7 @@ class Suspect:
     name: str  # tool_frame, joint_offset_3, payload, instrument, reading_4
     estimates: tuple[Estimate, ...]  # how far it moved; none for a bad reading
     chance: float  # of what is left, were it the only change
-    left: float  # chi-square that it leaves
+    chi_square: float  # that it leaves
 
 
 @dataclass(frozen=True)
@@ -65,14 +65,14 @@ class Verification:
 class _Task:
     """Readings against a baseline, whitened by the covariance stated there."""
 
-    left: Array  # (M,)
+    residual: Array  # (M,)
     root: Array  # (M, M): root @ equations are independent, of variance one
     F: Array  # (M, m) of the nuisances
 
     def chi_square(self, columns: Array) -> tuple[float, int, Array, Array]:
         """Return chi-square left, degrees of freedom, the columns' values and covariance."""
         A = self.root @ np.hstack([self.F, columns])
-        b = self.root @ self.left
+        b = self.root @ self.residual
         size = np.linalg.norm(A, axis=0)
         size = np.where(size > 0, size, 1.0)
         U, s, Vt = np.linalg.svd(A / size, full_matrices=False)
@@ -105,14 +105,14 @@ def verify(
     how = observable or make_observable(readings.kind, registered=metrology.registered)
     parameters = baseline.parameters(model)
     nuisance = how.start(model, readings)
-    left = how.residual(model, readings, nuisance)
-    if left.size <= how.layout(readings).size + 1:
+    residual = how.residual(model, readings, nuisance)
+    if residual.size <= how.layout(readings).size + 1:
         raise ExcitationError(
             f"verification: {len(readings)} reading(s) only determine where the instrument stands, "
             "expected more poses"
         )
     task, spread = _task(model, how, readings, nuisance, baseline, parameters, metrology)
-    rest, freedom, _, _ = task.chi_square(np.zeros((left.size, 0)))
+    rest, freedom, _, _ = task.chi_square(np.zeros((residual.size, 0)))
     ratio = float(np.sqrt(rest / freedom))
     chance = float(fisher.sf(rest / freedom, freedom, baseline.freedom))
     holds = chance > BROKEN
@@ -120,10 +120,10 @@ def verify(
     if suspects and suspects[0].chance <= BROKEN:  # far from where the model was, perhaps
         suspects = _suspects(model, how, readings, nuisance, task, STEPS)
     moved = suspects[0] if suspects and suspects[0].chance > BROKEN else None
-    errors = Errors(left[:, :3], np.arange(len(readings)))
+    errors = Errors(residual[:, :3], np.arange(len(readings)))
     return Verification(
         holds, errors, spread, ratio, chance, moved,
-        tuple(s for s in suspects[1:] if moved and s.left < moved.left + BESIDE),
+        tuple(s for s in suspects[1:] if moved and s.chi_square < moved.chi_square + BESIDE),
         nuisance.stations, _notes(baseline, metrology, freedom),
     )  # fmt: skip
 
@@ -174,7 +174,7 @@ def _suspects(
             if step:
                 moved = own.model(at)
                 where = how.start(moved, readings)
-                there = replace(task, left=how.residual(moved, readings, where).ravel())
+                there = replace(task, residual=how.residual(moved, readings, where).ravel())
             J, F = how.columns(own, at, readings, where)
             there = replace(there, F=F)
             at = at + there.chi_square(J)[2]
@@ -184,13 +184,13 @@ def _suspects(
         F = free.nuisance_columns(model.predict(readings.q, readings.loads), readings, nuisance)
         names = [f"instrument_{k}" for k in ("x", "y", "z", "rx", "ry", "rz")][: F.shape[1]]
         found.append(_suspect("instrument", task, F, names, ("m",) * 3 + ("rad",) * 3))
-    N, k = len(readings), len(task.left) // len(readings)
+    N, k = len(readings), len(task.residual) // len(readings)
     for i in range(N):
         columns = np.zeros((N * k, k))
         columns[i * k : i * k + k] = np.eye(k)
         found.append(_suspect(f"reading_{i + 1}", task, columns, (), ()))
-    costs = np.log(len(task.left))
-    return tuple(sorted((s for s, _ in found), key=lambda s: s.left + costs * _cost(s, k)))
+    costs = np.log(len(task.residual))
+    return tuple(sorted((s for s, _ in found), key=lambda s: s.chi_square + costs * _cost(s, k)))
 
 
 def _stories(model: Model, readings: Readings) -> list[tuple[str, tuple[str, ...]]]:
@@ -215,7 +215,7 @@ def _suspect(
     units: tuple[str, ...], found: Array | None = None,
 ) -> tuple[Suspect, int]:  # fmt: skip
     """Return a suspect and its degrees of freedom; ``found``: its values after several steps."""
-    left, freedom, values, covariance = task.chi_square(columns)
+    rest, freedom, values, covariance = task.chi_square(columns)
     values = values if found is None else found
     std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     # a direction that nothing shows has neither value nor width
@@ -225,8 +225,8 @@ def _suspect(
         for n, v, s, u, shown in zip(names, values, std, units, seen, strict=False)
         if shown
     )
-    chance = float(chi2.sf(left, freedom)) if freedom > 0 else 0.0
-    return Suspect(name, estimates, chance, left), freedom
+    chance = float(chi2.sf(rest, freedom)) if freedom > 0 else 0.0
+    return Suspect(name, estimates, chance, rest), freedom
 
 
 def _notes(baseline: AccuracyBaseline, metrology: Metrology, freedom: int) -> tuple[str, ...]:

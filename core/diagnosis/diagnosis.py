@@ -59,11 +59,11 @@ from gapbridge.core.diagnosis.selection.selection import Selection, refitted_alo
 from gapbridge.core.diagnosis.separation import Measurement, next_measurements
 from gapbridge.core.effects import CATALOGUE, Term, correcting, flexibility_effects
 from gapbridge.core.errors import LogError
+from gapbridge.core.fitted_range import outside_findings
 from gapbridge.core.log.columns import COLUMNS, misspelt
 from gapbridge.core.log.log import Log
 from gapbridge.core.metrology import Metrology
 from gapbridge.core.model import Model
-from gapbridge.core.ranges import outside_findings
 from gapbridge.core.sessions import session_of, sessions_in, with_sessions
 
 Array = NDArray[np.float64]

@@ -31,11 +31,11 @@ class System:
 
     J: Array  # (M, p)
     F: Array  # (M, m)
-    left: Array  # (M,)
+    residual: Array  # (M,)
 
-    def weighed(self, root: Array) -> System:
+    def weighted(self, root: Array) -> System:
         """Return the system with each equation times ``root`` (M,)."""
-        return System(self.J * root[:, None], self.F * root[:, None], self.left * root)
+        return System(self.J * root[:, None], self.F * root[:, None], self.residual * root)
 
 
 def solve(
@@ -50,7 +50,7 @@ def solve(
     step = np.zeros(p)
     stuck = np.zeros(p, dtype=bool)
     while True:
-        fixed = System(system.J[:, moving], system.F, system.left - system.J @ (step * ~moving))
+        fixed = System(system.J[:, moving], system.F, system.residual - system.J @ (step * ~moving))
         part, nuisance = _least_squares(fixed, at[moving], bounds, moving, damping)
         step[moving] = part
         low, high = at + step < bounds.lower, at + step > bounds.upper
@@ -72,7 +72,7 @@ def _least_squares(
         np.hstack([system.J, system.F]),
         np.hstack([np.diag(1 / bounds.held[moving]), np.zeros((p, m))]),
     ]
-    right = [system.left, (bounds.begin[moving] - at) / bounds.held[moving]]
+    right = [system.residual, (bounds.begin[moving] - at) / bounds.held[moving]]
     if damping > 0:
         length = np.hypot(np.linalg.norm(system.J, axis=0), 1 / bounds.held[moving])
         rows.append(np.hstack([np.diag(np.sqrt(damping) * length), np.zeros((p, m))]))
@@ -91,11 +91,25 @@ def posterior(system: System, bounds: Bounds) -> tuple[Array, float, Array]:
     nuisances are projected out.
     """
     p = system.J.shape[1]
-    A = np.hstack([system.J * bounds.held, system.F])
-    size = np.concatenate([np.ones(p), np.maximum(np.linalg.norm(system.F, axis=0), 1e-300)])
-    A = A / size
-    inner = A.T @ A + np.diag(np.concatenate([np.ones(p), np.zeros(A.shape[1] - p)]))
-    core = np.linalg.pinv(inner, rcond=1e-14, hermitian=True)
+    A, core, _ = _scaled_covariance(system, bounds)
     share = np.einsum("ij,jk,ik->i", A, core, A)
     covariance = core[:p, :p] * np.outer(bounds.held, bounds.held)
     return np.asarray((covariance + covariance.T) / 2), float(share.sum()), share
+
+
+def joint_covariance(system: System, bounds: Bounds) -> Array:
+    """Return the covariance of parameters and nuisances together (p + m, p + m)."""
+    _, core, size = _scaled_covariance(system, bounds)
+    return np.asarray(core / np.outer(size, size))
+
+
+def _scaled_covariance(system: System, bounds: Bounds) -> tuple[Array, Array, Array]:
+    """Return the columns over their ``size``, the covariance of what they multiply, and the size.
+
+    A parameter's size is one over how firmly it is held, a nuisance's the length of its column.
+    """
+    nuisances = np.maximum(np.linalg.norm(system.F, axis=0), 1e-300)
+    size = np.concatenate([1 / bounds.held, nuisances])
+    A = np.hstack([system.J, system.F]) / size
+    ridge = np.concatenate([np.ones(len(bounds.held)), np.zeros(len(nuisances))])
+    return A, np.linalg.pinv(A.T @ A + np.diag(ridge), rcond=1e-14, hermitian=True), size

@@ -17,7 +17,7 @@ TINY = 1e-12
 
 
 @dataclass(frozen=True)
-class Weighed:
+class RobustFit:
     """State of a weighted fit that has converged."""
 
     values: Array  # (p,)
@@ -45,7 +45,7 @@ def scaled_length(square: Array, cells: Array) -> Array:
     return np.asarray(np.maximum(normal, 0.0))
 
 
-def weighed(A: Array, b: Array, unit: Index, row: Index, rounds: int = ROUNDS) -> Weighed:
+def robust_fit(A: Array, b: Array, unit: Index, row: Index, rounds: int = ROUNDS) -> RobustFit:
     """Return the robust fit of A (M, p) @ values = b (M,).
 
     ``unit`` (M,) numbers cells that share one unknown noise, ``row`` (M,) the reading that a cell
@@ -73,7 +73,7 @@ def weighed(A: Array, b: Array, unit: Index, row: Index, rounds: int = ROUNDS) -
     covariance = np.asarray(inverse, float)
     # the unit that is known from the fewest cells says how sure the noise is
     freedom = max(float(spare.min()), 1.0)
-    return Weighed(values, covariance, noise, freedom, weights, np.flatnonzero(weights < 0.1))
+    return RobustFit(values, covariance, noise, freedom, weights, np.flatnonzero(weights < 0.1))
 
 
 def _begin(A: Array, b: Array, unit: Index, units: int) -> tuple[Array, Array]:

@@ -9,9 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapbridge.core.calibration.observables.fixed_point import fixed_at
-from gapbridge.core.calibration.observables.foreseen import beside, empty_readings, foreseen
 from gapbridge.core.calibration.observables.nuisance import Nuisance
 from gapbridge.core.calibration.observables.observable import Observable
+from gapbridge.core.calibration.observables.predicted_readings import (
+    beside,
+    empty_readings,
+    predicted_readings,
+)
 from gapbridge.core.calibration.parameters import Parameters
 from gapbridge.core.calibration.plan import Payload
 from gapbridge.core.calibration.readings import Readings
@@ -125,7 +129,7 @@ def _look(
     target = random.integers(first, targets, DRAWN)
     if observable.closes:
         readings = empty_readings(observable.kind, q, Loads(), station=station, target=target)
-        touching = foreseen(observable, parameters.nominal, readings, nuisance)
+        touching = predicted_readings(observable, parameters.nominal, readings, nuisance)
         sight.looked += len(q) - len(touching)
         missed = sight.hindered.get("do not reach the fixed point", 0)
         sight.hindered["do not reach the fixed point"] = missed + len(q) - len(touching)

@@ -9,10 +9,10 @@ import pytest
 
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.errors import LogError
+from gapbridge.core.fitted_range import Outside, merged, range_of
 from gapbridge.core.log.log import Log
 from gapbridge.core.model import Model
 from gapbridge.core.motion import motion_of
-from gapbridge.core.ranges import Outside, merged, range_of
 from gapbridge.core.sessions import join_sessions, session_of, sessions_in, with_sessions
 
 MODEL = replace(

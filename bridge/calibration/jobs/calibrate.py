@@ -27,8 +27,8 @@ from gapbridge.core.calibration.plan import Plan
 from gapbridge.core.calibration.result import Errors
 from gapbridge.core.calibration.spread import Spread
 from gapbridge.core.calibration.summary import unsupported
+from gapbridge.core.fitted_range import range_of
 from gapbridge.core.log.log import read_log
-from gapbridge.core.ranges import range_of
 
 Array = NDArray[np.float64]
 REFITS = 3  # times at most that the readings may ask for more

@@ -29,9 +29,9 @@ from gapbridge.core.diagnosis.diagnosis import Diagnosis
 from gapbridge.core.diagnosis.diagnosis import diagnose as diagnose_log
 from gapbridge.core.effects import effect_named
 from gapbridge.core.errors import InputError, LogError
+from gapbridge.core.fitted_range import range_of
 from gapbridge.core.log.log import Log
 from gapbridge.core.metrology import Metrology
-from gapbridge.core.ranges import range_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable

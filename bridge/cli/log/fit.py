@@ -29,9 +29,9 @@ from gapbridge.core.effects import by_approach
 from gapbridge.core.errors import ExcitationError
 from gapbridge.core.estimation.identification import Identification, identify_compliance
 from gapbridge.core.estimation.streamed import identify_streamed
+from gapbridge.core.fitted_range import merged, range_of
 from gapbridge.core.log.log import Log
 from gapbridge.core.metrology import Metrology
-from gapbridge.core.ranges import merged, range_of
 
 
 @click.command()

@@ -19,7 +19,7 @@ from gapbridge.bridge.calibration.session.journal import FILE, read_entries
 from gapbridge.bridge.cell import load_cell
 from gapbridge.core.calibration.accuracy_baseline import baseline_in
 from gapbridge.core.calibration.observables import Nuisance, fixed_at
-from gapbridge.core.calibration.observables.foreseen import foreseen
+from gapbridge.core.calibration.observables.predicted_readings import predicted_readings
 from gapbridge.core.calibration.plan import Plan
 from gapbridge.core.calibration.readings import Readings
 from gapbridge.core.loads import Loads
@@ -82,7 +82,7 @@ def begun(
         np.zeros(count, dtype=bool), np.arange(count),
     )  # fmt: skip
     observable = observable_of(loaded, loaded.calibration.instrument)
-    found = foreseen(observable, truth(), blank, nuisance)
+    found = predicted_readings(observable, truth(), blank, nuisance)
     assert len(found) == count
     random = np.random.default_rng(5)
     found.value[:] += random.normal(0, 2e-5, found.value.shape)

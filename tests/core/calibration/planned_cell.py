@@ -7,7 +7,7 @@ import numpy as np
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.calibration.identifiability import identifiable_parameters
 from gapbridge.core.calibration.observables import make_observable
-from gapbridge.core.calibration.observables.foreseen import empty_readings
+from gapbridge.core.calibration.observables.predicted_readings import empty_readings
 from gapbridge.core.calibration.parameters import Parameters
 from gapbridge.core.calibration.plan import Payload, Plan
 from gapbridge.core.calibration.readings import Readings

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import t as student
 
-from gapbridge.core.estimation.robust import INLIER, scaled_length, weighed
+from gapbridge.core.estimation.robust import INLIER, robust_fit, scaled_length
 
 ROWS, WIDTH, NUMBERS = 30, 3, 5
 
@@ -29,7 +29,7 @@ def one_unit(b: np.ndarray) -> np.ndarray:
 def test_without_outliers_it_is_about_least_squares() -> None:
     for seed in range(10):
         A, b, _, row = drawn(seed)
-        found = weighed(A, b, one_unit(b), row)
+        found = robust_fit(A, b, one_unit(b), row)
         plain = np.linalg.lstsq(A, b, rcond=None)[0]
         deviation = np.sqrt(np.diag(found.covariance))
         assert np.all(np.abs(found.values - plain) < 1.0 * deviation)
@@ -42,7 +42,7 @@ def test_the_stated_deviations_are_those_of_the_errors(rows: int, numbers: int) 
     scaled, noise = [], []
     for seed in range(150):
         A, b, truth, row = drawn(seed, rows=rows, numbers=numbers)
-        found = weighed(A, b, one_unit(b), row)
+        found = robust_fit(A, b, one_unit(b), row)
         scaled.append((found.values - truth) / np.sqrt(np.diag(found.covariance)))
         noise.append(found.noise[0])
     assert np.median(noise) == pytest.approx(1e-3, rel=0.15)
@@ -60,7 +60,7 @@ def test_outliers_are_found_as_wholes_and_change_nothing(seed: int, share: float
     alone = np.linalg.lstsq(A[good], b[good], rcond=None)[0]
     for k in bad:  # all to one side: a fit of least squares follows them
         b[row == k] += 0.05 * (1.0 + A[row == k, 0])
-    found = weighed(A, b, one_unit(b), row)
+    found = robust_fit(A, b, one_unit(b), row)
     assert set(bad) <= set(found.outliers.tolist())
     assert np.abs(found.values - alone).max() < 5e-4
     assert np.abs(np.linalg.lstsq(A, b, rcond=None)[0] - alone).max() > 2e-3
@@ -73,7 +73,7 @@ def test_a_third_of_gross_outliers_to_one_side_are_seen(seed: int) -> None:
     A[:, 0] = 1.0
     b = A @ truth + np.random.default_rng(seed + 50).normal(0.0, 1e-3, len(b))
     b[np.isin(row, bad)] += 0.02
-    found = weighed(A, b, one_unit(b), row)
+    found = robust_fit(A, b, one_unit(b), row)
     assert set(bad) == set(found.outliers.tolist())
     assert np.abs(found.values - truth).max() < 1e-3
 
@@ -83,7 +83,7 @@ def test_cells_of_two_units_have_each_their_own_noise() -> None:
     A, b, truth, row = drawn(3, rows=200)
     unit = (np.arange(len(b)) % WIDTH == 2).astype(np.int64)
     b[unit == 1] += rng.normal(0.0, 0.02, int(unit.sum()))
-    found = weighed(A, b, unit, row)
+    found = robust_fit(A, b, unit, row)
     np.testing.assert_allclose(found.noise, [1e-3, 0.02], rtol=0.15)
     assert np.abs(found.values - truth).max() < 3e-4
 

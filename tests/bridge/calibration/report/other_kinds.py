@@ -11,7 +11,11 @@ from gapbridge.core.arm import builtin_arm
 from gapbridge.core.calibration.fit import fit_session, judged
 from gapbridge.core.calibration.identifiability import identifiable_parameters
 from gapbridge.core.calibration.observables import make_observable
-from gapbridge.core.calibration.observables.foreseen import empty_readings, foreseen, somewhere
+from gapbridge.core.calibration.observables.predicted_readings import (
+    empty_readings,
+    predicted_readings,
+    usual_nuisance,
+)
 from gapbridge.core.calibration.result import Calibration
 from gapbridge.core.effects import Site, Term
 from gapbridge.core.loads import Loads
@@ -42,8 +46,8 @@ def calibration_of(kind: str) -> Calibration:
     target = np.where(np.arange(COUNT) % 3 == 0, 2, 1) if kind == "relative" else 0 * pose
     loads = Loads(payload_mass=mass, payload_cog=np.zeros((COUNT, 3)))
     empty = empty_readings(kind, q, loads, load=load, pose=pose, target=target)
-    nuisance = somewhere(real, observable, empty)
-    readings = foreseen(observable, real, empty, nuisance)
+    nuisance = usual_nuisance(real, observable, empty)
+    readings = predicted_readings(observable, real, empty, nuisance)
     value = readings.value + rng.normal(0, SIGMA, readings.value.shape)
     hand = 0.0 if readings.value.shape[1] else 2e-5  # rad: what is touched is touched by hand
     readings = replace(

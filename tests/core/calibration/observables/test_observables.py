@@ -18,7 +18,11 @@ from gapbridge.core.calibration.observables import (
     make_observable,
     point_of,
 )
-from gapbridge.core.calibration.observables.foreseen import empty_readings, foreseen, somewhere
+from gapbridge.core.calibration.observables.predicted_readings import (
+    empty_readings,
+    predicted_readings,
+    usual_nuisance,
+)
 from gapbridge.core.calibration.readings import Readings
 from gapbridge.core.errors import ExcitationError, InputError
 from gapbridge.core.estimation.registration import Registration
@@ -49,14 +53,14 @@ def two_places(
         observable.kind, q, Loads(payload_mass=random.choice([0.0, 4.0], count)),
         station=half, target=(np.arange(count) // 2) % 2,
     )  # fmt: skip
-    nuisance = somewhere(model, observable, readings, seed)
+    nuisance = usual_nuisance(model, observable, readings, seed)
     if not observable.unknown and not observable.registered:
         frames = tuple(
             Registration(rotation_matrix(random.normal(size=3)), random.normal(size=3))
             for _ in range(2)
         )
         nuisance = replace(nuisance, stations=frames)
-    return foreseen(observable, model, readings, nuisance), nuisance
+    return predicted_readings(observable, model, readings, nuisance), nuisance
 
 
 @pytest.mark.parametrize(("kind", "options"), KINDS)
@@ -131,7 +135,7 @@ def test_a_sphere_is_touched_where_the_arm_is_brought(model) -> None:
     nuisance = replace(Nuisance.zero(), stations=(fixed_at(np.array([0.5, 0.2, 0.3])),))
     nuisance = replace(nuisance, lengths=np.array([0.04]))
     q = np.random.default_rng(3).uniform(-2.5, 2.5, (40, 6))
-    readings = foreseen(observable, model, empty_readings("sphere", q, Loads()), nuisance)
+    readings = predicted_readings(observable, model, empty_readings("sphere", q, Loads()), nuisance)
     assert len(readings) > 20
     tip = model.predict(readings.q).position
     assert np.linalg.norm(tip - [0.5, 0.2, 0.3], axis=1) == pytest.approx(0.04, abs=1e-8)

@@ -34,7 +34,7 @@ def empty_readings(kind: str, q: Array, loads: Loads, **given: NDArray[np.int64]
     )  # fmt: skip
 
 
-def foreseen(
+def predicted_readings(
     observable: Observable, model: Model, readings: Readings, nuisance: Nuisance
 ) -> Readings:
     """Return the readings with the values that ``model`` predicts, exactly.
@@ -62,7 +62,9 @@ def _both(one: Any, other: Any, name: str) -> Any:
     return np.concatenate([first, second])
 
 
-def somewhere(model: Model, observable: Observable, readings: Readings, seed: int = 0) -> Nuisance:
+def usual_nuisance(
+    model: Model, observable: Observable, readings: Readings, seed: int = 0
+) -> Nuisance:
     """Return a nuisance of a usual kind: instruments, fixed points and balls within reach."""
     random = np.random.default_rng(seed)
     layout = observable.layout(readings)

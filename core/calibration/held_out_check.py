@@ -15,6 +15,7 @@ from gapbridge.core.calibration.problem import Problem
 from gapbridge.core.calibration.readings import Readings
 from gapbridge.core.diagnosis.diagnosis import Diagnosis, diagnose
 from gapbridge.core.errors import InputError
+from gapbridge.core.estimation.linear_system import joint_covariance
 from gapbridge.core.log.log import Log
 from gapbridge.core.metrology import Metrology
 from gapbridge.core.model import Model
@@ -26,7 +27,7 @@ FEWEST_TO_DIAGNOSE = 12
 
 
 @dataclass(frozen=True)
-class Remainder:
+class HeldOutCheck:
     """How poses that the fit never saw agree with its predicted covariance."""
 
     held_out: int  # readings
@@ -40,24 +41,24 @@ class Remainder:
         return self.chance > SURPRISE
 
 
-def carried(
+def check_held_out(
     problem: Problem, rest: ConvergedFit, found: Model, readings: Readings, metrology: Metrology
-) -> Remainder:
+) -> HeldOutCheck:
     """Return how the held-out readings stand against the fit, noise and uncertainty counted."""
     rows = np.flatnonzero(readings.held_out)
     if not len(rows):
-        return Remainder(0, float("nan"), 1.0, rows)
+        return HeldOutCheck(0, float("nan"), 1.0, rows)
     part, observable = readings[rows], problem.observable
-    left = observable.residual(found, part, rest.nuisance)
-    k = left.shape[1]
+    residual = observable.residual(found, part, rest.nuisance)
+    k = residual.shape[1]
     shape, _ = presumed(found, part, observable, rest.nuisance, metrology)
     V = replace(shape, sizes=rest.noise.sizes).variance + predicted(problem, rest, part)
-    square = np.einsum("ni,ni->n", left, np.linalg.solve(V, left[..., None])[..., 0])
+    square = np.einsum("ni,ni->n", residual, np.linalg.solve(V, residual[..., None])[..., 0])
     outliers = square > 30 + 5 * k
     kept = square[~outliers] if (~outliers).sum() >= 3 else square
     ratio = float(kept.sum() / (k * len(kept)))
     chance = float(fisher.sf(ratio, k * len(kept), rest.freedom))
-    return Remainder(len(rows), ratio, chance, rows[outliers])
+    return HeldOutCheck(len(rows), ratio, chance, rows[outliers])
 
 
 def predicted(problem: Problem, rest: ConvergedFit, readings: Readings) -> Array:
@@ -66,18 +67,7 @@ def predicted(problem: Problem, rest: ConvergedFit, readings: Readings) -> Array
     given = problem.parameters, rest.values, readings, rest.nuisance, layout
     J, F = problem.observable.columns(*given)
     X = np.hstack([J, F]).reshape(len(readings), problem.observable.equations, -1)
-    return np.asarray(X @ joint_covariance(problem, rest) @ np.swapaxes(X, 1, 2))
-
-
-def joint_covariance(problem: Problem, rest: ConvergedFit) -> Array:
-    """Return the covariance of parameters and nuisances together (p + m, p + m)."""
-    system, held = rest.system, problem.bounds.held
-    A = np.hstack([system.J, system.F])
-    size = np.concatenate([1 / held, np.maximum(np.linalg.norm(system.F, axis=0), 1e-300)])
-    A = A / size
-    ridge = np.concatenate([np.ones(len(held)), np.zeros(system.F.shape[1])])
-    core = np.linalg.pinv(A.T @ A + np.diag(ridge), rcond=1e-14, hermitian=True)
-    return np.asarray(core / np.outer(size, size))
+    return np.asarray(X @ joint_covariance(rest.system, problem.bounds) @ np.swapaxes(X, 1, 2))
 
 
 def repeatability_of(
@@ -87,7 +77,7 @@ def repeatability_of(
 
     The instrument's own noise is taken off.
     """
-    left = problem.observable.residual(found, readings, rest.nuisance)[:, :3]
+    residual = problem.observable.residual(found, readings, rest.nuisance)[:, :3]
     outliers = np.zeros(len(readings), dtype=bool)
     outliers[np.flatnonzero(~readings.held_out)[~rest.inliers]] = True
     keys = np.column_stack([readings.pose, readings.load, readings.station, readings.target])
@@ -95,7 +85,7 @@ def repeatability_of(
     group = group.reshape(-1)
     square, freedom = 0.0, 0
     for one in np.unique(group[~outliers]):
-        own = left[(group == one) & ~outliers]
+        own = residual[(group == one) & ~outliers]
         if len(own) > 1:
             square += float(np.sum((own - own.mean(axis=0)) ** 2))
             freedom += own.shape[1] * (len(own) - 1)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from gapbridge.core.calibration.noise import Noise
 from gapbridge.core.calibration.observables.nuisance import Nuisance
-from gapbridge.core.calibration.problem import Problem, cost, weighed_system
+from gapbridge.core.calibration.problem import Problem, cost, weighted_system
 from gapbridge.core.errors import InputError
 from gapbridge.core.estimation.linear_system import Mask, System, posterior, solve
 
@@ -59,28 +59,28 @@ def fit_state(
     problem: Problem, values: Array, nuisance: Nuisance, noise: Noise,
     columns: Columns | None = None, anchor: Array | None = None, share: Array | None = None,
 ) -> FitState:  # fmt: skip
-    """Return the standing at values, derivatives taken there where none are given.
+    """Return the state at ``values``, derivatives taken there where none are given.
 
     Raises InputError where the arm finds no equilibrium.
     """
-    left = problem.left(values, nuisance)
-    if left is None:
+    residual = problem.residual(values, nuisance)
+    if residual is None:
         raise InputError("the arm finds no equilibrium where the fit begins; expected one")
     if columns is None:
         columns = problem.observable.columns(
             problem.parameters, values, problem.readings, nuisance
         )  # fmt: skip
         anchor = values
-    system, weights = weighed_system(left, noise, columns, share)
+    system, weights = weighted_system(residual, noise, columns, share)
     covariance, spent, each = posterior(system, problem.bounds)
-    share = each.reshape(left.shape).sum(axis=1)
+    share = each.reshape(residual.shape).sum(axis=1)
     return FitState(
         values, nuisance, columns, values if anchor is None else anchor, system, weights,
         np.zeros(len(values), dtype=bool), covariance, spent, share, False,
     )  # fmt: skip
 
 
-def descended(problem: Problem, at: FitState, noise: Noise) -> FitState:
+def converge(problem: Problem, at: FitState, noise: Noise) -> FitState:
     """Return where steps from ``at`` converge under this noise, or where patience ends."""
     damping = 0.0
     at = fit_state(
@@ -100,7 +100,7 @@ def descended(problem: Problem, at: FitState, noise: Noise) -> FitState:
 def _stepped(
     problem: Problem, at: FitState, noise: Noise, damping: float
 ) -> tuple[FitState, float, bool]:
-    """Return the standing after steps with the same derivatives, and the damping.
+    """Return the state after steps with the same derivatives, and the damping.
 
     Last comes whether the derivatives predicted too much.
     """
@@ -140,13 +140,13 @@ def _kept(
     trial: tuple[Array, Nuisance],
 ) -> float:  # fmt: skip
     """Return the actual over the predicted decrease of a step; 1 where none is predicted."""
-    before = float(at.system.left @ at.system.left) + problem.prior(at.values)
-    rest = at.system.left - at.system.J @ step - at.system.F @ shift
+    before = float(at.system.residual @ at.system.residual) + problem.prior(at.values)
+    rest = at.system.residual - at.system.J @ step - at.system.F @ shift
     predicted = before - float(rest @ rest) - problem.prior(trial[0])
-    left = problem.left(*trial)
-    if left is None:
+    residual = problem.residual(*trial)
+    if residual is None:
         return -1.0
-    found = before - cost(left, noise, at.weights) - problem.prior(trial[0])
+    found = before - cost(residual, noise, at.weights) - problem.prior(trial[0])
     tiny = NOTHING * (1 + before)
     if abs(predicted) < tiny and abs(found) < tiny:
         return 1.0
