@@ -103,21 +103,21 @@ class SimulatedLoop(LoopProcess):
             driver = _watched(run, run.link.driver())
             source = _source(run)
             loop = self.loop = _Loop(
-                self._settings, run.link.setting.cell.model, driver, source, page, self._tell,
+                self._settings, run.link.setting.cell.model, driver, source, page, self._emit,
                 order["number"],
             )  # fmt: skip
             loop._in_force = loop._writing._in_force = run.offset_in_force
             commands = Commands(self._fds[1], order["after"])
             code = loop.run(commands, order["may_write"], order["latched"])
         except InputError as error:
-            self._tell({"kind": "failure", "detail": str(error)})
+            self._emit({"kind": "failure", "detail": str(error)})
             return Exit.INPUT
         except GapbridgeError as error:
-            self._tell({"kind": "failure", "detail": str(error)})
+            self._emit({"kind": "failure", "detail": str(error)})
             return Exit.LINK
         return code
 
-    def _tell(self, event: dict[str, Any]) -> None:
+    def _emit(self, event: dict[str, Any]) -> None:
         clock = self._run.clock
         self._reported.append({"time": clock.time(), "monotonic": clock.monotonic(), **event})
 

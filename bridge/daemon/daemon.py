@@ -84,7 +84,7 @@ class Daemon:
         self._output: IO[bytes] | int = subprocess.DEVNULL  # of all processes of the run
         self.sides = Sides(clock)
         self.tally = Tally(n, settings.link.rate)
-        listeners = [self._on_event, self.sides.tell]
+        listeners = [self._on_event, self.sides.emit]
         self.event_log = EventLog(*listeners, *([log] if log else []), clock=clock)
         self._posted: queue.SimpleQueue[Event] = queue.SimpleQueue()  # by other threads
         self.manager = ServiceManager(clock)
@@ -343,7 +343,7 @@ class Daemon:
             self.event_log.add(self._posted.get())
         if self._clock.monotonic() >= self._status_at:
             self._status_at = self._clock.monotonic() + STATUS_EVERY
-            self.sides.tell({"kind": "status", **self.status()})
+            self.sides.emit({"kind": "status", **self.status()})
         loop = self.loop
         if loop is None or not loop.hangs:
             self.manager.kick()

@@ -45,7 +45,7 @@ class Sides:
         for side in self._running.values():
             side.show(page)
 
-    def tell(self, event: dict[str, Any]) -> None:
+    def emit(self, event: dict[str, Any]) -> None:
         """Pass an event on to each; never blocks."""
         for side in self._running.values():
             side.emit(event)

@@ -128,7 +128,7 @@ def _calibrate(
     for load, poses in zip(link.scene.calibration_loads, planned.calibration, strict=True):
         console.print(f"measuring {len(poses)} poses with {load.name}")
         parts.append(session.visit(link.cell, load, poses))
-    write_log(out / "calibration.csv", joined(parts), link.tells_joints)
+    write_log(out / "calibration.csv", joined(parts), link.reports_joints)
     return out / "calibration.csv"
 
 

@@ -93,7 +93,7 @@ def candidates(model: Model, seed: int, workspace: Workspace = UR10E.workspace) 
     return q[free & (smallest > workspace.regular)]
 
 
-def telling(model: Model, q: Array, load: Load, count: int, known: Array) -> Array:
+def informative(model: Model, q: Array, load: Load, count: int, known: Array) -> Array:
     """Return the indices of ``count`` poses that add most to what is known (D-optimal, greedy).
 
     ``known`` (2n, 2n) is the information so far, in units of one measured position; it is updated
@@ -139,7 +139,7 @@ def plan(model: Model, home: Array, seed: int, scene: Scene = UR10E) -> Plan:
     used: set[int] = set()
     calibration = []
     for load in scene.calibration_loads:
-        chosen = telling(model, free, load, scene.calibrate, known)
+        chosen = informative(model, free, load, scene.calibrate, known)
         used |= set(chosen.tolist())
         calibration.append(free[chosen][tour(free[chosen], home)])
     position = model.rigid_pose(free).position

@@ -2,7 +2,7 @@
 
 One word for each command, holding the number of its last request; numbers only grow, over all
 processes of the loop. So no command overwrites another one and none has to be taken back: the loop
-compares a word with what it has taken, and says in a word of its own (SharedMemory.tell_taken) up
+compares a word with what it has taken, and says in a word of its own (SharedMemory.note_taken) up
 to which number it has. A STOP stays what it is until the process that it was meant for has ended.
 """
 

@@ -109,15 +109,15 @@ class SharedMemory:
         self.beat()
         self._words[_PHASE] = phase
 
-    def tell_state(self, state: int) -> None:
+    def note_state(self, state: int) -> None:
         """Report the supervisor's state."""
         self._words[_STATE] = state
 
-    def tell_ended(self) -> None:
+    def note_ended(self) -> None:
         """Report that the source has come to its end."""
         self._words[_ENDED] = 1
 
-    def tell_seen(self) -> None:
+    def note_seen(self) -> None:
         """Report that a state has been read: the link works."""
         self._words[_SEEN] = 1
 
@@ -137,7 +137,7 @@ class SharedMemory:
         self._rows[written % ROWS, 0] = written
         self._words[_WRITTEN] = written + 1
 
-    def tell_taken(self, number: int) -> None:
+    def note_taken(self, number: int) -> None:
         """Report up to which number requests have been taken; see command_page.py."""
         self._words[_TAKEN] = number
 

@@ -43,7 +43,7 @@ HASTY_RAMP = 0.5  # s: what a stop takes for the ramp at most
 
 UNSENT = 2  # "attempted" of a cycle whose setpoint was computed and did not (wholly) leave
 
-Tell = Callable[[dict[str, Any]], None]
+Emit = Callable[[dict[str, Any]], None]
 
 
 class Exit(IntEnum):
@@ -75,12 +75,12 @@ class Loop:
         driver: Driver,
         source: Source,
         page: SharedMemory,
-        tell: Tell,
+        emit: Emit,
         number: int = 0,
     ) -> None:
         self._number = number  # which process of the loop this is, from 0
         self._settings, self._driver, self._source = settings, driver, source
-        self._page, self._tell = page, tell
+        self._page, self._emit = page, emit
         clock, self._now = driver.clock, driver.clock.monotonic
         self._stream = SetpointStream(model, settings.limits, driver.rate, clock)
         self._loads = LiveLoads(
@@ -90,7 +90,7 @@ class Loop:
         self._acting = Loads()  # of the last cycle
         self._model_check = ModelCheck(model, settings.setpoints.use_force)
         self._clock = ControllerClock(driver.rate, hold_time(driver.rate), clock)
-        reports = Reports(page, tell)
+        reports = Reports(page, emit)
         self._supervisor = Supervisor(reports.transition)
         patience = settings.link.state_timeout
         self._watch = LinkMonitor(driver, self._supervisor, reports, patience)
@@ -130,7 +130,7 @@ class Loop:
         try:
             self._driver.connect()
         except LinkError as error:
-            self._tell({"kind": "failure", "detail": str(error)})
+            self._emit({"kind": "failure", "detail": str(error)})
             return Exit.LINK
         self._watch.forget()
         self._supervisor.take(Cause.CONNECTED)
@@ -148,7 +148,7 @@ class Loop:
                 if command == Command.ZERO_MOVED:
                     self._hold_for_zero()
             if asked:
-                self._page.tell_taken(commands.taken)
+                self._page.note_taken(commands.taken)
             if self._stop_requested or commands.stop:
                 self._stop()
             seen = self._page.seen and self._checks.rate.known
@@ -173,7 +173,7 @@ class Loop:
             if self._supervisor.take(Cause.ARM):
                 self._skip()
             return
-        self._tell({"kind": "refused", "what": "arm", "detail": words})
+        self._emit({"kind": "refused", "what": "arm", "detail": words})
 
     def _not_ready(self) -> str:
         """Return in words why writing could come to nothing here; empty: it can."""
@@ -243,7 +243,7 @@ class Loop:
             return
         self._page.count(Count.LINK_LOST)
         self._supervisor.take(Cause.LINK_LOST, detail)
-        self._tell({"kind": "failure", "detail": detail})
+        self._emit({"kind": "failure", "detail": detail})
         self._exit = Exit.LINK
 
     # -- one cycle --------------------------------------------------------------------------------
@@ -263,7 +263,7 @@ class Loop:
         expiry = self._clock.expiry(state)
         is_fresh = self._watch.believe(expiry)
         self._give_up(self._watch.lost)
-        self._page.tell_seen()
+        self._page.note_seen()
         flags = self._checks.begin(state, missed)
         if flags & RESYNC:
             self._loads.forget()

@@ -53,26 +53,26 @@ def main() -> None:
     """Run the loop; never returns."""
     order = json.loads(sys.stdin.readline())
     os.set_blocking(order["events"], False)
-    tell = _teller(order["events"])
-    compiling.listeners.append(_tell_compiling(tell))
+    emit = _emitter(order["events"])
+    compiling.listeners.append(_report_compiling(emit))
     code: int = Exit.CRASH
     try:
-        code = _run(order, tell)
+        code = _run(order, emit)
     except InputError as error:
-        tell({"kind": "failure", "detail": str(error), "input": True})
+        emit({"kind": "failure", "detail": str(error), "input": True})
         code = Exit.INPUT
     except GapbridgeError as error:
-        tell({"kind": "failure", "detail": str(error)})
+        emit({"kind": "failure", "detail": str(error)})
         code = Exit.LINK
     except BaseException as error:
         traceback.print_exc()
-        tell({"kind": "failure", "detail": f"the loop failed: {type(error).__name__}: {error}"})
+        emit({"kind": "failure", "detail": f"the loop failed: {type(error).__name__}: {error}"})
     sys.stderr.flush()
     become_ordinary()
     os._exit(code)
 
 
-def _run(order: dict[str, Any], tell: Callable[[dict[str, Any]], None]) -> Exit:
+def _run(order: dict[str, Any], emit: Callable[[dict[str, Any]], None]) -> Exit:
     page = SharedMemory(order["n"], order["page"])
     page.enter(Phase.STARTING)
     files = pickle.loads(all_bytes(order["files"]))  # by the daemon, which started this process
@@ -81,7 +81,7 @@ def _run(order: dict[str, Any], tell: Callable[[dict[str, Any]], None]) -> Exit:
     model = _read_model(settings)
     driver = make_driver(settings.link, model, gate_bounds(settings.limits))
     source = _make_source(settings, model, driver)
-    loop = _make_loop(settings, model, driver, source, page, tell, order["number"])
+    loop = _make_loop(settings, model, driver, source, page, emit, order["number"])
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: loop.request_stop())
     _end_with_parent(order["parent"])
@@ -89,7 +89,7 @@ def _run(order: dict[str, Any], tell: Callable[[dict[str, Any]], None]) -> Exit:
     if order["may_write"]:
         source.open()
     granted = ", ".join(become_realtime(1.0 / driver.rate))
-    tell({"kind": "granted", "hash": order["hash"], "detail": granted})
+    emit({"kind": "granted", "hash": order["hash"], "detail": granted})
     commands = Commands(order["commands"], order["after"])
     return loop.run(commands, order["may_write"], order["latched"])
 
@@ -112,26 +112,26 @@ def _make_loop(
     return Loop(settings, model, driver, source, *more)
 
 
-def _teller(events: int) -> Callable[[dict[str, Any]], None]:
+def _emitter(events: int) -> Callable[[dict[str, Any]], None]:
     """Return a function that notifies the daemon of an event and never blocks."""
 
-    def tell(event: dict[str, Any]) -> None:
+    def emit(event: dict[str, Any]) -> None:
         if len(event.get("detail", "")) > LONGEST_WORDS:
             event = {**event, "detail": event["detail"][:LONGEST_WORDS]}
         now = {"time": SYSTEM.time(), "monotonic": SYSTEM.monotonic()}
         with contextlib.suppress(OSError):  # a message each: taken whole, or not at all
             os.write(events, json.dumps({**now, **event}).encode())
 
-    return tell
+    return emit
 
 
-def _tell_compiling(tell: Callable[[dict[str, Any]], None]) -> Callable[[int], None]:
+def _report_compiling(emit: Callable[[dict[str, Any]], None]) -> Callable[[int], None]:
     """Return a listener that notifies the daemon of the first function and every tenth."""
 
     def began(functions: int) -> None:
         if functions % 10 == 1:
             far = "" if functions == 1 else f" ({functions} functions)"
-            tell({"kind": "compiling", "detail": f"starting: {compiling.ABOUT}{far}"})
+            emit({"kind": "compiling", "detail": f"starting: {compiling.ABOUT}{far}"})
 
     return began
 

@@ -49,8 +49,8 @@ class ReplayedLoop(Loop):
         try:
             state = self._recording.read_state()
         except EndOfRecordingError as error:
-            self._page.tell_ended()
-            self._tell({"kind": "note", "detail": str(error)})
+            self._page.note_ended()
+            self._emit({"kind": "note", "detail": str(error)})
             self._exit = Exit.DONE
             return
         cycle = self._recording.cycle
@@ -58,7 +58,7 @@ class ReplayedLoop(Loop):
         if cycle.loop != self._process:
             self._renew(cycle.loop)
         missed = self._clock.take(state)
-        self._page.tell_seen()
+        self._page.note_seen()
         if cycle.flags & RESYNC:
             self._loads.forget()
         loads = self._loads.update(state)
@@ -121,6 +121,6 @@ class ReplayedLoop(Loop):
                 self._in_force.note(setpoint.q, stream.joint_offset, setpoint.offset_in_base)
         except (LimitError, GateError) as error:  # of another cell than it was then
             stream.forget()
-            self._tell({"kind": "refused", "detail": str(error)})
+            self._emit({"kind": "refused", "detail": str(error)})
             return None
         return setpoint

@@ -24,7 +24,7 @@ class Reports:
 
     def transition(self, before: State, after: State, cause: Cause, detail: str) -> None:
         """Report a change of state: listener of a Supervisor."""
-        self.page.tell_state(after)
+        self.page.note_state(after)
         self.emit(
             {"kind": "transition", "from": before.name, "to": after.name, "cause": cause.value,
              "detail": detail, "cycle": self.page.written}

@@ -251,7 +251,7 @@ class Writing:
             self._supervisor.take(Cause.SOURCE_DRY, str(error))
             return None if self._driver.moves_arm else own
         if self._source.ended and not self._reports.page.ended:
-            self._reports.page.tell_ended()
+            self._reports.page.note_ended()
             words = "the source has come to its end; the arm stays there"
             self._reports.emit({"kind": "source", "what": "ended", "detail": words})
         return found

@@ -118,7 +118,7 @@ class Recorder:
         """Write what is there and finish the file."""
         self.step(flush=True)
         if self._segment is None:
-            self._tell_lost(max(self._page.written - self._next, 0))
+            self._report_lost(max(self._page.written - self._next, 0))
         else:
             try:
                 self._segment.close()
@@ -136,7 +136,7 @@ class Recorder:
             self._write_event(segment, event)
         segment.flush()
         self._events.clear()
-        self._tell_lost(self._reader.take_lost())
+        self._report_lost(self._reader.take_lost())
         self._next, self._flushed = self._reader.next, now
         room = self._room()
         if room < self._settings.keep_free:
@@ -212,7 +212,7 @@ class Recorder:
             self._say(f"recording paused: {why}", paused=why, next_cycle=self._next)
         self._why_paused = why
 
-    def _tell_lost(self, lost: int) -> None:
+    def _report_lost(self, lost: int) -> None:
         if lost:
             self.lost += lost
             self._say(f"{lost} cycles lost before cycle {self._page.written}", lost=lost)

@@ -73,7 +73,7 @@ class Feed:
         }  # fmt: skip
         self.side = SideProcess(f"bridge.{self.section}.main", order, self.page, self.log)
         self.page.enter(Phase.RUNNING)
-        self.page.tell_state(self.state)
+        self.page.note_state(self.state)
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
         return self
@@ -118,7 +118,7 @@ class Feed:
     def change(self, to: State, cause: str, detail: str = "") -> None:
         """Go into a state as the loop does."""
         before, self.state = self.state, to
-        self.page.tell_state(to)
+        self.page.note_state(to)
         self.emit(kind="transition", **{"from": before.name, "to": to.name}, cause=cause,
                   detail=detail)  # fmt: skip
 

@@ -37,7 +37,7 @@ class DemoLink(ABC):
     scene: ClassVar[Scene]
     settling: ClassVar[float] = SETTLING  # s from standing still until readings count
     hides: ClassVar[tuple[str, ...]] = ("bent_tool",)  # one of these, drawn from the seed
-    tells_joints: ClassVar[bool] = True  # joints as read are good enough to fit on
+    reports_joints: ClassVar[bool] = True  # joints as read are good enough to fit on
 
     def __init__(self, out: Path, seed: int) -> None:
         self.seed = seed

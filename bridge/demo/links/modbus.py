@@ -35,7 +35,7 @@ class ModbusLink(ControllerLink):
     template = "modbus.yaml"
     ports = (PORT, BENCH_PORT)
     settling = 0.3
-    tells_joints = False
+    reports_joints = False
     scene = replace(
         UR10E,
         # near to each other, as the robot's own program moves at 0.5 rad/s, but for the wrist: what

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from gapbridge.bridge.daemon.status import DaemonStatus
 from gapbridge.bridge.ipc.shared_memory import slices_of
-from gapbridge.bridge.loop.main import _tell_compiling
+from gapbridge.bridge.loop.main import _report_compiling
 from gapbridge.bridge.loop.supervisor import State
 
 
 def test_compiling_is_a_state_until_the_loop_connects() -> None:
     told: list[dict[str, object]] = []
-    began = _tell_compiling(told.append)
+    began = _report_compiling(told.append)
     for functions in range(1, 13):
         began(functions)
     assert [event["detail"] for event in told] == [

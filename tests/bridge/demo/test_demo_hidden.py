@@ -90,7 +90,7 @@ def errors(link: DemoLink, plant: Plant, cell: Cell) -> np.ndarray:
 def test_what_is_hidden_is_named_on_every_link(tmp_path: Path, name: str, seed: int) -> None:
     link = LINKS[name](tmp_path, seed)
     plant, path = plant_of(link), tmp_path / "calibration.csv"
-    write_log(path, measured(link, plant), link.tells_joints)
+    write_log(path, measured(link, plant), link.reports_joints)
     log = read_log(path, link.cell.arm.n)
     fitted = identify_compliance(link.cell.model, log, link.cell.metrology).model
     save_cell(link.cell, tmp_path / "calibrated.yaml", fitted)

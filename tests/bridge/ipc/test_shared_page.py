@@ -54,10 +54,10 @@ def run() -> Iterator[RunPage]:
 def test_a_new_process_of_the_loop_goes_on_counting_and_nothing_else_stays(run: RunPage) -> None:
     reader, loop = run.reader(), loop_of(run)
     loop.enter(Phase.RUNNING)
-    loop.tell_state(3)
-    loop.tell_seen()
-    loop.tell_ended()
-    loop.tell_taken(7)
+    loop.note_state(3)
+    loop.note_seen()
+    loop.note_ended()
+    loop.note_taken(7)
     loop.count(Count.LATE, 4)
     put(loop, 0.0)
     loop.next_row()[1] = 99.0  # killed here
@@ -103,7 +103,7 @@ def test_who_reads_along_changes_over_and_misses_nothing(run: RunPage) -> None:
         put(loop, 2.0 * k + 1)
         if k != 1:  # it may be slow, and two pages come at once
             assert reader.drain()[-1, 1] == 2.0 * k + 1
-        loop.tell_state(k)
+        loop.note_state(k)
         loop.close()
     assert reader.next == 6
     assert reader.lost == 0
@@ -131,7 +131,7 @@ from gapbridge.bridge.ipc.shared_memory import SharedMemory
 page = SharedMemory(2, {fd}, writable=False)
 assert page.reader().drain()[:, 1].tolist() == [7.0]
 again = os.open("/proc/self/fd/{fd}", os.O_RDWR)
-ways = (lambda: page.tell_state(3), lambda: os.write({fd}, b"x"), lambda: mmap.mmap({fd}, 64),
+ways = (lambda: page.note_state(3), lambda: os.write({fd}, b"x"), lambda: mmap.mmap({fd}, 64),
         lambda: os.pwrite(again, b"x", 0), lambda: mmap.mmap(again, 64),
         lambda: os.ftruncate(again, 0), lambda: SharedMemory(2, again))
 for way in ways:

@@ -221,8 +221,8 @@ import os, time
 from gapbridge.bridge.ipc.shared_memory import SharedMemory, Phase
 page = SharedMemory(3, {page.fd})
 page.enter(Phase.RUNNING)
-page.tell_state(3)
-page.tell_seen()
+page.note_state(3)
+page.note_seen()
 for k in range(10):
     page.next_row()[1] = k
     page.publish()
