@@ -46,8 +46,8 @@ from gapbridge.core.diagnosis.residual_structure import (
 )
 from gapbridge.core.diagnosis.selection.candidate import Candidate
 from gapbridge.core.diagnosis.selection.following import delayed_by
-from gapbridge.core.diagnosis.selection.local_search import rivals
-from gapbridge.core.diagnosis.selection.problem import CandidateFit, SampleSpace
+from gapbridge.core.diagnosis.selection.local_search import forward_selected, rivals
+from gapbridge.core.diagnosis.selection.problem import CandidateFit, SampleSpace, fit
 from gapbridge.core.diagnosis.selection.refit import Remainder, worth
 from gapbridge.core.diagnosis.selection.selection import Selection, refitted_alone
 from gapbridge.core.diagnosis.selection.stiffness_curves import without_curvature
@@ -148,6 +148,8 @@ def _verdict(
     if np.mean(~whole.kept) > OUTLIER_SHARE:  # no bad luck: something befalls the log
         p_value = 0.0
     unnamed = any(not space.candidates[c].named for c in selection.found.chosen)
+    if unnamed:
+        p_value = min(p_value, _needless(space, selection.found))
     structured = p_value < (HINT_P if unnamed or fallen else SURE_P)
     depends: tuple[tuple[str, float], ...] = ()
     if structured or not stays:
@@ -158,6 +160,13 @@ def _verdict(
         {place[c]: names for c, names in ties.items()},
         tuple((place[c], why) for c, why in withdrawn.items()),
     )  # fmt: skip
+
+
+def _needless(space: SampleSpace, found: CandidateFit) -> float:
+    """Return the probability that named causes alone would do, of a set with unnamed functions."""
+    named = fit(space, [c for c in found.chosen if space.candidates[c].named])
+    alone = forward_selected(space, named, named_only=True)
+    return float(1 / (1 + np.exp(0.5 * np.clip(alone.score - found.score, -700.0, 700.0))))
 
 
 def _no_value(selection: Selection) -> dict[int, Withdrawal]:
