@@ -175,7 +175,8 @@ def test_what_the_package_states_is_there_and_nothing_else_is_imported_for_it() 
 
 PRIVATE = {"told", "tell", "words", "wild", "calm", "raw", "foresight", "lacking", "leftover"}
 """What no engineer of the field would call a thing."""
-IN_THE_FIELDS_WORDS = ("bridge/document", "bridge/report", "bridge/calibration",
+IN_THE_FIELDS_WORDS = ("core/effects", "core/estimation", "core/calibration", "core/planning",
+                       "core/kernels", "bridge/document", "bridge/report", "bridge/calibration",
                        "bridge/fleet", "bridge/web")  # fmt: skip
 FOREIGN_NAMES = {"raw_wrench"}  # a sensor's reading before it is set to zero
 

@@ -90,13 +90,13 @@ def budget(calibration: Calibration, stated: Stated) -> Budget:
     found = [parameters_of_model(calibration, behind), repeatability]
     found.append(model_remainder(calibration, found[0].std, np.hypot(repeatability.std, reading)))
     missing = []
-    for part, words in (
+    for part, description in (
         (instrument_error(stated), "largest permissible error of the instrument"),
         (temperature_growth(calibration, stated), "temperature of the air during the session"),
         (payload_mass(calibration, stated), "how well the masses of the loads are known"),
     ):
         if part is None:
-            missing.append(words)
+            missing.append(description)
         else:
             found.append(part)
     combined = float(np.sqrt(sum(i.contribution**2 for i in found)))
