@@ -4,6 +4,7 @@ Play that opens with the load looks like play, and a joint that is softer on one
 joint: the catalogue's effect is the first order of what is there. So each accused number is let go
 by every quantity of the log in turn, by an unnamed function beside its constant. Where the residual
 asks for that and the function is no small part of the constant, the form is not the effect's.
+A periodic line is let go by the quarters of its joint's range: gears repeat in each.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 
 from gapbridge.core.diagnosis.criteria import VARIES
 from gapbridge.core.diagnosis.residual_structure import basis_of
-from gapbridge.core.diagnosis.selection.candidate import Candidate
+from gapbridge.core.diagnosis.selection.candidate import Candidate, joint_quantity
 from gapbridge.core.diagnosis.selection.following import exact_columns
 from gapbridge.core.diagnosis.selection.selection import Selection
 from gapbridge.core.diagnosis.selection.smooth import spline_basis
@@ -39,7 +40,8 @@ def not_constant(
         beside = selection.links.whitened(beside)
     found = {}
     for c in accused:
-        if _is_a_number(selection.working.candidates[c]):
+        candidate = selection.working.candidates[c]
+        if candidate.periodic or _is_a_number(candidate):
             quantity, share = _variation(selection, c, accused, beside)
             if share > VARIES:
                 found[c] = quantity
@@ -70,15 +72,14 @@ def _variation(
     basis = basis_of(_unit(np.hstack([constant, rest])))
     left = space.y - basis @ (basis.T @ space.y)
     variance = max(float(left @ left) / max(space.freedom - basis.shape[1], 1.0), space.floor)
-    quantities = _quantities(selection, space.candidates[c])
+    shapes = _shapes(selection, space.candidates[c])
     most, name, varying = 0.0, "", constant[:, :0]
-    for quantity, z in quantities.items():
-        shape = spline_basis(z)
+    for quantity, shape in shapes.items():
         columns = own[:, :, :, None] * shape[:, None, None, :]
         rows = _unit(selection.rows_of(columns.reshape(*own.shape[:2], -1)))
         further = basis_of(rows - basis @ (basis.T @ rows))
         gain = float(np.sum((further.T @ left) ** 2)) / variance
-        gain -= further.shape[1] * np.log(space.freedom) + 2 * np.log(len(quantities))
+        gain -= further.shape[1] * np.log(space.freedom) + 2 * np.log(len(shapes))
         if gain > most:
             most, name, varying = gain, quantity, rows
     if not name:
@@ -103,6 +104,23 @@ def _by_session(own: Array, session: Array | None) -> Array:
 
 def _others(selection: Selection, c: int) -> list[Term]:
     return [t for o, t in zip(selection.term_index, selection.terms, strict=True) if o != c]
+
+
+def _shapes(selection: Selection, candidate: Candidate) -> dict[str, Array]:
+    """Return the functions (N, d) by which a number may go, by the quantity that they go by."""
+    quantities = _quantities(selection, candidate)
+    if not candidate.periodic:
+        return {name: spline_basis(z) for name, z in quantities.items()}
+    assert candidate.site.joint is not None
+    own = joint_quantity(selection.observation, candidate.site.joint - 1)
+    return {own: _quarters(quantities[own])} if own in quantities else {}
+
+
+def _quarters(z: Array) -> Array:
+    """Return which quarter of a quantity's samples each belongs to (N, 3), centred."""
+    quarter = np.searchsorted(np.quantile(z, (0.25, 0.5, 0.75)), z)
+    indicators = (quarter[:, None] == np.arange(1, 4)).astype(float)
+    return np.asarray(indicators - indicators.mean(axis=0))
 
 
 def _quantities(selection: Selection, candidate: Candidate) -> dict[str, Array]:

@@ -13,6 +13,7 @@ from gapbridge.core.diagnosis.diagnosis import diagnose
 from gapbridge.core.metrology import Metrology
 
 GAP = 9e-4  # rad, of joint 2
+LINE = 12.0  # cycles a turn
 
 
 def by_load(share):
@@ -47,12 +48,35 @@ def test_play_that_opens_with_the_load_is_no_backlash():
     assert channel.structured
 
 
+def line_of(fades):
+    """Return which line of joint 2 is no constant, where one fades over the joint's range."""
+
+    def angle(session, q):
+        way = (q - q.min()) / np.ptp(q)
+        return GAP * (1 - fades * way) * np.sin(LINE * q)
+
+    session = small.session_of(0)
+    log = small.log_of(session, small.readings(small.turned(2, angle), session))
+    metrology = Metrology(registered=True, sigma=small.SIGMA)
+    selection = diagnose(small.model_of(), log, metrology).channels[0].selection
+    (own,) = [
+        c for c, k in enumerate(selection.space.candidates)
+        if k.periodic and k.site.joint == 2 and k.site.order == LINE
+    ]  # fmt: skip
+    return not_constant(selection, [own], np.zeros((len(selection.space.y), 0)))
+
+
+def test_a_gears_line_is_the_same_in_every_part_of_the_range():
+    assert line_of(0.0) == {}
+    assert [*line_of(1.0).values()] == ["actual_q_1"]
+
+
 def test_only_numbers_of_poses_are_judged():
-    """An offset is the mean of whatever turns its joint, and lines have forms of their own."""
+    """An offset is the mean of whatever turns its joint, and a link's numbers have their forms."""
     selection = diagnosed(1.0).selection
     candidates = selection.space.candidates
     nothing = np.zeros((len(selection.space.y), 0))
-    for family in ("joint_offset", "transmission_error", "link_geometry", "joint_slip"):
+    for family in ("joint_offset", "link_geometry", "joint_slip"):
         own = [c for c, k in enumerate(candidates) if k.family == family and k.site.joint == 2][:1]
         assert not_constant(selection, own, nothing) == {}
     (play_of_2,) = [
