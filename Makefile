@@ -76,9 +76,11 @@ simulate: .venv/.test
 	$(PYTHON) -m venv .venv
 
 # one stamp per set of dependencies: a later make finds nothing to do
+# What compiles the inner loops goes first: they are compiled while the rest is fetched and unpacked.
 .venv/.main: pyproject.toml | .venv/bin/python
-	$(PIP) install --quiet --editable .
-	$(BIN)/python -m gapbridge.bridge.loop.warm_up
+	$(PIP) install --quiet --no-compile numba pydantic pyyaml
+	$(BIN)/python -m gapbridge.bridge.loop.warm_up & compiling=$$!; \
+		$(PIP) install --quiet --no-compile --editable . && wait $$compiling
 	@touch $@
 
 .venv/.test: pyproject.toml | .venv/bin/python

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from gapbridge.core.kernels.single import LEVER
 from gapbridge.core.loads import Loads
 from gapbridge.core.model import Model
+from gapbridge.core.planning.travel import shortest_way
 
 Array = NDArray[np.float64]
 
@@ -64,9 +65,9 @@ class Scene:
     workspace: Workspace
     calibration_loads: tuple[Load, ...]
     test_loads: tuple[Load, ...]
-    calibrate: int = 11  # poses per calibration load
+    calibrate: int = 10  # poses per calibration load
     test: int = 3  # poses per test load
-    visits: int = 3  # of each test pose: what differs between them is the arm's repeatability
+    visits: int = 2  # of each test pose: what differs between them is the arm's repeatability
 
 
 UR10E = Scene(
@@ -113,14 +114,13 @@ def informative(model: Model, q: Array, load: Load, count: int, known: Array) ->
 
 
 def tour(q: Array, start: Array) -> Array:
-    """Return an order in which to visit the poses (N, 6): from the start, always the nearest."""
-    left, order, here = set(range(len(q))), [], start
-    while left:
-        nearest = min(left, key=lambda i: float(np.abs(q[i] - here).max()))
-        order.append(nearest)
-        left.remove(nearest)
-        here = q[nearest]
-    return np.array(order)
+    """Return a short way from the start through the poses (N, 6): their order."""
+    return np.array(shortest_way(_apart(q, q), _apart(start[None], q)[0]), dtype=int)
+
+
+def _apart(q: Array, to: Array) -> Array:
+    """Return how far the joint that moves most goes from ``q`` (A, n) to ``to`` (B, n): (A, B)."""
+    return np.asarray(np.abs(q[:, None] - to[None]).max(axis=2))
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,7 @@ STILL = 0.003  # rad/s: slower than this, the arm stands
 SETTLING = 0.15  # s from standing still until readings count
 LEAVING = 0.04  # s before it moves on from which they no longer count
 FEWEST = 8  # readings of the tracker at one rest
+FEW_READINGS = "readings of the tracker"
 NEAR = 0.05  # rad between a visited pose and the one that was meant
 
 
@@ -123,9 +124,7 @@ def _rest(
     begin, end = t[0] + settling, t[-1] - LEAVING
     seen = readings[(readings[:, 0] >= begin) & (readings[:, 0] <= end)]
     if len(seen) < FEWEST:
-        raise RunError(
-            f"visit {number + 1}: found {len(seen)} readings of the tracker, expected {FEWEST}"
-        )
+        raise RunError(f"visit {number + 1}: found {len(seen)} {FEW_READINGS}, expected {FEWEST}")
     during = np.arange(span.start, span.stop)[(t >= begin) & (t <= end)]
     return (
         np.array(begin),

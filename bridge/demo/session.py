@@ -18,7 +18,7 @@ from gapbridge.bridge.daemon.summary import RunSummary
 from gapbridge.bridge.demo.bench import Tracker
 from gapbridge.bridge.demo.links.link import DemoLink
 from gapbridge.bridge.demo.poses import Load
-from gapbridge.bridge.demo.rests import Rests, joined, rests_so_far
+from gapbridge.bridge.demo.rests import FEW_READINGS, Rests, joined, rests_so_far
 from gapbridge.bridge.demo.result import LoopFigures
 from gapbridge.bridge.loop.supervisor import Cause, State
 from gapbridge.core.errors import LinkError, RunError
@@ -34,6 +34,7 @@ STALL = 0.05  # s that a timer of this process comes late: the machine stood sti
 STALLED = (
     Cause.OVERRUN, Cause.STALE, Cause.RESYNC, Cause.SILENCE, Cause.LINK_LOST, Cause.INEFFECTIVE,
     Cause.WRITE_FAILED, Cause.SOURCE_DRY, "limits.following",
+    FEW_READINGS,
 )  # fmt: skip
 """Why a run ends on a machine that stands still: deadlines, and an arm that was left behind."""
 FRUITLESS = 4  # runs in a row without a visit, and no timer late: that is no machine standing still

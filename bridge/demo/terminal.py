@@ -8,7 +8,8 @@ from rich.text import Text
 
 from gapbridge.bridge.demo.result import Result, visits_of_poses
 
-WIDTH = 32  # characters of the longest bar
+WIDTH, NARROW = 32, 8  # characters of the longest bar, where there is room and where there is none
+BESIDE = 68  # characters of a row beside its bars
 EIGHTHS = " ▏▎▍▌▋▊▉█"
 
 
@@ -29,12 +30,13 @@ def show(result: Result, console: Console | None = None) -> None:
     for name in ("pose", "load", *names, ""):
         table.add_column(name, justify="left" if name in ("load", "") else "right")
     longest = float(before.max())
+    width = min(max(console.width - BESIDE, NARROW), WIDTH)
     for row in visits_of_poses(result):
         means = [float(values[row].mean()) for _, values in series]
         styles = ("red", "yellow", "green") if len(means) == 3 else ("red", "green")
         bars = Text()
         for k, (mean, style) in enumerate(zip(means, styles, strict=True)):
-            bars.append(("\n" if k else "") + bar(mean / longest), style=style)
+            bars.append(("\n" if k else "") + bar(mean / longest, width), style=style)
         table.add_row(
             str(len(table.rows) + 1), result.loads[row[0]], *(f"{m:.3f}" for m in means), bars
         )

@@ -6,6 +6,8 @@ installation spends half a minute on it, in the middle of its work.
 
 from __future__ import annotations
 
+from multiprocessing import get_context
+
 import numpy as np
 
 from gapbridge.bridge.loop.setpoint_stream import NominalStream
@@ -20,27 +22,48 @@ from gapbridge.core.model import Model
 from gapbridge.core.motion import motion_of
 from gapbridge.drivers.offset_inverse import Nominal
 
+N = 6
+Q = np.array([[0.0, -1.5, 1.8, -1.87, -1.57, 0.0]])
+FOUR = np.repeat(Q, 4, axis=0)
+
 
 def warm_up() -> None:
-    """Call each compiled function once."""
-    n = 6
-    model = Model(builtin_arm("ur10e")).with_compliance([1e-6] * n, [1e-6] * n)
-    q = np.array([[0.0, -1.5, 1.8, -1.87, -1.57, 0.0]])
-    for rows in (q, np.repeat(q, 4, axis=0)):  # one by one, and in blocks
-        model.predict(rows).rotation_vector  # noqa: B018 (compiled when asked for)
-        model.linear_form(rows)
-    with_pieces(model, motion_of(Log("", {"actual_q": q}, n)))
-    pose_columns(model, q, None, [(0, 0)], np.array([1e-9]))
-    gap, factor = np.zeros((1, 3)), np.zeros((2 * n + 1, 2 * n + 1))
-    factor_blocks(model.chain(), model.rows(q), gap, gap, 0, 0, 1, factor)
-    corrected = correct(model, q)  # many rows, and one in the loop
-    Compensator(model).correct(q[0])
+    """Call each compiled function once, the two halves of them on two cores."""
+    other = get_context("fork").Process(target=_one_row)
+    other.start()
+    _blocks_of_rows()
+    other.join()
+    _one_row()  # of what was compiled there this process has nothing yet, and nothing if it failed
+
+
+def _one_row() -> None:
+    """Call what the live loop needs, and the readable kernels."""
+    model = _model()
+    model.predict(Q).rotation_vector  # noqa: B018 (compiled when asked for)
+    model.linear_form(Q)
+    corrected = correct(model, Q)  # many rows, and one in the loop
+    Compensator(model).correct(Q[0])
     Nominal(model)
-    NominalStream(np.ones(n))
-    limits = Limits(np.full(n, -7.0), np.full(n, 7.0), np.full(n, 3.0))
-    limiter = Limiter(limits, n)
-    limiter.start(q[0])
-    limiter.limit(q[0], corrected.q[0], corrected.offset_in_base[0], 1.0, q[0], 0.002)
+    NominalStream(np.ones(N))
+    limits = Limits(np.full(N, -7.0), np.full(N, 7.0), np.full(N, 3.0))
+    limiter = Limiter(limits, N)
+    limiter.start(Q[0])
+    limiter.limit(Q[0], corrected.q[0], corrected.offset_in_base[0], 1.0, Q[0], 0.002)
+
+
+def _blocks_of_rows() -> None:
+    """Call what logs need: blocks of rows, their Jacobians, rigid dynamics."""
+    model = _model()
+    model.predict(FOUR).rotation_vector  # noqa: B018 (compiled when asked for)
+    model.linear_form(FOUR)
+    with_pieces(model, motion_of(Log("", {"actual_q": Q}, N)))
+    pose_columns(model, FOUR, None, [(0, 0)], np.array([1e-9]))
+    gap, factor = np.zeros((1, 3)), np.zeros((2 * N + 1, 2 * N + 1))
+    factor_blocks(model.chain(), model.rows(Q), gap, gap, 0, 0, 1, factor)
+
+
+def _model() -> Model:
+    return Model(builtin_arm("ur10e")).with_compliance([1e-6] * N, [1e-6] * N)
 
 
 if __name__ == "__main__":

@@ -27,6 +27,8 @@ SOFTNESS = 40.0
 joints come out at 1 to 10 kNm/rad about their axes, as small planetary gears are, and it hangs by 1
 to 3 mm under 1.4 kg of its rated 1.5. Its repeatability, 0.05 mm, is the plant's own."""
 
+TOP_SPEED = 2.0  # rad/s: faster, and its servos are more than limits.following behind
+
 HELD = (0.0, 15.0, 8.9, 1.9, 2.6, 0.0)
 """What the joints hold at most, Nm, at the poses that are measured with 1.5 kg."""
 
@@ -52,7 +54,7 @@ class CanLink(ControllerLink):
             Load("1.4 kg", 1.4, (0.01, 0.0, 0.09)),
             Load("1.2 kg at the side", 1.2, (-0.04, 0.03, 0.07)),
         ),
-        calibrate=13, test=2, visits=2,
+        calibrate=13, test=2,
     )  # fmt: skip
 
     def __init__(self, out: Path, seed: int) -> None:
@@ -80,7 +82,8 @@ class CanLink(ControllerLink):
 
     def prepare(self, folder: Path, poses: Array) -> float:
         """Write the trajectory that the daemon follows; see DemoLink.prepare."""
-        return write_trajectory(folder / "trajectory.csv", visits(self.home, poses))
+        top_speed = np.minimum(self.cell.arm.limits.velocity, TOP_SPEED)
+        return write_trajectory(folder / "trajectory.csv", visits(self.home, poses, top_speed))
 
     def motion(self, daemon: Daemon, poses: Array) -> AbstractContextManager[object]:
         """Do nothing: the daemon's setpoints move the arm."""

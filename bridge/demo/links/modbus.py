@@ -52,7 +52,7 @@ class ModbusLink(ControllerLink):
             Load("12 kg and off", 12.0, (0.01, 0.0, 0.08)),
             Load("8 kg", 8.0, (0.0, 0.02, 0.07)),
         ),
-        calibrate=11, visits=2,
+        calibrate=11,
     )  # fmt: skip
 
     def resolution(self) -> Resolution:

@@ -63,7 +63,9 @@ class UrRtdeLink(DemoLink):
 
     def prepare(self, folder: Path, poses: Array) -> float:
         """Write the trajectory that the daemon follows; see DemoLink.prepare."""
-        return write_trajectory(folder / "trajectory.csv", visits(self.home, poses))
+        return write_trajectory(
+            folder / "trajectory.csv", visits(self.home, poses, self.cell.arm.limits.velocity)
+        )
 
     def motion(self, daemon: Daemon, poses: Array) -> AbstractContextManager[object]:
         """Do nothing: the daemon's setpoints move the arm."""
