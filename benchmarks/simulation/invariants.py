@@ -94,13 +94,13 @@ class Judge:
         """Take what goes over the wire, as it does."""
         self._now = seen.time
         checker = self._checker
+        if self._lets_go(seen):
+            return
         checker.take([seen])
         if checker.doubts:  # the loop's state is known exactly here
             doubt = checker.doubts.pop()
             checker.doubts.clear()
-            holds = isinstance(seen, Write) and seen.values == self._last  # as it lets go
-            if not holds:
-                self.violate("state", f"write in state {State(doubt.state).name}")
+            self.violate("state", f"write in state {State(doubt.state).name}")
         if isinstance(seen, Write) and seen.kind in ("offset", "joints"):
             self.writes_noted += 1
             self._last = seen.values
@@ -109,6 +109,11 @@ class Judge:
             for words in found.violations[self._known - found.violated :]:
                 self.violate(_kind_of(words), words.split(" [")[0])
             self._known = found.violated
+
+    def _lets_go(self, seen: Fresh | Write) -> bool:
+        """Return whether joints only say again where the arm was sent: the motion has ended."""
+        again = isinstance(seen, Write) and seen.kind == "joints" and seen.values == self._last
+        return again and not State(seen.state).writes
 
     def sent(self, setpoint: Setpoint, sampled: float, now: float) -> None:
         """Take a setpoint as it is handed to the driver, and when its state was sampled, s."""

@@ -56,7 +56,8 @@ class ControllerClock:
         if self._lead is None or (self._stood_still(lead, state.received) and not writes):
             self._lead, self._old_since = lead, None
         else:
-            self._lead = min(lead, self._lead + DRIFT * gap)
+            # not over a break: the first state after it would count as younger than it can be
+            self._lead = min(lead, self._lead + DRIFT * (gap if gap <= self._hold else 0.0))
         return 0 if before is None else max(round(gap * self._rate) - 1, 0)
 
     def _stood_still(self, lead: float, now: float) -> bool:

@@ -109,6 +109,18 @@ def test_a_program_that_applies_nothing_after_a_stop_may_be_armed_at_once() -> N
     assert not [str(outcome) for outcome in found if outcome.violations]
 
 
+def test_the_first_state_after_a_standstill_is_judged_by_the_clock_before_it() -> None:
+    """Seed 3385: a state 42 ms old was written by, as if the clocks had drifted apart meanwhile."""
+    plan = [(0.1, "machine stalls"), (0.5, "held back"), (0.7, "loop stalls")]
+    found = [run(3385), *(run(seed, plan=plan) for seed in range(OFFSET, OFFSET + 24, len(LINKS)))]
+    assert not [str(outcome) for outcome in found if outcome.violations]
+
+
+def test_an_arm_that_is_let_go_of_in_silence_is_sent_where_it_was_sent_before() -> None:
+    """Seed 3243: stopped while the arm was silent; enabling frames say the last joints again."""
+    assert not run(3243).violations
+
+
 # -- each of the list is found where the product is broken -----------------------------------------
 
 

@@ -12,7 +12,7 @@ import pytest
 
 from gapbridge.bridge.ipc.cycle_row import write_cycle
 from gapbridge.bridge.ipc.shared_memory import ROWS, Phase, RunPage, SharedMemory
-from gapbridge.bridge.loop.link_monitor import ControllerClock
+from gapbridge.bridge.loop.link_monitor import DRIFT, ControllerClock
 from gapbridge.bridge.loop.live_loads import LiveLoads
 from gapbridge.core.load_bounds import LoadBounds
 from gapbridge.core.state import RobotState
@@ -127,6 +127,16 @@ def test_a_clock_that_drifts_is_followed() -> None:
     before = time.monotonic()
     age = clock.age(last)
     assert before - last.received - 1e-9 <= age <= time.monotonic() - last.received + 1e-4
+
+
+def test_a_break_does_not_make_the_state_after_it_younger() -> None:
+    clock = ControllerClock(500.0, hold=0.04)
+    clock.take(state(1.0, 10.0), writes=True)
+    after = state(1.6, 10.6 + 0.041)  # 41 ms old when it came to be read
+    clock.take(after, writes=True)
+    assert clock.expiry(after) == pytest.approx(10.64)
+    clock.take(state(1.602, 10.643), writes=True)  # from then on drift is followed as before
+    assert clock.expiry(state(1.604, 10.645)) == pytest.approx(10.644 + 0.002 * DRIFT, abs=1e-7)
 
 
 def test_a_clock_that_stood_still_is_tied_anew_once_nothing_younger_comes() -> None:
