@@ -16,6 +16,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from hypothesis import HealthCheck, settings
+
+# how fast examples are drawn says something of the machine, nothing of the code
+settings.register_profile(
+    "any machine", deadline=None, suppress_health_check=[HealthCheck.too_slow]
+)
+settings.load_profile("any machine")
 
 # Two processes share the cores: threads of linear algebra within each only wait for each other.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")

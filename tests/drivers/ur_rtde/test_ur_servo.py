@@ -222,14 +222,21 @@ def test_the_first_setpoint_does_not_wait_for_the_script(controller: SimulatedCo
     out = run(
         controller.host,
         """
-        took = []
-        for _ in range(20):
-            state = driver.read_state()
-            begun = time.monotonic()
-            driver.write_setpoint(setpoint(state, start, start))
-            took.append(time.monotonic() - begun)
-        out["first"], out["usual"] = took[0], sorted(took)[10]
+        firsts, usual = [], []
+        for _ in range(3):
+            took = []
+            for _ in range(20):
+                state = driver.read_state()
+                begun = time.monotonic()
+                driver.write_setpoint(setpoint(state, start, start))
+                took.append(time.monotonic() - begun)
+            firsts.append(took[0])
+            usual.append(sorted(took)[10])
+            driver.release()
+            driver.arm(read_for(20))
+        out["first"], out["usual"] = min(firsts), min(usual)
         """,
     )
-    # a script that is not ready makes it wait a cycle or more, 2 to 11 ms
+    # a script that is not ready makes it wait a cycle or more, 2 to 11 ms, every time; a busy
+    # machine delays some of three
     assert out["first"] < out["usual"] + 0.0015  # type: ignore[operator]
