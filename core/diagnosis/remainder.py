@@ -296,14 +296,23 @@ class _Beside:
         return value, spread, shown
 
     def beside_refit(self, accused: Sequence[int]) -> Remainder:
-        """Return what stands beside the accused in their last refit."""
+        """Return what stands beside the accused in their last refit.
+
+        A joint's constant that an accused effect holds is the effect's: a tool's turn about the
+        last axis would else be as unsure as its prior.
+        """
         asked, selection = self.beside, self._selection
+        functions, sigma = selection.space.columns(asked), self._sigma(accused, asked)
         constants = [selection.plain_rows_of(self._moved[t]) for t in self._targets(asked)]
-        columns = np.hstack([selection.space.columns(asked), *constants])
-        sigma = self._sigma(accused, asked)
-        free = np.full(columns.shape[1] - len(sigma), np.inf)
+        C = np.hstack([functions[:, :0], *constants])
+        V = basis_of(selection.space.columns(accused))
+        size = np.maximum(np.linalg.norm(C, axis=0), 1e-300)
+        beyond = np.linalg.norm(C - V @ (V.T @ C), axis=0) / size
+        free = np.isfinite(sigma) | (beyond**2 > DEGENERATE)
+        columns = np.hstack([functions, C[:, free]])
+        sigma = np.concatenate([np.full(functions.shape[1], np.inf), sigma[free]])
         region = np.repeat(regions(selection.observation, selection.kept), self._rows)
-        return Remainder(columns, np.concatenate([free, sigma]), region)
+        return Remainder(columns, sigma, region)
 
     def _with_siblings(self, accused: list[int], sigmas: Array, steady: Array) -> Array:
         """Return strengths: less is asked at further joints of an effect; of lines as much."""
