@@ -19,7 +19,7 @@ VARIES = (
     1 / 3
 )  # of a number's constant, how far it may go by a quantity: unknowns that an effect is
 # the first order of go by 0.39 to 0.87; lines of a UR10 by quarters of their joint's range: 0.23
-# the one that carries to three later series, 0.39 and 0.64 two that do not
+# the one that helps in three later series, 0.39 one that worsens all three
 # An accusation by itself
 OWN_SIGMAS = 3.0  # of at least one of its numbers: what an engineer calls a finding
 NEGLIGIBLE = 1e-3  # of its parameters' usual sizes: the tail of a servo is a dead band of 5e-9 rad
