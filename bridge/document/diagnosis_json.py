@@ -6,10 +6,10 @@ import math
 from typing import Any
 
 from gapbridge.bridge.document.findings import considered_text, finding_text
-from gapbridge.core.diagnosis.carrying import Carried
+from gapbridge.core.diagnosis.across_sessions import Carried
+from gapbridge.core.diagnosis.causes import Cause
 from gapbridge.core.diagnosis.channel_diagnosis import ChannelDiagnosis
 from gapbridge.core.diagnosis.diagnosis import Diagnosis
-from gapbridge.core.diagnosis.result import Cause
 from gapbridge.core.effects import CATALOGUE
 
 SCHEMA = "gapbridge.diagnosis/1"

@@ -6,6 +6,7 @@ from datetime import UTC, datetime
 
 import numpy as np
 
+from gapbridge.core.diagnosis.causes import Considered, Outcome
 from gapbridge.core.diagnosis.finding import (
     Check,
     Fact,
@@ -19,7 +20,6 @@ from gapbridge.core.diagnosis.finding import (
     TooFewRows,
     Withdrawal,
 )
-from gapbridge.core.diagnosis.result import Considered, Outcome
 
 SINCE_1970 = 1e9  # s: from here on a timestamp is a date
 SHOWN = 8  # rows of outliers

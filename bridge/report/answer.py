@@ -27,9 +27,9 @@ from gapbridge.bridge.report.labels import (
     with_unit,
 )  # fmt: skip
 from gapbridge.bridge.report.material import Material, after, chosen_channel, unexplained
+from gapbridge.core.diagnosis.causes import Cause
 from gapbridge.core.diagnosis.channel_diagnosis import ChannelDiagnosis
 from gapbridge.core.diagnosis.diagnosis import Diagnosis
-from gapbridge.core.diagnosis.result import Cause
 
 KINDS = {"no_gap": GOOD, "explained": GOOD, "partly_explained": DOUBTFUL, "unexplained": BAD}
 

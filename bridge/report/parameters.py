@@ -15,7 +15,7 @@ from gapbridge.bridge.document.blocks import (
 )
 from gapbridge.bridge.report.labels import effect_title, joint_list, listed, number, unit_of
 from gapbridge.bridge.report.material import Material
-from gapbridge.core.diagnosis.result import Cause
+from gapbridge.core.diagnosis.causes import Cause
 from gapbridge.core.diagnosis.separation import Measurement
 from gapbridge.core.effects import Reported
 

@@ -18,8 +18,8 @@ from gapbridge.bridge.document.drawing import EDGE
 from gapbridge.bridge.document.findings import considered_text
 from gapbridge.bridge.report.labels import effect_title, joint_list, likelihood, listed, percent
 from gapbridge.bridge.report.material import Material, channel_heading
+from gapbridge.core.diagnosis.causes import Cause, Considered, Outcome
 from gapbridge.core.diagnosis.channel_diagnosis import ChannelDiagnosis
-from gapbridge.core.diagnosis.result import Cause, Considered, Outcome
 
 HEADS = ("effect", "verdict", "shrinks alone", "probability", "why")
 NOTE = (

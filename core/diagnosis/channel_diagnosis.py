@@ -7,11 +7,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from gapbridge.core.diagnosis.carrying import Carried
+from gapbridge.core.diagnosis.across_sessions import Carried
+from gapbridge.core.diagnosis.causes import Cause, Considered
 from gapbridge.core.diagnosis.generalisation import NOWHERE, Generalisation
 from gapbridge.core.diagnosis.judgement import Judgement
 from gapbridge.core.diagnosis.location import Where
-from gapbridge.core.diagnosis.result import Cause, Considered
 from gapbridge.core.diagnosis.selection.selection import Selection
 from gapbridge.core.effects import Term
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from gapbridge.core.diagnosis.criteria import VARIES
 from gapbridge.core.diagnosis.residual_structure import basis_of
 from gapbridge.core.diagnosis.selection.candidate import Candidate, joint_quantity
-from gapbridge.core.diagnosis.selection.following import exact_columns
+from gapbridge.core.diagnosis.selection.delay_columns import exact_columns
 from gapbridge.core.diagnosis.selection.selection import Selection
 from gapbridge.core.diagnosis.selection.smooth import spline_basis
 from gapbridge.core.effects import Term

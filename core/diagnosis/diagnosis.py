@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from gapbridge.core.diagnosis.carrying import carried
+from gapbridge.core.diagnosis.across_sessions import carried
+from gapbridge.core.diagnosis.causes import Considered, causes_of, considered_of
 from gapbridge.core.diagnosis.channel_diagnosis import ChannelDiagnosis
 from gapbridge.core.diagnosis.channels import position, torque, tracking, wrench
 from gapbridge.core.diagnosis.channels.simulation import joined, predicted_by
@@ -44,6 +45,7 @@ from gapbridge.core.diagnosis.judgement import (
     with_stand_ins,
 )
 from gapbridge.core.diagnosis.location import Where, locate
+from gapbridge.core.diagnosis.log_checks.missing_flexibility import softness_findings
 from gapbridge.core.diagnosis.log_checks.units_and_clocks import check_units, findings
 from gapbridge.core.diagnosis.noise_floor import (
     Floor,
@@ -52,8 +54,6 @@ from gapbridge.core.diagnosis.noise_floor import (
 )
 from gapbridge.core.diagnosis.observation import NotObservable, Observation, thinned
 from gapbridge.core.diagnosis.residual_structure import dependence
-from gapbridge.core.diagnosis.result import Considered, causes_of, considered_of
-from gapbridge.core.diagnosis.rigid_suspicion import softness_findings
 from gapbridge.core.diagnosis.selection.moments import slips
 from gapbridge.core.diagnosis.selection.selection import Selection, refitted_alone, select
 from gapbridge.core.diagnosis.separation import Measurement, next_measurements

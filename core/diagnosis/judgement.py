@@ -45,7 +45,7 @@ from gapbridge.core.diagnosis.residual_structure import (
     structure_p_value,
 )
 from gapbridge.core.diagnosis.selection.candidate import Candidate
-from gapbridge.core.diagnosis.selection.following import delayed_by
+from gapbridge.core.diagnosis.selection.delay_columns import delayed_by
 from gapbridge.core.diagnosis.selection.local_search import forward_selected, rivals
 from gapbridge.core.diagnosis.selection.problem import CandidateFit, SampleSpace, fit
 from gapbridge.core.diagnosis.selection.refit import Remainder, worth

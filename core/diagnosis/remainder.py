@@ -29,7 +29,7 @@ from gapbridge.core.diagnosis.observation import Observation
 from gapbridge.core.diagnosis.regions import parts, regions
 from gapbridge.core.diagnosis.residual_structure import basis_of
 from gapbridge.core.diagnosis.selection.candidate import Candidate, carrying, joint_target
-from gapbridge.core.diagnosis.selection.following import as_one_delay
+from gapbridge.core.diagnosis.selection.delay_columns import as_one_delay
 from gapbridge.core.diagnosis.selection.problem import gains
 from gapbridge.core.diagnosis.selection.refit import Remainder
 from gapbridge.core.diagnosis.selection.selection import Selection

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from gapbridge.bridge.document.findings import finding_text
+from gapbridge.core.diagnosis.causes import Cause
 from gapbridge.core.diagnosis.channel_diagnosis import ChannelDiagnosis
 from gapbridge.core.diagnosis.diagnosis import Diagnosis
-from gapbridge.core.diagnosis.result import Cause
 from gapbridge.core.diagnosis.separation import Measurement
 from gapbridge.core.effects import Reported
 from gapbridge.core.log.columns import label

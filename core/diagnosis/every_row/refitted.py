@@ -18,7 +18,7 @@ from gapbridge.core.diagnosis.judgement import VAGUE, Judgement, gainless, ties_
 from gapbridge.core.diagnosis.observation import Observation
 from gapbridge.core.diagnosis.regions import regions
 from gapbridge.core.diagnosis.selection.candidate import Candidate
-from gapbridge.core.diagnosis.selection.following import exact_columns
+from gapbridge.core.diagnosis.selection.delay_columns import exact_columns
 from gapbridge.core.diagnosis.selection.geometry import links_of
 from gapbridge.core.diagnosis.selection.local_search import rivals
 from gapbridge.core.diagnosis.selection.noise import carried_to

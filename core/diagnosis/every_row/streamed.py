@@ -21,7 +21,7 @@ from gapbridge.core.diagnosis.noise_floor import BLOCK, own_coordinates
 from gapbridge.core.diagnosis.observation import NotObservable, Observation
 from gapbridge.core.diagnosis.regions import REGIONS
 from gapbridge.core.diagnosis.selection.candidate import Candidate, named_columns
-from gapbridge.core.diagnosis.selection.following import chord_columns, chord_value
+from gapbridge.core.diagnosis.selection.delay_columns import chord_columns, chord_value
 from gapbridge.core.diagnosis.selection.noise import Noise
 from gapbridge.core.diagnosis.selection.problem import SampleSpace, fit, penalties
 from gapbridge.core.diagnosis.selection.refit import Reduced, exact_jacobian, freed_of, step_on

@@ -1,6 +1,6 @@
 """Log checks: mistakes of units, names and clocks, reported by name before anything is fitted.
 
-Frames and signs need the model's prediction: ``frame_suspicion``, ``sign_suspicion``.
+Those that need a prediction (frames, signs, other kinematics) stand in the files beside this one.
 """
 
 from __future__ import annotations

@@ -13,7 +13,7 @@ from gapbridge.core.arm import Arm
 from gapbridge.core.diagnosis.criteria import OWN_SIGMAS, PRIOR_REACH
 from gapbridge.core.diagnosis.observation import Observation
 from gapbridge.core.diagnosis.selection.candidate import Candidate
-from gapbridge.core.diagnosis.selection.following import as_one_delay
+from gapbridge.core.diagnosis.selection.delay_columns import as_one_delay
 from gapbridge.core.diagnosis.selection.problem import CandidateFit, SampleSpace
 from gapbridge.core.diagnosis.selection.state import SelectionState, flat
 from gapbridge.core.effects import Term

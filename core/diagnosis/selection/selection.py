@@ -22,7 +22,7 @@ from gapbridge.core.diagnosis.selection.candidate import (
     named_candidates,
     with_what_it_needs,
 )
-from gapbridge.core.diagnosis.selection.following import exact_columns, one_delay
+from gapbridge.core.diagnosis.selection.delay_columns import exact_columns, one_delay
 from gapbridge.core.diagnosis.selection.geometry import (
     Links,
     link_candidates,

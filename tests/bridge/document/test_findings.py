@@ -10,6 +10,7 @@ from gapbridge.bridge.document.findings import (
     finding_text,
     withdrawal_text,
 )
+from gapbridge.core.diagnosis.causes import Considered, Outcome
 from gapbridge.core.diagnosis.finding import (
     ChannelFinding,
     Check,
@@ -22,7 +23,6 @@ from gapbridge.core.diagnosis.finding import (
     TooFewRows,
     Withdrawal,
 )
-from gapbridge.core.diagnosis.result import Considered, Outcome
 from gapbridge.core.effects import Site, Term
 
 PLAY = Term("backlash", Site(2), (9e-4,))

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from benchmarks.blind.session import Plan
 from gapbridge.bridge.document.findings import considered_text
 from gapbridge.core.diagnosis import judgement as judging
+from gapbridge.core.diagnosis.causes import Outcome, causes_of, considered_of, probability
 from gapbridge.core.diagnosis.diagnosis import diagnose
 from gapbridge.core.diagnosis.finding import (
     Check,
@@ -24,7 +25,6 @@ from gapbridge.core.diagnosis.finding import (
 )
 from gapbridge.core.diagnosis.held_out import HeldOut
 from gapbridge.core.diagnosis.judgement import Judgement, judge, pure_error, still_sure
-from gapbridge.core.diagnosis.result import Outcome, causes_of, considered_of, probability
 from gapbridge.core.effects import CATALOGUE, Site, Term
 from gapbridge.core.metrology import Metrology
 

@@ -14,7 +14,7 @@ import small_arm as small
 
 from benchmarks.blind.mechanics import turn
 from gapbridge.bridge.document.diagnosis_json import document
-from gapbridge.core.diagnosis.carrying import carried
+from gapbridge.core.diagnosis.across_sessions import carried
 from gapbridge.core.diagnosis.diagnosis import diagnose
 from gapbridge.core.errors import LogError
 from gapbridge.core.estimation.identification import identify_compliance

@@ -11,7 +11,7 @@ from benchmarks.fleet.simulating import TYPE, Habits, TrueArm, columns, write_ty
 from gapbridge.bridge.cell import load_cell
 from gapbridge.bridge.document.findings import finding_text
 from gapbridge.core.diagnosis.diagnosis import diagnose
-from gapbridge.core.diagnosis.rigid_suspicion import softness_findings
+from gapbridge.core.diagnosis.log_checks.missing_flexibility import softness_findings
 from gapbridge.core.estimation.identification import identify_compliance
 from gapbridge.core.log.log import Log
 from gapbridge.core.metrology import Metrology
