@@ -7,8 +7,8 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from gapbridge.core.log.columns import label
 from gapbridge.core.log.log import Log
+from gapbridge.core.log.log_finding import LogCheck, LogFinding
 from gapbridge.core.sessions import sessions_in
 
 Array = NDArray[np.float64]
@@ -63,16 +63,14 @@ class Outside:
             self._count[name] = self._count.get(name, 0) + len(rows)
             self._worst[name] = max(self._worst.get(name, found), found, key=lambda one: one[0])
 
-    def sentences(self) -> list[str]:
-        """Return one sentence for each quantity that lies outside."""
-        reported = []
+    def findings(self) -> list[LogFinding]:
+        """Return one finding for each quantity that lies outside."""
+        found = []
         for name, count in self._count.items():
             (low, high), (_, line, value) = self._fitted[name], self._worst[name]
-            reported.append(
-                f"{label(name)}: {count} of {self._rows} rows lie outside what was fitted, "
-                f"{low:.4g} to {high:.4g} {UNITS[stem_of(name)]} (row {line}: {value:.4g})"
-            )
-        return reported
+            values = (name,), count, self._rows, low, high, UNITS[stem_of(name)], line, value
+            found.append(LogFinding(LogCheck.BEYOND_FITTED, values))
+        return found
 
 
 def outside_rows(log: Log, fitted: Range) -> NDArray[np.bool_]:
@@ -91,18 +89,15 @@ def beyond(name: str, values: Array, fitted: Range) -> NDArray[np.bool_]:
     return np.asarray((values < low - margin) | (values > high + margin))
 
 
-def outside_findings(log: Log) -> list[str]:
+def outside_findings(log: Log) -> list[LogFinding]:
     """Return where many of a session's rows lie outside what the other sessions hold."""
     parts = sessions_in(log)
     ranges, found = [range_of(part) for part in parts], []
     for s, (name, part) in enumerate(zip(log.session_names, parts, strict=True)):
         others = merged(one for i, one in enumerate(ranges) if i != s)
-        columns = [label(c) for c, share in _beyond(part, others).items() if share >= MANY]
+        columns = tuple(c for c, share in _beyond(part, others).items() if share >= MANY)
         if columns:
-            found.append(
-                f"session {name} goes beyond the other sessions in {', '.join(columns)}: its "
-                "figure as a new session holds for rows unlike those fitted"
-            )
+            found.append(LogFinding(LogCheck.BEYOND_SESSIONS, (name, columns)))
     return found
 
 

@@ -17,6 +17,7 @@ from gapbridge.core.derivatives import differentiate
 from gapbridge.core.errors import LogError
 from gapbridge.core.loads import Loads
 from gapbridge.core.log.log import Log
+from gapbridge.core.log.log_finding import LogCheck, LogFinding
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -137,7 +138,13 @@ def _motion_of(log: Log) -> Motion:
     if time is not None:
         check_order(log, time)
         if moving:
-            rows, t, _ = _clock(log, time)
+            rows, t, finding = _clock(log, time)
+            if finding is not None and finding.check is LogCheck.AMBIGUOUS_TIME:
+                line, first, repeats, count = finding.values
+                raise LogError(
+                    f"{log.path}: row {line}, column timestamp: found {first:g} again (as in "
+                    f"{repeats} of {count} rows), expected a time of its own per row"
+                )
     still = np.full(q.shape[1], SMALLEST_MOTION)
     given = log.require("actual_qd")[rows] if log.has("actual_qd") else None
     target = log.require("target_q")[rows] if log.has("target_q") else None
@@ -165,11 +172,8 @@ def is_moving(time: Array, q: Array, speed: Array | None = None) -> bool:
     return not (rests and float(np.median(jump)) > 0.01)
 
 
-def time_finding(log: Log) -> str | None:
-    """Return one sentence on repeated timestamps of a moving log, or None.
-
-    Raises LogError where they cannot be worked with, as ``motion_of``.
-    """
+def time_finding(log: Log) -> LogFinding | None:
+    """Return what is odd about the timestamps of a moving log: how they repeat; or None."""
     time, q = log.get("timestamp"), log.get("actual_q")
     if time is None or q is None or not is_moving(time, q, log.get("actual_qd")):
         return None
@@ -187,33 +191,26 @@ def check_order(log: Log, time: Array) -> None:
         )
 
 
-def _clock(log: Log, time: Array) -> tuple[Index, Array, str | None]:
-    """Return the rows of a recording that count, their times, and what was made of repeats."""
+def _clock(log: Log, time: Array) -> tuple[Index, Array, LogFinding | None]:
+    """Return the rows of a recording that count, their times, and how its clock repeats."""
     repeats = np.flatnonzero(np.diff(time) <= 0) + 1
     everything: Index = np.arange(len(time))
     if not len(repeats):
         return everything, time, None
-    first = f"the first is row {log.line(repeats[0])}"
-    same = np.ones(len(repeats), dtype=bool)
+    count, first = len(repeats), log.line(repeats[0])
+    same = np.ones(count, dtype=bool)
     for column in log.columns.values():
         flat = column.reshape(len(column), -1)
         same &= (flat[repeats] == flat[repeats - 1]).all(axis=1)
-    if same.mean() >= COPIES or len(repeats) < FEW_REPEATS * len(time):
+    if same.mean() >= COPIES or count < FEW_REPEATS * len(time):
         kept = np.delete(everything, repeats)
-        reported = f"{len(repeats)} of {len(time)} rows repeat the timestamp before ({first})"
-        return kept, time[kept], f"{reported}; the moving channels leave them out"
+        return kept, time[kept], LogFinding(LogCheck.COPIED_ROWS, (count, len(time), first))
     even: Array = np.asarray(np.polyval(np.polyfit(everything, time, 1), everything), dtype=float)
     grain = float(np.diff(time)[np.diff(time) > 0].min())
     if np.abs(time - even).max() <= grain:
-        reported = (
-            f"timestamps are rounded to {grain:.3g} s and repeat in {len(repeats)} rows ({first})"
-        )
-        return everything, even, f"{reported}; the rows were taken as evenly spaced"
-    raise LogError(
-        f"{log.path}: row {log.line(repeats[0])}, column timestamp: found "
-        f"{time[repeats[0]]:g} again (as in {len(repeats)} of {len(time)} rows), expected a time "
-        "of its own per row"
-    )
+        return everything, even, LogFinding(LogCheck.ROUNDED_TIME, (grain, count, first))
+    values = first, float(time[repeats[0]]), count, len(time)
+    return everything, time, LogFinding(LogCheck.AMBIGUOUS_TIME, values)
 
 
 def _with_derivatives(

@@ -7,9 +7,11 @@ from pathlib import Path
 from gapbridge.bridge.cell.cell import Cell
 from gapbridge.bridge.cell.opened_log import open_log
 from gapbridge.bridge.cell.plausibility import Findings
+from gapbridge.bridge.document.log_findings import log_finding_text
 from gapbridge.core.diagnosis.log_checks.frames import frame_findings
 from gapbridge.core.diagnosis.log_checks.units_and_clocks import findings
 from gapbridge.core.errors import LogError
+from gapbridge.core.log.log_finding import LogFinding
 from gapbridge.core.sessions import sessions_in
 
 MEASURED = "measured_position"
@@ -26,13 +28,13 @@ def log_findings(cell: Cell, path: Path) -> Findings:
             f"{path}: columns {MEASURED}_0..2: not found, expected them: without measured "
             "positions nothing shows which arm it was"
         )
-    errors: dict[str, None] = {}  # in order, each once
-    odd: dict[str, None] = {}
+    errors: dict[LogFinding, None] = {}  # in order, each once
+    odd: dict[LogFinding, None] = {}
     for part in sessions_in(log):
         wrong = frame_findings(cell.model, part, cell.metrology)
         errors |= dict.fromkeys(wrong)
         odd |= dict.fromkeys(findings(part, cell.model, cell.metrology))
     return Findings(
-        [f"{cell.path} with {path}: {text}" for text in errors],
-        [f"{path}: {text}" for text in odd if text not in errors],
+        [f"{cell.path} with {path}: {log_finding_text(finding)}" for finding in errors],
+        [f"{path}: {log_finding_text(finding)}" for finding in odd if finding not in errors],
     )

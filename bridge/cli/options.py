@@ -9,6 +9,7 @@ import click
 
 from gapbridge.bridge.cell import Cell, load_cell
 from gapbridge.bridge.cell.opened_log import open_log
+from gapbridge.bridge.document.log_findings import log_finding_text
 from gapbridge.core.fitted_range import Outside
 from gapbridge.core.log.log import Log
 from gapbridge.core.sessions import join_sessions
@@ -63,5 +64,5 @@ def looked_over(pieces: Iterable[Log], cell: Cell) -> Iterator[Log]:
         found.add(piece)
         path = piece.path
         yield piece
-    for text in found.sentences():
-        click.echo(f"warning: {path}: {text}", err=True)
+    for finding in found.findings():
+        click.echo(f"warning: {path}: {log_finding_text(finding)}", err=True)

@@ -6,6 +6,7 @@ from datetime import UTC, datetime
 
 import numpy as np
 
+from gapbridge.bridge.document.log_findings import log_finding_text
 from gapbridge.core.diagnosis.causes import Considered, Outcome
 from gapbridge.core.diagnosis.finding import (
     Check,
@@ -20,6 +21,7 @@ from gapbridge.core.diagnosis.finding import (
     TooFewRows,
     Withdrawal,
 )
+from gapbridge.core.log.log_finding import LogFinding
 
 SINCE_1970 = 1e9  # s: from here on a timestamp is a date
 SHOWN = 8  # rows of outliers
@@ -41,8 +43,8 @@ WITHDRAWN = {
 
 def finding_text(finding: Finding, *, rows: bool = True) -> str:
     """Return a finding as a sentence; without ``rows`` it names no lines of a file."""
-    if isinstance(finding, str):
-        return finding
+    if isinstance(finding, LogFinding):
+        return log_finding_text(finding)
     return f"{finding.channel}: {_fact(finding.fact, rows)}"
 
 

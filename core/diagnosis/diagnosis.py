@@ -60,8 +60,9 @@ from gapbridge.core.diagnosis.separation import Measurement, next_measurements
 from gapbridge.core.effects import CATALOGUE, Term, correcting, flexibility_effects
 from gapbridge.core.errors import LogError
 from gapbridge.core.fitted_range import outside_findings
-from gapbridge.core.log.columns import COLUMNS, misspelt
+from gapbridge.core.log.columns import COLUMNS, did_you_mean
 from gapbridge.core.log.log import Log
+from gapbridge.core.log.log_finding import LogCheck, LogFinding
 from gapbridge.core.metrology import Metrology
 from gapbridge.core.model import Model
 from gapbridge.core.sessions import session_of, sessions_in, with_sessions
@@ -197,7 +198,7 @@ def _diagnose(
 def _no_channel(log: Log, hidden: Sequence[NotObservable]) -> LogError:
     needs = "; ".join(f"{h.channel}: {', '.join(h.needs)}" for h in hidden)
     lacking = [need for h in hidden for need in h.needs if need in COLUMNS]
-    hint = misspelt(log.unknown, lacking, log.n)
+    hint = did_you_mean(log.unknown, lacking, log.n)
     return LogError(f"{log.path}: found no channel to diagnose, expected one of: {needs}{hint}")
 
 
@@ -232,22 +233,19 @@ class _Searched:
         return RowSums(self.selection, self.verdict.accused, observe, model.arm, by_region)
 
 
-def _log_findings(model: Model, log: Log, metrology: Metrology) -> list[str]:
+def _log_findings(model: Model, log: Log, metrology: Metrology) -> list[LogFinding]:
     """Return what is suspicious about the log; of several sessions each by itself."""
     if len(log.session_names) < 2:
         return findings(log, model, metrology)
-    found: dict[str, list[str]] = {}
+    sessions: dict[LogFinding, list[str]] = {}
     for name, part in zip(log.session_names, sessions_in(log), strict=True):
         own = position.session_model(model, part, metrology)
-        for text in findings(part, own, metrology):
-            found.setdefault(text, []).append(name)
-    notes = [f"session {', '.join(names)}: {text}" for text, names in found.items()]
+        for finding in findings(part, own, metrology):
+            sessions.setdefault(finding, []).append(name)
+    found = [replace(finding, sessions=tuple(names)) for finding, names in sessions.items()]
     if not log.one_clock:
-        notes.append(
-            "the sessions' timestamps overlap: each has a clock of its own, so nothing is said of "
-            "the time between them"
-        )
-    return notes + outside_findings(log)
+        found.append(LogFinding(LogCheck.CLOCKS_OVERLAP))
+    return found + outside_findings(log)
 
 
 def _thinned(

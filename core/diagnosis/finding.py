@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from enum import Enum, auto
 
 from gapbridge.core.effects import Term
+from gapbridge.core.log.log_finding import LogFinding
 
 
 class Check(Enum):
@@ -102,4 +103,4 @@ class ChannelFinding:
     fact: Fact
 
 
-Finding = ChannelFinding | str  # checks of the log report sentences
+Finding = ChannelFinding | LogFinding

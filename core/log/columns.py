@@ -68,8 +68,8 @@ def label(column: str) -> str:
     return column
 
 
-def misspelt(unknown: Sequence[str], names: Sequence[str], n: int) -> str:
-    """Return which of the ``unknown`` columns may mean one of ``names``, as a question, or ''."""
+def misspelt(unknown: Sequence[str], names: Sequence[str], n: int) -> tuple[str, str] | None:
+    """Return which of the ``unknown`` columns may mean which of ``names``, or None."""
     likeness = [
         (difflib.SequenceMatcher(None, found.lower(), meant.lower()).ratio(), found, meant)
         for found in unknown
@@ -77,7 +77,13 @@ def misspelt(unknown: Sequence[str], names: Sequence[str], n: int) -> str:
         for meant in (f"{name}{index}" for name in names for index in indices(name, n))
     ]
     ratio, found, meant = max(likeness, key=lambda one: one[0], default=(0.0, "", ""))
-    return f"; found {found}; did you mean {meant}?" if ratio >= ALIKE else ""
+    return (found, meant) if ratio >= ALIKE else None
+
+
+def did_you_mean(unknown: Sequence[str], names: Sequence[str], n: int) -> str:
+    """Return the end of a message on missing ``names``: what may be misspelt, or ''."""
+    pair = misspelt(unknown, names, n)
+    return f"; found {pair[0]}; did you mean {pair[1]}?" if pair else ""
 
 
 def nearest(names: Sequence[str]) -> str:

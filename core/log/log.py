@@ -23,8 +23,8 @@ from gapbridge.core.loads import Loads
 from gapbridge.core.log.columns import (
     COLUMNS,
     INDEXED,
+    did_you_mean,
     is_known,
-    misspelt,
     nearest,
     wanted_of,
     written,
@@ -78,7 +78,7 @@ class Log:
                 self._check_finite(name)
                 return self.columns[name]
         wanted = " or ".join(written(name, self.n) for name in names)
-        hint = misspelt(self.unknown, names, self.n)
+        hint = did_you_mean(self.unknown, names, self.n)
         raise LogError(
             f"{self.path}: columns: found no {wanted}, expected it for this command{hint}"
         )

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from gapbridge.bridge.document.log_findings import log_finding_text
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.errors import LogError
 from gapbridge.core.fitted_range import Outside, merged, range_of
@@ -39,7 +40,7 @@ def moving(name: str, start: float = 0.0) -> Log:
 def outside_of(log, fitted):
     found = Outside(fitted)
     found.add(log)
-    return found.sentences()
+    return [log_finding_text(finding) for finding in found.findings()]
 
 
 def test_sessions_in_order_keep_their_clock_and_rows() -> None:

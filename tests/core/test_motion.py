@@ -10,6 +10,7 @@ import pytest
 
 from gapbridge.core.derivatives import differentiate, signal_noise
 from gapbridge.core.errors import LogError
+from gapbridge.core.log.log_finding import LogCheck, LogFinding
 from gapbridge.core.motion import motion_of, time_finding
 
 COURSE = truth.course(6, 1)
@@ -109,7 +110,7 @@ def test_cycles_recorded_twice_count_once_and_are_reported():
     motion = motion_of(twice)
     assert len(motion) == len(log)
     assert np.array_equal(motion.rows, np.arange(0, 2 * len(log), 2))
-    assert "repeat the timestamp" in str(time_finding(twice))
+    assert time_finding(twice) == LogFinding(LogCheck.COPIED_ROWS, (len(log), 2 * len(log), 2))
     assert time_finding(log) is None
 
 
@@ -118,7 +119,10 @@ def test_rounded_timestamps_are_replaced_by_an_even_clock():
     rounded = truth.log_of(6, timestamp=np.round(t, 1), actual_q=log.columns["actual_q"])
     motion = motion_of(rounded)
     assert np.abs(motion.t - motion.t.mean() - (t - t.mean())).max() < 0.01
-    assert "rounded to 0.1 s" in str(time_finding(rounded))
+    finding = time_finding(rounded)
+    assert finding is not None
+    assert finding.check is LogCheck.ROUNDED_TIME
+    assert finding.values[0] == pytest.approx(0.1)
 
 
 def test_other_repeats_name_their_row():

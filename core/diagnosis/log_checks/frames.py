@@ -20,6 +20,7 @@ from gapbridge.core.diagnosis.log_checks.kinematics import (
 from gapbridge.core.errors import InputError
 from gapbridge.core.estimation.registration import register_robustly
 from gapbridge.core.log.log import Log
+from gapbridge.core.log.log_finding import LogCheck, LogFinding
 from gapbridge.core.metrology import Metrology
 from gapbridge.core.model import Model
 from gapbridge.core.rotation import rotation_matrix, rotation_vector
@@ -32,7 +33,7 @@ CLEARLY = 0.8  # of the best mistake before, for another to be named instead
 BETTER = 0.1  # share of the distance that may be left for a mistake to be named
 
 
-def frame_findings(model: Model, log: Log, metrology: Metrology) -> list[str]:
+def frame_findings(model: Model, log: Log, metrology: Metrology) -> list[LogFinding]:
     """Return what is suspicious about where the measured poses are, or []."""
     measured = log.get("measured_position")
     q = log.get("actual_q") if log.has("actual_q") else log.get("target_q")
@@ -48,20 +49,17 @@ def frame_findings(model: Model, log: Log, metrology: Metrology) -> list[str]:
         return []
     seen = measured[rows]
     distance = _off(seen, predicted)
-    notes = []
+    found = []
     if distance > FAR:
-        notes.append(_why(model, q, measured, rows, distance, log.get("measured_rotation")))
+        found.append(_why(model, q, measured, rows, distance, log.get("measured_rotation")))
     elif metrology.registered:
         here = float(np.median(np.linalg.norm(seen - predicted, axis=1)))
         if here > FAR and distance < BETTER * here:
-            notes.append(
-                f"the measured positions lie {1e3 * here:.0f} mm from where the arm is, and fit it "
-                "in a frame of their own: they are not in base; set metrology.registered to false"
-            )
+            found.append(LogFinding(LogCheck.NOT_IN_BASE, (here,)))
     turned = log.get("measured_rotation")
-    if turned is not None and not notes:
-        notes += _rotations(model, q[rows], seen, turned[rows], metrology)
-    return notes
+    if turned is not None and not found:
+        found += _rotations(model, q[rows], seen, turned[rows], metrology)
+    return found
 
 
 def _off(measured: Array, predicted: Array) -> float:
@@ -72,45 +70,42 @@ def _off(measured: Array, predicted: Array) -> float:
 
 def _why(
     model: Model, q: Array, measured: Array, rows: Array, distance: float, turned: Array | None
-) -> str:
+) -> LogFinding:
     """Return the finding on positions that do not follow the arm."""
-    best, name = distance, ""
-    for what, trial_model, trial_q, trial in _mistakes(model, q, measured, rows, turned):
+    best, named = distance, None
+    for mistake, trial_model, trial_q, trial in _mistakes(model, q, measured, rows, turned):
         if len(trial) < FEWEST:
             continue
         left = _off(trial, trial_model.rigid_pose(trial_q).position)
         if left < CLEARLY * best:
-            best, name = left, what
-    problem = (
-        f"the measured positions do not follow the arm: {1e3 * distance:.0f} mm off in any frame"
-    )
-    if name and best < BETTER * distance:
-        return f"{problem}; {name}: then {1e3 * best:.1f} mm"
-    return f"{problem}; is it the right arm, tool and order of joints and rows?"
+            best, named = left, mistake
+    if named is not None and best < BETTER * distance:
+        return LogFinding(LogCheck.POSITIONS_OFF_BY, (distance, named, best))
+    return LogFinding(LogCheck.POSITIONS_OFF, (distance,))
 
 
 def _mistakes(
     model: Model, q: Array, measured: Array, rows: Array, turned: Array | None
-) -> Iterator[tuple[str, Model, Array, Array]]:
+) -> Iterator[tuple[LogFinding, Model, Array, Array]]:
     """Yield each mistake with the model, joint angles and positions that would put it right."""
     seen = measured[rows]
     mirrored = seen * [1.0, 1.0, -1.0]
-    yield "they look mirrored (a left-handed frame, or two axes swapped)", model, q[rows], mirrored
+    yield LogFinding(LogCheck.MIRRORED), model, q[rows], mirrored
     for joint in range(q.shape[1]):
         flipped = q[rows].copy()
         flipped[:, joint] *= -1
-        yield f"joint {joint + 1} looks turned round in sign", model, flipped, seen
-    for step, word in ((1, "late"), (-1, "early")):
+        yield LogFinding(LogCheck.JOINT_SIGN, (joint + 1,)), model, flipped, seen
+    for step, check in ((1, LogCheck.ROW_LATE), (-1, LogCheck.ROW_EARLY)):
         inside = rows[(rows + step >= 0) & (rows + step < len(q))]
         inside = inside[np.isfinite(measured[inside + step]).all(axis=1)]
-        yield f"they look one row too {word}", model, q[inside], measured[inside + step]
+        yield LogFinding(check), model, q[inside], measured[inside + step]
     predicted = model.rigid_pose(q[rows]).position
     size = _size(seen) / max(_size(predicted), 1e-9)
     for unit, factor in (("centimetres", 100.0), ("inches", 1 / 0.0254), ("feet", 1 / 0.3048)):
         if abs(np.log(size / factor)) < 0.2:
-            yield f"they look like {unit}, expected m", model, q[rows], seen / factor
-    for what, other in other_models(model):
-        yield what, other, q[rows], seen
+            yield LogFinding(LogCheck.LENGTH_UNIT, (unit,)), model, q[rows], seen / factor
+    for mistake, other in other_models(model):
+        yield mistake, other, q[rows], seen
     point = measured_point(model, q[rows], seen)
     if point is not None:
         yield point[0], point[1], q[rows], seen
@@ -120,7 +115,7 @@ def _mistakes(
     found = None if turned is None else turned[rows]
     if found is None or not np.isfinite(found).all():
         found = rotation_vector(np.swapaxes(model.rigid_pose(q[rows]).rotation, 1, 2))
-    yield ("they look inverted: the base seen from the tool", model, q[rows], inverted(seen, found))
+    yield LogFinding(LogCheck.INVERTED), model, q[rows], inverted(seen, found)
 
 
 def _size(position: Array) -> float:
@@ -129,7 +124,7 @@ def _size(position: Array) -> float:
 
 def _rotations(
     model: Model, q: Array, seen: Array, turned: Array, metrology: Metrology
-) -> list[str]:
+) -> list[LogFinding]:
     good = np.isfinite(turned).all(axis=1)
     if good.sum() < FEWEST:
         return []
@@ -139,16 +134,10 @@ def _rotations(
     base = np.eye(3) if metrology.registered else frame.rotation
     left, constant = _turned_off(poses.rotation, base, rotation_matrix(turned))
     if left > 10 * FAR:
-        problem = "the measured rotations do not follow the arm"
         if _turned_off(poses.rotation, base, _roll_pitch_yaw(turned))[0] < FAR:
-            return [f"{problem}: they look like roll, pitch and yaw, expected rotation vectors"]
-        return [f"{problem}: {left:.1f} rad off; expected rotation vectors of the TCP"]
-    if constant > 10 * FAR:
-        return [
-            f"the measured rotations are turned by {constant:.2f} rad against the cell's tool, the "
-            "same in every pose: the target's axes are not those of tool.tcp"
-        ]
-    return []
+            return [LogFinding(LogCheck.ROLL_PITCH_YAW)]
+        return [LogFinding(LogCheck.ROTATIONS_OFF, (left,))]
+    return [LogFinding(LogCheck.TARGET_AXES, (constant,))] if constant > 10 * FAR else []
 
 
 def _turned_off(predicted: Array, base: Array, measured: Array) -> tuple[float, float]:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from gapbridge.core.arm import Arm
 from gapbridge.core.estimation.registration import register
+from gapbridge.core.log.log_finding import LogCheck, LogFinding
 from gapbridge.core.model import Model
 from gapbridge.core.rotation import rotation_matrix
 
@@ -28,44 +29,34 @@ OUTLYING = 5.0  # times the median distance: a row left out the second time
 FARTHEST = 2.0  # m from the flange: no tool is longer
 
 
-def other_models(model: Model) -> Iterator[tuple[str, Model]]:
+def other_models(model: Model) -> Iterator[tuple[LogFinding, Model]]:
     """Yield what the model may have been taken for, with the model that puts it right."""
     bare = np.eye(4)
     if np.linalg.norm(model.tool_in_flange[:3, 3]) > 0:
         bare[:3, :3] = model.tool_in_flange[:3, :3]
-        yield (
-            "they look like the flange's, not the TCP's (tool.tcp)",
-            replace(model, tool_in_flange=bare),
-        )
+        yield LogFinding(LogCheck.FLANGE_NOT_TCP), replace(model, tool_in_flange=bare)
         turned = model.tool_in_flange.copy()
         turned[:3, 3] *= -1
-        yield "tool.tcp looks turned round in sign", replace(model, tool_in_flange=turned)
+        yield LogFinding(LogCheck.TCP_SIGN), replace(model, tool_in_flange=turned)
     rows = None if model.arm.joint_names else dh_rows(model.arm)
     if rows is None:
         return
-    yield (
-        "robot.dh looks like modified DH rows (Craig), expected standard ones",
-        replace(model, arm=_modified(model.arm, rows)),
-    )
+    yield LogFinding(LogCheck.MODIFIED_DH), replace(model, arm=_modified(model.arm, rows))
     for key, column in (("a", 0), ("alpha", 1), ("d", 2), ("offset", 3)):
         if not np.any(rows[:, column]):
             continue
         changed = rows.copy()
         changed[:, column] *= -1
-        yield (
-            f"{key} of the DH rows looks turned round in sign",
-            replace(model, arm=_standard(model.arm, changed)),
-        )
+        sign = LogFinding(LogCheck.DH_SIGN, (key,))
+        yield sign, replace(model, arm=_standard(model.arm, changed))
     for unit, size in (("inches", 0.0254), ("centimetres", 0.01)):
         changed = rows * [size, 1.0, size, 1.0]
-        yield (
-            f"lengths of the DH rows look like {unit}, expected m",
-            replace(model, arm=_standard(model.arm, changed)),
-        )
+        lengths = LogFinding(LogCheck.DH_UNIT, (unit,))
+        yield lengths, replace(model, arm=_standard(model.arm, changed))
 
 
-def measured_point(model: Model, q: Array, seen: Array) -> tuple[str, Model] | None:
-    """Return where on the flange the measured positions (N, 3) lie, in words, and that model.
+def measured_point(model: Model, q: Array, seen: Array) -> tuple[LogFinding, Model] | None:
+    """Return where on the flange the measured positions (N, 3) lie, and that model.
 
     The point and the instrument's frame are found together (Gauss-Newton, twice: the second time
     without outliers). None where there are too few rows to tell.
@@ -85,10 +76,10 @@ def measured_point(model: Model, q: Array, seen: Array) -> tuple[str, Model] | N
     tool = model.tool_in_flange.copy()
     declared = tool[:3, 3].copy()
     tool[:3, 3] = point
-    where = f"the measured point lies at {_millimetres(point)} mm in the flange's frame"
-    missing = "the cell declares no tool (tool.tcp)"
-    said = f"tool.tcp says {_millimetres(declared)}" if np.any(declared) else missing
-    return f"{where}, {said}", replace(model, tool_in_flange=tool)
+    points = tuple(map(float, point)), tuple(map(float, declared))
+    other = LogFinding(LogCheck.OTHER_TCP, points)
+    found = other if np.any(declared) else LogFinding(LogCheck.NO_TCP, points[:1])
+    return found, replace(model, tool_in_flange=tool)
 
 
 def _point_on_flange(position: Array, rotation: Array, seen: Array) -> tuple[Array, Array]:
@@ -109,12 +100,8 @@ def _point_on_flange(position: Array, rotation: Array, seen: Array) -> tuple[Arr
     return point, np.asarray(left)
 
 
-def _millimetres(point: Array) -> str:
-    return "(" + ", ".join(f"{1e3 * x:.0f}" for x in point) + ")"
-
-
-def best_order(model: Model, q: Array, seen: Array) -> tuple[str, Array] | None:
-    """Return the order of joints that fits positions (N, 3) best, in words, and q in it.
+def best_order(model: Model, q: Array, seen: Array) -> tuple[LogFinding, Array] | None:
+    """Return the order of joints that fits positions (N, 3) best, and q in it.
 
     All orders of up to six joints; of more, exchanges of two and cyclic shifts. None where the
     order as it stands is the best.
@@ -132,7 +119,7 @@ def best_order(model: Model, q: Array, seen: Array) -> tuple[str, Array] | None:
             best, chosen = left, order
     if chosen == tuple(range(n)):
         return None
-    return _order_text(chosen), q[:, chosen]
+    return _order(chosen), q[:, chosen]
 
 
 def _orders(n: int) -> Iterator[tuple[int, ...]]:
@@ -154,20 +141,18 @@ def _exchanged(order: tuple[int, ...], i: int, j: int) -> tuple[int, ...]:
     return tuple(swapped)
 
 
-def _order_text(order: tuple[int, ...]) -> str:
+def _order(order: tuple[int, ...]) -> LogFinding:
     """Return what is wrong with the order: ``order[i]`` is the column that is joint i + 1."""
     n = len(order)
     moved = [i for i in range(n) if order[i] != i]
     if order == tuple(range(n))[::-1]:
-        return "the joints look turned round in order"
+        return LogFinding(LogCheck.JOINTS_REVERSED)
     if len(moved) == 2:
         i, j = moved
-        hint = (
-            " (a UR's elbow and shoulder pan, as sorted by name)" if (i, j, n) == (0, 2, 6) else ""
-        )
-        return f"joints {i + 1} and {j + 1} look swapped{hint}"
-    columns = ", ".join(f"joint {i + 1} is column _{order[i]}" for i in moved)
-    return f"the joints look out of order: {columns}"
+        by_name = (i, j, n) == (0, 2, 6)
+        check = LogCheck.UR_JOINTS_SWAPPED if by_name else LogCheck.JOINTS_SWAPPED
+        return LogFinding(check, (i + 1, j + 1))
+    return LogFinding(LogCheck.JOINT_ORDER, (tuple((i + 1, order[i]) for i in moved),))
 
 
 def inverted(seen: Array, turned: Array) -> Array:

@@ -10,14 +10,15 @@ from gapbridge.core.errors import GapbridgeError
 from gapbridge.core.estimation.compliance_fit import flexibilities
 from gapbridge.core.estimation.identification import identify_compliance
 from gapbridge.core.log.log import Log
+from gapbridge.core.log.log_finding import LogCheck, LogFinding
 from gapbridge.core.metrology import Metrology
 from gapbridge.core.model import Model
 
 SHARE = 0.5  # of the gap on unseen poses: where more remains, softness is not the main thing
 
 
-def softness_findings(model: Model, log: Log, metrology: Metrology) -> list[str]:
-    """Return a word on joint flexibilities where the cell names none and a fit of them pays.
+def softness_findings(model: Model, log: Log, metrology: Metrology) -> list[LogFinding]:
+    """Return a finding on joint flexibilities where the cell names none and a fit of them pays.
 
     It pays where it halves the gap on poses that it did not see, at least. Frame and tool point
     are fitted along as ``gapbridge fit`` does.
@@ -31,9 +32,5 @@ def softness_findings(model: Model, log: Log, metrology: Metrology) -> list[str]
     before, after = found.gap_rms_held_out, found.remaining_rms_held_out
     if not after < SHARE * before:
         return []
-    return [
-        "position: the cell names no joint flexibility, and so many causes are hard to prove one "
-        f"by one; asked for alone (`gapbridge fit`), {found.identifiable.sum()} "
-        f"flexibilities take the gap from {1e3 * before:.3g} to {1e3 * after:.3g} mm on poses that "
-        "their fit did not see: fit first, then diagnose what is left"
-    ]
+    values = int(found.identifiable.sum()), before, after
+    return [LogFinding(LogCheck.MISSING_FLEXIBILITY, values)]

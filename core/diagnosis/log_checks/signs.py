@@ -18,6 +18,7 @@ from gapbridge.core.errors import InputError
 from gapbridge.core.estimation.registration import frame_columns, register_robustly
 from gapbridge.core.loads import Loads
 from gapbridge.core.log.log import Log
+from gapbridge.core.log.log_finding import LogCheck, LogFinding
 from gapbridge.core.model import Model
 from gapbridge.core.motion import Motion
 
@@ -28,26 +29,29 @@ FEWEST = 6  # pulled rows from which a sign is judged
 LEAST = 1.0  # N, Nm: less is no pull
 HALF = 0.5  # what must be left, at most, of what the column as it stands leaves
 ROUNDS = 4
-SHOWN_BY = ("ft_raw_wrench", "actual_current_as_torque")
+SHOWN_BY = {
+    "ft_raw_wrench": LogCheck.WRENCH_SIGN,
+    "actual_current_as_torque": LogCheck.TORQUE_SIGN,
+}
 
 
-def sign_findings(model: Model, log: Log) -> list[str]:
+def sign_findings(model: Model, log: Log) -> list[LogFinding]:
     """Return which forces look turned round or in other axes, or []."""
     q = log.get("actual_q") if log.has("actual_q") else log.get("target_q")
     if q is None:
         return []
-    notes = []
-    for name in SHOWN_BY:
-        if name == "ft_raw_wrench" or model.arm.mass.any():
-            notes += _readings(model, log, q, name)
+    found = []
+    for name, check in SHOWN_BY.items():
+        judged = name == "ft_raw_wrench" or model.arm.mass.any()
+        if judged and _reads_turned_round(model, log, q, name):
+            found.append(LogFinding(check))
     pull = log.get("actual_TCP_force")
-    if pull is None or notes:
-        return notes
+    if pull is None or found:
+        return found
     for judge in (_compliance_rivals, *(_sensed(name) for name in SHOWN_BY)):
-        word = judge(model, log, q, pull)
-        if word:
-            return [f"actual_TCP_force {word}; expected what the surroundings do to the tool, "
-                    "in base axes"]  # fmt: skip
+        pulled = judge(model, log, q, pull)
+        if pulled is not None:
+            return [LogFinding(pulled)]
     return []
 
 
@@ -68,40 +72,40 @@ def _loads(log: Log, rows: Index, pull: Array | None) -> Loads:
     return Loads(payload_mass=some("payload"), payload_cog=some("payload_cog"), wrench=pull)
 
 
-def _variants(model: Model, q: Array, pull: Array) -> dict[str, Array]:
-    """Return what the pull may mean: a name for each, '' for what the column says."""
+def _variants(model: Model, q: Array, pull: Array) -> dict[LogCheck | None, Array]:
+    """Return what the pull may mean; None: what a log's column says."""
     hand = model.rigid_pose(q).rotation
     turned = np.hstack([(hand @ part[..., None])[..., 0] for part in (pull[:, :3], pull[:, 3:])])
     return {
-        "": pull,
-        "looks turned round in sign": -pull,
-        "looks given in tool axes": turned,
-        "looks turned round in sign and given in tool axes": -turned,
+        None: pull,
+        LogCheck.PULL_SIGN: -pull,
+        LogCheck.PULL_IN_TOOL: turned,
+        LogCheck.PULL_SIGN_IN_TOOL: -turned,
     }
 
 
-def _best(left: dict[str, float]) -> str:
-    """Return the variant that leaves far less than the column as it stands, or ''."""
-    name = min(left, key=lambda key: left[key])
-    return name if left[name] < HALF * left[""] else ""
+def _best(left: dict[LogCheck | None, float]) -> LogCheck | None:
+    """Return the variant that leaves far less than the column as it stands, or None."""
+    least = min(left, key=lambda key: left[key])
+    return least if left[least] < HALF * left[None] else None
 
 
-def _compliance_rivals(model: Model, log: Log, q: Array, pull: Array) -> str:
+def _compliance_rivals(model: Model, log: Log, q: Array, pull: Array) -> LogCheck | None:
     """Return what the pull looks like by how the measured positions give way to it."""
     measured = log.get("measured_position")
     if measured is None:
-        return ""
+        return None
     rows = _rows(q, measured, pull)
     pulled = np.abs(pull[rows]).max(axis=1, initial=0.0) > LEAST
     if pulled.sum() < FEWEST or 3 * len(rows) < 2 * (3 * model.arm.n + 6):
-        return ""
+        return None
     left = {}
     try:
-        for name, variant in _variants(model, q[rows], pull[rows]).items():
+        for check, variant in _variants(model, q[rows], pull[rows]).items():
             off = _compliance_residual(model, q[rows], measured[rows], _loads(log, rows, variant))
-            left[name] = float(np.median(np.linalg.norm(off[pulled], axis=1)))
+            left[check] = float(np.median(np.linalg.norm(off[pulled], axis=1)))
     except InputError:
-        return ""
+        return None
     return _best(left)
 
 
@@ -148,41 +152,35 @@ def _spread(values: Array) -> float:
     return float(np.median(np.linalg.norm(values - np.median(values, axis=0), axis=1)))
 
 
-def _sensed(name: str) -> Callable[[Model, Log, Array, Array], str]:
+def _sensed(name: str) -> Callable[[Model, Log, Array, Array], LogCheck | None]:
     """Return the judge of a pull by what a sensor reads of it."""
 
-    def judge(model: Model, log: Log, q: Array, pull: Array) -> str:
+    def judge(model: Model, log: Log, q: Array, pull: Array) -> LogCheck | None:
         column = log.get(name)
         if column is None or (name != "ft_raw_wrench" and not model.arm.mass.any()):
-            return ""
+            return None
         rows = _rows(q, column, pull)
         pulled = rows[np.abs(pull[rows]).max(axis=1, initial=0.0) > LEAST]
         if len(pulled) < FEWEST:
-            return ""
+            return None
         left = {}
-        for word, variant in _variants(model, q[pulled], pull[pulled]).items():
-            left[word] = _spread(column[pulled] - _predicted(model, log, q, name, variant, pulled))
+        for check, variant in _variants(model, q[pulled], pull[pulled]).items():
+            predicted = _predicted(model, log, q, name, variant, pulled)
+            left[check] = _spread(column[pulled] - predicted)
         return _best(left)
 
     return judge
 
 
-def _readings(model: Model, log: Log, q: Array, name: str) -> list[str]:
+def _reads_turned_round(model: Model, log: Log, q: Array, name: str) -> bool:
     """Return whether a sensor itself looks turned round in sign."""
     column = log.get(name)
     pull = log.get("actual_TCP_force")
     if column is None:
-        return []
+        return False
     rows = _rows(q, column, pull)
     if len(rows) < FEWEST:
-        return []
+        return False
     expected = _predicted(model, log, q, name, None if pull is None else pull[rows], rows)
     asked, other = (_spread(sign * column[rows] - expected) for sign in (1.0, -1.0))
-    if _spread(expected) < LEAST or other > HALF * asked:
-        return []
-    what = {
-        "ft_raw_wrench": "what the load does to the sensor (a mass at rest reads its weight, "
-        "pointing down)",
-        "actual_current_as_torque": "what the motors deliver",
-    }[name]
-    return [f"{name} looks turned round in sign; expected {what}"]
+    return _spread(expected) >= LEAST and other <= HALF * asked

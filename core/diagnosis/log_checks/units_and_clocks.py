@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from gapbridge.core.errors import LogError
 from gapbridge.core.log.columns import COLUMNS, misspelt
 from gapbridge.core.log.log import Log
+from gapbridge.core.log.log_finding import LogCheck, LogFinding
 from gapbridge.core.metrology import Metrology
 from gapbridge.core.model import Model
 from gapbridge.core.motion import time_finding
@@ -26,6 +27,10 @@ WARM = 95.0  # °C: arms stop before; Fahrenheit do not
 FULL_TURN = 2 * np.pi + 0.3  # rad: rotation vectors end there
 FEW_POSES = 15
 AT_ONCE = 1000  # rows
+READINGS = (
+    "measured_position", "measured_rotation", "ft_raw_wrench", "actual_current_as_torque",
+)  # fmt: skip
+Array = NDArray[np.float64]
 
 
 def check_units(model: Model, log: Log) -> None:
@@ -115,100 +120,82 @@ def _share(flags: NDArray[np.bool_]) -> float:
     return float(np.mean(flags)) if len(flags) else 0.0
 
 
-def findings(log: Log, model: Model | None = None, metrology: Metrology | None = None) -> list[str]:
+def findings(
+    log: Log, model: Model | None = None, metrology: Metrology | None = None
+) -> list[LogFinding]:
     """Return what is odd about a log but does not forbid work.
 
     With ``model`` also mistakes of frames and signs, by what the arm can do at all.
     """
-    notes = [*_names(log), *_times(log), *_gaps(log)]
+    found = [*_names(log), *_times(log), *_gaps(log)]
     measured = log.get("measured_position")
-    still = False
+    at_rest = False
     if measured is not None and len(measured) > 3 and np.isfinite(measured).any():
-        still = float(np.nanmax(np.nanmax(measured, axis=0) - np.nanmin(measured, axis=0))) < 1e-3
-        if still:
-            notes.append("the measured positions hardly move: is it the right column?")
+        at_rest = float(np.nanmax(np.nanmax(measured, axis=0) - np.nanmin(measured, axis=0))) < 1e-3
+        if at_rest:
+            found.append(LogFinding(LogCheck.POSITIONS_AT_REST))
     warm = log.get("joint_temperatures")
     if warm is not None and np.isfinite(warm).any() and float(np.nanmedian(warm)) > WARM:
-        notes.append("the joint temperatures look like Fahrenheit, expected °C")
+        found.append(LogFinding(LogCheck.FAHRENHEIT))
     if model is None:
-        return notes
+        return found
     # prediction checks units alone, and need not wait for these
     from gapbridge.core.diagnosis.log_checks.frames import frame_findings
     from gapbridge.core.diagnosis.log_checks.signs import sign_findings
 
-    notes += [*_limits(model, log), *_poses(log)]
-    if not still:
-        notes += frame_findings(model, log, metrology or Metrology())
-    return notes + sign_findings(model, log)
+    found += [*_limits(model, log), *_poses(log)]
+    if not at_rest:
+        found += frame_findings(model, log, metrology or Metrology())
+    return found + sign_findings(model, log)
 
 
-def _names(log: Log) -> list[str]:
+def _names(log: Log) -> list[LogFinding]:
     """Return columns that nobody reads but whose name nearly is one of a log's."""
-    notes = []
-    lacking = [name for name in COLUMNS if not log.has(name)]
-    for unknown in log.unknown:
-        hint = misspelt([unknown], lacking, log.n)
-        if hint:
-            notes.append(f"a column was left out{hint}")
-    return notes[:3]
+    absent = [name for name in COLUMNS if not log.has(name)]
+    pairs = [misspelt([unknown], absent, log.n) for unknown in log.unknown]
+    return [LogFinding(LogCheck.MISSPELT, pair) for pair in pairs if pair][:3]
 
 
-def _times(log: Log) -> list[str]:
+def _times(log: Log) -> list[LogFinding]:
     t = log.get("timestamp")
     if t is None or len(t) < 2:
         return []
-    try:
-        moving = time_finding(log)
-    except LogError as error:
-        moving = str(error).removeprefix(f"{log.path}: ")
+    moving = time_finding(log)
     if moving is not None:
         return [moving]
-    notes = []
     repeated, back = int(np.sum(np.diff(t) == 0)), int(np.sum(np.diff(t) < 0))
-    if repeated:
-        notes.append(f"{repeated} timestamp(s) are repeated")
-    if back:
-        notes.append(f"{back} timestamp(s) run backwards: rows should be in time order")
-    return notes
+    counts = ((LogCheck.REPEATED_TIME, repeated), (LogCheck.BACKWARD_TIME, back))
+    return [LogFinding(check, (count,)) for check, count in counts if count]
 
 
-def _gaps(log: Log) -> list[str]:
-    notes = []
-    for name, what in (
-        ("measured_position", "measured position"),
-        ("measured_rotation", "measured rotation"),
-        ("ft_raw_wrench", "wrench"),
-        ("actual_current_as_torque", "joint torques"),
-    ):
+def _gaps(log: Log) -> list[LogFinding]:
+    found = []
+    for name in READINGS:
         column = log.get(name)
         gone = 0 if column is None else int(np.sum(~np.isfinite(column).all(axis=1)))
         if gone:
-            notes.append(f"{gone} row(s) have no {what} and were left out")
-    return notes
+            found.append(LogFinding(LogCheck.NO_READING, (gone, name)))
+    return found
 
 
-def _limits(model: Model, log: Log) -> list[str]:
-    q = (
-        log.get(
-            "actual_q",
-        )
-        if log.has("actual_q")
-        else log.get("target_q")
-    )
+def _angles(log: Log) -> Array | None:
+    return log.get("actual_q") if log.has("actual_q") else log.get("target_q")
+
+
+def _limits(model: Model, log: Log) -> list[LogFinding]:
+    q = _angles(log)
     if q is None or not np.isfinite(q).any():
         return []
     limits = model.arm.limits
     out = (np.nanmin(q, axis=0) < limits.lower - 0.05) | (
         np.nanmax(q, axis=0) > limits.upper + 0.05
     )
-    if not out.any():
-        return []
-    joints = ", ".join(str(j + 1) for j in np.flatnonzero(out))
-    return [f"joint(s) {joints} stand beyond the limits of the cell's arm: is it the right arm?"]
+    joints = tuple(int(j) + 1 for j in np.flatnonzero(out))
+    return [LogFinding(LogCheck.BEYOND_LIMITS, (joints,))] if joints else []
 
 
-def _poses(log: Log) -> list[str]:
-    q = log.get("actual_q") if log.has("actual_q") else log.get("target_q")
+def _poses(log: Log) -> list[LogFinding]:
+    q = _angles(log)
     if q is None or not np.isfinite(q).all():
         return []
     few, rows = q[:0], 0
@@ -218,9 +205,4 @@ def _poses(log: Log) -> list[str]:
         more = q[rows : rows + AT_ONCE]
         few, rows = np.unique(np.vstack([few, np.round(more, 4)]), axis=0), rows + AT_ONCE
     count = len(few)
-    if count >= FEW_POSES:
-        return []
-    return [
-        f"{count} different pose(s) are few: what is found may be one of several explanations; "
-        "30 or more that use the joints' whole range separate causes"
-    ]
+    return [LogFinding(LogCheck.FEW_POSES, (count,))] if count < FEW_POSES else []

@@ -17,6 +17,7 @@ from gapbridge.core.diagnosis import judgement as judging
 from gapbridge.core.diagnosis.causes import Outcome, causes_of, considered_of, probability
 from gapbridge.core.diagnosis.diagnosis import diagnose
 from gapbridge.core.diagnosis.finding import (
+    ChannelFinding,
     Check,
     NotAccused,
     ParameterNote,
@@ -66,7 +67,7 @@ def test_an_accusation_beside_a_leftover_is_withdrawn_and_reported_so():
     assert channel.judgement.accused == ()
     for position, reason in channel.judgement.withdrawn:
         effect = channel.selection.terms[position].effect
-        facts = [finding.fact for finding in found.findings if not isinstance(finding, str)]
+        facts = [finding.fact for finding in found.findings if isinstance(finding, ChannelFinding)]
         assert any(
             isinstance(f, NotAccused) and (f.term.effect, f.reason) == (effect, reason)
             for f in facts

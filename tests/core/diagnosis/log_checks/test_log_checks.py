@@ -10,7 +10,9 @@ import pytest
 import small_arm as small
 from scipy.spatial.transform import Rotation
 
-from gapbridge.core.diagnosis.log_checks.units_and_clocks import check_units, findings
+from gapbridge.bridge.document.log_findings import log_finding_text
+from gapbridge.core.diagnosis.log_checks.units_and_clocks import check_units
+from gapbridge.core.diagnosis.log_checks.units_and_clocks import findings as log_findings
 from gapbridge.core.errors import LogError
 from gapbridge.core.log.log import Log
 from gapbridge.core.metrology import Metrology
@@ -26,6 +28,10 @@ FREE = Metrology(sigma=small.SIGMA)
 
 def with_columns(**more) -> Log:
     return small.log_of(SESSION, READ, **more)
+
+
+def findings(log: Log, *cell) -> list[str]:
+    return [log_finding_text(finding) for finding in log_findings(log, *cell)]
 
 
 def reported(log: Log, metrology: Metrology = REGISTERED) -> str:

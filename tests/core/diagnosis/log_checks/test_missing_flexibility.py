@@ -34,9 +34,9 @@ def test_a_soft_arm_behind_a_rigid_cell_is_sent_to_the_fit(rigid: Model) -> None
     found = diagnose(rigid, log_of(TYPE), FREE)
     assert found.verdict in ("explained", "partly_explained")  # a dozen flexibilities, one by one
     assert {c.effect for c in found.channels[0].causes} & {"axial_compliance", "radial_compliance"}
-    (word,) = softness_findings(rigid, log_of(TYPE), FREE)
-    assert (word in found.findings) is (found.verdict == "partly_explained")
-    reported = re.search(r"from ([\d.]+) to ([\d.]+) mm", word)
+    (advice,) = softness_findings(rigid, log_of(TYPE), FREE)
+    assert (advice in found.findings) is (found.verdict == "partly_explained")
+    reported = re.search(r"from ([\d.]+) mm to ([\d.]+) mm", finding_text(advice))
     assert reported is not None
     before, after = map(float, reported.groups())
     assert before == pytest.approx(1e3 * found.channels[0].gap_rms, rel=0.2)

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from gapbridge.bridge.document.log_findings import log_finding_text
 from gapbridge.core.arm import arm_from_dh, builtin_arm, builtin_rows
 from gapbridge.core.diagnosis.log_checks.frames import frame_findings
 from gapbridge.core.diagnosis.log_checks.kinematics import dh_rows
@@ -31,11 +32,15 @@ Q = RNG.uniform(-2.5, 2.5, (40, 6))
 INSTRUMENT = transform(rpy_matrix(np.array([0.3, 0.2, 1.4])), np.array([2.0, -1.0, 0.4]))
 
 
+def texts(model: Model, log: Log) -> list[str]:
+    return [log_finding_text(f) for f in frame_findings(model, log, Metrology())]
+
+
 def reported(model: Model, q: np.ndarray, **more: np.ndarray) -> list[str]:
     position = TRUE.rigid_pose(Q).position @ INSTRUMENT[:3, :3].T + INSTRUMENT[:3, 3]
     position += RNG.normal(0, 2e-5, position.shape)
     columns = {"actual_q": q, "measured_position": position} | more
-    return frame_findings(model, Log("arm.csv", columns, 6), Metrology())
+    return texts(model, Log("arm.csv", columns, 6))
 
 
 def with_rows(**changed: float) -> Model:
@@ -84,7 +89,7 @@ def test_outliers_hide_no_missing_tool() -> None:
     position = TRUE.rigid_pose(Q).position @ INSTRUMENT[:3, :3].T + INSTRUMENT[:3, 3]
     position[[3, 17, 30]] += 0.5
     columns = {"actual_q": Q, "measured_position": position}
-    (line,) = frame_findings(Model(TRUE.arm), Log("arm.csv", columns, 6), Metrology())
+    (line,) = texts(Model(TRUE.arm), Log("arm.csv", columns, 6))
     assert "lies at (20, -50, 180) mm" in line
 
 

@@ -32,7 +32,7 @@ def test_glitches_become_no_cause_and_are_reported_with_their_rows(effect, regis
     assert [c.effect for c in channel.causes] == ([] if effect == "none" else [effect])
     assert not channel.structured
     assert set(np.flatnonzero(~channel.selection.kept)) == set(GLITCHES)
-    (reported,) = [f for f in found.findings if not isinstance(f, str)]
+    (reported,) = [f for f in found.findings if isinstance(f, ChannelFinding)]
     assert reported == ChannelFinding("position", Outliers(((13, ""), (42, ""))))
     assert channel.remaining_rms_held_out == pytest.approx(small.FLOOR, rel=0.2)
     assert channel.gap_max < 2e-3  # the glitches are no part of the gap

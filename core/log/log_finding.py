@@ -1,0 +1,72 @@
+"""What is odd about a log, or suspected of it: a kind and its values; ``bridge`` words them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum, auto
+from typing import Union
+
+
+class LogCheck(Enum):
+    """What a check of a log found; the comment says what the finding's values are."""
+
+    # the file
+    MISSPELT = auto()  # column found, column that may be meant
+    CLOCKS_OVERLAP = auto()
+    COPIED_ROWS = auto()  # rows that repeat the timestamp before, all rows, line of the first
+    ROUNDED_TIME = auto()  # grain (s), rows that repeat, line of the first
+    AMBIGUOUS_TIME = auto()  # line of the first, its time (s), rows that repeat, all rows
+    REPEATED_TIME = auto()  # rows
+    BACKWARD_TIME = auto()  # rows
+    NO_READING = auto()  # rows, column
+    POSITIONS_AT_REST = auto()
+    FAHRENHEIT = auto()
+    FEW_POSES = auto()  # poses
+    # against the cell's arm
+    BEYOND_LIMITS = auto()  # joints
+    BEYOND_SESSIONS = auto()  # session, columns
+    BEYOND_FITTED = auto()  # columns, rows, all rows, least, largest, unit, line, value
+    NOT_IN_BASE = auto()  # median distance (m)
+    POSITIONS_OFF = auto()  # median distance (m)
+    POSITIONS_OFF_BY = auto()  # median distance (m), the mistake, distance without it (m)
+    ROTATIONS_OFF = auto()  # median angle (rad)
+    ROLL_PITCH_YAW = auto()
+    TARGET_AXES = auto()  # angle (rad)
+    # mistakes that would explain positions that are far off
+    MIRRORED = auto()
+    INVERTED = auto()
+    JOINT_SIGN = auto()  # joint
+    ROW_LATE = auto()
+    ROW_EARLY = auto()
+    LENGTH_UNIT = auto()  # unit
+    FLANGE_NOT_TCP = auto()
+    TCP_SIGN = auto()
+    MODIFIED_DH = auto()
+    DH_SIGN = auto()  # key of the DH rows
+    DH_UNIT = auto()  # unit
+    NO_TCP = auto()  # the measured point in the flange's frame (m)
+    OTHER_TCP = auto()  # the measured point in the flange's frame (m), tool.tcp (m)
+    JOINTS_SWAPPED = auto()  # two joints
+    UR_JOINTS_SWAPPED = auto()  # elbow and shoulder pan, as sorted by name: two joints
+    JOINTS_REVERSED = auto()
+    JOINT_ORDER = auto()  # (joint, index of its column) of those out of place
+    # forces
+    PULL_SIGN = auto()
+    PULL_IN_TOOL = auto()
+    PULL_SIGN_IN_TOOL = auto()
+    WRENCH_SIGN = auto()
+    TORQUE_SIGN = auto()
+    # the model
+    MISSING_FLEXIBILITY = auto()  # flexibilities, gap before and after their fit (m)
+
+
+Value = Union[str, int, float, "LogFinding", tuple["Value", ...]]
+
+
+@dataclass(frozen=True)
+class LogFinding:
+    """One finding; ``sessions`` names those that it holds for where a log has several."""
+
+    check: LogCheck
+    values: tuple[Value, ...] = ()
+    sessions: tuple[str, ...] = ()
