@@ -22,13 +22,13 @@ Array = NDArray[np.float64]
 RIDGE = 5.0  # usual sizes of a parameter: prior of the fit that only looks for outliers
 
 
-def mark_outliers(state: SelectionState, columns: list[Array]) -> None:
+def mark_outliers(state: SelectionState, explained_by: list[tuple[Candidate, Array]]) -> None:
     """Mark outliers before anything is searched: by a fit that can explain nearly anything."""
     observation = state.observation
     gap = observation.measured - observation.predict(())
     N, k = gap.shape
     usual, parts = [], []
-    for c, block in zip(state.candidates, columns, strict=True):
+    for c, block in explained_by:
         if c.periodic and (c.site.order or 0) > 3:
             continue
         parts.append(block)

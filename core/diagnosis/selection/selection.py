@@ -207,8 +207,9 @@ def select(
         # the last round's are as large as the new ones: not both at a time
         space, near, columns = None, None, []
         columns = [exact_columns(state.observation, c, base) for c in state.candidates]
-        if turn == 0:
-            mark_outliers(state, columns)
+        if turn == 0:  # the rows after a late slip stand out unless it is among what may be there
+            steps = step_candidates(state, columns, base, withheld)
+            mark_outliers(state, [*zip(state.candidates, columns, strict=True), *steps])
         stepping = step_candidates(state, columns, base, withheld)
         state.candidates += [candidate for candidate, _ in stepping]
         columns += [own for _, own in stepping]

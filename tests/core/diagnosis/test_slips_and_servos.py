@@ -21,17 +21,19 @@ MODEL = Model(builtin_arm("ur10e"), payload_mass=4.0, payload_cog=np.array([0.0,
 SIGMA = 3e-5  # m
 
 
-def sampled(terms: list[Term], count: int = 70, seed: int = 0, clock: bool = True) -> Log:
+def sampled(
+    terms: list[Term], count: int = 70, seed: int = 0, clock: bool = True, at: float = 0.6
+) -> Log:
     """Return poses at rest, measured in a frame that nobody registered, with ``terms`` in the arm.
 
-    The truth of a slip is put in by hand: rows before and after it are two arms.
+    The truth of a slip is put in by hand: rows before and after ``at`` (a share) are two arms.
     """
     rng = np.random.default_rng(seed)
     q = np.array([0.0, -1.2, 1.5, -1.8, -1.5, 0.0]) + rng.uniform(-0.8, 0.8, (count, 6))
     loads = Loads(payload_mass=rng.choice([1.0, 4.0, 8.0], count))
     still = [t for t in terms if not t.effect.endswith("_slip")]
     position = MODEL.with_terms(still).predict(q, loads).position
-    moment = int(0.6 * count)
+    moment = int(at * count)
     for term in terms:
         if term not in still:
             stands = "joint_offset" if term.effect == "joint_slip" else "tool_frame"
@@ -67,6 +69,22 @@ def test_a_joint_that_slips_is_named_sized_and_dated(clock: bool) -> None:
     assert "before and after it nothing else changed" in sentence
     assert ("22:40:40" in sentence) is clock
     assert ("between rows 42 and 43 of the log" in sentence) is not clock
+
+
+@pytest.mark.parametrize("joint", [1, 4, 5])
+@pytest.mark.parametrize("at", [0.12, 0.88])
+def test_rows_beyond_a_slip_near_an_end_are_no_bad_readings(joint: int, at: float) -> None:
+    """Few rows have it, so that they stand out of a fit of all the others; one is bad by chance."""
+    log = sampled([Term("joint_slip", Site(joint), (5e-3,))], at=at)
+    log.columns["measured_position"][33] += [4e-3, -3e-3, 5e-3]
+    channel, _ = position(log)
+    (cause,) = channel.causes
+    assert (cause.effect, cause.joints) == ("joint_slip", (joint,))
+    size, moment = cause.parameters
+    assert size.std is not None
+    assert abs(size.value - 5e-3) < 4 * size.std
+    assert abs(moment.value - 1.7e9 - 40.0 * (int(70 * at) - 0.5)) <= 20.0
+    assert channel.outliers == (33,)
 
 
 def test_a_target_that_slips_is_no_joint_that_does() -> None:
