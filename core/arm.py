@@ -10,11 +10,9 @@ from typing import Any
 
 import numpy as np
 import yaml
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.errors import ArmError
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array, Index
 from gapbridge.core.effects import CATALOGUE, settling
 from gapbridge.core.kernels import reference as kernel
 from gapbridge.core.kernels import single
@@ -37,8 +37,6 @@ from gapbridge.core.kernels.threads import in_ranges
 from gapbridge.core.loads import Loads
 from gapbridge.core.model import Model, Poses
 
-Array = NDArray[np.float64]
-Steps = NDArray[np.int64]
 NOTHING = Loads()
 LEADS = 2  # times that a servo's rest is looked at for the command that leads there
 
@@ -52,7 +50,7 @@ class Correction(NamedTuple):
     q: Array  # (N, n) rad
     offset_in_base: Array  # (N, 6) m, rad: rigid TCP pose at q minus that at nominal_q
     residual: Array | float  # (N,) m: distance of predicted and wanted pose (rotation x lever)
-    steps: Steps | int  # (N,) Newton steps taken
+    steps: Index | int  # (N,) Newton steps taken
 
 
 @njit(**JIT)
@@ -238,7 +236,7 @@ class Compensator:
         return Correction(found[:, :n], found[:, n:], residual, steps)
 
     def _plain_rows(
-        self, nominal: Array, loads: Loads, found: Array, residual: Array, steps: Steps
+        self, nominal: Array, loads: Loads, found: Array, residual: Array, steps: Index
     ) -> None:
         """Write the corrections of rows that nothing but the chain's bending changes.
 

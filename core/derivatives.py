@@ -15,9 +15,9 @@ from itertools import pairwise
 from math import factorial
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from gapbridge.core.arrays import Array, Mask
+
 HALF_WIDTHS = (3, 4, 6, 9, 13, 19, 28, 42, 63)  # samples either side
 LONGEST = 0.3  # s, no window reaches further either side
 BIAS_SHARE = 0.5  # of the noise: how much flattening a longer window may bring
@@ -37,7 +37,7 @@ class Derivative:
     value: Array  # (N, n) unit of the signal per s^order
     noise: Array  # (n,) 1 sigma that the signal's noise makes in it
     half_width: int  # samples at either end that the longest window did not cover
-    unsure: NDArray[np.bool_]  # (N, n) the signal jumps here
+    unsure: Mask  # (N, n) the signal jumps here
 
 
 def signal_noise(signal: Array) -> Array:
@@ -163,9 +163,7 @@ def _widest(changes: list[float], sigma: float, filters: list[Array]) -> int:
     return len(changes)
 
 
-def _jumps(
-    change: Array, typical: float, sigma: float, h: Array, other: Array
-) -> NDArray[np.bool_]:
+def _jumps(change: Array, typical: float, sigma: float, h: Array, other: Array) -> Mask:
     """Return where (N,) two windows disagree, and the rows beside that the wider one mixes in."""
     limit = max(CLEAR * sigma * np.sqrt(_difference(h, other)), COARSE * typical)
     clear = (change > limit).astype(float)

@@ -18,15 +18,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.effects import CATALOGUE, Term, acting
 from gapbridge.core.kernels import rigid
 from gapbridge.core.kernels.reference import Chain
 from gapbridge.core.model import Model
 from gapbridge.core.motion import Motion, Pieces
 
-Array = NDArray[np.float64]
 LIGHTEST = 1e-6  # kg, of a link whose centre of gravity is anywhere
 
 

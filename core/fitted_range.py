@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array, Mask
 from gapbridge.core.log.log import Log
 from gapbridge.core.log.log_finding import LogCheck, LogFinding
 from gapbridge.core.sessions import sessions_in
 
-Array = NDArray[np.float64]
 Range = Mapping[str, tuple[float, float]]
 MARGIN = 0.05  # of a range's width: so far beyond it nothing is said
 MANY = 0.25  # share of a session's rows beyond the others' from which it is worth a sentence
@@ -73,7 +72,7 @@ class Outside:
         return found
 
 
-def outside_rows(log: Log, fitted: Range) -> NDArray[np.bool_]:
+def outside_rows(log: Log, fitted: Range) -> Mask:
     """Return which rows (N,) lie outside what was fitted, in any quantity."""
     out = np.zeros(len(log), dtype=bool)
     for name, values in _columns(log).items():
@@ -82,7 +81,7 @@ def outside_rows(log: Log, fitted: Range) -> NDArray[np.bool_]:
     return out
 
 
-def beyond(name: str, values: Array, fitted: Range) -> NDArray[np.bool_]:
+def beyond(name: str, values: Array, fitted: Range) -> Mask:
     """Return which values (N,) of a column lie outside what was fitted; NaN does not."""
     low, high = fitted[name]
     margin = _margin(name, low, high)

@@ -11,12 +11,11 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.errors import LimitError
 from gapbridge.core.kernels.reference import JIT
 
-Array = NDArray[np.float64]
 LONGEST_GAP = 5.0  # cycles: after a longer one, no more than this many cycles' steps are allowed
 HUGE = 1e6  # rad, m: no number of a setpoint is that large
 NUMBERS = 7  # limits that are one number each, first in the limiter's block

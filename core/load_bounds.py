@@ -6,11 +6,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.model import Model
 
-Vector = NDArray[np.float64]
 HEAVIEST = 1.5  # times the rated payload
 STRONGEST = 5.0  # times the weight of the rated payload: what process forces come to
 LEVER = 0.3  # m: at which that force, or the heaviest payload, acts beside the flange
@@ -53,7 +52,7 @@ class LoadBounds:
         """Return the strongest torque on the tool, Nm."""
         return LEVER * self.force
 
-    def doubt_payload(self, mass: float, cog: Vector) -> str | None:
+    def doubt_payload(self, mass: float, cog: Array) -> str | None:
         """Return in words why a payload (kg; (3,) m, flange frame) cannot be; None: it can."""
         if not 0.0 <= mass <= self.mass:  # NaN is not
             return f"payload: found {mass:g} kg, expected 0 to {self.mass:g} kg ({self._why})"
@@ -65,7 +64,7 @@ class LoadBounds:
             )
         return None
 
-    def doubt_wrench(self, wrench: Vector) -> str | None:
+    def doubt_wrench(self, wrench: Array) -> str | None:
         """Return in words why a pull on the tool (6,) N, Nm cannot be; None: it can."""
         numbers = wrench.tolist()
         force, torque = math.hypot(*numbers[:3]), math.hypot(*numbers[3:])

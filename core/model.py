@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gapbridge.core.arm import Arm
+from gapbridge.core.arrays import Array
 from gapbridge.core.effects import CATALOGUE, Site, Term, flexibility_effects, settling
 from gapbridge.core.effects.effect import Effect
 from gapbridge.core.errors import EquilibriumError, InputError
@@ -17,7 +17,6 @@ from gapbridge.core.kernels.reference import Chain, Rows
 from gapbridge.core.kernels.turns import rotation_vectors
 from gapbridge.core.loads import Loads
 
-Array = NDArray[np.float64]
 SETTLING = 10  # times that servos are looked at where they have given way
 CONVERGED = 1e-10  # rad: less is no change
 STANDARD_GRAVITY = (0.0, 0.0, -9.80665)

@@ -11,16 +11,14 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array, Index, Mask
 from gapbridge.core.derivatives import differentiate
 from gapbridge.core.errors import LogError
 from gapbridge.core.loads import Loads
 from gapbridge.core.log.log import Log
 from gapbridge.core.log.log_finding import LogCheck, LogFinding
 
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 SLOWEST_SAMPLING = 0.2  # s between rows beyond which they count as poses at rest
 FASTEST_JOINT = 15.0  # rad/s: rows that jump faster are poses, whatever their timestamps say
 FEWEST_SMOOTH = 0.5  # share of rows without jumps that windows must leave, or be shorter
@@ -67,7 +65,7 @@ class Motion:
     target_q: Array | None  # (N, n) rad
     loads: Loads
     rows: Index  # (N,) row in the log
-    valid: NDArray[np.bool_]  # (N,) False near the ends of a stretch
+    valid: Mask  # (N,) False near the ends of a stretch
     stretch: Index  # (N,) number of the stretch without a gap in time
     start: float  # s, the log's first timestamp
     moving: bool  # False: poses at rest
@@ -79,7 +77,7 @@ class Motion:
     def __len__(self) -> int:
         return len(self.t)
 
-    def pick(self, rows: Index | NDArray[np.bool_]) -> Motion:
+    def pick(self, rows: Index | Mask) -> Motion:
         """Return the motion of some of the rows (derivatives stay those of the full rate)."""
         index: Any = rows
         return replace(
@@ -103,7 +101,7 @@ class Motion:
         return np.asarray(np.tanh(4.0 * self.qd / self.still))
 
     @property
-    def turning(self) -> NDArray[np.bool_]:
+    def turning(self) -> Mask:
         """Return where (N, n) a joint that moves in this log stands or turns round."""
         moves = np.abs(self.qd).max(axis=0, initial=0.0) > 3 * self.still
         return np.asarray(moves & (np.abs(self.qd) < self.still))
@@ -213,9 +211,7 @@ def _clock(log: Log, time: Array) -> tuple[Index, Array, LogFinding | None]:
     return everything, time, LogFinding(LogCheck.AMBIGUOUS_TIME, values)
 
 
-def _with_derivatives(
-    motion: Motion, given: Array | None, new_session: NDArray[np.bool_]
-) -> Motion:
+def _with_derivatives(motion: Motion, given: Array | None, new_session: Mask) -> Motion:
     steps = np.diff(motion.t)
     step = float(np.median(steps))
     stretch = np.concatenate([[0], np.cumsum((steps > GAP * step) | new_session)])
@@ -244,7 +240,7 @@ def _at(time: Array, value: Array, wanted: Array) -> Array:
 
 def _derivatives(
     t: Array, step: float, q: Array, given: Array | None
-) -> tuple[Array, Array, NDArray[np.bool_], Array]:
+) -> tuple[Array, Array, Mask, Array]:
     """Return speeds, accelerations, the rows where they are good, and noise of the speeds (n,)."""
     grid = np.linspace(t[0], t[-1], max(round((t[-1] - t[0]) / step), 14) + 1)
     even = len(grid) == len(t) and bool(np.abs(grid - t).max() < 1e-2 * step)
@@ -254,7 +250,7 @@ def _derivatives(
     speed = differentiate(on_grid, step, 1)
     for longest in WINDOWS:
         qdd, unsure, edge = _accelerations(on_grid, known, step, longest)
-        good: NDArray[np.bool_] = ~np.any(unsure, axis=1)
+        good: Mask = ~np.any(unsure, axis=1)
         if good.mean() >= FEWEST_SMOOTH:
             break
     else:
@@ -270,7 +266,7 @@ def _derivatives(
 
 def _accelerations(
     q: Array, qd: Array | None, step: float, longest: float
-) -> tuple[Array, NDArray[np.bool_], int]:
+) -> tuple[Array, Mask, int]:
     """Return accelerations (N, n), where (N, n) they jump, and the rows to drop at either end."""
     bend = differentiate(q, step, 2, longest)
     if qd is None:

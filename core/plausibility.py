@@ -13,12 +13,11 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gapbridge.core.arm import Arm
+from gapbridge.core.arrays import Array
 from gapbridge.core.files import read_text
 
-Array = NDArray[np.float64]
 POSES = 64
 LONGEST, LONG, SHORT = 20.0, 5.0, 0.05  # m of reach: no arm, few arms, few arms
 TURN = 6.4  # rad: a little more than one turn; a fixed angle beyond is in degrees

@@ -6,14 +6,13 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array, Mask
 from gapbridge.core.dynamics import predict_torque, predict_tracking, predict_wrench, with_pieces
 from gapbridge.core.log.log import Log
 from gapbridge.core.model import Model
 from gapbridge.core.motion import EDGE, LEAD, Motion, motion_of, with_motion
 
-Array = NDArray[np.float64]
 NO_MASSES = "masses of the links (in the cell's robot)"
 ROWS = 20_000  # predicted at a time
 
@@ -94,7 +93,7 @@ def _from(log: Log, start: float | None) -> Log:
 
 def _spread(
     predict: Callable[[Model, Motion], Array], model: Model, motion: Motion, count: int,
-    valid: NDArray[np.bool_],
+    valid: Mask,
 ) -> Array:  # fmt: skip
     """Return a prediction at the rows of the log (N, k), nan where there is none."""
     value = predict(model, motion)

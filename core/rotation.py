@@ -5,9 +5,8 @@ from __future__ import annotations
 from math import sin, sqrt
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from gapbridge.core.arrays import Array
 
 
 def rotation_matrix(rotation_vector: Array) -> Array:

@@ -13,20 +13,19 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array, Index
 from gapbridge.core.errors import LogError
 from gapbridge.core.log.log import Log
 from gapbridge.core.model import Model
 from gapbridge.core.motion import is_moving
 
-Array = NDArray[np.float64]
 PAUSE = 60.0  # s between sessions whose clocks overlap
 LEAST_ROWS = 20  # from which a session shows whether it records motion
 MEASURED = ("measured_position", "measured_rotation", "ft_raw_wrench", "actual_current_as_torque")
 
 
-def session_of(log: Log) -> NDArray[np.int64]:
+def session_of(log: Log) -> Index:
     """Return the index (N,) of each row's session; zeros where the log is one session."""
     if len(log.session_names) < 2:
         return np.zeros(len(log), dtype=np.int64)

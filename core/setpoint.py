@@ -4,10 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
-Vector = NDArray[np.float64]
+from gapbridge.core.arrays import Array
 
 
 class Setpoint(NamedTuple):
@@ -18,8 +15,8 @@ class Setpoint(NamedTuple):
     controller takes a Cartesian offset send it instead of ``q``. A tuple, as RobotState is.
     """
 
-    q: Vector  # (n,) rad, the setpoint to be commanded
-    nominal_q: Vector  # (n,) rad, what was wanted before correction
-    offset_in_base: Vector  # (6,) m, rad
+    q: Array  # (n,) rad, the setpoint to be commanded
+    nominal_q: Array  # (n,) rad, what was wanted before correction
+    offset_in_base: Array  # (6,) m, rad
     state_timestamp: float  # s, controller clock of the state behind this setpoint
     state_received: float  # s, time.monotonic() when that state was first seen here

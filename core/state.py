@@ -4,10 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
-Vector = NDArray[np.float64]
+from gapbridge.core.arrays import Array
 
 
 class RobotState(NamedTuple):
@@ -20,15 +17,15 @@ class RobotState(NamedTuple):
 
     timestamp: float  # s, the controller's own clock
     received: float  # s, time.monotonic() when the sample was first seen here
-    actual_q: Vector  # (n,) rad, joint encoders
-    actual_qd: Vector  # (n,) rad/s
-    target_q: Vector  # (n,) rad, the controller's own joint command
-    actual_TCP_force: Vector  # (6,) N, Nm: surroundings on the tool, at the TCP, base axes
-    ft_raw_wrench: Vector | None = None  # (6,) N, Nm: flange sensor, flange axes
-    joint_temperatures: Vector | None = None  # (n,) °C
-    actual_current_as_torque: Vector | None = None  # (n,) Nm
+    actual_q: Array  # (n,) rad, joint encoders
+    actual_qd: Array  # (n,) rad/s
+    target_q: Array  # (n,) rad, the controller's own joint command
+    actual_TCP_force: Array  # (6,) N, Nm: surroundings on the tool, at the TCP, base axes
+    ft_raw_wrench: Array | None = None  # (6,) N, Nm: flange sensor, flange axes
+    joint_temperatures: Array | None = None  # (n,) °C
+    actual_current_as_torque: Array | None = None  # (n,) Nm
     payload: float | None = None  # kg, declared in the controller
-    payload_cog: Vector | None = None  # (3,) m, in the flange frame
+    payload_cog: Array | None = None  # (3,) m, in the flange frame
     robot_mode: int = 7  # RTDE robot_mode; 7 = running
     safety_mode: int = 1  # RTDE safety_mode; 1 = normal, 2 = reduced
     runtime_state: int = 2  # RTDE runtime_state; 2 = playing

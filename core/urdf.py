@@ -7,14 +7,13 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gapbridge.core.arm import Arm, JointLimits
+from gapbridge.core.arrays import Array
 from gapbridge.core.errors import ArmError
 from gapbridge.core.files import read_text
 from gapbridge.core.rotation import rotation_matrix, rpy_matrix, transform
 
-Array = NDArray[np.float64]
 TURNING = ("revolute", "continuous")
 
 

@@ -6,14 +6,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gapbridge.core.arm import Arm
+from gapbridge.core.arrays import Array
 from gapbridge.core.estimation.registration import register_robustly
 from gapbridge.core.model import Model
 from gapbridge.core.plausibility import flange_in_first
 
-Array = NDArray[np.float64]
 TCP_TURNED = 0.02  # rad: turned further, the controller's TCP is not the cell's
 OTHER_ARM, OTHER_CALIBRATION = 0.01, 5e-5  # m at the flange, in the frame that fits best
 MASS, COG = 0.1, 0.005  # kg, m: the controller's payload beside the cell's

@@ -11,9 +11,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from typing import Any, Self, final
 
-import numpy as np
-from numpy.typing import NDArray
-
+from gapbridge.core.arrays import Array
 from gapbridge.core.errors import WriteError
 from gapbridge.core.model import Model
 from gapbridge.core.setpoint import Setpoint
@@ -23,7 +21,6 @@ from gapbridge.drivers.controller_facts import ControllerFacts, Difference, diff
 from gapbridge.drivers.gate import Gate
 from gapbridge.drivers.state_check import FASTEST, SampleCheck
 
-Vector = NDArray[np.float64]
 GATED = ("read_state", "write_setpoint", "arm", "release")  # of the base alone
 
 
@@ -178,7 +175,7 @@ class Driver(ABC):
         """
         return None
 
-    def nominal_q(self, state: RobotState) -> Vector:
+    def nominal_q(self, state: RobotState) -> Array:
         """Return the joints (n,) that the robot itself wants, without our correction, rad."""
         return state.target_q
 

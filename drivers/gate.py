@@ -12,15 +12,14 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.errors import GateError
 from gapbridge.core.kernels.reference import JIT
 from gapbridge.core.model import Model
 from gapbridge.core.setpoint import Setpoint
 from gapbridge.drivers.clock import SYSTEM
 
-Vector = NDArray[np.float64]
 GAP = 5.0  # cycles: no step is larger than this many cycles' allowance
 HELD = 0.04  # s for which a wire may hold setpoints back and then hand them on at once
 DRIFT = 1.02  # how much faster than ours a controller's clock may be
@@ -177,7 +176,7 @@ class Gate:
         self._moves_arm = moves_arm
         self._longest = GAP / rate  # s
         self._most = self._longest + max(HELD, GAP / rate)  # s
-        self._started: tuple[Vector, Vector] | None = None  # rad, where the arm was when armed
+        self._started: tuple[Array, Array] | None = None  # rad, where the arm was when armed
         self._open = False
         self._budget = self._at = self._travel = 0.0  # s
         self._clock = clock
@@ -201,7 +200,7 @@ class Gate:
             bounds.joint_offset, self._longest,
         )  # fmt: skip
 
-    def begin(self, *stands: Vector) -> None:
+    def begin(self, *stands: Array) -> None:
         """Open for a stream that begins without an offset where the arm stands, (n,) rad each."""
         self._started = (stands[0].copy(), stands[-1].copy())
         self._offsets[:] = 0.0
@@ -234,7 +233,7 @@ class Gate:
         )
         return int(code), int(joint), float(found), float(travel)
 
-    def _check_start(self, q: Vector) -> None:
+    def _check_start(self, q: Array) -> None:
         assert self._started is not None
         if self._moves_arm:
             away = np.minimum(*(np.abs(q - stood) for stood in self._started))

@@ -11,14 +11,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.errors import InvalidStateError
 from gapbridge.core.kernels.packed import arm_block
 from gapbridge.core.kernels.single import NEARER, SCRATCH, take_out
 from gapbridge.core.model import Model
-
-Vector = NDArray[np.float64]
 
 
 class Nominal:
@@ -32,12 +30,12 @@ class Nominal:
         # compiled here: the loop's first offset must not wait for a compiler
         self.without(np.zeros(n), np.zeros(6))
 
-    def without(self, target_q: Vector, offset_in_base: Vector | Sequence[float]) -> Vector:
+    def without(self, target_q: Array, offset_in_base: Array | Sequence[float]) -> Array:
         """Return the joints (n,) whose TCP, moved by the offset (6,), is that of ``target_q``.
 
         Raises InvalidStateError where there are none nearby (at a singularity).
         """
-        nominal: Vector = np.empty(self._n)
+        nominal: Array = np.empty(self._n)
         self._target[:], self._offset[:] = target_q, offset_in_base
         distance = take_out(self._block, nominal)
         if not distance < NEARER:

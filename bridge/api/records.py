@@ -8,13 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gapbridge.bridge.cell import Cell, save_cell
 from gapbridge.bridge.document.provenance import provenance
+from gapbridge.core.arrays import Array, Mask
 from gapbridge.core.model import Model
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -24,7 +22,7 @@ class Predicted:
     position: Array  # (N, 3) m
     rotation_vector: Array  # (N, 3) rad
     position_std: Array | None = None  # (N, 3) m, 1 sigma in base axes; None: nothing was fitted
-    outside: NDArray[np.bool_] | None = None  # (N,) outside what was fitted; None: nothing was
+    outside: Mask | None = None  # (N,) outside what was fitted; None: nothing was
     channels: dict[str, Array] = field(default_factory=dict)  # (N, k) by name, where asked for
     lacking: dict[str, str] = field(default_factory=dict)  # what a channel needs that is not there
     sources: dict[str, list[Path]] = field(default_factory=dict)  # log and cell, by role
@@ -75,7 +73,7 @@ class Fitted:
     radial: Array
     std_axial: Array  # 1 sigma
     std_radial: Array
-    shown: NDArray[np.bool_]  # (2n,), axial then radial: what the data show; the rest is the cell's
+    shown: Mask  # (2n,), axial then radial: what the data show; the rest is the cell's
     samples: int
     gap_rms: float  # m, one coordinate, before
     remaining_rms: float  # m, after

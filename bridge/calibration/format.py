@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.plan import Payload
-
-Array = NDArray[np.float64]
 
 
 def degrees(q: Array) -> str:

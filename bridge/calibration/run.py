@@ -9,7 +9,6 @@ from pathlib import Path
 
 import click
 import numpy as np
-from numpy.typing import NDArray
 
 from gapbridge.bridge.calibration.format import load_text
 from gapbridge.bridge.calibration.instruments.instrument import (
@@ -31,10 +30,10 @@ from gapbridge.bridge.calibration.session.positioning import Positioning
 from gapbridge.bridge.calibration.session.prompt import InputEnded, Prompt, SessionCommand
 from gapbridge.bridge.calibration.session.session import Session
 from gapbridge.bridge.cell import Cell
+from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.plan import PlannedPose
 from gapbridge.core.errors import CellError, LinkError
 
-Array = NDArray[np.float64]
 TITLES = {
     "whole": "Calibration of",
     "verify": "Verification of",

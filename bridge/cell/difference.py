@@ -7,16 +7,15 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gapbridge.bridge.cell.cell import Cell
 from gapbridge.bridge.cell.message import key_path
+from gapbridge.core.arrays import Array
 from gapbridge.core.effects import Site, Term
 from gapbridge.core.loads import Loads
 from gapbridge.core.model import Model
 from gapbridge.core.rotation import rotation_vector
 
-Array = NDArray[np.float64]
 POSES = 200
 FIELDS = {  # part of a cell -> fields of its model
     "tool": ("tool_in_flange",),

@@ -8,13 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-import numpy as np
-from numpy.typing import NDArray
-
+from gapbridge.core.arrays import Array
 from gapbridge.core.fitted_range import UNITS, Range, beyond, stem_of
 from gapbridge.core.log.columns import label
 
-Array = NDArray[np.float64]
 WATCHED = ("actual_q", "payload", "joint_temperatures", "actual_TCP_force")
 CALM = 5.0  # s within what was fitted, after which leaving it again is reported again
 

@@ -5,15 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.dynamics import predict_torque, predict_wrench, with_pieces
 from gapbridge.core.loads import Loads
 from gapbridge.core.model import Model
 from gapbridge.core.motion import Motion
 from gapbridge.core.rotation import rotation_matrix
 
-Array = NDArray[np.float64]
 STEP = 1e-4  # rad, kg, kg m: of the differences
 
 

@@ -21,13 +21,11 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gapbridge.bridge.daemon.rest_model import Place, RestModel
 from gapbridge.bridge.ipc.events import Event
+from gapbridge.core.arrays import Array
 from gapbridge.core.model import Model
-
-Array = NDArray[np.float64]
 
 STILL = 1e-3  # rad from where a rest began: farther, the arm has moved on
 SETTLING = 0.1  # s at the begin of a rest that are left out

@@ -6,12 +6,10 @@ import math
 from collections import deque
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from gapbridge.bridge.ipc.events import Event
 from gapbridge.bridge.loop.checks import NOTHING, UNSOLVED
 from gapbridge.bridge.loop.supervisor import HEALED_BY_RECONNECTING, Cause, State
+from gapbridge.core.arrays import Array
 from gapbridge.drivers.clock import SYSTEM, Clock
 
 RATE_SPAN = 2.0  # s that the rate is taken over
@@ -56,7 +54,7 @@ class DaemonStatus:
         self.configured: Event = {}  # the last attempt to reload
         self._compiling = ""  # what the loop's process is at before its first cycle
 
-    def take(self, rows: NDArray[np.float64]) -> None:
+    def take(self, rows: Array) -> None:
         """Take note of cycles."""
         now = self._now()
         if len(rows):

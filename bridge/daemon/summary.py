@@ -7,12 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gapbridge.bridge.ipc.shared_memory import slices_of
+from gapbridge.core.arrays import Array
 from gapbridge.core.limits import CLAMPS
 
-Array = NDArray[np.float64]
 UNIT = 1e-6  # s: bin of a histogram
 BATCH = 50  # looks at the cycles, whose rows are counted at once
 BINS = 50_000  # to 50 ms; what is beyond counts as the last

@@ -8,13 +8,12 @@ import time
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gapbridge.bridge.demo.poses import Load
+from gapbridge.core.arrays import Array
 from gapbridge.core.errors import LinkError
 from gapbridge.drivers.simulated.ur.settings import ServerSettings
 
-Array = NDArray[np.float64]
 READINGS_PERIOD = 0.01  # s between two readings of the tracker
 LONGEST_MOVE = 20.0  # s
 LOOK = 0.25  # s between two looks at whether the arm stands

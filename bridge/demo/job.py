@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.console import Console
 
 from gapbridge.bridge.cell import Cell, load_cell, save_cell
@@ -28,11 +27,11 @@ from gapbridge.bridge.document.output_file import write_text
 from gapbridge.bridge.document.provenance import provenance
 from gapbridge.bridge.document.svg import svg_file
 from gapbridge.bridge.loop.warm_up import warm_up
+from gapbridge.core.arrays import Array
 from gapbridge.core.errors import RunError
 from gapbridge.core.estimation.identification import identify_compliance
 from gapbridge.core.log.log import read_log
 
-Array = NDArray[np.float64]
 PORTS = UrRtdeLink.ports
 
 

@@ -9,15 +9,14 @@ from types import TracebackType
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gapbridge.bridge.daemon.daemon import Daemon
 from gapbridge.bridge.demo.bench import Bench
 from gapbridge.bridge.loop.supervisor import State
+from gapbridge.core.arrays import Array
 from gapbridge.core.errors import LinkError
 from gapbridge.drivers.simulated.server.arm_controller import OWN_ACCELERATION, OWN_SPEED
 
-Array = NDArray[np.float64]
 LONGEST_START = 60.0  # s until the daemon writes
 RAMP = 0.8  # s until offsets are in
 REST = 0.35  # s at each pose, from when it is seen to stand

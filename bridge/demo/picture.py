@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gapbridge.bridge.demo.result import Result, visits_of_poses
 from gapbridge.bridge.document.drawing import (
@@ -20,8 +19,8 @@ from gapbridge.bridge.document.drawing import (
     Text,
 )
 from gapbridge.bridge.document.skeleton import skeleton
+from gapbridge.core.arrays import Array
 
-Array = NDArray[np.float64]
 WIDTH, HEIGHT = 430.0, 380.0
 MAGNIFIED = 60  # times the bending is drawn larger
 COLOURS = {2: (BAD_DOT, LIMIT), 3: (BAD_DOT, BEFORE, LIMIT)}  # by the number of rounds of visits

@@ -5,14 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.kernels.single import LEVER
 from gapbridge.core.loads import Loads
 from gapbridge.core.model import Model
 from gapbridge.core.planning.travel import shortest_way
-
-Array = NDArray[np.float64]
 
 CANDIDATES = 400
 

@@ -7,14 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gapbridge.bridge.demo.poses import Load
 from gapbridge.bridge.document.output_file import write_table
+from gapbridge.core.arrays import Array
 from gapbridge.core.errors import RunError
 from gapbridge.core.rotation import rotation_matrix, rotation_vector
 
-Array = NDArray[np.float64]
 STILL = 0.003  # rad/s: slower than this, the arm stands
 SETTLING = 0.15  # s from standing still until readings count
 LEAVING = 0.04  # s before it moves on from which they no longer count

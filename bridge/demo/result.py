@@ -6,18 +6,16 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gapbridge.bridge.demo.hidden import Accused, Hidden
 from gapbridge.bridge.demo.poses import TEST_LOADS, Load
 from gapbridge.bridge.demo.rests import Rests
+from gapbridge.core.arrays import Array
 from gapbridge.core.compensation import correct
 from gapbridge.core.effects import settling
 from gapbridge.core.estimation.identification import Identification
 from gapbridge.core.loads import Loads
 from gapbridge.core.model import Model
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -8,9 +8,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple, Self
 
-import numpy as np
-from numpy.typing import NDArray
-
 from gapbridge.bridge.cell import Cell
 from gapbridge.bridge.cell.daemon_settings import DaemonSettings
 from gapbridge.bridge.daemon.daemon import Daemon, settings_of
@@ -21,11 +18,11 @@ from gapbridge.bridge.demo.poses import Load
 from gapbridge.bridge.demo.rests import FEW_READINGS, Rests, joined, rests_so_far
 from gapbridge.bridge.demo.result import LoopFigures
 from gapbridge.bridge.loop.supervisor import Cause, State
+from gapbridge.core.arrays import Array
 from gapbridge.core.errors import LinkError, RunError
 from gapbridge.core.log.mcap_reading import read_columns
 from gapbridge.drivers.clock import SYSTEM, Clock
 
-Array = NDArray[np.float64]
 SLOWEST = 4  # a machine that cannot keep the cell's rate runs at half of it, or at a fourth
 MARGIN = 60.0  # s to connect, arm and end, on top of the trajectory
 PATIENCE = 1200.0  # s that a machine which stalls may take longer over one load

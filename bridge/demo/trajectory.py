@@ -5,11 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gapbridge.bridge.document.output_file import write_table
+from gapbridge.core.arrays import Array
 
-Array = NDArray[np.float64]
 PERIOD = 0.002  # s
 SHARE, FASTEST = 0.9, 2.8  # of each joint's top speed, and rad/s: in the middle of a move
 ACCELERATION = 14.0  # rad/s2, fastest joint

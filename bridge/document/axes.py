@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gapbridge.bridge.document.drawing import (
     EDGE,
@@ -23,6 +22,7 @@ from gapbridge.bridge.document.drawing import (
     Stroke,
     Text,
 )
+from gapbridge.core.arrays import Array
 
 WIDTH, HEIGHT = 340.0, 230.0
 LEFT, RIGHT, TOP, BOTTOM = 44.0, 10.0, 30.0, 38.0
@@ -233,9 +233,7 @@ def _widened(given: Scale, span: float) -> Scale:
     return Scale(given.title, middle - span / 2, middle + span / 2, given.ticks, given.labels)
 
 
-def distribution(
-    title: str, quantity: str, series: Sequence[tuple[str, NDArray[np.float64], str]]
-) -> Chart:
+def distribution(title: str, quantity: str, series: Sequence[tuple[str, Array, str]]) -> Chart:
     """Return the share of values that are at most so large, per series of (name, values, colour).
 
     ``quantity`` names the values, which stand in powers of ten.

@@ -17,11 +17,10 @@ from pathlib import Path
 from typing import IO
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.errors import InputError, RunError
 
-Array = NDArray[np.float64]
 PARQUET = (".parquet", ".pq")
 LONG = 50_000  # numbers from which a library writes a table as text: ten times as fast
 MODE = 0o640  # of a new file

@@ -7,12 +7,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gapbridge.bridge.document.drawing import GRID, INK, SOFT, Drawing, Stroke, Text
 from gapbridge.bridge.document.drawing import Circle as Ring
+from gapbridge.core.arrays import Array
 
-Array = NDArray[np.float64]
 AZIMUTH, ELEVATION = -0.9, 0.42  # rad, from where it is seen at first
 WIDTH, HEIGHT = 640.0, 430.0
 MARGIN = 22.0

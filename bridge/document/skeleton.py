@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.kernels import reference as kernel
 from gapbridge.core.loads import Loads
 from gapbridge.core.model import Model
-
-Array = NDArray[np.float64]
 
 
 def skeleton(model: Model, q: Array, loads: Loads | None = None) -> Array:

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import t as student
 
-Array = NDArray[np.float64]
+from gapbridge.core.arrays import Array
+
 FEWEST = 3  # sessions from which on a slope is reported
 WRONG = 0.05  # share of the drifts reported that may be none (Benjamini, Hochberg 1995)
 DAY = 86400.0

@@ -8,18 +8,17 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import norm
 
 from gapbridge.bridge.fleet.arms import by_arm
 from gapbridge.bridge.fleet.drift import ChannelFigure, Drift, Figure, believed
 from gapbridge.bridge.fleet.outlying import Outlier
 from gapbridge.bridge.fleet.task import Outcome
+from gapbridge.core.arrays import Array
 from gapbridge.core.effects import flexibility_names
 from gapbridge.core.estimation.hierarchical import ArmFit, Scatter, SessionFit, TypeFit, fit_type
 from gapbridge.core.estimation.hierarchical_evidence import Evidence
 
-Array = NDArray[np.float64]
 UNIT = "rad/Nm"
 UNLIKE = 3.5  # deviations of what arms of a type scatter, from which on an arm is reported
 SURPRISING = 3.0  # times the usual noise, in variance

@@ -5,21 +5,20 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.state import RobotState
 
-Vector = NDArray[np.float64]
 OPTIONAL = ("ft_raw_wrench", "joint_temperatures", "actual_current_as_torque", "payload_cog")
 
 
 def write_cycle(
-    row: Vector,
+    row: Array,
     slices: Mapping[str, slice],
     state: RobotState,
-    nominal_q: Vector,
-    corrected_q: Vector,
-    offset_in_base: Vector,
+    nominal_q: Array,
+    corrected_q: Array,
+    offset_in_base: Array,
 ) -> None:
     """Write a state and its setpoint into ``row``; NaN where the controller lacks a field."""
     row[1] = state.timestamp

@@ -19,7 +19,6 @@ import socket
 from enum import IntEnum
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gapbridge.bridge.ipc.counts import Count
 from gapbridge.bridge.ipc.sealed_memory import (
@@ -29,9 +28,9 @@ from gapbridge.bridge.ipc.sealed_memory import (
     map_as_writer,
     seal,
 )
+from gapbridge.core.arrays import Array
 from gapbridge.drivers.clock import SYSTEM, Clock
 
-Array = NDArray[np.float64]
 WORDS = 128
 ROWS = 8192  # cycles kept: 16 s at 500 Hz
 NAME = "gapbridge-cycles"  # of the memory, as /proc shows it

@@ -12,12 +12,12 @@ from gapbridge.bridge.ipc.counts import Count
 from gapbridge.bridge.loop.link_monitor import hold_time
 from gapbridge.bridge.loop.reports import Reports
 from gapbridge.bridge.loop.supervisor import Cause, State, Supervisor
+from gapbridge.core.arrays import Array
 from gapbridge.core.limits import ENVELOPE, JOINT_LIMIT, JOINT_OFFSET
 from gapbridge.core.state import RobotState
 from gapbridge.drivers.driver import Driver
 from gapbridge.drivers.robot_modes import NORMAL, REDUCED, RUNNING
 
-Vector = NDArray[np.float64]
 SAFE = (NORMAL, REDUCED)  # safety_mode
 STOPS = 0b111_1111_1100  # safety_status_bits: all but normal and reduced mode
 PLAYING = 2  # runtime_state
@@ -47,10 +47,10 @@ class FrozenWatch:
 
     def __init__(self) -> None:
         self._q: list[float] | None = None
-        self._target: Vector | None = None  # commanded when the joints were last seen to move
+        self._target: Array | None = None  # commanded when the joints were last seen to move
         self._since = 0.0  # s, controller clock: since when they should have moved
 
-    def update(self, state: RobotState, commanded: Vector) -> str | None:
+    def update(self, state: RobotState, commanded: Array) -> str | None:
         """Return in words that the values are frozen, None where they are not."""
         q, now = state.actual_q, state.timestamp
         joints = q.tolist()

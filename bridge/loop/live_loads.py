@@ -5,13 +5,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.load_bounds import LoadBounds
 from gapbridge.core.loads import Loads
 from gapbridge.core.state import RobotState
 
-Vector = NDArray[np.float64]
 MOVED = 1e-5  # rad: a joint that has come this far has moved, in that direction
 
 
@@ -36,7 +35,7 @@ class LiveLoads:
         self._cog = np.zeros((1, 3))
         self._temperature = np.zeros((1, n))
         self._approach = np.zeros((1, n))
-        self._turned_at: Vector | None = None
+        self._turned_at: Array | None = None
         self._last = -math.inf  # s, controller clock
 
     def update(self, state: RobotState) -> Loads:
@@ -96,7 +95,7 @@ class LiveLoads:
         share = 1.0 - math.exp(-gap / self._constant)
         self._wrench[0] += share * (state.actual_TCP_force - self._wrench[0])
 
-    def _follow_motion(self, q: Vector) -> None:
+    def _follow_motion(self, q: Array) -> None:
         before = self._turned_at
         if before is None:
             self._turned_at = q.copy()

@@ -11,7 +11,6 @@ from enum import IntEnum
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gapbridge.bridge.cell.daemon_settings import DaemonSettings
 from gapbridge.bridge.ipc.command_page import Command, Commands
@@ -28,6 +27,7 @@ from gapbridge.bridge.loop.setpoint_stream import SetpointStream, longest_withdr
 from gapbridge.bridge.loop.supervisor import Cause, State, Supervisor
 from gapbridge.bridge.loop.writing import Writing
 from gapbridge.bridge.setpoint_source.source import Source, SourceStatus
+from gapbridge.core.arrays import Array
 from gapbridge.core.errors import InvalidStateError, LinkError
 from gapbridge.core.load_bounds import LoadBounds
 from gapbridge.core.loads import Loads
@@ -35,8 +35,6 @@ from gapbridge.core.model import Model
 from gapbridge.core.setpoint import Setpoint
 from gapbridge.core.state import RobotState
 from gapbridge.drivers.driver import Driver
-
-Vector = NDArray[np.float64]
 
 LONGEST_STOP = 1.0  # s from a request to stop to letting go, beside what the cell's rates take
 HASTY_RAMP = 0.5  # s: what a stop takes for the ramp at most
@@ -60,7 +58,7 @@ class CycleInput(NamedTuple):
 
     state: RobotState
     missed: int  # cycles before it
-    own: Vector  # (n,) rad: nominal joints of the robot's own program
+    own: Array  # (n,) rad: nominal joints of the robot's own program
     loads: Loads
     flags: int
 

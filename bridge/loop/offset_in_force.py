@@ -13,21 +13,20 @@ from pathlib import Path
 from typing import NamedTuple, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gapbridge.bridge.cell.runtime_folder import runtime_folder
+from gapbridge.core.arrays import Array
 from gapbridge.drivers.controller_address import address_of
 from gapbridge.drivers.link_settings import DriverSettings
 
-Vector = NDArray[np.float64]
 STAYED = 0.02  # rad: an arm that is farther from its last setpoint has been moved by somebody
 
 
 class InForce(NamedTuple):
     """A joint offset (n,) rad and the TCP offset (6,) in base that it makes, m and rad."""
 
-    delta: Vector
-    offset_in_base: Vector
+    delta: Array
+    offset_in_base: Array
 
 
 class OffsetInForce:
@@ -62,14 +61,14 @@ class OffsetInForce:
         key = hashlib.sha256(address_of(link).encode()).hexdigest()[:16]
         return cls(n, runtime_folder() / f"{key}.offset")
 
-    def note(self, q: Vector, delta: Vector, offset_in_base: Vector) -> None:
+    def note(self, q: Array, delta: Array, offset_in_base: Array) -> None:
         """Keep what has been sent: joints (n,) rad, the offset in them, and its TCP offset (6,)."""
         place = 0 if self._which[0] == 2.0 else 1
         row, n = self._places[place], self._n
         row[:n], row[n : 2 * n], row[2 * n :] = q, delta, offset_in_base
         self._which[0] = place + 1.0
 
-    def at(self, q: Vector) -> InForce | None:
+    def at(self, q: Array) -> InForce | None:
         """Return the offset that an arm at q (n,) still has; None: it has none, or was moved."""
         if self._which[0] not in (1.0, 2.0):
             return None

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.compensation import Compensator
 from gapbridge.core.loads import Loads
 from gapbridge.core.model import Model
 
-Vector = NDArray[np.float64]
 LEAST = 1e-9  # m, rad: a smaller offset is none
 PULL = 10.0  # N: a model that bends under a pull corrects something
 POSES, SEED = 16, 14  # tried beside the present one
@@ -36,7 +35,7 @@ class ModelCheck:
         """Try anew the next time: the loads may be others."""
         self._known = None
 
-    def _offset(self, q: Vector, loads: Loads) -> bool:
+    def _offset(self, q: Array, loads: Loads) -> bool:
         wrench = np.zeros((1, 6)) if loads.wrench is None else loads.wrench
         tried = [wrench]
         if self._use_force:

@@ -6,11 +6,11 @@ import math
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from gapbridge.bridge.cell.sections import LimitSettings
 from gapbridge.bridge.loop.offset_in_force import InForce
 from gapbridge.core.arm import Arm
+from gapbridge.core.arrays import Array
 from gapbridge.core.compensation import Compensator, Correction
 from gapbridge.core.errors import StaleStateError
 from gapbridge.core.kernels.reference import JIT
@@ -22,7 +22,6 @@ from gapbridge.core.state import RobotState
 from gapbridge.drivers.clock import SYSTEM, Clock
 from gapbridge.drivers.gate import GateBounds
 
-Vector = NDArray[np.float64]
 DECELERATION = 8.0  # rad/s^2 of the fastest joint
 SMOOTHING = 0.02  # s: over which the velocity is averaged
 PLACE, RATE, LIMIT = range(3)  # rows of what is kept
@@ -85,24 +84,24 @@ class NominalStream:
     their way, the fastest with DECELERATION.
     """
 
-    def __init__(self, velocity_limit: Vector) -> None:
+    def __init__(self, velocity_limit: Array) -> None:
         # one array: each that is handed to compiled code is unwrapped anew in every call
         self._kept = np.zeros((3, len(velocity_limit)))
         self._kept[LIMIT] = velocity_limit
-        self.q: Vector = self._kept[PLACE]
-        self._rate: Vector = self._kept[RATE]
+        self.q: Array = self._kept[PLACE]
+        self._rate: Array = self._kept[RATE]
         _followed(self._kept, self.q.copy(), 1.0)  # compiled now: the loop waits for no compiler
 
-    def start(self, q: Vector) -> None:
+    def start(self, q: Array) -> None:
         """Begin at rest at ``q`` (n,) rad."""
         self.q[:] = q
         self._rate[:] = 0.0
 
-    def follow(self, q: Vector, gap: float) -> None:
+    def follow(self, q: Array, gap: float) -> None:
         """Take the source's setpoint (n,), ``gap`` s after the last one."""
         _followed(self._kept, q, gap)
 
-    def brake(self, gap: float) -> Vector:
+    def brake(self, gap: float) -> Array:
         """Return the setpoint ``gap`` s later on the way to rest; it holds until the next call."""
         fastest = float(np.abs(self._rate).max())
         if fastest > 0.0:
@@ -134,7 +133,7 @@ class SetpointStream:
         self._ramp = 0.0
         self._resumes = False  # begun with an offset in force, which the ramp goes on from
         self._last = 0.0  # s, controller time of the last setpoint
-        self._start_gap: Vector | None = None  # rad: where the arm stood minus the first setpoint
+        self._start_gap: Array | None = None  # rad: where the arm stood minus the first setpoint
         self._since_start = 0.0  # s
         self.residual = 0.0  # m, of the last correction
         self.finite = True  # the last correction is numbers
@@ -142,7 +141,7 @@ class SetpointStream:
         self._solved = np.zeros(model.arm.n + 6)  # joint and TCP offset of the last one solved
         self.clamped = 0  # bits of the last setpoint
 
-    def correct(self, nominal_q: Vector, loads: Loads) -> Correction:
+    def correct(self, nominal_q: Array, loads: Loads) -> Correction:
         """Return the correction alone, neither ramped nor limited."""
         correction = self._compensator.correct(nominal_q, loads)
         self.residual = float(correction.residual)
@@ -172,8 +171,8 @@ class SetpointStream:
         )
 
     def start(
-        self, own_q: Vector, timestamp: float, led: bool = False, in_force: InForce | None = None
-    ) -> Vector:
+        self, own_q: Array, timestamp: float, led: bool = False, in_force: InForce | None = None
+    ) -> Array:
         """Begin at rest at ``own_q`` (n,); returns the nominal joints there. Raises LimitError.
 
         ``led``: the setpoints that follow are led over from where the arm stands already.
@@ -194,7 +193,7 @@ class SetpointStream:
         return nominal
 
     def advance(
-        self, state: RobotState, source_q: Vector | None, loads: Loads, goal: float,
+        self, state: RobotState, source_q: Array | None, loads: Loads, goal: float,
         expiry: float = np.inf,
     ) -> Setpoint:  # fmt: skip
         """Return the next setpoint; ``source_q`` None: the motion brakes.
@@ -230,7 +229,7 @@ class SetpointStream:
         self._last, self.clamped = state.timestamp, limited.clamped
         return Setpoint(limited.q, nominal, limited.offset_in_base, state.timestamp, state.received)
 
-    def _share(self, offset_in_base: Vector) -> float:
+    def _share(self, offset_in_base: Array) -> float:
         """Return where the ramp is; at a beginning with an offset in force, its share of this one.
 
         0..1, by the length of the TCP's shift.
@@ -242,7 +241,7 @@ class SetpointStream:
         return min(held / wanted, 1.0) if wanted > 0.0 else 0.0
 
     @property
-    def joint_offset(self) -> Vector:
+    def joint_offset(self) -> Array:
         """Return the joint offset (n,) in the last setpoint, rad: read-only, of this moment."""
         return self.limiter.joint_offset
 
@@ -261,7 +260,7 @@ class SetpointStream:
         bare = self._ramp == 0.0 and not self._resumes
         return bare and not self.limiter.offset_in_base.any()
 
-    def _without_start_gap(self, source_q: Vector, gap: float) -> Vector:
+    def _without_start_gap(self, source_q: Array, gap: float) -> Array:
         """Return the source's setpoint, led over to from where the arm stood: no first jump."""
         if self._start_gap is None:
             self._start_gap = self._nominal.q - source_q

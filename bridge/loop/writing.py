@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gapbridge.bridge.cell.sections import SetpointSettings
 from gapbridge.bridge.ipc.counts import Count
@@ -14,6 +13,7 @@ from gapbridge.bridge.loop.reports import Reports
 from gapbridge.bridge.loop.setpoint_stream import SetpointStream
 from gapbridge.bridge.loop.supervisor import Cause, State, Supervisor
 from gapbridge.bridge.setpoint_source.source import Source, SourceDryError
+from gapbridge.core.arrays import Array
 from gapbridge.core.errors import (
     ForeignCommandError,
     GateError,
@@ -28,7 +28,6 @@ from gapbridge.core.setpoint import Setpoint
 from gapbridge.core.state import RobotState
 from gapbridge.drivers.driver import Driver
 
-Vector = NDArray[np.float64]
 SETTLED, LONGEST_SETTLING = 2e-6, 0.3  # rad, s
 PARTS_IN_A_ROW = 3  # setpoints that left in part only, after which the motion is ended
 
@@ -68,7 +67,7 @@ class Writing:
         """Take note that the driver is not armed any more: its watchdog, or a person, has it."""
         self.ready = False
 
-    def start(self, state: RobotState, own: Vector) -> bool:
+    def start(self, state: RobotState, own: Array) -> bool:
         """Begin writing once the source has a first setpoint and the driver is ready.
 
         Returns whether it took so long that a fresh state is needed.
@@ -129,7 +128,7 @@ class Writing:
         self._supervisor.take(Cause.START_REFUSED, detail)
 
     def write(
-        self, state: RobotState, own: Vector, loads: Loads, expiry: float = np.inf
+        self, state: RobotState, own: Array, loads: Loads, expiry: float = np.inf
     ) -> Setpoint | None:
         """Send one setpoint; returns it, or None where none has left.
 
@@ -240,7 +239,7 @@ class Writing:
             return True
         return False
 
-    def _next(self, state: RobotState, own: Vector) -> Vector | None:
+    def _next(self, state: RobotState, own: Array) -> Array | None:
         """Return the source's setpoint; None: the motion must brake."""
         if self._supervisor.state == State.HOLDING:
             return None if self._driver.moves_arm else own

@@ -8,14 +8,13 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gapbridge.bridge.cell.daemon_settings import DaemonSettings
 from gapbridge.bridge.cell.reread import RereadSettings
 from gapbridge.bridge.ipc.shared_memory import SharedMemory
+from gapbridge.core.arrays import Array
 from gapbridge.core.limits import CLAMPS
 
-Array = NDArray[np.float64]
 AGE_BOUNDS = (0.00025, 0.0005, 0.001, 0.002, 0.004, 0.008, 0.016, 0.032, 0.064, 0.128)  # s
 WORK_BOUNDS = (0.00005, 0.0001, 0.0002, 0.0004, 0.0008, 0.0016, 0.0032, 0.0064, 0.0128)  # s
 

@@ -10,8 +10,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.effects import CATALOGUE
 from gapbridge.core.effects.effect import Effect, Term
 from gapbridge.core.effects.simulator import Kind, SimulatorChange
@@ -19,7 +19,6 @@ from gapbridge.core.errors import InputError
 from gapbridge.core.model import Model
 from gapbridge.core.rotation import rotation_matrix, transform
 
-Array = NDArray[np.float64]
 ANGLE, DISTANCE = 1e-3, 1e-3  # rad, m: by which an axis may be off and still be the same arm's
 TINY = 1e-12
 

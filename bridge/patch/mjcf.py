@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gapbridge.bridge.patch.changes import TINY, ModelChanges, base_in_world
 from gapbridge.bridge.patch.mjcf_scene import Hinge, Scene
@@ -23,12 +22,12 @@ from gapbridge.bridge.patch.model_format import (
     named_one,
     pick_joints,
 )
+from gapbridge.core.arrays import Array
 from gapbridge.core.effects.effect import typical_moment
 from gapbridge.core.effects.simulator import Kind
 from gapbridge.core.errors import InputError
 from gapbridge.core.rotation import rotation_matrix, transform
 
-Array = NDArray[np.float64]
 TAKEN_UP = 0.2  # rad/s2: an arm that slows down no faster leaves its play behind it
 GAUSS = (0.5 - 3**0.5 / 6, 0.5 + 3**0.5 / 6)  # of a length: two points of quadrature
 HEAVY = 1.5  # times a joint's usual moment: up to there a stiffening spring has to hold

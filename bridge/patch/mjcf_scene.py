@@ -14,14 +14,13 @@ from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from gapbridge.bridge.patch.changes import Axes
+from gapbridge.core.arrays import Array
 from gapbridge.core.errors import InputError
 from gapbridge.core.rotation import transform
 
-Array = NDArray[np.float64]
 ARMATURE = 1e-3  # kg m2 of a further joint, which MuJoCo needs to integrate stiff springs
 DAMPING = 0.3  # ratio of a further joint's damping to the critical one
 FOLDERS = ("meshdir", "texturedir", "assetdir")  # of <compiler>, relative to the file

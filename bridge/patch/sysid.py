@@ -14,16 +14,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gapbridge.bridge.cell import Cell
 from gapbridge.bridge.patch.changes import changes_of
 from gapbridge.bridge.patch.mjcf import Mjcf
 from gapbridge.bridge.patch.model_format import PatchOptions
+from gapbridge.core.arrays import Array
 from gapbridge.core.effects import CATALOGUE
 from gapbridge.core.model import Model
 
-Array = NDArray[np.float64]
 SIGMAS = 3.0  # from the value to each bound
 MODELS = Mjcf.suffixes
 SUFFIXES = (".py", ".yaml", ".yml")

@@ -8,7 +8,6 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gapbridge.bridge.patch.changes import TINY, Axes, ModelChanges, base_in_world
 from gapbridge.bridge.patch.model_format import (
@@ -18,11 +17,11 @@ from gapbridge.bridge.patch.model_format import (
     named_one,
     pick_joints,
 )
+from gapbridge.core.arrays import Array
 from gapbridge.core.effects.simulator import Kind
 from gapbridge.core.errors import InputError
 from gapbridge.core.rotation import roll_pitch_yaw, rpy_matrix, transform
 
-Array = NDArray[np.float64]
 TURNING = ("revolute", "continuous")
 INSTEAD = {
     Kind.ARMATURE: "rotor inertia: set the armature where the simulator has it",

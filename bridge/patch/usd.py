@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gapbridge.bridge.patch.changes import TINY, Axes, ModelChanges, base_in_world
 from gapbridge.bridge.patch.model_format import (
@@ -23,6 +22,7 @@ from gapbridge.bridge.patch.model_format import (
     named_one,
     pick_joints,
 )
+from gapbridge.core.arrays import Array
 from gapbridge.core.effects.simulator import Kind
 from gapbridge.core.errors import InputError
 from gapbridge.core.rotation import transform
@@ -30,7 +30,6 @@ from gapbridge.core.rotation import transform
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-Array = NDArray[np.float64]
 PER_DEGREE = np.pi / 180  # of what a drive gives per rad
 AT_ZERO = 1e-5  # m and of rotations: by which a body may be off and still stand at zero angles
 SMALL = 1e-4  # kg, kg m2 of a body between two joints

@@ -17,9 +17,9 @@ from typing import Any
 
 import numpy as np
 from mcap.writer import CompressionType, Writer
-from numpy.typing import NDArray
 
 from gapbridge.bridge.document.output_file import MODE, sync_folder
+from gapbridge.core.arrays import Array
 from gapbridge.core.log.mcap_layout import layout_of
 from gapbridge.core.log.mcap_schema import (
     CYCLE_CHANNELS,
@@ -32,7 +32,6 @@ from gapbridge.core.log.mcap_schema import (
 )
 from gapbridge.drivers.clock import SYSTEM, Clock
 
-Array = NDArray[np.float64]
 LARGEST_CHUNK = 1 << 26  # bytes: chunks end by flush, long before this
 SYNC_SHARE = 0.1  # of the time may be spent in waiting for the disk
 SYNC_EVERY = 0.4  # s between two such waits at least

@@ -9,13 +9,12 @@ from gapbridge.bridge.document.drawing import EDGE, SOFT
 from gapbridge.bridge.document.scene import Arrows, Path, Scene, base
 from gapbridge.bridge.document.skeleton import reach, round_factor, skeleton
 from gapbridge.bridge.report.material import (
-    Array,
-    Index,
     Material,
     before_and_after,
     per_sample,
     thinned,
 )
+from gapbridge.core.arrays import Array, Index
 from gapbridge.core.diagnosis.channel_diagnosis import ChannelDiagnosis
 
 ARROWS = 250

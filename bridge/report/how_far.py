@@ -9,8 +9,6 @@ from gapbridge.bridge.document.blocks import Bar, Block, Cell, Paragraph, Pictur
 from gapbridge.bridge.document.drawing import BAD_DOT, EDGE, LIMIT, Drawing
 from gapbridge.bridge.report.labels import CHANNELS, effect_title, percent, unit_of, with_unit
 from gapbridge.bridge.report.material import (
-    Array,
-    Index,
     Material,
     before_and_after,
     channel_heading,
@@ -18,6 +16,7 @@ from gapbridge.bridge.report.material import (
     shares,
     thinned,
 )
+from gapbridge.core.arrays import Array, Index
 from gapbridge.core.diagnosis.channel_diagnosis import ChannelDiagnosis
 
 

@@ -7,19 +7,17 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gapbridge.bridge.document.blocks import Block, Heading
 from gapbridge.bridge.document.drawing import AFTER, BEFORE
 from gapbridge.bridge.report.labels import CHANNELS
+from gapbridge.core.arrays import Array, Index
 from gapbridge.core.diagnosis.channel_diagnosis import ChannelDiagnosis
 from gapbridge.core.diagnosis.diagnosis import Diagnosis
 from gapbridge.core.diagnosis.held_out import HeldOut
 from gapbridge.core.log.log import Log
 from gapbridge.core.model import Model
 
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 SHOWN = 1500  # points a figure draws at most; outliers and extremes are not thinned away
 
 

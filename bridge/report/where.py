@@ -10,8 +10,6 @@ from gapbridge.bridge.document.drawing import Drawing
 from gapbridge.bridge.report.arm_view import arm_view
 from gapbridge.bridge.report.labels import percent, quantity_title, quantity_unit, unit_of
 from gapbridge.bridge.report.material import (
-    Array,
-    Index,
     Material,
     before_and_after,
     channel_heading,
@@ -19,6 +17,7 @@ from gapbridge.bridge.report.material import (
     per_sample,
     thinned,
 )
+from gapbridge.core.arrays import Array, Index
 from gapbridge.core.diagnosis.channel_diagnosis import ChannelDiagnosis
 
 MOST_QUANTITIES = 14

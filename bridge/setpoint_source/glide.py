@@ -6,14 +6,11 @@ from abc import abstractmethod
 from pathlib import Path
 from typing import ClassVar
 
-import numpy as np
-from numpy.typing import NDArray
-
 from gapbridge.bridge.cell.sections import SetpointSettings
 from gapbridge.bridge.setpoint_source.source import Source, SourceDryError
+from gapbridge.core.arrays import Array
 from gapbridge.drivers.clock import SYSTEM, Clock
 
-Vector = NDArray[np.float64]
 LONGEST_GLIDE = 0.1  # s
 
 
@@ -26,13 +23,13 @@ class Glide:
     def __init__(self, timeout: float, what: str, clock: Clock = SYSTEM) -> None:
         self._now = clock.monotonic
         self._timeout, self._what = timeout, what
-        self._newest: Vector | None = None
+        self._newest: Array | None = None
         self._last_received = 0.0  # s, monotonic
-        self._from: Vector | None = None
+        self._from: Array | None = None
         self._length = 0.0  # s
-        self._present: Vector | None = None
+        self._present: Array | None = None
 
-    def take(self, q: Vector) -> None:
+    def take(self, q: Array) -> None:
         """Take a new setpoint (n,), rad."""
         now = self._now()
         self._length = (
@@ -40,13 +37,13 @@ class Glide:
         )
         self._newest, self._last_received = q, now
 
-    def first(self) -> Vector | None:
+    def first(self) -> Array | None:
         """Return the newest setpoint where one has come lately."""
         if self._newest is None or self._now() - self._last_received > self._timeout:
             return None
         return self._newest
 
-    def begin(self, own_q: Vector) -> None:
+    def begin(self, own_q: Array) -> None:
         """Start from where the arm stands."""
         self._present = own_q.copy()
         self.turn()
@@ -55,7 +52,7 @@ class Glide:
         """Glide to the newest setpoint from where the stream is."""
         self._from = self._present if self._present is not None else self._newest
 
-    def sample(self) -> Vector:
+    def sample(self) -> Array:
         """Return the setpoint of this moment. Raises SourceDryError where none came in time."""
         silent = self._now() - self._last_received
         if self._newest is None or silent > self._timeout:
@@ -83,16 +80,16 @@ class GlidingSource(Source):
     def _receive(self) -> bool:
         """Take what has arrived; returns whether there is a new setpoint."""
 
-    def first(self, own_q: Vector) -> Vector | None:
+    def first(self, own_q: Array) -> Array | None:
         """Return the newest setpoint where one has come lately."""
         self._receive()
         return self._glide.first()
 
-    def begin(self, timestamp: float, own_q: Vector) -> None:
+    def begin(self, timestamp: float, own_q: Array) -> None:
         """Start from where the arm stands."""
         self._glide.begin(own_q)
 
-    def sample(self, timestamp: float, own_q: Vector) -> Vector:
+    def sample(self, timestamp: float, own_q: Array) -> Array:
         """Return the setpoint of this moment. Raises SourceDryError where none came in time."""
         if self._receive():
             self._glide.turn()

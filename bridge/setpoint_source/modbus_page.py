@@ -7,11 +7,10 @@ import os
 import struct
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gapbridge.bridge.ipc.sealed_memory import is_sealed, make_memory, map_as_reader, map_as_writer
+from gapbridge.core.arrays import Array
 
-Vector = NDArray[np.float64]
 MOST_JOINTS = 10
 _HEAD = struct.Struct("<qqqqq")
 _SIZE = 512  # bytes of one record
@@ -28,7 +27,7 @@ class Record:
         self.fd = fd
         self._map: mmap.mmap = (map_as_writer if writes else map_as_reader)(fd, _SIZE)
 
-    def write(self, words: tuple[int, int, int, int], values: Vector) -> None:
+    def write(self, words: tuple[int, int, int, int], values: Array) -> None:
         """Replace the record."""
         version = _HEAD.unpack_from(self._map)[0]
         struct.pack_into("<q", self._map, 0, version + 1)
@@ -37,7 +36,7 @@ class Record:
         _HEAD.pack_into(self._map, 0, version + 1, *words)
         struct.pack_into("<q", self._map, 0, version + 2)
 
-    def read(self, count: int) -> tuple[tuple[int, ...], Vector] | None:
+    def read(self, count: int) -> tuple[tuple[int, ...], Array] | None:
         """Return words and numbers, or None where they are being written all the while."""
         for _ in range(ATTEMPTS):
             version, *words = _HEAD.unpack_from(self._map)
@@ -79,11 +78,11 @@ class PlcPage:
 
     # -- from the PLC -----------------------------------------------------------------------------
 
-    def put_setpoint(self, sequence: int, q: Vector) -> None:
+    def put_setpoint(self, sequence: int, q: Array) -> None:
         """Hand a setpoint (n,) rad to the loop."""
         self._setpoint.write((sequence, 1, 0, 0), q)
 
-    def setpoint(self) -> tuple[int, Vector] | None:
+    def setpoint(self) -> tuple[int, Array] | None:
         """Return sequence number and joints (n,) rad; None where there are none yet."""
         found = self._setpoint.read(self.n)
         if found is None or not found[0][1]:
@@ -92,11 +91,11 @@ class PlcPage:
 
     # -- to the PLC -------------------------------------------------------------------------------
 
-    def put_status(self, words: tuple[int, int, int, int], values: Vector) -> None:
+    def put_status(self, words: tuple[int, int, int, int], values: Array) -> None:
         """Report state, sequence taken, cycle and flags; corrected, nominal (n,), offset (6,)."""
         self._status.write(words, values)
 
-    def status(self) -> tuple[tuple[int, ...], Vector] | None:
+    def status(self) -> tuple[tuple[int, ...], Array] | None:
         """Return what ``put_status`` has reported last."""
         return self._status.read(2 * self.n + 6)
 

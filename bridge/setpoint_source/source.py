@@ -6,22 +6,18 @@ from abc import ABC, abstractmethod
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
 from gapbridge.bridge.cell.sections import SetpointSettings
+from gapbridge.core.arrays import Array
 from gapbridge.core.errors import RunError
-
-Vector = NDArray[np.float64]
 
 
 class SourceStatus(NamedTuple):
     """What the loop did in one cycle. A tuple, because one is made in each."""
 
     state: int  # of the supervisor
-    nominal_q: Vector  # (n,) rad
-    corrected_q: Vector  # (n,) rad
-    offset_in_base: Vector  # (6,) m, rad
+    nominal_q: Array  # (n,) rad
+    corrected_q: Array  # (n,) rad
+    offset_in_base: Array  # (6,) m, rad
     written: bool  # the corrected setpoint has left
     clamped: int  # bits of the limiter
 
@@ -47,18 +43,18 @@ class Source(ABC):
         """Open what the source listens on. Raises RunError."""
 
     @abstractmethod
-    def first(self, own_q: Vector) -> Vector | None:
+    def first(self, own_q: Array) -> Array | None:
         """Return where the source would start (n,), rad; None where it has nothing yet.
 
         ``own_q`` is what the robot itself wants now, (n,) rad. The caller checks that the start is
         near the arm: starting never jumps.
         """
 
-    def begin(self, timestamp: float, own_q: Vector) -> None:
+    def begin(self, timestamp: float, own_q: Array) -> None:
         """Start the motion at controller time ``timestamp`` (s)."""
 
     @abstractmethod
-    def sample(self, timestamp: float, own_q: Vector) -> Vector:
+    def sample(self, timestamp: float, own_q: Array) -> Array:
         """Return the setpoint (n,) rad at controller time ``timestamp``. Raises SourceDryError."""
 
     def emit(self, reported: SourceStatus) -> None:

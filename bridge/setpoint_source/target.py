@@ -4,13 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
 from gapbridge.bridge.cell.sections import SetpointSettings
 from gapbridge.bridge.setpoint_source.source import Source
-
-Vector = NDArray[np.float64]
+from gapbridge.core.arrays import Array
 
 
 class TargetSource(Source):
@@ -25,16 +21,16 @@ class TargetSource(Source):
     ) -> None:
         super().__init__(settings, n, moves_arm, folder, rate)
         self._stands = moves_arm
-        self._start: Vector | None = None
+        self._start: Array | None = None
 
-    def first(self, own_q: Vector) -> Vector | None:
+    def first(self, own_q: Array) -> Array | None:
         """Return the robot's own target."""
         return own_q
 
-    def begin(self, timestamp: float, own_q: Vector) -> None:
+    def begin(self, timestamp: float, own_q: Array) -> None:
         """Remember where the arm stands."""
         self._start = own_q.copy() if self._stands else None
 
-    def sample(self, timestamp: float, own_q: Vector) -> Vector:
+    def sample(self, timestamp: float, own_q: Array) -> Array:
         """Return the robot's own target, or where the arm stood."""
         return own_q if self._start is None else self._start

@@ -5,14 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gapbridge.bridge.cell.sections import SetpointSettings
 from gapbridge.bridge.setpoint_source.source import Source
+from gapbridge.core.arrays import Array
 from gapbridge.core.errors import LogError
 from gapbridge.core.log.log import read_log
-
-Vector = NDArray[np.float64]
 
 
 class TrajectorySource(Source):
@@ -28,7 +26,7 @@ class TrajectorySource(Source):
         super().__init__(settings, n, moves_arm, folder, rate)
         path = folder / (settings.file or "")
         log = read_log(path, n)
-        self._q: Vector = np.ascontiguousarray(log.require("target_q"))
+        self._q: Array = np.ascontiguousarray(log.require("target_q"))
         time = log.require("timestamp")
         behind = np.flatnonzero(np.diff(time) <= 0.0)
         if len(behind):
@@ -42,28 +40,28 @@ class TrajectorySource(Source):
         self._row = 0
         self._ended = False
 
-    def first(self, own_q: Vector) -> Vector | None:
+    def first(self, own_q: Array) -> Array | None:
         """Return the first row."""
-        first: Vector = self._q[0]
+        first: Array = self._q[0]
         return first
 
-    def begin(self, timestamp: float, own_q: Vector) -> None:
+    def begin(self, timestamp: float, own_q: Array) -> None:
         """Start the clock: the first row is due at ``timestamp``."""
         self._begun, self._row, self._ended = timestamp, 0, False
 
-    def sample(self, timestamp: float, own_q: Vector) -> Vector:
+    def sample(self, timestamp: float, own_q: Array) -> Array:
         """Return the joints at this moment."""
         time, q, row = self._time, self._q, self._row
         at = timestamp - (timestamp if self._begun is None else self._begun)
         if at >= time[-1]:
             self._ended = True
-            last: Vector = q[-1]
+            last: Array = q[-1]
             return last
         while time[row + 1] <= at:
             row += 1
         self._row = row
         share = (at - time[row]) / (time[row + 1] - time[row])
-        found: Vector = q[row] + share * (q[row + 1] - q[row])
+        found: Array = q[row] + share * (q[row + 1] - q[row])
         return found
 
     @property

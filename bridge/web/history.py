@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from gapbridge.core.arrays import Array
+
 STEP = 0.05  # s that one point stands for
 
 COLUMNS = (

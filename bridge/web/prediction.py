@@ -8,19 +8,18 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gapbridge.bridge.cell.daemon_settings import DaemonSettings
 from gapbridge.bridge.document.drawing import EDGE
 from gapbridge.bridge.document.scene import Path, Scene, base
 from gapbridge.bridge.document.skeleton import reach, round_factor, skeleton
+from gapbridge.core.arrays import Array
 from gapbridge.core.dynamics import predict_wrench
 from gapbridge.core.errors import GapbridgeError
 from gapbridge.core.loads import Loads
 from gapbridge.core.model import Model
 from gapbridge.core.motion import Motion
 
-Array = NDArray[np.float64]
 DRAWN = 0.15  # of the reach: how far the stretched arm's bend is drawn
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from gapbridge.core.arrays import Array
+
 SPAN = 60.0  # s that are looked back
 EDGES = np.logspace(-5, -1, 41)  # s: bounds of the bins, ten to a decade
 

@@ -9,7 +9,6 @@ from collections import deque
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gapbridge.bridge.cell.daemon_settings import DaemonSettings
 from gapbridge.bridge.cell.reread import RereadSettings
@@ -18,9 +17,9 @@ from gapbridge.bridge.loop.supervisor import State
 from gapbridge.bridge.web.history import COLUMNS, STEP, History
 from gapbridge.bridge.web.prediction import Prediction
 from gapbridge.bridge.web.timing import Timing
+from gapbridge.core.arrays import Array
 from gapbridge.core.limits import CLAMPS
 
-Array = NDArray[np.float64]
 Message = tuple[str, dict[str, Any]]  # kind, data
 ENDS = ("fault", "failure")  # kinds of events with which a process of the loop ends
 EVENTS = 200  # kept to show

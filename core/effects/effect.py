@@ -16,8 +16,8 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.effects.simulator import Kind, SimulatorChange
 
 if TYPE_CHECKING:
@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from gapbridge.core.loads import Loads
     from gapbridge.core.motion import Motion
 
-Array = NDArray[np.float64]
 CHANNELS = {"position": "m", "wrench": "N", "tracking": "rad", "torque": "Nm"}
 
 

@@ -7,14 +7,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.kernels.reference import JIT
 
 if TYPE_CHECKING:
     from gapbridge.core.motion import Motion
 
-Array = NDArray[np.float64]
 FINE_STEP = 1e-3  # s: a lag's command is filled in to at least this rate
 
 

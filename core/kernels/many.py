@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import numpy as np
 from numba import config
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.kernels import reference as kernel
 from gapbridge.core.kernels.predict import linear_blocks, predict_blocks
 from gapbridge.core.kernels.reference import Chain, Rows
 from gapbridge.core.kernels.threads import in_ranges
 
-Array = NDArray[np.float64]
 FEW = 2  # rows that are not worth a block
 
 

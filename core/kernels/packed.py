@@ -9,11 +9,9 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.kernels.reference import JIT, Chain, Rows, Shape, new_shape
-
-Array = NDArray[np.float64]
 
 
 def pack(record: Chain | Rows | Shape) -> Array:

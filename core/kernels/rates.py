@@ -10,13 +10,10 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.kernels.reference import JIT
-
-Array = NDArray[np.float64]
 
 
 class ChainRate(NamedTuple):

@@ -11,12 +11,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.kernels.machine_code import keep_by_all_sources
 
 keep_by_all_sources()
-Array = NDArray[np.float64]
 JIT: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy"}
 TOLERANCE = 1e-14  # rad and m: change of the shape at which the equilibrium counts as found
 MAX_ITERATIONS = 200

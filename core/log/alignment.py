@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.errors import LogError
 from gapbridge.core.log.log import Log
 from gapbridge.core.log.sources.resampling import Stream
 
-Array = NDArray[np.float64]
 POSE = "actual_TCP_pose"
 SAME = 1e-3  # s between two stamps of one row
 FAST = 0.05  # s: between rows that follow each other so closely values can be interpolated

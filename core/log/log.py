@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array, Index
 from gapbridge.core.errors import LogError
 from gapbridge.core.files import is_file, read_bytes
 from gapbridge.core.loads import Loads
@@ -31,7 +32,6 @@ from gapbridge.core.log.columns import (
 )
 from gapbridge.core.log.parquet_tables import ParquetColumns
 
-Array = NDArray[np.float64]
 GZIP = b"\x1f\x8b"
 STILL = 1e-6  # rad: a smaller change between rows is no motion
 
@@ -44,10 +44,10 @@ class Log:
     columns: Mapping[str, Array]
     n: int  # joints
     first_row: int = 2  # line of the first data row in the file, for messages
-    lines: NDArray[np.int64] | None = None  # (N,) line of each row; None: one after the other
+    lines: Index | None = None  # (N,) line of each row; None: one after the other
     unknown: tuple[str, ...] = ()  # names of the file's columns that no channel reads
     session_names: tuple[str, ...] = ()  # of several sessions; column session holds their index
-    numbers: NDArray[np.int64] | None = None  # (N,) of the rows of several sessions, from 1
+    numbers: Index | None = None  # (N,) of the rows of several sessions, from 1
     one_clock: bool = True  # False: timestamps of later sessions were shifted behind the first's
     # what several readers derive of these rows, once (``motion_of``); other rows begin anew
     derived: dict[str, Any] = field(init=False, repr=False, compare=False, default_factory=dict)
@@ -193,7 +193,7 @@ def _text(path: Path) -> str:
         raise LogError(f"{path}: found no readable file ({error})") from None
 
 
-def _read_csv(path: Path) -> tuple[list[str], Array, NDArray[np.int64] | None]:
+def _read_csv(path: Path) -> tuple[list[str], Array, Index | None]:
     """Return the names of all columns, those that are known (rows, known columns), and the lines.
 
     Lines of the rows in the file, or None where they follow each other from 2. Lines that begin

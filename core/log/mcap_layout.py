@@ -14,9 +14,9 @@ import numpy as np
 from google.protobuf.descriptor_pb2 import DescriptorProto, FieldDescriptorProto
 from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.log.mcap_schema import ENUM_FIELD, LOOP, Sizes
 
-Array = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
 _VARINT, _FIXED64, _LENGTH = 0, 1, 2  # wire types
 

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 from google.protobuf.descriptor_pb2 import DescriptorProto
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array, Index
 from gapbridge.core.errors import LogError
 from gapbridge.core.log import mcap_records as records
 from gapbridge.core.log.mcap_layout import Layout, layout_in
@@ -27,7 +27,6 @@ from gapbridge.core.log.mcap_schema import (
     message_of,
 )
 
-Array = NDArray[np.float64]
 SUFFIX = ".mcap"
 Document = dict[str, Any]
 
@@ -37,7 +36,7 @@ class Batch:
     """What one chunk of a recording holds, at most some seconds."""
 
     columns: Mapping[str, Array]  # (k,) or (k, count) by field name
-    log_time: NDArray[np.int64]  # (k,) ns since 1970
+    log_time: Index  # (k,) ns since 1970
     documents: tuple[tuple[str, Document], ...]  # (channel, JSON) in order of writing
     state_names: tuple[str, ...] = ()  # of column "state", from 0 on
 

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.errors import LogError
 from gapbridge.core.files import is_given, read_bytes
 from gapbridge.core.log.columns import wanted_of
@@ -17,7 +17,6 @@ from gapbridge.core.log.columns import wanted_of
 if TYPE_CHECKING:
     import pyarrow
 
-Array = NDArray[np.float64]
 BUFFER = 1 << 18  # bytes of each column that are read ahead
 
 

@@ -12,8 +12,8 @@ from itertools import islice
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array, Index
 from gapbridge.core.errors import LogError
 from gapbridge.core.log.columns import is_known
 from gapbridge.core.log.log import (
@@ -28,9 +28,8 @@ from gapbridge.core.log.log import (
 )
 from gapbridge.core.log.parquet_tables import ParquetColumns
 
-Array = NDArray[np.float64]
 # names of all columns, values of the known ones (rows, known columns), lines where not in sequence
-Table = tuple[list[str], Array, NDArray[np.int64] | None]
+Table = tuple[list[str], Array, Index | None]
 ROWS = 16_384  # of a piece
 RECORDING = ".mcap"
 PARQUET = (".parquet", ".pq")

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array, Index, Mask
 from gapbridge.core.calibration.observables.fixed_point import fixed_at
 from gapbridge.core.calibration.observables.nuisance import Nuisance
 from gapbridge.core.calibration.observables.observable import Observable
@@ -23,8 +23,6 @@ from gapbridge.core.errors import PlanError
 from gapbridge.core.loads import Loads
 from gapbridge.core.planning.workspace import Place, Space
 
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 STOPS = 900  # candidate poses
 DRAWN = 4000  # random poses looked at in one go
 TRIES = 40
@@ -144,7 +142,7 @@ def _look(
     sight.target.append(target[good])
 
 
-def readable(observable: Observable, space: Space, readings: Readings) -> NDArray[np.bool_]:
+def readable(observable: Observable, space: Space, readings: Readings) -> Mask:
     """Return which readings (N,) can be taken: nothing in the way, nothing hit."""
     hits = _hindrances(observable, space, readings.q, readings.station, readings.target)
     return np.asarray(~np.any(list(hits.values()), axis=0))
@@ -152,7 +150,7 @@ def readable(observable: Observable, space: Space, readings: Readings) -> NDArra
 
 def _hindrances(
     observable: Observable, space: Space, q: Array, station: Index, target: Index
-) -> dict[str, NDArray[np.bool_]]:
+) -> dict[str, Mask]:
     found = space.hindrances(q)
     if space.places and not observable.closes:
         found |= _unseen(space, q, station, np.minimum(target, len(space.targets) - 1))
@@ -166,9 +164,9 @@ def joined(found: Candidates, more: Readings) -> Candidates:
     return replace(found, q=q, readings=beside(found.readings, more), stop=stop)
 
 
-def _unseen(space: Space, q: Array, station: Index, target: Index) -> dict[str, NDArray[np.bool_]]:
+def _unseen(space: Space, q: Array, station: Index, target: Index) -> dict[str, Mask]:
     """Return by reason which targets are not seen from their places."""
-    found: dict[str, NDArray[np.bool_]] = {}
+    found: dict[str, Mask] = {}
     for s in range(len(space.places)):
         for t in range(len(space.targets)):
             rows = np.flatnonzero((station == s) & (target == t))

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from gapbridge.core.arrays import Array, Mask
+
 TINY = 1e-12
 FINEST = 0.02  # m, between points at which a segment is held against a box
 
@@ -51,7 +51,7 @@ def segment_distance(p: Array, q: Array, r: Array, s: Array) -> Array:
     return np.asarray(np.linalg.norm(gap, axis=-1))
 
 
-def in_box(capsules: Capsules, box: Box) -> NDArray[np.bool_]:
+def in_box(capsules: Capsules, box: Box) -> Mask:
     """Return at which poses (N,) some capsule comes into the box."""
     lower, upper = np.array(box.lower), np.array(box.upper)
     hit = np.zeros(len(capsules.begin), dtype=bool)
@@ -66,13 +66,13 @@ def in_box(capsules: Capsules, box: Box) -> NDArray[np.bool_]:
     return hit
 
 
-def below(capsules: Capsules, height: float, first: int) -> NDArray[np.bool_]:
+def below(capsules: Capsules, height: float, first: int) -> Mask:
     """Return at which poses (N,) a capsule from number ``first`` on dips below a height of base."""
     lowest = np.minimum(capsules.begin[:, first:, 2], capsules.end[:, first:, 2])
     return np.asarray((lowest - capsules.radius[first:] < height).any(axis=1))
 
 
-def touching(capsules: Capsules, pairs: tuple[tuple[int, int], ...]) -> NDArray[np.bool_]:
+def touching(capsules: Capsules, pairs: tuple[tuple[int, int], ...]) -> Mask:
     """Return at which poses (N,) two capsules of some pair touch."""
     hit = np.zeros(len(capsules.begin), dtype=bool)
     for i, j in pairs:
@@ -83,7 +83,7 @@ def touching(capsules: Capsules, pairs: tuple[tuple[int, int], ...]) -> NDArray[
     return hit
 
 
-def hidden(capsules: Capsules, eye: Array, target: Array) -> NDArray[np.bool_]:
+def hidden(capsules: Capsules, eye: Array, target: Array) -> Mask:
     """Return at which poses (N,) a capsule stands between the eye (3,) and a target (N, 3).
 
     A target nearer to a capsule than its radius sits on it: there the capsule is only as thick as

@@ -6,9 +6,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.observables.nuisance import Layout
 from gapbridge.core.calibration.observables.observable import Observable
 from gapbridge.core.calibration.parameters import Parameters
@@ -31,7 +31,6 @@ from gapbridge.core.planning.travel import joint_speed, leg_times
 from gapbridge.core.planning.workspace import Space
 from gapbridge.core.planning.worst_places import evened, leaning
 
-Array = NDArray[np.float64]
 REFERENCE = 200  # poses over which the predicted TCP is judged
 BOUGHT_ROUNDS = 3
 BOUGHT = (0.5, 0.75, 1.0, 1.5, 2.0)  # of the poses asked for: what these would give

@@ -12,11 +12,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.planning.information import information_of, inverse
 
-Array = NDArray[np.float64]
 CONVERGED = 2e-3  # relative gain of a whole round of exchanges that ends the search
 BETTER = 1e-6  # in the logarithm of the criterion
 ROUNDS = 6

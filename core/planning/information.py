@@ -9,8 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.observables.nuisance import Layout, Nuisance
 from gapbridge.core.calibration.observables.observable import Observable
 from gapbridge.core.calibration.parameters import Parameters
@@ -18,7 +18,6 @@ from gapbridge.core.calibration.plan import Expectation
 from gapbridge.core.calibration.readings import Readings
 from gapbridge.core.loads import Loads
 
-Array = NDArray[np.float64]
 UNSHOWN = 0.95  # of the prior's sigma: what readings leave no better known they do not show
 
 

@@ -5,13 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.payload_session import NAMES, UNITS, weight_columns
 from gapbridge.core.errors import ExcitationError
 from gapbridge.core.model import Model
 
-Array = NDArray[np.float64]
 WRIST = 3  # joints at the end that turn the flange and hardly move the arm
 CANDIDATES = 600
 ROOM = 0.05  # rad, kept to every joint limit

@@ -10,8 +10,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array, Index
 from gapbridge.core.calibration.observables.observable import Observable
 from gapbridge.core.calibration.parameters import Parameters
 from gapbridge.core.calibration.readings import Readings
@@ -20,7 +20,6 @@ from gapbridge.core.planning.exchange import Choice
 from gapbridge.core.planning.information import blocks, information_of, inverse
 from gapbridge.core.planning.workspace import Space
 
-Array = NDArray[np.float64]
 NUDGE = 0.02  # rad, for the gradient
 LENGTHS = (0.03, 0.06, 0.12, 0.25, 0.5)  # rad, down the gradient
 ASIDE = 0.5  # how far beside the gradient as many more steps go
@@ -109,9 +108,7 @@ class Refiner:
         one, other = -fall.reshape(count, 2, n).transpose(1, 0, 2)
         return np.asarray((one - other) / NUDGE)
 
-    def _moved(
-        self, readings: Readings, own: NDArray[np.int64], q: Array
-    ) -> tuple[Readings, NDArray[np.int64]]:
+    def _moved(self, readings: Readings, own: Index, q: Array) -> tuple[Readings, Index]:
         """Return readings at moved joints that can be taken, and which of ``own`` they are."""
         nominal, nuisance = self.parameters.nominal, self.found.nuisance
         whole = replace(readings[own], q=q)

@@ -7,14 +7,13 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array, Mask
 from gapbridge.core.calibration.plan import PlannedPose
 from gapbridge.core.planning.candidates import Candidates
 from gapbridge.core.planning.travel import joint_speed, leg_times, shortest_way
 from gapbridge.core.planning.workspace import Space
 
-Array = NDArray[np.float64]
 BETWEEN = 9  # poses looked at on a leg
 ROUNDABOUT = 3.0  # times as long a leg counts on which the arm would hit something
 
@@ -119,7 +118,7 @@ def _blocks(found: Candidates, stops: Sequence[Stop]) -> list[list[Stop]]:
     return [groups[key] for key in sorted(groups, key=turn)]
 
 
-def _legs(q: Array, space: Space, speed: Array) -> tuple[Array, NDArray[np.bool_]]:
+def _legs(q: Array, space: Space, speed: Array) -> tuple[Array, Mask]:
     """Return the times (B, B) between poses, and where the straight way hits something."""
     count = len(q)
     legs = leg_times(q, q, speed)

@@ -5,15 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.tool_session import NAMES, touch_columns
 from gapbridge.core.errors import ExcitationError
 from gapbridge.core.model import Model
 from gapbridge.core.planning.payload_plan import ROOM, greedy, tour
 from gapbridge.core.rotation import rotation_matrix, rotation_vector
 
-Array = NDArray[np.float64]
 CANDIDATES = 80
 TILT = 1.0  # rad, largest tilt of the tool against how it stands at the beginning
 MET = 1e-6  # m and rad, at which a pose counts as reached

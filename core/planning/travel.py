@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from gapbridge.core.arrays import Array
+
 SPEED = 0.25  # of the joints' top speed: what a technician moves with
 USUAL_SPEED = 0.5  # rad/s, where the top speed is unknown
 ROUNDS = 50

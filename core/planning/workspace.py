@@ -11,14 +11,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from gapbridge.core.arrays import Array, Mask
 from gapbridge.core.errors import PlanError
 from gapbridge.core.model import Model
 from gapbridge.core.planning.capsules import Box, Capsules, below, hidden, in_box, touching
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 THICK = 0.035  # of the arm's stretched length: radius of a link
 TOOL_THICK = 0.03  # of the same: tool and loads
 NEAR_SINGULAR = 0.01  # smallest singular value of the Jacobian, lengths in stretched lengths

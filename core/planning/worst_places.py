@@ -13,12 +13,11 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.planning.information import Reference, information_of, inverse
 from gapbridge.core.planning.refinement import Refined, Refiner
 
-Array = NDArray[np.float64]
 LEANING = 4  # power of a place's variance in its weight
 BOUTS = 7  # of moves, each with weights of its own
 ROUNDS = 15  # of moves in a bout at most

@@ -16,11 +16,10 @@ from collections import Counter
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.drivers.can.profile import CanProfile, Incoming, Key
 
-Vector = NDArray[np.float64]
 QUANTITIES = ("position", "velocity", "torque", "temperature")
 UNSTEADY = (
     0.3  # periods: a frame waits for a cycle's six setpoint frames, 3.1 of 10 ms at 250 kbit/s
@@ -33,8 +32,8 @@ class Sample(NamedTuple):
     A tuple, because one is made in every cycle.
     """
 
-    position: Vector  # rad
-    others: dict[str, Vector]  # velocity rad/s, torque Nm, temperature °C
+    position: Array  # rad
+    others: dict[str, Array]  # velocity rad/s, torque Nm, temperature °C
     stamp: float  # s, clock of the bus, of its last frame
     received: float  # s, time.monotonic() of its last frame
     began: float  # s, time.monotonic() of its first frame

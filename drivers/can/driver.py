@@ -5,8 +5,8 @@ from __future__ import annotations
 import contextlib
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.errors import (
     ForeignCommandError,
     InvalidStateError,
@@ -26,7 +26,6 @@ from gapbridge.drivers.can.writer import FrameWriter
 from gapbridge.drivers.clock import SYSTEM, Clock
 from gapbridge.drivers.driver import Driver
 
-Vector = NDArray[np.float64]
 FIRST_SAMPLE = 2.0  # s in which an arm on the bus must have reported everything once
 SLICE = 0.02  # s, of one wait for a frame
 ANSWER = 0.02  # s after which an answer that is not there does not come
@@ -55,7 +54,7 @@ class CanDriver(Driver):
         self._given = -1.0  # s, received of the sample last returned
         self._slot = 0.0  # s, when an arm that must be asked is asked next
         self._changed = 0.0  # s, monotonic: when the joints last changed
-        self._q: Vector | None = None
+        self._q: Array | None = None
         self._angles: list[float] = []  # the same, as they were reported in the last sample
         self._broken = 0  # samples dropped, as far as they were reported
         self._kept: Sample | None = None  # came before a dropped one was reported
@@ -189,7 +188,7 @@ class CanDriver(Driver):
                 f"commanded {away:.3f} rad away"
             )
 
-    def _target(self) -> Vector | None:
+    def _target(self) -> Array | None:
         """Return what the arm was last commanded, by us or by another commander."""
         if self._armed_at is not None:
             return self.writer.target
@@ -225,7 +224,7 @@ class CanDriver(Driver):
         self._armed_at = self._changed = self._now()
         self._begin_anew()
 
-    def _present(self) -> Vector:
+    def _present(self) -> Array:
         if self._q is None:
             raise WriteError(f"{self.profile.name}: found no state, expected read_state() first")
         return self._q

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
+from gapbridge.core.arrays import Array
 from gapbridge.drivers.can.dbc import Dbc, read_dbc
 from gapbridge.drivers.can.loading_outgoing import OutgoingLoading
 from gapbridge.drivers.can.names import Keys, Names
@@ -19,7 +20,6 @@ from gapbridge.drivers.can.profile import (
     JointMap,
     Key,
     Reading,
-    Vector,
 )
 from gapbridge.drivers.can.schema import ProfileFile, Quantity
 from gapbridge.drivers.can.units import UNITS
@@ -121,7 +121,7 @@ class _Loading:
         if (gear == 0.0).any():
             raise self.names.error(("gear",), "found 0, expected a ratio that is not zero")
         zero = np.array(self._per_joint("zero", file.zero, 0.0))
-        scale: dict[str, Vector] = {}
+        scale: dict[str, Array] = {}
         for name in ("position", "velocity", "torque", "temperature"):
             quantity: Quantity | None = getattr(feedback, name)
             if quantity is None:
@@ -146,7 +146,7 @@ class _Loading:
             raise self.names.error((key,), f"found {len(given)} values, expected {self.n}")
         return [float(v) for v in given]
 
-    def _units(self, quantity: Quantity, name: str, keys: Keys) -> Vector:
+    def _units(self, quantity: Quantity, name: str, keys: Keys) -> Array:
         """Return SI in one wire unit (n,); checks that every joint is there, once."""
         if len(quantity.signals) != self.n:
             missing = f"joint {len(quantity.signals) + 1} is missing"

@@ -6,10 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
+from gapbridge.core.arrays import Array
 
-Vector = NDArray[np.float64]
 Key = tuple[int, bool]  # identifier, whether it has 29 bits
 
 NORMAL = ""
@@ -104,12 +102,12 @@ class Action:
 class JointMap:
     """Wire <-> SI, all (n,): ``q = wire * scale[position] + zero``."""
 
-    scale: dict[str, Vector]
-    zero: Vector  # rad
-    setpoint_scale: Vector | None  # rad in one unit of the setpoint's signals
-    resolution: Vector | None  # rad, one count of the setpoint's signals
+    scale: dict[str, Array]
+    zero: Array  # rad
+    setpoint_scale: Array | None  # rad in one unit of the setpoint's signals
+    resolution: Array | None  # rad, one count of the setpoint's signals
 
-    def to_wire(self, q: Vector) -> Vector:
+    def to_wire(self, q: Array) -> Array:
         """Return a setpoint (n,) in the wire's units."""
         assert self.setpoint_scale is not None
         return (q - self.zero) / self.setpoint_scale

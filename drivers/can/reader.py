@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.errors import LinkError
 from gapbridge.drivers.can.assembler import Assembler, Sample
 from gapbridge.drivers.can.profile import CanProfile, Key
@@ -15,7 +15,6 @@ from gapbridge.drivers.can.settings import CanSettings
 from gapbridge.drivers.can_bus.bus import close_bus, first_line, open_bus
 from gapbridge.drivers.clock import SYSTEM, Clock
 
-Vector = NDArray[np.float64]
 LONGEST_WAY, LEAST_WAY = 4.0, 0.03  # cycles, s: what has lain here for longer is not fresh
 BACKLOG_TIME = 0.05  # s that reading what has piled up may take
 
@@ -140,7 +139,7 @@ class FrameReader:
         for signal, joint in target.joints:
             self._foreign_wire[joint] = values[signal]
 
-    def foreign_target(self, within: float) -> Vector | None:
+    def foreign_target(self, within: float) -> Array | None:
         """Return the joints (n,) that another commander asked for in the last ``within`` s, rad."""
         joints, foreign = self._profile.joints, self.foreign
         if foreign is None or joints.setpoint_scale is None:

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.state import RobotState
 from gapbridge.drivers.can.assembler import Sample
 from gapbridge.drivers.robot_modes import modes_of
-
-Vector = NDArray[np.float64]
 
 
 class StateBuilder:
@@ -28,7 +26,7 @@ class StateBuilder:
         """Take velocities from the state last made on: it can be believed."""
         self._before = self._last
 
-    def build(self, sample: Sample, target: Vector | None, trouble: str, ready: bool) -> RobotState:
+    def build(self, sample: Sample, target: Array | None, trouble: str, ready: bool) -> RobotState:
         """Return the state of a sample.
 
         ``target`` (n,) is what the arm was last commanded, where anyone commanded it.
@@ -54,7 +52,7 @@ class StateBuilder:
             safety_status_bits=modes.safety_status_bits,
         )
 
-    def _differences(self, sample: Sample, before: Sample | None) -> Vector:
+    def _differences(self, sample: Sample, before: Sample | None) -> Array:
         """Return velocities (n,) from two positions, rad/s; the bus's clock where it moves."""
         if before is not None:
             gap = sample.stamp - before.stamp

@@ -6,15 +6,14 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.errors import PartialWriteError, WriteError
 from gapbridge.drivers.can.profile import Action, CanProfile, Key, Outgoing
 from gapbridge.drivers.can.settings import CanSettings
 from gapbridge.drivers.can_bus.bus import first_line
 from gapbridge.drivers.clock import SYSTEM, Clock
 
-Vector = NDArray[np.float64]
 Frames = list[tuple[Key, bytes]]
 
 
@@ -26,7 +25,7 @@ class FrameWriter:
         self._settings, self._profile = settings, profile
         self._bus: Any = None
         self._last: Frames | None = None  # the setpoint that got out whole
-        self.target: Vector | None = None  # rad, the same as joints
+        self.target: Array | None = None  # rad, the same as joints
         self.mended = 0  # setpoints that had to be taken back
 
     def use(self, bus: Any) -> None:
@@ -37,7 +36,7 @@ class FrameWriter:
         """Forget the last setpoint: it is no longer what the arm holds."""
         self._last = self.target = None
 
-    def write(self, q: Vector) -> None:
+    def write(self, q: Array) -> None:
         """Send one setpoint (n,), rad, all its frames or none that is left standing.
 
         Raises WriteError; then the arm has its previous setpoint again, or its stop sequence,
@@ -73,7 +72,7 @@ class FrameWriter:
     def _stop_frames(self) -> Frames:
         return [(f.key, f.encode()) for action in self._profile.stop for f in action.frames]
 
-    def _encode(self, q: Vector) -> Frames:
+    def _encode(self, q: Array) -> Frames:
         """Return all frames before any is sent. Raises WriteError."""
         if q.shape != (self._profile.n,) or not np.isfinite(q).all():
             raise WriteError(f"{self._profile.name}: found {q}, expected finite joints")
@@ -91,7 +90,7 @@ class FrameWriter:
     def run(
         self,
         actions: Sequence[Action],
-        hold: Callable[[], Vector],
+        hold: Callable[[], Array],
         listen: Callable[[float], object],
         reached: Callable[[str], bool],
     ) -> None:
@@ -114,7 +113,7 @@ class FrameWriter:
                         f"{action.within:g} s"
                     )
 
-    def _do(self, action: Action, hold: Callable[[], Vector]) -> None:
+    def _do(self, action: Action, hold: Callable[[], Array]) -> None:
         for frame in action.frames:
             self._send(frame.key, self._bytes_of(frame))
         if action.hold:

@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.errors import LinkError, WriteError
 from gapbridge.drivers.canopen.master import Master
 from gapbridge.drivers.canopen.profile import CanopenProfile
 
-Vector = NDArray[np.float64]
 Frames = list[tuple[int, bytes, str]]
 OURS = ("Controlword",)  # beside the mode's own target
 
@@ -29,7 +28,7 @@ class RpdoWriter:
         self._last: Frames = []
         self.partial = False  # a part of a set stands in the drives, waiting for a SYNC
         self.mended = 0  # sets of which a part had to be taken back
-        self.target: Vector | None = None  # (n,) rad, of the last whole set
+        self.target: Array | None = None  # (n,) rad, of the last whole set
 
     def load(self) -> None:
         """Fill objects that we do not command with what the drives hold. Raises LinkError."""
@@ -45,7 +44,7 @@ class RpdoWriter:
         """Forget what was sent: the drives' own state holds."""
         self._last, self.partial, self.target = [], False, None
 
-    def send(self, controlwords: Sequence[int], q: Vector) -> None:
+    def send(self, controlwords: Sequence[int], q: Array) -> None:
         """Send Controlwords and joint targets (n,), rad; they count at the next SYNC.
 
         Raises WriteError where not all got out; then none of them will count.
@@ -60,7 +59,7 @@ class RpdoWriter:
                 raise WriteError(f"{error}{done}") from None
         self._last, self.partial, self.target = frames, False, q.copy()
 
-    def _encode(self, controlwords: Sequence[int], q: Vector) -> Frames:
+    def _encode(self, controlwords: Sequence[int], q: Array) -> Frames:
         """Return all frames before any is sent. Raises WriteError."""
         profile = self._profile
         if q.shape != (profile.n,) or not np.isfinite(q).all():

@@ -6,8 +6,8 @@ import contextlib
 import logging
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.errors import (
     InputError,
     InvalidStateError,
@@ -37,7 +37,6 @@ from gapbridge.drivers.canopen.sync_set import SyncSet
 from gapbridge.drivers.clock import SYSTEM, Clock
 from gapbridge.drivers.driver import Driver
 
-Vector = NDArray[np.float64]
 log = logging.getLogger("drivers.canopen")
 
 STARTING = 2.0  # s in which drives must be OPERATIONAL and answer a SYNC
@@ -174,7 +173,7 @@ class CanopenDriver(Driver):
         self._check_frozen(state, before)
         return state
 
-    def _check_frozen(self, state: RobotState, before: Vector | None) -> None:
+    def _check_frozen(self, state: RobotState, before: Array | None) -> None:
         """Refuse joints that stand still count by count though they were sent elsewhere."""
         now, q = state.received, state.actual_q
         away = float(np.abs(state.target_q - q).max())

@@ -5,9 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-import numpy as np
-from numpy.typing import NDArray
-
+from gapbridge.core.arrays import Array
 from gapbridge.core.errors import LinkError, WriteError
 from gapbridge.drivers.canopen.command import RpdoWriter
 from gapbridge.drivers.canopen.master import Master
@@ -25,7 +23,6 @@ from gapbridge.drivers.canopen.profile import CanopenProfile
 from gapbridge.drivers.canopen.state import not_following, positions, states
 from gapbridge.drivers.canopen.sync_set import SyncSet
 
-Vector = NDArray[np.float64]
 MODES_OF_OPERATION, CONSUMER_HEARTBEAT = Address(0x6060, 0), Address(0x1016, 1)
 ABORT_CONNECTION = Address(0x6007, 0)
 STOP_AT_LOSS = 3  # Abort connection option code: quick stop
@@ -85,12 +82,12 @@ class Power:
             self._master.write(node, MODES_OF_OPERATION, mode)
             del self._modes[node]
 
-    def enable(self, found: SyncSet, within: float, clear_faults: bool) -> Vector:
+    def enable(self, found: SyncSet, within: float, clear_faults: bool) -> Array:
         """Enable all drives where they stand; returns the joints (n,) that they hold, rad.
 
         ``found`` is the newest sample. Raises WriteError where one does not get there.
         """
-        hold: Vector | None = None
+        hold: Array | None = None
         resetting = False
         end = time.monotonic() + within
         while True:

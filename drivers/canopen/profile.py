@@ -8,17 +8,16 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
+from gapbridge.core.arrays import Array
 from gapbridge.drivers.canopen.eds import Eds, read_eds
 from gapbridge.drivers.canopen.objects import MODES, OBJECTS, Address
 from gapbridge.drivers.canopen.pdo import Entry, PdoLayout
 from gapbridge.drivers.canopen.schema import Heartbeat, Joint, ProfileFile
 from gapbridge.drivers.profile_file import ProfileDocument, ProfileError, read_profile_document
 
-Vector = NDArray[np.float64]
 Keys = tuple[str | int, ...]
 MOST_BITS = 64
 WINDOW = 0.7  # of the SYNC period: the last moment of a TPDO, where the profile says none
@@ -33,8 +32,8 @@ class CanopenProfile:
     eds: Eds
     file: ProfileFile
     nodes: tuple[int, ...]
-    counts_per_radian: Vector  # (n,), with the direction's sign
-    zero: Vector  # (n,) rad, at count 0
+    counts_per_radian: Array  # (n,), with the direction's sign
+    zero: Array  # (n,) rad, at count 0
     tpdo: tuple[PdoLayout, ...]
     rpdo: tuple[PdoLayout, ...]
 
@@ -59,7 +58,7 @@ class CanopenProfile:
         return self.file.heartbeat
 
     @property
-    def rated_torque(self) -> Vector | None:
+    def rated_torque(self) -> Array | None:
         """Return (n,) Nm, None where a joint has none or no torque is mapped."""
         values = [joint.rated_torque for joint in self.file.joints]
         mapped = any(e.name == "Torque actual value" for pdo in self.tpdo for e in pdo.entries)
@@ -67,15 +66,15 @@ class CanopenProfile:
         return np.array(known) if mapped and len(known) == self.n else None
 
     @property
-    def direction(self) -> Vector:
+    def direction(self) -> Array:
         """Return (n,) of 1 and -1."""
         return np.sign(self.counts_per_radian)
 
-    def angles(self, counts: Vector) -> Vector:
+    def angles(self, counts: Array) -> Array:
         """Return joint angles (n,), rad."""
         return counts / self.counts_per_radian + self.zero
 
-    def counts(self, q: Vector) -> Vector:
+    def counts(self, q: Array) -> Array:
         """Return the nearest whole position counts (n,) of joint angles, rad."""
         return np.rint((q - self.zero) * self.counts_per_radian)
 

@@ -5,15 +5,14 @@ from __future__ import annotations
 from collections import deque
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.state import RobotState
 from gapbridge.drivers.canopen.objects import MODE_ACTIVE, State, state_of
 from gapbridge.drivers.canopen.profile import CanopenProfile
 from gapbridge.drivers.canopen.sync_set import SyncSet
 from gapbridge.drivers.robot_modes import modes_of
 
-Vector = NDArray[np.float64]
 SPAN, OLDEST = 5, 0.1  # samples, s: what a velocity is reckoned from where drives report none
 
 
@@ -22,7 +21,7 @@ def states(found: SyncSet) -> list[State]:
     return [state_of(counts["Statusword"]) for counts in found.counts]
 
 
-def positions(profile: CanopenProfile, found: SyncSet) -> Vector:
+def positions(profile: CanopenProfile, found: SyncSet) -> Array:
     """Return the joint angles (n,), rad."""
     return profile.angles(np.array([c["Position actual value"] for c in found.counts], float))
 
@@ -43,10 +42,10 @@ class StateBuilder:
     def __init__(self, profile: CanopenProfile) -> None:
         self._profile = profile
         self._rated = profile.rated_torque
-        self._last: deque[tuple[float, Vector]] = deque(maxlen=SPAN)  # s of the SYNC, rad
+        self._last: deque[tuple[float, Array]] = deque(maxlen=SPAN)  # s of the SYNC, rad
 
     @property
-    def last_q(self) -> Vector | None:
+    def last_q(self) -> Array | None:
         """Return the joints (n,) of the sample before, rad."""
         return self._last[-1][1] if self._last else None
 
@@ -58,7 +57,7 @@ class StateBuilder:
         """Take note of a state that can be believed."""
         self._last.append((state.timestamp, state.actual_q))
 
-    def build(self, found: SyncSet, target: Vector | None, armed: bool) -> RobotState:
+    def build(self, found: SyncSet, target: Array | None, armed: bool) -> RobotState:
         """Return the state.
 
         ``target`` (n,) is what the drives were last commanded, rad. The time of the sample is that
@@ -89,7 +88,7 @@ class StateBuilder:
             return "protective_stop"
         return "" if not_following(self._profile, found) is None else "not_ready"
 
-    def _velocity(self, found: SyncSet, q: Vector) -> Vector:
+    def _velocity(self, found: SyncSet, q: Array) -> Array:
         """Return (n,) rad/s: the drives' own where the profile knows its unit.
 
         Else out of the last samples: one step alone would show the SYNC's jitter.
@@ -105,7 +104,7 @@ class StateBuilder:
         synced, before = self._last[0]
         return np.asarray((q - before) / max(found.synced - synced, 1e-4))
 
-    def _torque(self, found: SyncSet) -> Vector | None:
+    def _torque(self, found: SyncSet) -> Array | None:
         """Return (n,) Nm: Torque actual value is in thousandths of the rated torque."""
         if self._rated is None:
             return None

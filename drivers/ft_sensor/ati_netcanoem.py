@@ -14,8 +14,8 @@ import time
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.errors import LinkError
 from gapbridge.drivers.can_bus.bus import close_bus, first_line, open_bus
 from gapbridge.drivers.ft_sensor.sensor import ForceTorqueSensor, Reading
@@ -36,8 +36,6 @@ STATUS = (
     "gauge supply low", "thermistor high", "thermistor low", "DAC reading out of range", "bit 14",
     "bit 15", "gauge saturated",
 )  # fmt: skip
-
-Array = NDArray[np.float64]
 
 
 def decode_gauges(first: bytes, second: bytes) -> tuple[int, tuple[int, ...]] | None:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.errors import InvalidStateError, LinkError, StaleStateError, WriteError
 from gapbridge.core.model import Model
 from gapbridge.core.setpoint import Setpoint
@@ -16,8 +16,6 @@ from gapbridge.drivers.ft_sensor.clock_offset import ClockOffset
 from gapbridge.drivers.ft_sensor.reader import SensorReader
 from gapbridge.drivers.ft_sensor.settings import FtSensorSettings
 from gapbridge.drivers.ft_sensor.wrench import TcpForce, sensor_to_flange
-
-Vector = NDArray[np.float64]
 
 
 class DriverWithSensor(Driver):
@@ -119,6 +117,6 @@ class DriverWithSensor(Driver):
         """Stop writing to the arm."""
         self._arm.release()
 
-    def nominal_q(self, state: RobotState) -> Vector:
+    def nominal_q(self, state: RobotState) -> Array:
         """Return the joints (n,) that the robot itself wants, rad."""
         return self._arm.nominal_q(state)

@@ -6,10 +6,7 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Self
 
-import numpy as np
-from numpy.typing import NDArray
-
-Vector = NDArray[np.float64]
+from gapbridge.core.arrays import Array
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,7 +19,7 @@ class Reading:
 
     timestamp: float  # s, monotonic: when the sensor is reckoned to have sampled it
     received: float  # s, monotonic: when it had come in whole
-    wrench: Vector  # (6,) N, Nm: sensor axes, torque about the sensor's origin
+    wrench: Array  # (6,) N, Nm: sensor axes, torque about the sensor's origin
     status: int = 0  # the sensor's own status or overload bits, 0 = fine
 
 

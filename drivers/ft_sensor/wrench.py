@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.effects import CATALOGUE, acting
 from gapbridge.core.kernels import reference as kernel
 from gapbridge.core.loads import Loads
@@ -13,8 +13,6 @@ from gapbridge.core.motion import Motion
 from gapbridge.core.rotation import rpy_matrix, skew
 from gapbridge.core.state import RobotState
 from gapbridge.drivers.ft_sensor.settings import SensorFrame
-
-Array = NDArray[np.float64]
 
 
 def sensor_to_flange(frame: SensorFrame) -> Array:

@@ -9,8 +9,8 @@ from operator import itemgetter
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.errors import InvalidStateError
 from gapbridge.drivers.modbus.encode import units_of
 from gapbridge.drivers.modbus.map import RegisterMap, place_in
@@ -19,7 +19,6 @@ from gapbridge.drivers.modbus.registers import BIT_TABLES, UNITS, Coding, words_
 from gapbridge.drivers.modbus.schema import Condition, Mailbox, Place, ProfileFile, Vector
 from gapbridge.drivers.robot_modes import Trouble
 
-Array = NDArray[np.float64]
 Registers = Sequence[bytes]  # of each of RegisterMap.blocks, two bytes each, as on the wire
 Spot = tuple[int, int, Coding]  # a number's block and its first register there
 

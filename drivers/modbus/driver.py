@@ -6,8 +6,8 @@ import contextlib
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.compensation import wanted_pose
 from gapbridge.core.errors import InvalidStateError, LinkError, StaleStateError, WriteError
 from gapbridge.core.model import Model
@@ -26,7 +26,6 @@ from gapbridge.drivers.modbus.write import make_writer
 from gapbridge.drivers.offset_inverse import Nominal
 from gapbridge.drivers.robot_modes import NORMAL, REDUCED, RUNNING, modes_of
 
-Vector = NDArray[np.float64]
 SLOW_EVERY = 0.2  # s between two readings of conditions that lie apart
 LONGEST_ANSWER, LEAST_ANSWER = 4.0, 0.03  # cycles, s: an older answer is not fresh
 
@@ -195,7 +194,7 @@ class ModbusDriver(Driver):
             safety_status_bits=modes.safety_status_bits,
         )  # fmt: skip
 
-    def nominal_q(self, state: RobotState) -> Vector:
+    def nominal_q(self, state: RobotState) -> Array:
         """Return what the robot itself wants (n,), rad: with a mailbox, without its offset."""
         if self._nominal is None or self._sample is None:
             return state.target_q
@@ -229,7 +228,7 @@ class ModbusDriver(Driver):
         except LinkError as error:
             raise WriteError(str(error)) from None
 
-    def _check_resolution(self, q: Vector) -> None:
+    def _check_resolution(self, q: Array) -> None:
         """Refuse where one count of a target moves the TCP farther than the offset at hand."""
         write = self.profile.write
         if write.mode != "target_trigger":

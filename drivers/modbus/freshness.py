@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.drivers.modbus.registers import UNITS
 from gapbridge.drivers.modbus.schema import Clock, ProfileFile
 
-Array = NDArray[np.float64]
 MOVING = 0.05  # rad/s: a joint that says it is this fast must change its angle
 
 

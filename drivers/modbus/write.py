@@ -10,8 +10,8 @@ from collections.abc import Callable
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.errors import (
     ForeignCommandError,
     IneffectiveWriteError,
@@ -27,7 +27,6 @@ from gapbridge.drivers.modbus.registers import UNITS, Table
 from gapbridge.drivers.modbus.schema import Mailbox, Order, ProfileFile, ReadOnly, TargetTrigger
 from gapbridge.drivers.modbus.transport import Transport
 
-Array = NDArray[np.float64]
 Rates = Callable[[], tuple[float, float]]
 ANNOUNCE = 0.02  # s between two heartbeats while arming
 NEAR = 2.0  # counts: how near a target must be come to

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.errors import LinkError, LogError
 from gapbridge.core.setpoint import Setpoint
 from gapbridge.core.state import RobotState
@@ -23,7 +23,6 @@ from gapbridge.drivers.replay.settings import ReplaySettings
 if TYPE_CHECKING:
     from gapbridge.core.model import Model
 
-Vector = NDArray[np.float64]
 NEEDED = (
     "number", "timestamp", "state", "written", "attempted", "flags", "nominal_q", "own_q",
     "ramp_time", "rate", "loop", "target_q", "actual_q", "actual_qd", "actual_TCP_force",
@@ -46,8 +45,8 @@ class Cycle:
     written: bool
     attempted: int  # 0: not writing; 1: a setpoint was, or was refused; 2: computed, not sent
     flags: int  # of the loop's own
-    own_q: Vector  # (n,) rad, what the robot itself wanted
-    nominal_q: Vector  # (n,) rad, what the correction was computed for
+    own_q: Array  # (n,) rad, what the robot itself wanted
+    nominal_q: Array  # (n,) rad, what the correction was computed for
     ramp_time: float  # s
 
 
@@ -74,7 +73,7 @@ class ReplayDriver(Driver):
         super().__init__(float(first["rate"]), model, clock=clock)
         self.gate.count_by(lambda: self._last)  # a recording may go by faster than it was made
         self.cycle: Cycle | None = None
-        self._left: Iterator[Mapping[str, Vector]] = iter(())
+        self._left: Iterator[Mapping[str, Array]] = iter(())
         self._begun = 0.0  # s, monotonic: when the recording's time 0 was
         self._last = -np.inf  # s, controller clock
 
@@ -102,7 +101,7 @@ class ReplayDriver(Driver):
     def _validate(self, state: RobotState) -> None:
         """Believe it: it was checked when it was recorded."""
 
-    def nominal_q(self, state: RobotState) -> Vector:
+    def nominal_q(self, state: RobotState) -> Array:
         """Return what the robot itself wanted then, (n,) rad."""
         assert self.cycle is not None
         return self.cycle.own_q
@@ -114,7 +113,7 @@ class ReplayDriver(Driver):
         """Leave the recording."""
         self._left = iter(())
 
-    def _rows(self) -> Iterator[Mapping[str, Vector]]:
+    def _rows(self) -> Iterator[Mapping[str, Array]]:
         from gapbridge.core.log.mcap_reading import read_batches  # only who replays loads MCAP
 
         for batch in read_batches(self.settings.file):
@@ -129,10 +128,10 @@ class ReplayDriver(Driver):
         self.clock.sleep(max(self._begun + timestamp / speed - now, 0.0))
 
 
-def _state(row: Mapping[str, Vector], received: float) -> RobotState:
+def _state(row: Mapping[str, Array], received: float) -> RobotState:
     """Return the state of a recorded cycle; what it lacked is NaN there."""
 
-    def known(name: str) -> Vector | None:
+    def known(name: str) -> Array | None:
         value = row.get(name)
         return None if value is None or np.isnan(value).all() else value
 

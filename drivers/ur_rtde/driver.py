@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.compensation import wanted_pose
 from gapbridge.core.errors import InvalidStateError, LinkError, WriteError
 from gapbridge.core.model import Model
@@ -23,7 +23,6 @@ from gapbridge.drivers.ur_rtde.round_trip import round_trip
 from gapbridge.drivers.ur_rtde.settings import UrRtdeSettings
 from gapbridge.drivers.ur_rtde.state import StateReader
 
-Vector = NDArray[np.float64]
 OFFSET_SCRIPT = Path(__file__).with_name("gapbridge_offset.script")
 
 
@@ -72,7 +71,7 @@ class UrRtdeDriver(Driver):
         except LinkError as error:
             raise WriteError(str(error)) from None
 
-    def nominal_q(self, state: RobotState) -> Vector:
+    def nominal_q(self, state: RobotState) -> Array:
         """Return what the robot itself wants (6,), rad.
 
         Offset mode: ``target_q`` without the offset that the robot's program says it applied in

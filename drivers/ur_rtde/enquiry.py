@@ -16,14 +16,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gapbridge.core.arm import builtin_arm, builtin_names, builtin_rows
+from gapbridge.core.arrays import Array
 from gapbridge.core.errors import LinkError
 from gapbridge.core.rotation import rotation_matrix, transform
 from gapbridge.drivers.controller_facts import ControllerFacts
 
-Array = NDArray[np.float64]
 RTDE, PRIMARY = 30004, 30001
 N = 6
 SAME = 1e-3  # m, rad: nominal DH rows of one model

@@ -13,15 +13,14 @@ from itertools import chain
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.errors import InvalidStateError, LinkError, StaleStateError
 from gapbridge.core.state import RobotState
 from gapbridge.drivers.clock import SYSTEM, Clock
 from gapbridge.drivers.ur_rtde.registers import APPLIED, ECHO, PROGRAM
 from gapbridge.drivers.ur_rtde.settings import UrRtdeSettings
 
-Vector = NDArray[np.float64]
 N = 6
 POLL = 200e-6  # s: best of the polls measured (age 0.33 ms, a sixth of a core)
 ATTEMPTS = 4
@@ -201,7 +200,7 @@ class StateReader:
             **found,
         )  # fmt: skip
 
-    def joints_and_tcp(self) -> tuple[Vector, Vector] | None:
+    def joints_and_tcp(self) -> tuple[Array, Array] | None:
         """Return joints (6,) and the controller's own TCP pose (6,) of one sample, or None.
 
         The pose is in base, m and rotation vector. None where the controller does not report it, or

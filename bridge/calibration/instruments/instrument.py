@@ -6,12 +6,9 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Any, Generic, Protocol, Self, TypeVar
 
-import numpy as np
-from numpy.typing import NDArray
-
 from gapbridge.bridge.cell.settings.instruments import Base
+from gapbridge.core.arrays import Array
 
-Array = NDArray[np.float64]
 S = TypeVar("S", bound=Base)
 
 

@@ -6,13 +6,12 @@ import math
 import re
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gapbridge.bridge.calibration.instruments.instrument import ReadingError
 from gapbridge.bridge.cell.settings.instruments import METRES, RADIANS, Coordinates
+from gapbridge.core.arrays import Array
 from gapbridge.core.rotation import rotation_vector, rpy_matrix
 
-Array = NDArray[np.float64]
 FARTHEST = 100.0  # m: no instrument of this kind looks farther
 _NAME = re.compile(r"[A-Za-z_][A-Za-z_0-9]*\s*[:=]")  # "X = 12.3": what stands before a number
 _UNIT = re.compile(r"(?<=[\d.,\s])(mm|um|µm|m|in|deg|rad|°)(?=[\s,;]|$)")

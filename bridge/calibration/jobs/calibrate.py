@@ -6,7 +6,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gapbridge.bridge.calibration.format import duration, load_text, millimetres, parameter
 from gapbridge.bridge.calibration.jobs.fitting import (
@@ -20,6 +19,7 @@ from gapbridge.bridge.calibration.planning import metrology_of, planned
 from gapbridge.bridge.calibration.session.progress import seconds_left
 from gapbridge.bridge.document.provenance import fitted as fitted_on
 from gapbridge.bridge.document.provenance import provenance
+from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.accuracy_baseline import document_of
 from gapbridge.core.calibration.fit import SessionFit
 from gapbridge.core.calibration.missing_effects import MissingEffect
@@ -30,7 +30,6 @@ from gapbridge.core.calibration.summary import unsupported
 from gapbridge.core.fitted_range import range_of
 from gapbridge.core.log.log import read_log
 
-Array = NDArray[np.float64]
 REFITS = 3  # times at most that the readings may ask for more
 
 

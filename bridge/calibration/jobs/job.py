@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gapbridge.bridge.calibration.instruments import make_instrument
 from gapbridge.bridge.calibration.instruments.instrument import AnyInstrument, Surroundings
@@ -22,12 +21,12 @@ from gapbridge.bridge.calibration.session.session import Session
 from gapbridge.bridge.cell import Cell, save_cell
 from gapbridge.bridge.document.output_file import require_writable, write_text
 from gapbridge.bridge.document.provenance import provenance
+from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.payload_session import PayloadCalibration
 from gapbridge.core.calibration.plan import Expectation, Payload, Plan, PlannedPose
 from gapbridge.core.calibration.tool_session import ToolCalibration
 from gapbridge.core.model import Model
 
-Array = NDArray[np.float64]
 NO_EXPECTATION = Expectation((), (), np.zeros(0), np.zeros(0), float("nan"), float("nan"))
 
 

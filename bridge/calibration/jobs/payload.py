@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gapbridge.bridge.calibration.format import figure
 from gapbridge.bridge.calibration.instruments.flange_sensor import FlangeSensor
@@ -16,12 +15,11 @@ from gapbridge.bridge.calibration.session.prompt import Prompt
 from gapbridge.bridge.calibration.session.reading_check import ReadingCheck
 from gapbridge.bridge.calibration.session.session import Session
 from gapbridge.bridge.cell import Cell
+from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.payload_session import calibrate_payload
 from gapbridge.core.calibration.plan import Expectation, Payload, Plan, PlannedPose
 from gapbridge.core.errors import CellError
 from gapbridge.core.planning.payload_plan import plan_payload
-
-Array = NDArray[np.float64]
 
 
 class PayloadJob(Job):

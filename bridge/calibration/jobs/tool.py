@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gapbridge.bridge.calibration.format import millimetres
 from gapbridge.bridge.calibration.instruments.instrument import AnyInstrument, Surroundings
@@ -18,13 +17,13 @@ from gapbridge.bridge.calibration.session.reading_check import ReadingCheck
 from gapbridge.bridge.calibration.session.session import Session
 from gapbridge.bridge.cell import Cell
 from gapbridge.bridge.cell.settings.instruments import PointSettings
+from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.plan import Plan, PlannedPose
 from gapbridge.core.calibration.tool_session import calibrate_tool
 from gapbridge.core.errors import CellError
 from gapbridge.core.planning.tool_plan import plan_tool
 from gapbridge.core.rotation import roll_pitch_yaw
 
-Array = NDArray[np.float64]
 POSES = 6
 
 

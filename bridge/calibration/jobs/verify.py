@@ -8,7 +8,6 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gapbridge.bridge.calibration.format import duration, millimetres, parameter
 from gapbridge.bridge.calibration.jobs.calibrate import baseline_beside
@@ -23,6 +22,7 @@ from gapbridge.bridge.calibration.planning import (
 )
 from gapbridge.bridge.calibration.session.progress import seconds_left
 from gapbridge.bridge.calibration.verdict import moved_text, verdict_text
+from gapbridge.core.arrays import Array, Index
 from gapbridge.core.calibration.accuracy_baseline import baseline_in
 from gapbridge.core.calibration.plan import Plan, PlannedPose
 from gapbridge.core.calibration.verify import Verification, verify
@@ -30,7 +30,6 @@ from gapbridge.core.errors import InputError
 from gapbridge.core.planning.candidates import candidates_of
 from gapbridge.core.planning.travel import joint_speed, leg_times, shortest_way
 
-Array = NDArray[np.float64]
 POSES = 10
 
 
@@ -131,7 +130,7 @@ class VerifyJob(Job):
             prompt.say(f"  note: {note}")
 
 
-def _far_apart(position: Array, count: int) -> NDArray[np.int64]:
+def _far_apart(position: Array, count: int) -> Index:
     """Return rows (count,) of positions (N, 3), each far from those before it."""
     chosen = [int(np.argmax(np.linalg.norm(position - position.mean(axis=0), axis=1)))]
     nearest = np.linalg.norm(position - position[chosen[0]], axis=1)

@@ -8,14 +8,12 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gapbridge.bridge.calibration.instruments.instrument import Ask, ReadingError
 from gapbridge.bridge.calibration.instruments.numbers import numbers
+from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.plan import PlannedPose
 from gapbridge.core.errors import RunError
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gapbridge.bridge.calibration.instruments.instrument import ReadingError
 from gapbridge.bridge.calibration.joints.joint_source import JointSample, JointSource
@@ -25,10 +24,10 @@ from gapbridge.bridge.cell.settings.recording import RecordingSettings
 from gapbridge.bridge.daemon.daemon import settings_of
 from gapbridge.bridge.ipc.shared_memory import Phase
 from gapbridge.bridge.loop.supervisor import State
+from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.plan import PlannedPose
 from gapbridge.core.errors import LinkError, RunError
 
-Array = NDArray[np.float64]
 STILL = 0.003  # rad/s: slower than this, the arm stands
 NEAR = 0.05  # rad: an arm that rests this near to the pose has arrived
 MOVED = 2e-4  # rad: farther than this from where it stood, it has moved

@@ -7,11 +7,10 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gapbridge.bridge.document.output_file import write_table
+from gapbridge.core.arrays import Array
 
-Array = NDArray[np.float64]
 PERIOD = 0.01  # s; between rows the daemon's source goes straight
 ACCELERATION = 1.0  # rad/s2, fastest joint
 SHORTEST = 0.5  # s

@@ -5,14 +5,13 @@ from __future__ import annotations
 import threading
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gapbridge.bridge.cell.daemon_settings import DaemonSettings
 from gapbridge.bridge.daemon.daemon import Daemon
 from gapbridge.bridge.ipc.shared_memory import PageReader
+from gapbridge.core.arrays import Array
 from gapbridge.core.errors import GapbridgeError, LinkError
 
-Array = NDArray[np.float64]
 KEPT = 20.0  # s of cycles that are kept
 STEP = 1e-5  # rad: a joint that has come this far has moved, in that direction
 FOREVER = 1e9  # s

@@ -6,15 +6,13 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gapbridge.bridge.calibration.report.facts import SessionFacts
+from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.budget.budget import Budget, Stated, budget, outlier_readings
 from gapbridge.core.calibration.budget.pose_accuracy import KINDS, PoseAccuracy, pose_accuracies
 from gapbridge.core.calibration.plan import Plan
 from gapbridge.core.calibration.result import Calibration, Errors
-
-Array = NDArray[np.float64]
 
 ERRORS = {
     "position": "the distance between where the tool was measured and where the model puts it",

@@ -10,11 +10,10 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.readings import Readings
 
-Array = NDArray[np.float64]
 NEAREST = 0.02  # m: nothing on a tool comes nearer to an instrument's origin, or to a second ball
 FARTHEST = 100.0  # m: no instrument of this kind looks farther
 WIDEST = 3.0  # m between two balls on one tool

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gapbridge.bridge.calibration.format import force, millimetres, point
 from gapbridge.bridge.calibration.instruments.instrument import AnyInstrument, ReadingError, Where
@@ -15,12 +14,12 @@ from gapbridge.bridge.calibration.session.progress import header
 from gapbridge.bridge.calibration.session.prompt import Prompt, SessionCommand
 from gapbridge.bridge.calibration.session.reading_check import NOTHING, ReadingCheck, Verdict
 from gapbridge.bridge.calibration.session.session import Reading, Session
+from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.plan import PlannedPose
 from gapbridge.core.errors import LinkError
 from gapbridge.core.estimation.registration import register
 from gapbridge.core.rotation import rotation_matrix, rotation_vector
 
-Array = NDArray[np.float64]
 SHAKY = 10.0  # times the instrument's sigma: samples that scatter more are doubted
 SHAKIEST = 1e-4  # m: less than this is never doubted
 REVISITED = 3  # poses measured once more where the first of them has changed

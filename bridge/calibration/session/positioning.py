@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gapbridge.bridge.calibration.format import degrees, load_text
 from gapbridge.bridge.calibration.instruments.instrument import AnyInstrument, ReadingError
@@ -13,10 +12,10 @@ from gapbridge.bridge.calibration.joints.joint_source import JointSample, JointS
 from gapbridge.bridge.calibration.session.prompt import Prompt
 from gapbridge.bridge.calibration.session.session import Session
 from gapbridge.bridge.cell.settings.calibration import CalibrationSettings
+from gapbridge.core.arrays import Array, Mask
 from gapbridge.core.calibration.plan import PlannedPose
 from gapbridge.core.errors import RunError
 
-Array = NDArray[np.float64]
 FAR = np.radians(3.0)  # an arm farther from the pose than this is asked about
 THERE = 2e-3  # rad: an arm this near need not be driven
 HEAVY = 0.05  # kg, and share: the controller's payload may differ from the plan's by as much
@@ -60,7 +59,7 @@ def _first_free(clear: Clear, ways: list[list[Array]]) -> list[Array] | None:
     return None
 
 
-def all_free(clear: Clear, begin: Array, end: Array) -> NDArray[np.bool_]:
+def all_free(clear: Clear, begin: Array, end: Array) -> Mask:
     """Return which straight ways (N,) from ``begin`` to ``end``, both (N, n), are free."""
     if not len(begin):
         return np.zeros(0, dtype=bool)

@@ -12,10 +12,10 @@ from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtri
 
 from gapbridge.bridge.calibration.session.first_readings import early_check
+from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.observables import make_observable
 from gapbridge.core.calibration.observables.nuisance import Nuisance
 from gapbridge.core.calibration.observables.observable import Observable
@@ -27,7 +27,6 @@ from gapbridge.core.loads import Loads
 from gapbridge.core.metrology import Metrology
 from gapbridge.core.model import Model, Poses
 
-Array = NDArray[np.float64]
 REPEATABILITY = 1e-4  # m, 1 sigma of one coordinate: of an arm of which nobody knows it
 UNMODELLED = 1e-4  # m, 1 sigma: what a session cannot fit and still is no mistake
 UNITS = {

@@ -7,15 +7,14 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gapbridge.bridge.calibration.session.journal import Entry, Journal
 from gapbridge.bridge.calibration.session.plan_document import plan_entry, plan_of
+from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.plan import Plan, PlannedPose
 from gapbridge.core.calibration.readings import Readings
 from gapbridge.core.loads import Loads
 
-Array = NDArray[np.float64]
 _VECTORS = ("q", "value", "approach", "temperature", "wrench", "raw_wrench")
 
 

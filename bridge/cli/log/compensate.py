@@ -18,9 +18,9 @@ from gapbridge.bridge.cli.options import (
 )
 from gapbridge.bridge.cli.progress import progress
 from gapbridge.bridge.document.output_file import require_writable, writing_table
+from gapbridge.core.arrays import Array
 from gapbridge.core.errors import EquilibriumError, InputError
 from gapbridge.core.log.log import Log
-from gapbridge.core.model import Array
 
 MISSED = 1e-6  # m: a corrected setpoint that leaves more than this is reported
 

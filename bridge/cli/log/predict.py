@@ -9,7 +9,6 @@ from pathlib import Path
 
 import click
 import numpy as np
-from numpy.typing import NDArray
 
 from gapbridge.bridge.api.functions import predict as predicted
 from gapbridge.bridge.api.records import Predicted
@@ -24,10 +23,10 @@ from gapbridge.bridge.cli.options import (
 )
 from gapbridge.bridge.cli.progress import progress
 from gapbridge.bridge.document.output_file import require_writable, writing_table
+from gapbridge.core.arrays import Array
 from gapbridge.core.log.log import Log
 from gapbridge.core.predicted_channels import in_context, predicted_channels
 
-Array = NDArray[np.float64]
 SHOWN = 8  # rows named at most
 
 

@@ -6,7 +6,6 @@ from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gapbridge.bridge.daemon.daemon import Daemon
 from gapbridge.bridge.demo.hidden import soft_servos
@@ -14,6 +13,7 @@ from gapbridge.bridge.demo.links.controller_link import ControllerLink
 from gapbridge.bridge.demo.poses import Load, Scene, Workspace
 from gapbridge.bridge.demo.result import Resolution, reach
 from gapbridge.bridge.demo.trajectory import visits, write_trajectory
+from gapbridge.core.arrays import Array
 from gapbridge.drivers.can.loading import read_profile
 from gapbridge.drivers.can.settings import CanSettings
 from gapbridge.drivers.can_bus.bus import SOCKETCAND_PORT
@@ -21,7 +21,6 @@ from gapbridge.drivers.simulated.plant.plant_arm import plant_arm
 from gapbridge.drivers.simulated.plant.plant_settings import draw_plant_settings
 from gapbridge.drivers.simulated.ur.settings import BENCH_PORT
 
-Array = NDArray[np.float64]
 SOFTNESS = 40.0
 """How many times softer the PiPER is than what the seed draws, which is an arm of a UR's class. Its
 joints come out at 1 to 10 kNm/rad about their axes, as small planetary gears are, and it hangs by 1

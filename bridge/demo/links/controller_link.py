@@ -9,7 +9,6 @@ from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gapbridge.bridge.cell import Cell, load_cell
 from gapbridge.bridge.demo.bench import Bench
@@ -17,10 +16,10 @@ from gapbridge.bridge.demo.links.link import DemoLink
 from gapbridge.bridge.demo.poses import Load
 from gapbridge.bridge.demo.served_cell import ServedCell
 from gapbridge.bridge.document.output_file import write_text
+from gapbridge.core.arrays import Array
 from gapbridge.core.errors import CellError
 from gapbridge.drivers.simulated.ur.settings import BENCH_PORT
 
-Array = NDArray[np.float64]
 PAYLOAD = re.compile(r"^payload:.*$", re.MULTILINE)
 
 

@@ -10,9 +10,6 @@ from importlib import resources
 from pathlib import Path
 from typing import ClassVar
 
-import numpy as np
-from numpy.typing import NDArray
-
 from gapbridge.bridge.cell import Cell, load_cell
 from gapbridge.bridge.daemon.daemon import Daemon
 from gapbridge.bridge.demo.bench import Bench
@@ -21,9 +18,9 @@ from gapbridge.bridge.demo.poses import Load, Scene
 from gapbridge.bridge.demo.rests import SETTLING
 from gapbridge.bridge.demo.result import Resolution
 from gapbridge.bridge.document.output_file import write_text
+from gapbridge.core.arrays import Array
 from gapbridge.core.errors import RunError
 
-Array = NDArray[np.float64]
 LAST_HOST = 60  # 127.0.0.2 to this are tried
 
 

@@ -6,21 +6,18 @@ from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
 from gapbridge.bridge.daemon.daemon import Daemon
 from gapbridge.bridge.demo.links.controller_link import ControllerLink
 from gapbridge.bridge.demo.own_program import LONGEST_VISIT, OwnProgram
 from gapbridge.bridge.demo.poses import UR10E, Load, Workspace
 from gapbridge.bridge.demo.result import Resolution, reach
+from gapbridge.core.arrays import Array
 from gapbridge.drivers.modbus.profile import read_profile
 from gapbridge.drivers.modbus.registers import UNITS
 from gapbridge.drivers.modbus.schema import Mailbox
 from gapbridge.drivers.modbus.settings import ModbusSettings
 from gapbridge.drivers.simulated.ur.settings import BENCH_PORT
 
-Array = NDArray[np.float64]
 PORT = 15020  # below 1024 only root may listen; a real controller's is 502
 
 

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gapbridge.bridge.cell.simulation import server_settings
 from gapbridge.bridge.daemon.daemon import Daemon
@@ -17,6 +16,7 @@ from gapbridge.bridge.demo.links.link import DemoLink
 from gapbridge.bridge.demo.poses import UR10E
 from gapbridge.bridge.demo.result import Resolution
 from gapbridge.bridge.demo.trajectory import visits, write_trajectory
+from gapbridge.core.arrays import Array
 from gapbridge.drivers.simulated.ur.process import SimulatedController
 from gapbridge.drivers.simulated.ur.settings import (
     BENCH_PORT,
@@ -25,8 +25,6 @@ from gapbridge.drivers.simulated.ur.settings import (
     RTDE_PORT,
     SCRIPT_PORT,
 )
-
-Array = NDArray[np.float64]
 
 
 class UrRtdeLink(DemoLink):

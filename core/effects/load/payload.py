@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.effects.effect import Effect, Parameter, Site, Term
 from gapbridge.core.effects.simulator import Kind
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
     from gapbridge.core.arm import Arm
     from gapbridge.core.kernels.reference import Rows
     from gapbridge.core.loads import Loads
@@ -42,22 +40,16 @@ class Payload(Effect):
         """Return the extra mass."""
         return (Parameter("", "kg", 1.0),)
 
-    def condition(
-        self, term: Term, arm: Arm, rows: Rows, loads: Loads, q: NDArray[np.float64]
-    ) -> None:
+    def condition(self, term: Term, arm: Arm, rows: Rows, loads: Loads, q: Array) -> None:
         """Add the mass."""
         rows.payload_mass[:] += term.values[0]
 
-    def sense(
-        self, term: Term, arm: Arm, wrench: NDArray[np.float64], motion: Motion
-    ) -> NDArray[np.float64]:
+    def sense(self, term: Term, arm: Arm, wrench: Array, motion: Motion) -> Array:
         """Add the mass's weight and inertia to what the flange sensor carries."""
         assert motion.pieces is not None
         return wrench + term.values[0] * motion.pieces.payload_wrench
 
-    def drive(
-        self, term: Term, arm: Arm, torque: NDArray[np.float64], motion: Motion
-    ) -> NDArray[np.float64]:
+    def drive(self, term: Term, arm: Arm, torque: Array, motion: Motion) -> Array:
         """Add what holds and moves the mass."""
         assert motion.pieces is not None
         return torque + term.values[0] * motion.pieces.payload_torque

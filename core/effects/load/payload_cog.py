@@ -6,12 +6,11 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.effects.effect import Effect, Parameter, Site, Term
 from gapbridge.core.effects.simulator import Kind, SimulatorChange, along_axes
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from gapbridge.core.arm import Arm
     from gapbridge.core.kernels.reference import Rows
     from gapbridge.core.loads import Loads
@@ -52,24 +51,18 @@ class PayloadCog(Effect):
         """Return it in a simulator's terms."""
         return along_axes(Kind.PAYLOAD_COG, None, term.values)
 
-    def condition(
-        self, term: Term, arm: Arm, rows: Rows, loads: Loads, q: NDArray[np.float64]
-    ) -> None:
+    def condition(self, term: Term, arm: Arm, rows: Rows, loads: Loads, q: Array) -> None:
         """Move the centre of gravity."""
         rows.payload_cog[:] += term.values
 
-    def sense(
-        self, term: Term, arm: Arm, wrench: NDArray[np.float64], motion: Motion
-    ) -> NDArray[np.float64]:
+    def sense(self, term: Term, arm: Arm, wrench: Array, motion: Motion) -> Array:
         """Add what the load does more to the sensor from there."""
         assert motion.pieces is not None
         _, moved = motion.pieces.payload_from(np.array(term.values))
         there = moved - motion.pieces.payload_wrench
         return wrench + motion.pieces.carried_mass[:, None] * there
 
-    def drive(
-        self, term: Term, arm: Arm, torque: NDArray[np.float64], motion: Motion
-    ) -> NDArray[np.float64]:
+    def drive(self, term: Term, arm: Arm, torque: Array, motion: Motion) -> Array:
         """Add what holds and moves the load more from there."""
         assert motion.pieces is not None
         moved, _ = motion.pieces.payload_from(np.array(term.values))

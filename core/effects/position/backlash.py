@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.effects.effect import JointEffect, Parameter, Site, Term
 from gapbridge.core.effects.simulator import Kind
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
     from gapbridge.core.arm import Arm
     from gapbridge.core.kernels.reference import Rows
     from gapbridge.core.loads import Loads
@@ -37,9 +35,7 @@ class Backlash(JointEffect):
         """Return the whole clearance."""
         return (Parameter("", "rad", 3e-4, 0.0, 0.1),)
 
-    def condition(
-        self, term: Term, arm: Arm, rows: Rows, loads: Loads, q: NDArray[np.float64]
-    ) -> None:
+    def condition(self, term: Term, arm: Arm, rows: Rows, loads: Loads, q: Array) -> None:
         """Turn the joint back by half the clearance."""
         assert term.site.joint is not None
         if loads.approach is not None:

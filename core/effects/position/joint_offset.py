@@ -6,12 +6,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.effects.effect import JointEffect, Parameter, Site, Term
 from gapbridge.core.effects.simulator import Kind
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from gapbridge.core.arm import Arm
     from gapbridge.core.kernels.reference import Rows
     from gapbridge.core.loads import Loads
@@ -41,13 +40,11 @@ class JointOffset(JointEffect):
         """Return the offset."""
         return (Parameter("", "rad", 1e-3, -0.5, 0.5),)
 
-    def angle_columns(self, site: Site, q: NDArray[np.float64]) -> NDArray[np.float64]:
+    def angle_columns(self, site: Site, q: Array) -> Array:
         """Return ones: the same turn at every angle."""
         return np.ones((len(q), 1))
 
-    def condition(
-        self, term: Term, arm: Arm, rows: Rows, loads: Loads, q: NDArray[np.float64]
-    ) -> None:
+    def condition(self, term: Term, arm: Arm, rows: Rows, loads: Loads, q: Array) -> None:
         """Turn the joint further."""
         assert term.site.joint is not None
         rows.q[:, term.site.joint - 1] += term.values[0]

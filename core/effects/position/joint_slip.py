@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, ClassVar
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.effects.effect import JointEffect, Parameter, Site, Term, rows_after
 from gapbridge.core.effects.simulator import Kind
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
     from gapbridge.core.arm import Arm
     from gapbridge.core.kernels.reference import Rows
     from gapbridge.core.loads import Loads
@@ -40,9 +38,7 @@ class JointSlip(JointEffect):
         """Return the step, and when it happened."""
         return (Parameter("", "rad", 1e-3, -1.0, 1.0), Parameter("time", "s", 1.0))
 
-    def condition(
-        self, term: Term, arm: Arm, rows: Rows, loads: Loads, q: NDArray[np.float64]
-    ) -> None:
+    def condition(self, term: Term, arm: Arm, rows: Rows, loads: Loads, q: Array) -> None:
         """Turn the joint further in the rows after the slip."""
         assert term.site.joint is not None
         rows.q[rows_after(term, loads), term.site.joint - 1] += term.values[0]

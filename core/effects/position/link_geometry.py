@@ -7,12 +7,11 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.effects.effect import Effect, Parameter, Site, Term
 from gapbridge.core.rotation import one_rotation_matrix
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from gapbridge.core.arm import Arm
     from gapbridge.core.kernels.rates import ChainRate
     from gapbridge.core.kernels.reference import Chain
@@ -23,10 +22,10 @@ PARALLEL = 1e-6  # sine of the angle below which two axes count as parallel
 class LinkForm(NamedTuple):
     """A link from its joint's axis z to the next one's, as Tz(d) Tx(a) Rx(alpha) Tz(shift)."""
 
-    z: NDArray[np.float64]
-    x: NDArray[np.float64]  # the common normal
-    next_z: NDArray[np.float64]
-    y: NDArray[np.float64]  # across both
+    z: Array
+    x: Array  # the common normal
+    next_z: Array
+    y: Array  # across both
     shift: float  # m, how far the next frame lies along its own axis from the common normal
     parallel: bool
 

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.effects.effect import (
     JointEffect,
     Parameter,
@@ -16,8 +17,6 @@ from gapbridge.core.effects.effect import (
 )
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from gapbridge.core.arm import Arm
     from gapbridge.core.kernels.rates import ChainRate
     from gapbridge.core.kernels.reference import Chain
@@ -67,9 +66,7 @@ class StiffnessNonlinearity(JointEffect):
             rate.softening[i] = 1.0
         return True
 
-    def reported(
-        self, arm: Arm, term: Term, covariance: NDArray[np.float64] | None
-    ) -> tuple[Reported, ...]:
+    def reported(self, arm: Arm, term: Term, covariance: Array | None) -> tuple[Reported, ...]:
         """Return c and M0."""
         c, softening = term.values
         moment = float(1 / np.sqrt(softening)) if softening > 0 else float("inf")

@@ -6,11 +6,10 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.effects.effect import Effect, Parameter, Site, Term, rows_after
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from gapbridge.core.arm import Arm
     from gapbridge.core.kernels.reference import Chain
     from gapbridge.core.loads import Loads
@@ -54,8 +53,8 @@ class TargetSlip(Effect):
         self,
         term: Term,
         chain: Chain,
-        position: NDArray[np.float64],
-        rotation: NDArray[np.float64],
+        position: Array,
+        rotation: Array,
         loads: Loads,
     ) -> None:
         """Put the TCP back in the rows before the slip."""

@@ -6,11 +6,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.effects.effect import JointEffect, Parameter, Reported, Site, Term
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from gapbridge.core.arm import Arm
     from gapbridge.core.kernels.reference import Rows
     from gapbridge.core.loads import Loads
@@ -42,22 +41,18 @@ class TransmissionError(JointEffect):
             Parameter("cosine", "rad", 3e-4, -0.1, 0.1),
         )
 
-    def angle_columns(self, site: Site, q: NDArray[np.float64]) -> NDArray[np.float64]:
+    def angle_columns(self, site: Site, q: Array) -> Array:
         """Return sine and cosine of the angle times the order."""
         assert site.order is not None
         return np.stack([np.sin(site.order * q), np.cos(site.order * q)], axis=-1)
 
-    def condition(
-        self, term: Term, arm: Arm, rows: Rows, loads: Loads, q: NDArray[np.float64]
-    ) -> None:
+    def condition(self, term: Term, arm: Arm, rows: Rows, loads: Loads, q: Array) -> None:
         """Turn the joint by the wave at its encoder angle."""
         assert term.site.joint is not None and term.site.order is not None
         i = term.site.joint - 1
         rows.q[:, i] += self.angle_columns(term.site, q[:, i]) @ term.values
 
-    def reported(
-        self, arm: Arm, term: Term, covariance: NDArray[np.float64] | None
-    ) -> tuple[Reported, ...]:
+    def reported(self, arm: Arm, term: Term, covariance: Array | None) -> tuple[Reported, ...]:
         """Return order, amplitude and phase of amplitude sin(order q + phase)."""
         sine, cosine = term.values
         amplitude = float(np.hypot(sine, cosine))

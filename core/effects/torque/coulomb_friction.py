@@ -6,12 +6,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.effects.effect import Parameter, Site, Term, TorqueEffect, joint_scale
 from gapbridge.core.effects.simulator import Kind
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from gapbridge.core.arm import Arm
     from gapbridge.core.motion import Motion
 
@@ -37,6 +36,6 @@ class CoulombFriction(TorqueEffect):
         """Return the torque."""
         return (Parameter("", "Nm", 0.03 * joint_scale(arm, site), 0.0, np.inf),)
 
-    def added(self, term: Term, i: int, motion: Motion) -> NDArray[np.float64]:
+    def added(self, term: Term, i: int, motion: Motion) -> Array:
         """Return the friction that the motor overcomes."""
         return term.values[0] * motion.direction[:, i]

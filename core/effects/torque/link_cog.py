@@ -6,12 +6,11 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.effects.effect import JointEffect, Parameter, Site, Term, typical_moment
 from gapbridge.core.effects.simulator import Kind, SimulatorChange, along_axes
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from gapbridge.core.arm import Arm
     from gapbridge.core.motion import Motion
 
@@ -55,9 +54,7 @@ class LinkCog(JointEffect):
         in_joint = moment if arm.body_axes is None else arm.body_axes[i] @ moment
         return along_axes(Kind.LINK_MOMENT, term.site.joint, in_joint)
 
-    def drive(
-        self, term: Term, arm: Arm, torque: NDArray[np.float64], motion: Motion
-    ) -> NDArray[np.float64]:
+    def drive(self, term: Term, arm: Arm, torque: Array, motion: Motion) -> Array:
         """Add what holds and moves the first moment."""
         assert term.site.joint is not None
         assert motion.pieces is not None

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.effects.effect import JointEffect, Parameter, Site, Term
 from gapbridge.core.effects.simulator import Kind
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
     from gapbridge.core.arm import Arm
     from gapbridge.core.motion import Motion
 
@@ -37,9 +35,7 @@ class LinkInertia(JointEffect):
         """Return the relative increase; joint i stands for link i, which it turns."""
         return (Parameter("", "", 0.05, -1.0, 20.0),)
 
-    def drive(
-        self, term: Term, arm: Arm, torque: NDArray[np.float64], motion: Motion
-    ) -> NDArray[np.float64]:
+    def drive(self, term: Term, arm: Arm, torque: Array, motion: Motion) -> Array:
         """Add the link's torques once more, scaled."""
         assert term.site.joint is not None
         assert motion.pieces is not None

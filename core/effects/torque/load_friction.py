@@ -6,11 +6,10 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.effects.effect import Parameter, Site, Term, TorqueEffect
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from gapbridge.core.arm import Arm
     from gapbridge.core.motion import Motion
 
@@ -38,7 +37,7 @@ class LoadFriction(TorqueEffect):
         """Return the share of the load."""
         return (Parameter("", "", 0.05, 0.0, 5.0),)
 
-    def added(self, term: Term, i: int, motion: Motion) -> NDArray[np.float64]:
+    def added(self, term: Term, i: int, motion: Motion) -> Array:
         """Return the friction that the motor overcomes."""
         assert motion.load is not None
         return term.values[0] * np.abs(motion.load[:, i]) * motion.direction[:, i]

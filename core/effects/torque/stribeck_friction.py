@@ -6,11 +6,10 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.effects.effect import Parameter, Site, Term, TorqueEffect, joint_scale
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from gapbridge.core.arm import Arm
     from gapbridge.core.motion import Motion
 
@@ -42,7 +41,7 @@ class StribeckFriction(TorqueEffect):
             Parameter("velocity", "rad/s", 0.05, 0.0, 10.0),
         )
 
-    def added(self, term: Term, i: int, motion: Motion) -> NDArray[np.float64]:
+    def added(self, term: Term, i: int, motion: Motion) -> Array:
         """Return the friction that the motor overcomes."""
         speed = max(abs(term.values[1]), SLOWEST)
         fading = np.exp(-((motion.qd[:, i] / speed) ** 2))

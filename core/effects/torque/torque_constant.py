@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, ClassVar
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.effects.effect import JointEffect, Parameter, Site, Term
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
     from gapbridge.core.arm import Arm
     from gapbridge.core.motion import Motion
 
@@ -34,9 +32,7 @@ class TorqueConstant(JointEffect):
         """Return the relative increase."""
         return (Parameter("", "", 0.05, -0.8, 1.0),)
 
-    def drive(
-        self, term: Term, arm: Arm, torque: NDArray[np.float64], motion: Motion
-    ) -> NDArray[np.float64]:
+    def drive(self, term: Term, arm: Arm, torque: Array, motion: Motion) -> Array:
         """Scale the joint's torque."""
         assert term.site.joint is not None
         result = torque.copy()

@@ -6,11 +6,10 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.effects.effect import Parameter, Site, Term, TorqueEffect, joint_scale
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from gapbridge.core.arm import Arm
     from gapbridge.core.motion import Motion
 
@@ -41,6 +40,6 @@ class TorqueOffset(TorqueEffect):
         """Return the offset."""
         return (Parameter("", "Nm", 0.02 * joint_scale(arm, site)),)
 
-    def added(self, term: Term, i: int, motion: Motion) -> NDArray[np.float64]:
+    def added(self, term: Term, i: int, motion: Motion) -> Array:
         """Return the offset."""
         return np.full(len(motion.q), term.values[0])

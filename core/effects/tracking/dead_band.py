@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, ClassVar
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.effects.effect import Parameter, ServoEffect, Site, Term
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
     from gapbridge.core.arm import Arm
 
 
@@ -41,9 +39,7 @@ class DeadBand(ServoEffect):
         """Return the half width w."""
         return (Parameter("", "rad", 1e-3, 0.0, 0.2),)
 
-    def follow(
-        self, term: Term, time: NDArray[np.float64], command: NDArray[np.float64], first: float
-    ) -> NDArray[np.float64]:
+    def follow(self, term: Term, time: Array, command: Array, first: float) -> Array:
         """Move the joint only where its target has left the band."""
         from gapbridge.core.kernels.interpolation import played  # brings numba
 
@@ -53,10 +49,10 @@ class DeadBand(ServoEffect):
         self,
         term: Term,
         arm: Arm,
-        q: NDArray[np.float64],
-        held: NDArray[np.float64],
-        approach: NDArray[np.float64] | None,
-    ) -> NDArray[np.float64]:
+        q: Array,
+        held: Array,
+        approach: Array | None,
+    ) -> Array:
         """Let the joint rest on the side that it came from."""
         assert term.site.joint is not None
         if approach is None:

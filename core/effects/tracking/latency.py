@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.effects.effect import Parameter, ServoEffect, Site, Term
 from gapbridge.core.effects.simulator import Kind
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
     from gapbridge.core.arm import Arm
 
 
@@ -39,9 +37,7 @@ class Latency(ServoEffect):
         """Return the delay."""
         return (Parameter("", "s", 5e-3, 0.0, 2.0),)
 
-    def follow(
-        self, term: Term, time: NDArray[np.float64], command: NDArray[np.float64], first: float
-    ) -> NDArray[np.float64]:
+    def follow(self, term: Term, time: Array, command: Array, first: float) -> Array:
         """Look the command up in the past."""
         from gapbridge.core.kernels.interpolation import interpolate  # brings numba
 

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, ClassVar
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.effects.effect import JointEffect, Parameter, Site, Term, typical_moment
 from gapbridge.core.effects.simulator import Kind
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
     from gapbridge.core.arm import Arm
 
 
@@ -43,10 +41,10 @@ class ServoDroop(JointEffect):
         self,
         term: Term,
         arm: Arm,
-        q: NDArray[np.float64],
-        held: NDArray[np.float64],
-        approach: NDArray[np.float64] | None,
-    ) -> NDArray[np.float64]:
+        q: Array,
+        held: Array,
+        approach: Array | None,
+    ) -> Array:
         """Let the joint give way."""
         assert term.site.joint is not None
         i = term.site.joint - 1

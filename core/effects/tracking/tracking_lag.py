@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.effects.effect import Parameter, ServoEffect, Site, Term
 from gapbridge.core.effects.simulator import Kind
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
     from gapbridge.core.arm import Arm
 
 
@@ -37,9 +35,7 @@ class TrackingLag(ServoEffect):
         """Return the time constant."""
         return (Parameter("", "s", 5e-3, 0.0, 2.0),)
 
-    def follow(
-        self, term: Term, time: NDArray[np.float64], command: NDArray[np.float64], first: float
-    ) -> NDArray[np.float64]:
+    def follow(self, term: Term, time: Array, command: Array, first: float) -> Array:
         """Let the joint follow."""
         from gapbridge.core.kernels.interpolation import lagged  # brings numba
 

@@ -6,11 +6,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.effects.effect import Effect, Parameter, Site, Term
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from gapbridge.core.arm import Arm
     from gapbridge.core.motion import Motion
 
@@ -44,8 +43,6 @@ class FtBias(Effect):
         scales = (1.0,) * 3 + (0.1,) * 3
         return tuple(Parameter(*p) for p in zip(AXES, units, scales, strict=True))
 
-    def sense(
-        self, term: Term, arm: Arm, wrench: NDArray[np.float64], motion: Motion
-    ) -> NDArray[np.float64]:
+    def sense(self, term: Term, arm: Arm, wrench: Array, motion: Motion) -> Array:
         """Add the constant."""
         return np.asarray(wrench + np.array(term.values))

@@ -6,11 +6,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.effects.effect import Effect, Parameter, Site, Term
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from gapbridge.core.arm import Arm
     from gapbridge.core.motion import Motion
 
@@ -41,8 +40,6 @@ class FtDrift(Effect):
         scales = (1e-3,) * 3 + (1e-4,) * 3
         return tuple(Parameter(*p) for p in zip(AXES, units, scales, strict=True))
 
-    def sense(
-        self, term: Term, arm: Arm, wrench: NDArray[np.float64], motion: Motion
-    ) -> NDArray[np.float64]:
+    def sense(self, term: Term, arm: Arm, wrench: Array, motion: Motion) -> Array:
         """Add what has run up since the log's first row."""
         return wrench + np.outer(motion.t - motion.start, term.values)

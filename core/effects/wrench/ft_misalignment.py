@@ -6,13 +6,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.effects.effect import Effect, Parameter, Site, Term
 from gapbridge.core.effects.simulator import Kind, SimulatorChange, along_axes
 from gapbridge.core.rotation import rotation_matrix
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from gapbridge.core.arm import Arm
     from gapbridge.core.motion import Motion
 
@@ -44,9 +43,7 @@ class FtMisalignment(Effect):
         """Return it in a simulator's terms."""
         return along_axes(Kind.SENSOR_TURN, None, term.values)
 
-    def sense(
-        self, term: Term, arm: Arm, wrench: NDArray[np.float64], motion: Motion
-    ) -> NDArray[np.float64]:
+    def sense(self, term: Term, arm: Arm, wrench: Array, motion: Motion) -> Array:
         """Express the wrench in the sensor's own axes."""
         R = rotation_matrix(np.array(term.values))
         return np.concatenate([wrench[:, :3] @ R, wrench[:, 3:] @ R], axis=1)

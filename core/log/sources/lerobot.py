@@ -8,13 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.errors import LogError
 from gapbridge.core.log.sources.joint_order import order_joints
 from gapbridge.core.log.sources.source import Converted, Source, SourceOptions
 
-Array = NDArray[np.float64]
 INFO = Path("meta") / "info.json"
 STEPS = 4095  # of an encoder turn, as LeRobot counts its servos' 4096 positions
 PAUSE = 1.0  # s between two episodes, whose own times all begin at 0

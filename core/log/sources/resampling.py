@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from gapbridge.core.arrays import Array, Mask
+
 GAP = 5.0  # times the usual distance of two samples: beyond, nothing is interpolated
 
 
@@ -32,7 +32,7 @@ class Stream:
         long = np.flatnonzero(steps > GAP * np.median(steps))
         return [(float(self.time[i]), float(steps[i])) for i in long]
 
-    def at(self, time: Array) -> tuple[dict[str, Array], NDArray[np.bool_]]:
+    def at(self, time: Array) -> tuple[dict[str, Array], Mask]:
         """Return the columns interpolated to other times, and where that can be done (N,).
 
         Not before the first and after the last sample, nor inside of a gap. Rotation vectors

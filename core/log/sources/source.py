@@ -9,13 +9,11 @@ from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.errors import LogError
 from gapbridge.core.log.columns import COLUMNS
 from gapbridge.core.log.log import Log
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -7,13 +7,12 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.errors import LogError
 from gapbridge.core.log.columns import COLUMNS, is_known
 from gapbridge.core.log.sources.source import Converted, Source, SourceOptions
 
-Array = NDArray[np.float64]
 FRANKA = {  # libfranka's logToCSV -> the log's columns
     "state.q_d": "target_q", "state.q": "actual_q", "state.dq": "actual_qd",
     "state.tau_J": "actual_current_as_torque",

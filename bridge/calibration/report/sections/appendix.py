@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gapbridge.bridge.calibration.report.figures import degrees, fixed
 from gapbridge.bridge.calibration.report.material import Material
 from gapbridge.bridge.document.blocks import Block, Cell, Table
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
+from gapbridge.core.arrays import Array, Index
 
 
 def all_readings(material: Material) -> list[Block]:

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gapbridge.bridge.calibration.report.figures import load_title, mm
 from gapbridge.bridge.calibration.report.material import Material
 from gapbridge.bridge.document.axes import Chart, logarithmic, named, plain, visible
 from gapbridge.bridge.document.blocks import Block, Pictures, Table
 from gapbridge.bridge.document.drawing import AFTER, BEFORE, Drawing
-
-Index = NDArray[np.int64]
+from gapbridge.core.arrays import Index
 
 
 def over_the_load(material: Material) -> list[Block]:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gapbridge.bridge.calibration.report.figures import counted, fixed, mm, mrad
 from gapbridge.bridge.calibration.report.material import Material
 from gapbridge.bridge.document.axes import plain
 from gapbridge.bridge.document.blocks import Block, Paragraph, Table
+from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.budget.pose_accuracy import PoseAccuracy
 
 ASKED = 30  # visits that the standard asks for
@@ -57,7 +57,7 @@ def _table(found: tuple[PoseAccuracy, ...]) -> Table:
     return Table(tuple(heads), rows, tuple(widths), tuple(range(1, len(heads))))
 
 
-def _largest(angles: NDArray[np.float64] | None) -> str:
+def _largest(angles: Array | None) -> str:
     return "–" if angles is None else mrad(float(np.abs(angles).max()))
 
 

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Generic, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gapbridge.bridge.calibration.report.facts import SessionFacts
 from gapbridge.bridge.calibration.report.figures import fixed, mm
@@ -29,11 +28,11 @@ from gapbridge.bridge.document.blocks import (
 from gapbridge.bridge.document.drawing import AFTER, BAD_DOT, BEFORE, Drawing
 from gapbridge.bridge.document.section import Section
 from gapbridge.bridge.report.names import sentence
+from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.payload_session import PayloadCalibration
 from gapbridge.core.calibration.tool_session import ToolCalibration
 from gapbridge.core.model import Model
 
-Array = NDArray[np.float64]
 F = TypeVar("F", bound=PayloadCalibration | ToolCalibration)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gapbridge.bridge.calibration.report.figures import mm
 from gapbridge.bridge.calibration.report.material import Material
@@ -11,9 +10,9 @@ from gapbridge.bridge.document.axes import Chart, scale
 from gapbridge.bridge.document.blocks import Block, Paragraph, Pictures, Table
 from gapbridge.bridge.document.drawing import AFTER, BEFORE, EDGE, INK, Circle, Drawing
 from gapbridge.bridge.document.skeleton import round_factor
+from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.result import Errors
 
-Array = NDArray[np.float64]
 LONGEST = 0.16  # of the workspace's size: how long a large error is drawn
 VIEWS = {"from above": (("x, m", 0), ("y, m", 1)), "from the side": (("x, m", 0), ("z, m", 2))}
 
