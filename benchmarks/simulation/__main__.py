@@ -7,6 +7,7 @@ the same command again, at the same commit, goes on where it was left.
 from __future__ import annotations
 
 import argparse
+import gc
 import json
 import multiprocessing
 import os
@@ -48,7 +49,8 @@ def main() -> int:
     report(done)
     begun = reported = time.monotonic()
     before = sum(map(size, done))
-    with multiprocessing.Pool(given.processes) as pool:
+    # what was imported is not searched for garbage again
+    with multiprocessing.Pool(given.processes, gc.freeze) as pool:
         for part in pool.imap_unordered(run_part, todo):
             record.add(part)
             done.append(part)

@@ -46,26 +46,32 @@ class _Bus:
         self.frames: deque[tuple[int, bytes, float]] = deque(maxlen=MOST_WAITING)
 
     def recv(self, timeout: float) -> Any:
-        link, world = self._link, self._link.world
+        link = self._link
         if self.generation != link.generation:
             raise python_can.CanOperationError("Connection reset by peer")
+        if not self.frames and not self._wait(timeout):
+            return None
+        identifier, data, link.last_sampled = self.frames.popleft()
+        return python_can.Message(
+            timestamp=link.world.now, arbitration_id=identifier, is_extended_id=False, data=data,
+            check=False,
+        )  # fmt: skip
+
+    def _wait(self, timeout: float) -> bool:
+        """Wait for a frame; return whether one has come."""
+        link, world = self._link, self._link.world
         until = world.now + timeout
         while not self.frames:
             left = until - world.now
             if left <= 0.0:
-                return None
+                return False
             process = world.current
             assert process is not None
             link.waiting = process
             process.sleep(left)
             if self.generation != link.generation:
                 raise python_can.CanOperationError("Connection reset by peer")
-        identifier, data, sampled = self.frames.popleft()
-        link.last_sampled = sampled
-        return python_can.Message(
-            timestamp=world.now, arbitration_id=identifier, is_extended_id=False, data=data,
-            check=False,
-        )  # fmt: skip
+        return True
 
     def send(self, frame: Any, timeout: float | None = None) -> None:
         link = self._link

@@ -77,8 +77,9 @@ class UrLink(SimulatedLink):
         self._registers: OffsetRegisters | None = None
         self._applied = NOTHING
         self._solved: Any = None
-        self._solves_at: Any = None  # rad: joints that ``_inverse`` is of
+        self._solves_at: Any = None  # joints, rad, and tool that ``_inverse`` is of
         self._inverse: Any = None  # of the Jacobian
+        self._own_tcp: Any = None  # without an offset, in base
         self._kept_q: Any = None
 
     def driver(self) -> Driver:
@@ -191,11 +192,12 @@ class UrLink(SimulatedLink):
             controller.offset_by((0.0,) * 6)
             return
         arm, tool = controller.plant.arm, controller.declared.tool
-        wanted = offset_frame(tcp_in_base(arm, controller.own_q, tool), self._applied)
         near = [a + b for a, b in zip(controller.own_q, controller.joint_offset, strict=True)]
-        if self._solves_at != controller.own_q:
-            self._solves_at = controller.own_q
+        if self._solves_at != (controller.own_q, tool):
+            self._solves_at = controller.own_q, tool
+            self._own_tcp = tcp_in_base(arm, controller.own_q, tool)
             self._inverse = np.linalg.pinv(jacobian(arm, near, tool))
+        wanted = offset_frame(self._own_tcp, self._applied)
         found: Any = None
         for _ in range(6):  # offsets are small: one Jacobian does for all
             step = gap(tcp_in_base(arm, near, tool), wanted)

@@ -135,7 +135,10 @@ class Process:
             world.at(wakes, partial(self._resume, self._ticket))
             parent = self._greenlet.parent
             assert parent is not None
+            tracing = sys.gettrace()
+            sys.settrace(None)  # of this process only: all others run at their full speed
             parent.switch()
+            sys.settrace(tracing)
             self.check()
         if self._begin_tracing is not None:
             begin, self._begin_tracing = self._begin_tracing, None
@@ -182,8 +185,8 @@ class Process:
             return on_line
 
         def on_call(frame: FrameType, event: str, arg: object) -> Any:
-            inside = self.world.current is self and left[0] > 0
-            return on_line if inside and frame.f_code.co_filename.startswith(PRODUCT) else None
+            in_product = frame.f_code.co_filename.startswith(PRODUCT)
+            return on_line if left[0] > 0 and in_product else None
 
         self._begin_tracing = lambda: sys.settrace(on_call)
 

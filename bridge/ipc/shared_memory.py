@@ -198,9 +198,9 @@ class SharedMemory:
         oldest = max(first, last - ROWS + ROWS // 8)  # what is older may be under the pen
         index = np.arange(oldest, last)
         places = index % ROWS
-        rows = self._rows[places]
+        rows = self._rows.take(places, 0)
         whole = (rows[:, 0] == index) & (self._rows[places, 0] == index)
-        return rows[whole], oldest - first + int((~whole).sum())
+        return rows[whole], oldest - first + int(np.count_nonzero(~whole))
 
     def close(self) -> None:
         """Let go of the memory."""
@@ -217,6 +217,7 @@ class RunPage(SharedMemory):
         super().__init__(n, writable=False, clock=clock)
         seal(self.fd)  # of no loop: it only says that nothing has happened yet
         self._shown = os.dup(self.fd)  # the newest one that nobody but its loop can write to
+        self._is_shown = True
 
     def renew(self) -> None:
         """Make a page for a new process of the loop, the former being dead; cycles go on."""
@@ -226,17 +227,18 @@ class RunPage(SharedMemory):
         head[_BEAT_TIME] = 0
         os.pwrite(fd, head.tobytes(), 0)
         if self.written:
-            _write_whole(fd, self._rows, head.nbytes)
+            _write_whole(fd, self._rows[: self.written], head.nbytes)
         before = self.fd
         self._attach(fd, writable=False)  # first: other threads read along
+        self._is_shown = False
         os.close(before)
 
     def promote(self) -> bool:
         """Show the page to who reads along once its loop has sealed it; returns whether it has."""
-        if os.path.sameopenfile(self.fd, self._shown) or not is_sealed(self.fd):
+        if self._is_shown or not is_sealed(self.fd):
             return False
         os.close(self._shown)
-        self._shown = os.dup(self.fd)
+        self._shown, self._is_shown = os.dup(self.fd), True
         return True
 
     def open_for_reading(self) -> int:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -23,8 +24,7 @@ from gapbridge.drivers.simulated.plant.rotations import (
 FASTEST = 6.2831853  # rad/s, for an arm without velocity limits
 
 
-@dataclass(frozen=True, slots=True)
-class Frame:
+class Frame(NamedTuple):
     """A frame seen from base: rotation and origin (m)."""
 
     rotation: Rotation

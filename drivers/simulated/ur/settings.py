@@ -127,11 +127,11 @@ def to_json(settings: ServerSettings) -> dict[str, Any]:
 
 def from_json(data: dict[str, Any]) -> ServerSettings:
     """Return the settings that `to_json` has written."""
-    arm = dict(data["arm"])
-    arm["links"] = [Frame(_tuple(f["rotation"]), _tuple(f["origin"])) for f in arm["links"]]
+    arm = {k: _tuple(v) for k, v in data["arm"].items()}
+    arm["links"] = tuple(Frame(*frame) for frame in arm["links"])
     rest = {k: _tuple(v) for k, v in data.items() if k not in ("arm", "plant")}
     return ServerSettings(
-        arm=PlantArm(**{k: _tuple(v) for k, v in arm.items()}),
+        arm=PlantArm(**arm),
         plant=PlantSettings(**{k: _tuple(v) for k, v in data["plant"].items()}),
         **rest,
     )
