@@ -24,6 +24,7 @@ TURN = 6.4  # rad: a little more than one turn; a fixed angle beyond is in degre
 TURNS = 25.0  # rad: no revolute joint is limited further out
 QUICK = 60.0  # rad/s: no joint of an arm turns quicker
 HEAVY, HEAVIEST = 500.0, 5000.0  # kg of one link: few arms, no arm
+DENSEST = 2000.0  # kg of the arm by the cube of its reach, m: arms have 10 to 250
 
 
 @dataclass(frozen=True)
@@ -70,12 +71,14 @@ def arm_oddities(arm: Arm, keys: tuple[str | int, ...]) -> Iterator[Oddity]:
         yield Oddity(keys, f"an arm of {far:.3g} m reach", "0.05 to 5 m", sure=False)
     for i, mass in enumerate(arm.mass):
         if mass < 0 or mass > HEAVIEST:
-            yield Oddity(keys, f"a link {i + 1} of {mass:.4g} kg", "kg (grams?)")
+            yield Oddity(keys, f"{mass:.4g} kg of link {i + 1}", "kg, 0 or more (grams?)")
         elif mass > HEAVY:
-            yield Oddity(keys, f"a link {i + 1} of {mass:.4g} kg", "at most 500 kg", sure=False)
+            yield Oddity(keys, f"{mass:.4g} kg of link {i + 1}", "at most 500 kg", sure=False)
         away = float(np.linalg.norm(arm.cog[i])) if mass > 0 else 0.0
         if far <= LONGEST and away > 2.0 * far + 1.0:
             yield Oddity(keys, f"a centre of gravity of link {i + 1} {away:.4g} m off", "m (mm?)")
+    if (mass := float(arm.mass.sum())) > DENSEST * far**3 and mass > HEAVY:
+        yield Oddity(keys, f"an arm of {mass:.4g} kg and {far:.3g} m reach", "kg (grams?)")
     weightless = [str(i + 1) for i in range(arm.n) if arm.mass[i] == 0]
     if len(weightless) == arm.n:
         yield Oddity(

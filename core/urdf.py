@@ -15,6 +15,7 @@ from gapbridge.core.files import read_text
 from gapbridge.core.rotation import rotation_matrix, rpy_matrix, transform
 
 TURNING = ("revolute", "continuous")
+XACRO = "ros.org/wiki/xacro"  # in the namespace of its macros
 
 
 @dataclass
@@ -52,13 +53,21 @@ def _parse(path: Path) -> ElementTree.Element:
         root = ElementTree.fromstring(read_text(path))
     except FileNotFoundError:
         raise ArmError(f"{path}: robot.urdf: file not found") from None
-    except (OSError, UnicodeDecodeError) as error:
+    except UnicodeDecodeError:
+        raise ArmError(f"{path}: found bytes that are no text, expected a URDF (UTF-8)") from None
+    except OSError as error:
         raise ArmError(f"{path}: robot.urdf: cannot be read: {error}") from None
     except ElementTree.ParseError as error:
         raise ArmError(f"{path}: found broken XML ({error}), expected a URDF") from None
     if root.tag != "robot":
         raise ArmError(f"{path}: found a <{root.tag}> file, expected a URDF <robot>")
+    if any(XACRO in element.tag for element in root.iter()):
+        raise ArmError(
+            f"{path}: found xacro macros, expected a plain URDF (ros2 run xacro xacro {path.name} "
+            "-o robot.urdf)"
+        )
     links = {str(link.get("name")) for link in root.findall("link")}
+    moved: dict[str, str | None] = {}  # by the joint that turns or holds it
     for joint in root.findall("joint"):
         label = f"{path}: joint {joint.get('name')!r}"
         if joint.find("child") is None or joint.find("parent") is None:
@@ -66,6 +75,12 @@ def _parse(path: Path) -> ElementTree.Element:
         for link in (_parent(joint), _child(joint)):
             if link not in links:
                 raise ArmError(f"{label}: found link {link!r}, expected one that the file has")
+        if _child(joint) in moved:
+            raise ArmError(
+                f"{label}: found child link {_child(joint)!r}, expected one that joint "
+                f"{moved[_child(joint)]!r} does not move already"
+            )
+        moved[_child(joint)] = joint.get("name")
     return root
 
 

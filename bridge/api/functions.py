@@ -72,6 +72,7 @@ def fit(cell: Cell, log: Log, *, remounted: bool = False) -> Fitted:
     in the log excites the compliance.
     """
     from gapbridge.bridge.api.found_spread import fit_intervals
+    from gapbridge.bridge.cell.log_fit import pose_findings
     from gapbridge.core.estimation.identification import (
         identify_compliance,  # predict need not wait for it
     )
@@ -85,7 +86,7 @@ def fit(cell: Cell, log: Log, *, remounted: bool = False) -> Fitted:
         std_radial=found.std_radial, shown=found.identifiable, samples=found.samples,
         gap_rms=found.gap_rms, remaining_rms=found.remaining_rms,
         remaining_rms_held_out=held_out if math.isfinite(held_out) else None,
-        notes=(*found.notes, *found.combinations), provenance=fitted(
+        notes=(*pose_findings(cell, log), *found.notes, *found.combinations), provenance=fitted(
             _origin(cell, log), range_of(log),
             Spread.of_fit(found.identifiable, found.covariance).beside(cell.spread),
             cell.intervals | fit_intervals(found),

@@ -27,6 +27,14 @@ _FLOAT = re.compile(
 _Loader.add_implicit_resolver("tag:yaml.org,2002:float", _FLOAT, list("-+0123456789."))
 
 
+# What PyYAML says of common slips, as found and expected.
+PROBLEMS = {
+    r"'\t' that cannot start any token": "found a tab, expected spaces",
+    "found another document": "found a second document (---), expected one cell in a file",
+    "could not determine a constructor for the tag": "found a tag (!), expected plain values",
+}
+
+
 @dataclass(frozen=True)
 class Document:
     """One YAML file: its text, its nodes (with their marks) and its data."""
@@ -82,6 +90,9 @@ def parse(text: str, path: Path) -> Document:
         mark = error.problem_mark or error.context_mark
         line = mark.line + 1 if mark else 1
         what = " ".join(str(error.problem or error.context or "broken YAML").split())
+        for problem, said in PROBLEMS.items():
+            if problem in what:
+                raise CellError(f"{path}, line {line}: {said}") from None
         raise CellError(f"{path}, line {line}: found broken YAML: {what}") from None
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         what = " ".join(str(error).split())

@@ -11,7 +11,7 @@ from gapbridge.bridge.document.log_findings import log_finding_text
 from gapbridge.core.diagnosis.log_checks.frames import frame_findings
 from gapbridge.core.diagnosis.log_checks.units_and_clocks import findings
 from gapbridge.core.errors import LogError
-from gapbridge.core.log.log_finding import LogFinding
+from gapbridge.core.log.log import Log
 from gapbridge.core.sessions import sessions_in
 
 MEASURED = "measured_position"
@@ -28,13 +28,23 @@ def log_findings(cell: Cell, path: Path) -> Findings:
             f"{path}: columns {MEASURED}_0..2: not found, expected them: without measured "
             "positions nothing shows which arm it was"
         )
-    errors: dict[LogFinding, None] = {}  # in order, each once
-    odd: dict[LogFinding, None] = {}
+    log.require("actual_q", "target_q")
+    log.loads()
+    errors = pose_findings(cell, log)
+    odd: dict[str, None] = {}  # in order, each once
     for part in sessions_in(log):
-        wrong = frame_findings(cell.model, part, cell.metrology)
-        errors |= dict.fromkeys(wrong)
-        odd |= dict.fromkeys(findings(part, cell.model, cell.metrology))
+        found = findings(part, cell.model, cell.metrology)
+        odd |= dict.fromkeys(log_finding_text(finding) for finding in found)
     return Findings(
-        [f"{cell.path} with {path}: {log_finding_text(finding)}" for finding in errors],
-        [f"{path}: {log_finding_text(finding)}" for finding in odd if finding not in errors],
+        [f"{cell.path} with {path}: {text}" for text in errors],
+        [f"{path}: {text}" for text in odd if text not in errors],
     )
+
+
+def pose_findings(cell: Cell, log: Log) -> list[str]:
+    """Return where measured poses are not those of the cell's arm, each finding once."""
+    texts: dict[str, None] = {}
+    for part in sessions_in(log):
+        found = frame_findings(cell.model, part, cell.metrology)
+        texts |= dict.fromkeys(log_finding_text(finding) for finding in found)
+    return list(texts)

@@ -162,7 +162,7 @@ def read_log(path: Path | str, n: int) -> Log:
     """
     path = Path(path)
     if not is_file(path):
-        raise LogError(f"{path}: file not found, expected a CSV or Parquet log")
+        raise no_file(path)
     if path.suffix.lower() in (".parquet", ".pq"):
         file = ParquetColumns(path)
         names, lines, rows = file.names, None, file.rows
@@ -178,6 +178,12 @@ def read_log(path: Path | str, n: int) -> Log:
     unknown = tuple(name for name in names if not is_known(name))
     counted = None if lines is None else np.arange(rows) + 1
     return Log(str(path), columns, n, unknown=unknown, lines=lines, numbers=counted)
+
+
+def no_file(path: Path) -> LogError:
+    """Return the error of a log that is not there, or is a folder."""
+    what = "found a folder that is no data source" if path.is_dir() else "file not found"
+    return LogError(f"{path}: {what}, expected a CSV or Parquet log")
 
 
 def _text(path: Path) -> str:

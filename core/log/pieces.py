@@ -23,6 +23,7 @@ from gapbridge.core.log.log import (
     delimiter_of,
     is_comment,
     last_motion,
+    no_file,
     read_log,
     table_columns,
 )
@@ -95,7 +96,7 @@ class _Motion:
 def _tables(path: Path, rows: int) -> Iterator[Table]:
     """Yield the pieces of a file."""
     if not path.is_file():
-        raise LogError(f"{path}: file not found, expected a CSV or Parquet log")
+        raise no_file(path)
     if path.suffix.lower() in PARQUET:
         columns = ParquetColumns(path)
         return ((columns.names, table, None) for table in columns.tables(rows))

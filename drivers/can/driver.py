@@ -25,6 +25,7 @@ from gapbridge.drivers.can.state import StateBuilder
 from gapbridge.drivers.can.writer import FrameWriter
 from gapbridge.drivers.clock import SYSTEM, Clock
 from gapbridge.drivers.driver import Driver
+from gapbridge.drivers.profile_file import ProfileError
 
 FIRST_SAMPLE = 2.0  # s in which an arm on the bus must have reported everything once
 SLICE = 0.02  # s, of one wait for a frame
@@ -42,9 +43,9 @@ class CanDriver(Driver):
         profile = read_profile(settings.profile_path, settings.installation)
         super().__init__(min(settings.rate, profile.rate), model, clock=clock)
         if model.arm.n != profile.n:
-            raise LinkError(
-                f"link.profile: found {profile.n} joints in {profile.name}, the cell's arm has "
-                f"{model.arm.n}"
+            raise ProfileError(
+                f"link.profile: found {profile.n} joints in {profile.name}, expected "
+                f"{model.arm.n}: the cell's arm has those"
             )
         self.settings, self.profile = settings, profile
         self.reader = FrameReader(settings, profile, clock)

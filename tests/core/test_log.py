@@ -193,7 +193,7 @@ def test_what_is_no_text_is_reported(tmp_path):
         read_log(path, 6)
     with pytest.raises(LogError, match="file not found"):
         read_log(tmp_path / "none.csv", 6)
-    with pytest.raises(LogError, match="file not found"):
+    with pytest.raises(LogError, match="found a folder that is no data source"):
         read_log(tmp_path, 6)
 
 

@@ -160,6 +160,8 @@ TWO = (link("b"), link("l1"), joint("j1", "revolute", "b", "l1"))
          r"link 'l1': value: found 'nan', expected 1"),
         ((link("b"), '<joint name="j" type="fixed"/>'), None,
          r"joint 'j': found no parent or child link"),
+        ((*TWO, joint("j2", "revolute", "b", "l1")), None,
+         r"joint 'j2': found child link 'l1', expected one that joint 'j1' does not move already"),
     ],
 )  # fmt: skip
 def test_a_mistake_is_reported_in_one_line(tmp_path, parts, tip, message):
@@ -180,6 +182,12 @@ def test_what_is_no_urdf_is_reported(tmp_path):
         path.write_text(text)
         with pytest.raises(ArmError, match=message):
             arm_from_urdf(path)
+    path.write_bytes(bytes(range(256)))
+    with pytest.raises(ArmError, match="found bytes that are no text, expected a URDF"):
+        arm_from_urdf(path)
+    path.write_text('<robot xmlns:xacro="http://ros.org/wiki/xacro"><xacro:include/></robot>')
+    with pytest.raises(ArmError, match=r"found xacro macros.*ros2 run xacro xacro x\.urdf"):
+        arm_from_urdf(path)
 
 
 @pytest.mark.parametrize(

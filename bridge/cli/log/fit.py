@@ -13,6 +13,7 @@ from rich.table import Table
 
 from gapbridge.bridge.api.found_spread import fit_intervals
 from gapbridge.bridge.cell import Cell, save_cell
+from gapbridge.bridge.cell.log_fit import pose_findings
 from gapbridge.bridge.cli.log.large_log import LargeLog, has_sessions, is_large
 from gapbridge.bridge.cli.options import (
     cell_option,
@@ -83,18 +84,23 @@ def _identified(
         and not (has_sessions(paths[0]) or metrology.remounted)
     ):
         ranges: list[dict[str, tuple[float, float]]] = []
+        wrong: list[str] = []
 
         def read_once() -> Iterator[Log]:
             for piece in LargeLog(paths[0], cell, by_approach(cell.model.terms)):
+                if not ranges:
+                    wrong.extend(pose_findings(cell, piece))
                 ranges.append(range_of(piece))
                 yield piece
 
         with status("fitting") as emit:
             found = identify_streamed(cell.model, read_once(), metrology, progress=emit)
-        return found, merged(ranges)
+        return replace(found, notes=(*wrong, *found.notes)), merged(ranges)
     rows = open_logs(paths, cell)
     with progress("fitting"):
-        return identify_compliance(cell.model, rows, metrology), range_of(rows)
+        found = identify_compliance(cell.model, rows, metrology)
+    notes = (*pose_findings(cell, rows), *found.notes)
+    return replace(found, notes=notes), range_of(rows)
 
 
 def print_identification(found: Identification) -> None:

@@ -102,7 +102,7 @@ def _mistakes(
     predicted = model.rigid_pose(q[rows]).position
     size = _size(seen) / max(_size(predicted), 1e-9)
     for unit, factor in (("centimetres", 100.0), ("inches", 1 / 0.0254), ("feet", 1 / 0.3048)):
-        if abs(np.log(size / factor)) < 0.2:
+        if 0.82 < size / factor < 1.22:
             yield LogFinding(LogCheck.LENGTH_UNIT, (unit,)), model, q[rows], seen / factor
     for mistake, other in other_models(model):
         yield mistake, other, q[rows], seen

@@ -23,6 +23,9 @@ def make_servers(link: CanSettings, host: str, controller: ArmController) -> lis
     module, name = NODES.get(link.profile, MAPPED).split(":")
     nodes = getattr(importlib.import_module(module), name)
     if link.profile == "piper" and controller.n != 6:
-        raise InputError(f"link.profile: found piper, 6 joints, the cell's arm has {controller.n}")
+        raise InputError(
+            f"link.profile: found 6 joints in piper, expected {controller.n}: the cell's arm has "
+            "those"
+        )
     found: ProtocolServer = nodes(link, host, controller)
     return [found]

@@ -103,6 +103,19 @@ def test_keys_with_nothing_behind_them_count_as_left_out(tmp_path: Path) -> None
 @pytest.mark.parametrize(
     ("text", "phrase"),
     [
+        ("robot:\n\tmodel: ur10e", "line 2: found a tab, expected spaces"),
+        (f"{ARM}---\n{ARM}", "line 2: found a second document (---), expected one cell"),
+        ("robot: !!python/name:os.system", "line 1: found a tag (!), expected plain values"),
+        ("robot: [", "line 1: found broken YAML"),
+    ],
+)
+def test_text_that_is_no_plain_yaml_is_reported(tmp_path: Path, text: str, phrase: str) -> None:
+    assert phrase in reported(tmp_path, text)
+
+
+@pytest.mark.parametrize(
+    ("text", "phrase"),
+    [
         ("robot: {modle: ur10e}", "'modle' 'model'"),
         (ARM + "efects: []", "'efects' 'effects'"),
         (ARM + "payload: {mas: 5}", "payload.mas 'mass'"),

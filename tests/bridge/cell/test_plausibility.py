@@ -98,7 +98,8 @@ def test_what_is_only_odd_is_a_warning(tmp_path: Path, text: str, phrase: str) -
         ({"rpy": "0 90 0"}, "line 6: joint 'j2': found origin rpy 90"),
         ({"lower": "-170"}, "line 6: joint 'j2': found limit lower 170"),
         ({"more": "<mimic joint='j1'/>"}, "line 6: joint 'j2': found <mimic>"),
-        ({"mass": "7369"}, "found a link 1 of 7369 kg"),
+        ({"mass": "7369"}, "found 7369 kg of link 1"),
+        ({"mass": "4000"}, "m reach, expected kg (grams?)"),
     ],
 )
 def test_a_urdf_in_other_units_is_refused_with_its_line_too(

@@ -134,6 +134,33 @@ def test_the_arm_that_was_measured_fits_its_log(tmp_path: Path) -> None:
     assert "columns measured_position_0..2: not found" in refused("check", path, "--log", log)
 
 
+@pytest.mark.parametrize(
+    ("before", "after", "phrase"),
+    [
+        ("actual_q_", "q_", "columns: found no actual_q_0..5 or target_q_0..5"),
+        ("\n", ",payload\n", "row 2, column payload: found -1, expected 0 or more kg"),
+    ],
+)
+def test_a_log_that_no_command_can_use_does_not_pass(
+    tmp_path: Path, before: str, after: str, phrase: str
+) -> None:
+    path, log = tmp_path / "cell.yaml", measured_log(tmp_path)
+    path.write_text("robot: {model: ur10e}\n")
+    header, _, rows = log.read_text().partition("\n")
+    if "payload" in after:
+        rows = rows.replace("\n", ",-1\n")
+    log.write_text(f"{header}\n".replace(before, after) + rows)
+    assert phrase in refused("check", path, "--log", log)
+
+
+def test_a_fit_of_another_arm_reports_the_mistake(tmp_path: Path) -> None:
+    path, log = tmp_path / "cell.yaml", measured_log(tmp_path, (2, 1, 0, 3, 4, 5))
+    path.write_text("robot: {model: ur10e}\n")
+    answer = gapbridge("fit", log, "--cell", path, "--out", tmp_path / "new.yaml")
+    assert answer.code == 0
+    assert "joints 1 and 3 look swapped" in answer.out
+
+
 def test_every_command_refuses_it_in_one_line(tmp_path: Path) -> None:
     path = tmp_path / "cell.yaml"
     path.write_text("robot: {model: ur10e}\ntool: {tcp: {xyz: [0, 0, 180]}}\nlink: {}\n")
@@ -166,6 +193,15 @@ def test_live_reports_where_the_controller_differs(host: str, tmp_path: Path) ->
     assert answer.code == 2
     assert "line 2: tool.tcp: found a TCP 70 mm" in answer.err
     assert "line 1: robot.calibration: found geometry up to" in answer.err
+
+
+def test_a_rate_that_the_controller_has_not_is_one_warning(host: str, tmp_path: Path) -> None:
+    path = cell(tmp_path, host)
+    path.write_text(path.read_text().replace(f"host: {host}", f"host: {host}, rate: 1000"))
+    warned = [line for line in gapbridge("check", path, "--live").err.splitlines()
+              if "link.rate" in line]  # fmt: skip
+    assert len(warned) == 1
+    assert "expected at most 500 Hz" in warned[0]
 
 
 def test_live_passes_the_controllers_own_cell(host: str, tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ from can_arm import MODEL, UNIT, next_state, other_bus, served_arm, setpoint_of
 from gapbridge.core.errors import InvalidStateError, LinkError, StaleStateError, WriteError
 from gapbridge.drivers.can.driver import CanDriver
 from gapbridge.drivers.can.settings import CanSettings
+from gapbridge.drivers.profile_file import ProfileError
 
 
 @pytest.fixture
@@ -253,7 +254,7 @@ def test_an_arm_that_is_not_on_the_bus_is_one_line_with_what_was_missed():
 
 def test_an_arm_of_another_number_of_joints_is_refused_before_the_bus_is_opened():
     settings = CanSettings(profile="openarm", interface="virtual", channel="nobody")
-    with pytest.raises(LinkError, match="found 7 joints in OpenArm"):
+    with pytest.raises(ProfileError, match=r"found 7 joints in OpenArm .*, expected 6"):
         CanDriver(settings, MODEL)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -57,6 +58,13 @@ def test_a_point_of_the_cell_seen_from_the_tool_is_named_without_rotations() -> 
     seen = np.einsum("nji,nj->ni", poses.rotation, np.array([1.5, 0.2, 0.4]) - poses.position)
     (note,) = reported(TRUE, Q, measured_position=seen)
     assert "they look inverted: the base seen from the tool: then 0.0 mm" in note
+
+
+def test_positions_that_never_change_are_reported_without_a_warning_of_numpy() -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        (note,) = reported(TRUE, Q, measured_position=np.zeros((40, 3)))
+    assert "is it the right arm, tool and order" in note
 
 
 @pytest.mark.parametrize(
