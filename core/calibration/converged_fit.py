@@ -22,7 +22,6 @@ from gapbridge.core.metrology import Metrology
 Array = NDArray[np.float64]
 NOISES = 6  # times at most that the noise is estimated anew
 SAME = 0.02  # relative change of the noise that is none
-OUTLIER = 0.1  # weight below which a reading counts as an outlier
 
 
 @dataclass(frozen=True)
@@ -48,7 +47,7 @@ class ConvergedFit:
     @property
     def inliers(self) -> Mask:
         """Return which readings count (N,)."""
-        return np.asarray(self.weights > OUTLIER)
+        return np.asarray(self.weights > 0)
 
 
 def converged_fit(
@@ -113,5 +112,5 @@ def _noise(problem: Problem, at: FitState, noise: Noise) -> Noise:
     precision = np.concatenate([problem.bounds.held**-2.0, np.zeros(F.shape[1])])
     return estimated(
         noise, problem.known, residual + (J @ off).reshape(residual.shape), np.hstack([J, F]),
-        precision, np.asarray(at.weights > OUTLIER),
+        precision, np.asarray(at.weights > 0),
     )  # fmt: skip

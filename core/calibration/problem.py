@@ -16,7 +16,7 @@ from gapbridge.core.calibration.staging import Stages
 from gapbridge.core.effects import CATALOGUE
 from gapbridge.core.errors import ExcitationError, InputError
 from gapbridge.core.estimation.linear_system import Bounds, System
-from gapbridge.core.estimation.robust import scaled_length, weights_of
+from gapbridge.core.estimation.robust import scale_of, weights_of
 
 Array = NDArray[np.float64]
 HELD = 10.0  # usual sizes within which a parameter is weakly held at its beginning
@@ -87,10 +87,9 @@ def weighted_system(
     J, F = ((W @ c.reshape(N, k, -1)).reshape(N * k, -1) for c in columns)
     e = (W @ residual[..., None])[..., 0]
     cells = np.full(N, float(k)) if share is None else np.maximum(k - share, 0.3 * k)
-    square = np.sum(e**2, axis=1)
     # while much is still to be found, what remains is larger than the noise: its middle counts
-    usual = max(float(np.median(square / cells)) / _middle(k), 1.0)
-    weights = weights_of(scaled_length(square / usual, cells))
+    usual = max(scale_of(e / np.sqrt(cells / k)[:, None]), 1.0)
+    weights = weights_of(np.sqrt(np.sum(e**2, axis=1) / cells) / usual)
     return System(J, F, e.ravel()).weighted(np.repeat(np.sqrt(weights), k)), weights
 
 
@@ -98,8 +97,3 @@ def cost(residual: Array, noise: Noise, weights: Array) -> float:
     """Return the weighed sum of squares of ``residual`` (N, k) in units of the noise."""
     e = (noise.whitener @ residual[..., None])[..., 0]
     return float(np.sum(weights * np.sum(e**2, axis=1)))
-
-
-def _middle(k: int) -> float:
-    """Return the median of chi-square over its k degrees of freedom."""
-    return (1 - 2 / (9 * k)) ** 3

@@ -55,6 +55,7 @@ ACCUSATION_PENALTY = 6.0  # score that every accusation pays: keeps clean logs c
 SMOOTH_PENALTY = 18.0  # the same of an unnamed function beyond a named cause
 FAMILY_PENALTY = 4.0  # score that one kind of effect at two places may cost beyond two kinds
 NO_REVERSAL_PENALTY = 3.0  # of play in a log without reversals: it stands behind the offset
+ANY_CONSTANT_PENALTY = 1e-3  # of a sensor's constant: decides exact ties, which rounding did
 MAX_LINES = 4  # periodic lines a joint may have: more are the Fourier series of something else
 MAX_SMOOTH_TERMS = 2  # unnamed functions of a set: more add nothing
 LARGE_SAMPLE = 450  # rows of the sample space from which many causes are looked for, one by one
@@ -74,7 +75,6 @@ EXCESS = 0.5  # times the floor: a correlated part smaller than that changes no 
 OUTLIER_SHARE = 0.1  # of the samples: more outliers than that are structure, not bad luck
 MOST_OUTLIERS = 1 / 3  # of the poses, excluded nevertheless: ten bad rows of 33, fitted, stood as
 # causes that are not there; their median shows the noise of the others up to there
-OUTLIER_SIGMA = 5.0  # from which on a sample is an outlier
 UNPREDICTED_SHARE = 0.5  # share of an outlier that may be left where something else explains it
 # Several sessions
 CHANCE = 0.001  # probability below which the values of sessions differ by more than chance

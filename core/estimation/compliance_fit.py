@@ -21,6 +21,7 @@ from gapbridge.core.estimation.registration import (
     frame_columns,
     register_robustly,
 )
+from gapbridge.core.estimation.robust import distance_of, scale_of, weights_of
 from gapbridge.core.kernels.factor import factor_blocks
 from gapbridge.core.kernels.threads import in_ranges
 from gapbridge.core.loads import Loads
@@ -34,7 +35,6 @@ NUISANCE_ROUNDS = 20
 CONVERGED = 1e-8  # relative step at which a fit has converged
 ROUNDING = 1e-14  # share of a product that is none
 RANK = 1e-10  # singular values of the nuisances below this share are rounding
-OUTLIER = 5.0  # standard deviations beyond which a reading counts as an outlier
 AT_ONCE = 2000  # rows of one decomposition; of 60,000 by 22 columns it takes 9 ms, whole 24 ms
 
 
@@ -199,7 +199,7 @@ def fit_nuisances(model: Model, data: Data) -> Fit:
     """Return the frame and tool point that fit best, the model's flexibilities left alone."""
     if not data.nuisances:
         gap, _ = residual(model, data, IDENTITY)
-        return Fit(model, IDENTITY, _robust_weights(gap)[0])
+        return Fit(model, IDENTITY, robust_weights(gap)[0])
     return _placed(model, data, slice(None))
 
 
@@ -219,7 +219,7 @@ def _placed(model: Model, data: Data, free: slice) -> Fit:
     frame = _first_placements(model, data)
     for _ in range(NUISANCE_ROUNDS):
         gap, poses = residual(model, data, frame)
-        weights, scale = _robust_weights(gap)
+        weights, scale = robust_weights(gap)
         per_cell = per_cell_of(weights, scale, gap.shape[1])
         columns = nuisance_columns(model, poses, gap.shape[1], data)[:, :, free]
         step = np.zeros(data.nuisances)
@@ -266,7 +266,7 @@ def _round(now: Fit, data: Data, kept: Mask, prior: tuple[Array, float]) -> Fit:
     """Take one step of Gauss and Newton."""
     model, n = now.model, now.model.arm.n
     gap, poses = residual(model, data, now.frame)
-    weights, scale = _robust_weights(gap)
+    weights, scale = robust_weights(gap)
     R = weighed(model, now.frame, data, (gap, per_cell_of(weights, scale, gap.shape[1])), poses)
     problem = (R[:, : -2 * n - 1], R[:, -2 * n - 1 : -1], R[:, -1])
     return stepped(now, problem, weights, kept, prior)
@@ -449,27 +449,17 @@ def per_cell_of(weights: Array, scale: Array, width: int) -> Array:
     return np.asarray(np.sqrt(weights)[:, None] / np.repeat(scale, 3)[:width])
 
 
-def _robust_weights(gap: Array) -> tuple[Array, Array]:
-    """Return weights (N,) (Tukey's biweight on outliers) and the noise scale of each unit."""
-
-    def middle(part: Array) -> float:
-        return float(np.median(np.abs(part)))
-
-    scale = noise_scale(middle(gap[:, :3]), middle(gap[:, 3:]) if gap.shape[1] > 3 else None)
+def robust_weights(gap: Array) -> tuple[Array, Array]:
+    """Return the weights (N,) of gaps (N, 3 or 6), and their noise (2,), m and rad."""
+    scale = noise_of(gap)
     return weights_at(gap, scale), scale
 
 
-def noise_scale(middle: float, turned: float | None) -> Array:
-    """Return the noise (2,), m and rad, from the medians of a gap's absolute values."""
-    spread = [max(1.4826 * value, 1e-12) for value in (middle, turned or 0.0)]
-    return np.array([spread[0], 1.0 if turned is None else spread[1]])
+def noise_of(gap: Array) -> Array:
+    """Return the noise (2,), m and rad, of gaps (N, 3 or 6)."""
+    return np.array([scale_of(gap[:, :3]), scale_of(gap[:, 3:]) if gap.shape[1] > 3 else 1.0])
 
 
 def weights_at(gap: Array, scale: Array) -> Array:
     """Return the weights (N,) of gaps (N, 3 or 6) where the noise is ``scale`` (2,)."""
-    distance = np.linalg.norm(gap / np.repeat(scale, 3)[: gap.shape[1]], axis=1)
-    limit = OUTLIER * np.sqrt(gap.shape[1])
-    weights = np.clip(1 - (distance / limit) ** 2, 0, 1) ** 2
-    # below two deviations nothing is down-weighted: clean data keep their full information
-    weights = np.where(distance < 2 * np.sqrt(gap.shape[1]), 1.0, weights)
-    return np.asarray(np.maximum(weights, 1e-12))
+    return weights_of(distance_of(gap, np.repeat(scale, 3)[: gap.shape[1]]))

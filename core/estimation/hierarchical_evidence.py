@@ -13,17 +13,18 @@ from numpy.typing import NDArray
 
 from gapbridge.core.errors import ExcitationError
 from gapbridge.core.estimation.compliance_fit import (
-    OUTLIER,
     Data,
     Fit,
     fit_flexibilities,
     fit_nuisances,
+    noise_of,
     nuisance_columns,
     orthonormal,
     prior_of,
     residual,
 )
 from gapbridge.core.estimation.identification import measured_rows
+from gapbridge.core.estimation.robust import OUTLIER, distance_of, scale_of
 from gapbridge.core.log.log import Log
 from gapbridge.core.metrology import Metrology
 from gapbridge.core.model import Model
@@ -108,15 +109,13 @@ def _inliers(gap: Array, spent: int, least: float) -> NDArray[np.bool_]:
     """
     # of few poses the fit takes up much of the noise: what is left understates it
     share = max(1 - spent / gap.size, 0.1)
-    scale = max(1.4826 * float(np.median(np.abs(gap))) / np.sqrt(share), least)
-    limit = OUTLIER * scale * np.sqrt(gap.shape[1])
-    return np.asarray(np.linalg.norm(gap, axis=1) < limit)
+    scale = max(scale_of(gap) / np.sqrt(share), least)
+    return np.asarray(distance_of(gap, scale) < OUTLIER)
 
 
 def _units(gap: Array) -> Array:
     """Return what makes rotations (rad) as noisy as positions (m): (3,) or (6,)."""
     if gap.shape[1] == 3:
         return np.ones(3)
-    position, rotation = (float(np.median(np.abs(part))) for part in (gap[:, :3], gap[:, 3:]))
-    ratio = position / rotation if rotation > 0 else 1.0
-    return np.repeat([1.0, ratio], 3)
+    position, rotation = noise_of(gap)
+    return np.repeat([1.0, position / rotation], 3)

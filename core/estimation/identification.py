@@ -111,7 +111,7 @@ def identify_compliance(
     task = _Task(prior)
     before = fit_nuisances(model, data)
     fit, shown = task.run(before, data)
-    inlier = fit.weights > 1e-6
+    inlier = fit.weights > 0
     rest = replace(task, converged=NEAR)  # fits that lack some rows begin at the fit to all
     held_out = _held_out(model, data, rest, fit, inlier)
     found = _result(model, data, used, (before, fit), shown, held_out)
@@ -287,7 +287,7 @@ def _result(
 ) -> Identification:  # fmt: skip
     n, kept = model.arm.n, shown.kept
     after = fits[1]
-    inlier = after.weights > 1e-6
+    inlier = after.weights > 0
     gaps = [residual(fit.model, data, fit.frame)[0][inlier][:, :3] for fit in fits]
     std, flexibility = np.sqrt(np.diag(shown.covariance)), after.flexibility
     return Identification(

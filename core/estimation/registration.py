@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from gapbridge.core.estimation.robust import start_weights
 from gapbridge.core.rotation import rotation_matrix, skew
 
 Array = NDArray[np.float64]
@@ -53,12 +54,11 @@ def register(measured: Array, predicted: Array, weights: Array | None = None) ->
 
 
 def register_robustly(measured: Array, predicted: Array, rounds: int = 8) -> Registration:
-    """Return the frame with outliers down-weighted (Cauchy weights on the distance)."""
+    """Return the frame with outliers down-weighted, for a fit to begin with."""
     frame = register(measured, predicted)
     for _ in range(rounds):
-        distance = np.linalg.norm(frame.in_base(measured) - predicted, axis=1)
-        scale = max(float(np.median(distance)), 1e-12)
-        frame = register(measured, predicted, 1 / (1 + (distance / (2 * scale)) ** 2))
+        gap = frame.in_base(measured) - predicted
+        frame = register(measured, predicted, start_weights(gap))
     return frame
 
 

@@ -38,7 +38,6 @@ from gapbridge.core.estimation.identification import (
 from gapbridge.core.estimation.row_store import RowStore
 from gapbridge.core.estimation.streamed_fit import (
     FOLDS,
-    INLIER,
     NONE,
     Pass,
     Piece,
@@ -235,7 +234,7 @@ def _held_out(stream: Stream, task: _Task, before: Fit, found: _Found) -> tuple[
     """
     sums, cells, nuisances = np.zeros(2), 0, stream.nuisances
     gap = residual(found.fit.model, stream.sample, found.fit.frame)[0]
-    inlier = weights_at(gap, found.noise) > INLIER
+    inlier = weights_at(gap, found.noise) > 0
     placing = passed(before, scale_of(before, stream.sample), stream.of_sample()).factors
     for k in range(FOLDS):
         unseen = (stream.fold == k) & inlier

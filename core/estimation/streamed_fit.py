@@ -21,7 +21,7 @@ from gapbridge.core.estimation.compliance_fit import (
     add_rows,
     fold_rows,
     moved,
-    noise_scale,
+    noise_of,
     per_cell_of,
     residual,
     weights_at,
@@ -29,7 +29,6 @@ from gapbridge.core.estimation.compliance_fit import (
 
 Array = NDArray[np.float64]
 FOLDS = 5
-INLIER = 1e-6  # weight below which a row counts as an outlier
 NONE = np.zeros(0)  # weights of a fit whose rows nobody keeps
 
 
@@ -82,9 +81,7 @@ def stretches(number: int, rows: int) -> Iterator[tuple[int, slice]]:
 
 def scale_of(fit: Fit, sample: Data) -> Array:
     """Return the noise (2,), m and rad, by the gaps of the sample."""
-    gap = np.abs(residual(fit.model, sample, fit.frame)[0])
-    turned = float(np.median(gap[:, 3:])) if gap.shape[1] > 3 else None
-    return noise_scale(float(np.median(gap[:, :3])), turned)
+    return noise_of(residual(fit.model, sample, fit.frame)[0])
 
 
 def passed(fit: Fit, scale: Array, stream: Stream) -> Pass:
@@ -100,7 +97,7 @@ def passed(fit: Fit, scale: Array, stream: Stream) -> Pass:
         cells = per_cell_of(weights, scale, stream.width)
         for fold, rows in piece.folds:
             add_rows(fit.model, piece.data.part(rows), gap[rows], cells[rows], found[fold])
-        inliers.append(weights > INLIER)
+        inliers.append(weights > 0)
         square += float(np.sum(gap[inliers[-1], :3] ** 2))
     return Pass(found, inliers, square)
 

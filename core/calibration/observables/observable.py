@@ -18,6 +18,7 @@ from gapbridge.core.calibration.parameters import Parameters
 from gapbridge.core.calibration.readings import Readings
 from gapbridge.core.errors import ExcitationError
 from gapbridge.core.estimation.pose_jacobian import pose_columns
+from gapbridge.core.estimation.robust import start_weights
 from gapbridge.core.model import Model, Poses
 from gapbridge.core.rotation import one_rotation_matrix
 
@@ -150,15 +151,13 @@ class Observable(ABC):
         return self.refined(poses, readings, self.guess(poses, readings))
 
     def refined(self, poses: Poses, readings: Readings, nuisance: Nuisance) -> Nuisance:
-        """Return the nuisance moved to where it fits best (Gauss-Newton, Cauchy weights)."""
+        """Return the nuisance moved to where it fits best, outliers down-weighted."""
         layout = self.layout(readings)
         if not layout.size:
             return nuisance
         for _ in range(ROUNDS):
             gap = self.gap(poses, readings, nuisance) / self.sigmas
-            distance = np.linalg.norm(gap, axis=1)
-            scale = max(2 * float(np.median(distance)), 1e-12)
-            root = np.repeat(1 / np.sqrt(1 + (distance / scale) ** 2), self.equations)
+            root = np.repeat(np.sqrt(start_weights(gap)), self.equations)
             F = self.nuisance_columns(poses, readings, nuisance)
             F = F / np.tile(self.sigmas, len(readings))[:, None]
             step = np.linalg.lstsq(F * root[:, None], gap.ravel() * root, rcond=1e-10)[0]

@@ -19,6 +19,7 @@ from gapbridge.core.diagnosis.observation import NotObservable, Observation
 from gapbridge.core.diagnosis.selection.unnamed import unnamed_pulls
 from gapbridge.core.dynamics import predict_wrench, with_pieces
 from gapbridge.core.effects import Term
+from gapbridge.core.estimation.robust import scale_of
 from gapbridge.core.log.log import Log
 from gapbridge.core.metrology import Metrology
 from gapbridge.core.model import Model
@@ -113,7 +114,7 @@ def _noise(sensor: Array, whole: Motion, value: Array, predicted: Array, motion:
         spare = len(motion) - np.linalg.matrix_rank(loose)
         if spare >= max(5, len(motion) // 4):
             left = value - loose @ np.linalg.lstsq(loose, value, rcond=None)[0]
-            typical = 1.4826 * np.median(np.abs(left), axis=0)
+            typical = np.array([scale_of(axis) for axis in left.T])
             return np.asarray(typical * np.sqrt(len(motion) / spare))
         design.pop()
     return np.zeros(6)

@@ -28,6 +28,7 @@ from gapbridge.core.diagnosis.selection.refit import Remainder, refit, worth
 from gapbridge.core.diagnosis.selection.selection import Selection, refitted_alone
 from gapbridge.core.diagnosis.selection.state import SelectionState, sample_space
 from gapbridge.core.effects import Term
+from gapbridge.core.estimation.robust import start_weights
 from gapbridge.core.model import Model
 
 Alone = Callable[[Selection, Sequence[int]], Selection]
@@ -162,9 +163,8 @@ def _placed(whole: Observation, terms: Sequence[Term]) -> Observation:
     if whole.rebase is None:
         return whole
     gap = whole.measured - whole.predict(terms)
-    weight = whole.weight[: gap.shape[1], None]
-    A = (whole.nuisance * weight).reshape(gap.size, -1)
-    distance = np.linalg.norm(gap, axis=1)
-    row = np.repeat(1 / (1 + (distance / (3 * np.median(distance) + 1e-300)) ** 2), gap.shape[1])
-    b = (gap[..., None] * weight).ravel()
-    return whole.rebase(np.linalg.lstsq(A * row[:, None], b * row, rcond=1e-12)[0])
+    weight = whole.weight[: gap.shape[1]]
+    A, b = (whole.nuisance * weight[:, None]).reshape(gap.size, -1), gap * weight
+    row = np.repeat(start_weights(b), gap.shape[1])
+    step = np.linalg.lstsq(A * row[:, None], b.ravel() * row, rcond=1e-12)[0]
+    return whole.rebase(np.asarray(step))

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from gapbridge.core.arm import Arm
 from gapbridge.core.diagnosis.channels.recording import STRETCHES
-from gapbridge.core.diagnosis.criteria import OUTLIER_SHARE, OUTLIER_SIGMA
+from gapbridge.core.diagnosis.criteria import OUTLIER_SHARE
 from gapbridge.core.diagnosis.every_row.long_recording import Block, LongRecording
 from gapbridge.core.diagnosis.noise_floor import BLOCK, own_coordinates
 from gapbridge.core.diagnosis.observation import NotObservable, Observation
@@ -28,6 +28,7 @@ from gapbridge.core.diagnosis.selection.refit import Reduced, exact_jacobian, fr
 from gapbridge.core.diagnosis.selection.selection import Selection
 from gapbridge.core.diagnosis.selection.state import UnprojectedRows, chords_only, locate
 from gapbridge.core.effects import Term
+from gapbridge.core.estimation.robust import OUTLIER, distance_of, scale_of
 from gapbridge.core.log.log import Log
 
 Array = NDArray[np.float64]
@@ -304,9 +305,8 @@ def _limit(selection: Selection, terms: Sequence[Term], white: Array) -> float:
     """Return the whitened distance from which a row is an outlier; few are, or none is."""
     observation = selection.observation
     left = (observation.measured - observation.predict(terms)) * white
-    distance = np.sqrt(np.mean(left**2, axis=1))
-    usual = float(np.sqrt(np.median(left**2) / 0.4549))
-    return max(OUTLIER_SIGMA * usual, float(np.quantile(distance, 1 - OUTLIER_SHARE)))
+    far = float(np.quantile(distance_of(left, 1.0), 1 - OUTLIER_SHARE))
+    return max(OUTLIER * scale_of(left), far)
 
 
 class _Means:

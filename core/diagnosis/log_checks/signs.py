@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from gapbridge.core.dynamics import predict_torque, predict_wrench
 from gapbridge.core.errors import InputError
 from gapbridge.core.estimation.registration import frame_columns, register_robustly
+from gapbridge.core.estimation.robust import start_weights
 from gapbridge.core.loads import Loads
 from gapbridge.core.log.log import Log
 from gapbridge.core.log.log_finding import LogCheck, LogFinding
@@ -127,8 +128,7 @@ def _compliance_residual(model: Model, q: Array, measured: Array, loads: Loads) 
         root = np.sqrt(weight)
         x = lsq_linear((A * unit) * root[:, None], b * root, (lower / unit, np.inf)).x
         off = (b - (A * unit) @ x).reshape(-1, 3)
-        distance = np.linalg.norm(off, axis=1)
-        weight = np.repeat(1 / (1 + (distance / max(3 * np.median(distance), 1e-9)) ** 2), 3)
+        weight = np.repeat(start_weights(off), 3)
     return off
 
 

@@ -16,6 +16,7 @@ from gapbridge.core.diagnosis.observation import Observation
 from gapbridge.core.diagnosis.selection.candidate import Candidate, named_columns
 from gapbridge.core.diagnosis.selection.problem import CandidateFit, SampleSpace, fit
 from gapbridge.core.effects import CATALOGUE, Term
+from gapbridge.core.estimation.robust import scale_of
 
 Array = NDArray[np.float64]
 FEW_DELAYS = 3  # below, nobody knows which joint is the odd one
@@ -119,7 +120,7 @@ def as_one_delay(values: Array, variances: Array) -> tuple[Array, Array]:
     if known.sum() < FEW_DELAYS:
         return values, variances
     centre = float(np.median(values[known]))
-    scatter = 1.4826 * float(np.median(np.abs(values[known] - centre)))
+    scatter = scale_of(values[known] - centre)
     prior = max(scatter, ALIKE * abs(centre)) ** 2
     own = np.where(known, prior / (prior + np.where(known, variances, 0.0)), 0.0)
     return centre + own * (values - centre), np.where(known, own * variances, prior)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from gapbridge.core.diagnosis.observation import Observation
 from gapbridge.core.estimation.nelder_mead import nelder_mead
+from gapbridge.core.estimation.robust import scale_of
 
 Array = NDArray[np.float64]
 LARGE_SAMPLE = 150  # samples from which every coordinate is taken to scatter alike
@@ -54,8 +55,7 @@ def estimate_noise(
         use = use[:: len(use) // ENOUGH + 1]
     r = residual[use] / np.sqrt(max(shrink, 0.05))
     known = observation.sigma**2
-    spread = np.array([max(np.median(np.abs(r[:, block == b])) * 1.4826, 1e-15)
-                       for b in range(count)])  # fmt: skip
+    spread = np.array([scale_of(r[:, block == b]) for b in range(count)])
     if J is None:
         scale = np.array([max(float(np.mean(r[:, block == b] ** 2)), 1e-30) for b in range(count)])
         scale[0] = max(scale[0], known)

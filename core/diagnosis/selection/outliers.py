@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 from gapbridge.core.diagnosis.criteria import (
     MOST_OUTLIERS,
     OUTLIER_SHARE,
-    OUTLIER_SIGMA,
     UNPREDICTED_SHARE,
 )
 from gapbridge.core.diagnosis.selection.candidate import Candidate
@@ -17,8 +16,16 @@ from gapbridge.core.diagnosis.selection.noise import estimate_noise
 from gapbridge.core.diagnosis.selection.problem import CandidateFit, SampleSpace, fit
 from gapbridge.core.diagnosis.selection.state import SelectionState, UnprojectedRows, sample_space
 from gapbridge.core.effects import Term
+from gapbridge.core.estimation.robust import (
+    OUTLIER,
+    distance_of,
+    scale_of,
+    start_weights_of,
+    weights_of,
+)
 
 Array = NDArray[np.float64]
+STARTING, STEPS = 4, 8  # of the fit that looks for outliers
 RIDGE = 5.0  # usual sizes of a parameter: prior of the fit that only looks for outliers
 
 
@@ -39,7 +46,7 @@ def mark_outliers(state: SelectionState, explained_by: list[tuple[Candidate, Arr
     )
     A = np.concatenate([A, observation.nuisance], axis=2)
     weight, r, used = np.ones(N), gap, 0.0
-    for step in range(8):
+    for step in range(STEPS):
         W = state.noise.whitener * np.sqrt(weight)[:, None, None]
         M, rhs = (W @ A).reshape(N * k, -1), (W @ gap[..., None]).ravel()
         G = M.T @ M
@@ -47,10 +54,11 @@ def mark_outliers(state: SelectionState, explained_by: list[tuple[Candidate, Arr
         r = gap - A @ (inverse @ (M.T @ rhs))
         used = float(np.trace(inverse @ G))
         state.kept = _keep(state, r)
-        if step in (2, 5, 7):
+        if step in (2, 5, STEPS - 1):
             state.noise = estimate_noise(observation, r, state.kept, 1 - used / (N * k))
-        distance = _distance(state, r)
-        weight = 1 / (1 + (distance / 2) ** 2)
+        white = whitened(state, r)
+        distance = distance_of(white, scale_of(white))
+        weight = start_weights_of(distance) if step < STARTING else weights_of(distance)
     state.kept = _keep(state, r)
 
 
@@ -60,19 +68,15 @@ def inliers(state: SelectionState, residual: Array) -> NDArray[np.bool_]:
     if nuisance.shape[2]:
         W = state.noise.whitener
         A, b = (W @ nuisance).reshape(-1, nuisance.shape[2]), (W @ residual[..., None]).ravel()
-        white = (W @ residual[..., None])[..., 0]
-        size = np.sqrt(np.mean(white**2, axis=1))
-        row = np.repeat(size < OUTLIER_SIGMA * np.median(size), residual.shape[1])
+        white = whitened(state, residual)
+        row = np.repeat(distance_of(white, scale_of(white)) < OUTLIER, residual.shape[1])
         residual = residual - nuisance @ np.linalg.lstsq(A[row], b[row], rcond=1e-12)[0]
     return _keep(state, residual)
 
 
-def _distance(state: SelectionState, residual: Array) -> Array:
-    """Return how many standard deviations (rms over coordinates) each sample is off (N,)."""
-    white = (state.noise.whitener @ residual[..., None])[..., 0]
-    distance = np.sqrt(np.mean(white**2, axis=1))
-    usual = np.sqrt(np.median(white**2) / 0.4549)
-    return np.asarray(distance / max(usual, 1e-12))
+def whitened(state: SelectionState, residual: Array) -> Array:
+    """Return a residual (N, k) in units of the noise."""
+    return np.asarray((state.noise.whitener @ residual[..., None])[..., 0])
 
 
 def _keep(state: SelectionState, residual: Array) -> NDArray[np.bool_]:
@@ -80,8 +84,9 @@ def _keep(state: SelectionState, residual: Array) -> NDArray[np.bool_]:
 
     There what stands out is friction at rest or a delay rather than a bad reading.
     """
-    distance = _distance(state, residual)
-    outliers = np.flatnonzero(distance > OUTLIER_SIGMA)
+    white = whitened(state, residual)
+    distance = distance_of(white, scale_of(white))
+    outliers = np.flatnonzero(distance >= OUTLIER)
     moving = state.observation.channel in ("torque", "tracking")
     share = OUTLIER_SHARE if moving else MOST_OUTLIERS
     limit = int(np.ceil(share * len(residual)))
@@ -111,8 +116,8 @@ def readmit_explained_outliers(
         trial = fit(space, (*found.chosen, c))
         left = space.y - space.columns(trial.chosen) @ np.concatenate(trial.values)
         k = state.observation.measured.shape[1]
-        distance = np.sqrt(np.mean(left.reshape(-1, k) ** 2, axis=1))
-        if not (distance[outliers] < OUTLIER_SIGMA * np.median(distance)).all():
+        distance = distance_of(left.reshape(-1, k), scale_of(left))
+        if not (distance[outliers] < OUTLIER).all():
             continue
         A = np.hstack([unprojected.nuisance, unprojected.columns(space, trial.chosen)])
         d = int(space.start[c + 1] - space.start[c])

@@ -9,7 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapbridge.core.arm import Arm
-from gapbridge.core.diagnosis.criteria import KNOWN_SHARE, NO_REVERSAL_PENALTY
+from gapbridge.core.diagnosis.criteria import (
+    ANY_CONSTANT_PENALTY,
+    KNOWN_SHARE,
+    NO_REVERSAL_PENALTY,
+)
 from gapbridge.core.diagnosis.observation import Observation
 from gapbridge.core.diagnosis.selection.candidate import Candidate
 from gapbridge.core.diagnosis.selection.noise import Noise
@@ -85,7 +89,7 @@ def sample_space(
     X[:, _sizes(X) < DEAD * whole] = 0.0  # the frame takes it up wholly; the rest is rounding
     freedom = float(len(target) - Q.shape[1])
     penalty = penalties(candidates, freedom) + np.array(
-        [_no_reversal_penalty(c, observation) for c in candidates]
+        [_tie_penalty(c, observation) for c in candidates]
     )
     space = SampleSpace(
         y, X, start, tuple(candidates), penalty, freedom,
@@ -104,18 +108,18 @@ def _sizes(X: Array) -> Array:
     return np.asarray(np.sqrt(np.einsum("ij,ij->j", X, X)))
 
 
-def _no_reversal_penalty(candidate: Candidate, observation: Observation) -> float:
-    """Return what an effect pays more whose motion the log does not show: play without reversals.
+def _tie_penalty(candidate: Candidate, observation: Observation) -> float:
+    """Return what an effect pays more that another equals in this log: it stands behind that one.
 
-    It then stands behind the plain offset that it equals, as a tie.
+    So does play without reversals, behind the plain offset; and any constant of a sensor, behind
+    what reads a constant at these poses alone, which further poses decide.
     """
+    if candidate.effect.any_constant:
+        return ANY_CONSTANT_PENALTY
     if not candidate.effect.by_approach or candidate.site.joint is None:
         return 0.0
-    return (
-        0.0
-        if f"approach_{candidate.site.joint - 1}" in observation.quantities
-        else NO_REVERSAL_PENALTY
-    )
+    reversed_ = f"approach_{candidate.site.joint - 1}" in observation.quantities
+    return 0.0 if reversed_ else NO_REVERSAL_PENALTY
 
 
 def locate(candidates: list[Candidate], term: Term) -> tuple[int, Array]:
