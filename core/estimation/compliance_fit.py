@@ -195,12 +195,15 @@ def orthonormal(columns: Array) -> Array:
     return np.asarray(U[:, s > RANK * max(float(s.max(initial=0.0)), 1e-300)])
 
 
-def fit_nuisances(model: Model, data: Data) -> Fit:
-    """Return the frame and tool point that fit best, the model's flexibilities left alone."""
+def fit_nuisances(model: Model, data: Data, begin: Registration | Placements | None = None) -> Fit:
+    """Return the frame and tool point that fit best, the model's flexibilities left alone.
+
+    ``begin`` is a frame near it, as the model's tool point is then; None: they are searched for.
+    """
     if not data.nuisances:
         gap, _ = residual(model, data, IDENTITY)
         return Fit(model, IDENTITY, robust_weights(gap)[0])
-    return _placed(model, data, slice(None))
+    return _placed(model, data, slice(None), begin)
 
 
 def placed_gap(model: Model, data: Data) -> Array:
@@ -214,17 +217,20 @@ def placed_gap(model: Model, data: Data) -> Array:
     return residual(fit.model, one, fit.frame)[0]
 
 
-def _placed(model: Model, data: Data, free: slice) -> Fit:
+def _placed(
+    model: Model, data: Data, free: slice, begin: Registration | Placements | None = None
+) -> Fit:
     """Return the fit of the nuisances ``free``, the others left where they are."""
-    frame = _first_placements(model, data)
+    frame = begin or _first_placements(model, data)
     for _ in range(NUISANCE_ROUNDS):
         gap, poses = residual(model, data, frame)
         weights, scale = robust_weights(gap)
         per_cell = per_cell_of(weights, scale, gap.shape[1])
         columns = nuisance_columns(model, poses, gap.shape[1], data)[:, :, free]
         step = np.zeros(data.nuisances)
-        flat = (columns * per_cell[..., None]).reshape(gap.size, -1)
-        step[free] = np.linalg.lstsq(flat, (gap * per_cell).ravel(), rcond=RANK)[0]
+        flat = np.concatenate([columns, gap[..., None]], axis=2) * per_cell[..., None]
+        R = r_factor(flat.reshape(gap.size, -1))
+        step[free] = np.linalg.lstsq(R[:, :-1], R[:, -1], rcond=RANK)[0]
         model, frame = moved(model, frame, step)
         if np.abs(step).max(initial=0.0) < CONVERGED:
             break
@@ -292,7 +298,6 @@ def weighed(
         poses = poses or model.predict(data.q, data.loads)
         columns.insert(0, nuisance_columns(model, poses, width, data))
     whole = np.concatenate(columns, axis=2) * per_cell[..., None]
-    # of rows that stay in the processor's cache
     return r_factor(whole.reshape(gap.size, -1))
 
 

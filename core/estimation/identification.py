@@ -113,7 +113,7 @@ def identify_compliance(
     fit, shown = task.run(before, data)
     inlier = fit.weights > 0
     rest = replace(task, converged=NEAR)  # fits that lack some rows begin at the fit to all
-    held_out = _held_out(model, data, rest, fit, inlier)
+    held_out = _held_out(data, rest, (before, fit), inlier)
     found = _result(model, data, used, (before, fit), shown, held_out)
     return replace(
         found,
@@ -219,9 +219,7 @@ def pose_groups(q: Array) -> NDArray[np.int64]:
     return groups
 
 
-def _held_out(
-    model: Model, data: Data, task: _Task, whole: Fit, inlier: Mask
-) -> tuple[float, float]:
+def _held_out(data: Data, task: _Task, whole: tuple[Fit, Fit], inlier: Mask) -> tuple[float, float]:
     """Return the rms before and after over inlier rows of poses left out; nan: too few poses."""
     groups = pose_groups(data.q[:2000]) if len(data.q) <= 2000 else np.arange(len(data.q))
     poses = int(groups.max()) + 1
@@ -233,8 +231,8 @@ def _held_out(
         seen, unseen = data.part(fold != k), data.part((fold == k) & inlier)
         if not len(unseen.q):
             continue
-        before = fit_nuisances(model, seen)
-        for fit, gaps in zip((before, task.run(whole, seen)[0]), left, strict=True):
+        before = fit_nuisances(whole[0].model, seen, whole[0].frame)
+        for fit, gaps in zip((before, task.run(whole[1], seen)[0]), left, strict=True):
             gaps.append(residual(fit.model, unseen, fit.frame)[0][:, :3])
     return _rms(np.vstack(left[0])), _rms(np.vstack(left[1]))
 
