@@ -195,15 +195,19 @@ def orthonormal(columns: Array) -> Array:
     return np.asarray(U[:, s > RANK * max(float(s.max(initial=0.0)), 1e-300)])
 
 
-def fit_nuisances(model: Model, data: Data, begin: Registration | Placements | None = None) -> Fit:
+def fit_nuisances(
+    model: Model, data: Data, begin: Registration | Placements | None = None,
+    converged: float = CONVERGED,
+) -> Fit:  # fmt: skip
     """Return the frame and tool point that fit best, the model's flexibilities left alone.
 
     ``begin`` is a frame near it, as the model's tool point is then; None: they are searched for.
+    ``converged`` is the step (m, rad) at which it ends.
     """
     if not data.nuisances:
         gap, _ = residual(model, data, IDENTITY)
         return Fit(model, IDENTITY, robust_weights(gap)[0])
-    return _placed(model, data, slice(None), begin)
+    return _placed(model, data, slice(None), begin, converged)
 
 
 def placed_gap(model: Model, data: Data) -> Array:
@@ -218,8 +222,9 @@ def placed_gap(model: Model, data: Data) -> Array:
 
 
 def _placed(
-    model: Model, data: Data, free: slice, begin: Registration | Placements | None = None
-) -> Fit:
+    model: Model, data: Data, free: slice, begin: Registration | Placements | None = None,
+    converged: float = CONVERGED,
+) -> Fit:  # fmt: skip
     """Return the fit of the nuisances ``free``, the others left where they are."""
     frame = begin or _first_placements(model, data)
     for _ in range(NUISANCE_ROUNDS):
@@ -232,7 +237,7 @@ def _placed(
         R = r_factor(flat.reshape(gap.size, -1))
         step[free] = np.linalg.lstsq(R[:, :-1], R[:, -1], rcond=RANK)[0]
         model, frame = moved(model, frame, step)
-        if np.abs(step).max(initial=0.0) < CONVERGED:
+        if np.abs(step).max(initial=0.0) < converged:
             break
     return Fit(model, frame, weights)
 

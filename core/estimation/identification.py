@@ -40,6 +40,7 @@ Array = NDArray[np.float64]
 FOLDS = 5
 SAME_POSE = 1e-3  # rad, of every joint
 NEAR = 1e-4  # relative step at which a fit has converged that is only judged by
+NEAR_FRAME = 1e-6  # m, rad: step at which a frame has converged that is only judged by
 LOOK = 3  # rounds of the fit of everything, from which the choice is made
 UNSEEN = float("nan")
 
@@ -79,12 +80,13 @@ class _Task:
 
     prior: tuple[Array, float]  # (2n,) rad/Nm, 1 sigma rad/Nm
     converged: float = CONVERGED  # relative step
+    look: int = LOOK  # rounds of the fit of everything
 
     def run(self, before: Fit, data: Data) -> tuple[Fit, base_parameters.Shown]:
         """Fit everything, choose what the data show, fit that alone."""
         centre = self.prior[0]
         everything = np.ones(len(centre), dtype=bool)
-        look = fit_flexibilities(before, data, everything, self.prior, LOOK, self.converged)
+        look = fit_flexibilities(before, data, everything, self.prior, self.look, self.converged)
         assert look.linear is not None
         kept = base_parameters.choose(look.linear, self.prior)
         values, n = np.where(kept, look.flexibility, centre), len(centre) // 2
@@ -112,7 +114,8 @@ def identify_compliance(
     before = fit_nuisances(model, data)
     fit, shown = task.run(before, data)
     inlier = fit.weights > 0
-    rest = replace(task, converged=NEAR)  # fits that lack some rows begin at the fit to all
+    # fits that lack some rows begin at the fit to all
+    rest = replace(task, converged=NEAR, look=1)
     held_out = _held_out(data, rest, (before, fit), inlier)
     found = _result(model, data, used, (before, fit), shown, held_out)
     return replace(
@@ -231,7 +234,7 @@ def _held_out(data: Data, task: _Task, whole: tuple[Fit, Fit], inlier: Mask) -> 
         seen, unseen = data.part(fold != k), data.part((fold == k) & inlier)
         if not len(unseen.q):
             continue
-        before = fit_nuisances(whole[0].model, seen, whole[0].frame)
+        before = fit_nuisances(whole[0].model, seen, whole[0].frame, NEAR_FRAME)
         for fit, gaps in zip((before, task.run(whole[1], seen)[0]), left, strict=True):
             gaps.append(residual(fit.model, unseen, fit.frame)[0][:, :3])
     return _rms(np.vstack(left[0])), _rms(np.vstack(left[1]))
