@@ -22,8 +22,8 @@ help:
 demo: .venv/.main
 	$(BIN)/gapbridge demo
 
-# Two processes side by side: what goes over wires mostly waits.
-SIDE_BY_SIDE := -n 2 --dist loadgroup
+# Two processes for what goes over wires, which mostly waits; two that compute in the meantime.
+SIDE_BY_SIDE := -n 4
 
 test: .venv/.test
 	$(BIN)/python -m pytest $(SIDE_BY_SIDE) -m "not slow"

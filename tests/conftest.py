@@ -1,4 +1,7 @@
-"""How the tests are shared out over two processes, and what becomes of those in real time.
+"""How the tests are shared out over processes, and what becomes of those in real time.
+
+Tests in real time mostly wait: two processes run them, and more, if there are any, compute all
+others with what is left of the cores (``make test`` has four).
 
 Every test has one chance. A test in real time (marked ``realtime``: it judges threads, signals and
 sockets of real processes) says nothing where the machine itself was late: it is skipped where the
@@ -32,54 +35,31 @@ if str(HERE) not in sys.path:
     sys.path.insert(0, str(HERE))
 
 from lateness import HOPELESS, LIMIT, Witness  # noqa: E402
-
-REALTIME = (
-    "bridge/cli/test_cli_check.py",
-    "bridge/daemon/test_configuration_that_runs.py",
-    "bridge/daemon/test_control.py",
-    "bridge/daemon/test_daemon_checks.py",
-    "bridge/daemon/test_daemon_faults.py",
-    "bridge/daemon/test_daemon_writing.py",
-    "bridge/daemon/test_owner_lock.py",
-    "bridge/daemon/test_reload.py",
-    "bridge/daemon/test_service_manager.py",
-    "bridge/daemon/test_side_attack.py",
-    "bridge/daemon/test_withdrawal.py",
-    "bridge/demo/",
-    "bridge/ipc/test_side_process.py",
-    "bridge/loop/test_loop_parts.py",
-    "bridge/loop/test_replayed_loop.py",
-    "bridge/metrics/",
-    "bridge/recording/test_recorder_process.py",
-    "bridge/recording/test_recording_daemon.py",
-    "bridge/served/",
-    "bridge/setpoint_source/",
-    "bridge/web/",
-    "drivers/can/",
-    "drivers/canopen/",
-    "drivers/contract/",
-    "drivers/ft_sensor/",
-    "drivers/modbus/",
-    "drivers/simulated/",
-    "drivers/ur_rtde/",
-    "faults/test_matrix.py",
-    "faults/test_short.py",
-    "faults/test_start.py",
-    "hil/",
-)
-"""Files and folders whose tests run real processes, buses or servers against the clock."""
+from realtime import NICE, WAITING, is_realtime  # noqa: E402
 
 WITNESS = Witness()
 MADE: dict[pytest.FixtureDef[Any], tuple[float, float]] = {}  # s since 1970: begun, ended
 
 
-@pytest.hookimpl(tryfirst=True)
+def pytest_configure(config: pytest.Config) -> None:
+    """Have a process that only computes leave the cores to those that are due."""
+    worker = getattr(config, "workerinput", {}).get("workerid", WAITING[0])
+    if worker not in WAITING:
+        os.nice(NICE)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """Share out whole files; those in real time to the processes that wait."""
+    from shared_out import Scheduling
+
+    return Scheduling(config, log)
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Keep a file's tests in one process, and mark those in real time."""
+    """Mark tests in real time."""
     for item in items:
-        place = item.path.relative_to(HERE).as_posix()
-        item.add_marker(pytest.mark.xdist_group(place))
-        if place.startswith(REALTIME):
+        if is_realtime(item.nodeid):
             item.add_marker(pytest.mark.realtime)
 
 

@@ -61,10 +61,10 @@ def test_that_fails_without_a_clock():
 def test_a_failure_counts_unless_the_machine_was_late_and_the_test_in_real_time(
     tmp_path: Path,
 ) -> None:
-    (tmp_path / "conftest.py").write_text((HERE / "conftest.py").read_text(encoding="utf-8"))
-    (tmp_path / "lateness.py").write_text((HERE / "lateness.py").read_text(encoding="utf-8"))
+    for name in ("conftest.py", "lateness.py", "realtime.py"):
+        (tmp_path / name).write_text((HERE / name).read_text(encoding="utf-8"))
     (tmp_path / "test_it.py").write_text(FAILING)
-    options = ["-p", "no:cacheprovider", "-o", "markers=realtime: x\nxdist_group: x", "-rsfp"]
+    options = ["-p", "no:cacheprovider", "-o", "markers=realtime: x", "-rsfp"]
     ran = subprocess.run(
         [sys.executable, "-m", "pytest", "-q", *options, "--rootdir", str(tmp_path), str(tmp_path)],
         capture_output=True, text=True, check=False, cwd=tmp_path,

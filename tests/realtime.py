@@ -1,0 +1,48 @@
+"""Which tests judge real processes by the clock, and which processes of ``make test`` run them."""
+
+from __future__ import annotations
+
+REALTIME = (
+    "bridge/calibration/report/test_calibration_report_browser.py",
+    "bridge/cli/test_cli_check.py",
+    "bridge/daemon/test_configuration_that_runs.py",
+    "bridge/daemon/test_control.py",
+    "bridge/daemon/test_daemon_checks.py",
+    "bridge/daemon/test_daemon_faults.py",
+    "bridge/daemon/test_daemon_writing.py",
+    "bridge/daemon/test_owner_lock.py",
+    "bridge/daemon/test_reload.py",
+    "bridge/daemon/test_service_manager.py",
+    "bridge/daemon/test_side_attack.py",
+    "bridge/daemon/test_withdrawal.py",
+    "bridge/demo/",
+    "bridge/ipc/test_side_process.py",
+    "bridge/loop/test_loop_parts.py",
+    "bridge/loop/test_replayed_loop.py",
+    "bridge/metrics/",
+    "bridge/recording/test_recorder_process.py",
+    "bridge/recording/test_recording_daemon.py",
+    "bridge/report/test_report_browser.py",
+    "bridge/served/",
+    "bridge/setpoint_source/",
+    "bridge/web/",
+    "drivers/can/",
+    "drivers/canopen/",
+    "drivers/contract/",
+    "drivers/ft_sensor/",
+    "drivers/modbus/",
+    "drivers/simulated/",
+    "drivers/ur_rtde/",
+    "faults/test_matrix.py",
+    "faults/test_short.py",
+    "faults/test_start.py",
+    "hil/",
+)
+"""Files and folders whose tests run processes, buses, browsers or servers against the clock."""
+WAITING = ("gw0", "gw1")  # processes of xdist that run them: they mostly wait
+NICE = 10  # of its other processes, which compute with what is left of the cores
+
+
+def is_realtime(file: str) -> bool:
+    """Return whether the tests of a file (or one of them), seen from the root, are in real time."""
+    return file.removeprefix("tests/").startswith(REALTIME)
