@@ -224,12 +224,13 @@ class _Beside:
         """Return the unnamed columns, of those that hold an accused effect what they do beyond it.
 
         With the prior 1 sigma of each. A pull in any direction holds every weight; one that points
-        nearly down is a weight.
+        nearly down is a weight. A function of a joint's own speed holds its delay; one that is
+        nearly straight is a delay.
         """
         space, X, beside = self.space, self._unit(accused), self._beside(asked)
         constants = self._sigma(accused, asked)
         for c in asked:
-            if not space.candidates[c].of_no_quantity:
+            if not (space.candidates[c].of_no_quantity or _of_own_speed(space.candidates[c])):
                 continue
             U = basis_of(space.columns([c]))
             inside = np.einsum("ij,ij->j", U.T @ X, U.T @ X) > HELD_WHOLLY
@@ -328,14 +329,21 @@ def _unnamed(candidate: Candidate, observation: Observation) -> bool:
     """Return whether a candidate stands for an unknown, and not for a named effect's own form.
 
     A function of a joint's own last motion that moves it is play. Of joints that are measured one
-    by one, a function of a joint's own speed is friction or delay, and of its own torque droop.
+    by one, a function of a joint's own speed is friction, and of its own torque droop; what moves
+    it by its own speed may be more than a delay.
     """
     if candidate.named:
         return False
+    if observation.channel == "tracking":
+        return candidate.target != carrying(candidate.quantity)
+    if observation.channel == "torque":
+        return not _of_own_speed(candidate)
+    stem, _, index = candidate.quantity.rpartition("_")
+    return stem != "approach" or candidate.target != joint_target(int(index) + 1)
+
+
+def _of_own_speed(candidate: Candidate) -> bool:
+    """Return whether a candidate moves a joint by a function of its own speed."""
     stem, _, index = candidate.quantity.rpartition("_")
     own = index.isdigit() and candidate.target == joint_target(int(index) + 1)
-    if observation.channel in ("torque", "tracking"):
-        droop = observation.channel == "tracking"
-        held = droop and candidate.target == carrying(candidate.quantity)
-        return not (held or (own and stem in ("actual_qd", "target_qd")))
-    return not (own and stem == "approach")
+    return own and stem in ("actual_qd", "target_qd")

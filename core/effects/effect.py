@@ -266,14 +266,16 @@ def rows_after(term: Term, loads: Loads) -> Any:
     return slice(None) if loads.time is None else loads.time > term.values[-1]
 
 
-def typical_moment(arm: Arm) -> float:
-    """Return a usual joint moment (Nm): the arm's weight at half its stretched length.
+def typical_moment(arm: Arm, joint: int = 0) -> float:
+    """Return a usual moment (Nm): the weight beyond a joint (from 1) at half its stretched length.
 
-    Only scales parameters, so that solvers see numbers near one.
+    Of the whole arm with 0. Scales parameters, so that solvers see numbers near one, and says what
+    is beyond any arm's size.
     """
-    reach = float(np.linalg.norm(arm.link_in_link[:, :3, 3], axis=1).sum())
+    reach = float(np.linalg.norm(arm.link_in_link[joint:, :3, 3], axis=1).sum())
+    mass = float(arm.mass[max(joint - 1, 0) :].sum())
     payload = arm.payload if np.isfinite(arm.payload) else 5.0
-    return max(9.81 * (float(arm.mass.sum()) / 3 + payload) * max(reach, 0.1) / 2, 1.0)
+    return max(9.81 * (mass / 3 + payload) * max(reach, 0.1) / 2, 1.0)
 
 
 def joint_scale(arm: Arm, site: Site) -> float:

@@ -91,9 +91,18 @@ def _deep_search(space: SampleSpace, base: Sequence[int]) -> CandidateFit:
         found = min([found, pruned(space, again)], key=lambda f: f.score)
     beside = [fit(space, (*found.chosen, c)) for _, c in joining(space, found.chosen, 4)]
     nearest = min([found, *beside], key=lambda f: f.score)
-    if nearest.score < found.score:
-        return nearest  # no named cause goes for an unknown beside them
+    if nearest.score < found.score:  # no named cause goes for an unknown beside them; one that was
+        return forward_selected(space, nearest, named_only=True)  # small beside what it took joins
     return min([found, *joined_sets(space, found)], key=lambda f: f.score)
+
+
+def by_what_is_left(space: SampleSpace, chosen: Sequence[int], k: int) -> SampleSpace:
+    """Return the space with each of its k coordinates weighed by what a set leaves of it."""
+    values = np.concatenate([*fit(space, chosen).values, np.zeros(0)])
+    left = (space.y - space.columns(chosen) @ values).reshape(-1, k)
+    size = np.maximum(np.sqrt(np.mean(left**2, axis=0)), 1.0)
+    weight = np.tile(1 / size, len(left))
+    return replace(space, y=space.y * weight, X=space.X * weight[:, None])
 
 
 def screened(space: SampleSpace, base: Sequence[int] = ()) -> NDArray[np.int64]:

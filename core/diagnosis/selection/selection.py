@@ -40,7 +40,7 @@ from gapbridge.core.diagnosis.selection.outliers import (
 )
 from gapbridge.core.diagnosis.selection.problem import CandidateFit, SampleSpace, fit
 from gapbridge.core.diagnosis.selection.refit import Remainder, refit, worth
-from gapbridge.core.diagnosis.selection.search import screened_search
+from gapbridge.core.diagnosis.selection.search import by_what_is_left, screened_search
 from gapbridge.core.diagnosis.selection.smooth import smooth_candidates
 from gapbridge.core.diagnosis.selection.state import (
     SelectionState,
@@ -251,7 +251,7 @@ def select(
     assert space is not None and near is not None and found is not None
     if len(space.y) >= LARGE_SAMPLE and any(not space.candidates[c].named for c in found.chosen):
         state.kept, state.noise = counted.copy(), whitened_by
-        alone, found = _named_alone(near, found)
+        alone, found = _named_alone(near, found, observation)
         terms, index, covariance, residual = refit(state, space, alone, links)
     return Selection(
         state.observation, space, found, terms, index, covariance, counted, whitened_by,
@@ -276,16 +276,22 @@ def _named_candidates(
     ]
 
 
-def _named_alone(space: SampleSpace, found: CandidateFit) -> tuple[CandidateFit, CandidateFit]:
+def _named_alone(
+    space: SampleSpace, found: CandidateFit, observation: Observation
+) -> tuple[CandidateFit, CandidateFit]:
     """Return the named part of a set, as it stands without the unnamed functions, and with them.
 
     What goes into a model has to predict without the unnamed function beside it, nor may that
-    stand where a named cause would without it: friction of the same joint.
+    stand where a named cause would without it: friction of the same joint. What an unknown moves
+    one joint, of those that are measured one by one, says nothing of the causes at the others.
     """
     named = [c for c in found.chosen if space.candidates[c].named]
-    alone = pruned(space, forward_selected(space, fit(space, named), named_only=True))
+    near = space
+    if observation.channel in ("tracking", "torque"):
+        near = by_what_is_left(space, named, observation.measured.shape[1])
+    alone = pruned(near, forward_selected(near, fit(near, named), named_only=True)).chosen
     rest = (c for c in found.chosen if c not in named)
-    return alone, fit(space, (*alone.chosen, *rest))
+    return fit(space, alone), fit(space, (*alone, *rest))
 
 
 def _exactly(space: SampleSpace, best: CandidateFit, state: SelectionState) -> CandidateFit:

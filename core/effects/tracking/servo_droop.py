@@ -35,7 +35,8 @@ class ServoDroop(JointEffect):
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return the droop per torque."""
-        return (Parameter("", "rad/Nm", 5e-3 / typical_moment(arm), 0.0, 1.0),)
+        held = typical_moment(arm, site.joint or 0)  # a wrist gives way to far less than a shoulder
+        return (Parameter("", "rad/Nm", 5e-3 / held, 0.0, 1.0),)
 
     def settle(
         self,

@@ -148,6 +148,14 @@ def test_droop_and_dead_band_are_found_side_by_side() -> None:
     assert channel.verdict == "explained"
 
 
+def test_a_wrist_gives_way_to_little() -> None:
+    """It holds a newton metre where the shoulder holds a hundred: that makes no droop absurd."""
+    channel = followed([Term("servo_droop", Site(5), (8e-3,))])
+    ((value,),) = ([p.value for p in c.parameters] for c in channel.causes)
+    assert channel.causes[0].joints == (5,)
+    assert value == pytest.approx(8e-3, rel=0.02)
+
+
 def test_what_joints_hold_is_named_where_droop_is_out_of_the_catalogue() -> None:
     rng = np.random.default_rng(3)
     q = np.array([0.0, -1.2, 1.5, -1.8, -1.5, 0.0]) + rng.uniform(-0.8, 0.8, (50, 6))

@@ -11,6 +11,7 @@ from gapbridge.core.diagnosis.channels.tracking import encoder_step, observe
 from gapbridge.core.diagnosis.diagnosis import diagnose
 from gapbridge.core.diagnosis.observation import NotObservable
 from gapbridge.core.effects import Site, Term
+from gapbridge.core.loads import Loads
 from gapbridge.core.metrology import Metrology
 from gapbridge.core.model import Model
 
@@ -161,3 +162,25 @@ def test_delays_that_differ_are_each_joints_own():
     (channel,) = [c for c in found.channels if c.channel == "tracking"]
     (cause,) = channel.causes
     assert [p.value for p in cause.parameters] == pytest.approx(list(late), rel=1e-2)
+
+
+def drooping(t, joint, droop):
+    """Return where servos stand (N, n) of which one gives way to what it holds."""
+    target = COURSE.at(t)
+    held = MODEL.held_torque(target, Loads())
+    actual = target.copy()
+    actual[:, joint - 1] -= droop * held[:, joint - 1]
+    return actual
+
+
+def test_a_droop_stands_beside_an_unknown_that_goes_by_the_joints_own_speed():
+    """It is more than the delay that it holds at first order."""
+    t = times(125)
+    actual, speed = drooping(t, 3, 1e-3), COURSE.at(t, 1)[:, 2]
+    lost = np.maximum(speed - 0.3 * speed.max(), 0) ** 2
+    actual[:, 2] -= 2e-3 * lost / lost.std()
+    found = diagnose(MODEL, log_of(actual, COURSE.at(t), t), METROLOGY)
+    (channel,) = [c for c in found.channels if c.channel == "tracking"]
+    value = {p.name: p.value for c in channel.causes for p in c.parameters}
+    assert value["servo_droop_3"] == pytest.approx(1e-3, rel=0.05)
+    assert channel.structured

@@ -11,7 +11,13 @@ from hypothesis import strategies as st
 from gapbridge.core.diagnosis.selection.forward import exclusive
 from gapbridge.core.diagnosis.selection.local_search import improve, pruned, rivals
 from gapbridge.core.diagnosis.selection.problem import fit
-from gapbridge.core.diagnosis.selection.search import part, screened, screened_search, search
+from gapbridge.core.diagnosis.selection.search import (
+    by_what_is_left,
+    part,
+    screened,
+    screened_search,
+    search,
+)
 
 FAMILIES = [
     *(toy.named("joint_offset", 1, j) for j in range(1, 7)),
@@ -116,3 +122,25 @@ def test_equal_columns_are_rivals_and_a_stranger_is_none():
     assert [c for _, c in reported] == [2 if own == 0 else 0]
     assert reported[0][0] == pytest.approx(0, abs=1e-6)
     assert rivals(space, found, 13, within=5.0) == []
+
+
+def two_joints(rows: int = 600):
+    """Return a space of two joints by turns: an unknown moves one, a small cause the other."""
+    candidates = [*FAMILIES[:NAMED], toy.smooth("timestamp", "joint_1")]
+    space = toy.random_space(3, candidates, rows=rows)
+    X, y = space.X.copy(), space.y.copy()
+    X[0::2, :-1], X[1::2, -1] = 0.0, 0.0
+    y += 1000.0 * X[:, -1] + 3.0 * X[:, 4]
+    return toy.space_of(candidates, y, X)
+
+
+def test_what_an_unknown_moves_one_joint_hides_no_cause_at_another():
+    space = two_joints()
+    assert set(search(space).chosen) == {4, NAMED}
+
+
+def test_without_the_unknown_each_joint_is_weighed_by_what_is_left_of_it():
+    space = two_joints()
+    assert pruned(space, fit(space, (4,))).chosen == ()
+    near = by_what_is_left(space, (4,), 2)
+    assert pruned(near, fit(near, (4,))).chosen == (4,)
