@@ -233,9 +233,9 @@ def _with_derivatives(motion: Motion, given: Array | None, new_session: Mask) ->
 
 def _at(time: Array, value: Array, wanted: Array) -> Array:
     """Return signals (N, k) at other times (M,) by cubic splines."""
-    from scipy.interpolate import CubicSpline  # half a second that even sampling does not cost
+    from gapbridge.core.kernels.interpolation import splined  # brings numba
 
-    return np.asarray(CubicSpline(time, value)(wanted))
+    return np.stack([splined(time, column, wanted) for column in value.T], axis=1)
 
 
 def _derivatives(

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.interpolate import CubicSpline
 from scipy.signal import lsim
 
-from gapbridge.core.kernels.interpolation import interpolate, lagged, played
+from gapbridge.core.kernels.interpolation import interpolate, lagged, played, splined
 
 T = np.arange(2000) * 1e-3
 
@@ -44,3 +45,21 @@ def test_play_stands_still_within_its_width_and_is_pushed_at_both_ends() -> None
     np.testing.assert_allclose(found[101:121], 0.9, atol=1e-12)  # and again at the turn
     np.testing.assert_allclose(found[121:], command[121:] + 0.1, atol=1e-12)
     np.testing.assert_array_equal(played(command, 0.0, 0.0), command)
+
+
+@pytest.mark.parametrize("count", [4, 5, 500])
+def test_a_spline_is_that_of_scipy(count: int) -> None:
+    rng = np.random.default_rng(count)
+    time = np.cumsum(rng.uniform(1e-3, 4e-3, count))
+    value = rng.normal(size=count)
+    beyond = 0.01 * (time[-1] - time[0])  # the end cubics go on there
+    at = rng.uniform(time[0] - beyond, time[-1] + beyond, 1000)
+    at = np.concatenate([at, time, np.sort(at)])
+    expected = CubicSpline(time, value)(at)
+    assert np.abs(splined(time, value, at) - expected).max() < 1e-12 * np.abs(expected).max()
+
+
+def test_columns_of_a_table_are_read_where_they_lie() -> None:
+    time = np.linspace(0.0, 1.0, 50)
+    table = np.stack([time**3, time], axis=1)
+    assert np.allclose(splined(time, table[:, 0], time[:-1] + 0.01), (time[:-1] + 0.01) ** 3)
