@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -87,6 +88,11 @@ class Motion:
             stretch=self.stretch[rows], pieces=None,
             held=None if self.held is None else self.held[rows],
         )  # fmt: skip
+
+    def stretches(self) -> list[slice]:
+        """Return the rows of each stretch without a gap in time."""
+        cuts = np.flatnonzero(np.diff(self.stretch)) + 1
+        return [slice(a, b) for a, b in pairwise([0, *(int(c) for c in cuts), len(self)])]
 
     @property
     def recorded_time(self) -> Array:

@@ -242,10 +242,8 @@ class ServoEffect(JointEffect):
         if not motion.moving:
             return super().track(term, arm, q, motion)
         assert term.site.joint is not None
-        from gapbridge.core.kernels.interpolation import stretches  # brings numba
-
         i, result = term.site.joint - 1, q.copy()
-        for part in stretches(motion):
+        for part in motion.stretches():
             first = float(motion.q[part.start, i])
             result[part, i] = self.follow(term, motion.t[part], q[part, i], first)
         return result

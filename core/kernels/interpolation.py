@@ -2,26 +2,13 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
-from typing import TYPE_CHECKING
-
 import numpy as np
 from numba import njit
 
 from gapbridge.core.arrays import Array
 from gapbridge.core.kernels.reference import JIT
 
-if TYPE_CHECKING:
-    from gapbridge.core.motion import Motion
-
 FINE_STEP = 1e-3  # s: a lag's command is filled in to at least this rate
-
-
-def stretches(motion: Motion) -> list[slice]:
-    """Return the rows of each stretch without a gap in time."""
-    cuts = np.flatnonzero(np.diff(motion.stretch)) + 1
-    edges = [0, *(int(c) for c in cuts), len(motion)]
-    return [slice(a, b) for a, b in pairwise(edges)]
 
 
 def interpolate(time: Array, value: Array, at: Array) -> Array:
