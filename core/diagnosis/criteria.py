@@ -69,6 +69,8 @@ DEGENERATE = 1e-5  # eigenvalue of unit columns below which a direction is the u
 HELD_WHOLLY = 0.98  # share of an effect's column in an unnamed rival's span that makes it a part
 MOSTLY = 0.9  # share of what the rival takes that has to be this part: a pull nearly down, a weight
 # Noise and outliers
+UNRESOLVED = 1e-7  # m, N, rad, Nm: no instrument resolves what is left below (26 bits: 9e-8 rad);
+# a servo that rests 4e-9 rad from its target was an unexplained gap
 KNOWN_SHARE = 0.7  # of a stated repeatability, which is an average: less is not assumed
 NOT_WHITE = 0.001  # probability below which the residual of a recording is not white
 EXCESS = 0.5  # times the floor: a correlated part smaller than that changes no answer

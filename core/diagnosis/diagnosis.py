@@ -16,6 +16,7 @@ from gapbridge.core.diagnosis.causes import Considered, causes_of, considered_of
 from gapbridge.core.diagnosis.channel_diagnosis import ChannelDiagnosis
 from gapbridge.core.diagnosis.channels import position, torque, tracking, wrench
 from gapbridge.core.diagnosis.channels.simulation import joined, predicted_by
+from gapbridge.core.diagnosis.criteria import UNRESOLVED
 from gapbridge.core.diagnosis.every_row.gap_sizes import gaps, sizes_of, streamed_sizes
 from gapbridge.core.diagnosis.every_row.long_recording import long_recording
 from gapbridge.core.diagnosis.every_row.refitted import (
@@ -79,7 +80,6 @@ CHANNELS: Mapping[str, Observe] = {
 }
 
 
-ROUNDING = 1e-10  # m, N, rad, Nm: what is left below is the arithmetic's, and has no structure
 # samples that a diagnosis looks at: more cost time and add hardly anything
 MOST = {"position": 1200, "wrench": 300, "tracking": 300, "torque": 300}
 
@@ -359,7 +359,7 @@ def _decided(found: _Searched, model: Model, streamed: Streamed | None) -> Chann
     held_rms = held.rms(chosen) if held.possible else None
     if not causes:  # nothing was fitted but the frame, before as well as after
         held_rms = sizes.gap_rms
-    if sizes.left < ROUNDING:
+    if sizes.left < UNRESOLVED:
         verdict = replace(verdict, structured=False, depends_on=())
     structured = verdict.structured
     named = "explained" if causes else "no_gap"

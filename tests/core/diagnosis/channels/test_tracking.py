@@ -184,3 +184,12 @@ def test_a_droop_stands_beside_an_unknown_that_goes_by_the_joints_own_speed():
     value = {p.name: p.value for c in channel.causes for p in c.parameters}
     assert value["servo_droop_3"] == pytest.approx(1e-3, rel=0.05)
     assert channel.structured
+
+
+def test_what_no_encoder_resolves_is_no_gap():
+    q = np.random.default_rng(3).uniform(-2.0, 2.0, (30, N))
+    for off, structured in ((4e-9, False), (4e-5, True)):
+        log = truth.log_of(N, target_q=q, actual_q=q + off * np.sin(2 * q))
+        (channel,) = diagnose(MODEL, log, METROLOGY).channels
+        assert channel.structured == structured
+        assert (channel.verdict == "no_gap") != structured
