@@ -29,8 +29,9 @@ LEFT, RIGHT, TOP, BOTTOM = 44.0, 10.0, 30.0, 38.0
 
 
 def plain(value: float) -> str:
-    """Return a number without trailing zeros."""
-    return f"{value:.4g}".replace("-", "−")
+    """Return a number without trailing zeros, nor zeros before an exponent: ticks have no room."""
+    digits, e, exponent = f"{value:.4g}".partition("e")
+    return f"{digits}{e}{int(exponent) if e else ''}".replace("-", "−")
 
 
 @dataclass(frozen=True)
@@ -212,7 +213,8 @@ class Chart:
             label = self.x.labels[k] if self.x.labels else plain(tick)
             if not self.x.labels:
                 self.drawing.line([(x, self.top), (x, y)], Stroke(GRID, 0.8))
-            self.drawing.add(Text(x, y + 14, label, 10, SOFT, "middle"))
+            inside = min(x, self.drawing.width - 3.0 * len(label))
+            self.drawing.add(Text(inside, y + 14, label, 10, SOFT, "middle"))
         for k, tick in enumerate(self.y.ticks):
             x, y = self.at(self.x.low, tick)
             label = self.y.labels[k] if self.y.labels else plain(tick)
