@@ -24,6 +24,7 @@ from gapbridge.core.diagnosis.finding import (
 from gapbridge.core.log.log_finding import LogFinding
 
 SINCE_1970 = 1e9  # s: from here on a timestamp is a date
+DAY = 86400.0  # s
 SHOWN = 8  # rows of outliers
 WITHDRAWN = {
     Check.CURVED: "its curve cannot be distinguished from a straight line",
@@ -107,16 +108,19 @@ def _slip(slip: Slip) -> str:
         far = f"{1e3 * term.values[0]:.3g} mrad ({np.degrees(term.values[0]):.3g} deg)"
     when = f"rows {slip.before:g} and {slip.after:g} of the log"
     if slip.timed:
-        when = f"{_clock(slip.before)} and {_clock(slip.after)}"
+        dated = slip.before // DAY != slip.after // DAY
+        when = f"{clock(slip.before, dated)} and {clock(slip.after, dated)}"
     rest = "; before and after it nothing else changed" if slip.alone else ""
     return f"{term.effect}: {what} moved by {far} between {when}{rest}"
 
 
-def _clock(time: float) -> str:
-    """Return a time of day (UTC) for seconds since 1970, else seconds."""
+def clock(time: float, dated: bool = False) -> str:
+    """Return a time of day (UTC), if asked for with its date, of seconds since 1970; else s."""
     if time < SINCE_1970:
         return f"{time:.7g} s"
-    return datetime.fromtimestamp(time, tz=UTC).strftime("%H:%M:%S")
+    return datetime.fromtimestamp(time, tz=UTC).strftime(
+        "%Y-%m-%d %H:%M:%S" if dated else "%H:%M:%S"
+    )
 
 
 def _parameter(note: ParameterNote) -> str:

@@ -13,6 +13,7 @@ from gapbridge.bridge.document.blocks import (
     Paragraph,
     Table,
 )
+from gapbridge.bridge.document.findings import clock
 from gapbridge.bridge.report.labels import effect_title, joint_list, listed, number, unit_of
 from gapbridge.bridge.report.material import Material
 from gapbridge.core.diagnosis.causes import Cause
@@ -51,6 +52,8 @@ def _parameters(causes: list[Cause]) -> list[Block]:
 
 
 def _value(p: Reported) -> tuple[str, str, str]:
+    if p.name.endswith("_time"):
+        return clock(p.value, dated=True), "between two rows of the log", ""
     name, factor = unit_of(p.unit)
     if p.name.endswith("_phase"):
         name, factor = "deg", float(180 / np.pi)

@@ -21,7 +21,7 @@ def explain(effect: str | None) -> None:
     if effect is None:
         width = max(map(len, CATALOGUE))
         for name, member in CATALOGUE.items():
-            first = (inspect.getdoc(member) or "").partition("\n")[0]
+            first = _text(member).partition("\n")[0]
             click.echo(f"{name:<{width}}  {first}")
         return
     click.echo(explanation(effect_named(effect)))
@@ -34,7 +34,7 @@ def explanation(effect: Effect) -> str:
     arm = builtin_arm("ur10e")
     sites = effect.sites(arm)
     channels = ", ".join(f"{name} ({CHANNELS[name]})" for name in effect.channels)
-    lines = [effect.identifier, "", inspect.getdoc(effect) or "", "", f"shows in: {channels}"]
+    lines = [effect.identifier, "", _text(effect), "", f"shows in: {channels}"]
     if effect.motion:
         lines.append(f"needs motion: {effect.motion}")
     for other, data in ties_of(effect.identifier).items():
@@ -48,3 +48,8 @@ def explanation(effect: Effect) -> str:
         for parameter in effect.parameters(arm, sites[0])
     ]
     return "\n".join(lines)
+
+
+def _text(effect: Effect) -> str:
+    """Return an effect's docstring without the marks of its names."""
+    return (inspect.getdoc(effect) or "").replace("``", "")

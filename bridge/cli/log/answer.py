@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from gapbridge.bridge.document.findings import finding_text
+from gapbridge.bridge.document.findings import clock, finding_text
 from gapbridge.core.diagnosis.causes import Cause
 from gapbridge.core.diagnosis.channel_diagnosis import ChannelDiagnosis
 from gapbridge.core.diagnosis.diagnosis import Diagnosis
@@ -163,6 +163,8 @@ def _shrink(cause: Cause) -> str:
 
 
 def _parameter(parameter: Reported) -> str:
+    if parameter.name.endswith("_time"):
+        return f"{parameter.name} = {clock(parameter.value, dated=True)}"
     spread = "" if parameter.std is None else f" ± {parameter.std:.2g}"
     return f"{parameter.name} = {parameter.value:.5g}{spread} {parameter.unit}".rstrip()
 

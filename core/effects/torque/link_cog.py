@@ -20,10 +20,9 @@ class LinkCog(JointEffect):
 
     Axes of the URDF link (with ``dh`` those of the row's frame). Comes from cables, covers, and
     drawings without motors. Shows in the weight that the joint and those before it hold; the mass
-    stays, which ``link_inertia`` changes. Part of it loads no joint, or cannot be
-    distinguished from
-    the next link's: only some combinations are found, the rest stays open. Under one constant load
-    the last link's is the same as ``payload_cog``.
+    stays, which ``link_inertia`` changes. Part of it loads no joint, or cannot be distinguished
+    from the next link's: only some combinations are found, the rest stays open. Under one constant
+    load the last link's is the same as ``payload_cog``.
     Source: Gautier, Khalil, IEEE Trans. Robotics and Automation 6 (1990) 368, on base parameters.
     """
 

@@ -57,6 +57,9 @@ def test_a_value_that_is_no_constant_names_what_it_goes_by() -> None:
         (Slip(Term("joint_slip", Site(3), (2e-3, 1.7e9)), 1.7e9, 1.7e9 + 40, True, True),
          "joint_slip: the zero of joint 3 moved by 2 mrad (0.115 deg) between 22:13:20 and "
          "22:14:00; before and after it nothing else changed"),
+        (Slip(Term("joint_slip", Site(3), (2e-3, 1.7e9)), 1.7e9, 1.7e9 + 86400, True, False),
+         "joint_slip: the zero of joint 3 moved by 2 mrad (0.115 deg) between 2023-11-14 22:13:20 "
+         "and 2023-11-15 22:13:20"),
         (Slip(Term("joint_slip", Site(3), (2e-3, 42.5)), 42, 43, False, False),
          "joint_slip: the zero of joint 3 moved by 2 mrad (0.115 deg) between rows 42 and 43 of "
          "the log"),
