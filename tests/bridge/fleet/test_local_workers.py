@@ -7,7 +7,7 @@ import signal
 from collections import Counter
 from pathlib import Path
 
-from gapbridge.bridge.fleet.task import CRASHED, DIED, DONE
+from gapbridge.bridge.fleet.task import CRASHED, DIED, DONE, Outcome
 from gapbridge.bridge.fleet.workers.local_workers import LocalWorkers
 from tests.bridge.fleet.fleet_in import tasks_in
 from tests.bridge.fleet.jobs import count_rows, fail, kill_itself
@@ -29,13 +29,23 @@ def test_every_session_is_done_once_by_both_processes(tmp_path: Path) -> None:
 
 def test_a_killed_worker_loses_nothing(tmp_path: Path) -> None:
     names = [f"arm{i}/s" for i in range(16)]
-    tasks = tasks_in(tmp_path, names, count_rows, {"pause": 0.1})
-    outcomes = []
+    present = tmp_path / "present"
+    present.mkdir()
+    tasks = []
+    for part, others in ((names[:4], 2), (names[4:10], 3), (names[10:], 4)):  # waits for successors
+        folder = tmp_path / f"{others}"
+        folder.mkdir()
+        options = {"present": str(present), "others": others}
+        tasks += tasks_in(folder, part, count_rows, options)
+    outcomes: list[Outcome] = []
+    killed: list[int] = []
     with LocalWorkers(2) as workers:
         for outcome in workers.run(tasks):
             outcomes.append(outcome)
-            if len(outcomes) in (3, 7):
-                os.kill(outcome.result["process"], signal.SIGKILL)
+            process = outcome.result["process"]
+            if len(killed) < 2 and len(outcomes) >= (3, 7)[len(killed)] and process not in killed:
+                os.kill(process, signal.SIGKILL)
+                killed.append(process)
     assert Counter(o.session for o in outcomes) == Counter(names)
     assert {o.state for o in outcomes} == {DONE}
     assert len({o.result["process"] for o in outcomes}) == 4
