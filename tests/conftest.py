@@ -6,7 +6,8 @@ others with what is left of the cores (``make test`` has four).
 Every test has one chance. A test in real time (marked ``realtime``: it judges threads, signals and
 sockets of real processes) says nothing where the machine itself was late: it is skipped where the
 machine cannot keep any time before it begins, and where it failed while a process beside it on any
-core, which only sleeps, was woken later than a state may be old. How late is in the skip's reason.
+core, which only sleeps, was woken later than a state may be old, or while its own process waited
+for a core for longer than it had one. How late, or how long, is in the skip's reason.
 """
 
 from __future__ import annotations
@@ -34,10 +35,11 @@ HERE = Path(__file__).parent
 if str(HERE) not in sys.path:
     sys.path.insert(0, str(HERE))
 
-from lateness import HOPELESS, LIMIT, Witness  # noqa: E402
+from lateness import HOPELESS, LIMIT, Witness, core_time  # noqa: E402
 from realtime import NICE, WAITING, is_realtime  # noqa: E402
 
 WITNESS = Witness()
+HAD = pytest.StashKey[tuple[float, float]]()  # s that this process ran and waited, before a test
 MADE: dict[pytest.FixtureDef[Any], tuple[float, float]] = {}  # s since 1970: begun, ended
 
 
@@ -71,6 +73,13 @@ def pytest_fixture_setup(fixturedef: pytest.FixtureDef[Any]) -> Iterator[None]:
     MADE[fixturedef] = (begun, time.time())
 
 
+@pytest.hookimpl(hookwrapper=True, tryfirst=True)
+def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
+    """Note what this process has had of the cores before a test."""
+    item.stash[HAD] = core_time()
+    yield
+
+
 def worst_of(item: pytest.Item, begun: float, ended: float) -> float:
     """Return how late the machine was during a phase of a test, or while its fixtures were made."""
     info = item._fixtureinfo  # type: ignore[attr-defined]
@@ -97,14 +106,23 @@ def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) ->
     if not report.failed or item.get_closest_marker("realtime") is None:
         return
     late = worst_of(item, call.start, call.stop)
+    ran, waited = (now - before for now, before in zip(core_time(), item.stash[HAD], strict=True))
     if late > LIMIT:
-        words = str(call.excinfo.value).splitlines() if call.excinfo is not None else []
-        reason = (
+        why = (
             f"this machine woke a process {1e3 * late:.0f} ms late meanwhile, at most "
-            f"{1e3 * LIMIT:.0f} ms are judged by; it ended with: {(words or [''])[0][:200]}"
+            f"{1e3 * LIMIT:.0f} ms are judged by"
         )
-        report.outcome = "skipped"
-        report.longrepr = (str(item.path), item.location[1] or 0, f"Skipped: {reason}")
+    elif waited > max(ran, LIMIT):
+        why = (
+            f"this process waited {1e3 * waited:.0f} ms for a core meanwhile and had one for "
+            f"{1e3 * ran:.0f} ms, at most as long is judged by"
+        )
+    else:
+        return
+    words = str(call.excinfo.value).splitlines() if call.excinfo is not None else []
+    reason = f"{why}; it ended with: {(words or [''])[0][:200]}"
+    report.outcome = "skipped"
+    report.longrepr = (str(item.path), item.location[1] or 0, f"Skipped: {reason}")
 
 
 def pytest_sessionfinish() -> None:

@@ -55,6 +55,16 @@ os._exit(0)
 """
 
 
+def core_time() -> tuple[float, float]:
+    """Return how long the threads of this process have run and have waited for a core, s."""
+    ran, waited = 0.0, 0.0
+    for thread in os.listdir("/proc/self/task"):
+        with contextlib.suppress(OSError), open(f"/proc/self/task/{thread}/schedstat") as file:
+            parts = file.read().split()
+            ran, waited = ran + 1e-9 * int(parts[0]), waited + 1e-9 * int(parts[1])
+    return ran, waited
+
+
 class Witness:
     """Processes that only sleep, one on each core, and note when they were woken late.
 

@@ -40,7 +40,7 @@ REALTIME = (
 )
 """Files and folders whose tests run processes, buses, browsers or servers against the clock."""
 WAITING = ("gw0", "gw1")  # processes of xdist that run them: they mostly wait
-NICE = 10  # of its other processes, which compute with what is left of the cores
+NICE = 5  # of its other processes, which compute with what is left of the cores
 
 
 def is_realtime(file: str) -> bool:

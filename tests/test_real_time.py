@@ -11,11 +11,11 @@ import time
 from pathlib import Path
 
 import pytest
-from lateness import LIMIT, NOTED, Witness
+from lateness import LIMIT, NOTED, Witness, core_time
 
 HERE = Path(__file__).parent
 FAILING = """
-import signal, time
+import os, signal, subprocess, sys, time
 import pytest
 from conftest import WITNESS
 
@@ -48,6 +48,20 @@ def test_second_that_is_given_what_was_made_late(made_late):
     assert False, "made late"
 
 @pytest.mark.realtime
+def test_that_hardly_gets_a_core():
+    core = {min(os.sched_getaffinity(0))}
+    before, _ = os.sched_getaffinity(0), os.sched_setaffinity(0, core)
+    others = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(3)]
+    until = time.process_time() + 0.3
+    while time.process_time() < until:
+        pass
+    for other in others:
+        other.kill()
+        other.wait()
+    os.sched_setaffinity(0, before)
+    assert False, "no core"
+
+@pytest.mark.realtime
 def test_that_is_given_nothing():
     assert False, "not late"
 
@@ -72,9 +86,30 @@ def test_a_failure_counts_unless_the_machine_was_late_and_the_test_in_real_time(
     found = ran.stdout
     assert re.search(r"SKIPPED.*woke a process 1[0-9]{2} ms late meanwhile.*late", found), found
     assert len(re.findall(r"SKIPPED.*made late", found)) == 2, found
+    assert re.search(r"SKIPPED.*(waited [0-9]+ ms for a core|woke a process).*no core", found), (
+        found
+    )
     assert "FAILED test_it.py::test_that_is_given_nothing" in found
     assert "PASSED test_it.py::test_that_passes_while_the_machine_is_late" in found
     assert "FAILED test_it.py::test_that_fails_without_a_clock" in found
+
+
+def test_how_long_a_process_has_had_and_waited_for_a_core_is_the_kernels_count() -> None:
+    before, all_cores = core_time(), os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {min(all_cores)})
+    others = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(3)]
+    try:
+        until = time.process_time() + 0.3
+        while time.process_time() < until:
+            pass
+    finally:
+        os.sched_setaffinity(0, all_cores)
+        for other in others:
+            other.kill()
+            other.wait()
+    ran, waited = (now - then for now, then in zip(core_time(), before, strict=True))
+    assert 0.3 < ran < 0.6
+    assert waited > ran
 
 
 def test_nothing_gives_a_test_another_chance() -> None:

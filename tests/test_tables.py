@@ -1,12 +1,14 @@
-"""Every member that a table names by module and attribute can be imported from there."""
+"""What a table names, a module's member or a text of a file, is where the table says."""
 
 from __future__ import annotations
 
+import ast
 import importlib
 from pathlib import Path
 
 import pytest
 
+from benchmarks.mutants.mutant import Mutant, read_mutants
 from gapbridge.bridge.calibration.instruments import INSTRUMENTS
 from gapbridge.bridge.calibration.jobs.table import JOBS
 from gapbridge.bridge.cell.simulation import SIMULATORS
@@ -16,6 +18,7 @@ from gapbridge.bridge.setpoint_source import SOURCES
 from gapbridge.drivers import DRIVERS
 from gapbridge.drivers.ft_sensor import FT_SENSORS
 
+ROOT = Path(__file__).parents[1]
 NAMED = [
     *INSTRUMENTS.values(),
     *JOBS.values(),
@@ -38,3 +41,14 @@ def test_a_side_process_is_a_module_that_can_be_run(name: str) -> None:
     file = importlib.import_module(name).__file__
     assert file is not None
     assert 'if __name__ == "__main__":\n' in Path(file).read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("mutant", read_mutants(), ids=lambda m: m.what)
+def test_a_listed_mistake_can_be_made_and_names_tests_that_are_there(mutant: Mutant) -> None:
+    text = mutant.text(ROOT)
+    ast.parse(text)
+    assert text != (ROOT / mutant.file).read_text(encoding="utf-8")
+    for test in mutant.tests:
+        path, _, name = test.partition("::")
+        assert (ROOT / path).exists(), test
+        assert not name or f"def {name}" in (ROOT / path).read_text(encoding="utf-8"), test

@@ -60,6 +60,16 @@ def test_the_stated_deviations_are_those_of_the_errors(rows: int, numbers: int) 
     assert spread == pytest.approx(1.0, rel=0.15)
 
 
+def test_wide_readings_count_as_wholly_as_narrow_ones() -> None:
+    """A reading's distance is the mean of its cells: a dozen are no outlier by their sum."""
+    for cells in (1, 12):
+        rng = np.random.default_rng(cells)
+        A = rng.normal(size=(40 * cells, NUMBERS))
+        b = A @ rng.normal(size=NUMBERS) + rng.normal(0.0, 1e-3, len(A))
+        found = robust_fit(A, b, one_unit(b), np.repeat(np.arange(40), cells))
+        assert np.mean(found.weights) > 0.95
+
+
 @pytest.mark.parametrize("share", [0.1, 0.3])
 @pytest.mark.parametrize("seed", range(5))
 def test_outliers_are_found_as_wholes_and_change_nothing(seed: int, share: float) -> None:
