@@ -28,7 +28,7 @@ cell_option = click.option(
     "--cell", required=True, type=click.Path(path_type=Path), help="The cell file (YAML)."
 )
 csv_option = click.option(
-    "--out", required=True, type=click.Path(path_type=Path), help="The CSV file to write."
+    "--out", required=True, type=click.Path(path_type=Path), help="The file to write: CSV, or Parquet where it ends in .parquet."
 )
 
 

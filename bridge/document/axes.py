@@ -26,6 +26,7 @@ from gapbridge.core.arrays import Array
 
 WIDTH, HEIGHT = 340.0, 230.0
 LEFT, RIGHT, TOP, BOTTOM = 44.0, 10.0, 30.0, 38.0
+TITLE, FIGURE = 20.0, 5.8  # px: of the y axis' title and what stands between; of a figure
 
 
 def plain(value: float) -> str:
@@ -116,7 +117,8 @@ class Chart:
         width: float = WIDTH, equal: bool = False,
     ) -> None:  # fmt: skip
         self.x, self.y = x, y
-        self.left, self.top = left, TOP
+        longest = max(map(len, [] if y.labels else map(plain, y.ticks)), default=0)
+        self.left, self.top = max(left, TITLE + FIGURE * longest), TOP
         self.right, self.bottom = width - RIGHT, height - BOTTOM
         if equal:
             self._make_equal()
@@ -213,7 +215,7 @@ class Chart:
             label = self.x.labels[k] if self.x.labels else plain(tick)
             if not self.x.labels:
                 self.drawing.line([(x, self.top), (x, y)], Stroke(GRID, 0.8))
-            inside = min(x, self.drawing.width - 3.0 * len(label))
+            inside = min(x, self.drawing.width - FIGURE / 2 * len(label))
             self.drawing.add(Text(inside, y + 14, label, 10, SOFT, "middle"))
         for k, tick in enumerate(self.y.ticks):
             x, y = self.at(self.x.low, tick)

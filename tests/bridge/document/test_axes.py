@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gapbridge.bridge.document.axes import distribution, plain
+from gapbridge.bridge.document.axes import Chart, distribution, plain, scale
 from gapbridge.bridge.document.drawing import INK, Text
 
 
@@ -35,3 +35,13 @@ def test_numbers_at_the_end_of_an_axis_are_not_cut(size: float) -> None:
     ]  # fmt: skip
     assert len(ends) > 3
     assert max(ends) <= chart.drawing.width + 1
+
+
+@pytest.mark.parametrize("most", [1.0, 0.1, -0.025, 8e-6])
+def test_numbers_stand_beside_the_title_of_the_upright_axis(most: float) -> None:
+    chart = Chart("poses", scale("row", [0, 30]), scale("1 sigma, mm", [0.0, most]))
+    written = [shape for shape in chart.drawing.shapes if isinstance(shape, Text)]
+    title = next(shape for shape in written if shape.turned)
+    begins = [shape.x - 5.6 * len(shape.text) for shape in written if shape.anchor == "end"]
+    assert len(begins) > 3
+    assert min(begins) > title.x + title.size / 3  # what hangs below the line of text
