@@ -381,10 +381,9 @@ def ties_of(
 def covering_effects(space: SampleSpace, found: CandidateFit, c: int) -> list[int]:
     """Return the named effects that do all that a candidate does, and more: nothing decides.
 
-    The zero of the last joint is a shift of the tool; it is the simpler guess, and no surer.
+    The zero of the last joint is a shift of the tool, and a heavier link 1 of an upright arm one
+    whose centre of gravity is further out; each is the simpler guess, and no surer.
     """
-    if not _geometric(space.candidates[c]):
-        return []
     rest = basis_of(space.columns([o for o in found.chosen if o != c]))
     x = space.columns([c])
     x = x - rest @ (rest.T @ x)

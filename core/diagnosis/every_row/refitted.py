@@ -14,7 +14,13 @@ import numpy as np
 from gapbridge.core.diagnosis.criteria import OWN_SIGMAS, SIGMAS, TIE_SCORE
 from gapbridge.core.diagnosis.finding import Check, Withdrawal
 from gapbridge.core.diagnosis.held_out import HeldOut
-from gapbridge.core.diagnosis.judgement import VAGUE, Judgement, gainless, ties_of
+from gapbridge.core.diagnosis.judgement import (
+    VAGUE,
+    Judgement,
+    covering_effects,
+    gainless,
+    ties_of,
+)
 from gapbridge.core.diagnosis.observation import Observation
 from gapbridge.core.diagnosis.regions import regions
 from gapbridge.core.diagnosis.selection.candidate import Candidate
@@ -151,7 +157,9 @@ def _rivals(selection: Selection, accused: Sequence[int]) -> list[Candidate]:
     for p in accused:
         if selection.term_index[p] in selection.prior:
             continue
-        for score, other in rivals(space, selection.found, selection.term_index[p], TIE_SCORE):
+        c = selection.term_index[p]
+        equal = [(0.0, other) for other in covering_effects(space, selection.found, c)]
+        for score, other in [*rivals(space, selection.found, c, TIE_SCORE), *equal]:
             if space.candidates[other].named and other not in selection.term_index:
                 near[other] = min(score, near.get(other, np.inf))
     best = sorted(near, key=lambda c: near[c])[:MOST_RIVALS]

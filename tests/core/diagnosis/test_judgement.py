@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import small_arm as small
+import toy_space as toy
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -25,7 +26,8 @@ from gapbridge.core.diagnosis.finding import (
     Withdrawal,
 )
 from gapbridge.core.diagnosis.held_out import HeldOut
-from gapbridge.core.diagnosis.judgement import Judgement, judge, pure_error, still_sure
+from gapbridge.core.diagnosis.judgement import Judgement, judge, pure_error, still_sure, ties_of
+from gapbridge.core.diagnosis.selection.problem import fit
 from gapbridge.core.effects import CATALOGUE, Site, Term
 from gapbridge.core.metrology import Metrology
 
@@ -247,3 +249,15 @@ def test_links_as_a_whole_stand_only_where_one_of_them_is_sure(monkeypatch, thir
     assert judgement.accused == stays
     assert {p for p, _ in judgement.withdrawn} == {0, 1, 2} - {*stays}
     assert judgement.structured == (stays == (0,))
+
+
+def test_what_does_all_that_a_cause_does_and_more_is_a_tie():
+    """A heavier link 1 of an upright arm is one whose centre of gravity is further out."""
+    candidates = [toy.named("link_inertia", 1, 1), toy.named("link_cog", 3, 1),
+                  toy.named("link_cog", 3, 2), toy.named("payload")]  # fmt: skip
+    free = toy.random_space(5, candidates, rows=120, planted=(0,), size=30.0)
+    X = free.X.copy()
+    X[:, 1:4] = X[:, :1] * [0.3, -0.2, 0.5]
+    upright = toy.space_of(candidates, free.y, X)
+    assert ties_of(upright, fit(upright, (0,)), [0]) == {0: ("link_cog",)}
+    assert ties_of(free, fit(free, (0,)), [0]) == {0: ()}
