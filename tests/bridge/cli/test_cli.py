@@ -360,6 +360,7 @@ def test_explain_lists_the_catalogue_and_names_the_nearest(desk: Desk) -> None:
     assert "'backlash'" in desk.refuses("explain", "backlsh")
 
 
+@pytest.mark.realtime
 def test_simulate_serves_until_it_is_asked_to_stop(desk: Desk) -> None:
     host = f"127.{1 + os.getpid() // 250 % 250}.{os.getpid() % 250}.77"
     desk.write("cell.yaml", SOFT + f"simulation: {{host: {host}, seed: 3}}\n")
