@@ -28,7 +28,10 @@ cell_option = click.option(
     "--cell", required=True, type=click.Path(path_type=Path), help="The cell file (YAML)."
 )
 csv_option = click.option(
-    "--out", required=True, type=click.Path(path_type=Path), help="The file to write: CSV, or Parquet where it ends in .parquet."
+    "--out",
+    required=True,
+    type=click.Path(path_type=Path),
+    help="The file to write: CSV, or Parquet where it ends in .parquet.",
 )
 
 
