@@ -24,7 +24,7 @@ from gapbridge.core.kernels.one_row import (
 from gapbridge.core.kernels.packed import sizes_of
 
 
-@njit(**FAST)
+@njit(**{**FAST, "no_cpython_wrapper": False})
 def first_order(b, q, damping, found):  # type: ignore[no-untyped-def]
     """Write the joint step (n,) and the TCP's deflection (3,) at q (n,) into ``found``.
 

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import difflib
 import gc
 import importlib
 import os
 import sys
-import tempfile
-import traceback
 from typing import NoReturn
 
 import click
@@ -52,6 +49,8 @@ class CommandTable(click.Group):
     ) -> tuple[str | None, click.Command | None, list[str]]:
         """Return the command that is meant; an unknown one is reported with the nearest known."""
         if args and args[0] not in COMMANDS and not args[0].startswith("-"):
+            import difflib
+
             near = difflib.get_close_matches(args[0], COMMANDS, n=1)
             hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(COMMANDS)}"
             raise click.UsageError(f"found an unknown command {args[0]!r}; {hint}", ctx)
@@ -138,6 +137,9 @@ def _fail(text: str, code: int) -> int:
 
 def _crash(error: Exception) -> int:
     """Report an unforeseen failure in one line; its traceback goes to a file."""
+    import tempfile  # a twentieth of what --help takes
+    import traceback
+
     with tempfile.NamedTemporaryFile(
         "w", prefix="gapbridge-crash-", suffix=".txt", delete=False, encoding="utf-8"
     ) as file:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterable
 
 from gapbridge.core.effects.effect import CHANNELS, Effect, Parameter, Reported, Site, Term
@@ -135,6 +134,8 @@ def effect_named(identifier: str) -> Effect:
     """Return a member of the catalogue; raises InputError naming the nearest known one."""
     if identifier in CATALOGUE:
         return CATALOGUE[identifier]
+    import difflib  # only where a name is misspelt
+
     near = difflib.get_close_matches(identifier, CATALOGUE, n=1, cutoff=0.4)
     hint = f"; did you mean {near[0]!r}?" if near else f"; known: {', '.join(CATALOGUE)}"
     raise InputError(f"effect: found {identifier!r}, expected one of the catalogue{hint}")

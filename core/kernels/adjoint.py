@@ -27,7 +27,7 @@ from gapbridge.core.kernels.layout import (
     WRENCH,
     U,
 )
-from gapbridge.core.kernels.reference import JIT
+from gapbridge.core.kernels.reference import INNER
 
 # slots of a record of this workspace; records as in layout
 SWING, GIVE, BODY, PULL, PUSH, SHIFT, TWIST = 0, 9, 12, 15, 18, 21, 24
@@ -122,7 +122,7 @@ def _softness(w, u, record, compliance, softening):  # type: ignore[no-untyped-d
         u[U(b + (GIVE + 2) * _L + k)] = c2 * share * share * share
 
 
-@njit(**JIT)
+@njit(**INNER)
 def prepare(chain, w, v, u, s):  # type: ignore[no-untyped-def]
     """Write what all coordinates share, for lanes that have settled."""
     n, g = chain.mass.shape[0], chain.gravity
@@ -256,7 +256,7 @@ def _pulled(w, u, s, record):  # type: ignore[no-untyped-def]
             u[U(b + (PUSH + 2) * _L + k)] = pz
 
 
-@njit(**JIT)
+@njit(**INNER)
 def solve(w, v, u, s, n, axis, turning, deflected, converged):  # type: ignore[no-untyped-def]
     """Write the derivatives of one coordinate by twists, and the adjoints; whether it settled."""
     for record in range(n + 2):
@@ -285,7 +285,7 @@ def solve(w, v, u, s, n, axis, turning, deflected, converged):  # type: ignore[n
     return not deflected
 
 
-@njit(**JIT)
+@njit(**INNER)
 def _base(v, u, axis, turning):  # type: ignore[no-untyped-def]
     """Write the derivative by a turn of everything about the base's origin."""
     e, f = (axis + 1) % 3, (axis + 2) % 3

@@ -22,7 +22,7 @@ from gapbridge.core.kernels.layout import (
     U,
 )
 from gapbridge.core.kernels.least_offset import LARGEST_OFFSET, REGULAR
-from gapbridge.core.kernels.reference import JIT
+from gapbridge.core.kernels.reference import INNER, JIT
 from gapbridge.core.kernels.single import LEVER, TOLERANCE
 
 STEPS = 4  # of Newton's: what takes more is near a singularity
@@ -74,7 +74,7 @@ def correct_blocks(chain, rigid, rows, first, last, found, residual, steps):  # 
                 _motion(v, x, k, found[r + k, n:])
 
 
-@njit(**JIT)
+@njit(**INNER)
 def _solve(chain, w, v, x, n, deflected):  # type: ignore[no-untyped-def]
     """Bring all lanes that can be to the wanted pose; returns the steps, 0: no equilibrium."""
     for step in range(STEPS):
@@ -173,7 +173,7 @@ def _column(w, v, x, i, n):  # type: ignore[no-untyped-def]
             x[U((ERROR + j) * _L + k)] += x[U(c + j * _L + k)] * offset
 
 
-@njit(**JIT)
+@njit(**INNER)
 def _shortest(x, n):  # type: ignore[no-untyped-def]
     """Write the shortest offset that takes up the error; marks lanes where it would be damped.
 
@@ -271,7 +271,7 @@ def _mark(x, n):  # type: ignore[no-untyped-def]
                 x[U((OFFSET + i) * _L + k)] = 0.0
 
 
-@njit(**JIT)
+@njit(**INNER)
 def _motion(v, x, k, out):  # type: ignore[no-untyped-def]
     """Write the motion (6,) from a lane's wanted pose to the one it stands in; no offset, none."""
     turn, trace = np.zeros(3), 0.0

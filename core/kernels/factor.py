@@ -18,7 +18,7 @@ from gapbridge.core.kernels.layout import (
     TCP_ROTATION,
     U,
 )
-from gapbridge.core.kernels.reference import JIT
+from gapbridge.core.kernels.reference import INNER, JIT
 
 NUISANCES = 9  # instrument's frame (6), tool point (3)
 
@@ -82,7 +82,7 @@ def _turning_columns(w, X, e, f, b):  # type: ignore[no-untyped-def]
         X[U(f + 5 * LANES + k)] = mz - along * zz
 
 
-@njit(**JIT)
+@njit(**INNER)
 def nuisance_columns(v, X, tool_rotation, width):  # type: ignore[no-untyped-def]
     """Write d(measured minus predicted) / d(frame step, tool point), negated: first 9 columns."""
     size = width * LANES
@@ -114,7 +114,7 @@ def _weigh(X, cells, columns, size):  # type: ignore[no-untyped-def]
             X[U(a + k)] *= cells[U(k)]
 
 
-@njit(**JIT)
+@njit(**INNER)
 def _cells(per_cell, gap, first, end, width, X, column, cells):  # type: ignore[no-untyped-def]
     """Write the right side into its column and the weights; lanes that are over weigh nothing."""
     a = column * width * LANES

@@ -41,10 +41,10 @@ from gapbridge.core.kernels.mechanics import (
     sines,
     turn_joint,
 )
-from gapbridge.core.kernels.reference import JIT, TOLERANCE
+from gapbridge.core.kernels.reference import INNER, TOLERANCE
 
 
-@njit(**JIT)
+@njit(**INNER)
 def lanes_of(n):  # type: ignore[no-untyped-def]
     """Return the workspaces for arms of n joints: records, and what belongs to whole rows."""
     w, v = np.zeros((n + 2) * RECORD * LANES), np.zeros(ROW * LANES)
@@ -52,7 +52,7 @@ def lanes_of(n):  # type: ignore[no-untyped-def]
     return w, v
 
 
-@njit(**JIT)
+@njit(**INNER)
 def _level(w):  # type: ignore[no-untyped-def]
     """Write the base's record as it stands without tilt."""
     for s in range(RECORD * LANES):
@@ -62,7 +62,7 @@ def _level(w):  # type: ignore[no-untyped-def]
         w[(ROTATION + 8) * LANES + k] = w[GROWTH * LANES + k] = 1.0
 
 
-@njit(**JIT)
+@njit(**INNER)
 def gather(chain, rows, first, w, v):  # type: ignore[no-untyped-def]
     """Bring rows first.. into the lanes (the last row fills lanes that are over).
 
@@ -82,7 +82,7 @@ def gather(chain, rows, first, w, v):  # type: ignore[no-untyped-def]
     return far == 0
 
 
-@njit(**JIT)
+@njit(**INNER)
 def _spread(given, first, width, to, begin, apart):  # type: ignore[no-untyped-def]
     """Write rows first.. of ``given`` (N or 1, width) into slots ``apart`` from each other."""
     last = given.shape[0] - 1
@@ -103,7 +103,7 @@ def _spread(given, first, width, to, begin, apart):  # type: ignore[no-untyped-d
                 to[U(begin + j * apart + k)] = given[r, j]
 
 
-@njit(**JIT)
+@njit(**INNER)
 def settle(chain, w, v, deflected, warm):  # type: ignore[no-untyped-def]
     """Solve the lanes to equilibrium where ``deflected``, else place and load the rigid arm once.
 
@@ -143,7 +143,7 @@ def settle(chain, w, v, deflected, warm):  # type: ignore[no-untyped-def]
     return False
 
 
-@njit(**JIT)
+@njit(**INNER)
 def _place(chain, w, v, n, tilted, turned):  # type: ignore[no-untyped-def]
     """Place everything from the base to the TCP; ``turned``: with the joints' bending."""
     if tilted:
@@ -165,7 +165,7 @@ def _straighten(w, n):  # type: ignore[no-untyped-def]
             w[U(a + s)] = 0.0
 
 
-@njit(**JIT)
+@njit(**INNER)
 def _upright(w):  # type: ignore[no-untyped-def]
     for s in range(9):
         value = 1.0 if s % 4 == 0 else 0.0
@@ -173,7 +173,7 @@ def _upright(w):  # type: ignore[no-untyped-def]
             w[(ROTATION + s) * LANES + k] = value
 
 
-@njit(**JIT)
+@njit(**INNER)
 def _change(w, v, n):  # type: ignore[no-untyped-def]
     """Return how far a lane's bending has changed at most (rad).
 
@@ -195,7 +195,7 @@ def _change(w, v, n):  # type: ignore[no-untyped-def]
     return change
 
 
-@njit(**JIT)
+@njit(**INNER)
 def bends(chain):  # type: ignore[no-untyped-def]
     """Return whether anything in the chain bends; links that do are core.kernels.reference's."""
     for i in range(chain.mass.shape[0]):
@@ -205,7 +205,7 @@ def bends(chain):  # type: ignore[no-untyped-def]
     return _tilts(chain)
 
 
-@njit(**JIT)
+@njit(**INNER)
 def _tilts(chain):  # type: ignore[no-untyped-def]
     """Return whether the base tilts (np.any would bring scipy.linalg into each process)."""
     c = chain.base_compliance

@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from gapbridge.core.kernels.reference import JIT
+from gapbridge.core.kernels.reference import INNER
 
-FAST = {**JIT, "fastmath": {"contract", "nsz"}}  # nothing that reorders sums
-SUMS = {**JIT, "fastmath": {"contract", "nsz", "reassoc"}}  # sums over lanes, in any order
+FAST = {**INNER, "fastmath": {"contract", "nsz"}}  # nothing that reorders sums
+SUMS = {**INNER, "fastmath": {"contract", "nsz", "reassoc"}}  # sums over lanes, in any order
 LANES = 64
 U = np.uintp  # an index that is no signed number needs no look whether it counts from the end
 

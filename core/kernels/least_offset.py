@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from gapbridge.core.kernels.reference import JIT
+from gapbridge.core.kernels.reference import INNER, JIT
 
 LARGEST_OFFSET = 0.1  # rad: joint offset (norm) beyond which the correction is damped
 REGULAR = 1e-8  # smallest over largest pivot from which elimination is as good as eigenvalues
@@ -46,7 +46,7 @@ def smallest_offset(J, wanted, offset):  # type: ignore[no-untyped-def]
     _damped(J, G, right, offset)
 
 
-@njit(**JIT)
+@njit(**INNER)
 def _eliminated(G, y):  # type: ignore[no-untyped-def]
     """Solve G y = y in place by Cholesky's way; returns False where G is nearly singular."""
     size = y.shape[0]
@@ -74,7 +74,7 @@ def _eliminated(G, y):  # type: ignore[no-untyped-def]
     return True
 
 
-@njit(**JIT)
+@njit(**INNER)
 def _damped(J, G, right, offset):  # type: ignore[no-untyped-def]
     """Write the solution by eigenvalues, with as little damping as keeps it short."""
     wide, size = J.shape[1] > 6, G.shape[0]
@@ -102,7 +102,7 @@ def _damped(J, G, right, offset):  # type: ignore[no-untyped-def]
     _written(J, found, offset)
 
 
-@njit(**JIT)
+@njit(**INNER)
 def _diagonalised(G, V):  # type: ignore[no-untyped-def]
     """Turn G (n, n) into its eigenvalues on the diagonal, and V's columns with it.
 
@@ -124,7 +124,7 @@ def _diagonalised(G, V):  # type: ignore[no-untyped-def]
                     _rotated(G, V, p, q)
 
 
-@njit(**JIT)
+@njit(**INNER)
 def _rotated(G, V, p, q):  # type: ignore[no-untyped-def]
     """Take G[p, q] to zero by one rotation."""
     tau = 0.5 * (G[q, q] - G[p, p]) / G[p, q]
@@ -142,7 +142,7 @@ def _rotated(G, V, p, q):  # type: ignore[no-untyped-def]
         V[k, p], V[k, q] = c * a - s * b, s * a + c * b
 
 
-@njit(**JIT)
+@njit(**INNER)
 def _written(J, y, offset):  # type: ignore[no-untyped-def]
     """Write the joint offset (n,) that the solution of the smaller system means."""
     n = J.shape[1]

@@ -11,7 +11,7 @@ import numpy as np
 from numba import njit
 
 from gapbridge.core.arrays import Array
-from gapbridge.core.kernels.reference import JIT, Chain, Rows, Shape, new_shape
+from gapbridge.core.kernels.reference import INNER, JIT, Chain, Rows, Shape, new_shape
 
 
 def pack(record: Chain | Rows | Shape) -> Array:
@@ -38,7 +38,7 @@ def shape_size(n: int) -> int:
     return 12 * (n + 1) + 15 * n + 12
 
 
-@njit(**JIT)
+@njit(**INNER)
 def chain_of(block, n):  # type: ignore[no-untyped-def]
     """Return the chain of n joints whose arrays are views of ``block``."""
     a = 9 * (n + 1)

@@ -35,7 +35,7 @@ from gapbridge.core.kernels.layout import (
     U,
 )
 from gapbridge.core.kernels.rates import slots
-from gapbridge.core.kernels.reference import JIT
+from gapbridge.core.kernels.reference import INNER, JIT
 
 _L = LANES
 
@@ -181,7 +181,7 @@ def _of_payload(w, v, B, push, turned, n, g, gravity):  # type: ignore[no-untype
         B[U(load * _L + k)] = hx * gx + hy * gy + hz * gz
 
 
-@njit(**JIT)
+@njit(**INNER)
 def _derivatives(chain, w, v, u, B, push, turned, axis, turning, links, loads):  # type: ignore[no-untyped-def]
     """Write the slots of one coordinate; those of links, and of tool and weights, where wanted."""
     n = chain.mass.shape[0]
@@ -209,7 +209,7 @@ def _derivatives(chain, w, v, u, B, push, turned, axis, turning, links, loads): 
             B[(gravity + 3 + j) * _L + k] = u[(PULL + j) * _L + k] * total
 
 
-@njit(**JIT)
+@njit(**INNER)
 def _linked(used, n):  # type: ignore[no-untyped-def]
     """Return whether a parameter moves a link's geometry."""
     found = False
@@ -218,7 +218,7 @@ def _linked(used, n):  # type: ignore[no-untyped-def]
     return found
 
 
-@njit(**JIT)
+@njit(**INNER)
 def _loaded(used, n):  # type: ignore[no-untyped-def]
     """Return whether a parameter moves the tool, gravity or the payload's mass."""
     tool, gravity = 6 * (n + 1), 6 * (n + 2) + 4 * n
@@ -234,7 +234,7 @@ def _add(B, b, column, rate):  # type: ignore[no-untyped-def]
         column[U(k)] += rate * B[U(b + k)]
 
 
-@njit(**JIT)
+@njit(**INNER)
 def _columns(B, rates, varying, first, count, J, column):  # type: ignore[no-untyped-def]
     """Write one coordinate's column of each parameter: ``J`` (p, N)."""
     start, slot, rate = rates

@@ -9,7 +9,7 @@ from gapbridge.core.kernels import reference as kernel
 from gapbridge.core.kernels.factor import flexibility_columns
 from gapbridge.core.kernels.lanes import bends, gather, lanes_of, settle
 from gapbridge.core.kernels.layout import AXIS, LANES, MOMENT, ORIGIN, RECORD, TCP, TCP_ROTATION
-from gapbridge.core.kernels.reference import JIT, Shape
+from gapbridge.core.kernels.reference import INNER, JIT, Shape
 
 
 @njit(**JIT)
@@ -58,7 +58,7 @@ def linear_blocks(chain, rows, first, last, A, jacobians, moments):  # type: ign
     return -1
 
 
-@njit(**JIT)
+@njit(**INNER)
 def _written(w, v, k, J, moment):  # type: ignore[no-untyped-def]
     """Write the Jacobian (6, n) and the joint moments (n, 3) of lane k."""
     for i in range(moment.shape[0]):
@@ -72,7 +72,7 @@ def _written(w, v, k, J, moment):  # type: ignore[no-untyped-def]
             moment[i, j] = w[a + (MOMENT + j) * LANES]
 
 
-@njit(**JIT)
+@njit(**INNER)
 def _one_by_one(chain, rows, first, last, position, rotation):  # type: ignore[no-untyped-def]
     n, bad = chain.mass.shape[0], -1
     shape = Shape(

@@ -19,7 +19,7 @@ from gapbridge.core.kernels.one_row import (
     turn,
 )
 from gapbridge.core.kernels.packed import sizes_of
-from gapbridge.core.kernels.reference import JIT
+from gapbridge.core.kernels.reference import INNER, JIT
 
 LEVER = 0.5  # m: weighs a rotation against a shift
 TOLERANCE = 1e-9  # m, and rad times the lever: where the pose counts as reached
@@ -115,7 +115,7 @@ def _shortest(b, n, J, e0, e1, e2, e3, e4, e5):  # type: ignore[no-untyped-def]
     return True
 
 
-@njit(**JIT)
+@njit(**INNER)
 def _damped(b, n, J, e0, e1, e2, e3, e4, e5):  # type: ignore[no-untyped-def]
     """Write the offset by core.kernels.least_offset: singular poses, more than six joints."""
     whole, wanted, found = np.empty((6, n)), np.array([e0, e1, e2, e3, e4, e5]), np.empty(n)
