@@ -104,18 +104,11 @@ def torque_corrected(
     """
     import pinocchio as pin  # of the test extra
 
-    model = _pinocchio(cell, folder, pin)
-    A, b = _torque_rows(model, pin, fitted, max(1, len(fitted) // MOST))
+    model = pinocchio_model(cell, folder, pin)
+    A, b = torque_rows(model, pin, fitted, max(1, len(fitted) // MOST))
     n = model.nv
-    spread = np.ones(n)
-    values = np.zeros(A.shape[1])
-    for _ in range(2):  # every joint by its own scatter
-        weight = np.tile(1 / spread, len(b) // n)
-        scaled = A * weight[:, None]
-        size = np.maximum(np.linalg.norm(scaled, axis=0), 1e-12)
-        values = np.linalg.lstsq(scaled / size, b * weight, rcond=1e-6)[0] / size
-        spread = np.maximum(np.std((b - A @ values).reshape(-1, n), axis=0), 1e-9)
-    A, b = _torque_rows(model, pin, judged, 1)
+    values = solved(A, b, n)
+    A, b = torque_rows(model, pin, judged, 1)
     left = (b - A @ values).reshape(-1, n)
     edge = (len(judged) - len(left)) // 2
     measured = np.full_like(nominal, np.nan)
@@ -123,7 +116,20 @@ def torque_corrected(
     return judged.replaced("actual_current_as_torque", measured)
 
 
-def _pinocchio(cell: dict[str, Any], folder: Path, pin: Any) -> Any:
+def solved(A: Array, b: Array, n: int) -> Array:
+    """Return the least-squares values of flat rows of n joints, each weighed by its scatter."""
+    spread, values = np.ones(n), np.zeros(A.shape[1])
+    for _ in range(2):
+        weight = np.tile(1 / spread, len(b) // n)
+        scaled = A * weight[:, None]
+        size = np.maximum(np.linalg.norm(scaled, axis=0), 1e-12)
+        values = np.linalg.lstsq(scaled / size, b * weight, rcond=1e-6)[0] / size
+        spread = np.maximum(np.std((b - A @ values).reshape(-1, n), axis=0), 1e-9)
+    return values
+
+
+def pinocchio_model(cell: dict[str, Any], folder: Path, pin: Any) -> Any:
+    """Return the cell's arm as Pinocchio has it, its links without mass where given by rows."""
     gravity = np.array(cell.get("gravity", [0, 0, -9.80665]), dtype=float)
     links = links_of(cell)
     if links is None:
@@ -140,9 +146,9 @@ def _pinocchio(cell: dict[str, Any], folder: Path, pin: Any) -> Any:
     return model
 
 
-def _torque_rows(model: Any, pin: Any, table: Table, step: int) -> tuple[Array, Array]:
+def torque_rows(model: Any, pin: Any, table: Table, step: int) -> tuple[Array, Array]:
     """Return the regressor and the torques of every step-th row, flat; edges left out."""
-    q, qd, qdd, window = _derivatives(table)
+    q, qd, qdd, window = derivatives(table)
     measured, n = _needed(table, "actual_current_as_torque"), q.shape[1]
     data, blocks, values = model.createData(), [], []
     for t in range(window, len(q) - window, step):
@@ -154,7 +160,7 @@ def _torque_rows(model: Any, pin: Any, table: Table, step: int) -> tuple[Array, 
     return np.vstack(blocks), np.concatenate(values)
 
 
-def _derivatives(table: Table) -> tuple[Array, Array, Array, int]:
+def derivatives(table: Table) -> tuple[Array, Array, Array, int]:
     """Return joints, speeds and accelerations (N, n), smoothed, and the rows of the window.
 
     Speeds are the measured ones where the log has them. Rows are put on an even clock.
