@@ -195,8 +195,13 @@ def _known(label: Label, claims: tuple[Claim, ...], causes: list[dict[str, Any]]
     if named == label.effects:
         joints = _joints_right(truth, claims, hidden)
         return Verdict("right", (), joints, _needless(truth, claims, causes, hidden))
-    if named > label.effects or not _same_data(truth, claims, hidden):
-        return Verdict("wrong", tuple(sorted(named - label.effects)), False)
+    more = (
+        named - label.effects
+    )  # at one joint alone it may stand for an effect of others, as a tie
+    tied = all(label.effects & {*(c.get("indistinguishable_from") or [])}
+               for c in causes if c["effect"] in more)  # fmt: skip
+    if (named > label.effects and not tied) or not _same_data(truth, claims, hidden):
+        return Verdict("wrong", tuple(sorted(more)), False)
     reported = {str(e) for c in causes for e in c.get("indistinguishable_from") or []}
     outcome = "right_tie" if label.effects - named <= reported else "tie_untold"
     return Verdict(outcome, () if outcome == "right_tie" else tuple(sorted(named - label.effects)))

@@ -68,6 +68,15 @@ def test_a_true_twin_without_a_word_of_the_tie_is_not(case):
     assert (got.outcome, got.ok) == ("tie_untold", False)
 
 
+@pytest.mark.parametrize(("ties", "outcome"), [(["radial_compliance"], "right_tie"), ([], "wrong")])
+def test_a_twin_at_one_of_several_joints_is_right_with_the_tie_reported(case, ties, outcome):
+    labels = (case("radial_compliance", seed) for seed in range(60))
+    label = next(x for x in labels if x.causes[0].joints[0] == 1 and len(x.causes[0].joints) > 1)
+    rest = cause("radial_compliance", label.causes[0].joints[1:])
+    got = score(label, answer(label, [rest, cause("base_compliance", ties=ties)]))
+    assert got.outcome == outcome
+
+
 def test_a_tie_with_what_the_data_rule_out_does_not_help(case):
     label = case("thermal_drift")
     got = score(label, answer(label, [cause("backlash", [2], ties=["thermal_drift"])]))

@@ -75,7 +75,9 @@ def test_base_parameters_and_friction_are_found(tmp_path):
     phase = RNG.uniform(-3, 3, (6, 3))
     angle = time[:, None, None] * rate + phase
     q, qd, qdd = ((np.sin(angle + k * np.pi / 2) * rate**k * 0.4).sum(axis=2) for k in range(3))
-    model = rivals.pinocchio_model({"robot": {"dh": [x.document() for x in arms.UR10E]}}, tmp_path, pin)
+    model = rivals.pinocchio_model(
+        {"robot": {"dh": [x.document() for x in arms.UR10E]}}, tmp_path, pin
+    )
     for i, link in enumerate(arms.UR10E):
         model.inertias[i + 1] = pin.Inertia(link.mass, np.array(link.cog), 0.02 * np.eye(3))
     data = model.createData()
