@@ -30,8 +30,7 @@ from gapbridge.bridge.document.html import html
 from gapbridge.bridge.document.provenance import origin_blocks, origin_line
 
 NEXT_STEPS = (
-    "Write a cell for your own robot: gapbridge init HOST --out CELL, or copy "
-    "config/ur10e_simulated.yaml.",
+    "Write a cell for your own robot: gapbridge init HOST --out CELL.",
     "Check it: gapbridge check CELL --live, then watch it: gapbridge run CELL --observe.",
     "Calibrate it with an instrument: gapbridge calibrate CELL.",
 )

@@ -36,7 +36,7 @@ def check(cell: Path, live: bool, logs: tuple[Path, ...]) -> None:
     joints, frames), and the one that explains them is reported. Exits with 0 if there is no error,
     2 otherwise.
 
-    Example: gapbridge check config/ur10e_simulated.yaml --live
+    Example: gapbridge check cell.yaml --live
     """
     errors = complaints(cell)
     warnings: list[str] = []

@@ -17,7 +17,7 @@ def arm(cell: Path) -> None:
 
     Uses a local socket that only the daemon's own user can open; never the network.
 
-    Example: gapbridge arm config/ur10e_simulated.yaml
+    Example: gapbridge arm cell.yaml
     """
     click.echo(ask(cell, "arm"))
 
@@ -27,6 +27,6 @@ def arm(cell: Path) -> None:
 def disarm(cell: Path) -> None:
     """Make the daemon of a cell ramp out and observe; in a fault, acknowledge it.
 
-    Example: gapbridge disarm config/ur10e_simulated.yaml
+    Example: gapbridge disarm cell.yaml
     """
     click.echo(ask(cell, "disarm"))

@@ -36,7 +36,7 @@ def run(cell: Path, observe: bool, arm: bool, duration: float | None, log: str) 
     Setpoints are written where the cell has `setpoints.arm: true`, with --arm, or after
     `gapbridge arm CELL`. SIGHUP reads the cell file again; SIGTERM ramps out and ends.
 
-    Example: gapbridge run config/ur10e_simulated.yaml --observe --duration 60
+    Example: gapbridge run cell.yaml --observe --duration 60
     """
     if observe and arm:
         raise InputError("--observe: found beside --arm, expected one of them")

@@ -22,7 +22,7 @@ def simulate(cell: Path, host: str | None, seed: int | None) -> None:
     (30100) acts for people and the laser tracker in the cell: `measure`, `payload`, `wrench`,
     `help`. Ends on SIGINT and SIGTERM.
 
-    Example: gapbridge simulate config/ur10e_simulated.yaml
+    Example: gapbridge simulate cell.yaml
     """
     stopped: list[int] = []
     for number in (signal.SIGINT, signal.SIGTERM):

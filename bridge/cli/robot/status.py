@@ -17,7 +17,7 @@ from gapbridge.bridge.ipc.control_client import ask, running
 def status(cell: Path | None, as_json: bool) -> None:
     """Show what the daemon of a cell does; without CELL, all daemons of this user.
 
-    Example: gapbridge status config/ur10e_simulated.yaml --json
+    Example: gapbridge status cell.yaml --json
     """
     found = running() if cell is None else [ask(cell, "status")]
     if as_json:

@@ -18,6 +18,10 @@ export function number(value, digits = 3) {
   return value.toFixed(Math.min(places, 6));
 }
 
+export function fixed(value, digits) {
+  return value.toFixed(digits).replace(/^-(?=[0.]+$)/, ''); // no negative zero
+}
+
 export function count(value) {
   if (!Number.isFinite(value)) return '–';
   return Math.round(value).toLocaleString('en').replace(/,/g, '\u202f');

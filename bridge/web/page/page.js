@@ -1,5 +1,5 @@
 // The page: takes the daemon's messages, fills in texts and figures, draws.
-import { MEANING, clock, count, duration, describe, number } from './messages.js';
+import { MEANING, clock, count, duration, describe, fixed, number } from './messages.js';
 import { Lines, colour, drawHistogram, forgetColours } from './drawing.js';
 import { View } from './view.js';
 
@@ -199,7 +199,7 @@ function showArm(arm) {
   if (view) view.set(arm.scene);
   else view = new View($('arm'), arm.scene, colour);
   text($('arm-caption'), arm.factor > 1 ? `bend drawn ${count(arm.factor)} times larger` : '');
-  const along = (values, scale, digits) => values.map((v) => (scale * v).toFixed(digits)).join(', ');
+  const along = (values, scale, digits) => values.map((v) => fixed(scale * v, digits)).join(', ');
   $('arm-figures').replaceChildren(
     row('TCP in base, x, y, z', `${along(arm.tcp, 1e3, 1)} mm`),
     row('rotation vector', `${along(arm.rotation, 1, 4)} rad`),
@@ -210,7 +210,7 @@ function showArm(arm) {
   );
   $('joints').replaceChildren(...arm.q.map((angle, i) => {
     const line = document.createElement('tr'), warm = arm.temperature[i];
-    const texts = [`${i + 1}`, `${(angle * 180 / Math.PI).toFixed(2)}°`,
+    const texts = [`${i + 1}`, `${fixed(angle * 180 / Math.PI, 2)}°`,
       warm === null ? '–' : `${warm.toFixed(1)} °C`];
     line.append(...texts.map((word) => {
       const cell = document.createElement('td');

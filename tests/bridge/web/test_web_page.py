@@ -116,6 +116,9 @@ def test_the_arm_its_joints_tcp_and_load_are_shown_and_it_can_be_turned(browser,
         assert "TCP in base" in figures
         assert "5.00 kg at 0, 0, 60 mm" in figures
         assert page.locator("#joints tr").count() == 6
+        assert "-0.00°" not in page.locator("#joints").inner_text()
+        zero = "import('./messages.js').then(m => [m.fixed(-1e-3, 2), m.fixed(-0.5, 1)])"
+        assert page.evaluate(zero) == ["0.00", "-0.5"]
         box = page.locator("#arm").bounding_box()
         seen = page.evaluate("document.getElementById('arm').toDataURL()")
         page.mouse.move(box["x"] + 100, box["y"] + 100)
