@@ -81,7 +81,7 @@ def fit(cell: Cell, log: Log, *, remounted: bool = False) -> Fitted:
     found = identify_compliance(cell.model, log, metrology)
     held_out = found.remaining_rms_held_out
     return Fitted(
-        cell=cell, model=cell.model.with_compliance(found.axial, found.radial),
+        cell=cell, model=found.written,
         axial=found.axial, radial=found.radial, std_axial=found.std_axial,
         std_radial=found.std_radial, shown=found.identifiable, samples=found.samples,
         gap_rms=found.gap_rms, remaining_rms=found.remaining_rms,

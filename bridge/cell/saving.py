@@ -9,6 +9,7 @@ import re
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
 
 from gapbridge.bridge.cell.cell import Cell
@@ -46,7 +47,7 @@ def save_cell(
     model: Model | None = None,
     sections: dict[str, Any] | None = None,
 ) -> None:
-    """Write the cell, with the effects of ``model`` instead of its own, to ``path`` in one step.
+    """Write the cell, with effects and tool point of ``model``, to ``path`` in one step.
 
     ``sections`` are whole top-level keys that take the place of the cell's own (``payload``).
 
@@ -55,8 +56,18 @@ def save_cell(
     """
     path = Path(path)
     model = model or cell.model
-    text = cell_text(cell.document, path, model, sections)
+    text = cell_text(cell.document, path, model, _tool(cell, model) | (sections or {}))
     write_text(path, text)
+
+
+def _tool(cell: Cell, model: Model) -> dict[str, Any]:
+    """Return the key ``tool`` with the tool point of ``model``; nothing where it is the cell's."""
+    shift = model.tool_in_flange[:3, 3]
+    if np.array_equal(shift, cell.model.tool_in_flange[:3, 3]):
+        return {}
+    tool = copy.deepcopy(cell.document.data.get("tool") or {})
+    tool["tcp"] = {**(tool.get("tcp") or {}), "xyz": [float(v) for v in shift]}
+    return {"tool": tool}
 
 
 def cell_text(

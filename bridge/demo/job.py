@@ -75,7 +75,7 @@ def _job(
     planned = plan(cell.model, link.home, seed, scene)
     log = _calibrate(link, session, planned, out, console)
     found = identify_compliance(cell.model, read_log(log, cell.arm.n), cell.metrology)
-    save_cell(cell, out / "calibrated.yaml", found.model)
+    save_cell(cell, out / "calibrated.yaml", found.written)
     calibrated = load_cell(out / "calibrated.yaml")
     console.print(
         f"fitted on {found.samples} poses: gap in space {3**0.5 * found.gap_rms * 1e3:.3f} mm rms "

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from gapbridge.core.effects import CATALOGUE
 from gapbridge.core.effects.effect import typical_moment
+from gapbridge.core.estimation.geometry import Geometry, likelier, with_geometry
 from gapbridge.core.estimation.registration import (
     IDENTITY,
     Registration,
@@ -105,6 +106,7 @@ class Fit:
     frame: Registration | Placements
     weights: Array  # (N,)
     linear: Linear | None = None  # None: only the nuisances were fitted
+    geometry: Geometry | None = None  # numbers in the model that were estimated along, if any
 
     @property
     def flexibility(self) -> Array:
@@ -278,21 +280,23 @@ def _round(now: Fit, data: Data, kept: Mask, prior: tuple[Array, float]) -> Fit:
     model, n = now.model, now.model.arm.n
     gap, poses = residual(model, data, now.frame)
     weights, scale = robust_weights(gap)
-    R = weighed(model, now.frame, data, (gap, per_cell_of(weights, scale, gap.shape[1])), poses)
+    cells = (gap, per_cell_of(weights, scale, gap.shape[1]))
+    R = weighed(model, now.frame, data, cells, poses, now.geometry)
     problem = (R[:, : -2 * n - 1], R[:, -2 * n - 1 : -1], R[:, -1])
     return stepped(now, problem, weights, kept, prior)
 
 
 def weighed(
     model: Model, frame: Registration | Placements, data: Data, cells: tuple[Array, Array],
-    poses: Poses | None = None,
+    poses: Poses | None = None, geometry: Geometry | None = None,
 ) -> Array:  # fmt: skip
-    """Return the R factor of [nuisances | flexibilities | gap] at the model's shape.
+    """Return the R factor of [geometry | nuisances | flexibilities | gap] at the model's shape.
 
-    ``cells``: gap and what each cell is multiplied by (N, width); ``poses``: as predicted.
+    ``cells``: gap and what each cell is multiplied by (N, width); ``poses``: as predicted. What
+    is known of the geometry beforehand is in it.
     """
     gap, per_cell = cells
-    if data.session is None:
+    if data.session is None and geometry is None:
         k = data.nuisances + 2 * model.arm.n + 1
         R = np.zeros((k, k))
         add_rows(model, data, gap, per_cell, R)
@@ -302,8 +306,16 @@ def weighed(
     if data.nuisances:
         poses = poses or model.predict(data.q, data.loads)
         columns.insert(0, nuisance_columns(model, poses, width, data))
+    if geometry is not None:
+        columns.insert(0, geometry.columns(model, data.q, data.loads, width))
     whole = np.concatenate(columns, axis=2) * per_cell[..., None]
-    return r_factor(whole.reshape(gap.size, -1))
+    R = r_factor(whole.reshape(gap.size, -1))
+    if geometry is not None:
+        held = np.zeros((len(geometry.sigma), R.shape[1]))
+        np.fill_diagonal(held, 1 / geometry.sigma)
+        held[:, -1] = -geometry.prior(model)
+        R = r_factor(np.vstack([R, held]))
+    return R
 
 
 def add_rows(model: Model, data: Data, gap: Array, cells: Array, R: Array) -> None:
@@ -379,9 +391,77 @@ def stepped(
     found = solve(linear, kept, flexibility, prior)
     if F.shape[1]:
         left = b - A @ (found - flexibility)
-        model, frame = moved(model, frame, np.linalg.lstsq(F, left, rcond=RANK)[0])
+        step = np.asarray(np.linalg.lstsq(F, left, rcond=RANK)[0], float)
+        if now.geometry is not None:
+            count = len(now.geometry.sigma)
+            model, step = now.geometry.moved(model, step[:count]), step[count:]
+        if len(step):
+            model, frame = moved(model, frame, step)
     n = model.arm.n
-    return Fit(model.with_compliance(found[:n], found[n:]), frame, weights, linear)
+    found_model = model.with_compliance(found[:n], found[n:])
+    return Fit(found_model, frame, weights, linear, now.geometry)
+
+
+def beside_geometry(fit: Fit, data: Data) -> Fit:
+    """Return the fit with the geometry as further nuisances, where the rows are likelier with it.
+
+    The tool point is one of them where the cell's counts as known otherwise.
+    """
+    gap, poses = residual(fit.model, data, fit.frame)
+    weights, scale = robust_weights(gap)
+    model, geometry = with_geometry(fit.model, tool=not data.tools)
+    width, n = gap.shape[1], model.arm.n
+    if gap.size <= data.nuisances + 2 * n:
+        return fit
+    columns = [regressor(fit.model, data, fit.frame)[:, :width]]
+    if data.nuisances:
+        columns.insert(0, nuisance_columns(fit.model, poses, width, data))
+    columns += [geometry.columns(model, data.q, data.loads, width), gap[..., None]]
+    whole = np.concatenate(columns, axis=2) * per_cell_of(weights, scale, width)[..., None]
+    R = r_factor(whole.reshape(gap.size, -1))
+    found = likelier(R, data.nuisances + 2 * n, width * float(weights.sum()), geometry)
+    return fit if found is None else replace(fit, model=model, geometry=found)
+
+
+def projected(fit: Fit, data: Data, geometry: Geometry | None) -> Linear:
+    """Return the problem at a fit with its nuisances projected out, the geometry's where given."""
+    gap, poses = residual(fit.model, data, fit.frame)
+    weights, scale = robust_weights(gap)
+    cells = (gap, per_cell_of(weights, scale, gap.shape[1]))
+    R = weighed(fit.model, fit.frame, data, cells, poses, geometry)
+    n = fit.model.arm.n
+    F, A, b = R[:, : -2 * n - 1], R[:, -2 * n - 1 : -1], R[:, -1]
+    return _projected(A, b + A @ fit.flexibility, orthonormal(F) if F.shape[1] else F)
+
+
+def tool_deviation(fit: Fit, data: Data) -> float:
+    """Return the largest 1 sigma (m) of the tool point among all directions, frames beside it.
+
+    Infinite where there is not one tool point that is estimated.
+    """
+    if data.tools != 1:
+        return np.inf
+    gap, poses = residual(fit.model, data, fit.frame)
+    weights, scale = robust_weights(gap)
+    cells = (gap, per_cell_of(weights, scale, gap.shape[1]))
+    R = weighed(fit.model, fit.frame, data, cells, poses)
+    tool = 6 * data.frames + np.arange(3)
+    Q = orthonormal(R[:, : tool[0]])
+    own = R[:, tool] - Q @ (Q.T @ R[:, tool])
+    return 1 / max(float(np.linalg.svd(own, compute_uv=False)[-1]), 1e-300)
+
+
+def as_written(fit: Fit, data: Data) -> Fit:
+    """Return the fit as the cell will have it: links as drawn, frames and tool points fitted to it.
+
+    A tool point of a registered instrument is as it was, unless it alone is off.
+    """
+    if fit.geometry is None:
+        return fit
+    model = fit.geometry.written(fit.model)
+    if not data.nuisances:
+        return replace(fit, model=model, geometry=None)
+    return replace(_placed(model, data, slice(None)), weights=fit.weights)
 
 
 def _projected(A: Array, b: Array, Q: Array) -> Linear:

@@ -20,14 +20,18 @@ from gapbridge.core.estimation.compliance_fit import (
     Fit,
     Mask,
     Placements,
+    as_written,
+    beside_geometry,
     fit_flexibilities,
     fit_nuisances,
     orthonormal,
     placed_gap,
     prior_of,
     residual,
+    tool_deviation,
     weighed,
 )
+from gapbridge.core.estimation.geometry import Geometry
 from gapbridge.core.estimation.regions import joint_regions
 from gapbridge.core.estimation.registration import IDENTITY, Registration
 from gapbridge.core.log.log import Log
@@ -39,6 +43,7 @@ from gapbridge.core.sessions import session_of
 Array = NDArray[np.float64]
 FOLDS = 5
 SAME_POSE = 1e-3  # rad, of every joint
+TOOL_KNOWN = 2e-4  # m, 1 sigma: a tool point that is known worse stays the cell's
 NEAR = 1e-4  # relative step at which a fit has converged that is only judged by
 NEAR_FRAME = 1e-6  # m, rad: step at which a frame has converged that is only judged by
 LOOK = 3  # rounds of the fit of everything, from which the choice is made
@@ -72,6 +77,16 @@ class Identification:
     notes: tuple[str, ...]
     remaining_rms_new_region: float = UNSEEN  # m, folds are regions of joint space
     remaining_rms_new_session: float = UNSEEN  # m, folds are sessions
+    tool_known: bool = True  # the tool point found is good enough to be written
+
+    @property
+    def written(self) -> Model:
+        """Return the model as a cell should hold it: with a tool point that the poses determine."""
+        if self.tool_known:
+            return self.model
+        tool = self.model.tool_in_flange.copy()
+        tool[:3, 3] -= self.tool_offset
+        return replace(self.model, tool_in_flange=tool)
 
 
 @dataclass(frozen=True)
@@ -90,7 +105,7 @@ class _Task:
         assert look.linear is not None
         kept = base_parameters.choose(look.linear, self.prior)
         values, n = np.where(kept, look.flexibility, centre), len(centre) // 2
-        begin = Fit(look.model.with_compliance(values[:n], values[n:]), look.frame, look.weights)
+        begin = replace(look, model=look.model.with_compliance(values[:n], values[n:]))
         fit = fit_flexibilities(begin, data, kept, self.prior, converged=self.converged)
         assert fit.linear is not None
         return fit, base_parameters.what_is_shown(fit.linear, kept, self.prior[1])
@@ -113,6 +128,9 @@ def identify_compliance(
     task = _Task(prior)
     before = fit_nuisances(model, data)
     fit, shown = task.run(before, data)
+    beside = beside_geometry(fit, data)
+    if beside.geometry is not None:
+        fit, shown = task.run(beside, data)
     inlier = fit.weights > 0
     # fits that lack some rows begin at the fit to all
     rest = replace(task, converged=NEAR, look=1)
@@ -235,7 +253,8 @@ def _held_out(data: Data, task: _Task, whole: tuple[Fit, Fit], inlier: Mask) -> 
         if not len(unseen.q):
             continue
         before = fit_nuisances(whole[0].model, seen, whole[0].frame, NEAR_FRAME)
-        for fit, gaps in zip((before, task.run(whole[1], seen)[0]), left, strict=True):
+        after = as_written(task.run(whole[1], seen)[0], seen)
+        for fit, gaps in zip((before, after), left, strict=True):
             gaps.append(residual(fit.model, unseen, fit.frame)[0][:, :3])
     return _rms(np.vstack(left[0])), _rms(np.vstack(left[1]))
 
@@ -251,7 +270,7 @@ def _in_new_regions(data: Data, task: _Task, whole: Fit, inlier: Mask) -> float:
             judged &= np.isin(data.session, _placed_sessions(seen))
         if not judged.any() or 3 * len(seen.q) <= data.nuisances + 2:
             continue
-        fit = task.run(whole, seen)[0]
+        fit = as_written(task.run(whole, seen)[0], seen)
         left.append(residual(fit.model, data.part(judged), fit.frame)[0][:, :3])
     return _rms(np.vstack(left)) if len(left) > 1 else UNSEEN
 
@@ -272,7 +291,7 @@ def _in_new_sessions(data: Data, task: _Task, whole: Fit, inlier: Mask) -> float
         if not (rest.any() and own.any()):
             continue
         others = data.part(rest)
-        fit = task.run(whole, others)[0]
+        fit = as_written(task.run(whole, others)[0], others)
         left.append(placed_gap(fit.model, data.part(own))[:, :3])
     return _rms(np.vstack(left)) if left else UNSEEN
 
@@ -287,9 +306,9 @@ def _result(
     shown: base_parameters.Shown, held_out: tuple[float, float],
 ) -> Identification:  # fmt: skip
     n, kept = model.arm.n, shown.kept
-    after = fits[1]
-    inlier = after.weights > 0
-    gaps = [residual(fit.model, data, fit.frame)[0][inlier][:, :3] for fit in fits]
+    inlier = fits[1].weights > 0
+    after = as_written(fits[1], data)
+    gaps = [residual(fit.model, data, fit.frame)[0][inlier][:, :3] for fit in (fits[0], after)]
     std, flexibility = np.sqrt(np.diag(shown.covariance)), after.flexibility
     return Identification(
         after.model, flexibility[:n], flexibility[n:], std[:n], std[n:], shown.covariance, kept,
@@ -297,11 +316,19 @@ def _result(
         after.model.tool_in_flange[:3, 3] - model.tool_in_flange[:3, 3], len(data.q),
         _rms(gaps[0], data.nuisances), _rms(gaps[1], data.nuisances + int(kept.sum())),
         *held_out, used[~inlier],
-        tuple(notes_of(after, kept, int((~inlier).sum()), data.nuisances)),
+        tuple(notes_of(after, data, kept, int((~inlier).sum()), fits[1].geometry)),
+        tool_known=tool_known(after, data),
     )  # fmt: skip
 
 
-def notes_of(fit: Fit, kept: Mask, outlier: int, nuisances: int) -> list[str]:
+def tool_known(fit: Fit, data: Data) -> bool:
+    """Return whether the cell gets a tool point found: one for all sessions, and a sure one."""
+    return data.tools == 0 or tool_deviation(fit, data) < TOOL_KNOWN
+
+
+def notes_of(
+    fit: Fit, data: Data, kept: Mask, outlier: int, geometry: Geometry | None
+) -> list[str]:
     """Return in words what a fit was like: outliers, bounds reached, what was not identifiable."""
     notes = []
     if outlier:
@@ -314,6 +341,14 @@ def notes_of(fit: Fit, kept: Mask, outlier: int, nuisances: int) -> list[str]:
         notes.append("these data show no flexibility at all: the model is left as it was")
     if isinstance(fit.frame, Placements) and len(fit.frame.frames) > 1:
         notes.append("each session has a frame of its own, not written to the cell")
-    elif nuisances:
-        notes.append("frame and tool point were estimated along and are not written to the cell")
+    elif data.nuisances:
+        written = "the tool point is" if tool_known(fit, data) else "they are not"
+        notes.append(f"frame and tool point were estimated along; {written} written to the cell")
+    if geometry is not None and geometry.has_links:
+        notes.append(
+            "links and joints' zeros were estimated along (the poses are likelier with them); they "
+            "are not written to the cell: diagnose names what of them holds"
+        )
+    elif geometry is not None:
+        notes.append("the tool point is off: the cell has the one found")
     return notes

@@ -23,17 +23,20 @@ from gapbridge.core.estimation.compliance_fit import (
     Fit,
     Linear,
     Mask,
+    as_written,
     prior_of,
     residual,
     solve,
     stepped,
     weights_at,
 )
+from gapbridge.core.estimation.geometry import Geometry
 from gapbridge.core.estimation.identification import (
     Identification,
     data_of,
     notes_of,
     require_excitation,
+    tool_known,
 )
 from gapbridge.core.estimation.row_store import RowStore
 from gapbridge.core.estimation.streamed_fit import (
@@ -58,6 +61,7 @@ Rows = NDArray[np.int64]
 SAMPLE = 20_000  # rows kept at most, for the first guess and the look whether anything bends
 MANY_OUTLIERS = 100_000  # rows that are named at most
 ENOUGH = 0.2  # sigmas of a last step, which leaves some percent of itself, with many rows
+LINK_ROWS = 2000  # of them that determine the links, where these are off
 NEAR = 1e-3  # relative step on the sample, which is only where the passes over all rows begin
 
 
@@ -138,6 +142,11 @@ class _Found:
     base: Fit  # one step before
     rows: Pass  # at its shape
     shown: base_parameters.Shown
+    geometry: Geometry | None = None  # in the models of both fits
+
+    def written(self, fit: Fit, rows: Data) -> Fit:
+        """Return a fit as a cell has it, its frame and tool point fitted to some rows."""
+        return as_written(replace(fit, geometry=self.geometry), rows)
 
 
 def identify_streamed(
@@ -160,7 +169,13 @@ def identify_streamed(
     task = _Task(prior)
     emit("fitting")
     before = _nuisances_alone(model, stream.sample)
-    found = task.run(task.on_sample(before, stream), stream)
+    beside = _beside_geometry(before, stream.sample, prior)
+    begin = replace(before if beside is None else beside.fit, geometry=None)
+    found = task.run(task.on_sample(begin, stream), stream)
+    if beside is not None:
+        found = replace(
+            found, geometry=beside.fit.geometry, shown=beside.widened(found.shown, prior[1])
+        )
     emit("checking on held-out rows")
     return _result(model, stream, before, found, _held_out(stream, task, before, found))
 
@@ -169,6 +184,41 @@ def _nuisances_alone(model: Model, rows: Data) -> Fit:
     """Return the frame and tool point that fit best, the model's flexibilities left alone."""
     found = compliance_fit.fit_nuisances(model, rows)
     return Fit(found.model, found.frame, NONE)
+
+
+@dataclass(frozen=True)
+class _BesideGeometry:
+    """A fit to some rows with the geometry in it, and its problem with that free, and held."""
+
+    fit: Fit
+    free: Linear
+    held: Linear
+
+    def widened(self, shown: base_parameters.Shown, sigma: float) -> base_parameters.Shown:
+        """Return what all rows show at this geometry, with what it leaves open."""
+        wide, narrow = (
+            base_parameters.what_is_shown(own, shown.kept, sigma).covariance
+            for own in (self.free, self.held)
+        )
+        return replace(shown, covariance=shown.covariance + wide - narrow)
+
+
+def _beside_geometry(
+    before: Fit, sample: Data, prior: tuple[Array, float]
+) -> _BesideGeometry | None:
+    """Return the fit with the geometry that some rows show, None if they show none.
+
+    All rows are then fitted with it as it is.
+    """
+    some = sample.part(slice(None, None, max(len(sample.q) // LINK_ROWS, 1)))
+    everything = np.ones(len(prior[0]), dtype=bool)
+    fit = compliance_fit.fit_flexibilities(before, some, everything, prior, converged=NEAR)
+    fit = compliance_fit.beside_geometry(fit, some)
+    if fit.geometry is None:
+        return None
+    fit = compliance_fit.fit_flexibilities(fit, some, everything, prior, converged=NEAR)
+    free, held = (compliance_fit.projected(fit, some, own) for own in (fit.geometry, None))
+    return _BesideGeometry(replace(fit, weights=NONE), free, held)
 
 
 def _stream(log: Iterable[Log], metrology: Metrology, model: Model) -> Stream:
@@ -244,7 +294,9 @@ def _held_out(stream: Stream, task: _Task, before: Fit, found: _Found) -> tuple[
         others = joined(np.delete(found.rows.factors, k, axis=0))
         fits = (
             placed(before, R[:, -1], R[:, :nuisances]),
-            task.step(found.base, others, nuisances)[0],
+            found.written(
+                task.step(found.base, others, nuisances)[0], stream.sample.part(stream.fold != k)
+            ),
         )
         judged = stream.sample.part(unseen)
         gaps = [residual(fit.model, judged, fit.frame)[0][:, :3] for fit in fits]
@@ -257,17 +309,20 @@ def _held_out(stream: Stream, task: _Task, before: Fit, found: _Found) -> tuple[
 def _result(
     model: Model, stream: Stream, before: Fit, found: _Found, held_out: tuple[float, float]
 ) -> Identification:
-    n, shown, after = model.arm.n, found.shown, found.fit
+    n, shown, after = model.arm.n, found.shown, found.written(found.fit, stream.sample)
     kept = shown.kept
     # the last step is too small to be seen in what is left before it
-    square, inlier_rows, outliers = 0.0, 0, list[Rows]()
+    square, left, inlier_rows, outliers = 0.0, 0.0, 0, list[Rows]()
     for piece, inlier in zip(stream.pieces(), found.rows.inlier, strict=True):
         gap = residual(before.model, piece.data, before.frame)[0]
         square += float(np.sum(gap[inlier, :3] ** 2))
+        if found.geometry is not None:
+            gap = residual(after.model, piece.data, after.frame)[0]
+            left += float(np.sum(gap[inlier, :3] ** 2))
         inlier_rows += int(inlier.sum())
         outliers.append(piece.rows[~inlier])
     spent = np.array([stream.nuisances, stream.nuisances + int(kept.sum())])
-    sums = np.array([square, found.rows.square])
+    sums = np.array([square, found.rows.square if found.geometry is None else left])
     gap_rms, remaining_rms = np.sqrt(sums / np.maximum(3 * inlier_rows - spent, 1))
     std, flexibility = np.sqrt(np.diag(shown.covariance)), after.flexibility
     count = stream.count - inlier_rows
@@ -277,5 +332,6 @@ def _result(
         shown.reported, after.frame,
         after.model.tool_in_flange[:3, 3] - model.tool_in_flange[:3, 3], stream.count,
         float(gap_rms), float(remaining_rms), *held_out, named,
-        tuple(notes_of(after, kept, count, stream.nuisances)),
+        tuple(notes_of(after, stream.sample, kept, count, found.geometry)),
+        tool_known=tool_known(after, stream.sample),
     )  # fmt: skip

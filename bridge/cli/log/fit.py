@@ -49,11 +49,13 @@ def fit(logs: tuple[Path, ...], cell: Path, remounted: bool, out: Path) -> None:
     under different payloads or forces. Effects of the cell are kept. Writes NEW_CELL: the same cell
     with the identified flexibilities; those that the log does not determine keep the value of the
     cell, and are reported. If the instrument is not registered, its frame and the tool point are
-    estimated too, but not written. Declines, with the reason, if nothing in the log excites the
-    compliance. A log of more than 20,000 rows, or a recording of the daemon (.mcap), is read in
-    pieces, so that memory does not grow with it. Several logs (or a column session in one) are
-    sessions: each has its own instrument frame, with --remounted also its own tool point, and all
-    share the flexibilities.
+    estimated too; the tool point is written where the log determines it (not with --remounted).
+    Where the poses are likelier with them, so are links and joints' zeros (or a registered cell's
+    tool point alone, which is written): no flexibility stands for them, and diagnose names them.
+    Declines, with the reason, if nothing in the log excites the compliance. A log of more than
+    20,000 rows, or a recording of the daemon (.mcap), is read in pieces, so that memory does not
+    grow with it. Several logs (or a column session in one) are sessions: each has its own
+    instrument frame, with --remounted also its own tool point, and all share the flexibilities.
 
     Example: gapbridge fit log.csv --cell cell.yaml --out calibrated.yaml
     """
@@ -67,9 +69,7 @@ def fit(logs: tuple[Path, ...], cell: Path, remounted: bool, out: Path) -> None:
     spread = Spread.of_fit(found.identifiable, found.covariance).beside(given.spread)
     intervals = given.intervals | fit_intervals(found)
     origin = fitted(provenance({"log": logs, "cell": [cell]}), ranges, spread, intervals)
-    # frame and tool point that were estimated along stay out of the cell
-    model = given.model.with_compliance(found.axial, found.radial)
-    save_cell(given, out, model, {"provenance": origin})
+    save_cell(given, out, found.written, {"provenance": origin})
     print_identification(found)
     click.echo(f"{out}: written")
 

@@ -1,0 +1,91 @@
+"""`fit`, then `diagnose` on the same log: what the first found the second does not take back."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import small_arm as small
+
+from gapbridge.core.diagnosis.diagnosis import diagnose
+from gapbridge.core.estimation.identification import identify_compliance
+from gapbridge.core.metrology import Metrology
+
+SOFT = replace(
+    small.NOMINAL, axial=np.array(small.KIND.axial), radial=np.array(small.KIND.radial)
+)  # fmt: skip
+SHIFT = np.array([3e-3, -2e-3, 4e-3])  # m, flange axes
+ZEROS = np.array([0.0, 1e-3, -8e-4])  # rad
+COMPLIANCE = {"axial_compliance", "radial_compliance"}
+
+
+def off_zero(session):
+    return np.tile(ZEROS, (len(session.q), 1))
+
+
+def moved(tool: bool, zeros: bool):
+    """Return the arm with a tool point, or two joints' zeros, elsewhere than the cell has them."""
+    there = small.TOOL + (SHIFT if tool else 0.0)
+    return replace(SOFT, tool_position=there, angle_errors=(off_zero,) if zeros else ())
+
+
+def fitted(real, registered: bool, seed: int):
+    session = small.session_of(seed)
+    log = small.log_of(session, small.readings(real, session, seed, registered))
+    metrology = Metrology(registered, small.SIGMA)
+    return log, metrology, identify_compliance(small.model_of(), log, metrology)
+
+
+def sigmas_off(found):
+    """Return how far the flexibilities are from the true ones (2n,), in what the fit states."""
+    apart = np.concatenate([found.axial - SOFT.axial, found.radial - SOFT.radial])
+    return np.abs(apart) / np.concatenate([found.std_axial, found.std_radial])
+
+
+@pytest.mark.parametrize("seed", [11, 12])
+@pytest.mark.parametrize(
+    ("tool", "registered"), [(False, True), (False, False), (True, True), (True, False)]
+)
+def test_nothing_is_left_to_name(tool: bool, registered: bool, seed: int):
+    log, metrology, found = fitted(moved(tool, zeros=False), registered, seed)
+    shift = found.written.tool_in_flange[:3, 3] - small.TOOL
+    np.testing.assert_allclose(shift, SHIFT if tool else 0.0, atol=2e-5)
+    assert sigmas_off(found).max() < 3.5
+    assert found.remaining_rms < 1.15 * small.FLOOR
+    (channel,) = diagnose(found.written, log, metrology).channels
+    assert channel.verdict == "no_gap"
+    assert not channel.causes
+
+
+@pytest.mark.parametrize("seed", [11, 12])
+@pytest.mark.parametrize(
+    ("tool", "registered"), [(False, True), (False, False), (True, True), (True, False)]
+)
+def test_zeros_that_are_off_become_no_flexibilities(tool: bool, registered: bool, seed: int):
+    log, metrology, found = fitted(moved(tool, zeros=True), registered, seed)
+    assert sigmas_off(found).max() < 3.5
+    (channel,) = diagnose(found.written, log, metrology).channels
+    causes = {c.effect: c for c in channel.causes}
+    assert "joint_offset" in causes
+    assert not COMPLIANCE & set(causes)
+    (zero,) = (p for p in causes["joint_offset"].parameters if p.name == "joint_offset_2")
+    assert zero.value == pytest.approx(ZEROS[1], abs=3e-5)
+    assert channel.remaining_rms < 1.15 * small.FLOOR
+
+
+def test_an_arm_as_drawn_is_fitted_as_if_its_links_were_known(monkeypatch):
+    """The links are let in where the poses are likelier with them, and cost nothing elsewhere."""
+    _, _, found = fitted(SOFT, True, 11)
+    monkeypatch.setattr("gapbridge.core.estimation.geometry.SURE", np.inf)
+    _, _, alone = fitted(SOFT, True, 11)
+    np.testing.assert_array_equal(found.covariance, alone.covariance)
+
+
+def test_a_tool_point_that_the_poses_do_not_determine_stays_the_cells():
+    """One attitude: a shift of the tool is one of the frame."""
+    session = small.session_of(3)
+    session = replace(session, q=np.tile(session.q[:1], (len(session.q), 1)))
+    log = small.log_of(session, small.readings(SOFT, session, 3, registered=False))
+    found = identify_compliance(small.model_of(), log, Metrology(False, small.SIGMA))
+    np.testing.assert_array_equal(found.written.tool_in_flange[:3, 3], small.TOOL)
