@@ -19,6 +19,7 @@ from gapbridge.core.calibration.parameters import Parameters
 from gapbridge.core.calibration.problem import HELD, Problem
 from gapbridge.core.effects import CATALOGUE
 from gapbridge.core.estimation.identification import pose_groups
+from gapbridge.core.estimation.least_squares import basis_of, projected_out
 
 Array = NDArray[np.float64]
 MOST = 3  # effects at most
@@ -26,6 +27,7 @@ SURE = 6.0  # how much more likely (log) than nothing, the number of effects tri
 SMALL = 0.05  # share of the remainder below which an effect is not worth reporting
 SHOWN = 1e-6  # share of a column that the parameters leave of it, below which it is one of them
 FOLDS = 8
+DEPENDENT = 1e-8  # share below which a direction counts as given by the others
 FEWEST = 6  # poses, below which no further effect can be judged
 CONFIDENCE = 0.99  # one-sided, that an effect gains on poses that its fit did not see
 FREE = 1e-9  # ridge on the instrument's numbers, relative to their columns
@@ -62,16 +64,16 @@ def _likely(
     tried: dict[str, Candidate], known: Array, residual: Array, found: list[MissingEffect]
 ) -> list[str]:
     """Return the effects that are far likelier than nothing, their number paid for."""
-    Q = _orthonormal(known)
-    free = residual - Q @ (Q.T @ residual)
+    Q = basis_of(known, DEPENDENT)
+    free = projected_out(Q, residual)
     whole = max(float(free @ free), 1e-300)
     likely = []
     for name, (columns, _) in tried.items():
         if any(name == lack.name for lack in found):
             continue
-        own = columns - Q @ (Q.T @ columns)
+        own = projected_out(Q, columns)
         seen = np.linalg.norm(own, axis=0) > SHOWN * np.linalg.norm(columns, axis=0)
-        own = _orthonormal(own[:, seen])
+        own = basis_of(own[:, seen], DEPENDENT)
         spare = len(residual) - Q.shape[1] - own.shape[1]
         if not own.shape[1] or spare < 1:
             continue
@@ -144,13 +146,6 @@ class _Folds:
             x = np.linalg.lstsq(G - A.T @ A, g - A.T @ residual, rcond=1e-14)[0]
             out[own] = residual - A @ x
         return out
-
-
-def _orthonormal(columns: Array) -> Array:
-    size = np.linalg.norm(columns, axis=0)
-    columns = columns[:, size > 0] / size[size > 0]
-    U, s, _ = np.linalg.svd(columns, full_matrices=False)
-    return np.asarray(U[:, s > 1e-8 * max(float(s.max(initial=0.0)), 1e-300)])
 
 
 def _columns(problem: Problem, rest: ConvergedFit) -> dict[str, Candidate]:

@@ -26,6 +26,13 @@ from gapbridge.core.calibration.readings import Readings
 from gapbridge.core.calibration.result import Errors, Estimate
 from gapbridge.core.effects import CATALOGUE
 from gapbridge.core.errors import ExcitationError
+from gapbridge.core.estimation.least_squares import (
+    DEPENDENT,
+    basis_of,
+    inverse,
+    projected_out,
+    solve,
+)
 from gapbridge.core.estimation.registration import Registration
 from gapbridge.core.metrology import Metrology
 from gapbridge.core.model import Model
@@ -73,16 +80,10 @@ class _Task:
         """Return chi-square left, degrees of freedom, the columns' values and covariance."""
         A = self.root @ np.hstack([self.F, columns])
         b = self.root @ self.residual
-        size = np.linalg.norm(A, axis=0)
-        size = np.where(size > 0, size, 1.0)
-        U, s, Vt = np.linalg.svd(A / size, full_matrices=False)
-        seen = s > 1e-9 * max(float(s.max(initial=0.0)), 1e-300)
-        inside = U[:, seen].T @ b
-        values = (Vt[seen].T @ (inside / s[seen])) / size
-        wide = (Vt[seen].T / s[seen]) @ (Vt[seen].T / s[seen]).T / np.outer(size, size)
-        rest = float(b @ b - inside @ inside)
-        m = self.F.shape[1]
-        return max(rest, 0.0), len(b) - int(seen.sum()), values[m:], wide[m:, m:]
+        basis, m = basis_of(A), self.F.shape[1]
+        values, left = solve(A, b, rank=DEPENDENT), projected_out(basis, b)
+        freedom = len(b) - basis.shape[1]
+        return float(left @ left), freedom, values[m:], inverse(A.T @ A, DEPENDENT**2)[m:, m:]
 
 
 def verify(

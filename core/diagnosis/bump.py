@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapbridge.core.diagnosis.criteria import SMOOTH_PENALTY
-from gapbridge.core.diagnosis.residual_structure import basis_of
 from gapbridge.core.diagnosis.selection.candidate import joint_quantity
 from gapbridge.core.diagnosis.selection.selection import Selection
+from gapbridge.core.estimation.least_squares import basis_of, projected_out
 from gapbridge.core.estimation.nelder_mead import nelder_mead
 
 Array = NDArray[np.float64]
@@ -32,8 +32,8 @@ def bumps(selection: Selection) -> set[int]:
             continue
         group = [c for c in here if space.candidates[c].turns_its_joint]
         rest = basis_of(space.columns([c for c in chosen if c not in group]))
-        y = space.y - rest @ (rest.T @ space.y)
-        basis = basis_of(space.columns(group) - rest @ (rest.T @ space.columns(group)))
+        y = projected_out(rest, space.y)
+        basis = basis_of(projected_out(rest, space.columns(group)))
         lines_score = float(space.misfit(np.array(y @ y - np.sum((basis.T @ y) ** 2))))
         bump = float(space.misfit(np.array(_best_bump(selection, i, rest, y))))
         penalty = 3 * np.log(space.freedom) + 2 * np.log(len(space.candidates)) + SMOOTH_PENALTY
@@ -53,7 +53,7 @@ def _best_bump(selection: Selection, i: int, rest: Array, y: Array) -> float:
     def left(at: Array) -> float:
         bump = np.exp(-0.5 * ((z - at[0]) / np.exp(at[1])) ** 2)
         x = selection.rows_of(joint * bump[:, None, None])[:, 0]
-        x = x - rest @ (rest.T @ x)
+        x = projected_out(rest, x)
         size = float(x @ x)
         return float(y @ y) - (float(x @ y) ** 2 / size if size > 1e-9 else 0.0)
 

@@ -15,12 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapbridge.core.diagnosis.criteria import VARIES
-from gapbridge.core.diagnosis.residual_structure import basis_of
 from gapbridge.core.diagnosis.selection.candidate import Candidate, joint_quantity
 from gapbridge.core.diagnosis.selection.delay_columns import exact_columns
 from gapbridge.core.diagnosis.selection.selection import Selection
 from gapbridge.core.diagnosis.selection.smooth import spline_basis
 from gapbridge.core.effects import Term
+from gapbridge.core.estimation.least_squares import basis_of, projected_out, solve
 
 Array = NDArray[np.float64]
 
@@ -70,14 +70,14 @@ def _variation(
     constant = selection.rows_of(_by_session(own, observation.quantities.get("session")))
     rest = np.hstack([space.columns([o for o in accused if o != c]), beside])
     basis = basis_of(_unit(np.hstack([constant, rest])))
-    left = space.y - basis @ (basis.T @ space.y)
+    left = projected_out(basis, space.y)
     variance = max(float(left @ left) / max(space.freedom - basis.shape[1], 1.0), space.floor)
     shapes = _shapes(selection, space.candidates[c])
     most, name, varying = 0.0, "", constant[:, :0]
     for quantity, shape in shapes.items():
         columns = own[:, :, :, None] * shape[:, None, None, :]
         rows = _unit(selection.rows_of(columns.reshape(*own.shape[:2], -1)))
-        further = basis_of(rows - basis @ (basis.T @ rows))
+        further = basis_of(projected_out(basis, rows))
         gain = float(np.sum((further.T @ left) ** 2)) / variance
         gain -= further.shape[1] * np.log(space.freedom) + 2 * np.log(len(shapes))
         if gain > most:
@@ -86,10 +86,9 @@ def _variation(
         return "", 0.0
     both = np.hstack([constant, varying])
     A = np.hstack([both, rest])
-    size = np.linalg.norm(A, axis=0) + 1e-300
-    x = np.linalg.lstsq(A / size, space.y, rcond=1e-9)[0] / size
+    x = solve(A, space.y)
     whole = both @ x[: both.shape[1]]
-    mean = constant @ np.linalg.lstsq(constant, whole, rcond=1e-9)[0]
+    mean = constant @ solve(constant, whole)
     share = float(np.linalg.norm(whole - mean) / max(float(np.linalg.norm(mean)), 1e-300))
     return name, share
 

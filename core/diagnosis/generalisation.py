@@ -17,16 +17,14 @@ from numpy.typing import NDArray
 from gapbridge.core.diagnosis.criteria import PRIOR_REACH
 from gapbridge.core.diagnosis.observation import Observation
 from gapbridge.core.diagnosis.selection.selection import Selection
+from gapbridge.core.estimation.least_squares import solve
 from gapbridge.core.estimation.regions import joint_regions
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 REGIONS = 5  # of joint space, or stretches of time: each is left out whole
-MANY_ROWS = 6000  # of the sample space: from there sums instead of a decomposition of all rows
-TINY = 1e-12  # share of the largest eigenvalue
 FEWEST = 3  # samples of a region that the figure needs
 GAP = 0.02  # share of a recording on either side of a judged stretch that is not fitted either
-RANK = 1e-9
 
 
 @dataclass(frozen=True)
@@ -86,7 +84,7 @@ class _Problem:
             fitted &= np.isin(self._session, framed)
             if judged.sum() < FEWEST or self._k * fitted.sum() <= A.shape[1]:
                 continue
-            x = _solved(A[self._rows(fitted)], self._gap[self._rows(fitted)], self._hold)
+            x = solve(A[self._rows(fitted)], self._gap[self._rows(fitted)], self._hold)
             rows = self._rows(judged)
             left.append(self._in_unit(self._gap[rows] - A[rows] @ x, judged))
         if len(left) < 2:
@@ -104,10 +102,10 @@ class _Problem:
             rows = self._rows(~out)
             if len(self._gap[rows]) <= A.shape[1]:
                 continue
-            x = _solved(A[rows], self._gap[rows], self._hold)[: self._causes.shape[1]]
+            x = solve(A[rows], self._gap[rows], self._hold)[: self._causes.shape[1]]
             rows = self._rows(out)
             left, N = self._gap[rows] - self._causes[rows] @ x, self._nuisance[rows][:, own]
-            left = left - N @ _solved(N, left)
+            left = left - N @ solve(N, left)
             found.append((int(s), self._in_unit(left, out)))
         return found
 
@@ -148,28 +146,6 @@ def regions(
     poses = np.stack([observation.quantities[name][kept] for name in names], axis=1)
     fold = joint_regions(poses, REGIONS, seed)
     return fold, np.zeros((int(fold.max()) + 1, n), dtype=bool)
-
-
-def _solved(A: Array, b: Array, hold: Array | None = None) -> Array:
-    """Return the least squares solution (p,), columns scaled to one length.
-
-    ``hold`` (<= p,), one over a size, pulls the first columns' values towards zero: what the rows
-    at hand do not show stays there, instead of running to what other rows would never allow.
-    """
-    if not A.shape[1]:
-        return np.zeros(0)
-    ridge = np.zeros(A.shape[1])
-    if hold is not None:
-        ridge[: len(hold)] = hold**2
-    G = A.T @ A + np.diag(ridge)
-    unit = 1 / np.sqrt(np.diag(G) + 1e-300)
-    if len(A) > MANY_ROWS:
-        size, V = np.linalg.eigh(G * np.outer(unit, unit))
-        inverse = np.where(size > TINY * size[-1], 1 / np.maximum(size, 1e-300), 0.0)
-        return np.asarray(unit * (V @ (inverse * (V.T @ (unit * (A.T @ b))))))
-    rows = np.vstack([A, np.diag(np.sqrt(ridge))]) * unit
-    right = np.concatenate([b, np.zeros(len(ridge))])
-    return np.asarray(np.linalg.lstsq(rows, right, rcond=RANK)[0] * unit)
 
 
 def _rms(values: Array) -> float:

@@ -40,7 +40,6 @@ from gapbridge.core.diagnosis.remainder import (
     withstanding,
 )
 from gapbridge.core.diagnosis.residual_structure import (
-    basis_of,
     dependence,
     structure_p_value,
 )
@@ -52,6 +51,7 @@ from gapbridge.core.diagnosis.selection.refit import Remainder, worth
 from gapbridge.core.diagnosis.selection.selection import Selection, refitted_alone
 from gapbridge.core.diagnosis.selection.stiffness_curves import without_curvature
 from gapbridge.core.errors import InputError
+from gapbridge.core.estimation.least_squares import basis_of, projected_out
 
 Array = NDArray[np.float64]
 VAGUE = Withdrawal(Check.SIGNIFICANT)
@@ -246,7 +246,7 @@ def _like_a_load(selection: Selection) -> dict[int, str]:
                 continue
             x = space.columns([other])
             whole = float(np.sum(x**2))
-            if whole > 0 and float(np.sum((x - U @ (U.T @ x)) ** 2)) < SAME_SPAN * whole:
+            if whole > 0 and float(np.sum(projected_out(U, x) ** 2)) < SAME_SPAN * whole:
                 alike.append(candidate.family)
         if alike:
             found[c] = " or ".join(dict.fromkeys(alike))
@@ -386,15 +386,15 @@ def covering_effects(space: SampleSpace, found: CandidateFit, c: int) -> list[in
     """
     rest = basis_of(space.columns([o for o in found.chosen if o != c]))
     x = space.columns([c])
-    x = x - rest @ (rest.T @ x)
+    x = projected_out(rest, x)
     whole = float(np.sum(x**2))
     listed = []
     for other, k in enumerate(space.candidates):
         if other == c or other in found.chosen or not _geometric(k):
             continue
         U = space.columns([other])
-        U = basis_of(U - rest @ (rest.T @ U))
-        if whole > 0 and float(np.sum((x - U @ (U.T @ x)) ** 2)) < SAME_SPAN * whole:
+        U = basis_of(projected_out(rest, U))
+        if whole > 0 and float(np.sum(projected_out(U, x) ** 2)) < SAME_SPAN * whole:
             listed.append(other)
     return listed
 

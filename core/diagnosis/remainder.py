@@ -27,13 +27,13 @@ from gapbridge.core.diagnosis.criteria import (
 from gapbridge.core.diagnosis.held_out import HeldOut
 from gapbridge.core.diagnosis.observation import Observation
 from gapbridge.core.diagnosis.regions import parts, regions
-from gapbridge.core.diagnosis.residual_structure import basis_of
 from gapbridge.core.diagnosis.selection.candidate import Candidate, carrying, joint_target
 from gapbridge.core.diagnosis.selection.delay_columns import as_one_delay
 from gapbridge.core.diagnosis.selection.problem import gains
 from gapbridge.core.diagnosis.selection.refit import Remainder
 from gapbridge.core.diagnosis.selection.selection import Selection
 from gapbridge.core.diagnosis.selection.smooth import targets
+from gapbridge.core.estimation.least_squares import basis_of, projected_out, solve
 
 Array = NDArray[np.float64]
 SHOWN = 0.3  # share of a number that may lie in such directions
@@ -138,7 +138,7 @@ class _Beside:
             self._asked = asked
         value, spread, shown = self._values(accused, *self._beyond(accused, asked))
         found = [self._unit(accused), self.space.columns(self._first), self._zero(accused)]
-        alone = np.linalg.lstsq(np.hstack(found), self.space.y, rcond=1e-9)[0]
+        alone = solve(np.hstack(found), self.space.y)
         begin = 0
         sigmas: list[float] = []
         steady: list[float] = []
@@ -163,7 +163,7 @@ class _Beside:
         for _ in range(most if len(self._index) else 0):
             zero = self._zero(accused)
             basis = basis_of(np.hstack([space.columns(accused), self._beside(asked), zero]))
-            left = space.y - basis @ (basis.T @ space.y)
+            left = projected_out(basis, space.y)
             freedom = max(space.freedom - basis.shape[1], 1.0)
             variance = max(float(left @ left) / freedom, space.floor)
             gain = gains(space, left, basis)[0][self._index] / variance - self._price
@@ -182,7 +182,7 @@ class _Beside:
             return np.zeros((len(self.space.y), 0))
         C = np.hstack(list(self._constant.values()))
         V = basis_of(self._unit(accused))
-        left = np.linalg.norm(C - V @ (V.T @ C), axis=0) / np.linalg.norm(C, axis=0)
+        left = np.linalg.norm(projected_out(V, C), axis=0) / np.linalg.norm(C, axis=0)
         return np.asarray(C[:, left > 1e-6])
 
     def _beside(self, asked: Sequence[int]) -> Array:
@@ -206,7 +206,7 @@ class _Beside:
             return np.full(width, np.inf)
         beside = self._beside(asked)
         A = np.hstack([self._unit(accused), beside])
-        solution = np.linalg.lstsq(A, space.y, rcond=1e-9)[0]
+        solution = solve(A, space.y)
         rss = float(np.sum((space.y - A @ solution) ** 2))
         scatter = np.sqrt(max(rss / max(space.freedom - A.shape[1], 1.0), space.floor))
         x = solution[A.shape[1] - beside.shape[1] :]
@@ -238,11 +238,11 @@ class _Beside:
                 continue
             others = self._beside([o for o in asked if o != c])
             rest = basis_of(np.hstack([X[:, ~inside], others]))
-            own, whole = (basis_of(A - rest @ (rest.T @ A)) for A in (X[:, inside], U))
+            own, whole = (basis_of(projected_out(rest, A)) for A in (X[:, inside], U))
             if np.sum((own.T @ space.y) ** 2) < MOSTLY * np.sum((whole.T @ space.y) ** 2):
                 continue
             V = basis_of(X[:, inside])
-            beside = np.hstack([U - V @ (V.T @ U), others])
+            beside = np.hstack([projected_out(V, U), others])
         free = np.full(beside.shape[1] - len(constants), np.inf)
         return beside, np.concatenate([free, constants])
 
@@ -270,7 +270,7 @@ class _Beside:
 
         def solved(rows: NDArray[np.bool_]) -> tuple[Array, Array, Array, float]:
             A, b, U = X[rows], y[rows], basis_of(beside[rows])
-            A, b = A - U @ (U.T @ A), b - U @ (U.T @ b)
+            A, b = projected_out(U, A), projected_out(U, b)
             size, V = np.linalg.eigh(A.T @ A)
             open_ = size > DEGENERATE
             inverse = (V * np.where(open_, 1 / np.maximum(size, DEGENERATE), 0)) @ V.T
@@ -308,7 +308,7 @@ class _Beside:
         C = np.hstack([functions[:, :0], *constants])
         V = basis_of(selection.space.columns(accused))
         size = np.maximum(np.linalg.norm(C, axis=0), 1e-300)
-        beyond = np.linalg.norm(C - V @ (V.T @ C), axis=0) / size
+        beyond = np.linalg.norm(projected_out(V, C), axis=0) / size
         free = np.isfinite(sigma) | (beyond**2 > DEGENERATE)
         columns = np.hstack([functions, C[:, free]])
         sigma = np.concatenate([np.full(functions.shape[1], np.inf), sigma[free]])

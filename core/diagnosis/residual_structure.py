@@ -16,21 +16,13 @@ from numpy.typing import NDArray
 
 from gapbridge.core.diagnosis.observation import HELD
 from gapbridge.core.diagnosis.selection.problem import SampleSpace
+from gapbridge.core.estimation.least_squares import basis_of, projected_out
 
 Array = NDArray[np.float64]
 DRAWS = 1500
 AT_ONCE = 200  # directions: with all draws 2.4 MB
 FOLDS = 7
 ABOUT = 0.05  # held-out share within which two quantities say the same
-
-
-def basis_of(columns: Array) -> Array:
-    """Return an orthonormal basis of columns (m, r), nearly dependent ones left out."""
-    if not columns.shape[1]:
-        return columns
-    unit = columns / (np.sqrt(np.einsum("ij,ij->j", columns, columns)) + 1e-300)
-    U, s, _ = np.linalg.svd(unit, full_matrices=False)
-    return np.asarray(U[:, s > 1e-6 * max(s[0], 1e-300)])
 
 
 def structure_p_value(
@@ -106,7 +98,7 @@ def dependence(
     ``groups`` (m,) says which rows of the sample space are held out together.
     """
     fitted = basis_of(np.hstack([nuisance, space.columns(chosen)]))
-    r = space.y - fitted @ (fitted.T @ space.y)
+    r = projected_out(fitted, space.y)
     names = np.unique(groups)
     fold_of = np.random.default_rng(seed).permutation(len(names)) % FOLDS
     fold = fold_of[np.searchsorted(names, groups)]
@@ -118,7 +110,7 @@ def dependence(
     for size, members in by_size.items():
         for few in np.array_split(members, 1 + len(members) * size // AT_ONCE):
             columns = space.X[:, space.column_indices(few.tolist())]
-            clean = columns - fitted @ (fitted.T @ columns)
+            clean = projected_out(fitted, columns)
             blocks = clean.reshape(len(r), len(few), size).transpose(1, 0, 2)
             for c, share in zip(few, _held_out_shares(blocks, r, fold), strict=True):
                 quantity = space.candidates[c].quantity

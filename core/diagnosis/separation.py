@@ -22,6 +22,7 @@ from gapbridge.core.diagnosis.selection.local_search import rivals
 from gapbridge.core.diagnosis.selection.problem import CandidateFit, SampleSpace, fit
 from gapbridge.core.effects import CATALOGUE, Site, Term
 from gapbridge.core.errors import InputError
+from gapbridge.core.estimation.least_squares import solve
 from gapbridge.core.estimation.registration import frame_columns
 from gapbridge.core.log.log import Log
 from gapbridge.core.model import Model
@@ -149,7 +150,7 @@ def _framed(nuisance: Array, seen: Array, position: Array) -> Array:
     """Return how the frame that takes up the log's difference moves the readings of trials."""
     A = nuisance[:, :3].reshape(-1, nuisance.shape[2])
     # of several sessions the trials go on with the first one's frame
-    x = np.linalg.lstsq(A, seen[:, :3].ravel(), rcond=1e-9)[0][:6]
+    x = solve(A, seen[:, :3].ravel())[:6]
     return np.asarray(-frame_columns(position)[:, :3] @ x)
 
 

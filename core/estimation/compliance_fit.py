@@ -15,7 +15,9 @@ from numpy.typing import NDArray
 
 from gapbridge.core.effects import CATALOGUE
 from gapbridge.core.effects.effect import typical_moment
+from gapbridge.core.estimation import least_squares
 from gapbridge.core.estimation.geometry import Geometry, likelier, with_geometry
+from gapbridge.core.estimation.least_squares import basis_of, projected_out
 from gapbridge.core.estimation.registration import (
     IDENTITY,
     Registration,
@@ -34,7 +36,6 @@ Mask = NDArray[np.bool_]
 ROUNDS = 12
 NUISANCE_ROUNDS = 20
 CONVERGED = 1e-8  # relative step at which a fit has converged
-ROUNDING = 1e-14  # share of a product that is none
 RANK = 1e-10  # singular values of the nuisances below this share are rounding
 AT_ONCE = 2000  # rows of one decomposition; of 60,000 by 22 columns it takes 9 ms, whole 24 ms
 
@@ -191,12 +192,6 @@ def nuisance_columns(model: Model, poses: Poses, width: int, data: Data | None =
     return whole
 
 
-def orthonormal(columns: Array) -> Array:
-    """Return an orthonormal base of the columns (M, k); what is only rounding is left out."""
-    U, s, _ = np.linalg.svd(columns, full_matrices=False)
-    return np.asarray(U[:, s > RANK * max(float(s.max(initial=0.0)), 1e-300)])
-
-
 def fit_nuisances(
     model: Model, data: Data, begin: Registration | Placements | None = None,
     converged: float = CONVERGED,
@@ -237,7 +232,7 @@ def _placed(
         step = np.zeros(data.nuisances)
         flat = np.concatenate([columns, gap[..., None]], axis=2) * per_cell[..., None]
         R = r_factor(flat.reshape(gap.size, -1))
-        step[free] = np.linalg.lstsq(R[:, :-1], R[:, -1], rcond=RANK)[0]
+        step[free] = least_squares.solve(R[:, :-1], R[:, -1], rank=RANK)
         model, frame = moved(model, frame, step)
         if np.abs(step).max(initial=0.0) < converged:
             break
@@ -386,12 +381,11 @@ def stepped(
     """
     F, A, b = problem
     model, frame, flexibility = now.model, now.frame, now.flexibility
-    base = orthonormal(F) if F.shape[1] else F
-    linear = _projected(A, b + A @ flexibility, base)
+    linear = _projected(A, b + A @ flexibility, basis_of(F, RANK))
     found = solve(linear, kept, flexibility, prior)
     if F.shape[1]:
         left = b - A @ (found - flexibility)
-        step = np.asarray(np.linalg.lstsq(F, left, rcond=RANK)[0], float)
+        step = least_squares.solve(F, left, rank=RANK)
         if now.geometry is not None:
             count = len(now.geometry.sigma)
             model, step = now.geometry.moved(model, step[:count]), step[count:]
@@ -431,7 +425,7 @@ def projected(fit: Fit, data: Data, geometry: Geometry | None) -> Linear:
     R = weighed(fit.model, fit.frame, data, cells, poses, geometry)
     n = fit.model.arm.n
     F, A, b = R[:, : -2 * n - 1], R[:, -2 * n - 1 : -1], R[:, -1]
-    return _projected(A, b + A @ fit.flexibility, orthonormal(F) if F.shape[1] else F)
+    return _projected(A, b + A @ fit.flexibility, basis_of(F, RANK))
 
 
 def tool_deviation(fit: Fit, data: Data) -> float:
@@ -446,8 +440,7 @@ def tool_deviation(fit: Fit, data: Data) -> float:
     cells = (gap, per_cell_of(weights, scale, gap.shape[1]))
     R = weighed(fit.model, fit.frame, data, cells, poses)
     tool = 6 * data.frames + np.arange(3)
-    Q = orthonormal(R[:, : tool[0]])
-    own = R[:, tool] - Q @ (Q.T @ R[:, tool])
+    own = projected_out(basis_of(R[:, : tool[0]], RANK), R[:, tool])
     return 1 / max(float(np.linalg.svd(own, compute_uv=False)[-1]), 1e-300)
 
 
@@ -467,7 +460,7 @@ def as_written(fit: Fit, data: Data) -> Fit:
 def _projected(A: Array, b: Array, Q: Array) -> Linear:
     """Return the problem off the nuisances ``Q``, brought to as few rows as it has unknowns."""
     whole = np.column_stack([A, b])
-    R = np.asarray(np.linalg.qr(whole - Q @ (Q.T @ whole), mode="r"))
+    R = np.asarray(np.linalg.qr(projected_out(Q, whole), mode="r"))
     return Linear(R[:, :-1], R[:, -1])
 
 
@@ -477,39 +470,15 @@ def solve(linear: Linear, kept: Mask, now: Array, prior: tuple[Array, float]) ->
     None is below zero; one at that bound is exactly zero.
     """
     centre, sigma = prior
-    found = now.copy()
-    if not kept.any():
+    found, count = now.copy(), int(kept.sum())
+    if not count:
         return found
-    A = linear.matrix[:, kept]
-    # scaled by what data and prior say together: a column of rounding errors stays harmless
-    norm = np.linalg.norm(A, axis=0)
-    unit = 1 / np.sqrt(norm**2 + sigma**-2 + (1e-9 * norm.max()) ** 2)
-    rows = np.vstack([A * unit, np.diag(unit / sigma)])
+    rows = np.vstack([linear.matrix[:, kept], np.eye(count) / sigma])
     right = np.concatenate(
         [linear.right - linear.matrix[:, ~kept] @ now[~kept], centre[kept] / sigma]
     )
-    found[kept] = not_negative(rows, right) * unit
+    found[kept] = least_squares.bounded(rows, right, np.zeros(count), np.full(count, np.inf))[0]
     return found
-
-
-def not_negative(rows: Array, right: Array) -> Array:
-    """Return the least squares solution of rows x = right with no x below zero.
-
-    Where x of all that stays positive meets the conditions of an optimum (Kuhn, Tucker 1951) it is
-    the solution; else scipy searches for it, whose import takes a quarter of a second.
-    """
-    free = np.ones(rows.shape[1], dtype=bool)
-    x = np.linalg.lstsq(rows, right, rcond=None)[0]
-    while free.any() and (x[free] < 0).any():
-        free &= x >= 0
-        x = np.zeros(len(free))
-        x[free] = np.linalg.lstsq(rows[:, free], right, rcond=None)[0]
-    gain = rows[:, ~free].T @ (right - rows @ x)
-    if (gain <= ROUNDING * np.linalg.norm(right) * np.linalg.norm(rows[:, ~free], axis=0)).all():
-        return np.asarray(x)
-    from scipy.optimize import nnls
-
-    return np.asarray(nnls(rows, right, maxiter=100 * rows.shape[1])[0])
 
 
 def moved(

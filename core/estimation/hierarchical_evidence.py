@@ -19,11 +19,11 @@ from gapbridge.core.estimation.compliance_fit import (
     fit_nuisances,
     noise_of,
     nuisance_columns,
-    orthonormal,
     prior_of,
     residual,
 )
 from gapbridge.core.estimation.identification import measured_rows
+from gapbridge.core.estimation.least_squares import basis_of, projected_out
 from gapbridge.core.estimation.robust import OUTLIER, distance_of, scale_of
 from gapbridge.core.log.log import Log
 from gapbridge.core.metrology import Metrology
@@ -85,8 +85,8 @@ def _folded(fit: Fit, data: Data, metrology: Metrology) -> Evidence:
     spent = 0
     if data.nuisances:
         columns = nuisance_columns(fit.model, poses, width)[inlier] * unit[..., None]
-        Q = orthonormal(columns.reshape(len(A), -1))
-        whole, spent = whole - Q @ (Q.T @ whole), Q.shape[1]
+        Q = basis_of(columns.reshape(len(A), -1), RANK)
+        whole, spent = projected_out(Q, whole), Q.shape[1]
     R = np.zeros((count + 1, count + 1))
     upper = np.linalg.qr(whole, mode="r")
     R[: len(upper)] = upper

@@ -16,6 +16,7 @@ from gapbridge.core.errors import ExcitationError, LogError
 from gapbridge.core.estimation import base_parameters
 from gapbridge.core.estimation.compliance_fit import (
     CONVERGED,
+    RANK,
     Data,
     Fit,
     Mask,
@@ -24,14 +25,14 @@ from gapbridge.core.estimation.compliance_fit import (
     beside_geometry,
     fit_flexibilities,
     fit_nuisances,
-    orthonormal,
     placed_gap,
     prior_of,
     residual,
     tool_deviation,
     weighed,
 )
-from gapbridge.core.estimation.geometry import Geometry
+from gapbridge.core.estimation.geometry import TOOL, Geometry
+from gapbridge.core.estimation.least_squares import basis_of, projected_out
 from gapbridge.core.estimation.regions import joint_regions
 from gapbridge.core.estimation.registration import IDENTITY, Registration
 from gapbridge.core.log.log import Log
@@ -44,6 +45,9 @@ Array = NDArray[np.float64]
 FOLDS = 5
 SAME_POSE = 1e-3  # rad, of every joint
 TOOL_KNOWN = 2e-4  # m, 1 sigma: a tool point that is known worse stays the cell's
+TOOL_NEAR = (
+    3 * TOOL
+)  # m from the cell's: a point farther off is none that somebody took for the TCP
 NEAR = 1e-4  # relative step at which a fit has converged that is only judged by
 NEAR_FRAME = 1e-6  # m, rad: step at which a frame has converged that is only judged by
 LOOK = 3  # rounds of the fit of everything, from which the choice is made
@@ -198,8 +202,7 @@ def require_excitation(model: Model, data: Data, metrology: Metrology, usual: fl
         )
     nothing, all_alike = np.zeros((len(data.q), 3)), np.ones((len(data.q), 3))
     R = weighed(model, IDENTITY, replace(data, rotation=None), (nothing, all_alike))[:, :-1]
-    Q = orthonormal(R[:, : -2 * n])
-    form = R[:, -2 * n :] - Q @ (Q.T @ R[:, -2 * n :])
+    form = projected_out(basis_of(R[:, : -2 * n], RANK), R[:, -2 * n :])
     shown = np.linalg.norm(form, axis=0) * usual
     if not (shown > 3 * metrology.sigma).any():
         weightless = not model.arm.mass.any() and data.loads.wrench is None
@@ -310,26 +313,36 @@ def _result(
     after = as_written(fits[1], data)
     gaps = [residual(fit.model, data, fit.frame)[0][inlier][:, :3] for fit in (fits[0], after)]
     std, flexibility = np.sqrt(np.diag(shown.covariance)), after.flexibility
+    known, count = tool_known(after, data, model), int((~inlier).sum())
     return Identification(
         after.model, flexibility[:n], flexibility[n:], std[:n], std[n:], shown.covariance, kept,
         shown.reported, after.frame,
         after.model.tool_in_flange[:3, 3] - model.tool_in_flange[:3, 3], len(data.q),
         _rms(gaps[0], data.nuisances), _rms(gaps[1], data.nuisances + int(kept.sum())),
         *held_out, used[~inlier],
-        tuple(notes_of(after, data, kept, int((~inlier).sum()), fits[1].geometry)),
-        tool_known=tool_known(after, data),
+        tuple(notes_of(after, kept, count, data.nuisances, known, fits[1].geometry)),
+        tool_known=known,
     )  # fmt: skip
 
 
-def tool_known(fit: Fit, data: Data) -> bool:
-    """Return whether the cell gets a tool point found: one for all sessions, and a sure one."""
+def tool_known(fit: Fit, data: Data, nominal: Model) -> bool:
+    """Return whether the cell gets the tool point found: one for all sessions, sure, and a TCP's.
+
+    What is farther off than a TCP may be is a target that sits elsewhere on the tool.
+    """
+    shift = fit.model.tool_in_flange[:3, 3] - nominal.tool_in_flange[:3, 3]
+    if np.linalg.norm(shift) > TOOL_NEAR:
+        return False
     return data.tools == 0 or tool_deviation(fit, data) < TOOL_KNOWN
 
 
 def notes_of(
-    fit: Fit, data: Data, kept: Mask, outlier: int, geometry: Geometry | None
+    fit: Fit, kept: Mask, outlier: int, nuisances: int, tool: bool, geometry: Geometry | None
 ) -> list[str]:
-    """Return in words what a fit was like: outliers, bounds reached, what was not identifiable."""
+    """Return in words what a fit was like: outliers, bounds reached, what was not identifiable.
+
+    ``tool``: the tool point found is written.
+    """
     notes = []
     if outlier:
         notes.append(f"{outlier} outlier(s) down-weighted")
@@ -341,8 +354,8 @@ def notes_of(
         notes.append("these data show no flexibility at all: the model is left as it was")
     if isinstance(fit.frame, Placements) and len(fit.frame.frames) > 1:
         notes.append("each session has a frame of its own, not written to the cell")
-    elif data.nuisances:
-        written = "the tool point is" if tool_known(fit, data) else "they are not"
+    elif nuisances:
+        written = "the tool point is" if tool else "they are not"
         notes.append(f"frame and tool point were estimated along; {written} written to the cell")
     if geometry is not None and geometry.has_links:
         notes.append(
@@ -350,5 +363,7 @@ def notes_of(
             "are not written to the cell: diagnose names what of them holds"
         )
     elif geometry is not None:
-        notes.append("the tool point is off: the cell has the one found")
+        notes.append(
+            f"the tool point is off: the one found is {'' if tool else 'not '}written to the cell"
+        )
     return notes

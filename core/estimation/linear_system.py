@@ -11,6 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from gapbridge.core.estimation.least_squares import bounded, inverse
+
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
@@ -43,45 +45,26 @@ def solve(
 ) -> tuple[Array, Array, Mask]:
     """Return the steps of parameters (p,) and nuisances (m,), and who ends on a bound (p,).
 
-    Parameters not ``free`` do not move. One that would pass its bound stops on it and the others
-    are found anew. ``damping`` shortens the parameters' steps, in lengths of their columns.
+    Parameters not ``free`` do not move. ``damping`` shortens the parameters' steps, in lengths of
+    their columns.
     """
-    p, moving = len(at), free.copy()
-    step = np.zeros(p)
-    stuck = np.zeros(p, dtype=bool)
-    while True:
-        fixed = System(system.J[:, moving], system.F, system.residual - system.J @ (step * ~moving))
-        part, nuisance = _least_squares(fixed, at[moving], bounds, moving, damping)
-        step[moving] = part
-        low, high = at + step < bounds.lower, at + step > bounds.upper
-        out = (low | high) & moving
-        if not out.any():
-            return step, nuisance, stuck
-        # the one that is furthest out, in its own size, stops first
-        far = np.maximum(bounds.lower - at - step, at + step - bounds.upper) / bounds.held
-        first = int(np.argmax(np.where(out, far, -np.inf)))
-        step[first] = (bounds.lower if low[first] else bounds.upper)[first] - at[first]
-        moving[first], stuck[first] = False, True
-
-
-def _least_squares(
-    system: System, at: Array, bounds: Bounds, moving: Mask, damping: float
-) -> tuple[Array, Array]:
-    p, m = system.J.shape[1], system.F.shape[1]
-    rows = [
-        np.hstack([system.J, system.F]),
-        np.hstack([np.diag(1 / bounds.held[moving]), np.zeros((p, m))]),
-    ]
-    right = [system.residual, (bounds.begin[moving] - at) / bounds.held[moving]]
+    J, held = system.J[:, free], bounds.held[free]
+    p, m = J.shape[1], system.F.shape[1]
+    rows = [np.hstack([J, system.F]), np.hstack([np.diag(1 / held), np.zeros((p, m))])]
+    right = [system.residual, (bounds.begin - at)[free] / held]
     if damping > 0:
-        length = np.hypot(np.linalg.norm(system.J, axis=0), 1 / bounds.held[moving])
+        length = np.hypot(np.linalg.norm(J, axis=0), 1 / held)
         rows.append(np.hstack([np.diag(np.sqrt(damping) * length), np.zeros((p, m))]))
         right.append(np.zeros(p))
-    A = np.vstack(rows)
-    size = np.linalg.norm(A, axis=0)
-    size = np.where(size > 0, size, 1.0)
-    found = np.linalg.lstsq(A / size, np.concatenate(right), rcond=1e-13)[0] / size
-    return found[:p], found[p:]
+    wide = np.full(m, np.inf)
+    found, on_bound = bounded(
+        np.vstack(rows), np.concatenate(right),
+        np.concatenate([(bounds.lower - at)[free], -wide]),
+        np.concatenate([(bounds.upper - at)[free], wide]),
+    )  # fmt: skip
+    step, stuck = np.zeros(len(at)), np.zeros(len(at), dtype=bool)
+    step[free], stuck[free] = found[:p], on_bound[:p]
+    return step, found[p:], stuck
 
 
 def posterior(system: System, bounds: Bounds) -> tuple[Array, float, Array]:
@@ -112,4 +95,4 @@ def _scaled_covariance(system: System, bounds: Bounds) -> tuple[Array, Array, Ar
     size = np.concatenate([1 / bounds.held, nuisances])
     A = np.hstack([system.J, system.F]) / size
     ridge = np.concatenate([np.ones(len(bounds.held)), np.zeros(len(nuisances))])
-    return A, np.linalg.pinv(A.T @ A + np.diag(ridge), rcond=1e-14, hermitian=True), size
+    return A, inverse(A.T @ A + np.diag(ridge)), size

@@ -15,6 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from gapbridge.core.estimation.least_squares import inverse, solve
+
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 STARTING, ROUNDS = 12, 60
@@ -77,7 +79,7 @@ def robust_fit(A: Array, b: Array, unit: Index, row: Index, rounds: int = ROUNDS
     left_over = np.sqrt(max(1 - A.shape[1] / len(b), 0.1))
     for turn in range(STARTING + rounds):
         before, root = weights, np.sqrt(weights[row]) / noise[unit]
-        values = np.asarray(np.linalg.lstsq(A * root[:, None], b * root, rcond=None)[0], float)
+        values = solve(A * root[:, None], b * root)
         left, starting = b - A @ values, turn < STARTING
         if starting:
             noise = np.array([scale_of(left[unit == u]) for u in range(units)]) / left_over
@@ -89,8 +91,7 @@ def robust_fit(A: Array, b: Array, unit: Index, row: Index, rounds: int = ROUNDS
             break
     root = np.sqrt(weights[row]) / noise[unit]
     scaled = A * root[:, None]
-    inverse = np.linalg.pinv(scaled.T @ scaled, rcond=1e-15, hermitian=True)
-    covariance = np.asarray(inverse, float)
+    covariance = inverse(scaled.T @ scaled)
     # the unit that is known from the fewest cells says how sure the noise is
     freedom = max(float(spare.min()), 1.0)
     return RobustFit(values, covariance, noise, freedom, weights, np.flatnonzero(weights == 0))

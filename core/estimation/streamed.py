@@ -325,13 +325,13 @@ def _result(
     sums = np.array([square, found.rows.square if found.geometry is None else left])
     gap_rms, remaining_rms = np.sqrt(sums / np.maximum(3 * inlier_rows - spent, 1))
     std, flexibility = np.sqrt(np.diag(shown.covariance)), after.flexibility
-    count = stream.count - inlier_rows
+    count, known = stream.count - inlier_rows, tool_known(after, stream.sample, model)
     named = np.fromiter(islice((row for rows in outliers for row in rows), MANY_OUTLIERS), np.int64)
     return Identification(
         after.model, flexibility[:n], flexibility[n:], std[:n], std[n:], shown.covariance, kept,
         shown.reported, after.frame,
         after.model.tool_in_flange[:3, 3] - model.tool_in_flange[:3, 3], stream.count,
         float(gap_rms), float(remaining_rms), *held_out, named,
-        tuple(notes_of(after, stream.sample, kept, count, found.geometry)),
-        tool_known=tool_known(after, stream.sample),
+        tuple(notes_of(after, kept, count, stream.nuisances, known, found.geometry)),
+        tool_known=known,
     )  # fmt: skip

@@ -26,6 +26,7 @@ from gapbridge.core.estimation.compliance_fit import (
     residual,
     weights_at,
 )
+from gapbridge.core.estimation.least_squares import solve
 
 Array = NDArray[np.float64]
 FOLDS = 5
@@ -106,7 +107,7 @@ def placed(fit: Fit, left: Array, F: Array) -> Fit:
     """Return the fit with its nuisances moved so that F @ step takes up what is ``left``."""
     if not F.shape[1]:
         return fit
-    step = np.linalg.lstsq(F, left, rcond=RANK)[0]
+    step = solve(F, left, rank=RANK)
     return Fit(*moved(fit.model, fit.frame, step), NONE)
 
 

@@ -17,6 +17,7 @@ from gapbridge.core.calibration.observables.nuisance import Layout, Nuisance
 from gapbridge.core.calibration.parameters import Parameters
 from gapbridge.core.calibration.readings import Readings
 from gapbridge.core.errors import ExcitationError
+from gapbridge.core.estimation.least_squares import solve
 from gapbridge.core.estimation.pose_jacobian import pose_columns
 from gapbridge.core.estimation.robust import start_weights
 from gapbridge.core.model import Model, Poses
@@ -160,7 +161,7 @@ class Observable(ABC):
             root = np.repeat(np.sqrt(start_weights(gap)), self.equations)
             F = self.nuisance_columns(poses, readings, nuisance)
             F = F / np.tile(self.sigmas, len(readings))[:, None]
-            step = np.linalg.lstsq(F * root[:, None], gap.ravel() * root, rcond=1e-10)[0]
+            step = solve(F * root[:, None], gap.ravel() * root)
             nuisance = nuisance.moved(step, layout)
             if np.abs(step).max() < SETTLED:
                 break

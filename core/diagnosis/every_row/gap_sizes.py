@@ -12,6 +12,7 @@ from gapbridge.core.diagnosis.every_row.streamed import Streamed
 from gapbridge.core.diagnosis.noise_floor import block_means, own_coordinates
 from gapbridge.core.diagnosis.observation import Observation
 from gapbridge.core.diagnosis.selection.selection import Selection
+from gapbridge.core.estimation.least_squares import solve
 
 Array = NDArray[np.float64]
 
@@ -71,6 +72,6 @@ def gaps(selection: Selection, chosen: Sequence[int]) -> tuple[Array, Array]:
             kept = selection.kept
             A = (W @ observation.nuisance)[kept].reshape(-1, observation.nuisance.shape[2])
             b = (W @ gap[..., None])[kept].ravel()
-            gap = gap - observation.nuisance @ np.linalg.lstsq(A, b, rcond=1e-12)[0]
+            gap = gap - observation.nuisance @ solve(A, b)
         found.append(gap)
     return found[0], found[1]

@@ -34,6 +34,7 @@ from gapbridge.core.diagnosis.selection.refit import Remainder, refit, worth
 from gapbridge.core.diagnosis.selection.selection import Selection, refitted_alone
 from gapbridge.core.diagnosis.selection.state import SelectionState, sample_space
 from gapbridge.core.effects import Term
+from gapbridge.core.estimation.least_squares import solve
 from gapbridge.core.estimation.robust import start_weights
 from gapbridge.core.model import Model
 
@@ -174,5 +175,4 @@ def _placed(whole: Observation, terms: Sequence[Term]) -> Observation:
     weight = whole.weight[: gap.shape[1]]
     A, b = (whole.nuisance * weight[:, None]).reshape(gap.size, -1), gap * weight
     row = np.repeat(start_weights(b), gap.shape[1])
-    step = np.linalg.lstsq(A * row[:, None], b.ravel() * row, rcond=1e-12)[0]
-    return whole.rebase(np.asarray(step))
+    return whole.rebase(solve(A * row[:, None], b.ravel() * row))

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapbridge.core.arm import Arm
+from gapbridge.core.estimation.least_squares import solve
 from gapbridge.core.estimation.registration import register
 from gapbridge.core.log.log_finding import LogCheck, LogFinding
 from gapbridge.core.model import Model
@@ -94,7 +95,7 @@ def _point_on_flange(position: Array, rotation: Array, seen: Array) -> tuple[Arr
             turn[:, :, k] = np.cross(axis, found)
         shift = np.broadcast_to(np.eye(3), turn.shape)
         columns = np.concatenate([rotation, -turn, -shift], axis=2).reshape(-1, 9)
-        point = point + np.linalg.lstsq(columns, apart, rcond=1e-6)[0][:3]
+        point = point + solve(columns, apart, rank=1e-6)[:3]
     there = position + rotation @ point
     left = np.linalg.norm(register(seen, there).in_base(seen) - there, axis=1)
     return point, np.asarray(left)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from gapbridge.core.dynamics import predict_torque, predict_wrench
 from gapbridge.core.errors import InputError
+from gapbridge.core.estimation.least_squares import bounded
 from gapbridge.core.estimation.registration import frame_columns, register_robustly
 from gapbridge.core.estimation.robust import start_weights
 from gapbridge.core.loads import Loads
@@ -112,8 +113,6 @@ def _compliance_rivals(model: Model, log: Log, q: Array, pull: Array) -> LogChec
 
 def _compliance_residual(model: Model, q: Array, measured: Array, loads: Loads) -> Array:
     """Return what joints that give way, never less than nothing, leave of the positions (N, 3)."""
-    from scipy.optimize import lsq_linear  # a quarter of a second, only where pulls are judged
-
     predicted = model.predict(q, loads).position
     seen = register_robustly(measured, predicted).in_base(measured)
     form, n = model.linear_form(q, loads), model.arm.n
@@ -121,13 +120,11 @@ def _compliance_residual(model: Model, q: Array, measured: Array, loads: Loads) 
     A = np.concatenate([form.regressor[:, :3], free], axis=2).reshape(3 * len(q), -1)
     b = (seen - predicted).ravel()
     lower = np.concatenate([-np.concatenate(model.compliance()), np.full(n + 6, -np.inf)])
-    lower[: 2 * n] -= 1e-12
-    unit = 1 / np.sqrt(np.einsum("ij,ij->j", A, A) + 1e-300)
     weight, off = np.ones(len(b)), seen - predicted
     for _ in range(ROUNDS):
         root = np.sqrt(weight)
-        x = lsq_linear((A * unit) * root[:, None], b * root, (lower / unit, np.inf)).x
-        off = (b - (A * unit) @ x).reshape(-1, 3)
+        x = bounded(A * root[:, None], b * root, lower, np.full(len(lower), np.inf))[0]
+        off = (b - A @ x).reshape(-1, 3)
         weight = np.repeat(start_weights(off), 3)
     return off
 

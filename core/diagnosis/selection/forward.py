@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from gapbridge.core.diagnosis.criteria import MAX_LINES, MAX_SMOOTH_TERMS
 from gapbridge.core.diagnosis.selection.problem import CandidateFit, SampleSpace, fit, gains
+from gapbridge.core.estimation.least_squares import basis_of, projected_out
 
 Array = NDArray[np.float64]
 BEAM = 6
@@ -52,29 +53,18 @@ def exclusive(space: SampleSpace, chosen: Sequence[int], new: int) -> bool:
 
 def forward_step(space: SampleSpace, state: State, new: int, score: float) -> State:
     """Return the state with one more term."""
-    block = _without(state.basis, space.X[:, space.start[new] : space.start[new + 1]])
-    U = _directions(block)
-    r = _without(U, state.r)
+    block = projected_out(state.basis, space.X[:, space.start[new] : space.start[new + 1]])
+    U = basis_of(block, DEPENDENT)
+    r = projected_out(U, state.r)
     return State((*state.chosen, new), np.hstack([state.basis, U]), r, float(r @ r), score)
-
-
-def _without(basis: Array, columns: Array) -> Array:
-    return np.asarray(columns - basis @ (basis.T @ columns))
-
-
-def _directions(block: Array) -> Array:
-    """Return an orthonormal basis of columns (m, r), nearly dependent ones left out."""
-    unit = np.sqrt(np.einsum("ij,ij->j", block, block)) + 1e-300
-    U, s, _ = np.linalg.svd(block / unit, full_matrices=False)
-    return np.asarray(U[:, s > DEPENDENT])
 
 
 def projected(space: SampleSpace, chosen: Sequence[int]) -> State:
     """Return the state of a whole set."""
     if not chosen:
         return State((), np.zeros((len(space.y), 0)), space.y, float(space.y @ space.y), 0.0)
-    U = _directions(space.columns(chosen))
-    r = _without(U, space.y)
+    U = basis_of(space.columns(chosen), DEPENDENT)
+    r = projected_out(U, space.y)
     return State(tuple(chosen), U, r, float(r @ r), 0.0)
 
 

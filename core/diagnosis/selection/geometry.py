@@ -33,6 +33,7 @@ from gapbridge.core.diagnosis.selection.candidate import Candidate
 from gapbridge.core.diagnosis.selection.local_search import pruned
 from gapbridge.core.diagnosis.selection.problem import CandidateFit, SampleSpace, fit
 from gapbridge.core.diagnosis.selection.search import screened_search
+from gapbridge.core.estimation.least_squares import solve
 
 Array = NDArray[np.float64]
 Members = Callable[[SampleSpace], tuple[int, ...]]
@@ -217,5 +218,5 @@ def _of_mass(candidate: Candidate) -> bool:
 def _beside_set(space: SampleSpace, rest: Sequence[int], links: Links) -> float:
     """Return the score of a set beside the links, the penalty of these left out."""
     A, y = links.whitened(space.columns(rest)), links.whitened(space.y)
-    rss = float(np.sum((y - A @ np.linalg.lstsq(A, y, rcond=1e-9)[0]) ** 2))
+    rss = float(np.sum((y - A @ solve(A, y)) ** 2))
     return float(space.misfit(np.array(rss)) + space.penalty[list(rest)].sum())

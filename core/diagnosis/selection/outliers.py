@@ -16,6 +16,7 @@ from gapbridge.core.diagnosis.selection.noise import estimate_noise
 from gapbridge.core.diagnosis.selection.problem import CandidateFit, SampleSpace, fit
 from gapbridge.core.diagnosis.selection.state import SelectionState, UnprojectedRows, sample_space
 from gapbridge.core.effects import Term
+from gapbridge.core.estimation.least_squares import solve
 from gapbridge.core.estimation.robust import (
     OUTLIER,
     distance_of,
@@ -70,7 +71,7 @@ def inliers(state: SelectionState, residual: Array) -> NDArray[np.bool_]:
         A, b = (W @ nuisance).reshape(-1, nuisance.shape[2]), (W @ residual[..., None]).ravel()
         white = whitened(state, residual)
         row = np.repeat(distance_of(white, scale_of(white)) < OUTLIER, residual.shape[1])
-        residual = residual - nuisance @ np.linalg.lstsq(A[row], b[row], rcond=1e-12)[0]
+        residual = residual - nuisance @ solve(A[row], b[row])
     return _keep(state, residual)
 
 
@@ -139,8 +140,8 @@ def _predicted_without_it(
         out = np.arange(k * sample, k * sample + k)
         rest = np.delete(np.arange(len(target)), out)
         with_it, without = A[rest], A[rest, :-d]
-        x = np.linalg.lstsq(with_it, target[rest], rcond=1e-9)[0]
-        plain = np.linalg.lstsq(without, target[rest], rcond=1e-9)[0]
+        x = solve(with_it, target[rest])
+        plain = solve(without, target[rest])
         off = float(np.linalg.norm(target[out] - A[out] @ x))
         if off > UNPREDICTED_SHARE * float(np.linalg.norm(target[out] - A[out, :-d] @ plain)):
             return False

@@ -18,6 +18,7 @@ from gapbridge.core.diagnosis.selection.problem import CandidateFit, SampleSpace
 from gapbridge.core.diagnosis.selection.state import SelectionState, flat
 from gapbridge.core.effects import Term
 from gapbridge.core.errors import EquilibriumError, InputError
+from gapbridge.core.estimation.least_squares import basis_of, projected_out, solve
 
 Array = NDArray[np.float64]
 REFITS = 8
@@ -256,8 +257,7 @@ def _step(
 def _along(extra: Array, nuisance: Array, gap: Array, state: SelectionState) -> Array:
     """Return what of the nuisance (p,) a gap (N, k) asks for, unnamed functions beside it."""
     b = flat(gap[..., None], state)[:, 0]
-    solution = np.linalg.lstsq(np.hstack([extra, nuisance]), b, rcond=1e-12)[0]
-    return np.asarray(solution[extra.shape[1] :])
+    return solve(np.hstack([extra, nuisance]), b)[extra.shape[1] :]
 
 
 def _pull(
@@ -298,7 +298,7 @@ def _share(
     if not index:
         return 1.0
     linear = A[:, sum(len(v) for v in x) :]  # smooth terms and nuisance, refitted for each trial
-    Q = np.linalg.qr(linear)[0] if linear.shape[1] else linear
+    Q = basis_of(linear)
 
     def left(share: float) -> float:
         ahead = [_within(freed[c], v + share * part)
@@ -309,7 +309,7 @@ def _share(
         except InputError:
             return float("inf")
         r = flat(gap[..., None], state)[:, 0]
-        r = r - Q @ (Q.T @ r)
+        r = projected_out(Q, r)
         off = np.concatenate([v / size for v, size in zip(ahead, near, strict=True)])
         return float(r @ r + off @ off)
 

@@ -51,6 +51,7 @@ from gapbridge.core.diagnosis.selection.state import (
 )
 from gapbridge.core.diagnosis.selection.stiffness_curves import with_straight_stiffness
 from gapbridge.core.effects import Site, Term
+from gapbridge.core.estimation.least_squares import projected_out, solve
 from gapbridge.core.load_bounds import LoadBounds
 from gapbridge.core.model import Model
 
@@ -119,7 +120,7 @@ class Selection:
         """Return columns (N, k, d) as rows (m, d) of the space in which the links are no noise."""
         kept, B = self.kept, self.nuisance_basis
         rows = (self.noise.whitener[kept] @ columns[kept]).reshape(len(B), -1)
-        return np.asarray(rows - B @ (B.T @ rows))
+        return projected_out(B, rows)
 
     def pull(self, chosen: Sequence[int]) -> Array:
         """Return one over the prior sigma of each number of a set of candidates; 0: none."""
@@ -131,10 +132,7 @@ class Selection:
         """Return the linear values (d,) of a set of candidates; links are kept near nominal."""
         space, size = self.space, np.diff(self.space.start)
         X = space.columns(chosen)
-        whole = X.T @ X + np.diag(self.pull(chosen) ** 2)
-        unit = 1 / np.sqrt(np.diag(whole) + 1e-300)
-        inverse = np.linalg.pinv(whole * np.outer(unit, unit), rcond=1e-12, hermitian=True)
-        x = unit * (inverse @ (unit * (X.T @ space.y)))
+        x = solve(X, space.y, self.pull(chosen))
         return dict(zip(chosen, np.split(x, np.cumsum(size[list(chosen)])[:-1]), strict=True))
 
     def without_links(self) -> Selection:
@@ -324,7 +322,7 @@ def _without_smooth_part(
         return residual
     both = np.concatenate([*columns, state.observation.nuisance], axis=2)
     rows, target = flat(both, state), flat(residual[..., None], state)[:, 0]
-    return np.asarray(residual - both @ np.linalg.lstsq(rows, target, rcond=1e-9)[0])
+    return np.asarray(residual - both @ solve(rows, target))
 
 
 def refitted_alone(

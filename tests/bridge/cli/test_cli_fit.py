@@ -74,7 +74,31 @@ def test_what_a_fit_of_a_rigid_arm_leaves_can_be_read_again(tmp_path: Path) -> N
     assert max(axial[1:3]) < 5e-7
 
 
-def test_a_fit_writes_no_tool_point_no_frame_and_exact_zeros(tmp_path: Path) -> None:
+def test_a_fit_writes_the_tool_point_it_found(tmp_path: Path) -> None:
+    cell = cell_in(tmp_path)
+    loose = CELL.replace("registered: true", "registered: false")
+    cell.write_text(loose, encoding="utf-8")
+    q, loads = poses_and_loads(60)
+    deflected, shift = bent_model(), np.array([2e-3, -1e-3, 3e-3])
+    poses = deflected.predict(q, loads)
+    target = poses.position + poses.rotation @ shift
+    seen = target @ rotation_matrix(np.array([0.3, 1.0, -2.0])).T + 2.0
+    seen += 2e-5 * np.random.default_rng(1).normal(size=seen.shape)
+    columns = {f"measured_position_{i}": seen[:, i] for i in range(3)}
+    log, new = log_in(tmp_path, columns_of(q, loads) | columns), tmp_path / "new.yaml"
+    answer = gapbridge("fit", log, "--cell", cell, "--out", new)
+    assert answer.code == 0, answer.err
+    assert "the tool point is written to the cell" in answer.out.replace("\n", " ")
+    there = deflected.tool_in_flange[:3, 3] + deflected.tool_in_flange[:3, :3] @ shift
+    np.testing.assert_allclose(load_cell(new).model.tool_in_flange[:3, 3], there, atol=2e-5)
+    np.testing.assert_array_equal(
+        load_cell(new).model.tool_in_flange[:3, :3], deflected.tool_in_flange[:3, :3]
+    )
+
+
+def test_a_fit_takes_no_target_beside_the_tcp_for_it_writes_no_frame_and_exact_zeros(
+    tmp_path: Path,
+) -> None:
     cell = cell_in(tmp_path)
     assert "registered: true" in cell.read_text(encoding="utf-8")
     loose = CELL.replace("registered: true", "registered: false")

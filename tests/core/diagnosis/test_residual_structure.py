@@ -10,7 +10,8 @@ import toy_space as toy
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gapbridge.core.diagnosis.residual_structure import basis_of, dependence, structure_p_value
+from gapbridge.core.diagnosis.residual_structure import dependence, structure_p_value
+from gapbridge.core.estimation.least_squares import basis_of
 
 ROWS = 90
 CANDIDATES = [
