@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 from oracle import equilibrium as oracle
-from scipy.optimize import nnls
 from test_equilibrium import SEVEN
 
 from benchmarks.evidence import paper, poses
@@ -11,7 +10,6 @@ from benchmarks.evidence.finite_elements import STIFF
 from gapbridge.core.arm import arm_from_dh, builtin_rows
 from gapbridge.core.errors import ExcitationError, LogError
 from gapbridge.core.estimation.base_parameters import name
-from gapbridge.core.estimation.compliance_fit import not_negative
 from gapbridge.core.estimation.identification import identify_compliance
 from gapbridge.core.loads import Loads
 from gapbridge.core.log.log import Log
@@ -321,14 +319,3 @@ def test_fifty_noisy_poses_foretell_fifty_others_of_finite_elements_to_the_noise
             # what the model is off from the truth, the noise of a reading beside it
             assert np.sqrt(np.mean(gap**2) + poses.NOISE**2) < 1.2 * poses.NOISE
         assert found.remaining_rms_held_out < 1.2 * poses.NOISE
-
-
-def test_least_squares_without_a_negative_value_are_those_of_scipys_search():
-    rng = np.random.default_rng(0)
-    for _ in range(300):
-        size = rng.integers(1, 13)
-        rows = rng.normal(size=(25, size)) * 10.0 ** rng.integers(-3, 3, size)
-        right = rows @ np.maximum(rng.normal(size=size), 0.0) + rng.normal(size=25)
-        expected = nnls(rows, right)[0]
-        unit = np.linalg.norm(rows, axis=0)
-        np.testing.assert_allclose(not_negative(rows, right) * unit, expected * unit, atol=1e-10)
