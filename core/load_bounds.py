@@ -52,7 +52,7 @@ class LoadBounds:
         """Return the strongest torque on the tool, Nm."""
         return LEVER * self.force
 
-    def doubt_payload(self, mass: float, cog: Array) -> str | None:
+    def payload_problem(self, mass: float, cog: Array) -> str | None:
         """Return in words why a payload (kg; (3,) m, flange frame) cannot be; None: it can."""
         if not 0.0 <= mass <= self.mass:  # NaN is not
             return f"payload: found {mass:g} kg, expected 0 to {self.mass:g} kg ({self._why})"
@@ -64,7 +64,7 @@ class LoadBounds:
             )
         return None
 
-    def doubt_wrench(self, wrench: Array) -> str | None:
+    def wrench_problem(self, wrench: Array) -> str | None:
         """Return in words why a pull on the tool (6,) N, Nm cannot be; None: it can."""
         numbers = wrench.tolist()
         force, torque = math.hypot(*numbers[:3]), math.hypot(*numbers[3:])

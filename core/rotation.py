@@ -92,6 +92,12 @@ def rotation_vector(matrix: Array) -> Array:
     return np.asarray(scale * quaternion[..., 1:])
 
 
+def mean_rotation(vectors: Array) -> Array:
+    """Return the mean (3,) of close rotation vectors (N, 3), rad: of matrices, as vectors flip."""
+    U, _, Vt = np.linalg.svd(rotation_matrix(vectors).mean(axis=0))
+    return rotation_vector(U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt)
+
+
 def skew(vector: Array) -> Array:
     """Return the matrices (..., 3, 3) whose product with b is vector (..., 3) x b."""
     v = np.asarray(vector, dtype=float)

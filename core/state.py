@@ -1,4 +1,4 @@
-"""What a controller reports: one sample, in RTDE's field names."""
+"""What layers exchange: a sample that a controller reports, and a setpoint that goes to it."""
 
 from __future__ import annotations
 
@@ -32,3 +32,18 @@ class RobotState(NamedTuple):
     safety_status_bits: int = 1  # RTDE safety_status_bits; bit 0 = normal mode
     speed_scaling: float = 1.0
     sensor_lost: str = ""  # why the force is missing: then actual_TCP_force is NaN
+
+
+class Setpoint(NamedTuple):
+    """One corrected joint setpoint, as it leaves the limiter.
+
+    ``offset_in_base`` is the same correction seen at the rigid arm's TCP: where ``q`` puts it minus
+    where ``nominal_q`` puts it, position (m) and rotation vector (rad) in base axes. Drivers whose
+    controller takes a Cartesian offset send it instead of ``q``. A tuple, as RobotState is.
+    """
+
+    q: Array  # (n,) rad, the setpoint to be commanded
+    nominal_q: Array  # (n,) rad, what was wanted before correction
+    offset_in_base: Array  # (6,) m, rad
+    state_timestamp: float  # s, controller clock of the state behind this setpoint
+    state_received: float  # s, time.monotonic() when that state was first seen here

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import importlib
+from pkgutil import resolve_name
 from typing import TYPE_CHECKING, cast
 
 from gapbridge.core.errors import LinkError
@@ -38,9 +38,8 @@ def make_driver(
     name = str(getattr(settings, "driver", ""))
     if name not in DRIVERS:
         raise LinkError(f"link.driver: found {name!r}, expected one of {', '.join(DRIVERS)}")
-    module, kind = DRIVERS[name].split(":")
     try:
-        found = getattr(importlib.import_module(module), kind)
+        found = resolve_name(DRIVERS[name])
     except ImportError as error:
         raise LinkError(f"link.driver {name}: its library cannot be imported: {error}") from None
     driver = cast("Driver", found(settings, model, clock))

@@ -14,8 +14,7 @@ from typing import Any, Self, final
 from gapbridge.core.arrays import Array
 from gapbridge.core.errors import WriteError
 from gapbridge.core.model import Model
-from gapbridge.core.setpoint import Setpoint
-from gapbridge.core.state import RobotState
+from gapbridge.core.state import RobotState, Setpoint
 from gapbridge.drivers.clock import SYSTEM, Clock
 from gapbridge.drivers.controller_facts import ControllerFacts, Difference, differences
 from gapbridge.drivers.gate import Gate

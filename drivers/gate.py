@@ -17,7 +17,7 @@ from gapbridge.core.arrays import Array
 from gapbridge.core.errors import GateError
 from gapbridge.core.kernels.reference import JIT
 from gapbridge.core.model import Model
-from gapbridge.core.setpoint import Setpoint
+from gapbridge.core.state import Setpoint
 from gapbridge.drivers.clock import SYSTEM
 
 GAP = 5.0  # cycles: no step is larger than this many cycles' allowance

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Self
+from typing import ClassVar, Self
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
+
+from gapbridge.core.errors import InputError
+from gapbridge.drivers.section import Section
 
 
-class DriverSettings(BaseModel):
+class DriverSettings(Section):
     """What every link says, whatever the driver."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
     rate: float = Field(500.0, gt=0.0, le=1000.0, description="cycles per second asked for")
     state_timeout: float = Field(
@@ -27,12 +28,38 @@ class DriverSettings(BaseModel):
         """Return whether setpoints are the arm's motion; False: they ride on the robot's own."""
         return True
 
-    def located(self, folder: Path) -> Self:
-        """Return the settings with paths relative to ``folder`` made absolute.
-
-        Raises InputError where a file that they name cannot be used.
-        """
-        return self
-
     def read_files(self) -> None:
         """Read, through core.files, all files that the driver will read. Raises InputError."""
+
+
+class ProfileSettings(DriverSettings):
+    """A link with a ``profile``: the name of a shipped one, or a path ending in .yaml.
+
+    Paths are relative to the cell's folder.
+    """
+
+    shipped: ClassVar[Path]  # folder of the profiles that the driver ships
+    profile: str = Field(min_length=1, description="a shipped profile, or a path to one")
+
+    @property
+    def names_file(self) -> bool:
+        """Return whether ``profile`` is a path rather than a shipped name."""
+        return self.profile.endswith((".yaml", ".yml"))
+
+    @property
+    def profile_path(self) -> Path:
+        """Return the file of the profile."""
+        return Path(self.profile) if self.names_file else self.shipped / f"{self.profile}.yaml"
+
+    def located(self, folder: Path) -> Self:
+        """Return the settings with whole paths. Raises InputError for no such profile."""
+        found = super().located(folder)
+        if self.names_file:
+            return found.model_copy(update={"profile": str((folder / self.profile).resolve())})
+        if not self.profile_path.is_file():
+            shipped = ", ".join(sorted(path.stem for path in self.shipped.glob("*.yaml")))
+            raise InputError(
+                f"link.profile: found {self.profile!r}, expected one of {shipped}, or a path "
+                "ending in .yaml"
+            )
+        return found

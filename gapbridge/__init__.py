@@ -36,8 +36,8 @@ if TYPE_CHECKING:
     from gapbridge.core.compensation import Compensator as Compensator
     from gapbridge.core.loads import Loads as Loads
     from gapbridge.core.model import Model as Model
-    from gapbridge.core.setpoint import Setpoint as Setpoint
     from gapbridge.core.state import RobotState as RobotState
+    from gapbridge.core.state import Setpoint as Setpoint
     from gapbridge.drivers import make_driver as make_driver
     from gapbridge.drivers.driver import Driver as Driver
 
@@ -52,7 +52,7 @@ PUBLIC: dict[str, str] = dict.fromkeys(API, "bridge.api") | {
     "Loads": "core.loads",
     "Model": "core.model",
     "RobotState": "core.state",
-    "Setpoint": "core.setpoint",
+    "Setpoint": "core.state",
     "builtin_arm": "core.arm",
     "make_driver": "drivers",
 }

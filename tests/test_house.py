@@ -173,7 +173,8 @@ PRIVATE = {"told", "tell", "words", "wild", "calm", "raw", "foresight", "lacking
 """What no engineer of the field would call a thing."""
 IN_THE_FIELDS_WORDS = ("core/effects", "core/estimation", "core/calibration", "core/planning",
                        "core/kernels", "bridge/document", "bridge/report", "bridge/calibration",
-                       "bridge/fleet", "bridge/web")  # fmt: skip
+                       "bridge/fleet", "bridge/web", "bridge/demo", "bridge/daemon",
+                       "bridge/loop", "bridge/patch", "bridge/cell", "bridge/metrics")  # fmt: skip
 FOREIGN_NAMES = {"raw_wrench"}  # a sensor's reading before it is set to zero
 
 

@@ -9,8 +9,6 @@ from pathlib import Path
 import pytest
 
 from benchmarks.mutants.mutant import Mutant, read_mutants
-from gapbridge.bridge.calibration.instruments import INSTRUMENTS
-from gapbridge.bridge.calibration.jobs.table import JOBS
 from gapbridge.bridge.cell.simulation import SIMULATORS
 from gapbridge.bridge.cli.table import COMMANDS
 from gapbridge.bridge.daemon.sides import SIDES
@@ -20,8 +18,6 @@ from gapbridge.drivers.ft_sensor import FT_SENSORS
 
 ROOT = Path(__file__).parents[1]
 NAMED = [
-    *INSTRUMENTS.values(),
-    *JOBS.values(),
     *SIMULATORS.values(),
     *(name for name, _ in COMMANDS.values()),
     *SOURCES.values(),

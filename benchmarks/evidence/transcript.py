@@ -21,7 +21,7 @@ import pexpect  # type: ignore[import-untyped]
 
 from gapbridge.bridge.demo.links.link import free_address
 from gapbridge.bridge.demo.links.ur_rtde import UrRtdeLink
-from gapbridge.bridge.demo.served_cell import ServedCell
+from gapbridge.bridge.demo.processes import ServedCell
 from gapbridge.drivers.simulated.ur.settings import BENCH_PORT, SCRIPT_PORT
 
 ROOT = Path(__file__).resolve().parents[2]

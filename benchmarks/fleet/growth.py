@@ -19,11 +19,11 @@ import psutil
 from threadpoolctl import threadpool_limits
 
 from benchmarks.fleet.simulating import write_fleet
-from gapbridge.bridge.fleet import fitting
 from gapbridge.bridge.fleet.cell_source import OneCell
 from gapbridge.bridge.fleet.journal import Journal
 from gapbridge.bridge.fleet.runner import run, tasks_of
 from gapbridge.bridge.fleet.session import find_sessions
+from gapbridge.bridge.fleet.session_work import fit_session
 from gapbridge.bridge.fleet.task import DONE, Outcome, Task, perform
 from gapbridge.bridge.fleet.workers.dask_workers import DaskWorkers
 from gapbridge.bridge.fleet.workers.local_workers import LocalWorkers
@@ -60,7 +60,7 @@ def measure(folder: Path, sessions: int, chunk: int, seed: int, *, dask: bool) -
     """Return times and ratios for so many sessions."""
     cell, _ = write_fleet(folder, [[POSES]] * sessions, seed)
     found = find_sessions([str(folder / "logs")])
-    tasks, _ = tasks_of(found.sessions, OneCell(cell), fitting.work, {})
+    tasks, _ = tasks_of(found.sessions, OneCell(cell), fit_session, {})
     chunks = [tasks[i : i + chunk] for i in range(0, len(tasks), chunk)]
     with ExitStack() as stack:
         ways, started, below = _ways(folder, stack, dask=dask)
@@ -163,7 +163,7 @@ def whole(folder: Path, sessions: int, seed: int) -> float:
     cell, _ = write_fleet(folder, [[POSES]] * sessions, seed)
     begin = time.perf_counter()
     found = find_sessions([str(folder / "logs")])
-    tasks, _ = tasks_of(found.sessions, OneCell(cell), fitting.work, {})
+    tasks, _ = tasks_of(found.sessions, OneCell(cell), fit_session, {})
     with Journal(folder / "journal", fresh=True) as book:
         run(tasks, [], LocalWorkers(WORKERS), book, lambda outcome: None)
     return time.perf_counter() - begin

@@ -14,9 +14,14 @@ from benchmarks.blind.mechanics import Array
 from benchmarks.fleet.simulating import KIND, TYPE, Habits, columns, write_type_cell
 from gapbridge.bridge.cell import load_cell
 from gapbridge.core.errors import ExcitationError
-from gapbridge.core.estimation.compliance_fit import Data, fit_nuisances, residual
+from gapbridge.core.estimation.compliance_fit import (
+    Data,
+    fit_nuisances,
+    residual,
+    usual_flexibility,
+)
 from gapbridge.core.estimation.hierarchical import fit_type
-from gapbridge.core.estimation.hierarchical_evidence import evidence, usual_flexibility
+from gapbridge.core.estimation.hierarchical_evidence import evidence
 from gapbridge.core.estimation.identification import identify_compliance
 from gapbridge.core.log.log import Log
 from gapbridge.core.metrology import Metrology

@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 
 from gapbridge.core.compensation import Compensator
 from gapbridge.core.model import Model
-from gapbridge.core.setpoint import Setpoint
-from gapbridge.core.state import RobotState
+from gapbridge.core.state import RobotState, Setpoint
 from gapbridge.drivers.driver import Driver
 
 Vector = NDArray[np.float64]

@@ -11,7 +11,7 @@ from benchmarks.faults.invariants import Checker
 from benchmarks.faults.wire.seen import Fresh, Numbers, Write
 from gapbridge.bridge.loop.link_monitor import DRIFT, hold_time
 from gapbridge.bridge.loop.supervisor import HEALED_BY_RECONNECTING, TRANSITIONS, Cause, State
-from gapbridge.core.setpoint import Setpoint
+from gapbridge.core.state import Setpoint
 
 MARGIN = 0.01  # s: a cycle of the controller and what computing takes
 LONGEST_LIST = 20

@@ -24,8 +24,7 @@ from gapbridge.bridge.setpoint_source.glide import Glide
 from gapbridge.bridge.setpoint_source.source import Source
 from gapbridge.bridge.setpoint_source.target import TargetSource
 from gapbridge.core.errors import GapbridgeError, InputError
-from gapbridge.core.setpoint import Setpoint
-from gapbridge.core.state import RobotState
+from gapbridge.core.state import RobotState, Setpoint
 from gapbridge.drivers.driver import Driver
 
 Vector = NDArray[np.float64]

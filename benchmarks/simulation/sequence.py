@@ -18,7 +18,7 @@ from benchmarks.simulation.ur import UrLink, library
 from benchmarks.simulation.world import BEGIN, Process, SimulatedClock, World
 from gapbridge.bridge.ipc.control_socket import Peer
 from gapbridge.bridge.loop.supervisor import State
-from gapbridge.core.setpoint import Setpoint
+from gapbridge.core.state import Setpoint
 
 LINKS: dict[str, type[SimulatedLink]] = {
     "ur_servoj": UrLink, "ur_offset": UrLink, "modbus": ModbusLink, "can": CanLink,

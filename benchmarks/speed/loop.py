@@ -26,11 +26,12 @@ import psutil
 from numpy.typing import NDArray
 
 from benchmarks.machine_stalls import MachineStalls, Missed
+from gapbridge.bridge.demo.processes import ServedCell
 from gapbridge.core.log.mcap_reading import SUFFIX, read_columns
-from gapbridge.drivers.simulated.ur.process import SimulatedController
 from gapbridge.drivers.simulated.ur.settings import simulated_cell
 
-HOST, RATE = "127.78.0.5", 500.0
+HOST, SEED = 11
+RATE = "127.78.0.5", 500.0
 CONVERGED = 5.0  # s of compensating before anything is counted
 PATIENCE = 240.0  # s until the daemon compensates
 PAYLOAD, COG = 5.0, (0.0, 0.0, 0.06)
@@ -138,7 +139,7 @@ def _beside_the_loop() -> Iterator[None]:
 def _served(folder: Path) -> Iterator[tuple[str, str, Path]]:
     """Yield the addresses of page and metrics of a daemon on a simulated robot, and its cell."""
     settings = simulated_cell(
-        "ur10e", HOST, 11, tcp=(0.0, 0.0, 0.18, 0.0, 0.0, 0.0), payload_mass=PAYLOAD,
+        "ur10e", HOST, SEED, tcp=(0.0, 0.0, 0.18, 0.0, 0.0, 0.0), payload_mass=PAYLOAD,
         payload_cog=COG,
     )  # fmt: skip
     ports = [_free_port(), _free_port()]
@@ -160,7 +161,7 @@ def _served(folder: Path) -> Iterator[tuple[str, str, Path]]:
         "recording: {folder: recordings}\n",
         encoding="utf-8",
     )
-    with SimulatedController(settings), (folder / LOG).open("wb") as log:
+    with ServedCell(cell, SEED), (folder / LOG).open("wb") as log:
         command = [sys.executable, "-m", "gapbridge", "run", str(cell), "--log", "json"]
         timing = Path(__file__).with_name("in_the_loop")
         path = os.pathsep.join([str(timing), *(p for p in sys.path if p)])

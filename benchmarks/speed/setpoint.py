@@ -17,7 +17,7 @@ from benchmarks.speed.peers.casadi_task import casadi_setpoint
 from benchmarks.speed.peers.cpp import Cpp, compiler
 from benchmarks.speed.peers.pinocchio_task import PinocchioTask
 from benchmarks.speed.sides import Call, Side, compared, interleaved
-from gapbridge.bridge.loop.realtime import become_realtime
+from gapbridge.bridge.loop.main import become_realtime
 from gapbridge.core.compensation import Compensator
 from gapbridge.core.kernels import single
 from gapbridge.core.kernels.packed import pack

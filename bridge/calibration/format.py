@@ -1,11 +1,17 @@
-"""How poses, loads, lengths and times are worded for a technician."""
+"""How poses, loads, lengths, times and a verification are worded for a technician."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
+from gapbridge.bridge.report.labels import unit_of
 from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.plan import Payload
+from gapbridge.core.calibration.result import Estimate
+from gapbridge.core.calibration.verify import Suspect, Verification
+from gapbridge.core.effects import CATALOGUE
 
 
 def degrees(q: Array) -> str:
@@ -54,9 +60,6 @@ def duration(seconds: float) -> str:
     return f"about {int(minutes // 60)} h {round(minutes % 60 / 5) * 5:02d} min"
 
 
-SHOWN_IN = {"m": ("mm", 1e3), "rad": ("mrad", 1e3), "rad/Nm": ("µrad/Nm", 1e6)}
-
-
 def figure(value: float) -> str:
     """Return a number with three or four digits that count."""
     if not np.isfinite(value):
@@ -66,5 +69,47 @@ def figure(value: float) -> str:
 
 def parameter(value: float, unit: str) -> str:
     """Return a value as it is reported, m as mm, rad as mrad."""
-    shown, factor = SHOWN_IN.get(unit, (unit, 1.0))
+    shown, factor = unit_of(unit)
     return f"{figure(value * factor)} {shown}"
+
+
+def verdict_text(found: Verification) -> str:
+    """Return the verification in one sentence."""
+    errors = found.errors
+    text = (
+        f"{len(errors.rows)} poses are {1e3 * errors.rms:.3f} mm rms off, {found.ratio:.2f} times "
+        "what the calibration predicted"
+    )
+    if found.holds:
+        return f"the calibration holds: {text}"
+    moved = (
+        "no single change of tool, load, instrument or one joint explains it: calibrate anew"
+        if found.moved is None
+        else moved_text(found.moved)
+    )
+    return f"the calibration no longer holds: {text} (chance {found.chance:.1g}); {moved}"
+
+
+def moved_text(moved: Suspect) -> str:
+    """Return what moved, and by how much."""
+    kind, _, number = moved.name.rpartition("_")
+    if kind == "reading":
+        return f"reading {number} alone does not fit: measure it again"
+    effect = CATALOGUE.get(moved.name) or CATALOGUE.get(kind)
+    if effect is not None:
+        return effect.moved.format(joint=number, size=_size(moved.estimates))
+    return f"the instrument stands elsewhere, by {_size(moved.estimates)}: register it again"
+
+
+def _size(estimates: Sequence[Estimate]) -> str:
+    """Return how far lengths, angles and masses moved."""
+    sizes = []
+    for unit in ("m", "rad", "kg"):
+        own, (name, factor) = [e for e in estimates if e.unit == unit], unit_of(unit)
+        if not own:
+            continue
+        size = float(np.linalg.norm([e.value for e in own]))
+        sure = float(np.sqrt(np.mean([e.std**2 for e in own])))
+        if size > 2 * sure or len(estimates) == 1:
+            sizes.append(f"{factor * size:.3g} {name} (1 sigma {factor * sure:.2g})")
+    return " and ".join(sizes) or "little"

@@ -13,16 +13,25 @@ import numpy as np
 from gapbridge.bridge.calibration.format import load_text
 from gapbridge.bridge.calibration.instruments.instrument import (
     AnyInstrument,
+    Ask,
     ReadingError,
     Surroundings,
 )
+from gapbridge.bridge.calibration.jobs.calibrate import WholeJob
 from gapbridge.bridge.calibration.jobs.job import Job
-from gapbridge.bridge.calibration.jobs.table import make_job
-from gapbridge.bridge.calibration.joints.joint_source import JointSource, PlannedJoints
+from gapbridge.bridge.calibration.jobs.payload import PayloadJob
+from gapbridge.bridge.calibration.jobs.tool import ToolJob
+from gapbridge.bridge.calibration.jobs.verify import VerifyJob
+from gapbridge.bridge.calibration.joints.joint_source import JointSource, PlannedJoints, TypedJoints
 from gapbridge.bridge.calibration.options import SessionOptions
-from gapbridge.bridge.calibration.planning import loads_of, metrology_of, space_of, with_loads
+from gapbridge.bridge.calibration.planning import (
+    TOUCHED,
+    loads_of,
+    metrology_of,
+    space_of,
+    with_loads,
+)
 from gapbridge.bridge.calibration.session.folders import begun_entry, check_begun, session_folder
-from gapbridge.bridge.calibration.session.joint_sources import make_joints
 from gapbridge.bridge.calibration.session.journal import Journal
 from gapbridge.bridge.calibration.session.measuring import Measuring
 from gapbridge.bridge.calibration.session.plan_document import write_poses
@@ -34,12 +43,13 @@ from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.plan import PlannedPose
 from gapbridge.core.errors import CellError, LinkError
 
-TITLES = {
-    "whole": "Calibration of",
-    "verify": "Verification of",
-    "payload": "Load and force sensor of",
-    "tool": "Tool of",
+JOBS: dict[str, tuple[str, type[Job]]] = {
+    "whole": ("Calibration of", WholeJob),
+    "verify": ("Verification of", VerifyJob),
+    "payload": ("Load and force sensor of", PayloadJob),
+    "tool": ("Tool of", ToolJob),
 }
+"""SessionOptions.kind -> title, and what is done."""
 
 
 def run_session(cell: Cell, options: SessionOptions) -> None:
@@ -72,8 +82,9 @@ def run_session(cell: Cell, options: SessionOptions) -> None:
 
 def _lead(cell: Cell, options: SessionOptions, prompt: Prompt, session: Session) -> None:
     folder = session.journal.path.parent
-    prompt.say(f"{TITLES[options.kind]} {cell.path}: {cell.arm.name}", "bold")
-    job = make_job(cell, options, prompt, session)
+    title, kind = JOBS[options.kind]
+    prompt.say(f"{title} {cell.path}: {cell.arm.name}", "bold")
+    job = kind(cell, options, prompt, session)
     if session.begun:
         check_begun(session.begun, cell, options, folder)
         _report_resumed(prompt, session, folder)
@@ -215,3 +226,26 @@ def _command(cell: Cell, options: SessionOptions, session: Session) -> str:
     parts += ["--move"] if options.move else []
     parts += ["--apply", str(options.new_cell)] if options.new_cell else []
     return shlex.join(parts)
+
+
+def make_joints(cell: Cell, options: SessionOptions, ask: Ask, folder: Path) -> JointSource:
+    """Return how joints are known, not yet open. Raises CellError where the cell does not fit."""
+    given = cell.calibration
+    source = given.joints or ("link" if cell.link is not None else "typed")
+    if source != "link":
+        if options.move:
+            raise CellError(
+                f"{cell.path}: calibration.joints: found {source!r} with --move, expected 'link'"
+            )
+        seated = options.kind == "tool" or options.instrument.measures in TOUCHED
+        return TypedJoints(ask, seated) if source == "typed" else PlannedJoints()
+    if cell.link is None:
+        raise CellError(f"{cell.path}: link: found nothing, expected the robot's address")
+    if options.move and not cell.link.moves_arm:
+        raise CellError(
+            f"{cell.path}: link.driver: found {cell.link.driver!r}, which cannot move the arm; "
+            "expected another for --move, or jog it"
+        )
+    from gapbridge.bridge.calibration.joints.link import LinkedJoints
+
+    return LinkedJoints(cell, given.settle, given.speed, folder, options.move)

@@ -81,22 +81,12 @@ class Cell:
     @property
     def setpoints(self) -> SetpointSettings:
         """Return section ``setpoints``, its paths made absolute."""
-        given, folder = self.file.setpoints, self.path.parent
-        return given.model_copy(
-            update={
-                name: folder / path
-                for name in ("file", "socket", "token_file")
-                if (path := getattr(given, name)) is not None
-            }
-        )
+        return self.file.setpoints.located(self.path.parent)
 
     @property
     def recording(self) -> RecordingSettings:
         """Return section ``recording``, its folder made absolute."""
-        given = self.file.recording
-        if given.folder is None:
-            return given
-        return given.model_copy(update={"folder": self.path.parent / given.folder})
+        return self.file.recording.located(self.path.parent)
 
     @property
     def web(self) -> WebSettings | None:
@@ -113,12 +103,7 @@ class Cell:
     @property
     def calibration(self) -> CalibrationSettings:
         """Return section ``calibration``, its paths made absolute."""
-        given, folder = self.file.calibration, self.path.parent
-        return given.model_copy(
-            update={
-                "folder": folder / given.folder, "instrument": given.instrument.located(folder),
-            }
-        )  # fmt: skip
+        return self.file.calibration.located(self.path.parent)
 
     @property
     def fitted_range(self) -> dict[str, tuple[float, float]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from gapbridge.bridge.cell.sections import (
     LimitSettings,
@@ -15,17 +15,16 @@ from gapbridge.bridge.cell.sections import (
 from gapbridge.bridge.cell.settings.metrics import MetricsSettings
 from gapbridge.bridge.cell.settings.web import WebSettings
 from gapbridge.drivers.ft_sensor.settings import AnyFtSensor
+from gapbridge.drivers.section import Section
 from gapbridge.drivers.ur_rtde.settings import UrRtdeSettings
 
 
-class DaemonSettings(BaseModel):
+class DaemonSettings(Section):
     """One run: a cell's sections, and the path by which the loop's process reads the model.
 
     ``model_source`` names the function that reads it, ``module:function`` from a path to an object
     with a ``model``; tests replace it.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
     cell: Path = Field(description="the cell file; the loop's process takes its model from there")
     link: LinkSettings = Field(default_factory=UrRtdeSettings)

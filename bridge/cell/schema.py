@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from gapbridge.bridge.cell.sections import (
     LimitSettings,
@@ -16,16 +16,11 @@ from gapbridge.bridge.cell.settings.calibration import CalibrationSettings
 from gapbridge.bridge.cell.settings.metrics import MetricsSettings
 from gapbridge.bridge.cell.settings.web import WebSettings
 from gapbridge.drivers.ft_sensor.settings import AnyFtSensor
+from gapbridge.drivers.section import Section
 
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 NotNegative = Annotated[Number, Field(ge=0)]
 Vector3 = Annotated[list[Number], Field(min_length=3, max_length=3)]
-
-
-class Section(BaseModel):
-    """One mapping of the file: unknown keys and lax conversions are refused."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
 
 class DhRow(Section):
@@ -158,10 +153,10 @@ class Accused(Section):
     """A cause that the diagnosis named, and what it could not distinguish from it."""
 
     effect: str
-    joints: list[int] = []
+    joints: list[int] = Field(default=[])
     channel: str = ""
-    parameters: list[AccusedParameter] = []
-    indistinguishable_from: list[str] = []
+    parameters: list[AccusedParameter] = Field(default=[])
+    indistinguishable_from: list[str] = Field(default=[])
 
 
 class Provenance(Section):
@@ -171,7 +166,7 @@ class Provenance(Section):
     time: str = Field(default="", description="when it was written, UTC")
     command: str = Field(default="", description="that wrote it")
     arguments: dict[str, Any] = Field(default={}, description="of the command")
-    files: list[SourceFile] = []
+    files: list[SourceFile] = Field(default=[])
     fitted: dict[str, tuple[Number, Number]] = Field(
         default={}, description="least and largest value of each column that was fitted on"
     )
@@ -201,7 +196,7 @@ class CellFile(Section):
     gravity: Vector3 = Field(default=[0.0, 0.0, -9.80665], description="m/s2, in base")
     reference_temperature: Number = Field(default=25.0, description="°C")
     compliance: Compliance = Compliance()
-    effects: list[EffectEntry] = []
+    effects: list[EffectEntry] = Field(default=[])
     metrology: MetrologyEntry = MetrologyEntry()
     link: LinkSettings | None = Field(default=None, description="driver, host, ...")
     ft_sensor: AnyFtSensor | None = Field(

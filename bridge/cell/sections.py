@@ -9,8 +9,6 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import (
-    BaseModel,
-    ConfigDict,
     Discriminator,
     Field,
     Tag,
@@ -25,6 +23,7 @@ from gapbridge.drivers.can.settings import CanSettings
 from gapbridge.drivers.canopen.settings import CanopenSettings
 from gapbridge.drivers.modbus.settings import ModbusSettings
 from gapbridge.drivers.replay.settings import ReplaySettings
+from gapbridge.drivers.section import Section
 from gapbridge.drivers.ur_rtde.settings import UrRtdeSettings
 
 DEFAULT_DRIVER = "ur_rtde"
@@ -57,13 +56,8 @@ def link_settings(**keys: Any) -> LinkSettings:
     return adapter.validate_python(keys)
 
 
-_FROZEN = ConfigDict(extra="forbid", frozen=True, defer_build=True)
-
-
-class LimitSettings(BaseModel):
+class LimitSettings(Section):
     """Section ``limits``: what no setpoint passes, whatever computed it."""
-
-    model_config = _FROZEN
 
     offset: float = Field(0.010, gt=0.0, le=0.1, description="longest TCP offset, m")
     offset_rotation: float = Field(0.02, gt=0.0, le=0.5, description="largest TCP rotation, rad")
@@ -95,10 +89,8 @@ class LimitSettings(BaseModel):
     )
 
 
-class SetpointSettings(BaseModel):
+class SetpointSettings(Section):
     """Section ``setpoints``: where nominal setpoints come from, and whether they are written."""
-
-    model_config = _FROZEN
 
     source: Literal["target", "trajectory", "planner", "tcp", "modbus"] = "target"
     arm: bool = Field(False, description="true: `run` writes setpoints; false: it only observes")

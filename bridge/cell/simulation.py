@@ -5,9 +5,9 @@ A UR controller has a server of its own; any other protocol: servers around an A
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Callable
 from dataclasses import replace
+from pkgutil import resolve_name
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -95,8 +95,8 @@ def served_controller(
         **_plant(cell),
     )
     controller = make_controller(arm, plant, start, PERIOD)
-    module, function = SIMULATORS[str(getattr(link, "driver", ""))].split(":")
-    servers = getattr(importlib.import_module(module), function)(link, address, controller)
+    make_servers = resolve_name(SIMULATORS[str(getattr(link, "driver", ""))])
+    servers = make_servers(link, address, controller)
     return ServedController(controller, servers, address, simulation.bench_port or BENCH_PORT)
 
 

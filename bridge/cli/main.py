@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import gc
-import importlib
 import os
 import sys
+from pkgutil import resolve_name
 from typing import NoReturn
 
 import click
@@ -32,11 +32,10 @@ class CommandTable(click.Group):
         """
         if cmd_name not in COMMANDS:
             return None
-        module, name = COMMANDS[cmd_name][0].split(":")
         collecting = gc.isenabled()
         gc.disable()
         try:
-            command = getattr(importlib.import_module(module), name)
+            command = resolve_name(COMMANDS[cmd_name][0])
         finally:
             gc.freeze()
             if collecting:

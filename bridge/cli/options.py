@@ -14,23 +14,20 @@ from gapbridge.core.fitted_range import Outside
 from gapbridge.core.log.log import Log
 from gapbridge.core.sessions import join_sessions
 
-log_argument = click.argument("log", type=click.Path(path_type=Path))
-logs_argument = click.argument(
-    "logs", metavar="LOG...", nargs=-1, required=True, type=click.Path(path_type=Path)
-)
+FILE = click.Path(path_type=Path)
+log_argument = click.argument("log", type=FILE)
+logs_argument = click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=FILE)
 remounted_option = click.option(
     "--remounted",
     is_flag=True,
     help="The target was taken off between sessions: each has its own tool point.",
 )
-cell_argument = click.argument("cell", type=click.Path(path_type=Path))
-cell_option = click.option(
-    "--cell", required=True, type=click.Path(path_type=Path), help="The cell file (YAML)."
-)
+cell_argument = click.argument("cell", type=FILE)
+cell_option = click.option("--cell", required=True, type=FILE, help="The cell file (YAML).")
 csv_option = click.option(
     "--out",
     required=True,
-    type=click.Path(path_type=Path),
+    type=FILE,
     help="The file to write: CSV, or Parquet where it ends in .parquet.",
 )
 

@@ -148,5 +148,5 @@ class Control:
         return True
 
 
-def _done(words: str) -> dict[str, Any]:
-    return {"ok": True, "answer": words}
+def _done(detail: str) -> dict[str, Any]:
+    return {"ok": True, "answer": detail}

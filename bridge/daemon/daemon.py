@@ -30,7 +30,7 @@ from gapbridge.bridge.daemon.slip_watch import Slip, SlipWatch
 from gapbridge.bridge.daemon.status import DaemonStatus
 from gapbridge.bridge.daemon.status_document import SCHEMA
 from gapbridge.bridge.daemon.summary import RunSummary, Tally
-from gapbridge.bridge.document.output_file import private
+from gapbridge.bridge.document.output_file import private, require_folder
 from gapbridge.bridge.ipc.command_page import Command, CommandPage
 from gapbridge.bridge.ipc.control_socket import ControlSocket
 from gapbridge.bridge.ipc.counts import DROPPED
@@ -39,7 +39,7 @@ from gapbridge.bridge.ipc.shared_memory import Phase, RunPage
 from gapbridge.bridge.loop.loop import LONGEST_STOP, Exit
 from gapbridge.bridge.loop.setpoint_stream import longest_withdrawal
 from gapbridge.bridge.loop.supervisor import Cause, State
-from gapbridge.bridge.recording.folder import LOOP_LOG, new_session, require_folder
+from gapbridge.bridge.recording.folder import LOOP_LOG, new_session
 from gapbridge.core.errors import InputError, LinkError
 from gapbridge.drivers.clock import SYSTEM, Clock
 from gapbridge.drivers.controller_address import address_of
@@ -248,10 +248,10 @@ class Daemon:
         while not self._requests.empty():
             number, command, by = self._requests.get()
             name = "arm" if command == Command.ARM else "disarm"
-            words = f"{name} asked for by {by}"
+            detail = f"{name} asked for by {by}"
             self.event_log.add(
                 {"kind": "request", "command": name, "number": number, "by": by,
-                 "acknowledges": command == Command.DISARM, "detail": words}
+                 "acknowledges": command == Command.DISARM, "detail": detail}
             )  # fmt: skip
             self._commands.ask(command, number)
 
@@ -290,7 +290,7 @@ class Daemon:
         lock = stack.enter_context(OwnerLock(address_of(settings.link), settings.cell))
         folder = settings.recording.folder
         if folder is not None:
-            require_folder(folder)
+            require_folder(folder, "recording.folder")
         self.session = new_session(folder)
         if folder is not None:
             log = folder / f"{self.session}{LOOP_LOG}"
@@ -314,11 +314,11 @@ class Daemon:
             self.event_log.add({"kind": "note", "detail": where})
         # a person at the terminal may arm after a crash; a service that was started anew may not
         if arm and lock.before and (by != "--arm" or self.manager.present):
-            words = (
+            detail = (
                 f"the run before (process {lock.before.get('pid')}) did not end in order: "
                 "not arming by itself; gapbridge arm"
             )
-            self.event_log.add({"kind": "refused", "detail": words})
+            self.event_log.add({"kind": "refused", "detail": detail})
             return False
         return arm
 
@@ -375,9 +375,9 @@ class Daemon:
                         self.manager.stopping()
                     loop.ask_to_stop()
                 if loop.hangs or (stop_by is not None and self._clock.monotonic() > stop_by):
-                    words = f"the loop stood still for {self.page.silence:.2f} s and was ended"
+                    detail = f"the loop stood still for {self.page.silence:.2f} s and was ended"
                     loop.kill()  # reported when it is over: nothing is written after that
-                    self._fault("hang", words)
+                    self._fault("hang", detail)
             self._take()
             self._after(loop)
             if first_cycle is not None and self._clock.monotonic() - first_cycle > HEALTHY:
@@ -422,8 +422,8 @@ class Daemon:
         self._status.take(rows)
         for event in events:
             self.event_log.add(event)
-        for words in self._fitted.take(rows, self._clock.monotonic()):
-            self.event_log.add({"kind": "warning", "what": "outside_fitted", "detail": words})
+        for detail in self._fitted.take(rows, self._clock.monotonic()):
+            self.event_log.add({"kind": "warning", "what": "outside_fitted", "detail": detail})
         for found in self._slips.take(rows):
             self.event_log.add(found.event)
             if isinstance(found, Slip):
@@ -458,18 +458,18 @@ class Daemon:
             return
         self._last_state = State.DISCONNECTED
         self._status.lost_loop()
-        words = str(self._failure.get("detail", "")) or f"the loop's process {loop.describe_end()}"
+        detail = str(self._failure.get("detail", "")) or f"the loop's process {loop.describe_end()}"
         if self._stopping.is_set() and not self._failure:
             return
         if code == Exit.INPUT and not self._seen:
-            raise InputError(words)  # later, it is a file that somebody is at: tried again
+            raise InputError(detail)  # later, it is a file that somebody is at: tried again
         if not self._seen:
-            raise LinkError(words)
-        self._fault("loop", words)
+            raise LinkError(detail)
+        self._fault("loop", detail)
 
-    def _fault(self, cause: str, words: str) -> None:
-        self._faults.append(words)
-        self.event_log.add({"kind": "fault", "cause": cause, "detail": words})
+    def _fault(self, cause: str, detail: str) -> None:
+        self._faults.append(detail)
+        self.event_log.add({"kind": "fault", "cause": cause, "detail": detail})
 
     def _summary(self) -> RunSummary:
         state = self._last_state

@@ -13,7 +13,7 @@ from gapbridge.core.fitted_range import UNITS, Range, beyond, stem_of
 from gapbridge.core.log.columns import label
 
 WATCHED = ("actual_q", "payload", "joint_temperatures", "actual_TCP_force")
-CALM = 5.0  # s within what was fitted, after which leaving it again is reported again
+QUIET = 5.0  # s within what was fitted, after which leaving it again is reported again
 
 
 class FittedWatch:
@@ -43,7 +43,7 @@ class FittedWatch:
             values = rows[:, place]
             out = beyond(name, values, self._fitted)
             if not out.any():
-                if name in self._outside and now - self._outside[name] > CALM:
+                if name in self._outside and now - self._outside[name] > QUIET:
                     del self._outside[name]
                 continue
             if name not in self._outside:

@@ -78,9 +78,9 @@ class Reload:
             self._next = _fitting(found, running)
         except GapbridgeError as error:
             self._manager.ready()
-            words = "; ".join(_all_of(before.cell, error))
-            words = f"the cell file was not taken, the old one stays: {words}"
-            self._report(False, running if self._next is None else self._next, words)
+            detail = "; ".join(_all_of(before.cell, error))
+            detail = f"the cell file was not taken, the old one stays: {detail}"
+            self._report(False, running if self._next is None else self._next, detail)
             return
         self._rearm = state == State.COMPENSATING and found.settings.setpoints.arm
         changed = [
@@ -88,12 +88,12 @@ class Reload:
             if getattr(found.settings, name) != getattr(before, name)
         ]  # fmt: skip
         later = f"; {', '.join(changed)}: at the daemon's next start" if changed else ""
-        words = f"the cell file was read again and is being taken{later}"
-        self._report(True, self._next, words)
+        detail = f"the cell file was read again and is being taken{later}"
+        self._report(True, self._next, detail)
 
-    def _report(self, fine: bool, taken: Configuration, words: str) -> None:
+    def _report(self, fine: bool, taken: Configuration, detail: str) -> None:
         self._event_log.add(
-            {"kind": "configuration", "ok": fine, "hash": taken.hash, "detail": words}
+            {"kind": "configuration", "ok": fine, "hash": taken.hash, "detail": detail}
         )
 
 

@@ -58,8 +58,8 @@ class Sides:
                 if event.get("kind") == name:
                     found.append(event)
                 else:  # states and requests are not a side process's to emit
-                    words = f"{name} emitted {str(event.get('kind'))[:40]!r}, which is not its own"
-                    found.append({"kind": "side", "side": name, "detail": words})
+                    detail = f"{name} emitted {str(event.get('kind'))[:40]!r}, which is not its own"
+                    found.append({"kind": "side", "side": name, "detail": detail})
             if (wrong := side.check()) is not None:
                 found.append({"kind": "side", "side": name, "detail": wrong})
         return found

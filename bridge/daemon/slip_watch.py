@@ -173,8 +173,8 @@ class SlipWatch:
         if self._model is None:
             return "not watched"
         seen = len({rest.place for rest in self._rests})
-        words = f"{len(self._rests)} rests at {seen} poses compared"
-        return words if self.learned else f"{words}; learning, until poses have come back"
+        detail = f"{len(self._rests)} rests at {seen} poses compared"
+        return detail if self.learned else f"{detail}; learning, until poses have come back"
 
     def take(self, rows: Array) -> list[Slip | Force]:
         """Return what has just been found. ``rows`` (k, width): cycles of the loop, in order."""
@@ -457,5 +457,5 @@ def _first_finite(first: Array, second: Array) -> Array:
     return first if np.isfinite(first).all() else second
 
 
-def _force(size: float, since: float, words: str) -> Force:
-    return Force(size, since, f"an unexpected force of {size:.1f} N {words}")
+def _force(size: float, since: float, detail: str) -> Force:
+    return Force(size, since, f"an unexpected force of {size:.1f} N {detail}")

@@ -20,15 +20,15 @@ def correction(flags: int, residual: float) -> dict[str, Any]:
 
     ``flags`` of a cycle; ``residual``: its correction's distance from the wanted pose, m.
     """
-    words = ""
+    detail = ""
     if flags & UNSOLVED:
-        words = "the model has no correction at the present pose: nothing is corrected"
+        detail = "the model has no correction at the present pose: nothing is corrected"
     elif flags & NOTHING:
-        words = "the model corrects nothing: found neither compliance nor an effect that acts"
+        detail = "the model corrects nothing: found neither compliance nor an effect that acts"
     return {
         "solved": not flags & UNSOLVED,
         "residual": residual if math.isfinite(residual) else None,
-        "detail": words,
+        "detail": detail,
     }
 
 

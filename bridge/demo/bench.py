@@ -12,7 +12,7 @@ import numpy as np
 from gapbridge.bridge.demo.poses import Load
 from gapbridge.core.arrays import Array
 from gapbridge.core.errors import LinkError
-from gapbridge.drivers.simulated.ur.settings import ServerSettings
+from gapbridge.drivers.simulated.ur.settings import BENCH_PORT, SCRIPT_PORT
 
 READINGS_PERIOD = 0.01  # s between two readings of the tracker
 LONGEST_MOVE = 20.0  # s
@@ -88,9 +88,8 @@ class Bench:
 class UrBench(Bench):
     """The bench of a UR controller: people use its pendant, and its clock is everyone's."""
 
-    def __init__(self, settings: ServerSettings) -> None:
-        super().__init__(settings.host, settings.bench_port)
-        self._settings = settings
+    def __init__(self, host: str) -> None:
+        super().__init__(host, BENCH_PORT)
 
     def measure(self) -> Array:
         """Return one reading (7,), its time the controller's; see Bench.measure."""
@@ -108,7 +107,7 @@ class UrBench(Bench):
 
     def _pendant(self, program: str) -> None:
         """Run a short program, as a person at the pendant would."""
-        address = (self._settings.host, self._settings.script_port)
+        address = (self._host, SCRIPT_PORT)
         with socket.create_connection(address, timeout=10) as script:
             script.sendall(program.encode())
             time.sleep(0.1)

@@ -11,14 +11,12 @@ import numpy as np
 from rich.console import Console
 
 from gapbridge.bridge.cell import Cell, load_cell, save_cell
-from gapbridge.bridge.demo.diagnosing import Diagnosing
 from gapbridge.bridge.demo.hidden import accused_in
 from gapbridge.bridge.demo.links import DemoLink, demo_link
-from gapbridge.bridge.demo.links.link import free_address as _free_address
-from gapbridge.bridge.demo.links.ur_rtde import UrRtdeLink
 from gapbridge.bridge.demo.page import page
 from gapbridge.bridge.demo.picture import picture
 from gapbridge.bridge.demo.poses import Load, Plan, plan
+from gapbridge.bridge.demo.processes import Diagnosing
 from gapbridge.bridge.demo.rests import Rests, joined, write_log
 from gapbridge.bridge.demo.result import Result
 from gapbridge.bridge.demo.session import Session
@@ -31,8 +29,6 @@ from gapbridge.core.arrays import Array
 from gapbridge.core.errors import RunError
 from gapbridge.core.estimation.identification import identify_compliance
 from gapbridge.core.log.log import read_log
-
-PORTS = UrRtdeLink.ports
 
 
 @dataclass
@@ -141,11 +137,6 @@ def _check(
     console.print(f"checking {len(poses)} visits with {load.name}, with compensation")
     seen.compensated.append(session.visit(calibrated, load, poses))
     seen.loads.extend([load.name] * len(poses))
-
-
-def free_address() -> str:
-    """Return a loopback address on which none of a UR controller's ports is taken."""
-    return _free_address(PORTS)
 
 
 def _write(result: Result, diagnosis: str, out: Path) -> None:

@@ -12,7 +12,7 @@ from gapbridge.bridge.demo.poses import Load
 from gapbridge.bridge.document.output_file import write_table
 from gapbridge.core.arrays import Array
 from gapbridge.core.errors import RunError
-from gapbridge.core.rotation import rotation_matrix, rotation_vector
+from gapbridge.core.rotation import mean_rotation
 
 STILL = 0.003  # rad/s: slower than this, the arm stands
 SETTLING = 0.15  # s from standing still until readings count
@@ -52,9 +52,9 @@ def rests(
     the arm carried, where the controller does not report it. Raises RunError where a visit is
     missing or the tracker saw too little of it.
     """
-    found, lacking = rests_so_far(recording, readings, visited, load, settling)
-    if found is None or lacking:
-        raise RunError(lacking)
+    found, missing = rests_so_far(recording, readings, visited, load, settling)
+    if found is None or missing:
+        raise RunError(missing)
     return found
 
 
@@ -72,20 +72,20 @@ def rests_so_far(
         recording = {**recording, **_declared(load, len(recording["timestamp"]))}
     spans = _spans(recording, settling)
     rows: list[tuple[Array, ...]] = []
-    lacking = ""
+    missing = ""
     for number, pose in enumerate(visited):
         span = _next_span(recording, spans, pose)
         if span is None:
-            lacking = f"visit {number + 1} of {len(visited)}: the arm never rested there"
+            missing = f"visit {number + 1} of {len(visited)}: the arm never rested there"
             break
         try:
             rows.append(_rest(recording, readings, span, pose, number, settling))
         except RunError as error:
-            lacking = str(error)
+            missing = str(error)
             break
     if not rows:
-        return None, lacking
-    return Rests(*(np.array(column) for column in zip(*rows, strict=True))), lacking
+        return None, missing
+    return Rests(*(np.array(column) for column in zip(*rows, strict=True))), missing
 
 
 def _declared(load: Load, count: int) -> dict[str, Array]:
@@ -134,14 +134,8 @@ def _rest(
         recording["payload_cog"][during].mean(axis=0),
         recording["actual_TCP_force"][during].mean(axis=0),
         seen[:, 1:4].mean(axis=0),
-        _mean_rotation(seen[:, 4:7]),
+        mean_rotation(seen[:, 4:7]),
     )
-
-
-def _mean_rotation(vectors: Array) -> Array:
-    """Return the mean of close rotations (N, 3): of their matrices, as near pi vectors flip."""
-    U, _, Vt = np.linalg.svd(rotation_matrix(vectors).mean(axis=0))
-    return rotation_vector(U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt)
 
 
 def joined(parts: list[Rests]) -> Rests:

@@ -161,8 +161,8 @@ class Session:
         if summary is None or broke or summary.recording is None:
             return Ended(None, broke or "nothing was recorded", stalled)
         recording = read_columns(summary.recording, reported_only=True)
-        found, lacking = rests_so_far(recording, readings, poses, load, self._link.settling)
-        return Ended(found, summary.faults[0] if summary.faults else lacking, stalled)
+        found, missing = rests_so_far(recording, readings, poses, load, self._link.settling)
+        return Ended(found, summary.faults[0] if summary.faults else missing, stalled)
 
     @property
     def written(self) -> int:

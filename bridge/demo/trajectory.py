@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 
-from gapbridge.bridge.document.output_file import write_table
+from gapbridge.bridge.setpoint_source.quintic import quintic, quintic_time
 from gapbridge.core.arrays import Array
 
 PERIOD = 0.002  # s
@@ -21,11 +19,9 @@ def move(start: Array, goal: Array, top_speed: Array) -> Array:
 
     ``top_speed`` (n,) is what the joints may do, rad/s.
     """
-    distance = np.abs(goal - start)
-    shortest = float((distance / np.minimum(SHARE * top_speed, FASTEST)).max())
-    duration = max(1.875 * shortest, np.sqrt(5.774 * distance.max() / ACCELERATION), SHORTEST)
-    s = np.linspace(0, 1, max(int(duration / PERIOD), 2) + 1)[1:, None]
-    return np.asarray(start + (goal - start) * (10 * s**3 - 15 * s**4 + 6 * s**5))
+    fastest = np.minimum(SHARE * top_speed, FASTEST)
+    duration = max(quintic_time(goal - start, fastest, ACCELERATION), SHORTEST)
+    return quintic(start, goal, max(int(duration / PERIOD), 2))[1:]
 
 
 def visits(home: Array, poses: Array, top_speed: Array, rest: float = REST) -> Array:
@@ -36,11 +32,3 @@ def visits(home: Array, poses: Array, top_speed: Array, rest: float = REST) -> A
         parts += [move(here, pose, top_speed), np.tile(pose, (still, 1))]
         here = pose
     return np.vstack(parts)
-
-
-def write_trajectory(path: Path, q: Array) -> float:
-    """Write the trajectory's CSV; returns how long it takes, s."""
-    t = np.arange(len(q)) * PERIOD
-    names = ["timestamp", *(f"target_q_{i}" for i in range(q.shape[1]))]
-    write_table(path, names, np.column_stack([t, q]))
-    return float(t[-1])

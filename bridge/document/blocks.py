@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import Generic, TypeVar
 
 from gapbridge.bridge.document.drawing import AFTER, Drawing
 from gapbridge.bridge.document.scene import Scene
 
 GOOD, DOUBTFUL, BAD, QUIET = "good", "doubtful", "bad", "quiet"
+M = TypeVar("M")
 
 
 @dataclass(frozen=True)
@@ -197,3 +199,20 @@ class Document:
     subtitle: str
     parts: tuple[Part, ...]
     footer: str = field(default="")  # stands on every page of the PDF
+
+
+@dataclass(frozen=True)
+class Section(Generic[M]):
+    """One section; ``blocks`` makes its blocks of M: none where there is nothing to show."""
+
+    key: str
+    title: str
+    blocks: Callable[[M], list[Block]]
+    about: str = ""
+    folded: bool = False  # True: the page shows it only when asked to
+
+
+def parts(sections: Sequence[Section[M]], material: M) -> tuple[Part, ...]:
+    """Return the sections that have something to show as parts of a document."""
+    made = [(s, tuple(s.blocks(material))) for s in sections]
+    return tuple(Part(s.key, s.title, s.about, b, s.folded) for s, b in made if b)

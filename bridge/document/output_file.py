@@ -46,6 +46,23 @@ def require_writable(path: Path, *inputs: Path) -> Path:
     return path
 
 
+def require_folder(path: Path, option: str, *, above: bool = True) -> None:
+    """Make the folder that ``option`` names, with those above it unless they must exist.
+
+    Raises InputError where no file can be written into it.
+    """
+    if path.exists() and not path.is_dir():
+        raise InputError(f"{path}: found a file, expected a folder for {option}")
+    if not above and not path.parent.is_dir():
+        raise InputError(f"{path}: found no folder {path.parent}, expected an existing one")
+    try:
+        path.mkdir(FOLDER_MODE, parents=above, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{path}: folder cannot be made: {error.strerror}") from None
+    if not os.access(path, os.W_OK | os.X_OK):
+        raise InputError(f"{path}: found a folder that cannot be written to, for {option}")
+
+
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[IO[str]]:
     """Give a text file that takes the place of ``path`` when the block ends without an error."""

@@ -38,9 +38,8 @@ from gapbridge.bridge.document.blocks import (
     View,
 )
 from gapbridge.bridge.document.pdf_drawing import DrawnRow
-from gapbridge.bridge.document.pdf_style import STYLES, badge_markup
 from gapbridge.bridge.document.pdf_table import beside_table, columns_table, table, tiles_table
-from gapbridge.bridge.document.pdf_text import PLAIN, load_fonts, markup
+from gapbridge.bridge.document.pdf_text import PLAIN, STYLES, badge_markup, load_fonts, markup
 
 SIDE, TOP, BOTTOM = 18 * mm, 16 * mm, 18 * mm
 WIDTH = A4[0] - 2 * SIDE

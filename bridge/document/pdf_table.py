@@ -21,8 +21,7 @@ from gapbridge.bridge.document.blocks import (
     Tiles,
 )
 from gapbridge.bridge.document.drawing import PALETTE
-from gapbridge.bridge.document.pdf_style import STYLES, badge_markup
-from gapbridge.bridge.document.pdf_text import markup
+from gapbridge.bridge.document.pdf_text import STYLES, badge_markup, markup
 
 LINE, RULE = HexColor("#e3e8ec"), HexColor("#9aa5b1")
 Command = tuple[str, tuple[int, int], tuple[int, int], *tuple[Any, ...]]

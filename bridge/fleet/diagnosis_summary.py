@@ -9,18 +9,18 @@ from typing import Any
 
 import numpy as np
 
-from gapbridge.bridge.fleet.arms import by_arm, usable
 from gapbridge.bridge.fleet.drift import (
     ChannelFigure,
     Drift,
     Figure,
+    Outlier,
     Quantity,
     Series,
     drifts,
+    far_from_median,
     places,
 )
-from gapbridge.bridge.fleet.outlying import Outlier, far_from_median
-from gapbridge.bridge.fleet.task import Outcome
+from gapbridge.bridge.fleet.task import Outcome, by_arm, usable
 
 GAP = "gap_rms"
 

@@ -15,6 +15,8 @@ from gapbridge.core.arrays import Array
 FEWEST = 3  # sessions from which on a slope is reported
 WRONG = 0.05  # share of the drifts reported that may be none (Benjamini, Hochberg 1995)
 DAY = 86400.0
+FAR = 4.0  # robust deviations
+FEWEST_VALUES = 8  # values from which on a median's deviation is worth anything
 
 
 class Figure(Enum):
@@ -64,7 +66,6 @@ class Drift:
     p_value: float
     at: tuple[float, ...] = ()
     value: tuple[float, ...] = ()
-    value_std: tuple[float, ...] = ()
     sessions: tuple[str, ...] = ()
 
     @property
@@ -100,7 +101,7 @@ def drifts(series: Sequence[Series]) -> list[Drift]:
         p = float(2 * student.sf(abs(slope) / wide, freedom))
         found.append(Drift(
             one.arm, one.quantity, one.unit, one.per, slope, wide, p, tuple(one.at.tolist()),
-            tuple(one.value.tolist()), tuple(one.std.tolist()), one.sessions,
+            tuple(one.value.tolist()), one.sessions,
         ))  # fmt: skip
     return believed(found)
 
@@ -125,3 +126,35 @@ def _line(series: Series) -> tuple[float, float, float, int]:
     level = float(weight @ series.value / weight.sum())
     left = (series.value - level - slope * t) / series.std
     return slope, 1 / math.sqrt(information), float(left @ left), len(t) - 2
+
+
+@dataclass(frozen=True)
+class Outlier:
+    """One arm or session that is unlike the others."""
+
+    arm: str
+    session: str  # empty: the arm as a whole
+    quantity: Quantity
+    value: float
+    usual: float
+    unit: str
+    deviations: float
+
+
+def far_from_median(values: Sequence[float], *, ratios: bool) -> list[tuple[int, float, float]]:
+    """Return (index, usual value, deviations) of values far from the median.
+
+    ``ratios``: values are positive, judged by their ratio to the median, and only those above it
+    are far. The deviation is the median one; where more than half agree exactly, nothing is far.
+    """
+    given = np.array(values, dtype=float)
+    if len(given) < FEWEST_VALUES:
+        return []
+    shown = np.log(np.maximum(given, 1e-300)) if ratios else given
+    middle = float(np.median(shown))
+    spread = 1.4826 * float(np.median(np.abs(shown - middle)))
+    if spread <= 0:
+        return []
+    usual = math.exp(middle) if ratios else middle
+    deviations = (shown - middle) / spread
+    return [(int(i), usual, float(deviations[i])) for i in np.flatnonzero(np.abs(deviations) > FAR)]

@@ -10,10 +10,8 @@ from typing import Any
 import numpy as np
 from scipy.stats import norm
 
-from gapbridge.bridge.fleet.arms import by_arm
-from gapbridge.bridge.fleet.drift import ChannelFigure, Drift, Figure, believed
-from gapbridge.bridge.fleet.outlying import Outlier
-from gapbridge.bridge.fleet.task import Outcome
+from gapbridge.bridge.fleet.drift import ChannelFigure, Drift, Figure, Outlier, believed
+from gapbridge.bridge.fleet.task import Outcome, by_arm
 from gapbridge.core.arrays import Array
 from gapbridge.core.effects import flexibility_names
 from gapbridge.core.estimation.hierarchical import ArmFit, Scatter, SessionFit, TypeFit, fit_type
@@ -101,9 +99,8 @@ def _type(name: str, arms: dict[str, list[Outcome]]) -> FittedType:
 
 def _evidence(outcome: Outcome) -> Evidence:
     given = dict(outcome.result["evidence"])
-    outliers = given.pop("wild")  # as journals of former versions have it
     arrays = {k: np.array(given[k]) for k in ("matrix", "right")}
-    return Evidence(**(given | arrays), outliers=outliers)
+    return Evidence(**(given | arrays))
 
 
 def _session(
@@ -132,7 +129,7 @@ def _drifts(kind: FittedType) -> Iterator[Drift]:
                     float(2 * norm.sf(abs(slope) / std)),
                     tuple(float(i) for i in range(len(names))),
                     tuple(float(s.fit.flexibility[j]) for s in arm.sessions),
-                    tuple(float(s.fit.std[j]) for s in arm.sessions), names,
+                    names,
                 )  # fmt: skip
 
 
@@ -182,7 +179,7 @@ def session_figures(found: Fitted) -> dict[str, dict[str, Any]]:
     """Return the figures of each session by its name."""
     return {
         s.outcome.session: {
-            "wild": s.outcome.result["evidence"]["wild"], "noise": s.fit.noise,
+            "outliers": s.outcome.result["evidence"]["outliers"], "noise": s.fit.noise,
             "gap_before": s.gap_before, "gap_after": s.gap_after, "gap_held_out": s.gap_held_out,
             "surprise": s.fit.surprise,
         }

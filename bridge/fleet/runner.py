@@ -12,12 +12,17 @@ from typing import Any
 
 from gapbridge.bridge.fleet.cell_source import CellSource
 from gapbridge.bridge.fleet.journal import Journal
-from gapbridge.bridge.fleet.session import Session, natural
-from gapbridge.bridge.fleet.task import BAD, Outcome, Task, Work, outcome
+from gapbridge.bridge.fleet.session import Found, Session, natural
+from gapbridge.bridge.fleet.task import BAD, CRASHED, DIED, DONE, Outcome, Task, Work, outcome
 from gapbridge.bridge.fleet.workers.workers import Workers
 from gapbridge.core.errors import InputError
 
-FORM = 1  # of the results: another form is another key
+FORM = 2  # of the results: another form is another key
+STATES = {
+    BAD: "cannot be used",
+    CRASHED: "failed",
+    DIED: "killed their workers",
+}
 
 
 @dataclass(frozen=True)
@@ -87,3 +92,24 @@ def _key(session: Session, cell: Path, work: Work, options: Mapping[str, Any]) -
     parts = [FORM, f"{work.__module__}:{work.__qualname__}", session.arm, session.name, stamps,
             dict(options)]  # fmt: skip
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:24]
+
+
+def ending(done: Done, found: Found) -> list[str]:
+    """Return the lines: how many, whose, by whom, how long; what was skipped."""
+    states = [o.state for o in done.outcomes]
+    fresh = len(states) - done.resumed
+    lines = [
+        f"{counted(len(states), 'session')} of {counted(found.arms, 'arm')} ({found.rule}): "
+        f"{states.count(DONE)} done"
+        + "".join(f", {states.count(s)} {w}" for s, w in STATES.items() if s in states)
+    ]
+    if done.resumed:
+        lines.append(f"{done.resumed} of them known from an earlier run")
+    if fresh:
+        lines.append(f"{done.seconds:.1f} s by {done.who}")
+    return lines
+
+
+def counted(number: int, word: str) -> str:
+    """Return "1 arm" or "2 arms"."""
+    return f"{number} {word}{'' if number == 1 else 's'}"

@@ -39,7 +39,7 @@ FLEXIBILITY = {
     "drift_per": "string",
 }  # fmt: skip
 FITTED = {
-    **SESSION, "wild": "int64", "noise": "float64", "gap_before": "float64",
+    **SESSION, "outliers": "int64", "noise": "float64", "gap_before": "float64",
     "gap_after": "float64", "gap_held_out": "float64", "surprise": "float64",
 }  # fmt: skip
 

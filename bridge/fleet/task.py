@@ -5,13 +5,14 @@ from __future__ import annotations
 import functools
 import time
 import traceback
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
 from gapbridge.bridge.cell import Cell, load_cell
 from gapbridge.bridge.cell.opened_log import open_log
+from gapbridge.bridge.fleet.session import natural
 from gapbridge.core.errors import ArmError, CellError, GapbridgeError, LogError
 from gapbridge.core.log.log import Log
 
@@ -110,3 +111,22 @@ def _line(error: Exception) -> str:
 def _cell(path: Path, changed: int) -> Cell:
     """Return a cell, read once by each process."""
     return load_cell(path)
+
+
+def usable(outcomes: Sequence[Outcome]) -> list[Outcome]:
+    """Return the outcomes with a result."""
+    return [o for o in outcomes if o.state == DONE]
+
+
+def by_arm(outcomes: Sequence[Outcome]) -> dict[str, list[Outcome]]:
+    """Return the usable sessions of each arm: by date where all have one, else by name."""
+    found: dict[str, list[Outcome]] = {}
+    for outcome in usable(outcomes):
+        found.setdefault(outcome.arm, []).append(outcome)
+    for arm, sessions in found.items():
+        dated = all(o.result["time"] is not None for o in sessions)
+        found[arm] = sorted(
+            sessions,
+            key=lambda o: (o.result["time"] if dated else 0.0, natural(o.session)),
+        )
+    return {arm: found[arm] for arm in sorted(found, key=natural)}

@@ -71,7 +71,7 @@ def slices_of(n: int) -> dict[str, slice]:
 
 
 class SharedMemory:
-    """The shared memory, seen from any side.
+    """The shared memory, as any side reads it.
 
     Without ``fd`` it is made; with one it is joined, for reading only unless ``writable``. Who
     joins it for writing is the last who can.

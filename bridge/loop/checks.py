@@ -95,9 +95,9 @@ class OverrunWatch:
         if self._sum <= MOST_MISSED * OVERRUN_SPAN * self._rate or len(queue) < 2:
             return None  # a single long one is judged by the gap that it leaves
         cycles = OVERRUN_SPAN * self._rate
-        words = f"{self._sum} of {cycles:.0f} cycles missed within {OVERRUN_SPAN:g} s"
+        detail = f"{self._sum} of {cycles:.0f} cycles missed within {OVERRUN_SPAN:g} s"
         self.forget()
-        return words
+        return detail
 
 
 class SaturationWatch:
@@ -138,7 +138,7 @@ class RateCheck:
         return len(self._gaps) >= GAPS
 
     @property
-    def doubt(self) -> str:
+    def problem(self) -> str:
         """Return in words that the cell asks for more than the controller has; empty: it does not.
 
         The shortest gap is the controller's own: whatever is late on the way only lengthens gaps.
@@ -193,8 +193,8 @@ class LoopChecks:
         gap = 0.0 if self._last is None else state.timestamp - self._last
         self._last = state.timestamp
         resync = gap > self._longest_gap
-        words = f"found a gap of {gap:.3f} s between two states: begun anew" if resync else None
-        self._judge(Count.RESYNC, words, Cause.RESYNC)
+        detail = f"found a gap of {gap:.3f} s between two states: begun anew" if resync else None
+        self._judge(Count.RESYNC, detail, Cause.RESYNC)
         if resync:
             flags |= RESYNC
             self._overrun.forget()
@@ -206,9 +206,9 @@ class LoopChecks:
         self._check_following(state)
         return flags
 
-    def judge_loads(self, words: str | None) -> None:
+    def judge_loads(self, detail: str | None) -> None:
         """Hold where a payload or a force is none that the arm can bear."""
-        self._judge(Count.LOAD, words, Cause.LOAD)
+        self._judge(Count.LOAD, detail, Cause.LOAD)
 
     def judge_settings(self, state: RobotState, driver: Driver) -> None:
         """Compare the controller's own settings with the cell's, once a second while armed."""
@@ -227,8 +227,8 @@ class LoopChecks:
             Count.SATURATED, self._saturation.update(state.timestamp, clamped), Cause.SATURATED
         )
         # its own work only: what a controller sends late or never is the link's affair
-        words = self._overrun.update(state.timestamp, int(duration / self._period))
-        self._judge(Count.OVERRUN, words, Cause.OVERRUN)
+        detail = self._overrun.update(state.timestamp, int(duration / self._period))
+        self._judge(Count.OVERRUN, detail, Cause.OVERRUN)
 
     def _check_robot(self, state: RobotState) -> None:
         """Take note of a robot that cannot move."""
@@ -245,26 +245,26 @@ class LoopChecks:
 
     def _check_following(self, state: RobotState) -> None:
         """Hold where the robot's program does not play, or plays slower than we move the arm."""
-        scaling, words = state.speed_scaling, None
+        scaling, detail = state.speed_scaling, None
         if state.runtime_state != PLAYING:
-            words = f"runtime_state: found {state.runtime_state}, expected {PLAYING} (playing)"
+            detail = f"runtime_state: found {state.runtime_state}, expected {PLAYING} (playing)"
         elif not 0.0 <= scaling <= FASTEST:  # NaN is not
-            words = f"speed_scaling: found {scaling:g}, expected 0 to {FASTEST:g}"
+            detail = f"speed_scaling: found {scaling:g}, expected 0 to {FASTEST:g}"
         elif self._moves_arm and scaling < SLOWED:
-            words = (
+            detail = (
                 f"speed_scaling: found {scaling:g}, expected {SLOWED:g} or more: it falls behind"
             )
-        if words is None or not self._supervisor.state.writes:
+        if detail is None or not self._supervisor.state.writes:
             self._not_following = None
         elif self._not_following is None:
             self._not_following = state.timestamp
         since = self._not_following
         lasts = since is not None and state.timestamp - since > self._patience
-        self._judge(Count.NOT_FOLLOWING, words if lasts else None, Cause.NOT_FOLLOWING)
+        self._judge(Count.NOT_FOLLOWING, detail if lasts else None, Cause.NOT_FOLLOWING)
 
-    def _judge(self, what: Count, words: str | None, cause: Cause | None) -> None:
+    def _judge(self, what: Count, detail: str | None, cause: Cause | None) -> None:
         """Notify the supervisor of a finding; count and report it once for as long as it lasts."""
-        if words is None:
+        if detail is None:
             if what in self._lasting:
                 self._lasting.discard(what)
                 if what == Count.SENSOR_LOST:
@@ -272,11 +272,11 @@ class LoopChecks:
                         {"kind": "degraded", "what": "", "detail": "the sensor is back"}
                     )
             return
-        changed = cause is not None and self._supervisor.take(cause, words)
+        changed = cause is not None and self._supervisor.take(cause, detail)
         if what in self._lasting:
             return
         self._lasting.add(what)
         self._reports.count(what)
         if not changed and self._supervisor.state != State.FAULT:
             kind = "degraded" if what == Count.SENSOR_LOST else "warning"
-            self._reports.emit({"kind": kind, "what": what.label, "detail": words})
+            self._reports.emit({"kind": kind, "what": what.label, "detail": detail})

@@ -19,7 +19,7 @@ class LiveLoads:
 
     The controller's declared payload stands instead of the model's own, because its TCP force has
     that payload taken off. Where a load is beyond ``bounds``, none of the state's is taken: the
-    last ones stay, and ``doubt`` says why.
+    last ones stay, and ``problem`` says why.
     """
 
     def __init__(
@@ -27,7 +27,7 @@ class LiveLoads:
     ) -> None:
         self._bounds = bounds or LoadBounds(math.inf)
         self._has_payload = False  # a payload has been taken
-        self.doubt: str | None = None  # why a load of the last state cannot be
+        self.problem: str | None = None  # why a load of the last state cannot be
         self._use_force = use_force
         self._constant = time_constant
         self._wrench = np.zeros((1, 6))
@@ -40,8 +40,8 @@ class LiveLoads:
 
     def update(self, state: RobotState) -> Loads:
         """Return the loads (one row) of this state; the arrays are this object's own."""
-        self.doubt = self._doubt(state)
-        if self.doubt is None:
+        self.problem = self._problem(state)
+        if self.problem is None:
             self._filter_force(state)
             self._take_payload(state)
         self._follow_motion(state.actual_q)
@@ -56,16 +56,16 @@ class LiveLoads:
             approach=self._approach,
         )
 
-    def _doubt(self, state: RobotState) -> str | None:
+    def _problem(self, state: RobotState) -> str | None:
         """Return in words which load of a state cannot be; None: all can.
 
         Together: the controller takes the declared payload off its force.
         """
         found = None
         if state.payload is not None and state.payload_cog is not None:
-            found = self._bounds.doubt_payload(state.payload, state.payload_cog)
+            found = self._bounds.payload_problem(state.payload, state.payload_cog)
         if found is None and self._use_force and not state.sensor_lost:
-            found = self._bounds.doubt_wrench(state.actual_TCP_force)
+            found = self._bounds.wrench_problem(state.actual_TCP_force)
         return found
 
     def _take_payload(self, state: RobotState) -> None:

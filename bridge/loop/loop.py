@@ -21,19 +21,18 @@ from gapbridge.bridge.loop.checks import NOTHING, RAMPING_OUT, RESYNC, UNSOLVED,
 from gapbridge.bridge.loop.link_monitor import ControllerClock, LinkMonitor, hold_time
 from gapbridge.bridge.loop.live_loads import LiveLoads
 from gapbridge.bridge.loop.offset_in_force import OffsetInForce
-from gapbridge.bridge.loop.readiness import ModelCheck
 from gapbridge.bridge.loop.reports import Reports
 from gapbridge.bridge.loop.setpoint_stream import SetpointStream, longest_withdrawal
 from gapbridge.bridge.loop.supervisor import Cause, State, Supervisor
 from gapbridge.bridge.loop.writing import Writing
 from gapbridge.bridge.setpoint_source.source import Source, SourceStatus
 from gapbridge.core.arrays import Array
+from gapbridge.core.compensation import Compensator
 from gapbridge.core.errors import InvalidStateError, LinkError
 from gapbridge.core.load_bounds import LoadBounds
 from gapbridge.core.loads import Loads
 from gapbridge.core.model import Model
-from gapbridge.core.setpoint import Setpoint
-from gapbridge.core.state import RobotState
+from gapbridge.core.state import RobotState, Setpoint
 from gapbridge.drivers.driver import Driver
 
 LONGEST_STOP = 1.0  # s from a request to stop to letting go, beside what the cell's rates take
@@ -42,6 +41,9 @@ HASTY_RAMP = 0.5  # s: what a stop takes for the ramp at most
 UNSENT = 2  # "attempted" of a cycle whose setpoint was computed and did not (wholly) leave
 
 Emit = Callable[[dict[str, Any]], None]
+LEAST = 1e-9  # m, rad: a smaller offset is none
+PULL = 10.0  # N: a model that bends under a pull corrects something
+POSES, SEED = 16, 14  # tried beside the present one
 
 
 class Exit(IntEnum):
@@ -162,16 +164,16 @@ class Loop:
     def _arm(self) -> None:
         """Arm where a robot is that can move, and nothing that waits for a person."""
         if self._supervisor.state == State.FAULT:
-            words = "a fault is latched: acknowledge it first (gapbridge disarm)"
+            detail = "a fault is latched: acknowledge it first (gapbridge disarm)"
         elif not self._checks.fine:
-            words = f"the robot is not ready: {self._checks.robot}"
+            detail = f"the robot is not ready: {self._checks.robot}"
         elif not_ready := self._not_ready():
-            words = not_ready
+            detail = not_ready
         else:
             if self._supervisor.take(Cause.ARM):
                 self._skip()
             return
-        self._emit({"kind": "refused", "what": "arm", "detail": words})
+        self._emit({"kind": "refused", "what": "arm", "detail": detail})
 
     def _not_ready(self) -> str:
         """Return in words why writing could come to nothing here; empty: it can."""
@@ -179,10 +181,10 @@ class Loop:
         if self._zero_moved:
             return "a joint's zero has moved: acknowledge it first (gapbridge disarm)"
         self._model_check.forget()
-        if self._checks.rate.doubt:
-            return self._checks.rate.doubt
-        if self._loads.doubt is not None:
-            return f"the load is implausible: {self._loads.doubt}"
+        if self._checks.rate.problem:
+            return self._checks.rate.problem
+        if self._loads.problem is not None:
+            return f"the load is implausible: {self._loads.problem}"
         if not stream.finite:
             return "the model's correction is no number at the present pose"
         if stream.unsolved:
@@ -270,7 +272,7 @@ class Loop:
         if supervisor.state == State.FAULT:
             writing.abandon()
         loads = self._acting = self._loads.update(state)
-        self._checks.judge_loads(self._loads.doubt)
+        self._checks.judge_loads(self._loads.problem)
         self._checks.judge_settings(state, self._driver)
         seen = self._now()
         if is_fresh and supervisor.state == State.ARMED:
@@ -345,3 +347,44 @@ class Loop:
         self._source.emit(
             SourceStatus(self._supervisor.state, nominal, corrected, offset, left, clamped)
         )
+
+
+class ModelCheck:
+    """Says whether a model corrects anything at all; tries poses once, then remembers."""
+
+    def __init__(self, model: Model, use_force: bool) -> None:
+        self._compensator = Compensator(model)
+        limits, n = model.arm.limits, model.arm.n
+        lower, upper = np.maximum(limits.lower, -np.pi), np.minimum(limits.upper, np.pi)
+        self._poses = np.random.default_rng(SEED).uniform(lower, upper, (POSES, n))
+        self._use_force = use_force
+        self._known: bool | None = None
+
+    def corrects(self, loads: Loads) -> bool:
+        """Return whether some pose gets an offset under these loads (one row), or under a pull."""
+        if self._known is None:
+            self._known = any(self._offset(q, loads) for q in self._poses)
+        return self._known
+
+    def forget(self) -> None:
+        """Try anew the next time: the loads may be others."""
+        self._known = None
+
+    def _offset(self, q: Array, loads: Loads) -> bool:
+        wrench = np.zeros((1, 6)) if loads.wrench is None else loads.wrench
+        tried = [wrench]
+        if self._use_force:
+            pulls = np.zeros((3, 1, 6))
+            pulls[range(3), 0, range(3)] = PULL
+            tried += [wrench + pull for pull in pulls]
+        for pull in tried:
+            found = self._compensator.correct(
+                q,
+                Loads(
+                    loads.payload_mass, loads.payload_cog, pull, loads.temperature, loads.approach
+                ),
+            )
+            # what cannot be solved is not nothing: it is said where it happens
+            if not found.residual < np.inf or np.abs(found.offset_in_base).max() > LEAST:
+                return True
+        return False

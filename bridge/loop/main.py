@@ -11,7 +11,6 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import gc
-import importlib
 import json
 import os
 import pickle
@@ -19,6 +18,7 @@ import signal
 import sys
 import traceback
 from collections.abc import Callable
+from pkgutil import resolve_name
 from typing import Any
 
 import numpy as np
@@ -46,7 +46,7 @@ from gapbridge.drivers.ft_sensor.joined import DriverWithSensor
 from gapbridge.drivers.replay.driver import ReplayDriver
 
 _PR_SET_PDEATHSIG = 1
-LONGEST_WORDS = 1000  # of an event
+LONGEST_DETAIL = 1000  # of an event
 
 
 def main() -> None:
@@ -116,8 +116,8 @@ def _emitter(events: int) -> Callable[[dict[str, Any]], None]:
     """Return a function that notifies the daemon of an event and never blocks."""
 
     def emit(event: dict[str, Any]) -> None:
-        if len(event.get("detail", "")) > LONGEST_WORDS:
-            event = {**event, "detail": event["detail"][:LONGEST_WORDS]}
+        if len(event.get("detail", "")) > LONGEST_DETAIL:
+            event = {**event, "detail": event["detail"][:LONGEST_DETAIL]}
         now = {"time": SYSTEM.time(), "monotonic": SYSTEM.monotonic()}
         with contextlib.suppress(OSError):  # a message each: taken whole, or not at all
             os.write(events, json.dumps({**now, **event}).encode())
@@ -137,8 +137,7 @@ def _report_compiling(emit: Callable[[dict[str, Any]], None]) -> Callable[[int],
 
 
 def _read_model(settings: DaemonSettings) -> Model:
-    module, function = settings.model_source.split(":")
-    found = getattr(importlib.import_module(module), function)(settings.cell).model
+    found = resolve_name(settings.model_source)(settings.cell).model
     if not isinstance(found, Model):
         raise InputError(f"{settings.model_source}: found {type(found).__name__}, expected a Model")
     return found

@@ -21,8 +21,7 @@ from gapbridge.core.errors import GateError, LimitError
 from gapbridge.core.load_bounds import LoadBounds
 from gapbridge.core.loads import Loads
 from gapbridge.core.model import Model
-from gapbridge.core.setpoint import Setpoint
-from gapbridge.core.state import RobotState
+from gapbridge.core.state import RobotState, Setpoint
 from gapbridge.drivers.replay.driver import Cycle, EndOfRecordingError, ReplayDriver
 
 

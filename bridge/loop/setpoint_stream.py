@@ -17,8 +17,7 @@ from gapbridge.core.kernels.reference import JIT
 from gapbridge.core.limits import LONGEST_GAP, Limiter, Limits
 from gapbridge.core.loads import Loads
 from gapbridge.core.model import Model
-from gapbridge.core.setpoint import Setpoint
-from gapbridge.core.state import RobotState
+from gapbridge.core.state import RobotState, Setpoint
 from gapbridge.drivers.clock import SYSTEM, Clock
 from gapbridge.drivers.gate import GateBounds
 

@@ -24,8 +24,7 @@ from gapbridge.core.errors import (
     WriteError,
 )
 from gapbridge.core.loads import Loads
-from gapbridge.core.setpoint import Setpoint
-from gapbridge.core.state import RobotState
+from gapbridge.core.state import RobotState, Setpoint
 from gapbridge.drivers.driver import Driver
 
 SETTLED, LONGEST_SETTLING = 2e-6, 0.3  # rad, s
@@ -160,8 +159,8 @@ class Writing:
         try:
             if not stream.finite:
                 self.unsent = _copied(setpoint)
-                words = "the model's correction is no number"
-                self._end(Count.BAD_OUTPUT, Cause.BAD_OUTPUT, words)
+                detail = "the model's correction is no number"
+                self._end(Count.BAD_OUTPUT, Cause.BAD_OUTPUT, detail)
             elif self._now() > expiry:  # the system stopped this process since it was judged
                 self.unsent = _copied(setpoint)
                 self._reports.count(Count.LATE)
@@ -179,17 +178,17 @@ class Writing:
 
     def _judge_correction(self) -> None:
         """End the motion where the model has no correction; the offset is on its way out."""
-        words = self._stream.unsolved
-        if words and self._supervisor.take(Cause.UNSOLVED, words):
+        detail = self._stream.unsolved
+        if detail and self._supervisor.take(Cause.UNSOLVED, detail):
             self._reports.count(Count.UNSOLVED)
 
     def _judge_sending(self, expiry: float) -> None:
         """End the motion where the system stopped this process between judging and sending."""
         late = self._now() - expiry
         if late > 0.0:
-            words = f"a setpoint left {1e3 * late:.0f} ms after its state was too old"
+            detail = f"a setpoint left {1e3 * late:.0f} ms after its state was too old"
             self._reports.count(Count.OVERRUN)
-            self._supervisor.take(Cause.OVERRUN, words)
+            self._supervisor.take(Cause.OVERRUN, detail)
 
     def _fail(self, error: WriteError) -> None:
         """Act on a setpoint that could not be delivered."""
@@ -251,8 +250,8 @@ class Writing:
             return None if self._driver.moves_arm else own
         if self._source.ended and not self._reports.page.ended:
             self._reports.page.note_ended()
-            words = "the source has come to its end; the arm stays there"
-            self._reports.emit({"kind": "source", "what": "ended", "detail": words})
+            detail = "the source has come to its end; the arm stays there"
+            self._reports.emit({"kind": "source", "what": "ended", "detail": detail})
         return found
 
     def release(self) -> None:

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import re
 import time
 from pathlib import Path
 
-from gapbridge.bridge.document.output_file import FOLDER_MODE
-from gapbridge.core.errors import InputError
 from gapbridge.core.log.mcap_reading import SUFFIX, last_batch
 
 NAME = re.compile(r"(?P<session>.+)-(?P<number>\d{3,})\.mcap$")
@@ -29,18 +26,6 @@ def new_session(folder: Path | None) -> str:
 
 def _is_taken(folder: Path, session: str) -> bool:
     return bool(segments(folder, session)) or (folder / f"{session}{LOOP_LOG}").exists()
-
-
-def require_folder(folder: Path) -> None:
-    """Make the folder. Raises InputError where recordings cannot be written into it."""
-    try:
-        folder.mkdir(FOLDER_MODE, parents=True, exist_ok=True)
-        if not os.access(folder, os.W_OK | os.X_OK):
-            raise PermissionError(13, "Permission denied")
-    except OSError as error:
-        raise InputError(
-            f"recording.folder: {folder}: {error.strerror}, expected a folder that can be written"
-        ) from None
 
 
 def segments(folder: Path, session: str) -> list[Path]:

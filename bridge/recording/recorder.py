@@ -19,7 +19,6 @@ from gapbridge.bridge.cell.settings.recording import RecordingSettings
 from gapbridge.bridge.document.output_file import make_folder
 from gapbridge.bridge.ipc.shared_memory import SharedMemory
 from gapbridge.bridge.loop.supervisor import State
-from gapbridge.bridge.recording.event_text import LEVELS, level_of, text_of
 from gapbridge.bridge.recording.finishing import finish, unfinished
 from gapbridge.bridge.recording.folder import next_path, number_after, prune, segments
 from gapbridge.bridge.recording.segment import Segment
@@ -34,6 +33,8 @@ MB = 1e6
 
 Event = Mapping[str, Any]
 Emit = Callable[[dict[str, Any]], None]
+LEVELS = {"info": 2, "warning": 3, "error": 4}  # foxglove.Log's own numbers
+_PLAIN = ("time", "monotonic", "sequence", "kind", "cycle")
 
 
 class Recorder:
@@ -228,3 +229,22 @@ class Recorder:
         """Return the MB that are free for us."""
         found = os.statvfs(self._folder)
         return found.f_bavail * found.f_frsize / MB
+
+
+def level_of(event: Mapping[str, Any]) -> str:
+    """Return how grave an event is."""
+    if event.get("kind") == "fault" or event.get("to") == "FAULT":
+        return "error"
+    grave = event.get("kind") == "refused" or "paused" in event or "lost" in event
+    return "warning" if grave or event.get("to") == "HOLDING" else "info"
+
+
+def text_of(event: Mapping[str, Any]) -> str:
+    """Return an event in words."""
+    if "from" in event and "to" in event:
+        text = f"{event['from']} -> {event['to']} ({event.get('cause', '')})"
+        return f"{text}: {event['detail']}" if event.get("detail") else text
+    if event.get("detail"):
+        return str(event["detail"])
+    parts = [f"{key} {value}" for key, value in event.items() if key not in _PLAIN]
+    return f"{event.get('kind', '')}: {', '.join(parts)}"

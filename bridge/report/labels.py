@@ -48,6 +48,17 @@ _VECTORS = {
     "ft_raw_wrench": "sensor reading",
 }
 _AXES = ("x", "y", "z", "about x", "about y", "about z")
+OF_SESSIONS = {  # what sessions find that is no effect
+    "tool_tcp": "tool centre {part}",
+    "payload_mass": "mass of the load",
+    "payload_cog": "centre of gravity {part}",
+}
+PARTS = {
+    "a": "length a", "d": "offset d", "alpha": "twist alpha", "beta": "twist beta",
+    "x": "x", "y": "y", "z": "z", "rx": "turn about x", "ry": "turn about y", "rz": "turn about z",
+    "fx": "force x", "fy": "force y", "fz": "force z",
+    "mx": "torque x", "my": "torque y", "mz": "torque z",
+}  # fmt: skip
 
 
 def effect_title(identifier: str) -> str:
@@ -89,6 +100,23 @@ def quantity_unit(name: str) -> tuple[str, float]:
 def unit_of(unit: str) -> tuple[str, float]:
     """Return the unit that people use for an SI unit, and the factor to it."""
     return UNITS.get(unit, (unit, 1.0))
+
+
+def fixed(value: float, decimals: int) -> str:
+    """Return a number with so many decimals, with a true minus sign, never minus nothing."""
+    if not math.isfinite(value):
+        return "unknown"
+    text = f"{value:.{decimals}f}"
+    if not text.strip("-0."):
+        text = text.lstrip("-")
+    return text.replace("-", "−")
+
+
+def decimals_of(spread: float) -> int:
+    """Return the decimals that show two digits of a spread."""
+    if not math.isfinite(spread) or spread <= 0:
+        return 3
+    return min(max(1 - math.floor(math.log10(spread)), 0), 9)
 
 
 def number(value: float, digits: int = 3) -> str:
@@ -142,3 +170,54 @@ def joint_list(joints: tuple[int, ...]) -> str:
     if not joints:
         return ""
     return f"joint{'s' if len(joints) > 1 else ''} {listed([str(j) for j in joints])}"
+
+
+def patterns() -> dict[str, str]:
+    """Return how parameters are named in words, by the beginning of their public name."""
+    templates = {name: e.label_template for name, e in CATALOGUE.items()}
+    return {name: text for name, text in templates.items() if text} | OF_SESSIONS
+
+
+def effect_of(name: str) -> str:
+    """Return the effect that a parameter's public name begins with; empty for none."""
+    return max((e for e in (*CATALOGUE, *OF_SESSIONS) if name.startswith(e)), key=len, default="")
+
+
+def parameter_title(name: str) -> str:
+    """Return a parameter's public name in words; the name itself where there are none."""
+    effect = effect_of(name)
+    if name == effect and effect in CATALOGUE and "{" in patterns().get(effect, "{"):
+        return effect_title(effect)
+    match = re.fullmatch(r"(?:_(\d+))?(?:_(.+))?", name.removeprefix(effect))
+    if not effect or match is None:
+        return name
+    joint, rest = match[1] or "", match[2] or ""
+    part = PARTS.get(rest, re.sub(r"^order(\S+?)_", r"\1 a turn, ", rest).replace("_", " "))
+    pattern = patterns().get(effect)
+    if pattern is None:
+        where = f", joint {joint}" if joint else ""
+        return f"{effect_title(effect)}{where}{', ' + part if part else ''}"
+    return pattern.format(joint=joint, part=part).replace(" ()", "").strip()
+
+
+def with_titles(text: str) -> str:
+    """Return a text with public names of parameters and effects in words instead."""
+    names = "|".join(sorted((*CATALOGUE, *OF_SESSIONS), key=len, reverse=True))
+    return re.sub(rf"\b(?:{names})(?:_[A-Za-z0-9_.]*\w)?\b", _as_title, text)
+
+
+def sentence(text: str) -> str:
+    """Return a text that begins with a capital and ends with a full stop."""
+    text = with_titles(text).strip()
+    end = "" if text.endswith((".", "!", "?")) else "."
+    return text[:1].upper() + text[1:] + end
+
+
+def _as_title(match: re.Match[str]) -> str:
+    # words of the language are names too ("payload", "backlash"): only what has a _ is a name
+    return parameter_title(match[0]) if "_" in match[0] else match[0]
+
+
+def counted(count: int, one: str, many: str = "") -> str:
+    """Return "1 pose" or "3 poses"."""
+    return f"{count} {one if count == 1 else many or one + 's'}"

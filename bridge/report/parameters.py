@@ -14,7 +14,15 @@ from gapbridge.bridge.document.blocks import (
     Table,
 )
 from gapbridge.bridge.document.findings import clock
-from gapbridge.bridge.report.labels import effect_title, joint_list, listed, number, unit_of
+from gapbridge.bridge.report.labels import (
+    decimals_of,
+    effect_title,
+    fixed,
+    joint_list,
+    listed,
+    number,
+    unit_of,
+)
 from gapbridge.bridge.report.material import Material
 from gapbridge.core.diagnosis.causes import Cause
 from gapbridge.core.diagnosis.separation import Measurement
@@ -61,18 +69,9 @@ def _value(p: Reported) -> tuple[str, str, str]:
     if p.std is None or not np.isfinite(p.std):
         return number(value), "unknown", name
     side = SIDE * p.std * factor
-    digits = _decimals(side)
-    return (
-        f"{value:.{digits}f}".replace("-", "−"),
-        f"{value - side:.{digits}f} to {value + side:.{digits}f}".replace("-", "−"), name,
-    )  # fmt: skip
-
-
-def _decimals(side: float) -> int:
-    """Return the decimals that show two digits of an interval's half width."""
-    if side <= 0:
-        return 3
-    return int(min(max(1 - np.floor(np.log10(side)), 0), 9))
+    digits = decimals_of(side)
+    low, high = (fixed(v, digits) for v in (value - side, value + side))
+    return fixed(value, digits), f"{low} to {high}", name
 
 
 def _ties(causes: list[Cause]) -> list[Block]:

@@ -6,15 +6,15 @@ import ipaddress
 from pathlib import Path
 from typing import Self
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
+
+from gapbridge.drivers.section import Section
 
 GUARDS = ("certificate", "key", "token_file")
 
 
-class ServedSettings(BaseModel):
+class ServedSettings(Section):
     """Where something is served. Elsewhere than on this machine only by TLS and with a token."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
     host: str = Field("127.0.0.1", description="an address of this machine, or localhost")
     port: int = Field(0, ge=0, le=65535, description="TCP port; 0: any that is free")
@@ -72,6 +72,5 @@ class ServedSettings(BaseModel):
         return self
 
     def located(self, folder: Path) -> Self:
-        """Return the settings with paths made absolute from ``folder``."""
-        seen = {name: (folder / path).resolve() for name in GUARDS if (path := getattr(self, name))}
-        return self.model_copy(update=seen)
+        """Return the settings with paths made absolute, without links in them."""
+        return super().located(folder.resolve())

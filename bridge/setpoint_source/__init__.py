@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import importlib
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import TYPE_CHECKING, cast
 
 if TYPE_CHECKING:
@@ -29,6 +29,5 @@ def make_source(
     relative paths start; ``rate``: of the robot's cycles, Hz. Raises InputError where it cannot be
     used.
     """
-    module, kind = SOURCES[settings.source].split(":")
-    found = getattr(importlib.import_module(module), kind)
+    found = resolve_name(SOURCES[settings.source])
     return cast("Source", found(settings, n, moves_arm, folder, rate))

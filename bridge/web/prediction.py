@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import importlib
 import threading
 from collections.abc import Mapping
+from pkgutil import resolve_name
 from typing import Any
 
 import numpy as np
@@ -37,9 +37,8 @@ class Prediction:
         threading.Thread(target=self._read, daemon=True).start()
 
     def _read(self) -> None:
-        module, function = self._settings.model_source.split(":")
         try:
-            model = getattr(importlib.import_module(module), function)(self._settings.cell).model
+            model = resolve_name(self._settings.model_source)(self._settings.cell).model
             # compiled before it is needed
             q = np.zeros(model.arm.n)
             self._predict(model, q[None], Loads())

@@ -49,6 +49,12 @@ class Site:
     joint: int | None = None
     order: float | None = None  # cycles per turn of the joint
 
+    @property
+    def index(self) -> int:
+        """Return the joint's place in arrays, from 0."""
+        assert self.joint is not None
+        return self.joint - 1
+
 
 @dataclass(frozen=True)
 class Term:
@@ -222,9 +228,8 @@ class TorqueEffect(JointEffect):
 
     def drive(self, term: Term, arm: Arm, torque: Array, motion: Motion) -> Array:
         """Add it at the joint."""
-        assert term.site.joint is not None
         result = torque.copy()
-        result[:, term.site.joint - 1] += self.added(term, term.site.joint - 1, motion)
+        result[:, term.site.index] += self.added(term, term.site.index, motion)
         return result
 
     @abstractmethod
@@ -241,8 +246,7 @@ class ServoEffect(JointEffect):
         """Let the joint follow, stretch by stretch."""
         if not motion.moving:
             return super().track(term, arm, q, motion)
-        assert term.site.joint is not None
-        i, result = term.site.joint - 1, q.copy()
+        i, result = term.site.index, q.copy()
         for part in motion.stretches():
             first = float(motion.q[part.start, i])
             result[part, i] = self.follow(term, motion.t[part], q[part, i], first)
@@ -278,6 +282,5 @@ def typical_moment(arm: Arm, joint: int = 0) -> float:
 
 def joint_scale(arm: Arm, site: Site) -> float:
     """Return a usual torque (Nm) of a joint: its rated effort, or what the arm's weight makes."""
-    assert site.joint is not None
-    effort = float(arm.limits.effort[site.joint - 1])
+    effort = float(arm.limits.effort[site.index])
     return effort if np.isfinite(effort) and effort > 0 else typical_moment(arm)

@@ -30,7 +30,7 @@ from gapbridge.core.kernels.layout import (
 from gapbridge.core.kernels.reference import INNER
 
 # slots of a record of this workspace; records as in layout
-SWING, GIVE, BODY, PULL, PUSH, SHIFT, TWIST = 0, 9, 12, 15, 18, 21, 24
+MOMENT_RATE, GIVE, BODY, PULL, PUSH, SHIFT, TWIST = 0, 9, 12, 15, 18, 21, 24
 SHARE = 27
 OWN = 28
 # slots beside the records: sums on the way
@@ -42,8 +42,8 @@ _L = LANES
 
 
 @njit(**FAST)
-def _swing(w, u, s, record, load):  # type: ignore[no-untyped-def]
-    """Write how the moment of the loads beyond changes as they swing about a record's origin.
+def _moment_rate(w, u, s, record, load):  # type: ignore[no-untyped-def]
+    """Write by how much the moment of the loads beyond changes per turn about a record's origin.
 
     K' of K t = sum (t x d) x f, from the sum of r f' at ``OUTER``; ``load``: the record whose
     total is the force.
@@ -58,7 +58,7 @@ def _swing(w, u, s, record, load):  # type: ignore[no-untyped-def]
             o = w[U(a + (ORIGIN + i) * _L + k)] if record > 0 else 0.0
             for j in range(3):
                 outer = s[U((OUTER + 3 * i + j) * _L + k)] - o * w[U(b + (TOTAL + j) * _L + k)]
-                u[U(c + (SWING + 3 * j + i) * _L + k)] = outer - (trace if i == j else 0.0)
+                u[U(c + (MOMENT_RATE + 3 * j + i) * _L + k)] = outer - (trace if i == j else 0.0)
 
 
 @njit(**FAST)
@@ -127,13 +127,13 @@ def prepare(chain, w, v, u, s):  # type: ignore[no-untyped-def]
     """Write what all coordinates share, for lanes that have settled."""
     n, g = chain.mass.shape[0], chain.gravity
     _hang_tool(w, v, s, n, g)
-    _swing(w, u, s, n + 1, n + 1)
+    _moment_rate(w, u, s, n + 1, n + 1)
     for i in range(n - 1, -1, -1):
         m = chain.mass[i]
         _hang(w, s, i + 1, chain.cog[i], m * g[0], m * g[1], m * g[2])
-        _swing(w, u, s, i + 1, i + 1)
+        _moment_rate(w, u, s, i + 1, i + 1)
         _softness(w, u, i + 1, chain.compliance[i], chain.softening[i])
-    _swing(w, u, s, 0, 1)
+    _moment_rate(w, u, s, 0, 1)
     for j in range(3):
         for k in range(_L):
             u[(GIVE + j) * _L + k] = chain.base_compliance[j]
@@ -167,9 +167,9 @@ def _out(w, v, u, s, record, axis, turning):  # type: ignore[no-untyped-def]
         u[U(b + (TWIST + 2) * _L + k)] = turned * ez + moved * (x * ey - y * ex)
         for j in range(3):
             u[U(b + (TWIST + j) * _L + k)] += (
-                u[U(b + (SWING + 3 * j) * _L + k)] * px
-                + u[U(b + (SWING + 3 * j + 1) * _L + k)] * py
-                + u[U(b + (SWING + 3 * j + 2) * _L + k)] * pz
+                u[U(b + (MOMENT_RATE + 3 * j) * _L + k)] * px
+                + u[U(b + (MOMENT_RATE + 3 * j + 1) * _L + k)] * py
+                + u[U(b + (MOMENT_RATE + 3 * j + 2) * _L + k)] * pz
             )
             s[U((SUM + j) * _L + k)] += u[U(b + (PUSH + j) * _L + k)]
 
@@ -178,17 +178,17 @@ def _out(w, v, u, s, record, axis, turning):  # type: ignore[no-untyped-def]
 def _back(w, u, s, record):  # type: ignore[no-untyped-def]
     """Add what the joints from a record on see of a twist there; the sum goes with it."""
     a, b = record * RECORD * _L, record * OWN * _L
-    swung = 1.0 if record > 0 else 0.0  # the base's moment counts about axes that do not swing
+    turns = 1.0 if record > 0 else 0.0  # the base's moment counts about axes that do not turn
     for k in range(_L):
         px, py = u[U(b + PUSH * _L + k)], u[U(b + (PUSH + 1) * _L + k)]
         pz = u[U(b + (PUSH + 2) * _L + k)]
-        mx, my = swung * w[U(a + MOMENT * _L + k)], swung * w[U(a + (MOMENT + 1) * _L + k)]
-        mz = swung * w[U(a + (MOMENT + 2) * _L + k)]
+        mx, my = turns * w[U(a + MOMENT * _L + k)], turns * w[U(a + (MOMENT + 1) * _L + k)]
+        mz = turns * w[U(a + (MOMENT + 2) * _L + k)]
         for j in range(3):
             s[U((SUM + j) * _L + k)] += (
-                u[U(b + (SWING + 3 * j) * _L + k)] * px
-                + u[U(b + (SWING + 3 * j + 1) * _L + k)] * py
-                + u[U(b + (SWING + 3 * j + 2) * _L + k)] * pz
+                u[U(b + (MOMENT_RATE + 3 * j) * _L + k)] * px
+                + u[U(b + (MOMENT_RATE + 3 * j + 1) * _L + k)] * py
+                + u[U(b + (MOMENT_RATE + 3 * j + 2) * _L + k)] * pz
             )
         s[U(SUM * _L + k)] -= my * pz - mz * py
         s[U((SUM + 1) * _L + k)] -= mz * px - mx * pz

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from numba import config
+import numpy as np
+from numba import config, njit
 
 from gapbridge.core.arrays import Array
 from gapbridge.core.kernels import reference as kernel
-from gapbridge.core.kernels.predict import linear_blocks, predict_blocks
-from gapbridge.core.kernels.reference import Chain, Rows
+from gapbridge.core.kernels.factor import flexibility_columns
+from gapbridge.core.kernels.lanes import bends, gather, lanes_of, settle
+from gapbridge.core.kernels.layout import AXIS, LANES, MOMENT, ORIGIN, RECORD, TCP, TCP_ROTATION
+from gapbridge.core.kernels.reference import INNER, JIT, Chain, Rows, Shape
 from gapbridge.core.kernels.threads import in_ranges
 
 FEW = 2  # rows that are not worth a block
@@ -54,3 +57,78 @@ def linear_form(chain: Chain, rows: Rows, A: Array, jacobian: Array, moment: Arr
     if _singly(chain, rows):
         return singly(0, len(rows.q))
     return next((bad for bad in in_ranges(work, len(rows.q)) if bad >= 0), -1)
+
+
+@njit(**JIT)
+def predict_blocks(chain, rows, first, last, position, rotation):  # type: ignore[no-untyped-def]
+    """Write the TCP poses of rows first..last; returns the first without equilibrium, or -1.
+
+    The arm's links must not bend themselves. A block that does not settle at once goes through
+    core.kernels.reference, which says which of its rows it is.
+    """
+    n = chain.mass.shape[0]
+    w, v = lanes_of(n)
+    deflected, bad = bends(chain), -1
+    for r in range(first, last, LANES):
+        end = min(r + LANES, last)
+        if not (gather(chain, rows, r, w, v) and settle(chain, w, v, deflected, False)):
+            found = _one_by_one(chain, rows, r, end, position, rotation)
+            bad = found if bad < 0 else bad
+            continue
+        for k in range(end - r):
+            for j in range(3):
+                position[r + k, j] = v[(TCP + j) * LANES + k]
+                for i in range(3):
+                    rotation[r + k, j, i] = v[(TCP_ROTATION + 3 * j + i) * LANES + k]
+    return bad
+
+
+@njit(**JIT)
+def linear_blocks(chain, rows, first, last, A, jacobians, moments):  # type: ignore[no-untyped-def]
+    """Write what ``kernel.regressor_rows`` does, for rows first..last of links that are stiff.
+
+    Returns -1, or the first row of a block that does not settle at once: reference.py's from there.
+    """
+    n = chain.mass.shape[0]
+    w, v = lanes_of(n)
+    X = np.empty(2 * n * 6 * LANES)
+    deflected = bends(chain)
+    for r in range(first, last, LANES):
+        if not (gather(chain, rows, r, w, v) and settle(chain, w, v, deflected, False)):
+            return r
+        flexibility_columns(w, v, X, 0, n, 6)
+        for k in range(min(LANES, last - r)):
+            for j in range(6):
+                for c in range(2 * n):
+                    A[r + k, j, c] = X[(6 * c + j) * LANES + k]
+            _written(w, v, k, jacobians[r + k], moments[r + k])
+    return -1
+
+
+@njit(**INNER)
+def _written(w, v, k, J, moment):  # type: ignore[no-untyped-def]
+    """Write the Jacobian (6, n) and the joint moments (n, 3) of lane k."""
+    for i in range(moment.shape[0]):
+        a = (i + 1) * RECORD * LANES + k
+        for j in range(3):
+            e, f = (j + 1) % 3, (j + 2) % 3
+            lever_e = v[(TCP + e) * LANES + k] - w[a + (ORIGIN + e) * LANES]
+            lever_f = v[(TCP + f) * LANES + k] - w[a + (ORIGIN + f) * LANES]
+            J[j, i] = w[a + (AXIS + e) * LANES] * lever_f - w[a + (AXIS + f) * LANES] * lever_e
+            J[3 + j, i] = w[a + (AXIS + j) * LANES]
+            moment[i, j] = w[a + (MOMENT + j) * LANES]
+
+
+@njit(**INNER)
+def _one_by_one(chain, rows, first, last, position, rotation):  # type: ignore[no-untyped-def]
+    n, bad = chain.mass.shape[0], -1
+    shape = Shape(
+        np.zeros((n + 1, 3)), np.zeros((n + 1, 3, 3)), np.zeros((n, 3)), np.zeros((n, 3)),
+        np.zeros((n, 3)), np.zeros((n, 6)), np.zeros(3), np.zeros((3, 3)),
+    )  # fmt: skip
+    for r in range(first, last):
+        if kernel.equilibrium(chain, rows, r, shape) < 0 and bad < 0:
+            bad = r
+        kernel.copy_vector(shape.tcp_position, position[r])
+        kernel.copy_matrix(shape.tcp_rotation, rotation[r])
+    return bad

@@ -128,8 +128,8 @@ def _reaction(w, u, push, turned, record):  # type: ignore[no-untyped-def]
 
 
 @njit(**FAST)
-def _weighed(w, B, push, turned, record, m, c, slot):  # type: ignore[no-untyped-def]
-    """Add what a mass ``m`` at ``c`` in a record's axes feels of gravity to the slots."""
+def _add_gravity(w, B, push, turned, record, m, c, slot):  # type: ignore[no-untyped-def]
+    """Add the derivative by gravity of a mass ``m`` at ``c`` (record's axes) to the slots."""
     a = record * RECORD * _L
     cx, cy, cz = c[0], c[1], c[2]
     for k in range(_L):
@@ -153,7 +153,7 @@ def _weighed(w, B, push, turned, record, m, c, slot):  # type: ignore[no-untyped
 
 @njit(**FAST)
 def _of_payload(w, v, B, push, turned, n, g, gravity):  # type: ignore[no-untyped-def]
-    """Write the derivative by the payload's mass; add what the payload feels of gravity."""
+    """Write the derivative by the payload's mass; add its derivative by gravity."""
     a, load = (n + 1) * RECORD * _L, 12 * n + 18
     gx, gy, gz = g[0], g[1], g[2]
     for k in range(_L):
@@ -200,7 +200,7 @@ def _derivatives(chain, w, v, u, B, push, turned, axis, turning, links, loads): 
         _reaction(w, u, push, turned, 0)
         for i in range(n):
             _reaction(w, u, push, turned, i + 1)
-            _weighed(w, B, push, turned, i + 1, chain.mass[i], chain.cog[i], gravity)
+            _add_gravity(w, B, push, turned, i + 1, chain.mass[i], chain.cog[i], gravity)
         _of_tool(w, v, B, n, 6 * (n + 1), push, axis, turning)
         _of_payload(w, v, B, push, turned, n, chain.gravity, gravity)
     for j in range(3):

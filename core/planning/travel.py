@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gapbridge.core.arrays import Array
+from gapbridge.core.arrays import Array, Index
 
 SPEED = 0.25  # of the joints' top speed: what a technician moves with
 USUAL_SPEED = 0.5  # rad/s, where the top speed is unknown
@@ -55,3 +55,13 @@ def _turned_round(order: list[int], legs: Array, first: Array) -> bool:
                 order[i : j + 1] = order[i : j + 1][::-1]
                 better = True
     return better
+
+
+def far_apart(position: Array, count: int) -> Index:
+    """Return rows (count,) of positions (N, 3), m, each far from those before it."""
+    chosen = [int(np.argmax(np.linalg.norm(position - position.mean(axis=0), axis=1)))]
+    nearest = np.linalg.norm(position - position[chosen[0]], axis=1)
+    while len(chosen) < min(count, len(position)):
+        chosen.append(int(np.argmax(nearest)))
+        nearest = np.minimum(nearest, np.linalg.norm(position - position[chosen[-1]], axis=1))
+    return np.array(chosen, dtype=np.int64)

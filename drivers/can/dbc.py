@@ -30,10 +30,10 @@ class Dbc:
         """Return the line (from 1) of a message or of one of its signals."""
         return self.lines.get((message, signal), self.lines.get((message, ""), 1))
 
-    def error(self, message: str, signal: str, words: str) -> ProfileError:
+    def error(self, message: str, signal: str, detail: str) -> ProfileError:
         """Return the error that says ``words`` about a signal, or about its message."""
         name = f"{message}.{signal}" if signal else message
-        return ProfileError(f"{self.path}, line {self.line(message, signal)}: {name}: {words}")
+        return ProfileError(f"{self.path}, line {self.line(message, signal)}: {name}: {detail}")
 
     def nearest(self, name: str) -> str:
         """Return a hint at the nearest message or ``MESSAGE.SIGNAL``."""

@@ -15,8 +15,7 @@ from gapbridge.core.errors import (
     WriteError,
 )
 from gapbridge.core.model import Model
-from gapbridge.core.setpoint import Setpoint
-from gapbridge.core.state import RobotState
+from gapbridge.core.state import RobotState, Setpoint
 from gapbridge.drivers.can.assembler import Sample
 from gapbridge.drivers.can.loading import read_profile
 from gapbridge.drivers.can.reader import FrameReader

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -22,29 +23,24 @@ from gapbridge.drivers.can.profile import (
     Reading,
 )
 from gapbridge.drivers.can.schema import ProfileFile, Quantity
-from gapbridge.drivers.can.units import UNITS
 from gapbridge.drivers.profile_file import ProfileDocument, ProfileError, read_profile_document
 
-SHIPPED = Path(__file__).with_name("profiles")
+TURN = 2.0 * math.pi
+DEGREE = math.pi / 180.0
 
-
-def shipped_profiles() -> tuple[str, ...]:
-    """Return the names of the profiles that come with Gapbridge."""
-    return tuple(sorted(path.stem for path in SHIPPED.glob("*.yaml")))
-
-
-def load_profile(name: str, folder: Path | None = None) -> CanProfile:
-    """Return a shipped profile by name, or one by its path relative to ``folder``.
-
-    Raises ProfileError in one line: file, line, key, found, expected.
-    """
-    if name in shipped_profiles():
-        return read_profile(SHIPPED / f"{name}.yaml")
-    path = (folder or Path()) / name
-    if path.suffix not in (".yaml", ".yml"):
-        known = ", ".join(shipped_profiles())
-        raise ProfileError(f"link.profile: found {name!r}, expected {known}, or a YAML file")
-    return read_profile(path)
+UNITS: dict[str, dict[str, float]] = {
+    "position": {
+        "rad": 1.0, "mrad": 1e-3, "deg": DEGREE, "°": DEGREE, "mdeg": 1e-3 * DEGREE,
+        "turn": TURN, "turns": TURN, "rev": TURN,
+    },
+    "velocity": {
+        "rad/s": 1.0, "mrad/s": 1e-3, "deg/s": DEGREE, "°/s": DEGREE, "mdeg/s": 1e-3 * DEGREE,
+        "turn/s": TURN, "turns/s": TURN, "rev/s": TURN, "rpm": TURN / 60.0,
+    },
+    "torque": {"Nm": 1.0, "N.m": 1.0, "mNm": 1e-3},
+    "temperature": {"degC": 1.0, "°C": 1.0, "C": 1.0},
+}  # fmt: skip
+"""Quantity -> unit -> rad, rad/s, Nm or °C in one of it."""
 
 
 def read_profile(path: Path, installation: Mapping[str, list[float]] | None = None) -> CanProfile:

@@ -51,8 +51,8 @@ class OutgoingLoading:
         known = {signal.name for signal in message.signals}
         for name in entry.signals:
             if name not in known:
-                words = f"found {name!r}, no signal of {message.name}: {', '.join(sorted(known))}"
-                raise self.names.error((*keys, "signals", name), words)
+                detail = f"found {name!r}, no signal of {message.name}: {', '.join(sorted(known))}"
+                raise self.names.error((*keys, "signals", name), detail)
         filled = {name for name, _ in joints}
         if missing := known - filled - set(entry.signals):
             raise self.names.error(

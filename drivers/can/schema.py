@@ -4,18 +4,12 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from gapbridge.drivers.robot_modes import Trouble
+from gapbridge.drivers.section import Number, Section
 
-Number = Annotated[float, Field(allow_inf_nan=False)]
 Identifier = Annotated[int, Field(ge=0, le=0x1FFFFFFF)]
-
-
-class Section(BaseModel):
-    """One mapping of the file; unknown keys are refused."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
 
 class Quantity(Section):
@@ -66,7 +60,7 @@ class FrameEntry(Section):
     """One frame: a message of the DBC with its signals' values, or with its bytes."""
 
     message: str
-    signals: dict[str, Number] = {}
+    signals: dict[str, Number] = Field(default={})
     data: str | None = Field(default=None, description="bytes, hexadecimal")
 
     @model_validator(mode="after")
@@ -80,7 +74,7 @@ class FrameEntry(Section):
 class Step(Section):
     """One step of a sequence: frames, a hold at the present joints, a wait."""
 
-    send: list[FrameEntry] = []
+    send: list[FrameEntry] = Field(default=[])
     hold: bool = Field(default=False, description="send the present joints as setpoint")
     wait: Number = Field(default=0.0, ge=0.0, le=5.0, description="s, after the frames")
     until: Literal["enabled", "disabled", "ready"] | None = Field(
@@ -110,16 +104,16 @@ class ProfileFile(Section):
     gear: list[Number] | Number = Field(default=1.0, description="wire turns per joint turn")
     feedback: Feedback
     sample: SampleEntry
-    status: list[StatusEntry] = []
+    status: list[StatusEntry] = Field(default=[])
     status_timeout: Number = Field(default=1.0, gt=0.0, le=60.0, description="s")
     enabled: EnabledEntry | None = None
     request: list[FrameEntry] = Field(
         default=[], description="asked each cycle of an arm that speaks only when spoken to"
     )
     setpoint: SetpointEntry | None = Field(default=None, description="left out: read only")
-    enable: list[Step] = []
-    release: list[Step] = []
-    stop: list[Step] = []
+    enable: list[Step] = Field(default=[])
+    release: list[Step] = Field(default=[])
+    stop: list[Step] = Field(default=[])
     sends: list[Identifier] = Field(default=[], description="the only identifiers we may send")
     control: list[Identifier] = Field(
         default=[], description="further identifiers that only a commander sends"

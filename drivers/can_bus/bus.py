@@ -54,6 +54,24 @@ class BusSettings(BaseModel):
         return f"{self.interface} {self.channel}{at}"
 
 
+class ArmBusSettings(BusSettings):
+    """A bus on which an arm is moved: who else may command it, and when a joint is stuck."""
+
+    foreign_quiet: float = Field(
+        1.0, gt=0.0, le=10.0, description="s without a frame of another master before we may write"
+    )
+    frozen_after: float = Field(
+        0.5, gt=0.0, le=10.0,
+        description="s that joints may stand still, count by count, though commanded away",
+    )  # fmt: skip
+    frozen_distance: float = Field(
+        0.02, gt=0.0, le=0.5, description="rad of command from joint that counts as away"
+    )
+    arming_distance: float = Field(
+        0.03, gt=0.0, le=0.3, description="rad that a joint may give while it is enabled"
+    )
+
+
 def open_bus(settings: BusSettings, filters: list[can.typechecking.CanFilter] | None = None) -> Any:
     """Return an open ``can.BusABC``. Raises LinkError, soon, where the bus is not there.
 

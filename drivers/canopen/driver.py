@@ -16,8 +16,7 @@ from gapbridge.core.errors import (
     WriteError,
 )
 from gapbridge.core.model import Model
-from gapbridge.core.setpoint import Setpoint
-from gapbridge.core.state import RobotState
+from gapbridge.core.state import RobotState, Setpoint
 from gapbridge.drivers.canopen.command import RpdoWriter
 from gapbridge.drivers.canopen.configure import (
     check_identity,

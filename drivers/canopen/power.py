@@ -100,8 +100,8 @@ class Power:
             if time.monotonic() > end:
                 raise self._not_there(found)
             resetting = not resetting and clear_faults
-            words = [self._towards(state, enabled, resetting) for state in reported]
-            self._writer.send(words, positions(self._profile, found) if hold is None else hold)
+            detail = [self._towards(state, enabled, resetting) for state in reported]
+            self._writer.send(detail, positions(self._profile, found) if hold is None else hold)
             found = self._exchange() or found
 
     def _towards(self, state: State, all_enabled: bool, resetting: bool) -> int:
@@ -141,8 +141,8 @@ class Power:
                 late = time.monotonic() > end - 0.5 * STOPPING
                 word = DISABLE_VOLTAGE if still >= STANDING or late else QUICK_STOP
                 moving = "OPERATION ENABLED"
-                words = [QUICK_STOP if s == moving and not late else word for s in reported]
-                self._writer.send(words, q)
+                detail = [QUICK_STOP if s == moving and not late else word for s in reported]
+                self._writer.send(detail, q)
             found = self._exchange()
             if found is not None:
                 reported, now = states(found), positions(profile, found)

@@ -4,21 +4,14 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from gapbridge.drivers.canopen.objects import Mode
+from gapbridge.drivers.section import Number, Positive, Section
 
-Number = Annotated[float, Field(allow_inf_nan=False)]
-Positive = Annotated[Number, Field(gt=0.0)]
 NodeId = Annotated[int, Field(ge=1, le=127, strict=True)]
 PdoNumber = Annotated[int, Field(ge=1, le=4, strict=True)]
 ObjectName = Annotated[str | int, Field(union_mode="left_to_right")]
-
-
-class Section(BaseModel):
-    """One mapping of the file; unknown keys are refused."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
 
 class Joint(Section):

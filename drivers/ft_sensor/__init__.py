@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import importlib
+from pkgutil import resolve_name
 from typing import TYPE_CHECKING, cast
 
 from gapbridge.core.errors import LinkError
@@ -29,9 +29,8 @@ def make_sensor(settings: FtSensorSettings) -> ForceTorqueSensor:
         raise LinkError(
             f"ft_sensor.driver: found {name!r}, expected one of {', '.join(FT_SENSORS)}"
         )
-    module, kind = FT_SENSORS[name].split(":")
     try:
-        found = getattr(importlib.import_module(module), kind)
+        found = resolve_name(FT_SENSORS[name])
     except ImportError as error:
         raise LinkError(f"ft_sensor.driver {name}: cannot be imported: {error}") from None
     return cast("ForceTorqueSensor", found(settings))

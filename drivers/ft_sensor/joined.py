@@ -5,17 +5,20 @@ from __future__ import annotations
 import numpy as np
 
 from gapbridge.core.arrays import Array
+from gapbridge.core.effects import CATALOGUE, acting
 from gapbridge.core.errors import InvalidStateError, LinkError, StaleStateError, WriteError
+from gapbridge.core.kernels import reference as kernel
+from gapbridge.core.loads import Loads
 from gapbridge.core.model import Model
-from gapbridge.core.setpoint import Setpoint
-from gapbridge.core.state import RobotState
+from gapbridge.core.motion import Motion
+from gapbridge.core.rotation import rpy_matrix, skew
+from gapbridge.core.state import RobotState, Setpoint
 from gapbridge.drivers.controller_facts import ControllerFacts, Difference
 from gapbridge.drivers.driver import Driver
 from gapbridge.drivers.ft_sensor import make_sensor
 from gapbridge.drivers.ft_sensor.clock_offset import ClockOffset
 from gapbridge.drivers.ft_sensor.reader import SensorReader
-from gapbridge.drivers.ft_sensor.settings import FtSensorSettings
-from gapbridge.drivers.ft_sensor.wrench import TcpForce, sensor_to_flange
+from gapbridge.drivers.ft_sensor.settings import FtSensorSettings, SensorFrame
 
 
 class DriverWithSensor(Driver):
@@ -120,3 +123,85 @@ class DriverWithSensor(Driver):
     def nominal_q(self, state: RobotState) -> Array:
         """Return the joints (n,) that the robot itself wants, rad."""
         return self._arm.nominal_q(state)
+
+
+def sensor_to_flange(frame: SensorFrame) -> Array:
+    """Return the matrix (6, 6) that takes a wrench in sensor axes to one in flange axes.
+
+    Torques are about the sensor's origin before and about the flange's origin after.
+    """
+    rotation, position = rpy_matrix(np.array(frame.rpy)), np.array(frame.xyz)
+    matrix = np.zeros((6, 6))
+    matrix[:3, :3] = matrix[3:, 3:] = rotation
+    matrix[3:, :3] = skew(position) @ rotation
+    return matrix
+
+
+class TcpForce:
+    """Derives ``actual_TCP_force`` from the flange sensor, as controllers do from their own.
+
+    The declared payload's weight is taken off (its inertia is not: the figure holds for slow
+    motion), and the sensor's errors that the model knows are undone. Bending is left out.
+    """
+
+    def __init__(self, model: Model) -> None:
+        self._model = model
+        self._tool = np.array(model.tool_in_flange, dtype=float)
+        self._undo, self._bias = _undoing(model)
+        # laid out once: Model.predict would do it anew in every cycle
+        rigid = model.without_terms()
+        self._chain, self._rows = rigid.chain(), rigid.rows(np.zeros((1, model.arm.n)))
+        self._place = np.empty((1, 3)), np.empty((1, 3, 3))
+        self._flange_in_base()  # loads what is compiled, before the first cycle
+
+    def of(self, raw_in_flange: Array, state: RobotState) -> Array:
+        """Return force and torque (6,) of the surroundings on the tool, at the TCP, base axes.
+
+        ``raw_in_flange`` is the sensor's wrench (6,), flange axes, about the flange origin. The
+        payload is the one that the controller declares, else the model's.
+        """
+        model = self._model
+        mass = model.payload_mass if state.payload is None else state.payload
+        cog = model.payload_cog if state.payload_cog is None else state.payload_cog
+        self._rows.q[0] = state.actual_q
+        flange_in_base = self._flange_in_base()
+        weight = flange_in_base.T @ (mass * model.gravity)
+        wrench = self._undo @ (raw_in_flange - self._bias)
+        force = wrench[:3] - weight
+        torque = wrench[3:] - _cross(cog, weight) - _cross(self._tool[:3, 3], force)
+        return np.concatenate([flange_in_base @ force, flange_in_base @ torque])
+
+    def _flange_in_base(self) -> Array:
+        """Return the rigid arm's flange rotation (3, 3) at the joints in ``_rows``."""
+        kernel.predict_rows(self._chain, self._rows, *self._place)
+        rotation: Array = self._place[1][0] @ self._tool[:3, :3].T
+        return rotation
+
+
+def _cross(a: Array, b: Array) -> Array:
+    """Return a x b of two vectors (3,); numpy's own takes ten times as long."""
+    return np.array(
+        (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
+    )
+
+
+def _undoing(model: Model) -> tuple[Array, Array]:
+    """Return matrix (6, 6) and bias (6,): what acts = matrix (reading - bias)."""
+    probes = np.vstack([np.zeros((1, 6)), np.eye(6)])
+    for term in acting(model.terms, "wrench"):
+        effect = CATALOGUE[term.effect]
+        # the sensor's own; a drift needs the time of its log
+        if effect.channels == ("wrench",) and "timestamp" not in effect.needs:
+            probes = effect.sense(term, model.arm, probes, _standing(model))
+    bias = probes[0]
+    return np.linalg.inv((probes[1:] - bias).T), bias
+
+
+def _standing(model: Model) -> Motion:
+    """Return seven rows of an arm at rest, for the probes."""
+    rest, rows = np.zeros((7, model.arm.n)), np.arange(7)
+    return Motion(
+        t=np.zeros(7), q=rest, qd=rest, qdd=rest, target_q=None, loads=Loads(), rows=rows,
+        valid=np.ones(7, dtype=bool), stretch=np.zeros(7, dtype=np.int64), start=0.0,
+        moving=False, still=np.zeros(model.arm.n),
+    )  # fmt: skip

@@ -4,37 +4,31 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator
+from pydantic import Field, ValidationInfo, field_validator
 
 from gapbridge.drivers.can_bus.bus import BusSettings
+from gapbridge.drivers.section import Number, Section
 
-Number = Annotated[float, Field(allow_inf_nan=False)]
 Vector3 = tuple[Number, Number, Number]
 STANDARD_IDS = 0x7FF
 
 
-class SensorFrame(BaseModel):
+class SensorFrame(Section):
     """The sensor's frame in the flange frame."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
     xyz: Vector3 = Field((0.0, 0.0, 0.0), description="x, y, z in m")
     rpy: Vector3 = Field((0.0, 0.0, 0.0), description="rad, roll pitch yaw as in URDF")
 
 
-class Overload(BaseModel):
+class Overload(Section):
     """What the sensor may carry; more is not believed. Left out: the sensor's own bits alone."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
     force: float | None = Field(None, gt=0.0, description="N, length of the force")
     torque: float | None = Field(None, gt=0.0, description="Nm, length of the torque")
 
 
-class FtSensorSettings(BaseModel):
+class FtSensorSettings(Section):
     """What every sensor's section says. A zero that is off is the model's ``ft_bias``."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
     driver: str = Field(description="the kind of sensor")
     sensor_in_flange: SensorFrame = Field(SensorFrame(), description="how it is mounted")

@@ -11,8 +11,7 @@ from gapbridge.core.arrays import Array
 from gapbridge.core.compensation import wanted_pose
 from gapbridge.core.errors import InvalidStateError, LinkError, StaleStateError, WriteError
 from gapbridge.core.model import Model
-from gapbridge.core.setpoint import Setpoint
-from gapbridge.core.state import RobotState
+from gapbridge.core.state import RobotState, Setpoint
 from gapbridge.drivers.clock import SYSTEM, Clock
 from gapbridge.drivers.driver import Driver
 from gapbridge.drivers.modbus.decode import Decoder, Sample, check_identity

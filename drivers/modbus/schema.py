@@ -4,20 +4,13 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from gapbridge.drivers.modbus.registers import LAST_ADDRESS, Coding, Table, TypeName, WordOrder
 from gapbridge.drivers.robot_modes import Trouble
+from gapbridge.drivers.section import Number, Positive, Section
 
-Number = Annotated[float, Field(allow_inf_nan=False)]
-Positive = Annotated[Number, Field(gt=0)]
 Address = Annotated[int, Field(ge=0, le=LAST_ADDRESS, strict=True)]
-
-
-class Section(BaseModel):
-    """One mapping of the file; unknown keys are refused."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
 
 class Place(Section):
@@ -152,5 +145,5 @@ class ProfileFile(Section):
     identity: list[Condition] = Field(default=[], description="read once when connecting")
     state: State = Field(description="position, velocity, ...")
     clock: Clock | None = Field(default=None, description="left out: samples have no age of theirs")
-    status: list[Condition] = []
+    status: list[Condition] = Field(default=[])
     write: Write = Field(description="mode: mailbox, target_trigger or read_only")

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import ClassVar, Literal, Self
+from typing import Literal, Self
 
 from pydantic import Field, field_validator, model_validator
 
-from gapbridge.drivers.profile_settings import ProfileSettings
-
-SHIPPED = Path(__file__).with_name("profiles")
+from gapbridge.drivers.link_settings import ProfileSettings
 
 
 class ModbusSettings(ProfileSettings):
@@ -19,9 +17,8 @@ class ModbusSettings(ProfileSettings):
     relative to the cell's folder.
     """
 
-    shipped: ClassVar[Path] = SHIPPED
+    shipped = Path(__file__).with_name("profiles")
     driver: Literal["modbus"] = "modbus"
-    profile: str = Field(min_length=1, description="a shipped register map, or a path to one")
     transport: Literal["tcp", "tls", "rtu"] = "tcp"
     host: str = Field("127.0.0.2", min_length=1, description="tcp, tls: address or name")
     port: int | None = Field(
@@ -104,12 +101,3 @@ class ModbusSettings(ProfileSettings):
         from gapbridge.drivers.modbus.profile import read_profile
 
         read_profile(self.profile_path)
-
-    def located(self, folder: Path) -> Self:
-        """Return the settings with paths made absolute from ``folder``; see DriverSettings."""
-        update: dict[str, object] = {
-            name: folder / path
-            for name in ("authority", "certificate", "key")
-            if (path := getattr(self, name)) is not None
-        }
-        return super().located(folder).model_copy(update=update)

@@ -21,9 +21,9 @@ class CheckedContext(ssl.SSLContext):
     pinned: bytes | None = None  # SHA-256 of the controller's certificate
     refused = ""  # why the last handshake failed: the library keeps it to itself
 
-    def note_refusal(self, words: str) -> None:
+    def note_refusal(self, detail: str) -> None:
         """Keep why the last handshake failed; empty: it did not."""
-        self.refused = words
+        self.refused = detail
 
     def wrap_socket(self, *arguments: Any, **keys: Any) -> ssl.SSLSocket:
         """Return a TLS socket that checks its peer as it connects."""
@@ -48,12 +48,12 @@ class _CheckedSocket(ssl.SSLSocket):
             return
         found = hashlib.sha256(self.getpeercert(binary_form=True) or b"").digest()
         if found != context.pinned:
-            words = (
+            detail = (
                 f"found a certificate with SHA-256 {found.hex()}, expected {context.pinned.hex()} "
                 "(link.fingerprint)"
             )
-            context.note_refusal(words)
-            raise ssl.SSLError(1, words)
+            context.note_refusal(detail)
+            raise ssl.SSLError(1, detail)
 
 
 def checked_context(settings: ModbusSettings) -> ssl.SSLContext:

@@ -18,8 +18,7 @@ from gapbridge.core.errors import (
     StaleStateError,
     WriteError,
 )
-from gapbridge.core.setpoint import Setpoint
-from gapbridge.core.state import RobotState
+from gapbridge.core.state import RobotState, Setpoint
 from gapbridge.drivers.clock import SYSTEM, Clock
 from gapbridge.drivers.modbus import encode
 from gapbridge.drivers.modbus.decode import Sample

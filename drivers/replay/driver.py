@@ -14,8 +14,7 @@ import numpy as np
 
 from gapbridge.core.arrays import Array
 from gapbridge.core.errors import LinkError, LogError
-from gapbridge.core.setpoint import Setpoint
-from gapbridge.core.state import RobotState
+from gapbridge.core.state import RobotState, Setpoint
 from gapbridge.drivers.clock import SYSTEM, Clock
 from gapbridge.drivers.driver import Driver
 from gapbridge.drivers.replay.settings import ReplaySettings
@@ -62,9 +61,9 @@ class ReplayDriver(Driver):
         first = next(self._rows(), None)
         if first is None:
             raise LogError(f"{settings.file}: found no cycles, expected a recording to replay")
-        lacking = [name for name in NEEDED if name not in first]
-        if lacking:
-            raise LogError(f"{settings.file}: found no {lacking[0]}, expected it for a replay")
+        missing = [name for name in NEEDED if name not in first]
+        if missing:
+            raise LogError(f"{settings.file}: found no {missing[0]}, expected it for a replay")
         n = len(first["actual_q"])
         if n != model.arm.n:
             raise LogError(

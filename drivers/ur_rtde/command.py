@@ -13,8 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from gapbridge.core.errors import WriteError
-from gapbridge.core.setpoint import Setpoint
-from gapbridge.core.state import RobotState
+from gapbridge.core.state import RobotState, Setpoint
 from gapbridge.drivers.clock import SYSTEM, Clock
 from gapbridge.drivers.ur_rtde import registers
 from gapbridge.drivers.ur_rtde.allowed import AllowedControl, AllowedInputs

@@ -11,8 +11,7 @@ from gapbridge.core.compensation import wanted_pose
 from gapbridge.core.errors import InvalidStateError, LinkError, WriteError
 from gapbridge.core.model import Model
 from gapbridge.core.rotation import one_rotation_matrix
-from gapbridge.core.setpoint import Setpoint
-from gapbridge.core.state import RobotState
+from gapbridge.core.state import RobotState, Setpoint
 from gapbridge.drivers.clock import SYSTEM, Clock
 from gapbridge.drivers.controller_facts import TCP_TURNED, ControllerFacts, Difference, differences
 from gapbridge.drivers.driver import Driver

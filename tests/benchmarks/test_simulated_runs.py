@@ -28,7 +28,7 @@ from gapbridge.bridge.loop.link_monitor import ControllerClock, LinkMonitor
 from gapbridge.bridge.loop.loop import Loop
 from gapbridge.bridge.loop.supervisor import Cause, State, Supervisor
 from gapbridge.core.errors import StaleStateError
-from gapbridge.core.setpoint import Setpoint
+from gapbridge.core.state import Setpoint
 from gapbridge.drivers.modbus import encode
 from gapbridge.drivers.ur_rtde.command import OffsetWriter, ServoWriter
 from gapbridge.drivers.ur_rtde.driver import UrRtdeDriver

@@ -12,12 +12,10 @@ import pytest
 from gapbridge.bridge.calibration.session.journal import Journal as SessionJournal
 from gapbridge.bridge.cell import load_cell
 from gapbridge.bridge.cell.saving import save_cell
-from gapbridge.bridge.document.output_file import replacing, write_text
-from gapbridge.bridge.fleet.folder import require_folder as require_fleet_folder
+from gapbridge.bridge.document.output_file import replacing, require_folder, write_text
 from gapbridge.bridge.fleet.journal import Journal as FleetJournal
 from gapbridge.bridge.ipc.shared_memory import slices_of
 from gapbridge.bridge.loop.supervisor import State
-from gapbridge.bridge.recording.folder import require_folder
 from gapbridge.bridge.recording.segment import Segment
 
 CELL = "robot: {model: ur10e}\npayload: {mass: 5.0}\n"
@@ -62,9 +60,8 @@ def test_a_new_file_is_0640(tmp_path: Path, make: Callable[[Path], None]) -> Non
     assert mode(path) == 0o640
 
 
-@pytest.mark.parametrize("make", [require_folder, lambda path: require_fleet_folder(path, "--out")])
-def test_a_new_folder_is_0750(tmp_path: Path, make: Callable[[Path], object]) -> None:
-    make(tmp_path / "folder")
+def test_a_new_folder_is_0750(tmp_path: Path) -> None:
+    require_folder(tmp_path / "folder", "--out")
     assert mode(tmp_path / "folder") == 0o750
 
 

@@ -20,35 +20,35 @@ def test_a_built_in_arm_has_bounds_from_its_rated_payload(name: str) -> None:
     bounds = LoadBounds.of(Model(arm))
     assert np.isfinite(arm.payload)
     assert bounds.mass == pytest.approx(1.5 * arm.payload)
-    assert bounds.doubt_payload(arm.payload, COG) is None
-    assert bounds.doubt_payload(1.5 * arm.payload, COG) is None
-    assert bounds.doubt_wrench(np.array([0, 0, -1.5 * GRAVITY * arm.payload, 0, 0, 0])) is None
-    assert "payload: found" in (bounds.doubt_payload(1.51 * arm.payload, COG) or "")
+    assert bounds.payload_problem(arm.payload, COG) is None
+    assert bounds.payload_problem(1.5 * arm.payload, COG) is None
+    assert bounds.wrench_problem(np.array([0, 0, -1.5 * GRAVITY * arm.payload, 0, 0, 0])) is None
+    assert "payload: found" in (bounds.payload_problem(1.51 * arm.payload, COG) or "")
     strongest = STRONGEST * GRAVITY * arm.payload
-    assert "force: found" in (bounds.doubt_wrench(np.array([1.01 * strongest] + [0] * 5)) or "")
+    assert "force: found" in (bounds.wrench_problem(np.array([1.01 * strongest] + [0] * 5)) or "")
     twisted = np.array([0, 0, 0, 1.01 * LEVER * strongest, 0, 0])
-    assert "torque: found" in (bounds.doubt_wrench(twisted) or "")
+    assert "torque: found" in (bounds.wrench_problem(twisted) or "")
 
 
 @pytest.mark.parametrize("mass", [40.0, 400.0, -0.1, np.nan, np.inf])
 def test_what_a_ur5e_cannot_carry_is_rejected(mass: float) -> None:
-    found = LoadBounds.of(Model(builtin_arm("ur5e"))).doubt_payload(mass, COG)
+    found = LoadBounds.of(Model(builtin_arm("ur5e"))).payload_problem(mass, COG)
     assert found is not None
     assert "expected 0 to 7.5 kg (rated payload 5 kg)" in found
 
 
 def test_a_small_mass_far_out_is_rejected_as_a_moment() -> None:
     bounds = LoadBounds.of(Model(builtin_arm("ur5e")))
-    assert bounds.doubt_payload(2.0, np.array([0, 0, 1.0])) is None
-    assert "kg m" in (bounds.doubt_payload(3.0, np.array([0, 0, 1.0])) or "")
-    assert "kg m" in (bounds.doubt_payload(3.0, np.array([0, 0, np.nan])) or "")
+    assert bounds.payload_problem(2.0, np.array([0, 0, 1.0])) is None
+    assert "kg m" in (bounds.payload_problem(3.0, np.array([0, 0, 1.0])) or "")
+    assert "kg m" in (bounds.payload_problem(3.0, np.array([0, 0, np.nan])) or "")
 
 
 @pytest.mark.parametrize("value", [9000.0, np.nan])
 def test_nine_kilonewtons_are_rejected_on_every_arm(value: float) -> None:
     for name in builtin_names():
         bounds = LoadBounds.of(Model(builtin_arm(name)))
-        assert bounds.doubt_wrench(np.array([0, 0, value, 0, 0, 0])) is not None
+        assert bounds.wrench_problem(np.array([0, 0, value, 0, 0, 0])) is not None
 
 
 def test_an_arm_of_unknown_rating_gets_the_documented_default() -> None:

@@ -16,8 +16,7 @@ from gapbridge.core.arm import builtin_arm
 from gapbridge.core.errors import GateError, WriteError
 from gapbridge.core.limits import Limiter
 from gapbridge.core.model import Model
-from gapbridge.core.setpoint import Setpoint
-from gapbridge.core.state import RobotState
+from gapbridge.core.state import RobotState, Setpoint
 from gapbridge.drivers import DRIVERS, gate, make_driver
 from gapbridge.drivers.driver import GATED, Driver
 from gapbridge.drivers.gate import Gate, GateBounds

@@ -17,8 +17,7 @@ from contract_checks import (
 
 from gapbridge.bridge.cell import Cell
 from gapbridge.core.errors import WriteError
-from gapbridge.core.setpoint import Setpoint
-from gapbridge.core.state import RobotState
+from gapbridge.core.state import RobotState, Setpoint
 from gapbridge.drivers.driver import Driver
 
 SHIFT = 2e-4  # m, along base z

@@ -22,7 +22,7 @@ from benchmarks.faults.row import Row, cycles, seconds
 from gapbridge.bridge.cell import load_cell
 from gapbridge.drivers.can_bus.bus import BusSettings
 from gapbridge.drivers.simulated.can.hub import Hub
-from gapbridge.drivers.simulated.ft_sensor.robotous_node import RobotousNode
+from gapbridge.drivers.simulated.ft_sensor.ati_node import RobotousNode
 
 MOVING, GOES_ON = ("ur_servoj", "can"), ("compensating",)
 ROOM = 0.02  # rad that a joint has to its limit where a planner is to go beyond it

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from gapbridge.bridge.calibration.instruments import make_instrument
+from gapbridge.bridge.calibration.instruments import INSTRUMENTS
 from gapbridge.bridge.calibration.instruments.instrument import AnyInstrument, Surroundings
 from gapbridge.bridge.calibration.options import SessionOptions
 from gapbridge.bridge.calibration.planning import effects_of, loads_of, metrology_of
@@ -19,11 +19,12 @@ from gapbridge.bridge.calibration.session.prompt import Prompt
 from gapbridge.bridge.calibration.session.reading_check import ReadingCheck
 from gapbridge.bridge.calibration.session.session import Session
 from gapbridge.bridge.cell import Cell, save_cell
-from gapbridge.bridge.document.output_file import require_writable, write_text
+from gapbridge.bridge.document.output_file import require_writable, write_table, write_text
 from gapbridge.bridge.document.provenance import provenance
 from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.payload_session import PayloadCalibration
 from gapbridge.core.calibration.plan import Expectation, Payload, Plan, PlannedPose
+from gapbridge.core.calibration.readings import Readings
 from gapbridge.core.calibration.tool_session import ToolCalibration
 from gapbridge.core.model import Model
 
@@ -56,7 +57,7 @@ class Job(ABC):
 
     def instrument(self, around: Surroundings) -> AnyInstrument:
         """Return what measures, not yet open."""
-        return make_instrument(self.options.instrument, around)
+        return INSTRUMENTS[self.options.instrument.kind](self.options.instrument, around)
 
     def reading_check(self) -> ReadingCheck | None:
         """Return who judges the readings; None: nobody can."""
@@ -139,3 +140,30 @@ def _free(path: Path) -> Path:
     """Return the path, or the first numbered one beside it that is free."""
     names = [path, *(path.with_name(f"{path.stem}_{i}{path.suffix}") for i in range(2, 1000))]
     return next(p for p in names if not p.exists())
+
+
+def write_log(readings: Readings, registered: bool, path: Path) -> None:
+    """Write readings in a log's columns; those that an instrument did not give are left out.
+
+    A log has one frame: of an instrument that was moved, rows of its first place alone are written.
+    """
+    rows = readings if registered else readings[readings.station == 0]
+    if rows.kind in ("position", "pose"):
+        rows = rows[rows.target == 0]
+    n, loads = rows.q.shape[1], rows.loads
+    columns: dict[str, np.ndarray[tuple[int, ...], np.dtype[np.float64]]] = {
+        "timestamp": np.arange(len(rows), dtype=float),
+        **{f"actual_q_{i}": rows.q[:, i] for i in range(n)},
+    }
+    if loads.payload_mass is not None and loads.payload_cog is not None:
+        columns["payload"] = loads.payload_mass
+        columns |= {f"payload_cog_{i}": loads.payload_cog[:, i] for i in range(3)}
+    if loads.approach is not None:
+        columns |= {f"approach_{i}": loads.approach[:, i] for i in range(n)}
+    if loads.temperature is not None:
+        columns |= {f"joint_temperatures_{i}": loads.temperature[:, i] for i in range(n)}
+    if rows.kind in ("position", "pose"):
+        columns |= {f"measured_position_{i}": rows.value[:, i] for i in range(3)}
+    if rows.kind == "pose":
+        columns |= {f"measured_rotation_{i}": rows.value[:, 3 + i] for i in range(3)}
+    write_table(path, list(columns), np.column_stack(list(columns.values())))

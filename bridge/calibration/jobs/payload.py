@@ -7,14 +7,15 @@ from collections.abc import Callable
 import numpy as np
 
 from gapbridge.bridge.calibration.format import figure
-from gapbridge.bridge.calibration.instruments.flange_sensor import FlangeSensor
 from gapbridge.bridge.calibration.instruments.instrument import AnyInstrument, Surroundings
+from gapbridge.bridge.calibration.instruments.joints_alone import FlangeSensor
 from gapbridge.bridge.calibration.jobs.job import Job, bare_plan
 from gapbridge.bridge.calibration.options import SessionOptions
 from gapbridge.bridge.calibration.session.prompt import Prompt
 from gapbridge.bridge.calibration.session.reading_check import ReadingCheck
 from gapbridge.bridge.calibration.session.session import Session
 from gapbridge.bridge.cell import Cell
+from gapbridge.bridge.cell.settings.instruments import Base
 from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.payload_session import calibrate_payload
 from gapbridge.core.calibration.plan import Expectation, Payload, Plan, PlannedPose
@@ -61,7 +62,7 @@ class PayloadJob(Job):
 
     def instrument(self, around: Surroundings) -> AnyInstrument:
         """Return the flange's own sensor."""
-        return FlangeSensor.here(around)
+        return FlangeSensor(Base(), around)
 
     def reading_check(self) -> ReadingCheck | None:
         """Return nobody: ten unknowns of a few orientations are judged at the end."""

@@ -8,7 +8,7 @@ import numpy as np
 
 from gapbridge.bridge.calibration.format import millimetres
 from gapbridge.bridge.calibration.instruments.instrument import AnyInstrument, Surroundings
-from gapbridge.bridge.calibration.instruments.point import TipOnPoint
+from gapbridge.bridge.calibration.instruments.joints_alone import TipOnPoint
 from gapbridge.bridge.calibration.jobs.job import Job, bare_plan
 from gapbridge.bridge.calibration.options import SessionOptions
 from gapbridge.bridge.calibration.planning import loads_of

@@ -9,10 +9,15 @@ from typing import Any
 
 import numpy as np
 
-from gapbridge.bridge.calibration.format import duration, millimetres, parameter
+from gapbridge.bridge.calibration.format import (
+    duration,
+    millimetres,
+    moved_text,
+    parameter,
+    verdict_text,
+)
 from gapbridge.bridge.calibration.jobs.calibrate import baseline_beside
-from gapbridge.bridge.calibration.jobs.job import Job, bare_plan
-from gapbridge.bridge.calibration.jobs.log_of import write_log
+from gapbridge.bridge.calibration.jobs.job import Job, bare_plan, write_log
 from gapbridge.bridge.calibration.planning import (
     loads_of,
     metrology_of,
@@ -20,15 +25,14 @@ from gapbridge.bridge.calibration.planning import (
     space_of,
     with_loads,
 )
-from gapbridge.bridge.calibration.session.progress import seconds_left
-from gapbridge.bridge.calibration.verdict import moved_text, verdict_text
-from gapbridge.core.arrays import Array, Index
+from gapbridge.bridge.calibration.session.session import seconds_left
+from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.accuracy_baseline import baseline_in
 from gapbridge.core.calibration.plan import Plan, PlannedPose
 from gapbridge.core.calibration.verify import Verification, verify
 from gapbridge.core.errors import InputError
 from gapbridge.core.planning.candidates import candidates_of
-from gapbridge.core.planning.travel import joint_speed, leg_times, shortest_way
+from gapbridge.core.planning.travel import far_apart, joint_speed, leg_times, shortest_way
 
 POSES = 10
 
@@ -70,7 +74,7 @@ class VerifyJob(Job):
             baseline.parameters(self.cell.model), observable, loads, space, self.options.seed
         )
         count = min(self.options.poses or POSES, len(found.q))
-        chosen = _far_apart(self.cell.model.rigid_pose(found.q).position, count)
+        chosen = far_apart(self.cell.model.rigid_pose(found.q).position, count)
         speed = joint_speed(self.cell.arm.limits.velocity)
         poses: list[PlannedPose] = []
         for load, part in enumerate(np.array_split(chosen, len(loads))):
@@ -128,13 +132,3 @@ class VerifyJob(Job):
             prompt.say(f"  these readings cannot distinguish it from: {moved_text(other)}")
         for note in found.notes:
             prompt.say(f"  note: {note}")
-
-
-def _far_apart(position: Array, count: int) -> Index:
-    """Return rows (count,) of positions (N, 3), each far from those before it."""
-    chosen = [int(np.argmax(np.linalg.norm(position - position.mean(axis=0), axis=1)))]
-    nearest = np.linalg.norm(position - position[chosen[0]], axis=1)
-    while len(chosen) < count:
-        chosen.append(int(np.argmax(nearest)))
-        nearest = np.minimum(nearest, np.linalg.norm(position - position[chosen[-1]], axis=1))
-    return np.array(chosen, dtype=np.int64)

@@ -9,13 +9,13 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
 from gapbridge.bridge.calibration.instruments.instrument import ReadingError
 from gapbridge.bridge.calibration.joints.joint_source import JointSample, JointSource
-from gapbridge.bridge.calibration.joints.move import write_move
 from gapbridge.bridge.calibration.joints.watched_run import WatchedRun
 from gapbridge.bridge.cell import Cell, load_cell
 from gapbridge.bridge.cell.daemon_settings import DaemonSettings
@@ -24,6 +24,7 @@ from gapbridge.bridge.cell.settings.recording import RecordingSettings
 from gapbridge.bridge.daemon.daemon import settings_of
 from gapbridge.bridge.ipc.shared_memory import Phase
 from gapbridge.bridge.loop.supervisor import State
+from gapbridge.bridge.setpoint_source.quintic import quintic, quintic_time, write_trajectory
 from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.plan import PlannedPose
 from gapbridge.core.errors import LinkError, RunError
@@ -35,6 +36,10 @@ STEADY = 1.0  # N: the force may drift by this over the time of settling, beside
 PATIENCE = 30.0  # s for a connection, on top of the link's own
 STARTING = 180.0  # s that the loop's process may take to start
 SLOWEST = 4.0  # a move may take this many times as long as planned
+PERIOD = 0.01  # s; between rows the daemon's source goes straight
+ACCELERATION = 1.0  # rad/s2, fastest joint
+SHORTEST = 0.5  # s
+HOLD = 0.2  # s at the end
 
 
 def uncorrected(path: Path) -> Cell:
@@ -206,3 +211,16 @@ class LinkedJoints(JointSource):
             payload=None if payload is None else float(payload[0]),
             approach=run.approach.copy(),
         )
+
+
+def write_move(path: Path, stops: Sequence[Array], speed: float) -> float:
+    """Write the move from stop to stop, at rest in each, as the daemon's trajectory.
+
+    All joints together, the fastest at most ``speed`` rad/s. Returns how long it takes, s.
+    """
+    parts = []
+    for begin, end in pairwise(stops):
+        duration = max(quintic_time(end - begin, speed, ACCELERATION), SHORTEST)
+        parts.append(quintic(begin, end, int(np.ceil(duration / PERIOD))))
+        parts.append(np.tile(end, (int(HOLD / PERIOD), 1)))
+    return write_trajectory(path, np.vstack(parts), PERIOD)

@@ -16,8 +16,6 @@ class InstrumentFacts:
     serial: str = ""
     certificate: str = ""  # number or date of its own calibration
     sigma: float = 2.0e-5  # m, 1 sigma of one coordinate of a single reading, as declared
-    error: float | None = None  # m, largest permissible error; None: nobody has stated it
-    error_per_metre: float = 0.0  # m per m of distance, on top of ``error``
     distance: float = 0.0  # m, usual distance from the instrument to the target
 
 
@@ -36,9 +34,6 @@ class SessionFacts:
     serial: str = ""  # of the arm
     operator: str = ""
     customer: str = ""
-    place: str = ""
-    temperature: tuple[float, float] | None = None  # °C of the air, at the start and at the end
-    payload_error: float | None = None  # kg, largest error of the loads' masses; None: not stated
     environment: str = ""  # anything else worth knowing, in words
     number: str = ""  # of the report
     version: str = ""  # of Gapbridge

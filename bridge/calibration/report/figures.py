@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from gapbridge.bridge.document.axes import plain
-from gapbridge.bridge.report.labels import unit_of
+from gapbridge.bridge.report.labels import decimals_of, fixed, unit_of
 from gapbridge.core.calibration.result import Estimate
 
 
@@ -34,23 +34,6 @@ def mrad(angle: float) -> str:
     return f"{fixed(angle * 1e3, 3)} mrad" if math.isfinite(angle) else "unknown"
 
 
-def fixed(value: float, decimals: int) -> str:
-    """Return a number with so many decimals, with a true minus sign, never minus nothing."""
-    if not math.isfinite(value):
-        return "unknown"
-    text = f"{value:.{decimals}f}"
-    if not text.strip("-0."):
-        text = text.lstrip("-")
-    return text.replace("-", "−")
-
-
-def decimals_of(spread: float) -> int:
-    """Return the decimals that show two digits of a spread."""
-    if not math.isfinite(spread) or spread <= 0:
-        return 3
-    return min(max(1 - math.floor(math.log10(spread)), 0), 9)
-
-
 def estimate_texts(e: Estimate) -> tuple[str, str, str, str]:
     """Return value, interval, 1 sigma and unit of an estimate, all to the digits of its sigma."""
     unit, factor = unit_of(e.unit)
@@ -62,8 +45,3 @@ def estimate_texts(e: Estimate) -> tuple[str, str, str, str]:
 def degrees(q: object) -> str:
     """Return joint angles (rad) in degrees, with one decimal."""
     return ", ".join(fixed(math.degrees(float(v)), 1) for v in q)  # type: ignore[attr-defined]
-
-
-def counted(count: int, one: str, many: str = "") -> str:
-    """Return "1 pose" or "3 poses"."""
-    return f"{count} {one if count == 1 else many or one + 's'}"

@@ -89,13 +89,7 @@ class Material:
     @cached_property
     def budget(self) -> Budget:
         """Return the uncertainty budget."""
-        facts = self.session
-        error = facts.instrument.error
-        if error is not None:
-            error += facts.instrument.error_per_metre * facts.instrument.distance
-        air = facts.temperature
-        span = None if air is None else abs(air[1] - air[0])
-        return budget(self.calibration, Stated(error, span, facts.payload_error))
+        return budget(self.calibration, Stated())
 
     @cached_property
     def tip(self) -> Array:

@@ -13,18 +13,17 @@ from gapbridge.bridge.calibration.report.sections.short_sections import (
     TOOL,
     ShortMaterial,
 )
-from gapbridge.bridge.calibration.report.sections.signature_section import signature
 from gapbridge.bridge.calibration.report.sections.verification_sections import (
     VERIFICATION,
     VerificationMaterial,
 )
-from gapbridge.bridge.document.blocks import Document, Part
+from gapbridge.bridge.document.blocks import Document, Part, Table, parts
 from gapbridge.bridge.document.html import html
 from gapbridge.bridge.document.output_file import replacing_bytes, write_text
-from gapbridge.bridge.document.section import parts
 from gapbridge.core.calibration.payload_session import PayloadCalibration
 
 AnyMaterial = Material | VerificationMaterial | ShortMaterial[Any]
+LINE = "_" * 24
 
 
 def write_report(material: AnyMaterial, out: Path) -> tuple[Path, Path]:
@@ -61,3 +60,15 @@ def _document(what: str, session: SessionFacts, made: tuple[Part, ...]) -> Docum
         (*made, signature(session)),
         f"{number}{title[:1].lower()}{title[1:]} · {session.started:%Y-%m-%d} · {software}",
     )
+
+
+def signature(session: SessionFacts) -> Part:
+    """Return the last section: who measured, who releases, room for name, date and signature."""
+    rows = [
+        ["measured by", session.operator or LINE, LINE, LINE],
+        ["released by", LINE, LINE, LINE],
+    ]
+    table = Table(("", "name", "date", "signature"), rows, (1.0, 1.8, 1.8, 1.8))
+    number = f" of report {session.number}" if session.number else ""
+    about = f"The figures{number} hold for the cell file whose SHA-256 stands under Session."
+    return Part("signature", "Signatures", about if session.cell_sha256 else "", (table,))

@@ -10,15 +10,14 @@ from gapbridge.bridge.calibration.format import force, millimetres, point
 from gapbridge.bridge.calibration.instruments.instrument import AnyInstrument, ReadingError, Where
 from gapbridge.bridge.calibration.joints.joint_source import JointSample, JointSource, TypedJoints
 from gapbridge.bridge.calibration.session.positioning import Positioning
-from gapbridge.bridge.calibration.session.progress import header
 from gapbridge.bridge.calibration.session.prompt import Prompt, SessionCommand
 from gapbridge.bridge.calibration.session.reading_check import NOTHING, ReadingCheck, Verdict
-from gapbridge.bridge.calibration.session.session import Reading, Session
+from gapbridge.bridge.calibration.session.session import Reading, Session, header
 from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.plan import PlannedPose
 from gapbridge.core.errors import LinkError
 from gapbridge.core.estimation.registration import register
-from gapbridge.core.rotation import rotation_matrix, rotation_vector
+from gapbridge.core.rotation import mean_rotation
 
 SHAKY = 10.0  # times the instrument's sigma: samples that scatter more are doubted
 SHAKIEST = 1e-4  # m: less than this is never doubted
@@ -70,12 +69,10 @@ def capture(
 
 
 def mean(values: Array) -> Array:
-    """Return the mean (k,) of samples (M, k); rotations as matrices, as near pi vectors flip."""
+    """Return the mean (k,) of samples (M, k)."""
     found: Array = np.asarray(values.mean(axis=0), dtype=float)
     if values.shape[1] == 6:
-        U, _, Vt = np.linalg.svd(rotation_matrix(values[:, 3:]).mean(axis=0))
-        turn = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
-        found[3:] = rotation_vector(turn)
+        found[3:] = mean_rotation(values[:, 3:])
     return found
 
 

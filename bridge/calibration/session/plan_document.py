@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -10,11 +9,6 @@ import numpy as np
 
 from gapbridge.bridge.document.output_file import write_table
 from gapbridge.core.calibration.plan import Expectation, Payload, Plan, PlannedPose
-
-
-def plan_entry(plan: Plan) -> dict[str, Any]:
-    """Return a plan for the journal."""
-    return asdict(plan)
 
 
 def plan_of(entry: dict[str, Any]) -> Plan:

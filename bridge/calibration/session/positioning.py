@@ -214,7 +214,7 @@ class Positioning:
         return self.joints.stand(pose)
 
     def _look_at_load(self, pose: PlannedPose, stand: JointSample) -> None:
-        """Report where the controller believes in another load, or feels a pull."""
+        """Report where the controller believes in another load, or reports a force."""
         assert self.session.plan is not None
         meant = self.session.plan.loads[pose.load].mass
         believed = stand.payload

@@ -1,21 +1,25 @@
-"""Where a session stands: what its journal holds, entry by entry."""
+"""Where a session stands: what its journal holds, entry by entry; how far it has come."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
+from statistics import median
 from typing import Any
 
 import numpy as np
 
+from gapbridge.bridge.calibration.format import duration
 from gapbridge.bridge.calibration.session.journal import Entry, Journal
-from gapbridge.bridge.calibration.session.plan_document import plan_entry, plan_of
+from gapbridge.bridge.calibration.session.plan_document import plan_of
 from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.plan import Plan, PlannedPose
 from gapbridge.core.calibration.readings import Readings
 from gapbridge.core.loads import Loads
 
 _VECTORS = ("q", "value", "approach", "temperature", "wrench", "raw_wrench")
+FIRST = 60.0  # s a stop, before anyone knows
+PAUSE = 600.0  # s: a longer time between two readings was a pause
+WIDTH = 16  # characters of the whole bar
 
 
 @dataclass(frozen=True)
@@ -70,7 +74,6 @@ class Session:
     target: int = 0
     notes: list[str] = field(default_factory=list)
     used: set[str] = field(default_factory=set)
-    ended: Entry | None = None  # the fit was made and what to do with it decided
     seconds: list[float] = field(default_factory=list)  # between a reading and the one before
 
     @classmethod
@@ -87,41 +90,34 @@ class Session:
 
     def apply(self, entry: Entry) -> None:
         """Act on an entry of the journal; one of a kind that is not known means nothing here."""
-        action = _ACTIONS.get(entry["kind"])
-        if action is not None:
-            action(self, entry)
+        match entry["kind"]:
+            case "begun":
+                self.begun = entry
+            case "plan":
+                self.plan = plan_of(entry["plan"])
+            case "reading":
+                self._take(Reading.of(entry))
+            case "rejected":
+                self.used.add(entry.get("source", ""))
+            case "undo":
+                self.undone += 1
+                self.taken.pop()
+            case "skip":
+                self.skipped.add(int(entry["stop"]))
+            case "mounted":
+                self.mounted = int(entry["load"])
+            case "moved":
+                self._move(entry)
+            case "note":
+                self.notes.append(str(entry["text"]))
 
-    # -- entries, by their kind -------------------------------------------------------------------
-
-    def _begun(self, entry: Entry) -> None:
-        self.begun = entry
-
-    def _plan(self, entry: Entry) -> None:
-        self.plan = plan_of(entry["plan"])
-
-    def _reading(self, entry: Entry) -> None:
-        found = Reading.of(entry)
+    def _take(self, found: Reading) -> None:
         if self.taken and found.time - self.taken[-1].time > 0.0:
             self.seconds.append(found.time - self.taken[-1].time)
         self.taken.append(found)
-        if found.source:
-            self.used.add(found.source)
+        self.used.add(found.source)
 
-    def _rejected(self, entry: Entry) -> None:
-        if entry.get("source"):
-            self.used.add(entry["source"])
-
-    def _undo(self, entry: Entry) -> None:
-        self.undone += 1
-        self.taken.pop()
-
-    def _skip(self, entry: Entry) -> None:
-        self.skipped.add(int(entry["stop"]))
-
-    def _mounted(self, entry: Entry) -> None:
-        self.mounted = int(entry["load"])
-
-    def _moved(self, entry: Entry) -> None:
+    def _move(self, entry: Entry) -> None:
         self.station = int(entry["station"])
         self.target = int(entry["target"])
         self.place = int(entry.get("place", self.place))
@@ -129,12 +125,6 @@ class Session:
         if since is not None:
             for i in range(int(since), len(self.taken)):
                 self.taken[i] = replace(self.taken[i], station=self.station, target=self.target)
-
-    def _note(self, entry: Entry) -> None:
-        self.notes.append(str(entry["text"]))
-
-    def _ended(self, entry: Entry) -> None:
-        self.ended = entry
 
     # -- what follows -----------------------------------------------------------------------------
 
@@ -195,19 +185,30 @@ class Session:
 
     def keep_plan(self, plan: Plan) -> None:
         """Write the plan that the session follows."""
-        self.add("plan", plan=plan_entry(plan))
+        self.add("plan", plan=asdict(plan))
 
 
-_ACTIONS: dict[str, Callable[[Session, Entry], None]] = {
-    "begun": Session._begun,
-    "plan": Session._plan,
-    "reading": Session._reading,
-    "rejected": Session._rejected,
-    "undo": Session._undo,
-    "skip": Session._skip,
-    "mounted": Session._mounted,
-    "moved": Session._moved,
-    "note": Session._note,
-    "ended": Session._ended,
-}
-"""Kind of an entry -> what it does to the session."""
+def seconds_left(session: Session, minutes_per_load: float) -> float:
+    """Return s until the last stop, by the readings so far."""
+    paces = [s for s in session.seconds if s < PAUSE][-20:]
+    done = {t.stop for t in session.taken} | session.skipped
+    blocks = {(p.station, p.load) for i, p in enumerate(session.stops) if i not in done}
+    changes = len(blocks - {(session.place, session.mounted)})
+    return session.left * (median(paces) if paces else FIRST) + changes * 60.0 * minutes_per_load
+
+
+def header(session: Session, stop: int, minutes_per_load: float) -> str:
+    """Return the line above a stop."""
+    count, done = len(session.stops), len(session.stops) - session.left
+    pose = session.stops[stop]
+    drawn = "█" * round(done / count * WIDTH)
+    more = [f"place {pose.station + 1}"] if any(p.station for p in session.stops) else []
+    if pose.repeat:
+        first = next(i for i, p in enumerate(session.stops) if p.number == pose.number)
+        more.append(f"stop {first + 1} once more")
+    if pose.held_out:
+        more.append("to verify, not fitted")
+    return " · ".join(
+        [f"{drawn:░<{WIDTH}} stop {stop + 1} of {count}", f"load {pose.load + 1}", *more,
+         f"{duration(seconds_left(session, minutes_per_load))} left"]
+    )  # fmt: skip

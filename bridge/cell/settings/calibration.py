@@ -5,9 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from gapbridge.bridge.cell.settings.instruments import InstrumentSettings, TypedSettings
+from gapbridge.drivers.section import Section
 
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 NotNegative = Annotated[Number, Field(ge=0)]
@@ -16,11 +17,7 @@ Vector3 = Annotated[list[Number], Field(min_length=3, max_length=3)]
 FEWEST_HELD_OUT = 8  # poses kept out of the fit by which an accuracy can be decided
 
 
-class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
-
-
-class LoadEntry(_Section):
+class LoadEntry(Section):
     """A load that people hang on the flange, the tool's own weight included."""
 
     name: str = Field(default="", description="as people call it")
@@ -28,28 +25,28 @@ class LoadEntry(_Section):
     cog: Vector3 = Field(default=[0.0, 0.0, 0.0], description="m, in the flange frame")
 
 
-class BoxEntry(_Section):
+class BoxEntry(Section):
     """A box, edges along base axes, that the arm stays out of."""
 
     lower: Vector3 = Field(description="m, in base")
     upper: Vector3 = Field(description="m, in base")
 
 
-class JointRange(_Section):
+class JointRange(Section):
     """Narrower joint limits for the session."""
 
     lower: list[Number] = Field(description="rad, one value per joint")
     upper: list[Number] = Field(description="rad, one value per joint")
 
 
-class RangeEntry(_Section):
+class RangeEntry(Section):
     """How far the instrument reaches."""
 
     nearest: NotNegative = Field(default=0.0, description="m")
     farthest: Positive | None = Field(default=None, description="m; default: as far as it sees")
 
 
-class ReflectorEntry(_Section):
+class ReflectorEntry(Section):
     """Which way the reflector on the tool looks, and from how far aside it is still seen."""
 
     looks: Vector3 = Field(description="direction in the tool's axes")
@@ -58,7 +55,7 @@ class ReflectorEntry(_Section):
     )
 
 
-class CalibrationSettings(_Section):
+class CalibrationSettings(Section):
     """The whole section. Everything has a default but what hangs on the flange."""
 
     instrument: InstrumentSettings = Field(

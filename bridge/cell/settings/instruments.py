@@ -6,23 +6,22 @@ Small pydantic models without any instrument behind them, so that a cell is read
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
+
+from gapbridge.drivers.section import Positive, Section
 
 LengthUnit = Literal["m", "mm", "um", "in"]
 AngleUnit = Literal["rad", "deg"]
 METRES: dict[str, float] = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "in": 0.0254}
 RADIANS: dict[str, float] = {"rad": 1.0, "deg": 0.017453292519943295}
 
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
-
-class Base(BaseModel):
+class Base(Section):
     """What every instrument says."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
-
+    reads: ClassVar[str] = "position"  # kind of its readings where it gives no pose
     sigma: Positive | None = Field(
         default=None, description="m, 1 sigma of one coordinate; default: metrology.sigma"
     )
@@ -34,16 +33,12 @@ class Base(BaseModel):
     @property
     def measures(self) -> str:
         """Return the kind of its readings, a key of the calibration's observables."""
-        return "position"
+        return self.reads
 
     @property
     def options(self) -> dict[str, Any]:
         """Return what else the calibration must know of this kind of reading."""
         return {}
-
-    def located(self, folder: Path) -> Base:
-        """Return the settings with paths relative to ``folder`` made absolute."""
-        return self
 
 
 class Coordinates(Base):
@@ -75,35 +70,28 @@ class TypedSettings(Coordinates):
     kind: Literal["typed"] = "typed"
 
 
-class FileSettings(Coordinates):
+class ExportSettings(Coordinates):
+    """Text files that the instrument's software writes."""
+
+    columns: tuple[str, ...] | None = Field(
+        default=None, description="names of the columns; default: the last ones of each row"
+    )
+    timeout: Positive = Field(default=600.0, description="s to wait for the next reading")
+
+
+class FileSettings(ExportSettings):
     """A CSV file in which the readings stand, row by row, in the order of the plan."""
 
     kind: Literal["file"]
     file: Path = Field(description="the CSV, relative to the cell's folder")
-    columns: tuple[str, ...] | None = Field(
-        default=None, description="names of its columns; default: the last ones of each row"
-    )
-    timeout: Positive = Field(default=600.0, description="s to wait for the next row")
-
-    def located(self, folder: Path) -> FileSettings:
-        """Return the settings with the file made absolute."""
-        return self.model_copy(update={"file": folder / self.file})
 
 
-class FolderSettings(Coordinates):
+class FolderSettings(ExportSettings):
     """A folder into which the tracker's software exports one file a reading."""
 
     kind: Literal["folder"]
     folder: Path = Field(description="relative to the cell's folder")
     pattern: str = Field(default="*.csv", description="which files count")
-    columns: tuple[str, ...] | None = Field(
-        default=None, description="names of the columns; default: the last ones of each row"
-    )
-    timeout: Positive = Field(default=600.0, description="s to wait for the next file")
-
-    def located(self, folder: Path) -> FolderSettings:
-        """Return the settings with the folder made absolute."""
-        return self.model_copy(update={"folder": folder / self.folder})
 
 
 class LineFeedSettings(Coordinates):
@@ -119,6 +107,7 @@ class LineFeedSettings(Coordinates):
 class DialGaugeSettings(Base):
     """A dial gauge, draw wire or ballbar: the distance from a fixed point to the target."""
 
+    reads = "distance"
     kind: Literal["dial_gauge"]
     unit: LengthUnit = Field(description="of lengths: m, mm, um or in")
     zero: float | None = Field(
@@ -130,27 +119,19 @@ class DialGaugeSettings(Base):
         """Return whether its zero is unknown."""
         return {"zeroed": self.zero is None}
 
-    @property
-    def measures(self) -> str:
-        """Return ``distance``."""
-        return "distance"
-
 
 class TwoBallsSettings(Base):
     """Two balls on the tool, both measured at each pose: only their difference counts."""
 
+    reads = "relative"
     kind: Literal["two_balls"]
     unit: LengthUnit = Field(description="of lengths: m, mm, um or in")
-
-    @property
-    def measures(self) -> str:
-        """Return ``relative``."""
-        return "relative"
 
 
 class SphereSettings(Base):
     """A fixed sphere that the tool's probe touches: joint angles alone are the reading."""
 
+    reads = "sphere"
     kind: Literal["sphere"]
     radius: Positive | None = Field(
         default=None, description="m, of sphere and probe together; default: found along"
@@ -161,21 +142,12 @@ class SphereSettings(Base):
         """Return the radius."""
         return {"radius": self.radius}
 
-    @property
-    def measures(self) -> str:
-        """Return ``sphere``."""
-        return "sphere"
-
 
 class PointSettings(Base):
     """A fixed point that the tool's tip is brought onto: joint angles alone are the reading."""
 
+    reads = "point"
     kind: Literal["point"]
-
-    @property
-    def measures(self) -> str:
-        """Return ``point``."""
-        return "point"
 
 
 class SimulatedTrackerSettings(Base):

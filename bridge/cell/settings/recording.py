@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
+
+from gapbridge.drivers.section import Section
 
 
-class RecordingSettings(BaseModel):
+class RecordingSettings(Section):
     """Section ``recording``: where cycles are written to, and how much of them."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
     folder: Path | None = Field(
         Path("recordings"), description="the files of each run go here (MCAP); null: record nothing"

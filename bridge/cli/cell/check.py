@@ -11,7 +11,7 @@ from gapbridge.bridge.cell.cell import complaints
 from gapbridge.bridge.cell.live import live_findings
 from gapbridge.bridge.cell.log_fit import log_findings
 from gapbridge.bridge.cell.run_settings import read_configuration
-from gapbridge.bridge.cli.options import cell_argument
+from gapbridge.bridge.cli.options import FILE, cell_argument
 from gapbridge.core.errors import InputError
 
 
@@ -21,7 +21,7 @@ from gapbridge.core.errors import InputError
 @click.option(
     "--log",
     "logs",
-    type=click.Path(path_type=Path),
+    type=FILE,
     multiple=True,
     metavar="LOG",
     help="Hold the arm against measured poses too: order and signs of joints, DH rows, frames.",

@@ -12,7 +12,7 @@ import numpy as np
 from gapbridge.bridge.cell import Cell
 from gapbridge.bridge.cell.difference import FIELDS, Change, Moved, Part, changes, moved, parts
 from gapbridge.bridge.cell.opened_log import open_log
-from gapbridge.bridge.cli.options import open_cell
+from gapbridge.bridge.cli.options import FILE, open_cell
 from gapbridge.bridge.document.provenance import provenance
 from gapbridge.bridge.report.labels import effect_title, unit_of
 from gapbridge.core.arm import Arm
@@ -23,11 +23,9 @@ MODEL = (*FIELDS, "compliance", "effect")  # beginnings of keys that are parts o
 
 
 @click.command()
-@click.argument("before", type=click.Path(path_type=Path))
-@click.argument("after", type=click.Path(path_type=Path))
-@click.option(
-    "--log", type=click.Path(path_type=Path), help="Compare over its poses and loads instead."
-)
+@click.argument("before", type=FILE)
+@click.argument("after", type=FILE)
+@click.option("--log", type=FILE, help="Compare over its poses and loads instead.")
 @click.option("--seed", type=click.IntRange(min=0), default=0, help="Of the random poses.")
 @click.option("--json", "as_json", is_flag=True, help="As JSON, SI units.")
 def diff(before: Path, after: Path, log: Path | None, seed: int, as_json: bool) -> None:
@@ -60,7 +58,7 @@ def diff(before: Path, after: Path, log: Path | None, seed: int, as_json: bool) 
         if not (several and change.key.partition(".")[0].partition(" ")[0] in MODEL):
             click.echo(_line(change))
     for part in several:
-        click.echo(f"{_words(part, one, other)}{_by_itself(part.moved)}")
+        click.echo(f"{_described(part, one, other)}{_by_itself(part.moved)}")
     _print_origin(other)
     click.echo(_in_space(shift, "the log" if log else "the workspace"))
 
@@ -86,7 +84,7 @@ def _text(value: Any) -> str:
 def _part_json(part: Part, one: Cell, other: Cell) -> dict[str, Any]:
     """Return a part in words, and how far it alone moves the predicted TCP, SI."""
     shift = None if part.moved is None else part.moved.to_json()
-    return {"part": part.name, "words": _words(part, one, other), "moved": shift}
+    return {"part": part.name, "words": _described(part, one, other), "moved": shift}
 
 
 def _by_itself(shift: Moved | None) -> str:
@@ -95,7 +93,7 @@ def _by_itself(shift: Moved | None) -> str:
     return f"; alone {1e3 * shift.rms:.3f} mm rms at the TCP, at most {1e3 * shift.largest:.3f} mm"
 
 
-def _words(part: Part, one: Cell, other: Cell) -> str:
+def _described(part: Part, one: Cell, other: Cell) -> str:
     """Return what differs in a part, in units that people read."""
     old, new = one.model, other.model
     if part.name == "tool":

@@ -15,6 +15,7 @@ from gapbridge.bridge.cell import load_cell
 from gapbridge.bridge.cell.first_cell import Asked, first_cell
 from gapbridge.bridge.cell.live import whole_state
 from gapbridge.bridge.cell.sections import link_settings
+from gapbridge.bridge.cli.options import FILE
 from gapbridge.bridge.document.output_file import require_writable, write_text
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.errors import GapbridgeError, InputError
@@ -27,9 +28,7 @@ from gapbridge.drivers.ur_rtde.enquiry import enquire
 
 @click.command()
 @click.argument("host")
-@click.option(
-    "--out", required=True, type=click.Path(path_type=Path), metavar="CELL", help="The new cell."
-)
+@click.option("--out", required=True, type=FILE, metavar="CELL", help="The new cell.")
 @click.option(
     "--driver",
     type=click.Choice(["ur_rtde", "modbus", "can", "canopen"]),
@@ -43,7 +42,7 @@ from gapbridge.drivers.ur_rtde.enquiry import enquire
 )
 @click.option("--port", type=click.IntRange(1, 65535), help="modbus, socketcand: its port.")
 @click.option("--model", help="A built-in arm, where the controller does not say which it moves.")
-@click.option("--urdf", type=click.Path(path_type=Path), help="The arm's URDF, instead of --model.")
+@click.option("--urdf", type=FILE, help="The arm's URDF, instead of --model.")
 def init(
     host: str, out: Path, driver: str, profile: str | None, port: int | None,
     model: str | None, urdf: Path | None,

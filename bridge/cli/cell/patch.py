@@ -2,29 +2,30 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import click
 
 from gapbridge.bridge.cell import Cell
-from gapbridge.bridge.cli.options import cell_option, open_cell
+from gapbridge.bridge.cell.schema import Accused
+from gapbridge.bridge.cli.options import FILE, cell_option, open_cell
 from gapbridge.bridge.document.output_file import require_writable, write_text
 from gapbridge.bridge.patch.model_format import PatchOptions
+from gapbridge.core.effects import CATALOGUE, Term
 from gapbridge.core.errors import InputError
 
 
 @click.command()
-@click.argument("model", type=click.Path(path_type=Path))
+@click.argument("model", type=FILE)
 @cell_option
-@click.option(
-    "--out", required=True, type=click.Path(path_type=Path), help="The patched model to write."
-)
+@click.option("--out", required=True, type=FILE, help="The patched model to write.")
 @click.option("--joints", metavar="A,B,...", help="The model's joints, in the order of the arm's.")
 @click.option("--tcp", metavar="NAME", help="The model's TCP: a site (MJCF) or a link (URDF).")
 @click.option("--load", metavar="NAME", help="The model's body that is the declared payload.")
 @click.option(
     "--parameters",
-    type=click.Path(path_type=Path),
+    type=FILE,
     metavar="FILE",
     help="Write bounds for MuJoCo's sysid: .py (with modifiers) or .yaml.",
 )
@@ -50,8 +51,8 @@ def patch(
 
     Example: gapbridge patch ur10e.xml --cell better.yaml --out ur10e_real.xml --tcp attachment_site
     """
+    from gapbridge.bridge.cli.cell.patch import tie_lines
     from gapbridge.bridge.patch import changes_of, format_of
-    from gapbridge.bridge.patch.ties import tie_lines
 
     kind = format_of(model)
     if not model.is_file():
@@ -101,3 +102,31 @@ def _bounds(
         )
     require_writable(file, model, *others)
     return parameters_text(model, cell, options, suffix)
+
+
+def tie_lines(accused: Sequence[Accused], terms: Sequence[Term]) -> tuple[str, ...]:
+    """Return one line for each accused effect that has ties and is in the model: both candidates.
+
+    The accused one is in the model with its value; of the other it is said how people put it in
+    and where its value comes from.
+    """
+    there = {(term.effect, term.site.joint) for term in terms if not term.stand_in}
+    lines = []
+    for cause in accused:
+        joints: list[int | None] = [*cause.joints] or [None]
+        if not cause.indistinguishable_from or not any((cause.effect, j) in there for j in joints):
+            continue
+        numbers = ", ".join(f"{p.name} = {p.value:.6g} {p.unit}".rstrip() for p in cause.parameters)
+        others = " or ".join(
+            f"{name} ({CATALOGUE[name].instead})" if _instead(name) else name
+            for name in cause.indistinguishable_from
+        )
+        lines.append(
+            f"tie: either {numbers}, which is written, or {others}: the data do not separate them; "
+            f"the other's value: diagnose with --withhold {cause.effect}"
+        )
+    return tuple(lines)
+
+
+def _instead(name: str) -> str:
+    return CATALOGUE[name].instead if name in CATALOGUE else ""

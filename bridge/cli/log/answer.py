@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from gapbridge.bridge.document.findings import clock, finding_text
+from gapbridge.bridge.report.labels import unit_of
 from gapbridge.core.diagnosis.causes import Cause
 from gapbridge.core.diagnosis.channel_diagnosis import ChannelDiagnosis
 from gapbridge.core.diagnosis.diagnosis import Diagnosis
@@ -18,7 +19,6 @@ VERDICTS = {
     "partly_explained": "partly explained: causes were found, but residual structure remains",
     "unexplained": "unexplained: there is a gap that no effect of the catalogue accounts for",
 }
-SMALL = {"m": ("mm", 1e3), "rad": ("mrad", 1e3)}  # gaps are reported in units that people read
 SHOWN = 6  # next measurements
 CHANGED = 3  # parameters of a cause that changed between sessions
 
@@ -48,7 +48,7 @@ def size(value: float | None, unit: str) -> str:
     """Return a gap as text, m as mm and rad as mrad."""
     if value is None:
         return "unknown"
-    name, factor = SMALL.get(unit, (unit, 1.0))
+    name, factor = unit_of(unit)
     return f"{value * factor:.4g} {name}"
 
 

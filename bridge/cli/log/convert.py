@@ -8,7 +8,7 @@ from typing import Any
 import click
 
 from gapbridge.bridge.cell.opened_log import joint_names
-from gapbridge.bridge.cli.options import open_cell
+from gapbridge.bridge.cli.options import FILE, open_cell
 from gapbridge.bridge.document.output_file import PARQUET, require_writable, write_table
 from gapbridge.core.errors import InputError, LogError
 from gapbridge.core.log.sources import SOURCES, SourceOptions, source_of
@@ -18,17 +18,11 @@ ROLES = tuple(TYPES)
 
 
 @click.command()
-@click.argument("source", type=click.Path(path_type=Path))
+@click.argument("source", type=FILE)
 @click.option(
-    "--out",
-    required=True,
-    type=click.Path(path_type=Path),
-    metavar="LOG",
-    help="The log to write, .csv or .parquet.",
+    "--out", required=True, type=FILE, metavar="LOG", help="The log to write, .csv or .parquet."
 )
-@click.option(
-    "--cell", type=click.Path(path_type=Path), help="The cell whose arm's joints are meant."
-)
+@click.option("--cell", type=FILE, help="The cell whose arm's joints are meant.")
 @click.option(
     "--joints", metavar="A,B,...", help="The source's joint names, in the order of the arm's."
 )
@@ -42,10 +36,7 @@ ROLES = tuple(TYPES)
 @click.option("--wrench", type=click.Choice(WRENCHES), help="Which column a bag's wrench topic is.")
 @click.option("--effort-is-torque", is_flag=True, help="JointState.effort is joint torque in Nm.")
 @click.option(
-    "--calibration",
-    type=click.Path(path_type=Path),
-    metavar="FILE",
-    help="LeRobot's calibration file of the arm.",
+    "--calibration", type=FILE, metavar="FILE", help="LeRobot's calibration file of the arm."
 )
 @click.option(
     "--units", type=click.Choice(("degrees", "rad")), help="What a LeRobot dataset's angles are in."

@@ -14,6 +14,7 @@ from gapbridge.bridge.cell import Cell, save_cell
 from gapbridge.bridge.cell.opened_log import open_simulated
 from gapbridge.bridge.cli.log.answer import answer
 from gapbridge.bridge.cli.options import (
+    FILE,
     cell_option,
     logs_argument,
     open_cell,
@@ -23,7 +24,7 @@ from gapbridge.bridge.cli.options import (
 )
 from gapbridge.bridge.cli.progress import status
 from gapbridge.bridge.document.diagnosis_json import document
-from gapbridge.bridge.document.output_file import FOLDER_MODE, require_writable, write_text
+from gapbridge.bridge.document.output_file import require_folder, require_writable, write_text
 from gapbridge.bridge.document.provenance import fitted, provenance
 from gapbridge.core.diagnosis.diagnosis import Diagnosis
 from gapbridge.core.diagnosis.diagnosis import diagnose as diagnose_log
@@ -43,21 +44,15 @@ if TYPE_CHECKING:
 @remounted_option
 @click.option(
     "--out",
-    type=click.Path(path_type=Path),
+    type=FILE,
     metavar="DIR",
     help="Folder for diagnosis.json and report.html; made where it is missing.",
 )
-@click.option(
-    "--json",
-    "json_file",
-    type=click.Path(path_type=Path),
-    metavar="FILE",
-    help="Write the diagnosis as JSON.",
-)
+@click.option("--json", "json_file", type=FILE, metavar="FILE", help="Write the diagnosis as JSON.")
 @click.option(
     "--apply",
     "new_cell",
-    type=click.Path(path_type=Path),
+    type=FILE,
     metavar="NEW_CELL",
     help="Write the cell with the found effects added.",
 )
@@ -74,7 +69,7 @@ if TYPE_CHECKING:
 )
 @click.option(
     "--sim",
-    type=click.Path(path_type=Path),
+    type=FILE,
     metavar="SIM_LOG",
     help="Take the prediction from a log of your own simulator: rows of the same time.",
 )
@@ -134,7 +129,7 @@ class _Output:
             if file is not None:
                 require_writable(file, *inputs)
         if self.out is not None:
-            _folder(self.out)
+            require_folder(self.out, "--out", above=False)
 
     def write(
         self, found: Diagnosis, cell: Cell, log: Log, origin: dict[str, Any]
@@ -172,18 +167,6 @@ def _check_effects(names: tuple[str, ...]) -> None:
             effect_named(name)
         except InputError as error:
             raise InputError(f"--withhold: {error}") from None
-
-
-def _folder(path: Path) -> None:
-    """Make the folder of the results; its parent must exist."""
-    if path.exists() and not path.is_dir():
-        raise InputError(f"{path}: found a file, expected a folder for --out")
-    if not path.parent.is_dir():
-        raise InputError(f"{path}: found no folder {path.parent}, expected an existing one")
-    try:
-        path.mkdir(FOLDER_MODE, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{path}: folder cannot be made: {error.strerror}") from None
 
 
 def _json(reported: dict[str, Any]) -> str:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import click
 
+from gapbridge.bridge.cli.options import FILE
 from gapbridge.bridge.document.output_file import require_writable, write_text
 from gapbridge.bridge.recording.export import Exported, Span, export, moment
 from gapbridge.core.errors import InputError
@@ -14,17 +15,15 @@ from gapbridge.core.log.mcap_reading import SUFFIX, files_of, read_configuration
 
 
 @click.command("export")
-@click.argument("recording", type=click.Path(path_type=Path))
+@click.argument("recording", type=FILE)
 @click.option(
     "--out",
-    type=click.Path(path_type=Path),
+    type=FILE,
     help="The log to write, .csv or .parquet; left out: a CSV beside the recording.",
 )
 @click.option("--from", "start", metavar="T", help="Leave out what was before.")
 @click.option("--to", "stop", metavar="T", help="Leave out what was after.")
-@click.option(
-    "--cell-out", type=click.Path(path_type=Path), help="Write the cell file that it ran by, too."
-)
+@click.option("--cell-out", type=FILE, help="Write the cell file that it ran by, too.")
 def export_recording(
     recording: Path, out: Path | None, start: str | None, stop: str | None, cell_out: Path | None
 ) -> None:

@@ -16,6 +16,7 @@ from gapbridge.bridge.cell import Cell, save_cell
 from gapbridge.bridge.cell.log_fit import pose_findings
 from gapbridge.bridge.cli.log.large_log import LargeLog, has_sessions, is_large
 from gapbridge.bridge.cli.options import (
+    FILE,
     cell_option,
     logs_argument,
     open_cell,
@@ -39,9 +40,7 @@ from gapbridge.core.metrology import Metrology
 @logs_argument
 @cell_option
 @remounted_option
-@click.option(
-    "--out", required=True, type=click.Path(path_type=Path), help="The new cell file to write."
-)
+@click.option("--out", required=True, type=FILE, help="The new cell file to write.")
 def fit(logs: tuple[Path, ...], cell: Path, remounted: bool, out: Path) -> None:
     """Identify the compliance of a cell from a log, or from several sessions of one arm.
 

@@ -10,14 +10,14 @@ from typing import Any
 
 import click
 
+from gapbridge.bridge.cli.options import FILE
 from gapbridge.bridge.cli.progress import progress
-from gapbridge.bridge.fleet import diagnosing, fitting
+from gapbridge.bridge.document.output_file import require_folder
 from gapbridge.bridge.fleet.cell_source import cell_source
-from gapbridge.bridge.fleet.ending import ending
-from gapbridge.bridge.fleet.folder import require_folder
 from gapbridge.bridge.fleet.journal import Journal
-from gapbridge.bridge.fleet.runner import Done, run, tasks_of
+from gapbridge.bridge.fleet.runner import Done, ending, run, tasks_of
 from gapbridge.bridge.fleet.session import Found, find_sessions
+from gapbridge.bridge.fleet.session_work import diagnose_session, fit_session
 from gapbridge.bridge.fleet.task import BAD, DONE, Outcome, Work
 from gapbridge.bridge.fleet.workers.dask_workers import DaskWorkers
 from gapbridge.bridge.fleet.workers.local_workers import LocalWorkers
@@ -51,7 +51,7 @@ def shared(command: Callable[..., None]) -> Callable[..., None]:
             "or the file's name up to its first underscore.",
         ),
         click.option(
-            "--out", type=click.Path(path_type=Path), default=OUT, show_default=True,
+            "--out", type=FILE, default=OUT, show_default=True,
             metavar="DIR", help="Folder of the results; an interrupted run is resumed there.",
         ),
         click.option("--fresh", is_flag=True, help="Start over, ignoring earlier results."),
@@ -98,7 +98,7 @@ def diagnose(withhold: tuple[str, ...], **given: Any) -> None:
     for name in withhold:
         effect_named(name)
     options = FleetOptions(**given)
-    done, found = _run("diagnose", diagnosing.work, {"withhold": list(withhold)}, options)
+    done, found = _run("diagnose", diagnose_session, {"withhold": list(withhold)}, options)
     from gapbridge.bridge.fleet.output import write_diagnosed
 
     _reported(done, found, *write_diagnosed(done, found, options.out))
@@ -107,8 +107,8 @@ def diagnose(withhold: tuple[str, ...], **given: Any) -> None:
 @fleet.command()
 @shared
 @click.option(
-    "--apply", "cells", type=click.Path(path_type=Path), metavar="DIR",
-    help="Write a new cell per arm there, and cells.csv, a table of them.",
+    "--apply", "cells", type=FILE, metavar="DIR",
+    help="Write a new cell per arm there, and cells.csv, a table of them."
 )  # fmt: skip
 def fit(cells: Path | None, **given: Any) -> None:
     """Fit the compliance of all arms together: type, arm, session.
@@ -121,7 +121,7 @@ def fit(cells: Path | None, **given: Any) -> None:
     if cells is not None:
         require_folder(cells, "--apply")
     options = FleetOptions(**given)
-    done, found = _run("fit", fitting.work, {}, options)
+    done, found = _run("fit", fit_session, {}, options)
     from gapbridge.bridge.fleet.output import write_fitted
 
     _reported(done, found, *write_fitted(done, found, options.out, cells))

@@ -7,9 +7,9 @@ from typing import Any
 
 import click
 
-from gapbridge.bridge.calibration.instruments.choice import instrument_settings
+from gapbridge.bridge.calibration.instruments import instrument_settings
 from gapbridge.bridge.calibration.session.prompt import COMMANDS, ENTER, HELP
-from gapbridge.bridge.cli.options import cell_argument, open_cell
+from gapbridge.bridge.cli.options import FILE, cell_argument, open_cell
 from gapbridge.bridge.document.output_file import require_writable
 
 EPILOG = "\b\nAt every question:\n" + "\n".join(
@@ -22,7 +22,7 @@ EPILOG = "\b\nAt every question:\n" + "\n".join(
 @click.option(
     "--session",
     "folder",
-    type=click.Path(path_type=Path),
+    type=FILE,
     metavar="DIR",
     help="Folder of the session; default: the cell's last one that is not finished, or a new one.",
 )
@@ -43,7 +43,7 @@ EPILOG = "\b\nAt every question:\n" + "\n".join(
 @click.option(
     "--apply",
     "new_cell",
-    type=click.Path(path_type=Path),
+    type=FILE,
     metavar="NEW_CELL",
     help="Where to write the calibrated cell, after confirmation; the old one is kept.",
 )

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import click
 
-from gapbridge.bridge.cli.optional import member
-from gapbridge.core.errors import InputError
+from gapbridge.bridge.cli.options import FILE
+from gapbridge.bridge.document.output_file import require_folder
 
 
 @click.command()
@@ -20,7 +20,7 @@ from gapbridge.core.errors import InputError
 )
 @click.option(
     "--out",
-    type=click.Path(path_type=Path),
+    type=FILE,
     default=Path("out/demo"),
     show_default=True,
     help="Folder for summary.json and report.html.",
@@ -44,6 +44,7 @@ def demo(seed: int, out: Path, link: str) -> None:  # fmt: skip
     Example: gapbridge demo --seed 3
     Example: gapbridge demo --link can --out out/demo_can
     """
-    if out.exists() and not out.is_dir():
-        raise InputError(f"{out}: found a file, expected a folder for --out")
-    member("gapbridge.bridge.demo", "run_demo", "demo")(seed=seed, out=out, link=link)
+    require_folder(out, "--out")
+    from gapbridge.bridge.demo import run_demo  # takes the simulated controllers along
+
+    run_demo(seed=seed, out=out, link=link)

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import click
 
-from gapbridge.bridge.cli.optional import member
 from gapbridge.bridge.cli.options import cell_argument, open_cell
 from gapbridge.bridge.ipc.log_lines import JsonLines
 from gapbridge.core.errors import InputError
@@ -41,12 +40,8 @@ def run(cell: Path, observe: bool, arm: bool, duration: float | None, log: str) 
     if observe and arm:
         raise InputError("--observe: found beside --arm, expected one of them")
     given = open_cell(cell)
-    result = member("gapbridge.bridge.daemon.run", "run_cell", "run")(
-        given,
-        observe=observe,
-        arm=arm,
-        duration=duration,
-        log=JsonLines(sys.stderr).emit if log == "json" else None,
-    )
-    if isinstance(result, int) and not isinstance(result, bool) and result:
-        raise click.exceptions.Exit(result)
+    from gapbridge.bridge.daemon.run import run_cell  # takes the numerical libraries along
+
+    json = JsonLines(sys.stderr).emit if log == "json" else None
+    if code := run_cell(given, observe=observe, arm=arm, duration=duration, log=json):
+        raise click.exceptions.Exit(code)

@@ -7,12 +7,13 @@ from pathlib import Path
 
 import click
 
+from gapbridge.bridge.cli.options import FILE
 from gapbridge.bridge.daemon.status_document import lines
 from gapbridge.bridge.ipc.control_client import ask, running
 
 
 @click.command()
-@click.argument("cell", type=click.Path(path_type=Path), required=False)
+@click.argument("cell", type=FILE, required=False)
 @click.option("--json", "as_json", is_flag=True, help="Print the whole status document.")
 def status(cell: Path | None, as_json: bool) -> None:
     """Show what the daemon of a cell does; without CELL, all daemons of this user.

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 
 import numpy as np
 
-from gapbridge.bridge.daemon.daemon import Daemon
 from gapbridge.bridge.demo.hidden import soft_servos
-from gapbridge.bridge.demo.links.controller_link import ControllerLink
+from gapbridge.bridge.demo.links.link import DemoLink
 from gapbridge.bridge.demo.poses import Load, Scene, Workspace
 from gapbridge.bridge.demo.result import Resolution, reach
-from gapbridge.bridge.demo.trajectory import visits, write_trajectory
+from gapbridge.bridge.demo.trajectory import PERIOD, visits
+from gapbridge.bridge.setpoint_source.quintic import write_trajectory
 from gapbridge.core.arrays import Array
 from gapbridge.drivers.can.loading import read_profile
 from gapbridge.drivers.can.settings import CanSettings
@@ -32,7 +31,7 @@ HELD = (0.0, 15.0, 8.9, 1.9, 2.6, 0.0)
 """What the joints hold at most, Nm, at the poses that are measured with 1.5 kg."""
 
 
-class CanLink(ControllerLink):
+class CanLink(DemoLink):
     """A PiPER on a CAN bus between processes, by the socketcand protocol."""
 
     name = "can"
@@ -82,8 +81,5 @@ class CanLink(ControllerLink):
     def prepare(self, folder: Path, poses: Array) -> float:
         """Write the trajectory that the daemon follows; see DemoLink.prepare."""
         top_speed = np.minimum(self.cell.arm.limits.velocity, TOP_SPEED)
-        return write_trajectory(folder / "trajectory.csv", visits(self.home, poses, top_speed))
-
-    def motion(self, daemon: Daemon, poses: Array) -> AbstractContextManager[object]:
-        """Do nothing: the daemon's setpoints move the arm."""
-        return nullcontext()
+        q = visits(self.home, poses, top_speed)
+        return write_trajectory(folder / "trajectory.csv", q, PERIOD)

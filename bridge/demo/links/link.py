@@ -3,24 +3,32 @@
 from __future__ import annotations
 
 import os
+import re
 import socket
+import tempfile
 from abc import ABC, abstractmethod
-from contextlib import AbstractContextManager
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from importlib import resources
 from pathlib import Path
 from typing import ClassVar
+
+import numpy as np
 
 from gapbridge.bridge.cell import Cell, load_cell
 from gapbridge.bridge.daemon.daemon import Daemon
 from gapbridge.bridge.demo.bench import Bench
 from gapbridge.bridge.demo.hidden import Hidden
 from gapbridge.bridge.demo.poses import Load, Scene
+from gapbridge.bridge.demo.processes import ServedCell
 from gapbridge.bridge.demo.rests import SETTLING
 from gapbridge.bridge.demo.result import Resolution
 from gapbridge.bridge.document.output_file import write_text
 from gapbridge.core.arrays import Array
-from gapbridge.core.errors import RunError
+from gapbridge.core.errors import CellError, RunError
+from gapbridge.drivers.simulated.ur.settings import BENCH_PORT
 
+PAYLOAD = re.compile(r"^payload:.*$", re.MULTILINE)
 LAST_HOST = 60  # 127.0.0.2 to this are tried
 
 
@@ -52,33 +60,57 @@ class DemoLink(ABC):
         return load_cell(out / "cell.yaml")
 
     @property
-    @abstractmethod
     def home(self) -> Array:
         """Return where the arm stands at the start (n,), rad."""
+        return np.array(self.cell.simulation.start_q)
 
-    @abstractmethod
-    def served(self) -> AbstractContextManager[object]:
-        """Serve the simulated controller in a process of its own. Raises LinkError."""
+    @contextmanager
+    def served(self) -> Iterator[None]:
+        """Serve the simulated controller in a process of its own. Raises LinkError.
 
-    @abstractmethod
+        It gets a copy of the cell that lies elsewhere: what is hidden in it stays hidden.
+        """
+        with tempfile.TemporaryDirectory(prefix="simulated-") as folder:
+            hidden = Path(folder) / "cell.yaml"
+            text = self.cell.path.read_text(encoding="utf-8") + self._hidden()
+            for key, values in self.hidden.simulation.items():
+                text += f"  {key}: [{', '.join(f'{v:.9e}' for v in values)}]\n"
+            write_text(hidden, text)
+            for name in self.files:
+                write_text(Path(folder) / name, (self.cell.path.parent / name).read_text("utf-8"))
+            with ServedCell(hidden, self.seed):
+                yield
+
+    def _hidden(self) -> str:
+        """Return lines of section ``simulation`` that only the simulated arm may know."""
+        return ""
+
     def bench(self) -> Bench:
         """Return a connection to the people and the tracker around the arm."""
+        return Bench(self.host, BENCH_PORT)
 
     @abstractmethod
     def resolution(self) -> Resolution:
         """Return what one count of what is written and read comes to at the TCP."""
 
     def declared(self, cell: Cell, load: Load) -> Cell:
-        """Return the cell of a run with a load, where the controller is not informed of it."""
-        return cell
+        """Return the cell of a run with this load as its payload, as its user would write it."""
+        cog = ", ".join(f"{v:g}" for v in load.cog)
+        text = cell.path.read_text(encoding="utf-8")
+        declared, count = PAYLOAD.subn(f"payload: {{mass: {load.mass:g}, cog: [{cog}]}}", text)
+        if count != 1:
+            raise CellError(f"{cell.path}: payload: found {count} lines, expected one")
+        path = cell.path.with_name(f"{cell.path.stem}-{load.name.replace(' ', '-')}.yaml")
+        write_text(path, declared)
+        return load_cell(path)
 
     @abstractmethod
     def prepare(self, folder: Path, poses: Array) -> float:
         """Prepare a motion from home through ``poses`` (M, n) and home; returns its length, s."""
 
-    @abstractmethod
     def motion(self, daemon: Daemon, poses: Array) -> AbstractContextManager[object]:
         """Move the arm during a run, where setpoints do not. Raises LinkError at its end."""
+        return nullcontext()
 
 
 def free_address(ports: tuple[int, ...]) -> str:

@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from gapbridge.bridge.daemon.daemon import Daemon
-from gapbridge.bridge.demo.links.controller_link import ControllerLink
+from gapbridge.bridge.demo.links.link import DemoLink
 from gapbridge.bridge.demo.own_program import LONGEST_VISIT, OwnProgram
 from gapbridge.bridge.demo.poses import UR10E, Load, Workspace
 from gapbridge.bridge.demo.result import Resolution, reach
@@ -21,7 +21,7 @@ from gapbridge.drivers.simulated.ur.settings import BENCH_PORT
 PORT = 15020  # below 1024 only root may listen; a real controller's is 502
 
 
-class ModbusLink(ControllerLink):
+class ModbusLink(DemoLink):
     """A UR10e whose mailbox takes offsets in micrometres, and whose joints read in milliradians.
 
     The program that moves the arm is the user's own, who knows where it was sent: the fit takes

@@ -10,11 +10,10 @@ from gapbridge.bridge.document.html import html
 from gapbridge.bridge.document.output_file import write_text
 from gapbridge.bridge.document.provenance import origin_blocks, origin_line, provenance
 from gapbridge.bridge.fleet.diagnosis_summary import Diagnosed
-from gapbridge.bridge.fleet.ending import counted
 from gapbridge.bridge.fleet.fit_summary import Fitted
 from gapbridge.bridge.fleet.report import diagnosed_sections, fitted_sections, shared_sections
 from gapbridge.bridge.fleet.report.shared_sections import part
-from gapbridge.bridge.fleet.runner import Done
+from gapbridge.bridge.fleet.runner import Done, counted
 from gapbridge.bridge.fleet.session import Found
 
 FILE = "report.html"

@@ -20,13 +20,10 @@ from gapbridge.bridge.document.blocks import (
     Table,
 )
 from gapbridge.bridge.document.drawing import AFTER, BAD_DOT, BEFORE, LIMIT, SOFT, VIOLET, Drawing
-from gapbridge.bridge.fleet.drift import ChannelFigure, Drift, Quantity
-from gapbridge.bridge.fleet.ending import STATES
-from gapbridge.bridge.fleet.outlying import Outlier
-from gapbridge.bridge.fleet.runner import Done
+from gapbridge.bridge.fleet.drift import ChannelFigure, Drift, Outlier, Quantity
+from gapbridge.bridge.fleet.runner import STATES, Done
 from gapbridge.bridge.fleet.task import DONE, Outcome
-from gapbridge.bridge.report.labels import CHANNELS, number, with_unit
-from gapbridge.bridge.report.names import parameter_title
+from gapbridge.bridge.report.labels import CHANNELS, number, parameter_title, with_unit
 
 MOST = 40  # rows of a table: the Parquet files have all
 DRAWN = 6  # drifts in the picture

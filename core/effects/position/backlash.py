@@ -37,7 +37,6 @@ class Backlash(JointEffect):
 
     def condition(self, term: Term, arm: Arm, rows: Rows, loads: Loads, q: Array) -> None:
         """Turn the joint back by half the clearance."""
-        assert term.site.joint is not None
         if loads.approach is not None:
-            i = term.site.joint - 1
+            i = term.site.index
             rows.q[:, i] -= 0.5 * term.values[0] * loads.approach[:, i]

@@ -46,5 +46,4 @@ class JointOffset(JointEffect):
 
     def condition(self, term: Term, arm: Arm, rows: Rows, loads: Loads, q: Array) -> None:
         """Turn the joint further."""
-        assert term.site.joint is not None
-        rows.q[:, term.site.joint - 1] += term.values[0]
+        rows.q[:, term.site.index] += term.values[0]

@@ -40,5 +40,4 @@ class JointSlip(JointEffect):
 
     def condition(self, term: Term, arm: Arm, rows: Rows, loads: Loads, q: Array) -> None:
         """Turn the joint further in the rows after the slip."""
-        assert term.site.joint is not None
-        rows.q[rows_after(term, loads), term.site.joint - 1] += term.values[0]
+        rows.q[rows_after(term, loads), term.site.index] += term.values[0]

@@ -43,5 +43,4 @@ class LinkFlexibility(Effect):
 
     def shape(self, term: Term, arm: Arm, chain: Chain) -> None:
         """Soften the link."""
-        assert term.site.joint is not None
-        chain.flexibility[term.site.joint - 1] += term.values[0]
+        chain.flexibility[term.site.index] += term.values[0]

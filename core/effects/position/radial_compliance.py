@@ -36,11 +36,9 @@ class RadialCompliance(JointEffect):
 
     def shape(self, term: Term, arm: Arm, chain: Chain) -> None:
         """Soften the joint about x and y alike."""
-        assert term.site.joint is not None
-        chain.compliance[term.site.joint - 1, :2] += term.values[0]
+        chain.compliance[term.site.index, :2] += term.values[0]
 
     def shape_rate(self, term: Term, arm: Arm, chain: Chain, value: int, rate: ChainRate) -> bool:
         """Write the softer joint."""
-        assert term.site.joint is not None
-        rate.compliance[term.site.joint - 1, :2] = 1.0
+        rate.compliance[term.site.index, :2] = 1.0
         return True

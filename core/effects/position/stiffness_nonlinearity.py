@@ -51,15 +51,13 @@ class StiffnessNonlinearity(JointEffect):
 
     def shape(self, term: Term, arm: Arm, chain: Chain) -> None:
         """Soften the joint about z by the bent curve."""
-        assert term.site.joint is not None
-        i = term.site.joint - 1
+        i = term.site.index
         chain.compliance[i, 2] += term.values[0]
         chain.softening[i] += term.values[1]
 
     def shape_rate(self, term: Term, arm: Arm, chain: Chain, value: int, rate: ChainRate) -> bool:
         """Write the softer joint, or the bent curve."""
-        assert term.site.joint is not None
-        i = term.site.joint - 1
+        i = term.site.index
         if value == 0:
             rate.compliance[i, 2] = 1.0
         else:

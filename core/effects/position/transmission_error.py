@@ -49,7 +49,7 @@ class TransmissionError(JointEffect):
     def condition(self, term: Term, arm: Arm, rows: Rows, loads: Loads, q: Array) -> None:
         """Turn the joint by the wave at its encoder angle."""
         assert term.site.joint is not None and term.site.order is not None
-        i = term.site.joint - 1
+        i = term.site.index
         rows.q[:, i] += self.angle_columns(term.site, q[:, i]) @ term.values
 
     def reported(self, arm: Arm, term: Term, covariance: Array | None) -> tuple[Reported, ...]:

@@ -49,14 +49,13 @@ class LinkCog(JointEffect):
     def simulator(self, term: Term, arm: Arm) -> tuple[SimulatorChange, ...]:
         """Return it in a simulator's terms."""
         assert term.site.joint is not None
-        i, moment = term.site.joint - 1, np.array(term.values)
+        i, moment = term.site.index, np.array(term.values)
         in_joint = moment if arm.body_axes is None else arm.body_axes[i] @ moment
         return along_axes(Kind.LINK_MOMENT, term.site.joint, in_joint)
 
     def drive(self, term: Term, arm: Arm, torque: Array, motion: Motion) -> Array:
         """Add what holds and moves the first moment."""
-        assert term.site.joint is not None
         assert motion.pieces is not None
-        i, moment = term.site.joint - 1, np.array(term.values)
+        i, moment = term.site.index, np.array(term.values)
         in_link = moment if arm.body_axes is None else arm.body_axes[i] @ moment
         return torque + motion.pieces.link_from(i, in_link)

@@ -37,6 +37,5 @@ class LinkInertia(JointEffect):
 
     def drive(self, term: Term, arm: Arm, torque: Array, motion: Motion) -> Array:
         """Add the link's torques once more, scaled."""
-        assert term.site.joint is not None
         assert motion.pieces is not None
-        return torque + term.values[0] * motion.pieces.link_torque[:, term.site.joint - 1]
+        return torque + term.values[0] * motion.pieces.link_torque[:, term.site.index]

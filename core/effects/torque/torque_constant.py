@@ -34,7 +34,6 @@ class TorqueConstant(JointEffect):
 
     def drive(self, term: Term, arm: Arm, torque: Array, motion: Motion) -> Array:
         """Scale the joint's torque."""
-        assert term.site.joint is not None
         result = torque.copy()
-        result[:, term.site.joint - 1] *= 1.0 + term.values[0]
+        result[:, term.site.index] *= 1.0 + term.values[0]
         return result

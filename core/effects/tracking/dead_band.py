@@ -54,10 +54,9 @@ class DeadBand(ServoEffect):
         approach: Array | None,
     ) -> Array:
         """Let the joint rest on the side that it came from."""
-        assert term.site.joint is not None
         if approach is None:
             return q
-        i = term.site.joint - 1
+        i = term.site.index
         result = q.copy()
         result[:, i] -= term.values[0] * approach[:, i]
         return result

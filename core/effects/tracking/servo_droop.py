@@ -47,8 +47,7 @@ class ServoDroop(JointEffect):
         approach: Array | None,
     ) -> Array:
         """Let the joint give way."""
-        assert term.site.joint is not None
-        i = term.site.joint - 1
+        i = term.site.index
         result = q.copy()
         result[:, i] -= term.values[0] * held[:, i]
         return result

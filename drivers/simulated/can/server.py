@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import importlib
+from pkgutil import resolve_name
 
 from gapbridge.core.errors import InputError
 from gapbridge.drivers.can.settings import CanSettings
@@ -20,8 +20,7 @@ MAPPED = "gapbridge.drivers.simulated.can.mapped_node:MappedNodes"
 
 def make_servers(link: CanSettings, host: str, controller: ArmController) -> list[ProtocolServer]:
     """Return the nodes of an arm, not yet on a bus. Raises InputError where they do not fit."""
-    module, name = NODES.get(link.profile, MAPPED).split(":")
-    nodes = getattr(importlib.import_module(module), name)
+    nodes = resolve_name(NODES.get(link.profile, MAPPED))
     if link.profile == "piper" and controller.n != 6:
         raise InputError(
             f"link.profile: found 6 joints in piper, expected {controller.n}: the cell's arm has "

@@ -1,4 +1,4 @@
-"""What a sensor on the flange feels, in its own axes: shares no mathematics with the driver."""
+"""What a sensor on the flange measures, in its own axes: shares no mathematics with the driver."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from gapbridge.drivers.simulated.plant.rotations import (
 )
 
 Reaction = Callable[[], Vector6]
-"""Returns the wrench that a sensor feels now, N and Nm, in its own axes, about its origin."""
+"""Returns the wrench that a sensor measures now, N and Nm, in its own axes, about its origin."""
 
 
 def reaction_at(
     in_flange: Callable[[], Sequence[float]], xyz: Vector3, rpy: Vector3, sign: int = 1
 ) -> Reaction:
-    """Return what a sensor mounted at ``xyz``, ``rpy`` feels of the flange's wrench (6,).
+    """Return what a sensor mounted at ``xyz``, ``rpy`` measures of the flange's wrench (6,).
 
     ``sign`` -1: it reports the reaction.
     """

@@ -12,7 +12,7 @@ from gapbridge.drivers.simulated.ft_sensor.mounting import Reaction
 
 
 class SimulatedSensor(ABC):
-    """What the simulated sensors share: what they feel, faults, start and stop."""
+    """What the simulated sensors share: what they measure, faults, start and stop."""
 
     def __init__(self, reaction: Reaction) -> None:
         self.reaction = reaction

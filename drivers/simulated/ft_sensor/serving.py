@@ -17,11 +17,10 @@ from gapbridge.drivers.ft_sensor.settings import (
     RobotousSettings,
 )
 from gapbridge.drivers.simulated.can.hub import Hub
-from gapbridge.drivers.simulated.ft_sensor.ati_node import AtiNode
+from gapbridge.drivers.simulated.ft_sensor.ati_node import AtiNode, RobotousNode
 from gapbridge.drivers.simulated.ft_sensor.ft300_device import Ft300Device
 from gapbridge.drivers.simulated.ft_sensor.mounting import Reaction, reaction_at
 from gapbridge.drivers.simulated.ft_sensor.node import SimulatedSensor
-from gapbridge.drivers.simulated.ft_sensor.robotous_node import RobotousNode
 
 RETRY = 0.1  # s between two tries at a bus that somebody else serves
 BETWEEN_PROCESSES = ("socketcand", "socketcan")

@@ -25,7 +25,7 @@ FASTEST = 6.2831853  # rad/s, for an arm without velocity limits
 
 
 class Frame(NamedTuple):
-    """A frame seen from base: rotation and origin (m)."""
+    """A frame in base: rotation and origin (m)."""
 
     rotation: Rotation
     origin: Vector3
@@ -35,7 +35,7 @@ BASE = Frame(IDENTITY, (0.0, 0.0, 0.0))
 
 
 def place(outer: Frame, inner: Frame) -> Frame:
-    """Return `inner`, which is given in `outer`, as seen from where `outer` is seen."""
+    """Return `inner`, which is given in `outer`, in the frame that `outer` is given in."""
     return Frame(
         compose(outer.rotation, inner.rotation),
         add(outer.origin, rotate(outer.rotation, inner.origin)),

@@ -46,7 +46,7 @@ class Sensors:
         self._random = np.random.default_rng((plant.settings.seed, 1))
         self._noise: list[list[float]] = []
         self._zero = plant.settings.sensor_bias  # taken off actual_TCP_force; zeroFt sets it anew
-        self._bend = IDENTITY  # true flange seen from the rigid one
+        self._bend = IDENTITY  # true flange in the rigid one
         self._bent_at: object = None
         self._wrench: tuple[float, ...] = (0.0,) * len(plant.q)
         self._flange = plant.arm.flange(plant.q)

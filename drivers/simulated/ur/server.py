@@ -18,7 +18,7 @@ from gapbridge.drivers.simulated.server.bench import BenchServer
 from gapbridge.drivers.simulated.server.connection import Connection, listen
 from gapbridge.drivers.simulated.server.real_time import become_punctual
 from gapbridge.drivers.simulated.ur.controller import CYCLE, Controller
-from gapbridge.drivers.simulated.ur.programs.own_motion import move_own
+from gapbridge.drivers.simulated.ur.programs.script_programs import move_own
 from gapbridge.drivers.simulated.ur.servers.dashboard_server import DashboardServer
 from gapbridge.drivers.simulated.ur.servers.primary_server import PrimaryServer
 from gapbridge.drivers.simulated.ur.servers.rtde_server import RtdeServer, RtdeSession

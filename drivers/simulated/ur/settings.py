@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 from gapbridge.core.arm import Arm, builtin_names, builtin_rows
@@ -11,7 +11,7 @@ from gapbridge.core.errors import ArmError
 from gapbridge.drivers.simulated.plant.declared import Declared
 from gapbridge.drivers.simulated.plant.kinematics import within_limits
 from gapbridge.drivers.simulated.plant.plant import Plant
-from gapbridge.drivers.simulated.plant.plant_arm import Frame, PlantArm, plant_arm
+from gapbridge.drivers.simulated.plant.plant_arm import PlantArm, plant_arm
 from gapbridge.drivers.simulated.plant.plant_settings import PlantSettings, draw_plant_settings
 from gapbridge.drivers.simulated.ur.controller import Controller
 
@@ -118,25 +118,3 @@ def make_controller(settings: ServerSettings) -> Controller:
         x, y, z = settings.plant.gravity
         declared.gravity = (-x, -y, -z)
     return Controller(Plant(settings.arm, settings.plant, settings.start_q), declared)
-
-
-def to_json(settings: ServerSettings) -> dict[str, Any]:
-    """Return the settings as JSON-able data, for a server in another process."""
-    return asdict(settings)
-
-
-def from_json(data: dict[str, Any]) -> ServerSettings:
-    """Return the settings that `to_json` has written."""
-    arm = {k: _tuple(v) for k, v in data["arm"].items()}
-    arm["links"] = tuple(Frame(*frame) for frame in arm["links"])
-    rest = {k: _tuple(v) for k, v in data.items() if k not in ("arm", "plant")}
-    return ServerSettings(
-        arm=PlantArm(**arm),
-        plant=PlantSettings(**{k: _tuple(v) for k, v in data["plant"].items()}),
-        **rest,
-    )
-
-
-def _tuple(value: Any) -> Any:
-    """Return nested lists as nested tuples, anything else as it is."""
-    return tuple(_tuple(v) for v in value) if isinstance(value, list | tuple) else value

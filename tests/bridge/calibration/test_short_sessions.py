@@ -13,7 +13,7 @@ from bench_hand import BenchHand, lead
 from technician import Hands, Terminal, last_pose
 
 from gapbridge.bridge.cell import load_cell
-from gapbridge.bridge.demo.served_cell import ServedCell
+from gapbridge.bridge.demo.processes import ServedCell
 
 _hosts = itertools.count(2)
 BEGIN = np.array([0.2, -1.4, 1.6, -1.8, -1.5, 0.3])

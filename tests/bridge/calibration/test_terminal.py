@@ -15,7 +15,7 @@ from technician import FRAME, Hands, Terminal, last_pose
 from benchmarks.calibration.kills import run as run_kills
 from gapbridge.bridge.calibration.session.journal import FILE, read_entries
 from gapbridge.bridge.cell import load_cell
-from gapbridge.bridge.demo.served_cell import ServedCell
+from gapbridge.bridge.demo.processes import ServedCell
 from gapbridge.core.estimation.registration import Registration
 from gapbridge.core.rotation import rotation_matrix
 

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from cli_runs import gapbridge, refused
 from daemon_cell import plant
+from simulated_controller import SimulatedController
 
 from gapbridge.bridge.cell import load_cell
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.model import Model
 from gapbridge.core.plausibility import flange_in_first
 from gapbridge.drivers.controller_facts import ControllerFacts, differences
-from gapbridge.drivers.simulated.ur.process import SimulatedController
 from gapbridge.drivers.simulated.ur.settings import announced_rows
 from gapbridge.drivers.ur_rtde.enquiry import enquire
 

@@ -1,4 +1,4 @@
-"""The commands run, demo and blind: what they pass on, and parts that are missing."""
+"""The commands run, demo and blind: what they pass on."""
 
 from __future__ import annotations
 
@@ -11,8 +11,7 @@ from cli_runs import cell_in, gapbridge, refused
 
 from gapbridge.bridge.cell import Cell
 from gapbridge.bridge.cli.log.blind import benchmark
-from gapbridge.bridge.cli.optional import member
-from gapbridge.core.errors import LinkError, RunError
+from gapbridge.core.errors import LinkError
 
 
 def daemon(monkeypatch: pytest.MonkeyPatch, run_cell: object) -> None:
@@ -68,17 +67,6 @@ def test_a_duration_must_be_a_time(tmp_path: Path, duration: str) -> None:
 def test_demo_wants_a_folder(tmp_path: Path) -> None:
     path = cell_in(tmp_path)
     assert "expected a folder" in refused("demo", "--out", path)
-
-
-def test_a_missing_part_is_reported_by_name_and_a_broken_one_is_not_taken_for_missing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with pytest.raises(RunError, match=r"demo: found no module bridge\.nowhere"):
-        member("bridge.nowhere", "run", "demo")
-    (tmp_path / "halfpart.py").write_text("import not_to_be_found_anywhere\n", encoding="utf-8")
-    monkeypatch.syspath_prepend(tmp_path)
-    with pytest.raises(ModuleNotFoundError, match="not_to_be_found_anywhere"):
-        member("halfpart", "run", "demo")
 
 
 def test_the_benchmark_of_a_checkout_is_found() -> None:

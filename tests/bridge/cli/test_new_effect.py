@@ -22,7 +22,7 @@ from gapbridge.core.log.log import Log
 from gapbridge.core.model import Model
 from gapbridge.core.motion import Motion, motion_of
 from gapbridge.core.state import RobotState
-from gapbridge.drivers.ft_sensor.wrench import TcpForce
+from gapbridge.drivers.ft_sensor.joined import TcpForce
 
 FILE = '''
 """A made-up effect."""

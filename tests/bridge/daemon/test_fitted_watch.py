@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gapbridge.bridge.daemon.fitted_watch import CALM, FittedWatch
+from gapbridge.bridge.daemon.fitted_watch import QUIET, FittedWatch
 from gapbridge.bridge.ipc.shared_memory import slices_of
 
 SLICES = slices_of(6)
@@ -34,8 +34,8 @@ def test_a_joint_outside_is_named_once_for_as_long_as_it_lasts() -> None:
     assert watch.take(cycles(1.6), 2.0) == []
     assert watch.take(cycles(0.0), 3.0) == []  # a moment within is no end of it
     assert watch.take(cycles(1.5), 4.0) == []
-    assert watch.take(cycles(0.0), 4.0 + 2 * CALM) == []
-    assert len(watch.take(cycles(1.5), 5.0 + 2 * CALM)) == 1
+    assert watch.take(cycles(0.0), 4.0 + 2 * QUIET) == []
+    assert len(watch.take(cycles(1.5), 5.0 + 2 * QUIET)) == 1
 
 
 def test_a_load_outside_is_named_beside_a_joint() -> None:

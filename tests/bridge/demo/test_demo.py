@@ -12,7 +12,9 @@ from pathlib import Path
 import pytest
 
 from gapbridge.bridge.cell import load_cell
-from gapbridge.bridge.demo.job import PORTS, free_address, run_demo
+from gapbridge.bridge.demo.job import run_demo
+from gapbridge.bridge.demo.links.link import free_address
+from gapbridge.bridge.demo.links.ur_rtde import UrRtdeLink
 from gapbridge.core.errors import InputError
 from gapbridge.core.log.log import read_log
 
@@ -26,11 +28,11 @@ def test_an_unknown_link_is_reported_with_the_known_ones(tmp_path: Path) -> None
 
 
 def test_an_address_that_is_taken_is_passed_over() -> None:
-    first = free_address()
+    first = free_address(UrRtdeLink.ports)
     with socket.socket() as taken:
-        taken.bind((first, PORTS[0]))
+        taken.bind((first, UrRtdeLink.ports[0]))
         taken.listen()
-        assert free_address() != first
+        assert free_address(UrRtdeLink.ports) != first
 
 
 @pytest.mark.slow

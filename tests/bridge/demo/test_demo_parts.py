@@ -20,15 +20,9 @@ from gapbridge.bridge.demo.rests import Rests, joined, rests, write_log
 from gapbridge.bridge.demo.result import LoopFigures, Result, repeatability
 from gapbridge.bridge.demo.session import Ended, Session
 from gapbridge.bridge.demo.terminal import bar, show
-from gapbridge.bridge.demo.trajectory import (
-    ACCELERATION,
-    FASTEST,
-    PERIOD,
-    SHARE,
-    visits,
-    write_trajectory,
-)
+from gapbridge.bridge.demo.trajectory import ACCELERATION, FASTEST, PERIOD, SHARE, visits
 from gapbridge.bridge.document.svg import svg_file
+from gapbridge.bridge.setpoint_source.quintic import write_trajectory
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.compensation import correct
 from gapbridge.core.errors import RunError
@@ -114,7 +108,7 @@ def test_a_trajectory_rests_at_every_pose_and_keeps_its_limits(tmp_path: Path) -
     np.testing.assert_array_equal(q[[0, -1]], [HOME, HOME])
     for pose in poses:
         assert (q == pose).all(axis=1).sum() * PERIOD > 0.3
-    duration = write_trajectory(tmp_path / "t.csv", q)
+    duration = write_trajectory(tmp_path / "t.csv", q, PERIOD)
     log = read_log(tmp_path / "t.csv", 6)
     assert duration == pytest.approx((len(q) - 1) * PERIOD)
     np.testing.assert_array_equal(log.require("target_q"), q)

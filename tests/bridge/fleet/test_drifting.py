@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gapbridge.bridge.fleet.drift import DAY, Series, drifts, places
-from gapbridge.bridge.fleet.outlying import far_from_median
+from gapbridge.bridge.fleet.drift import DAY, Series, drifts, far_from_median, places
 
 SESSIONS = 6
 

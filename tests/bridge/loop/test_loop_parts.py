@@ -61,8 +61,8 @@ def test_a_load_beyond_the_arms_bounds_is_not_taken_and_the_last_one_stays() -> 
         found = loads.update(state(at, payload=mass, payload_cog=cog, actual_TCP_force=force))
         assert found.payload_mass == pytest.approx([4.0])
         assert found.wrench[0] == pytest.approx(pull)
-        assert (loads.doubt is None) == (doubt is None)
-        assert (doubt or "") in (loads.doubt or "")
+        assert (loads.problem is None) == (doubt is None)
+        assert (doubt or "") in (loads.problem or "")
 
 
 def test_a_first_payload_that_cannot_be_leaves_the_models_own() -> None:
@@ -73,7 +73,7 @@ def test_a_first_payload_that_cannot_be_leaves_the_models_own() -> None:
 def test_a_force_that_does_not_count_is_not_rejected() -> None:
     loads = LiveLoads(3, False, 0.0, LoadBounds(5.0))
     loads.update(state(1.0, actual_TCP_force=np.full(6, 9e3)))
-    assert loads.doubt is None
+    assert loads.problem is None
 
 
 def test_approach_is_the_last_motion_and_noise_is_none() -> None:

@@ -33,8 +33,7 @@ from gapbridge.core.errors import (
 )
 from gapbridge.core.loads import Loads
 from gapbridge.core.model import Model
-from gapbridge.core.setpoint import Setpoint
-from gapbridge.core.state import RobotState
+from gapbridge.core.state import RobotState, Setpoint
 from gapbridge.drivers.driver import Driver
 
 Q = np.array([0.0, -1.5, 1.8, -1.87, -1.57, 0.0])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gapbridge.bridge.loop.checks import GAPS, RateCheck
-from gapbridge.bridge.loop.readiness import ModelCheck
+from gapbridge.bridge.loop.loop import ModelCheck
 from gapbridge.core.arm import arm_from_dh, builtin_arm
 from gapbridge.core.loads import Loads
 from gapbridge.core.model import Model
@@ -54,7 +54,7 @@ def test_a_rate_above_the_controllers_is_reported_by_name() -> None:
     for at in states(125.0, 40):
         check.take(at)
     assert check.known
-    assert check.doubt.startswith("link.rate: found 500 Hz, expected at most 125 Hz")
+    assert check.problem.startswith("link.rate: found 500 Hz, expected at most 125 Hz")
 
 
 @pytest.mark.parametrize("late", [0, 1])
@@ -65,7 +65,7 @@ def test_the_controllers_own_rate_is_fine_however_many_states_were_missed(
     check = RateCheck(500.0)
     for at in states(own, 40, late):
         check.take(at)
-    assert check.doubt == ""
+    assert check.problem == ""
 
 
 def test_a_rate_is_known_after_a_few_states() -> None:

@@ -24,8 +24,7 @@ from gapbridge.bridge.setpoint_source.target import TargetSource
 from gapbridge.core.errors import LinkError, PartialWriteError
 from gapbridge.core.log.mcap_reading import read_columns
 from gapbridge.core.model import Model
-from gapbridge.core.setpoint import Setpoint
-from gapbridge.core.state import RobotState
+from gapbridge.core.state import RobotState, Setpoint
 from gapbridge.drivers.driver import Driver
 from gapbridge.drivers.replay.driver import ReplayDriver
 from gapbridge.drivers.replay.settings import ReplaySettings

@@ -17,8 +17,7 @@ from gapbridge.core.compensation import correct
 from gapbridge.core.errors import LimitError
 from gapbridge.core.loads import Loads
 from gapbridge.core.model import Model
-from gapbridge.core.setpoint import Setpoint
-from gapbridge.core.state import RobotState
+from gapbridge.core.state import RobotState, Setpoint
 
 Q = np.array([0.0, -1.5, 1.8, -1.87, -1.57, 0.0])
 CYCLE = 0.002

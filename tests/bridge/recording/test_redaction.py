@@ -7,7 +7,7 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gapbridge.bridge.recording.redaction import HIDDEN, redacted
+from gapbridge.bridge.recording.main import HIDDEN, redacted
 
 SECRET = "s3cr3t-squeamish"
 

@@ -11,6 +11,7 @@ from gapbridge.bridge.document.skeleton import skeleton
 from gapbridge.bridge.report import SECTIONS, write_report
 from gapbridge.bridge.report.labels import (
     VERDICTS,
+    decimals_of,
     joint_list,
     likelihood,
     listed,
@@ -20,7 +21,6 @@ from gapbridge.bridge.report.labels import (
     with_unit,
 )  # fmt: skip
 from gapbridge.bridge.report.material import SHOWN, shares, thinned, unexplained
-from gapbridge.bridge.report.parameters import _decimals
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.effects import CATALOGUE
 from gapbridge.core.model import Model
@@ -135,4 +135,4 @@ def test_values_are_reported_in_the_units_that_people_use(text, wanted):
 
 
 def test_an_interval_is_reported_with_two_digits_of_its_width():
-    assert (_decimals(0.0123), _decimals(1.23), _decimals(250.0)) == (3, 1, 0)
+    assert (decimals_of(0.0123), decimals_of(1.23), decimals_of(250.0)) == (3, 1, 0)

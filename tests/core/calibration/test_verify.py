@@ -22,7 +22,7 @@ from benchmarks.calibration.laid_out import (
     readings_of,
     with_values,
 )
-from gapbridge.bridge.calibration.verdict import verdict_text
+from gapbridge.bridge.calibration.format import verdict_text
 from gapbridge.core.calibration.accuracy_baseline import baseline_in, document_of
 from gapbridge.core.calibration.fit import fit_session, judged
 from gapbridge.core.calibration.identifiability import identifiable_parameters

@@ -11,7 +11,7 @@ from gapbridge.core.kernels import many, threads
 from gapbridge.core.kernels import reference as kernel
 from gapbridge.core.kernels.factor import factor_blocks
 from gapbridge.core.kernels.layout import LANES
-from gapbridge.core.kernels.predict import linear_blocks, predict_blocks
+from gapbridge.core.kernels.many import linear_blocks, predict_blocks
 from gapbridge.core.kernels.reference import Chain, Rows
 from gapbridge.core.loads import Loads
 from gapbridge.core.model import Model

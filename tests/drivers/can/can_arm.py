@@ -15,8 +15,7 @@ import numpy as np
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.errors import InvalidStateError
 from gapbridge.core.model import Model
-from gapbridge.core.setpoint import Setpoint
-from gapbridge.core.state import RobotState
+from gapbridge.core.state import RobotState, Setpoint
 from gapbridge.drivers.can.driver import CanDriver
 from gapbridge.drivers.can.settings import CanSettings
 from gapbridge.drivers.simulated.can.nodes import CanNodes

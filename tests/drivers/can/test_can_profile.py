@@ -4,7 +4,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gapbridge.drivers.can.loading import load_profile, read_profile, shipped_profiles
+from gapbridge.core.errors import InputError
+from gapbridge.drivers.can.loading import read_profile
+from gapbridge.drivers.can.settings import CanSettings
 from gapbridge.drivers.profile_file import ProfileError
 
 HERE = Path(__file__).parent
@@ -118,9 +120,10 @@ def test_the_line_named_is_the_line_of_the_key(folder):
 
 
 def test_every_shipped_profile_loads_and_its_setpoint_reads_back():
-    assert shipped_profiles() == ("odrive", "openarm", "piper")
-    for name in shipped_profiles():
-        profile = load_profile(name)
+    shipped = sorted(CanSettings.shipped.glob("*.yaml"))
+    assert [path.stem for path in shipped] == ["odrive", "openarm", "piper"]
+    for path in shipped:
+        profile = read_profile(path)
         q = np.resize(Q, profile.n)
         wire = profile.joints.to_wire(q)
         back = np.full(profile.n, np.nan)
@@ -135,7 +138,8 @@ def test_every_shipped_profile_loads_and_its_setpoint_reads_back():
 
 def test_direction_zero_and_gear_of_the_installation_stand_before_the_profiles():
     profile = read_profile(
-        load_profile_path("odrive"), {"gear": [8.0] * 6, "zero": [0.1] * 6, "direction": [-1] * 6}
+        CanSettings.shipped / "odrive.yaml",
+        {"gear": [8.0] * 6, "zero": [0.1] * 6, "direction": [-1] * 6},
     )
     turns = profile.joints.to_wire(np.full(6, 0.1 + 2.0 * np.pi))
     assert turns == pytest.approx([-8.0] * 6)
@@ -143,13 +147,9 @@ def test_direction_zero_and_gear_of_the_installation_stand_before_the_profiles()
 
 def test_an_installation_of_another_length_is_refused():
     with pytest.raises(ProfileError, match="gear: found 2 values, expected 6"):
-        read_profile(load_profile_path("odrive"), {"gear": [8.0, 8.0]})
-
-
-def load_profile_path(name):
-    return Path(load_profile(name).path)
+        read_profile(CanSettings.shipped / "odrive.yaml", {"gear": [8.0, 8.0]})
 
 
 def test_a_profile_that_is_not_shipped_is_refused_with_those_that_are():
-    with pytest.raises(ProfileError, match=r"found 'pipr', expected odrive, openarm, piper"):
-        load_profile("pipr")
+    with pytest.raises(InputError, match=r"found 'pipr', expected one of odrive, openarm, piper"):
+        CanSettings(profile="pipr").located(Path())

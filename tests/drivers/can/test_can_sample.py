@@ -10,11 +10,12 @@ from hypothesis import strategies as st
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.errors import InvalidStateError
 from gapbridge.drivers.can.assembler import Assembler
-from gapbridge.drivers.can.loading import load_profile
+from gapbridge.drivers.can.loading import read_profile
+from gapbridge.drivers.can.settings import CanSettings
 from gapbridge.drivers.can.state import StateBuilder
 from gapbridge.drivers.state_check import SampleCheck
 
-PIPER = load_profile("piper")
+PIPER = read_profile(CanSettings.shipped / "piper.yaml")
 PERIOD = 0.005  # s
 INVENTED = Path(__file__).with_name("invented.yaml")
 # A frame that is later than this cannot be distinguished from one of the next cycle, where those
@@ -87,7 +88,7 @@ def test_whatever_gets_lost_doubled_swapped_or_late_no_two_cycles_mix(edits):
     assert firsts == sorted(set(firsts))
 
 
-ODRIVE = load_profile("odrive")
+ODRIVE = read_profile(CanSettings.shipped / "odrive.yaml")
 NODES = range(6)
 
 
@@ -134,7 +135,7 @@ def test_nodes_that_drift_past_each_other_lose_no_sample():
 
 
 def test_equal_counts_tie_frames_together_and_a_repeated_sample_is_none():
-    profile = load_profile(str(INVENTED))
+    profile = read_profile(INVENTED)
     shoulder, hand = profile.sample
     assembler = Assembler(profile)
 
@@ -222,7 +223,7 @@ def test_stray_frames_raise_nothing_and_no_wrong_sample_is_taken_for_good():
 
 @pytest.mark.parametrize("name", ["piper", "openarm", "odrive", "invented"])
 def test_no_frame_of_any_length_and_content_raises_an_exception(name):
-    profile = load_profile(name if name != "invented" else str(INVENTED))
+    profile = read_profile(CanSettings.shipped / f"{name}.yaml" if name != "invented" else INVENTED)
     assembler, random = Assembler(profile), np.random.default_rng(3)
     keys = list(profile.incoming)
     for k in range(20_000):

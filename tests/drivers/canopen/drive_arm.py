@@ -14,8 +14,7 @@ import numpy as np
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.errors import InvalidStateError, LinkError
 from gapbridge.core.model import Model
-from gapbridge.core.setpoint import Setpoint
-from gapbridge.core.state import RobotState
+from gapbridge.core.state import RobotState, Setpoint
 from gapbridge.drivers.canopen.driver import CanopenDriver
 from gapbridge.drivers.canopen.settings import CanopenSettings
 from gapbridge.drivers.simulated.canopen.server import CanopenServer

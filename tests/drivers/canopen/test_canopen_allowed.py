@@ -4,7 +4,7 @@ import pytest
 from drive_arm import served
 
 from gapbridge.core.errors import GapbridgeError, WriteError
-from gapbridge.drivers.canopen.allowed import AllowedFrames
+from gapbridge.drivers.canopen.master import AllowedFrames
 from gapbridge.drivers.canopen.objects import Address
 from gapbridge.drivers.canopen.profile import read_profile
 

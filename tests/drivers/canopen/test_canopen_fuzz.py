@@ -13,7 +13,7 @@ from gapbridge.core.arm import builtin_arm
 from gapbridge.core.errors import InvalidStateError
 from gapbridge.drivers.canopen.listening import BusListener, Life
 from gapbridge.drivers.canopen.profile import CanopenProfile, read_profile
-from gapbridge.drivers.canopen.settings import SHIPPED
+from gapbridge.drivers.canopen.settings import CanopenSettings
 from gapbridge.drivers.canopen.state import StateBuilder
 from gapbridge.drivers.canopen.sync_set import SyncCollector
 from gapbridge.drivers.state_check import SampleCheck
@@ -67,7 +67,7 @@ def ruined(
 
 @pytest.mark.slow
 def test_a_million_frames_give_no_exception_and_no_wrong_sample() -> None:
-    profile = read_profile(SHIPPED / "cia402.yaml")
+    profile = read_profile(CanopenSettings.shipped / "cia402.yaml")
     collector = SyncCollector(profile)
     builder, check = StateBuilder(profile), SampleCheck(builtin_arm("ur10e"))
     network = Network()
@@ -113,7 +113,7 @@ def test_a_million_frames_give_no_exception_and_no_wrong_sample() -> None:
 
 @pytest.mark.slow
 def test_random_payloads_are_refused_or_are_what_their_bytes_say() -> None:
-    profile = read_profile(SHIPPED / "cia402.yaml")
+    profile = read_profile(CanopenSettings.shipped / "cia402.yaml")
     collector = SyncCollector(profile)
     arm = builtin_arm("ur10e")
     builder, check = StateBuilder(profile), SampleCheck(arm)

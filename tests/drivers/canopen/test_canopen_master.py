@@ -12,9 +12,9 @@ import pytest
 from canopen.profiles.p402 import BaseNode402
 from drive_arm import DriveArm, served, wait_for
 
-from gapbridge.drivers.canopen.settings import SHIPPED
+from gapbridge.drivers.canopen.settings import CanopenSettings
 
-EDS = str(SHIPPED / "cia402.eds")
+EDS = str(CanopenSettings.shipped / "cia402.eds")
 NODE = 3
 
 

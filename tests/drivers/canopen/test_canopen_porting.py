@@ -18,7 +18,7 @@ from drive_arm import follow, served, settled
 from gapbridge.core.errors import InputError
 from gapbridge.core.log.mcap_reading import read_columns
 from gapbridge.drivers.canopen.profile import read_profile
-from gapbridge.drivers.canopen.settings import SHIPPED
+from gapbridge.drivers.canopen.settings import CanopenSettings
 
 ROOT = Path(__file__).parents[3]
 PORTING = (ROOT / "docs" / "porting.md").read_text(encoding="utf-8")
@@ -30,7 +30,7 @@ def profile(tmp_path: Path) -> Path:
     [text] = [block for block in BLOCKS if block.startswith("name: My drives")]
     path = tmp_path / "my_drives.yaml"
     path.write_text(text, encoding="utf-8")
-    shutil.copy(SHIPPED / "cia402.eds", tmp_path / "my_drive.eds")
+    shutil.copy(CanopenSettings.shipped / "cia402.eds", tmp_path / "my_drive.eds")
     return path
 
 

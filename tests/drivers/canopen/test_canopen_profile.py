@@ -11,22 +11,22 @@ import pytest
 from gapbridge.core.errors import InputError
 from gapbridge.drivers.canopen.configure import interpolation_period
 from gapbridge.drivers.canopen.profile import read_profile
-from gapbridge.drivers.canopen.settings import SHIPPED, CanopenSettings
+from gapbridge.drivers.canopen.settings import CanopenSettings
 
-NAMES = sorted(path.stem for path in SHIPPED.glob("*.yaml"))
+NAMES = sorted(path.stem for path in CanopenSettings.shipped.glob("*.yaml"))
 
 
 @pytest.fixture
 def copy(tmp_path: Path) -> Path:
-    shutil.copy(SHIPPED / "cia402.eds", tmp_path)
-    return Path(shutil.copy(SHIPPED / "cia402.yaml", tmp_path / "mine.yaml"))
+    shutil.copy(CanopenSettings.shipped / "cia402.eds", tmp_path)
+    return Path(shutil.copy(CanopenSettings.shipped / "cia402.yaml", tmp_path / "mine.yaml"))
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_shipped_profile_has_six_drives_and_puts_counts_back_where_they_came_from(
     name: str,
 ) -> None:
-    profile = read_profile(SHIPPED / f"{name}.yaml", 6)
+    profile = read_profile(CanopenSettings.shipped / f"{name}.yaml", 6)
     q = np.linspace(-2.0, 2.0, 6)
     count = 1.0 / np.abs(profile.counts_per_radian)
     assert np.abs(profile.angles(profile.counts(q)) - q).max() <= 0.5 * count.max() + 1e-12
@@ -34,7 +34,7 @@ def test_a_shipped_profile_has_six_drives_and_puts_counts_back_where_they_came_f
 
 
 def test_an_lwa4p_count_is_a_thousandth_of_a_degree() -> None:
-    profile = read_profile(SHIPPED / "lwa4p.yaml", 6)
+    profile = read_profile(CanopenSettings.shipped / "lwa4p.yaml", 6)
     assert profile.nodes == (3, 4, 5, 6, 7, 8)
     assert profile.angles(np.full(6, 90_000.0)) == pytest.approx(np.pi / 2)
     assert profile.mode_number == 7
@@ -95,7 +95,7 @@ def test_a_wrong_profile_is_refused_with_file_line_and_key(
 
 def test_an_arm_with_other_joints_is_refused() -> None:
     with pytest.raises(InputError, match=r"joints: found 6, expected 7: the arm has those"):
-        read_profile(SHIPPED / "cia402.yaml", 7)
+        read_profile(CanopenSettings.shipped / "cia402.yaml", 7)
 
 
 def test_an_eds_that_is_no_drives_is_refused(copy: Path) -> None:

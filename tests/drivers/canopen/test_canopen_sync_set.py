@@ -13,11 +13,11 @@ from hypothesis import strategies as st
 from gapbridge.drivers.canopen.objects import Address
 from gapbridge.drivers.canopen.pdo import Entry, PdoLayout
 from gapbridge.drivers.canopen.profile import read_profile
-from gapbridge.drivers.canopen.settings import SHIPPED
+from gapbridge.drivers.canopen.settings import CanopenSettings
 from gapbridge.drivers.canopen.state import StateBuilder, positions
 from gapbridge.drivers.canopen.sync_set import SyncCollector, SyncSet
 
-PROFILE = read_profile(SHIPPED / "cia402.yaml")
+PROFILE = read_profile(CanopenSettings.shipped / "cia402.yaml")
 COB_IDS = [layout.cob_id(node) for node in PROFILE.nodes for layout in PROFILE.tpdo]
 LENGTHS = {layout.cob_id(n): layout.length for n in PROFILE.nodes for layout in PROFILE.tpdo}
 
@@ -114,7 +114,7 @@ def test_counts_survive_their_way_through_a_pdo(
 def test_a_layout_agrees_with_the_canopen_library() -> None:
     import canopen
 
-    node = canopen.RemoteNode(1, str(SHIPPED / "cia402.eds"))
+    node = canopen.RemoteNode(1, str(CanopenSettings.shipped / "cia402.eds"))
     for layout in PROFILE.tpdo:
         pdo = node.tpdo[layout.number]
         pdo.clear()
@@ -128,7 +128,7 @@ def test_a_layout_agrees_with_the_canopen_library() -> None:
 
 @pytest.mark.parametrize("name", ["lwa4p", "cia402"])
 def test_speeds_are_the_drives_own_or_come_from_positions(name: str) -> None:
-    profile = read_profile(SHIPPED / f"{name}.yaml")
+    profile = read_profile(CanopenSettings.shipped / f"{name}.yaml")
     builder = StateBuilder(profile)
     speed = np.array([0.5, -0.5, 0.2, 0.0, -0.3, 1.0])
     reported = np.rint(speed * profile.counts_per_radian)

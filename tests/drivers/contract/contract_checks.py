@@ -19,8 +19,7 @@ from gapbridge.core.errors import (
     WriteError,
 )
 from gapbridge.core.model import Model
-from gapbridge.core.setpoint import Setpoint
-from gapbridge.core.state import RobotState
+from gapbridge.core.state import RobotState, Setpoint
 from gapbridge.drivers.driver import Driver
 from gapbridge.drivers.simulated.plant.kinematics import gap, tcp_in_base
 

@@ -15,7 +15,7 @@ from gapbridge.drivers.modbus.driver import ModbusDriver
 from gapbridge.drivers.modbus.profile import read_profile
 from gapbridge.drivers.modbus.registers import UNITS
 from gapbridge.drivers.modbus.schema import Vector
-from gapbridge.drivers.modbus.settings import SHIPPED, ModbusSettings
+from gapbridge.drivers.modbus.settings import ModbusSettings
 from gapbridge.drivers.simulated.modbus.server import ModbusServer, make_servers
 from gapbridge.drivers.simulated.server.protocol_server import ProtocolServer
 
@@ -68,7 +68,7 @@ def modbus_cases() -> dict[str, Callable[[], Case]]:
     """Return a maker of each case by its name."""
     found: dict[str, Callable[[], Case]] = {
         f"modbus {path.stem}": partial(ModbusCase, path.stem)
-        for path in sorted(SHIPPED.glob("*.yaml"))
+        for path in sorted(ModbusSettings.shipped.glob("*.yaml"))
     }
     found["modbus, a map that no code knows"] = partial(ModbusCase, str(INVENTED))
     return found

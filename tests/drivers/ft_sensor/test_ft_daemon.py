@@ -19,7 +19,7 @@ from sensor_wires import Reaction  # noqa: E402
 from gapbridge.bridge.loop.supervisor import State  # noqa: E402
 from gapbridge.drivers.can_bus.bus import BusSettings  # noqa: E402
 from gapbridge.drivers.simulated.can.hub import Hub  # noqa: E402
-from gapbridge.drivers.simulated.ft_sensor.robotous_node import RobotousNode  # noqa: E402
+from gapbridge.drivers.simulated.ft_sensor.ati_node import RobotousNode  # noqa: E402
 
 WEIGHT = (0.0, 0.0, 49.0, 0.0, 0.0, 0.0)
 

@@ -28,8 +28,7 @@ from gapbridge.core.effects import Site, Term
 from gapbridge.core.errors import InvalidStateError, LinkError, StaleStateError
 from gapbridge.core.model import Model
 from gapbridge.core.rotation import transform
-from gapbridge.core.setpoint import Setpoint
-from gapbridge.core.state import RobotState
+from gapbridge.core.state import RobotState, Setpoint
 from gapbridge.drivers.driver import Driver
 from gapbridge.drivers.ft_sensor.joined import DriverWithSensor
 from gapbridge.drivers.simulated.server.arm_controller import ArmController

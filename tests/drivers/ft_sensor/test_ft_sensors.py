@@ -28,10 +28,9 @@ from sensor_wires import (
 
 from gapbridge.core.errors import LinkError
 from gapbridge.drivers.ft_sensor import FT_SENSORS, make_sensor
-from gapbridge.drivers.ft_sensor.wrench import sensor_to_flange
-from gapbridge.drivers.simulated.ft_sensor.ati_node import AtiNode
+from gapbridge.drivers.ft_sensor.joined import sensor_to_flange
+from gapbridge.drivers.simulated.ft_sensor.ati_node import AtiNode, RobotousNode
 from gapbridge.drivers.simulated.ft_sensor.ft300_device import Ft300Device
-from gapbridge.drivers.simulated.ft_sensor.robotous_node import RobotousNode
 
 TURNED = (0.3, -1.2, 1.4, -1.1, -1.3, 0.8)  # rad
 GRAVITY = 9.80665

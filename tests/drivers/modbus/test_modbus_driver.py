@@ -15,12 +15,11 @@ from contract_modbus import INVENTED, ModbusCase
 
 from gapbridge.bridge.cell import load_cell
 from gapbridge.core.errors import LinkError, WriteError
-from gapbridge.core.setpoint import Setpoint
-from gapbridge.core.state import RobotState
+from gapbridge.core.state import RobotState, Setpoint
 from gapbridge.drivers.gate import GateBounds
 from gapbridge.drivers.modbus import encode
 from gapbridge.drivers.modbus.driver import ModbusDriver
-from gapbridge.drivers.modbus.settings import SHIPPED
+from gapbridge.drivers.modbus.settings import ModbusSettings
 from gapbridge.drivers.simulated.modbus.programs import MailboxProgram
 from gapbridge.drivers.simulated.modbus.server import ModbusServer
 from gapbridge.drivers.simulated.server.bench import BenchError
@@ -217,7 +216,7 @@ def test_the_wrong_controller_is_reported_when_connecting() -> None:
 
 def test_a_map_with_the_wrong_word_order_is_reported_when_connecting(tmp_path: Path) -> None:
     path = tmp_path / "wrong.yaml"
-    text = (SHIPPED / "igus.yaml").read_text()
+    text = (ModbusSettings.shipped / "igus.yaml").read_text()
     path.write_text(text.replace("type: i32, word_order: low_first", "type: i32", 1))
     with ModbusCase("igus") as case:
         wrong = case.settings.model_copy(update={"profile": str(path)})

@@ -18,7 +18,7 @@ from gapbridge.drivers.modbus.decode import Decoder, Sample
 from gapbridge.drivers.modbus.map import compile_map
 from gapbridge.drivers.modbus.profile import read_profile
 from gapbridge.drivers.modbus.registers import wire_of
-from gapbridge.drivers.modbus.settings import SHIPPED, ModbusSettings
+from gapbridge.drivers.modbus.settings import ModbusSettings
 from gapbridge.drivers.modbus.transport import Transport
 from gapbridge.drivers.simulated.modbus import image
 from gapbridge.drivers.state_check import SampleCheck
@@ -27,7 +27,7 @@ Q = (0.3, -1.2, 1.1, -0.4, 2.8, -3.0)
 GAP = 0.02  # s between two samples
 FASTEST = 3.0  # rad/s
 DH = {"a": 0.3, "alpha": 0.0, "d": 0.1, "offset": 0.0}
-UR = read_profile(SHIPPED / "ur.yaml")
+UR = read_profile(ModbusSettings.shipped / "ur.yaml")
 
 
 def holding_of(profile) -> dict[int, int]:
@@ -147,7 +147,9 @@ def test_a_sample_whose_clock_moves_on_while_it_is_read_is_refused() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("path", [*sorted(SHIPPED.glob("*.yaml")), INVENTED], ids=lambda p: p.stem)
+@pytest.mark.parametrize(
+    "path", [*sorted(ModbusSettings.shipped.glob("*.yaml")), INVENTED], ids=lambda p: p.stem
+)
 def test_random_registers_are_refused_or_plausible(path) -> None:
     """Random and ruined samples of each profile."""
     profile = read_profile(path)

@@ -12,7 +12,7 @@ from gapbridge.drivers.modbus.decode import check_identity
 from gapbridge.drivers.modbus.map import Block, compile_map
 from gapbridge.drivers.modbus.profile import read_profile
 from gapbridge.drivers.modbus.registers import wire_of
-from gapbridge.drivers.modbus.settings import SHIPPED
+from gapbridge.drivers.modbus.settings import ModbusSettings
 
 GOOD = """\
 name: an arm
@@ -82,7 +82,9 @@ def test_the_good_map_is_taken(tmp_path: Path) -> None:
     assert compiled.writable == wanted
 
 
-@pytest.mark.parametrize("path", [*sorted(SHIPPED.glob("*.yaml")), INVENTED], ids=lambda p: p.stem)
+@pytest.mark.parametrize(
+    "path", [*sorted(ModbusSettings.shipped.glob("*.yaml")), INVENTED], ids=lambda p: p.stem
+)
 def test_shipped_maps_are_read_in_blocks_that_hold_all_they_need(path: Path) -> None:
     profile = read_profile(path)
     compiled = compile_map(profile)

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from gapbridge.core.errors import ForeignCommandError, IneffectiveWriteError, WriteError
-from gapbridge.core.setpoint import Setpoint
+from gapbridge.core.state import Setpoint
 from gapbridge.drivers.modbus import encode
 from gapbridge.drivers.modbus.decode import Sample
 from gapbridge.drivers.modbus.profile import read_profile
-from gapbridge.drivers.modbus.settings import SHIPPED
+from gapbridge.drivers.modbus.settings import ModbusSettings
 from gapbridge.drivers.modbus.write import MailboxWriter, TargetWriter, make_writer
 
 NOTHING = np.zeros(6)
@@ -53,7 +53,7 @@ class Wire:
 def opened(name: str) -> tuple[Any, Wire, ByHand]:
     """Return the armed writer of a shipped profile, its wire and its clock."""
     wire, clock = Wire(), ByHand()
-    profile = read_profile(SHIPPED / f"{name}.yaml")
+    profile = read_profile(ModbusSettings.shipped / f"{name}.yaml")
     if profile.function_23:
         profile = profile.model_copy(update={"function_23": False})
     writer = make_writer(profile, wire, lambda: (0.01, 0.02), 1.0, clock)  # type: ignore[arg-type]
@@ -119,7 +119,7 @@ def test_a_program_that_does_not_run_ends_the_writing(says: int) -> None:
 
 
 def test_a_target_waits_while_the_robot_is_busy_and_the_newest_goes_out_after() -> None:
-    profiles = [p.stem for p in sorted(SHIPPED.glob("*.yaml"))
+    profiles = [p.stem for p in sorted(ModbusSettings.shipped.glob("*.yaml"))
                 if read_profile(p).write.mode == "target_trigger"]  # fmt: skip
     assert profiles
     for name in profiles:

@@ -4,8 +4,7 @@ from collections.abc import Iterator
 
 import pytest
 from simulated_cell import Bench, cell_settings
-
-from gapbridge.drivers.simulated.ur.process import SimulatedController
+from simulated_controller import SimulatedController
 
 
 @pytest.fixture

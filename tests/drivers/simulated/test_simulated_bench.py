@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from rtde_client import RtdeClient
 from simulated_cell import Bench, cell_settings
-
-from gapbridge.drivers.simulated.ur.process import SimulatedController
+from simulated_controller import SimulatedController
 
 
 def reader(host: str, names: str) -> RtdeClient:

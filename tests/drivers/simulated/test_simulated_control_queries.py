@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from simulated_cell import run_client
-
-from gapbridge.drivers.simulated.ur.process import SimulatedController
+from simulated_controller import SimulatedController
 
 CONTROL = """
 from rtde_receive import RTDEReceiveInterface

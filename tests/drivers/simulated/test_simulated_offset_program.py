@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 from rtde_client import RtdeClient
 from simulated_cell import Bench
+from simulated_controller import SimulatedController
 
-from gapbridge.drivers.simulated.ur.process import SimulatedController
 from gapbridge.drivers.simulated.ur.programs.offset_program import checksum
 
 OUT = ",".join(

@@ -5,7 +5,8 @@ from __future__ import annotations
 import socket
 import struct
 
-from gapbridge.drivers.simulated.ur.process import SimulatedController
+from simulated_controller import SimulatedController
+
 from gapbridge.drivers.ur_rtde.enquiry import CONFIGURATION, STATE, _parts
 
 UR10 = 2  # RobotType of the client library, for the e-Series too

@@ -1,8 +1,7 @@
 from __future__ import annotations
 
-import json
 import os
-import signal
+import pickle
 import socket
 import subprocess
 import sys
@@ -13,39 +12,9 @@ from pathlib import Path
 import pytest
 from rtde_client import RtdeClient
 from simulated_cell import cell_settings, own_address
+from simulated_controller import SimulatedController
 
 from gapbridge.core.errors import LinkError
-from gapbridge.drivers.simulated.ur.process import SimulatedController
-from gapbridge.drivers.simulated.ur.settings import from_json, to_json
-
-ROOT = Path(__file__).parents[3]
-
-
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_the_command_serves_until_a_signal_and_exits_with_zero(number: signal.Signals) -> None:
-    host = own_address()
-    process = subprocess.Popen(
-        [sys.executable, "-m", "gapbridge.drivers.simulated",
-         "--arm", "ur3e", "--host", host, "--seed", "4"],
-        stdout=subprocess.PIPE, text=True, cwd=ROOT,
-    )  # fmt: skip
-    assert process.stdout is not None
-    assert process.stdout.readline() == f"ready {host}\n"
-    RtdeClient(host).close()
-    process.send_signal(number)
-    assert process.wait(5) == 0
-    process.stdout.close()
-
-
-def test_an_unknown_arm_is_bad_input_reported_in_one_line() -> None:
-    done = subprocess.run(
-        [sys.executable, "-m", "gapbridge.drivers.simulated",
-         "--arm", "ur10f", "--host", own_address()],
-        capture_output=True, text=True, cwd=ROOT, timeout=20, check=False,
-    )  # fmt: skip
-    assert done.returncode == 2
-    assert done.stderr.count("\n") == 1
-    assert "found 'ur10f'" in done.stderr
 
 
 def test_a_taken_port_is_reported_and_nothing_is_left_running() -> None:
@@ -72,15 +41,14 @@ def test_the_server_listens_on_its_own_address_only() -> None:
 def test_the_server_ends_with_its_parent() -> None:
     settings = cell_settings()
     code = (
-        "import json, sys, os\n"
-        "from gapbridge.drivers.simulated.ur.process import SimulatedController\n"
-        "from gapbridge.drivers.simulated.ur.settings import from_json\n"
-        "c = SimulatedController(from_json(json.loads(sys.stdin.read())))\n"
+        "import os, pickle, sys\n"
+        "from simulated_controller import SimulatedController\n"
+        "c = SimulatedController(pickle.load(sys.stdin.buffer))\n"
         "c.start()\nprint(c.pid, flush=True)\nos.kill(os.getpid(), 9)\n"
     )
     done = subprocess.run(
-        [sys.executable, "-c", code], input=json.dumps(to_json(settings)),
-        capture_output=True, text=True, cwd=ROOT, timeout=30, check=False,
+        [sys.executable, "-c", code], input=pickle.dumps(settings), capture_output=True,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}, timeout=30, check=False,
     )  # fmt: skip
     pid = int(done.stdout)
     end = time.monotonic() + 5.0
@@ -94,11 +62,6 @@ def test_the_server_ends_with_its_parent() -> None:
             return
         time.sleep(0.02)
     pytest.fail("the server outlives its parent")
-
-
-def test_settings_survive_the_way_to_another_process() -> None:
-    settings = cell_settings(seed=11, arm="ur3", payload_mass=1.5)
-    assert from_json(json.loads(json.dumps(to_json(settings)))) == settings
 
 
 def test_the_clock_keeps_five_hundred_hertz() -> None:

@@ -8,9 +8,9 @@ from itertools import pairwise
 import pytest
 from rtde_client import RtdeClient
 from simulated_cell import cell_settings
+from simulated_controller import SimulatedController
 
 from gapbridge.drivers.simulated.server.connection import listen
-from gapbridge.drivers.simulated.ur.process import SimulatedController
 from gapbridge.drivers.simulated.ur.rtde_names import INPUTS, OUTPUTS
 from gapbridge.drivers.simulated.ur.servers.rtde_server import RtdeServer
 from gapbridge.drivers.simulated.ur.settings import make_controller

@@ -7,8 +7,8 @@ from collections.abc import Iterator
 import pytest
 from rtde_client import RtdeClient
 from simulated_cell import Bench, cell_settings
+from simulated_controller import SimulatedController
 
-from gapbridge.drivers.simulated.ur.process import SimulatedController
 from gapbridge.drivers.simulated.ur.programs.script_text import (
     Pose,
     parse_assignment,

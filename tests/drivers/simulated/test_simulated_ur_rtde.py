@@ -5,8 +5,7 @@ from __future__ import annotations
 import pytest
 from rtde_client import RtdeClient
 from simulated_cell import Bench, cell_settings, run_client
-
-from gapbridge.drivers.simulated.ur.process import SimulatedController
+from simulated_controller import SimulatedController
 
 NO_HANDSHAKE_WAIT = 2.0  # s: the library gives up on a broken handshake after 4
 

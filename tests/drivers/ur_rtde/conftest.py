@@ -6,8 +6,8 @@ from collections.abc import Iterator
 
 import pytest
 from driver_runs import Bench, cell_settings, offset_program
+from simulated_controller import SimulatedController
 
-from gapbridge.drivers.simulated.ur.process import SimulatedController
 from gapbridge.drivers.simulated.ur.settings import SCRIPT_PORT
 
 

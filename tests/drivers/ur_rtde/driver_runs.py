@@ -24,7 +24,7 @@ from simulated_cell import Bench
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.errors import *
 from gapbridge.core.model import Model
-from gapbridge.core.setpoint import Setpoint
+from gapbridge.core.state import Setpoint
 from gapbridge.drivers import make_driver
 from gapbridge.drivers.ur_rtde.settings import UrRtdeSettings
 

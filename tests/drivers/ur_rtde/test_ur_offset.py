@@ -7,8 +7,8 @@ from textwrap import dedent
 import numpy as np
 import pytest
 from driver_runs import Bench, offset_program, run_driver
+from simulated_controller import SimulatedController
 
-from gapbridge.drivers.simulated.ur.process import SimulatedController
 from gapbridge.drivers.ur_rtde import registers
 
 OFFSET = [1.0e-3, -5.0e-4, 2.0e-3, 1.0e-3, -4.0e-4, -2.0e-3]

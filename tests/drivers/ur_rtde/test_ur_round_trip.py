@@ -7,9 +7,9 @@ import threading
 import time
 
 import pytest
+from simulated_controller import SimulatedController
 
 from gapbridge.core.errors import WriteError
-from gapbridge.drivers.simulated.ur.process import SimulatedController
 from gapbridge.drivers.ur_rtde import round_trip as module
 from gapbridge.drivers.ur_rtde.round_trip import round_trip
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 from driver_runs import Bench, run_driver
-
-from gapbridge.drivers.simulated.ur.process import SimulatedController
+from simulated_controller import SimulatedController
 
 ARMED = """
 driver.connect()

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 from driver_runs import run_driver
+from simulated_controller import SimulatedController
 
-from gapbridge.drivers.simulated.ur.process import SimulatedController
 from gapbridge.drivers.ur_rtde.settings import UrRtdeSettings
 
 

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 from gapbridge.bridge.calibration.report.material import Material
-from gapbridge.bridge.calibration.report.sections.appendix import all_readings
-from gapbridge.bridge.calibration.report.sections.budget_section import uncertainty_budget
-from gapbridge.bridge.calibration.report.sections.errors_section import before_and_after
-from gapbridge.bridge.calibration.report.sections.loads_section import over_the_load
-from gapbridge.bridge.calibration.report.sections.parameters_section import parameters
-from gapbridge.bridge.calibration.report.sections.poses_section import poses
-from gapbridge.bridge.calibration.report.sections.repeats_section import pose_accuracy
-from gapbridge.bridge.calibration.report.sections.residual_section import residual
+from gapbridge.bridge.calibration.report.sections.errors_section import (
+    before_and_after,
+    over_the_workspace,
+)
+from gapbridge.bridge.calibration.report.sections.loads_section import over_the_load, pose_accuracy
+from gapbridge.bridge.calibration.report.sections.parameters_section import parameters, residual
+from gapbridge.bridge.calibration.report.sections.poses_section import all_readings, poses
+from gapbridge.bridge.calibration.report.sections.result_section import summary, uncertainty_budget
 from gapbridge.bridge.calibration.report.sections.session_section import session_and_instrument
-from gapbridge.bridge.calibration.report.sections.summary import summary
-from gapbridge.bridge.calibration.report.sections.workspace_section import over_the_workspace
-from gapbridge.bridge.document.section import Section
+from gapbridge.bridge.document.blocks import Section
 
 CALIBRATION: tuple[Section[Material], ...] = (
     Section("result", "Result", summary),

@@ -1,13 +1,41 @@
-"""The parameters: values with intervals, what the plan predicted, what cannot be separated."""
+"""The parameters with intervals, what cannot be separated, and what is left: the residual."""
 
 from __future__ import annotations
 
-from gapbridge.bridge.calibration.report.figures import decimals_of, estimate_texts, fixed
+from gapbridge.bridge.calibration.report.figures import degrees, estimate_texts
 from gapbridge.bridge.calibration.report.material import Material
-from gapbridge.bridge.document.blocks import Block, Bullets, Cell, Heading, Paragraph, Table
-from gapbridge.bridge.report.labels import unit_of
-from gapbridge.bridge.report.names import parameter_title, with_titles
+from gapbridge.bridge.document.axes import plain
+from gapbridge.bridge.document.blocks import (
+    DOUBTFUL,
+    GOOD,
+    QUIET,
+    Badge,
+    Block,
+    Bullets,
+    Cell,
+    Heading,
+    Paragraph,
+    Table,
+    Verdict,
+)
+from gapbridge.bridge.document.findings import finding_text
+from gapbridge.bridge.report.answer import one_line, sentences
+from gapbridge.bridge.report.labels import (
+    CHANNELS,
+    decimals_of,
+    effect_title,
+    fixed,
+    listed,
+    parameter_title,
+    sentence,
+    unit_of,
+    with_titles,
+)
+from gapbridge.bridge.report.material import chosen_channel
 from gapbridge.core.calibration.result import Estimate
+from gapbridge.core.diagnosis.diagnosis import Diagnosis
+
+SHOWN = 8  # measurements proposed
 
 
 def parameters(material: Material) -> list[Block]:
@@ -54,3 +82,35 @@ def _planned(e: Estimate) -> str:
         return "–"
     _, factor = unit_of(e.unit)
     return fixed(e.expected_std * factor, decimals_of(e.std * factor))
+
+
+def residual(material: Material) -> list[Block]:
+    """Return the verdict, what was found, and what would settle it."""
+    c = material.calibration
+    if c.diagnosis is None:
+        text = "These readings do not allow to examine the residual."
+        return [Verdict(Badge("Not examined", QUIET), text)]
+    badge = Badge("Complete", GOOD) if c.complete else Badge("Not complete", DOUBTFUL)
+    main = chosen_channel(c.diagnosis)
+    blocks: list[Block] = [Verdict(badge, sentence(c.remaining))]
+    if not c.missing_effects and (c.complete or c.diagnosis.verdict != "no_gap"):
+        blocks.append(Paragraph(" ".join(sentences(main))))
+    others = [ch for ch in c.diagnosis.channels if ch is not main]
+    blocks += [Paragraph(f"{CHANNELS[ch.channel]}: {one_line(ch)}") for ch in others]
+    if c.diagnosis.findings:
+        blocks.append(
+            Bullets(tuple(sentence(finding_text(f, rows=False)) for f in c.diagnosis.findings))
+        )
+    return [*blocks, *([] if c.complete else _next(c.diagnosis))]
+
+
+def _next(diagnosis: Diagnosis) -> list[Block]:
+    if not diagnosis.next_measurements:
+        return []
+    rows = [
+        [str(i), degrees(m.q), f"{plain(m.payload)} kg",
+         listed([effect_title(name) for name in m.separates], "or")]
+        for i, m in enumerate(diagnosis.next_measurements[:SHOWN], start=1)
+    ]  # fmt: skip
+    heads = ("", "joint angles, degrees", "load", "would settle")
+    return [Heading("What to measure next"), Table(heads, rows, (0.3, 2.6, 0.7, 2.4), (2,))]

@@ -9,7 +9,7 @@ from gapbridge.bridge.calibration.report.figures import load_title, mm
 from gapbridge.bridge.calibration.report.material import Material
 from gapbridge.bridge.document.axes import plain
 from gapbridge.bridge.document.blocks import Block, Bullets, Columns, Heading, Pairs
-from gapbridge.bridge.report.names import sentence
+from gapbridge.bridge.report.labels import sentence
 
 KINDS = {
     "position": "position of a target on the tool, three coordinates",
@@ -53,17 +53,13 @@ def _front(facts: SessionFacts) -> list[tuple[str, str]]:
     start, end = facts.started, facts.ended
     minutes = round((end - start).total_seconds() / 60)
     last = f"{end:%H:%M}" if end.date() == start.date() else f"{end:%Y-%m-%d %H:%M}"
-    temperature = ""
-    if facts.temperature:
-        low, high = facts.temperature
-        temperature = f"{plain(low)} °C at the start, {plain(high)} °C at the end"
     given = [
         ("report", facts.number), ("software", facts.version and f"Gapbridge {facts.version}"),
         ("customer", facts.customer), ("cell", facts.cell),
         ("SHA-256 of the cell file", _grouped(facts.cell_sha256)), ("arm", facts.arm),
-        ("serial number", facts.serial), ("place", facts.place),
+        ("serial number", facts.serial),
         ("measured", f"{start:%Y-%m-%d %H:%M} to {last} ({minutes} min)"),
-        ("by", facts.operator), ("air", temperature), ("surroundings", facts.environment),
+        ("by", facts.operator), ("surroundings", facts.environment),
         ("data", str(facts.folder)),
     ]  # fmt: skip
     return [(name, text) for name, text in given if text]
@@ -76,20 +72,15 @@ def _grouped(digest: str) -> str:
 
 def _instrument(facts: SessionFacts, stations: int) -> list[tuple[str, str]]:
     tool = facts.instrument
-    noise = error = ""
+    noise = ""
     far = tool.distance > 0 and tool.kind in ("position", "pose", "distance")
     if tool.kind not in ("wrench", "touch"):
         noise = f"{mm(tool.sigma)} (1 sigma of one coordinate)"
-    if tool.error is not None:
-        error = f"± {mm(tool.error)}"
-        if tool.error_per_metre:
-            error += f" and {mm(tool.error_per_metre)} per metre of distance"
     given = [
         ("instrument", tool.name), ("serial number", tool.serial),
         ("its own calibration", tool.certificate),
         ("measures", KINDS.get(tool.kind, tool.kind)),
         ("noise, declared", noise),
-        ("largest permissible error", error),
         ("distance", f"{plain(tool.distance)} m" if far else ""),
         ("places", f"{stations}" if stations > 1 else ""),
     ]  # fmt: skip

@@ -9,7 +9,7 @@ from typing import Generic, TypeVar
 import numpy as np
 
 from gapbridge.bridge.calibration.report.facts import SessionFacts
-from gapbridge.bridge.calibration.report.figures import fixed, mm
+from gapbridge.bridge.calibration.report.figures import mm
 from gapbridge.bridge.calibration.report.sections.parameters_section import estimates_table
 from gapbridge.bridge.calibration.report.sections.session_section import facts_blocks
 from gapbridge.bridge.document.axes import Chart, named, scale
@@ -20,14 +20,14 @@ from gapbridge.bridge.document.blocks import (
     Block,
     Paragraph,
     Pictures,
+    Section,
     Table,
     Tile,
     Tiles,
     Verdict,
 )
 from gapbridge.bridge.document.drawing import AFTER, BAD_DOT, BEFORE, Drawing
-from gapbridge.bridge.document.section import Section
-from gapbridge.bridge.report.names import sentence
+from gapbridge.bridge.report.labels import fixed, sentence
 from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.payload_session import PayloadCalibration
 from gapbridge.core.calibration.tool_session import ToolCalibration

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gapbridge.bridge.calibration.format import verdict_text
 from gapbridge.bridge.calibration.report.facts import SessionFacts
-from gapbridge.bridge.calibration.report.figures import degrees, fixed, mm
+from gapbridge.bridge.calibration.report.figures import degrees, mm
 from gapbridge.bridge.calibration.report.sections.parameters_section import estimates_table
 from gapbridge.bridge.calibration.report.sections.session_section import facts_blocks
-from gapbridge.bridge.calibration.verdict import verdict_text
 from gapbridge.bridge.document.axes import Chart, named, scale
 from gapbridge.bridge.document.blocks import (
     BAD,
@@ -21,15 +21,20 @@ from gapbridge.bridge.document.blocks import (
     Heading,
     Paragraph,
     Pictures,
+    Section,
     Table,
     Tile,
     Tiles,
     Verdict,
 )
 from gapbridge.bridge.document.drawing import AFTER, EDGE, Drawing
-from gapbridge.bridge.document.section import Section
-from gapbridge.bridge.report.labels import effect_title, likelihood
-from gapbridge.bridge.report.names import parameter_title, sentence
+from gapbridge.bridge.report.labels import (
+    effect_title,
+    fixed,
+    likelihood,
+    parameter_title,
+    sentence,
+)
 from gapbridge.core.calibration.readings import Readings
 from gapbridge.core.calibration.verify import Suspect, Verification
 from gapbridge.core.effects import CATALOGUE

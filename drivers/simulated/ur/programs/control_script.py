@@ -10,10 +10,12 @@ from __future__ import annotations
 
 import logging
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from gapbridge.drivers.simulated.ur.controller import Controller, Steps
-from gapbridge.drivers.simulated.ur.programs.control_commands import COMMANDS, REALTIME
+from gapbridge.drivers.simulated.ur.programs.control_motions import MOTIONS, REALTIME_MOTIONS
+from gapbridge.drivers.simulated.ur.programs.control_queries import QUERIES, REALTIME_QUERIES
 from gapbridge.drivers.simulated.ur.programs.control_registers import Registers
 from gapbridge.drivers.simulated.ur.programs.script_text import ScriptText
 
@@ -23,6 +25,11 @@ READY, DONE = 1, 2
 STOP_SCRIPT = 255
 _OFFSET = re.compile(r"#\s*(int|float) register offset\s*\n\s*(\d+)")
 _PATH_MARK = "# inject move path"
+#: Executed once; those that return steps block the script until they end.
+COMMANDS: dict[int, Callable[[Registers], Steps | None]] = {**MOTIONS, **QUERIES}
+
+#: Executed in every cycle in which the register holds them.
+REALTIME: dict[int, Callable[[Registers], None]] = {**REALTIME_MOTIONS, **REALTIME_QUERIES}
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,13 +8,16 @@ from __future__ import annotations
 import logging
 from typing import Any
 
-from gapbridge.drivers.simulated.plant.kinematics import frame_of
-from gapbridge.drivers.simulated.plant.motion import Stop
+from gapbridge.drivers.simulated.plant.kinematics import Joints, frame_of
+from gapbridge.drivers.simulated.plant.motion import MoveJoints, Stop
+from gapbridge.drivers.simulated.server.bench import BenchError
 from gapbridge.drivers.simulated.ur.controller import CYCLE, Controller, Steps
+from gapbridge.drivers.simulated.ur.programs.offset_program import OffsetMotion
 from gapbridge.drivers.simulated.ur.programs.path_program import MOVES, make_move
 from gapbridge.drivers.simulated.ur.programs.script_text import Call, parse_assignment, parse_call
 
 log = logging.getLogger("drivers.simulated")
+DEFAULT_SPEED = 0.5  # rad/s
 
 
 def script_program(controller: Controller, name: str, lines: tuple[str, ...]) -> Steps:
@@ -78,3 +81,16 @@ def _set(controller: Controller, call: Call) -> bool:
     else:
         return False
     return True
+
+
+def move_own(controller: Controller, goal: Joints) -> None:
+    """Have the robot's own program move to `goal` (n, rad). Raises BenchError where it cannot."""
+    if not controller.can_move:
+        raise BenchError("move: the robot is not running")
+    motion = controller.motion
+    if isinstance(motion, OffsetMotion):
+        motion.own = MoveJoints(motion.nominal, goal, DEFAULT_SPEED, 2.0 * DEFAULT_SPEED)
+        return
+    if controller.program is not None:
+        raise BenchError("move: another program runs")
+    controller.motion = MoveJoints(controller.target_q, goal, DEFAULT_SPEED, 1.0)

@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import TypeAdapter
 
-from gapbridge.bridge.calibration.instruments import INSTRUMENTS, make_instrument
+from gapbridge.bridge.calibration.instruments import INSTRUMENTS
 from gapbridge.bridge.calibration.instruments.instrument import (
     AnyInstrument,
     ReadingError,
@@ -33,7 +33,8 @@ def instrument(kind: str, *lines: str, since: float = 0.0, **keys: Any) -> AnyIn
     """Return an instrument at a terminal where these lines are typed."""
     typed = iter(lines)
     around = Surroundings(ask=lambda question: next(typed), since=since)
-    return make_instrument(SETTINGS.validate_python({"kind": kind, **keys}), around)
+    settings = SETTINGS.validate_python({"kind": kind, **keys})
+    return INSTRUMENTS[settings.kind](settings, around)
 
 
 def test_every_kind_that_a_cell_may_name_has_an_instrument() -> None:

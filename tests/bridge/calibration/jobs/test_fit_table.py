@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 from rich.console import Console
 
-from gapbridge.bridge.calibration.jobs.fitting import _table
+from gapbridge.bridge.calibration.jobs.calibrate import _table
 
 
 def estimate(name: str, unit: str, *, shown: bool, on_bound: bool) -> SimpleNamespace:

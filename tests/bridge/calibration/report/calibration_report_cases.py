@@ -39,11 +39,11 @@ def session(**changes) -> SessionFacts:
     given = {
         "cell": "Cell 7", "arm": "ur10e", "folder": Path("sessions/cell7"),
         "instrument": InstrumentFacts("laser tracker", serial="LT-4411",
-                                      certificate="2026-03, no. 88120", sigma=SIGMA, error=1.5e-5,
-                                      error_per_metre=6e-6, distance=2.5),
+                                      certificate="2026-03, no. 88120", sigma=SIGMA,
+                                      distance=2.5),
         "started": datetime(2026, 11, 21, 9, 12), "ended": datetime(2026, 11, 21, 11, 47),
         "readings": 132, "undone": 2, "serial": "2019-334-117", "operator": "M. Łukasik",
-        "customer": "Beispiel & Söhne <Werk 2>", "place": "Hall 3", "temperature": (21.4, 23.0),
+        "customer": "Beispiel & Söhne <Werk 2>",
         "remarks": ("Reading 31 was taken back: the reflector was not seated.",),
     }  # fmt: skip
     return SessionFacts(**(given | changes))

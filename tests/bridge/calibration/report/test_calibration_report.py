@@ -53,7 +53,7 @@ def test_names_are_written_as_they_are_and_nothing_of_them_is_markup(written):
 
 
 def test_names_in_other_scripts_are_not_lost(tmp_path):
-    names = {"customer": "株式会社ロボット", "operator": "Елена Ψαρρά", "place": "서울 2"}
+    names = {"customer": "株式会社ロボット", "operator": "Елена Ψαρρά", "serial": "서울 2"}
     facts = session(cell="机器人 3", **names)
     page, paper = write_report(Material(calibration(), None, facts), tmp_path)
     html, phrase = page.read_text("utf-8"), text_of(paper)
@@ -71,7 +71,7 @@ def test_nothing_is_loaded_from_outside(written):
 @pytest.mark.parametrize("kind", list(OBSERVABLES))
 def test_every_kind_of_reading_has_its_report(kind, tmp_path):
     c = calibration_of(kind)
-    facts = session(instrument=InstrumentFacts("an instrument", kind=kind), temperature=None)
+    facts = session(instrument=InstrumentFacts("an instrument", kind=kind))
     page, paper = write_report(Material(c, None, facts), tmp_path)
     html, phrase = page.read_text("utf-8"), text_of(paper)
     assert mm(c.held_out_after.mean) in html

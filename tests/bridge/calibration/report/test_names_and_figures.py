@@ -11,7 +11,7 @@ from gapbridge.bridge.calibration.report.figures import (
     load_title,
     mm,
 )
-from gapbridge.bridge.report.names import parameter_title, sentence, with_titles
+from gapbridge.bridge.report.labels import parameter_title, sentence, with_titles
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.calibration.parameters import Parameters
 from gapbridge.core.calibration.result import Estimate

@@ -7,6 +7,7 @@ import multiprocessing
 import os
 import signal
 import time
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gapbridge.bridge.calibration.session.journal import FILE, Journal, plain, read_entries
-from gapbridge.bridge.calibration.session.plan_document import plan_entry, plan_of
+from gapbridge.bridge.calibration.session.plan_document import plan_of
 from gapbridge.bridge.calibration.session.session import Reading, Session
 from gapbridge.core.calibration.plan import Expectation, Payload, Plan, PlannedPose
 from gapbridge.core.errors import InputError, RunError
@@ -42,7 +43,7 @@ def taken(stop: int, **changed: object) -> Reading:
 
 def test_a_plan_reads_back_as_it_was_written(tmp_path: Path) -> None:
     plan = small_plan()
-    found = plan_of(json.loads(json.dumps(plain(plan_entry(plan)), allow_nan=False)))
+    found = plan_of(json.loads(json.dumps(plain(asdict(plan)), allow_nan=False)))
     assert found.loads == plan.loads
     assert found.bought == plan.bought
     assert np.isinf(found.expected.std[0])

@@ -8,7 +8,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gapbridge.bridge.calibration.joints.move import PERIOD, write_move
+from gapbridge.bridge.calibration.joints.link import PERIOD, write_move
 from gapbridge.bridge.calibration.session.positioning import all_free, route
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.model import Model

@@ -1,10 +1,12 @@
-"""The simulated controller as a child process: start it, wait until it serves, end it."""
+"""A simulated UR controller with any settings as a child process; run as a script, the child."""
 
 from __future__ import annotations
 
-import json
+import logging
 import os
+import pickle
 import queue
+import signal
 import subprocess
 import sys
 import tempfile
@@ -13,8 +15,9 @@ import time
 from dataclasses import dataclass
 from typing import IO, Self
 
-from gapbridge.core.errors import LinkError
-from gapbridge.drivers.simulated.ur.settings import ServerSettings, to_json
+from gapbridge.core.errors import GapbridgeError, LinkError
+from gapbridge.drivers.simulated.ur.server import serve
+from gapbridge.drivers.simulated.ur.settings import ServerSettings
 
 START_LIMIT = 20.0  # s
 STOP_LIMIT = 3.0  # s
@@ -22,7 +25,7 @@ STOP_LIMIT = 3.0  # s
 
 @dataclass(slots=True)
 class _Running:
-    process: subprocess.Popen[str]
+    process: subprocess.Popen[bytes]
     errors: IO[str]
 
 
@@ -42,7 +45,9 @@ class SimulatedController:
     @property
     def pid(self) -> int:
         """Process id of the server."""
-        return self._process().pid
+        if self._running is None:
+            raise LinkError("the simulated controller is not running")
+        return self._running.process.pid
 
     def log(self) -> str:
         """Return what the server has logged so far."""
@@ -56,31 +61,31 @@ class SimulatedController:
     def start(self) -> None:
         """Start the server and wait until every port listens."""
         errors = tempfile.NamedTemporaryFile("w+", prefix="simulated-", suffix=".log")  # noqa: SIM115
-        command = [sys.executable, "-m", "gapbridge.drivers.simulated", "--settings", "-"]
+        path = os.pathsep.join(p for p in sys.path if p)
         process = subprocess.Popen(
-            [*command, "--log", self._log_level],
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=errors, text=True,
-            env=_environment(), start_new_session=True,
+            [sys.executable, __file__, self._log_level],
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=errors,
+            env={**os.environ, "PYTHONPATH": path}, start_new_session=True,
         )  # fmt: skip
         self._running = _Running(process, errors)
         assert process.stdin is not None
         try:
-            process.stdin.write(json.dumps(to_json(self.settings)) + "\n")
+            pickle.dump(self.settings, process.stdin)
             process.stdin.flush()
         except BrokenPipeError:
             pass  # the reason stands in its log
         self._wait_ready(process)
 
-    def _wait_ready(self, process: subprocess.Popen[str]) -> None:
-        lines: queue.Queue[str] = queue.Queue()
+    def _wait_ready(self, process: subprocess.Popen[bytes]) -> None:
+        lines: queue.Queue[bytes] = queue.Queue()
         assert process.stdout is not None
         stdout = process.stdout
         threading.Thread(target=lambda: lines.put(stdout.readline()), daemon=True).start()
         try:
             line = lines.get(timeout=START_LIMIT)
         except queue.Empty:
-            line = ""
-        if not line.startswith("ready"):
+            line = b""
+        if not line.startswith(b"ready"):
             message = self.log().strip().splitlines()
             self.stop()
             raise LinkError(
@@ -113,14 +118,27 @@ class SimulatedController:
     def __exit__(self, *_: object) -> None:
         self.stop()
 
-    def _process(self) -> subprocess.Popen[str]:
-        if self._running is None:
-            raise LinkError("the simulated controller is not running")
-        return self._running.process
+
+def main(log_level: str) -> int:
+    """Serve the settings that come through stdin, until SIGTERM, SIGINT or the end of stdin."""
+    logging.basicConfig(level=log_level, stream=sys.stderr)
+    stopped: list[int] = []
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda n, _: stopped.append(n))
+    settings = pickle.load(sys.stdin.buffer)
+
+    def wait_for_parent() -> None:
+        os.read(sys.stdin.fileno(), 1)  # a daemon thread in a buffered read ends Python badly
+        stopped.append(0)
+
+    threading.Thread(target=wait_for_parent, daemon=True).start()
+    try:
+        serve(settings, lambda: bool(stopped))
+    except GapbridgeError as error:
+        sys.stderr.write(f"error: {error}\n")
+        return error.exit_code
+    return 0
 
 
-def _environment() -> dict[str, str]:
-    """Return the environment with this interpreter's import path."""
-    environment = dict(os.environ)
-    environment["PYTHONPATH"] = os.pathsep.join(p for p in sys.path if p)
-    return environment
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1]))

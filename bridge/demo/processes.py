@@ -1,4 +1,4 @@
-"""``gapbridge simulate`` as a process of its own: a cell's simulated controller."""
+"""Commands that run beside the demo: ``gapbridge simulate`` of its cell, and the diagnosis."""
 
 from __future__ import annotations
 
@@ -13,11 +13,14 @@ import time
 from pathlib import Path
 from typing import Self
 
-from gapbridge.core.errors import LinkError
+from gapbridge.bridge.ipc.side_process import environment
+from gapbridge.core.errors import LinkError, RunError
 
 PR_SET_PDEATHSIG = 1  # prctl's
 START_LIMIT = 40.0  # s
 STOP_LIMIT = 5.0  # s
+LONGEST = 900.0  # s, on a machine that stalls
+POLITE = 10  # niceness: the loop comes first
 
 
 class ServedCell:
@@ -32,10 +35,9 @@ class ServedCell:
 
     def __enter__(self) -> Self:
         """Start it and wait until it serves. Raises LinkError, with its last words."""
-        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
         self._process = subprocess.Popen(
             self._command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT, text=True, env=environment, start_new_session=True,
+            stderr=subprocess.STDOUT, text=True, env=environment(), start_new_session=True,
             preexec_fn=_end_with_parent,
         )  # fmt: skip
         lines: queue.Queue[str] = queue.Queue()
@@ -81,3 +83,37 @@ def _end_with_parent() -> None:
     """Have the kernel end the controller with the demo, however that ends: ports stay free."""
     if sys.platform.startswith("linux"):
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0)
+
+
+class Diagnosing:
+    """``gapbridge diagnose`` as a process of its own while the ``with`` block lasts."""
+
+    def __init__(self, log: Path, cell: Path, out: Path, new_cell: Path) -> None:
+        self._command = [
+            sys.executable, "-m", "gapbridge", "diagnose", str(log), "--cell", str(cell),
+            "--out", str(out), "--apply", str(new_cell),
+        ]  # fmt: skip
+        self._process: subprocess.Popen[str] | None = None
+
+    def __enter__(self) -> Self:
+        self._process = subprocess.Popen(
+            self._command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+            stdin=subprocess.DEVNULL, env=environment(), preexec_fn=lambda: os.nice(POLITE),
+        )  # fmt: skip
+        return self
+
+    def answer(self) -> str:
+        """Wait for the answer in plain sentences. Raises RunError where there is none."""
+        assert self._process is not None
+        try:
+            output, _ = self._process.communicate(timeout=LONGEST)
+        except subprocess.TimeoutExpired:
+            raise RunError(f"the diagnosis did not end within {LONGEST:g} s") from None
+        if self._process.returncode:
+            raise RunError(f"the diagnosis failed: {output.strip()[-300:]}")
+        return output.strip()
+
+    def __exit__(self, *_: object) -> None:
+        if self._process is not None and self._process.poll() is None:
+            self._process.kill()
+            self._process.wait()

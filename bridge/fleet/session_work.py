@@ -1,9 +1,10 @@
-"""The work on one session: its diagnosis, as rows."""
+"""The work on one session: its diagnosis as rows, or what it says about the arm's compliance."""
 
 from __future__ import annotations
 
 import zlib
 from collections.abc import Mapping
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -11,12 +12,14 @@ import numpy as np
 from gapbridge.bridge.cell import Cell
 from gapbridge.bridge.document.diagnosis_json import document
 from gapbridge.core.diagnosis.diagnosis import diagnose
+from gapbridge.core.estimation.compliance_fit import flexibilities, usual_flexibility
+from gapbridge.core.estimation.hierarchical_evidence import evidence
 from gapbridge.core.log.log import Log
 
 EPOCH = 1.0e9  # s: timestamps beyond count from 1970, those below from some start
 
 
-def work(cell: Cell, log: Log, options: Mapping[str, Any]) -> dict[str, Any]:
+def diagnose_session(cell: Cell, log: Log, options: Mapping[str, Any]) -> dict[str, Any]:
     """Return the diagnosis as facts of the session, its channels, and a row per parameter."""
     found = document(
         diagnose(cell.model, log, cell.metrology, withhold=options.get("withhold", ()))
@@ -77,3 +80,15 @@ def _rows(channel: Mapping[str, Any]) -> list[dict[str, Any]]:
         for k in channel["considered"] if k["excited"]
     ]  # fmt: skip
     return rows
+
+
+def fit_session(cell: Cell, log: Log, options: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the session's equations for the flexibilities, and what the cell says of them."""
+    found = evidence(cell.model, log, cell.metrology)
+    arrays = {"matrix": found.matrix.tolist(), "right": found.right.tolist()}
+    return {
+        **facts(cell, log),
+        "nominal": flexibilities(cell.model).tolist(),
+        "usual": usual_flexibility(cell.model),
+        "evidence": asdict(found) | arrays,
+    }
