@@ -6,7 +6,7 @@ surely wrong is an error in every command; what is only odd is a warning.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -14,10 +14,12 @@ import numpy as np
 from gapbridge.bridge.cell.document import Document
 from gapbridge.bridge.cell.message import key_path
 from gapbridge.bridge.cell.schema import CellFile, Payload
+from gapbridge.bridge.cell.settings.calibration import CalibrationSettings, LoadEntry
 from gapbridge.core.arm import Arm, builtin_arm
 from gapbridge.core.load_bounds import LEVER, LoadBounds
 from gapbridge.core.model import Model
 from gapbridge.core.plausibility import (
+    QUICK,
     TURN,
     TURNS,
     Oddity,
@@ -34,6 +36,7 @@ COARSEST, COARSE, FINE = 0.01, 1e-3, 1e-7  # m: 1 sigma of no instrument, of few
 COLD, HOT = (-60.0, -20.0), (150.0, 60.0)  # °C: never, hardly
 SOFTEST, SOFT = 1.0, 0.01  # rad/Nm: no joint, few joints
 CALIBRATED, MUCH = 0.1, 0.02  # m at the flange: no factory calibration, few
+FARTHEST = 50.0  # m: no floor, box or instrument is so far from a base
 HEAVIEST_LOAD, HEAVY_LOAD = 3000.0, 300.0  # kg, where the arm's rating is not known
 UR_JOINTS = 6
 DISPLACED = 2.0  # times the reach, and a metre: no tool is that long
@@ -83,11 +86,45 @@ def oddities(file: CellFile, document: Document, arm: Arm) -> Iterator[Oddity]:
         mounted = file.ft_sensor.sensor_in_flange
         yield from _length(("ft_sensor", "sensor_in_flange", "xyz"), mounted.xyz, far, "")
         yield from _angles(("ft_sensor", "sensor_in_flange", "rpy"), mounted.rpy)
+    yield from _session(file.calibration, arm, far)
+    if (quick := file.limits.joint_velocity or 0.0) > QUICK:
+        yield Oddity(("limits", "joint_velocity"), f"{quick:g}", "rad/s (it looks like degrees)")
     if file.simulation.payload is not None:
         yield from _payload(("simulation", "payload"), file.simulation.payload, arm, far)
     for i, angle in enumerate(file.simulation.start_q or []):
         if abs(angle) > TURNS:
             yield Oddity(("simulation", "start_q", i), f"{angle:g}", "rad (it looks like degrees)")
+
+
+def _session(given: CalibrationSettings, arm: Arm, far: float) -> Iterator[Oddity]:
+    """Yield what cannot be meant in the section of calibration sessions."""
+    top = "calibration"
+    rated = LoadBounds.of(Model(arm=arm)).mass
+    for i, load in enumerate(given.loads):
+        keys = (top, "loads", i)
+        if load.mass > rated:
+            yield Oddity(
+                (*keys, "mass"), f"{load.mass:g} kg", f"at most {rated:.3g} kg (grams?)",
+                sure=bool(np.isfinite(arm.payload)),
+            )  # fmt: skip
+        yield from _payload(keys, load, arm, far)
+    if given.accuracy is not None and given.accuracy >= COARSEST:
+        yield Oddity((top, "accuracy"), f"{given.accuracy:g}", "m (it looks like mm)")
+    places: list[tuple[tuple[str | int, ...], Sequence[float]]] = [
+        ((top, "floor"), [given.floor or 0.0]), ((top, "instrument_at"), given.instrument_at or []),
+        *(((top, "further_places", i), place) for i, place in enumerate(given.further_places)),
+    ]  # fmt: skip
+    for i, box in enumerate(given.keep_out):
+        keys = (top, "keep_out", i)
+        places += [((*keys, "lower"), box.lower), ((*keys, "upper"), box.upper)]
+        if np.any(np.array(box.lower) > box.upper):
+            yield Oddity((*keys, "lower"), f"{box.lower}", f"no more than upper, {box.upper}")
+    for where, xyz in places:
+        if (size := max(map(abs, xyz), default=0.0)) > FARTHEST:
+            yield Oddity(where, f"{size:g}", "m (it looks like mm)")
+    for end in ("lower", "upper") if given.joint_range is not None else ():
+        if (angle := max(map(abs, getattr(given.joint_range, end)))) > TURNS:
+            yield Oddity((top, "joint_range", end), f"{angle:g}", "rad (it looks like degrees)")
 
 
 def _robot(file: CellFile, document: Document, arm: Arm) -> Iterator[Oddity]:
@@ -154,7 +191,7 @@ def _angles(keys: tuple[str | int, ...], rpy: list[float] | tuple[float, ...]) -
 
 
 def _payload(
-    keys: tuple[str | int, ...], payload: Payload, arm: Arm, far: float
+    keys: tuple[str | int, ...], payload: Payload | LoadEntry, arm: Arm, far: float
 ) -> Iterator[Oddity]:
     yield from _length((*keys, "cog"), payload.cog, far, "of the centre of gravity")
     if np.isfinite(arm.payload):

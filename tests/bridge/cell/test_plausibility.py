@@ -24,6 +24,10 @@ URDF = """<robot name="r"><link name="base"/>
 <origin xyz="0 0 0.4"/></joint></robot>"""
 
 
+def session(text: str) -> str:
+    return f"{ARM}calibration: {{{text}}}"
+
+
 def written(folder: Path, text: str) -> Path:
     path = folder / "cell.yaml"
     path.write_text(text, encoding="utf-8")
@@ -51,6 +55,17 @@ def dh(**changed: float) -> str:
         (ARM + "metrology: {repeatability: 0.05}", 2, "metrology.repeatability", "0.05", "mm"),
         (ARM + "compliance: {axial: [1e5, 0, 0, 0, 0, 0]}", 2, "compliance.axial", "100000", "Nm"),
         (ARM + "simulation: {start_q: [0, -90, 0, 0, 0, 0]}", 2, "start_q", "-90", "degrees"),
+        (ARM + "limits: {joint_velocity: 180}", 2, "limits.joint_velocity", "180", "degrees"),
+        (session("accuracy: 0.2"), 2, "calibration.accuracy", "0.2", "mm"),
+        (session("floor: 100"), 2, "calibration.floor", "100", "mm"),
+        (session("instrument_at: [2000, -100, 0]"), 2, "instrument_at", "2000", "mm"),
+        (session("further_places: [[0, -1500, 0]]"), 2, "further_places", "1500", "mm"),
+        (session("keep_out: [{lower: [0, 0, 0], upper: [-1, 1, 1]}]"), 2,
+         "keep_out entry 1.lower", "[0.0, 0.0, 0.0]", "no more than upper"),
+        (session("joint_range: {lower: [-90, 0, 0, 0, 0, 0], upper: [1, 1, 1, 1, 1, 1]}"), 2,
+         "calibration.joint_range.lower", "90", "degrees"),
+        (session("loads: [{mass: 900}]"), 2, "calibration.loads entry 1.mass", "900", "kg"),
+        (session("loads: [{mass: 2, cog: [0, 0, 50]}]"), 2, "entry 1.cog", "50 m", "mm"),
         ("robot: {model: ur10e, calibration: {delta_theta: [0, 0, 0, 0, 0, 0],\n"
          "  delta_a: [0, 0.5, 0, 0, 0, 0]}}", 1, "robot.calibration", "500 mm", "few mm"),
         (dh(a=1e3, d=1e3), 1, "robot.dh entry 2.a", "-612.7", "mm"),
