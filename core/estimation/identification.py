@@ -355,8 +355,8 @@ def notes_of(
     if isinstance(fit.frame, Placements) and len(fit.frame.frames) > 1:
         notes.append("each session has a frame of its own, not written to the cell")
     elif nuisances:
-        written = "the tool point is" if tool else "they are not"
-        notes.append(f"frame and tool point were estimated along; {written} written to the cell")
+        written = "; the tool point is" if tool else " and are not"
+        notes.append(f"frame and tool point were estimated along{written} written to the cell")
     if geometry is not None and geometry.has_links:
         notes.append(
             "links and joints' zeros were estimated along (the poses are likelier with them); they "
