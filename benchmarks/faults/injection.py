@@ -29,22 +29,27 @@ def _make(rig: Rig, row: Row, witness: Witness) -> Result:
     assert row.inject is not None
     found = rig.found
     found.largest_step, before = 0.0, found.violated
-    counts = rig.run.page.counts()
+    counts, first = rig.run.page.counts(), rig.run.page.written
     moment = time.time()
     row.inject(rig)
     detected = _await(rig, row, moment, counts)
+    # whoever takes the newest state only has not seen one that was overtaken: nor its fault
+    missed = _missed(rig, first) if detected is None else 0
     rig.pass_time(row.lasting)
     rig.heal()
     if row.after is not None:
         row.after(rig)
     end = _settle(rig, row)
     found = rig.found
-    wrong = _judge(rig, row, detected, end) + found.violations[-(found.violated - before) or 9999 :]
+    wrong = (
+        _judge(rig, row, detected, end, missed)
+        + found.violations[-(found.violated - before) or 9999 :]
+    )
     bounds = rig.checker.bounds
     return Result(
         row.key, rig.link.name, rig.link.cycle, detected, end, found.largest_step,
         bounds.offset_rate * bounds.cycle, tuple(wrong), found.violated > before,
-        not found.violated > before and _disturbed(rig, row, moment, witness),
+        not found.violated > before and (missed > 0 or _disturbed(rig, row, moment, witness)),
     )  # fmt: skip
 
 
@@ -115,11 +120,18 @@ def _settle(rig: Rig, row: Row) -> str:
     return state.name.lower()
 
 
-def _judge(rig: Rig, row: Row, detected: float | None, end: str) -> list[str]:
+def _missed(rig: Rig, first: int) -> int:
+    """Return how many states the loop has missed since its cycle number ``first``."""
+    page = rig.run.page
+    rows, _ = page.rows(first, page.written)
+    return int(rows[:, page.slices["missed"].start].sum())
+
+
+def _judge(rig: Rig, row: Row, detected: float | None, end: str, missed: int) -> list[str]:
     wrong = []
     limit = row.within(rig.link)
     if detected is None:
-        wrong.append(f"not detected ({rig.run.last_words()})")
+        wrong.append(f"not detected; the loop missed {missed} states ({rig.run.last_words()})")
     elif detected > limit:
         wrong.append(f"detected after {detected:.3f} s, allowed {limit:.3f}")
     if end not in row.end:
