@@ -54,7 +54,7 @@ def test_a_fault_is_detected_and_answered(rigs: Rigs, name: str, key: str) -> No
 
 def test_a_fault_in_a_state_that_the_loop_missed_is_not_judged() -> None:
     given = ("one leap", "can piper", 0.005, None, "compensating", 0.0, 1e-4, ("not detected",))
-    with pytest.raises(pytest.skip.Exception, match="late.*not detected"):
+    with pytest.raises(pytest.skip.Exception, match=r"late.*not detected"):
         judge(Result(*given, disturbed=True))
     with pytest.raises(AssertionError, match="not detected"):
         judge(Result(*given))
