@@ -14,14 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapbridge.core.arm import Arm
-from gapbridge.core.diagnosis.criteria import CHANCE, MATERIAL_SHARE
+from gapbridge.core.diagnosis.criteria import CHANCE, EXCITED, MATERIAL_SHARE
 from gapbridge.core.diagnosis.selection.candidate import Candidate
 from gapbridge.core.diagnosis.selection.selection import Selection
 from gapbridge.core.effects import CATALOGUE, Reported
 
 Array = NDArray[np.float64]
 DEAD = 1e-7  # share of a parameter's column that a session has: below, it shows nothing of it
-SHOWN = 3.0  # whitened length of an effect of usual size from which a session shows it
 
 
 @dataclass(frozen=True)
@@ -60,7 +59,7 @@ def _compared(
     usual = np.concatenate([[p.scale for p in space.candidates[c].parameters] for c in own])
     shown = [
         int(s) for s in np.unique(of_row)
-        if np.sqrt(np.sum((columns[of_row == s] * usual) ** 2, axis=0)).max() > SHOWN
+        if np.sqrt(np.sum((columns[of_row == s] * usual) ** 2, axis=0)).max() > EXCITED
     ]  # fmt: skip
     if len(shown) < 2:
         return None

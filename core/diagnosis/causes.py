@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapbridge.core.arm import Arm
-from gapbridge.core.diagnosis.criteria import UNDETERMINED
+from gapbridge.core.diagnosis.criteria import EXCITED, UNDETERMINED
 from gapbridge.core.diagnosis.finding import ParameterNote, ParameterState, Withdrawal
 from gapbridge.core.diagnosis.held_out import HeldOut, Shrink
 from gapbridge.core.diagnosis.judgement import Judgement
@@ -20,7 +20,6 @@ from gapbridge.core.diagnosis.selection.selection import Selection
 from gapbridge.core.effects import CATALOGUE, Reported, Term
 
 Array = NDArray[np.float64]
-SHOWN = 3.0  # whitened length of an effect of usual size from which it counts as excited
 
 
 @dataclass(frozen=True)
@@ -203,7 +202,7 @@ def _shown(selection: Selection, c: int) -> bool:
     space = selection.space
     usual = np.array([p.scale for p in space.candidates[c].parameters])
     columns = space.X[:, space.start[c] : space.start[c + 1]] * usual
-    return bool(np.sqrt(np.sum(columns**2, axis=0)).max() > SHOWN)
+    return bool(np.sqrt(np.sum(columns**2, axis=0)).max() > EXCITED)
 
 
 def _score_with(selection: Selection, base: CandidateFit, c: int) -> float:

@@ -14,6 +14,10 @@ SIBLING = 3.0  # at further joints of an effect that stays at one: 7 of 218 true
 MAX_DRIFT = 1.5  # times, of its value: 2 gives one false more, 1.3 loses real friction
 ALIKE = 0.1  # 1 sigma of a joint's delay about the median of all, in shares of it, at least: a
 # UR5e's five joints lie within 0.15 of it, the sixth never moves
+MAX_TAKEN = 0.3  # share of a number that directions of the unnamed functions may hold: with more,
+# what is left of it is no estimate
+SEVERAL_AT_A_TIME = 900  # rows of the sample space from which the weakest eighth goes at once,
+HOPELESS = 0.6  # as far as its strength is below this: a matter of time, not of the answer
 MAX_UNNAMED = 6  # unnamed functions asked for at a time: more span the short logs
 VARIES = (
     1 / 3
@@ -42,9 +46,18 @@ SURE_P = 0.002  # probability below which it is sure: chance says so of one clea
 HINT_P = 0.05  # the same where the search needed an unnamed function or an accusation has fallen
 OVER_STATED_NOISE = 1.5  # times the stated noise: beyond, more than noise is left
 OVER_REPEAT_SCATTER = 1.6  # times the scatter of repeated poses
-ENOUGH_REPEATS = 30  # degrees of freedom from which repeats are a measure of the noise
+REPEATS_REFUTE = 30  # degrees of freedom from which repeats may say that more than noise is left
+SAME_SHARE = 0.05  # held-out share within which two quantities say the same
 USUAL_REPEATABILITY = 1.2e-4  # m, one coordinate: a worse repeatability than that is none
 OVER_INSTRUMENT_SIGMA = 5.0  # times the instrument's sigma, for coarse instruments
+# The noise floor
+REPEATS_MEASURE = 10  # degrees of freedom from which repeats measure it: to a quarter of its size
+RESIDUAL_MEASURES = 400  # samples from which the residual's own rms is the better estimate
+# What a log shows
+EXCITED = 3.0  # whitened length of an effect of usual size: an engineer's three sigmas
+DECISIVE = 1.0  # times the noise: a proposed measurement that differs by less decides nothing
+MAIN_SHARE = 0.5  # of the gap on unseen poses: where a fit of flexibilities leaves more, they are
+# not the main thing
 # Ties
 TIE_SCORE = 7.0  # score within which another explanation counts as equally good
 CURVATURE_GAIN = 10.8  # in -2 log likelihood, of a nonlinear stiffness over a linear one
@@ -64,6 +77,7 @@ MAX_TIMES_USUAL = 200.0  # times the usual size: beyond, a fit is no explanation
 MAX_SOFTENING = 6000.0  # times the usual softening of a stiffness curve
 PRIOR_REACH = 100.0  # times the usual size: how far the data may take a number against nothing
 UNDETERMINED = 30.0  # times the usual size: with a wider spread nothing is known of a number
+LOOSE_PRIOR = 5.0  # times the usual size: 1 sigma of what else may be there (outliers, steps)
 # Unnamed functions against what they stand beside
 DEGENERATE = 1e-5  # eigenvalue of unit columns below which a direction is the unnamed ones
 HELD_WHOLLY = 0.98  # share of an effect's column in an unnamed rival's span that makes it a part

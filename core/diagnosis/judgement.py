@@ -17,13 +17,13 @@ from gapbridge.core.arm import Arm
 from gapbridge.core.diagnosis.bump import bumps
 from gapbridge.core.diagnosis.constancy import not_constant
 from gapbridge.core.diagnosis.criteria import (
-    ENOUGH_REPEATS,
     HINT_P,
     NEGLIGIBLE,
     OUTLIER_SHARE,
     OVER_INSTRUMENT_SIGMA,
     OVER_REPEAT_SCATTER,
     OVER_STATED_NOISE,
+    REPEATS_REFUTE,
     SAME_SPAN,
     STAND_IN_GAIN,
     SURE_P,
@@ -327,7 +327,7 @@ def _too_much_left(selection: Selection) -> float:
     pure, repeats = pure_error(left, observation.groups[selection.kept])
     if observation.sigma_is_whole:
         least, times = observation.sigma**2, OVER_STATED_NOISE
-    elif repeats >= ENOUGH_REPEATS:
+    elif repeats >= REPEATS_REFUTE:
         least, times = max(pure, observation.sigma**2), OVER_REPEAT_SCATTER
     else:
         least, times = max(USUAL_REPEATABILITY, OVER_INSTRUMENT_SIGMA * observation.sigma) ** 2, 1.0

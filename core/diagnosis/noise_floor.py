@@ -12,13 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gapbridge.core.diagnosis.criteria import EXCESS, NOT_WHITE
+from gapbridge.core.diagnosis.criteria import EXCESS, NOT_WHITE, REPEATS_MEASURE, RESIDUAL_MEASURES
 from gapbridge.core.diagnosis.observation import Observation
 from gapbridge.core.diagnosis.selection.selection import Selection
 
 Array = NDArray[np.float64]
-ENOUGH_REPEATS = 10  # degrees of freedom from which repeats measure the noise
-MANY = 400  # samples from which the residual's own rms is the better estimate
 BLOCK = 0.1  # s: what is correlated for less is the sensor's filter, not the arm
 LAGS = 5  # of block means
 FEWEST_BLOCKS = 40
@@ -48,7 +46,7 @@ def noise_floor(selection: Selection, structured: bool) -> Floor:
         return Floor(observation.sigma, "stated")
     own = own_coordinates(observation)
     variance, freedom = repeat_variance(observation, selection.residual, selection.kept)
-    if freedom >= ENOUGH_REPEATS:
+    if freedom >= REPEATS_MEASURE:
         return Floor(float(np.sqrt(max(variance, observation.sigma**2))), "repeats")
     instrument = observation.instrument and observation.instrument()
     if instrument is not None:
@@ -60,7 +58,7 @@ def noise_floor(selection: Selection, structured: bool) -> Floor:
         each = np.einsum("nij,nij->ni", covariance, covariance)[:, :own]
         estimated = float(np.mean(each))
         left = selection.residual[selection.kept][:, :own]
-        if len(left) >= MANY:  # the estimate rests on fewer rows
+        if len(left) >= RESIDUAL_MEASURES:  # the estimate rests on fewer rows
             estimated = max(
                 float(np.sum(left**2)) / max(left.size - selection.used, 1), observation.sigma**2
             )

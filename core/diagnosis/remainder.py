@@ -17,9 +17,12 @@ from gapbridge.core.diagnosis.criteria import (
     CLOSED_SHARE,
     DEGENERATE,
     HELD_WHOLLY,
+    HOPELESS,
     MAX_DRIFT,
+    MAX_TAKEN,
     MAX_UNNAMED,
     MOSTLY,
+    SEVERAL_AT_A_TIME,
     SIBLING,
     SIGMAS,
     STAND_IN_GAIN,
@@ -36,9 +39,6 @@ from gapbridge.core.diagnosis.selection.smooth import targets
 from gapbridge.core.estimation.least_squares import basis_of, projected_out, solve
 
 Array = NDArray[np.float64]
-SHOWN = 0.3  # share of a number that may lie in such directions
-LARGE_SAMPLE = 900  # rows of the sample space from which several accusations go at a time
-HOPELESS = 0.6  # strength below which they do
 
 
 def withstanding(selection: Selection, believed: Sequence[int]) -> tuple[list[int], Remainder]:
@@ -50,7 +50,7 @@ def withstanding(selection: Selection, believed: Sequence[int]) -> tuple[list[in
         if strength.min() >= 1:
             break
         out = {int(np.argmin(strength))}
-        if len(remainder.space.y) > LARGE_SAMPLE:
+        if len(remainder.space.y) > SEVERAL_AT_A_TIME:
             worst = np.argsort(strength)[: max(1, len(accused) // 8)]
             out |= {int(i) for i in worst if strength[i] < HOPELESS}
         accused = [c for i, c in enumerate(accused) if i not in out]
@@ -132,9 +132,9 @@ class _Beside:
     def strengths(self, accused: list[int]) -> Array:
         """Return of each accusation how far it is over what it takes to stay (1: just)."""
         # of a large log the functions asked for once stay, so that one more is asked for a round
-        large = len(self.space.y) > LARGE_SAMPLE and len(self._asked) >= MAX_UNNAMED
+        large = len(self.space.y) > SEVERAL_AT_A_TIME and len(self._asked) >= MAX_UNNAMED
         asked = self.beside = self.asked_for(accused, 1 if large else MAX_UNNAMED)
-        if len(self.space.y) > LARGE_SAMPLE:
+        if len(self.space.y) > SEVERAL_AT_A_TIME:
             self._asked = asked
         value, spread, shown = self._values(accused, *self._beyond(accused, asked))
         found = [self._unit(accused), self.space.columns(self._first), self._zero(accused)]
@@ -282,7 +282,7 @@ class _Beside:
         without = np.array([solved(part != p)[0] for p in np.unique(self._part)])
         away = without - without.mean(axis=0)
         scatter = (len(without) - 1) / len(without) * away.T @ away
-        spread, shown = inverse * max(rss / freedom, self.space.floor) + scatter, taken < SHOWN
+        spread, shown = inverse * max(rss / freedom, self.space.floor) + scatter, taken < MAX_TAKEN
         candidates = [self.space.candidates[c] for c in accused]
         begin = np.cumsum([0, *(len(k.parameters) for k in candidates)])
         late = np.array(

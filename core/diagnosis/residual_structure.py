@@ -14,6 +14,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from gapbridge.core.diagnosis.criteria import SAME_SHARE
 from gapbridge.core.diagnosis.observation import HELD
 from gapbridge.core.diagnosis.selection.problem import SampleSpace
 from gapbridge.core.estimation.least_squares import basis_of, projected_out
@@ -22,7 +23,6 @@ Array = NDArray[np.float64]
 DRAWS = 1500
 AT_ONCE = 200  # directions: with all draws 2.4 MB
 FOLDS = 7
-ABOUT = 0.05  # held-out share within which two quantities say the same
 
 
 def structure_p_value(
@@ -128,7 +128,7 @@ def _loads_before_time(ranked: list[tuple[str, float]]) -> list[tuple[str, float
         return ranked
     time = ranked[at]
     as_good = [i for i, (name, share) in enumerate(ranked)
-               if name.startswith(HELD) and at < i and share > time[1] - ABOUT]  # fmt: skip
+               if name.startswith(HELD) and at < i and share > time[1] - SAME_SHARE]  # fmt: skip
     if as_good:
         ranked.insert(as_good[-1] + 1, time)
         del ranked[at]

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapbridge.core.diagnosis.channel_diagnosis import ChannelDiagnosis
-from gapbridge.core.diagnosis.criteria import TIE_SCORE
+from gapbridge.core.diagnosis.criteria import DECISIVE, TIE_SCORE
 from gapbridge.core.diagnosis.next_measurements import PREDICTED, Predict, Trials, draw_trials
 from gapbridge.core.diagnosis.selection.local_search import rivals
 from gapbridge.core.diagnosis.selection.problem import CandidateFit, SampleSpace, fit
@@ -30,7 +30,6 @@ from gapbridge.core.model import Model
 Array = NDArray[np.float64]
 EACH = 2  # measurements proposed per open question
 APART = 0.5  # rad, of some joint, between poses that are proposed together
-VISIBLE = 1.0  # times the noise: a smaller difference decides nothing
 POSED = 1e-6  # share of a difference that changes with the pose: less, and no pose decides
 
 
@@ -159,7 +158,7 @@ def _best(moving: bool, trials: Trials, names: tuple[str, ...], gain: Array) -> 
     q, loads = trials.q, trials.loads
     assert loads.payload_mass is not None and loads.approach is not None
     for r in np.argsort(-gain):
-        if gain[r] < VISIBLE or len(chosen) == EACH:
+        if gain[r] < DECISIVE or len(chosen) == EACH:
             break
         if all(np.abs(q[r] - np.array(m.q)).max() > APART for m in chosen):
             sided = any(CATALOGUE[name].by_approach for name in names)

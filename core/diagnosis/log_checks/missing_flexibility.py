@@ -6,6 +6,7 @@ a fit that asks for the softness alone does not.
 
 from __future__ import annotations
 
+from gapbridge.core.diagnosis.criteria import MAIN_SHARE
 from gapbridge.core.errors import GapbridgeError
 from gapbridge.core.estimation.compliance_fit import flexibilities
 from gapbridge.core.estimation.identification import identify_compliance
@@ -13,8 +14,6 @@ from gapbridge.core.log.log import Log
 from gapbridge.core.log.log_finding import LogCheck, LogFinding
 from gapbridge.core.metrology import Metrology
 from gapbridge.core.model import Model
-
-SHARE = 0.5  # of the gap on unseen poses: where more remains, softness is not the main thing
 
 
 def softness_findings(model: Model, log: Log, metrology: Metrology) -> list[LogFinding]:
@@ -30,7 +29,7 @@ def softness_findings(model: Model, log: Log, metrology: Metrology) -> list[LogF
     except GapbridgeError:
         return []
     before, after = found.gap_rms_held_out, found.remaining_rms_held_out
-    if not after < SHARE * before:
+    if not after < MAIN_SHARE * before:
         return []
     values = int(found.identifiable.sum()), before, after
     return [LogFinding(LogCheck.MISSING_FLEXIBILITY, values)]

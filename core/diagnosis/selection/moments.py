@@ -15,13 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapbridge.core.arm import Arm
+from gapbridge.core.diagnosis.criteria import LOOSE_PRIOR
 from gapbridge.core.diagnosis.selection.candidate import Candidate
 from gapbridge.core.diagnosis.selection.state import SelectionState, flat
 from gapbridge.core.effects import CATALOGUE, Effect, Site, Term
 
 Array = NDArray[np.float64]
 Pair = tuple[Candidate, Array]
-PRIOR = 5.0  # usual sizes: 1 sigma of what else may be there
 FREE = 1e6  # usual sizes of a nuisance: nothing is known of it
 MOMENTS = 3  # of a site that the search looks at
 FEWEST = 3  # rows on either side of a moment
@@ -98,7 +98,7 @@ def _integrated(
         if candidate.periodic and (candidate.site.order or 0.0) > 2.0:
             continue
         blocks.append(block)
-        prior.append(np.array([PRIOR * p.scale for p in candidate.parameters]))
+        prior.append(np.array([LOOSE_PRIOR * p.scale for p in candidate.parameters]))
     A = flat(np.concatenate(blocks, axis=2), state)
     spread = np.concatenate(prior)
     spread[: observation.nuisance.shape[2]] /= np.maximum(

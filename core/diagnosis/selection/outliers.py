@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapbridge.core.diagnosis.criteria import (
+    LOOSE_PRIOR,
     MOST_OUTLIERS,
     OUTLIER_SHARE,
     UNPREDICTED_SHARE,
@@ -27,7 +28,6 @@ from gapbridge.core.estimation.robust import (
 
 Array = NDArray[np.float64]
 STARTING, STEPS = 4, 8  # of the fit that looks for outliers
-RIDGE = 5.0  # usual sizes of a parameter: prior of the fit that only looks for outliers
 
 
 def mark_outliers(state: SelectionState, explained_by: list[tuple[Candidate, Array]]) -> None:
@@ -43,7 +43,7 @@ def mark_outliers(state: SelectionState, explained_by: list[tuple[Candidate, Arr
         usual += [p.scale for p in c.parameters]
     A = np.concatenate(parts, axis=2) * np.array(usual) if parts else np.zeros((N, k, 0))
     prior = np.concatenate(
-        [np.full(A.shape[2], 1 / RIDGE), np.zeros(observation.nuisance.shape[2])]
+        [np.full(A.shape[2], 1 / LOOSE_PRIOR), np.zeros(observation.nuisance.shape[2])]
     )
     A = np.concatenate([A, observation.nuisance], axis=2)
     weight, r, used = np.ones(N), gap, 0.0
