@@ -35,7 +35,7 @@ def absurdities(causes: list[dict[str, Any]], least: float, largest: float) -> l
         effect, strong = str(cause["effect"]), False
         for parameter in cause.get("parameters") or []:
             name, value = str(parameter["name"]), parameter.get("value")
-            if value is None or any(p in name for p in PLACES):
+            if value is None or name.endswith(PLACES):
                 continue
             std = parameter.get("std")
             strong = strong or not std or abs(value) > 3 * std

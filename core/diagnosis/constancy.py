@@ -26,23 +26,25 @@ Array = NDArray[np.float64]
 
 
 def not_constant(
-    selection: Selection, accused: Sequence[int], beside: Array
-) -> dict[int, str]:  # fmt: skip
+    selection: Selection, accused: Sequence[int], beside: Array | None = None
+) -> dict[int, str]:
     """Return the candidates, of those accused, whose number is none, and the quantity it goes by.
 
     ``beside`` (m, d) are the unnamed functions that stand beside the accused, as rows of the sample
-    space. Poses alone are judged: in motion friction and delay go by a joint's speed in their own
-    right.
+    space; None: they are not known (on all rows), and lines alone are judged, which are compared
+    with themselves. Poses alone are judged: in motion friction and delay go by a joint's speed in
+    their own right.
     """
     if selection.observation.channel != "position":
         return {}
+    unnamed = selection.working.X[:, :0] if beside is None else beside
     if selection.links is not None:
-        beside = selection.links.whitened(beside)
-    found = {}
-    for c in accused:
+        unnamed = selection.links.whitened(unnamed)
+    single, found = [c for c in accused if c not in selection.block], {}
+    for c in single:
         candidate = selection.working.candidates[c]
-        if candidate.periodic or _is_a_number(candidate):
-            quantity, share = _variation(selection, c, accused, beside)
+        if candidate.periodic or (beside is not None and _is_a_number(candidate)):
+            quantity, share = _variation(selection, c, single, unnamed)
             if share > VARIES:
                 found[c] = quantity
     return found

@@ -342,7 +342,8 @@ def _decided(found: _Searched, model: Model, streamed: Streamed | None) -> Chann
     decided = shown if streamed is None else streamed.selection(verdict.accused)
     held = HeldOut(decided)
     if found.more or streamed is not None:
-        alone = partial(refitted, model) if streamed is None else streamed.alone
+        unknown = verdict.remainder is not None
+        alone = partial(refitted, model, unknown) if streamed is None else streamed.alone
         decided, verdict = still_accused(decided, verdict, held, alone)
     if streamed is None:
         shown = decided

@@ -36,7 +36,6 @@ from gapbridge.core.diagnosis.regions import one_place, parts
 from gapbridge.core.diagnosis.remainder import (
     closes_everywhere,
     links_withstand,
-    with_the_links,
     withstanding,
 )
 from gapbridge.core.diagnosis.residual_structure import (
@@ -93,7 +92,6 @@ def judge(selection: Selection, held: HeldOut) -> Judgement:
         c for c in selection.term_index if c not in withdrawn and c not in selection.block
     ]  # fmt: skip
     stays, remainder = withstanding(selection, believed)
-    stays += with_the_links(selection, stays, [c for c in believed if c not in stays])
     withdrawn |= {c: BESIDE for c in believed if c not in stays}
     for c, quantity in not_constant(selection, stays, remainder.columns).items():
         withdrawn[c] = Withdrawal(Check.CONSTANT, quantity)
@@ -209,9 +207,10 @@ def still_sure(selection: Selection, judgement: Judgement, arm: Arm) -> tuple[Se
             p: 0.0 if p in straight else worth(found.terms[p], found.covariance[p])
             for p in judgement.accused
         }
-        whole = tuple(p for p in judgement.accused if found.as_a_whole(p))
-        kinds = [(p,) for p in judgement.accused if p not in whole] + ([whole] if whole else [])
-        weakest = min(kinds, key=lambda kind: max(share[p] for p in kind), default=())
+        weakest = min(
+            found.judged_together(judgement.accused),
+            key=lambda kind: max(share[p] for p in kind), default=(),
+        )  # fmt: skip
         if not weakest or max(share[p] for p in weakest) >= 1:
             return found, judgement
         # of friction beside the links more rows may still be sure

@@ -52,7 +52,8 @@ class Observation:
     axial_moment: Array | None = None  # (N, n) Nm about each joint's axis, where it is known
     times: Array | None = None  # (N,) s or numbers of rows, where something may have stepped
     order_in_time: bool = False  # True: neighbours in time are correlated (a moving log)
-    rebase: Callable[[Array], Observation] | None = None  # the same with the nuisance moved (p,)
+    # the same with the nuisance moved (p,), its columns those of the model with these terms
+    rebase: Callable[[Array, Sequence[Term]], Observation] | None = None
     # 1 sigma (k,) measured by neighbouring samples, where a recording shows it
     instrument: Callable[[], Array | None] | None = None
     fewer: Callable[[NDArray[np.int64]], Observation] | None = None  # of some samples only
@@ -128,9 +129,9 @@ def stacked(parts: Sequence[Observation], quantities: Mapping[str, Array]) -> Ob
             if all(target in rivals for rivals in each)
         )
 
-    def rebase(step: Array) -> Observation:
+    def rebase(step: Array, terms: Sequence[Term]) -> Observation:
         moved = [
-            part if part.rebase is None else part.rebase(step[columns[i] : columns[i + 1]])
+            part if part.rebase is None else part.rebase(step[columns[i] : columns[i + 1]], terms)
             for i, part in enumerate(parts)
         ]
         changed = {n: z for n, z in quantities.items() if not n.startswith("measured_position")}

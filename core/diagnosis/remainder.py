@@ -42,11 +42,18 @@ Array = NDArray[np.float64]
 
 
 def withstanding(selection: Selection, believed: Sequence[int]) -> tuple[list[int], Remainder]:
-    """Return the candidates, of those believed, that withstand, and the unnamed beside them."""
+    """Return the candidates, of those believed, that withstand, and the unnamed beside them.
+
+    Where all links are a cause the tool's point is one more number of the same geometry: hardly
+    ever sure beside unnamed functions, it is judged by what it does in regions that its fit did not
+    see. Until then it stays: without it nothing else would keep its value.
+    """
     remainder = _Beside(selection)
     accused = list(believed)
+    point = _tool_point(selection, accused)
     while accused:
         strength = remainder.strengths(accused)
+        strength[[c in point for c in accused]] = np.inf
         if strength.min() >= 1:
             break
         out = {int(np.argmin(strength))}
@@ -54,6 +61,12 @@ def withstanding(selection: Selection, believed: Sequence[int]) -> tuple[list[in
             worst = np.argsort(strength)[: max(1, len(accused) // 8)]
             out |= {int(i) for i in worst if strength[i] < HOPELESS}
         accused = [c for i, c in enumerate(accused) if i not in out]
+        sized = selection.sized_beside(accused)
+        if sized is not selection:
+            selection = sized
+            remainder = _Beside(selection)
+    if point and not _gains(selection, [c for c in accused if c not in point], point):
+        accused = [c for c in accused if c not in point]
     return accused, remainder.beside_refit(accused)
 
 
@@ -71,20 +84,17 @@ def links_withstand(selection: Selection) -> bool:
     return held.shrink(links, named).interval[0] > STAND_IN_GAIN
 
 
-def with_the_links(selection: Selection, stays: Sequence[int], fallen: Sequence[int]) -> list[int]:
-    """Return the tool's point, where it fell, if it stands with the links.
+def _tool_point(selection: Selection, chosen: Sequence[int]) -> list[int]:
+    """Return the tool's point among candidates, where all links are a cause."""
+    own = selection.space.candidates
+    return [c for c in chosen if selection.block and own[c].effect.beside_links]
 
-    Where all links are a cause it is one more number of the same geometry: not sure beside unnamed
-    functions, so it is judged by what it does in regions that its fit did not see.
-    """
-    space = selection.space
-    own = [c for c in fallen if space.candidates[c].effect.beside_links]
-    if not (selection.block and own):
-        return []
+
+def _gains(selection: Selection, stays: Sequence[int], point: Sequence[int]) -> bool:
+    """Return whether the tool's point shrinks the gap of regions not fitted, beside the links."""
     held = HeldOut(selection, parts=parts(selection.observation, selection.kept))
     rest = [*stays, *selection.block]
-    gains = held.possible and held.shrink([*rest, *own], rest).interval[0] > STAND_IN_GAIN
-    return own if gains else []
+    return held.possible and held.shrink([*rest, *point], rest).interval[0] > STAND_IN_GAIN
 
 
 def closes_everywhere(selection: Selection, accused: Sequence[int]) -> bool:

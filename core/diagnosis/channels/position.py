@@ -85,9 +85,9 @@ def _numbered(seen: Observation, session: int, rows: NDArray[np.int64]) -> Obser
     """Return a session's observation with its number and its rows in the joined log."""
     rebase = seen.rebase
 
-    def moved(step: Array) -> Observation:
+    def moved(step: Array, terms: Sequence[Term]) -> Observation:
         assert rebase is not None
-        return _numbered(rebase(step), session, rows)
+        return _numbered(rebase(step, terms), session, rows)
 
     return replace(
         seen, rows=rows, session=np.full(len(rows), session),
@@ -106,9 +106,14 @@ def _check_enough(seen: Observation, log: Log, name: str) -> None:
 
 
 def _observe_session(
-    model: Model, log: Log, metrology: Metrology, placement: Placement | None = None
-) -> Observation | None:
-    """Return the position channel of one session, or None where nothing was measured."""
+    model: Model, log: Log, metrology: Metrology, placement: Placement | None = None,
+    terms: Sequence[Term] = (),
+) -> Observation | None:  # fmt: skip
+    """Return the position channel of one session, or None where nothing was measured.
+
+    The tool point's columns are those of the model with ``terms``: at the nominal arm they are off
+    by as much as its joints are, and a joint's turn that they should take up stands as a cause.
+    """
     q = log.require("actual_q", "target_q")
     measured, turned = log.columns["measured_position"], log.get("measured_rotation")
     whole_pose = measured if turned is None else np.hstack([measured, turned])
@@ -122,7 +127,7 @@ def _observe_session(
                             metrology)  # fmt: skip
     frame = placement.frame
     model = replace(model, tool_in_flange=placement.tool_in_flange)
-    poses = model.predict(q, loads)
+    poses = model.with_terms(terms).predict(q, loads)
     in_base = frame.in_base(measured)
     reference = None if rotation is None else frame.rotation_in_base(rotation)
 
@@ -136,9 +141,9 @@ def _observe_session(
     form = model.linear_form(q, loads)
     placed = placement
 
-    def rebase(step: Array) -> Observation:
+    def rebase(step: Array, terms: Sequence[Term]) -> Observation:
         whole = np.concatenate([np.zeros(6), step]) if metrology.registered else step
-        moved = _observe_session(model, log, metrology, placed.moved(whole))
+        moved = _observe_session(model, log, metrology, placed.moved(whole), terms)
         assert moved is not None
         return moved
 

@@ -88,6 +88,10 @@ def _with_prediction(seen: Observation, values: Array) -> Observation:
     def predict(terms: Sequence[Term]) -> Array:
         return np.asarray(base + (own(terms) - nominal)) if terms else base
 
-    moved = None if rebase is None else lambda step: _with_prediction(rebase(step), values)
+    moved = (
+        None
+        if rebase is None
+        else lambda step, terms: _with_prediction(rebase(step, terms), values)
+    )
     thinned = None if fewer is None else lambda take: _with_prediction(fewer(take), values)
     return replace(seen, predict=predict, rebase=moved, fewer=thinned)

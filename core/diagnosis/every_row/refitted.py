@@ -11,6 +11,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from gapbridge.core.arrays import Mask
+from gapbridge.core.diagnosis.constancy import not_constant
 from gapbridge.core.diagnosis.criteria import OWN_SIGMAS, SIGMAS, TIE_SCORE
 from gapbridge.core.diagnosis.finding import Check, Withdrawal
 from gapbridge.core.diagnosis.held_out import HeldOut
@@ -79,10 +81,7 @@ def on_every_row(
              if c in selection.prior and p in accused}  # fmt: skip
     near = links_of(space, links).beside(space, links) if links else space
     found = fit(near, tuple(p for p in accused if p not in links))
-    remainder = None
-    if judgement.remainder is not None:
-        region = np.repeat(regions(placed, state.kept), placed.measured.shape[1])
-        remainder = Remainder(np.zeros((len(region), 0)), np.zeros(0), region)
+    remainder = None if judgement.remainder is None else _scatter(placed, state.kept)
     fitted, index, spread, residual = refit(state, space, found, links, remainder)
     values, covariance = list(selection.terms), list(selection.covariance)
     for c, term, own in zip(index, fitted, spread, strict=True):
@@ -91,6 +90,12 @@ def on_every_row(
         state.observation, space, found, tuple(values), tuple(range(len(values))),
         tuple(covariance), state.kept, noise, residual, terms, unprojected, links,
     )  # fmt: skip
+
+
+def _scatter(observation: Observation, kept: Mask) -> Remainder:
+    """Return the regions that values scatter among, where something unknown is left."""
+    region = np.repeat(regions(observation, kept), observation.measured.shape[1])
+    return Remainder(np.zeros((len(region), 0)), np.zeros(0), region)
 
 
 def _shaped_as(candidate: Candidate, term: Term) -> Candidate:
@@ -105,10 +110,19 @@ def still_accused(
 ) -> tuple[Selection, Judgement]:
     """Return what all rows leave accused: effects that shrink the gap where nothing was fitted.
 
-    The weakest goes first; of what was vague before, it has to be sure now. Ties that all rows
-    decide are none any more. ``alone`` refits some of the selection's terms.
+    The weakest goes first; of what was vague before, it has to be sure now; a line has to be one
+    in every quarter of its joint's range. Ties that all rows decide are none any more. ``alone``
+    refits some of the selection's terms.
     """
     selection, judgement = _sure(selection, judgement, alone)
+    varying = not_constant(selection, judgement.accused)
+    if varying:
+        changing = tuple((p, Withdrawal(Check.CONSTANT, by)) for p, by in varying.items())
+        judgement = replace(
+            judgement, accused=tuple(p for p in judgement.accused if p not in varying),
+            withdrawn=(*judgement.withdrawn, *changing),
+        )  # fmt: skip
+        selection = alone(selection, judgement.accused)
     # in the space of all rows a term's position is its candidate
     fallen = gainless(selection, judgement.accused, held) if held.possible else []
     accused = tuple(p for p in judgement.accused if p not in fallen)
@@ -132,9 +146,10 @@ def _sure(selection: Selection, judgement: Judgement, alone: Alone) -> tuple[Sel
             p: worth(selection.terms[p], selection.covariance[p]) / least.get(p, 1.0)
             for p in accused
         }
-        whole = [p for p in accused if selection.as_a_whole(p)]
-        kinds = [[p] for p in accused if p not in whole] + ([whole] if whole else [])
-        weakest = min(kinds, key=lambda kind: max(sure[p] for p in kind), default=[])
+        weakest = min(
+            selection.judged_together(accused),
+            key=lambda kind: max(sure[p] for p in kind), default=(),
+        )  # fmt: skip
         if not weakest or max(sure[p] for p in weakest) >= 1:
             return selection, replace(judgement, accused=tuple(accused), withdrawn=tuple(withdrawn))
         accused = [p for p in accused if p not in weakest]
@@ -142,9 +157,15 @@ def _sure(selection: Selection, judgement: Judgement, alone: Alone) -> tuple[Sel
         selection = alone(selection, accused)
 
 
-def refitted(model: Model, selection: Selection, accused: Sequence[int]) -> Selection:
-    """Return the selection on all rows with some of its terms refitted as all there is."""
-    whole = refitted_alone(selection, model.arm, accused)
+def refitted(
+    model: Model, unknown: bool, selection: Selection, accused: Sequence[int]
+) -> Selection:
+    """Return the selection on all rows with some of its terms refitted as all there is.
+
+    Beside something ``unknown`` covariances stay those of its scatter among regions.
+    """
+    remainder = _scatter(selection.observation, selection.kept) if unknown else None
+    whole = refitted_alone(selection, model.arm, accused, remainder)
     links = {p: own for p, own in selection.prior.items() if p in accused}
     whole = replace(whole, prior=links)
     single = tuple(p for p in accused if p not in links)
@@ -175,4 +196,4 @@ def _placed(whole: Observation, terms: Sequence[Term]) -> Observation:
     weight = whole.weight[: gap.shape[1]]
     A, b = (whole.nuisance * weight[:, None]).reshape(gap.size, -1), gap * weight
     row = np.repeat(start_weights(b), gap.shape[1])
-    return whole.rebase(solve(A * row[:, None], b.ravel() * row))
+    return whole.rebase(solve(A * row[:, None], b.ravel() * row), terms)

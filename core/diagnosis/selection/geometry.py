@@ -13,6 +13,7 @@ whitened by it, and log det of what it adds is the penalty (marginal likelihood)
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -28,11 +29,12 @@ from gapbridge.core.diagnosis.criteria import (
     MIN_GEOMETRIC_CAUSES,
     OWN_SIGMAS,
     TIMES_MACHINED,
+    TIMES_SET,
 )
 from gapbridge.core.diagnosis.selection.candidate import Candidate
 from gapbridge.core.diagnosis.selection.local_search import pruned
 from gapbridge.core.diagnosis.selection.problem import CandidateFit, SampleSpace, fit
-from gapbridge.core.diagnosis.selection.search import screened_search
+from gapbridge.core.diagnosis.selection.search import part, screened_search
 from gapbridge.core.estimation.least_squares import solve
 
 Array = NDArray[np.float64]
@@ -63,20 +65,36 @@ def prior(space: SampleSpace, block: Sequence[int], rest: Sequence[int]) -> dict
     """Return 1 sigma (d,) of each number of the links beside a set of other candidates.
 
     An engineer's size times the power of two under which the gap is most likely: arms differ in
-    how well their links are known (empirical Bayes; MacKay, Neural Computation 4 (1992) 415).
+    how well their links are known (empirical Bayes; MacKay, Neural Computation 4 (1992) 415). What
+    each joint has of its own has a power of its own: its zero is set, not machined.
     """
     usual = {"m": LENGTH, "rad": ANGLE}
+    few = _reduced(space, [*block, *rest])
+    place = {c: k for k, c in enumerate([*block, *rest])}
     size = {
         c: np.array([usual.get(p.unit, p.scale) for p in space.candidates[c].parameters])
         for c in block
     }
 
-    def score(times: float) -> float:
-        links = links_of(space, {c: times * own for c, own in size.items()})
-        return _beside_set(space, rest, links) + links.penalty
+    def sized(links: float, joints: float) -> dict[int, Array]:
+        return {
+            c: (links if space.candidates[c].effect.together else joints) * own
+            for c, own in size.items()
+        }
 
-    times = min(TIMES_MACHINED, key=score)
-    return {c: times * own for c, own in size.items()}
+    def score(times: tuple[float, float]) -> float:
+        links = links_of(few, {place[c]: own for c, own in sized(*times).items()})
+        return _beside_set(few, [place[c] for c in rest], links) + links.penalty
+
+    return sized(*min(itertools.product(TIMES_MACHINED, TIMES_SET), key=score))
+
+
+def _reduced(space: SampleSpace, chosen: Sequence[int]) -> SampleSpace:
+    """Return the space of some candidates, in this order, in as few rows as hold the same sums."""
+    X = np.hstack([space.columns(chosen), space.y[:, None]])
+    R = np.asarray(np.linalg.qr(X, mode="r"))
+    few = part(space, np.array(chosen, dtype=np.int64))
+    return replace(few, X=R[:, :-1], y=R[:, -1])
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from gapbridge.core.diagnosis.selection.candidate import Candidate
 from gapbridge.core.diagnosis.selection.delay_columns import as_one_delay
 from gapbridge.core.diagnosis.selection.problem import CandidateFit, SampleSpace
 from gapbridge.core.diagnosis.selection.state import SelectionState, flat
-from gapbridge.core.effects import Term
+from gapbridge.core.effects import CATALOGUE, Term
 from gapbridge.core.errors import EquilibriumError, InputError
 from gapbridge.core.estimation.least_squares import basis_of, projected_out, solve
 
@@ -96,7 +96,9 @@ def refit(
         if observation.rebase is not None:
             moved_terms = tuple(freed[c].term(v) for c, v in zip(index, x, strict=True))
             left = observation.measured - observation.predict(moved_terms)
-            state.observation = observation.rebase(_along(extra, nuisance, left, state))
+            state.observation = observation.rebase(
+                _along(extra, nuisance, left, state), moved_terms
+            )
         if moved < 1e-6:
             break
     residual_ss = float(np.sum((b - A @ step) ** 2))
@@ -224,10 +226,19 @@ def _no_narrower(scatter: Array, white: Array) -> Array:
 
 
 def worth(term: Term, spread: Array) -> float:
-    """Return a term's value, of covariance (d, d), over what makes it a finding (1: just)."""
-    value = np.array(term.values[: len(spread)])
-    least = len(value) * OWN_SIGMAS**2
-    return float(value @ np.linalg.pinv(spread, hermitian=True) @ value) / least
+    """Return a term's value, of covariance (d, d), over what makes it a finding (1: just).
+
+    As a whole, and of its numbers the surest: of a line its amplitude, whose phase has any value,
+    as has what shapes a curve.
+    """
+    effect, value = CATALOGUE[term.effect], np.array(term.values[: len(spread)])
+    whole = float(value @ np.linalg.pinv(spread, hermitian=True) @ value) / len(value)
+    if effect.periodic:
+        single = float(value @ value) ** 2 / max(float(value @ spread @ value), 1e-300)
+    else:
+        own = slice(0, 1) if effect.curved or effect.shapes else slice(None)
+        single = float(np.max(value[own] ** 2 / np.maximum(np.diag(spread)[own], 1e-300)))
+    return min(whole, single) / OWN_SIGMAS**2
 
 
 def _step(

@@ -94,12 +94,16 @@ class Selection:
         """Return the candidates of all links, where their geometry is a cause as a whole."""
         return tuple(self.prior)
 
-    def as_a_whole(self, position: int) -> bool:
-        """Return whether a term is of the links' geometry, accused as a whole.
+    def judged_together(self, positions: Sequence[int]) -> list[tuple[int, ...]]:
+        """Return positions of terms in the groups of which one term has to be sure by itself.
 
-        Of first moments and friction each joint's has to be sure by itself.
+        The links' geometry is accused as a whole, the joints' zeros in it: without these a UR10's
+        links stand for them. Everything else, first moments and friction too, goes by joints.
         """
-        return self.term_index[position] in self.prior and self.observation.channel == "position"
+        shape = self.observation.channel == "position"
+        whole = tuple(p for p in positions if shape and self.term_index[p] in self.prior)
+        single: list[tuple[int, ...]] = [(p,) for p in positions if p not in whole]
+        return [*single, whole] if whole else single
 
     @cached_property
     def links(self) -> Links | None:
@@ -134,6 +138,19 @@ class Selection:
         X = space.columns(chosen)
         x = solve(X, space.y, self.pull(chosen))
         return dict(zip(chosen, np.split(x, np.cumsum(size[list(chosen)])[:-1]), strict=True))
+
+    def sized_beside(self, chosen: Sequence[int]) -> Selection:
+        """Return the selection with the links of the size that is most likely beside a set.
+
+        What falls leaves them more to account for, or nothing to be large for.
+        """
+        if not self.prior:
+            return self
+        rest = [c for c in chosen if c not in self.block]
+        sigma = prior(self.space, self.block, rest)
+        if all(np.array_equal(sigma[c], own) for c, own in self.prior.items()):
+            return self
+        return replace(self, prior=sigma)
 
     def without_links(self) -> Selection:
         """Return the selection with the links' geometry no cause, the rest as it is."""
@@ -338,6 +355,7 @@ def refitted_alone(
     if not accused or (len(accused) == len(selection.terms) and remainder is None):
         return selection
     chosen = [selection.term_index[p] for p in accused]
+    selection = selection.sized_beside(chosen)
     links = {c: sigma for c, sigma in selection.prior.items() if c in chosen}
     if remainder is not None and (links or len(selection.space.y) >= LARGE_SAMPLE):
         remainder = remainder.scatter_alone()

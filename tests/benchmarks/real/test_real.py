@@ -125,6 +125,13 @@ def test_a_value_within_its_own_spread_is_absurd():
     assert absurdities([cause], 0, 0) == ["backlash (no number of it over 3 sigma)"]
 
 
+def test_a_line_is_judged_by_its_amplitude_whatever_its_name_holds():
+    name = "transmission_error_3_order81"
+    line = [{"name": f"{name}_amplitude", "value": 7.2e-5, "std": 6.8e-6},
+            {"name": f"{name}_phase", "value": 1.9, "std": 0.1}]  # fmt: skip
+    assert absurdities([{"effect": "transmission_error", "parameters": line}], 0, 0) == []
+
+
 def test_a_clone_becomes_a_log_and_a_cell(tmp_path):
     source = SOURCES["force_sensor_100"]
     place = tmp_path / source.folder / "datas"

@@ -10,6 +10,7 @@ import pytest
 import small_arm as small
 
 from benchmarks.blind.session import Plan
+from gapbridge.core.diagnosis import remainder
 from gapbridge.core.diagnosis.channels.position import observe as observe_position
 from gapbridge.core.diagnosis.channels.wrench import observe
 from gapbridge.core.diagnosis.criteria import NEGLIGIBLE
@@ -17,11 +18,11 @@ from gapbridge.core.diagnosis.diagnosis import diagnose
 from gapbridge.core.diagnosis.finding import Check, Withdrawal
 from gapbridge.core.diagnosis.held_out import HeldOut
 from gapbridge.core.diagnosis.judgement import Judgement, judge, judge_geometry, still_sure
-from gapbridge.core.diagnosis.remainder import closes_everywhere, with_the_links
+from gapbridge.core.diagnosis.remainder import closes_everywhere, withstanding
 from gapbridge.core.diagnosis.selection import selection
 from gapbridge.core.diagnosis.selection.candidate import named_candidates, with_what_it_needs
 from gapbridge.core.diagnosis.selection.refit import Remainder, _cluster_covariance, worth
-from gapbridge.core.effects import CATALOGUE
+from gapbridge.core.effects import CATALOGUE, Site, Term
 from gapbridge.core.metrology import Metrology
 
 N, ROWS = 6, 70
@@ -177,7 +178,7 @@ def test_links_that_close_no_gap_are_not_accused(effect):
     assert not found.block
 
 
-def test_a_tool_point_goes_with_the_links_where_it_helps_elsewhere():
+def test_a_tool_point_goes_with_the_links_where_it_helps_elsewhere(monkeypatch):
     session = small.session_of(0)
     off = np.array([2e-3, -1e-3, 3e-3])
     real = replace(small.NOMINAL, rows=STRETCHED, tool_position=small.TOOL + off)
@@ -187,9 +188,43 @@ def test_a_tool_point_goes_with_the_links_where_it_helps_elsewhere():
     own = whole.space.candidates
     point = [c for c, k in enumerate(own) if k.family == "tool_frame"]
     lines = [c for c, k in enumerate(own) if k.periodic][:1]
-    assert with_the_links(whole, (), [*point, *lines]) == point
-    assert with_the_links(whole, point, lines) == []
-    assert with_the_links(replace(whole, prior={}), (), point) == []  # no links are a cause
+    asked = []
+
+    def strengths(_, accused):  # beside an unknown that moves the tool its point is the least sure
+        asked.append(set(accused))
+        return np.array([0.0 if c in point else 0.5 + (len(accused) < 3) for c in accused])
+
+    monkeypatch.setattr(remainder._Beside, "strengths", strengths)
+    zero = [c for c, k in enumerate(own) if k.family == "backlash"][:1]
+    stays, _ = withstanding(whole, [*point, *lines, *zero])
+    assert asked[1] > {*point}  # the others are judged with the point, not with its gap
+    assert {*stays} >= {*point}
+    found, _ = withstanding(replace(whole, prior={}), point)
+    assert found == []  # no links are a cause
+
+
+def test_links_are_sized_anew_beside_what_stays(links):
+    whole, _ = fallen(links)
+    wrong = replace(whole, prior={c: 8 * own for c, own in whole.prior.items()})
+    sized = wrong.sized_beside(whole.found.chosen)
+    assert all(np.array_equal(sized.prior[c], own) for c, own in whole.prior.items())
+    assert whole.sized_beside(whole.found.chosen) is whole
+
+
+@pytest.mark.parametrize(
+    ("effect", "order", "values", "spread", "sure"),
+    [
+        # three numbers whose sum is known, and of none of them anything
+        ("link_geometry", None, (1.0, 1.0, 1.0), np.ones((3, 3)) * 0.98 + 0.02 * np.eye(3), False),
+        ("link_geometry", None, (1.0, -1.0, 0.0), 0.98 + 0.02 * np.eye(3), False),
+        ("link_geometry", None, (4.0, 4.0, 4.0), 0.2 + 0.8 * np.eye(3), True),
+        # of a line the amplitude, not one of its parts
+        ("transmission_error", 17.0, (2.9, 2.9), 0.5 * np.eye(2), True),
+        ("transmission_error", 17.0, (2.0, 2.0), np.array([[1.0, 0.9], [0.9, 1.0]]), False),
+    ],
+)
+def test_a_finding_has_a_number_that_is_sure(effect, order, values, spread, sure):
+    assert (worth(Term(effect, Site(2, order), values), spread) >= 1) is sure
 
 
 @pytest.fixture(scope="module")

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from functools import partial
+
 import numpy as np
 import pytest
 import small_arm as small
@@ -10,6 +13,11 @@ from benchmarks.blind.measuring import axial_moments
 from benchmarks.blind.session import play
 from gapbridge.core.diagnosis.constancy import not_constant
 from gapbridge.core.diagnosis.diagnosis import diagnose
+from gapbridge.core.diagnosis.every_row.refitted import on_every_row, refitted, still_accused
+from gapbridge.core.diagnosis.finding import Check
+from gapbridge.core.diagnosis.held_out import HeldOut
+from gapbridge.core.diagnosis.judgement import Judgement
+from gapbridge.core.diagnosis.selection.problem import fit
 from gapbridge.core.metrology import Metrology
 
 GAP = 9e-4  # rad, of joint 2
@@ -48,8 +56,8 @@ def test_play_that_opens_with_the_load_is_no_backlash():
     assert channel.structured
 
 
-def line_of(fades):
-    """Return which line of joint 2 is no constant, where one fades over the joint's range."""
+def fading(fades):
+    """Return the selection of an arm with a line of joint 2 that fades over the joint's range."""
 
     def angle(session, q):
         way = (q - q.min()) / np.ptp(q)
@@ -58,11 +66,21 @@ def line_of(fades):
     session = small.session_of(0)
     log = small.log_of(session, small.readings(small.turned(2, angle), session))
     metrology = Metrology(registered=True, sigma=small.SIGMA)
-    selection = diagnose(small.model_of(), log, metrology).channels[0].selection
+    return diagnose(small.model_of(), log, metrology).channels[0].selection
+
+
+def line_in(selection):
     (own,) = [
         c for c, k in enumerate(selection.space.candidates)
         if k.periodic and k.site.joint == 2 and k.site.order == LINE
     ]  # fmt: skip
+    return own
+
+
+def line_of(fades):
+    """Return which line of joint 2 is no constant, where one fades over the joint's range."""
+    selection = fading(fades)
+    own = line_in(selection)
     return not_constant(selection, [own], np.zeros((len(selection.space.y), 0)))
 
 
@@ -83,3 +101,20 @@ def test_only_numbers_of_poses_are_judged():
         c for c, k in enumerate(candidates) if k.family == "backlash" and k.site.joint == 2
     ]
     assert list(not_constant(selection, [play_of_2], nothing).values()) == ["load"]
+
+
+@pytest.mark.parametrize(("fades", "stays"), [(0.0, True), (1.0, False)])
+def test_all_rows_judge_whether_a_line_is_one(fades, stays):
+    """A search saw a tenth of a UR10's rows: its lines helped there, and in no other series."""
+    selection, model = fading(fades), small.model_of()
+    line, space = line_in(selection), selection.space
+    found = fit(space, (line,))
+    selection = replace(
+        selection, found=found, term_index=(line,), covariance=(1e-12 * np.eye(2),),
+        terms=(space.candidates[line].term(found.values[0]),),
+    )  # fmt: skip
+    accused = Judgement((0,), True, 0.0, (), {}, ())
+    whole = on_every_row(selection, accused, selection.observation, model)
+    _, decided = still_accused(whole, accused, HeldOut(whole), partial(refitted, model, False))
+    assert decided.accused == ((0,) if stays else ())
+    assert stays or dict(decided.withdrawn)[0].failed is Check.CONSTANT

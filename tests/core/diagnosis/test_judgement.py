@@ -28,6 +28,7 @@ from gapbridge.core.diagnosis.finding import (
 from gapbridge.core.diagnosis.held_out import HeldOut
 from gapbridge.core.diagnosis.judgement import Judgement, judge, pure_error, still_sure, ties_of
 from gapbridge.core.diagnosis.selection.problem import fit
+from gapbridge.core.diagnosis.selection.selection import Selection
 from gapbridge.core.effects import CATALOGUE, Site, Term
 from gapbridge.core.metrology import Metrology
 
@@ -239,8 +240,9 @@ def test_links_as_a_whole_stand_only_where_one_of_them_is_sure(monkeypatch, thir
     )
     found = SimpleNamespace(
         terms=terms, covariance=[np.eye(1), *[1e-8 * np.eye(3)] * 2], term_index=(7, 8, 9),
-        block=(8, 9), as_a_whole=lambda p: p > 0,
+        prior={8: None, 9: None}, block=(8, 9), observation=SimpleNamespace(channel="position"),
     )  # fmt: skip
+    found.judged_together = lambda positions: Selection.judged_together(found, positions)
     found.covariance[0] = found.covariance[0] * 1e-4
     monkeypatch.setattr(judging, "refitted_alone", lambda *_: found)
     given = Judgement((0, 1, 2), False, None, (), {}, ())

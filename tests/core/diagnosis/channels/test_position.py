@@ -7,6 +7,8 @@ import pytest
 import small_arm as small
 
 from gapbridge.bridge.document.diagnosis_json import document
+from gapbridge.core.diagnosis.channels.position import observe
+from gapbridge.core.effects import Site, Term
 from gapbridge.core.errors import LogError
 from gapbridge.core.metrology import Metrology
 from gapbridge.core.model import Model
@@ -46,6 +48,23 @@ def test_a_cause_is_named_with_its_joint_and_its_size(effect, registered):
     assert cause.shrink.interval[0] < cause.shrink.shrink < cause.shrink.interval[1]
     assert channel.remaining_rms_held_out < 1.2 * small.FLOOR
     assert channel.remaining_rms <= channel.remaining_rms_held_out < channel.gap_rms
+
+
+def test_a_remounted_tools_columns_are_those_of_the_arm_found():
+    """At the nominal arm they are off by as much as its zeros: a turn of the last joint stood."""
+    session, model = small.session_of(0), small.model_of()
+    log = small.log_of(session, small.readings(small.NOMINAL, session))
+    seen = observe(model, log, Metrology(sigma=small.SIGMA, remounted=True))
+    terms = (Term("joint_offset", Site(2), (0.05,)), Term("joint_offset", Site(3), (0.04,)))
+    there = seen.rebase(np.zeros(seen.nuisance.shape[2]), terms)
+    tool, h = there.nuisance[:, :, 6:9], 1e-6
+    for k in range(3):
+        step = np.zeros(seen.nuisance.shape[2])
+        step[6 + k] = h
+        moved = seen.rebase(step, terms)
+        slope = (moved.predict(terms) - there.predict(terms)) / h
+        assert np.abs(tool[:, :, k] - slope).max() < 1e-6
+    assert np.abs(tool - seen.nuisance[:, :, 6:9]).max() > 0.01
 
 
 @pytest.mark.parametrize("registered", [True, False])

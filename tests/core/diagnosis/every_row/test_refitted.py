@@ -16,15 +16,25 @@ from gapbridge.core.diagnosis.every_row.refitted import (
     with_uncertain_terms,
 )
 from gapbridge.core.diagnosis.held_out import HeldOut
-from gapbridge.core.diagnosis.judgement import VAGUE, judge
+from gapbridge.core.diagnosis.judgement import VAGUE, Judgement, judge
 
-ALONE = partial(refitted, small.model_of())
+ALONE = partial(refitted, small.model_of(), False)
 
 
 @pytest.fixture(scope="module")
 def searched():
     selection = small.diagnosed("backlash").channels[0].selection
     return selection, judge(selection, HeldOut(selection))
+
+
+def test_what_stays_beside_the_unknown_keeps_its_scatter_among_regions():
+    """One accusation falls: the others' intervals were those of white noise from then on."""
+    selection = small.diagnosed("cross_coupling").channels[0].selection
+    everything = tuple(range(len(selection.terms)))
+    white, _ = on_all(selection, Judgement(everything, True, 0.0, (), {}, ()))
+    beside = refitted(small.model_of(), True, white, everything)
+    for p in everything:
+        assert beside.covariance[p].item() > 1.5 * white.covariance[p].item()
 
 
 def on_all(selection, judgement):

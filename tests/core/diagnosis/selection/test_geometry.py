@@ -55,6 +55,28 @@ def test_links_that_pay_less_than_the_set_are_no_cause(singles):
     assert links == {}
 
 
+def test_joints_zeros_have_a_size_of_their_own(singles):
+    """An IRB 120's lengths are machined, its zeros are off by up to 35 mrad."""
+    space, _ = singles
+    block = geometry.link_candidates(space)
+    rng = np.random.default_rng(0)
+    times = {"link_geometry": 1.0, "joint_offset": 20.0}
+    found = []
+    for _ in range(20):
+        drawn = sum(
+            space.columns([c])[:, k] * rng.normal() * times[space.candidates[c].family]
+            * {"m": 5e-4, "rad": 1e-3}[p.unit]
+            for c in block
+            for k, p in enumerate(space.candidates[c].parameters)
+        )  # fmt: skip
+        sigma = geometry.prior(replace(space, y=drawn + rng.normal(size=len(space.y))), block, ())
+        found.append([max(max(sigma[c]) for c in block if space.candidates[c].family == family)
+                      / 1e-3 for family in times])  # fmt: skip
+    links, zeros = np.median(found, axis=0)
+    assert links <= 2.0
+    assert 8.0 <= zeros <= 32.0
+
+
 @pytest.mark.parametrize(("times", "least", "most"), [(1.0, 1.0, 2.0), (6.0, 4.0, 8.0)])
 def test_the_size_of_the_links_errors_is_the_most_likely_one(singles, times, least, most):
     space, _ = singles
