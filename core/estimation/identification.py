@@ -122,7 +122,9 @@ def identify_compliance(
 
     Each is weakly held at the model's own value, by ten usual flexibilities of an arm of this size;
     one that the data do not know better stays there exactly. None is below zero. Where the
-    metrology is not registered, frame and tool point are estimated along. Raises LogError where
+    metrology is not registered, frame and tool point are estimated along; so are links and joints'
+    zeros where the poses are likelier with them, unless a cell without them would then predict
+    unseen poses worse than ``model`` does. Raises LogError where
     needed columns are missing, ExcitationError where nothing in the log makes the joints bend.
     """
     metrology = metrology or Metrology()
@@ -131,15 +133,21 @@ def identify_compliance(
     require_excitation(model, data, metrology, prior[1])
     task = _Task(prior)
     before = fit_nuisances(model, data)
-    fit, shown = task.run(before, data)
-    beside = beside_geometry(fit, data)
-    if beside.geometry is not None:
-        fit, shown = task.run(beside, data)
-    inlier = fit.weights > 0
     # fits that lack some rows begin at the fit to all
     rest = replace(task, converged=NEAR, look=1)
-    held_out = _held_out(data, rest, (before, fit), inlier)
-    found = _result(model, data, used, (before, fit), shown, held_out)
+    fit, shown = task.run(before, data)
+    held_out, held = (UNSEEN, UNSEEN), False
+    beside = beside_geometry(fit, data)
+    if beside.geometry is not None:
+        other, other_shown = task.run(beside, data)
+        held_out = _held_out(data, rest, (before, other), other.weights > 0)
+        held = held_out[1] > held_out[0]  # the cell would be worse without the links found
+        if not held:
+            fit, shown = other, other_shown
+    inlier = fit.weights > 0
+    if fit.geometry is None:
+        held_out = _held_out(data, rest, (before, fit), inlier)
+    found = _result(model, data, used, (before, fit), shown, held_out, held)
     return replace(
         found,
         remaining_rms_new_region=_in_new_regions(data, rest, fit, inlier),
@@ -306,7 +314,7 @@ def _rms(gap: Array, spent: int = 0) -> float:
 
 def _result(
     model: Model, data: Data, used: NDArray[np.int64], fits: tuple[Fit, Fit],
-    shown: base_parameters.Shown, held_out: tuple[float, float],
+    shown: base_parameters.Shown, held_out: tuple[float, float], held: bool,
 ) -> Identification:  # fmt: skip
     n, kept = model.arm.n, shown.kept
     inlier = fits[1].weights > 0
@@ -320,7 +328,7 @@ def _result(
         after.model.tool_in_flange[:3, 3] - model.tool_in_flange[:3, 3], len(data.q),
         _rms(gaps[0], data.nuisances), _rms(gaps[1], data.nuisances + int(kept.sum())),
         *held_out, used[~inlier],
-        tuple(notes_of(after, kept, count, data.nuisances, known, fits[1].geometry)),
+        tuple(notes_of(after, kept, count, data.nuisances, known, fits[1].geometry, held)),
         tool_known=known,
     )  # fmt: skip
 
@@ -337,11 +345,12 @@ def tool_known(fit: Fit, data: Data, nominal: Model) -> bool:
 
 
 def notes_of(
-    fit: Fit, kept: Mask, outlier: int, nuisances: int, tool: bool, geometry: Geometry | None
-) -> list[str]:
+    fit: Fit, kept: Mask, outlier: int, nuisances: int, tool: bool, geometry: Geometry | None,
+    held: bool,
+) -> list[str]:  # fmt: skip
     """Return in words what a fit was like: outliers, bounds reached, what was not identifiable.
 
-    ``tool``: the tool point found is written.
+    ``tool``: the tool point found is written; ``held``: links are off, and were held nominal.
     """
     notes = []
     if outlier:
@@ -357,7 +366,13 @@ def notes_of(
     elif nuisances:
         written = "; the tool point is" if tool else " and are not"
         notes.append(f"frame and tool point were estimated along{written} written to the cell")
-    if geometry is not None and geometry.has_links:
+    if held:
+        notes.append(
+            "links or joints' zeros are off too; they were held nominal, since the cell without "
+            "them would be worse than it was, so that flexibilities make up for them in part: "
+            "diagnose names what holds"
+        )
+    elif geometry is not None and geometry.has_links:
         notes.append(
             "links and joints' zeros were estimated along (the poses are likelier with them); they "
             "are not written to the cell: diagnose names what of them holds"

@@ -177,7 +177,12 @@ def identify_streamed(
             found, geometry=beside.fit.geometry, shown=beside.widened(found.shown, prior[1])
         )
     emit("checking on held-out rows")
-    return _result(model, stream, before, found, _held_out(stream, task, before, found))
+    held_out = _held_out(stream, task, before, found)
+    held = beside is not None and held_out[1] > held_out[0]
+    if held:  # the cell would be worse without the links found
+        found = task.run(task.on_sample(before, stream), stream)
+        held_out = _held_out(stream, task, before, found)
+    return _result(model, stream, before, found, held_out, held)
 
 
 def _nuisances_alone(model: Model, rows: Data) -> Fit:
@@ -307,8 +312,9 @@ def _held_out(stream: Stream, task: _Task, before: Fit, found: _Found) -> tuple[
 
 
 def _result(
-    model: Model, stream: Stream, before: Fit, found: _Found, held_out: tuple[float, float]
-) -> Identification:
+    model: Model, stream: Stream, before: Fit, found: _Found, held_out: tuple[float, float],
+    held: bool,
+) -> Identification:  # fmt: skip
     n, shown, after = model.arm.n, found.shown, found.written(found.fit, stream.sample)
     kept = shown.kept
     # the last step is too small to be seen in what is left before it
@@ -332,6 +338,6 @@ def _result(
         shown.reported, after.frame,
         after.model.tool_in_flange[:3, 3] - model.tool_in_flange[:3, 3], stream.count,
         float(gap_rms), float(remaining_rms), *held_out, named,
-        tuple(notes_of(after, kept, count, stream.nuisances, known, found.geometry)),
+        tuple(notes_of(after, kept, count, stream.nuisances, known, found.geometry, held)),
         tool_known=known,
     )  # fmt: skip
