@@ -30,8 +30,7 @@ from gapbridge.bridge.demo.processes import ServedCell
 from gapbridge.core.log.mcap_reading import SUFFIX, read_columns
 from gapbridge.drivers.simulated.ur.settings import simulated_cell
 
-HOST, SEED = 11
-RATE = "127.78.0.5", 500.0
+HOST, RATE, SEED = "127.78.0.5", 500.0, 11
 CONVERGED = 5.0  # s of compensating before anything is counted
 PATIENCE = 240.0  # s until the daemon compensates
 PAYLOAD, COG = 5.0, (0.0, 0.0, 0.06)

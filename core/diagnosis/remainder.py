@@ -148,7 +148,8 @@ class _Beside:
             self._asked = asked
         value, spread, shown = self._values(accused, *self._beyond(accused, asked))
         found = [self._unit(accused), self.space.columns(self._first), self._zero(accused)]
-        alone = solve(np.hstack(found), self.space.y)
+        # what the rows leave open goes by these columns' own lengths: not to unit ones
+        alone = np.linalg.lstsq(np.hstack(found), self.space.y, rcond=1e-9)[0]
         begin = 0
         sigmas: list[float] = []
         steady: list[float] = []
