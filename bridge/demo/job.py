@@ -71,7 +71,9 @@ def _job(
     planned = plan(cell.model, link.home, seed, scene)
     log = _calibrate(link, session, planned, out, console)
     found = identify_compliance(cell.model, read_log(log, cell.arm.n), cell.metrology)
-    save_cell(cell, out / "calibrated.yaml", found.written)
+    # the flexibilities alone: the diagnosis is to find what else is wrong, the bent tool with it
+    flexible = cell.model.with_compliance(found.axial, found.radial)
+    save_cell(cell, out / "calibrated.yaml", flexible)
     calibrated = load_cell(out / "calibrated.yaml")
     console.print(
         f"fitted on {found.samples} poses: gap in space {3**0.5 * found.gap_rms * 1e3:.3f} mm rms "
@@ -111,7 +113,8 @@ def _fit_again(log: Path, explained: Cell, out: Path) -> Cell:
     found = identify_compliance(
         explained.model, read_log(log, explained.arm.n), explained.metrology
     )
-    save_cell(explained, out / "corrected.yaml", found.model)
+    flexible = explained.model.with_compliance(found.axial, found.radial)
+    save_cell(explained, out / "corrected.yaml", flexible)
     return load_cell(out / "corrected.yaml")
 
 

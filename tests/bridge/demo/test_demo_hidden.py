@@ -92,8 +92,9 @@ def test_what_is_hidden_is_named_on_every_link(tmp_path: Path, name: str, seed: 
     plant, path = plant_of(link), tmp_path / "calibration.csv"
     write_log(path, measured(link, plant), link.reports_joints)
     log = read_log(path, link.cell.arm.n)
-    fitted = identify_compliance(link.cell.model, log, link.cell.metrology).model
-    save_cell(link.cell, tmp_path / "calibrated.yaml", fitted)
+    fitted = identify_compliance(link.cell.model, log, link.cell.metrology)
+    flexible = link.cell.model.with_compliance(fitted.axial, fitted.radial)
+    save_cell(link.cell, tmp_path / "calibrated.yaml", flexible)
     calibrated = load_cell(tmp_path / "calibrated.yaml")
     causes = [c for ch in diagnose(calibrated.model, log, calibrated.metrology).channels
               for c in ch.causes]  # fmt: skip
