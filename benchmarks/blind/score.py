@@ -197,7 +197,7 @@ def _known(label: Label, claims: tuple[Claim, ...], causes: list[dict[str, Any]]
         return Verdict("right", (), joints, _needless(truth, claims, causes, hidden))
     more = (
         named - label.effects
-    )  # at one joint alone it may stand for an effect of others, as a tie
+    )  # at one joint alone it may be named for an effect of others, as a tie
     tied = all(label.effects & {*(c.get("indistinguishable_from") or [])}
                for c in causes if c["effect"] in more)  # fmt: skip
     if (named > label.effects and not tied) or not _same_data(truth, claims, hidden):

@@ -30,18 +30,9 @@ NEGLIGIBLE = 1e-3  # of its parameters' usual sizes: the tail of a servo is a de
 STAND_IN_GAIN = 0.02  # lower end of a stand-in's held-out gain, in regions that its fit did not see
 HEAVIEST = 3.0  # times the largest declared payload (or the rated one): a load is not off by more
 # Geometry as a whole
-LENGTH, ANGLE = 5e-4, 1e-3  # m, rad: 1 sigma of machining and assembly
-TIMES_MACHINED = (1.0, 2.0, 4.0, 8.0)  # times these, the most likely: a WAM's grid and a UR5's say
-# 4, the Motoman cube 8; at 1 the WAM is pulled to nominal by as much as it gains
-TIMES_SET = (
-    1.0,
-    2.0,
-    4.0,
-    8.0,
-    16.0,
-    32.0,
-)  # the same of joints' zeros, which are set: an IRB 120's
-# lengths are machined (1), its zeros 7 to 35 mrad off
+# (sizes of machining, which a fit needs too: core/estimation/geometry.py)
+TIMES_SET = tuple(2.0**k for k in range(6))  # times an angle of machining, of joints' zeros, which
+# are set: an IRB 120's lengths are machined (1), its zeros 7 to 35 mrad off
 FEW_LINKS = 3  # joints with a first moment, friction or zero singly, from which all are tried: four
 # logs of a UR10e then agree on what is there, and one moves from 1.07 to 0.97 of base parameters;
 # or with a flexibility: in 33 rows of a soft arm links were accused that do not bend

@@ -50,7 +50,9 @@ def fit(logs: tuple[Path, ...], cell: Path, remounted: bool, out: Path) -> None:
     cell, and are reported. If the instrument is not registered, its frame and the tool point are
     estimated too; the tool point is written where the log determines it (not with --remounted).
     Where the poses are likelier with them, so are links and joints' zeros (or a registered cell's
-    tool point alone, which is written): no flexibility stands for them, and diagnose names them.
+    tool point alone, which is written): no flexibility makes up for them, and diagnose names them.
+    Links are not written; where the cell would then predict unseen poses worse, they are held
+    nominal.
     Declines, with the reason, if nothing in the log excites the compliance. A log of more than
     20,000 rows, or a recording of the daemon (.mcap), is read in pieces, so that memory does not
     grow with it. Several logs (or a column session in one) are sessions: each has its own

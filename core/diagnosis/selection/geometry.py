@@ -23,18 +23,16 @@ from numpy.typing import NDArray
 
 from gapbridge.core.diagnosis.criteria import (
     ACCUSATION_PENALTY,
-    ANGLE,
     FEW_LINKS,
-    LENGTH,
     MIN_GEOMETRIC_CAUSES,
     OWN_SIGMAS,
-    TIMES_MACHINED,
     TIMES_SET,
 )
 from gapbridge.core.diagnosis.selection.candidate import Candidate
 from gapbridge.core.diagnosis.selection.local_search import pruned
 from gapbridge.core.diagnosis.selection.problem import CandidateFit, SampleSpace, fit
 from gapbridge.core.diagnosis.selection.search import part, screened_search
+from gapbridge.core.estimation.geometry import ANGLE, LENGTH, TIMES_MACHINED
 from gapbridge.core.estimation.least_squares import solve
 
 Array = NDArray[np.float64]
