@@ -95,10 +95,15 @@ def test_a_failure_counts_unless_the_machine_was_late_and_the_test_in_real_time(
 
 
 def test_how_long_a_process_has_had_and_waited_for_a_core_is_the_kernels_count() -> None:
-    before, all_cores = core_time(), os.sched_getaffinity(0)
+    all_cores = os.sched_getaffinity(0)
     os.sched_setaffinity(0, {min(all_cores)})
-    others = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(3)]
+    spinning = [sys.executable, "-S", "-E", "-c", "print(flush=True)\nwhile True: pass"]
+    others = [subprocess.Popen(spinning, stdout=subprocess.PIPE) for _ in range(3)]
     try:
+        for other in others:
+            assert other.stdout is not None
+            other.stdout.readline()  # it has begun
+        before = core_time()
         until = time.process_time() + 0.3
         while time.process_time() < until:
             pass
@@ -106,7 +111,7 @@ def test_how_long_a_process_has_had_and_waited_for_a_core_is_the_kernels_count()
         os.sched_setaffinity(0, all_cores)
         for other in others:
             other.kill()
-            other.wait()
+            other.communicate()
     ran, waited = (now - then for now, then in zip(core_time(), before, strict=True))
     assert 0.3 < ran < 0.6
     assert waited > ran

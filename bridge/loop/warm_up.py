@@ -14,12 +14,17 @@ from gapbridge.bridge.loop.setpoint_stream import NominalStream
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.compensation import Compensator, correct
 from gapbridge.core.dynamics import with_pieces
+from gapbridge.core.effects import CATALOGUE
+from gapbridge.core.effects.effect import Effect, Term
 from gapbridge.core.estimation.pose_jacobian import pose_columns
 from gapbridge.core.kernels.factor import factor_blocks
+from gapbridge.core.kernels.interpolation import lagged, played
+from gapbridge.core.kernels.rates import of_rows
 from gapbridge.core.limits import Limiter, Limits
 from gapbridge.core.log.log import Log
 from gapbridge.core.model import Model
 from gapbridge.core.motion import motion_of
+from gapbridge.drivers.gate import Gate
 from gapbridge.drivers.offset_inverse import Nominal
 
 N = 6
@@ -42,7 +47,14 @@ def _one_row() -> None:
     model.predict(Q).rotation_vector  # noqa: B018 (compiled when asked for)
     model.linear_form(Q)
     corrected = correct(model, Q)  # many rows, and one in the loop
+    correct(model, 0.0 * Q)  # a singularity, which the blocks leave
     Compensator(model).correct(Q[0])
+    looking = next(e for e in CATALOGUE.values() if type(e).condition is not Effect.condition)
+    site = looking.sites(model.arm)[0]
+    values = (0.0,) * len(looking.parameters(model.arm, site))
+    of_angles = model.with_terms([Term(looking.identifier, site, values)])
+    Compensator(of_angles).correct(Q[0])  # an effect that looks at the joint angles
+    Gate(500.0, model, True)
     Nominal(model)
     NominalStream(np.ones(N))
     limits = Limits(np.full(N, -7.0), np.full(N, 7.0), np.full(N, 3.0))
@@ -52,12 +64,16 @@ def _one_row() -> None:
 
 
 def _blocks_of_rows() -> None:
-    """Call what logs need: blocks of rows, their Jacobians, rigid dynamics."""
+    """Call what logs need: blocks of rows, their Jacobians, rigid dynamics, signals in time."""
     model = _model()
     model.predict(FOUR).rotation_vector  # noqa: B018 (compiled when asked for)
     model.linear_form(FOUR)
     with_pieces(model, motion_of(Log("", {"actual_q": Q}, N)))
     pose_columns(model, FOUR, None, [(0, 0)], np.array([1e-9]))
+    of_rows(N)
+    time = np.array([0.0, 0.002, 0.004, 0.006])
+    lagged(time, time, 0.1, 0.0)
+    played(time, 0.1, 0.0)
     gap, factor = np.zeros((1, 3)), np.zeros((2 * N + 1, 2 * N + 1))
     factor_blocks(model.chain(), model.rows(Q), gap, gap, 0, 0, 1, factor)
 

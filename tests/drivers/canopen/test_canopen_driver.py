@@ -76,7 +76,10 @@ def test_connecting_reading_and_closing_enable_nothing_and_move_nothing(arm: Dri
             settled(driver)
         assert phases(arm) == {Phase.SWITCH_ON_DISABLED}
     assert arm.controller.q == start
-    assert all(drive.nmt.state == "PRE-OPERATIONAL" for drive in arm.server.drives)
+    wait_for(
+        lambda: all(drive.nmt.state == "PRE-OPERATIONAL" for drive in arm.server.drives),
+        1.0, "the drives' answer to NMT",
+    )  # fmt: skip
 
 
 def test_arming_holds_the_arm_where_it_stands(arm: DriveArm) -> None:
