@@ -137,20 +137,19 @@ def still_accused(
 def _sure(selection: Selection, judgement: Judgement, alone: Alone) -> tuple[Selection, Judgement]:
     """Return what stays: values of three sigmas, of what was vague on some rows of many.
 
-    Of the links, accused as a whole, one term at least has to be sure.
+    Of the links, accused as a whole, one term at least has to be sure. The weakest goes first, by
+    its own evidence: of two that can stand for each other the one with more of it is judged last.
     """
     accused, withdrawn = list(judgement.accused), list(judgement.withdrawn)
     least = dict.fromkeys(judgement.vague, (SIGMAS / OWN_SIGMAS) ** 2)
     while True:
-        sure = {
-            p: worth(selection.terms[p], selection.covariance[p]) / least.get(p, 1.0)
-            for p in accused
-        }
-        weakest = min(
-            selection.judged_together(accused),
-            key=lambda kind: max(sure[p] for p in kind), default=(),
-        )  # fmt: skip
-        if not weakest or max(sure[p] for p in weakest) >= 1:
+        sure = {p: worth(selection.terms[p], selection.covariance[p]) for p in accused}
+        unsure = [
+            kind for kind in selection.judged_together(accused)
+            if max(sure[p] / least.get(p, 1.0) for p in kind) < 1
+        ]  # fmt: skip
+        weakest = min(unsure, key=lambda kind: max(sure[p] for p in kind), default=())
+        if not weakest:
             return selection, replace(judgement, accused=tuple(accused), withdrawn=tuple(withdrawn))
         accused = [p for p in accused if p not in weakest]
         withdrawn += [(p, VAGUE) for p in weakest]
