@@ -1,18 +1,19 @@
-"""What several commands share: arguments, and how a log is read for a cell."""
+"""What several commands share: arguments, and how a log is read for a cell.
+
+What reads cells and logs is imported when it is called: ``status`` and ``--help`` read none.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
-from gapbridge.bridge.cell import Cell, load_cell
-from gapbridge.bridge.cell.opened_log import open_log
-from gapbridge.bridge.document.log_findings import log_finding_text
-from gapbridge.core.fitted_range import Outside
-from gapbridge.core.log.log import Log
-from gapbridge.core.sessions import join_sessions
+if TYPE_CHECKING:
+    from gapbridge.bridge.cell import Cell
+    from gapbridge.core.log.log import Log
 
 FILE = click.Path(path_type=Path)
 log_argument = click.argument("log", type=FILE)
@@ -34,6 +35,8 @@ csv_option = click.option(
 
 def open_cell(path: Path) -> Cell:
     """Return a cell; its warnings go to stderr."""
+    from gapbridge.bridge.cell import load_cell
+
     cell = load_cell(path)
     for warning in cell.warnings:
         click.echo(f"warning: {warning}", err=True)
@@ -45,6 +48,9 @@ def open_logs(paths: Sequence[Path], cell: Cell) -> Log:
 
     Raises LogError as ``open_log`` does, and where the sessions do not belong together.
     """
+    from gapbridge.bridge.cell.opened_log import open_log
+    from gapbridge.core.sessions import join_sessions
+
     return join_sessions([open_log(path, cell) for path in paths], cell.model)
 
 
@@ -59,6 +65,9 @@ def warn_outside(log: Log, cell: Cell) -> None:
 
 def looked_over(pieces: Iterable[Log], cell: Cell) -> Iterator[Log]:
     """Yield the pieces of a log, then print what ``warn_outside`` does of all of them."""
+    from gapbridge.bridge.document.log_findings import log_finding_text
+    from gapbridge.core.fitted_range import Outside
+
     found, path = Outside(cell.fitted_range), ""
     for piece in pieces:
         found.add(piece)

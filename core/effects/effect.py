@@ -10,18 +10,17 @@ prediction.
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
-import numpy as np
-
-from gapbridge.core.arrays import Array
 from gapbridge.core.effects.simulator import Kind, SimulatorChange
 
 if TYPE_CHECKING:
     from gapbridge.core.arm import Arm
+    from gapbridge.core.arrays import Array
     from gapbridge.core.kernels.rates import ChainRate
     from gapbridge.core.kernels.reference import Chain, Rows
     from gapbridge.core.loads import Loads
@@ -37,8 +36,8 @@ class Parameter:
     name: str  # one word, '' where the effect's own name says it
     unit: str
     scale: float  # a usual size, for steps, priors and scaling
-    lower: float = -np.inf
-    upper: float = np.inf
+    lower: float = -math.inf
+    upper: float = math.inf
     of_rotation: bool = False  # True: shows only where the instrument measures rotations too
 
 
@@ -201,7 +200,7 @@ class Effect(ABC):
         for k, parameter in enumerate(self.parameters(arm, term.site)):
             std = None
             if covariance is not None and k < len(covariance):  # the rest was not fitted
-                std = float(np.sqrt(max(covariance[k, k], 0.0)))
+                std = math.sqrt(max(covariance[k, k], 0.0))
             lines.append(
                 Reported(self.label(term.site, parameter), term.values[k], std, parameter.unit)
             )
@@ -274,13 +273,15 @@ def typical_moment(arm: Arm, joint: int = 0) -> float:
     Of the whole arm with 0. Scales parameters, so that solvers see numbers near one, and says what
     is beyond any arm's size.
     """
+    import numpy as np
+
     reach = float(np.linalg.norm(arm.link_in_link[joint:, :3, 3], axis=1).sum())
     mass = float(arm.mass[max(joint - 1, 0) :].sum())
-    payload = arm.payload if np.isfinite(arm.payload) else 5.0
+    payload = arm.payload if math.isfinite(arm.payload) else 5.0
     return max(9.81 * (mass / 3 + payload) * max(reach, 0.1) / 2, 1.0)
 
 
 def joint_scale(arm: Arm, site: Site) -> float:
     """Return a usual torque (Nm) of a joint: its rated effort, or what the arm's weight makes."""
     effort = float(arm.limits.effort[site.index])
-    return effort if np.isfinite(effort) and effort > 0 else typical_moment(arm)
+    return effort if math.isfinite(effort) and effort > 0 else typical_moment(arm)

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, ClassVar
 
-import numpy as np
-
-from gapbridge.core.arrays import Array
 from gapbridge.core.effects.effect import Effect, Parameter, Site, Term
 from gapbridge.core.effects.simulator import Kind, SimulatorChange, along_axes
 
 if TYPE_CHECKING:
     from gapbridge.core.arm import Arm
+    from gapbridge.core.arrays import Array
     from gapbridge.core.kernels.reference import Rows
     from gapbridge.core.loads import Loads
     from gapbridge.core.motion import Motion
@@ -57,6 +55,8 @@ class PayloadCog(Effect):
 
     def sense(self, term: Term, arm: Arm, wrench: Array, motion: Motion) -> Array:
         """Add what the load does more to the sensor from there."""
+        import numpy as np
+
         assert motion.pieces is not None
         _, moved = motion.pieces.payload_from(np.array(term.values))
         there = moved - motion.pieces.payload_wrench
@@ -64,6 +64,8 @@ class PayloadCog(Effect):
 
     def drive(self, term: Term, arm: Arm, torque: Array, motion: Motion) -> Array:
         """Add what holds and moves the load more from there."""
+        import numpy as np
+
         assert motion.pieces is not None
         moved, _ = motion.pieces.payload_from(np.array(term.values))
         there = moved - motion.pieces.payload_torque

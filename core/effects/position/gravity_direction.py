@@ -4,10 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from gapbridge.core.effects.effect import Effect, Parameter, Site, Term
-from gapbridge.core.rotation import left_jacobian, rotation_matrix
 
 if TYPE_CHECKING:
     from gapbridge.core.arm import Arm
@@ -36,11 +33,19 @@ class GravityDirection(Effect):
 
     def shape(self, term: Term, arm: Arm, chain: Chain) -> None:
         """Turn gravity."""
+        import numpy as np
+
+        from gapbridge.core.rotation import rotation_matrix
+
         turn = rotation_matrix(np.array([term.values[0], term.values[1], 0.0]))
         chain.gravity[:] = turn @ chain.gravity
 
     def shape_rate(self, term: Term, arm: Arm, chain: Chain, value: int, rate: ChainRate) -> bool:
         """Write how gravity turns."""
+        import numpy as np
+
+        from gapbridge.core.rotation import left_jacobian
+
         turn = left_jacobian(np.array([term.values[0], term.values[1], 0.0]))[:, value]
         rate.gravity[:] = np.cross(turn, chain.gravity)
         return True

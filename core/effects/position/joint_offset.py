@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-import numpy as np
-
-from gapbridge.core.arrays import Array
 from gapbridge.core.effects.effect import JointEffect, Parameter, Site, Term
 from gapbridge.core.effects.simulator import Kind
 
 if TYPE_CHECKING:
     from gapbridge.core.arm import Arm
+    from gapbridge.core.arrays import Array
     from gapbridge.core.kernels.reference import Rows
     from gapbridge.core.loads import Loads
 
@@ -42,6 +40,8 @@ class JointOffset(JointEffect):
 
     def angle_columns(self, site: Site, q: Array) -> Array:
         """Return ones: the same turn at every angle."""
+        import numpy as np
+
         return np.ones((len(q), 1))
 
     def condition(self, term: Term, arm: Arm, rows: Rows, loads: Loads, q: Array) -> None:

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from gapbridge.core.effects.effect import Effect, Parameter, Site, Term, typical_moment
 
 if TYPE_CHECKING:
@@ -32,11 +30,15 @@ class LinkFlexibility(Effect):
 
     def sites(self, arm: Arm) -> tuple[Site, ...]:
         """Return the links between two joints that have a length."""
+        import numpy as np
+
         length = np.linalg.norm(arm.link_in_link[1 : arm.n, :3, 3], axis=1)
         return tuple(Site(joint=i + 1) for i in range(arm.n - 1) if length[i] > 1e-6)
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return 1/EI."""
+        import numpy as np
+
         assert site.joint is not None
         length = max(float(np.linalg.norm(arm.link_in_link[site.joint, :3, 3])), 0.01)
         return (Parameter("", "1/(N m2)", 1e-3 / (typical_moment(arm) * length), 0.0),)

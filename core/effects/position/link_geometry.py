@@ -5,14 +5,11 @@ from __future__ import annotations
 from functools import lru_cache
 from typing import TYPE_CHECKING, NamedTuple
 
-import numpy as np
-
-from gapbridge.core.arrays import Array
 from gapbridge.core.effects.effect import Effect, Parameter, Site, Term
-from gapbridge.core.rotation import one_rotation_matrix
 
 if TYPE_CHECKING:
     from gapbridge.core.arm import Arm
+    from gapbridge.core.arrays import Array
     from gapbridge.core.kernels.rates import ChainRate
     from gapbridge.core.kernels.reference import Chain
 
@@ -38,6 +35,8 @@ def link_form(arm: Arm, joint: int) -> LinkForm:
 @lru_cache(maxsize=256)  # a fit asks for the few links of one arm thousands of times
 def _form(link: bytes) -> LinkForm:
     """Return the form of a link from the bytes of its transform (4, 4)."""
+    import numpy as np
+
     step = np.frombuffer(link).reshape(4, 4)
     z, next_z, p = np.array([0, 0, 1.0]), step[:3, 2], step[:3, 3]
     sine = float(np.hypot(next_z[0], next_z[1]))
@@ -92,6 +91,8 @@ class LinkGeometry(Effect):
 
     def shape(self, term: Term, arm: Arm, chain: Chain) -> None:
         """Move and twist the next joint's frame."""
+        from gapbridge.core.rotation import one_rotation_matrix
+
         joint = term.site.joint
         assert joint is not None
         form = link_form(arm, joint)
@@ -106,6 +107,10 @@ class LinkGeometry(Effect):
 
     def shape_rate(self, term: Term, arm: Arm, chain: Chain, value: int, rate: ChainRate) -> bool:
         """Write the way along z or the common normal, or the turn about it or across."""
+        import numpy as np
+
+        from gapbridge.core.rotation import one_rotation_matrix
+
         assert term.site.joint is not None
         form, link = link_form(arm, term.site.joint), rate.link[term.site.joint]
         if value == 0:

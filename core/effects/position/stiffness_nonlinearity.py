@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
-import numpy as np
-
-from gapbridge.core.arrays import Array
 from gapbridge.core.effects.effect import (
     JointEffect,
     Parameter,
@@ -18,6 +16,7 @@ from gapbridge.core.effects.effect import (
 
 if TYPE_CHECKING:
     from gapbridge.core.arm import Arm
+    from gapbridge.core.arrays import Array
     from gapbridge.core.kernels.rates import ChainRate
     from gapbridge.core.kernels.reference import Chain
 
@@ -67,12 +66,12 @@ class StiffnessNonlinearity(JointEffect):
     def reported(self, arm: Arm, term: Term, covariance: Array | None) -> tuple[Reported, ...]:
         """Return c and M0."""
         c, softening = term.values
-        moment = float(1 / np.sqrt(softening)) if softening > 0 else float("inf")
+        moment = 1 / math.sqrt(softening) if softening > 0 else float("inf")
         spread: list[float | None] = [None, None]
         if covariance is not None:
-            derivative = 0.5 * moment**3 if np.isfinite(moment) else float("inf")
-            deviation = np.sqrt(np.maximum(np.diag(covariance), 0))
-            spread = [float(deviation[0]), float(deviation[1] * derivative)]
+            derivative = 0.5 * moment**3 if math.isfinite(moment) else float("inf")
+            deviation = [math.sqrt(max(v, 0.0)) for v in covariance.diagonal()]
+            spread = [deviation[0], deviation[1] * derivative]
         base = f"{self.identifier}_{term.site.joint}"
         return (
             Reported(f"{base}_compliance", c, spread[0], "rad/Nm"),

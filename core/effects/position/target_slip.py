@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, ClassVar
 
-import numpy as np
-
-from gapbridge.core.arrays import Array
 from gapbridge.core.effects.effect import Effect, Parameter, Site, Term, rows_after
 
 if TYPE_CHECKING:
     from gapbridge.core.arm import Arm
+    from gapbridge.core.arrays import Array
     from gapbridge.core.kernels.reference import Chain
     from gapbridge.core.loads import Loads
 
@@ -58,6 +56,8 @@ class TargetSlip(Effect):
         loads: Loads,
     ) -> None:
         """Put the TCP back in the rows before the slip."""
+        import numpy as np
+
         if loads.time is None:
             return
         rows = ~rows_after(term, loads)

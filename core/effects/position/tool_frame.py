@@ -4,10 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from gapbridge.core.effects.effect import Effect, Parameter, Site, Term
-from gapbridge.core.rotation import left_jacobian, one_rotation_matrix
 
 if TYPE_CHECKING:
     from gapbridge.core.arm import Arm
@@ -41,12 +38,20 @@ class ToolFrame(Effect):
 
     def shape(self, term: Term, arm: Arm, chain: Chain) -> None:
         """Move the TCP."""
+        import numpy as np
+
+        from gapbridge.core.rotation import one_rotation_matrix
+
         chain.tool_position[:] += term.values[:3]
         turn = one_rotation_matrix(np.array(term.values[3:]))
         chain.tool_rotation[:] = turn @ chain.tool_rotation
 
     def shape_rate(self, term: Term, arm: Arm, chain: Chain, value: int, rate: ChainRate) -> bool:
         """Write the shift, or the turn."""
+        import numpy as np
+
+        from gapbridge.core.rotation import left_jacobian
+
         if value < 3:
             rate.tool[value] = 1.0
         else:

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-import numpy as np
-
-from gapbridge.core.arrays import Array
 from gapbridge.core.effects.effect import JointEffect, Parameter, Reported, Site, Term
 
 if TYPE_CHECKING:
     from gapbridge.core.arm import Arm
+    from gapbridge.core.arrays import Array
     from gapbridge.core.kernels.reference import Rows
     from gapbridge.core.loads import Loads
 
@@ -43,6 +41,8 @@ class TransmissionError(JointEffect):
 
     def angle_columns(self, site: Site, q: Array) -> Array:
         """Return sine and cosine of the angle times the order."""
+        import numpy as np
+
         assert site.order is not None
         return np.stack([np.sin(site.order * q), np.cos(site.order * q)], axis=-1)
 
@@ -54,6 +54,8 @@ class TransmissionError(JointEffect):
 
     def reported(self, arm: Arm, term: Term, covariance: Array | None) -> tuple[Reported, ...]:
         """Return order, amplitude and phase of amplitude sin(order q + phase)."""
+        import numpy as np
+
         sine, cosine = term.values
         amplitude = float(np.hypot(sine, cosine))
         spread: list[float | None] = [None, None]

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
-import numpy as np
-
-from gapbridge.core.arrays import Array
 from gapbridge.core.effects.effect import Parameter, Site, Term, TorqueEffect, joint_scale
 from gapbridge.core.effects.simulator import Kind
 
 if TYPE_CHECKING:
     from gapbridge.core.arm import Arm
+    from gapbridge.core.arrays import Array
     from gapbridge.core.motion import Motion
 
 
@@ -34,7 +33,7 @@ class CoulombFriction(TorqueEffect):
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return the torque."""
-        return (Parameter("", "Nm", 0.03 * joint_scale(arm, site), 0.0, np.inf),)
+        return (Parameter("", "Nm", 0.03 * joint_scale(arm, site), 0.0, math.inf),)
 
     def added(self, term: Term, i: int, motion: Motion) -> Array:
         """Return the friction that the motor overcomes."""

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, ClassVar
 
-import numpy as np
-
-from gapbridge.core.arrays import Array
 from gapbridge.core.effects.effect import JointEffect, Parameter, Site, Term, typical_moment
 from gapbridge.core.effects.simulator import Kind, SimulatorChange, along_axes
 
 if TYPE_CHECKING:
     from gapbridge.core.arm import Arm
+    from gapbridge.core.arrays import Array
     from gapbridge.core.motion import Motion
 
 
@@ -48,6 +46,8 @@ class LinkCog(JointEffect):
 
     def simulator(self, term: Term, arm: Arm) -> tuple[SimulatorChange, ...]:
         """Return it in a simulator's terms."""
+        import numpy as np
+
         assert term.site.joint is not None
         i, moment = term.site.index, np.array(term.values)
         in_joint = moment if arm.body_axes is None else arm.body_axes[i] @ moment
@@ -55,6 +55,8 @@ class LinkCog(JointEffect):
 
     def drive(self, term: Term, arm: Arm, torque: Array, motion: Motion) -> Array:
         """Add what holds and moves the first moment."""
+        import numpy as np
+
         assert motion.pieces is not None
         i, moment = term.site.index, np.array(term.values)
         in_link = moment if arm.body_axes is None else arm.body_axes[i] @ moment

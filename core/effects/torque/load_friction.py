@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, ClassVar
 
-import numpy as np
-
-from gapbridge.core.arrays import Array
 from gapbridge.core.effects.effect import Parameter, Site, Term, TorqueEffect
 
 if TYPE_CHECKING:
     from gapbridge.core.arm import Arm
+    from gapbridge.core.arrays import Array
     from gapbridge.core.motion import Motion
 
 
@@ -39,5 +37,7 @@ class LoadFriction(TorqueEffect):
 
     def added(self, term: Term, i: int, motion: Motion) -> Array:
         """Return the friction that the motor overcomes."""
+        import numpy as np
+
         assert motion.load is not None
         return term.values[0] * np.abs(motion.load[:, i]) * motion.direction[:, i]

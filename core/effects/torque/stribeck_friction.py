@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, ClassVar
 
-import numpy as np
-
-from gapbridge.core.arrays import Array
 from gapbridge.core.effects.effect import Parameter, Site, Term, TorqueEffect, joint_scale
 
 if TYPE_CHECKING:
     from gapbridge.core.arm import Arm
+    from gapbridge.core.arrays import Array
     from gapbridge.core.motion import Motion
 
 SLOWEST = 1e-4  # rad/s
@@ -32,17 +31,19 @@ class StribeckFriction(TorqueEffect):
     motion = "the joint moved both ways, slowly and fast"
     alike: ClassVar = {"coulomb_friction": "motion at one low speed"}
     instead = "friction by speed in the control loop, or the simulator's actuator"
-    shapes = tuple(float(v) for v in np.geomspace(4e-3, 0.6, 9))
+    shapes = tuple(4e-3 * 150 ** (i / 8) for i in range(9))  # rad/s
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return the torque at standstill above Coulomb's, and the speed at which it is gone."""
         return (
-            Parameter("", "Nm", 0.03 * joint_scale(arm, site), 0.0, np.inf),
+            Parameter("", "Nm", 0.03 * joint_scale(arm, site), 0.0, math.inf),
             Parameter("velocity", "rad/s", 0.05, 0.0, 10.0),
         )
 
     def added(self, term: Term, i: int, motion: Motion) -> Array:
         """Return the friction that the motor overcomes."""
+        import numpy as np
+
         speed = max(abs(term.values[1]), SLOWEST)
         fading = np.exp(-((motion.qd[:, i] / speed) ** 2))
         return term.values[0] * fading * motion.direction[:, i]

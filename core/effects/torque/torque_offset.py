@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, ClassVar
 
-import numpy as np
-
-from gapbridge.core.arrays import Array
 from gapbridge.core.effects.effect import Parameter, Site, Term, TorqueEffect, joint_scale
 
 if TYPE_CHECKING:
     from gapbridge.core.arm import Arm
+    from gapbridge.core.arrays import Array
     from gapbridge.core.motion import Motion
 
 
@@ -42,4 +40,6 @@ class TorqueOffset(TorqueEffect):
 
     def added(self, term: Term, i: int, motion: Motion) -> Array:
         """Return the offset."""
+        import numpy as np
+
         return np.full(len(motion.q), term.values[0])

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from gapbridge.core.arrays import Array
 from gapbridge.core.effects.effect import Parameter, ServoEffect, Site, Term
 from gapbridge.core.effects.simulator import Kind
 
 if TYPE_CHECKING:
     from gapbridge.core.arm import Arm
+    from gapbridge.core.arrays import Array
 
 
 class Latency(ServoEffect):

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-import numpy as np
-
-from gapbridge.core.arrays import Array
 from gapbridge.core.effects.effect import Effect, Parameter, Site, Term
 
 if TYPE_CHECKING:
     from gapbridge.core.arm import Arm
+    from gapbridge.core.arrays import Array
     from gapbridge.core.motion import Motion
 
 
@@ -45,4 +43,6 @@ class FtBias(Effect):
 
     def sense(self, term: Term, arm: Arm, wrench: Array, motion: Motion) -> Array:
         """Add the constant."""
+        import numpy as np
+
         return np.asarray(wrench + np.array(term.values))

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
-import numpy as np
-
-from gapbridge.core.arrays import Array
 from gapbridge.core.effects.effect import Effect, Parameter, Site, Term
 from gapbridge.core.effects.simulator import Kind, SimulatorChange, along_axes
-from gapbridge.core.rotation import rotation_matrix
 
 if TYPE_CHECKING:
     from gapbridge.core.arm import Arm
+    from gapbridge.core.arrays import Array
     from gapbridge.core.motion import Motion
 
 
@@ -37,7 +35,7 @@ class FtMisalignment(Effect):
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return the rotation vector of the sensor in the flange."""
-        return tuple(Parameter(axis, "rad", 0.01, -np.pi, np.pi) for axis in ("rx", "ry", "rz"))
+        return tuple(Parameter(axis, "rad", 0.01, -math.pi, math.pi) for axis in ("rx", "ry", "rz"))
 
     def simulator(self, term: Term, arm: Arm) -> tuple[SimulatorChange, ...]:
         """Return it in a simulator's terms."""
@@ -45,5 +43,9 @@ class FtMisalignment(Effect):
 
     def sense(self, term: Term, arm: Arm, wrench: Array, motion: Motion) -> Array:
         """Express the wrench in the sensor's own axes."""
+        import numpy as np
+
+        from gapbridge.core.rotation import rotation_matrix
+
         R = rotation_matrix(np.array(term.values))
         return np.concatenate([wrench[:, :3] @ R, wrench[:, 3:] @ R], axis=1)
