@@ -35,11 +35,11 @@ HERE = Path(__file__).parent
 if str(HERE) not in sys.path:
     sys.path.insert(0, str(HERE))
 
-from lateness import HOPELESS, LIMIT, Witness, core_time  # noqa: E402
+from lateness import HOPELESS, LIMIT, Witness, core_time, core_times  # noqa: E402
 from realtime import NICE, WAITING, is_realtime  # noqa: E402
 
 WITNESS = Witness()
-HAD = pytest.StashKey[tuple[float, float]]()  # s that this process ran and waited, before a test
+HAD = pytest.StashKey[dict[str, tuple[float, float]]]()  # s that threads had, before a test
 MADE: dict[pytest.FixtureDef[Any], tuple[float, float]] = {}  # s since 1970: begun, ended
 
 
@@ -76,7 +76,7 @@ def pytest_fixture_setup(fixturedef: pytest.FixtureDef[Any]) -> Iterator[None]:
 @pytest.hookimpl(hookwrapper=True, tryfirst=True)
 def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
     """Note what this process has had of the cores before a test."""
-    item.stash[HAD] = core_time()
+    item.stash[HAD] = core_times()
     yield
 
 
@@ -106,7 +106,7 @@ def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) ->
     if not report.failed or item.get_closest_marker("realtime") is None:
         return
     late = worst_of(item, call.start, call.stop)
-    ran, waited = (now - before for now, before in zip(core_time(), item.stash[HAD], strict=True))
+    ran, waited = core_time(item.stash[HAD])
     if late > LIMIT:
         why = (
             f"this machine woke a process {1e3 * late:.0f} ms late meanwhile, at most "

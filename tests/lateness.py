@@ -1,4 +1,4 @@
-"""How late this machine wakes a process that waits: measured beside the tests in real time."""
+"""How late this machine wakes what waits: measured beside the tests in real time."""
 
 from __future__ import annotations
 
@@ -16,24 +16,29 @@ LIMIT = 0.040  # s: what a state may be old (docs/reliability.md); a machine so 
 PROBE = 0.1  # s that it is watched before a test
 HOPELESS = 0.2  # s: so late within the probe, a test need not begin
 _WATCH = f"""
-import mmap, os, signal, struct, sys, time
+import mmap, os, select, signal, struct, sys, time, tty
 parent = os.getppid()
 cores = sorted(os.sched_getaffinity(0))
-shared = mmap.mmap(int(sys.argv[1]), 8 * len(cores))
-slot = 0
-for k, core in enumerate(cores[1:], 1):
+shared = mmap.mmap(int(sys.argv[1]), 8 * (len(cores) + 1))
+slot, first = 0, os.getpid()
+for k in range(1, len(cores) + 1):
     if os.fork() == 0:
-        cores[0], parent, slot = core, os.getppid(), k
+        parent, slot = first, k  # ends, too, where the first has ended by now
         break
 def ended(*_):
     if os.waitpid(-1, os.WNOHANG)[0]:  # not one that is only stopped
         os._exit(1)
 if slot == 0:
     signal.signal(signal.SIGCHLD, ended)
-try:
-    os.sched_setaffinity(0, cores[:1])
-except OSError:
-    pass
+terminal = None
+if slot == len(cores):
+    terminal = os.openpty()
+    tty.setraw(terminal[1])
+else:
+    try:
+        os.sched_setaffinity(0, cores[slot : slot + 1])
+    except OSError:
+        pass
 os.set_blocking(1, False)
 due = time.time() + {EVERY}
 struct.pack_into("d", shared, 8 * slot, due)
@@ -41,6 +46,10 @@ try:
     os.write(1, b"\\n")
     while os.getppid() == parent:
         time.sleep({EVERY})
+        if terminal:
+            os.write(terminal[0], b"x")
+            select.select(terminal[1:], [], [])
+            os.read(terminal[1], 1)
         now = time.time()
         if now - due > {NOTED}:
             try:
@@ -55,13 +64,25 @@ os._exit(0)
 """
 
 
-def core_time() -> tuple[float, float]:
-    """Return how long the threads of this process have run and have waited for a core, s."""
-    ran, waited = 0.0, 0.0
+def core_times() -> dict[str, tuple[float, float]]:
+    """Return how long each thread of this process has run and has waited for a core, s."""
+    found = {}
     for thread in os.listdir("/proc/self/task"):
         with contextlib.suppress(OSError), open(f"/proc/self/task/{thread}/schedstat") as file:
-            parts = file.read().split()
-            ran, waited = ran + 1e-9 * int(parts[0]), waited + 1e-9 * int(parts[1])
+            ran, waited, _ = file.read().split()
+            found[thread] = (1e-9 * int(ran), 1e-9 * int(waited))
+    return found
+
+
+def core_time(since: dict[str, tuple[float, float]]) -> tuple[float, float]:
+    """Return how long the threads that there are have run and waited since then, s.
+
+    What has ended meanwhile has taken its counts with it.
+    """
+    ran, waited = 0.0, 0.0
+    for thread, now in core_times().items():
+        before = since.get(thread, (0.0, 0.0))
+        ran, waited = ran + now[0] - before[0], waited + now[1] - before[1]
     return ran, waited
 
 
@@ -69,13 +90,15 @@ class Witness:
     """Processes that only sleep, one on each core, and note when they were woken late.
 
     A host may stop one of a virtual machine's cores while the others run: what slept on another
-    would not notice. They are as important as this process. When each is due stands in memory that
+    would not notice. One more hands bytes to itself over a pseudo-terminal, which a thread of the
+    kernel carries: on a busy machine it waits for a core, too, while no process is woken late. They
+    are as important as this process. When each is due stands in memory that
     is shared: one that has not been woken yet is as late as it is overdue.
     """
 
     def __init__(self) -> None:
         self._process: subprocess.Popen[bytes] | None = None
-        self._due: mmap.mmap | None = None  # one double a core, s since 1970
+        self._due: mmap.mmap | None = None  # one double a watcher, s since 1970
         self._rest = b""
         self._late: list[tuple[float, float]] = []  # s since 1970: due; s: how late
 
@@ -83,18 +106,21 @@ class Witness:
         """Begin to watch, and return when each core is watched; may be repeated."""
         if self._process is not None:
             return
-        cores = len(os.sched_getaffinity(0))
+        watchers = len(os.sched_getaffinity(0)) + 1
         shared = os.memfd_create("lateness")
         try:
-            os.ftruncate(shared, 8 * cores)
-            self._due = mmap.mmap(shared, 8 * cores)
+            os.ftruncate(shared, 8 * watchers)
+            self._due = mmap.mmap(shared, 8 * watchers)
             command = [sys.executable, "-S", "-E", "-c", _WATCH, str(shared)]
             self._process = subprocess.Popen(command, stdout=subprocess.PIPE, pass_fds=[shared])
         finally:
             os.close(shared)
         assert self._process.stdout is not None
-        for _ in range(cores):
-            assert os.read(self._process.stdout.fileno(), 1) == b"\n", "a watcher has ended"
+        watching = 0
+        while watching < watchers:  # those that watch already may have noted something
+            data = os.read(self._process.stdout.fileno(), 65536)
+            assert data, "a watcher has ended"
+            watching += self._take(data)
         os.set_blocking(self._process.stdout.fileno(), False)
 
     def worst(self, since: float, until: float) -> float:
@@ -127,13 +153,17 @@ class Witness:
             return
         with contextlib.suppress(BlockingIOError):
             while data := os.read(self._process.stdout.fileno(), 65536):
-                self._rest += data
-        *lines, self._rest = self._rest.split(b"\n")
+                self._take(data)
+
+    def _take(self, data: bytes) -> int:
+        """Keep what the watchers wrote; return how many began to watch: an empty line each."""
+        *lines, self._rest = (self._rest + data).split(b"\n")
         for line in lines:
             with contextlib.suppress(ValueError):  # an attacker writes into every pipe it finds
                 due, late = map(float, line.split())
                 self._late.append((due, late))
         del self._late[:-10_000]
+        return lines.count(b"")
 
     def stop(self) -> None:
         """End it."""
