@@ -30,7 +30,7 @@ from benchmarks.calibration.laid_out import (
     lay_out,
     readings_of,
 )
-from gapbridge.core.calibration.budget.budget import Stated, budget
+from gapbridge.core.calibration.budget.budget import budget
 from gapbridge.core.calibration.fit import fit_session, judged
 from gapbridge.core.calibration.identifiability import identifiable_parameters
 from gapbridge.core.calibration.observables import make_observable
@@ -66,7 +66,7 @@ def run(arm: str, repeats: str, seed: int) -> Outcome:
     readings = readings_of(real, lay_out(kind, layout, rng), instrument, rng)
     metrology = Metrology(True, layout.sigma)
     found = judged(model, fit_session(readings, parameters, metrology), diagnose=False)
-    given = budget(found, Stated())
+    given = budget(found)
     # the arm alone: it comes to rest as it repeats, seen by an instrument without noise
     visits = lay_out(kind, replace(layout, held_out=AWAY), rng)
     there = readings_of(real, visits, replace(instrument, sigma=0.0), rng)

@@ -9,7 +9,8 @@ import numpy as np
 
 from gapbridge.bridge.calibration.report.facts import SessionFacts
 from gapbridge.core.arrays import Array
-from gapbridge.core.calibration.budget.budget import Budget, Stated, budget, outlier_readings
+from gapbridge.core.calibration.budget.budget import Budget, budget
+from gapbridge.core.calibration.budget.inputs import outlier_readings
 from gapbridge.core.calibration.budget.pose_accuracy import KINDS, PoseAccuracy, pose_accuracies
 from gapbridge.core.calibration.plan import Plan
 from gapbridge.core.calibration.result import Calibration, Errors
@@ -89,7 +90,7 @@ class Material:
     @cached_property
     def budget(self) -> Budget:
         """Return the uncertainty budget."""
-        return budget(self.calibration, Stated())
+        return budget(self.calibration)
 
     @cached_property
     def tip(self) -> Array:

@@ -16,15 +16,11 @@ from scipy.special import bdtr, stdtr, stdtrit
 
 from gapbridge.core.calibration.budget.inputs import (
     Input,
-    Stated,
-    instrument_error,
     model_remainder,
     outlier_readings,
     parameters_of_model,
-    payload_mass,
     reading_noise,
     repeatability_of_arm,
-    temperature_growth,
 )
 from gapbridge.core.calibration.budget.pose_accuracy import KINDS
 from gapbridge.core.calibration.budget.sensitivity import Sensitivities, sensitivities
@@ -48,7 +44,6 @@ class Budget:
     inside: int  # of the held-out coordinates looked at, those whose error is within the bound
     looked_at: int  # 0: none were held out, or they do not show the TCP's place
     bound: float  # m: k times combined uncertainty and measurement of one reading
-    missing: tuple[str, ...]  # inputs that nobody has stated, in words
 
     @property
     def expanded(self) -> float:
@@ -82,30 +77,21 @@ class Budget:
         return LENGTH_95 * self.combined
 
 
-def budget(calibration: Calibration, stated: Stated) -> Budget:
+def budget(calibration: Calibration) -> Budget:
     """Return the budget of a calibration."""
     reading = reading_noise(calibration)
     repeatability = repeatability_of_arm(calibration, reading)
     behind = sensitivities(calibration)
-    found = [parameters_of_model(calibration, behind), repeatability]
-    found.append(model_remainder(calibration, found[0].std, np.hypot(repeatability.std, reading)))
-    missing = []
-    for part, description in (
-        (instrument_error(stated), "largest permissible error of the instrument"),
-        (temperature_growth(calibration, stated), "temperature of the air during the session"),
-        (payload_mass(calibration, stated), "how well the masses of the loads are known"),
-    ):
-        if part is None:
-            missing.append(description)
-        else:
-            found.append(part)
-    combined = float(np.sqrt(sum(i.contribution**2 for i in found)))
-    freedom = _effective(found, combined)
+    parameters = parameters_of_model(calibration, behind)
+    scatter = float(np.hypot(repeatability.std, reading))
+    remainder = model_remainder(calibration, parameters.std, scatter)
+    inputs = (parameters, repeatability, remainder)
+    combined = float(np.sqrt(sum(i.std**2 for i in inputs)))
     bound = COVERAGE * float(np.hypot(combined, reading))
     errors = _looked_at(calibration)
     return Budget(
-        tuple(found), combined, freedom, behind, int((errors <= bound).sum()),
-        len(errors), bound, tuple(missing),
+        inputs, combined, _effective(inputs, combined), behind, int((errors <= bound).sum()),
+        len(errors), bound,
     )  # fmt: skip
 
 
@@ -120,13 +106,10 @@ def _looked_at(calibration: Calibration) -> Array:
     return np.abs(held.vector[~np.isin(held.rows, outlier_readings(calibration))]).ravel()
 
 
-def _effective(inputs: list[Input], combined: float) -> float:
-    weight = sum(i.contribution**4 / i.freedom for i in inputs if np.isfinite(i.freedom))
+def _effective(inputs: tuple[Input, ...], combined: float) -> float:
+    weight = sum(i.std**4 / i.freedom for i in inputs)
     return float(combined**4 / weight) if weight > 0 else float("inf")
 
 
 def _coverage(freedom: float) -> float:
     return float(1 - 2 * stdtr(freedom if np.isfinite(freedom) else 1e9, -COVERAGE))
-
-
-__all__ = ["Budget", "Input", "Stated", "budget", "outlier_readings"]

@@ -35,10 +35,25 @@ from gapbridge.bridge.report.labels import (
     unit_of,
     with_unit,
 )
-from gapbridge.core.calibration.budget.budget import Budget, Input
+from gapbridge.core.calibration.budget.budget import Budget
+from gapbridge.core.calibration.budget.inputs import Basis, Input
 from gapbridge.core.calibration.budget.sensitivity import Sensitivities, Sensitivity
 
+REPEATABILITY = "repeatability of the arm"
+UNEXPLAINED = "what the model does not explain"
+INPUTS = {
+    Basis.COVARIANCE: ("parameters of the model", "covariance of {0} parameters from {1} "
+                       "coordinates, carried to the tool"),
+    Basis.REPEATS: (REPEATABILITY, "poses visited again: {0}, with {1} readings"),
+    Basis.FIT_SCATTER: (REPEATABILITY, "too few repeats: scatter of the fit without the "
+                        "instrument's share"),
+    Basis.HELD_OUT: (UNEXPLAINED, "{0} coordinates of the held-out poses"),
+    Basis.FITTED: (UNEXPLAINED, "{0} coordinates of the fitted poses (none were held out)"),
+}  # fmt: skip
 OUTSIDE = (
+    "the largest permissible error of the instrument",
+    "the temperature of the air during the session",
+    "how well the masses of the loads are known",
     "where the robot's base stands in the hall: everything here is seen from the base",
     "changes after this session: wear, a collision, a tool that was taken off and put on again",
 )
@@ -106,15 +121,25 @@ def uncertainty_budget(material: Material) -> list[Block]:
     """Return the result, the budget, its check, what stands behind it and what is not in it."""
     given = material.budget
     blocks: list[Block] = [Paragraph(_result(given)), _table(given)]
-    blocks.append(Bullets(tuple(f"{i.name}: {i.source}" for i in given.inputs)))
+    blocks.append(Bullets(tuple(f"{INPUTS[i.basis][0]}: {_source(i)}" for i in given.inputs)))
     blocks.append(Paragraph(_factor(given)))
     if given.looked_at:
         blocks += [Heading("Check against the poses kept out of the fit"),
                    Paragraph(_check(given))]  # fmt: skip
     if given.parameters is not None:
         blocks += _behind(given.parameters)
-    missing = tuple(f"{name}: nobody has stated it" for name in given.missing)
-    return [*blocks, Heading("Not in the budget"), Bullets((*missing, *OUTSIDE))]
+    return [*blocks, Heading("Not in the budget"), Bullets(OUTSIDE)]
+
+
+def _source(i: Input) -> str:
+    """Return where the figure of an input is from."""
+    text = INPUTS[i.basis][1].format(*i.values)
+    if i.basis not in (Basis.HELD_OUT, Basis.FITTED):
+        return text
+    outliers = ", ".join(str(row + 1) for row in i.values[1])
+    without = f", without outliers (reading {outliers})" if outliers else ""
+    beyond = "what is" if i.std else "nothing found"
+    return f"{text}{without}: {beyond} beyond the lines above"
 
 
 def _result(given: Budget) -> str:
@@ -128,23 +153,18 @@ def _result(given: Budget) -> str:
 
 def _table(given: Budget) -> Table:
     rows: list[list[Cell]] = [_row(i, given.combined) for i in given.inputs]
-    rows.append(["combined standard uncertainty", "", "", "", "", _freedom(given.freedom),
-                 fine(given.combined), ""])  # fmt: skip
     rows.append(
-        ["expanded uncertainty, k\u00a0=\u00a02", "", "", "", "", "", fine(given.expanded), ""]
+        ["combined standard uncertainty", fine(given.combined), _freedom(given.freedom), ""]
     )
-    heads = ("input", "type", "distribution", "standard uncertainty", "sensitivity",
-             "degrees of freedom", "contribution", "share")  # fmt: skip
-    return Table(heads, rows, (2.5, 0.55, 1.15, 1.15, 1.25, 0.95, 1.15, 1.2), (3, 4, 5, 6), sums=2)
+    rows.append(["expanded uncertainty, k\u00a0=\u00a02", fine(given.expanded), "", ""])
+    heads = ("input", "standard uncertainty", "degrees of freedom", "share")
+    return Table(heads, rows, (2.5, 1.3, 1.3, 1.5), (1, 2), sums=2)
 
 
 def _row(i: Input, combined: float) -> list[Cell]:
-    share = (i.contribution / combined) ** 2 if combined else 0.0
-    own = i.unit == "m"
+    share = (i.std / combined) ** 2 if combined else 0.0
     return [
-        i.name, i.kind, i.distribution, fine(i.std) if own else f"{number(i.std, 2)} {i.unit}",
-        "1" if own else f"{number(i.sensitivity * 1e3, 2)} mm/{i.unit}", _freedom(i.freedom),
-        fine(i.contribution), Bar(share, f"{share * 100:.0f} %"),
+        INPUTS[i.basis][0], fine(i.std), _freedom(i.freedom), Bar(share, f"{share * 100:.0f} %")
     ]  # fmt: skip
 
 
@@ -154,8 +174,8 @@ def _freedom(freedom: float) -> str:
 
 def _factor(given: Budget) -> str:
     text = (
-        "Type A comes from the readings of this session, type B from data sheets, certificates "
-        "and what people stated. The instrument's noise is in the scatter from which type A is "
+        "All inputs are of type A, from the readings of this session, with normal distributions "
+        "and a sensitivity of 1. The instrument's noise is in the scatter from which they are "
         "made, and not counted again."
     )
     if math.isfinite(given.freedom):

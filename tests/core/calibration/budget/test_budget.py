@@ -7,7 +7,8 @@ import pytest
 from hand_made import hand_made
 from scipy.stats import t as student
 
-from gapbridge.core.calibration.budget.budget import Stated, budget
+from gapbridge.core.calibration.budget.budget import budget
+from gapbridge.core.calibration.budget.inputs import Basis
 from gapbridge.core.calibration.budget.sensitivity import sensitivities
 from gapbridge.core.calibration.result import Estimate
 from gapbridge.core.effects import Site, Term
@@ -23,67 +24,46 @@ def session(scatter=0.0, seed=0, **given):
     return hand_made(error, held_out=HELD, **given)
 
 
-def named(found, name):
-    return next(i for i in found.inputs if i.name.startswith(name))
+def part(found, *bases):
+    return next(i for i in found.inputs if i.basis in bases)
 
 
-def test_inputs_combine_in_squares_with_their_sensitivities():
-    found = budget(session(), Stated(error=17.32 * UM, temperature_range=2.0))
+def test_inputs_combine_in_squares():
+    found = budget(session())
     # 30 um in 3D is 30/sqrt(3) along an axis; scatter of 20 um less the instrument's 10 um
     parameters, arm = 30 / np.sqrt(3), np.sqrt(20**2 - 10**2)
-    reach = np.sqrt(np.mean(session().model.predict(session().readings.q).position ** 2))
-    warmth = 1.0 / np.sqrt(3) * 23e-6 * reach / UM
-    expected = np.sqrt(parameters**2 + arm**2 + (17.32 / np.sqrt(3)) ** 2 + warmth**2)
-    assert found.combined / UM == pytest.approx(expected, rel=1e-6)
+    assert found.combined / UM == pytest.approx(np.hypot(parameters, arm), rel=1e-6)
     assert found.expanded == pytest.approx(2 * found.combined)
 
 
-def test_type_a_is_what_was_read_and_type_b_what_was_stated():
-    found = budget(session(), Stated(error=1e-5, temperature_range=1.0, payload_error=0.1))
-    kinds = {i.name: (i.kind, np.isfinite(i.freedom)) for i in found.inputs}
-    assert len(kinds) == 6
-    assert all(kind == ("A" if finite else "B") for kind, finite in kinds.values())
-    assert found.missing == ()
-
-
-def test_what_nobody_states_is_named_and_counts_nothing():
-    found = budget(session(), Stated())
-    assert len(found.missing) == 3
-    assert {i.kind for i in found.inputs} == {"A"}
-
-
 def test_effective_freedom_is_of_welch_and_satterthwaite():
-    found = budget(session(), Stated(error=1e-5))
-    rule = found.combined**4 / sum(
-        i.contribution**4 / i.freedom for i in found.inputs if i.contribution
-    )
+    found = budget(session())
+    rule = found.combined**4 / sum(i.std**4 / i.freedom for i in found.inputs if i.std)
     assert found.freedom == pytest.approx(rule)
     assert found.coverage == pytest.approx(1 - 2 * student.sf(2, found.freedom))
     assert 2 * student.sf(found.needed_factor, found.freedom) == pytest.approx(0.0455)
 
 
 def test_few_readings_ask_for_a_larger_factor():
-    few = budget(session(freedom=4.0, tcp_std=np.full(10, 2e-4)), Stated())
+    few = budget(session(freedom=4.0, tcp_std=np.full(10, 2e-4)))
     assert few.freedom < 5
     assert few.needed_factor > 2.5
     assert few.coverage < 0.9
 
 
 def test_enough_repeats_show_the_arms_scatter_by_themselves():
-    alone = budget(session(repeatability=7e-6), Stated())
-    repeated = budget(
-        session(repeatability=7e-6, pose=[0, 0, 0, 1, 1, 1, 2, 2, 2, *range(3, 24)]), Stated()
-    )
-    assert named(alone, "repeatability").std == pytest.approx(np.sqrt(3) * 1e-5)
-    assert named(repeated, "repeatability").std == 7e-6
-    assert named(repeated, "repeatability").freedom == 3 * 6
+    alone = budget(session(repeatability=7e-6))
+    repeated = budget(session(repeatability=7e-6, pose=[0, 0, 0, 1, 1, 1, 2, 2, 2, *range(3, 24)]))
+    assert part(alone, Basis.FIT_SCATTER).std == pytest.approx(np.sqrt(3) * 1e-5)
+    assert part(repeated, Basis.REPEATS).std == 7e-6
+    assert part(repeated, Basis.REPEATS).freedom == 3 * 6
 
 
 def test_what_held_out_poses_show_beyond_the_rest_is_an_input():
-    inlier = budget(session(scatter=2e-5), Stated())
-    off = budget(session(scatter=2e-4), Stated())
-    assert named(inlier, "what the model").std < 1e-5
-    left = named(off, "what the model").std
+    inlier = budget(session(scatter=2e-5))
+    off = budget(session(scatter=2e-4))
+    assert part(inlier, Basis.HELD_OUT).std < 1e-5
+    left = part(off, Basis.HELD_OUT).std
     assert left == pytest.approx(2e-4, rel=0.25)
     assert off.inside / off.looked_at > 0.85
     assert not off.doubtful
@@ -94,32 +74,17 @@ def test_one_blunder_is_named_and_no_uncertainty():
     held = good.held_out_after.vector.copy()
     held[4] += 3e-3
     error = np.vstack([good.after.vector, held])
-    found = budget(hand_made(error, held_out=HELD), Stated())
+    found = budget(hand_made(error, held_out=HELD))
     assert found.combined < 1e-4
-    assert "without outliers (reading 25)" in named(found, "what the model").source
+    assert part(found, Basis.HELD_OUT).values == (27, (24,))
     assert found.looked_at == 27
 
 
 def test_errors_far_beyond_an_honest_budget_are_doubtful():
-    found = budget(session(scatter=2e-5), Stated())
+    found = budget(session(scatter=2e-5))
     small = replace(found, inside=15)
     assert not found.doubtful
     assert small.doubtful
-
-
-def test_a_load_counts_by_how_far_it_bends_the_arm():
-    soft = session()
-    bending = soft.model.with_terms((Term("axial_compliance", Site(2), (2e-5,)),))
-    soft = replace(soft, model=bending)
-    part = named(budget(soft, Stated(payload_error=0.3)), "mass of the load")
-    q = soft.readings.q[:1]
-    tip = [bending.predict(q, loads(m)).position[0] for m in (0.0, 0.2)]
-    slope = np.sqrt(np.mean(((tip[1] - tip[0]) / 0.2) ** 2))
-    assert part.contribution == pytest.approx(slope * 0.3 / np.sqrt(3), rel=1e-3)
-
-
-def loads(mass):
-    return Loads(payload_mass=np.array([mass]))
 
 
 ESTIMATES = (Estimate("joint_offset_2", 0.0, 1e-5, "rad"),
@@ -152,10 +117,10 @@ def test_names_of_no_effect_have_no_sensitivities():
     strange = (Estimate("something_else", 0.0, 1e-5, "m"),)
     c = session(estimates=strange, covariance=np.eye(1))
     assert sensitivities(c) is None
-    assert budget(c, Stated()).parameters is None
+    assert budget(c).parameters is None
 
 
 def test_closures_are_no_check_of_the_tools_place():
-    found = budget(session(scatter=2e-5, kind="sphere"), Stated())
+    found = budget(session(scatter=2e-5, kind="sphere"))
     assert found.looked_at == 0
     assert not found.doubtful
