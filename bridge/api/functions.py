@@ -73,6 +73,7 @@ def fit(cell: Cell, log: Log, *, remounted: bool = False) -> Fitted:
     """
     from gapbridge.bridge.api.found_spread import fit_intervals
     from gapbridge.bridge.cell.log_fit import pose_findings
+    from gapbridge.bridge.document.notes import note_texts
     from gapbridge.core.estimation.identification import (
         identify_compliance,  # predict need not wait for it
     )
@@ -86,7 +87,8 @@ def fit(cell: Cell, log: Log, *, remounted: bool = False) -> Fitted:
         std_radial=found.std_radial, shown=found.identifiable, samples=found.samples,
         gap_rms=found.gap_rms, remaining_rms=found.remaining_rms,
         remaining_rms_held_out=held_out if math.isfinite(held_out) else None,
-        notes=(*pose_findings(cell, log), *found.notes, *found.combinations), provenance=fitted(
+        notes=(*pose_findings(cell, log), *note_texts((*found.notes, *found.combinations))),
+        provenance=fitted(
             _origin(cell, log), range_of(log),
             Spread.of_fit(found.identifiable, found.covariance).beside(cell.spread),
             cell.intervals | fit_intervals(found),

@@ -27,6 +27,7 @@ from gapbridge.bridge.document.blocks import (
 )
 from gapbridge.bridge.document.drawing import AFTER, BEFORE, EDGE, INK, Drawing
 from gapbridge.bridge.document.html import html
+from gapbridge.bridge.document.notes import note_texts
 from gapbridge.bridge.document.provenance import origin_blocks, origin_line
 
 NEXT_STEPS = (
@@ -131,7 +132,7 @@ def _flexibilities(result: Result) -> list[Block]:
             chart.column(i + shift, v, colour, 0.36)
             chart.line([i + shift] * 2, [max(v - 2 * s, 0.0), v + 2 * s], INK)
     chart.legend([(name, colour) for name, _, _, _, colour, _ in kinds])
-    notes = (*found.notes, *found.combinations)
+    notes = note_texts((*found.notes, *found.combinations))
     heads = ("joint", "axial, µrad/Nm", "radial, µrad/Nm")
     return [
         Pictures((chart.drawing,)), Table(heads, cells, (0.5, 1, 1)),

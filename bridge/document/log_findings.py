@@ -76,6 +76,7 @@ TEXTS = {
     "take the gap from {1:.3g mm} to {2:.3g mm} on poses that their fit did not see: fit "
     "first, then diagnose what is left",
 }
+WAYS = 8  # between stops, that are named
 READINGS = {
     "measured_position": "measured position",
     "measured_rotation": "measured rotation",
@@ -96,7 +97,21 @@ class _Formatter(Formatter):
     def format_field(self, value: Any, format_spec: str) -> str:
         match format_spec:
             case "":
-                return ", ".join(map(str, value)) if isinstance(value, tuple) else str(value)
+                several = isinstance(value, (tuple, list))  # a list where it was read from JSON
+                return ", ".join(map(str, value)) if several else str(value)
+            case "and":
+                return " and ".join(value)
+            case "place":
+                return " and ".join((*value, "where instrument or target stand"))
+            case "kg":
+                return ", ".join(f"{mass:g} kg" for mass in value)
+            case "members":
+                return " ".join(f"{share:+.2f} {name}" for share, name in value)
+            case "shares":
+                return ", ".join(f"{name} ({100 * share:.0f} %)" for name, share in value)
+            case "ways":
+                more = f" and {len(value) - WAYS} more" if len(value) > WAYS else ""
+                return ", ".join(f"{a} to {b}" for a, b in value[:WAYS]) + more
             case "finding":
                 return log_finding_text(value)
             case "columns":

@@ -64,7 +64,6 @@ def document_of(calibration: Calibration, sigma: float = float("nan")) -> dict[s
         "rms": _plain(errors.rms),
         "held_out": held,
         "complete": calibration.complete,
-        "verdict": calibration.verdict,
     }
 
 

@@ -22,11 +22,12 @@ from gapbridge.core.calibration.problem import Problem
 from gapbridge.core.calibration.readings import Readings
 from gapbridge.core.calibration.result import Calibration, Errors, Estimate
 from gapbridge.core.calibration.staging import at_odds
-from gapbridge.core.calibration.summary import combinations, notes_of, remaining_of, verdict_of
+from gapbridge.core.calibration.summary import combinations, notes_of, remaining_of
 from gapbridge.core.diagnosis.diagnosis import Diagnosis
 from gapbridge.core.errors import ExcitationError
 from gapbridge.core.metrology import Metrology
 from gapbridge.core.model import Model
+from gapbridge.core.notes import Note, Reason
 
 Array = NDArray[np.float64]
 Progress = Callable[[str], None]
@@ -44,7 +45,7 @@ class SessionFit:
     readings: Readings  # all, those held out too
     problem: Problem
     rest: ConvergedFit
-    notes: tuple[str, ...]
+    notes: tuple[Note, ...]
     missing: tuple[MissingEffect, ...]  # further effects that the fitted poses support
 
     def estimates(self, expected: Expectation | None = None) -> tuple[Estimate, ...]:
@@ -110,7 +111,6 @@ def judged(
     complete = rest.converged and remainder.is_consistent and not missing
     complete = complete and (diagnosis is None or diagnosis.verdict == "no_gap")
     remaining = remaining_of(remainder, diagnosis, complete, missing, rest.converged)
-    floor = _floor(diagnosis)
     notes = (*fit.notes, *notes_of(problem, rest, remainder, odds, estimates))
     return Calibration(
         model=found, nominal=model, readings=readings, estimates=estimates,
@@ -123,11 +123,11 @@ def judged(
         stations=rest.nuisance.stations,
         tcp_std=tcp_deviation(parameters, rest, readings[readings.held_out]),
         diagnosis=diagnosis, complete=complete,
-        verdict=verdict_of(errors, rest, floor, complete, remaining), notes=notes,
+        remaining=remaining, notes=notes,
         instrument_noise=rest.noise.instrument, turn_noise=_turn_noise(how, rest.noise),
         joint_noise=rest.noise.joint, freedom=rest.freedom,
         whole_covariance=rest.covariance, missing_effects=tuple(effect.name for effect in missing),
-        remaining=remaining, noise_floor=floor,
+        noise_floor=_floor(diagnosis),
     )  # fmt: skip
 
 
@@ -142,7 +142,7 @@ def _floor(diagnosis: Diagnosis | None) -> float:
     return float("nan") if not floors or floors[0] is None else float(floors[0])
 
 
-def _with_places(readings: Readings, how: Observable) -> tuple[Readings, tuple[str, ...]]:
+def _with_places(readings: Readings, how: Observable) -> tuple[Readings, tuple[Note, ...]]:
     """Return the readings with those to verify fitted where too few others determine their place.
 
     Where an instrument stands, or a target sits, only readings there can say; and a note of it.
@@ -159,10 +159,7 @@ def _with_places(readings: Readings, how: Observable) -> tuple[Readings, tuple[s
                 alone |= held & (place == one)
     if not alone.any():
         return readings, ()
-    note = (
-        f"{int(alone.sum())} reading(s) to verify were fitted: too few others determine where "
-        "their instrument stands, or their target sits"
-    )
+    note = Note(Reason.VERIFYING_FITTED, (int(alone.sum()),))
     return replace(readings, held_out=held & ~alone), (note,)
 
 

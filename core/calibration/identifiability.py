@@ -29,6 +29,7 @@ from gapbridge.core.calibration.readings import Readings
 from gapbridge.core.effects import CATALOGUE
 from gapbridge.core.loads import Loads
 from gapbridge.core.model import Model
+from gapbridge.core.notes import Note, Reason
 
 Array = NDArray[np.float64]
 POSES = 120
@@ -70,10 +71,10 @@ def identifiable_parameters(
             kept.append(i)
             base.append(left / size)
         elif whole <= limit:
-            reasons.append(f"{parameters.names[i]}: nothing that is hung or read here shows it")
+            reasons.append(Note(Reason.NEVER_SHOWN, (parameters.names[i],)))
         else:
             names = [parameters.names[k] for k in kept]
-            reasons.append(f"{parameters.names[i]}: {_stand_in(J[:, i], F, J[:, kept], names)}")
+            reasons.append(_redundant(parameters.names[i], J[:, i], F, J[:, kept], names))
     return parameters.part(sorted(kept), tuple(reasons))
 
 
@@ -102,16 +103,17 @@ def _columns(
     return J, F
 
 
-def _stand_in(column: Array, F: Array, J: Array, names: list[str]) -> str:
-    """Return what acts like one parameter: others (columns J), and where the instrument stands."""
+def _redundant(name: str, column: Array, F: Array, J: Array, names: list[str]) -> Note:
+    """Return what acts like parameter ``name``: others (columns J), the instrument's place."""
     every = np.hstack([F, J])
     share = np.linalg.lstsq(every, column, rcond=1e-9)[0]
     reach = np.abs(share[F.shape[1] :]) * np.linalg.norm(J, axis=0) / np.linalg.norm(column)
-    stand = [names[k] for k in np.argsort(-reach)[:3] if reach[k] > MEMBER]
+    stand = tuple(names[k] for k in np.argsort(-reach)[:3] if reach[k] > MEMBER)
     if F.shape[1]:
         fixed = np.linalg.norm(F @ share[: F.shape[1]]) / np.linalg.norm(column)
-        stand += ["where instrument or target stand"] if fixed > MEMBER else []
-    return f"the same as {' and '.join(stand)}; what it adds is found there"
+        if fixed > MEMBER:
+            return Note(Reason.REDUNDANT_WITH_PLACE, (name, stand))
+    return Note(Reason.REDUNDANT, (name, stand))
 
 
 def _anywhere(

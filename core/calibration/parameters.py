@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from gapbridge.core.effects import CATALOGUE, Site, Term, effect_named
 from gapbridge.core.errors import InputError
 from gapbridge.core.model import Model
+from gapbridge.core.notes import Note
 
 Array = NDArray[np.float64]
 DEFAULT = tuple(  # what a calibration looks for that names no effects; earlier ones come first
@@ -37,7 +38,7 @@ class Parameters:
     lower: Array  # (p,) bounds; the whole flexibility, the nominal model's with it, is 0 or more
     upper: Array  # (p,)
     begin: Array  # (p,) where a fit begins, and where plans are made
-    redundant: tuple[str, ...] = ()  # in words: what was left out, and what stands for it
+    redundant: tuple[Note, ...] = ()  # what was left out, and what stands for it
 
     @classmethod
     def every(cls, model: Model, effects: Sequence[str] = DEFAULT) -> Parameters:
@@ -66,7 +67,7 @@ class Parameters:
         """Return the number of parameters (p)."""
         return len(self.names)
 
-    def part(self, kept: Sequence[int], redundant: tuple[str, ...] = ()) -> Parameters:
+    def part(self, kept: Sequence[int], redundant: tuple[Note, ...] = ()) -> Parameters:
         """Return the parameters ``kept``; ``redundant``: the others, and what stands for them."""
         rows = list(kept)
         return replace(

@@ -19,6 +19,7 @@ from gapbridge.core.estimation.robust import robust_fit
 from gapbridge.core.log.log import Log
 from gapbridge.core.model import Model
 from gapbridge.core.motion import Motion, motion_of
+from gapbridge.core.notes import Note, Reason
 
 Array = NDArray[np.float64]
 AXES = ("fx", "fy", "fz", "mx", "my", "mz")
@@ -41,8 +42,7 @@ class PayloadCalibration:
     noise: tuple[float, float]  # N and Nm, 1 sigma of one axis of one reading
     residual: Array  # (N, 6) reading minus prediction
     outliers: NDArray[np.int64]  # readings down-weighted as outlier
-    verdict: str  # one sentence
-    notes: tuple[str, ...]
+    notes: tuple[Note, ...]
 
     def applied(self, model: Model) -> Model:
         """Return the model that carries this load and knows this bias, instead of its own."""
@@ -103,12 +103,11 @@ def calibrate_payload(model: Model, q: Array, wrench: Array) -> PayloadCalibrati
         Estimate(name, float(v), float(s), u, freedom=fit.freedom)
         for name, v, s, u in zip(NAMES, values, std, UNITS, strict=True)
     )
-    notes = _notes(mass, float(std[0]), fit.outliers)
     return PayloadCalibration(
         mass, cog, fit.values[4:].copy(), estimates, covariance,
         (float(fit.noise[0]), float(fit.noise[1])),
         (value - flat @ fit.values).reshape(-1, 6), fit.outliers,
-        _verdict(estimates, notes), notes,
+        _notes(mass, float(std[0]), fit.outliers),
     )  # fmt: skip
 
 
@@ -152,28 +151,12 @@ def _about_centre(values: Array, covariance: Array) -> tuple[Array, Array]:
     return T @ covariance @ T.T, moment / mass
 
 
-def _notes(mass: float, std: float, outliers: NDArray[np.int64]) -> tuple[str, ...]:
+def _notes(mass: float, std: float, outliers: NDArray[np.int64]) -> tuple[Note, ...]:
     notes = []
     if abs(mass) < LIGHT * std:
-        notes.append("nothing that weighs hangs on the sensor: no centre of gravity can be found")
+        notes.append(Note(Reason.NOTHING_WEIGHS))
     elif mass < 0:
-        notes.append(
-            f"the load weighs {mass:.3f} kg: the sensor's signs or axes are not those of a log "
-            "(a mass at rest reads its weight, pointing down, in flange axes)"
-        )
+        notes.append(Note(Reason.NEGATIVE_MASS, (mass,)))
     if len(outliers):
-        rows = ", ".join(str(int(r) + 1) for r in outliers)
-        notes.append(f"down-weighted as outlier: reading {rows}")
+        notes.append(Note(Reason.READINGS_DOWN, (tuple(int(r) + 1 for r in outliers),)))
     return tuple(notes)
-
-
-def _verdict(estimates: tuple[Estimate, ...], notes: tuple[str, ...]) -> str:
-    mass = estimates[0]
-    if mass.value < 0 or not np.isfinite(estimates[1].std):
-        return notes[0]
-    low, high = mass.interval
-    centre = max(e.std for e in estimates[1:4])
-    return (
-        f"the load weighs {mass.value:.3f} kg ({low:.3f} to {high:.3f}), its centre of gravity is "
-        f"known to {1e3 * centre:.1f} mm (1 sigma)"
-    )

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from gapbridge.core.notes import Note
+
 Array = NDArray[np.float64]
 
 
@@ -54,4 +56,4 @@ class Plan:
     expected: Expectation
     bought: tuple[tuple[int, float], ...]  # number of poses to fit, tcp_std (m) that they give
     travel: float  # s, motion alone
-    notes: tuple[str, ...] = ()  # what could not be planned, and why
+    notes: tuple[Note, ...] = ()  # what could not be planned, and why

@@ -12,6 +12,7 @@ from gapbridge.core.calibration.readings import Readings
 from gapbridge.core.diagnosis.diagnosis import Diagnosis
 from gapbridge.core.estimation.registration import Registration
 from gapbridge.core.model import Model
+from gapbridge.core.notes import Note
 
 Array = NDArray[np.float64]
 
@@ -73,7 +74,7 @@ class Calibration:
     readings: Readings
     estimates: tuple[Estimate, ...]
     covariance: Array  # (p, p) of the estimates that are shown, in their order
-    combinations: tuple[str, ...]  # in words: what cannot be separated
+    combinations: tuple[Note, ...]  # what cannot be separated
     before: Errors  # fitted poses, nominal model
     after: Errors
     held_out_before: Errors  # held-out poses
@@ -85,13 +86,12 @@ class Calibration:
     tcp_std: Array  # (M,) m, 1 sigma (3D) of the predicted TCP at the held-out poses
     diagnosis: Diagnosis | None  # of the residual; None where the readings do not allow it
     complete: bool  # True: nothing is left that a further effect could explain
-    verdict: str  # one sentence
-    notes: tuple[str, ...] = field(default=())
+    remaining: Note
+    notes: tuple[Note, ...] = field(default=())
     instrument_noise: float = float("nan")  # m, 1 sigma of one coordinate, the instrument alone
     turn_noise: float = float("nan")  # rad, 1 sigma of a measured rotation; nan: none were
     joint_noise: float = float("nan")  # rad, 1 sigma of one joint's repeatability
     freedom: float = float("inf")  # degrees of freedom that the fit left
     missing_effects: tuple[str, ...] = ()  # supported by the fit's own poses, not asked for
-    remaining: str = ""  # in words: what is left, the same in every section of a report
     noise_floor: float = float("nan")  # m, 1 sigma of one coordinate, without the fit; nan: unknown
     whole_covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))  # of all estimates

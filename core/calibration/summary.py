@@ -1,4 +1,4 @@
-"""A calibration in words: its verdict, what cannot be separated, what deserves a second look."""
+"""What a calibration notes: what is left, what cannot be separated, what needs a second look."""
 
 from __future__ import annotations
 
@@ -10,19 +10,20 @@ from gapbridge.core.calibration.held_out_check import HeldOutCheck
 from gapbridge.core.calibration.missing_effects import MissingEffect
 from gapbridge.core.calibration.parameters import Parameters
 from gapbridge.core.calibration.problem import Problem
-from gapbridge.core.calibration.result import Errors, Estimate
+from gapbridge.core.calibration.result import Estimate
 from gapbridge.core.calibration.staging import AT_ODDS
 from gapbridge.core.diagnosis.diagnosis import Diagnosis
+from gapbridge.core.estimation.base_parameters import CLOSE, hardly_separated
+from gapbridge.core.notes import Note, Reason
 
 Array = NDArray[np.float64]
-CLOSE = 0.98  # correlation from which two parameters count as one combination
 SIGMAS = 3.0  # from zero, of its own, that a further effect must be to be fitted
 MEMBER = 0.35  # share of a combination from which a parameter is named in it
 
 
 def combinations(
     parameters: Parameters, rest: ConvergedFit, shown: NDArray[np.bool_]
-) -> tuple[str, ...]:
+) -> tuple[Note, ...]:
     """Return what these readings do not determine, or only together."""
     notes = []
     names = parameters.names
@@ -32,22 +33,13 @@ def combinations(
         partners = [int(j) for j in np.argsort(-np.abs(correlation[i])) if j != i]
         best = partners[0] if partners else -1
         if best >= 0 and abs(correlation[i, best]) > CLOSE:
-            what = "difference" if correlation[i, best] > 0 else "sum"
-            notes.append(f"{names[i]}: these readings determine only its {what} with {names[best]}")
+            known = Reason.ONLY_DIFFERENCE if correlation[i, best] > 0 else Reason.ONLY_SUM
+            notes.append(Note(known, (names[i], names[best])))
         elif others := _company(correlation, int(i)):
-            company = ", ".join(names[j] for j in others)
-            notes.append(f"{names[i]}: these readings determine it only together with {company}")
+            notes.append(Note(Reason.ONLY_TOGETHER, (names[i], tuple(names[j] for j in others))))
         else:
-            notes.append(f"{names[i]}: these readings hardly show it; it stays near its beginning")
-    for i in np.flatnonzero(shown):
-        for j in np.flatnonzero(shown):
-            if j > i and abs(correlation[i, j]) > CLOSE:
-                what = "difference" if correlation[i, j] > 0 else "sum"
-                notes.append(
-                    f"{names[i]} and {names[j]}: mostly their {what} is known "
-                    f"(correlation {correlation[i, j]:+.3f})"
-                )
-    return tuple(notes)
+            notes.append(Note(Reason.HARDLY_SHOWN, (names[i],)))
+    return (*notes, *hardly_separated(rest.covariance, shown, names))
 
 
 def _company(correlation: Array, i: int) -> list[int]:
@@ -65,76 +57,46 @@ def _company(correlation: Array, i: int) -> list[int]:
 def notes_of(
     problem: Problem, rest: ConvergedFit, remainder: HeldOutCheck, odds: float | None,
     estimates: tuple[Estimate, ...],
-) -> tuple[str, ...]:  # fmt: skip
+) -> tuple[Note, ...]:  # fmt: skip
     """Return what deserves a second look."""
     notes = []
     if not rest.converged:
-        notes.append(
-            "the fit did not converge: take its figures for where it stood, and fit fewer "
-            "effects or measure more poses"
-        )
-    bound = [e.name for e in estimates if e.on_bound]
+        notes.append(Note(Reason.NOT_CONVERGED))
+    bound = tuple(e.name for e in estimates if e.on_bound)
     if bound:
-        notes.append(f"on their bound: {', '.join(bound)}")
-    outliers = np.flatnonzero(~rest.inliers)
-    if len(outliers):
-        notes.append(f"{len(outliers)} outlier(s) down-weighted")
+        notes.append(Note(Reason.ON_BOUND, (bound,)))
+    outliers = int((~rest.inliers).sum())
+    if outliers:
+        notes.append(Note(Reason.OUTLIERS, (outliers,)))
     if len(remainder.outliers):
-        rows = ", ".join(str(int(r) + 1) for r in remainder.outliers)
-        notes.append(f"held-out reading(s) far beyond the predicted spread: row {rows}")
+        rows = tuple(int(r) + 1 for r in remainder.outliers)
+        notes.append(Note(Reason.HELD_OUT_FAR, (rows,)))
     if odds is not None and odds < AT_ODDS:
-        notes.append(
-            "what differs between loads and all readings together disagree on the flexibilities: "
-            "something else changes with the load, or came between the loads (a wrong payload, a "
-            "tool that slipped, an instrument that moved)"
-        )
+        notes.append(Note(Reason.LOADS_AT_ODDS))
     if not problem.stages.possible and problem.stages.elastic.any():
-        notes.append(
-            "no pose was measured under two loads: flexibilities rest on geometry and load together"
-        )
+        notes.append(Note(Reason.SAME_LOADS))
     return tuple(notes)
-
-
-def verdict_of(
-    errors: tuple[Errors, ...], rest: ConvergedFit, floor: float, complete: bool, remaining: str
-) -> str:
-    """Return the calibration in one sentence."""
-    held = len(errors[2].rows) > 0
-    before, after = (errors[2], errors[3]) if held else (errors[0], errors[1])
-    where = "on poses that the fit never saw" if held else "on the fitted poses (none held out)"
-    change = "rises" if after.rms > before.rms else "falls"
-    text = (
-        f"the error {change} from {1e3 * before.rms:.3f} to {1e3 * after.rms:.3f} mm rms {where}; "
-        f"the fit leaves {1e3 * rest.noise.coordinate():.3f} mm a coordinate"
-    )
-    if np.isfinite(floor):
-        text += f" (instrument and arm alone: {1e3 * floor:.3f} mm)"
-    return f"{text}; {'' if complete else 'not complete: '}{remaining}"
 
 
 def remaining_of(
     remainder: HeldOutCheck, diagnosis: Diagnosis | None, complete: bool,
     missing: tuple[MissingEffect, ...], converged: bool,
-) -> str:  # fmt: skip
-    """Return what is left: one statement, which every section of a report repeats."""
+) -> Note:  # fmt: skip
+    """Return what is left."""
     if complete:
-        return "nothing is left that a further effect could explain"
+        return Note(Reason.NOTHING)
     if not converged:
-        return "the fit did not converge"
+        return Note(Reason.UNCONVERGED)
     if missing:
-        names = ", ".join(f"{lack.name} ({100 * lack.share:.0f} %)" for lack in missing)
-        return (
-            "to be added, with the share that each takes off what is left on poses left out of its "
-            f"fit: {names}"
-        )
-    left = [] if diagnosis is None else sorted(
-        {cause.effect for c in diagnosis.channels for cause in c.causes}
-    )  # fmt: skip
+        pairs = tuple((lack.name, lack.share) for lack in missing)
+        return Note(Reason.EFFECTS_MISSING, (pairs,))
+    channels = () if diagnosis is None else diagnosis.channels
+    left = sorted({cause.effect for c in channels for cause in c.causes})
     if left:
-        return f"{', '.join(left)} is left to be added"
+        return Note(Reason.EFFECTS_ACCUSED, (tuple(left),))
     if diagnosis is not None and diagnosis.verdict != "no_gap":
-        return "structure is left that no effect of the catalogue explains"
-    return f"held-out poses are {np.sqrt(remainder.ratio):.1f} times as far off as predicted"
+        return Note(Reason.STRUCTURE)
+    return Note(Reason.FAR_OFF, (float(np.sqrt(remainder.ratio)),))
 
 
 def unsupported(estimates: tuple[Estimate, ...], names: tuple[str, ...]) -> tuple[str, ...]:

@@ -18,6 +18,7 @@ from gapbridge.core.errors import ExcitationError, InputError
 from gapbridge.core.estimation.robust import RobustFit, robust_fit
 from gapbridge.core.loads import Loads
 from gapbridge.core.model import Model
+from gapbridge.core.notes import Note, Reason
 
 Array = NDArray[np.float64]
 NAMES = tuple(f"tool_tcp_{k}" for k in "xyz")
@@ -39,8 +40,8 @@ class ToolCalibration:
     residual: Array  # (N,) m, how far each touch is from the fixed point or ball
     nominal_residual: Array  # (N,) m, the same with the tool that the cell had, point fitted
     outliers: NDArray[np.int64]  # touches down-weighted as outlier
-    verdict: str  # one sentence
-    notes: tuple[str, ...]
+    notes: tuple[Note, ...]
+    moved: float  # m, from the tool that the cell had
 
     def applied(self, model: Model) -> Model:
         """Return the model with this tool centre point; the tool's axes stay as they are."""
@@ -73,15 +74,13 @@ def calibrate_tool(
         Estimate(name, float(v), float(s), "m", freedom=inner.freedom)
         for name, v, s in zip(NAMES, values, std, strict=False)
     )
-    notes: tuple[str, ...] = ()
-    if len(inner.outliers):
-        rows = ", ".join(str(int(r) + 1) for r in inner.outliers)
-        notes = (f"down-weighted as outlier: touch {rows}",)
+    down = tuple(int(r) + 1 for r in inner.outliers)
     return ToolCalibration(
         values[:3].copy(), values[3:].copy(), estimates, inner.covariance[:3, :3].copy(),
         float(inner.noise[0]), _off(position, rotation, values, distance),
         _off(position, rotation, before, distance), inner.outliers,
-        _verdict(nominal, values[:3], std), notes,
+        (Note(Reason.TOUCHES_DOWN, (down,)),) if down else (),
+        float(np.linalg.norm(values[:3] - nominal)),
     )  # fmt: skip
 
 
@@ -166,17 +165,3 @@ def _require_turning(A: Array, count: int) -> None:
 def _off(position: Array, rotation: Array, values: Array, distance: float) -> Array:
     apart = np.linalg.norm(position + rotation @ values[:3] - values[3:], axis=1)
     return np.asarray(np.abs(apart - distance))
-
-
-def _verdict(nominal: Array, tcp: Array, std: Array) -> str:
-    moved = float(np.linalg.norm(tcp - nominal))
-    sure = float(np.linalg.norm(std))
-    if moved < 2.5 * sure:
-        return (
-            f"the tool's tip is where the cell says, within {1e3 * sure:.2f} mm (1 sigma of its "
-            "place)"
-        )
-    return (
-        f"the tool's tip sits {1e3 * moved:.2f} mm beside the cell's, known to {1e3 * sure:.2f} mm "
-        "(1 sigma)"
-    )

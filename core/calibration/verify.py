@@ -36,6 +36,7 @@ from gapbridge.core.estimation.least_squares import (
 from gapbridge.core.estimation.registration import Registration
 from gapbridge.core.metrology import Metrology
 from gapbridge.core.model import Model
+from gapbridge.core.notes import Note, Reason
 
 Array = NDArray[np.float64]
 BROKEN = 1e-3  # chance below which a model has moved since its calibration
@@ -65,7 +66,7 @@ class Verification:
     moved: Suspect | None  # what explains the change, where one thing does
     suspects: tuple[Suspect, ...]  # others that explain it as well
     stations: tuple[Registration, ...]
-    notes: tuple[str, ...]
+    notes: tuple[Note, ...]
 
 
 @dataclass(frozen=True)
@@ -230,13 +231,10 @@ def _suspect(
     return Suspect(name, estimates, chance, rest), freedom
 
 
-def _notes(baseline: AccuracyBaseline, metrology: Metrology, freedom: int) -> tuple[str, ...]:
+def _notes(baseline: AccuracyBaseline, metrology: Metrology, freedom: int) -> tuple[Note, ...]:
     notes = []
     if not metrology.registered:
-        notes.append(
-            "the instrument's place was fitted to these poses: a turn of the whole arm, or another "
-            "zero of joint 1, is not seen"
-        )
+        notes.append(Note(Reason.FRAME_FITTED))
     if freedom < 9:
-        notes.append(f"only {freedom} numbers are left to judge by: measure more poses")
+        notes.append(Note(Reason.FEW_NUMBERS, (freedom,)))
     return tuple(notes)

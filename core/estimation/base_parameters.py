@@ -8,7 +8,9 @@ Gautier, Khalil, IEEE Trans. Robotics and Automation 6 (1990) 368).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -16,13 +18,14 @@ from numpy.typing import NDArray
 
 from gapbridge.core.effects import flexibility_effects
 from gapbridge.core.estimation.compliance_fit import Linear, Mask, solve
+from gapbridge.core.notes import Note, Reason
 
 Array = NDArray[np.float64]
 VAGUE = 0.3  # of the prior's sigma: what is known no better counts as not identifiable
 VISIBLE = float(
     np.sqrt(VAGUE**-2 - 1)
 )  # length of a column, in units of noise, that is shown alone
-CLOSE = 0.98  # correlation from which two flexibilities count as one combination
+CLOSE = 0.98  # correlation from which two parameters count as one combination
 MEMBER = 0.1  # share of a combination from which a flexibility is named in it
 
 
@@ -32,7 +35,7 @@ class Shown:
 
     kept: Mask  # (2n,) fitted; the others stay at the model's value
     covariance: Array  # (2n, 2n): of the kept ones, the others held; prior's square for the others
-    reported: tuple[str, ...]  # what is not identifiable, or only in combination
+    reported: tuple[Note, ...]  # what is not identifiable, or only in combination
 
 
 def choose(linear: Linear, prior: tuple[Array, float]) -> Mask:
@@ -72,14 +75,16 @@ def _cost(linear: Linear, kept: Mask, held: int, prior: tuple[Array, float]) -> 
 
 
 def what_is_shown(linear: Linear, kept: Mask, sigma: float) -> Shown:
-    """Return covariance and words for the chosen flexibilities; sigma is the prior's (rad/Nm)."""
+    """Return covariance and notes of the chosen flexibilities; sigma is the prior's (rad/Nm)."""
     count = len(kept)
     covariance = np.diag(np.full(count, sigma**2))
     root = _root(linear, kept, sigma) * sigma
     covariance[np.ix_(kept, kept)] = root @ root.T
     columns = linear.matrix * sigma
     reported = [_held(int(i), columns, kept) for i in np.flatnonzero(~kept)]
-    reported += _faint(columns, kept) + _alike(covariance, kept)
+    reported += _faint(columns, kept)
+    names = [name(i, count) for i in range(count)]
+    reported += hardly_separated(covariance, kept, names)
     return Shown(kept, covariance, tuple(reported))
 
 
@@ -90,7 +95,7 @@ def name(i: int | np.integer[Any], count: int) -> str:
     return f"{named['axial']}_{i + 1}" if i < n else f"{named['radial']}_{i - n + 1}"
 
 
-def _held(i: int, columns: Array, kept: Mask) -> str:
+def _held(i: int, columns: Array, kept: Mask) -> Note:
     """Return why flexibility ``i`` is held, and which others stand for it."""
     count, size = len(kept), float(np.linalg.norm(columns[:, i]))
     this = name(i, count)
@@ -98,20 +103,17 @@ def _held(i: int, columns: Array, kept: Mask) -> str:
         share = np.linalg.lstsq(columns[:, kept], columns[:, i], rcond=1e-9)[0]
         left = np.linalg.norm(columns[:, i] - columns[:, kept] @ share)
         reach = np.abs(share) * np.linalg.norm(columns[:, kept], axis=0) / size
-        members = [
-            f"{share[k]:+.2f} {name(np.flatnonzero(kept)[k], count)}"
+        members = tuple(
+            (float(share[k]), name(np.flatnonzero(kept)[k], count))
             for k in np.argsort(-reach)[:3]
             if reach[k] > MEMBER
-        ]
+        )
         if members and left < VAGUE * size:
-            return (
-                f"{this}: not identifiable alone from these data, it acts like {' '.join(members)}"
-                "; what they make together is written there, this one stays at the model's value"
-            )
-    return f"{this}: not identifiable from these data, stays at the model's value"
+            return Note(Reason.ACTS_LIKE, (this, members))
+    return Note(Reason.HELD, (this,))
 
 
-def _faint(columns: Array, kept: Mask) -> list[str]:
+def _faint(columns: Array, kept: Mask) -> list[Note]:
     """Return combinations that show although none of their members does."""
     held = np.flatnonzero(~kept)
     if len(held) < 2:
@@ -125,25 +127,17 @@ def _faint(columns: Array, kept: Mask) -> list[str]:
         members = np.flatnonzero(np.abs(vector) > 0.3 * np.abs(vector).max())
         if value > VISIBLE**2 and len(members) > 1:
             sign = np.sign(vector[members[0]])
-            parts = [f"{sign * vector[k]:+.2f} {name(held[k], len(kept))}" for k in members]
-            reported.append(
-                f"{' '.join(parts)}: shown together, none of them alone; they stay at the model's "
-                "values"
-            )
+            parts = tuple((float(sign * vector[k]), name(held[k], len(kept))) for k in members)
+            reported.append(Note(Reason.SHOWN_TOGETHER, (parts,)))
     return reported
 
 
-def _alike(covariance: Array, kept: Mask) -> list[str]:
-    """Return the pairs of kept flexibilities that the data hardly separate."""
-    reported, std, count = [], np.sqrt(np.diag(covariance)), len(kept)
-    for i in np.flatnonzero(kept):
-        for j in np.flatnonzero(kept):
-            if j > i and std[i] > 0 and std[j] > 0:
-                correlation = covariance[i, j] / (std[i] * std[j])
-                if abs(correlation) > CLOSE:
-                    what = "difference" if correlation > 0 else "sum"
-                    reported.append(
-                        f"{name(i, count)} and {name(j, count)}: mostly their {what} is known "
-                        f"(correlation {correlation:+.3f})"
-                    )
+def hardly_separated(covariance: Array, shown: Mask, names: Sequence[str]) -> list[Note]:
+    """Return the pairs of shown parameters (p,) that the data hardly separate."""
+    reported, std = [], np.sqrt(np.diag(covariance))
+    for i, j in combinations(np.flatnonzero(shown & (std > 0)).tolist(), 2):
+        correlation = float(covariance[i, j] / (std[i] * std[j]))
+        if abs(correlation) > CLOSE:
+            known = Reason.DIFFERENCE_KNOWN if correlation > 0 else Reason.SUM_KNOWN
+            reported.append(Note(known, (names[i], names[j], correlation)))
     return reported

@@ -38,6 +38,7 @@ from gapbridge.core.estimation.registration import IDENTITY, Registration
 from gapbridge.core.log.log import Log
 from gapbridge.core.metrology import Metrology
 from gapbridge.core.model import Model
+from gapbridge.core.notes import Note, Reason
 from gapbridge.core.rotation import rotation_matrix
 from gapbridge.core.sessions import session_of
 
@@ -69,7 +70,7 @@ class Identification:
     std_radial: Array  # (n,) rad/Nm, 1 sigma; the prior's where not identifiable
     covariance: Array  # (2n, 2n), axial then radial, of those shown with the others held
     identifiable: Mask  # (2n,): shown by the data; the others stand at the model's value
-    combinations: tuple[str, ...]  # what the data cannot separate or do not show
+    combinations: tuple[Note, ...]  # what the data cannot separate or do not show
     registration: Registration | Placements  # one frame, or one a session
     tool_offset: Array  # (3,) m, flange axes: found tool point minus the cell's; 0 if registered
     samples: int
@@ -78,7 +79,7 @@ class Identification:
     gap_rms_held_out: float  # m, before, on poses that the fit did not see; nan: too few poses
     remaining_rms_held_out: float  # m, after, on the same poses
     outliers: NDArray[np.int64]  # rows down-weighted as outlier
-    notes: tuple[str, ...]
+    notes: tuple[Note, ...]
     remaining_rms_new_region: float = UNSEEN  # m, folds are regions of joint space
     remaining_rms_new_session: float = UNSEEN  # m, folds are sessions
     tool_known: bool = True  # the tool point found is good enough to be written
@@ -347,38 +348,28 @@ def tool_known(fit: Fit, data: Data, nominal: Model) -> bool:
 def notes_of(
     fit: Fit, kept: Mask, outlier: int, nuisances: int, tool: bool, geometry: Geometry | None,
     held: bool,
-) -> list[str]:  # fmt: skip
-    """Return in words what a fit was like: outliers, bounds reached, what was not identifiable.
+) -> list[Note]:  # fmt: skip
+    """Return what a fit was like: outliers, bounds reached, what was not identifiable.
 
     ``tool``: the tool point found is written; ``held``: links are off, and were held nominal.
     """
     notes = []
     if outlier:
-        notes.append(f"{outlier} outlier(s) down-weighted")
+        notes.append(Note(Reason.OUTLIERS, (outlier,)))
     at_zero = np.flatnonzero((fit.flexibility <= 0) & kept)
     if len(at_zero):
-        names = ", ".join(base_parameters.name(i, len(kept)) for i in at_zero)
-        notes.append(f"at their bound of zero: {names}")
+        names = tuple(base_parameters.name(i, len(kept)) for i in at_zero)
+        notes.append(Note(Reason.AT_ZERO, (names,)))
     if not kept.any():
-        notes.append("these data show no flexibility at all: the model is left as it was")
+        notes.append(Note(Reason.NO_FLEXIBILITY))
     if isinstance(fit.frame, Placements) and len(fit.frame.frames) > 1:
-        notes.append("each session has a frame of its own, not written to the cell")
+        notes.append(Note(Reason.SESSION_FRAMES))
     elif nuisances:
-        written = "; the tool point is" if tool else " and are not"
-        notes.append(f"frame and tool point were estimated along{written} written to the cell")
+        notes.append(Note(Reason.TOOL_WRITTEN if tool else Reason.NOTHING_WRITTEN))
     if held:
-        notes.append(
-            "links or joints' zeros are off too; they were held nominal, since the cell without "
-            "them would be worse than it was, so that flexibilities make up for them in part: "
-            "diagnose names what holds"
-        )
+        notes.append(Note(Reason.LINKS_HELD))
     elif geometry is not None and geometry.has_links:
-        notes.append(
-            "links and joints' zeros were estimated along (the poses are likelier with them); they "
-            "are not written to the cell: diagnose names what of them holds"
-        )
+        notes.append(Note(Reason.LINKS_ESTIMATED))
     elif geometry is not None:
-        notes.append(
-            f"the tool point is off: the one found is {'' if tool else 'not '}written to the cell"
-        )
+        notes.append(Note(Reason.TOOL_OFF_WRITTEN if tool else Reason.TOOL_OFF))
     return notes

@@ -21,6 +21,7 @@ from gapbridge.core.calibration.plan import Payload
 from gapbridge.core.calibration.readings import Readings
 from gapbridge.core.errors import PlanError
 from gapbridge.core.loads import Loads
+from gapbridge.core.notes import Note, Reason
 from gapbridge.core.planning.workspace import Place, Space
 
 STOPS = 900  # candidate poses
@@ -39,7 +40,7 @@ class Candidates:
     stop: Index  # (R,) number of the pose
     nuisance: Nuisance
     why: str  # what hinders random poses, in words
-    notes: tuple[str, ...]
+    notes: tuple[Note, ...]
 
 
 @dataclass
@@ -92,7 +93,7 @@ def candidates_of(
     q, station = np.concatenate(sight.q)[:stops], np.concatenate(sight.station)[:stops]
     target = np.concatenate(sight.target)[:stops]
     readings, stop = _under_loads(parameters, observable, loads, (q, station, target), random)
-    notes = () if sight.count >= stops else (f"few poses to choose from: {sight.why}",)
+    notes = () if sight.count >= stops else (Note(Reason.FEW_POSES, (sight.why,)),)
     readings = replace(readings, value=observable.predict(parameters.nominal, readings, nuisance))
     return Candidates(q, readings, stop, nuisance, sight.why, notes)
 

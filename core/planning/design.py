@@ -16,6 +16,7 @@ from gapbridge.core.calibration.plan import Payload, Plan
 from gapbridge.core.effects import flexibility_effects
 from gapbridge.core.errors import PlanError
 from gapbridge.core.loads import Loads
+from gapbridge.core.notes import Note, Reason
 from gapbridge.core.planning.candidates import STOPS, Candidates, candidates_of, joined
 from gapbridge.core.planning.exchange import Choice, exchanged, grown, shrunk
 from gapbridge.core.planning.information import (
@@ -34,7 +35,6 @@ from gapbridge.core.planning.worst_places import evened, leaning
 REFERENCE = 200  # poses over which the predicted TCP is judged
 BOUGHT_ROUNDS = 3
 BOUGHT = (0.5, 0.75, 1.0, 1.5, 2.0)  # of the poses asked for: what these would give
-SIGHT = "nobody said where the instrument stands: whether it sees the target was not looked at"
 Progress = Callable[[str, float], None]
 
 
@@ -115,7 +115,7 @@ def _planned(
     expected = expectation_of(parameters, measured, reference)
     emit("planned", 1.0)
     hung = set(found.readings.load[len(rows) :])
-    unseen = () if space.places or observable.unknown else (SIGHT,)
+    unseen = () if space.places or observable.unknown else (Note(Reason.SIGHT_UNKNOWN),)
     notes = (*found.notes, *unseen, *way.notes, *_notes(parameters, loads, hung, expected.std))
     return Plan(
         tuple(loads), way.poses(found), expected, tuple(sorted(bought.items())), way.travel, notes
@@ -257,18 +257,15 @@ def _held_out(found: Candidates, chosen: list[int], wish: Wish) -> list[int]:
 
 def _notes(
     parameters: Parameters, loads: Sequence[Payload], hung: set[int], std: Array
-) -> list[str]:
+) -> list[Note]:
     notes = []
-    vague = [n for n, s in zip(parameters.names, std, strict=True) if not np.isfinite(s)]
+    vague = tuple(n for n, s in zip(parameters.names, std, strict=True) if not np.isfinite(s))
     if vague:
-        notes.append(f"not identifiable from these poses: {', '.join(vague)}")
-    idle = [f"{load.mass:g} kg" for i, load in enumerate(loads) if i not in hung]
+        notes.append(Note(Reason.NOT_IDENTIFIABLE, (vague,)))
+    idle = tuple(load.mass for i, load in enumerate(loads) if i not in hung)
     if idle:
-        notes.append(f"loads that add nothing and need not be hung: {', '.join(idle)}")
+        notes.append(Note(Reason.IDLE_LOADS, (idle,)))
     soft = [e for e in flexibility_effects().values() if parameters.joints(e)]
     if soft and len(loads) == 1:
-        notes.append(
-            "one load alone: compliance is found from the arm's own weight; a second load "
-            "determines it better"
-        )
+        notes.append(Note(Reason.ONE_LOAD))
     return notes

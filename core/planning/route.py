@@ -10,6 +10,7 @@ import numpy as np
 
 from gapbridge.core.arrays import Array, Mask
 from gapbridge.core.calibration.plan import PlannedPose
+from gapbridge.core.notes import Note, Reason
 from gapbridge.core.planning.candidates import Candidates
 from gapbridge.core.planning.travel import joint_speed, leg_times, shortest_way
 from gapbridge.core.planning.workspace import Space
@@ -33,7 +34,7 @@ class Itinerary:
 
     stops: tuple[Stop, ...]
     travel: float  # s
-    notes: tuple[str, ...]
+    notes: tuple[Note, ...]
 
     def poses(self, found: Candidates) -> tuple[PlannedPose, ...]:
         """Return the planned poses; those at the same joints share a number."""
@@ -80,12 +81,8 @@ def itinerary(found: Candidates, stops: Sequence[Stop], space: Space, repeats: i
         travel += float(first[order[0]])
         way += own + [replace(block[i], repeat=1) for i in order[len(own) :]]
         at = q[order[-1]]
-    notes: tuple[str, ...] = ()
-    if hit:
-        pairs = ", ".join(f"{a + 1} to {b + 1}" for a, b in hit[:8])
-        more = f" and {len(hit) - 8} more" if len(hit) > 8 else ""
-        notes = (f"no straight way in joint space, go round: stops {pairs}{more}",)
-    return Itinerary(tuple(way), travel, notes)
+    ways = tuple((a + 1, b + 1) for a, b in hit)
+    return Itinerary(tuple(way), travel, (Note(Reason.DETOURS, (ways,)),) if ways else ())
 
 
 def _shares(fitted: list[int], repeats: int) -> list[int]:

@@ -22,6 +22,7 @@ from gapbridge.bridge.calibration.planning import effects_of, metrology_of, obse
 from gapbridge.bridge.calibration.session.prompt import Prompt
 from gapbridge.bridge.calibration.session.session import Session, seconds_left
 from gapbridge.bridge.cell import Cell
+from gapbridge.bridge.document.notes import calibration_text, note_text
 from gapbridge.bridge.document.provenance import fitted as fitted_on
 from gapbridge.bridge.document.provenance import provenance
 from gapbridge.bridge.report.labels import unit_of
@@ -80,7 +81,7 @@ class WholeJob(Job):
         if weak:
             prompt.say(f"  poorly determined by these poses: {', '.join(weak)}")
         for note in plan.notes:
-            prompt.say(f"  note: {note}")
+            prompt.say(f"  note: {note_text(note)}")
 
     def _report_places(self, plan: Plan) -> None:
         """Say where the instrument stands in turn, where it is carried about."""
@@ -146,7 +147,8 @@ class WholeJob(Job):
         metrology = metrology_of(self.cell, options.instrument, self.session.places)
         write_log(found.readings, metrology.registered, folder / "readings.csv")
         origin = provenance({"log": [folder / "readings.csv"], "cell": [self.cell.path]})
-        baseline = document_of(found, sigma=metrology.sigma) | {"provenance": origin}
+        baseline = document_of(found, sigma=metrology.sigma)
+        baseline |= {"verdict": calibration_text(found), "provenance": origin}
         write_document(folder / "promise.json", baseline)
         from gapbridge.bridge.calibration.jobs.facts import (
             session_facts,  # pictures take their time
@@ -157,7 +159,7 @@ class WholeJob(Job):
         for file in write_report(Material(found, self.session.plan, facts), folder):
             prompt.say(f"{file}: written")
         if not found.complete:
-            prompt.warn(f"not complete: {found.remaining}")
+            prompt.warn(f"not complete: {note_text(found.remaining)}")
         if (why := worse_than_before(found.held_out_before, found.held_out_after)) is not None:
             self.session.add("ended", applied=None)
             prompt.warn(why)
@@ -237,7 +239,7 @@ def calibration_of(
 
 def report_calibration(prompt: Prompt, found: Calibration) -> None:
     """Say what a fit has found, how far it carries, and what stays unknown."""
-    prompt.say(found.verdict, "bold green" if found.complete else "bold yellow")
+    prompt.say(calibration_text(found), "bold green" if found.complete else "bold yellow")
     pairs = (
         ("fitted poses", found.before, found.after),
         ("poses to verify", found.held_out_before, found.held_out_after),
@@ -258,8 +260,8 @@ def report_calibration(prompt: Prompt, found: Calibration) -> None:
     prompt.console.print(_table(found))
     for row in found.outliers:
         prompt.say(f"  outlier, down-weighted: reading {int(row) + 1}")
-    for line in found.notes:
-        prompt.say(f"  note: {line}")
+    for note in found.notes:
+        prompt.say(f"  note: {note_text(note)}")
     if found.combinations:
         prompt.say(f"  {len(found.combinations)} parameters cannot be separated; the report "
                  "names them")  # fmt: skip

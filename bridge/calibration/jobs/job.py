@@ -19,6 +19,7 @@ from gapbridge.bridge.calibration.session.prompt import Prompt
 from gapbridge.bridge.calibration.session.reading_check import ReadingCheck
 from gapbridge.bridge.calibration.session.session import Session
 from gapbridge.bridge.cell import Cell, save_cell
+from gapbridge.bridge.document.notes import note_text, short_text
 from gapbridge.bridge.document.output_file import require_writable, write_table, write_text
 from gapbridge.bridge.document.provenance import provenance
 from gapbridge.core.arrays import Array
@@ -84,8 +85,8 @@ class Job(ABC):
 
         prompt = self.prompt
         prompt.say()
-        prompt.say(found.verdict, "bold")
-        for line in (*lines, *(f"  note: {note}" for note in found.notes)):
+        prompt.say(short_text(found), "bold")
+        for line in (*lines, *(f"  note: {note_text(note)}" for note in found.notes)):
             prompt.say(line)
         facts = session_facts(self.cell, self.options, self.session, instrument)
         for file in write_report(ShortMaterial(found, facts, self.cell.model), self.folder):

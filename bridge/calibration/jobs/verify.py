@@ -26,6 +26,7 @@ from gapbridge.bridge.calibration.planning import (
     with_loads,
 )
 from gapbridge.bridge.calibration.session.session import seconds_left
+from gapbridge.bridge.document.notes import note_texts
 from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.accuracy_baseline import baseline_in
 from gapbridge.core.calibration.plan import Plan, PlannedPose
@@ -130,5 +131,5 @@ class VerifyJob(Job):
             )
         for other in found.suspects:
             prompt.say(f"  these readings cannot distinguish it from: {moved_text(other)}")
-        for note in found.notes:
+        for note in note_texts(found.notes):
             prompt.say(f"  note: {note}")

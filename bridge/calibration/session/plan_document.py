@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,7 @@ import numpy as np
 
 from gapbridge.bridge.document.output_file import write_table
 from gapbridge.core.calibration.plan import Expectation, Payload, Plan, PlannedPose
+from gapbridge.core.notes import Note, Reason
 
 
 def plan_of(entry: dict[str, Any]) -> Plan:
@@ -26,8 +28,17 @@ def plan_of(entry: dict[str, Any]) -> Plan:
         ),
         bought=tuple((int(n), float(s)) for n, s in entry["bought"]),
         travel=float(entry["travel"]),
-        notes=tuple(entry["notes"]),
+        notes=tuple(
+            Note(Reason[note[0]], tuple(note[1]))
+            for note in entry["notes"]
+            if not isinstance(note, str)  # older journals kept sentences
+        ),
     )  # fmt: skip
+
+
+def entry_of(plan: Plan) -> dict[str, Any]:
+    """Return the entry of the journal for a plan."""
+    return {**asdict(plan), "notes": [(note.reason.name, note.values) for note in plan.notes]}
 
 
 def _pose(entry: dict[str, Any]) -> PlannedPose:

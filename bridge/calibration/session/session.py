@@ -10,7 +10,7 @@ import numpy as np
 
 from gapbridge.bridge.calibration.format import duration
 from gapbridge.bridge.calibration.session.journal import Entry, Journal
-from gapbridge.bridge.calibration.session.plan_document import plan_of
+from gapbridge.bridge.calibration.session.plan_document import entry_of, plan_of
 from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.plan import Plan, PlannedPose
 from gapbridge.core.calibration.readings import Readings
@@ -185,7 +185,7 @@ class Session:
 
     def keep_plan(self, plan: Plan) -> None:
         """Write the plan that the session follows."""
-        self.add("plan", plan=asdict(plan))
+        self.add("plan", plan=entry_of(plan))
 
 
 def seconds_left(session: Session, minutes_per_load: float) -> float:

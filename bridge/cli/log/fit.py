@@ -24,6 +24,7 @@ from gapbridge.bridge.cli.options import (
     remounted_option,
 )
 from gapbridge.bridge.cli.progress import progress, status
+from gapbridge.bridge.document.notes import note_texts
 from gapbridge.bridge.document.output_file import require_writable
 from gapbridge.bridge.document.provenance import fitted, provenance
 from gapbridge.core.calibration.spread import Spread
@@ -64,21 +65,24 @@ def fit(logs: tuple[Path, ...], cell: Path, remounted: bool, out: Path) -> None:
     require_writable(out, *logs, cell)
     metrology = replace(given.metrology, remounted=remounted)
     try:
-        found, ranges = _identified(logs, given, metrology)
+        found, wrong, ranges = _identified(logs, given, metrology)
     except ExcitationError as error:
         raise ExcitationError(f"{', '.join(map(str, logs))}: {error}") from None
     spread = Spread.of_fit(found.identifiable, found.covariance).beside(given.spread)
     intervals = given.intervals | fit_intervals(found)
     origin = fitted(provenance({"log": logs, "cell": [cell]}), ranges, spread, intervals)
     save_cell(given, out, found.written, {"provenance": origin})
-    print_identification(found)
+    print_identification(found, wrong)
     click.echo(f"{out}: written")
 
 
 def _identified(
     paths: Sequence[Path], cell: Cell, metrology: Metrology
-) -> tuple[Identification, dict[str, tuple[float, float]]]:
-    """Return what the logs show, and the ranges fitted on; one of many rows passes in pieces."""
+) -> tuple[Identification, list[str], dict[str, tuple[float, float]]]:
+    """Return what the logs show, what is odd in them, and the ranges fitted on.
+
+    One of many rows passes in pieces.
+    """
     if (
         len(paths) == 1
         and is_large(paths[0])
@@ -96,15 +100,14 @@ def _identified(
 
         with status("fitting") as emit:
             found = identify_streamed(cell.model, read_once(), metrology, progress=emit)
-        return replace(found, notes=(*wrong, *found.notes)), merged(ranges)
+        return found, wrong, merged(ranges)
     rows = open_logs(paths, cell)
     with progress("fitting"):
         found = identify_compliance(cell.model, rows, metrology)
-    notes = (*pose_findings(cell, rows), *found.notes)
-    return replace(found, notes=notes), range_of(rows)
+    return found, pose_findings(cell, rows), range_of(rows)
 
 
-def print_identification(found: Identification) -> None:
+def print_identification(found: Identification, wrong: Sequence[str]) -> None:
     """Print flexibilities with their spread, how far they carry, and what stays unknown."""
     table = Table(title="joint flexibility, 1e-6 rad/Nm", title_justify="left")
     for column in ("joint", "axial", "±", "radial", "±"):
@@ -131,7 +134,7 @@ def print_identification(found: Identification) -> None:
     ):
         if np.isfinite(left):
             click.echo(f"to expect in {where}, mm rms per coordinate (in space): {_mm(left)}")
-    for line in (*found.notes, *found.combinations):
+    for line in (*wrong, *note_texts((*found.notes, *found.combinations))):
         click.echo(f"note: {line}")
 
 

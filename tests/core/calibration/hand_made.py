@@ -11,6 +11,7 @@ from gapbridge.core.calibration.result import Calibration, Errors, Estimate
 from gapbridge.core.estimation.registration import IDENTITY, Registration
 from gapbridge.core.loads import Loads
 from gapbridge.core.model import Model
+from gapbridge.core.notes import Note, Reason
 
 Array = NDArray[np.float64]
 
@@ -48,5 +49,5 @@ def hand_made(
         covariance=np.zeros((0, 0)) if covariance is None else covariance, combinations=(),
         before=part(before, ~held), after=part(error, ~held), held_out_before=part(before, held),
         held_out_after=part(error, held), outliers=np.zeros(0, dtype=np.int64), stations=(frame,),
-        diagnosis=None, complete=True, verdict="", **reported,  # type: ignore[arg-type]
+        diagnosis=None, complete=True, remaining=Note(Reason.NOTHING), **reported,  # type: ignore[arg-type]
     )  # fmt: skip

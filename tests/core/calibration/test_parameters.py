@@ -15,6 +15,7 @@ from gapbridge.core.effects import Site, Term
 from gapbridge.core.errors import InputError
 from gapbridge.core.loads import Loads
 from gapbridge.core.model import Model
+from gapbridge.core.notes import Reason
 
 POSITION = make_observable("position")
 
@@ -32,11 +33,13 @@ def parameters(model: Model) -> Parameters:
 
 
 def test_redundant_ones_are_left_out_and_named(parameters: Parameters) -> None:
-    reported = dict(line.split(": ", 1) for line in parameters.redundant)
-    assert "joint_offset_1" in reported and "instrument" in reported["joint_offset_1"]
-    assert "joint_offset_6" in reported and "tool_frame" in reported["joint_offset_6"]
-    assert "link_geometry_3_d" in reported and "link_geometry_2_d" in reported["link_geometry_3_d"]
-    assert "nothing" in reported["axial_compliance_1"]  # weights do not turn a vertical joint
+    reported = {note.values[0]: note for note in parameters.redundant}
+    assert reported["joint_offset_1"].reason is Reason.REDUNDANT_WITH_PLACE
+    assert any("tool_frame" in name for name in reported["joint_offset_6"].values[1])
+    assert "link_geometry_2_d" in reported["link_geometry_3_d"].values[1]
+    assert (
+        reported["axial_compliance_1"].reason is Reason.NEVER_SHOWN
+    )  # weights do not turn a vertical joint
     assert not set(reported) & set(parameters.names)
 
 
@@ -127,8 +130,9 @@ def test_a_base_that_gives_way_is_found_about_both_axes_wherever_it_is_named(mod
     found = [identifiable_parameters(model, effects, observable=POSITION) for effects in chosen]
     assert set(found[0].names) == set(found[1].names)
     assert {"base_compliance_x", "base_compliance_y"} <= set(found[0].names)
-    reported = dict(line.split(": ", 1) for line in found[0].redundant)
-    assert "base_compliance_x and base_compliance_y" in reported["radial_compliance_1"]
+    reported = {note.values[0]: note for note in found[0].redundant}
+    parts = ("base_compliance_x", "base_compliance_y")
+    assert reported["radial_compliance_1"].values[1] == parts
 
 
 def test_a_payload_is_a_parameter_of_an_arm_whose_softness_is_to_be_found(model: Model) -> None:

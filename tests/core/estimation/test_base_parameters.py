@@ -5,6 +5,7 @@ import pytest
 
 from gapbridge.core.estimation.base_parameters import VISIBLE, choose, name, what_is_shown
 from gapbridge.core.estimation.compliance_fit import Linear
+from gapbridge.core.notes import Note, Reason
 
 SIGMA = 1e-4  # rad/Nm, the prior's
 
@@ -23,8 +24,8 @@ def chosen(linear):
 def test_what_has_columns_of_its_own_is_kept_and_the_empty_ones_are_held():
     kept, shown = chosen(problem(np.diag([50.0, 20.0, 0.0, 1.0]), [1, 1, 0, 0]))
     assert kept.tolist() == [True, True, False, False]
-    held = "not identifiable from these data, stays at the model's value"
-    assert shown.reported == (f"radial_compliance_1: {held}", f"radial_compliance_2: {held}")
+    held = [Note(Reason.HELD, (f"radial_compliance_{i}",)) for i in (1, 2)]
+    assert list(shown.reported) == held
     std = np.sqrt(np.diag(shown.covariance)) / SIGMA
     np.testing.assert_allclose(std[:2], [1 / 50, 1 / 20], rtol=2e-3)
     np.testing.assert_array_equal(std[2:], 1)
@@ -36,10 +37,11 @@ def test_two_that_act_alike_are_carried_by_one_and_both_are_named():
     kept, shown = chosen(problem(columns, [1, 0.5, 1, 0.5]))
     assert kept[[0, 2]].all()
     assert kept[1] != kept[3]
-    assert len(shown.reported) == 1
-    assert "not identifiable alone from these data, it acts like +1.00 " in shown.reported[0]
-    assert name(1, 4) in shown.reported[0]
-    assert name(3, 4) in shown.reported[0]
+    (note,) = shown.reported
+    assert note.reason is Reason.ACTS_LIKE
+    ((share, carrier),) = note.values[1]
+    assert share == pytest.approx(1.0)
+    assert {note.values[0], carrier} == {name(1, 4), name(3, 4)}
 
 
 def test_of_a_difference_the_one_is_kept_that_can_carry_it_without_going_below_zero():
@@ -57,10 +59,10 @@ def test_a_sum_that_shows_though_none_of_its_members_does_is_named():
     columns[0] = 0.7 * VISIBLE
     kept, shown = chosen(problem(columns, [1, 1, 1, 1]))
     assert not kept.any()
-    together = [line for line in shown.reported if "shown together, none of them alone" in line]
+    together = [note for note in shown.reported if note.reason is Reason.SHOWN_TOGETHER]
     assert len(together) == 1
-    for i in range(4):
-        assert f"+0.50 {name(i, 4)}" in together[0]
+    assert {part for _, part in together[0].values[0]} == {name(i, 4) for i in range(4)}
+    np.testing.assert_allclose([share for share, _ in together[0].values[0]], 0.5)
 
 
 @pytest.mark.parametrize("sign", [1, -1])
@@ -69,9 +71,8 @@ def test_two_kept_ones_whose_sum_is_much_better_known_are_named(sign):
     columns[0, 1], columns[1, 1], columns[2, 2] = sign * 500, 5, 50
     columns[0, 0] = 500
     _, shown = chosen(problem(columns, [1, 1, 1, 1]))
-    what = "sum" if sign > 0 else "difference"
-    line = f"axial_compliance_1 and axial_compliance_2: mostly their {what} is known"
-    assert shown.reported[0].startswith(line)
+    assert shown.reported[0].reason is (Reason.SUM_KNOWN if sign > 0 else Reason.DIFFERENCE_KNOWN)
+    assert shown.reported[0].values[:2] == ("axial_compliance_1", "axial_compliance_2")
 
 
 def test_flexibilities_are_named_as_the_effects_are():

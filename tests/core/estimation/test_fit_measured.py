@@ -9,6 +9,7 @@ from gapbridge.bridge.cell import load_cell
 from gapbridge.bridge.cell.opened_log import open_log
 from gapbridge.core.estimation.identification import Identification, identify_compliance
 from gapbridge.core.estimation.streamed import identify_streamed
+from gapbridge.core.notes import Note, Reason
 
 
 def fitted(name: str, streamed: bool) -> Identification:
@@ -27,4 +28,4 @@ def test_links_that_are_not_written_make_no_cell_worse(streamed: bool) -> None:
     """A UR5's links are off by more than its joints bend: with them free 0.331 became 0.387 mm."""
     found = fitted("tsinghua_ur5_random", streamed)
     assert found.remaining_rms_held_out < 0.85 * found.gap_rms_held_out
-    assert any("held nominal" in note for note in found.notes)
+    assert Note(Reason.LINKS_HELD) in found.notes

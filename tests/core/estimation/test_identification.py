@@ -15,6 +15,7 @@ from gapbridge.core.loads import Loads
 from gapbridge.core.log.log import Log
 from gapbridge.core.metrology import Metrology
 from gapbridge.core.model import Model
+from gapbridge.core.notes import Note, Reason
 from gapbridge.core.rotation import rotation_matrix, rotation_vector
 
 DH = {6: builtin_rows("ur10e")["dh"], 7: SEVEN}
@@ -110,7 +111,7 @@ def test_outlier_readings_are_named_and_do_not_count():
     columns["measured_position"][outlier] += [0.003, -0.002, 0.004]
     found = identify_compliance(model_of(6), log_of(6, columns), KNOWN)
     assert found.outliers.tolist() == outlier
-    assert "3 outlier(s) down-weighted" in found.notes
+    assert Note(Reason.OUTLIERS, (3,)) in found.notes
     assert found.remaining_rms < 1.2 * NOISE
     std = np.concatenate([found.std_axial, found.std_radial])
     assert (np.abs(np.concatenate([found.axial, found.radial]) - planted) < 5 * std).all()
@@ -131,8 +132,7 @@ def test_what_the_data_do_not_show_is_named():
     del columns["actual_TCP_force"]
     found = identify_compliance(model_of(6), log_of(6, columns), KNOWN)
     assert not found.identifiable[0]
-    reported = "axial_compliance_1: not identifiable from these data, stays at the model's value"
-    assert reported in found.combinations
+    assert Note(Reason.HELD, ("axial_compliance_1",)) in found.combinations
     assert found.identifiable[1:3].all()
 
 
@@ -150,10 +150,9 @@ def test_what_the_data_do_not_show_stays_exactly_at_the_models_value(own):
     np.testing.assert_array_equal(values[held], own)
     assert (values[found.identifiable] != own).sum() > 6
     for i in held:
-        begin = f"{name(i, 12)}: not identifiable"
-        reported = [line for line in found.combinations if line.startswith(begin)]
+        reported = [note for note in found.combinations if note.values[0] == name(i, 12)]
         assert len(reported) == 1
-        assert "stays at the model's value" in reported[0]
+        assert reported[0].reason in (Reason.HELD, Reason.ACTS_LIKE)
 
 
 def test_of_a_sum_that_is_known_alone_one_member_carries_the_whole():
@@ -169,9 +168,9 @@ def test_of_a_sum_that_is_known_alone_one_member_carries_the_whole():
     )
     assert abs(value - planted[1] - planted[6]) < 4 * std
     other = name(np.array([1, 6])[~both][0], 12)
-    reported = next(line for line in found.combinations if line.startswith(other))
-    assert "not identifiable alone from these data, it acts like" in reported
-    assert name(carrier, 12) in reported
+    reported = next(note for note in found.combinations if note.values[0] == other)
+    assert reported.reason is Reason.ACTS_LIKE
+    assert name(carrier, 12) in [part for _, part in reported.values[1]]
 
 
 def test_a_tool_point_that_nobody_registered_is_found_along_and_costs_no_flexibility():
@@ -191,8 +190,7 @@ def test_a_tool_point_that_nobody_registered_is_found_along_and_costs_no_flexibi
     np.testing.assert_allclose(values[[1, 2, 3, 4, 7, 8, 9]], planted[[1, 2, 3, 4, 7, 8, 9]],
                                rtol=1e-3)  # fmt: skip
     assert found.remaining_rms < 1e-8
-    reported = "frame and tool point were estimated along and are not written to the cell"
-    assert reported in found.notes
+    assert Note(Reason.NOTHING_WRITTEN) in found.notes
     known = identify_compliance(model_of(6), log, KNOWN)
     assert not known.tool_known  # 116 mm: a target that sits elsewhere, and no TCP to write
     assert known.remaining_rms > 1e-2
@@ -215,8 +213,8 @@ def test_two_flexibilities_that_act_alike_are_reported_as_one_combination():
     # where shoulder and elbow never turn, the base's tilt and the shoulder's give look the same
     planted, columns = truth(6, 40, 7, rotation=False, pull=0.0, still=(1, 2))
     found = identify_compliance(model_of(6), log_of(6, columns), KNOWN)
-    reported = [line for line in found.combinations if "mostly their sum is known" in line]
-    assert reported[0].startswith("axial_compliance_2 and radial_compliance_1")
+    reported = [note for note in found.combinations if note.reason is Reason.SUM_KNOWN]
+    assert reported[0].values[:2] == ("axial_compliance_2", "radial_compliance_1")
     both = found.axial[1] + found.radial[0]
     of_both = found.covariance[np.ix_([1, 6], [1, 6])].sum() ** 0.5
     assert of_both < 0.3 * found.std_axial[1]

@@ -22,6 +22,7 @@ from gapbridge.core.calibration.parameters import Parameters
 from gapbridge.core.calibration.plan import Payload, Plan
 from gapbridge.core.errors import PlanError
 from gapbridge.core.model import Model
+from gapbridge.core.notes import Note, Reason
 from gapbridge.core.planning import design
 from gapbridge.core.planning.candidates import candidates_of
 from gapbridge.core.planning.design import reference_of
@@ -184,8 +185,8 @@ def test_one_load_alone_and_an_unknown_place_are_reported(
 ) -> None:
     space = replace(space, places=())
     planned = plan(parameters, POSITION, LOADS[:1], space, poses=8, held_out=0, repeats=0)
-    assert any("where the instrument stands" in note for note in planned.notes)
-    assert any("one load alone" in note for note in planned.notes)
+    assert Note(Reason.SIGHT_UNKNOWN) in planned.notes
+    assert Note(Reason.ONE_LOAD) in planned.notes
 
 
 @pytest.mark.parametrize(
@@ -256,8 +257,8 @@ def test_a_load_that_shows_nothing_is_named(parameters: Parameters, space: Space
     loads = [Payload(0.0), Payload(0.01), Payload(4.0, (0.0, 0.02, 0.06))]
     planned = plan(parameters, POSITION, loads, space, poses=9, held_out=3, repeats=0)
     hung = {planned.loads[pose.load].mass for pose in planned.poses}
-    idle = [note for note in planned.notes if "need not be hung" in note]
-    assert ("0.01 kg" in str(idle)) == (0.01 not in hung)
+    idle = [note for note in planned.notes if note.reason is Reason.IDLE_LOADS]
+    assert any(0.01 in note.values[0] for note in idle) == (0.01 not in hung)
     assert 4.0 in hung
 
 

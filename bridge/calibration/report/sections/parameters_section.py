@@ -19,6 +19,7 @@ from gapbridge.bridge.document.blocks import (
     Verdict,
 )
 from gapbridge.bridge.document.findings import finding_text
+from gapbridge.bridge.document.notes import note_text
 from gapbridge.bridge.report.answer import one_line, sentences
 from gapbridge.bridge.report.labels import (
     CHANNELS,
@@ -42,7 +43,9 @@ def parameters(material: Material) -> list[Block]:
     """Return the table and what the readings do not determine."""
     c = material.calibration
     shown = [e for e in c.estimates if e.shown]
-    hidden = [parameter_title(e.name) for e in c.estimates if not e.shown]
+    # the combinations speak of most of those that are not shown
+    named = {note.values[0] for note in c.combinations}
+    hidden = [e.name for e in c.estimates if not e.shown and e.name not in named]
     planned = any(e.expected_std is not None for e in shown)
     blocks: list[Block] = [estimates_table(shown, planned=planned)]
     if any(e.on_bound for e in shown):
@@ -50,12 +53,10 @@ def parameters(material: Material) -> list[Block]:
         blocks.append(Paragraph(text, "note"))
     if c.combinations or hidden:
         blocks.append(Heading("What these readings cannot determine"))
-        items = [with_titles(text) for text in c.combinations]
-        # the combinations speak of most of them
+        items = [with_titles(note_text(note)) for note in c.combinations]
         items += [
-            f"{name}: these readings do not show it; it stays near where it stood"
+            f"{parameter_title(name)}: these readings do not show it; it stays near where it stood"
             for name in hidden
-            if not any(text.startswith(name) for text in items)
         ]
         blocks.append(Bullets(tuple(items)))
     return blocks
@@ -92,7 +93,7 @@ def residual(material: Material) -> list[Block]:
         return [Verdict(Badge("Not examined", QUIET), text)]
     badge = Badge("Complete", GOOD) if c.complete else Badge("Not complete", DOUBTFUL)
     main = chosen_channel(c.diagnosis)
-    blocks: list[Block] = [Verdict(badge, sentence(c.remaining))]
+    blocks: list[Block] = [Verdict(badge, sentence(note_text(c.remaining)))]
     if not c.missing_effects and (c.complete or c.diagnosis.verdict != "no_gap"):
         blocks.append(Paragraph(" ".join(sentences(main))))
     others = [ch for ch in c.diagnosis.channels if ch is not main]

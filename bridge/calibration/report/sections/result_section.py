@@ -26,6 +26,7 @@ from gapbridge.bridge.document.blocks import (
     Tiles,
     Verdict,
 )
+from gapbridge.bridge.document.notes import calibration_text
 from gapbridge.bridge.report.labels import (
     listed,
     number,
@@ -88,7 +89,7 @@ def summary(material: Material) -> list[Block]:
         )
     asked = [] if material.session.accuracy is None else [_asked(material)]
     return [
-        Verdict(badge, sentence(c.verdict)), *asked, Tiles(tuple(tiles)),
+        Verdict(badge, sentence(calibration_text(c))), *asked, Tiles(tuple(tiles)),
         Paragraph(text, "note"),
     ]  # fmt: skip
 

@@ -27,6 +27,7 @@ from gapbridge.bridge.document.blocks import (
     Verdict,
 )
 from gapbridge.bridge.document.drawing import AFTER, BAD_DOT, BEFORE, Drawing
+from gapbridge.bridge.document.notes import note_texts, short_text
 from gapbridge.bridge.report.labels import fixed, sentence
 from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.payload_session import PayloadCalibration
@@ -51,7 +52,7 @@ def _result(
     """Return the verdict, the large figures, and what the cell had."""
     badge = Badge("Found, see remarks", DOUBTFUL) if found.notes else Badge("Found", GOOD)
     return [
-        Verdict(badge, sentence(found.verdict)), Tiles(tiles),
+        Verdict(badge, sentence(short_text(found))), Tiles(tiles),
         *([Paragraph(before)] if before else []),
     ]  # fmt: skip
 
@@ -106,7 +107,7 @@ def payload_result(material: ShortMaterial[PayloadCalibration]) -> list[Block]:
 def payload_facts(material: ShortMaterial[PayloadCalibration]) -> list[Block]:
     """Return who, where, when, with what."""
     counts = [("orientations", str(len(material.found.residual)))]
-    return facts_blocks(material.session, counts, 1, material.found.notes)
+    return facts_blocks(material.session, counts, 1, note_texts(material.found.notes))
 
 
 def payload_parameters(material: ShortMaterial[PayloadCalibration]) -> list[Block]:
@@ -155,7 +156,7 @@ def _rms(values: Array) -> float:
 def tool_facts(material: ShortMaterial[ToolCalibration]) -> list[Block]:
     """Return who, where, when, with what."""
     counts = [("touches", str(len(material.found.residual)))]
-    return facts_blocks(material.session, counts, 1, material.found.notes)
+    return facts_blocks(material.session, counts, 1, note_texts(material.found.notes))
 
 
 def tool_parameters(material: ShortMaterial[ToolCalibration]) -> list[Block]:

@@ -28,6 +28,7 @@ from gapbridge.bridge.document.blocks import (
     Verdict,
 )
 from gapbridge.bridge.document.drawing import AFTER, EDGE, Drawing
+from gapbridge.bridge.document.notes import note_texts
 from gapbridge.bridge.report.labels import (
     effect_title,
     fixed,
@@ -74,7 +75,7 @@ def facts(material: VerificationMaterial) -> list[Block]:
     """Return the facts."""
     v = material.verification
     counts = [("readings", str(len(v.errors.rows)))]
-    return facts_blocks(material.session, counts, len(v.stations), v.notes)
+    return facts_blocks(material.session, counts, len(v.stations), note_texts(v.notes))
 
 
 def poses(material: VerificationMaterial) -> list[Block]:

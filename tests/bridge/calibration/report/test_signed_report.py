@@ -12,6 +12,7 @@ from calibration_report_cases import calibration, plan, session
 
 from gapbridge.bridge.calibration.report import Material, write_report
 from gapbridge.core.calibration.result import Errors
+from gapbridge.core.notes import Note, Reason
 
 FACTS = {"number": "GB-20261121-0912-1a2b3c4d", "version": "9.8.7", "cell_sha256": "ab" * 32}
 
@@ -54,12 +55,10 @@ def test_fewer_than_eight_poses_decide_nothing(tmp_path: Path) -> None:
 
 def test_what_is_left_is_the_same_statement_in_every_section(tmp_path: Path) -> None:
     c = calibration(True)
-    left = (
-        "to be added, with the share that each takes off what is left: transmission_error_2 (90 %)"
-    )
+    left = Note(Reason.EFFECTS_MISSING, ((("transmission_error_2", 0.9),),))
     changed = {
         "diagnosis": c.diagnosis, "complete": False, "missing_effects": ("transmission_error_2",),
-        "remaining": left, "verdict": f"the error falls; not complete: {left}",
+        "remaining": left,
     }  # fmt: skip
     text = page(tmp_path, None, **changed)
     section = text[text.index('id="residual"') : text.index('id="poses"')]

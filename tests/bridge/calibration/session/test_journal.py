@@ -7,7 +7,6 @@ import multiprocessing
 import os
 import signal
 import time
-from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -16,10 +15,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gapbridge.bridge.calibration.session.journal import FILE, Journal, plain, read_entries
-from gapbridge.bridge.calibration.session.plan_document import plan_of
+from gapbridge.bridge.calibration.session.plan_document import entry_of, plan_of
 from gapbridge.bridge.calibration.session.session import Reading, Session
+from gapbridge.bridge.document.notes import note_texts
 from gapbridge.core.calibration.plan import Expectation, Payload, Plan, PlannedPose
 from gapbridge.core.errors import InputError, RunError
+from gapbridge.core.notes import Note, Reason
+
+NOTE = Note(Reason.IDLE_LOADS, ((1.0,),))
 
 
 def small_plan(stops: int = 4) -> Plan:
@@ -29,7 +32,7 @@ def small_plan(stops: int = 4) -> Plan:
     )
     loads = (Payload(1.0, (0.0, 0.0, 0.1), "light"), Payload(5.0))
     expected = Expectation(("a",), ("m",), np.array([np.inf]), np.array([1e-3]), 1e-4, 2e-4)
-    return Plan(loads, poses, expected, ((6, 1e-4),), 12.0, ("a note",))
+    return Plan(loads, poses, expected, ((6, 1e-4),), 12.0, (NOTE,))
 
 
 def taken(stop: int, **changed: object) -> Reading:
@@ -43,9 +46,12 @@ def taken(stop: int, **changed: object) -> Reading:
 
 def test_a_plan_reads_back_as_it_was_written(tmp_path: Path) -> None:
     plan = small_plan()
-    found = plan_of(json.loads(json.dumps(plain(asdict(plan)), allow_nan=False)))
+    found = plan_of(json.loads(json.dumps(plain(entry_of(plan)), allow_nan=False)))
     assert found.loads == plan.loads
     assert found.bought == plan.bought
+    assert note_texts(found.notes) == note_texts(plan.notes)
+    older = plan_of(json.loads(json.dumps(plain(entry_of(plan)))) | {"notes": ["a sentence"]})
+    assert older.notes == ()
     assert np.isinf(found.expected.std[0])
     for one, other in zip(found.poses, plan.poses, strict=True):
         np.testing.assert_array_equal(one.q, other.q)

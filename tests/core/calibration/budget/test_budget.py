@@ -11,8 +11,6 @@ from gapbridge.core.calibration.budget.budget import budget
 from gapbridge.core.calibration.budget.inputs import Basis
 from gapbridge.core.calibration.budget.sensitivity import sensitivities
 from gapbridge.core.calibration.result import Estimate
-from gapbridge.core.effects import Site, Term
-from gapbridge.core.loads import Loads
 
 UM = 1e-6
 HELD = [False] * 20 + [True] * 10

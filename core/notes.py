@@ -1,0 +1,73 @@
+"""What a fit, a calibration or a plan reports beside its figures; ``bridge`` words it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum, auto
+from typing import Any
+
+
+class Reason(Enum):
+    """What is noted; the comment says what the note's values are."""
+
+    # of any fit
+    OUTLIERS = auto()  # rows
+    NOT_CONVERGED = auto()
+    SUM_KNOWN = auto()  # two parameters, their correlation
+    DIFFERENCE_KNOWN = auto()  # two parameters, their correlation
+    # of flexibilities from a log
+    AT_ZERO = auto()  # parameters
+    NO_FLEXIBILITY = auto()
+    SESSION_FRAMES = auto()
+    NOTHING_WRITTEN = auto()
+    TOOL_WRITTEN = auto()
+    LINKS_HELD = auto()
+    LINKS_ESTIMATED = auto()
+    TOOL_OFF_WRITTEN = auto()
+    TOOL_OFF = auto()
+    HELD = auto()  # parameter
+    ACTS_LIKE = auto()  # parameter, pairs of share and parameter
+    SHOWN_TOGETHER = auto()  # pairs of share and parameter
+    # of a calibration's parameters
+    ONLY_SUM = auto()  # parameter, the other
+    ONLY_DIFFERENCE = auto()  # parameter, the other
+    ONLY_TOGETHER = auto()  # parameter, the others
+    HARDLY_SHOWN = auto()  # parameter
+    NEVER_SHOWN = auto()  # parameter
+    REDUNDANT = auto()  # parameter, those that stand for it
+    REDUNDANT_WITH_PLACE = auto()  # the same; where instrument or target stand does too
+    # of a calibration
+    ON_BOUND = auto()  # parameters
+    HELD_OUT_FAR = auto()  # rows, from 1
+    LOADS_AT_ODDS = auto()
+    SAME_LOADS = auto()
+    VERIFYING_FITTED = auto()  # readings
+    FRAME_FITTED = auto()
+    FEW_NUMBERS = auto()  # how many
+    # what a calibration leaves
+    NOTHING = auto()
+    UNCONVERGED = auto()
+    EFFECTS_MISSING = auto()  # pairs of effect and share of what is left
+    EFFECTS_ACCUSED = auto()  # effects
+    STRUCTURE = auto()
+    FAR_OFF = auto()  # times as far as predicted
+    # of a session at the flange
+    NOTHING_WEIGHS = auto()
+    NEGATIVE_MASS = auto()  # kg
+    READINGS_DOWN = auto()  # rows, from 1
+    TOUCHES_DOWN = auto()  # rows, from 1
+    # of a plan
+    NOT_IDENTIFIABLE = auto()  # parameters
+    IDLE_LOADS = auto()  # kg
+    ONE_LOAD = auto()
+    SIGHT_UNKNOWN = auto()
+    DETOURS = auto()  # pairs of stops, from 1
+    FEW_POSES = auto()  # what hinders the others
+
+
+@dataclass(frozen=True)
+class Note:
+    """One fact, and its numbers or names."""
+
+    reason: Reason
+    values: tuple[Any, ...] = ()
