@@ -97,6 +97,7 @@ def test_a_failure_counts_unless_the_machine_was_late_and_the_test_in_real_time(
 
 
 def test_how_long_a_process_has_had_and_waited_for_a_core_is_the_kernels_count() -> None:
+    assert os.sched_getscheduler(0) == os.SCHED_OTHER, "an earlier test kept its priority"
     all_cores = os.sched_getaffinity(0)
     os.sched_setaffinity(0, {min(all_cores)})
     spinning = [sys.executable, "-S", "-E", "-c", "print(flush=True)\nwhile True: pass"]

@@ -23,6 +23,12 @@ def be_punctual() -> None:
         os.sched_setscheduler(0, policy, os.sched_param(PRIORITY))
 
 
+def be_ordinary() -> None:
+    """Give real-time priority back: what a thread does later must not keep others from the core."""
+    with contextlib.suppress(OSError, AttributeError):
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+
+
 def go_first(pid: int | None = None) -> None:
     """Have a process, or what the calling thread starts, go before other work, where allowed.
 

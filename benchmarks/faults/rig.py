@@ -12,7 +12,7 @@ from benchmarks.faults.controller_process import ControllerProcess
 from benchmarks.faults.invariants import Checker, Found
 from benchmarks.faults.links import Link, own_address
 from benchmarks.faults.proxy import Proxy
-from benchmarks.faults.punctual import be_punctual
+from benchmarks.faults.punctual import be_ordinary, be_punctual
 from benchmarks.faults.running import Running
 from benchmarks.faults.tap import Tap
 from gapbridge.bridge.loop.supervisor import State
@@ -75,6 +75,7 @@ class Rig:
             self.start_daemon()
         except BaseException:
             self.controller.stop()
+            be_ordinary()
             raise
         return self
 
@@ -87,6 +88,7 @@ class Rig:
         finally:
             self.proxy.__exit__(None, None, None)
             self.controller.stop()
+            be_ordinary()
 
     def start_daemon(self) -> None:
         """Start a run, observing; again where a busy machine was too slow for the first words."""
