@@ -177,7 +177,7 @@ class _Beside:
             left = projected_out(basis, space.y)
             freedom = max(space.freedom - basis.shape[1], 1.0)
             variance = max(float(left @ left) / freedom, space.floor)
-            gain = gains(space, left, basis)[0][self._index] / variance - self._price
+            gain = gains(space, left, basis.T @ space.X)[0][self._index] / variance - self._price
             gain[np.isin(self._index, asked)] = -np.inf
             if gain.max() <= 0:
                 break

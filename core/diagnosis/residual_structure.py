@@ -21,7 +21,7 @@ from gapbridge.core.estimation.least_squares import basis_of, projected_out
 
 Array = NDArray[np.float64]
 DRAWS = 1500
-AT_ONCE = 200  # directions: with all draws 2.4 MB
+AT_ONCE = 40  # directions: with all draws 0.5 MB
 FOLDS = 7
 
 

@@ -25,6 +25,7 @@ class State:
 
     chosen: tuple[int, ...]
     basis: Array  # (m, r) orthonormal, of the chosen columns
+    along: Array  # (r, K) parts of all columns along it
     r: Array
     rss: float
     score: float
@@ -55,24 +56,23 @@ def forward_step(space: SampleSpace, state: State, new: int, score: float) -> St
     """Return the state with one more term."""
     block = projected_out(state.basis, space.X[:, space.start[new] : space.start[new + 1]])
     U = basis_of(block, DEPENDENT)
+    basis, along = np.hstack([state.basis, U]), np.vstack([state.along, U.T @ space.X])
     r = projected_out(U, state.r)
-    return State((*state.chosen, new), np.hstack([state.basis, U]), r, float(r @ r), score)
+    return State((*state.chosen, new), basis, along, r, float(r @ r), score)
 
 
 def projected(space: SampleSpace, chosen: Sequence[int]) -> State:
     """Return the state of a whole set."""
-    if not chosen:
-        return State((), np.zeros((len(space.y), 0)), space.y, float(space.y @ space.y), 0.0)
     U = basis_of(space.columns(chosen), DEPENDENT)
     r = projected_out(U, space.y)
-    return State(tuple(chosen), U, r, float(r @ r), 0.0)
+    return State(tuple(chosen), U, U.T @ space.X, r, float(r @ r), 0.0)
 
 
 def additions(
     space: SampleSpace, state: State, width: int, named_only: bool = False
 ) -> list[tuple[float, int]]:
     """Return the best terms to join a state: (score of the joint set, index), best first."""
-    gain, sign = gains(space, state.r, state.basis)
+    gain, sign = gains(space, state.r, state.along)
     score = space.misfit(np.maximum(state.rss - gain, 1e-300)) + space.penalty
     score += space.penalty[list(state.chosen)].sum()
     found: list[tuple[float, int]] = []

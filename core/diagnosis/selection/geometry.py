@@ -116,7 +116,8 @@ class Links:
         """Return columns (m, ...) in which the links are noise like any other."""
         less = 1 - 1 / np.sqrt(1 + self.spread**2)
         along = self.directions.T @ columns
-        return np.asarray(columns - self.directions @ (less * along.T).T)
+        taken = self.directions @ (less * along.T).T
+        return np.subtract(columns, taken, out=taken)  # one copy of many columns, not two
 
     def beside(self, space: SampleSpace, block: Iterable[int]) -> SampleSpace:
         """Return the space beside them; ``block``, their candidates, can be in no set there."""

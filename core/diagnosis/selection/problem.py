@@ -20,8 +20,8 @@ from gapbridge.core.diagnosis.selection.candidate import Candidate
 
 Array = NDArray[np.float64]
 RANK = 1e-10  # share of a column's square below which it counts as already explained
-DEPENDENT = 1e-8  # the same of a direction among several columns
-AT_ONCE = 250_000  # numbers of a temporary: 2 MB
+DEPENDENT = 1e-8  # the same of one among several columns
+AT_ONCE = 60_000  # numbers of a temporary: 0.5 MB
 SENSED = ("N", "Nm", "N/s", "Nm/s")  # units of sensor biases, which may have any size
 USUAL_ORDERS = (1.0, 2.0, 3.0, 4.0)  # eccentricity and its kin
 
@@ -33,7 +33,7 @@ class Blocks:
     index: NDArray[np.int64]  # (n,) candidates
     columns: NDArray[np.int64]  # (n, d)
     unit: Array  # (n, d) one over each column's size
-    gram: Array  # (n, d, d) of the unit columns
+    gram: Array  # (d, d, n) of the unit columns
 
 
 def _blocks(X: Array, index: NDArray[np.int64], columns: NDArray[np.int64]) -> Blocks:
@@ -43,7 +43,8 @@ def _blocks(X: Array, index: NDArray[np.int64], columns: NDArray[np.int64]) -> B
         block = X[:, columns[few].ravel()].T.reshape(len(few), d, len(X))
         gram[few] = block @ block.transpose(0, 2, 1)
     unit = 1 / np.sqrt(np.einsum("cii->ci", gram) + 1e-300)
-    return Blocks(index, columns, unit, gram * unit[:, :, None] * unit[:, None, :])
+    gram = gram * unit[:, :, None] * unit[:, None, :]
+    return Blocks(index, columns, unit, np.ascontiguousarray(gram.transpose(1, 2, 0)))
 
 
 @dataclass(frozen=True)
@@ -119,31 +120,37 @@ def _kind(candidate: Candidate) -> str:
     return candidate.family
 
 
-def gains(space: SampleSpace, r: Array, basis: Array | None = None) -> tuple[Array, Array]:
+def gains(space: SampleSpace, r: Array, along: Array | None = None) -> tuple[Array, Array]:
     """Return how much of |r|^2 each candidate takes (C,), and its first value's sign (C,).
 
-    ``basis`` (m, p), orthonormal, is projected out of the columns; of them all only their parts
-    along it are formed, so that a step of a search costs little beside the columns themselves.
+    ``along`` (p, K) are the columns' parts along an orthonormal basis that is projected out of
+    them; ``r`` is free of it.
     """
-    within = np.zeros((0, space.X.shape[1])) if basis is None else basis.T @ space.X
+    within = np.zeros((0, space.X.shape[1])) if along is None else along
     g = space.X.T @ r
-    if basis is not None:
-        g -= within.T @ (basis.T @ r)
     gain, sign = np.zeros(len(space.candidates)), np.ones(len(space.candidates))
     for blocks in space.blocks:
-        own = g[blocks.columns] * blocks.unit
-        taken = (within[:, blocks.columns] * blocks.unit).transpose(1, 2, 0)
-        if blocks.columns.shape[1] == 1:
-            left = blocks.gram[:, 0, 0] - np.sum(taken[:, 0] ** 2, axis=1)
-            along, alive = own, (left > RANK)[:, None]
-            left = left[:, None]
-            sign[blocks.index] = np.sign(own[:, 0])
-        else:
-            left, vectors = np.linalg.eigh(blocks.gram - taken @ taken.transpose(0, 2, 1))
-            along, alive = np.einsum("cji,cj->ci", vectors, own), left > DEPENDENT
-        share = np.where(alive, along**2 / np.where(alive, left, 1), 0)
-        gain[blocks.index] = share.sum(axis=1)
+        own = (g[blocks.columns] * blocks.unit).T
+        taken = within[:, blocks.columns] * blocks.unit
+        d, n = own.shape
+        whole = np.zeros((d + 1, d + 1, n))  # products of the columns and, last, of r
+        np.subtract(blocks.gram, np.einsum("pci,pcj->ijc", taken, taken), out=whole[:d, :d])
+        whole[d, :d] = whole[:d, d] = own
+        gain[blocks.index] = -_eliminated(whole, RANK if d == 1 else DEPENDENT)
+        if d == 1:
+            sign[blocks.index] = np.sign(own[0])
     return gain, sign
+
+
+def _eliminated(products: Array, least: float) -> Array:
+    """Return what n matrices (d, d, n) have last on the diagonal (n,) after Gaussian elimination.
+
+    They are overwritten. A pivot of ``least`` or less counts as zero, and so does its column.
+    """
+    for k, row in enumerate(products[:-1]):
+        inverse = 1 / np.where(row[k] > least, row[k], np.inf)
+        products[k + 1 :, k + 1 :] -= (row[k + 1 :] * inverse)[:, None] * row[None, k + 1 :]
+    return np.asarray(products[-1, -1])
 
 
 def fit(space: SampleSpace, chosen: Sequence[int]) -> CandidateFit:

@@ -71,8 +71,11 @@ def sample_space(
     size = np.array([len(c.parameters) for c in candidates])
     start = np.concatenate([[0], np.cumsum(size)])
     X = np.empty((int(state.kept.sum()) * observation.measured.shape[1], int(start[-1])))
-    for c, block in enumerate([*columns, *(s for _, s in smooth)]):
-        X[:, start[c] : start[c + 1]] = flat(block, state)
+    blocks = [*columns, *(s for _, s in smooth)]
+    for few in np.array_split(np.arange(len(blocks)), 1 + X.size // AT_ONCE):
+        if len(few):
+            together = np.concatenate([blocks[c] for c in few], axis=2)
+            X[:, start[few[0]] : start[few[-1] + 1]] = flat(together, state)
     chords = chords_only(observation, base)
     gap = (observation.measured - observation.predict(() if chords else base))[..., None]
     # what the terms already in the model explain is put back, in the linear form at hand

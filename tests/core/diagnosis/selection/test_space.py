@@ -79,7 +79,7 @@ def test_growing_term_by_term_comes_to_the_joint_fit(seed, chosen):
 def test_a_gain_is_what_a_fit_would_take(seed, chosen):
     space = toy.random_space(seed, FAMILIES, planted=(1, 3))
     state = projected(space, chosen)
-    gain, sign = gains(space, state.r, state.basis)
+    gain, sign = gains(space, state.r, state.along)
     for c in set(range(len(FAMILIES))) - set(chosen):
         with_it = fit(space, [*chosen, c])
         assert gain[c] == pytest.approx(state.rss - with_it.rss, rel=1e-6, abs=1e-7)
@@ -114,7 +114,7 @@ def test_a_candidate_never_named_twice_by_two_of_the_same_columns():
     twice = replace(space, X=X)
     assert fit(twice, (0, 1)).rss == pytest.approx(fit(twice, (0,)).rss)
     state = projected(twice, (0,))
-    assert gains(twice, state.r, state.basis)[0][1] == pytest.approx(0, abs=1e-9)
+    assert gains(twice, state.r, state.along)[0][1] == pytest.approx(0, abs=1e-9)
 
 
 def test_what_cannot_be_negative_has_no_score_where_it_would_have_to():
