@@ -49,6 +49,9 @@ class Difference:
     expected: str
     sure: bool = True
 
+    def __str__(self) -> str:
+        return f"{'.'.join(self.keys)}: found {self.found}, expected {self.expected}"
+
 
 def differences(
     facts: ControllerFacts, model: Model, rate: float | None = None, tolerance: float = 0.005

@@ -106,22 +106,20 @@ class Driver(ABC):
         """Leave the link: the arm stops where setpoints moved it. Never raises; may be repeated."""
 
     @final
-    def arm(self, state: RobotState) -> None:
+    def arm(self, state: RobotState) -> list[Difference]:
         """Make ready for writing; may take seconds and never moves the arm. Raises WriteError.
 
         ``state`` is the sample last read; states read before are stale afterwards. Refuses where
-        the controller's arm, TCP or gravity are not the cell's.
+        the controller's arm, TCP or gravity are not the cell's; returns what else differs.
         """
         self.gate.end()
-        wrong = [d for d in self.differences(state) if d.sure]
-        if wrong:
-            first = wrong[0]
-            raise WriteError(
-                f"{'.'.join(first.keys)}: found {first.found}, expected {first.expected} "
-                "(gapbridge check --live)"
-            )
+        found = self.differences(state)
+        for wrong in found:
+            if wrong.sure:
+                raise WriteError(f"{wrong} (gapbridge check --live)")
         self._make_ready(state)
         self.gate.begin(state.target_q, state.actual_q)
+        return found
 
     def _make_ready(self, state: RobotState) -> None:
         """Do what ``arm`` promises; see there."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 
 from gapbridge.bridge.cell.cell import Cell
-from gapbridge.bridge.cell.message import key_path
 from gapbridge.bridge.cell.plausibility import Findings
 from gapbridge.core.errors import CellError, InvalidStateError, StaleStateError
 from gapbridge.core.state import RobotState
@@ -36,11 +35,7 @@ def live_findings(cell: Cell) -> Findings:
         state = whole_state(driver)
         differences = list(driver.differences(state))
         for found in differences:
-            line = cell.document.line(found.keys)
-            text = (
-                f"{cell.path}, line {line}: {key_path(found.keys)}: found {found.found}, "
-                f"expected {found.expected}"
-            )
+            text = f"{cell.path}, line {cell.document.line(found.keys)}: {found}"
             (errors if found.sure else warnings).append(text)
         if driver.mismatch() is not None and not errors:
             errors.append(f"{cell.path}: {driver.mismatch()}")

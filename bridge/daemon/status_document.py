@@ -6,6 +6,8 @@ import time
 from typing import Any
 
 SCHEMA = "gapbridge.status/1"
+AGES = (("ms", 1e-3, 1.0), ("s", 1.0, 120.0), ("min", 60.0, 7200.0), ("h", 3600.0, float("inf")))
+"""How an age is shown: unit, its seconds, the age (s) from which the next one is taken."""
 
 
 def lines(status: dict[str, Any]) -> list[str]:
@@ -39,4 +41,8 @@ def lines(status: dict[str, Any]) -> list[str]:
 
 
 def _last(age: float | None) -> str:
-    return "no state yet" if age is None else f"last state {1e3 * age:.0f} ms ago"
+    """Return how old the last state is, in the unit of its size."""
+    if age is None:
+        return "no state yet"
+    unit, size = next((unit, size) for unit, size, until in AGES if age < until)
+    return f"last state {age / size:.0f} {unit} ago"

@@ -107,7 +107,8 @@ class Writing:
         self.has_armed = True
         try:
             self._check_way()
-            self._driver.arm(state)
+            for found in self._driver.arm(state):
+                self._reports.emit({"kind": "warning", "what": "cell", "detail": str(found)})
             self.ready = True
         finally:
             self._reports.page.enter(Phase.RUNNING)

@@ -6,12 +6,13 @@ from pathlib import Path
 
 import click
 
-from gapbridge.bridge.cell import load_cell
+from gapbridge.bridge.cell import Cell, load_cell
 from gapbridge.bridge.cell.cell import complaints
 from gapbridge.bridge.cell.live import live_findings
 from gapbridge.bridge.cell.log_fit import log_findings
 from gapbridge.bridge.cell.run_settings import read_configuration
 from gapbridge.bridge.cli.options import FILE, cell_argument
+from gapbridge.bridge.setpoint_source import make_source
 from gapbridge.core.errors import InputError
 
 
@@ -44,10 +45,7 @@ def check(cell: Path, live: bool, logs: tuple[Path, ...]) -> None:
         given = load_cell(cell)
         warnings += given.warnings
         if given.file.link is not None:
-            try:
-                read_configuration(cell)  # what only a run reads: profiles, tokens, credentials
-            except InputError as error:
-                errors.append(str(error))
+            errors += _of_a_run(given)
         if live and not errors:
             found = live_findings(given)
             errors += found.errors
@@ -66,3 +64,17 @@ def check(cell: Path, live: bool, logs: tuple[Path, ...]) -> None:
     beside = [*["its controller"] * live, *map(str, logs)]
     text = f" with {' and '.join(beside)}" if beside else ""
     click.echo(f"{cell}: fit to be used{text}{counted}")
+
+
+def _of_a_run(cell: Cell) -> list[str]:
+    """Return what is wrong with the files that only a run reads: profiles, tokens, a trajectory."""
+    try:
+        settings = read_configuration(cell.path).settings
+    except InputError as error:
+        return [str(error)]
+    try:
+        make_source(settings.setpoints, cell.arm.n, True, cell.path.parent, settings.link.rate)
+    except InputError as error:
+        line = cell.document.line(("setpoints", "file"))
+        return [f"{cell.path}, line {line}: setpoints: {error}"]
+    return []

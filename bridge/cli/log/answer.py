@@ -71,9 +71,10 @@ def _channel(channel: ChannelDiagnosis, sessions: tuple[str, ...]) -> list[str]:
         lines += [f"  {line}" for line in _cause(cause, unit)]
         lines += [f"    {line}" for line in _changed(channel, cause, sessions)]
     if channel.causes:
+        lines.append(f"  remaining with these values {_both(channel, channel.remaining_rms)}")
         lines.append(
-            f"  remaining {_both(channel, channel.remaining_rms)}, on held-out samples "
-            f"{_both(channel, channel.remaining_rms_held_out)}"
+            f"  on samples held out {_both(channel, channel.remaining_rms_held_out)}, "
+            "these causes alone fitted to the others"
         )
     lines += [f"  {line}" for line in _elsewhere(channel, sessions)]
     for stand_in in channel.stand_ins:

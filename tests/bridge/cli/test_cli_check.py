@@ -55,6 +55,17 @@ def test_a_cell_that_is_wrong_ends_with_two_and_every_line(tmp_path: Path) -> No
     assert all(line.startswith(f"error: {path}, line ") for line in lines)
 
 
+def test_a_trajectory_that_cannot_be_run_is_named(tmp_path: Path) -> None:
+    path = cell(tmp_path, "127.0.0.1", more="setpoints: {source: trajectory, file: way.csv}\n")
+    err = refused("check", path)
+    assert err.startswith(f"error: {path}, line 5: setpoints: {tmp_path}/way.csv: file not found")
+    (tmp_path / "way.csv").write_text("timestamp,target_q_0\n0,0\n1,0\n")
+    assert "target_q" in refused("check", path)
+    joints = ",".join(f"target_q_{i}" for i in range(6))
+    (tmp_path / "way.csv").write_text(f"timestamp,{joints}\n0{',0' * 6}\n1{',0' * 6}\n")
+    assert gapbridge("check", path).code == 0
+
+
 def test_a_fit_cell_ends_with_zero_and_says_so(tmp_path: Path) -> None:
     path = tmp_path / "cell.yaml"
     path.write_text("robot: {model: ur10e}\nmetrology: {sigma: 0.005}\n")

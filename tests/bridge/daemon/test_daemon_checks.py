@@ -119,6 +119,30 @@ def test_a_model_that_is_no_use_is_reported_and_does_not_arm(robot: Robot, times
         assert "the model corrects nothing" in "\n".join(lines(status))
 
 
+def test_arming_warns_of_what_differs_from_the_controller_and_is_no_reason_to_refuse(
+    robot: Robot,
+) -> None:
+    cell = robot.cell(PATIENT)
+    changed(cell, "mass: 5.0", "mass: 4.5")
+    with Run(cell, arm=True) as run:
+        run.wait(State.COMPENSATING)
+        run.end()
+    warned = [line for line in run.output if "payload.mass" in line]
+    assert warned == ["payload.mass: found 4.5 kg, expected 5 kg, as the controller has it"]
+
+
+def test_the_age_of_the_last_state_is_shown_in_the_unit_of_its_size(robot: Robot) -> None:
+    with Run(robot.cell(PATIENT)) as run:
+        run.wait(State.OBSERVING)
+        status = run.daemon.status()
+        run.end()
+    for age, text in ((0.0124, "12 ms"), (15.244, "15 s"), (300.0, "5 min"), (9e4, "25 h")):
+        status["link"]["age"] = age
+        assert f" Hz, last state {text} ago, cycles" in lines(status)[2]
+    status["link"]["age"] = None
+    assert " Hz, no state yet, cycles" in lines(status)[2]
+
+
 def script(robot: Robot, line: str) -> None:
     """Have the controller run a line beside its program, as a person at the pendant would."""
     text = f"sec person():\n  {line}\nend\n"
