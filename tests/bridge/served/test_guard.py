@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -44,7 +45,7 @@ def delays(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     async def sleep(seconds: float) -> None:
         waited.append(seconds)
 
-    monkeypatch.setattr(guard_module.asyncio, "sleep", sleep)
+    monkeypatch.setattr(guard_module, "asyncio", SimpleNamespace(sleep=sleep))
     return waited
 
 

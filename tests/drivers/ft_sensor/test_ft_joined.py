@@ -21,6 +21,7 @@ from sensor_wires import (
     make_wire,
     reaction_of,
     resting_controller,
+    settings_of,
 )
 
 from gapbridge.core.arm import builtin_arm
@@ -199,30 +200,24 @@ def test_a_sensor_that_was_switched_off_and_on_comes_back() -> None:
     controller = resting_controller(TURNED)
     for kind in ("robotous_rft", "ati_netcanoem"):
         wire = make_wire(kind, reaction_of(controller))
-        with joined_started(wire, controller) as driver:
+        with wire.device, joined(wire, controller) as driver:
             wire.device.stop()
             time.sleep(0.3)
             with pytest.raises(StaleStateError):
                 driver.read_state()
             wire.device.start()
             heal(driver)
-            wire.device.stop()
-
-
-def joined_started(wire: Wire, controller: ArmController) -> DriverWithSensor:
-    wire.device.start()
-    return joined(wire, controller)
 
 
 def test_a_cut_serial_line_is_reported_and_opened_anew(tmp_path: Any) -> None:
     from gapbridge.drivers.simulated.ft_sensor.ft300_device import Ft300Device
 
     controller, link = resting_controller(TURNED), tmp_path / "ft300"
-    device = Ft300Device(reaction_of(controller), link)
-    wire = Wire(device, {"driver": "robotiq_ft300", "max_age": 0.2})
-    device.start()
-    settings = wire.settings(**MOUNTED).model_copy(update={"port": str(link)})
-    with DriverWithSensor(ControllerDriver(controller), settings, model()) as driver:
+    device, arm = Ft300Device(reaction_of(controller), link), ControllerDriver(controller)
+    settings = settings_of(
+        driver="robotiq_ft300", port=str(link), max_age=0.2, when_lost="stop", **MOUNTED
+    )
+    with device, DriverWithSensor(arm, settings, model()) as driver:
         driver.read_state()
         device.stop()
         time.sleep(0.3)
@@ -230,7 +225,6 @@ def test_a_cut_serial_line_is_reported_and_opened_anew(tmp_path: Any) -> None:
             driver.read_state()
         device.start()
         heal(driver)
-        device.stop()
 
 
 @pytest.mark.parametrize(
