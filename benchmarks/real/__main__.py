@@ -75,8 +75,13 @@ def main(
 
 
 def _line(o: Outcome) -> str:
-    ratio = "–" if o.ratio is None else f"{o.ratio:.3f}"
-    return f"{o.log} {o.channel}: judged {_size(o, o.judged)}, rival {_size(o, o.rival)}, {ratio}"
+    sizes = f"judged {_size(o, o.judged)}, rival {_size(o, o.rival)}"
+    return f"{o.log} {o.channel}: {sizes}, {_ratio(o)}"
+
+
+def _ratio(o: Outcome) -> str:
+    """Return the ratio with its standard error: within it of 1 the two are alike."""
+    return f"{o.ratio:.3f} ± {o.ratio_error:.3f}"
 
 
 def _size(o: Outcome, value: float | None) -> str:
@@ -100,7 +105,7 @@ def _table(outcomes: list[Outcome]) -> Table:
         table.add_row(
             o.log, o.channel, o.split, str(o.rows), _size(o, o.gap), _size(o, o.reported),
             _size(o, o.judged), _size(o, o.rival), theirs,
-            "–" if o.ratio is None else f"{o.ratio:.2f}", o.verdict, " ".join(o.accused) or "–",
+            _ratio(o), o.verdict, " ".join(o.accused) or "–",
             "; ".join(o.absurd) or "–", f"{o.seconds:.1f}",
         )  # fmt: skip
     return table

@@ -28,6 +28,12 @@ from benchmarks.real.sets import HELD_BACK, PUBLISHED, REMOUNTED, SPLIT
 from benchmarks.real.table import Mask, Table, copy_cell, halves, read_cell, read_table
 
 LIMIT = 900.0  # s, of one diagnosis
+STRETCHES = 10  # of a judged recording, by which the ratio scatters: its rows are no samples
+READ = {  # channel: the columns measured and predicted
+    "wrench": ("ft_raw_wrench", "predicted_wrench"),
+    "tracking": ("actual_q", "predicted_q"),
+    "torque": ("actual_current_as_torque", "predicted_torque"),
+}
 
 
 @dataclass(frozen=True)
@@ -42,21 +48,22 @@ class Outcome:
     reported: float | None  # the diagnosis' own held-out figure
     reported_new_region: float | None
     judged: float  # what its cell leaves of rows that it did not see
-    rival: float | None  # what plain least squares leave of the same rows
+    rival: float  # what plain least squares leave of the same rows
     published: tuple[float, float, str] | None  # ours and theirs, mean length (m), and what
     verdict: str
     accused: tuple[str, ...]
     absurd: tuple[str, ...]
     seconds: float
     unit: str = field(default="")
+    ratio_error: float = 0.0  # 1 sigma of judged over rival
 
     @property
-    def ratio(self) -> float | None:
+    def ratio(self) -> float:
         """Return judged over the best rival there is."""
-        ratios = [self.judged / self.rival] if self.rival else []
+        ratios = [self.judged / self.rival]
         if self.published is not None:
             ratios.append(self.published[0] / self.published[1])
-        return max(ratios) if ratios else None
+        return max(ratios)
 
     def document(self) -> dict[str, Any]:
         """Return the outcome for JSON."""
@@ -130,9 +137,13 @@ def _judge(
             after = program.diagnosis(place / "test.csv", better)
         out = []
         for channel in channels:
-            left, published = _judged(name, channel, program, place, train, test, after)
-            rival = _rival(channel, cell, cell_file.parent, train, test, place, program)
-            out.append(_outcome(name, reported[channel], train, left, rival, published, seconds))
+            ours = _left(name, channel, program, place, train, test)
+            judged = float(after[channel]["gap_rms"]) if channel in after else _rms(ours)
+            theirs, rival = _rival(channel, cell, cell_file.parent, train, test, place, program)
+            published = _published(name, ours) if channel == "position" else None
+            error = ratio_error(ours, theirs, test.moving)
+            found = reported[channel]
+            out.append(_outcome(name, found, train, (judged, rival, error), published, seconds))
     return out
 
 
@@ -143,12 +154,12 @@ def _knows(program: Program) -> bool:
     return "--remounted" in output
 
 
-def _judged(
-    name: str, channel: str, program: Program, place: Path, train: Table, test: Table,
-    after: dict[str, dict[str, Any]],
-) -> tuple[float, tuple[float, float, str] | None]:  # fmt: skip
+def _left(
+    name: str, channel: str, program: Program, place: Path, train: Table, test: Table
+) -> np.ndarray:
+    """Return what the written cell leaves of the judged rows (N, k); nan where it says nothing."""
     if channel != "position":
-        return float(after[channel]["gap_rms"]) if channel in after else float("nan"), None
+        return _gap(channel, program, place, test, "better")
     predicted, turned = _predicted(program, place, "test")
     if name in REMOUNTED:  # as the rival: each session's tool point as the fitted rows have it
         p, R = _predicted(program, place, "train")
@@ -157,12 +168,25 @@ def _judged(
             measured = train.get("measured_position")
             assert measured is not None
             predicted[judged] += turned[judged] @ tool_step(p[own], R[own], measured[own])
-    left = rivals.left_of(predicted, test)
+    return rivals.left_of(predicted, test)
+
+
+def _published(name: str, left: np.ndarray) -> tuple[float, float, str] | None:
     theirs = PUBLISHED.get(name)
     if theirs is None:
-        return _rms(left), None
+        return None
     length = float(np.linalg.norm(left, axis=1).mean())
-    return _rms(left), (length, theirs.mean_length, theirs.what)
+    return length, theirs.mean_length, theirs.what
+
+
+def _gap(channel: str, program: Program, place: Path, table: Table, cell: str) -> np.ndarray:
+    """Return measured minus predicted (N, k) of the rows of test.csv; nan where not predicted."""
+    program("predict", place / "test.csv", "--cell", place / f"{cell}.yaml", "--channels",
+            "--out", place / "channels.csv")  # fmt: skip
+    measured, predicted = READ[channel]
+    own, model = table.get(measured), read_table(place / "channels.csv").get(predicted)
+    assert own is not None and model is not None
+    return np.asarray(own - model)
 
 
 def _predicted(program: Program, place: Path, rows: str) -> tuple[np.ndarray, np.ndarray]:
@@ -178,26 +202,43 @@ def _predicted(program: Program, place: Path, rows: str) -> tuple[np.ndarray, np
 def _rival(
     channel: str, cell: dict[str, Any], folder: Path, train: Table, test: Table, place: Path,
     program: Program,
-) -> float | None:  # fmt: skip
-    if channel == "position":
-        return _rms(rivals.position_left(cell, train, test))
-    if channel == "tracking":
-        return _rms(rivals.tracking_left(train, test))
-    if channel == "torque":  # on the rows that the program judges
-        program("predict", place / "test.csv", "--cell", place / "cell.yaml", "--channels",
-                "--out", place / "nominal.csv")  # fmt: skip
-        nominal = read_table(place / "nominal.csv").get("predicted_torque")
-        assert nominal is not None
+) -> tuple[np.ndarray, float]:  # fmt: skip
+    """Return what plain least squares leave of the judged rows (N, k), and its rms."""
+    if channel in ("position", "tracking"):
+        left = (
+            rivals.position_left(cell, train, test) if channel == "position"
+            else rivals.tracking_left(train, test)
+        )  # fmt: skip
+        return left, _rms(left)
+    if channel == "torque":
+        nominal = _gap(channel, program, place, test, "cell")
         corrected = rivals.torque_corrected(cell, folder, train, test, nominal)
     else:
         corrected = rivals.wrench_corrected(cell, train, test)
-    corrected.write(place / "corrected.csv")
+    corrected.write(place / "corrected.csv")  # on the rows that the program judges
     seen = program.diagnosis(place / "corrected.csv", place / "cell.yaml")
-    return float(seen[channel]["gap_rms"])
+    left = _gap(channel, program, place, corrected, "cell")
+    return left, float(seen[channel]["gap_rms"])
+
+
+def ratio_error(ours: np.ndarray, theirs: np.ndarray, moving: bool) -> float:
+    """Return 1 sigma of the ratio of two rms (N, k) of the same rows: a jackknife.
+
+    Over single poses, or over stretches of a recording, whose neighbouring rows are no samples of
+    their own.
+    """
+    a, b = (np.sum(left**2, axis=1) for left in (ours, theirs))
+    both = np.isfinite(a) & np.isfinite(b)
+    a, b = a[both], b[both]
+    count = STRETCHES if moving else len(a)
+    part = np.arange(len(a)) * count // len(a)
+    less_a, less_b = (np.sum(x) - np.bincount(part, x, count) for x in (a, b))
+    ratio = np.sqrt(less_a / less_b)
+    return float(np.sqrt((count - 1) * np.var(ratio)))
 
 
 def _outcome(
-    name: str, reported: dict[str, Any], train: Table, left: float, rival: float | None,
+    name: str, reported: dict[str, Any], train: Table, sizes: tuple[float, float, float],
     published: tuple[float, float, str] | None, seconds: float,
 ) -> Outcome:  # fmt: skip
     mass = train.get("payload")
@@ -212,14 +253,15 @@ def _outcome(
         gap=float(reported["gap_rms"]),
         reported=reported.get("remaining_rms_held_out"),
         reported_new_region=reported.get("remaining_rms_new_region"),
-        judged=left,
-        rival=rival,
+        judged=sizes[0],
+        rival=sizes[1],
         published=published,
         verdict=str(reported["verdict"]),
         accused=tuple(_accused(c) for c in reported["causes"]),
         absurd=tuple(absurdities(reported["causes"], least, largest)),
         seconds=seconds,
         unit=str(reported["unit"]),
+        ratio_error=sizes[2],
     )
 
 
@@ -229,4 +271,4 @@ def _accused(cause: dict[str, Any]) -> str:
 
 
 def _rms(values: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(values**2)))
+    return float(np.sqrt(np.nanmean(values**2)))

@@ -74,16 +74,22 @@ def _wrench_rows(cell: dict[str, Any], table: Table) -> Array:
 
 
 def tracking_left(fitted: Table, judged: Table) -> Array:
-    """Return what one delay a joint, fitted, leaves of the judged following error (N, n)."""
+    """Return what one delay a joint, fitted, leaves of the judged following error (N, n).
+
+    nan where the delayed target is not in the log, or a row's time is repeated.
+    """
     delay = np.zeros(fitted.joints().shape[1])
     for _ in range(6):
-        error, speed = _following(fitted, delay)
+        _, error, speed = _following(fitted, delay)
         delay -= np.sum(speed * error, axis=0) / np.maximum(np.sum(speed**2, axis=0), 1e-12)
-    return _following(judged, delay)[0]
+    rows, error, _ = _following(judged, delay)
+    left = np.full(judged.joints().shape, np.nan)
+    left[rows] = error
+    return left
 
 
-def _following(table: Table, delay: Array) -> tuple[Array, Array]:
-    """Return actual minus delayed target (N, n), and the delayed target's speed."""
+def _following(table: Table, delay: Array) -> tuple[NDArray[np.int64], Array, Array]:
+    """Return rows (m,), actual minus delayed target (m, n), and the delayed target's speed."""
     time, first = np.unique(table.time, return_index=True)  # a log may repeat a row's time
     target, actual = _needed(table, "target_q")[first], _needed(table, "actual_q")[first]
     wanted, speed = np.empty_like(target), np.empty_like(target)
@@ -92,15 +98,15 @@ def _following(table: Table, delay: Array) -> tuple[Array, Array]:
         wanted[:, j] = np.interp(time - delay[j], time, target[:, j])
         speed[:, j] = np.interp(time - delay[j], time, rate[:, j])
     began = time >= time[0] + max(float(delay.max()), 0.0)  # before, the target is not in the log
-    return (actual - wanted)[began], speed[began]
+    return first[began], (actual - wanted)[began], speed[began]
 
 
 def torque_corrected(
-    cell: dict[str, Any], folder: Path, fitted: Table, judged: Table, nominal: Array
+    cell: dict[str, Any], folder: Path, fitted: Table, judged: Table, gap: Array
 ) -> Table:
     """Return the judged log with what base parameters and friction leave as its torques' gap.
 
-    ``nominal`` (N, n) are the torques that the cell predicts. Rows at the edges have no torque.
+    ``gap`` (N, n) is what the cell leaves of the torques. Rows at the edges have no torque.
     """
     import pinocchio as pin  # of the test extra
 
@@ -111,8 +117,10 @@ def torque_corrected(
     A, b = torque_rows(model, pin, judged, 1)
     left = (b - A @ values).reshape(-1, n)
     edge = (len(judged) - len(left)) // 2
-    measured = np.full_like(nominal, np.nan)
-    measured[edge : len(judged) - edge] = nominal[edge : len(judged) - edge] + left
+    inner = slice(edge, len(judged) - edge)
+    torque = _needed(judged, "actual_current_as_torque")
+    measured = np.full_like(torque, np.nan)
+    measured[inner] = torque[inner] - gap[inner] + left
     return judged.replaced("actual_current_as_torque", measured)
 
 

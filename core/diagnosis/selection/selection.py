@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapbridge.core.arm import Arm
-from gapbridge.core.diagnosis.criteria import HEAVIEST, LARGE_SAMPLE
+from gapbridge.core.diagnosis.criteria import HEAVIEST, LARGE_SAMPLE, UNDETERMINED
 from gapbridge.core.diagnosis.observation import Observation
 from gapbridge.core.diagnosis.selection.candidate import (
     Candidate,
@@ -250,14 +250,13 @@ def select(
         changed = revise_noise_and_outliers(
             state, _without_smooth_part(state, space, best, smooth, residual), free
         )
-        single = [p for p, c in enumerate(index) if c not in links]
-        share = [worth(terms[p], covariance[p]) for p in single]
         settled = same and not changed
         # beside an unnamed function a value is not yet what it comes to without; but what shows
         # nothing by itself (the scale of a torque that is not there) keeps the place of what does
-        least = 1.0 if settled and len(best.chosen) <= len(single) else NOTHING
-        if min(share, default=1.0) < least:
-            weakest = single[int(np.argmin(share))]
+        named_only = all(space.candidates[c].named for c in best.chosen)
+        least = 1.0 if settled and named_only else NOTHING
+        weakest = _weakest(space, terms, index, covariance, links, least)
+        if weakest is not None:
             none.add((terms[weakest].effect, terms[weakest].site))
             terms = terms[:weakest] + terms[weakest + 1 :]
         elif settled:
@@ -268,10 +267,35 @@ def select(
         state.kept, state.noise = counted.copy(), whitened_by
         alone, found = _named_alone(near, found, observation)
         terms, index, covariance, residual = refit(state, space, alone, links)
+        while (weakest := _weakest(space, terms, index, covariance, links, NOTHING)) is not None:
+            alone, found = (
+                fit(near, [c for c in own.chosen if c != index[weakest]]) for own in (alone, found)
+            )
+            terms, index, covariance, residual = refit(state, space, alone, links)
     return Selection(
         state.observation, space, found, terms, index, covariance, counted, whitened_by,
         residual, base, unprojected, links,
     )  # fmt: skip
+
+
+def _weakest(
+    space: SampleSpace, terms: Sequence[Term], index: Sequence[int], covariance: Sequence[Array],
+    links: Iterable[int], least: float,
+) -> int | None:  # fmt: skip
+    """Return the position of the term that is worth least, none of the links, if under a least.
+
+    One of which the data show nothing at all is worth nothing: beside equal gains of all axes no
+    load is sure.
+    """
+    share = {}
+    for p, c in enumerate(index):
+        if c not in set(links):
+            size = np.array([k.scale for k in space.candidates[c].parameters])
+            spread = np.sqrt(np.diag(covariance[p])) / size[: len(covariance[p])]
+            unknown = float(spread.min()) / UNDETERMINED
+            share[p] = -unknown if unknown > 1 else worth(terms[p], covariance[p])
+    weakest = min(share, key=lambda p: share[p], default=None)
+    return None if weakest is None or share[weakest] >= least else weakest
 
 
 def _named_candidates(

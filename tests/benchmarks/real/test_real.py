@@ -17,6 +17,7 @@ from benchmarks.real.geometry import (
     rough_turn,
     tool_step,
 )
+from benchmarks.real.judging import ratio_error
 from benchmarks.real.table import Table, halves, read_table
 
 RNG = np.random.default_rng(7)
@@ -65,7 +66,10 @@ def test_one_delay_a_joint_is_found():
     target = np.column_stack([np.sin((1.3 + j) * time) for j in range(2)])
     log = table(timestamp=time, target_q=target, actual_q=np.column_stack(wave))
     fitted, judged = (log.rows(keep) for keep in halves(log))
-    assert np.sqrt(np.mean(rivals.tracking_left(fitted, judged)[20:] ** 2)) < 1e-5
+    left = rivals.tracking_left(fitted, judged)
+    assert left.shape == judged.joints().shape
+    assert np.isnan(left[:7]).all()  # their delayed target is not in the log
+    assert np.sqrt(np.mean(left[20:] ** 2)) < 1e-5
 
 
 def test_base_parameters_and_friction_are_found(tmp_path):
@@ -87,7 +91,8 @@ def test_base_parameters_and_friction_are_found(tmp_path):
     cell = {"robot": {"dh": [x.document() for x in arms.UR10E]}}
     fitted, judged = (log.rows(keep) for keep in halves(log))
     nominal = np.ones((len(judged), 6))
-    left = rivals.torque_corrected(cell, tmp_path, fitted, judged, nominal)
+    gap = judged.get("actual_current_as_torque") - nominal
+    left = rivals.torque_corrected(cell, tmp_path, fitted, judged, gap)
     gap = left.get("actual_current_as_torque") - nominal
     assert np.isfinite(gap).all(axis=1).sum() > 0.8 * len(judged)
     assert np.sqrt(np.nanmean(gap**2)) < 0.05 * np.sqrt(np.mean(torque**2))
@@ -158,6 +163,21 @@ def test_sets_that_are_not_there_are_skipped_by_name(tmp_path):
     assert "panda: skipped, no clone of github.com/" in done.output
 
 
+def test_the_error_of_a_ratio_is_the_scatter_of_ratios_of_logs_drawn_anew():
+    """Poses: samples of their own. A recording: an error that lasts is one sample a stretch."""
+    rng = np.random.default_rng(3)
+    draws = rng.normal(size=(300, 2, 80, 3)) * [[[1.0]], [[1.2]]]
+    ratios = [np.sqrt(np.mean(a**2) / np.mean(b**2)) for a, b in draws]
+    told = [ratio_error(a, b, moving=False) for a, b in draws]
+    assert np.median(told) == pytest.approx(np.std(ratios), rel=0.15)
+    lasting = np.repeat(rng.normal(size=(300, 2, 10, 3)), 50, axis=2)
+    ratios = [np.sqrt(np.mean(a**2) / np.mean(b**2)) for a, b in lasting]
+    told = [ratio_error(a, b, moving=True) for a, b in lasting]
+    assert np.median(told) == pytest.approx(np.std(ratios), rel=0.3)
+    left_out = np.where(np.arange(80)[:, None] < 5, np.nan, draws[0, 0])
+    assert np.isfinite(ratio_error(left_out, draws[0, 1], moving=True))
+
+
 @pytest.mark.slow
 def test_a_log_of_weight_alone_is_judged_beside_least_squares(tmp_path):
     from click.testing import CliRunner
@@ -180,6 +200,7 @@ def test_a_log_of_weight_alone_is_judged_beside_least_squares(tmp_path):
     assert outcome["channel"] == "wrench"
     assert outcome["rival"] < 0.1
     assert outcome["gap"] > 1.0
+    assert 0 < outcome["ratio_error"] < 0.5
     assert outcome["ratio"] == pytest.approx(outcome["judged"] / outcome["rival"])
 
 

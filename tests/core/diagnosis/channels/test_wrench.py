@@ -178,3 +178,22 @@ def test_poses_that_turn_the_flange_separate_a_sensors_zero_from_a_weight(plant)
     weight = plant.dynamics(q, 0 * q, 0 * q, payload=2.0)[1]
     assert named_at(plant, q, 20.0, weight + BIAS)[0] == {"ft_bias"}
     assert named_at(plant, q, 20.0, 1.2 * weight)[0] == {"payload"}
+
+
+def test_gains_that_stand_for_a_load_do_not_take_it_along(plant):
+    """One load that nobody declared: equal gains are its mass, and leave neither of them sure.
+
+    Gains that differ are a little better than none, beside a zero that jumps.
+    """
+    q = truth.poses(N, 80, 8)
+    wrench = plant.dynamics(q, 0 * q, 0 * q, payload=1.2)[1] * (1 + GAIN) + 5 * BIAS
+    wrench[32:, 2] += 0.8
+    noise = np.random.default_rng(2).normal(0, 1, wrench.shape) * NOISE / 3
+    log = truth.log_of(
+        N, timestamp=np.arange(80) * 20.0, actual_q=q, ft_raw_wrench=wrench + noise
+    )  # fmt: skip
+    (channel,) = [c for c in diagnose(plant.model(), log, METROLOGY).channels
+                  if c.channel == "wrench"]  # fmt: skip
+    causes = {cause.effect: cause for cause in channel.causes}
+    assert {"ft_bias", "payload"} <= set(causes)
+    assert causes["payload"].parameters[0].value == pytest.approx(1.2, abs=0.05)
