@@ -126,4 +126,9 @@ def clock(time: float, dated: bool = False) -> str:
 def _parameter(note: ParameterNote) -> str:
     if note.state is ParameterState.ON_BOUND:
         return f"{note.name} stands on its bound ({note.value:g} {note.unit})"
+    if note.state is ParameterState.HELD:
+        return (
+            f"{note.name} is held nominal: it came out several times as large as its like, and not "
+            "surely; something that is not named may stand behind it"
+        )
     return f"{note.name} is not identifiable from these data: others can stand in for it"

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapbridge.core.arm import Arm
+from gapbridge.core.arrays import Mask
 from gapbridge.core.diagnosis.criteria import EXCITED, UNDETERMINED
 from gapbridge.core.diagnosis.finding import ParameterNote, ParameterState, Withdrawal
 from gapbridge.core.diagnosis.held_out import HeldOut, Shrink
@@ -99,8 +100,11 @@ def _cause(
         listed += CATALOGUE[effect].reported(arm, term, covariance)
         value, deviation = np.array(term.values), np.sqrt(np.maximum(np.diag(covariance), 0))
         size = np.abs(value[: len(deviation)])
-        relative.append(float(np.min(deviation / np.maximum(size, 1e-300))))
-        notes += _at_bounds(effect, term, arm) + _not_identifiable(effect, term, deviation, arm)
+        relative.append(float(np.min(np.where(deviation > 0, deviation, np.inf)
+                                     / np.maximum(size, 1e-300))))  # fmt: skip
+        held_nominal = selection.held.get(selection.term_index[p])
+        notes += _at_bounds(effect, term, arm)
+        notes += _not_identifiable(effect, term, deviation, arm, held_nominal)
     joints = sorted({t.site.joint for t in (selection.terms[p] for p in positions)
                      if t.site.joint is not None})  # fmt: skip
     ties = tuple(dict.fromkeys(n for p in positions for n in judgement.ties.get(p, ())))
@@ -123,16 +127,18 @@ def _at_bounds(effect: str, term: Term, arm: Arm) -> list[ParameterNote]:
 
 
 def _not_identifiable(
-    effect: str, term: Term, deviation: Array, arm: Arm
-) -> list[ParameterNote]:  # fmt: skip
+    effect: str, term: Term, deviation: Array, arm: Arm, held: Mask | None
+) -> list[ParameterNote]:
     """Return a note on each parameter that these data leave open; nothing is hidden."""
     notes = []
-    for parameter, value, spread in zip(
-        CATALOGUE[effect].parameters(arm, term.site), term.values, deviation, strict=False
-    ):
+    nominal = np.zeros(len(deviation), dtype=bool) if held is None else held
+    for parameter, value, spread, is_held in zip(
+        CATALOGUE[effect].parameters(arm, term.site), term.values, deviation, nominal,
+        strict=False,
+    ):  # fmt: skip
         if spread == 0 or spread > UNDETERMINED * parameter.scale:
             name = CATALOGUE[effect].label(term.site, parameter)
-            state = ParameterState.NOT_IDENTIFIABLE
+            state = ParameterState.HELD if is_held else ParameterState.NOT_IDENTIFIABLE
             notes.append(ParameterNote(state, name, value, parameter.unit))
     return notes
 

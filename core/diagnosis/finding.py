@@ -38,6 +38,7 @@ class ParameterState(Enum):
 
     ON_BOUND = auto()
     NOT_IDENTIFIABLE = auto()  # from these data: others can stand in for it
+    HELD = auto()  # nominal: far from the size of its like, and not sure by itself
 
 
 @dataclass(frozen=True)

@@ -196,10 +196,13 @@ def still_sure(selection: Selection, judgement: Judgement, arm: Arm) -> tuple[Se
 
     Beside the unknown, and over the regions of the log, a value may be less sure than it was, and a
     stiffness curve straight. Of the links, accused as a whole, one term at least must be sure by
-    itself: else the data show none of their numbers.
+    itself: else the data show none of their numbers; and none may be far off without being sure.
     """
     while True:
         found = refitted_alone(selection, arm, judgement.accused, judgement.remainder)
+        if far := found.far_off(judgement.accused):
+            selection = selection.with_nominal(far)
+            continue
         straight = {
             p for p in without_curvature(found.terms, found.covariance) if judgement.remainder
         }

@@ -200,7 +200,7 @@ class Effect(ABC):
         for k, parameter in enumerate(self.parameters(arm, term.site)):
             std = None
             if covariance is not None and k < len(covariance):  # the rest was not fitted
-                std = math.sqrt(max(covariance[k, k], 0.0))
+                std = math.sqrt(max(covariance[k, k], 0.0)) or None
             lines.append(
                 Reported(self.label(term.site, parameter), term.values[k], std, parameter.unit)
             )

@@ -21,6 +21,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Mask
 from gapbridge.core.diagnosis.criteria import (
     ACCUSATION_PENALTY,
     FEW_LINKS,
@@ -38,6 +39,8 @@ from gapbridge.core.estimation.least_squares import solve
 Array = NDArray[np.float64]
 Members = Callable[[SampleSpace], tuple[int, ...]]
 NEVER = 1e9  # a penalty that no fit is worth
+NOMINAL = 1e-9  # of a number's usual size: 1 sigma of one that is held
+NONE_HELD: Mapping[int, Mask] = {}
 
 
 def soft_candidates(space: SampleSpace) -> tuple[int, ...]:
@@ -59,8 +62,13 @@ def link_candidates(space: SampleSpace, joints: bool = True) -> tuple[int, ...]:
     return (*links, *beside) if links else ()
 
 
-def prior(space: SampleSpace, block: Sequence[int], rest: Sequence[int]) -> dict[int, Array]:
+def prior(
+    space: SampleSpace, block: Sequence[int], rest: Sequence[int],
+    held: Mapping[int, Mask] = NONE_HELD,
+) -> dict[int, Array]:  # fmt: skip
     """Return 1 sigma (d,) of each number of the links beside a set of other candidates.
+
+    ``held`` (d,) are numbers that stay nominal.
 
     An engineer's size times the power of two under which the gap is most likely: arms differ in
     how well their links are known (empirical Bayes; MacKay, Neural Computation 4 (1992) 415). What
@@ -73,6 +81,7 @@ def prior(space: SampleSpace, block: Sequence[int], rest: Sequence[int]) -> dict
         c: np.array([usual.get(p.unit, p.scale) for p in space.candidates[c].parameters])
         for c in block
     }
+    size |= {c: np.where(nominal, NOMINAL * size[c], size[c]) for c, nominal in held.items()}
 
     def sized(links: float, joints: float) -> dict[int, Array]:
         return {

@@ -6,7 +6,7 @@ prediction, frames and all), outliers looked at again; until the set stays the s
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -14,7 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapbridge.core.arm import Arm
-from gapbridge.core.diagnosis.criteria import HEAVIEST, LARGE_SAMPLE, UNDETERMINED
+from gapbridge.core.arrays import Mask
+from gapbridge.core.diagnosis.criteria import (
+    HEAVIEST,
+    LARGE_SAMPLE,
+    OWN_SIGMAS,
+    SIGMAS,
+    UNDETERMINED,
+)
 from gapbridge.core.diagnosis.observation import Observation
 from gapbridge.core.diagnosis.selection.candidate import (
     Candidate,
@@ -77,6 +84,7 @@ class Selection:
     unprojected: UnprojectedRows  # the space before the nuisance was projected out
     prior: dict[int, Array] = field(default_factory=dict)  # 1 sigma (d,) of the numbers of each
     # link's candidate, where the geometry of all links is a cause
+    held: dict[int, Mask] = field(default_factory=dict)  # numbers (d,) of these that stay nominal
     rows_each: float = 1.0  # rows of the log that each sample stands for, squares added up
 
     def unwhitener(self) -> Array:
@@ -147,10 +155,33 @@ class Selection:
         if not self.prior:
             return self
         rest = [c for c in chosen if c not in self.block]
-        sigma = prior(self.space, self.block, rest)
+        sigma = prior(self.space, self.block, rest, self.held)
         if all(np.array_equal(sigma[c], own) for c, own in self.prior.items()):
             return self
         return replace(self, prior=sigma)
+
+    def far_off(self, positions: Sequence[int]) -> dict[int, Mask]:
+        """Return, by candidate, numbers of the links (d,) that neither prior nor data vouch for.
+
+        Where all others are of one size, a number several times as large is no machining: it
+        stands by itself, and has to be as sure as what is accused by itself.
+        """
+        found = {}
+        for p in positions:
+            c = self.term_index[p]
+            if c in self.prior and self.observation.channel == "position":
+                size = np.abs(self.terms[p].values)
+                unsure = size < SIGMAS * np.sqrt(np.diag(self.covariance[p]))
+                far = (size > OWN_SIGMAS * self.prior[c]) & unsure
+                if far.any():
+                    found[c] = far
+        return found
+
+    def with_nominal(self, numbers: Mapping[int, Mask]) -> Selection:
+        """Return the selection with further numbers of the links (d,) held nominal."""
+        return replace(self, held=self.held | {
+            c: own | self.held.get(c, False) for c, own in numbers.items()
+        })  # fmt: skip
 
     def without_links(self) -> Selection:
         """Return the selection with the links' geometry no cause, the rest as it is."""
@@ -376,7 +407,8 @@ def refitted_alone(
     averages over it, and its model has to predict without it. Beside all links it would take what
     their prior holds back.
     """
-    if not accused or (len(accused) == len(selection.terms) and remainder is None):
+    whole = len(accused) == len(selection.terms) and remainder is None
+    if not accused or (whole and not selection.held):
         return selection
     chosen = [selection.term_index[p] for p in accused]
     selection = selection.sized_beside(chosen)
@@ -390,6 +422,9 @@ def refitted_alone(
     terms, covariance = list(selection.terms), list(selection.covariance)
     for c, term, own in zip(index, fitted, spread, strict=True):
         position = selection.term_index.index(c)
+        if (nominal := selection.held.get(c)) is not None:
+            term = term.with_values(np.where(nominal, 0.0, term.values))
+            own = own * ~(nominal | nominal[:, None])
         terms[position], covariance[position] = term, own
     return replace(
         selection, observation=state.observation, terms=tuple(terms),

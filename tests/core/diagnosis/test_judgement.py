@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -240,9 +241,11 @@ def test_links_as_a_whole_stand_only_where_one_of_them_is_sure(monkeypatch, thir
     )
     found = SimpleNamespace(
         terms=terms, covariance=[np.eye(1), *[1e-8 * np.eye(3)] * 2], term_index=(7, 8, 9),
-        prior={8: None, 9: None}, block=(8, 9), observation=SimpleNamespace(channel="position"),
+        prior=dict.fromkeys((8, 9), np.full(3, 5e-4)), block=(8, 9),
+        observation=SimpleNamespace(channel="position"),
     )  # fmt: skip
-    found.judged_together = lambda positions: Selection.judged_together(found, positions)
+    found.judged_together = partial(Selection.judged_together, found)
+    found.far_off = partial(Selection.far_off, found)
     found.covariance[0] = found.covariance[0] * 1e-4
     monkeypatch.setattr(judging, "refitted_alone", lambda *_: found)
     given = Judgement((0, 1, 2), False, None, (), {}, ())
@@ -251,6 +254,36 @@ def test_links_as_a_whole_stand_only_where_one_of_them_is_sure(monkeypatch, thir
     assert judgement.accused == stays
     assert {p for p, _ in judgement.withdrawn} == {0, 1, 2} - {*stays}
     assert judgement.structured == (stays == (0,))
+
+
+@pytest.mark.parametrize(("spread", "held"), [(9e-3, True), (5e-3, False)])
+def test_a_twist_far_from_all_others_has_to_be_sure_by_itself(monkeypatch, spread, held):
+    """A WAM's wrist: 41 mrad beside links of 2 mrad, where its joints turn each other. A UR5's
+    twist, as far off, is sure."""
+    sizes, prior = np.array([1e-3, 1e-3, 41e-3]), np.full(3, 8e-3)
+    found = SimpleNamespace(
+        terms=(Term("link_geometry", Site(5), tuple(sizes)),), term_index=(4,), block=(4,),
+        covariance=[np.diag([1e-4, 1e-4, spread]) ** 2], prior={4: prior}, held={},
+        observation=SimpleNamespace(channel="position"),
+    )  # fmt: skip
+    again = SimpleNamespace(
+        **vars(found) | {"terms": (Term("link_geometry", Site(5), (1e-3, 1e-3, 0.0)),)}
+    )
+    for own in (found, again):
+        own.judged_together = partial(Selection.judged_together, own)
+        own.far_off = partial(Selection.far_off, own)
+    asked = []
+
+    def with_nominal(numbers):
+        asked.append({c: far.tolist() for c, far in numbers.items()})
+        return again
+
+    found.with_nominal = with_nominal
+    monkeypatch.setattr(judging, "refitted_alone", lambda selection, *_: selection)
+    selection, judgement = still_sure(found, Judgement((0,), False, None, (), {}, ()), None)
+    assert selection is (again if held else found)
+    assert asked == ([{4: [False, False, True]}] if held else [])
+    assert judgement.accused == (0,)
 
 
 def test_what_does_all_that_a_cause_does_and_more_is_a_tie():
