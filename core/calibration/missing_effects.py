@@ -8,7 +8,7 @@ looked at.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,7 @@ from gapbridge.core.calibration.converged_fit import ConvergedFit
 from gapbridge.core.calibration.parameters import Parameters
 from gapbridge.core.calibration.problem import HELD, Problem
 from gapbridge.core.effects import CATALOGUE
+from gapbridge.core.estimation.held_out import missed, random_folds
 from gapbridge.core.estimation.identification import pose_groups
 from gapbridge.core.estimation.least_squares import basis_of, projected_out
 
@@ -89,9 +90,8 @@ class _Folds:
     """The fit's linear system with its poses left out in turn."""
 
     A: Array  # (M, c) columns of parameters and instrument, divided by their usual sizes
-    residual: Array  # (M,)
-    ridge: Array  # (c,) how firmly each number is held at zero
-    pull: Array  # (c,) of the priors, towards where each began
+    target: Array  # (M,) residual, where each number begins taken off
+    hold: Array  # (c,) how firmly each number is held there
     pose: NDArray[np.int64]  # (M,) number of each row's pose
     fold: NDArray[np.int64]  # (M,)
 
@@ -101,22 +101,17 @@ class _Folds:
         system, held = rest.system, problem.bounds.held
         size = np.maximum(np.linalg.norm(system.F, axis=0), 1e-300)
         A = np.hstack([system.J * held, system.F / size])
-        m = system.F.shape[1]
-        pull = np.concatenate([(problem.bounds.begin - rest.values) / held, np.zeros(m)])
-        ridge = np.concatenate([np.ones(len(held)), np.full(m, FREE)])
+        target = system.residual - system.J @ (problem.bounds.begin - rest.values)
+        hold = np.concatenate([np.ones(len(held)), np.full(len(size), np.sqrt(FREE))])
         pose = np.repeat(pose_groups(problem.readings.q), problem.observable.equations)
-        count = int(pose.max()) + 1
-        order = np.random.default_rng(0).permutation(count) % FOLDS
-        return cls(A, system.residual, ridge, pull, pose, order[pose])
+        return cls(A, target, hold, pose, random_folds(pose, FOLDS))
 
     def beside(self, candidate: Candidate) -> _Folds:
         """Return the folds of the fit with a further effect in it."""
         columns, sizes = candidate
-        return _Folds(
-            np.hstack([self.A, columns * HELD * sizes]), self.residual,
-            np.concatenate([self.ridge, np.ones(len(sizes))]),
-            np.concatenate([self.pull, np.zeros(len(sizes))]), self.pose, self.fold,
-        )  # fmt: skip
+        hold = np.concatenate([self.hold, np.ones(len(sizes))])
+        A = np.hstack([self.A, columns * HELD * sizes])
+        return replace(self, A=A, hold=hold)
 
     def gain(self, candidate: Candidate) -> float:
         """Return the share of the squares that an effect takes off poses left out of its fit.
@@ -135,17 +130,7 @@ class _Folds:
 
     def _missed(self) -> Array:
         """Return what each row misses (M,) where its pose was left out of the fit."""
-        G, g = (
-            self.A.T @ self.A + np.diag(self.ridge),
-            self.A.T @ self.residual + self.ridge * self.pull,
-        )
-        out = np.empty(len(self.residual))
-        for fold in np.unique(self.fold):
-            own = self.fold == fold
-            A, residual = self.A[own], self.residual[own]
-            x = np.linalg.lstsq(G - A.T @ A, g - A.T @ residual, rcond=1e-14)[0]
-            out[own] = residual - A @ x
-        return out
+        return missed(self.A, self.target, self.fold, self.hold)
 
 
 def _columns(problem: Problem, rest: ConvergedFit) -> dict[str, Candidate]:

@@ -18,6 +18,7 @@ from gapbridge.core.diagnosis.criteria import CHANCE, EXCITED, MATERIAL_SHARE
 from gapbridge.core.diagnosis.selection.candidate import Candidate
 from gapbridge.core.diagnosis.selection.selection import Selection
 from gapbridge.core.effects import CATALOGUE, Reported
+from gapbridge.core.estimation.least_squares import inverse, sigmas_square, solve
 
 Array = NDArray[np.float64]
 DEAD = 1e-7  # share of a parameter's column that a session has: below, it shows nothing of it
@@ -72,16 +73,15 @@ def _compared(
         [np.tile(np.sqrt(np.einsum("ij,ij->j", columns, columns)), len(shown)),
          size[split.shape[1] :]]
     )  # fmt: skip
-    unit = np.where(alive, 1 / np.where(alive, size, 1.0), 0.0)
-    solution, *_ = np.linalg.lstsq(A * unit, unprojected.target, rcond=1e-9)
-    left = unprojected.target - (A * unit) @ solution
+    A = A * alive
+    solution = solve(A, unprojected.target)
+    left = unprojected.target - A @ solution
     variance = max(
         float(left @ left) / max(len(left) * selection.rows_each - A.shape[1], 1), space.floor
     )
-    inverse = np.linalg.pinv((A * unit).T @ (A * unit), rcond=1e-10, hermitian=True)
     own_part = slice(0, split.shape[1])
-    covariance = (inverse * variance * np.outer(unit, unit))[own_part, own_part]
-    values = (solution * unit)[own_part].reshape(len(shown), width)
+    covariance = inverse(A.T @ A)[own_part, own_part] * variance
+    values = solution[own_part].reshape(len(shown), width)
     everywhere = alive[own_part].reshape(len(shown), width).all(axis=0)
     if not everywhere.any():
         return None
@@ -110,7 +110,7 @@ def _differing(
     C = np.kron(np.eye(count)[1:] - np.eye(count)[0], np.eye(width))  # each against the first
     apart = C @ values.ravel()
     spread = C @ covariance @ C.T
-    square = float(apart @ np.linalg.pinv(spread, rcond=1e-10, hermitian=True) @ apart)
+    square = sigmas_square(apart, spread)
     p_value = float(gammaincc(len(apart) / 2, square / 2))
     mean = values.mean(axis=0)
     change = np.concatenate(

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from gapbridge.core.diagnosis.criteria import PRIOR_REACH
 from gapbridge.core.diagnosis.observation import Observation
 from gapbridge.core.diagnosis.selection.selection import Selection
+from gapbridge.core.estimation.held_out import joint_regions
 from gapbridge.core.estimation.least_squares import solve
-from gapbridge.core.estimation.regions import joint_regions
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]

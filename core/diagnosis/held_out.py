@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapbridge.core.diagnosis.selection.selection import Selection
+from gapbridge.core.estimation.held_out import missed, random_folds
 
 Array = NDArray[np.float64]
 FOLDS = 10
 RESAMPLES = 400
-TINY = 1e-13  # eigenvalue of unit columns below which a direction is none
 
 
 @dataclass(frozen=True)
@@ -53,10 +53,8 @@ class HeldOut:
         names, group = np.unique(selection.observation.groups[selection.kept], return_inverse=True)
         self._group, self._groups = group, len(names)
         if parts is None:
-            order = np.random.default_rng(seed).permutation(len(names))
-            parts = (order % min(FOLDS, len(names)))[group]
-        self._folds = int(parts.max()) + 1
-        self.possible = self._folds >= 2 and len(self._target) > self._nuisance.shape[1] + 3
+            parts = random_folds(group, FOLDS, seed)
+        self.possible = int(parts.max()) > 0 and len(self._target) > self._nuisance.shape[1] + 3
         self._fold = np.repeat(parts, k)
         self._pull = selection.pull
         self._seed = seed
@@ -86,18 +84,9 @@ class HeldOut:
         A = np.hstack([self._raw.columns(self._space, chosen), self._nuisance])
         if not A.shape[1]:
             return self._target
-        pull = np.concatenate([self._pull(chosen), np.zeros(self._nuisance.shape[1])])
         # with the pull: of a number that moves nothing only the pull is there
-        unit = 1 / np.sqrt(np.einsum("ij,ij->j", A, A) + pull**2 + 1e-300)
-        A = A * unit
-        whole, g = A.T @ A + np.diag((pull * unit) ** 2), A.T @ self._target
-        left = np.empty_like(self._target)
-        for k in range(self._folds):
-            out = self._fold == k
-            own, y = A[out], self._target[out]
-            inverse = np.linalg.pinv(whole - own.T @ own, rcond=TINY, hermitian=True)
-            left[out] = y - own @ (inverse @ (g - own.T @ y))
-        return left
+        pull = np.concatenate([self._pull(chosen), np.zeros(self._nuisance.shape[1])])
+        return missed(A, self._target, self._fold, pull)
 
     def shrink(self, with_set: Sequence[int], without_set: Sequence[int]) -> Shrink:
         """Return how far the gap shrinks from one set to another, with its interval."""

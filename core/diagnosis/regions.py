@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapbridge.core.diagnosis.observation import Observation
-from gapbridge.core.estimation.regions import k_means
+from gapbridge.core.estimation.held_out import k_means, random_folds
 
 SAME_PLACE = 0.01  # rad that no joint leaves: one pose, whatever the encoders report
 REGIONS = 24  # of joint space, or stretches of time
@@ -22,8 +22,7 @@ def parts(observation: Observation, kept: NDArray[np.bool_]) -> NDArray[np.int64
     region = regions(observation, kept)
     if observation.order_in_time:
         return np.asarray(region % PARTS)
-    order = np.random.default_rng(0).permutation(int(region.max()) + 1)
-    return np.asarray(order[region] % PARTS)
+    return random_folds(region, PARTS)
 
 
 def one_place(observation: Observation) -> bool:

@@ -36,7 +36,8 @@ from gapbridge.core.diagnosis.selection.problem import gains
 from gapbridge.core.diagnosis.selection.refit import Remainder
 from gapbridge.core.diagnosis.selection.selection import Selection
 from gapbridge.core.diagnosis.selection.smooth import targets
-from gapbridge.core.estimation.least_squares import basis_of, projected_out, solve
+from gapbridge.core.estimation.held_out import jackknife
+from gapbridge.core.estimation.least_squares import basis_of, projected_out, sigmas_square, solve
 
 Array = NDArray[np.float64]
 
@@ -163,8 +164,8 @@ class _Beside:
                 sigmas.append(0.0)
                 steady.append(0.0)
                 continue
-            inverse = np.linalg.pinv(spread[np.ix_(own, own)], hermitian=True)
-            sigmas.append(float(np.sqrt(max(float(b @ inverse @ b), 0.0) / len(own))))
+            square = sigmas_square(b, spread[np.ix_(own, own)])
+            sigmas.append(float(np.sqrt(max(square, 0.0) / len(own))))
             steady.append(min(share * MAX_DRIFT, MAX_DRIFT / share))
         return self._with_siblings(accused, np.array(sigmas), np.array(steady))
 
@@ -291,9 +292,8 @@ class _Beside:
         value, inverse, taken, rss = solved(np.ones(len(part), dtype=bool))
         freedom = max(self.space.freedom - X.shape[1] - beside.shape[1], 1.0)
         without = np.array([solved(part != p)[0] for p in np.unique(self._part)])
-        away = without - without.mean(axis=0)
-        scatter = (len(without) - 1) / len(without) * away.T @ away
-        spread, shown = inverse * max(rss / freedom, self.space.floor) + scatter, taken < MAX_TAKEN
+        spread = inverse * max(rss / freedom, self.space.floor) + jackknife(without)
+        shown = taken < MAX_TAKEN
         candidates = [self.space.candidates[c] for c in accused]
         begin = np.cumsum([0, *(len(k.parameters) for k in candidates)])
         late = np.array(

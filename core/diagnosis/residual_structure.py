@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from gapbridge.core.diagnosis.criteria import SAME_SHARE
 from gapbridge.core.diagnosis.observation import HELD
 from gapbridge.core.diagnosis.selection.problem import SampleSpace
+from gapbridge.core.estimation.held_out import random_folds
 from gapbridge.core.estimation.least_squares import basis_of, projected_out
 
 Array = NDArray[np.float64]
@@ -99,9 +100,7 @@ def dependence(
     """
     fitted = basis_of(np.hstack([nuisance, space.columns(chosen)]))
     r = projected_out(fitted, space.y)
-    names = np.unique(groups)
-    fold_of = np.random.default_rng(seed).permutation(len(names)) % FOLDS
-    fold = fold_of[np.searchsorted(names, groups)]
+    fold = random_folds(groups, FOLDS, seed)
     by_size: dict[int, list[int]] = {}
     for c, candidate in enumerate(space.candidates):
         if not candidate.named and candidate.quantity:

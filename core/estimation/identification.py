@@ -32,8 +32,8 @@ from gapbridge.core.estimation.compliance_fit import (
     weighed,
 )
 from gapbridge.core.estimation.geometry import TOOL, Geometry
+from gapbridge.core.estimation.held_out import FOLDS, joint_regions, random_folds
 from gapbridge.core.estimation.least_squares import basis_of, projected_out
-from gapbridge.core.estimation.regions import joint_regions
 from gapbridge.core.estimation.registration import IDENTITY, Registration
 from gapbridge.core.log.log import Log
 from gapbridge.core.metrology import Metrology
@@ -43,7 +43,6 @@ from gapbridge.core.rotation import rotation_matrix
 from gapbridge.core.sessions import session_of
 
 Array = NDArray[np.float64]
-FOLDS = 5
 SAME_POSE = 1e-3  # rad, of every joint
 TOOL_KNOWN = 2e-4  # m, 1 sigma: a tool point that is known worse stays the cell's
 TOOL_NEAR = (
@@ -255,10 +254,9 @@ def pose_groups(q: Array) -> NDArray[np.int64]:
 def _held_out(data: Data, task: _Task, whole: tuple[Fit, Fit], inlier: Mask) -> tuple[float, float]:
     """Return the rms before and after over inlier rows of poses left out; nan: too few poses."""
     groups = pose_groups(data.q[:2000]) if len(data.q) <= 2000 else np.arange(len(data.q))
-    poses = int(groups.max()) + 1
-    if poses < 2 * FOLDS:
+    if int(groups.max()) + 1 < 2 * FOLDS:
         return UNSEEN, UNSEEN
-    fold = np.random.default_rng(0).permutation(poses)[groups] % FOLDS
+    fold = random_folds(groups)
     left: tuple[list[Array], list[Array]] = ([], [])
     for k in range(FOLDS):
         seen, unseen = data.part(fold != k), data.part((fold == k) & inlier)

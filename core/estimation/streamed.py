@@ -31,6 +31,7 @@ from gapbridge.core.estimation.compliance_fit import (
     weights_at,
 )
 from gapbridge.core.estimation.geometry import Geometry
+from gapbridge.core.estimation.held_out import FOLDS
 from gapbridge.core.estimation.identification import (
     Identification,
     data_of,
@@ -40,7 +41,6 @@ from gapbridge.core.estimation.identification import (
 )
 from gapbridge.core.estimation.row_store import RowStore
 from gapbridge.core.estimation.streamed_fit import (
-    FOLDS,
     NONE,
     Pass,
     Piece,

@@ -26,10 +26,10 @@ from gapbridge.core.estimation.compliance_fit import (
     residual,
     weights_at,
 )
+from gapbridge.core.estimation.held_out import FOLDS
 from gapbridge.core.estimation.least_squares import solve
 
 Array = NDArray[np.float64]
-FOLDS = 5
 NONE = np.zeros(0)  # weights of a fit whose rows nobody keeps
 
 

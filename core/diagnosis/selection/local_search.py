@@ -13,6 +13,7 @@ from gapbridge.core.diagnosis.selection.forward import (
     projected,
 )
 from gapbridge.core.diagnosis.selection.problem import CandidateFit, SampleSpace, fit
+from gapbridge.core.estimation.least_squares import inverse, sigmas_square
 
 Array = NDArray[np.float64]
 MERGED = 9  # terms up to which every pair is tried against one
@@ -73,26 +74,17 @@ def pruned(space: SampleSpace, found: CandidateFit) -> CandidateFit:
 def _drops(space: SampleSpace, found: CandidateFit) -> list[tuple[float, int]]:
     """Return the score of the set less each of its terms, best first, out of one inverse."""
     X = space.columns(found.chosen)
-    unit = 1 / np.sqrt(np.einsum("ij,ij->j", X, X) + 1e-300)
-    A = X * unit
-    inverse = np.linalg.pinv(A.T @ A, rcond=1e-12, hermitian=True)
-    x = inverse @ (A.T @ space.y)
-    rss = float(np.sum((space.y - A @ x) ** 2))
+    spread = inverse(X.T @ X)
+    x = spread @ (X.T @ space.y)
+    rss = float(np.sum((space.y - X @ x) ** 2))
     paid = float(space.penalty[list(found.chosen)].sum())
     begin, scores = 0, []
     for c in found.chosen:
         own = slice(begin, begin + len(space.candidates[c].parameters))
         begin = own.stop
-        more = _explained(x[own], inverse[own, own])
+        more = sigmas_square(x[own], spread[own, own])
         scores.append((float(space.misfit(np.array(rss + more))) + paid - space.penalty[c], c))
     return sorted(scores)
-
-
-def _explained(x: Array, covariance: Array) -> float:
-    """Return by how much the sum of squares grows without values (d,) of this covariance."""
-    if len(x) == 1:  # most are; a decomposition of one number costs 0.1 ms
-        return float(x[0] ** 2 / covariance[0, 0]) if covariance[0, 0] else 0.0
-    return float(x @ np.linalg.pinv(covariance, hermitian=True) @ x)
 
 
 def joined_sets(space: SampleSpace, found: CandidateFit) -> list[CandidateFit]:

@@ -18,7 +18,14 @@ from gapbridge.core.diagnosis.selection.problem import CandidateFit, SampleSpace
 from gapbridge.core.diagnosis.selection.state import SelectionState, flat
 from gapbridge.core.effects import CATALOGUE, Term
 from gapbridge.core.errors import EquilibriumError, InputError
-from gapbridge.core.estimation.least_squares import basis_of, projected_out, solve
+from gapbridge.core.estimation.held_out import jackknife, without_each
+from gapbridge.core.estimation.least_squares import (
+    basis_of,
+    inverse,
+    projected_out,
+    sigmas_square,
+    solve,
+)
 
 Array = NDArray[np.float64]
 REFITS = 8
@@ -103,9 +110,9 @@ def refit(
             break
     residual_ss = float(np.sum((b - A @ step) ** 2))
     variance = max(residual_ss / max(len(b) - A.shape[1], 1), space.floor)
-    whole, right = np.vstack([A, pull]) * unit, np.concatenate([b, towards])
+    whole, right = np.vstack([A, pull]), np.concatenate([b, towards])
     region = None if remainder is None or not len(index) else remainder.region
-    covariance = _covariances(whole, right, unit, variance, sizes, region)
+    covariance = _covariances(whole, right, variance, sizes, region)
     x, covariance = _as_one_delay([freed[c] for c in index], x, covariance)
     terms = tuple(freed[c].term(v) for c, v in zip(index, x, strict=True))
     gap = state.observation.measured - state.observation.predict(terms)
@@ -156,7 +163,7 @@ def step_on(
     ]
     left = float(np.sum((rows.b - rows.A @ step) ** 2))
     variance = max(left / max(rows.count - rows.A.shape[1], 1), floor)
-    spread = _covariances(whole * unit, right, unit, variance, sizes, rows.region)
+    spread = _covariances(whole, right, variance, sizes, rows.region)
     return _as_one_delay(freed, values, spread)
 
 
@@ -174,42 +181,28 @@ def _as_one_delay(
 
 
 def _covariances(
-    whole: Array, right: Array, unit: Array, variance: float, sizes: list[int],
+    rows: Array, right: Array, variance: float, sizes: list[int],
     region: NDArray[np.int64] | None,
 ) -> list[Array]:  # fmt: skip
-    """Return the covariance (d, d) of each term; ``whole`` (m, p) are the rows times ``unit``."""
-    inverse = np.linalg.pinv(whole.T @ whole, rcond=1e-13, hermitian=True)
-    spread = inverse * np.outer(unit, unit) * variance
+    """Return the covariance (d, d) of each term by the rows (m, p) of the regression."""
+    spread = inverse(rows.T @ rows) * variance
     if region is not None:
-        spread = _cluster_covariance(spread, whole, right, unit, region)
+        spread = _cluster_covariance(spread, rows, right, region)
     begin = np.concatenate([[0], np.cumsum(sizes)]).astype(int)
     return [spread[i:j, i:j] for i, j in itertools.pairwise(begin)]
 
 
-def _cluster_covariance(
-    white: Array, A: Array, b: Array, unit: Array, region: NDArray[np.int64]
-) -> Array:  # fmt: skip
+def _cluster_covariance(white: Array, A: Array, b: Array, region: NDArray[np.int64]) -> Array:
     """Return the covariance (p, p) by leaving out regions, nowhere narrower than ``white``.
 
-    ``A`` (m, p) are the rows of the regression times ``unit``; those after ``region`` always stay.
-    The jackknife over clusters: Cameron, Miller, "A Practitioner's Guide to Cluster-Robust
-    Inference" (2015), CV3.
+    ``A`` (m, p) are the rows of the regression; those after ``region`` always stay.
     """
-    G, g = A.T @ A, A.T @ b
-    names = np.unique(region)
-    without = np.empty((len(names), len(unit)))
-    for k, name in enumerate(names):
-        out = np.flatnonzero(region == name)
-        rest = G - A[out].T @ A[out]
-        inverse = np.linalg.pinv(rest, rcond=1e-12, hermitian=True)
-        without[k] = unit * (inverse @ (g - A[out].T @ b[out]))
-    away = without - without.mean(axis=0)
+    without = np.array([x for _, x in without_each(A, b, region)])
     from scipy.special import ndtri, stdtrit  # a fifth of a second, only beside the unknown
 
     # few regions: as wide as a normal distribution of the same 95 % interval
-    few = float(stdtrit(max(len(names) - 1, 1), 0.975) / ndtri(0.975))
-    scatter = few**2 * (len(names) - 1) / len(names) * away.T @ away
-    return _no_narrower(scatter, white)
+    few = float(stdtrit(max(len(without) - 1, 1), 0.975) / ndtri(0.975))
+    return _no_narrower(few**2 * jackknife(without), white)
 
 
 def _no_narrower(scatter: Array, white: Array) -> Array:
@@ -232,7 +225,7 @@ def worth(term: Term, spread: Array) -> float:
     as has what shapes a curve.
     """
     effect, value = CATALOGUE[term.effect], np.array(term.values[: len(spread)])
-    whole = float(value @ np.linalg.pinv(spread, hermitian=True) @ value) / len(value)
+    whole = sigmas_square(value, spread) / len(value)
     if effect.periodic:
         single = float(value @ value) ** 2 / max(float(value @ spread @ value), 1e-300)
     else:

@@ -121,7 +121,7 @@ def test_intervals_hold_where_regions_differ():
     off = []
     for seed in range(150):
         white, A, b, region = linear(seed, 1.0)
-        spread = np.sqrt(np.diag(_cluster_covariance(white, A, b, np.ones(2), region)))
+        spread = np.sqrt(np.diag(_cluster_covariance(white, A, b, region)))
         off.append((np.linalg.lstsq(A, b, rcond=None)[0] - [1.0, 2.0]) / spread)
         assert np.all(spread >= np.sqrt(np.diag(white)) * (1 - 1e-9))
     inside = np.mean(np.abs(off) < 1.96, axis=0)
@@ -136,7 +136,7 @@ def test_intervals_hold_where_regions_differ():
 def test_rows_after_the_regions_are_a_prior_that_always_stays():
     white, A, b, region = linear(0, 0.0)
     held = np.vstack([A, [1e6, 0.0]])
-    spread = _cluster_covariance(white * 0, held, np.append(b, 1e6), np.ones(2), region)
+    spread = _cluster_covariance(white * 0, held, np.append(b, 1e6), region)
     assert spread[0, 0] < 1e-9
 
 
