@@ -27,19 +27,19 @@ def predicted_channels(model: Model, log: Log) -> tuple[dict[str, Array], dict[s
     """
     motion = motion_of(log)
     found: dict[str, Array] = {}
-    lacking: dict[str, str] = {}
+    needs: dict[str, str] = {}
     whole = with_pieces(model, motion)
     if model.arm.mass.any():
         found["predicted_torque"] = _spread(predict_torque, model, whole, len(log), whole.valid)
     else:
-        lacking["torque"] = NO_MASSES
+        needs["torque"] = NO_MASSES
     found["predicted_wrench"] = _spread(predict_wrench, model, whole, len(log), whole.valid)
     if motion.target_q is None:
-        lacking["tracking"] = "target_q"
+        needs["tracking"] = "target_q"
     else:
         every = np.ones(len(motion), dtype=bool)
         found["predicted_q"] = _spread(predict_tracking, model, motion, len(log), every)
-    return found, lacking
+    return found, needs
 
 
 def in_context(pieces: Iterable[Log], rows: int = ROWS) -> Iterator[tuple[Log, slice]]:

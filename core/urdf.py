@@ -18,13 +18,21 @@ TURNING = ("revolute", "continuous")
 XACRO = "ros.org/wiki/xacro"  # in the namespace of its macros
 
 
-@dataclass
+@dataclass(frozen=True)
 class _Body:
     """What is rigidly joined to one moving link, in that link's frame."""
 
     mass: float
     first: Array  # sum of mass x position
     second: Array  # inertia about the frame's origin
+
+    def __add__(self, other: _Body) -> _Body:
+        return _Body(
+            self.mass + other.mass, self.first + other.first, self.second + other.second
+        )  # fmt: skip
+
+
+NOTHING = _Body(0.0, np.zeros(3), np.zeros((3, 3)))
 
 
 def arm_from_urdf(path: Path | str, tip: str | None = None) -> Arm:
@@ -122,10 +130,10 @@ def _assemble(
     joints: dict[str, ElementTree.Element],
     links: dict[str, ElementTree.Element],
 ) -> Arm:
-    fixed, bodies, moving = [np.eye(4)], [_Body(0, np.zeros(3), np.zeros((3, 3)))], []
+    fixed, bodies, moving = [np.eye(4)], [NOTHING], []
     on_chain = {_child(j) for j in chain}
     root = _parent(chain[0]) if chain else ""
-    _add_branches(path, root, np.eye(4), bodies[-1], joints, links, on_chain)
+    bodies[-1] += _branches(path, root, np.eye(4), joints, links, on_chain)
     for joint in chain:
         kind, label = joint.get("type"), f"{path}: joint {joint.get('name')!r}"
         step = fixed[-1] @ _origin(joint, label)
@@ -134,13 +142,13 @@ def _assemble(
             fixed[-1] = step @ align
             moving.append(joint)
             fixed.append(align.T)  # align is a pure rotation
-            bodies.append(_Body(0, np.zeros(3), np.zeros((3, 3))))
+            bodies.append(NOTHING)
         elif kind == "fixed":
             fixed[-1] = step
         else:
             raise ArmError(f"{label}: found type {kind!r}, expected revolute, continuous or fixed")
-        _add_link(path, links[_child(joint)], fixed[-1], bodies[-1])
-        _add_branches(path, _child(joint), fixed[-1], bodies[-1], joints, links, on_chain)
+        bodies[-1] += _link(path, links[_child(joint)], fixed[-1])
+        bodies[-1] += _branches(path, _child(joint), fixed[-1], joints, links, on_chain)
     if not moving:
         raise ArmError(f"{path}: found no revolute joint on the way to the tip")
     return _arm(path, name, np.array(fixed), bodies[1:], moving)
@@ -174,24 +182,28 @@ def _child(joint: ElementTree.Element) -> str:
     return "" if child is None else str(child.get("link"))
 
 
-def _add_branches(
-    path: Path, link: str, frame: Array, body: _Body,
+def _branches(
+    path: Path, link: str, frame: Array,
     joints: dict[str, ElementTree.Element], links: dict[str, ElementTree.Element],
     on_chain: set[str],
-) -> None:  # fmt: skip
+) -> _Body:  # fmt: skip
+    """Return what hangs on a link beside the way to the tip."""
+    body = NOTHING
     for child, joint in joints.items():
         if _parent(joint) != link or child in on_chain:
             continue
         # a gripper's fingers count where they stand at zero
         beyond = frame @ _origin(joint, f"{path}: joint {joint.get('name')!r}")
-        _add_link(path, links[child], beyond, body)
-        _add_branches(path, child, beyond, body, joints, links, on_chain)
+        body += _link(path, links[child], beyond)
+        body += _branches(path, child, beyond, joints, links, on_chain)
+    return body
 
 
-def _add_link(path: Path, link: ElementTree.Element, frame: Array, body: _Body) -> None:
+def _link(path: Path, link: ElementTree.Element, frame: Array) -> _Body:
+    """Return a link's own mass and inertia, in the frame's axes."""
     inertial = link.find("inertial")
     if inertial is None:
-        return
+        return NOTHING
     label = f"{path}: link {link.get('name')!r}"
     element = inertial.find("mass")
     mass = _vector(element, "value", "0", label)[0]
@@ -203,9 +215,7 @@ def _add_link(path: Path, link: ElementTree.Element, frame: Array, body: _Body) 
             key = "i" + "xyz"[i] + "xyz"[j]
             about_centre[i, j] = about_centre[j, i] = _vector(tensor, key, "0", label)[0]
     R, c = pose[:3, :3], pose[:3, 3]
-    body.mass += mass
-    body.first = body.first + mass * c
-    body.second = body.second + R @ about_centre @ R.T + mass * _point(c)
+    return _Body(mass, mass * c, R @ about_centre @ R.T + mass * _point(c))
 
 
 def _point(c: Array) -> Array:

@@ -18,12 +18,12 @@ from can.interfaces.socketcand.socketcand import SocketCanDaemonBus
 
 from benchmarks.links.case import Cycles, LinkCase, OurCycle, Pause
 from benchmarks.links.serving import served_cell, written
+from benchmarks.server_thread import ServerThread
 from gapbridge.bridge.cell import load_cell
 from gapbridge.bridge.cell.cell import Cell
 from gapbridge.bridge.cell.simulation import served_controller
 from gapbridge.drivers.can.driver import CanDriver
 from gapbridge.drivers.can.settings import CanSettings
-from gapbridge.drivers.simulated.server.protocol_server import ServerThread
 
 HOST, PORT = "127.77.0.4", 29921
 BURST = 0.0015  # s in which all frames of one sample have come

@@ -17,12 +17,12 @@ from canopen.network import MessageListener
 
 from benchmarks.links.case import Cycles, LinkCase, OurCycle, Pause
 from benchmarks.links.serving import served_cell, written
+from benchmarks.server_thread import ServerThread
 from gapbridge.bridge.cell import load_cell
 from gapbridge.bridge.cell.cell import Cell
 from gapbridge.bridge.cell.simulation import served_controller
 from gapbridge.drivers.canopen.driver import CanopenDriver
 from gapbridge.drivers.canopen.settings import CanopenSettings
-from gapbridge.drivers.simulated.server.protocol_server import ServerThread
 
 HOST, PORT = "127.77.0.3", 29920
 PACE = 0.010  # s from one SYNC to the next, as the drives are configured

@@ -50,10 +50,10 @@ def predict(cell: Cell, log: Log, *, channels: bool = False) -> Predicted:
             poses = cell.model.predict(q, loads)
     except EquilibriumError as error:
         raise InputError(f"{log.path}: row {log.line(error.row)}: {error.text}") from None
-    further, lacking = predicted_channels(cell.model, log) if channels else ({}, {})
+    further, needs = predicted_channels(cell.model, log) if channels else ({}, {})
     return Predicted(
         poses.position, poses.rotation_vector, std,
-        outside_rows(log, ranges) if ranges else None, further, lacking,
+        outside_rows(log, ranges) if ranges else None, further, needs,
         _sources(cell, log),
     )  # fmt: skip
 

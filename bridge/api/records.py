@@ -24,7 +24,7 @@ class Predicted:
     position_std: Array | None = None  # (N, 3) m, 1 sigma in base axes; None: nothing was fitted
     outside: Mask | None = None  # (N,) outside what was fitted; None: nothing was
     channels: dict[str, Array] = field(default_factory=dict)  # (N, k) by name, where asked for
-    lacking: dict[str, str] = field(default_factory=dict)  # what a channel needs that is not there
+    needs: dict[str, str] = field(default_factory=dict)  # what a channel needs that is not there
     sources: dict[str, list[Path]] = field(default_factory=dict)  # log and cell, by role
 
     @property

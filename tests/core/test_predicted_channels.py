@@ -37,8 +37,8 @@ def test_every_row_comes_once_with_its_line_and_predicted_as_in_the_whole(log: L
     whole, _ = predicted_channels(MODEL, log)
     lines, parts = [], []
     for around, own in in_context(ragged(log), 900):
-        found, lacking = predicted_channels(MODEL, around)
-        assert not lacking
+        found, needs = predicted_channels(MODEL, around)
+        assert not needs
         lines += [around.line(row) for row in range(len(around))[own]]
         parts.append({name: values[own] for name, values in found.items()})
     assert lines == [log.line(row) for row in range(len(log))]

@@ -74,9 +74,9 @@ def _predicted(cell: Cell, log: Path, channels: bool) -> Iterator[tuple[Log, Pre
         return
     for around, own in in_context(pieces):
         piece = around.select(own)
-        further, lacking = predicted_channels(cell.model, around)
+        further, needs = predicted_channels(cell.model, around)
         further = {name: values[own] for name, values in further.items()}
-        yield piece, replace(predicted(cell, piece), channels=further, lacking=lacking)
+        yield piece, replace(predicted(cell, piece), channels=further, needs=needs)
 
 
 def _table(found: Predicted) -> tuple[list[str], Array]:
@@ -96,7 +96,7 @@ class _Summary:
         self._worst = (-1.0, 0)  # mm, line
         self._outside: list[int] = []  # lines of the first
         self._count = 0
-        self._lacking: dict[str, str] = {}
+        self._needs: dict[str, str] = {}
 
     def add(self, log: Log, found: Predicted) -> None:
         self.rows += len(log)
@@ -109,7 +109,7 @@ class _Summary:
             rows = np.flatnonzero(found.outside)
             self._count += len(rows)
             self._outside += [log.line(i) for i in rows[: SHOWN - len(self._outside)]]
-        self._lacking |= found.lacking
+        self._needs |= found.needs
 
     def lines(self, cell: Cell) -> Iterator[str]:
         """Yield what a person should know."""
@@ -125,5 +125,5 @@ class _Summary:
         if self._count:
             some = ", ".join(map(str, self._outside)) + (", ..." if self._count > SHOWN else "")
             yield f"outside what was fitted: {self._count} of {self.rows} rows ({some})"
-        for channel, needs in self._lacking.items():
-            yield f"no {channel} predicted: needs {needs}"
+        for channel, needed in self._needs.items():
+            yield f"no {channel} predicted: needs {needed}"

@@ -23,6 +23,7 @@ from gapbridge.core.log.log import Log
 from gapbridge.core.metrology import Metrology
 from gapbridge.core.model import Model
 from gapbridge.core.motion import Motion, motion_of
+from gapbridge.core.predicted_channels import NO_MASSES
 from gapbridge.core.sessions import session_of
 
 Array = NDArray[np.float64]
@@ -40,9 +41,9 @@ def observe(model: Model, log: Log, metrology: Metrology) -> Observation | NotOb
     holds something unusable.
     """
     measured = log.get("actual_current_as_torque")
-    lacking = _lacking(model, log)
-    if measured is None or lacking:
-        return NotObservable("torque", lacking)
+    needs = _needed(model, log)
+    if measured is None or needs:
+        return NotObservable("torque", needs)
     whole = motion_of(log)
     finite = np.isfinite(measured[whole.rows]).all(axis=1)
     rows = subsampled(whole.valid & finite & _steady(whole))
@@ -87,12 +88,12 @@ def _observed(
     )
 
 
-def _lacking(model: Model, log: Log) -> tuple[str, ...]:
+def _needed(model: Model, log: Log) -> tuple[str, ...]:
     needs = [] if log.has("actual_current_as_torque") else ["actual_current_as_torque"]
     if not (log.has("actual_q") or log.has("target_q")):
         needs.append("actual_q")
     if not model.arm.mass.any():
-        needs.append("masses of the links (in the cell's robot)")
+        needs.append(NO_MASSES)
     return tuple(needs)
 
 

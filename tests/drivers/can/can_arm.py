@@ -12,6 +12,7 @@ from typing import NamedTuple
 import can
 import numpy as np
 
+from benchmarks.server_thread import ServerThread
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.errors import InvalidStateError
 from gapbridge.core.model import Model
@@ -21,7 +22,6 @@ from gapbridge.drivers.can.settings import CanSettings
 from gapbridge.drivers.simulated.can.nodes import CanNodes
 from gapbridge.drivers.simulated.can.server import make_servers
 from gapbridge.drivers.simulated.server.arm_controller import ArmController, make_controller
-from gapbridge.drivers.simulated.server.protocol_server import ServerThread
 from gapbridge.drivers.simulated.ur.settings import simulated_arm
 
 _channels = itertools.count()

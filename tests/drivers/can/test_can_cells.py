@@ -7,11 +7,11 @@ import pytest
 from can_arm import next_state
 from ports import free_port
 
+from benchmarks.server_thread import ServerThread
 from gapbridge.bridge.cell import load_cell
 from gapbridge.bridge.cell.simulation import served_controller
 from gapbridge.core.errors import LinkError
 from gapbridge.drivers import make_driver
-from gapbridge.drivers.simulated.server.protocol_server import ServerThread
 
 CONFIG = Path(__file__).parents[3] / "config"
 CELLS = [CONFIG / f"{name}_can_simulated.yaml" for name in ("piper", "odrive")]

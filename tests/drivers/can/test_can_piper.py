@@ -13,13 +13,13 @@ from piper_sdk import C_PiperInterface_V2
 from piper_sdk.kinematics.piper_fk import C_PiperForwardKinematics
 from ports import free_port, own_host
 
+from benchmarks.server_thread import ServerThread
 from gapbridge.bridge.cell import load_cell
 from gapbridge.drivers.can.driver import CanDriver
 from gapbridge.drivers.can.settings import CanSettings
 from gapbridge.drivers.simulated.can.server import make_servers
 from gapbridge.drivers.simulated.plant.plant_arm import plant_arm
 from gapbridge.drivers.simulated.server.arm_controller import make_controller
-from gapbridge.drivers.simulated.server.protocol_server import ServerThread
 from gapbridge.drivers.simulated.ur.settings import simulated_arm
 
 CONFIG = Path(__file__).parents[3] / "config"

@@ -8,12 +8,12 @@ import pytest
 from can_arm import MODEL, next_state, setpoint_of
 from ports import free_port, own_host
 
+from benchmarks.server_thread import ServerThread
 from gapbridge.drivers.can.driver import CanDriver
 from gapbridge.drivers.can.settings import CanSettings
 from gapbridge.drivers.link_settings import DriverSettings
 from gapbridge.drivers.simulated.can.server import make_servers
 from gapbridge.drivers.simulated.server.arm_controller import make_controller
-from gapbridge.drivers.simulated.server.protocol_server import ServerThread
 from gapbridge.drivers.simulated.ur.settings import simulated_arm
 
 PAGE = Path(__file__).parents[3] / "docs" / "porting.md"

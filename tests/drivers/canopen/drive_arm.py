@@ -11,6 +11,7 @@ from typing import Any
 import can
 import numpy as np
 
+from benchmarks.server_thread import ServerThread
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.errors import InvalidStateError, LinkError
 from gapbridge.core.model import Model
@@ -19,7 +20,6 @@ from gapbridge.drivers.canopen.driver import CanopenDriver
 from gapbridge.drivers.canopen.settings import CanopenSettings
 from gapbridge.drivers.simulated.canopen.server import CanopenServer
 from gapbridge.drivers.simulated.server.arm_controller import ArmController, make_controller
-from gapbridge.drivers.simulated.server.protocol_server import ServerThread
 from gapbridge.drivers.simulated.ur.settings import simulated_arm
 
 HOST = "127.0.0.1"

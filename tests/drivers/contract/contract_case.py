@@ -11,12 +11,13 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
+from benchmarks.server_thread import ServerThread
 from gapbridge.bridge.cell import load_cell
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.model import Model
 from gapbridge.drivers.driver import Driver
 from gapbridge.drivers.simulated.server.arm_controller import ArmController, make_controller
-from gapbridge.drivers.simulated.server.protocol_server import ProtocolServer, ServerThread
+from gapbridge.drivers.simulated.server.protocol_server import ProtocolServer
 from gapbridge.drivers.simulated.ur.settings import simulated_arm
 
 PERIOD = 0.004  # s

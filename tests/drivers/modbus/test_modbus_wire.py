@@ -20,11 +20,11 @@ from contract_modbus import ModbusCase
 from evil_proxy import EvilProxy, Ruin
 from ports import free_port
 
+from benchmarks.server_thread import ServerThread
 from gapbridge.core.errors import InvalidStateError, LinkError, StaleStateError
 from gapbridge.drivers.modbus.driver import ModbusDriver
 from gapbridge.drivers.modbus.settings import ModbusSettings
 from gapbridge.drivers.simulated.modbus.server import ModbusServer
-from gapbridge.drivers.simulated.server.protocol_server import ServerThread
 
 QUICK = {"timeout": 0.05, "state_timeout": 0.4}
 

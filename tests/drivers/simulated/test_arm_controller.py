@@ -8,11 +8,12 @@ import socket
 
 import pytest
 
+from benchmarks.server_thread import ServerThread
 from gapbridge.core.arm import Arm, builtin_arm
 from gapbridge.core.errors import ArmError, LinkError
 from gapbridge.drivers.simulated.server.arm_controller import ArmController, make_controller
 from gapbridge.drivers.simulated.server.bench import BenchError
-from gapbridge.drivers.simulated.server.protocol_server import ProtocolServer, ServerThread
+from gapbridge.drivers.simulated.server.protocol_server import ProtocolServer
 from gapbridge.drivers.simulated.ur.settings import simulated_arm
 
 PERIOD = 0.004
