@@ -7,15 +7,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.parameters import Parameters
 from gapbridge.core.calibration.result import Calibration
 from gapbridge.core.calibration.spread import parameters_named
 from gapbridge.core.errors import InputError
 from gapbridge.core.model import Model
 
-Array = NDArray[np.float64]
 SCHEMA = "gapbridge.calibration/1"
 
 

@@ -6,8 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array, Mask
 from gapbridge.core.calibration.levenberg_marquardt import FitState, converge, fit_state
 from gapbridge.core.calibration.noise import Noise, estimated, presumed
 from gapbridge.core.calibration.observables.nuisance import Nuisance
@@ -16,10 +16,9 @@ from gapbridge.core.calibration.parameters import Parameters
 from gapbridge.core.calibration.problem import Problem, bounds_of, cost, require_enough
 from gapbridge.core.calibration.readings import Readings
 from gapbridge.core.calibration.staging import staged_step, stages_of
-from gapbridge.core.estimation.linear_system import Mask, System
+from gapbridge.core.estimation.linear_system import System
 from gapbridge.core.metrology import Metrology
 
-Array = NDArray[np.float64]
 NOISES = 6  # times at most that the noise is estimated anew
 SAME = 0.02  # relative change of the noise that is none
 

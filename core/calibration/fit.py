@@ -6,9 +6,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.converged_fit import ConvergedFit, converged_fit
 from gapbridge.core.calibration.held_out_check import check_held_out, diagnosed, repeatability_of
 from gapbridge.core.calibration.missing_effects import MissingEffect, missing_effects
@@ -29,7 +29,6 @@ from gapbridge.core.metrology import Metrology
 from gapbridge.core.model import Model
 from gapbridge.core.notes import Note, Reason
 
-Array = NDArray[np.float64]
 Progress = Callable[[str], None]
 TELLING = 1.0  # usual sizes: a parameter that is known no better counts as not identifiable
 TCP_STEP = 1e-3  # share of a parameter's scale, for derivatives of the predicted TCP

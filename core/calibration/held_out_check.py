@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import f as fisher
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.converged_fit import ConvergedFit
 from gapbridge.core.calibration.noise import presumed
 from gapbridge.core.calibration.problem import Problem
@@ -21,7 +22,6 @@ from gapbridge.core.metrology import Metrology
 from gapbridge.core.model import Model
 from gapbridge.core.rotation import rotation_matrix, rotation_vector
 
-Array = NDArray[np.float64]
 SURPRISE = 1e-3  # chance below which held-out poses are no longer like the fitted ones
 FEWEST_TO_DIAGNOSE = 12
 

@@ -16,8 +16,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.observables.nuisance import Nuisance
 from gapbridge.core.calibration.observables.observable import Observable
 from gapbridge.core.calibration.observables.predicted_readings import (
@@ -31,7 +31,6 @@ from gapbridge.core.loads import Loads
 from gapbridge.core.model import Model
 from gapbridge.core.notes import Note, Reason
 
-Array = NDArray[np.float64]
 POSES = 120
 VISIBLE = 3e-7  # m, rms: a usual size that changes readings by less shows nothing
 APART = 2e-3  # share of what a parameter changes that the others must leave over

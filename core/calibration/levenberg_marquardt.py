@@ -11,15 +11,14 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array, Mask
 from gapbridge.core.calibration.noise import Noise
 from gapbridge.core.calibration.observables.nuisance import Nuisance
 from gapbridge.core.calibration.problem import Problem, cost, weighted_system
 from gapbridge.core.errors import InputError
-from gapbridge.core.estimation.linear_system import Mask, System, posterior, solve
+from gapbridge.core.estimation.linear_system import System, posterior, solve
 
-Array = NDArray[np.float64]
 Columns = tuple[Array, Array]
 LOOKS = 20  # derivatives taken anew at most
 STEPS = 12  # steps tried with the same derivatives at most

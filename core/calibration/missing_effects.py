@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtrit
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.converged_fit import ConvergedFit
 from gapbridge.core.calibration.parameters import Parameters
 from gapbridge.core.calibration.problem import HELD, Problem
@@ -22,7 +23,6 @@ from gapbridge.core.estimation.held_out import missed, random_folds
 from gapbridge.core.estimation.identification import pose_groups
 from gapbridge.core.estimation.least_squares import basis_of, projected_out
 
-Array = NDArray[np.float64]
 MOST = 3  # effects at most
 SURE = 6.0  # how much more likely (log) than nothing, the number of effects tried paid for
 SMALL = 0.05  # share of the remainder below which an effect is not worth reporting

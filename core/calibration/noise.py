@@ -13,13 +13,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.observables.nuisance import Nuisance
 from gapbridge.core.calibration.observables.observable import Observable
 from gapbridge.core.calibration.readings import Readings
 from gapbridge.core.metrology import Metrology
 from gapbridge.core.model import Model
 
-Array = NDArray[np.float64]
 STEP = 1e-5  # rad, for derivatives by joint angles
 SURE_INSTRUMENT = 0.5  # 1 sigma of log(noise): what a data sheet is worth
 SURE_TURN = 1.0  # of the noise of rotations, which nobody states

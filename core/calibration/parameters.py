@@ -6,14 +6,13 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.effects import CATALOGUE, Site, Term, effect_named
 from gapbridge.core.errors import InputError
 from gapbridge.core.model import Model
 from gapbridge.core.notes import Note
 
-Array = NDArray[np.float64]
 DEFAULT = tuple(  # what a calibration looks for that names no effects; earlier ones come first
     sorted(
         (name for name, effect in CATALOGUE.items() if effect.calibrated),

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.result import Estimate
 from gapbridge.core.effects import CATALOGUE, Site, Term, acting, correcting
 from gapbridge.core.errors import ExcitationError, InputError
@@ -21,7 +22,6 @@ from gapbridge.core.model import Model
 from gapbridge.core.motion import Motion, motion_of
 from gapbridge.core.notes import Note, Reason
 
-Array = NDArray[np.float64]
 AXES = ("fx", "fy", "fz", "mx", "my", "mz")
 (BIAS,) = correcting("sensor zero")
 NAMES = ("payload_mass", *(f"payload_cog_{k}" for k in "xyz"), *(f"{BIAS}_{k}" for k in AXES))

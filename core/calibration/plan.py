@@ -4,12 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
+from gapbridge.core.arrays import Array
 from gapbridge.core.notes import Note
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

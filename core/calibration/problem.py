@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.noise import Known, Noise
 from gapbridge.core.calibration.observables.nuisance import Nuisance
 from gapbridge.core.calibration.observables.observable import Observable
@@ -18,7 +18,6 @@ from gapbridge.core.errors import ExcitationError, InputError
 from gapbridge.core.estimation.linear_system import Bounds, System
 from gapbridge.core.estimation.robust import scale_of, weights_of
 
-Array = NDArray[np.float64]
 HELD = 10.0  # usual sizes within which a parameter is weakly held at its beginning
 
 

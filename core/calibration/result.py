@@ -8,13 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtrit
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.readings import Readings
 from gapbridge.core.diagnosis.diagnosis import Diagnosis
 from gapbridge.core.estimation.registration import Registration
 from gapbridge.core.model import Model
 from gapbridge.core.notes import Note
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

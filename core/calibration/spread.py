@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.parameters import Parameters
 from gapbridge.core.effects import CATALOGUE, Term, flexibility_names
 from gapbridge.core.errors import EquilibriumError, InputError
@@ -15,7 +16,6 @@ from gapbridge.core.estimation.pose_jacobian import pose_columns
 from gapbridge.core.loads import Loads
 from gapbridge.core.model import Model, Poses
 
-Array = NDArray[np.float64]
 STEP = 1e-3  # share of a parameter's usual size, where a derivative of the TCP is a difference
 FIRST_ORDER = np.inf  # m/rad: no second round of the adjoints, which would change some thousandths
 BLOCK = 20_000  # rows at a time, so that memory does not grow with them

@@ -10,17 +10,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from gapbridge.core.arrays import Array, Index, Mask
 from gapbridge.core.calibration.parameters import Parameters
 from gapbridge.core.calibration.readings import Readings
 from gapbridge.core.effects import CATALOGUE
 from gapbridge.core.estimation.identification import pose_groups
-from gapbridge.core.estimation.linear_system import Bounds, Mask, System, posterior, solve
+from gapbridge.core.estimation.linear_system import Bounds, System, posterior, solve
 
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 AT_ODDS = 1e-3  # chance below which differences and everything together count as at odds
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.converged_fit import ConvergedFit
 from gapbridge.core.calibration.held_out_check import HeldOutCheck
 from gapbridge.core.calibration.missing_effects import MissingEffect
@@ -16,7 +17,6 @@ from gapbridge.core.diagnosis.diagnosis import Diagnosis
 from gapbridge.core.estimation.base_parameters import CLOSE, hardly_separated
 from gapbridge.core.notes import Note, Reason
 
-Array = NDArray[np.float64]
 SIGMAS = 3.0  # from zero, of its own, that a further effect must be to be fitted
 MEMBER = 0.35  # share of a combination from which a parameter is named in it
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.result import Estimate
 from gapbridge.core.effects import correcting
 from gapbridge.core.errors import ExcitationError, InputError
@@ -20,7 +21,6 @@ from gapbridge.core.loads import Loads
 from gapbridge.core.model import Model
 from gapbridge.core.notes import Note, Reason
 
-Array = NDArray[np.float64]
 NAMES = tuple(f"tool_tcp_{k}" for k in "xyz")
 FEWEST = {False: 3, True: 7}  # readings needed: tip on a point, ball on a ball
 TURNED = 0.15  # rad, about: orientations closer together leave a direction of the tool open

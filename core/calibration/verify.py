@@ -12,10 +12,10 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import chi2
 from scipy.stats import f as fisher
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.accuracy_baseline import AccuracyBaseline, baseline_in
 from gapbridge.core.calibration.noise import presumed
 from gapbridge.core.calibration.observables import make_observable
@@ -38,7 +38,6 @@ from gapbridge.core.metrology import Metrology
 from gapbridge.core.model import Model
 from gapbridge.core.notes import Note, Reason
 
-Array = NDArray[np.float64]
 BROKEN = 1e-3  # chance below which a model has moved since its calibration
 STEPS = 5  # of Gauss-Newton: a zero that moved by a tooth is no small change
 BESIDE = 6.0  # of chi-square: suspects that explain as much are reported beside the best one

@@ -14,13 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapbridge.core.arm import Arm
+from gapbridge.core.arrays import Array
 from gapbridge.core.diagnosis.criteria import CHANCE, EXCITED, MATERIAL_SHARE
 from gapbridge.core.diagnosis.selection.candidate import Candidate
 from gapbridge.core.diagnosis.selection.selection import Selection
 from gapbridge.core.effects import CATALOGUE, Reported
 from gapbridge.core.estimation.least_squares import inverse, sigmas_square, solve
 
-Array = NDArray[np.float64]
 DEAD = 1e-7  # share of a parameter's column that a session has: below, it shows nothing of it
 
 

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.diagnosis.criteria import SMOOTH_PENALTY
 from gapbridge.core.diagnosis.selection.candidate import joint_quantity
 from gapbridge.core.diagnosis.selection.selection import Selection
 from gapbridge.core.estimation.least_squares import basis_of, projected_out
 from gapbridge.core.estimation.nelder_mead import nelder_mead
 
-Array = NDArray[np.float64]
 PLACES, WIDTHS = 13, (0.05, 0.1, 0.2)  # where a bump is first looked for, in shares of the range
 
 

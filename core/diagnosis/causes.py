@@ -7,10 +7,9 @@ from dataclasses import dataclass
 from enum import Enum, auto
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gapbridge.core.arm import Arm
-from gapbridge.core.arrays import Mask
+from gapbridge.core.arrays import Array, Mask
 from gapbridge.core.diagnosis.criteria import EXCITED, UNDETERMINED
 from gapbridge.core.diagnosis.finding import ParameterNote, ParameterState, Withdrawal
 from gapbridge.core.diagnosis.held_out import HeldOut, Shrink
@@ -19,8 +18,6 @@ from gapbridge.core.diagnosis.selection.forward import joining
 from gapbridge.core.diagnosis.selection.problem import CandidateFit, fit
 from gapbridge.core.diagnosis.selection.selection import Selection
 from gapbridge.core.effects import CATALOGUE, Reported, Term
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.diagnosis.across_sessions import Carried
 from gapbridge.core.diagnosis.causes import Cause, Considered
 from gapbridge.core.diagnosis.generalisation import NOWHERE, Generalisation
@@ -14,8 +15,6 @@ from gapbridge.core.diagnosis.judgement import Judgement
 from gapbridge.core.diagnosis.location import Where
 from gapbridge.core.diagnosis.selection.selection import Selection
 from gapbridge.core.effects import Term
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.diagnosis.criteria import VARIES
 from gapbridge.core.diagnosis.selection.candidate import Candidate, joint_quantity
 from gapbridge.core.diagnosis.selection.delay_columns import exact_columns
@@ -21,8 +21,6 @@ from gapbridge.core.diagnosis.selection.selection import Selection
 from gapbridge.core.diagnosis.selection.smooth import spline_basis
 from gapbridge.core.effects import Term
 from gapbridge.core.estimation.least_squares import basis_of, projected_out, solve
-
-Array = NDArray[np.float64]
 
 
 def not_constant(

@@ -8,9 +8,9 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.diagnosis.across_sessions import carried
 from gapbridge.core.diagnosis.causes import Considered, causes_of, considered_of
 from gapbridge.core.diagnosis.channel_diagnosis import ChannelDiagnosis
@@ -68,7 +68,6 @@ from gapbridge.core.metrology import Metrology
 from gapbridge.core.model import Model
 from gapbridge.core.sessions import session_of, sessions_in, with_sessions
 
-Array = NDArray[np.float64]
 Depends = tuple[tuple[str, float], ...]  # quantity, share
 Observe = Callable[[Model, Log, Metrology], Observation | NotObservable]
 

@@ -14,14 +14,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array, Index
 from gapbridge.core.diagnosis.criteria import PRIOR_REACH
 from gapbridge.core.diagnosis.observation import Observation
 from gapbridge.core.diagnosis.selection.selection import Selection
 from gapbridge.core.estimation.held_out import joint_regions
 from gapbridge.core.estimation.least_squares import solve
 
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 REGIONS = 5  # of joint space, or stretches of time: each is left out whole
 FEWEST = 3  # samples of a region that the figure needs
 GAP = 0.02  # share of a recording on either side of a judged stretch that is not fitted either

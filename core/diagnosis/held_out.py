@@ -13,10 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.diagnosis.selection.selection import Selection
 from gapbridge.core.estimation.held_out import missed, random_folds
 
-Array = NDArray[np.float64]
 FOLDS = 10
 RESAMPLES = 400
 

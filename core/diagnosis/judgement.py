@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapbridge.core.arm import Arm
+from gapbridge.core.arrays import Array
 from gapbridge.core.diagnosis.bump import bumps
 from gapbridge.core.diagnosis.constancy import not_constant
 from gapbridge.core.diagnosis.criteria import (
@@ -52,7 +53,6 @@ from gapbridge.core.diagnosis.selection.stiffness_curves import without_curvatur
 from gapbridge.core.errors import InputError
 from gapbridge.core.estimation.least_squares import basis_of, projected_out
 
-Array = NDArray[np.float64]
 VAGUE = Withdrawal(Check.SIGNIFICANT)
 BESIDE = Withdrawal(Check.STABLE_VALUE)
 

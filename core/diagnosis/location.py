@@ -6,14 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.diagnosis.residual_structure import dependence
 from gapbridge.core.diagnosis.selection.candidate import joint_target
 from gapbridge.core.diagnosis.selection.selection import Selection
 from gapbridge.core.estimation.least_squares import basis_of
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.dynamics import (
     predict_torque,
     predict_tracking,
@@ -25,7 +25,6 @@ from gapbridge.core.log.log import Log
 from gapbridge.core.model import Model
 from gapbridge.core.motion import Motion
 
-Array = NDArray[np.float64]
 Predict = Callable[[Sequence[Term]], Array]
 POSES = 160
 FAST = 0.7  # share of a joint's greatest speed that a trial uses at most

@@ -12,11 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.diagnosis.criteria import EXCESS, NOT_WHITE, REPEATS_MEASURE, RESIDUAL_MEASURES
 from gapbridge.core.diagnosis.observation import Observation
 from gapbridge.core.diagnosis.selection.selection import Selection
 
-Array = NDArray[np.float64]
 BLOCK = 0.1  # s: what is correlated for less is the sensor's filter, not the arm
 LAGS = 5  # of block means
 FEWEST_BLOCKS = 40

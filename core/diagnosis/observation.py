@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.effects import Term
 
-Array = NDArray[np.float64]
 HELD = "held_torque"  # Nm that a joint holds at rest: a quantity beside the columns of the log
 Rivals = tuple[tuple[str, Array], ...]
 Predict = Callable[[Sequence[Term]], Array]

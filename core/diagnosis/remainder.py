@@ -13,6 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.diagnosis.criteria import (
     CLOSED_SHARE,
     DEGENERATE,
@@ -38,8 +39,6 @@ from gapbridge.core.diagnosis.selection.selection import Selection
 from gapbridge.core.diagnosis.selection.smooth import targets
 from gapbridge.core.estimation.held_out import jackknife
 from gapbridge.core.estimation.least_squares import basis_of, projected_out, sigmas_square, solve
-
-Array = NDArray[np.float64]
 
 
 def withstanding(selection: Selection, believed: Sequence[int]) -> tuple[list[int], Remainder]:

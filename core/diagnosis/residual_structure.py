@@ -14,13 +14,13 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.diagnosis.criteria import SAME_SHARE
 from gapbridge.core.diagnosis.observation import HELD
 from gapbridge.core.diagnosis.selection.problem import SampleSpace
 from gapbridge.core.estimation.held_out import random_folds
 from gapbridge.core.estimation.least_squares import basis_of, projected_out
 
-Array = NDArray[np.float64]
 DRAWS = 1500
 AT_ONCE = 40  # directions: with all draws 0.5 MB
 FOLDS = 7

@@ -13,8 +13,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.diagnosis.channel_diagnosis import ChannelDiagnosis
 from gapbridge.core.diagnosis.criteria import DECISIVE, TIE_SCORE
 from gapbridge.core.diagnosis.next_measurements import PREDICTED, Predict, Trials, draw_trials
@@ -27,7 +27,6 @@ from gapbridge.core.estimation.registration import frame_columns
 from gapbridge.core.log.log import Log
 from gapbridge.core.model import Model
 
-Array = NDArray[np.float64]
 EACH = 2  # measurements proposed per open question
 APART = 0.5  # rad, of some joint, between poses that are proposed together
 POSED = 1e-6  # share of a difference that changes with the pose: less, and no pose decides

@@ -14,13 +14,12 @@ from itertools import combinations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array, Mask
 from gapbridge.core.effects import flexibility_effects
-from gapbridge.core.estimation.compliance_fit import Linear, Mask, solve
+from gapbridge.core.estimation.compliance_fit import Linear, solve
 from gapbridge.core.notes import Note, Reason
 
-Array = NDArray[np.float64]
 VAGUE = 0.3  # of the prior's sigma: what is known no better counts as not identifiable
 VISIBLE = float(
     np.sqrt(VAGUE**-2 - 1)

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array, Mask
 from gapbridge.core.effects import CATALOGUE
 from gapbridge.core.effects.effect import typical_moment
 from gapbridge.core.estimation import least_squares
@@ -31,8 +32,6 @@ from gapbridge.core.loads import Loads
 from gapbridge.core.model import Model, Poses
 from gapbridge.core.rotation import rotation_vector
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 ROUNDS = 12
 NUISANCE_ROUNDS = 20
 CONVERGED = 1e-8  # relative step at which a fit has converged

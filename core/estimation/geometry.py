@@ -12,14 +12,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.effects import CATALOGUE, Term
 from gapbridge.core.estimation.pose_jacobian import pose_columns
 from gapbridge.core.loads import Loads
 from gapbridge.core.model import Model
 
-Array = NDArray[np.float64]
 LENGTH, ANGLE = 5e-4, 1e-3  # m, rad: 1 sigma of machining and assembly
 TIMES_MACHINED = (1.0, 2.0, 4.0, 8.0)  # times these, the most likely: a WAM's grid and a UR5's say
 # 4, the Motoman cube 8; at 1 the WAM is pulled to nominal by as much as it gains

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.estimation.hierarchical_evidence import Evidence
 from gapbridge.core.estimation.hierarchical_prior import (
     Information,
@@ -28,7 +29,6 @@ from gapbridge.core.estimation.hierarchical_prior import (
 )
 from gapbridge.core.estimation.hierarchical_sampling import draws
 
-Array = NDArray[np.float64]
 MOST = 400  # arms from which scatters are estimated: more add hardly anything
 SURE = 100  # arms from which on the scatters count as known
 NOISE_WEIGHT = 10.0  # coordinates that the type's noise counts for beside a session's own

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.errors import ExcitationError
 from gapbridge.core.estimation.compliance_fit import (
     Data,
@@ -29,7 +30,6 @@ from gapbridge.core.log.log import Log
 from gapbridge.core.metrology import Metrology
 from gapbridge.core.model import Model
 
-Array = NDArray[np.float64]
 FEWEST = 4  # poses, where nobody has registered the instrument: three place its frame and tool
 RANK = 1e-9  # singular values below this share of the largest are rounding
 

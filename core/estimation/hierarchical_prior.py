@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+from gapbridge.core.arrays import Array, Mask
+
 ROUNDS = 400
 CONVERGED = 1e-5  # relative change of every scatter at which it has converged
 SPREAD_WEIGHT = 3.0  # arms that the scatter of all joints counts for beside a joint's own

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.random import Generator
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.estimation.hierarchical_prior import (
     BEGIN,
     LARGEST,
@@ -24,7 +24,6 @@ from gapbridge.core.estimation.hierarchical_prior import (
     with_mean,
 )
 
-Array = NDArray[np.float64]
 WARM_UP, APART, KEPT = 60, 8, 40
 SESSION_WEIGHT = 1.0  # what the first guess of the sessions' scatter counts for
 

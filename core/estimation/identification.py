@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array, Mask
 from gapbridge.core.errors import ExcitationError, LogError
 from gapbridge.core.estimation import base_parameters
 from gapbridge.core.estimation.compliance_fit import (
@@ -19,7 +20,6 @@ from gapbridge.core.estimation.compliance_fit import (
     RANK,
     Data,
     Fit,
-    Mask,
     Placements,
     as_written,
     beside_geometry,
@@ -42,7 +42,6 @@ from gapbridge.core.notes import Note, Reason
 from gapbridge.core.rotation import rotation_matrix
 from gapbridge.core.sessions import session_of
 
-Array = NDArray[np.float64]
 SAME_POSE = 1e-3  # rad, of every joint
 TOOL_KNOWN = 2e-4  # m, 1 sigma: a tool point that is known worse stays the cell's
 TOOL_NEAR = (

@@ -7,10 +7,9 @@ flexibilities have one meaning of rank. A prior is rows of its own.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+from gapbridge.core.arrays import Array, Mask
+
 RANK = 1e-9  # singular value of unit columns below which a direction is rounding
 SUMS_RANK = 1e-13  # the same of an eigenvalue of their sums of products
 DEPENDENT = 1e-6  # the same of columns that say the same for every purpose

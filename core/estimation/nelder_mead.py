@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from gapbridge.core.arrays import Array
+
 FIRST, FIRST_FROM_ZERO = 0.05, 0.00025  # edges of the first simplex, as shares and of what is zero
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from numba import config
 from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array, Mask
 from gapbridge.core.effects import CATALOGUE
 from gapbridge.core.effects.effect import Effect
 from gapbridge.core.kernels.adjoint import CONVERGED
@@ -25,8 +26,6 @@ from gapbridge.core.loads import Loads
 from gapbridge.core.model import Model, Poses
 from gapbridge.core.rotation import rotation_vector
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 Value = tuple[int, int]  # number of the term in the model, number of the value in the term
 Entries = tuple[NDArray[np.int64], NDArray[np.int64], Array]  # starts (p+1), slots, rates
 

@@ -5,12 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.estimation.robust import start_weights
 from gapbridge.core.rotation import rotation_matrix, skew
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

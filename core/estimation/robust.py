@@ -13,12 +13,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array, Index
 from gapbridge.core.estimation.least_squares import inverse, solve
 
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 STARTING, ROUNDS = 12, 60
 CONVERGED = 1e-9  # change of the weights at which the fit has converged
 FULL = 2.0  # distance up to which a reading counts wholly: clean data keep their information

@@ -14,6 +14,7 @@ from itertools import islice
 import numpy as np
 from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array, Mask
 from gapbridge.core.effects import at_moment, by_approach
 from gapbridge.core.estimation import base_parameters, compliance_fit
 from gapbridge.core.estimation.compliance_fit import (
@@ -22,7 +23,6 @@ from gapbridge.core.estimation.compliance_fit import (
     Data,
     Fit,
     Linear,
-    Mask,
     as_written,
     prior_of,
     residual,
@@ -56,7 +56,6 @@ from gapbridge.core.log.log import Log
 from gapbridge.core.metrology import Metrology
 from gapbridge.core.model import Model
 
-Array = NDArray[np.float64]
 Rows = NDArray[np.int64]
 SAMPLE = 20_000  # rows kept at most, for the first guess and the look whether anything bends
 MANY_OUTLIERS = 100_000  # rows that are named at most

@@ -13,11 +13,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array, Mask
 from gapbridge.core.estimation.compliance_fit import (
     RANK,
     Data,
     Fit,
-    Mask,
     add_rows,
     fold_rows,
     moved,
@@ -29,7 +29,6 @@ from gapbridge.core.estimation.compliance_fit import (
 from gapbridge.core.estimation.held_out import FOLDS
 from gapbridge.core.estimation.least_squares import solve
 
-Array = NDArray[np.float64]
 NONE = np.zeros(0)  # weights of a fit whose rows nobody keeps
 
 

@@ -11,9 +11,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import bdtr, stdtr, stdtrit
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.budget.inputs import (
     Input,
     model_remainder,
@@ -26,7 +26,6 @@ from gapbridge.core.calibration.budget.pose_accuracy import KINDS
 from gapbridge.core.calibration.budget.sensitivity import Sensitivities, sensitivities
 from gapbridge.core.calibration.result import Calibration
 
-Array = NDArray[np.float64]
 COVERAGE = 2.0  # k
 PROBABILITY = 0.9545  # of a normal distribution within two standard deviations
 RARE = 0.01  # a chance below which the held-out poses speak against the budget

@@ -13,12 +13,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array, Index
 from gapbridge.core.calibration.readings import Readings
 from gapbridge.core.calibration.result import Calibration, Errors
 from gapbridge.core.rotation import rotation_matrix, rotation_vector
 
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 KINDS = ("position", "pose")  # of readings that show where the TCP is
 SAME = 2e-4  # rad: encoders that differ by more were not given the same command
 

@@ -5,14 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.parameters import Parameters
 from gapbridge.core.calibration.result import Calibration
 from gapbridge.core.calibration.spread import effects_of
 from gapbridge.core.errors import InputError
 
-Array = NDArray[np.float64]
 STEP = 1e-3  # usual sizes
 
 

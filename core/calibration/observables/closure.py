@@ -6,8 +6,8 @@ from abc import abstractmethod
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.observables.fixed_point import point_of
 from gapbridge.core.calibration.observables.nuisance import Nuisance
 from gapbridge.core.calibration.observables.observable import Observable
@@ -15,7 +15,6 @@ from gapbridge.core.calibration.readings import Readings
 from gapbridge.core.model import Model, Poses
 from gapbridge.core.rotation import skew
 
-Array = NDArray[np.float64]
 NEWTON_ROUNDS = 25
 CLOSED = 1e-10  # m
 MISSED = 1e-6  # m: farther off than this, no pose was found

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.estimation.registration import Registration
 
-Array = NDArray[np.float64]
 TINY = 1e-9  # m: nearer to the point than this, no direction is known
 
 

@@ -5,11 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.estimation.registration import IDENTITY, Registration
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

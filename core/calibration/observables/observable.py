@@ -11,8 +11,8 @@ from abc import ABC, abstractmethod
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.observables.nuisance import Layout, Nuisance
 from gapbridge.core.calibration.parameters import Parameters
 from gapbridge.core.calibration.readings import Readings
@@ -23,7 +23,6 @@ from gapbridge.core.estimation.robust import start_weights
 from gapbridge.core.model import Model, Poses
 from gapbridge.core.rotation import one_rotation_matrix
 
-Array = NDArray[np.float64]
 SHARE = 0.01  # of a parameter's usual size, as the step of a difference
 STEP = 1e-5  # m and rad, of a nuisance: the gap is all but linear in it
 SETTLED = 1e-9  # m and rad: a smaller step moves nothing that anybody measures

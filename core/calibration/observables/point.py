@@ -6,15 +6,13 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.observables.closure import Closure
 from gapbridge.core.calibration.observables.fixed_point import fixed_at
 from gapbridge.core.calibration.observables.nuisance import Nuisance
 from gapbridge.core.calibration.readings import Readings
 from gapbridge.core.model import Poses
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

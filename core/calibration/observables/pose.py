@@ -8,6 +8,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.observables.nuisance import Nuisance
 from gapbridge.core.calibration.observables.observable import Observable
 from gapbridge.core.calibration.observables.position import (
@@ -21,8 +22,6 @@ from gapbridge.core.calibration.readings import Readings
 from gapbridge.core.estimation.registration import Registration
 from gapbridge.core.model import Poses
 from gapbridge.core.rotation import rotation_matrix, rotation_vector
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.observables.nuisance import Nuisance
 from gapbridge.core.calibration.observables.observable import Observable
 from gapbridge.core.calibration.readings import Readings
@@ -15,7 +15,6 @@ from gapbridge.core.estimation.registration import Registration, register_robust
 from gapbridge.core.model import Poses
 from gapbridge.core.rotation import skew
 
-Array = NDArray[np.float64]
 FEWEST = 3  # points that fix a frame
 
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.observables.fixed_point import fixed_at
 from gapbridge.core.calibration.observables.nuisance import Nuisance
 from gapbridge.core.calibration.observables.observable import Observable
@@ -15,7 +16,6 @@ from gapbridge.core.calibration.readings import Readings
 from gapbridge.core.loads import Loads
 from gapbridge.core.model import Model
 
-Array = NDArray[np.float64]
 TOUCHED = 0.03  # m, usual radius of sphere and ball together
 
 

@@ -6,15 +6,13 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.observables.nuisance import Nuisance
 from gapbridge.core.calibration.observables.observable import Observable
 from gapbridge.core.calibration.readings import Readings
 from gapbridge.core.estimation.registration import IDENTITY, Registration
 from gapbridge.core.model import Poses
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

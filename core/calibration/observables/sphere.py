@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.observables.closure import Closure
 from gapbridge.core.calibration.observables.fixed_point import (
     TINY,
@@ -18,8 +18,6 @@ from gapbridge.core.calibration.observables.fixed_point import (
 from gapbridge.core.calibration.observables.nuisance import Nuisance
 from gapbridge.core.calibration.readings import Readings
 from gapbridge.core.model import Poses
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

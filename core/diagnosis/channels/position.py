@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.diagnosis.observation import NotObservable, Observation, Predict, stacked
 from gapbridge.core.diagnosis.selection.unnamed import unnamed_rivals
 from gapbridge.core.effects import Term
@@ -27,7 +28,6 @@ from gapbridge.core.model import Model, Poses
 from gapbridge.core.rotation import rotation_matrix, rotation_vector
 from gapbridge.core.sessions import session_of, sessions_in
 
-Array = NDArray[np.float64]
 LEVER = 0.2  # m/rad: first weight of a rotation against a position
 VARIES = 1e-9  # spread below which a quantity counts as constant
 

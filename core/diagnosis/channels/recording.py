@@ -5,14 +5,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array, Index
 from gapbridge.core.derivatives import signal_noise
 from gapbridge.core.diagnosis.observation import HELD
 from gapbridge.core.estimation.identification import pose_groups
 from gapbridge.core.log.log import Log
 from gapbridge.core.motion import Motion
 
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 MOST_SAMPLES = 30_000  # poses at rest, evenly picked: what memory holds
 STRETCHES = 24  # conditions of a recording: even stretches of time
 FEWEST_CONDITIONS = 5

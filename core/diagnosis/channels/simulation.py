@@ -10,8 +10,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.diagnosis.observation import NotObservable, Observation
 from gapbridge.core.effects import Term
 from gapbridge.core.errors import LogError
@@ -21,7 +21,6 @@ from gapbridge.core.metrology import Metrology
 from gapbridge.core.model import Model
 from gapbridge.core.motion import motion_of, with_motion
 
-Array = NDArray[np.float64]
 Observe = Callable[[Model, Log, Metrology], Observation | NotObservable]
 SHOWN_BY = {
     "position": "measured_position",

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.diagnosis.channels.recording import (
     conditions,
     instrument_noise,
@@ -26,7 +27,6 @@ from gapbridge.core.motion import Motion, motion_of
 from gapbridge.core.predicted_channels import NO_MASSES
 from gapbridge.core.sessions import session_of
 
-Array = NDArray[np.float64]
 ENOUGH = 0.4  # share of rows that must remain for rests to be left out too
 BRIEF = 0.15  # s: a joint that is slow for no longer is turning round, not resting
 

@@ -8,8 +8,8 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array, Index
 from gapbridge.core.diagnosis.channels.recording import (
-    Index,
     conditions,
     held_torques,
     instrument_noise,
@@ -27,7 +27,6 @@ from gapbridge.core.model import Model
 from gapbridge.core.motion import Motion, motion_of
 from gapbridge.core.sessions import session_of
 
-Array = NDArray[np.float64]
 SHORTEST_LEAD = 0.1  # s left out at the start of each stretch, whose past is unknown
 TEXT = 2e-7  # rad: smaller differences come from how the log was written
 REMEMBERED = 64  # predictions of one joint

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.derivatives import signal_noise
 from gapbridge.core.diagnosis.channels.recording import (
     VARIES,
@@ -26,7 +27,6 @@ from gapbridge.core.model import Model
 from gapbridge.core.motion import Motion, motion_of
 from gapbridge.core.sessions import session_of
 
-Array = NDArray[np.float64]
 AXES = ("fx", "fy", "fz", "mx", "my", "mz")
 USUAL_WEIGHT = 10.0  # N/Nm between force and torque where the log does not show it
 WEIGHTS = (1.0, 1000.0)  # N/Nm, the range that a sensor can have

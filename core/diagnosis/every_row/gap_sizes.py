@@ -8,13 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.diagnosis.every_row.streamed import Streamed
 from gapbridge.core.diagnosis.noise_floor import block_means, own_coordinates
 from gapbridge.core.diagnosis.observation import Observation
 from gapbridge.core.diagnosis.selection.selection import Selection
 from gapbridge.core.estimation.least_squares import solve
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -11,12 +11,11 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Index
 from gapbridge.core.log.log import Log
 from gapbridge.core.motion import EDGE, LEAD, check_order, is_moving, motion_of, with_motion
 
-Index = NDArray[np.int64]
 WHOLE = 30_000  # rows of a recording that are looked at as a whole
 EXCERPT = 20_000  # rows of an excerpt
 WINDOW, FEWEST = 1.0, 500  # s and rows of each window of an excerpt, at least

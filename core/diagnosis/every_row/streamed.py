@@ -11,9 +11,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gapbridge.core.arm import Arm
+from gapbridge.core.arrays import Array, Index
 from gapbridge.core.diagnosis.channels.recording import STRETCHES
 from gapbridge.core.diagnosis.criteria import OUTLIER_SHARE
 from gapbridge.core.diagnosis.every_row.long_recording import Block, LongRecording
@@ -31,8 +31,6 @@ from gapbridge.core.effects import Term
 from gapbridge.core.estimation.robust import OUTLIER, distance_of, scale_of
 from gapbridge.core.log.log import Log
 
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 Observe = Callable[[Log], Observation | NotObservable]
 
 

@@ -9,8 +9,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.diagnosis.log_checks.kinematics import (
     best_order,
     inverted,
@@ -25,7 +25,6 @@ from gapbridge.core.metrology import Metrology
 from gapbridge.core.model import Model
 from gapbridge.core.rotation import rotation_matrix, rotation_vector
 
-Array = NDArray[np.float64]
 MOST = 200  # rows looked at
 FEWEST = 6
 FAR = 0.02  # m and rad: more than any arm errs

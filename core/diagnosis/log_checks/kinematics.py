@@ -11,16 +11,15 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gapbridge.core.arm import Arm
+from gapbridge.core.arrays import Array
 from gapbridge.core.estimation.least_squares import solve
 from gapbridge.core.estimation.registration import register
 from gapbridge.core.log.log_finding import LogCheck, LogFinding
 from gapbridge.core.model import Model
 from gapbridge.core.rotation import rotation_matrix
 
-Array = NDArray[np.float64]
 MANY = 6  # joints up to which all orders are tried: 720
 SCREENED = 24  # rows that an order is judged on before all are
 NEAR = 1e-6  # m, rad: frames that are standard DH rows

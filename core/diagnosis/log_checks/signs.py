@@ -11,8 +11,8 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array, Index
 from gapbridge.core.dynamics import predict_torque, predict_wrench
 from gapbridge.core.errors import InputError
 from gapbridge.core.estimation.least_squares import bounded
@@ -24,8 +24,6 @@ from gapbridge.core.log.log_finding import LogCheck, LogFinding
 from gapbridge.core.model import Model
 from gapbridge.core.motion import Motion
 
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 MOST = 200  # rows looked at
 FEWEST = 6  # pulled rows from which a sign is judged
 LEAST = 1.0  # N, Nm: less is no pull

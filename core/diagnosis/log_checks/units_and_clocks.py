@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.errors import LogError
 from gapbridge.core.log.columns import COLUMNS, misspelt
 from gapbridge.core.log.log import Log
@@ -30,7 +31,6 @@ AT_ONCE = 1000  # rows
 READINGS = (
     "measured_position", "measured_rotation", "ft_raw_wrench", "actual_current_as_torque",
 )  # fmt: skip
-Array = NDArray[np.float64]
 
 
 def check_units(model: Model, log: Log) -> None:

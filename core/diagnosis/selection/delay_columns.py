@@ -9,8 +9,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.diagnosis.criteria import ALIKE
 from gapbridge.core.diagnosis.observation import Observation
 from gapbridge.core.diagnosis.selection.candidate import Candidate, named_columns
@@ -18,7 +18,6 @@ from gapbridge.core.diagnosis.selection.problem import CandidateFit, SampleSpace
 from gapbridge.core.effects import CATALOGUE, Term
 from gapbridge.core.estimation.robust import scale_of
 
-Array = NDArray[np.float64]
 FEW_DELAYS = 3  # below, nobody knows which joint is the odd one
 SHORTEST = 1e-3  # usual sizes of the value: a chord needs a length
 

@@ -6,13 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.diagnosis.criteria import MAX_LINES, MAX_SMOOTH_TERMS
 from gapbridge.core.diagnosis.selection.problem import CandidateFit, SampleSpace, fit, gains
 from gapbridge.core.estimation.least_squares import basis_of, projected_out
 
-Array = NDArray[np.float64]
 BEAM = 6
 DEPTH = 9
 PATIENCE = 2  # depths without a better set before the beam stops

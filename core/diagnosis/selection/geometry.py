@@ -19,9 +19,8 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
-from gapbridge.core.arrays import Mask
+from gapbridge.core.arrays import Array, Mask
 from gapbridge.core.diagnosis.criteria import (
     ACCUSATION_PENALTY,
     FEW_LINKS,
@@ -36,7 +35,6 @@ from gapbridge.core.diagnosis.selection.search import part, screened_search
 from gapbridge.core.estimation.geometry import ANGLE, LENGTH, TIMES_MACHINED
 from gapbridge.core.estimation.least_squares import solve
 
-Array = NDArray[np.float64]
 Members = Callable[[SampleSpace], tuple[int, ...]]
 NEVER = 1e9  # a penalty that no fit is worth
 NOMINAL = 1e-9  # of a number's usual size: 1 sigma of one that is held

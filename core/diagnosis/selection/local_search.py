@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gapbridge.core.diagnosis.criteria import FAMILY_PENALTY
 from gapbridge.core.diagnosis.selection.forward import (
@@ -15,7 +14,6 @@ from gapbridge.core.diagnosis.selection.forward import (
 from gapbridge.core.diagnosis.selection.problem import CandidateFit, SampleSpace, fit
 from gapbridge.core.estimation.least_squares import inverse, sigmas_square
 
-Array = NDArray[np.float64]
 MERGED = 9  # terms up to which every pair is tried against one
 GROWTH = 30  # terms added to a set at most
 

@@ -12,15 +12,14 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gapbridge.core.arm import Arm
+from gapbridge.core.arrays import Array
 from gapbridge.core.diagnosis.criteria import LOOSE_PRIOR
 from gapbridge.core.diagnosis.selection.candidate import Candidate
 from gapbridge.core.diagnosis.selection.state import SelectionState, flat
 from gapbridge.core.effects import CATALOGUE, Effect, Site, Term
 
-Array = NDArray[np.float64]
 Pair = tuple[Candidate, Array]
 FREE = 1e6  # usual sizes of a nuisance: nothing is known of it
 MOMENTS = 3  # of a site that the search looks at

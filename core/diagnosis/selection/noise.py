@@ -12,11 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.diagnosis.observation import Observation
 from gapbridge.core.estimation.nelder_mead import nelder_mead
 from gapbridge.core.estimation.robust import scale_of
 
-Array = NDArray[np.float64]
 LARGE_SAMPLE = 150  # samples from which every coordinate is taken to scatter alike
 ENOUGH = 400  # samples from which the sizes are estimated
 

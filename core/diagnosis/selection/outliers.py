@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.diagnosis.criteria import (
     LOOSE_PRIOR,
     MOST_OUTLIERS,
@@ -26,7 +27,6 @@ from gapbridge.core.estimation.robust import (
     weights_of,
 )
 
-Array = NDArray[np.float64]
 STARTING, STEPS = 4, 8  # of the fit that looks for outliers
 
 

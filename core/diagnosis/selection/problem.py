@@ -10,6 +10,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.diagnosis.criteria import (
     ACCUSATION_PENALTY,
     MAX_SOFTENING,
@@ -18,7 +19,6 @@ from gapbridge.core.diagnosis.criteria import (
 )
 from gapbridge.core.diagnosis.selection.candidate import Candidate
 
-Array = NDArray[np.float64]
 RANK = 1e-10  # share of a column's square below which it counts as already explained
 DEPENDENT = 1e-8  # the same of one among several columns
 AT_ONCE = 60_000  # numbers of a temporary: 0.5 MB

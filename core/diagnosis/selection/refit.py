@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapbridge.core.arm import Arm
+from gapbridge.core.arrays import Array
 from gapbridge.core.diagnosis.criteria import OWN_SIGMAS, PRIOR_REACH
 from gapbridge.core.diagnosis.observation import Observation
 from gapbridge.core.diagnosis.selection.candidate import Candidate
@@ -27,7 +28,6 @@ from gapbridge.core.estimation.least_squares import (
     solve,
 )
 
-Array = NDArray[np.float64]
 REFITS = 8
 LEAST = 1e-13  # of the largest eigenvalue of a covariance: what is less is rounding
 NO_PRIOR: Mapping[int, Array] = {}

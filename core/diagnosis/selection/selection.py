@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapbridge.core.arm import Arm
-from gapbridge.core.arrays import Mask
+from gapbridge.core.arrays import Array, Mask
 from gapbridge.core.diagnosis.criteria import (
     HEAVIEST,
     LARGE_SAMPLE,
@@ -62,7 +62,6 @@ from gapbridge.core.estimation.least_squares import projected_out, solve
 from gapbridge.core.load_bounds import LoadBounds
 from gapbridge.core.model import Model
 
-Array = NDArray[np.float64]
 ROUNDS = 8
 NOTHING = 1e-4  # worth of a value: a thirtieth of its sigma
 

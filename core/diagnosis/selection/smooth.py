@@ -7,8 +7,8 @@ a joint's angle, the measurement in base axes, the tool in flange axes, or the s
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.diagnosis.observation import Observation
 from gapbridge.core.diagnosis.selection.candidate import (
     Candidate,
@@ -18,7 +18,6 @@ from gapbridge.core.diagnosis.selection.candidate import (
 )
 from gapbridge.core.effects import Parameter, Site
 
-Array = NDArray[np.float64]
 Pair = tuple[Candidate, Array]
 KNOTS = 5
 BUMPS = 24  # places along a joint's range where something local may sit

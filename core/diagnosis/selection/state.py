@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapbridge.core.arm import Arm
+from gapbridge.core.arrays import Array
 from gapbridge.core.diagnosis.criteria import (
     ANY_CONSTANT_PENALTY,
     KNOWN_SHARE,
@@ -20,7 +21,6 @@ from gapbridge.core.diagnosis.selection.noise import Noise
 from gapbridge.core.diagnosis.selection.problem import AT_ONCE, SampleSpace, penalties
 from gapbridge.core.effects import CATALOGUE, Term
 
-Array = NDArray[np.float64]
 DEAD = 1e-7  # share of a column that the nuisance leaves: below, nothing is left
 
 

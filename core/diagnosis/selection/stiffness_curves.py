@@ -5,13 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.diagnosis.criteria import CURVATURE_GAIN
 from gapbridge.core.diagnosis.selection.problem import SampleSpace
 from gapbridge.core.effects import CATALOGUE, Term
-
-Array = NDArray[np.float64]
 
 
 def without_curvature(terms: Sequence[Term], covariance: Sequence[Array]) -> list[int]:

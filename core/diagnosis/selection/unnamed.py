@@ -9,8 +9,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.dynamics import frames_of, pieces_of
 from gapbridge.core.effects.effect import typical_moment
 from gapbridge.core.kernels.reference import Chain, Rows, predict_rows
@@ -19,7 +19,6 @@ from gapbridge.core.model import Model
 from gapbridge.core.motion import Motion
 from gapbridge.core.rotation import rotation_vector
 
-Array = NDArray[np.float64]
 SHORTEST = 1e-3  # m: shorter links do not bend
 OFF = 0.1  # m, of a load from the TCP
 PULL = 1.0  # N, step of the central differences
