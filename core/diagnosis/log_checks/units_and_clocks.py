@@ -52,9 +52,11 @@ def check_units(model: Model, log: Log) -> None:
         ("joint_temperatures", HOT, "the temperatures look like kelvin, expected °C"),
     ):
         column = log.get(name)
-        if column is None or not np.isfinite(column).any():
+        if column is None:
             continue
         rows = column.reshape(len(column), -1)
+        if _within(rows, most / np.sqrt(rows.shape[1])) or not np.isfinite(rows).any():
+            continue
         size = (
             np.linalg.norm(rows, axis=1)
             if name == "measured_rotation"
@@ -72,13 +74,13 @@ def check_units(model: Model, log: Log) -> None:
 
 def _check_angles(model: Model, log: Log, name: str) -> None:
     q = log.get(name)
-    if q is None or not np.isfinite(q).any():
-        return
-    if np.isinf(q).any():
-        log.require(name)
     limits = model.arm.limits
     widest = BEYOND * np.maximum(np.abs(limits.lower), np.abs(limits.upper))
     most = np.clip(widest, LEAST_TURN, TURNS)
+    if q is None or _within(q, float(most.min())) or not np.isfinite(q).any():
+        return
+    if np.isinf(q).any():
+        log.require(name)
     worst = np.nanmax(np.abs(q), axis=0)
     if (worst > most).any():
         raise LogError(
@@ -89,9 +91,11 @@ def _check_angles(model: Model, log: Log, name: str) -> None:
 
 def _check_positions(model: Model, log: Log) -> None:
     measured = log.get("measured_position")
-    if measured is None or not np.isfinite(measured).any():
-        return
     reach = _reach(model)
+    if measured is None or _within(measured, REACHES * reach / np.sqrt(12)):
+        return  # no two are farther apart
+    if not np.isfinite(measured).any():
+        return
     widest = np.nanmax(measured, axis=0) - np.nanmin(measured, axis=0)
     if np.linalg.norm(widest) <= REACHES * reach:  # no median can lie farther away
         return
@@ -102,6 +106,11 @@ def _check_positions(model: Model, log: Log) -> None:
             f"{log.path}: columns measured_position_*: found positions {size:g} apart for an arm "
             f"of {reach:.2f} m reach; the positions look like millimetres, expected m"
         )
+
+
+def _within(values: Array, most: float) -> bool:
+    """Return whether all values are numbers of at most this size: one look at a sound log."""
+    return bool(-most <= values.min(initial=0.0) and values.max(initial=0.0) <= most)
 
 
 def _reach(model: Model) -> float:
