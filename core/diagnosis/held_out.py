@@ -41,7 +41,7 @@ class HeldOut:
         self, selection: Selection, seed: int = 0, parts: NDArray[np.int64] | None = None
     ) -> None:
         self._space = selection.space
-        self._raw, self._target = selection.unprojected, selection.unprojected.target
+        self._unprojected, self._target = selection.unprojected, selection.unprojected.target
         self._nuisance = selection.unprojected.nuisance
         k = selection.observation.measured.shape[1]
         own = {"position": 3}.get(selection.observation.channel, k)
@@ -81,7 +81,7 @@ class HeldOut:
         return float(np.sqrt(np.mean(self.squares(chosen))))
 
     def _left(self, chosen: tuple[int, ...]) -> Array:
-        A = np.hstack([self._raw.columns(self._space, chosen), self._nuisance])
+        A = np.hstack([self._unprojected.columns(self._space, chosen), self._nuisance])
         if not A.shape[1]:
             return self._target
         # with the pull: of a number that moves nothing only the pull is there
