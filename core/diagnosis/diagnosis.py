@@ -196,8 +196,8 @@ def _diagnose(
 
 def _no_channel(log: Log, hidden: Sequence[NotObservable]) -> LogError:
     needs = "; ".join(f"{h.channel}: {', '.join(h.needs)}" for h in hidden)
-    lacking = [need for h in hidden for need in h.needs if need in COLUMNS]
-    hint = did_you_mean(log.unknown, lacking, log.n)
+    missing = [need for h in hidden for need in h.needs if need in COLUMNS]
+    hint = did_you_mean(log.unknown, missing, log.n)
     return LogError(f"{log.path}: found no channel to diagnose, expected one of: {needs}{hint}")
 
 
