@@ -122,13 +122,13 @@ class Streamed:
         freed = dict(zip(self.columns.accused, self.columns.freed, strict=True))
         for p, value, own in zip(accused, values, spread, strict=True):
             terms[p], covariance[p] = freed[p].term(value), own
-        space, raw = self._space()
+        space, unprojected = self._space()
         observation, noise = self._samples()
         return Selection(
             observation, space, fit(space, tuple(accused)), tuple(terms),
             tuple(range(len(terms))), tuple(covariance),
             np.ones(len(observation.rows), dtype=bool), noise, observation.measured,
-            self.columns.terms, raw, rows_each=self.gap.kept / len(observation.rows),
+            self.columns.terms, unprojected, rows_each=self.gap.kept / len(observation.rows),
         )  # fmt: skip
 
     def alone(self, _: Selection, accused: Sequence[int]) -> Selection:
