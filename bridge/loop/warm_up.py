@@ -1,11 +1,13 @@
 """Compile the inner loops: ``python -m gapbridge.bridge.loop.warm_up``, once per installation.
 
 Numba keeps what it has compiled beside the sources. Without this, the first command of a new
-installation spends half a minute on it, in the middle of its work.
+installation spends half a minute on it, in the middle of its work. ``--demo`` leaves out what the
+demo does not need.
 """
 
 from __future__ import annotations
 
+import sys
 from multiprocessing import get_context
 
 import numpy as np
@@ -32,50 +34,58 @@ Q = np.array([[0.0, -1.5, 1.8, -1.87, -1.57, 0.0]])
 FOUR = np.repeat(Q, 4, axis=0)
 
 
-def warm_up() -> None:
-    """Call each compiled function once, the two halves of them on two cores."""
-    other = get_context("fork").Process(target=_one_row)
+def warm_up(demo: bool = False) -> None:
+    """Call each compiled function once, the two halves of them on two cores.
+
+    ``demo``: only what the demo calls.
+    """
+    other = get_context("fork").Process(target=_setpoints, args=(demo,))
     other.start()
-    _blocks_of_rows()
+    _logs(demo)
     other.join()
-    _one_row()  # of what was compiled there this process has nothing yet, and nothing if it failed
+    _setpoints(
+        demo
+    )  # of what was compiled there this process has nothing, and nothing if it failed
 
 
-def _one_row() -> None:
-    """Call what the live loop needs, and the readable kernels."""
+def _setpoints(demo: bool) -> None:
+    """Call what the live loop needs, and signals in time."""
     model = _model()
     model.predict(Q).rotation_vector  # noqa: B018 (compiled when asked for)
-    model.linear_form(Q)
-    corrected = correct(model, Q)  # many rows, and one in the loop
-    correct(model, 0.0 * Q)  # a singularity, which the blocks leave
-    Compensator(model).correct(Q[0])
-    looking = next(e for e in CATALOGUE.values() if type(e).condition is not Effect.condition)
-    site = looking.sites(model.arm)[0]
-    values = (0.0,) * len(looking.parameters(model.arm, site))
-    of_angles = model.with_terms([Term(looking.identifier, site, values)])
-    Compensator(of_angles).correct(Q[0])  # an effect that looks at the joint angles
+    corrected = Compensator(model).correct(Q[0])
     Gate(500.0, model, True)
     Nominal(model)
     NominalStream(np.ones(N))
     limits = Limits(np.full(N, -7.0), np.full(N, 7.0), np.full(N, 3.0))
     limiter = Limiter(limits, N)
     limiter.start(Q[0])
-    limiter.limit(Q[0], corrected.q[0], corrected.offset_in_base[0], 1.0, Q[0], 0.002)
-
-
-def _blocks_of_rows() -> None:
-    """Call what logs need: blocks of rows, their Jacobians, rigid dynamics, signals in time."""
-    model = _model()
-    model.predict(FOUR).rotation_vector  # noqa: B018 (compiled when asked for)
-    model.linear_form(FOUR)
-    with_pieces(model, motion_of(Log("", {"actual_q": Q}, N)))
-    pose_columns(model, FOUR, None, [(0, 0)], np.array([1e-9]))
-    of_rows(N)
+    limiter.limit(Q[0], corrected.q, corrected.offset_in_base, 1.0, Q[0], 0.002)
+    if demo:
+        return
+    looking = next(e for e in CATALOGUE.values() if type(e).condition is not Effect.condition)
+    site = looking.sites(model.arm)[0]
+    values = (0.0,) * len(looking.parameters(model.arm, site))
+    of_angles = model.with_terms([Term(looking.identifier, site, values)])
+    Compensator(of_angles).correct(Q[0])  # an effect that looks at the joint angles
     time = np.array([0.0, 0.002, 0.004, 0.006])
     lagged(time, time, 0.1, 0.0)
     played(time, 0.1, 0.0)
+
+
+def _logs(demo: bool) -> None:
+    """Call what logs need: blocks of rows, their Jacobians, rigid dynamics."""
+    model = _model()
+    for rows in (Q, FOUR):
+        model.predict(rows).rotation_vector  # noqa: B018 (compiled when asked for)
+        model.linear_form(rows)
+    pose_columns(model, FOUR, None, [(0, 0)], np.array([1e-9]))
     gap, factor = np.zeros((1, 3)), np.zeros((2 * N + 1, 2 * N + 1))
     factor_blocks(model.chain(), model.rows(Q), gap, gap, 0, 0, 1, factor)
+    if demo:
+        return
+    of_rows(N)
+    with_pieces(model, motion_of(Log("", {"actual_q": Q}, N)))
+    correct(model, np.vstack([Q, 0.0 * Q]))  # a singularity, too, which the blocks leave
 
 
 def _model() -> Model:
@@ -83,4 +93,4 @@ def _model() -> Model:
 
 
 if __name__ == "__main__":
-    warm_up()
+    warm_up(demo="--demo" in sys.argv)
