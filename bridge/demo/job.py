@@ -83,8 +83,7 @@ def _job(
     explained: list[Rests] = []
     better, folder = out / "explained.yaml", out / "diagnosis"
     with Diagnosing(log, calibrated.path, folder, better) as diagnosing:
-        for load, poses in zip(scene.test_loads, planned.test, strict=True):
-            visits = np.tile(poses, (scene.visits, 1))
+        for load, visits in zip(scene.test_loads, planned.test, strict=True):
             _check(cell, calibrated, session, load, visits, seen, console)
         console.print("diagnosing what the fit leaves of the calibration log")
         diagnosis = diagnosing.answer()
@@ -93,8 +92,7 @@ def _job(
     names = dict.fromkeys(cause.effect for cause in accused)
     console.print(f"named by the diagnosis, and applied: {', '.join(names) or 'nothing'}")
     corrected = _fit_again(log, load_cell(better), out)
-    for load, poses in zip(scene.test_loads, planned.test, strict=True):
-        visits = np.tile(poses, (scene.visits, 1))
+    for load, visits in zip(scene.test_loads, planned.test, strict=True):
         console.print(f"checking {len(visits)} visits with {load.name}, with that")
         explained.append(session.visit(corrected, load, visits))
     result = Result(

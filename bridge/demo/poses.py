@@ -65,7 +65,8 @@ class Scene:
     test_loads: tuple[Load, ...]
     calibrate: int = 10  # poses per calibration load
     test: int = 3  # poses per test load
-    visits: int = 2  # of each test pose: what differs between them is the arm's repeatability
+    # of each pose of each test load: what differs between them is the arm's repeatability
+    visits: tuple[int, ...] = (2, 1)
 
 
 UR10E = Scene(
@@ -126,7 +127,7 @@ class Plan:
     """Poses of the whole demo, each list in the order of its visits."""
 
     calibration: tuple[Array, ...]  # per calibration load (N, 6)
-    test: tuple[Array, ...]  # per test load (M, 6), none of them in the calibration
+    test: tuple[Array, ...]  # visits per test load (M, 6), at no pose of the calibration
 
 
 def plan(model: Model, home: Array, seed: int, scene: Scene = UR10E) -> Plan:
@@ -146,5 +147,6 @@ def plan(model: Model, home: Array, seed: int, scene: Scene = UR10E) -> Plan:
     tests = []
     for k in range(len(scene.test_loads)):
         chosen_poses = rest[k * scene.test : (k + 1) * scene.test]
-        tests.append(chosen_poses[tour(chosen_poses, home)])
+        chosen_poses = chosen_poses[tour(chosen_poses, home)]
+        tests.append(np.tile(chosen_poses, (scene.visits[k], 1)))
     return Plan(tuple(calibration), tuple(tests))

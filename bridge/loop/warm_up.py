@@ -2,7 +2,7 @@
 
 Numba keeps what it has compiled beside the sources. Without this, the first command of a new
 installation spends half a minute on it, in the middle of its work. ``--demo`` leaves out what the
-demo does not need.
+demo does not wait for.
 """
 
 from __future__ import annotations
@@ -35,10 +35,13 @@ FOUR = np.repeat(Q, 4, axis=0)
 
 
 def warm_up(demo: bool = False) -> None:
-    """Call each compiled function once, the two halves of them on two cores.
+    """Call each compiled function once: what all need first, then two halves on two cores.
 
-    ``demo``: only what the demo calls.
+    ``demo``: only what the demo waits for; its diagnosis compiles the rest while the arm moves.
     """
+    model = _model()
+    model.predict(Q).rotation_vector  # noqa: B018 (compiled when asked for)
+    model.linear_form(Q)
     other = get_context("fork").Process(target=_setpoints, args=(demo,))
     other.start()
     _logs(demo)
@@ -51,7 +54,6 @@ def warm_up(demo: bool = False) -> None:
 def _setpoints(demo: bool) -> None:
     """Call what the live loop needs, and signals in time."""
     model = _model()
-    model.predict(Q).rotation_vector  # noqa: B018 (compiled when asked for)
     corrected = Compensator(model).correct(Q[0])
     Gate(500.0, model, True)
     Nominal(model)
@@ -75,9 +77,8 @@ def _setpoints(demo: bool) -> None:
 def _logs(demo: bool) -> None:
     """Call what logs need: blocks of rows, their Jacobians, rigid dynamics."""
     model = _model()
-    for rows in (Q, FOUR):
-        model.predict(rows).rotation_vector  # noqa: B018 (compiled when asked for)
-        model.linear_form(rows)
+    model.predict(FOUR).rotation_vector  # noqa: B018 (compiled when asked for)
+    model.linear_form(FOUR)
     pose_columns(model, FOUR, None, [(0, 0)], np.array([1e-9]))
     gap, factor = np.zeros((1, 3)), np.zeros((2 * N + 1, 2 * N + 1))
     factor_blocks(model.chain(), model.rows(Q), gap, gap, 0, 0, 1, factor)

@@ -54,8 +54,9 @@ def test_poses_are_within_the_arms_limits_and_there_are_enough(link: DemoLink, s
     scene, model = link.scene, link.cell.model
     given = plan(model, link.home, seed, scene)
     arm = plant_arm(link.cell.arm)
-    for poses, count in ((given.calibration, scene.calibrate), (given.test, scene.test)):
-        assert [len(q) for q in poses] == [count] * len(poses)
+    assert [len(q) for q in given.calibration] == [scene.calibrate] * len(given.calibration)
+    assert [len(q) for q in given.test] == [scene.test * times for times in scene.visits]
+    for poses in (given.calibration, given.test):
         assert all(within_limits(arm, q.tolist()) for q in np.vstack(poses))
     far = model.rigid_pose(np.vstack(given.test)).position
     assert np.hypot(far[:, 0], far[:, 1]).min() > scene.workspace.far

@@ -15,7 +15,7 @@ from gapbridge.bridge.cell import load_cell
 from gapbridge.bridge.demo.hidden import Accused, Hidden
 from gapbridge.bridge.demo.page import page
 from gapbridge.bridge.demo.picture import picture
-from gapbridge.bridge.demo.poses import CALIBRATION_LOADS, TEST_LOADS, candidates, plan
+from gapbridge.bridge.demo.poses import CALIBRATION_LOADS, TEST_LOADS, UR10E, candidates, plan
 from gapbridge.bridge.demo.rests import Rests, joined, rests, write_log
 from gapbridge.bridge.demo.result import LoopFigures, Result, repeatability
 from gapbridge.bridge.demo.session import Ended, Session
@@ -68,16 +68,17 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> Result:
     path = tmp_path_factory.mktemp("demo") / "log.csv"
     write_log(path, joined(runs))
     found = identify_compliance(MODEL, read_log(path, 6), Metrology(True, scatter))
-    twice = [np.vstack([q, q]) for q in given.test]
-    corrected = [correct(found.model, q, TEST_LOADS[k].rows(len(q))).q for k, q in enumerate(twice)]
+    corrected = [
+        correct(found.model, q, TEST_LOADS[k].rows(len(q))).q for k, q in enumerate(given.test)
+    ]
     return Result(
         link="ur_rtde", seed=4, identification=found, model=found.model,
-        without=joined([measured(q, q, k, scatter, 20 + k) for k, q in enumerate(twice)]),
+        without=joined([measured(q, q, k, scatter, 20 + k) for k, q in enumerate(given.test)]),
         compensated=joined(
             [measured(c, q, k, scatter, 30 + k)
-             for k, (c, q) in enumerate(zip(corrected, twice, strict=True))]
+             for k, (c, q) in enumerate(zip(corrected, given.test, strict=True))]
         ),
-        loads=tuple(load.name for load, q in zip(TEST_LOADS, twice, strict=True) for _ in q),
+        loads=tuple(load.name for load, q in zip(TEST_LOADS, given.test, strict=True) for _ in q),
         setpoints_written=1000, loop=LoopFigures(500.0, 1, 1000, 2100.0), duration=1.0,
     )  # fmt: skip
 
@@ -91,7 +92,9 @@ def test_planned_poses_are_free_and_none_is_tested_that_was_fitted(seed: int) ->
     assert position[:, 2].min() > 0.15
     for pose in tested:
         assert np.abs(fitted - pose).max(axis=1).min() > 0.02
-    assert len(np.unique(tested, axis=0)) == len(tested)
+    for visits, times in zip(given.test, UR10E.visits, strict=True):
+        assert len(np.unique(visits, axis=0)) * times == len(visits)
+    assert len(np.unique(tested, axis=0)) == UR10E.test * len(given.test)
 
 
 def test_another_seed_draws_other_poses() -> None:
