@@ -11,7 +11,7 @@ PERIOD = 0.002  # s
 SHARE, FASTEST = 0.9, 2.8  # of each joint's top speed, and rad/s: in the middle of a move
 ACCELERATION = 14.0  # rad/s2, fastest joint
 SHORTEST = 0.3  # s a move takes at least
-REST = 0.4  # s at each pose: settle, then be measured
+REST = 0.36  # s at each pose: settle, then be measured
 
 
 def move(start: Array, goal: Array, top_speed: Array) -> Array:

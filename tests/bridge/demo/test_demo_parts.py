@@ -92,8 +92,8 @@ def test_planned_poses_are_free_and_none_is_tested_that_was_fitted(seed: int) ->
     assert position[:, 2].min() > 0.15
     for pose in tested:
         assert np.abs(fitted - pose).max(axis=1).min() > 0.02
-    for visits, times in zip(given.test, UR10E.visits, strict=True):
-        assert len(np.unique(visits, axis=0)) * times == len(visits)
+    for rows, times in zip(given.test, UR10E.visits, strict=True):
+        assert len(np.unique(rows, axis=0)) * times == len(rows)
     assert len(np.unique(tested, axis=0)) == UR10E.test * len(given.test)
 
 
