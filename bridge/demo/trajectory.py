@@ -11,7 +11,7 @@ PERIOD = 0.002  # s
 SHARE, FASTEST = 0.9, 2.8  # of each joint's top speed, and rad/s: in the middle of a move
 ACCELERATION = 14.0  # rad/s2, fastest joint
 SHORTEST = 0.3  # s a move takes at least
-REST = 0.36  # s at each pose: settle, then be measured
+REST = 0.4  # s at each pose: settle, then be measured
 
 
 def move(start: Array, goal: Array, top_speed: Array) -> Array:
@@ -28,7 +28,7 @@ def visits(home: Array, poses: Array, top_speed: Array, rest: float = REST) -> A
     """Return joints (N, n) at every period: from home through all poses, resting, and home."""
     still = int(rest / PERIOD)
     parts, here = [np.tile(home, (still, 1))], home
-    for pose in (*poses, home):
+    for pose in poses:
         parts += [move(here, pose, top_speed), np.tile(pose, (still, 1))]
         here = pose
-    return np.vstack(parts)
+    return np.vstack([*parts, move(here, home, top_speed)])
