@@ -79,7 +79,7 @@ simulate: .venv/.test
 # What compiles the inner loops goes first: they are compiled while the rest is fetched and unpacked.
 .venv/.main: pyproject.toml | .venv/bin/python
 	$(PIP) install --quiet --no-compile numba pydantic pyyaml
-	$(BIN)/python -m gapbridge.bridge.loop.warm_up --demo & compiling=$$!; \
+	$(BIN)/python -m gapbridge.bridge.loop.warm_up & compiling=$$!; \
 		$(PIP) install --quiet --no-compile --editable . && wait $$compiling
 	@touch $@
 

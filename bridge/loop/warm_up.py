@@ -1,13 +1,11 @@
 """Compile the inner loops: ``python -m gapbridge.bridge.loop.warm_up``, once per installation.
 
 Numba keeps what it has compiled beside the sources. Without this, the first command of a new
-installation spends half a minute on it, in the middle of its work. ``--demo`` leaves out what the
-demo does not wait for.
+installation spends half a minute on it, in the middle of its work.
 """
 
 from __future__ import annotations
 
-import sys
 from multiprocessing import get_context
 
 import numpy as np
@@ -34,24 +32,19 @@ Q = np.array([[0.0, -1.5, 1.8, -1.87, -1.57, 0.0]])
 FOUR = np.repeat(Q, 4, axis=0)
 
 
-def warm_up(demo: bool = False) -> None:
-    """Call each compiled function once: what all need first, then two halves on two cores.
-
-    ``demo``: only what the demo waits for; its diagnosis compiles the rest while the arm moves.
-    """
+def warm_up() -> None:
+    """Call each compiled function once: what all need first, then two halves on two cores."""
     model = _model()
     model.predict(Q).rotation_vector  # noqa: B018 (compiled when asked for)
     model.linear_form(Q)
-    other = get_context("fork").Process(target=_setpoints, args=(demo,))
+    other = get_context("fork").Process(target=_setpoints)
     other.start()
-    _logs(demo)
+    _logs()
     other.join()
-    _setpoints(
-        demo
-    )  # of what was compiled there this process has nothing, and nothing if it failed
+    _setpoints()  # of what was compiled there this process has nothing, and nothing if it failed
 
 
-def _setpoints(demo: bool) -> None:
+def _setpoints() -> None:
     """Call what the live loop needs, and signals in time."""
     model = _model()
     corrected = Compensator(model).correct(Q[0])
@@ -62,8 +55,6 @@ def _setpoints(demo: bool) -> None:
     limiter = Limiter(limits, N)
     limiter.start(Q[0])
     limiter.limit(Q[0], corrected.q, corrected.offset_in_base, 1.0, Q[0], 0.002)
-    if demo:
-        return
     looking = next(e for e in CATALOGUE.values() if type(e).condition is not Effect.condition)
     site = looking.sites(model.arm)[0]
     values = (0.0,) * len(looking.parameters(model.arm, site))
@@ -74,7 +65,7 @@ def _setpoints(demo: bool) -> None:
     played(time, 0.1, 0.0)
 
 
-def _logs(demo: bool) -> None:
+def _logs() -> None:
     """Call what logs need: blocks of rows, their Jacobians, rigid dynamics."""
     model = _model()
     model.predict(FOUR).rotation_vector  # noqa: B018 (compiled when asked for)
@@ -82,8 +73,6 @@ def _logs(demo: bool) -> None:
     pose_columns(model, FOUR, None, [(0, 0)], np.array([1e-9]))
     gap, factor = np.zeros((1, 3)), np.zeros((2 * N + 1, 2 * N + 1))
     factor_blocks(model.chain(), model.rows(Q), gap, gap, 0, 0, 1, factor)
-    if demo:
-        return
     of_rows(N)
     with_pieces(model, motion_of(Log("", {"actual_q": Q}, N)))
     correct(model, np.vstack([Q, 0.0 * Q]))  # a singularity, too, which the blocks leave
@@ -94,4 +83,4 @@ def _model() -> Model:
 
 
 if __name__ == "__main__":
-    warm_up(demo="--demo" in sys.argv)
+    warm_up()
