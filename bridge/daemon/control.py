@@ -16,6 +16,7 @@ LONGEST_RAMP = 20.0  # s
 LONGEST_TAKING = 20.0  # s: a new process of the loop may have to start first
 SOURCE_SILENT = 1.0  # s without a first setpoint after which arming is reported to be waiting
 LOOK = 0.02  # s
+ARMED = State.ARMED.name
 
 
 class Controlled(Protocol):
@@ -103,7 +104,8 @@ class Control:
             for event in daemon.events_since(mark):
                 if event["kind"] == "refused" or event.get("cause") == Cause.START_REFUSED:
                     return refusal(f"refused: {event['detail']}")
-                if event.get("to") in (State.FAULT.name, State.DISCONNECTED.name):
+                given_up = (event.get("from"), event.get("to")) == (ARMED, State.OBSERVING.name)
+                if given_up or event.get("to") in (State.FAULT.name, State.DISCONNECTED.name):
                     return refusal(f"{event['cause']}: {event['detail']}")
                 if event.get("to") == State.COMPENSATING.name:
                     return _done("compensating")

@@ -110,6 +110,11 @@ def test_an_arm_that_is_let_go_of_in_silence_is_sent_where_it_was_sent_before() 
     assert not run(3243).violations
 
 
+def test_an_arming_that_a_gap_in_the_states_ends_is_answered() -> None:
+    """Seed 2007469: who had asked waited for 25 s, and was told that nobody had answered."""
+    assert not run(2007469).violations
+
+
 # -- each of the list is found where the product is broken -----------------------------------------
 
 

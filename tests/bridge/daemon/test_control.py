@@ -296,3 +296,25 @@ def test_a_disarming_is_asked_for_though_the_arm_seems_to_observe() -> None:
     reply = control.Control(daemon).answer("disarm", Peer(1, 2))  # type: ignore[arg-type]
     assert reply == {"ok": True, "answer": "is observing already"}
     assert daemon.asked == 4
+
+
+class GivesUp(NoLoop):
+    """A daemon whose loop arms, then finds that what was before means nothing, and observes."""
+
+    state, latched = State.OBSERVING, ""
+
+    def arm(self, by: str) -> int:
+        return 4
+
+    def events_since(self, sequence: int) -> list[dict[str, Any]]:
+        steps = [("OBSERVING", "ARMED", "arm", "arm"),
+                 ("ARMED", "OBSERVING", "gap in time", "found a gap of 0.408 s")]  # fmt: skip
+        return [
+            {"kind": "transition", "from": a, "to": b, "cause": cause, "detail": detail}
+            for a, b, cause, detail in steps
+        ]
+
+
+def test_an_arming_that_the_loop_gives_up_is_answered_at_once_and_says_why() -> None:
+    reply = control.Control(GivesUp()).answer("arm", Peer(1, 2))  # type: ignore[arg-type]
+    assert reply == {"ok": False, "error": "gap in time: found a gap of 0.408 s"}
