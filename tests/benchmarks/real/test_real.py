@@ -168,12 +168,12 @@ def test_the_error_of_a_ratio_is_the_scatter_of_ratios_of_logs_drawn_anew():
     rng = np.random.default_rng(3)
     draws = rng.normal(size=(300, 2, 80, 3)) * [[[1.0]], [[1.2]]]
     ratios = [np.sqrt(np.mean(a**2) / np.mean(b**2)) for a, b in draws]
-    told = [ratio_error(a, b, moving=False) for a, b in draws]
-    assert np.median(told) == pytest.approx(np.std(ratios), rel=0.15)
+    estimated = [ratio_error(a, b, moving=False) for a, b in draws]
+    assert np.median(estimated) == pytest.approx(np.std(ratios), rel=0.15)
     lasting = np.repeat(rng.normal(size=(300, 2, 10, 3)), 50, axis=2)
     ratios = [np.sqrt(np.mean(a**2) / np.mean(b**2)) for a, b in lasting]
-    told = [ratio_error(a, b, moving=True) for a, b in lasting]
-    assert np.median(told) == pytest.approx(np.std(ratios), rel=0.3)
+    estimated = [ratio_error(a, b, moving=True) for a, b in lasting]
+    assert np.median(estimated) == pytest.approx(np.std(ratios), rel=0.3)
     left_out = np.where(np.arange(80)[:, None] < 5, np.nan, draws[0, 0])
     assert np.isfinite(ratio_error(left_out, draws[0, 1], moving=True))
 
