@@ -25,13 +25,13 @@ demo: .venv/.main
 # Two processes for what goes over wires, which mostly waits; two that compute in the meantime.
 SIDE_BY_SIDE := -n 4
 
-test: .venv/.test
+test: warm
 	$(BIN)/python -m pytest $(SIDE_BY_SIDE) -m "not slow"
 
-everything: .venv/.test
+everything: warm
 	$(BIN)/python -m pytest $(SIDE_BY_SIDE)
 
-check: .venv/.test
+check: warm
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
@@ -42,11 +42,11 @@ check: .venv/.test
 KERNEL_TESTS := $(addprefix tests/core/test_,kinematics.py statics.py equilibrium.py \
 	compensation.py limits.py effects_position.py effects_moving.py)
 
-coverage: .venv/.test
+coverage: warm
 	NUMBA_DISABLE_JIT=1 $(BIN)/python -m pytest --cov --cov-report= $(KERNEL_TESTS)
 	$(BIN)/python -m pytest --cov --cov-append --cov-report=term-missing:skip-covered
 
-bench: .venv/.test
+bench: warm
 	$(BIN)/python -m benchmarks.speed --out out/speed.json
 	$(BIN)/python -m benchmarks.fleet growth --no-dask --json out/fleet.json
 
@@ -55,11 +55,11 @@ REPEAT ?= 5
 SEQUENCES ?= 1000
 MINUTES ?= 120
 
-faults: .venv/.test
+faults: warm
 	$(BIN)/python -m benchmarks.faults --repeat $(REPEAT) --sequences $(SEQUENCES) \
 		--minutes $(MINUTES) --page
 
-mutants: .venv/.test
+mutants: warm
 	$(BIN)/python -m benchmarks.mutants --out out/mutants.jsonl
 
 # SEEDS: how many runs; the same command again goes on where it was left (out/simulation.jsonl).
@@ -67,7 +67,7 @@ mutants: .venv/.test
 SEEDS ?= 2000
 FIRST ?= 0
 
-simulate: .venv/.test
+simulate: warm
 	$(BIN)/python -m benchmarks.simulation --first $(FIRST) --seeds $(SEEDS)
 
 .venv/bin/python:
@@ -85,8 +85,13 @@ simulate: .venv/.test
 
 .venv/.test: pyproject.toml | .venv/bin/python
 	$(PIP) install --quiet --editable '.[test]'
-	$(BIN)/python -m gapbridge.bridge.loop.warm_up
 	@touch $@ .venv/.main
+
+# After an installation, and after every change of a compiled function:
+# nothing is compiled in the middle of a test.
+.PHONY: warm
+warm: .venv/.test
+	@$(BIN)/python -m gapbridge.bridge.loop.warm_up
 
 clean:
 	rm -rf .venv out build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache

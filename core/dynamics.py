@@ -148,6 +148,7 @@ def _times(matrix: Array, vector: Array) -> Array:
 def _about_axes(frames: Frames, joints: int, point: Array, force: Array, moment: Array) -> Array:
     """Return the torques (N, joints) that hold ``force`` at ``point`` and ``moment``."""
     torque = np.empty((len(point), joints))
+    force, moment = np.ascontiguousarray(force), np.ascontiguousarray(moment)  # as compiled for
     rigid.about_axes(frames.origin, frames.rotation, point, force, moment, torque)
     return torque
 

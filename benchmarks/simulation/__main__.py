@@ -1,17 +1,16 @@
 """``python -m benchmarks.simulation --seeds 100000``; one seed again: ``--seed 1234``.
 
-Seeds run on all cores. What each hundred of them came to is a line of ``--out``, with the commit:
-the same command again, at the same commit, goes on where it was left.
+Seeds run on all cores. What each hundred of them came to is a line of ``--out``, with a hash of
+the sources that run: the same command again, with the same sources, goes on where it was left.
 """
 
 from __future__ import annotations
 
 import argparse
 import gc
+import hashlib
 import json
 import multiprocessing
-import os
-import subprocess
 import sys
 import time
 from collections import Counter
@@ -22,6 +21,7 @@ from typing import Any
 from benchmarks.simulation.sequence import LINKS, run
 
 ROOT = Path(__file__).parents[2]
+FOLDERS = ("core", "drivers", "bridge", "gapbridge", "benchmarks")
 RECORD = Path("out/simulation.jsonl")
 PART = 100  # seeds, of a line
 REPORT_EVERY = 60.0  # s
@@ -43,7 +43,7 @@ def main() -> int:
         print(outcome)
         return int(bool(outcome.violations))
     end = given.first + given.seeds
-    record = Record(given.out, commit())
+    record = Record(given.out, sources())
     done = [part for part in record.parts if given.first <= part["first"] and part["end"] <= end]
     todo = [*missing(given.first, end, done)]
     report(done)
@@ -136,31 +136,36 @@ def report(parts: Iterable[Part]) -> None:
 
 
 class Record:
-    """The lines of a file that are of this commit; it is added to."""
+    """The lines of a file that are of these sources; it is added to."""
 
     def __init__(self, path: Path, of: str) -> None:
-        self._path, self._commit = path, of
+        self._path, self._sources = path, of
         self.parts: list[Part] = []
         for line in path.read_text(encoding="utf-8").splitlines() if path.exists() else ():
             part = json.loads(line)
-            if part["commit"] == of and not of.endswith("dirty"):
+            if part.get("sources") == of:
                 self.parts.append(part)
 
     def add(self, part: Part) -> None:
         """Write one more line."""
         self._path.parent.mkdir(parents=True, exist_ok=True)
-        line = json.dumps({"commit": self._commit, **part}) + "\n"
+        line = json.dumps({"sources": self._sources, **part}) + "\n"
         with open(self._path, "ab") as file:
             file.write(line.encode())
 
 
-def commit() -> str:
-    """Return the commit that runs, ``-dirty`` where files differ from it."""
-    found = subprocess.run(
-        ["git", "describe", "--always", "--abbrev=12", "--dirty", "--exclude=*"],
-        cwd=ROOT, capture_output=True, text=True, env={**os.environ, "LC_ALL": "C"}, check=False,
-    )  # fmt: skip
-    return found.stdout.strip() or "unknown-dirty"
+def sources() -> str:
+    """Return a hash of the product's and the simulation's modules that this process imported.
+
+    A run imports nothing more, so a commit that changes other files lets what has run count.
+    """
+    found = hashlib.sha256()
+    files = {getattr(module, "__file__", None) for module in sys.modules.values()}
+    for file in sorted(Path(name).resolve() for name in files if name):
+        inside = file.is_relative_to(ROOT) and file.relative_to(ROOT).parts[0] in FOLDERS
+        if inside and file.name != Path(__file__).name:
+            found.update(b"%s\n" % str(file.relative_to(ROOT)).encode() + file.read_bytes())
+    return found.hexdigest()[:12]
 
 
 if __name__ == "__main__":

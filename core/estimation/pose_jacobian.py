@@ -78,9 +78,9 @@ def _chain_rates(model: Model, chain: Chain, values: Sequence[Value]) -> tuple[A
 
 def _entries(rates: Array) -> Entries:
     """Return what is not zero of rates (p, slots)."""
-    column, slot = np.nonzero(rates)
+    column, slot = np.nonzero(rates)  # views of one array, which would be compiled for separately
     starts = np.searchsorted(column, np.arange(len(rates) + 1))
-    return starts, slot, rates[column, slot]
+    return starts, np.ascontiguousarray(slot), rates[column, slot]
 
 
 def _row_rates(

@@ -52,7 +52,7 @@ def played(command: Array, width: float, first: float) -> Array:
     It stands still while the command is within the width, and is pushed along at either end of it.
     A negative width, which only steps of a solver ask for, is continued oddly.
     """
-    result = _pushed(command, abs(width), first)
+    result = _pushed(np.ascontiguousarray(command), abs(width), first)
     return np.asarray(result if width >= 0 else 2 * command - result)
 
 

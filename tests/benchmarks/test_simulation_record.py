@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -25,14 +27,38 @@ def test_only_seeds_without_a_line_are_run() -> None:
     assert [*many.missing(100, 200, done)] == []
 
 
-@pytest.mark.parametrize(("now", "kept"), [("abc", [0]), ("def", []), ("abc-dirty", [])], ids=str)
-def test_lines_of_another_commit_count_for_nothing(
+@pytest.mark.parametrize(("now", "kept"), [("abc", [0]), ("def", [])], ids=str)
+def test_lines_of_other_sources_count_for_nothing(
     tmp_path: Path, now: str, kept: list[int]
 ) -> None:
     path = tmp_path / "out" / "record.jsonl"
     many.Record(path, "abc").add(part(0, 100))
-    many.Record(path, "abc-dirty").add(part(100, 200))
     assert [found["first"] for found in many.Record(path, now).parts] == kept
+
+
+SOURCES = """
+from benchmarks.simulation import __main__ as many
+from pathlib import Path
+import sys
+loaded = set(sys.modules)
+before = many.sources()
+for seed in range(4):
+    many.run(seed)
+assert not {n for n in set(sys.modules) - loaded if n.startswith(("gapbridge", "benchmarks"))}
+read, changed = Path.read_bytes, set(sys.argv[1:])
+Path.read_bytes = lambda path: b"changed" if path.name in changed else read(path)
+print(before == many.sources())
+"""
+
+
+@pytest.mark.parametrize(
+    ("changed", "counts"), [("writing.py", False), ("judgement.py", True)], ids=str
+)
+def test_what_has_run_counts_until_a_source_that_runs_changes(changed: str, counts: bool) -> None:
+    ran = subprocess.run(
+        [sys.executable, "-c", SOURCES, changed], cwd=many.ROOT, capture_output=True, text=True
+    )
+    assert ran.stdout.split() == [str(counts)], ran.stderr
 
 
 def test_a_run_goes_on_where_it_was_left_and_tells_of_what_did_not_hold(
@@ -56,7 +82,7 @@ def test_a_run_goes_on_where_it_was_left_and_tells_of_what_did_not_hold(
         imap_unordered = staticmethod(map)
 
     monkeypatch.setattr(many, "run", run)
-    monkeypatch.setattr(many, "commit", lambda: "abc")
+    monkeypatch.setattr(many, "sources", lambda: "abc")
     monkeypatch.setattr(many.multiprocessing, "Pool", Pool)
     out = tmp_path / "record.jsonl"
 
