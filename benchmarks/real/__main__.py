@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable
 from pathlib import Path
 
 import click
@@ -45,29 +46,34 @@ def main(
     console = Console()
     if not console.is_terminal:
         console.width = 190
-    found = {}
+    found: dict[str, Path] = {}
     for folder in folders:
         if not folder.is_dir():
             console.print(f"{folder}: skipped, there is no such folder")
             continue
         found |= {p.parent.name: p.parent for p in sorted(folder.glob("*/log.csv"))}
     wanted = set(names.split(",")) if names else None
-    program, outcomes = Program(command, stand_ins), []
-    jobs: list[tuple[str, Path, Path | None]] = [(n, p, None) for n, p in found.items()]
-    if carried:
-        jobs += [(f"{a} > {b}", found[a], found[b]) for a, b in CARRIED if {a, b} <= set(found)]
-    for name, first, second in jobs:
+
+    def chosen(name: str) -> bool:
         own = SPLIT.get(name.rpartition(" > ")[2], "held back")
-        if (wanted is not None and name not in wanted) or (split is not None and own != split):
-            continue
+        return (wanted is None or name in wanted) and (split is None or own == split)
+
+    program = Program(command, stand_ins)
+    jobs: list[tuple[str, Iterable[Outcome]]] = []
+    jobs += [(name, judge_log(found[name], program)) for name in found if chosen(name)]
+    for first in dict.fromkeys(a for a, _ in CARRIED) if carried else ():
+        later = [found[b] for a, b in CARRIED
+                 if a == first and {a, b} <= set(found) and chosen(f"{a} > {b}")]  # fmt: skip
+        if later:
+            jobs.append((f"{first} > ", judge_carried(found[first], later, program)))
+    outcomes: list[Outcome] = []
+    for name, job in jobs:
         try:
-            new = judge_carried(first, second, program) if second else judge_log(first, program)
+            for outcome in job:
+                console.print(_line(outcome))
+                outcomes.append(outcome)
         except (RuntimeError, ValueError) as error:
             console.print(f"{name}: skipped, {error}")
-            continue
-        for outcome in new:
-            console.print(_line(outcome))
-        outcomes += new
     console.print(_table(outcomes))
     if file is not None:
         document = json.dumps([o.document() for o in outcomes], indent=1)

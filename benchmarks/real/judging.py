@@ -14,6 +14,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -25,9 +26,9 @@ from benchmarks.real import rivals
 from benchmarks.real.absurd import absurdities
 from benchmarks.real.geometry import tool_step
 from benchmarks.real.sets import HELD_BACK, PUBLISHED, REMOUNTED, SPLIT
-from benchmarks.real.table import Mask, Table, copy_cell, halves, read_cell, read_table
+from benchmarks.real.table import Table, copy_cell, halves, read_cell, read_table
 
-LIMIT = 900.0  # s, of one diagnosis
+LIMIT = 3600.0  # s, of one diagnosis: 11,911 poses take a quarter of it
 STRETCHES = 10  # of a judged recording, by which the ratio scatters: its rows are no samples
 READ = {  # channel: the columns measured and predicted
     "wrench": ("ft_raw_wrench", "predicted_wrench"),
@@ -100,50 +101,61 @@ class Program:
         return {c["channel"]: c for c in document["channels"]}
 
 
-def judge_log(folder: Path, program: Program) -> list[Outcome]:
-    """Return the outcomes of one log: four fifths fitted, one fifth judged."""
+@dataclass(frozen=True)
+class Answer:
+    """What the program found in the rows of a log that it was given."""
+
+    place: Path  # holds train.csv, cell.yaml, and better.yaml with what was found
+    source: Path  # the cell
+    train: Table
+    reported: dict[str, dict[str, Any]]
+    seconds: float
+
+
+def judge_log(folder: Path, program: Program) -> Iterator[Outcome]:
+    """Yield the outcomes of one log: four fifths fitted, one fifth judged."""
     table = read_table(folder / "log.csv").with_approach()
-    fitted, judged = halves(table)
-    return _judge(folder.name, folder / "cell.yaml", (table, fitted), (table, judged), program)
-
-
-def judge_carried(fitted: Path, judged: Path, program: Program) -> list[Outcome]:
-    """Return the outcomes of one log's answer carried to another of the same arm."""
-    a, b = (read_table(f / "log.csv") for f in (fitted, judged))
-    whole = tuple((t, np.ones(len(t), dtype=bool)) for t in (a, b))
-    return _judge(f"{fitted.name} > {judged.name}", fitted / "cell.yaml", *whole, program)
-
-
-def _judge(
-    name: str, cell_file: Path, fitted: tuple[Table, Mask], judged: tuple[Table, Mask],
-    program: Program,
-) -> list[Outcome]:  # fmt: skip
-    cell = read_cell(cell_file)
-    train, test = fitted[0].rows(fitted[1]), judged[0].rows(judged[1])
+    fitted, judged = (table.rows(keep) for keep in halves(table))
     with tempfile.TemporaryDirectory(prefix="real-") as scratch:
-        place = Path(scratch)
-        nominal = copy_cell(cell_file, place)
-        train.write(place / "train.csv")
-        test.write(place / "test.csv")
-        better = place / "better.yaml"
-        arguments: list[object] = [*program.words_of_apply]
-        arguments += ["--remounted"] if name in REMOUNTED and _knows(program) else []
-        start = time.perf_counter()
-        reported = program.diagnosis(place / "train.csv", nominal, "--apply", better, *arguments)
-        seconds = time.perf_counter() - start
-        channels = [c for c in train.channels() if c in reported]
-        after: dict[str, dict[str, Any]] = {}
-        if set(channels) - {"position"}:
-            after = program.diagnosis(place / "test.csv", better)
-        out = []
-        for channel in channels:
-            ours = _left(name, channel, program, place, train, test)
-            judged = float(after[channel]["gap_rms"]) if channel in after else _rms(ours)
-            theirs, rival = _rival(channel, cell, cell_file.parent, train, test, place, program)
-            published = _published(name, ours) if channel == "position" else None
-            error = ratio_error(ours, theirs, test.moving)
-            found = reported[channel]
-            out.append(_outcome(name, found, train, (judged, rival, error), published, seconds))
+        answer = _answer(folder, fitted, Path(scratch), program)
+        yield from _judge(folder.name, answer, judged, program)
+
+
+def judge_carried(fitted: Path, judged: Sequence[Path], program: Program) -> Iterator[Outcome]:
+    """Yield the outcomes of one log's answer carried to others of the same arm."""
+    with tempfile.TemporaryDirectory(prefix="real-") as scratch:
+        answer = _answer(fitted, read_table(fitted / "log.csv"), Path(scratch), program)
+        for folder in judged:
+            name = f"{fitted.name} > {folder.name}"
+            yield from _judge(name, answer, read_table(folder / "log.csv"), program)
+
+
+def _answer(folder: Path, train: Table, place: Path, program: Program) -> Answer:
+    nominal = copy_cell(folder / "cell.yaml", place)
+    train.write(place / "train.csv")
+    arguments: list[object] = ["--apply", place / "better.yaml", *program.words_of_apply]
+    arguments += ["--remounted"] if folder.name in REMOUNTED and _knows(program) else []
+    start = time.perf_counter()
+    reported = program.diagnosis(place / "train.csv", nominal, *arguments)
+    seconds = time.perf_counter() - start
+    return Answer(place, folder / "cell.yaml", train, reported, seconds)
+
+
+def _judge(name: str, answer: Answer, test: Table, program: Program) -> list[Outcome]:
+    place, train, reported = answer.place, answer.train, answer.reported
+    test.write(place / "test.csv")
+    channels = [c for c in train.channels() if c in reported]
+    after: dict[str, dict[str, Any]] = {}
+    if set(channels) - {"position"}:
+        after = program.diagnosis(place / "test.csv", place / "better.yaml")
+    out = []
+    for channel in channels:
+        ours = _left(name, channel, program, place, train, test)
+        judged = float(after[channel]["gap_rms"]) if channel in after else _rms(ours)
+        theirs, rival = _rival(channel, answer, test, program)
+        published = _published(name, ours) if channel == "position" else None
+        sizes = judged, rival, ratio_error(ours, theirs, test.moving)
+        out.append(_outcome(name, channel, answer, sizes, published))
     return out
 
 
@@ -199,11 +211,9 @@ def _predicted(program: Program, place: Path, rows: str) -> tuple[np.ndarray, np
     return position, Rotation.from_rotvec(rotation).as_matrix()
 
 
-def _rival(
-    channel: str, cell: dict[str, Any], folder: Path, train: Table, test: Table, place: Path,
-    program: Program,
-) -> tuple[np.ndarray, float]:  # fmt: skip
+def _rival(channel: str, answer: Answer, test: Table, program: Program) -> tuple[np.ndarray, float]:
     """Return what plain least squares leave of the judged rows (N, k), and its rms."""
+    place, train, cell = answer.place, answer.train, read_cell(answer.source)
     if channel in ("position", "tracking"):
         left = (
             rivals.position_left(cell, train, test) if channel == "position"
@@ -212,7 +222,7 @@ def _rival(
         return left, _rms(left)
     if channel == "torque":
         nominal = _gap(channel, program, place, test, "cell")
-        corrected = rivals.torque_corrected(cell, folder, train, test, nominal)
+        corrected = rivals.torque_corrected(cell, answer.source.parent, train, test, nominal)
     else:
         corrected = rivals.wrench_corrected(cell, train, test)
     corrected.write(place / "corrected.csv")  # on the rows that the program judges
@@ -238,16 +248,17 @@ def ratio_error(ours: np.ndarray, theirs: np.ndarray, moving: bool) -> float:
 
 
 def _outcome(
-    name: str, reported: dict[str, Any], train: Table, sizes: tuple[float, float, float],
-    published: tuple[float, float, str] | None, seconds: float,
+    name: str, channel: str, answer: Answer, sizes: tuple[float, float, float],
+    published: tuple[float, float, str] | None,
 ) -> Outcome:  # fmt: skip
+    train, reported = answer.train, answer.reported[channel]
     mass = train.get("payload")
     least, largest = (
         (float(np.nanmin(mass)), float(np.nanmax(mass))) if mass is not None else (0, 0)
     )
     return Outcome(
         log=name,
-        channel=reported["channel"],
+        channel=channel,
         split=SPLIT.get(name.rpartition(" > ")[2], HELD_BACK),
         rows=len(train),
         gap=float(reported["gap_rms"]),
@@ -259,7 +270,7 @@ def _outcome(
         verdict=str(reported["verdict"]),
         accused=tuple(_accused(c) for c in reported["causes"]),
         absurd=tuple(absurdities(reported["causes"], least, largest)),
-        seconds=seconds,
+        seconds=answer.seconds,
         unit=str(reported["unit"]),
         ratio_error=sizes[2],
     )

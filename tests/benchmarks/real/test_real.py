@@ -17,7 +17,7 @@ from benchmarks.real.geometry import (
     rough_turn,
     tool_step,
 )
-from benchmarks.real.judging import ratio_error
+from benchmarks.real.judging import Program, judge_carried, ratio_error
 from benchmarks.real.table import Table, halves, read_table
 
 RNG = np.random.default_rng(7)
@@ -178,22 +178,27 @@ def test_the_error_of_a_ratio_is_the_scatter_of_ratios_of_logs_drawn_anew():
     assert np.isfinite(ratio_error(left_out, draws[0, 1], moving=True))
 
 
+def log_of_weight(folder, count=40):
+    q = poses(count)
+    _, R = arms.flange(arms.UR10, q)
+    down = np.einsum("nji,j->ni", R, [0, 0, -9.80665])
+    wrench = np.hstack([1.2 * down + [4, 2, 3], 1.2 * np.cross([0, 0.01, 0.1], down) + 0.5])
+    log = table(timestamp=np.arange(count) * 10.0, actual_q=q,
+                ft_raw_wrench=wrench + RNG.normal(size=wrench.shape) * 0.02)  # fmt: skip
+    folder.mkdir()
+    log.write(folder / "log.csv")
+    cell = {"robot": {"dh": [link.document() for link in arms.UR10]}}
+    (folder / "cell.yaml").write_text(yaml.safe_dump(cell), encoding="utf-8")
+    return folder
+
+
 @pytest.mark.slow
 def test_a_log_of_weight_alone_is_judged_beside_least_squares(tmp_path):
     from click.testing import CliRunner
 
     from benchmarks.real.__main__ import main as judge
 
-    q = poses(40)
-    _, R = arms.flange(arms.UR10, q)
-    down = np.einsum("nji,j->ni", R, [0, 0, -9.80665])
-    wrench = np.hstack([1.2 * down + [4, 2, 3], 1.2 * np.cross([0, 0.01, 0.1], down) + 0.5])
-    log = table(timestamp=np.arange(40) * 10.0, actual_q=q,
-                ft_raw_wrench=wrench + RNG.normal(size=wrench.shape) * 0.02)  # fmt: skip
-    (tmp_path / "one").mkdir()
-    log.write(tmp_path / "one/log.csv")
-    cell = {"robot": {"dh": [link.document() for link in arms.UR10]}}
-    (tmp_path / "one/cell.yaml").write_text(yaml.safe_dump(cell), encoding="utf-8")
+    log_of_weight(tmp_path / "one")
     done = CliRunner().invoke(judge, ["--data", str(tmp_path), "--json", str(tmp_path / "o.json")])
     assert done.exit_code == 0, done.output
     (outcome,) = json.loads((tmp_path / "o.json").read_text(encoding="utf-8"))
@@ -202,6 +207,24 @@ def test_a_log_of_weight_alone_is_judged_beside_least_squares(tmp_path):
     assert outcome["gap"] > 1.0
     assert 0 < outcome["ratio_error"] < 0.5
     assert outcome["ratio"] == pytest.approx(outcome["judged"] / outcome["rival"])
+
+
+@pytest.mark.slow
+def test_an_answer_that_is_carried_to_several_logs_is_found_once(tmp_path):
+    class Counting(Program):
+        found = 0
+
+        def __call__(self, *arguments):
+            self.found += "--apply" in arguments
+            super().__call__(*arguments)
+
+    program = Counting()
+    first, *later = (log_of_weight(tmp_path / name) for name in "abc")
+    outcomes = list(judge_carried(first, later, program))
+    assert [o.log for o in outcomes] == ["a > b", "a > c"]
+    assert [o.judged / o.rival < 1.1 for o in outcomes] == [True, True]
+    assert outcomes[0].judged != outcomes[1].judged
+    assert program.found == 1
 
 
 def test_the_turn_of_a_probe_on_its_flange_is_found():
