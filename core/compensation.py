@@ -38,6 +38,7 @@ from gapbridge.core.loads import Loads
 from gapbridge.core.model import Model, Poses
 
 NOTHING = Loads()
+ROW = np.int64  # of a number of a row: a literal would compile anew all that is called with it
 LEADS = 2  # times that a servo's rest is looked at for the command that leads there
 
 
@@ -118,21 +119,27 @@ def _turned(A, B, out):  # type: ignore[no-untyped-def]
 @njit(**JIT)
 def _moved(wanted, pose, offset, moved):  # type: ignore[no-untyped-def]
     """Write how far (6,) a pose (12,) is from the wanted one; no offset, no motion."""
-    moved[:] = 0.0
-    if np.any(offset != 0.0):
-        moved[:3] = pose[:3] - wanted[:3]
+    moves = False
+    for i in range(offset.shape[0]):
+        moves = moves or offset[i] != 0.0
+    for k in range(3):
+        moved[k] = pose[k] - wanted[k] if moves else 0.0
+        moved[3 + k] = 0.0
+    if moves:
         _turned(pose[3:].reshape((3, 3)), wanted[3:].reshape((3, 3)), moved[3:])
 
 
 @njit(**JIT)
 def _rigid_pose(rigid, row, shape, q, pose):  # type: ignore[no-untyped-def]
     """Write the rigid TCP pose (12,) at q (n,), position first; nothing in ``shape`` bends."""
-    row.q[0, :] = q
+    for i in range(q.shape[0]):
+        row.q[0, i] = q[i]
     A, B, base_rotation = np.empty((3, 3)), np.empty((3, 3)), np.zeros(3)
-    kernel.place(rigid, row, 0, shape, base_rotation, A, B)
-    pose[:3] = shape.tcp_position
+    kernel.place(rigid, row, ROW(0), shape, base_rotation, A, B)
     for i in range(3):
-        pose[3 + 3 * i : 6 + 3 * i] = shape.tcp_rotation[i]
+        pose[i] = shape.tcp_position[i]
+        for j in range(3):
+            pose[3 + 3 * i + j] = shape.tcp_rotation[i, j]
 
 
 @njit(**JIT)
@@ -149,7 +156,7 @@ def _step(chain_block, row_block, shape_block, pose, offset):  # type: ignore[no
     """``next_offset`` of packed records."""
     n = offset.shape[0]
     return next_offset(
-        chain_of(chain_block, n), row_of(row_block, n), 0, shape_of(shape_block, n), pose[:3],
+        chain_of(chain_block, n), row_of(row_block, n), ROW(0), shape_of(shape_block, n), pose[:3],
         pose[3:].reshape((3, 3)), LEVER, offset,
     )  # fmt: skip
 

@@ -46,9 +46,17 @@ class GateBounds:
 
 
 @njit(**JIT)
+def _copy(frame, out):  # type: ignore[no-untyped-def]
+    """Copy a frame (3, 4); ``out[:] = frame`` would bring the text of an error with it."""
+    for a in range(3):
+        for b in range(4):
+            out[a, b] = frame[a, b]
+
+
+@njit(**JIT)
 def _place(links, q, frame, turn):  # type: ignore[no-untyped-def]
     """Write the TCP's frame (3, 4) at joints q (n,); ``links`` (n + 1, 3, 4) end with the tool."""
-    frame[:] = links[0]
+    _copy(links[0], frame)
     for i in range(q.shape[0]):
         c, s = math.cos(q[i]), math.sin(q[i])
         for a in range(3):
@@ -60,7 +68,7 @@ def _place(links, q, frame, turn):  # type: ignore[no-untyped-def]
                 turn[a, b] = frame[a, 3] if b == 3 else 0.0
                 for k in range(3):
                     turn[a, b] += frame[a, k] * links[i + 1, k, b]
-        frame[:] = turn
+        _copy(turn, frame)
 
 
 @njit(**JIT)

@@ -236,6 +236,11 @@ class ModbusLink(SimulatedLink):
         requests.take(number, answer)
         process.wake()
 
+    def reconnected(self) -> None:
+        """Have wires carry again; what the last connection's requests come to reaches nobody."""
+        super().reconnected()
+        self.generation += 1
+
     def disconnect(self) -> None:
         """See SimulatedLink.disconnect."""
         super().disconnect()

@@ -78,7 +78,9 @@ def _eliminated(G, y):  # type: ignore[no-untyped-def]
 def _damped(J, G, right, offset):  # type: ignore[no-untyped-def]
     """Write the solution by eigenvalues, with as little damping as keeps it short."""
     wide, size = J.shape[1] > 6, G.shape[0]
-    V = np.eye(size)
+    V = np.zeros((size, size))
+    for i in range(size):
+        V[i, i] = 1.0
     _diagonalised(G, V)
     y, s, most = np.zeros(size), np.empty(size), 1e-12  # s: the squared singular values
     for i in range(size):

@@ -32,7 +32,7 @@ def frames_of_rows(  # type: ignore[no-untyped-def]
     """Write the frames of N rows (core.dynamics.Frames); ``motion`` (3, N, n): q, qd, qdd."""
     n = motion.shape[2]
     step, turn, frame = np.empty(3), np.empty(3), np.empty((3, 3))
-    R, w, dw, o, a = np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3)
+    R, w, dw, o, a = np.empty((3, 3)), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3)
     for r in range(motion.shape[1]):
         R[:] = 0.0
         R[0, 0] = R[1, 1] = R[2, 2] = 1.0

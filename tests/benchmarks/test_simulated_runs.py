@@ -115,6 +115,11 @@ def test_an_arming_that_a_gap_in_the_states_ends_is_answered() -> None:
     assert not run(2007469).violations
 
 
+def test_the_answer_to_a_closed_connection_is_nobodys() -> None:
+    """Seed 3000286: a new Modbus connection numbers from one again, and took the old one's."""
+    assert not run(3000286).violations
+
+
 # -- each of the list is found where the product is broken -----------------------------------------
 
 
