@@ -19,8 +19,7 @@ from gapbridge.bridge.calibration.instruments.instrument import (
 )
 from gapbridge.bridge.calibration.jobs.calibrate import WholeJob
 from gapbridge.bridge.calibration.jobs.job import Job
-from gapbridge.bridge.calibration.jobs.payload import PayloadJob
-from gapbridge.bridge.calibration.jobs.tool import ToolJob
+from gapbridge.bridge.calibration.jobs.short import PayloadJob, ToolJob
 from gapbridge.bridge.calibration.jobs.verify import VerifyJob
 from gapbridge.bridge.calibration.joints.joint_source import JointSource, PlannedJoints, TypedJoints
 from gapbridge.bridge.calibration.options import SessionOptions

@@ -1,27 +1,44 @@
 """The metrics' process: ``python -m gapbridge.bridge.metrics.main``, started by the daemon.
 
 It reads along as the status page does, and answers Prometheus at /metrics.
+
+Names, units and help are by Prometheus' conventions.
 """
 
 from __future__ import annotations
 
+import math
 import sys
+import time
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
 
 from prometheus_client import CollectorRegistry, generate_latest
+from prometheus_client.core import (
+    CounterMetricFamily,
+    GaugeMetricFamily,
+    HistogramMetricFamily,
+    InfoMetricFamily,
+    Metric,
+)
+from prometheus_client.registry import Collector
 from starlette.applications import Starlette
 from starlette.requests import Request
 from starlette.responses import Response
 from starlette.routing import Route
 
+from gapbridge.bridge.ipc.counts import DROPPED
 from gapbridge.bridge.ipc.side_main import Order, run_side
-from gapbridge.bridge.metrics.counts import Counts
-from gapbridge.bridge.metrics.families import Families
+from gapbridge.bridge.loop.supervisor import State
+from gapbridge.bridge.metrics.counts import Buckets, Counts
 from gapbridge.bridge.served.credentials import read_token
 from gapbridge.bridge.served.guard import Guard
 from gapbridge.bridge.served.server import serve
 
 TURN = 0.25  # s between two looks at the shared page
 TEXT = "text/plain; version=0.0.4; charset=utf-8"
+AXES = ("x", "y", "z")
 
 
 def run(order: Order) -> None:
@@ -47,3 +64,209 @@ def run(order: Order) -> None:
 
 if __name__ == "__main__":
     sys.exit(run_side("metrics", run))
+
+
+class Families(Collector):
+    """One scrape: all metrics of a daemon."""
+
+    def __init__(self, session: str, counts: Counts, refused: Mapping[str, int]) -> None:
+        self._session, self._counts = session, counts
+        self._refused = refused  # requests, by reason
+
+    def collect(self) -> Iterator[Metric]:
+        """Give all families."""
+        yield self._info()
+        yield self._state()
+        yield from self._cycles()
+        yield from self._histograms()
+        yield from self._offset()
+        yield from self._reported()
+        yield from self._processes()
+        yield from self._recorder()
+        yield _counter(
+            "gapbridge_requests_refused",
+            "Requests for metrics that were refused.",
+            self._refused,
+            "reason",
+        )
+
+    def _info(self) -> Metric:
+        found = InfoMetricFamily("gapbridge_session", "The run that is counted.")
+        configuration = str(self._counts.status.get("configuration_hash", ""))
+        found.add_metric(
+            [],
+            {
+                "session": self._session,
+                "cell": self._counts.settings.cell.stem,
+                "driver": self._counts.settings.link.driver,
+                "configuration_hash": configuration,
+            },
+        )
+        return found
+
+    def _state(self) -> Metric:
+        found = GaugeMetricFamily(
+            "gapbridge_state", "1 for the state that the supervisor is in.", labels=["state"]
+        )
+        for state in State:
+            found.add_metric([state.name.lower()], float(self._counts.state == state))
+        return found
+
+    def _cycles(self) -> Iterator[Metric]:
+        counts = self._counts
+        for name, message, value in (
+            ("cycles", "Cycles of the controller that were seen.", counts.cycles),
+            ("missed_cycles", "Cycles of the controller that were not seen.", counts.missed),
+            ("late_cycles", "Cycles finished later than a period after their state.", counts.late),
+            ("setpoints_written", "Setpoints that left for the robot.", counts.written),
+            ("uncounted_cycles", "Cycles overwritten before they could be counted.", counts.lost),
+        ):
+            yield CounterMetricFamily(f"gapbridge_{name}", message, float(value))
+        yield _counter(
+            "gapbridge_setpoints_clamped",
+            "Setpoints that a limit held back.",
+            counts.clamped,
+            "limit",
+        )
+        yield GaugeMetricFamily(
+            "gapbridge_link_rate_hertz",
+            "Cycles a second that the link is to have.",
+            self._counts.settings.link.rate,
+        )
+        yield GaugeMetricFamily(
+            "gapbridge_link_silence_seconds",
+            "Time since the last state of the robot.",
+            counts.silence,
+        )
+        yield GaugeMetricFamily(
+            "gapbridge_loop_heartbeat_age_seconds",
+            "Time since the loop's last sign of life.",
+            counts.heartbeat,
+        )
+
+    def _histograms(self) -> Iterator[Metric]:
+        counts = self._counts
+        yield _histogram(
+            "gapbridge_state_age_seconds",
+            "Age of the robot's state when its cycle was done.",
+            counts.age,
+        )
+        yield _histogram(
+            "gapbridge_loop_duration_seconds", "From seeing a state to having written.", counts.work
+        )
+
+    def _offset(self) -> Iterator[Metric]:
+        limits = self._counts.settings.limits
+        offset = GaugeMetricFamily(
+            "gapbridge_offset_meters", "TCP offset of the last cycle, in base.", labels=["axis"]
+        )
+        rotation = GaugeMetricFamily(
+            "gapbridge_offset_rotation_radians",
+            "Rotation of the TCP offset of the last cycle, in base.",
+            labels=["axis"],
+        )
+        for i, axis in enumerate(AXES):
+            offset.add_metric([axis], float(self._counts.offset[i]))
+            rotation.add_metric([axis], float(self._counts.offset[3 + i]))
+        yield offset
+        yield rotation
+        yield GaugeMetricFamily(
+            "gapbridge_offset_limit_meters", "Longest offset that may leave.", limits.offset
+        )
+        yield GaugeMetricFamily(
+            "gapbridge_offset_rotation_limit_radians",
+            "Largest rotation of an offset that may leave.",
+            limits.offset_rotation,
+        )
+
+    def _reported(self) -> Iterator[Metric]:
+        counts = self._counts
+        yield _counter("gapbridge_faults", "Faults, by what caused them.", counts.faults, "cause")
+        yield _counter("gapbridge_events", "Events of the daemon, by kind.", counts.events, "kind")
+        transitions = CounterMetricFamily(
+            "gapbridge_transitions", "Changes of state.", labels=["to", "cause"]
+        )
+        for (to, cause), times in sorted(counts.transitions.items()):
+            transitions.add_metric([to, cause], float(times))
+        yield transitions
+        reported = _numbers(counts.status.get("counts"))
+        dropped = {
+            reason.value: reported.pop(count.label)
+            for reason, count in DROPPED.items()
+            if count.label in reported
+        }
+        yield _counter(
+            "gapbridge_dropped_samples", "Samples that could not be believed.", dropped, "reason"
+        )
+        yield _counter("gapbridge_incidents", "What the loop met with, by kind.", reported, "kind")
+
+    def _processes(self) -> Iterator[Metric]:
+        status = self._counts.status
+        processes = {"loop": status.get("loop"), **(status.get("sides") or {})}
+        up = GaugeMetricFamily(
+            "gapbridge_process_up", "1 while the process runs.", labels=["process"]
+        )
+        again = CounterMetricFamily(
+            "gapbridge_process_restarts", "Restarts by the daemon.", labels=["process"]
+        )
+        for name, found in processes.items():
+            if isinstance(found, Mapping):
+                up.add_metric([name], float(bool(found.get("pid"))))
+                again.add_metric([name], float(found.get("restarts") or 0))
+        yield up
+        yield again
+
+    def _recorder(self) -> Iterator[Metric]:
+        yield CounterMetricFamily(
+            "gapbridge_recorder_lost_cycles",
+            "Cycles that could not be recorded.",
+            float(self._counts.recorder_lost),
+        )
+        yield GaugeMetricFamily(
+            "gapbridge_recorder_paused",
+            "1 while nothing can be recorded (disk full, ...).",
+            float(self._counts.recorder_paused),
+        )
+        lag = _lag(self._counts.status.get("recording"))
+        if lag is not None:
+            yield GaugeMetricFamily(
+                "gapbridge_recorder_lag_seconds",
+                "Time since the newest file of the recording was written to.",
+                lag,
+            )
+
+
+def _counter(name: str, message: str, values: Mapping[str, float], label: str) -> Metric:
+    found = CounterMetricFamily(name, message, labels=[label])
+    for key, value in sorted(values.items()):
+        found.add_metric([key], float(value))
+    return found
+
+
+def _histogram(name: str, message: str, buckets: Buckets) -> Metric:
+    found = HistogramMetricFamily(name, message)
+    found.add_metric([], buckets.cumulative(), buckets.sum)
+    return found
+
+
+def _numbers(found: Any) -> dict[str, float]:
+    """Return what of a document's part are numbers."""
+    if not isinstance(found, Mapping):
+        return {}
+    return {
+        str(key): float(value)
+        for key, value in found.items()
+        if isinstance(value, int | float) and math.isfinite(value)
+    }
+
+
+def _lag(recording: Any) -> float | None:
+    """Return s since the newest file of a recording (its stem) changed; None without any."""
+    if not recording:
+        return None
+    stem = Path(str(recording))
+    try:
+        newest = max(p.stat().st_mtime for p in stem.parent.glob(f"{stem.name}-*.mcap"))
+    except (OSError, ValueError):
+        return None
+    return max(time.time() - newest, 0.0)

@@ -6,34 +6,35 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from gapbridge.bridge.document.blocks import Document, Section, parts
+import numpy as np
+
+from gapbridge.bridge.document.blocks import (
+    Block,
+    Bullets,
+    Document,
+    Heading,
+    Paragraph,
+    Section,
+    Table,
+    parts,
+)
+from gapbridge.bridge.document.findings import finding_text
 from gapbridge.bridge.document.html import html
 from gapbridge.bridge.document.output_file import write_text
-from gapbridge.bridge.document.provenance import origin_line
+from gapbridge.bridge.document.provenance import origin_blocks, origin_line
 from gapbridge.bridge.report.answer import answer
-from gapbridge.bridge.report.data_quality import data_quality
 from gapbridge.bridge.report.how_far import how_far
-from gapbridge.bridge.report.material import Material
+from gapbridge.bridge.report.labels import CHANNELS, with_unit
+from gapbridge.bridge.report.material import Material, own_coordinates, per_sample
 from gapbridge.bridge.report.parameters import parameters
-from gapbridge.bridge.report.where import where
-from gapbridge.bridge.report.which import which
+from gapbridge.bridge.report.where import where, which
+from gapbridge.core.diagnosis.channel_diagnosis import ChannelDiagnosis
 from gapbridge.core.diagnosis.diagnosis import Diagnosis
 from gapbridge.core.log.log import Log
 from gapbridge.core.model import Model
 
-SECTIONS: tuple[Section[Material], ...] = (
-    Section("answer", "The answer", answer),
-    Section("where", "Where the gap lies", where,
-            "Which joints and axes it comes from, and what it follows."),
-    Section("which", "Which effect causes it", which,
-            "Every effect that was tried, with the evidence for and against."),
-    Section("how_far", "How far it shrinks", how_far,
-            "Judged only on measurements that the fit did not see."),
-    Section("parameters", "Parameters and next measurements", parameters,
-            "What goes into the model, how surely, and what would settle the open questions."),
-    Section("data_quality", "Data quality", data_quality,
-            "What was used, what was excluded, what could not be seen."),
-)  # fmt: skip
+LISTED = 20  # outliers listed a channel
+
 FILE = "report.html"
 
 
@@ -67,3 +68,69 @@ def document(material: Material) -> Document:
 def _cell_title(name: str) -> str:
     """Return a cell's name; of a path to a cell file, the file's own."""
     return Path(name).stem if name.endswith((".yaml", ".yml")) else name
+
+
+def data_quality(material: Material) -> list[Block]:
+    """Return rows used, findings, outliers, channels that the log does not show, origin."""
+    diagnosis = material.diagnosis
+    rows = [
+        [CHANNELS[c.channel], str(len(material.log)), str(c.samples),
+         str(len(c.outliers)),
+         str(len(np.unique(c.selection.observation.groups)))]
+        for c in diagnosis.channels
+    ]  # fmt: skip
+    heads = ("channel", "rows in the log", "samples used", "excluded as outliers",
+             "different poses or stretches of time")  # fmt: skip
+    blocks: list[Block] = [Table(heads, rows), Heading("Findings")]
+    blocks.append(
+        Bullets(tuple(finding_text(f) for f in diagnosis.findings)) if diagnosis.findings
+        else Paragraph("No check of the log found anything odd.")
+    )  # fmt: skip
+    for channel in diagnosis.channels:
+        blocks += _outliers(channel, material.log)
+    if diagnosis.not_observable:
+        hidden = [
+            [CHANNELS.get(h.channel, h.channel), ", ".join(h.needs)]
+            for h in diagnosis.not_observable
+        ]
+        blocks += [
+            Heading("What this log cannot show"),
+            Table(("channel", "columns it would need"), hidden),
+        ]
+    return blocks + origin_blocks(material.origin)
+
+
+def _outliers(channel: ChannelDiagnosis, log: Log) -> list[Block]:
+    outliers = np.flatnonzero(~channel.selection.kept)
+    if not len(outliers):
+        return []
+    size = per_sample(channel.remaining, own_coordinates(channel))
+    worst = outliers[np.argsort(-size[outliers])][:LISTED]
+    rows = [
+        [str(log.line(channel.selection.observation.rows[i])), with_unit(float(size[i]),
+         channel.unit)] for i in worst
+    ]  # fmt: skip
+    count = len(channel.outliers)
+    more = f" The {len(worst)} largest of {count}:" if count > len(worst) else ""
+    return [
+        Heading(f"Outliers: {CHANNELS[channel.channel]}"),
+        Paragraph(
+            f"They fit nothing around them and were excluded before any effect was judged.{more}"
+        ),
+        Table(("line of the file", "distance from the model"), rows),
+    ]
+
+
+SECTIONS: tuple[Section[Material], ...] = (
+    Section("answer", "The answer", answer),
+    Section("where", "Where the gap lies", where,
+            "Which joints and axes it comes from, and what it follows."),
+    Section("which", "Which effect causes it", which,
+            "Every effect that was tried, with the evidence for and against."),
+    Section("how_far", "How far it shrinks", how_far,
+            "Judged only on measurements that the fit did not see."),
+    Section("parameters", "Parameters and next measurements", parameters,
+            "What goes into the model, how surely, and what would settle the open questions."),
+    Section("data_quality", "Data quality", data_quality,
+            "What was used, what was excluded, what could not be seen."),
+)  # fmt: skip

@@ -1,15 +1,39 @@
-"""Where: joints, axes, and the quantities that the gap follows."""
+"""Where the gap is: joints, axes, the quantities it follows; which effects explain it."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from gapbridge.bridge.document.axes import Chart, scale
-from gapbridge.bridge.document.blocks import Bar, Beside, Block, Cell, Gallery, Table, View
+from gapbridge.bridge.document.blocks import (
+    DOUBTFUL,
+    GOOD,
+    QUIET,
+    Badge,
+    Bar,
+    Beside,
+    Block,
+    Cell,
+    Gallery,
+    Named,
+    Paragraph,
+    Table,
+    View,
+)
 from gapbridge.bridge.document.drawing import EDGE, SOFT, Drawing
+from gapbridge.bridge.document.findings import considered_text
 from gapbridge.bridge.document.scene import Arrows, Path, Scene, base
 from gapbridge.bridge.document.skeleton import reach, round_factor, skeleton
-from gapbridge.bridge.report.labels import percent, quantity_title, quantity_unit, unit_of
+from gapbridge.bridge.report.labels import (
+    effect_title,
+    joint_list,
+    likelihood,
+    listed,
+    percent,
+    quantity_title,
+    quantity_unit,
+    unit_of,
+)
 from gapbridge.bridge.report.material import (
     Material,
     before_and_after,
@@ -19,6 +43,7 @@ from gapbridge.bridge.report.material import (
     thinned,
 )
 from gapbridge.core.arrays import Array, Index
+from gapbridge.core.diagnosis.causes import Cause, Considered, Outcome
 from gapbridge.core.diagnosis.channel_diagnosis import ChannelDiagnosis
 from gapbridge.core.planning.travel import far_apart
 
@@ -28,6 +53,12 @@ POINTS = 600  # of a drawing among many
 ARROWS = 250
 DRAWN = 4  # poses in which the arm is drawn
 LENGTH = 0.18  # of the arm's reach: how long a large error's arrow is drawn
+HEADS = ("effect", "verdict", "shrinks alone", "probability", "why")
+NOTE = (
+    "“Alone” says how far the gap would fall, on measurements the fit did not see, if this effect "
+    "were the only one in the model. An effect can score well alone and still lose: when another "
+    "explains the same better, or with fewer numbers."
+)
 
 
 def where(material: Material) -> list[Block]:
@@ -184,3 +215,61 @@ def arm_view(channel: ChannelDiagnosis, material: Material) -> View:
         f"{factor:,.0f} times larger than they are. Drag to turn; click, then scroll to zoom. "
         f"Base frame, squares of the floor 0.1 or 0.25 m.{drawn}",
     )
+
+
+def which(material: Material) -> list[Block]:
+    """Return one table per channel."""
+    blocks: list[Block] = [Paragraph(NOTE, "note")]
+    for channel in material.diagnosis.channels:
+        blocks += [*channel_heading(material.diagnosis, channel), _table(channel)]
+    return blocks
+
+
+def _table(channel: ChannelDiagnosis) -> Table:
+    rows = [_accused(c) for c in channel.causes]
+    losers = sorted(channel.considered, key=lambda k: (not k.excited, -(k.shrink_alone or 0.0)))
+    tied = {name for c in channel.causes for name in c.indistinguishable_from}
+    rows += [_considered(k, k.effect in tied, bool(channel.causes)) for k in losers]
+    return Table(HEADS, rows, (2.2, 1.1, 1.1, 0.9, 3))
+
+
+def _name(effect: str, joints: tuple[int, ...] = ()) -> Named:
+    return Named(effect_title(effect), f", {joint_list(joints)}" if joints else "", effect)
+
+
+def _accused(cause: Cause) -> list[Cell]:
+    why = "needed: without it the gap stays larger"
+    if cause.shrink is not None:
+        low, high = cause.shrink.interval
+        why = (
+            f"with it in the model the gap falls by a further {percent(cause.shrink.shrink)} "
+            f"({percent(low)} to {percent(high)})"
+        )
+    if cause.indistinguishable_from:
+        ties = listed([effect_title(n) for n in cause.indistinguishable_from], "or")
+        why += f"; these data cannot separate it from: {ties}"
+    tied = bool(cause.indistinguishable_from)
+    verdict = Badge("cause, tied", DOUBTFUL) if tied else Badge("cause", GOOD)
+    alone = Bar(cause.shrink_alone, percent(cause.shrink_alone))
+    return [_name(cause.effect, cause.joints), verdict, alone, likelihood(cause.probability), why]
+
+
+def _considered(considered: Considered, tied: bool, beside: bool) -> list[Cell]:
+    """Return the row of an effect that is not accused; ``beside``: others are."""
+    if considered.outcome is Outcome.NOT_EXCITED:
+        why = f"this log does not show it; it needs {considered.needs}"
+        return [_name(considered.effect), Badge("not excited", QUIET), "–", "–", why]
+    if tied:
+        verdict = Badge("tied", DOUBTFUL)
+        why = "would explain these data as well as the cause named above"
+    elif considered.outcome is Outcome.WITHDRAWN:
+        verdict = Badge("withdrawn", DOUBTFUL)
+        why = f"looked like a cause, but is not accused: {considered_text(considered)}"
+    else:
+        verdict = Badge("no", QUIET)
+        others = ", beside the causes found," if beside else ""
+        why = f"explains too little{' more' if beside else ''}{others} for the numbers it adds"
+    alone: Cell = "–"
+    if considered.shrink_alone is not None:
+        alone = Bar(considered.shrink_alone, percent(considered.shrink_alone), EDGE)
+    return [_name(considered.effect), verdict, alone, likelihood(considered.probability), why]

@@ -1,21 +1,43 @@
 """The status page's process: ``python -m gapbridge.bridge.web.main``, started by the daemon.
 
 It reads along - the shared page through a descriptor that cannot be written to - and answers
-browsers. It has no way to the robot and none to arm anything.
+browsers: the page itself, /status, /events, /history. All of them only read: it has no way to the
+robot and none to arm anything.
 """
 
 from __future__ import annotations
 
+import asyncio
+import hmac
+import math
 import sys
+from collections.abc import AsyncIterator, Awaitable, Callable
+from importlib.resources import files
+from urllib.parse import parse_qs
 
+from starlette.applications import Starlette
+from starlette.requests import ClientDisconnect, Request
+from starlette.responses import PlainTextResponse, Response, StreamingResponse
+from starlette.routing import Route
+from starlette.types import Receive, Scope, Send
+
+from gapbridge.bridge.cell.settings.web import WebSettings
 from gapbridge.bridge.ipc.side_main import Order, run_side
 from gapbridge.bridge.served.credentials import read_token
+from gapbridge.bridge.served.guard import WRONG_TOKEN_DELAY, Guard, cookie_name, cookie_of
 from gapbridge.bridge.served.server import serve
-from gapbridge.bridge.web.app import make_app
-from gapbridge.bridge.web.stream import Stream
+from gapbridge.bridge.web.stream import Stream, message
 from gapbridge.bridge.web.watched import Watched, encoded
 
 TURN = 0.1  # s between two looks at the shared page
+FILES = {
+    "index.html": "text/html", "style.css": "text/css", "page.js": "text/javascript",
+    "drawing.js": "text/javascript", "view.js": "text/javascript",
+    "messages.js": "text/javascript", "icon.svg": "image/svg+xml",
+}  # fmt: skip
+MOST_POINTS = 2000
+LARGEST_FORM = 4096  # bytes
+FORM_TIME = 5.0  # s that it may take to come
 
 
 def run(order: Order) -> None:
@@ -42,3 +64,112 @@ def run(order: Order) -> None:
 
 if __name__ == "__main__":
     sys.exit(run_side("web", run))
+
+
+def make_app(watched: Watched, stream: Stream, settings: WebSettings, token: str | None) -> Guard:
+    """Return the application behind its guard."""
+
+    async def status(request: Request) -> Response:
+        return _json(encoded(watched.snapshot()))
+
+    async def history(request: Request) -> Response:
+        found = {}
+        for name, default, most in (
+            ("seconds", 60.0, 86400.0), ("points", 600.0, float(MOST_POINTS)),
+        ):  # fmt: skip
+            text = request.query_params.get(name, str(default))
+            try:
+                value = float(text)
+            except ValueError:
+                value = math.nan
+            if not 1.0 <= value <= most:
+                return PlainTextResponse(
+                    f"{name}: found {text[:40]!r}, expected 1 to {most:g}\n", 400
+                )
+            found[name] = value
+        return _json(encoded(watched.history(found["seconds"], int(found["points"]))))
+
+    async def events(request: Request) -> Response:
+        if stream.full:
+            return PlainTextResponse("too many pages are open\n", 503, {"retry-after": "10"})
+        return StreamingResponse(
+            _bytes(stream, watched), media_type="text/event-stream",
+            headers={"x-accel-buffering": "no"},
+        )  # fmt: skip
+
+    routes = [
+        Route("/status", status), Route("/history", history), Route("/events", events),
+        Route("/", _file("index.html")),
+        *(Route(f"/{name}", _file(name)) for name in FILES if name != "index.html"),
+    ]  # fmt: skip
+    sign_in = None if token is None else SignIn(settings, token)
+    return Guard(Starlette(routes=routes), settings, token, sign_in)
+
+
+async def _bytes(stream: Stream, watched: Watched) -> AsyncIterator[str]:
+    async for text in stream.subscribe(lambda: message("hello", encoded(watched.snapshot()))):
+        yield text
+
+
+class SignIn:
+    """A form that takes the token once and gives the browser a cookie instead."""
+
+    def __init__(self, settings: WebSettings, token: str) -> None:
+        self._token = token.encode()
+        secure = "; Secure" if settings.certificate is not None else ""
+        self._cookie = (
+            f"{cookie_name(settings)}={cookie_of(self._token)}; Path=/; HttpOnly; "
+            f"SameSite=Strict{secure}"
+        )
+        self._page = _read("sign-in.html")
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer with the form, or take it."""
+        request = Request(scope, receive)
+        response = await self._take(request) if request.method == "POST" else self._form()
+        await response(scope, receive, send)
+
+    def _form(self) -> Response:
+        headers = {"www-authenticate": 'Bearer realm="gapbridge"'}
+        return Response(self._page, 401, headers, media_type="text/html")
+
+    async def _take(self, request: Request) -> Response:
+        try:
+            async with asyncio.timeout(FORM_TIME):
+                given = await self._token_of(request)
+        except (ClientDisconnect, TimeoutError, ValueError):
+            return PlainTextResponse("found no form with a token\n", 400, {"connection": "close"})
+        if not hmac.compare_digest(given.strip().encode(), self._token):
+            await asyncio.sleep(WRONG_TOKEN_DELAY)
+            return self._form()
+        return Response(status_code=303, headers={"location": "/", "set-cookie": self._cookie})
+
+    @staticmethod
+    async def _token_of(request: Request) -> str:
+        """Return what a form holds. Raises ValueError where it is too large or none."""
+        body = b""
+        async for chunk in request.stream():
+            body += chunk
+            if len(body) > LARGEST_FORM:
+                raise ValueError("too large")
+        return parse_qs(body.decode("ascii", "replace"), max_num_fields=4).get("token", [""])[0]
+
+
+def _file(name: str) -> Callable[[Request], Awaitable[Response]]:
+    """Return what answers with one of the page's files."""
+    content = _read(name)
+
+    async def answer(request: Request) -> Response:
+        return Response(content, media_type=FILES[name])
+
+    return answer
+
+
+def _read(name: str) -> bytes:
+    if name == "view.js":  # as reports have it
+        return files("gapbridge.bridge.document").joinpath(name).read_bytes()
+    return files("gapbridge.bridge.web").joinpath("page", name).read_bytes()
+
+
+def _json(text: str) -> Response:
+    return Response(text, media_type="application/json")

@@ -9,7 +9,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from gapbridge.core.arrays import Array
-from gapbridge.core.calibration.converged_fit import ConvergedFit, converged_fit
+from gapbridge.core.calibration.converged_fit import FitState, converged_fit
 from gapbridge.core.calibration.held_out_check import check_held_out, diagnosed, repeatability_of
 from gapbridge.core.calibration.missing_effects import MissingEffect, missing_effects
 from gapbridge.core.calibration.noise import Noise
@@ -43,7 +43,7 @@ class SessionFit:
     metrology: Metrology
     readings: Readings  # all, those held out too
     problem: Problem
-    rest: ConvergedFit
+    rest: FitState
     notes: tuple[Note, ...]
     missing: tuple[MissingEffect, ...]  # further effects that the fitted poses support
 
@@ -163,7 +163,7 @@ def _with_places(readings: Readings, how: Observable) -> tuple[Readings, tuple[N
 
 
 def estimates_of(
-    parameters: Parameters, rest: ConvergedFit, expected: Expectation | None
+    parameters: Parameters, rest: FitState, expected: Expectation | None
 ) -> tuple[Estimate, ...]:
     """Return the parameters as they are reported, beside what was ``expected`` of them."""
     planned = {} if expected is None else dict(
@@ -210,14 +210,14 @@ def _turn_noise(observable: Observable, noise: Noise) -> float:
     return float(noise.sizes[1] * observable.sigmas[3])
 
 
-def _stages_at_odds(problem: Problem, rest: ConvergedFit) -> float | None:
+def _stages_at_odds(problem: Problem, rest: FitState) -> float | None:
     return at_odds(
         rest.system, problem.stages, rest.covariance, problem.bounds,
         problem.observable.equations, np.sqrt(rest.weights),
     )  # fmt: skip
 
 
-def tcp_deviation(parameters: Parameters, rest: ConvergedFit, readings: Readings) -> Array:
+def tcp_deviation(parameters: Parameters, rest: FitState, readings: Readings) -> Array:
     """Return 1 sigma (3D, m) of the predicted TCP at readings (M,): the parameters' part alone."""
     if not len(readings):
         return np.zeros(0)

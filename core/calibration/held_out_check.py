@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.stats import f as fisher
 
 from gapbridge.core.arrays import Array
-from gapbridge.core.calibration.converged_fit import ConvergedFit
+from gapbridge.core.calibration.converged_fit import FitState
 from gapbridge.core.calibration.noise import presumed
 from gapbridge.core.calibration.problem import Problem
 from gapbridge.core.calibration.readings import Readings
@@ -42,7 +42,7 @@ class HeldOutCheck:
 
 
 def check_held_out(
-    problem: Problem, rest: ConvergedFit, found: Model, readings: Readings, metrology: Metrology
+    problem: Problem, rest: FitState, found: Model, readings: Readings, metrology: Metrology
 ) -> HeldOutCheck:
     """Return how the held-out readings stand against the fit, noise and uncertainty counted."""
     rows = np.flatnonzero(readings.held_out)
@@ -61,7 +61,7 @@ def check_held_out(
     return HeldOutCheck(len(rows), ratio, chance, rows[outliers])
 
 
-def predicted(problem: Problem, rest: ConvergedFit, readings: Readings) -> Array:
+def predicted(problem: Problem, rest: FitState, readings: Readings) -> Array:
     """Return the covariance (N, k, k) of what the fit predicts of readings, noise left aside."""
     layout = problem.observable.layout(problem.readings)  # these may be of some places only
     given = problem.parameters, rest.values, readings, rest.nuisance, layout
@@ -70,9 +70,7 @@ def predicted(problem: Problem, rest: ConvergedFit, readings: Readings) -> Array
     return np.asarray(X @ joint_covariance(rest.system, problem.bounds) @ np.swapaxes(X, 1, 2))
 
 
-def repeatability_of(
-    problem: Problem, rest: ConvergedFit, found: Model, readings: Readings
-) -> float:
+def repeatability_of(problem: Problem, rest: FitState, found: Model, readings: Readings) -> float:
     """Return the arm's 1 sigma of one coordinate from repeated poses (m); nan without repeats.
 
     The instrument's own noise is taken off.
@@ -95,7 +93,7 @@ def repeatability_of(
 
 
 def diagnosed(
-    found: Model, readings: Readings, rest: ConvergedFit, metrology: Metrology,
+    found: Model, readings: Readings, rest: FitState, metrology: Metrology,
     progress: Callable[[str], None],
 ) -> Diagnosis | None:  # fmt: skip
     """Return the diagnosis of what the calibrated model leaves over, or None where it has no log.

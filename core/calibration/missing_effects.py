@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.special import stdtrit
 
 from gapbridge.core.arrays import Array
-from gapbridge.core.calibration.converged_fit import ConvergedFit
+from gapbridge.core.calibration.converged_fit import FitState
 from gapbridge.core.calibration.parameters import Parameters
 from gapbridge.core.calibration.problem import HELD, Problem
 from gapbridge.core.effects import CATALOGUE
@@ -43,7 +43,7 @@ class MissingEffect:
     share: float  # of the residuals' squares on poses left out in folds that it takes off
 
 
-def missing_effects(problem: Problem, rest: ConvergedFit) -> tuple[MissingEffect, ...]:
+def missing_effects(problem: Problem, rest: FitState) -> tuple[MissingEffect, ...]:
     """Return the further effects that the poses of the fit support, the strongest first."""
     tried = _columns(problem, rest)
     folds = _Folds.of(problem, rest)
@@ -96,7 +96,7 @@ class _Folds:
     fold: NDArray[np.int64]  # (M,)
 
     @classmethod
-    def of(cls, problem: Problem, rest: ConvergedFit) -> _Folds:
+    def of(cls, problem: Problem, rest: FitState) -> _Folds:
         """Return the folds of a converged fit; repeats and loads of a pose stay together."""
         system, held = rest.system, problem.bounds.held
         size = np.maximum(np.linalg.norm(system.F, axis=0), 1e-300)
@@ -133,7 +133,7 @@ class _Folds:
         return missed(self.A, self.target, self.fold, self.hold)
 
 
-def _columns(problem: Problem, rest: ConvergedFit) -> dict[str, Candidate]:
+def _columns(problem: Problem, rest: FitState) -> dict[str, Candidate]:
     """Return the columns and usual sizes of every further effect, weighed as the system is."""
     parameters, observable, readings = problem.parameters, problem.observable, problem.readings
     found = parameters.model(rest.values)

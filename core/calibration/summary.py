@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapbridge.core.arrays import Array
-from gapbridge.core.calibration.converged_fit import ConvergedFit
+from gapbridge.core.calibration.converged_fit import FitState
 from gapbridge.core.calibration.held_out_check import HeldOutCheck
 from gapbridge.core.calibration.missing_effects import MissingEffect
 from gapbridge.core.calibration.parameters import Parameters
@@ -22,7 +22,7 @@ MEMBER = 0.35  # share of a combination from which a parameter is named in it
 
 
 def combinations(
-    parameters: Parameters, rest: ConvergedFit, shown: NDArray[np.bool_]
+    parameters: Parameters, rest: FitState, shown: NDArray[np.bool_]
 ) -> tuple[Note, ...]:
     """Return what these readings do not determine, or only together."""
     notes = []
@@ -55,7 +55,7 @@ def _company(correlation: Array, i: int) -> list[int]:
 
 
 def notes_of(
-    problem: Problem, rest: ConvergedFit, remainder: HeldOutCheck, odds: float | None,
+    problem: Problem, rest: FitState, remainder: HeldOutCheck, odds: float | None,
     estimates: tuple[Estimate, ...],
 ) -> tuple[Note, ...]:  # fmt: skip
     """Return what deserves a second look."""

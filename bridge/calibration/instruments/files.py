@@ -123,12 +123,16 @@ class _Exported(Instrument[E]):
     def _look(self, where: Where) -> Samples | None:
         """Return the next reading, None where there is none yet. Raises ReadingError."""
 
-    def _awaited(self, where: Where, what: str) -> Samples:
-        """Return a reading as soon as there is one; ``what``: the place, what is new, expected."""
+    @abstractmethod
+    def _nothing(self, where: Where) -> str:
+        """Return what was not found in time, and what was expected."""
+
+    def read(self, where: Where) -> Samples:
+        """Return the next reading. Raises ReadingError where it is none or none comes in time."""
         until = time.monotonic() + self.settings.timeout
         while (found := self._look(where)) is None:
             if time.monotonic() > until:
-                raise ReadingError(what)
+                raise ReadingError(self._nothing(where))
             time.sleep(LOOK)
         return found
 
@@ -154,13 +158,9 @@ class File(_Exported[FileSettings]):
         if file.exists():
             read_table(file)
 
-    def read(self, where: Where) -> Samples:
-        """Return one sample. Raises ReadingError where it is none or does not come in time."""
+    def _nothing(self, where: Where) -> str:
         given = self.settings
-        return self._awaited(
-            where, f"{given.file}: found no new row for {given.timeout:g} s, expected stop "
-            f"{where.stop}",
-        )  # fmt: skip
+        return f"{given.file}: found no new row for {given.timeout:g} s, expected stop {where.stop}"
 
     def _look(self, where: Where) -> Samples | None:
         if not self.settings.file.exists():
@@ -199,13 +199,9 @@ class WatchedFolder(_Exported[FolderSettings]):
                 "tracker's software writes to"
             )
 
-    def read(self, where: Where) -> Samples:
-        """Return a file's samples. Raises ReadingError where it has none or none comes in time."""
-        given = self.settings
-        return self._awaited(
-            where, f"{given.folder}: found no new file for {given.timeout:g} s, expected "
-            f"{given.pattern}",
-        )  # fmt: skip
+    def _nothing(self, where: Where) -> str:
+        given, of = self.settings, self.settings.pattern
+        return f"{given.folder}: found no new file for {given.timeout:g} s, expected {of}"
 
     def _look(self, where: Where) -> Samples | None:
         """Return the samples of the oldest new file, once it is whole."""

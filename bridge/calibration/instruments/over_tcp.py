@@ -19,7 +19,16 @@ from gapbridge.core.errors import LinkError
 
 LONGEST_LINE = 4096  # bytes
 CONNECTING = 5.0  # s
-PERIOD_LIMIT = 5.0  # s
+
+
+def _connected(who: str, address: tuple[str, int], expected: str) -> socket.socket:
+    """Return a connection. Raises LinkError, which names who did not answer."""
+    try:
+        return socket.create_connection(address, timeout=CONNECTING)
+    except OSError as error:
+        raise LinkError(
+            f"{who} {address[0]}:{address[1]}: {error.strerror or error}; expected {expected}"
+        ) from None
 
 
 class LineFeed(Instrument[LineFeedSettings]):
@@ -35,14 +44,10 @@ class LineFeed(Instrument[LineFeedSettings]):
         self._connect().close()
 
     def _connect(self) -> socket.socket:
-        given = self.settings
-        try:
-            return socket.create_connection((given.host, given.port), timeout=CONNECTING)
-        except OSError as error:
-            raise LinkError(
-                f"calibration.instrument {given.host}:{given.port}: {error.strerror or error}; "
-                "expected the tracker's software to listen there"
-            ) from None
+        return _connected(
+            "calibration.instrument", (self.settings.host, self.settings.port),
+            "the tracker's software to listen there",
+        )  # fmt: skip
 
     def read(self, where: Where) -> Samples:
         """Return as many samples as are asked for. Raises ReadingError, LinkError."""
@@ -102,13 +107,8 @@ class SimulatedTracker(Instrument[SimulatedTrackerSettings]):
     def open(self) -> None:
         """Connect to the bench. Raises LinkError."""
         address = (self._host, self.settings.port)
-        try:
-            self._socket = socket.create_connection(address, timeout=PERIOD_LIMIT)
-        except OSError as error:
-            raise LinkError(
-                f"simulated tracker at {address[0]}:{address[1]}: {error.strerror or error}; "
-                "expected `gapbridge simulate` to serve the cell"
-            ) from None
+        expected = "`gapbridge simulate` to serve the cell"
+        self._socket = _connected("simulated tracker at", address, expected)
 
     def read(self, where: Where) -> Samples:
         """Return samples (M, 3) or (M, 6). Raises LinkError."""

@@ -6,6 +6,7 @@ pose, through the one limiter, without corrections; once it rests there the daem
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -16,18 +17,17 @@ import numpy as np
 
 from gapbridge.bridge.calibration.instruments.instrument import ReadingError
 from gapbridge.bridge.calibration.joints.joint_source import JointSample, JointSource
-from gapbridge.bridge.calibration.joints.watched_run import WatchedRun
 from gapbridge.bridge.cell import Cell, load_cell
 from gapbridge.bridge.cell.daemon_settings import DaemonSettings
 from gapbridge.bridge.cell.sections import SetpointSettings
 from gapbridge.bridge.cell.settings.recording import RecordingSettings
-from gapbridge.bridge.daemon.daemon import settings_of
-from gapbridge.bridge.ipc.shared_memory import Phase
+from gapbridge.bridge.daemon.daemon import Daemon, settings_of
+from gapbridge.bridge.ipc.shared_memory import PageReader, Phase
 from gapbridge.bridge.loop.supervisor import State
 from gapbridge.bridge.setpoint_source.quintic import quintic, quintic_time, write_trajectory
 from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.plan import PlannedPose
-from gapbridge.core.errors import LinkError, RunError
+from gapbridge.core.errors import GapbridgeError, LinkError, RunError
 
 STILL = 0.003  # rad/s: slower than this, the arm stands
 NEAR = 0.05  # rad: an arm that rests this near to the pose has arrived
@@ -40,6 +40,9 @@ PERIOD = 0.01  # s; between rows the daemon's source goes straight
 ACCELERATION = 1.0  # rad/s2, fastest joint
 SHORTEST = 0.5  # s
 HOLD = 0.2  # s at the end
+KEPT = 20.0  # s of cycles that are kept
+STEP = 1e-5  # rad: a joint that has come this far has moved, in that direction
+FOREVER = 1e9  # s
 
 
 def uncorrected(path: Path) -> Cell:
@@ -224,3 +227,76 @@ def write_move(path: Path, stops: Sequence[Array], speed: float) -> float:
         parts.append(quintic(begin, end, int(np.ceil(duration / PERIOD))))
         parts.append(np.tile(end, (int(HOLD / PERIOD), 1)))
     return write_trajectory(path, np.vstack(parts), PERIOD)
+
+
+class WatchedRun:
+    """One run of the daemon in a thread of its own."""
+
+    def __init__(self, settings: DaemonSettings, write: bool) -> None:
+        self.daemon = Daemon(settings, may_write=write, say=self._say)
+        self.slices = self.daemon.page.slices
+        self.rows = np.empty((0, self.daemon.page.width))
+        self.approach = np.zeros(self.daemon.page.n)
+        self._turned_at: Array | None = None
+        self._reader: PageReader | None = self.daemon.page.reader()
+        self._messages: list[str] = []
+        self._error: BaseException | None = None
+        self._thread = threading.Thread(target=self._main, args=(write,), daemon=True)
+        self._thread.start()
+
+    def _say(self, text: str) -> None:
+        self._messages.append(text)
+
+    def _main(self, write: bool) -> None:
+        try:
+            self.daemon.run(arm=write, duration=FOREVER, by="--arm")
+        except BaseException as error:
+            self._error = error
+
+    def message(self) -> str:
+        """Return what the daemon said last."""
+        return self._messages[-1] if self._messages else ""
+
+    def messages(self, since: int = 0) -> list[str]:
+        """Return what the daemon said, from the message of that number on."""
+        return self._messages[since:]
+
+    def check(self) -> None:
+        """Raise what ended the run."""
+        if self._thread.is_alive():
+            return
+        if isinstance(self._error, GapbridgeError):
+            raise self._error
+        raise LinkError(
+            f"the link to the arm ended: {self._error or self.message() or 'no reason'}"
+        )
+
+    def take(self) -> None:
+        """Take the cycles over that came since the last call."""
+        if self._reader is None:
+            return
+        try:
+            new = self._reader.drain()
+        except (IndexError, ValueError):  # the page was closed meanwhile
+            return
+        if not len(new):
+            return
+        at = self.slices["timestamp"].start
+        self._follow_motion(new[:, self.slices["actual_q"]])
+        rows = np.vstack([self.rows, new])
+        self.rows = rows[rows[:, at] >= rows[-1, at] - KEPT]
+
+    def _follow_motion(self, q: Array) -> None:
+        before = q[0].copy() if self._turned_at is None else self._turned_at
+        for row in q:
+            way = row - before
+            moved = np.abs(way) > STEP
+            self.approach[moved] = np.sign(way[moved])
+            before[moved] = row[moved]
+        self._turned_at = before
+
+    def end(self) -> None:
+        """End the run."""
+        self._reader = None
+        self.daemon.stop()
+        self._thread.join(20.0)

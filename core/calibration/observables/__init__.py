@@ -9,11 +9,10 @@ from gapbridge.core.calibration.observables.distance import Distance
 from gapbridge.core.calibration.observables.fixed_point import fixed_at, point_of
 from gapbridge.core.calibration.observables.nuisance import Layout, Nuisance
 from gapbridge.core.calibration.observables.observable import Observable
-from gapbridge.core.calibration.observables.point import Point
 from gapbridge.core.calibration.observables.pose import Pose
 from gapbridge.core.calibration.observables.position import Position
 from gapbridge.core.calibration.observables.relative import Relative
-from gapbridge.core.calibration.observables.sphere import Sphere
+from gapbridge.core.calibration.observables.touching import Point, Sphere
 from gapbridge.core.errors import InputError
 
 OBSERVABLES: dict[str, type[Observable]] = {

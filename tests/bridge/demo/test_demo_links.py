@@ -16,7 +16,7 @@ import pytest
 
 from gapbridge.bridge.cell import load_cell
 from gapbridge.bridge.demo.links import LINKS, DemoLink
-from gapbridge.bridge.demo.own_program import travel_time
+from gapbridge.bridge.demo.links.modbus import travel_time
 from gapbridge.bridge.demo.poses import candidates, plan
 from gapbridge.bridge.demo.rests import rests, write_log
 from gapbridge.bridge.demo.result import reach

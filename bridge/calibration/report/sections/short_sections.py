@@ -104,10 +104,12 @@ def payload_result(material: ShortMaterial[PayloadCalibration]) -> list[Block]:
     return _result(found, tiles, before)
 
 
-def payload_facts(material: ShortMaterial[PayloadCalibration]) -> list[Block]:
+def short_facts(material: ShortMaterial[F]) -> list[Block]:
     """Return who, where, when, with what."""
-    counts = [("orientations", str(len(material.found.residual)))]
-    return facts_blocks(material.session, counts, 1, note_texts(material.found.notes))
+    found = material.found
+    what = "orientations" if isinstance(found, PayloadCalibration) else "touches"
+    counts = [(what, str(len(found.residual)))]
+    return facts_blocks(material.session, counts, 1, note_texts(found.notes))
 
 
 def payload_parameters(material: ShortMaterial[PayloadCalibration]) -> list[Block]:
@@ -153,12 +155,6 @@ def _rms(values: Array) -> float:
     return float(np.sqrt(np.mean(np.asarray(values) ** 2)))
 
 
-def tool_facts(material: ShortMaterial[ToolCalibration]) -> list[Block]:
-    """Return who, where, when, with what."""
-    counts = [("touches", str(len(material.found.residual)))]
-    return facts_blocks(material.session, counts, 1, note_texts(material.found.notes))
-
-
 def tool_parameters(material: ShortMaterial[ToolCalibration]) -> list[Block]:
     """Return the tool centre with its intervals, and the touches."""
     found = material.found
@@ -182,13 +178,13 @@ def _touches(found: ToolCalibration) -> Drawing:
 
 PAYLOAD: tuple[Section[ShortMaterial[PayloadCalibration]], ...] = (
     Section("result", "Result", payload_result),
-    Section("session", "Session and instrument", payload_facts),
+    Section("session", "Session and instrument", short_facts),
     Section("parameters", "What was found", payload_parameters, "Flange axes; intervals of 95 %."),
     Section("residual", "The residual", payload_residual,
             "Reading minus load and sensor zero, orientation by orientation."),
 )  # fmt: skip
 TOOL: tuple[Section[ShortMaterial[ToolCalibration]], ...] = (
     Section("result", "Result", tool_result),
-    Section("session", "Session and instrument", tool_facts),
+    Section("session", "Session and instrument", short_facts),
     Section("parameters", "What was found", tool_parameters, "Flange axes; intervals of 95 %."),
 )

@@ -9,7 +9,7 @@ from other_kinds import calibration_of
 
 from gapbridge.bridge.calibration.report import InstrumentFacts, Material, write_report
 from gapbridge.bridge.calibration.report.figures import mm
-from gapbridge.bridge.calibration.report.sections.calibration_sections import CALIBRATION
+from gapbridge.bridge.calibration.report.report import CALIBRATION
 from gapbridge.core.calibration.observables import OBSERVABLES
 
 
