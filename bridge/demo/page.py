@@ -57,7 +57,7 @@ def document(result: Result, diagnosis: str, origin: Mapping[str, Any]) -> Docum
     return Document(
         f"The whole job on a simulated {result.model.arm.name}",
         f"Link {result.link}, seed {result.seed} · {software}",
-        tuple(Part(key, title, "", tuple(blocks)) for key, title, blocks in parts if blocks),
+        tuple(Part(key, title, "", blocks) for key, title, blocks in parts if blocks),
         f"Demo of {software}, seed {result.seed}",
     )
 

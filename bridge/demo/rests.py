@@ -39,25 +39,6 @@ class Rests:
         return len(self.timestamp)
 
 
-def rests(
-    recording: Mapping[str, Array],
-    readings: Array,
-    visited: Array,
-    load: Load | None = None,
-    settling: float = SETTLING,
-) -> Rests:
-    """Return the rests at the ``visited`` poses (M, n), in their order.
-
-    ``recording`` holds columns by RTDE name, ``readings`` (K, 7) is the tracker's; ``load`` is what
-    the arm carried, where the controller does not report it. Raises RunError where a visit is
-    missing or the tracker saw too little of it.
-    """
-    found, missing = rests_so_far(recording, readings, visited, load, settling)
-    if found is None or missing:
-        raise RunError(missing)
-    return found
-
-
 def rests_so_far(
     recording: Mapping[str, Array],
     readings: Array,
@@ -65,7 +46,12 @@ def rests_so_far(
     load: Load | None = None,
     settling: float = SETTLING,
 ) -> tuple[Rests | None, str]:
-    """Return the rests up to the first that is missing (None: all are), and why; see ``rests``."""
+    """Return the rests at the ``visited`` poses (M, n), in their order, and why one is missing.
+
+    Up to the first that is missing; None: all are. ``recording`` holds columns by RTDE name,
+    ``readings`` (K, 7) is the tracker's; ``load`` is what the arm carried, where the controller
+    does not report it.
+    """
     if "timestamp" not in recording:
         return None, "the recording holds no state of the arm, expected one of each cycle"
     if load is not None and "payload" not in recording:

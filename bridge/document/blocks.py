@@ -187,7 +187,7 @@ class Part:
     key: str
     title: str
     about: str
-    blocks: tuple[Block, ...]
+    blocks: Sequence[Block]
     folded: bool = False  # True: the page shows it only when asked to
 
 
@@ -214,5 +214,5 @@ class Section(Generic[M]):
 
 def parts(sections: Sequence[Section[M]], material: M) -> tuple[Part, ...]:
     """Return the sections that have something to show as parts of a document."""
-    made = [(s, tuple(s.blocks(material))) for s in sections]
+    made = [(s, s.blocks(material)) for s in sections]
     return tuple(Part(s.key, s.title, s.about, b, s.folded) for s, b in made if b)

@@ -27,10 +27,10 @@ from gapbridge.bridge.fleet.fit_summary import (
 )
 from gapbridge.bridge.fleet.report.page import write_diagnosed_report, write_fitted_report
 from gapbridge.bridge.fleet.report.shared_sections import quantity_title, type_title
-from gapbridge.bridge.fleet.runner import Done, counted
+from gapbridge.bridge.fleet.runner import Done
 from gapbridge.bridge.fleet.session import Found
 from gapbridge.bridge.fleet.task import Outcome
-from gapbridge.bridge.report.labels import effect_title, joint_list, with_unit
+from gapbridge.bridge.report.labels import counted, effect_title, joint_list, with_unit
 from gapbridge.core.estimation.compliance_fit import flexibilities
 
 SHOWN = 8  # lines of a kind on the terminal; all are in the tables

@@ -15,6 +15,7 @@ from gapbridge.bridge.fleet.journal import Journal
 from gapbridge.bridge.fleet.session import Found, Session, natural
 from gapbridge.bridge.fleet.task import BAD, CRASHED, DIED, DONE, Outcome, Task, Work, outcome
 from gapbridge.bridge.fleet.workers.workers import Workers
+from gapbridge.bridge.report.labels import counted
 from gapbridge.core.errors import InputError
 
 FORM = 2  # of the results: another form is another key
@@ -108,8 +109,3 @@ def ending(done: Done, found: Found) -> list[str]:
     if fresh:
         lines.append(f"{done.seconds:.1f} s by {done.who}")
     return lines
-
-
-def counted(number: int, word: str) -> str:
-    """Return "1 arm" or "2 arms"."""
-    return f"{number} {word}{'' if number == 1 else 's'}"

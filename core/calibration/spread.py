@@ -69,20 +69,11 @@ class Spread:
         names = (*self.names, *(earlier.names[i] for i in kept))
         return Spread(names, _blocks([self.covariance, earlier.covariance[np.ix_(kept, kept)]]))
 
-    def position_std(self, model: Model, q: Array, loads: Loads | None = None) -> Array:
-        """Return 1 sigma of the predicted TCP (N, 3), m, base axes: the parameters' part alone.
-
-        Raises InputError where a parameter is none of the model's arm.
-        """
-        q = np.atleast_2d(q)
-        if not self.names:
-            return np.full((len(q), 3), np.nan)
-        return self.poses_and_std(model, q, loads)[1]
-
     def poses_and_std(self, model: Model, q: Array, loads: Loads | None) -> tuple[Poses, Array]:
-        """Return what ``model.predict`` does, and ``position_std`` (N, 3); one parameter at least.
+        """Return the poses, and 1 sigma (N, 3), m, base axes, of positions; one parameter at least.
 
-        Raises InputError where a parameter is none of the model's arm, or a row has no equilibrium.
+        The parameters' part alone. Raises InputError where a parameter is none of the model's arm,
+        or a row has no equilibrium.
         """
         parameters = parameters_named(model, self.names, "provenance")
         here, chosen = parameters.model_with_all(np.zeros(len(parameters)))

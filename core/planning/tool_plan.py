@@ -37,17 +37,16 @@ def plan_tool(
     *,
     poses: int = 6,
     noise: float = USUAL_NOISE,
-    base_rotation: float = TILT,
     seed: int = 0,
 ) -> ToolPlan:
     """Return poses that keep the tip where it is at ``begin`` (n,) rad and turn the tool about it.
 
-    Tilted by up to ``tilt`` (rad) and turned about its own axis, within the joint limits; chosen so
+    Tilted by up to TILT (rad) and turned about its own axis, within the joint limits; chosen so
     that the tip is determined best (D-optimal). ``noise`` is 1 sigma (m) of one coordinate of a
     touch. Raises ExcitationError where the arm reaches no orientations that determine the tip.
     """
     begin = np.asarray(begin, dtype=float)
-    reached = _candidates(model, begin, base_rotation, np.random.default_rng(seed))
+    reached = _candidates(model, begin, np.random.default_rng(seed))
     rotation = model.predict(reached).rotation @ model.chain().tool_rotation.T
     columns = touch_columns(rotation) / noise
     chosen = greedy(columns * 1e-3, min(poses, len(reached)), first=0)
@@ -63,16 +62,14 @@ def plan_tool(
     return ToolPlan(tuple(tour(begin, reached[chosen])), NAMES, std, tuple(bought))
 
 
-def _candidates(
-    model: Model, begin: Array, base_rotation: float, rng: np.random.Generator
-) -> Array:
+def _candidates(model: Model, begin: Array, rng: np.random.Generator) -> Array:
     """Return poses that hold the tip in place, ``begin`` first."""
     limits = model.arm.limits
     here = model.predict(begin)
     found = [begin]
     for _ in range(CANDIDATES):
         across = rng.normal(size=2)
-        lean = across / np.linalg.norm(across) * base_rotation * np.sqrt(rng.random())
+        lean = across / np.linalg.norm(across) * TILT * np.sqrt(rng.random())
         spin = rng.uniform(-np.pi / 2, np.pi / 2)
         turn = rotation_matrix(np.array([*lean, 0.0])) @ rotation_matrix(np.array([0, 0, spin]))
         q = _reach(model, begin, here.position[0], here.rotation[0] @ turn)

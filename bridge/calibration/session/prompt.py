@@ -59,11 +59,7 @@ class Prompt:
 
     def ask(self, question: str) -> str:
         """Return what is typed; raises SessionCommand for a command, InputEnded at the end."""
-        while True:
-            line = self._read(question, lambda: None)
-            assert isinstance(line, str)
-            if not self._is_help(line):
-                return self._answer(line)
+        return self.ask_unless(question, lambda: None) or ""
 
     def ask_unless(self, question: str, look: Callable[[], T | None]) -> str | T:
         """Return what is typed, or what ``look`` finds meanwhile, whichever comes first."""
@@ -161,9 +157,15 @@ class _Lines:
         self._rest = b""
         self.ended = False
 
-    @property
-    def _ready(self) -> bool:
-        return b"\n" in self._rest
+    def _took(self, wait: float) -> bool:
+        """Return whether anything came within ``wait`` s, and keep it."""
+        fd = sys.stdin.fileno()
+        if self.ended or not select.select([fd], [], [], wait)[0]:
+            return False
+        data = os.read(fd, 4096)
+        self.ended = not data
+        self._rest += data
+        return True
 
     def flush(self) -> str:
         """Drop what was typed at a terminal so far, and return it; a file or pipe keeps its lines.
@@ -173,21 +175,16 @@ class _Lines:
         fd = sys.stdin.fileno()
         if not os.isatty(fd):
             return ""
-        while not self.ended and select.select([fd], [], [], 0.0)[0]:
-            data = os.read(fd, 4096)
-            self.ended = not data
-            self._rest += data
+        while self._took(0.0):
+            pass
         termios.tcflush(fd, termios.TCIFLUSH)  # a line that has not ended yet
         early, self._rest = self._rest, b""
         return " ⏎ ".join(early.decode("utf-8", "replace").splitlines())
 
     def line(self, wait: float) -> str | None:
         """Return the next line, None where none comes within ``wait`` s."""
-        fd = sys.stdin.fileno()
-        if not self._ready and not self.ended and select.select([fd], [], [], wait)[0]:
-            data = os.read(fd, 4096)
-            self.ended = not data
-            self._rest += data
+        if b"\n" not in self._rest:
+            self._took(wait)
         line, end, rest = self._rest.partition(b"\n")
         if not end:
             return None

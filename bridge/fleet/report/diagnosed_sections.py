@@ -21,12 +21,13 @@ from gapbridge.bridge.document.blocks import (
 )
 from gapbridge.bridge.document.drawing import AFTER, LIMIT, PALE, Drawing
 from gapbridge.bridge.fleet.diagnosis_summary import Diagnosed, Onset, Recurrence
-from gapbridge.bridge.fleet.runner import Done, counted
+from gapbridge.bridge.fleet.runner import Done
 from gapbridge.bridge.fleet.session import natural
 from gapbridge.bridge.fleet.task import DONE, Outcome
 from gapbridge.bridge.report.answer import KINDS
 from gapbridge.bridge.report.labels import (
     VERDICTS,
+    counted,
     effect_title,
     joint_list,
     listed,

@@ -21,9 +21,8 @@ from gapbridge.bridge.document.blocks import (
 from gapbridge.bridge.document.drawing import AFTER, BEFORE, EDGE, PALE, Drawing
 from gapbridge.bridge.fleet.fit_summary import Fitted, FittedArm, FittedSession, FittedType
 from gapbridge.bridge.fleet.report.shared_sections import MOST, type_title
-from gapbridge.bridge.fleet.runner import counted
 from gapbridge.bridge.fleet.task import Outcome
-from gapbridge.bridge.report.labels import number, parameter_title, percent, with_unit
+from gapbridge.bridge.report.labels import counted, number, parameter_title, percent, with_unit
 
 SESSION_HEADS = ("poses", "gap with the cell", "with the fit", "predicted by the others")
 MICRO = 1e6

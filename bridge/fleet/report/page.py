@@ -12,9 +12,9 @@ from gapbridge.bridge.document.provenance import origin_blocks, origin_line, pro
 from gapbridge.bridge.fleet.diagnosis_summary import Diagnosed
 from gapbridge.bridge.fleet.fit_summary import Fitted
 from gapbridge.bridge.fleet.report import diagnosed_sections, fitted_sections, shared_sections
-from gapbridge.bridge.fleet.report.shared_sections import part
-from gapbridge.bridge.fleet.runner import Done, counted
+from gapbridge.bridge.fleet.runner import Done
 from gapbridge.bridge.fleet.session import Found
+from gapbridge.bridge.report.labels import counted
 
 FILE = "report.html"
 
@@ -23,14 +23,14 @@ def write_diagnosed_report(together: Diagnosed, done: Done, found: Found, folder
     """Write the report of ``fleet diagnose`` and return its path."""
     drifts = [*shared_sections.drifts(together.drifts), *diagnosed_sections.onsets(together.onsets)]
     parts = (
-        part("answer", "The answer", "", diagnosed_sections.answer(together, done)),
-        part("recurring", "Which effects recur", "Over all sessions whose log could show them.",
+        Part("answer", "The answer", "", diagnosed_sections.answer(together, done)),
+        Part("recurring", "Which effects recur", "Over all sessions whose log could show them.",
              diagnosed_sections.recurring(together)),
-        part("drifting", "Which arms drift", "What changes over an arm's sessions by more than it "
+        Part("drifting", "Which arms drift", "What changes over an arm's sessions by more than it "
              "scatters.", drifts),
-        part("outlying", "What stands out", "Sessions unlike the others of their kind.",
+        Part("outlying", "What stands out", "Sessions unlike the others of their kind.",
              shared_sections.outliers(together.outliers)),
-        part("sessions", "Sessions", "What was used, and what was skipped.",
+        Part("sessions", "Sessions", "What was used, and what was skipped.",
              shared_sections.sessions(done, diagnosed_sections.SESSION_HEADS,
                                       diagnosed_sections.session_cells)),
     )  # fmt: skip
@@ -40,17 +40,17 @@ def write_diagnosed_report(together: Diagnosed, done: Done, found: Found, folder
 def write_fitted_report(together: Fitted, done: Done, found: Found, folder: Path) -> Path:
     """Write the report of ``fleet fit`` and return its path."""
     parts = (
-        part("answer", "The answer", "", fitted_sections.answer(together)),
-        part("types", "What arms of a type have in common",
+        Part("answer", "The answer", "", fitted_sections.answer(together)),
+        Part("types", "What arms of a type have in common",
              "Flexibilities of the type, how far arms scatter about them, how far sessions do.",
              fitted_sections.types(together)),
-        part("arms", "The arms", "Each arm's own flexibilities, with what they borrow.",
+        Part("arms", "The arms", "Each arm's own flexibilities, with what they borrow.",
              fitted_sections.arms(together)),
-        part("drifting", "Which arms drift", "What changes over an arm's sessions by more than it "
+        Part("drifting", "Which arms drift", "What changes over an arm's sessions by more than it "
              "scatters.", shared_sections.drifts(together.drifts)),
-        part("outlying", "What stands out", "Arms and sessions unlike the others of their type.",
+        Part("outlying", "What stands out", "Arms and sessions unlike the others of their type.",
              shared_sections.outliers(together.outliers)),
-        part("sessions", "Sessions", "What was used, and what was skipped.",
+        Part("sessions", "Sessions", "What was used, and what was skipped.",
              shared_sections.sessions(done, fitted_sections.SESSION_HEADS,
                                       fitted_sections.session_cells(together))),
     )  # fmt: skip
@@ -65,7 +65,7 @@ def _write(folder: Path, title: str, parts: Sequence[Part], done: Done, found: F
     about = f"{counted(len(done.outcomes), 'session')} of {counted(found.arms, 'arm')}"
     document = Document(
         title, f"{about} · {origin_line(origin)}",
-        (*parts, part("origin", "Where this comes from", "", origin_blocks(origin)[1:])),
+        (*parts, Part("origin", "Where this comes from", "", origin_blocks(origin)[1:])),
         f"{title} · {origin_line(origin)}",
     )  # fmt: skip
     write_text(path, html(document))

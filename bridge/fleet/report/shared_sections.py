@@ -14,7 +14,6 @@ from gapbridge.bridge.document.blocks import (
     Cell,
     Heading,
     Paragraph,
-    Part,
     Pictures,
     Strong,
     Table,
@@ -129,11 +128,6 @@ def _names(outcome: Outcome) -> tuple[Cell, Cell]:
 def _short(session: str, arm: str) -> str:
     """Return a session's name below the folder of its arm."""
     return session.removeprefix(f"{arm}/")
-
-
-def part(key: str, title: str, about: str, blocks: Sequence[Block]) -> Part:
-    """Return one section."""
-    return Part(key, title, about, tuple(blocks))
 
 
 def _rest(count: int) -> list[Block]:
