@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -21,6 +22,7 @@ from gapbridge.core.calibration.plan import Payload
 from gapbridge.core.calibration.readings import Readings
 from gapbridge.core.errors import PlanError
 from gapbridge.core.loads import Loads
+from gapbridge.core.model import Model
 from gapbridge.core.notes import Note, Reason
 from gapbridge.core.planning.workspace import Place, Space
 
@@ -43,25 +45,58 @@ class Candidates:
     notes: tuple[Note, ...]
 
 
-@dataclass
 class _Sight:
-    """Poses found so far, and what hindered the others."""
+    """Random poses that can be read, found so far, and what hindered the others."""
 
-    q: list[Array]
-    station: list[Index]
-    target: list[Index]
-    looked: int
-    hindered: dict[str, int]
+    def __init__(
+        self, nominal: Model, observable: Observable, space: Space, nuisance: Nuisance
+    ) -> None:
+        self._nominal, self._observable = nominal, observable
+        self._space, self._nuisance = space, nuisance
+        self._found: list[tuple[Array, Index, Index]] = []  # joints, place, target
+        self._looked = 0
+        self._hindered: Counter[str] = Counter()
 
     @property
     def count(self) -> int:
-        return sum(len(q) for q in self.q)
+        """Return how many there are."""
+        return sum(len(q) for q, _, _ in self._found)
 
     @property
     def why(self) -> str:
-        worst = sorted(self.hindered.items(), key=lambda item: -item[1])[:3]
-        parts = [f"{100 * n / max(self.looked, 1):.0f} % {reason}" for reason, n in worst if n]
-        return f"of {self.looked} random poses " + (", ".join(parts) or "none can be read")
+        """Return what hinders random poses, in words."""
+        parts = [
+            f"{100 * n / max(self._looked, 1):.0f} % {reason}"
+            for reason, n in self._hindered.most_common(3)
+            if n
+        ]
+        return f"of {self._looked} random poses " + (", ".join(parts) or "none can be read")
+
+    def first(self, most: int) -> tuple[Array, Index, Index]:
+        """Return joints (C, n), place (C,) and target (C,) of the first ``most``."""
+        q, station, target = (
+            np.concatenate(parts)[:most] for parts in zip(*self._found, strict=True)
+        )
+        return q, station, target
+
+    def look(self, random: np.random.Generator) -> None:
+        """Look at some random poses, each from a random place at a random target."""
+        observable, nuisance = self._observable, self._nuisance
+        q = self._space.draw(DRAWN, random)
+        self._looked += DRAWN
+        first = 1 if observable.kind == "relative" else 0
+        station = random.integers(0, len(nuisance.stations), DRAWN)
+        target = random.integers(first, len(nuisance.targets), DRAWN)
+        if observable.closes:
+            readings = empty_readings(observable.kind, q, Loads(), station=station, target=target)
+            touching = predicted_readings(observable, self._nominal, readings, nuisance)
+            self._hindered["do not reach the fixed point"] += DRAWN - len(touching)
+            q, station, target = touching.q, touching.station, touching.target
+        good = np.ones(len(q), dtype=bool)
+        for reason, hit in _hindrances(observable, self._space, q, station, target).items():
+            self._hindered[reason] += int(hit.sum())
+            good &= ~hit
+        self._found.append((q[good], station[good], target[good]))
 
 
 def candidates_of(
@@ -83,19 +118,18 @@ def candidates_of(
         )
     nuisance = _nuisance(observable, space)
     random = np.random.default_rng(seed)
-    sight = _Sight([], [], [], 0, {})
+    sight = _Sight(parameters.nominal, observable, space, nuisance)
     for tried in range(TRIES):
-        _look(parameters, observable, space, nuisance, random, sight)
+        sight.look(random)
         if sight.count >= stops or (tried >= HOPELESS and not sight.count):
             break
     if not sight.count:
         raise PlanError(f"no pose can be reached and seen: {sight.why}")
-    q, station = np.concatenate(sight.q)[:stops], np.concatenate(sight.station)[:stops]
-    target = np.concatenate(sight.target)[:stops]
-    readings, stop = _under_loads(parameters, observable, loads, (q, station, target), random)
+    seen = sight.first(stops)
+    readings, stop = _under_loads(parameters, observable, loads, seen, random)
     notes = () if sight.count >= stops else (Note(Reason.FEW_POSES, (sight.why,)),)
     readings = replace(readings, value=observable.predict(parameters.nominal, readings, nuisance))
-    return Candidates(q, readings, stop, nuisance, sight.why, notes)
+    return Candidates(seen[0], readings, stop, nuisance, sight.why, notes)
 
 
 def _nuisance(observable: Observable, space: Space) -> Nuisance:
@@ -110,37 +144,6 @@ def _nuisance(observable: Observable, space: Space) -> Nuisance:
         tuple(fixed_at(np.array(place.position)) for place in places),
         targets - targets[0], np.full(len(places), long),
     )  # fmt: skip
-
-
-def _look(
-    parameters: Parameters,
-    observable: Observable,
-    space: Space,
-    nuisance: Nuisance,
-    random: np.random.Generator,
-    sight: _Sight,
-) -> None:
-    """Look at some random poses, each from a random place at a random target."""
-    q = space.draw(DRAWN, random)
-    stations, targets = len(nuisance.stations), len(nuisance.targets)
-    first = 1 if observable.kind == "relative" else 0
-    station = random.integers(0, stations, DRAWN)
-    target = random.integers(first, targets, DRAWN)
-    if observable.closes:
-        readings = empty_readings(observable.kind, q, Loads(), station=station, target=target)
-        touching = predicted_readings(observable, parameters.nominal, readings, nuisance)
-        sight.looked += len(q) - len(touching)
-        missed = sight.hindered.get("do not reach the fixed point", 0)
-        sight.hindered["do not reach the fixed point"] = missed + len(q) - len(touching)
-        q, station, target = touching.q, touching.station, touching.target
-    good = np.ones(len(q), dtype=bool)
-    for reason, hit in _hindrances(observable, space, q, station, target).items():
-        sight.hindered[reason] = sight.hindered.get(reason, 0) + int(hit.sum())
-        good &= ~hit
-    sight.looked += len(q)
-    sight.q.append(q[good])
-    sight.station.append(station[good])
-    sight.target.append(target[good])
 
 
 def readable(observable: Observable, space: Space, readings: Readings) -> Mask:

@@ -26,11 +26,10 @@ from gapbridge.core.planning.information import (
     information_of,
     inverse,
 )
-from gapbridge.core.planning.refinement import Refined, Refiner
+from gapbridge.core.planning.refinement import Refined, Refiner, evened, leaning
 from gapbridge.core.planning.route import Stop, itinerary
 from gapbridge.core.planning.travel import joint_speed, leg_times
 from gapbridge.core.planning.workspace import Space
-from gapbridge.core.planning.worst_places import evened, leaning
 
 REFERENCE = 200  # poses over which the predicted TCP is judged
 BOUGHT_ROUNDS = 3

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapbridge.core.arrays import Array
+from gapbridge.core.diagnosis.channels.recording import varying
 from gapbridge.core.diagnosis.observation import NotObservable, Observation, Predict, stacked
 from gapbridge.core.diagnosis.selection.unnamed import unnamed_rivals
 from gapbridge.core.effects import Term
@@ -29,7 +30,6 @@ from gapbridge.core.rotation import rotation_matrix, rotation_vector
 from gapbridge.core.sessions import session_of, sessions_in
 
 LEVER = 0.2  # m/rad: first weight of a rotation against a position
-VARIES = 1e-9  # spread below which a quantity counts as constant
 
 
 @dataclass(frozen=True)
@@ -230,18 +230,12 @@ def _prediction(model: Model, q: Array, loads: Loads, reference: Array | None) -
 
 def quantities(log: Log, rows: NDArray[np.int64]) -> dict[str, Array]:
     """Return every scalar column of the log that varies over ``rows``, by its name in the log."""
-    found: dict[str, Array] = {}
     q = "actual_q" if log.has("actual_q") else "target_q"
-    for name in ("timestamp", "session", q, "payload", "payload_cog", "joint_temperatures",
-                 "actual_TCP_force", "measured_position"):  # fmt: skip
-        column = log.get(name)
-        if column is None:
-            continue
-        values = column[rows].reshape(len(rows), -1)
-        for i in range(values.shape[1]):
-            if np.isfinite(values[:, i]).all() and np.ptp(values[:, i]) > VARIES:
-                found[name if column.ndim == 1 else f"{name}_{i}"] = values[:, i]
-    return found
+    given = ((name, log.get(name)) for name in (
+        "timestamp", "session", q, "payload", "payload_cog", "joint_temperatures",
+        "actual_TCP_force", "measured_position",
+    ))  # fmt: skip
+    return varying({name: column[rows] for name, column in given if column is not None})
 
 
 def approaches(approach: Array | None, rows: NDArray[np.int64] | None = None) -> dict[str, Array]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -53,7 +55,6 @@ def conditions(motion: Motion) -> Index:
 
 def quantities(log: Log, motion: Motion) -> dict[str, Array]:
     """Return what a residual may depend on: columns of the log, and speeds, where they vary."""
-    found: dict[str, Array] = {}
     columns: dict[str, Array | None] = {
         "timestamp": motion.t,
         "actual_q" if log.has("actual_q") else "target_q": motion.q,
@@ -62,10 +63,16 @@ def quantities(log: Log, motion: Motion) -> dict[str, Array]:
     for name in ("session", "payload", "payload_cog", "joint_temperatures", "actual_TCP_force"):
         column = log.get(name)
         columns[name] = None if column is None else column[motion.rows]
+    return varying(columns)
+
+
+def varying(columns: Mapping[str, Array | None]) -> dict[str, Array]:
+    """Return each scalar (N,) of columns (N,) or (N, k) that varies, by its name in the log."""
+    found: dict[str, Array] = {}
     for name, values in columns.items():
         if values is None:
             continue
-        table = values.reshape(len(motion), -1)
+        table = values.reshape(len(values), -1)
         for i in range(table.shape[1]):
             if np.isfinite(table[:, i]).all() and np.ptp(table[:, i]) > VARIES:
                 found[name if values.ndim == 1 else f"{name}_{i}"] = table[:, i]

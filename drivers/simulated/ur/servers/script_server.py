@@ -1,17 +1,38 @@
-"""Port 30003: programs arrive as text; what runs depends on what they are."""
+"""Port 30003: programs arrive as text; what runs depends on what they are.
+
+The control script that ur_rtde uploads is emulated, a handshake over registers. The client writes a
+command code to input_int_register_0 with arguments behind it, waits for output_int_register_0 to
+become 2 (done), clears the command and waits for 1 (ready). Real-time commands are executed in
+every cycle in which the register holds them and never leave 1. All registers are shifted by the
+offset that the client wrote into the script (0 or 24).
+"""
 
 from __future__ import annotations
 
 import logging
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
 
 from gapbridge.drivers.simulated.server.connection import Connection
-from gapbridge.drivers.simulated.ur.controller import Controller
+from gapbridge.drivers.simulated.ur.controller import Controller, Steps
 from gapbridge.drivers.simulated.ur.programs import offset_program
-from gapbridge.drivers.simulated.ur.programs.control_script import control_script, read_control_text
+from gapbridge.drivers.simulated.ur.programs.control_motions import MOTIONS, REALTIME_MOTIONS
+from gapbridge.drivers.simulated.ur.programs.control_queries import QUERIES, REALTIME_QUERIES
+from gapbridge.drivers.simulated.ur.programs.control_registers import Registers
 from gapbridge.drivers.simulated.ur.programs.script_programs import script_program
 from gapbridge.drivers.simulated.ur.programs.script_text import ScriptText, take_script
 
 log = logging.getLogger("drivers.simulated")
+READY, DONE = 1, 2
+STOP_SCRIPT = 255
+_OFFSET = re.compile(r"#\s*(int|float) register offset\s*\n\s*(\d+)")
+_PATH_MARK = "# inject move path"
+#: Executed once; those that return steps block the script until they end.
+COMMANDS: dict[int, Callable[[Registers], Steps | None]] = {**MOTIONS, **QUERIES}
+
+#: Executed in every cycle in which the register holds them.
+REALTIME: dict[int, Callable[[Registers], None]] = {**REALTIME_MOTIONS, **REALTIME_QUERIES}
 
 
 class ScriptServer:
@@ -42,3 +63,70 @@ class ScriptServer:
                 pass
             return
         controller.start_program(script.name, steps)
+
+
+@dataclass(frozen=True, slots=True)
+class ControlText:
+    """What the client wrote into the control script."""
+
+    int_offset: int
+    float_offset: int
+    path: tuple[str, ...]
+
+
+def read_control_text(script: ScriptText) -> ControlText | None:
+    """Return what was written into an uploaded control script; None if it is none."""
+    body = "\n".join(script.lines)
+    offsets = {kind: int(number) for kind, number in _OFFSET.findall(body)}
+    if script.name != "rtde_control" and len(offsets) < 2:
+        return None
+    path: list[str] = []
+    marked = [i for i, line in enumerate(script.lines) if line.strip() == _PATH_MARK]
+    if marked:
+        for line in script.lines[marked[0] + 1 :]:
+            if line.strip() == "end":
+                break
+            path.append(line.strip())
+    return ControlText(offsets.get("int", 0), offsets.get("float", 0), tuple(path))
+
+
+def control_script(controller: Controller, text: ControlText) -> Steps:
+    """Run the control script: one pass of its main loop per cycle, until it is asked to stop."""
+    registers = Registers(controller, text.int_offset, text.float_offset, text.path)
+    try:
+        registers.finish_operation()
+        registers.state(READY)
+        yield from _main_loop(registers)
+    finally:
+        registers.clear()
+
+
+def _main_loop(registers: Registers) -> Steps:
+    executed = False
+    while True:
+        registers.follow_operation()
+        command = registers.command()
+        if command == STOP_SCRIPT:
+            return
+        if command == 0:
+            executed = False
+            registers.state(READY)
+        elif command in REALTIME:
+            REALTIME[command](registers)
+            registers.state(READY)
+        elif not executed:
+            executed = True
+            yield from _execute(registers, command)
+            registers.state(DONE)
+        yield
+
+
+def _execute(registers: Registers, command: int) -> Steps:
+    """Run a command to its end; an unknown one is done at once."""
+    action = COMMANDS.get(command)
+    if action is None:
+        log.warning("control script: command %d is unknown and ignored", command)
+        return
+    steps = action(registers)
+    if steps is not None:
+        yield from steps

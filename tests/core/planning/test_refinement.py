@@ -10,8 +10,7 @@ from planned_cell import LOADS, POSITION, SIGMA, small_model, small_parameters, 
 from gapbridge.core.planning.candidates import candidates_of
 from gapbridge.core.planning.design import reference_of
 from gapbridge.core.planning.information import Reference, blocks, information_of, inverse
-from gapbridge.core.planning.refinement import Refined, Refiner
-from gapbridge.core.planning.worst_places import ROUNDS, evened, leaning
+from gapbridge.core.planning.refinement import ROUNDS, Refined, Refiner, evened, leaning
 
 Array = NDArray[np.float64]
 
