@@ -29,7 +29,9 @@ from benchmarks.calibration.best_possible import least_possible
 from benchmarks.calibration.random_cells import RandomCell, random_cell
 from benchmarks.calibration.repeated import Scatter, repeated_sessions
 from gapbridge.core.calibration.identifiability import identifiable_parameters
-from gapbridge.core.calibration.observables import Nuisance, Observable, make_observable
+from gapbridge.core.calibration.observables import make_observable
+from gapbridge.core.calibration.observables.nuisance import Nuisance
+from gapbridge.core.calibration.observables.observable import Observable
 from gapbridge.core.calibration.observables.predicted_readings import empty_readings
 from gapbridge.core.calibration.parameters import Parameters
 from gapbridge.core.calibration.plan import Plan

@@ -10,7 +10,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from gapbridge.core.calibration.observables import Nuisance, Observable
+from gapbridge.core.calibration.observables.nuisance import Nuisance
+from gapbridge.core.calibration.observables.observable import Observable
 from gapbridge.core.calibration.parameters import Parameters
 from gapbridge.core.calibration.readings import Readings
 

@@ -17,7 +17,8 @@ from gapbridge.bridge.cell.settings.calibration import (
 )
 from gapbridge.bridge.cell.settings.instruments import Base
 from gapbridge.core.calibration.identifiability import identifiable_parameters
-from gapbridge.core.calibration.observables import Observable, make_observable
+from gapbridge.core.calibration.observables import make_observable
+from gapbridge.core.calibration.observables.observable import Observable
 from gapbridge.core.calibration.parameters import DEFAULT, Parameters
 from gapbridge.core.calibration.plan import Payload, Plan
 from gapbridge.core.errors import CellError

@@ -6,8 +6,6 @@ import difflib
 from typing import Any
 
 from gapbridge.core.calibration.observables.distance import Distance
-from gapbridge.core.calibration.observables.fixed_point import fixed_at, point_of
-from gapbridge.core.calibration.observables.nuisance import Layout, Nuisance
 from gapbridge.core.calibration.observables.observable import Observable
 from gapbridge.core.calibration.observables.pose import Pose
 from gapbridge.core.calibration.observables.position import Position
@@ -33,20 +31,3 @@ def make_observable(kind: str, *, registered: bool = False, **options: Any) -> O
             f"kind of reading: found {kind!r}, expected one of {', '.join(OBSERVABLES)}{hint}"
         )
     return OBSERVABLES[kind](registered=registered, **options)  # type: ignore[call-arg]
-
-
-__all__ = [
-    "OBSERVABLES",
-    "Distance",
-    "Layout",
-    "Nuisance",
-    "Observable",
-    "Point",
-    "Pose",
-    "Position",
-    "Relative",
-    "Sphere",
-    "fixed_at",
-    "make_observable",
-    "point_of",
-]

@@ -18,7 +18,8 @@ from gapbridge.bridge.calibration.planning import observable_of
 from gapbridge.bridge.calibration.session.journal import FILE, read_entries
 from gapbridge.bridge.cell import load_cell
 from gapbridge.core.calibration.accuracy_baseline import baseline_in
-from gapbridge.core.calibration.observables import Nuisance, fixed_at
+from gapbridge.core.calibration.observables.fixed_point import fixed_at
+from gapbridge.core.calibration.observables.nuisance import Nuisance
 from gapbridge.core.calibration.observables.predicted_readings import predicted_readings
 from gapbridge.core.calibration.plan import Plan
 from gapbridge.core.calibration.readings import Readings

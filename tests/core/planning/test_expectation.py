@@ -10,7 +10,7 @@ from planned_cell import LOADS, POSITION, SIGMA, readings_of, small_model, small
 
 from benchmarks.calibration.repeated import repeated_sessions
 from gapbridge.core.calibration.identifiability import identifiable_parameters
-from gapbridge.core.calibration.observables import Nuisance
+from gapbridge.core.calibration.observables.nuisance import Nuisance
 from gapbridge.core.calibration.parameters import Parameters
 from gapbridge.core.loads import Loads
 from gapbridge.core.planning.design import Wish, plan

@@ -11,7 +11,9 @@ from played import plan_in, play, write_cell
 
 from gapbridge.bridge.cell import load_cell
 from gapbridge.core.arm import builtin_arm
-from gapbridge.core.calibration.observables import Nuisance, fixed_at, make_observable
+from gapbridge.core.calibration.observables import make_observable
+from gapbridge.core.calibration.observables.fixed_point import fixed_at
+from gapbridge.core.calibration.observables.nuisance import Nuisance
 from gapbridge.core.calibration.observables.predicted_readings import empty_readings
 from gapbridge.core.loads import Loads
 from gapbridge.core.model import Model

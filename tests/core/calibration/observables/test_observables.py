@@ -10,14 +10,10 @@ from numpy.typing import NDArray
 
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.calibration.identifiability import identifiable_parameters
-from gapbridge.core.calibration.observables import (
-    OBSERVABLES,
-    Nuisance,
-    Observable,
-    fixed_at,
-    make_observable,
-    point_of,
-)
+from gapbridge.core.calibration.observables import OBSERVABLES, make_observable
+from gapbridge.core.calibration.observables.fixed_point import fixed_at, point_of
+from gapbridge.core.calibration.observables.nuisance import Nuisance
+from gapbridge.core.calibration.observables.observable import Observable
 from gapbridge.core.calibration.observables.predicted_readings import (
     empty_readings,
     predicted_readings,
