@@ -77,7 +77,7 @@ def _job(
     calibrated = load_cell(out / "calibrated.yaml")
     console.print(
         f"fitted on {found.samples} poses: gap in space {3**0.5 * found.gap_rms * 1e3:.3f} mm rms "
-        f"before, {3**0.5 * found.remaining_rms * 1e3:.3f} mm after"
+        f"before, {3**0.5 * found.remaining_rms * 1e3:.3f} mm after; its flexibilities are kept"
     )
     seen = _Visits()
     explained: list[Rests] = []

@@ -29,7 +29,14 @@ from gapbridge.bridge.document.drawing import AFTER, BEFORE, EDGE, INK, Drawing
 from gapbridge.bridge.document.html import html
 from gapbridge.bridge.document.notes import note_texts
 from gapbridge.bridge.document.provenance import origin_blocks, origin_line
+from gapbridge.core.notes import Reason
 
+KEPT = (
+    "Only the flexibilities are kept of this fit, also where it found the tool point off: whatever "
+    "else is wrong is left to the diagnosis."
+)
+OF_THE_CELL = (Reason.TOOL_WRITTEN, Reason.TOOL_OFF_WRITTEN)  # what `gapbridge fit` would write
+NARROW = 380.0  # px of a chart: a phone shows it at nearly its own size
 NEXT_STEPS = (
     "Write a cell for your own robot: gapbridge init HOST --out CELL.",
     "Check it: gapbridge check CELL --live, then watch it: gapbridge run CELL --observe.",
@@ -97,8 +104,8 @@ def _errors(result: Result) -> Drawing:
     rounds = coloured(result)
     visit = [float(i) for i in range(1, len(result.loads) + 1)]
     every = [v * 1e3 for _, error, _ in rounds for v in error]
-    chart = Chart("Distance from the wanted place", scale("visit", visit, zero=False),
-                  logarithmic("mm", [*every, result.repeatability * 1e3]), width=520)  # fmt: skip
+    errors = logarithmic("mm", [*every, result.repeatability * 1e3])
+    chart = Chart("TCP error", scale("visit", visit, zero=False), errors, width=NARROW)
     for _, error, colour in rounds:
         hints = [
             f"{load}: {e * 1e3:.3f} mm, q = {np.round(q, 3).tolist()}"
@@ -119,8 +126,9 @@ def _flexibilities(result: Result) -> list[Block]:
     )
     tops = [v * 1e6 for _, value, std, shown, _, _ in kinds for v in (value + 2 * std)[shown]]
     labels = [f"joint {i + 1}" for i in range(n)]
-    chart = Chart("Flexibility, lines: 2 sigma", named("", labels), scale("µrad/Nm", tops),
-                  width=520)  # fmt: skip
+    chart = Chart(
+        "Flexibility, lines: 2 sigma", named("", labels), scale("µrad/Nm", tops), width=NARROW
+    )
     cells: list[list[str]] = [[str(i + 1)] for i in range(n)]
     for _, value, std, shown, colour, shift in kinds:
         for i in range(n):
@@ -132,10 +140,11 @@ def _flexibilities(result: Result) -> list[Block]:
             chart.column(i + shift, v, colour, 0.36)
             chart.line([i + shift] * 2, [max(v - 2 * s, 0.0), v + 2 * s], INK)
     chart.legend([(name, colour) for name, _, _, _, colour, _ in kinds])
-    notes = note_texts((*found.notes, *found.combinations))
+    said = (n for n in (*found.notes, *found.combinations) if n.reason not in OF_THE_CELL)
+    notes = note_texts(tuple(said))
     heads = ("joint", "axial, µrad/Nm", "radial, µrad/Nm")
     return [
-        Pictures((chart.drawing,)), Table(heads, cells, (0.5, 1, 1)),
+        Pictures((chart.drawing,)), Table(heads, cells, (0.5, 1, 1)), Paragraph(KEPT),
         *([Bullets(notes)] if notes else []),
     ]  # fmt: skip
 

@@ -26,13 +26,19 @@ from gapbridge.core.arrays import Array
 
 WIDTH, HEIGHT = 340.0, 230.0
 LEFT, RIGHT, TOP, BOTTOM = 44.0, 10.0, 30.0, 38.0
-TITLE, FIGURE = 20.0, 5.8  # px: of the y axis' title and what stands between; of a figure
+TITLE = 20.0  # px: of the y axis' title and what stands between
+FIGURE, MINUS = 6.4, 8.4  # px of a figure and of a minus sign of 10 px, in the widest usual font
 
 
 def plain(value: float) -> str:
     """Return a number without trailing zeros, nor zeros before an exponent: ticks have no room."""
     digits, e, exponent = f"{value:.4g}".partition("e")
     return f"{digits}{e}{int(exponent) if e else ''}".replace("-", "−")
+
+
+def _width(text: str) -> float:
+    """Return the px that a number of 10 px needs at most."""
+    return FIGURE * len(text) + (MINUS - FIGURE) * text.count("−")
 
 
 @dataclass(frozen=True)
@@ -117,8 +123,8 @@ class Chart:
         width: float = WIDTH, equal: bool = False,
     ) -> None:  # fmt: skip
         self.x, self.y = x, y
-        longest = max(map(len, [] if y.labels else map(plain, y.ticks)), default=0)
-        self.left, self.top = max(left, TITLE + FIGURE * longest), TOP
+        widest = max(map(_width, [] if y.labels else map(plain, y.ticks)), default=0.0)
+        self.left, self.top = max(left, TITLE + widest), TOP
         self.right, self.bottom = width - RIGHT, height - BOTTOM
         if equal:
             self._make_equal()
@@ -215,7 +221,7 @@ class Chart:
             label = self.x.labels[k] if self.x.labels else plain(tick)
             if not self.x.labels:
                 self.drawing.line([(x, self.top), (x, y)], Stroke(GRID, 0.8))
-            inside = min(x, self.drawing.width - FIGURE / 2 * len(label))
+            inside = min(x, self.drawing.width - _width(label) / 2)
             self.drawing.add(Text(inside, y + 14, label, 10, SOFT, "middle"))
         for k, tick in enumerate(self.y.ticks):
             x, y = self.at(self.x.low, tick)

@@ -23,7 +23,7 @@ TEXTS = {
     Reason.SUM_KNOWN: MOSTLY % "sum",
     Reason.DIFFERENCE_KNOWN: MOSTLY % "difference",
     Reason.AT_ZERO: "at their bound of zero: {0}",
-    Reason.NO_FLEXIBILITY: "these data show no flexibility at all: the model is left as it was",
+    Reason.NO_FLEXIBILITY: "these data show no flexibility: those of the cell stay as they are",
     Reason.SESSION_FRAMES: "each session has a frame of its own, not written to the cell",
     Reason.NOTHING_WRITTEN: "frame and tool point were estimated along and are not written to the "
     "cell",

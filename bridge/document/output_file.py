@@ -30,11 +30,13 @@ FOLDER_MODE = 0o750  # of a new folder of recordings, sessions and the like
 def require_writable(path: Path, *inputs: Path) -> Path:
     """Return the path if a file can be written there; asked before the work is done.
 
-    Raises InputError where its folder is missing, it is a folder itself, or it is one of the
-    inputs.
+    Raises InputError where its folder is missing, it is a folder or a device itself, or it is one
+    of the inputs.
     """
     if path.is_dir():
         raise InputError(f"{path}: found a folder, expected a file to write")
+    if path.exists() and not path.is_file():  # root would put a file in the place of /dev/null
+        raise InputError(f"{path}: found a device or pipe, expected a file to write")
     folder = path.parent
     if not folder.is_dir():
         raise InputError(f"{path}: found no folder {folder}, expected an existing one")

@@ -209,9 +209,12 @@ def fit_nuisances(
 def placed_gap(model: Model, data: Data) -> Array:
     """Return what a model leaves (N, 3 or 6) of one session whose frame is fitted on itself.
 
-    So is its tool point where it was remounted; nothing else of the model moves.
+    So is its tool point where it was remounted; nothing else of the model moves. A registered
+    instrument has no frame to fit.
     """
     one = replace(data, session=np.zeros(len(data.q), dtype=np.int64), sessions=1)
+    if not one.nuisances:
+        return residual(model, one, IDENTITY)[0]
     free = slice(0, one.nuisances if one.remounted else 6 * one.frames)
     fit = _placed(model, one, free)
     return residual(fit.model, one, fit.frame)[0]

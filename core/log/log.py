@@ -80,7 +80,7 @@ class Log:
         wanted = " or ".join(written(name, self.n) for name in names)
         hint = did_you_mean(self.unknown, names, self.n)
         raise LogError(
-            f"{self.path}: columns: found no {wanted}, expected it for this command{hint}"
+            f"{self.path}: columns: found no {wanted}, expected them for this command{hint}"
         )
 
     def _check_finite(self, name: str) -> None:

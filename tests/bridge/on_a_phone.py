@@ -22,6 +22,12 @@ CUT = """() => [...document.querySelectorAll('body *')].filter(e => {
     if (['auto', 'scroll'].includes(getComputedStyle(up).overflowX)) return false;
   return r.right > innerWidth + 1;
 }).map(e => `${e.tagName} ${e.textContent.trim().slice(0, 60)}`)"""
+# Text of a drawing that is too small to read, as large as the screen shows it.
+SMALL = """() => [...document.querySelectorAll('svg text')].filter(e => {
+  const own = e.ownerSVGElement, shown = own.getBoundingClientRect().width;
+  const size = parseFloat(getComputedStyle(e).fontSize) * shown / own.viewBox.baseVal.width;
+  return shown && size < 6.9;
+}).map(e => `too small: ${e.textContent}`)"""
 DARK = """() => getComputedStyle(document.body).backgroundColor.match(/[0-9]+/g).slice(0, 3)
   .reduce((sum, part) => sum + Number(part), 0) < 200"""
 
@@ -37,7 +43,8 @@ def faults_on_a_phone(playwright: Any, path: Path) -> list[str]:
             page.wait_for_timeout(500)
             if page.evaluate("document.documentElement.scrollWidth") > WIDTH:
                 found.append(f"{scheme}: wider than the screen")
-            found += [f"{scheme}: {what}" for what in page.evaluate(CUT)]
+            faults = [*page.evaluate(CUT), *page.evaluate(SMALL)]
+            found += [f"{scheme}: {what}" for what in faults]
             if page.evaluate(DARK) != (scheme == "dark"):
                 found.append(f"{scheme}: another ground")
         browser.close()

@@ -250,7 +250,7 @@ def test_a_misspelt_column_is_named_where_the_right_one_is_missing(tmp_path, hea
     log = read_log(path, 6)
     with pytest.raises(LogError) as caught:
         log.select(slice(None)).require("actual_q", "target_q")
-    wanted = "found no actual_q_0..5 or target_q_0..5, expected it for this command"
+    wanted = "found no actual_q_0..5 or target_q_0..5, expected them for this command"
     assert str(caught.value) == f"{path}: columns: {wanted}{hint}"
 
 

@@ -128,6 +128,8 @@ class _Output:
         for file in (self.json_file, self.new_cell):
             if file is not None:
                 require_writable(file, *inputs)
+        if self.json_file is not None and self.json_file == self.new_cell:
+            raise InputError(f"{self.new_cell}: found for --json and --apply, expected two files")
         if self.out is not None:
             require_folder(self.out, "--out", above=False)
 

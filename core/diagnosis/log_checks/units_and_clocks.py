@@ -81,7 +81,7 @@ def _check_angles(model: Model, log: Log, name: str) -> None:
         return
     if np.isinf(q).any():
         log.require(name)
-    worst = np.nanmax(np.abs(q), axis=0)
+    worst = np.fmax.reduce(np.abs(q), axis=0)  # nan of a joint without a number
     if (worst > most).any():
         raise LogError(
             f"{log.path}: columns {name}_*: found values up to {worst.max():g}; the joint angles "
@@ -94,13 +94,14 @@ def _check_positions(model: Model, log: Log) -> None:
     reach = _reach(model)
     if measured is None or _within(measured, REACHES * reach / np.sqrt(12)):
         return  # no two are farther apart
-    if not np.isfinite(measured).any():
+    measured = measured[np.isfinite(measured).all(axis=1)]
+    if not len(measured):
         return
-    widest = np.nanmax(measured, axis=0) - np.nanmin(measured, axis=0)
+    widest = measured.max(axis=0) - measured.min(axis=0)
     if np.linalg.norm(widest) <= REACHES * reach:  # no median can lie farther away
         return
-    spread = measured - np.nanmedian(measured, axis=0)
-    size = float(np.nanmedian(np.linalg.norm(spread, axis=1)))
+    spread = measured - np.median(measured, axis=0)
+    size = float(np.median(np.linalg.norm(spread, axis=1)))
     if size > REACHES * reach:
         raise LogError(
             f"{log.path}: columns measured_position_*: found positions {size:g} apart for an arm "
@@ -140,7 +141,8 @@ def findings(
     measured = log.get("measured_position")
     at_rest = False
     if measured is not None and len(measured) > 3 and np.isfinite(measured).any():
-        at_rest = float(np.nanmax(np.nanmax(measured, axis=0) - np.nanmin(measured, axis=0))) < 1e-3
+        width = np.fmax.reduce(measured, axis=0) - np.fmin.reduce(measured, axis=0)
+        at_rest = float(np.nanmax(width)) < 1e-3
         if at_rest:
             found.append(LogFinding(LogCheck.POSITIONS_AT_REST))
     warm = log.get("joint_temperatures")
@@ -196,9 +198,8 @@ def _limits(model: Model, log: Log) -> list[LogFinding]:
     if q is None or not np.isfinite(q).any():
         return []
     limits = model.arm.limits
-    out = (np.nanmin(q, axis=0) < limits.lower - 0.05) | (
-        np.nanmax(q, axis=0) > limits.upper + 0.05
-    )
+    low, high = np.fmin.reduce(q, axis=0), np.fmax.reduce(q, axis=0)
+    out = (low < limits.lower - 0.05) | (high > limits.upper + 0.05)
     joints = tuple(int(j) + 1 for j in np.flatnonzero(out))
     return [LogFinding(LogCheck.BEYOND_LIMITS, (joints,))] if joints else []
 

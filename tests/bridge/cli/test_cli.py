@@ -295,6 +295,7 @@ def test_an_unusable_log_is_refused_in_one_line(
 @pytest.mark.parametrize("command", ["predict", "compensate", "fit"])
 def test_unusable_paths_are_refused_in_one_line(desk: Desk, command: str) -> None:
     desk.write("log.csv", f"{Q1}\n{ROW}\n")
+    os.mkfifo(desk.folder / "pipe")  # as /dev/null is: root could rename a file over it
     for given, reported in (
         (("@none.csv", "--cell", "@cell.yaml", "--out", "@o.csv"), "none.csv: file not found"),
         (("@log.csv", "--cell", "@none.yaml", "--out", "@o.csv"), "none.yaml: file not found"),
@@ -302,8 +303,10 @@ def test_unusable_paths_are_refused_in_one_line(desk: Desk, command: str) -> Non
         (("@log.csv", "--cell", "@cell.yaml", "--out", "@log.csv"), "output to be the input"),
         (("@log.csv", "--cell", "@cell.yaml", "--out", "@cell.yaml"), "output to be the input"),
         (("@log.csv", "--cell", "@cell.yaml", "--out", "@"), "found a folder"),
+        (("@log.csv", "--cell", "@cell.yaml", "--out", "@pipe"), "found a device or pipe"),
     ):
         assert reported in desk.refuses(command, *given)
+    assert (desk.folder / "pipe").is_fifo()
 
 
 def test_an_unknown_key_of_a_cell_is_reported_by_the_real_command(desk: Desk) -> None:

@@ -118,16 +118,17 @@ def test_stand_ins_go_into_the_cell_only_when_asked_for(
         (("--json", "{}/none/d.json"), ["found no folder"]),
         (("--apply", "{}/cell.yaml"), ["output to be the input"]),
         (("--apply", "{}"), ["found a folder"]),
+        (("--json", "{}/both", "--apply", "{}/both"), ["--json and --apply", "two files"]),
         (("--sim", "{}/none.csv"), ["none.csv: file not found"]),
         (("--sim", "{}/short.csv"), ["short.csv", "found 3 rows, expected 40"]),
     ],
 )
 def test_unusable_options_are_refused_before_any_work(
-    tmp_path: Path, options: tuple[str, str], words: list[str]
+    tmp_path: Path, options: tuple[str, ...], words: list[str]
 ) -> None:
     log = soft_log(tmp_path)
     (tmp_path / "short.csv").write_text("payload\n1\n2\n3\n", encoding="utf-8")
-    given = (options[0], options[1].format(tmp_path))
+    given = [option.format(tmp_path) for option in options]
     line = refused("diagnose", log, "--cell", cell_in(tmp_path), *given)
     for word in words:
         assert word in line

@@ -80,6 +80,20 @@ def test_two_logs_are_one_diagnosis(answered) -> None:
         assert arguments in report
 
 
+def test_sessions_of_a_registered_instrument_are_fitted(tmp_path: Path) -> None:
+    q, loads = poses_and_loads(80)
+    columns = columns_of(q, loads) | measured(SOFT, q, loads, noise=2e-5)
+    logs = [
+        log_in(tmp_path, {name: v[rows] for name, v in columns.items()}, f"{rows.start}.csv")
+        for rows in (slice(0, 40), slice(40, 80))
+    ]
+    cell, out = registered_cell_in(tmp_path), tmp_path / "fitted.yaml"
+    answer = gapbridge("fit", *logs, "--cell", cell, "--out", out)
+    assert answer.code == 0, answer.err
+    assert "a new session" in answer.out
+    assert load_cell(out).model.compliance()[0][1] == pytest.approx(2e-5, rel=0.02)
+
+
 def test_provenance_stands_in_the_json_and_in_the_cell(answered) -> None:
     folder, logs, _, reported = answered
     origin = reported["provenance"]

@@ -30,6 +30,7 @@ from gapbridge.core.estimation.identification import identify_compliance
 from gapbridge.core.log.log import read_log
 from gapbridge.core.metrology import Metrology
 from gapbridge.core.model import Model
+from gapbridge.core.notes import Note, Reason
 from gapbridge.core.rotation import rotation_vector, transform
 from gapbridge.drivers.clock import Clock
 
@@ -196,6 +197,14 @@ def test_the_page_needs_nothing_from_elsewhere(result: Result) -> None:
     assert "verdict: &lt;explained&gt;" in text
     assert "<script src" not in text
     assert text.count("<link") == text.count('<link rel="icon" href="data:,">')
+
+
+def test_the_page_does_not_claim_a_tool_point_that_the_demo_leaves_out(result: Result) -> None:
+    notes = (Note(Reason.TOOL_OFF_WRITTEN), Note(Reason.OUTLIERS, (3,)))
+    text = page(replace(result, identification=replace(result.identification, notes=notes)), "")
+    assert "3 outlier(s)" in text
+    assert "written to the cell" not in text
+    assert "Only the flexibilities are kept" in text
 
 
 def test_bars_grow_with_their_share() -> None:

@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 from report_cases import CASES, diagnosed
 
+from gapbridge.bridge.document.drawing import Text
 from gapbridge.bridge.document.skeleton import skeleton
 from gapbridge.bridge.report import SECTIONS, write_report
+from gapbridge.bridge.report.answer import picture
 from gapbridge.bridge.report.labels import (
     VERDICTS,
     decimals_of,
@@ -100,6 +102,16 @@ def test_a_path_to_a_cell_is_reported_by_its_file(tmp_path):
     c = diagnosed("no gap")
     text = write_report(c.diagnosis, "a/b/line4.yaml", c.log, c.model, tmp_path).read_text("utf-8")
     assert "<h1>line4: " in text
+
+
+@pytest.mark.parametrize("size", [4.35e-9, 2.8e-5, 0.0123])
+def test_a_figure_stands_beside_the_name_of_its_bar(size):
+    channel = replace(diagnosed("explained").diagnosis.channels[0], gap_rms=size, unit="rad")
+    written = [shape for shape in picture(channel).shapes if isinstance(shape, Text)]
+    name, figure = (next(t for t in written if t.text == "before"), written[2])
+    wide = 0.64 * figure.size  # of a letter, as Chromium draws it
+    assert figure.text == with_unit(size, "rad")
+    assert figure.x - wide * len(figure.text) > name.x + wide * len(name.text)
 
 
 def test_the_drawn_arm_ends_at_the_rigid_tcp():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import warnings
 from dataclasses import replace
 
 import moving_truth as truth
@@ -82,6 +84,18 @@ def test_one_slip_in_a_column_is_no_unit():
 def test_an_empty_column_is_no_unit():
     nothing = np.full_like(READ, np.nan)
     check_units(MODEL, with_columns(measured_position=nothing, payload_cog=nothing))
+
+
+@pytest.mark.parametrize(("column", "size"), [("actual_q", 1e3), ("measured_position", 1e6)])
+def test_a_coordinate_without_a_number_is_no_warning_of_numpy(column, size):
+    values = size * (SESSION.q if column == "actual_q" else READ)
+    values[:, 1] = np.nan
+    log = with_columns(**{column: values})
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with contextlib.suppress(LogError):
+            check_units(MODEL, log)
+        findings(log, MODEL, REGISTERED)
 
 
 def test_an_arm_without_rated_payload_knows_grams_by_its_own_weight():
