@@ -3,7 +3,7 @@
     python -m benchmarks.evidence.transcript --out docs/transcript.md
 
 Runs the commands that it prints, one after the other, against ``gapbridge simulate``, and plays the
-person beside the arm: says yes, hangs the plate on the flange. Takes five minutes or so.
+person beside the arm, who says yes. Takes five minutes or so.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ from __future__ import annotations
 import argparse
 import os
 import re
-import socket
 import subprocess
 import sys
 import tempfile
@@ -22,15 +21,10 @@ import pexpect  # type: ignore[import-untyped]
 from gapbridge.bridge.demo.links.link import free_address
 from gapbridge.bridge.demo.links.ur_rtde import UrRtdeLink
 from gapbridge.bridge.demo.processes import ServedCell
-from gapbridge.drivers.simulated.ur.settings import BENCH_PORT, SCRIPT_PORT
 
 ROOT = Path(__file__).resolve().parents[2]
 SEED = 3
 PATIENCE = 420.0  # s: many stops pass without a question
-LOADS = {  # kg, m from the flange
-    "reflector alone": (1.5, (0.0, 0.0, 0.05)),
-    "with the 8 kg plate": (9.5, (0.0, 0.0, 0.09)),
-}
 CONTROL = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
 SECTION = """
 calibration:
@@ -97,32 +91,12 @@ class Session:
             shown += f"{new} > "
             question = re.split(r"[\r\n]+", new)[-1]
             if "as soon as it rests" not in question:
-                child.send(self._answer(new, question) + "\r")
+                child.send(("yes" if "yes" in question else "") + "\r")
         child.close()
         shown += CONTROL.sub("", child.before or "")
         self._show(arguments, shown)
         if child.exitstatus:
             raise SystemExit(f"gapbridge {arguments}: ended with {child.exitstatus}\n{shown}")
-
-    def _answer(self, shown: str, question: str) -> str:
-        if "it is mounted" in question:
-            name = re.findall(r"load \d+ · ([^:\r\n]+):", shown)[-1]
-            self._hang(*LOADS[name])
-        return "yes" if "yes" in question else ""
-
-    def _hang(self, mass: float, cog: tuple[float, float, float]) -> None:
-        numbers = ",".join(f"{v:g}" for v in cog)
-        for port, line in (
-            (BENCH_PORT, f"payload {mass:g} {numbers.replace(',', ' ')}\n"),
-            (SCRIPT_PORT, f"def hang():\n  set_payload({mass:g}, [{numbers}])\nend\n"),
-        ):
-            with socket.create_connection((self.host, port), timeout=10) as link:
-                link.sendall(line.encode())
-                link.settimeout(0.5)
-                try:
-                    link.recv(256)
-                except TimeoutError:
-                    continue
 
     def _show(self, arguments: str, text: str) -> None:
         lines = [

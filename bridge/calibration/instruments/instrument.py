@@ -8,6 +8,7 @@ from typing import Any, Generic, Protocol, Self, TypeVar
 
 from gapbridge.bridge.cell.settings.instruments import Base
 from gapbridge.core.arrays import Array
+from gapbridge.core.calibration.plan import Payload
 
 S = TypeVar("S", bound=Base)
 
@@ -80,6 +81,12 @@ class Instrument(ABC, Generic[S]):
         """Return samples of the target where it is now.
 
         Raises ReadingError where what came is no reading, LinkError where it is gone.
+        """
+
+    def hung(self, load: Payload) -> None:
+        """Be told of the load on the flange, which a simulated one hangs there.
+
+        Raises LinkError.
         """
 
     def close(self) -> None:

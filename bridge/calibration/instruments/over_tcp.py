@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import socket
 import time
 
@@ -15,10 +16,12 @@ from gapbridge.bridge.calibration.instruments.instrument import (
 )
 from gapbridge.bridge.calibration.instruments.numbers import coordinates, numbers
 from gapbridge.bridge.cell.settings.instruments import LineFeedSettings, SimulatedTrackerSettings
+from gapbridge.core.calibration.plan import Payload
 from gapbridge.core.errors import LinkError
 
 LONGEST_LINE = 4096  # bytes
 CONNECTING = 5.0  # s
+SCRIPT_PORT = 30003  # of a UR controller
 
 
 def _connected(who: str, address: tuple[str, int], expected: str) -> socket.socket:
@@ -116,10 +119,30 @@ class SimulatedTracker(Instrument[SimulatedTrackerSettings]):
         found = np.array(samples)[:, 1:]
         return Samples(found if self.settings.pose else found[:, :3])
 
+    def hung(self, load: Payload) -> None:
+        """Hang the load on the simulated flange, and enter it in a UR controller.
+
+        Raises LinkError.
+        """
+        numbers = [f"{v:.9g}" for v in (load.mass, *load.cog)]
+        answer = self._answer("payload " + " ".join(numbers))
+        if answer.startswith("error"):
+            raise LinkError(f"{self.name}: load: {answer}")
+        program = f"def hang():\n  set_payload({numbers[0]}, [{', '.join(numbers[1:])}])\nend\n"
+        with (
+            contextlib.suppress(ConnectionError),  # other controllers are told no load
+            socket.create_connection((self._host, SCRIPT_PORT), CONNECTING) as script,
+        ):
+            script.sendall(program.encode())
+
     def _measure(self) -> list[float]:
+        return [float(v) for v in self._answer("measure").split(",")]
+
+    def _answer(self, line: str) -> str:
+        """Return what the bench answers to a line. Raises LinkError."""
         assert self._socket is not None
         try:
-            self._socket.sendall(b"measure\n")
+            self._socket.sendall(line.encode() + b"\n")
             while b"\n" not in self._buffer:
                 data = self._socket.recv(4096)
                 if not data:
@@ -127,8 +150,8 @@ class SimulatedTracker(Instrument[SimulatedTrackerSettings]):
                 self._buffer += data
         except OSError as error:
             raise LinkError(f"{self.name}: {error}") from None
-        line, _, self._buffer = self._buffer.partition(b"\n")
-        return [float(v) for v in line.split(b",")]
+        answer, _, self._buffer = self._buffer.partition(b"\n")
+        return answer.decode()
 
     def close(self) -> None:
         """Hang up."""

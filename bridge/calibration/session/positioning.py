@@ -122,6 +122,7 @@ class Positioning:
         else:
             self.prompt.say("  mount it on the flange, and enter its mass and centre")
         self.prompt.enter("  Enter when it is mounted")
+        self._instrument.hung(what)
         self.session.add("mounted", load=load)
 
     def bring(self, pose: PlannedPose) -> JointSample | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import socket
 import threading
@@ -14,6 +15,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import TypeAdapter
+from rtde_receive import RTDEReceiveInterface
+from technician import Hands
 
 from gapbridge.bridge.calibration.instruments import INSTRUMENTS
 from gapbridge.bridge.calibration.instruments.instrument import (
@@ -24,6 +27,10 @@ from gapbridge.bridge.calibration.instruments.instrument import (
 )
 from gapbridge.bridge.calibration.instruments.numbers import numbers
 from gapbridge.bridge.cell.settings.instruments import InstrumentSettings
+from gapbridge.bridge.demo.links.link import free_address
+from gapbridge.bridge.demo.links.ur_rtde import UrRtdeLink
+from gapbridge.bridge.demo.processes import ServedCell
+from gapbridge.core.calibration.plan import Payload
 from gapbridge.core.errors import InputError, LinkError
 
 SETTINGS: TypeAdapter[InstrumentSettings] = TypeAdapter(InstrumentSettings)
@@ -213,3 +220,23 @@ def test_an_instrument_that_is_not_there_is_reported(tmp_path: Path) -> None:
         instrument("folder", unit="m", folder=str(tmp_path / "none")).open()
     with pytest.raises(InputError, match="no such file"):
         instrument("file", unit="m", file=str(tmp_path / "none" / "x.csv")).open()
+
+
+def test_the_simulated_tracker_hangs_what_was_said_to_be_mounted(tmp_path: Path) -> None:
+    host = free_address(UrRtdeLink.ports)
+    cell = tmp_path / "cell.yaml"
+    cell.write_text(f"robot: {{model: ur10e}}\nlink: {{host: {host}}}\n", encoding="utf-8")
+    with ServedCell(cell, 3), instrument("simulated_tracker", host=host) as tracker:
+        hands, state = Hands(host), RTDEReceiveInterface(host)
+        tracker.hung(Payload(9.5, (0.0, 0.01, 0.09), "plate"))
+        assert json.loads(hands.bench("truth"))["payload"] == {
+            "mass": 9.5,
+            "cog": [0.0, 0.01, 0.09],
+        }
+        latest = time.monotonic() + 60
+        while state.getPayload() != 9.5 and time.monotonic() < latest:
+            time.sleep(0.05)
+        assert state.getPayload() == 9.5
+        np.testing.assert_allclose(state.getPayloadCog(), [0.0, 0.01, 0.09])
+        assert tracker.read(Where(samples=3)).values.shape == (3, 3)
+        state.disconnect()
