@@ -89,7 +89,8 @@ def join_sessions(logs: Sequence[Log], model: Model) -> Log:
                 f"{log.path}: column session: found several sessions beside further logs, "
                 "expected one log a session, or one log with all of them"
             )
-    return _joined(logs, names, model, ", ".join(log.path for log in logs))
+    paths = [log.path for log in logs]
+    return replace(_joined(logs, names, model, ", ".join(paths)), files=tuple(paths))
 
 
 def _names(paths: Sequence[str]) -> tuple[str, ...]:

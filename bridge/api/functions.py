@@ -89,7 +89,7 @@ def fit(cell: Cell, log: Log, *, remounted: bool = False) -> Fitted:
         remaining_rms_held_out=held_out if math.isfinite(held_out) else None,
         notes=(*pose_findings(cell, log), *note_texts((*found.notes, *found.combinations))),
         provenance=fitted(
-            _origin(cell, log), range_of(log),
+            provenance(_sources(cell, log), "fit", remounted=remounted), range_of(log),
             Spread.of_fit(found.identifiable, found.covariance).beside(cell.spread),
             cell.intervals | fit_intervals(found),
         ),
@@ -113,11 +113,12 @@ def diagnose(
 
     for name in withhold:
         effect_named(name)
+    read = _sources(cell, log, simulated)
     if simulated is not None:
         simulated = at_joints_of(log, aligned(simulated, log), cell)
     metrology = replace(cell.metrology, remounted=remounted)
     found = diagnose_log(cell.model, log, metrology, withhold=withhold, simulated=simulated)
-    origin = _origin(cell, log)
+    origin = provenance(read, "diagnose", withhold=list(withhold), remounted=remounted)
     content = document(found) | {"provenance": origin}
     applied = fitted(
         origin, range_of(log), spread_of(found).beside(cell.spread),
@@ -126,9 +127,9 @@ def diagnose(
     return Diagnosed(cell, found.model, str(found.verdict), content, applied)
 
 
-def _origin(cell: Cell, log: Log) -> dict[str, object]:
-    return provenance(_sources(cell, log))
-
-
-def _sources(cell: Cell, log: Log) -> dict[str, list[Path]]:
-    return {"log": [Path(log.path)] if Path(log.path).is_file() else [], "cell": [cell.path]}
+def _sources(cell: Cell, log: Log, simulated: Log | None = None) -> dict[str, list[Path]]:
+    """Return the files by role: a log made in Python has none."""
+    logs = {"log": log} if simulated is None else {"log": log, "sim": simulated}
+    read = {role: [Path(p) for p in one.files or (one.path,)] for role, one in logs.items()}
+    return {**{role: [p for p in paths if p.exists()] for role, paths in read.items()},
+            "cell": [cell.path]}  # fmt: skip

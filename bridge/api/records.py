@@ -44,7 +44,8 @@ class Predicted:
         Beside them stands the provenance: version, time, arguments, SHA-256 of log and cell.
         """
         found: dict[str, Any] = {name: _plain(values) for name, values in self.columns.items()}
-        return {**found, "provenance": provenance(self.sources)}
+        origin = provenance(self.sources, "predict", channels=bool(self.channels or self.needs))
+        return {**found, "provenance": origin}
 
 
 @dataclass(frozen=True)
@@ -59,7 +60,7 @@ class Corrected:
         """Return setpoints and residuals as lists, and their provenance; see Predicted."""
         return {
             "corrected_q": self.q.tolist(), "residual": self.residual.tolist(),
-            "provenance": provenance(self.sources),
+            "provenance": provenance(self.sources, "compensate"),
         }  # fmt: skip
 
 

@@ -20,18 +20,23 @@ BLOCK = 1 << 20  # bytes read at a time
 SIDE = 1.96  # sigmas on each side of a 95 % interval
 
 
-def provenance(files: Mapping[str, Sequence[Path]]) -> dict[str, Any]:
+def provenance(
+    files: Mapping[str, Sequence[Path]], command: str = "", **options: object
+) -> dict[str, Any]:
     """Return the provenance of the running command's result, as JSON and cells hold it.
 
     ``files`` are what it read, by their role (``log``, ``cell``); a folder counts as all of its
-    files. Arguments are those of the command that differ from their defaults.
+    files. Arguments are those of the command that differ from their defaults. Called from Python,
+    it is ``command`` that was done, with these files and the ``options`` that were given.
     """
     context = click.get_current_context(silent=True)
+    given = {role: [str(path) for path in paths] for role, paths in files.items() if paths}
+    called = given | {name: value for name, value in options.items() if value}
     return {
         "version": installed_version(),
         "time": datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z"),
-        "command": "" if context is None else str(context.info_name),
-        "arguments": {} if context is None else _arguments(context),
+        "command": command if context is None else str(context.info_name),
+        "arguments": called if context is None else _arguments(context),
         "files": [
             {"role": role, "name": path.name, "sha256": digest(path)}
             for role, paths in files.items()

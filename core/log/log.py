@@ -47,6 +47,7 @@ class Log:
     lines: Index | None = None  # (N,) line of each row; None: one after the other
     unknown: tuple[str, ...] = ()  # names of the file's columns that no channel reads
     session_names: tuple[str, ...] = ()  # of several sessions; column session holds their index
+    files: tuple[str, ...] = ()  # that several sessions came from; none: ``path`` alone
     numbers: Index | None = None  # (N,) of the rows of several sessions, from 1
     one_clock: bool = True  # False: timestamps of later sessions were shifted behind the first's
     # what several readers derive of these rows, once (``motion_of``); other rows begin anew

@@ -52,6 +52,27 @@ def test_predict_and_compensate_are_what_the_commands_write(desk: Path) -> None:
             assert files[role]["sha256"] == true
 
 
+def test_a_cell_written_from_python_tells_what_was_done_with_which_files(desk: Path) -> None:
+    q, loads = poses_and_loads(40, 5)
+    more = columns_of(q, loads) | measured(bent_model(), q, loads, noise=2e-5)
+    logs = [desk / "log.csv", log_in(desk, more, "more.csv")]
+    cell = api.load_cell(desk / "cell.yaml")
+    api.fit(cell, api.read_log(logs, cell), remounted=True).save(desk / "fitted.yaml")
+    origin = api.load_cell(desk / "fitted.yaml").file.provenance
+    assert origin is not None
+    assert origin.command == "fit"
+    assert origin.arguments["log"] == [str(log) for log in logs]
+    assert origin.arguments["remounted"] is True
+    assert [(f.role, f.name) for f in origin.files] == [
+        ("log", "log.csv"), ("log", "more.csv"), ("cell", "cell.yaml"),
+    ]  # fmt: skip
+    true = [hashlib.sha256(log.read_bytes()).hexdigest() for log in logs]
+    assert [f.sha256 for f in origin.files][:2] == true
+    told = gapbridge("diff", desk / "cell.yaml", desk / "fitted.yaml").out
+    assert "fitted.yaml was written by fit" in told
+    assert "from log.csv, more.csv" in told
+
+
 def test_what_cannot_be_used_raises_the_line_of_the_command(desk: Path) -> None:
     (desk / "bad.yaml").write_text("robot: {model: ur10e}\ngravity: [0, 0, -1]\n")
     with pytest.raises(api.InputError, match="line 2: gravity"):
