@@ -89,9 +89,41 @@ def summary(material: Material) -> list[Block]:
         )
     asked = [] if material.session.accuracy is None else [_asked(material)]
     return [
-        Verdict(badge, sentence(calibration_text(c))), *asked, Tiles(tuple(tiles)),
+        Verdict(badge, sentence(calibration_text(c))), *asked,
+        Heading("What to do now"), Bullets(tuple(next_steps(material))), Tiles(tuple(tiles)),
         Paragraph(text, "note"),
     ]  # fmt: skip
+
+
+def next_steps(material: Material) -> list[str]:
+    """Return what the user does next, most urgent first."""
+    before, after = material.judged
+    if not after.mean < before.mean:
+        return [
+            "Do not use this calibration. Look for a mistake among loads, readings and instrument "
+            "(“All readings” has the errors), and measure again."
+        ]
+    steps = []
+    if [r for r in after.rows if r in material.outlier_rows] and material.held_out:
+        steps.append("Measure the readings again that are far beyond all others.")
+    asked = material.session.accuracy
+    if asked is not None and after.max > asked:
+        steps.append(
+            "The accuracy asked for is not shown: measure more poses (“What poses buy”), or what "
+            "else “The residual” names."
+        )
+    if not material.calibration.complete:
+        steps.append(
+            "The fitted effects do not explain everything: see what “The residual” names, and "
+            "calibrate with it, or have the arm looked at."
+        )
+    return [
+        *steps,
+        "Watch the calibrated cell first (gapbridge run CELL --observe), then let it write "
+        "(gapbridge run CELL --arm).",
+        "Check it again after some months, and after every collision, repair or change of the "
+        "tool: gapbridge calibrate CELL --verify.",
+    ]
 
 
 def _asked(material: Material) -> Verdict:

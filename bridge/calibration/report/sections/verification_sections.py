@@ -17,6 +17,7 @@ from gapbridge.bridge.document.blocks import (
     GOOD,
     Badge,
     Block,
+    Bullets,
     Cell,
     Heading,
     Paragraph,
@@ -40,6 +41,16 @@ from gapbridge.core.calibration.readings import Readings
 from gapbridge.core.calibration.verify import Suspect, Verification
 from gapbridge.core.effects import CATALOGUE
 
+HOLDS = (
+    "Nothing: use the cell as it is. Check it again after some months, and after every collision, "
+    "repair or change of the tool.",
+)
+BROKEN = (
+    "Do not rely on this cell's correction: gapbridge disarm CELL.",
+    "Look at what the report names: loose screws, the tool and its load, the instrument's target.",
+    "Then measure it anew: gapbridge calibrate CELL, or --tool-only or --payload-only where only "
+    "those have changed.",
+)
 TWICE = 2.0  # predicted sigmas that an error hardly exceeds
 
 
@@ -68,7 +79,11 @@ def holds(material: VerificationMaterial) -> list[Block]:
         "would be. It counts as broken where so large an error would come by chance less than "
         "once in a thousand."
     )
-    return [Verdict(badge, sentence(verdict_text(v))), tiles, Paragraph(text, "note")]
+    steps = HOLDS if v.holds else BROKEN
+    return [
+        Verdict(badge, sentence(verdict_text(v))), Heading("What to do now"), Bullets(steps),
+        tiles, Paragraph(text, "note"),
+    ]  # fmt: skip
 
 
 def facts(material: VerificationMaterial) -> list[Block]:

@@ -26,6 +26,7 @@ def test_a_calibration_that_holds_says_so_and_accuses_nothing(tmp_path):
     html, phrase = read(write_report(VerificationMaterial(found, session(), readings), tmp_path))
     for text in (html, phrase):
         assert "Still holds" in text
+        assert "Nothing: use the cell as it is." in text
         assert "What may have moved" not in text
         assert mm(found.errors.rms) in text
     assert sorted(p.name for p in tmp_path.iterdir()) == ["verification.html", "verification.pdf"]
@@ -36,6 +37,7 @@ def test_a_calibration_that_no_longer_holds_names_what_moved(tmp_path):
     html, phrase = read(write_report(VerificationMaterial(found, session(), readings), tmp_path))
     for text in (html, phrase):
         assert "No longer holds" in text
+        assert "Do not rely on this cell" in text
         assert "another zero of joint 3" in text
         assert "joint_offset" not in text
 

@@ -36,6 +36,17 @@ def test_the_accuracy_asked_for_is_met_or_not(tmp_path: Path, accuracy: float, w
     text = page(tmp_path, accuracy)
     assert f">{word}</span>" in text
     assert f"farther off than {accuracy * 1e3:.3f} mm" in text
+    steps = text.split("What to do now")[1].split("</ul>")[0]
+    assert ("The accuracy asked for is not shown" in steps) == (word == "Fail")
+    assert "gapbridge calibrate CELL --verify" in steps
+
+
+def test_a_calibration_that_improves_nothing_is_not_to_be_used(tmp_path: Path) -> None:
+    c = calibration()
+    text = page(tmp_path, None, held_out_after=c.held_out_before)
+    steps = text.split("What to do now")[1].split("</ul>")[0]
+    assert "Do not use this calibration" in steps
+    assert "gapbridge run" not in steps
 
 
 def test_fewer_than_eight_poses_decide_nothing(tmp_path: Path) -> None:
