@@ -274,13 +274,18 @@ def fit_flexibilities(
 
 def _round(now: Fit, data: Data, kept: Mask, prior: tuple[Array, float]) -> Fit:
     """Take one step of Gauss and Newton."""
-    model, n = now.model, now.model.arm.n
-    gap, poses = residual(model, data, now.frame)
-    weights, scale = robust_weights(gap)
-    cells = (gap, per_cell_of(weights, scale, gap.shape[1]))
-    R = weighed(model, now.frame, data, cells, poses, now.geometry)
+    n = now.model.arm.n
+    R, weights = _factor(now, data, now.geometry)
     problem = (R[:, : -2 * n - 1], R[:, -2 * n - 1 : -1], R[:, -1])
     return stepped(now, problem, weights, kept, prior)
+
+
+def _factor(fit: Fit, data: Data, geometry: Geometry | None = None) -> tuple[Array, Array]:
+    """Return what ``weighed`` does at the shape of a fit, and the rows' weights (N,) there."""
+    gap, poses = residual(fit.model, data, fit.frame)
+    weights, scale = robust_weights(gap)
+    cells = (gap, per_cell_of(weights, scale, gap.shape[1]))
+    return weighed(fit.model, fit.frame, data, cells, poses, geometry), weights
 
 
 def weighed(
@@ -421,11 +426,7 @@ def beside_geometry(fit: Fit, data: Data) -> Fit:
 
 def projected(fit: Fit, data: Data, geometry: Geometry | None) -> Linear:
     """Return the problem at a fit with its nuisances projected out, the geometry's where given."""
-    gap, poses = residual(fit.model, data, fit.frame)
-    weights, scale = robust_weights(gap)
-    cells = (gap, per_cell_of(weights, scale, gap.shape[1]))
-    R = weighed(fit.model, fit.frame, data, cells, poses, geometry)
-    n = fit.model.arm.n
+    R, n = _factor(fit, data, geometry)[0], fit.model.arm.n
     F, A, b = R[:, : -2 * n - 1], R[:, -2 * n - 1 : -1], R[:, -1]
     return _projected(A, b + A @ fit.flexibility, basis_of(F, RANK))
 
@@ -437,10 +438,7 @@ def tool_deviation(fit: Fit, data: Data) -> float:
     """
     if data.tools != 1:
         return np.inf
-    gap, poses = residual(fit.model, data, fit.frame)
-    weights, scale = robust_weights(gap)
-    cells = (gap, per_cell_of(weights, scale, gap.shape[1]))
-    R = weighed(fit.model, fit.frame, data, cells, poses)
+    R = _factor(fit, data)[0]
     tool = 6 * data.frames + np.arange(3)
     own = projected_out(basis_of(R[:, : tool[0]], RANK), R[:, tool])
     return 1 / max(float(np.linalg.svd(own, compute_uv=False)[-1]), 1e-300)

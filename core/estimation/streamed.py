@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from gapbridge.core.arrays import Array, Mask
 from gapbridge.core.effects import at_moment, by_approach
-from gapbridge.core.estimation import base_parameters, compliance_fit
+from gapbridge.core.estimation import base_parameters
 from gapbridge.core.estimation.compliance_fit import (
     CONVERGED,
     ROUNDS,
@@ -24,7 +24,11 @@ from gapbridge.core.estimation.compliance_fit import (
     Fit,
     Linear,
     as_written,
+    beside_geometry,
+    fit_flexibilities,
+    fit_nuisances,
     prior_of,
+    projected,
     residual,
     solve,
     stepped,
@@ -68,17 +72,10 @@ NEAR = 1e-3  # relative step on the sample, which is only where the passes over 
 class _Task:
     prior: tuple[Array, float]
 
-    def on_sample(self, before: Fit, stream: Stream) -> Fit:
-        """Fit everything on the rows of the sample: where the passes over all rows begin."""
-        now, sample = before, stream.of_sample()
+    def near(self, before: Fit, rows: Data) -> Fit:
+        """Fit everything on some rows: where the passes over all rows begin."""
         everything = np.ones(len(self.prior[0]), dtype=bool)
-        for _ in range(ROUNDS):
-            R = joined(passed(now, scale_of(now, stream.sample), sample).factors)
-            base, now = now, self.step(now, R, stream.nuisances, everything)[0]
-            change = np.abs(now.flexibility - base.flexibility).max()
-            if change < NEAR * max(np.abs(now.flexibility).max(), 1e-12):
-                break
-        return now
+        return fit_flexibilities(before, rows, everything, self.prior, converged=NEAR)
 
     def run(self, begin: Fit, stream: Stream) -> _Found:
         """Choose what all rows show, and fit that alone.
@@ -167,10 +164,10 @@ def identify_streamed(
     require_excitation(model, stream.sample, metrology, prior[1])
     task = _Task(prior)
     emit("fitting")
-    before = _nuisances_alone(model, stream.sample)
-    beside = _beside_geometry(before, stream.sample, prior)
+    before = replace(fit_nuisances(model, stream.sample), weights=NONE)
+    beside = _beside_geometry(before, stream.sample, task)
     begin = replace(before if beside is None else beside.fit, geometry=None)
-    found = task.run(task.on_sample(begin, stream), stream)
+    found = task.run(task.near(begin, stream.sample), stream)
     if beside is not None:
         found = replace(
             found, geometry=beside.fit.geometry, shown=beside.widened(found.shown, prior[1])
@@ -179,15 +176,9 @@ def identify_streamed(
     held_out = _held_out(stream, task, before, found)
     held = beside is not None and held_out[1] > held_out[0]
     if held:  # the cell would be worse without the links found
-        found = task.run(task.on_sample(before, stream), stream)
+        found = task.run(task.near(before, stream.sample), stream)
         held_out = _held_out(stream, task, before, found)
     return _result(model, stream, before, found, held_out, held)
-
-
-def _nuisances_alone(model: Model, rows: Data) -> Fit:
-    """Return the frame and tool point that fit best, the model's flexibilities left alone."""
-    found = compliance_fit.fit_nuisances(model, rows)
-    return Fit(found.model, found.frame, NONE)
 
 
 @dataclass(frozen=True)
@@ -207,21 +198,17 @@ class _BesideGeometry:
         return replace(shown, covariance=shown.covariance + wide - narrow)
 
 
-def _beside_geometry(
-    before: Fit, sample: Data, prior: tuple[Array, float]
-) -> _BesideGeometry | None:
+def _beside_geometry(before: Fit, sample: Data, task: _Task) -> _BesideGeometry | None:
     """Return the fit with the geometry that some rows show, None if they show none.
 
     All rows are then fitted with it as it is.
     """
     some = sample.part(slice(None, None, max(len(sample.q) // LINK_ROWS, 1)))
-    everything = np.ones(len(prior[0]), dtype=bool)
-    fit = compliance_fit.fit_flexibilities(before, some, everything, prior, converged=NEAR)
-    fit = compliance_fit.beside_geometry(fit, some)
+    fit = beside_geometry(task.near(before, some), some)
     if fit.geometry is None:
         return None
-    fit = compliance_fit.fit_flexibilities(fit, some, everything, prior, converged=NEAR)
-    free, held = (compliance_fit.projected(fit, some, own) for own in (fit.geometry, None))
+    fit = task.near(fit, some)
+    free, held = (projected(fit, some, own) for own in (fit.geometry, None))
     return _BesideGeometry(replace(fit, weights=NONE), free, held)
 
 
