@@ -12,6 +12,7 @@ from scipy.stats import f as fisher
 from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.converged_fit import FitState
 from gapbridge.core.calibration.noise import presumed
+from gapbridge.core.calibration.observables.position import measured_in_base
 from gapbridge.core.calibration.problem import Problem
 from gapbridge.core.calibration.readings import Readings
 from gapbridge.core.diagnosis.diagnosis import Diagnosis, diagnose
@@ -105,15 +106,12 @@ def diagnosed(
     if readings.kind not in ("position", "pose") or use.sum() < FEWEST_TO_DIAGNOSE:
         return None
     part = readings[use]
-    position, rotation = np.empty((len(part), 3)), np.empty((len(part), 3, 3))
-    for s, frame in enumerate(rest.nuisance.stations):
-        own = part.station == s
-        position[own] = frame.in_base(part.value[own, :3])
-        if readings.kind == "pose":
-            rotation[own] = frame.rotation_in_base(rotation_matrix(part.value[own, 3:]))
+    position = measured_in_base(part, rest.nuisance)
     columns = {"actual_q": part.q, "measured_position": position} | _acting(part)
     if readings.kind == "pose":
-        columns["measured_rotation"] = rotation_vector(rotation)
+        frames, _ = rest.nuisance.frames(part.station)
+        turned = np.swapaxes(frames, 1, 2) @ rotation_matrix(part.value[:, 3:])
+        columns["measured_rotation"] = rotation_vector(turned)
     log = Log("the session's readings", columns, part.q.shape[1])
     progress("diagnosing what is left")
     try:

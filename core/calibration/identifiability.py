@@ -21,6 +21,7 @@ from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.observables.nuisance import Nuisance
 from gapbridge.core.calibration.observables.observable import Observable
 from gapbridge.core.calibration.observables.predicted_readings import (
+    empty_readings,
     predicted_readings,
     usual_nuisance,
 )
@@ -133,11 +134,7 @@ def _anywhere(
         temperature=random.uniform(15, 45, (POSES, n)),
         approach=random.choice([-1.0, 1.0], (POSES, n)),
     )
-    zeros = np.zeros(POSES, dtype=np.int64)
-    target = zeros + (1 if observable.kind == "relative" else 0)
-    readings = Readings(
-        observable.kind, q, np.zeros((POSES, observable.width)), np.full(POSES, np.nan), loads,
-        zeros, zeros, target, np.zeros(POSES, dtype=bool), np.arange(POSES),
-    )  # fmt: skip
+    target = np.full(POSES, int(observable.kind == "relative"))
+    readings = empty_readings(observable.kind, q, loads, target=target)
     nuisance = usual_nuisance(model, observable, readings, seed)
     return predicted_readings(observable, model, readings, nuisance), nuisance

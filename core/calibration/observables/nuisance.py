@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gapbridge.core.arrays import Array
+from gapbridge.core.arrays import Array, Index
 from gapbridge.core.estimation.registration import IDENTITY, Registration
 
 
@@ -39,6 +39,12 @@ class Nuisance:
     def zero(cls, stations: int = 1, targets: int = 1) -> Nuisance:
         """Return instruments that stand in base, and targets at the TCP."""
         return cls((IDENTITY,) * stations, np.zeros((targets, 3)), np.zeros(stations))
+
+    def frames(self, station: Index) -> tuple[Array, Array]:
+        """Return rotation (N, 3, 3) and position (N, 3), m, of the places numbered (N,)."""
+        rotation = np.array([place.rotation for place in self.stations]).reshape(-1, 3, 3)
+        position = np.array([place.position for place in self.stations]).reshape(-1, 3)
+        return rotation[station], position[station]
 
     def moved(self, step: Array, layout: Layout) -> Nuisance:
         """Return the nuisance after a step (m,) of what is unknown in it."""

@@ -43,19 +43,14 @@ class Pose(Observable):
     def gap(self, poses: Poses, readings: Readings, nuisance: Nuisance) -> Array:
         """Return measured minus predicted (N, 6): position, then the turn between them."""
         shift = measured_in_base(readings, nuisance) - self.seen(poses, readings, nuisance)
-        measured = rotation_matrix(readings.value[:, 3:])
-        for s, frame in enumerate(nuisance.stations):
-            own = readings.station == s
-            measured[own] = frame.rotation_in_base(measured[own])
+        frames = nuisance.frames(readings.station)[0]
+        measured = np.swapaxes(frames, 1, 2) @ rotation_matrix(readings.value[:, 3:])
         return np.hstack([shift, rotation_vector(measured @ np.swapaxes(poses.rotation, 1, 2))])
 
     def reading(self, poses: Poses, readings: Readings, nuisance: Nuisance) -> Array:
         """Return position and rotation vector in the instrument's frame (N, 6)."""
         position = in_instrument(self.seen(poses, readings, nuisance), readings, nuisance)
-        rotation = np.empty((len(readings), 3, 3))
-        for s, frame in enumerate(nuisance.stations):
-            own = readings.station == s
-            rotation[own] = frame.rotation @ poses.rotation[own]
+        rotation = nuisance.frames(readings.station)[0] @ poses.rotation
         return np.hstack([position, rotation_vector(rotation)])
 
     def guess(self, poses: Poses, readings: Readings) -> Nuisance:

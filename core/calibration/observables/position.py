@@ -54,20 +54,14 @@ class Position(Observable):
 
 def measured_in_base(readings: Readings, nuisance: Nuisance) -> Array:
     """Return measured positions (N, 3) in base."""
-    found = np.empty((len(readings), 3))
-    for s, frame in enumerate(nuisance.stations):
-        own = readings.station == s
-        found[own] = frame.in_base(readings.value[own, :3])
-    return found
+    rotation, position = nuisance.frames(readings.station)
+    return np.asarray(np.einsum("nji,nj->ni", rotation, readings.value[:, :3] - position))
 
 
 def in_instrument(position: Array, readings: Readings, nuisance: Nuisance) -> Array:
     """Return positions in base (N, 3) as the frame of each reading's place has them."""
-    found = np.empty((len(readings), 3))
-    for s, frame in enumerate(nuisance.stations):
-        own = readings.station == s
-        found[own] = position[own] @ frame.rotation.T + frame.position
-    return found
+    rotation, origin = nuisance.frames(readings.station)
+    return np.asarray(np.einsum("nij,nj->ni", rotation, position) + origin)
 
 
 def station_frame(poses: Poses, readings: Readings, station: int) -> Registration:

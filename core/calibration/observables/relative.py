@@ -35,13 +35,13 @@ class Relative(Observable):
 
     def gap(self, poses: Poses, readings: Readings, nuisance: Nuisance) -> Array:
         """Return measured minus predicted way (N, 3), base axes."""
-        frames = np.array([place.rotation for place in nuisance.stations])[readings.station]
+        frames, _ = nuisance.frames(readings.station)
         measured = np.einsum("nji,nj->ni", frames, readings.value)
         return np.asarray(measured - _way(poses, readings, nuisance))
 
     def reading(self, poses: Poses, readings: Readings, nuisance: Nuisance) -> Array:
         """Return the way in the instrument's axes (N, 3)."""
-        frames = np.array([place.rotation for place in nuisance.stations])[readings.station]
+        frames, _ = nuisance.frames(readings.station)
         return np.asarray(np.einsum("nij,nj->ni", frames, _way(poses, readings, nuisance)))
 
     def guess(self, poses: Poses, readings: Readings) -> Nuisance:
