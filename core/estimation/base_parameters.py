@@ -11,12 +11,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from typing import Any
 
 import numpy as np
 
 from gapbridge.core.arrays import Array, Mask
-from gapbridge.core.effects import flexibility_effects
+from gapbridge.core.effects import flexibility_names
 from gapbridge.core.estimation.compliance_fit import Linear, solve
 from gapbridge.core.notes import Note, Reason
 
@@ -82,39 +81,31 @@ def what_is_shown(linear: Linear, kept: Mask, sigma: float) -> Shown:
     columns = linear.matrix * sigma
     reported = [_held(int(i), columns, kept) for i in np.flatnonzero(~kept)]
     reported += _faint(columns, kept)
-    names = [name(i, count) for i in range(count)]
+    names = flexibility_names(count // 2)
     reported += hardly_separated(covariance, kept, names)
     return Shown(kept, covariance, tuple(reported))
 
 
-def name(i: int | np.integer[Any], count: int) -> str:
-    """Return the public name of flexibility ``i`` of ``count`` = 2n: axial first, then radial."""
-    n = count // 2
-    named = flexibility_effects()
-    return f"{named['axial']}_{i + 1}" if i < n else f"{named['radial']}_{i - n + 1}"
-
-
 def _held(i: int, columns: Array, kept: Mask) -> Note:
     """Return why flexibility ``i`` is held, and which others stand for it."""
-    count, size = len(kept), float(np.linalg.norm(columns[:, i]))
-    this = name(i, count)
+    names, size = flexibility_names(len(kept) // 2), float(np.linalg.norm(columns[:, i]))
     if size > VISIBLE and kept.any():
         share = np.linalg.lstsq(columns[:, kept], columns[:, i], rcond=1e-9)[0]
         left = np.linalg.norm(columns[:, i] - columns[:, kept] @ share)
         reach = np.abs(share) * np.linalg.norm(columns[:, kept], axis=0) / size
         members = tuple(
-            (float(share[k]), name(np.flatnonzero(kept)[k], count))
+            (float(share[k]), names[np.flatnonzero(kept)[k]])
             for k in np.argsort(-reach)[:3]
             if reach[k] > MEMBER
         )
         if members and left < VAGUE * size:
-            return Note(Reason.ACTS_LIKE, (this, members))
-    return Note(Reason.HELD, (this,))
+            return Note(Reason.ACTS_LIKE, (names[i], members))
+    return Note(Reason.HELD, (names[i],))
 
 
 def _faint(columns: Array, kept: Mask) -> list[Note]:
     """Return combinations that show although none of their members does."""
-    held = np.flatnonzero(~kept)
+    held, names = np.flatnonzero(~kept), flexibility_names(len(kept) // 2)
     if len(held) < 2:
         return []
     left = columns[:, held]
@@ -126,7 +117,7 @@ def _faint(columns: Array, kept: Mask) -> list[Note]:
         members = np.flatnonzero(np.abs(vector) > 0.3 * np.abs(vector).max())
         if value > VISIBLE**2 and len(members) > 1:
             sign = np.sign(vector[members[0]])
-            parts = tuple((float(sign * vector[k]), name(held[k], len(kept))) for k in members)
+            parts = tuple((float(sign * vector[k]), names[held[k]]) for k in members)
             reported.append(Note(Reason.SHOWN_TOGETHER, (parts,)))
     return reported
 

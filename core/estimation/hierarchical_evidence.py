@@ -19,9 +19,9 @@ from gapbridge.core.estimation.compliance_fit import (
     fit_flexibilities,
     fit_nuisances,
     noise_of,
-    nuisance_columns,
     prior_of,
     residual,
+    weighed,
 )
 from gapbridge.core.estimation.identification import measured_rows
 from gapbridge.core.estimation.least_squares import basis_of, projected_out
@@ -71,22 +71,17 @@ def evidence(model: Model, log: Log, metrology: Metrology | None = None) -> Evid
 
 
 def _folded(fit: Fit, data: Data, metrology: Metrology) -> Evidence:
-    gap, poses = residual(fit.model, data, fit.frame)
-    width, count = gap.shape[1], 2 * fit.model.arm.n
+    gap, _ = residual(fit.model, data, fit.frame)
+    count = 2 * fit.model.arm.n
     units = _units(gap)
     inlier = _inliers(gap * units, count + data.nuisances, metrology.sigma)
     if not inlier.any():
         raise ExcitationError("found outliers alone, expected measured poses")
-    unit = units * np.ones((int(inlier.sum()), 1))
-    form = fit.model.linear_form(data.q, data.loads).regressor[inlier, :width]
-    A = (form * unit[..., None]).reshape(-1, count)
-    b = (gap[inlier] * unit).ravel() + A @ fit.flexibility
-    whole = np.column_stack([A, b])
-    spent = 0
-    if data.nuisances:
-        columns = nuisance_columns(fit.model, poses, width)[inlier] * unit[..., None]
-        Q = basis_of(columns.reshape(len(A), -1), RANK)
-        whole, spent = projected_out(Q, whole), Q.shape[1]
+    own = gap[inlier]
+    factor = weighed(fit.model, fit.frame, data.part(inlier), (own, units * np.ones(own.shape)))
+    F, A, b = np.split(factor, [data.nuisances, data.nuisances + count], axis=1)
+    Q = basis_of(F, RANK)
+    whole = projected_out(Q, np.hstack([A, b + A @ fit.flexibility[:, None]]))
     R = np.zeros((count + 1, count + 1))
     upper = np.linalg.qr(whole, mode="r")
     R[: len(upper)] = upper
@@ -97,7 +92,7 @@ def _folded(fit: Fit, data: Data, metrology: Metrology) -> Evidence:
     squares = float(np.sum(R[:, count] ** 2) - right @ right)
     return Evidence(
         R[:count, :count], right, max(squares, 0.0),
-        max(float(A.shape[0] - spent - U.shape[1]), 0.0), metrology.sigma,
+        max(float(own.size - Q.shape[1] - U.shape[1]), 0.0), metrology.sigma,
         int(inlier.sum()), int((~inlier).sum()),
     )  # fmt: skip
 

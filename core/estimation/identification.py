@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapbridge.core.arrays import Array, Mask
+from gapbridge.core.effects import flexibility_names
 from gapbridge.core.errors import ExcitationError, LogError
 from gapbridge.core.estimation import base_parameters
 from gapbridge.core.estimation.compliance_fit import (
@@ -355,7 +356,8 @@ def notes_of(
         notes.append(Note(Reason.OUTLIERS, (outlier,)))
     at_zero = np.flatnonzero((fit.flexibility <= 0) & kept)
     if len(at_zero):
-        names = tuple(base_parameters.name(i, len(kept)) for i in at_zero)
+        every = flexibility_names(len(kept) // 2)
+        names = tuple(every[i] for i in at_zero)
         notes.append(Note(Reason.AT_ZERO, (names,)))
     if not kept.any():
         notes.append(Note(Reason.NO_FLEXIBILITY))

@@ -8,8 +8,8 @@ from test_equilibrium import SEVEN
 from benchmarks.evidence import paper, poses
 from benchmarks.evidence.finite_elements import STIFF
 from gapbridge.core.arm import arm_from_dh, builtin_rows
+from gapbridge.core.effects import flexibility_names
 from gapbridge.core.errors import ExcitationError, LogError
-from gapbridge.core.estimation.base_parameters import name
 from gapbridge.core.estimation.identification import identify_compliance
 from gapbridge.core.loads import Loads
 from gapbridge.core.log.log import Log
@@ -150,7 +150,9 @@ def test_what_the_data_do_not_show_stays_exactly_at_the_models_value(own):
     np.testing.assert_array_equal(values[held], own)
     assert (values[found.identifiable] != own).sum() > 6
     for i in held:
-        reported = [note for note in found.combinations if note.values[0] == name(i, 12)]
+        reported = [
+            note for note in found.combinations if note.values[0] == flexibility_names(6)[i]
+        ]
         assert len(reported) == 1
         assert reported[0].reason in (Reason.HELD, Reason.ACTS_LIKE)
 
@@ -167,10 +169,10 @@ def test_of_a_sum_that_is_known_alone_one_member_carries_the_whole():
         np.concatenate([found.std_axial, found.std_radial])[carrier],
     )
     assert abs(value - planted[1] - planted[6]) < 4 * std
-    other = name(np.array([1, 6])[~both][0], 12)
+    other = flexibility_names(6)[np.array([1, 6])[~both][0]]
     reported = next(note for note in found.combinations if note.values[0] == other)
     assert reported.reason is Reason.ACTS_LIKE
-    assert name(carrier, 12) in [part for _, part in reported.values[1]]
+    assert flexibility_names(6)[carrier] in [part for _, part in reported.values[1]]
 
 
 def test_a_tool_point_that_nobody_registered_is_found_along_and_costs_no_flexibility():
