@@ -7,8 +7,9 @@ wrong is tried: another unit, exchanged axes, one mistyped coordinate, another l
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -19,11 +20,11 @@ from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.observables import make_observable
 from gapbridge.core.calibration.observables.nuisance import Nuisance
 from gapbridge.core.calibration.observables.observable import Observable
+from gapbridge.core.calibration.observables.predicted_readings import beside
 from gapbridge.core.calibration.parameters import Parameters
 from gapbridge.core.calibration.plan import Payload
 from gapbridge.core.calibration.readings import Readings
 from gapbridge.core.errors import GapbridgeError
-from gapbridge.core.loads import Loads
 from gapbridge.core.metrology import Metrology
 from gapbridge.core.model import Model, Poses
 
@@ -83,7 +84,7 @@ class FittedSoFar:
         values, count = np.zeros(p), len(before)
         first = count > 0 and observable.layout(before).size > 0
         nuisance = observable.start(parameters.nominal, before) if first else Nuisance.zero()
-        both = joined(before, new)
+        both = beside(before, new)
         every, frames = observable.columns(parameters, values, both, nuisance)
         J, k = every[: count * observable.equations], observable.equations
         layout = observable.layout(both)
@@ -165,22 +166,6 @@ def here(readings: Readings) -> Readings:
     return replace(readings, station=zero, target=zero)
 
 
-def joined(first: Readings, second: Readings) -> Readings:
-    """Return the rows of both."""
-    given: dict[str, Any] = {}
-    for field in fields(Readings):
-        a, b = getattr(first, field.name), getattr(second, field.name)
-        if isinstance(a, Loads):
-            pairs = [(getattr(a, f.name), getattr(b, f.name), f.name) for f in fields(Loads)]
-            given[field.name] = Loads(
-                **{n: None if u is None or v is None else np.concatenate([u, v])
-                   for u, v, n in pairs}
-            )  # fmt: skip
-        else:
-            given[field.name] = a if isinstance(a, str) else np.concatenate([a, b])
-    return Readings(**given)
-
-
 def _inverse(A: Array, prior: Array, held: Array) -> Array:
     """Return the covariance of parameters, held by ``prior``, and of free nuisances."""
     free = np.maximum(np.linalg.norm(A[:, len(held) :], axis=0), 1e-12)
@@ -225,10 +210,7 @@ class ReadingCheck:
         ``typed``: a person has typed it; ``joints``: the joint angles were typed.
         """
         same = before[(before.station == new.station[0]) & (before.target == new.target[0])]
-        try:
-            state = self._fitted(same, new)
-        except GapbridgeError:
-            state = None
+        state = self._fitted(same, new)
         if state is None:  # too few readings yet to know where the instrument stands
             return self._first(same, new)
         off, allowed, doubted = state.compare(new)
@@ -261,10 +243,7 @@ class ReadingCheck:
         The way that the arm itself has gone between the two is taken off.
         """
         same = before[(before.station == old.station[0]) & (before.target == old.target[0])]
-        try:
-            state = self._fitted(same, old)
-        except GapbridgeError:
-            state = None
+        state = self._fitted(same, old)
         if state is None:
             return np.asarray((new.value - old.value)[0, :3])
         return state.gap(new)[:3] - state.gap(old)[:3]
@@ -274,6 +253,7 @@ class ReadingCheck:
         return self._model.predict(readings.q, readings.loads)
 
     def _fitted(self, before: Readings, new: Readings) -> FittedSoFar | None:
+        """Return the fit to the readings ``before``; None where they are too few, or fit no arm."""
         registered = self._metrology.registered and int(new.station[0]) == 0
         before, new = here(before), here(new)
         observable = make_observable(self._kind, registered=registered, **self._options)
@@ -284,7 +264,10 @@ class ReadingCheck:
             return None
         if registered not in self._parameters:
             self._parameters[registered] = Parameters.every(self._model, self._effects)
-        return FittedSoFar.to(before, new, self._parameters[registered], observable, self._sigma)
+        own = self._parameters[registered]
+        with contextlib.suppress(GapbridgeError):
+            return FittedSoFar.to(before, new, own, observable, self._sigma)
+        return None
 
     def _reasons(
         self, state: FittedSoFar, new: Readings, typed: bool, joints: bool

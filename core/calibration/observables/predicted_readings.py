@@ -49,7 +49,7 @@ def predicted_readings(
 
 
 def beside(one: Readings, other: Readings) -> Readings:
-    """Return the readings of both, one after the other; both know the same of their loads."""
+    """Return the readings of both, one after the other, with what both know of their loads."""
     loads = Loads(**{f.name: _both(one.loads, other.loads, f.name) for f in fields(Loads)})
     columns = {f.name: _both(one, other, f.name) for f in fields(Readings)[1:]}
     return Readings(one.kind, **(columns | {"loads": loads}))
@@ -57,7 +57,7 @@ def beside(one: Readings, other: Readings) -> Readings:
 
 def _both(one: Any, other: Any, name: str) -> Any:
     first, second = getattr(one, name), getattr(other, name)
-    if first is None or isinstance(first, Loads):
+    if first is None or second is None or isinstance(first, Loads):
         return None
     return np.concatenate([first, second])
 
