@@ -31,7 +31,6 @@ from gapbridge.core.notes import Note, Reason
 
 Progress = Callable[[str], None]
 TELLING = 1.0  # usual sizes: a parameter that is known no better counts as not identifiable
-TCP_STEP = 1e-3  # share of a parameter's scale, for derivatives of the predicted TCP
 
 
 @dataclass(frozen=True)
@@ -221,19 +220,5 @@ def tcp_deviation(parameters: Parameters, rest: FitState, readings: Readings) ->
     """Return 1 sigma (3D, m) of the predicted TCP at readings (M,): the parameters' part alone."""
     if not len(readings):
         return np.zeros(0)
-    J = tcp_columns(parameters, rest.values, readings)
+    J = parameters.tcp_jacobian(rest.values, readings.q, readings.loads)
     return np.asarray(np.sqrt(np.einsum("nki,ij,nkj->n", J, rest.covariance, J)))
-
-
-def tcp_columns(parameters: Parameters, values: Array, readings: Readings) -> Array:
-    """Return d TCP position / d parameters (N, 3, p), base axes."""
-    J = np.empty((len(readings), 3, len(values)))
-    for i in range(len(values)):
-        step = np.zeros(len(values))
-        step[i] = TCP_STEP * parameters.scales[i]
-        ends = [
-            parameters.model(values + way * step).predict(readings.q, readings.loads).position
-            for way in (1, -1)
-        ]
-        J[:, :, i] = (ends[0] - ends[1]) / (2 * step[i])
-    return J

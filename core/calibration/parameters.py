@@ -10,6 +10,9 @@ import numpy as np
 from gapbridge.core.arrays import Array
 from gapbridge.core.effects import CATALOGUE, Site, Term, effect_named
 from gapbridge.core.errors import InputError
+from gapbridge.core.estimation.pose_jacobian import PoseColumns, pose_columns
+from gapbridge.core.kernels.adjoint import CONVERGED
+from gapbridge.core.loads import Loads
 from gapbridge.core.model import Model
 from gapbridge.core.notes import Note
 
@@ -21,6 +24,7 @@ DEFAULT = tuple(  # what a calibration looks for that names no effects; earlier 
 )
 ORDERS = (1.0, 2.0)  # cycles a turn at which a transmission error is looked for
 PRIOR = 10.0  # usual sizes
+SHARE = 0.01  # of a usual size, as the step where a derivative is a difference
 LEAST_LEVER = 0.05  # of the arm's reach, beyond a joint
 
 
@@ -99,17 +103,29 @@ class Parameters:
         new = [term.with_values(np.array(v)) for term, v in added.values() if any(v)]
         return replace(self.nominal, terms=(*terms, *new))
 
-    def model_with_all(self, values: Array) -> tuple[Model, list[tuple[int, int]]]:
-        """Return ``model(values)`` with the terms of zeros, which have derivatives nevertheless.
+    def pose_columns(
+        self, values: Array, q: Array, loads: Loads | None, *, coordinates: int = 6,
+        converged: float = CONVERGED,
+    ) -> PoseColumns:  # fmt: skip
+        """Return the TCP poses of ``model(values)`` at ``q`` (N, n), and how all p change them.
 
-        And where each parameter (p) stands in it: number of the term, number of the value.
+        See ``core.estimation.pose_jacobian``. Terms of zeros have derivatives nevertheless.
         """
         model = self.model(values)
         present = {(term.effect, term.site) for term in model.terms}
         model = model.with_terms([t for t in self.terms if (t.effect, t.site) not in present])
         numbers = {(term.effect, term.site): i for i, term in enumerate(model.terms)}
         places = [(self.terms[t], k) for t, k in self.place]
-        return model, [(numbers[term.effect, term.site], k) for term, k in places]
+        chosen = [(numbers[term.effect, term.site], k) for term, k in places]
+        return pose_columns(
+            model, q, loads, chosen, SHARE * self.scales, coordinates=coordinates,
+            converged=converged,
+        )  # fmt: skip
+
+    def tcp_jacobian(self, values: Array, q: Array, loads: Loads) -> Array:
+        """Return d TCP position / d parameters (N, 3, p) at ``q`` (N, n), base axes."""
+        found = self.pose_columns(values, q, loads, coordinates=3)
+        return np.asarray(found.jacobian.transpose(2, 0, 1))
 
     @property
     def prior(self) -> Array:

@@ -12,11 +12,9 @@ from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.parameters import Parameters
 from gapbridge.core.effects import CATALOGUE, Term, flexibility_names
 from gapbridge.core.errors import EquilibriumError, InputError
-from gapbridge.core.estimation.pose_jacobian import pose_columns
 from gapbridge.core.loads import Loads
 from gapbridge.core.model import Model, Poses
 
-STEP = 1e-3  # share of a parameter's usual size, where a derivative of the TCP is a difference
 FIRST_ORDER = np.inf  # m/rad: no second round of the adjoints, which would change some thousandths
 BLOCK = 20_000  # rows at a time, so that memory does not grow with them
 FEW = 2048  # the same of products with the covariance
@@ -76,15 +74,14 @@ class Spread:
         or a row has no equilibrium.
         """
         parameters = parameters_named(model, self.names, "provenance")
-        here, chosen = parameters.model_with_all(np.zeros(len(parameters)))
         position, rotation = np.empty((len(q), 3)), np.empty((len(q), 3, 3))
         std = np.empty((len(q), 3))
         for begin in range(0, len(q), BLOCK):
             rows = slice(begin, begin + BLOCK)
             try:
-                found = pose_columns(
-                    here, q[rows], None if loads is None else loads[rows], chosen,
-                    STEP * parameters.scales, coordinates=3, converged=FIRST_ORDER,
+                found = parameters.pose_columns(
+                    np.zeros(len(parameters)), q[rows], None if loads is None else loads[rows],
+                    coordinates=3, converged=FIRST_ORDER,
                 )  # fmt: skip
             except EquilibriumError as error:
                 raise EquilibriumError(begin + error.row) from None

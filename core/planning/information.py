@@ -32,14 +32,8 @@ class Reference:
     @classmethod
     def of(cls, parameters: Parameters, q: Array, loads: Loads) -> Reference:
         """Return the reference at poses ``q`` (M, n)."""
-        columns = np.empty((len(q), 3, len(parameters)))
-        for i in range(len(parameters)):
-            step = np.zeros(len(parameters))
-            step[i] = 0.01 * parameters.scales[i]
-            one = parameters.model(parameters.begin + step).predict(q, loads).position
-            other = parameters.model(parameters.begin - step).predict(q, loads).position
-            columns[:, :, i] = (one - other) / (2 * step[i]) * parameters.prior[i]
-        return cls(q, loads, columns)
+        columns = parameters.tcp_jacobian(parameters.begin, q, loads)
+        return cls(q, loads, columns * parameters.prior)
 
     def weight(self, size: int, share: Array | None = None) -> Array:
         """Return W (size, size): trace(W covariance) is the mean square TCP error, m^2.

@@ -7,12 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from gapbridge.core.arrays import Array
-from gapbridge.core.calibration.parameters import Parameters
 from gapbridge.core.calibration.result import Calibration
-from gapbridge.core.calibration.spread import effects_of
+from gapbridge.core.calibration.spread import parameters_named
 from gapbridge.core.errors import InputError
-
-STEP = 1e-3  # usual sizes
 
 
 @dataclass(frozen=True)
@@ -63,22 +60,11 @@ def sensitivities(calibration: Calibration) -> Sensitivities | None:
 
 
 def _columns(calibration: Calibration, names: list[str]) -> Array | None:
-    """Return d TCP / d parameter (M, 3, p), central differences around the calibrated model."""
+    """Return d TCP / d parameter (M, 3, p) at the calibrated model; None for an unknown name."""
     try:
-        every = Parameters.every(calibration.model, effects_of(names))
+        own = parameters_named(calibration.model, names, "calibration")
     except InputError:
-        return None
-    places = {name: i for i, name in enumerate(every.names)}
-    if not set(names) <= set(places):
         return None
     readings = calibration.readings
     chosen = readings[readings.held_out] if readings.held_out.any() else readings
-    columns = []
-    for name in names:
-        step = np.zeros(len(every))
-        step[places[name]] = STEP * every.scales[places[name]]
-        ends = [
-            every.model(sign * step).predict(chosen.q, chosen.loads).position for sign in (1, -1)
-        ]
-        columns.append((ends[0] - ends[1]) / (2 * step[places[name]]))
-    return np.stack(columns, axis=2) if columns else None
+    return own.tcp_jacobian(np.zeros(len(own)), chosen.q, chosen.loads)

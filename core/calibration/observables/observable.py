@@ -18,12 +18,10 @@ from gapbridge.core.calibration.parameters import Parameters
 from gapbridge.core.calibration.readings import Readings
 from gapbridge.core.errors import ExcitationError
 from gapbridge.core.estimation.least_squares import solve
-from gapbridge.core.estimation.pose_jacobian import pose_columns
 from gapbridge.core.estimation.robust import start_weights
 from gapbridge.core.model import Model, Poses
 from gapbridge.core.rotation import one_rotation_matrix
 
-SHARE = 0.01  # of a parameter's usual size, as the step of a difference
 STEP = 1e-5  # m and rad, of a nuisance: the gap is all but linear in it
 SETTLED = 1e-9  # m and rad: a smaller step moves nothing that anybody measures
 ROUNDS = 30
@@ -95,9 +93,7 @@ class Observable(ABC):
 
         ``layout`` of all readings, where these are a part of them.
         """
-        model, chosen = parameters.model_with_all(values)
-        steps = SHARE * parameters.scales
-        moved = pose_columns(model, readings.q, readings.loads, chosen, steps)
+        moved = parameters.pose_columns(values, readings.q, readings.loads)
         jacobian = self.jacobian(moved.poses, readings, nuisance)
         J = -np.matmul(jacobian, moved.jacobian.transpose(2, 0, 1)).reshape(-1, len(values))
         return J, self.nuisance_columns(moved.poses, readings, nuisance, layout)

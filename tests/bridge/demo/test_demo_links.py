@@ -18,7 +18,7 @@ from gapbridge.bridge.cell import load_cell
 from gapbridge.bridge.demo.links import LINKS, DemoLink
 from gapbridge.bridge.demo.links.modbus import travel_time
 from gapbridge.bridge.demo.poses import candidates, plan
-from gapbridge.bridge.demo.rests import rests, write_log
+from gapbridge.bridge.demo.rests import rests_so_far, write_log
 from gapbridge.bridge.demo.result import reach
 from gapbridge.core.errors import LinkError
 from gapbridge.core.log.log import read_log
@@ -119,7 +119,8 @@ def test_a_load_that_no_controller_reports_goes_into_the_log(tmp_path: Path) -> 
     t, q = np.arange(0, 2, 0.01), np.full((200, 6), 0.4)
     recording = {"timestamp": t, "actual_q": q, "actual_qd": 0 * q}
     readings = np.column_stack([t, np.tile([0.1, 0.2, 0.3, 0.0, 0.0, 1.0], (200, 1))])
-    found = rests(recording, readings, q[:1] + 0.001, load)
+    found, missing = rests_so_far(recording, readings, q[:1] + 0.001, load)
+    assert found is not None, missing
     write_log(tmp_path / "both.csv", found)
     write_log(tmp_path / "sent.csv", found, joints=False)
     both, sent = (read_log(tmp_path / name, 6) for name in ("both.csv", "sent.csv"))

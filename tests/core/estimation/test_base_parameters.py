@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from gapbridge.core.estimation.base_parameters import VISIBLE, choose, name, what_is_shown
+from gapbridge.core.effects import flexibility_names
+from gapbridge.core.estimation.base_parameters import VISIBLE, choose, what_is_shown
 from gapbridge.core.estimation.compliance_fit import Linear
 from gapbridge.core.notes import Note, Reason
 
@@ -41,7 +42,7 @@ def test_two_that_act_alike_are_carried_by_one_and_both_are_named():
     assert note.reason is Reason.ACTS_LIKE
     ((share, carrier),) = note.values[1]
     assert share == pytest.approx(1.0)
-    assert {note.values[0], carrier} == {name(1, 4), name(3, 4)}
+    assert {note.values[0], carrier} == set(flexibility_names(2)[1::2])
 
 
 def test_of_a_difference_the_one_is_kept_that_can_carry_it_without_going_below_zero():
@@ -61,7 +62,7 @@ def test_a_sum_that_shows_though_none_of_its_members_does_is_named():
     assert not kept.any()
     together = [note for note in shown.reported if note.reason is Reason.SHOWN_TOGETHER]
     assert len(together) == 1
-    assert {part for _, part in together[0].values[0]} == {name(i, 4) for i in range(4)}
+    assert {part for _, part in together[0].values[0]} == set(flexibility_names(2))
     np.testing.assert_allclose([share for share, _ in together[0].values[0]], 0.5)
 
 
@@ -76,6 +77,6 @@ def test_two_kept_ones_whose_sum_is_much_better_known_are_named(sign):
 
 
 def test_flexibilities_are_named_as_the_effects_are():
-    assert [name(i, 14) for i in (0, 6, 7, 13)] == [
+    assert [flexibility_names(7)[i] for i in (0, 6, 7, 13)] == [
         "axial_compliance_1", "axial_compliance_7", "radial_compliance_1", "radial_compliance_7"
     ]  # fmt: skip
