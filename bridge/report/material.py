@@ -41,12 +41,6 @@ class Shares:
     unexplained: float
 
 
-def own_coordinates(channel: ChannelDiagnosis) -> int:
-    """Return how many coordinates the channel's figures speak about (rotations, torques apart)."""
-    k = int(channel.gap.shape[1])
-    return min(k, 3) if channel.channel in ("position", "wrench") else k
-
-
 def shares(channel: ChannelDiagnosis) -> Shares:
     """Return the shares of a channel's gap; held out where held-out figures can be had."""
     total = max(channel.gap_rms**2, 1e-300)

@@ -25,11 +25,12 @@ from gapbridge.bridge.document.provenance import origin_blocks, origin_line
 from gapbridge.bridge.report.answer import answer
 from gapbridge.bridge.report.how_far import how_far
 from gapbridge.bridge.report.labels import CHANNELS, with_unit
-from gapbridge.bridge.report.material import Material, own_coordinates, per_sample
+from gapbridge.bridge.report.material import Material, per_sample
 from gapbridge.bridge.report.parameters import parameters
 from gapbridge.bridge.report.where import where, which
 from gapbridge.core.diagnosis.channel_diagnosis import ChannelDiagnosis
 from gapbridge.core.diagnosis.diagnosis import Diagnosis
+from gapbridge.core.diagnosis.noise_floor import own_coordinates
 from gapbridge.core.log.log import Log
 from gapbridge.core.model import Model
 
@@ -104,7 +105,7 @@ def _outliers(channel: ChannelDiagnosis, log: Log) -> list[Block]:
     outliers = np.flatnonzero(~channel.selection.kept)
     if not len(outliers):
         return []
-    size = per_sample(channel.remaining, own_coordinates(channel))
+    size = per_sample(channel.remaining, own_coordinates(channel.selection.observation))
     worst = outliers[np.argsort(-size[outliers])][:LISTED]
     rows = [
         [str(log.line(channel.selection.observation.rows[i])), with_unit(float(size[i]),

@@ -38,13 +38,13 @@ from gapbridge.bridge.report.material import (
     Material,
     before_and_after,
     channel_heading,
-    own_coordinates,
     per_sample,
     thinned,
 )
 from gapbridge.core.arrays import Array, Index
 from gapbridge.core.diagnosis.causes import Cause, Considered, Outcome
 from gapbridge.core.diagnosis.channel_diagnosis import ChannelDiagnosis
+from gapbridge.core.diagnosis.noise_floor import own_coordinates
 from gapbridge.core.planning.travel import far_apart
 
 MOST_QUANTITIES = 14
@@ -115,7 +115,7 @@ def _against(channel: ChannelDiagnosis) -> Gallery:
     """Return the gap of every sample against what it may depend on, one drawing a choice."""
     kept = channel.selection.kept
     gap, after = channel.gap[kept], channel.remaining[kept]
-    count = own_coordinates(channel)
+    count = own_coordinates(channel.selection.observation)
     keep = thinned(per_sample(gap, count), POINTS)
     given = before_and_after(channel, gap[keep], after[keep])
     across, upwards = _abscissas(channel, keep), _ordinates(channel, given, count)
