@@ -10,6 +10,7 @@ from typing import NoReturn
 
 import click
 
+from gapbridge.bridge.cli.interrupt import heed_interrupts
 from gapbridge.bridge.cli.progress import Compiling
 from gapbridge.bridge.cli.table import COMMANDS
 from gapbridge.core.errors import GapbridgeError
@@ -96,6 +97,7 @@ def gapbridge() -> None:
 
 def main(arguments: list[str] | None = None) -> NoReturn:
     """Run the command line and leave with its exit code; never shows a traceback."""
+    heed_interrupts()
     code = _run(sys.argv[1:] if arguments is None else arguments)
     gc.freeze()  # else Python's last collection, of all compiled code, costs 0.1 s
     sys.exit(code)

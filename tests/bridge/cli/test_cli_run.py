@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import signal
+import subprocess
 import sys
 from pathlib import Path
 from types import ModuleType
@@ -52,6 +55,34 @@ def test_an_interrupt_ends_without_a_traceback(
     daemon(monkeypatch, run_cell)
     answer = gapbridge("run", cell_in(tmp_path))
     assert (answer.code, answer.err.strip()) == (1, "error: interrupted")
+
+
+LOADING = """
+import os, signal
+os.kill(os.getpid(), signal.SIGINT)
+for _ in range(1000): pass
+print("loaded", flush=True)
+"""
+INTERRUPTED = f"""
+import threading
+from gapbridge.bridge.cli import main
+def loading(*_, **__):
+    exec({LOADING!r}, {{"__name__": "llvmlite.binding.executionengine"}})
+    threading.Event().wait(60)
+import gapbridge.bridge.cli.cell.check as command
+command.check.callback = loading
+main(["check", "cell.yaml"])
+"""
+
+
+def test_an_interrupt_waits_until_machine_code_is_loaded() -> None:
+    ran = subprocess.run(
+        [sys.executable, "-c", INTERRUPTED], capture_output=True, text=True, check=False,
+        env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])}, timeout=120,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # a shell may ignore it
+    )  # fmt: skip
+    assert ran.stdout == "loaded\n"
+    assert (ran.returncode, ran.stderr.strip()) == (1, "error: interrupted")
 
 
 def test_observing_and_writing_exclude_each_other(tmp_path: Path) -> None:
