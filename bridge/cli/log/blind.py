@@ -20,14 +20,22 @@ BENCHMARK = "benchmarks.blind.__main__"
     add_help_option=False,
 )
 @click.argument("arguments", nargs=-1, type=click.UNPROCESSED)
-def blind(arguments: tuple[str, ...]) -> None:
+@click.pass_context
+def blind(context: click.Context, arguments: tuple[str, ...]) -> None:
     """Run the blind benchmark of the diagnosis.
 
-    Data are drawn whose effect is withheld from the diagnosis, and its answers are scored.
+    Data are drawn whose effect is withheld from the diagnosis, and its answers are scored. It
+    needs a checkout of the project; the installed package has no benchmarks.
 
     Example: gapbridge blind --quick --out out/blind
     """
-    command = benchmark()
+    try:
+        command = benchmark()
+    except RunError:
+        if not {"-h", "--help"} & set(arguments):
+            raise
+        click.echo(context.get_help())
+        return
     command.main(args=list(arguments), prog_name="gapbridge blind", standalone_mode=False)
 
 

@@ -102,3 +102,15 @@ def test_demo_wants_a_folder(tmp_path: Path) -> None:
 
 def test_the_benchmark_of_a_checkout_is_found() -> None:
     assert {"seeds", "quick"} <= {parameter.name for parameter in benchmark().params}
+
+
+def test_where_there_is_no_checkout_the_help_says_that_one_is_needed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setitem(sys.modules, "benchmarks.blind", None)
+    monkeypatch.delitem(sys.modules, "benchmarks.blind.__main__", raising=False)
+    answer = gapbridge("blind", "--help")
+    assert answer.code == 0
+    assert "Example: gapbridge blind" in answer.out
+    assert "needs a checkout" in " ".join(answer.out.split())
+    assert gapbridge("blind").code == 1
