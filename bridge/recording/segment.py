@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
-import json
-import math
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -18,6 +16,7 @@ from typing import Any
 import numpy as np
 from mcap.writer import CompressionType, Writer
 
+from gapbridge.bridge.document.json_text import json_text
 from gapbridge.bridge.document.output_file import MODE, sync_folder
 from gapbridge.core.arrays import Array
 from gapbridge.core.log.mcap_layout import layout_of
@@ -140,7 +139,7 @@ class Segment:
     def emit(self, topic: str, document: Mapping[str, Any], at: float | None = None) -> None:
         """Take a JSON message over; ``at``: s since 1970, else now."""
         stamp = int((self._clock.time() if at is None else at) * 1e9)
-        data = _json(document)
+        data = json_text(document).encode()
         self._writer.add_message(self._channels[topic], stamp, data, stamp)
 
     def flush(self) -> None:
@@ -170,19 +169,3 @@ class Segment:
                 os.ftruncate(self._file.fd, self._file.good)
             with contextlib.suppress(OSError):
                 self._file.close()
-
-
-def _json(document: Mapping[str, Any]) -> bytes:
-    """Return a document as JSON; numbers that JSON does not know become null."""
-    try:
-        return json.dumps(document, default=str, allow_nan=False).encode()
-    except ValueError:
-        return json.dumps(_finite(document), default=str).encode()
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {key: _finite(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

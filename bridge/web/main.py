@@ -13,6 +13,7 @@ import math
 import sys
 from collections.abc import AsyncIterator, Awaitable, Callable
 from importlib.resources import files
+from typing import Any
 from urllib.parse import parse_qs
 
 from starlette.applications import Starlette
@@ -22,12 +23,13 @@ from starlette.routing import Route
 from starlette.types import Receive, Scope, Send
 
 from gapbridge.bridge.cell.settings.web import WebSettings
+from gapbridge.bridge.document.json_text import json_text
 from gapbridge.bridge.ipc.side_main import Order, run_side
 from gapbridge.bridge.served.credentials import read_token
 from gapbridge.bridge.served.guard import WRONG_TOKEN_DELAY, Guard, cookie_name, cookie_of
 from gapbridge.bridge.served.server import serve
 from gapbridge.bridge.web.stream import Stream, message
-from gapbridge.bridge.web.watched import Watched, encoded
+from gapbridge.bridge.web.watched import Watched
 
 TURN = 0.1  # s between two looks at the shared page
 FILES = {
@@ -52,7 +54,7 @@ def run(order: Order) -> None:
     def turn() -> None:
         for kind, data in watched.turn(order.events.poll()):
             if stream.is_watched:
-                stream.publish(kind, encoded(data))
+                stream.publish(kind, _text(data))
 
     def over() -> bool:
         if order.events.closed:
@@ -70,7 +72,7 @@ def make_app(watched: Watched, stream: Stream, settings: WebSettings, token: str
     """Return the application behind its guard."""
 
     async def status(request: Request) -> Response:
-        return _json(encoded(watched.snapshot()))
+        return _json(_text(watched.snapshot()))
 
     async def history(request: Request) -> Response:
         found = {}
@@ -87,7 +89,7 @@ def make_app(watched: Watched, stream: Stream, settings: WebSettings, token: str
                     f"{name}: found {text[:40]!r}, expected 1 to {most:g}\n", 400
                 )
             found[name] = value
-        return _json(encoded(watched.history(found["seconds"], int(found["points"]))))
+        return _json(_text(watched.history(found["seconds"], int(found["points"]))))
 
     async def events(request: Request) -> Response:
         if stream.full:
@@ -107,7 +109,7 @@ def make_app(watched: Watched, stream: Stream, settings: WebSettings, token: str
 
 
 async def _bytes(stream: Stream, watched: Watched) -> AsyncIterator[str]:
-    async for text in stream.subscribe(lambda: message("hello", encoded(watched.snapshot()))):
+    async for text in stream.subscribe(lambda: message("hello", _text(watched.snapshot()))):
         yield text
 
 
@@ -169,6 +171,10 @@ def _read(name: str) -> bytes:
     if name == "view.js":  # as reports have it
         return files("gapbridge.bridge.document").joinpath(name).read_bytes()
     return files("gapbridge.bridge.web").joinpath("page", name).read_bytes()
+
+
+def _text(data: dict[str, Any]) -> str:
+    return json_text(data, (",", ":"))
 
 
 def _json(text: str) -> Response:

@@ -5,7 +5,6 @@ What it draws over time is thinned to a few points a second.
 
 from __future__ import annotations
 
-import json
 import math
 import time
 from collections import deque
@@ -207,24 +206,6 @@ def plain(points: Array) -> list[list[float | None]]:
         ]
         for row in points.tolist()
     ]
-
-
-def encoded(data: dict[str, Any]) -> str:
-    """Return JSON that every browser reads: no NaN in it."""
-    try:
-        return json.dumps(data, allow_nan=False, default=str, separators=(",", ":"))
-    except ValueError:
-        return json.dumps(_finite(data), default=str, separators=(",", ":"))
-
-
-def _finite(data: Any) -> Any:
-    if isinstance(data, float) and not math.isfinite(data):
-        return None
-    if isinstance(data, dict):
-        return {key: _finite(value) for key, value in data.items()}
-    if isinstance(data, list | tuple):
-        return [_finite(value) for value in data]
-    return data
 
 
 class Timing:

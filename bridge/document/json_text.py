@@ -1,0 +1,24 @@
+"""JSON that every reader takes: numbers that it does not know are null."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from typing import Any
+
+
+def json_text(document: Mapping[str, Any], separators: tuple[str, str] | None = None) -> str:
+    """Return a document as JSON; what is no JSON value stands as text."""
+    try:
+        return json.dumps(document, default=str, allow_nan=False, separators=separators)
+    except ValueError:
+        return json.dumps(_finite(document), default=str, separators=separators)
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
