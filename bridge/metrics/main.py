@@ -62,10 +62,6 @@ def run(order: Order) -> None:
     )  # fmt: skip
 
 
-if __name__ == "__main__":
-    sys.exit(run_side("metrics", run))
-
-
 class Families(Collector):
     """One scrape: all metrics of a daemon."""
 
@@ -270,3 +266,7 @@ def _lag(recording: Any) -> float | None:
     except (OSError, ValueError):
         return None
     return max(time.time() - newest, 0.0)
+
+
+if __name__ == "__main__":
+    sys.exit(run_side("metrics", run))

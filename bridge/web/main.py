@@ -64,10 +64,6 @@ def run(order: Order) -> None:
     serve(make_app(watched, stream, settings, token), settings, "web", over, turn, TURN)
 
 
-if __name__ == "__main__":
-    sys.exit(run_side("web", run))
-
-
 def make_app(watched: Watched, stream: Stream, settings: WebSettings, token: str | None) -> Guard:
     """Return the application behind its guard."""
 
@@ -179,3 +175,7 @@ def _text(data: dict[str, Any]) -> str:
 
 def _json(text: str) -> Response:
     return Response(text, media_type="application/json")
+
+
+if __name__ == "__main__":
+    sys.exit(run_side("web", run))
