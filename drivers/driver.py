@@ -165,6 +165,13 @@ class Driver(ABC):
         """
         return None
 
+    def way(self) -> float:
+        """Return the longest time, s, that the last sample may have been under way to here.
+
+        Beyond what its timestamp shows beside those before; asked in each cycle. 0: not known.
+        """
+        return 0.0
+
     def mismatch(self) -> str | None:
         """Return in words how the controller is set otherwise than the cell says; None: it is not.
 

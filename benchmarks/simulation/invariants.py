@@ -27,7 +27,7 @@ INVARIANTS: dict[str, str] = {
     "stopped": "nothing is written to a robot that has said that it must not move",
     "fresh": "behind each write is a state that came at most 40 ms or five cycles before it, and "
     "there are never more writes than states",
-    "age": "a state behind a write was sampled by the controller at most twice that long before",
+    "age": "a state behind a write was sampled by the controller at most that long before",
     "asked": "writing begins after a person has asked for it, anew after each time that it ended",
     "latched": "a fault that does not end with its link stays until a person has acknowledged it, "
     "over the deaths of all processes",
@@ -73,7 +73,7 @@ class Judge:
         self._checker, self._begin = checker, begin
         self._known = 0
         self._now = begin
-        self._most_age = 2.0 * hold_time(rate) + MARGIN
+        self._most_age = hold_time(rate) + MARGIN
         self._asked = False  # since writing ended last
         self._acknowledged = False  # since the fault began
         self._fault: str | None = None  # that is latched

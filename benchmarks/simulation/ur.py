@@ -56,7 +56,8 @@ class _Driver(UrRtdeDriver):
 
     def round_trip(self) -> float:
         """Ask the controller, there and back."""
-        return self.link.ask()
+        self._way = found = self.link.ask()
+        return found
 
 
 class UrLink(SimulatedLink):

@@ -32,7 +32,8 @@ class ControllerClock:
 
     The age of a state counts from when its sample could have been here at the earliest, so that
     late packets, late wake-ups and long computing all count. The shortest way over the wire, which
-    one clock alone cannot show, does not. ``hold``: s after which a state is too old to write by.
+    one clock alone cannot show, does not: see ``Driver.way``. ``hold``: s after which a state is
+    too old to write by.
     What a stalled link hands on at once is old for a moment only. Where all samples are older than
     that for as long, either the controller's clock has stood still or the way has become longer,
     which no clock shows: the two are tied anew only while nothing is written.

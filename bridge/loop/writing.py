@@ -116,7 +116,8 @@ class Writing:
 
     def _check_way(self) -> None:
         """Refuse a link on which no state can be fresh. Raises WriteError."""
-        taken, most = self._driver.round_trip(), hold_time(self._driver.rate)
+        taken, rate = self._driver.round_trip(), self._driver.rate
+        most = hold_time(rate) - 1.0 / rate  # a setpoint leaves within a cycle
         if taken is not None and taken > most:
             raise WriteError(
                 f"link: a question and its answer take {1e3 * taken:.0f} ms, expected at most "

@@ -96,6 +96,10 @@ class DriverWithSensor(Driver):
         """See Driver.round_trip."""
         return self._arm.round_trip()
 
+    def way(self) -> float:
+        """See Driver.way."""
+        return self._arm.way()
+
     def facts(self, state: RobotState) -> ControllerFacts:
         """See Driver.facts."""
         return self._arm.facts(state)

@@ -20,6 +20,7 @@ class Freshness:
 
     def __init__(self, profile: ProfileFile) -> None:
         self._clock = profile.clock
+        self.has_clock = profile.clock is not None and profile.clock.kind != "heartbeat"
         self._step = _step(profile.clock, profile.period)
         self._wrap = _wrap(profile.clock)
         self._count: float | None = None
@@ -45,7 +46,7 @@ class Freshness:
         A timestamp or counter gives the controller's time; anything else the time of arrival here.
         """
         before, self._count, self._q = self._count, count, q
-        if self._clock is None or count is None or self._clock.kind == "heartbeat":
+        if count is None or not self.has_clock:
             self._time = received
             return received
         if before is None:

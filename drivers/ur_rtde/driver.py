@@ -45,6 +45,7 @@ class UrRtdeDriver(Driver):
             else OffsetWriter(settings, self._rates, clock)
         )
         self._state: RobotState | None = None
+        self._way = 0.0  # s: the last round trip
 
     def connect(self) -> None:
         """Open the receiving side only: no program is touched, no input claimed."""
@@ -89,7 +90,12 @@ class UrRtdeDriver(Driver):
 
     def round_trip(self) -> float | None:
         """Return how long a question to the RTDE server takes, s; see Driver.round_trip."""
-        return round_trip(self.settings.host)
+        self._way = found = round_trip(self.settings.host)
+        return found
+
+    def way(self) -> float:
+        """Return the round trip when the arm was armed; see Driver.way."""
+        return self._way
 
     def mismatch(self) -> str | None:
         """Return in words how the controller's TCP differs from the cell's; see Driver.mismatch.

@@ -29,7 +29,9 @@ from gapbridge.bridge.loop.loop import Loop
 from gapbridge.bridge.loop.supervisor import Cause, State, Supervisor
 from gapbridge.core.errors import StaleStateError
 from gapbridge.core.state import Setpoint
+from gapbridge.drivers.driver import Driver
 from gapbridge.drivers.modbus import encode
+from gapbridge.drivers.modbus.driver import ModbusDriver
 from gapbridge.drivers.ur_rtde.command import OffsetWriter, ServoWriter
 from gapbridge.drivers.ur_rtde.driver import UrRtdeDriver
 from gapbridge.drivers.ur_rtde.state import StateReader
@@ -108,6 +110,15 @@ def test_the_first_state_after_a_standstill_is_judged_by_the_clock_before_it() -
 def test_an_arm_that_is_let_go_of_in_silence_is_sent_where_it_was_sent_before() -> None:
     """Seed 3243: stopped while the arm was silent; enabling frames say the last joints again."""
     assert not run(3243).violations
+
+
+@pytest.mark.parametrize(("driver", "seed"), [(UrRtdeDriver, SERVOJ), (ModbusDriver, MODBUS)])
+def test_a_way_longer_than_a_state_may_be_old_lets_no_setpoint_leave(
+    monkeypatch: Patch, driver: type[Driver], seed: int
+) -> None:
+    assert run(seed, plan=[]).writes > 0
+    monkeypatch.setattr(driver, "way", lambda _: 0.11)
+    assert run(seed, plan=[]).writes == 0
 
 
 def test_an_arming_that_a_gap_in_the_states_ends_is_answered() -> None:

@@ -122,6 +122,15 @@ def test_an_answer_that_was_long_under_way_is_not_fresh(case: ModbusCase, proxy:
         assert np.isfinite(next_state(driver).actual_q).all()
 
 
+def test_a_readings_time_is_the_longest_way_of_its_state(
+    case: ModbusCase, proxy: EvilProxy
+) -> None:
+    with driver_through(case, proxy) as driver:
+        proxy.wait = 0.02
+        next_state(driver)
+        assert 0.02 <= driver.way() <= (driver.round_trip() or 0.0)
+
+
 def test_an_offset_whose_answer_is_lost_once_is_sent_once_more(
     case: ModbusCase, proxy: EvilProxy
 ) -> None:
