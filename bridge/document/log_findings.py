@@ -50,6 +50,7 @@ TEXTS = {
     LogCheck.ROW_LATE: "they look one row too late",
     LogCheck.ROW_EARLY: "they look one row too early",
     LogCheck.LENGTH_UNIT: "they look like {0}, expected m",
+    LogCheck.OTHER_ARM: "they look like those of a {0}",
     LogCheck.FLANGE_NOT_TCP: "they look like the flange's, not the TCP's (tool.tcp)",
     LogCheck.TCP_SIGN: "tool.tcp looks turned round in sign",
     LogCheck.MODIFIED_DH: "robot.dh looks like modified DH rows (Craig), expected standard ones",

@@ -39,6 +39,7 @@ class LogCheck(Enum):
     ROW_LATE = auto()
     ROW_EARLY = auto()
     LENGTH_UNIT = auto()  # unit
+    OTHER_ARM = auto()  # name of a built-in arm
     FLANGE_NOT_TCP = auto()
     TCP_SIGN = auto()
     MODIFIED_DH = auto()

@@ -57,7 +57,8 @@ def files_of(path: Path) -> list[Path]:
     matches = [name.fullmatch(one.name) for one in folder.iterdir()] if folder.is_dir() else []
     found = sorted((int(match[1]), match[0]) for match in matches if match)
     if not found:
-        raise LogError(f"{path}: file not found, expected a recording of the daemon (MCAP)")
+        what = "found a folder" if path.is_dir() else "file not found"
+        raise LogError(f"{path}: {what}, expected a recording of the daemon (MCAP)")
     return [folder / one for _, one in found]
 
 

@@ -15,6 +15,7 @@ from gapbridge.core.diagnosis.log_checks.kinematics import (
     best_order,
     inverted,
     measured_point,
+    other_arms,
     other_models,
 )
 from gapbridge.core.errors import InputError
@@ -115,6 +116,8 @@ def _mistakes(
     if found is None or not np.isfinite(found).all():
         found = rotation_vector(np.swapaxes(model.rigid_pose(q[rows]).rotation, 1, 2))
     yield LogFinding(LogCheck.INVERTED), model, q[rows], inverted(seen, found)
+    for mistake, other in other_arms(model):
+        yield mistake, other, q[rows], seen
 
 
 def _size(position: Array) -> float:

@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from gapbridge.core.arm import Arm
+from gapbridge.core.arm import Arm, builtin_arm, builtin_names
 from gapbridge.core.arrays import Array
 from gapbridge.core.estimation.least_squares import solve
 from gapbridge.core.estimation.registration import register
@@ -53,6 +53,14 @@ def other_models(model: Model) -> Iterator[tuple[LogFinding, Model]]:
         changed = rows * [size, 1.0, size, 1.0]
         lengths = LogFinding(LogCheck.DH_UNIT, (unit,))
         yield lengths, replace(model, arm=_standard(model.arm, changed))
+
+
+def other_arms(model: Model) -> Iterator[tuple[LogFinding, Model]]:
+    """Yield the model with each other built-in arm of as many joints."""
+    for name in builtin_names():
+        arm = builtin_arm(name)
+        if name != model.arm.name and arm.n == model.arm.n:
+            yield LogFinding(LogCheck.OTHER_ARM, (name,)), replace(model, arm=arm)
 
 
 def measured_point(model: Model, q: Array, seen: Array) -> tuple[LogFinding, Model] | None:

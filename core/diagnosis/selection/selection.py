@@ -286,12 +286,12 @@ def select(
         named_only = all(space.candidates[c].named for c in best.chosen)
         least = 1.0 if settled and named_only else NOTHING
         weakest = _weakest(space, terms, index, covariance, links, least)
+        base = terms
         if weakest is not None:
             none.add((terms[weakest].effect, terms[weakest].site))
-            terms = terms[:weakest] + terms[weakest + 1 :]
+            base = terms[:weakest] + terms[weakest + 1 :]
         elif settled:
             break
-        base = terms
     assert space is not None and near is not None and found is not None
     if len(space.y) >= LARGE_SAMPLE and any(not space.candidates[c].named for c in found.chosen):
         state.kept, state.noise = counted.copy(), whitened_by

@@ -12,6 +12,7 @@ import pytest
 from cli_runs import (
     CELL,
     Array,
+    bent_model,
     cell_in,
     columns_of,
     gapbridge,
@@ -284,6 +285,18 @@ def test_odd_rows_and_names_are_reported_where_work_is_still_possible(tmp_path: 
         "did you mean joint_temperatures_0?",
     ):
         assert words in answer.out
+
+
+def test_a_log_of_another_arm_is_diagnosed_and_reported_as_such(tmp_path: Path) -> None:
+    q, loads = poses_and_loads(60)
+    columns = {f"actual_q_{i}": q[:, i] for i in range(6)}
+    assert loads.wrench is not None
+    columns |= {f"actual_TCP_force_{i}": loads.wrench[:, i] for i in range(6)}
+    columns |= measured(bent_model(), q, loads, noise=2e-5)
+    other = cell_in(tmp_path, CELL.replace("ur10e", "ur5e").replace("true", "false"))
+    answer = gapbridge("diagnose", log_in(tmp_path, columns), "--cell", other)
+    assert answer.code == 0, answer.err
+    assert "do not follow the arm" in " ".join(answer.out.split())
 
 
 def test_five_poses_for_forty_parameters_end_without_a_traceback(tmp_path: Path) -> None:

@@ -116,6 +116,7 @@ def test_the_command_writes_beside_the_recording_and_gives_the_cell_back(
     ("arguments", "phrase"),
     [
         (["missing"], "missing: file not found, expected a recording"),
+        (["{recording.parent}"], "found a folder, expected a recording"),
         (["{recording}", "--out", "log.txt"], "found .txt, expected .csv or .parquet"),
         (["{recording}", "--from", "noon"], "--from: found 'noon'"),
         (["{recording}", "--out", "{recording}.csv/x.csv"], "found no folder"),

@@ -53,6 +53,12 @@ def test_the_arm_itself_is_not_suspected() -> None:
     assert reported(TRUE, Q) == []
 
 
+def test_another_builtin_arm_is_named() -> None:
+    right, wrong = (replace(TRUE, arm=builtin_arm(name)) for name in ("ur10e", "ur5e"))
+    (note,) = reported(wrong, Q, measured_position=right.rigid_pose(Q).position)
+    assert "they look like those of a ur10e: then 0.0 mm" in note
+
+
 def test_a_point_of_the_cell_seen_from_the_tool_is_named_without_rotations() -> None:
     poses = TRUE.rigid_pose(Q)
     seen = np.einsum("nji,nj->ni", poses.rotation, np.array([1.5, 0.2, 0.4]) - poses.position)
