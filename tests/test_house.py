@@ -160,6 +160,17 @@ def test_the_recorder_loads_nothing_that_compiles() -> None:
     assert done.stdout == "False\n", done.stderr
 
 
+def test_a_module_that_is_run_ends_with_its_run() -> None:
+    """What stands after it is not there yet when a process of it runs."""
+    for top in ("core", "drivers", "bridge"):
+        for file in (ROOT / top).rglob("*.py"):
+            text = file.read_text(encoding="utf-8")
+            if "__main__" in text:
+                before = ast.parse(text).body[:-1]
+                guards = [n for n in before if isinstance(n, ast.If) and "__name__" in ast.dump(n)]
+                assert not guards, file
+
+
 def test_what_the_package_states_is_there_and_nothing_else_is_imported_for_it() -> None:
     code = (
         "import sys, gapbridge; early = {m.split('.')[0] for m in sys.modules}\n"
