@@ -80,7 +80,8 @@ UNDETERMINED = 30.0  # times the usual size: with a wider spread nothing is know
 LOOSE_PRIOR = 5.0  # times the usual size: 1 sigma of what else may be there (outliers, steps)
 # Unnamed functions against what they stand beside
 DEGENERATE = 1e-5  # eigenvalue of unit columns below which a direction is the unnamed ones
-HELD_WHOLLY = 0.98  # share of an effect's column in an unnamed rival's span that makes it a part
+HELD_WHOLLY = 0.98  # share of an effect's column in an unnamed rival's span that makes it a part,
+# and of what an unnamed load does in the span of a load found
 MOSTLY = 0.9  # share of what the rival takes that has to be this part: a pull nearly down, a weight
 # Noise and outliers
 UNRESOLVED = 1e-7  # m, N, rad, Nm: no instrument resolves what is left below (26 bits: 9e-8 rad);

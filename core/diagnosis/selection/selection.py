@@ -17,6 +17,7 @@ from gapbridge.core.arm import Arm
 from gapbridge.core.arrays import Array, Mask
 from gapbridge.core.diagnosis.criteria import (
     HEAVIEST,
+    HELD_WHOLLY,
     LARGE_SAMPLE,
     OWN_SIGMAS,
     SIGMAS,
@@ -48,7 +49,7 @@ from gapbridge.core.diagnosis.selection.outliers import (
 from gapbridge.core.diagnosis.selection.problem import CandidateFit, SampleSpace, fit
 from gapbridge.core.diagnosis.selection.refit import Remainder, refit, worth
 from gapbridge.core.diagnosis.selection.search import by_what_is_left, screened_search
-from gapbridge.core.diagnosis.selection.smooth import smooth_candidates
+from gapbridge.core.diagnosis.selection.smooth import Pair, smooth_candidates, unnamed
 from gapbridge.core.diagnosis.selection.state import (
     SelectionState,
     UnprojectedRows,
@@ -58,7 +59,7 @@ from gapbridge.core.diagnosis.selection.state import (
 )
 from gapbridge.core.diagnosis.selection.stiffness_curves import with_straight_stiffness
 from gapbridge.core.effects import Site, Term
-from gapbridge.core.estimation.least_squares import projected_out, solve
+from gapbridge.core.estimation.least_squares import basis_of, projected_out, solve
 from gapbridge.core.load_bounds import LoadBounds
 from gapbridge.core.model import Model
 
@@ -242,7 +243,7 @@ def select(
     space: SampleSpace | None = None
     near: SampleSpace | None = None  # the same, beside the links where their geometry is a cause
     columns: list[Array] = []
-    smooth = smooth_candidates(observation)
+    offered = smooth_candidates(observation)
     none: set[tuple[str, Site]] = set()  # what the exact refit takes back: its place is free
     for turn in range(ROUNDS):
         if progress:
@@ -255,6 +256,7 @@ def select(
         if turn == 0:  # the rows after a late slip stand out unless it is among what may be there
             steps = step_candidates(state, columns, base, withheld)
             mark_outliers(state, [*zip(state.candidates, columns, strict=True), *steps])
+        smooth = _beyond_loads(offered, state.candidates, columns, base)
         stepping = step_candidates(state, columns, base, withheld)
         state.candidates += [candidate for candidate, _ in stepping]
         columns += [own for _, own in stepping]
@@ -306,6 +308,39 @@ def select(
         state.observation, space, found, terms, index, covariance, counted, whitened_by,
         residual, base, unprojected, links,
     )  # fmt: skip
+
+
+def _beyond_loads(
+    smooth: list[Pair], candidates: Sequence[Candidate], columns: Sequence[Array],
+    base: Sequence[Term],
+) -> list[Pair]:  # fmt: skip
+    """Return the smooth candidates, unnamed loads without what a load found does.
+
+    A mass anywhere at the tool is a payload and its centre, a pull downwards a weight. Beside these
+    it would show nothing of its own, but take their values away, and then stand where they do.
+    """
+    there = {t.effect for t in base}
+    loads = [
+        own.reshape(-1, own.shape[-1])
+        for c, own in zip(candidates, columns, strict=True)
+        if c.effect.carried and not c.site.joint and there & {c.family, c.beside}
+    ]
+    if not loads:
+        return smooth
+    U, found = basis_of(np.hstack(loads)), []
+    for c, own in smooth:
+        if c.of_no_quantity:
+            X = basis_of(own.reshape(len(U), -1))
+            _, left, V = np.linalg.svd(projected_out(U, X), full_matrices=False)
+            unknown = left**2 > 1 - HELD_WHOLLY
+            if not unknown.any():
+                continue
+            if not unknown.all():
+                rest = (X @ V[unknown].T).reshape(*own.shape[:2], -1)
+                found.append(unnamed("", c.target, rest))
+                continue
+        found.append((c, own))
+    return found
 
 
 def _weakest(

@@ -47,7 +47,7 @@ def smooth_candidates(observation: Observation) -> list[Pair]:
         found += _frictions(name, z, observation)
     found += _springs(observation)
     for target, columns in observation.unnamed():
-        found.append((_candidate("", target, columns.shape[-1]), columns))
+        found.append(unnamed("", target, columns))
     return found
 
 
@@ -107,13 +107,15 @@ def targets(observation: Observation) -> dict[str, Array]:
 
 def _spread(quantity: str, target: str, directions: Array, shape: Array) -> Pair:
     columns = directions[:, :, :, None] * shape[:, None, None, :]
-    columns = columns.reshape(*columns.shape[:2], -1)
-    return _candidate(quantity, target, columns.shape[-1]), columns
+    return unnamed(quantity, target, columns.reshape(*columns.shape[:2], -1))
 
 
-def _candidate(quantity: str, target: str, size: int) -> Candidate:
+def unnamed(quantity: str, target: str, columns: Array) -> Pair:
+    """Return a smooth candidate with its columns (N, k, d)."""
+    size = columns.shape[-1]
     scale = (Parameter("", "", 1e-3),) * size
-    return Candidate("smooth", Site(), scale, (None,) * size, quantity=quantity, target=target)
+    smooth = Candidate("smooth", Site(), scale, (None,) * size, quantity=quantity, target=target)
+    return smooth, columns
 
 
 def _bumps(name: str, target: str, z: Array, directions: Array) -> list[Pair]:

@@ -43,6 +43,20 @@ def test_an_undeclared_load_is_found_with_its_centre_and_the_zero(plant, pull):
     assert np.allclose(found["ft_bias"], BIAS, atol=0.1)
 
 
+@pytest.mark.parametrize("seed", [0, 2, 5])
+def test_an_undeclared_load_is_found_by_a_sensor_whose_gains_differ(plant, seed):
+    """Beside the load found, a mass anywhere at the tool explains the gains no better than it."""
+    rng, q = np.random.default_rng(seed), truth.poses(N, ROWS, 5)
+    weight = plant.dynamics(q, 0 * q, 0 * q, payload=MASS)[1]
+    wrench = weight * (1 + rng.uniform(-0.03, 0.03, 6)) + BIAS
+    wrench += rng.normal(0, 1, wrench.shape) * NOISE
+    log = truth.log_of(N, timestamp=np.arange(ROWS) * 20.0, actual_q=q, ft_raw_wrench=wrench)
+    found = next(c for c in diagnose(plant.model(0.0), log).channels if c.channel == "wrench")
+    (load,) = (c.terms[0].values[0] for c in found.causes if c.effect == "payload")
+    assert load == pytest.approx(MASS, rel=0.03)
+    assert found.remaining_rms_held_out < 0.1 * found.gap_rms
+
+
 def test_no_centre_is_accused_of_a_load_that_is_not(plant):
     channel = diagnosed(plant, SIDEWAYS, ("payload",))
     assert "payload_cog" not in [c.effect for c in channel.causes]
