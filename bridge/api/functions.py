@@ -29,6 +29,8 @@ __all__ = ["compensate", "diagnose", "fit", "load_cell", "predict", "read_log"]
 def read_log(path: Path | str | Sequence[Path | str], cell: Cell) -> Log:
     """Return a log for a cell's arm, checked; several paths are sessions of one arm."""
     paths = [path] if isinstance(path, (str, Path)) else list(path)
+    if not paths:
+        raise InputError("read_log: found no path, expected a log or several")
     return join_sessions([open_log(Path(one), cell) for one in paths], cell.model)
 
 

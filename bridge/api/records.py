@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from gapbridge.bridge.cell import Cell, save_cell
+from gapbridge.bridge.document.output_file import require_writable
 from gapbridge.bridge.document.provenance import provenance
 from gapbridge.core.arrays import Array, Mask
 from gapbridge.core.model import Model
@@ -84,7 +85,7 @@ class Fitted:
 
     def save(self, path: Path | str) -> None:
         """Write the cell with the flexibilities found, as ``gapbridge fit`` does."""
-        save_cell(self.cell, path, self.model, {"provenance": self.provenance})
+        _save(self.cell, path, self.model, self.provenance)
 
     def to_json(self) -> dict[str, Any]:
         """Return the figures as lists and numbers."""
@@ -116,11 +117,16 @@ class Diagnosed:
 
     def save(self, path: Path | str) -> None:
         """Write the cell with the causes added, as ``--apply`` does."""
-        save_cell(self.cell, path, self.model, {"provenance": self.provenance})
+        _save(self.cell, path, self.model, self.provenance)
 
     def to_json(self) -> dict[str, Any]:
         """Return the document, schema ``gapbridge.diagnosis/1``."""
         return self.document
+
+
+def _save(cell: Cell, path: Path | str, model: Model, origin: dict[str, Any]) -> None:
+    """Write a cell. Raises InputError where it cannot be written, or is the one it came from."""
+    save_cell(cell, require_writable(Path(path), cell.path), model, {"provenance": origin})
 
 
 def _finite(values: Array) -> list[float | None]:

@@ -78,6 +78,15 @@ def test_what_cannot_be_used_raises_the_line_of_the_command(desk: Path) -> None:
     with pytest.raises(api.InputError, match="line 2: gravity"):
         api.load_cell(desk / "bad.yaml")
     cell = api.load_cell(desk / "cell.yaml")
+    with pytest.raises(api.InputError, match="found no path"):
+        api.read_log([], cell)
+    found = api.fit(cell, api.read_log(desk / "log.csv", cell))
+    for path, line in (
+        (desk / "cell.yaml", "output to be the input"),
+        (desk / "no/c.yaml", "no folder"),
+    ):
+        with pytest.raises(api.InputError, match=line):
+            found.save(path)
     with pytest.raises(api.InputError, match="'nonsense'"):
         api.diagnose(cell, api.read_log(desk / "log.csv", cell), withhold=["nonsense"])
 
