@@ -75,6 +75,28 @@ main(["check", "cell.yaml"])
 """
 
 
+IMPORTING = """
+import os, signal, sys
+
+class Interrupting:
+    def find_spec(self, name, *_):
+        if name == "gapbridge.bridge.cli":
+            os.kill(os.getpid(), signal.SIGINT)
+
+sys.meta_path.insert(0, Interrupting())
+from gapbridge.__main__ import run
+run()
+"""
+
+
+def test_an_interrupt_while_the_command_is_imported_is_one_line() -> None:
+    ran = subprocess.run(
+        [sys.executable, "-c", IMPORTING], capture_output=True, text=True, check=False,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # a shell may ignore it
+    )  # fmt: skip
+    assert (ran.returncode, ran.stderr.strip()) == (1, "error: interrupted")
+
+
 def test_an_interrupt_waits_until_machine_code_is_loaded() -> None:
     ran = subprocess.run(
         [sys.executable, "-c", INTERRUPTED], capture_output=True, text=True, check=False,
