@@ -72,15 +72,18 @@ def _why(
     model: Model, q: Array, measured: Array, rows: Array, distance: float, turned: Array | None
 ) -> LogFinding:
     """Return the finding on positions that do not follow the arm."""
-    best, named = distance, None
-    for mistake, trial_model, trial_q, trial in _mistakes(model, q, measured, rows, turned):
-        if len(trial) < FEWEST:
-            continue
-        left = _off(trial, trial_model.rigid_pose(trial_q).position)
-        if left < CLEARLY * best:
-            best, named = left, mistake
-    if named is not None and best < BETTER * distance:
-        return LogFinding(LogCheck.POSITIONS_OFF_BY, (distance, named, best))
+    others = ((found, arm, q[rows], measured[rows]) for found, arm in other_arms(model))
+    # another arm only where no mistake about this one says it
+    for tried in (_mistakes(model, q, measured, rows, turned), others):
+        best, named = distance, None
+        for mistake, trial_model, trial_q, trial in tried:
+            if len(trial) < FEWEST:
+                continue
+            left = _off(trial, trial_model.rigid_pose(trial_q).position)
+            if left < CLEARLY * best:
+                best, named = left, mistake
+        if named is not None and best < BETTER * distance:
+            return LogFinding(LogCheck.POSITIONS_OFF_BY, (distance, named, best))
     return LogFinding(LogCheck.POSITIONS_OFF, (distance,))
 
 
@@ -116,8 +119,6 @@ def _mistakes(
     if found is None or not np.isfinite(found).all():
         found = rotation_vector(np.swapaxes(model.rigid_pose(q[rows]).rotation, 1, 2))
     yield LogFinding(LogCheck.INVERTED), model, q[rows], inverted(seen, found)
-    for mistake, other in other_arms(model):
-        yield mistake, other, q[rows], seen
 
 
 def _size(position: Array) -> float:

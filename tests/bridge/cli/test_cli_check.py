@@ -120,7 +120,8 @@ def measured_log(folder: Path, order: tuple[int, ...] = (0, 1, 2, 3, 4, 5)) -> P
         (CRAIG, (0, 1, 2, 3, 4, 5), "robot.dh looks like modified DH rows (Craig)"),
         ("robot: {model: ur10e}\n", (2, 1, 0, 3, 4, 5), "joints 1 and 3 look swapped (a UR's"),
         ("robot: {model: ur10e}\n", (0, 1, 2, 5, 3, 4), "the joints look out of order: joint 4 is"),
-        ("robot: {model: ur3e}\n", (0, 1, 2, 3, 4, 5), "is it the right arm, tool and order"),
+        ("robot: {model: ur3e}\n", (0, 1, 2, 3, 4, 5), "they look like those of a ur10e"),
+        ("robot: {model: ur3e}\n", (1, 0, 2, 4, 3, 5), "is it the right arm, tool and order"),
     ],
 )  # fmt: skip
 def test_another_arm_than_was_measured_is_named_by_its_mistake(
