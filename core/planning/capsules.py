@@ -40,7 +40,7 @@ def segment_distance(p: Array, q: Array, r: Array, s: Array) -> Array:
     denominator = a * e - b * b
     # parallel, or one of them a point: from where the other's beginning stands before the first
     plumb = np.where(a > TINY, -c / np.maximum(a, TINY), 0.0)
-    skewed = denominator > TINY * np.maximum(a * e, TINY)
+    skewed = (a > TINY) & (e > TINY) & (denominator > TINY * a * e)
     along = np.where(skewed, (b * f - c * e) / np.where(skewed, denominator, 1.0), plumb)
     along = np.clip(along, 0, 1)
     across = np.where(e > TINY, (b * along + f) / np.maximum(e, TINY), 0.0)
