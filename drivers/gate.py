@@ -94,11 +94,12 @@ def _length(vector, first):  # type: ignore[no-untyped-def]
 
 
 @njit(**JIT)
-def _judge(links, joints, offsets, numbers, budget, moves):  # type: ignore[no-untyped-def]
+def _judge(links, joints, offsets, numbers, budget, moves, first):  # type: ignore[no-untyped-def]
     """Return (reason, joint, found, s of travel that the step takes).
 
     joints (6, n): q, nominal, last q, lower, upper, velocity. offsets (2, 6): this, last. numbers:
-    envelope, its rotation, its rates, joint offset, longest step (s).
+    envelope, its rotation, its rates, joint offset, longest step (s). first: nothing was sent yet,
+    last q is where the arm stood.
     """
     n, travel = joints.shape[1], 0.0
     q, nominal, last = joints[0], joints[1], joints[2]
@@ -128,7 +129,8 @@ def _judge(links, joints, offsets, numbers, budget, moves):  # type: ignore[no-u
             nearer = nearer and abs(q[i] - nominal[i]) <= lag + GRAIN
             if abs(q[i] - nominal[i]) > max(numbers[4], lag) + GRAIN:
                 return JOINT_OFFSET, i, abs(q[i] - nominal[i]), 0.0
-            travel = max(travel, (abs(q[i] - last[i]) - GRAIN) / joints[5, i])
+            if not first:  # it may have given since
+                travel = max(travel, (abs(q[i] - last[i]) - GRAIN) / joints[5, i])
         if not nearer and (
             length > numbers[0] * SECOND_ORDER + GRAIN or turn > numbers[1] * SECOND_ORDER + GRAIN
         ):
@@ -237,17 +239,19 @@ class Gate:
 
     def _judged(self, budget: float) -> tuple[int, int, float, float]:
         code, joint, found, travel = _judge(
-            self._links, self._joints, self._offsets, self._numbers, budget, self._moves_arm
-        )
+            self._links, self._joints, self._offsets, self._numbers, budget, self._moves_arm,
+            self._started is not None,
+        )  # fmt: skip
         return int(code), int(joint), float(found), float(travel)
 
     def _check_start(self, q: Array) -> None:
         assert self._started is not None
-        if self._moves_arm:
-            away = np.minimum(*(np.abs(q - stood) for stood in self._started))
-            if not (away <= START).all():  # NaN is not
-                raise GateError(self._reason(AWAY, int(np.argmax(away)), float(away.max())))
-        self._joints[2] = q
+        was, is_at = self._started
+        stood = np.where(np.abs(q - was) <= np.abs(q - is_at), was, is_at)
+        away = np.abs(q - stood)
+        if self._moves_arm and not (away <= START).all():  # NaN is not
+            raise GateError(self._reason(AWAY, int(np.argmax(away)), float(away.max())))
+        self._joints[2] = stood
 
     def sent(self) -> None:
         """Take note that the setpoint that was checked has left."""

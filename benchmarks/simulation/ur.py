@@ -30,6 +30,7 @@ from gapbridge.drivers.simulated.ur.programs.offset_program import (
 )
 from gapbridge.drivers.ur_rtde import command, registers
 from gapbridge.drivers.ur_rtde.driver import UrRtdeDriver
+from gapbridge.drivers.ur_rtde.round_trip import TRIES
 
 UPLOAD = 0.1  # s that uploading a script takes
 DEAD_AFTER = 0.3  # s of a broken connection until the library says so
@@ -56,7 +57,7 @@ class _Driver(UrRtdeDriver):
 
     def round_trip(self) -> float:
         """Ask the controller, there and back."""
-        self._way = found = self.link.ask()
+        self._way = found = max(self.link.ask() for _ in range(TRIES))
         return found
 
 
@@ -116,7 +117,9 @@ class UrLink(SimulatedLink):
 
     def ask(self) -> float:
         """Return how long a question and its answer take now, s."""
-        way = self.up.delay + self.down.delay + max(self.down.held_until - self.world.now, 0.0)
+        way = max(self.down.held_until - self.world.now, 0.0)
+        for wire in (self.up, self.down):
+            way += wire.delay + self.world.random.uniform(0.0, wire.jitter)
         self.clock.sleep(min(way, 1.0))
         if self.up.is_cut or way > 1.0:
             from gapbridge.core.errors import WriteError

@@ -14,6 +14,9 @@ from gapbridge.drivers.driver import Driver
 
 DRIFT = 5e-3  # s per s: how fast the bound follows a clock that drifts or stumbles
 INVALID_IN_A_ROW = 3  # states that cannot be believed, after which they count as silence
+LEAP = 0.01  # s that the controller's clock may pass ours by from one sample to the next
+AGREES = 2e-3  # s by which two samples may have come differently quickly and agree
+AGREEING_IN_A_ROW = 5  # samples as quick as before a leap, after which it was none
 OLD_IN_A_ROW = 2  # states too old to write by, after which they count as none
 SILENCE = 0.2  # s without a state: a fault
 LOST = 3.0  # s without a state: the link is lost
@@ -37,13 +40,19 @@ class ControllerClock:
     What a stalled link hands on at once is old for a moment only. Where all samples are older than
     that for as long, either the controller's clock has stood still or the way has become longer,
     which no clock shows: the two are tied anew only while nothing is written.
+    Where the controller's clock passes this machine's, either it has been set forward or the link
+    hands on what it held back: the sample counts as the next one after the last, until some in a
+    row come as quick as those before.
     """
 
     def __init__(self, rate: float, hold: float = 1.0, clock: Clock = SYSTEM) -> None:
         self._now = clock.monotonic
         self._rate, self._hold = rate, hold
         self._lead: float | None = None  # s: monotonic minus controller time, quickest sample
-        self._last: float | None = None  # s, controller clock
+        self._last: tuple[float, float] | None = None  # s: controller clock, monotonic
+        self._counts = True  # the cycles missed since the last sample are this loop's
+        self._quickest: float | None = None  # s, as _lead, before the controller's clock leapt
+        self._agreeing = 0  # samples in a row that are as quick as that
         self._old_since: float | None = None  # s, monotonic: all samples have been old since
 
     def take(self, state: RobotState, writes: bool = False) -> int:
@@ -51,15 +60,39 @@ class ControllerClock:
 
         ``writes``: setpoints are made of the samples, so that old ones stay old.
         """
-        lead, before = state.received - state.timestamp, self._last
-        self._last = state.timestamp
-        gap = 0.0 if before is None else state.timestamp - before
+        lead, before, counts = state.received - state.timestamp, self._last, self._counts
+        self._last, self._counts = (state.timestamp, state.received), True
+        gap = 0.0 if before is None else state.timestamp - before[0]
         if self._lead is None or (self._stood_still(lead, state.received) and not writes):
-            self._lead, self._old_since = lead, None
+            self._lead, self._old_since, self._quickest = lead, None, None
         else:
             # not over a break: the first state after it would count as younger than it can be
-            self._lead = min(lead, self._lead + DRIFT * (gap if gap <= self._hold else 0.0))
-        return 0 if before is None else max(round(gap * self._rate) - 1, 0)
+            drifted = self._lead + DRIFT * (gap if gap <= self._hold else 0.0)
+            elapsed = 0.0 if before is None else state.received - before[1]
+            leapt = gap - 1.0 / self._rate if gap - elapsed > LEAP else 0.0
+            self._lead = min(lead, self._doubted(lead, drifted, leapt))
+        return max(round(gap * self._rate) - 1, 0) if counts and before is not None else 0
+
+    def _doubted(self, lead: float, drifted: float, leapt: float) -> float:
+        """Return the lead (s) that counts where the controller's clock may have leapt.
+
+        ``leapt``: by how much (s) at this sample, zero where it has not; ``drifted``: the lead
+        that counts where it never has.
+        """
+        if leapt > 0.0:
+            if self._quickest is None:
+                self._quickest = drifted
+            self._agreeing = 0
+            drifted = min(drifted, self._quickest - leapt)
+        if self._quickest is None:
+            return drifted
+        later = lead - self._quickest
+        self._agreeing = self._agreeing + 1 if abs(later) <= AGREES else 0
+        if self._agreeing >= AGREEING_IN_A_ROW:
+            drifted, self._quickest = self._quickest, None
+        elif later < -AGREES:  # quicker than any before: it has been set
+            self._quickest = None
+        return drifted
 
     def _stood_still(self, lead: float, now: float) -> bool:
         """Return whether samples have come too old for long enough."""
@@ -71,7 +104,7 @@ class ControllerClock:
 
     def skip(self) -> None:
         """Do not count what the loop does not see now as missed: it does something else."""
-        self._last = None
+        self._counts = False
 
     def age(self, state: RobotState) -> float:
         """Return how old a state is now, s."""

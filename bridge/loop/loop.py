@@ -260,7 +260,7 @@ class Loop:
             self._give_up(self._watch.lost)
             return
         missed = self._clock.take(state, self._supervisor.state.writes)
-        expiry = self._clock.expiry(state) - self._driver.way()
+        expiry = self._clock.expiry(state) - self._writing.way
         is_fresh = self._watch.believe(expiry)
         self._give_up(self._watch.lost)
         self._page.note_seen()

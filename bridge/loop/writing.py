@@ -62,6 +62,11 @@ class Writing:
         paused, self._paused = self._paused, False
         return paused
 
+    @property
+    def way(self) -> float:
+        """Return how long the last sample may have been under way, s: as measured when arming."""
+        return self._driver.way() if self.ready else 0.0
+
     def abandon(self) -> None:
         """Take note that the driver is not armed any more: its watchdog, or a person, has it."""
         self.ready = False

@@ -206,6 +206,14 @@ def test_a_command_that_its_joints_speed_holds_back_may_only_come_nearer() -> No
     found.sent()
 
 
+def test_a_first_setpoint_is_within_the_envelope_of_its_nominal_joints() -> None:
+    gate, _ = opened(moves_arm=True, bounds=GateBounds(offset=0.002))
+    far = Q + np.array([0.0, 0.03, 0.0, 0.0, 0.0, 0.0])  # near the arm, some 20 mm from nominal
+    with pytest.raises(GateError, match=r"found an offset of 0\.0[1-9]"):
+        gate.check(setpoint(far))
+    gate.check(setpoint(Q + np.array([0.0, 0.001, 0.0, 0.0, 0.0, 0.0])))
+
+
 def test_a_first_setpoint_away_from_the_arm_is_refused() -> None:
     found, _ = opened(moves_arm=True)
     with pytest.raises(GateError, match=r"joint 3: found a first setpoint 0\.0600 rad"):

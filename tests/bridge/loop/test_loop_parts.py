@@ -164,6 +164,34 @@ def test_while_writing_samples_that_come_later_for_good_stay_old() -> None:
     assert clock.expiry(late) > late.received
 
 
+def test_a_clock_that_is_set_forward_behind_late_samples_makes_none_of_them_younger() -> None:
+    clock = ControllerClock(500.0, hold=0.04)
+    for k in range(50):
+        clock.take(state(1.0 + 0.002 * k, 10.0 + 0.002 * k), writes=True)
+    for k in range(50, 500):  # 45 to 60 ms late; meanwhile it is set forward by 50 ms
+        set_by = 0.05 if k > 55 else 0.0
+        late = state(1.0 + set_by + 0.002 * k, 10.045 + 0.002 * k + 0.015 * (k % 7) / 6)
+        clock.take(late, writes=True)
+        assert clock.expiry(late) < late.received
+    for k in range(500, 520):  # they come in time again
+        fresh = state(1.05 + 0.002 * k, 10.0 + 0.002 * k)
+        clock.take(fresh, writes=True)
+        assert clock.expiry(fresh) == pytest.approx(fresh.received + 0.04, abs=1e-6)
+
+
+def test_the_newest_of_what_a_link_held_back_counts_once_others_come_as_quickly() -> None:
+    clock = ControllerClock(500.0, hold=0.04)
+    for k in range(50):
+        clock.take(state(1.0 + 0.002 * k, 10.0 + 0.002 * k), writes=True)
+    clock.take(state(1.1, 10.16), writes=True)  # 60 ms late; the next that is read is in time
+    fresh = []
+    for k in range(80, 90):
+        newest = state(1.0 + 0.002 * k, 10.0 + 0.002 * k)
+        clock.take(newest, writes=True)
+        fresh.append(clock.expiry(newest) > newest.received)
+    assert fresh == [False] * 4 + [True] * 6
+
+
 def test_what_a_stalled_link_hands_on_at_once_is_old_until_the_newest_has_come() -> None:
     clock = ControllerClock(500.0, hold=0.04)
     now = time.monotonic()
