@@ -21,7 +21,8 @@ import numpy as np
 from gapbridge.core.arrays import Array
 from gapbridge.core.errors import InputError, RunError
 
-PARQUET = (".parquet", ".pq")
+CSV, PARQUET = ".csv", (".parquet", ".pq")
+TABLES = ".csv or .parquet"
 LONG = 50_000  # numbers from which a library writes a table as text: ten times as fast
 MODE = 0o640  # of a new file
 FOLDER_MODE = 0o750  # of a new folder of recordings, sessions and the like
@@ -45,6 +46,17 @@ def require_writable(path: Path, *inputs: Path) -> Path:
             raise InputError(f"{path}: found the output to be the input {given}, expected another")
     if not os.access(folder, os.W_OK):
         raise InputError(f"{path}: found a folder {folder} that cannot be written to")
+    return path
+
+
+def require_table(path: Path, *inputs: Path) -> Path:
+    """Return the path if a table can be written there; see ``require_writable``.
+
+    Raises InputError, too, where its suffix promises another format than CSV or Parquet.
+    """
+    require_writable(path, *inputs)
+    if path.suffix.lower() not in (CSV, *PARQUET):
+        raise InputError(f"--out {path}: found {path.suffix or 'no suffix'}, expected {TABLES}")
     return path
 
 

@@ -33,6 +33,16 @@ from gapbridge.core.log.columns import (
 from gapbridge.core.log.parquet_tables import ParquetColumns
 
 GZIP = b"\x1f\x8b"
+PACKED: dict[bytes, str] = {  # first bytes -> what it is, and what to do
+    b"\x28\xb5\x2f\xfd": "a file packed by Zstandard: unpack it (zstd -d)",
+    b"\xfd7zXZ\x00": "a file packed by xz: unpack it (unxz)",
+    b"BZh": "a file packed by bzip2: unpack it (bunzip2)",
+    b"7z\xbc\xaf\x27\x1c": "a 7-Zip archive: unpack it",
+    b"PK\x03\x04": "an Excel workbook or a zip archive: save the sheet as CSV, or unpack it",
+    b"PAR1": "a Parquet file: give it a name that ends in .parquet",
+    b"\xd0\xcf\x11\xe0": "an Excel workbook: save the sheet as CSV",
+}
+UTF_16 = (b"\xff\xfe", b"\xfe\xff")
 STILL = 1e-6  # rad: a smaller change between rows is no motion
 
 
@@ -187,13 +197,24 @@ def no_file(path: Path) -> LogError:
     return LogError(f"{path}: {what}, expected a CSV or Parquet log")
 
 
+def encoding_of(path: Path, head: bytes) -> str:
+    """Return how the text of a log is encoded, by its first bytes.
+
+    Raises LogError with the cure where they are those of a packed file.
+    """
+    for first, what in PACKED.items():
+        if head.startswith(first):
+            raise LogError(f"{path}: found {what}")
+    return "utf-16" if head[:2] in UTF_16 else "utf-8-sig"
+
+
 def _text(path: Path) -> str:
     """Return a text file, unpacked where it is gzip."""
     try:
         data = read_bytes(path)
         if data[:2] == GZIP:
             data = gzip.decompress(data)
-        return data.decode("utf-8-sig").replace("\r\n", "\n").replace("\r", "\n")
+        return data.decode(encoding_of(path, data)).replace("\r\n", "\n").replace("\r", "\n")
     except UnicodeDecodeError:
         raise LogError(f"{path}: found bytes that are no text, expected CSV (UTF-8)") from None
     except (OSError, EOFError, zlib.error) as error:

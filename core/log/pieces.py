@@ -21,6 +21,7 @@ from gapbridge.core.log.log import (
     Log,
     csv_table,
     delimiter_of,
+    encoding_of,
     is_comment,
     last_motion,
     no_file,
@@ -103,16 +104,17 @@ def _tables(path: Path, rows: int) -> Iterator[Table]:
     if path.suffix.lower() == RECORDING:
         return _recording(path)
     with path.open("rb") as file:
-        if file.read(2) == GZIP:
+        head = file.read(8)
+        if head[:2] == GZIP:
             raise LogError(
                 f"{path}: found gzip of a log that is too long to be read as a whole, expected it "
                 "unpacked (gunzip)"
             )
-    return _csv(path, rows)
+    return _csv(path, rows, encoding_of(path, head))
 
 
-def _csv(path: Path, rows: int) -> Iterator[Table]:
-    with path.open(encoding="utf-8-sig") as file:
+def _csv(path: Path, rows: int, encoding: str) -> Iterator[Table]:
+    with path.open(encoding=encoding) as file:
         kept = _lines(file)
         header = next(kept, (1, ""))[1]
         delimiter = delimiter_of(header)

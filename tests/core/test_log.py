@@ -1,6 +1,8 @@
 """Logs: recordings as they come, and one line for every way in which a file can be wrong."""
 
+import bz2
 import gzip
+import lzma
 from pathlib import Path
 
 import numpy as np
@@ -72,6 +74,35 @@ def test_decimal_commas_comments_and_gzip_are_read(tmp_path):
     packed.write_bytes(packed.read_bytes()[:40])
     with pytest.raises(LogError, match="no readable file"):
         read_log(packed, 6)
+
+
+def test_utf_16_as_excel_writes_it_is_read(tmp_path):
+    text = "actual_q_0,actual_q_1,payload_mass\n0.5,-0.25,1.5\n0.1,0.2,3\n"
+    for encoding in ("utf-16", "utf-16-le", "utf-16-be"):
+        path = tmp_path / f"{encoding}.csv"
+        mark = {"utf-16-le": b"\xff\xfe", "utf-16-be": b"\xfe\xff"}.get(encoding, b"")
+        path.write_bytes(mark + text.encode(encoding))
+        for log in (read_log(path, 2), *LogPieces(path, 2)):
+            assert log.require("actual_q").tolist() == [[0.5, -0.25], [0.1, 0.2]]
+
+
+@pytest.mark.parametrize(
+    ("packed", "cure"),
+    [
+        (lzma.compress(b"actual_q_0\n1\n"), "packed by xz: unpack it"),
+        (bz2.compress(b"actual_q_0\n1\n"), "packed by bzip2: unpack it"),
+        (b"\x28\xb5\x2f\xfd" + bytes(20), "packed by Zstandard: unpack it"),
+        (b"PK\x03\x04" + bytes(20), "an Excel workbook or a zip archive: save the sheet as CSV"),
+        (b"PAR1" + bytes(20), "a Parquet file: give it a name that ends in .parquet"),
+    ],
+)
+def test_what_is_packed_is_refused_with_the_cure(tmp_path, packed, cure):
+    path = tmp_path / "log.csv"
+    path.write_bytes(packed)
+    with pytest.raises(LogError, match=cure):
+        read_log(path, 1)
+    with pytest.raises(LogError, match=cure):
+        next(iter(LogPieces(path, 1)))
 
 
 def test_decimal_commas_between_commas_are_refused_with_the_cure(tmp_path):
@@ -188,7 +219,7 @@ def test_unusable_files_are_reported_in_one_line(tmp_path, case):
 
 def test_what_is_no_text_is_reported(tmp_path):
     path = tmp_path / "log.csv"
-    path.write_bytes(b"\xff\xfe\x00\x01" * 10)
+    path.write_bytes(b"\x80\x81\x00\x01" * 10)
     with pytest.raises(LogError, match="no text"):
         read_log(path, 6)
     with pytest.raises(LogError, match="file not found"):

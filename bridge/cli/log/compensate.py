@@ -17,7 +17,7 @@ from gapbridge.bridge.cli.options import (
     open_cell,
 )
 from gapbridge.bridge.cli.progress import progress
-from gapbridge.bridge.document.output_file import require_writable, writing_table
+from gapbridge.bridge.document.output_file import require_table, writing_table
 from gapbridge.core.arrays import Array
 from gapbridge.core.errors import EquilibriumError, InputError
 from gapbridge.core.log.log import Log
@@ -39,7 +39,7 @@ def compensate(log: Path, cell: Path, out: Path) -> None:
     Example: gapbridge compensate log.csv --cell cell.yaml --out corrected.csv
     """
     given = open_cell(cell)
-    require_writable(out, log, cell)
+    require_table(out, log, cell)
     names = [f"corrected_q_{i}" for i in range(given.arm.n)]
     rows, missed, worst, line = 0, 0, 0.0, 0
     with writing_table(out) as append, progress("correcting") as advance:

@@ -9,7 +9,7 @@ import click
 
 from gapbridge.bridge.cell.opened_log import joint_names
 from gapbridge.bridge.cli.options import FILE, open_cell
-from gapbridge.bridge.document.output_file import PARQUET, require_writable, write_table
+from gapbridge.bridge.document.output_file import PARQUET, require_table, write_table
 from gapbridge.core.errors import InputError, LogError
 from gapbridge.core.log.sources import SOURCES, SourceOptions, source_of
 from gapbridge.core.log.sources.ros_bag import TYPES, WRENCHES
@@ -63,11 +63,7 @@ def convert(source: Path, out: Path, cell: Path | None, **given: Any) -> None:
         raise LogError(
             f"{source}: found no known kind of recording, expected one of: {listed}{also}"
         )
-    if out.suffix.lower() not in (".csv", *PARQUET):
-        raise InputError(
-            f"--out {out}: found {out.suffix or 'no suffix'}, expected .csv or .parquet"
-        )
-    require_writable(out, *([source] if source.is_file() else []), *([cell] if cell else []))
+    require_table(out, *([source] if source.is_file() else []), *([cell] if cell else []))
     options = _options(**given)
     for_cell = open_cell(cell) if cell else None
     converted = kind.read(source, joint_names(for_cell) if for_cell else (), options)

@@ -8,7 +8,7 @@ from pathlib import Path
 import click
 
 from gapbridge.bridge.cli.options import FILE
-from gapbridge.bridge.document.output_file import require_writable, write_text
+from gapbridge.bridge.document.output_file import require_table, require_writable, write_text
 from gapbridge.bridge.recording.export import Exported, Span, export, moment
 from gapbridge.core.errors import InputError
 from gapbridge.core.log.mcap_reading import SUFFIX, files_of, read_configuration
@@ -40,11 +40,7 @@ def export_recording(
     if out is None:
         name = recording.name.removesuffix(SUFFIX)
         out = recording.with_name(f"{name}.csv")
-    if out.suffix.lower() not in (".csv", ".parquet", ".pq"):
-        raise InputError(
-            f"--out {out}: found {out.suffix or 'no suffix'}, expected .csv or .parquet"
-        )
-    require_writable(out, *files)
+    require_table(out, *files)
     span = Span(_moment("--from", start), _moment("--to", stop))
     if cell_out is not None:
         require_writable(cell_out, *files)

@@ -22,7 +22,7 @@ from gapbridge.bridge.cli.options import (
     open_cell,
 )
 from gapbridge.bridge.cli.progress import progress
-from gapbridge.bridge.document.output_file import require_writable, writing_table
+from gapbridge.bridge.document.output_file import require_table, writing_table
 from gapbridge.core.arrays import Array
 from gapbridge.core.log.log import Log
 from gapbridge.core.predicted_channels import in_context, predicted_channels
@@ -54,7 +54,7 @@ def predict(log: Path, cell: Path, out: Path, channels: bool) -> None:
     Example: gapbridge predict log.csv --cell cell.yaml --out predicted.csv
     """
     given = open_cell(cell)
-    require_writable(out, log, cell)
+    require_table(out, log, cell)
     summary = _Summary()
     with writing_table(out) as append, progress("predicting") as advance:
         for piece, found in _predicted(given, log, channels):

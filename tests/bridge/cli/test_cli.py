@@ -172,6 +172,14 @@ def test_the_line_of_a_command_is_the_first_of_its_help(name: str) -> None:
         (["fit"], "Missing argument 'LOG...'"),
         (["fit", "x", "--cel", "y"], "--cell"),
         (["predict", "@log.csv", "--cell", "@cell.yaml"], "--out"),
+        (
+            ["predict", "@log.csv", "--cell", "@cell.yaml", "--out", "@o.xlsx"],
+            "found .xlsx, expected .csv or .parquet",
+        ),
+        (
+            ["compensate", "@log.csv", "--cell", "@cell.yaml", "--out", "@o.csv.gz"],
+            "found .gz, expected .csv or .parquet",
+        ),
     ],
 )
 def test_a_slip_on_the_command_line_is_reported_in_one_line(
