@@ -18,6 +18,8 @@ from gapbridge.bridge.document.blocks import (
     GOOD,
     Badge,
     Block,
+    Bullets,
+    Heading,
     Paragraph,
     Pictures,
     Section,
@@ -49,12 +51,26 @@ class ShortMaterial(Generic[F]):
 def _result(
     found: PayloadCalibration | ToolCalibration, tiles: tuple[Tile, ...], before: str
 ) -> list[Block]:
-    """Return the verdict, the large figures, and what the cell had."""
+    """Return the verdict, what to do, the large figures, and what the cell had."""
     badge = Badge("Found, see remarks", DOUBTFUL) if found.notes else Badge("Found", GOOD)
     return [
-        Verdict(badge, sentence(short_text(found))), Tiles(tiles),
+        Verdict(badge, sentence(short_text(found))),
+        Heading("What to do now"), Bullets(tuple(_next_steps(found))), Tiles(tiles),
         *([Paragraph(before)] if before else []),
     ]  # fmt: skip
+
+
+def _next_steps(found: PayloadCalibration | ToolCalibration) -> list[str]:
+    """Return what the user does next, most urgent first."""
+    what = "payload and centre of gravity" if isinstance(found, PayloadCalibration) else "TCP"
+    first = ["See the remarks under “Session”, and measure again what they name."]
+    return [
+        *(first if found.notes else []),
+        f"Set the same {what} in the robot controller; gapbridge check CELL --live compares both.",
+        "Watch the new cell first (gapbridge run CELL --observe), then let it write "
+        "(gapbridge run CELL --arm).",
+        "Measure again after every collision and every change of the tool.",
+    ]
 
 
 def _point(values: Sequence[float] | Array, factor: float = 1e3, decimals: int = 1) -> str:

@@ -66,6 +66,9 @@ def test_a_short_session_shows_each_number_with_its_interval(kind, unit, tmp_pat
         assert f"<div>{interval}</div>" in html
         assert interval in phrase
     assert unit in phrase
+    for text in (html, phrase):
+        assert "What to do now" in text
+        assert "run CELL --observe" in text
     # an instrument that measures no lengths has no noise in mm
     assert "noise, declared" not in html
 
@@ -75,4 +78,5 @@ def test_a_outlier_reading_of_the_sensor_is_remarked(tmp_path):
     assert list(found.outliers) == [5]
     html, _ = read(write_report(ShortMaterial(found, session(), nominal), tmp_path))
     assert "Found, see remarks" in html
+    assert html.index("See the remarks under") < html.index("Set the same payload")
     assert "Down-weighted as outlier: reading 6." in html
