@@ -7,6 +7,7 @@ import math
 import sys
 import types
 from collections.abc import Iterator
+from statistics import median
 from typing import Any
 
 import numpy as np
@@ -57,7 +58,7 @@ class _Driver(UrRtdeDriver):
 
     def round_trip(self) -> float:
         """Ask the controller, there and back."""
-        self._way = found = max(self.link.ask() for _ in range(TRIES))
+        self._way = found = median(self.link.ask() for _ in range(TRIES))
         return found
 
 
