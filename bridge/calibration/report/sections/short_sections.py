@@ -63,7 +63,7 @@ def _result(
 def _next_steps(found: PayloadCalibration | ToolCalibration) -> list[str]:
     """Return what the user does next, most urgent first."""
     what = "payload and centre of gravity" if isinstance(found, PayloadCalibration) else "TCP"
-    first = ["See the remarks under “Session”, and measure again what they name."]
+    first = ["See the remarks under “Session and instrument”, and measure again what they name."]
     return [
         *(first if found.notes else []),
         f"Set the same {what} in the robot controller; gapbridge check CELL --live compares both.",
