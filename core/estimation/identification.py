@@ -203,10 +203,13 @@ def require_excitation(model: Model, data: Data, metrology: Metrology, usual: fl
     """Raise ExcitationError where nothing in the data makes a joint bend by ``usual`` (rad/Nm)."""
     n = model.arm.n
     unknown = 2 + data.nuisances
-    if 3 * len(data.q) < unknown:
+    distinct = _distinct(data, unknown + 2 * n)
+    found = f"found {len(data.q)} row(s) with measured positions"
+    if distinct < len(data.q):
+        found += f" of {distinct} different pose(s) and load(s)"
+    if 3 * distinct < unknown:
         raise ExcitationError(
-            f"found {len(data.q)} row(s) with measured positions, expected at least "
-            f"{-(-unknown // 3)} to fit the compliance"
+            f"{found}, expected at least {-(-unknown // 3)} to fit the compliance"
         )
     nothing, all_alike = np.zeros((len(data.q), 3)), np.ones((len(data.q), 3))
     R = weighed(model, IDENTITY, replace(data, rotation=None), (nothing, all_alike))[:, :-1]
@@ -223,15 +226,26 @@ def require_excitation(model: Model, data: Data, metrology: Metrology, usual: fl
             f"nothing in the log excites the compliance: {reason}; expected poses under different "
             "payloads (payload) or pulls (actual_TCP_force)"
         )
-    if 3 * len(data.q) - data.nuisances <= 2 * n:
+    if 3 * distinct - data.nuisances <= 2 * n:
         size = np.linalg.svd(form, compute_uv=False) * usual
         determined = int((size > 3 * metrology.sigma).sum())
-        if 3 * len(data.q) - data.nuisances <= determined:
+        if 3 * distinct - data.nuisances <= determined:
             raise ExcitationError(
-                f"found {len(data.q)} row(s) with measured positions for {determined} "
-                "flexibilities that they bend: nothing is left by which a fit could be judged; "
-                "expected more poses"
+                f"{found} for {determined} flexibilities that they bend: nothing is left by which "
+                "a fit could be judged; expected more poses"
             )
+
+
+def _distinct(data: Data, enough: int) -> int:
+    """Return how many rows differ in joints or load: a reading that is repeated fits no more.
+
+    Of a long log some rows are looked at first, and no others where ``enough`` differ.
+    """
+    loads = (data.loads.payload_mass, data.loads.payload_cog, data.loads.wrench)
+    given = [values.reshape(len(data.q), -1) for values in loads if values is not None]
+    table = np.column_stack([data.q, *given])
+    found = len(np.unique(table[:: max(len(table) // (4 * enough), 1)], axis=0))
+    return found if found >= enough else len(np.unique(table, axis=0))
 
 
 def _any_payload(model: Model, data: Data) -> bool:

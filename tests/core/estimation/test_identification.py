@@ -285,6 +285,15 @@ def test_a_fit_that_leaves_nothing_to_judge_it_by_is_declined():
             identify_compliance(model_of(6), log_of(6, few), KNOWN)
 
 
+@pytest.mark.parametrize(("rows", "registered"), [(1, True), (2, True), (1, False), (3, False)])
+def test_rows_that_are_copies_of_each_other_are_no_poses_more(rows, registered):
+    _, columns = truth(6, 4, 10)
+    copies = {k: np.repeat(v[:rows], 40, axis=0) for k, v in columns.items()}
+    found = rf"found {40 * rows} row\(s\) with measured positions of {rows} different pose"
+    with pytest.raises(ExcitationError, match=found):
+        identify_compliance(model_of(6), log_of(6, copies), Metrology(registered=registered))
+
+
 @pytest.mark.parametrize("name", ["ur10e", "seven"])
 @pytest.mark.parametrize("links", [STIFF, paper.TUBE])
 def test_the_papers_experiment_holds_against_finite_elements(name, links):
