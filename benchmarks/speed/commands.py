@@ -87,6 +87,7 @@ def rows_of(folder: Path, rows: int) -> list[Row]:
             "diagnose", moving, "--cell", cell),
         row("`--help`", 0.1, None, "--help"),
         row("`explain`", 0.1, None, "explain"),
+        row("`explain backlash`", 0.1, None, "explain", "backlash"),
         row("`status`", 0.1, None, "status"),
     ]  # fmt: skip
 

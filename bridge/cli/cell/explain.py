@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import os
 
 import click
 
@@ -24,6 +25,8 @@ def explain(effect: str | None) -> None:
             first = _text(member).partition("\n")[0]
             click.echo(f"{name:<{width}}  {first}")
         return
+    # numpy's threads would take longer to begin than all the rest
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     click.echo(explanation(effect_named(effect)))
 
 
