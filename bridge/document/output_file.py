@@ -22,7 +22,6 @@ from gapbridge.core.arrays import Array
 from gapbridge.core.errors import InputError, RunError
 
 CSV, PARQUET = ".csv", (".parquet", ".pq")
-TABLES = ".csv or .parquet"
 LONG = 50_000  # numbers from which a library writes a table as text: ten times as fast
 MODE = 0o640  # of a new file
 FOLDER_MODE = 0o750  # of a new folder of recordings, sessions and the like
@@ -56,7 +55,8 @@ def require_table(path: Path, *inputs: Path) -> Path:
     """
     require_writable(path, *inputs)
     if path.suffix.lower() not in (CSV, *PARQUET):
-        raise InputError(f"--out {path}: found {path.suffix or 'no suffix'}, expected {TABLES}")
+        found = path.suffix or "no suffix"
+        raise InputError(f"--out {path}: found {found}, expected .csv or .parquet")
     return path
 
 
