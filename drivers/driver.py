@@ -8,6 +8,7 @@ and whatever is written the gate (drivers/gate.py) here, in the base: a driver i
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from typing import Any, Self, final
 
@@ -171,6 +172,14 @@ class Driver(ABC):
         Beyond what its timestamp shows beside those before; asked in each cycle. 0: not known.
         """
         return 0.0
+
+    def unanswered_since(self) -> float:
+        """Return when the oldest setpoint left that the last sample does not answer, s monotonic.
+
+        A sample that answers all that left before some moment was taken after it, whatever clocks
+        say. Infinite where there is none, or the link answers none.
+        """
+        return math.inf
 
     def mismatch(self) -> str | None:
         """Return in words how the controller is set otherwise than the cell says; None: it is not.

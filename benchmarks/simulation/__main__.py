@@ -76,6 +76,7 @@ def run_part(seeds: range) -> Part:
     faults, oldest = Counter[str](), dict.fromkeys(LINKS, 0.0)
     setpoints, simulated = 0, 0.0
     violated: dict[str, str] = {}
+    undetectable: dict[str, float] = {}
     for seed in seeds:
         outcome = run(seed)
         by_link[outcome.link] += 1
@@ -85,10 +86,13 @@ def run_part(seeds: range) -> Part:
         simulated += outcome.seconds
         if outcome.violations:
             violated[str(seed)] = str(outcome)
+        if outcome.hidden:
+            undetectable[str(seed)] = outcome.hidden
     return {
         "first": seeds.start, "end": seeds.stop, "by_link": dict(by_link), "faults": dict(faults),
         "setpoints": setpoints, "oldest_state_s": oldest, "simulated_s": simulated,
         "cpu_s": time.process_time() - begun, "violated": violated,
+        "undetectable": undetectable,
     }  # fmt: skip
 
 
@@ -114,6 +118,7 @@ def figures(parts: list[Part]) -> dict[str, Any]:
         "faults": faults.total(), "by_fault": dict(faults.most_common()),
         "setpoints": sum(part["setpoints"] for part in parts),
         "violated": sum(len(part["violated"]) for part in parts),
+        "undetectable": {seed: age for part in parts for seed, age in part["undetectable"].items()},
         "oldest_state_s": {
             link: max((part["oldest_state_s"][link] for part in parts), default=0.0)
             for link in LINKS

@@ -81,6 +81,7 @@ class Judge:
         self._last: Numbers = ()  # the values of the last write
         self.writes_noted = 0  # setpoints seen on the wire
         self.oldest = 0.0  # s
+        self.hidden = 0.0  # s, oldest state whose age nothing could show; 0 where there was none
 
     def violate(self, invariant: str, words: str) -> None:
         """Note that an invariant did not hold."""
@@ -115,15 +116,24 @@ class Judge:
         again = isinstance(seen, Write) and seen.kind == "joints" and seen.values == self._last
         return again and not State(seen.state).writes
 
-    def sent(self, setpoint: Setpoint, sampled: float, now: float) -> None:
-        """Take a setpoint as it is handed to the driver, and when its state was sampled, s."""
+    def sent(
+        self, setpoint: Setpoint, sampled: float, now: float, hidden_leap: float = 0.0
+    ) -> None:
+        """Take a setpoint as it is handed to the driver, and when its state was sampled, s.
+
+        ``hidden_leap``: s by which the controller's clock was set while nothing could show it.
+        """
         self._now = now
         if math.isnan(sampled):
             self.violate("age", "a setpoint of a state that no controller has sampled")
             return
         age = now - sampled
+        most = self._most_age + DRIFT * (now - self._begin)
+        if most < age <= most + hidden_leap:
+            self.hidden = max(self.hidden, age)
+            return
         self.oldest = max(self.oldest, age)
-        if age > self._most_age + DRIFT * (now - self._begin):
+        if age > most:
             self.violate("age", f"a setpoint of a state sampled {age:.3f} s before")
 
     # -- what the daemon hears --------------------------------------------------------------------

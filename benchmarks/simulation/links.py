@@ -114,6 +114,7 @@ class SimulatedLink(ABC):
         self.freezes_values = False
         self.foreign_until = 0.0
         self.supervisor_state: Callable[[], int] = lambda: -1
+        self.hidden_leap = 0.0  # s, on this connection: see UrLink
         self._sampled: dict[float, float] = {}  # by what a driver stamps its state with -> truth, s
         world.every(lambda: self.period, self._tick)
 
@@ -196,6 +197,7 @@ class SimulatedLink(ABC):
 
     def reconnected(self) -> None:
         """Have wires carry again: a client has connected."""
+        self.hidden_leap = 0.0
         self.up.is_cut = self.down.is_cut = False
 
     def forget_client(self) -> None:

@@ -42,11 +42,16 @@ class Outcome:
     violations: list[Violation] = field(default_factory=list)
     writes: int = 0
     oldest: float = 0.0  # s, state behind a write
+    hidden: float = 0.0  # s, the same where nothing could show it: no violation
     seconds: float = 0.0  # of simulated time
 
     def __str__(self) -> str:
         what = "; ".join(self.faults) or "no faults"
         lines = [f"seed {self.seed}, {self.link}: {what}", *(f"  {v}" for v in self.violations)]
+        if self.hidden:
+            lines.append(
+                f"  undetectable: a setpoint of a state sampled {self.hidden:.3f} s before"
+            )
         return "\n".join(lines)
 
 
@@ -83,7 +88,8 @@ def run(seed: int, say: Any = None, plan: Sequence[tuple[float, str]] | None = N
             found.daemon._commands.close()
             found.daemon.page.close()
     outcome.violations, outcome.writes = judge.violations, judge.writes_noted
-    outcome.oldest, outcome.seconds = judge.oldest, world.now - BEGIN
+    outcome.oldest, outcome.hidden = judge.oldest, judge.hidden
+    outcome.seconds = world.now - BEGIN
     return outcome
 
 
@@ -109,7 +115,8 @@ def _listen(run: Run, judge: Judge, say: Any) -> None:
 
     def sent(setpoint: Setpoint) -> None:
         key = setpoint.state_timestamp if isinstance(link, UrLink) else setpoint.state_received
-        judge.sent(setpoint, link._sampled.get(key, float("nan")), run.world.now)
+        sampled = link._sampled.get(key, float("nan"))
+        judge.sent(setpoint, sampled, run.world.now, link.hidden_leap)
 
     events._listeners = (*events._listeners, heard)
     run.on_send = sent

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.simulation.links import SimulatedLink
+from gapbridge.bridge.loop.link_monitor import LEAP
 from gapbridge.drivers.controller_facts import ControllerFacts
 from gapbridge.drivers.driver import Driver
 from gapbridge.drivers.simulated.plant.kinematics import (
@@ -69,6 +70,7 @@ class UrLink(SimulatedLink):
         super().__init__(*given)
         self.offsets = self.setting.name == "ur_offset"
         self.latest: Packet | None = None  # that has reached the client
+        self._arrived = 0.0  # s: when it did
         self.script = False  # the control script runs
         self.program = self.offsets  # the robot's own program runs
         self.speed = 1.0
@@ -251,13 +253,28 @@ class UrLink(SimulatedLink):
         if self.latest is not None and packet["timestamp"] == self.latest["timestamp"]:
             self.latest = packet
             return
-        self.latest = packet
+        self._note_hidden_leap(packet)
+        self.latest, self._arrived = packet, self.world.now
         self._sampled[packet["timestamp"]] = packet["sampled"]
         safe = packet["safety_mode"] in (1, 2) and packet["robot_mode"] == 7
         q = packet["actual_q"]
         if all(map(math.isfinite, q)):
             bare = self.offsets and not any(packet["doubles"].values())
             self.see((packet["timestamp"], q, packet["target_q"], safe), bare)
+
+    def _note_hidden_leap(self, packet: Packet) -> None:
+        """Note where the clock is set forward and the next packet comes later by as much.
+
+        Timestamps and arrivals are then those of a clock that nobody touched. The echo of
+        offsets shows it nevertheless, except in the first setpoint after a pause.
+        """
+        before = self.latest
+        if before is None:
+            return
+        gap = packet["timestamp"] - before["timestamp"]
+        leap = gap - (packet["sampled"] - before["sampled"])
+        if leap > LEAP / 2 and gap - (self.world.now - self._arrived) <= LEAP:
+            self.hidden_leap = max(self.hidden_leap, leap)
 
     def _on_up(self, message: tuple[str, Any]) -> None:
         kind, value = message

@@ -45,7 +45,7 @@ class Writing:
         in_force: OffsetInForce | None = None,
     ) -> None:
         self._settings, self._driver, self._source = settings, driver, source
-        self._now = driver.clock.monotonic
+        self._now, self._hold = driver.clock.monotonic, hold_time(driver.rate)
         self._stream, self._supervisor, self._reports = stream, supervisor, reports
         self._in_force = in_force or OffsetInForce(driver.n, None)
         self.ready = False  # the driver is armed
@@ -150,6 +150,7 @@ class Writing:
         goal = 0.0 if self.ramps_out else 1.0
         try:
             self._driver.keep_alive()  # may wait for the robot: before the state's age is judged
+            expiry = min(expiry, self._driver.unanswered_since() + self._hold)
             setpoint = stream.advance(state, source_q, loads, goal, expiry)
         except StaleStateError:
             stream.forget()

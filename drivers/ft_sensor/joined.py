@@ -100,6 +100,10 @@ class DriverWithSensor(Driver):
         """See Driver.way."""
         return self._arm.way()
 
+    def unanswered_since(self) -> float:
+        """See Driver.unanswered_since."""
+        return self._arm.unanswered_since()
+
     def facts(self, state: RobotState) -> ControllerFacts:
         """See Driver.facts."""
         return self._arm.facts(state)

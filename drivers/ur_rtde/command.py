@@ -7,6 +7,8 @@ follow a setpoint, the sequence number that comes back.
 
 from __future__ import annotations
 
+import math
+from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
@@ -219,8 +221,8 @@ class OffsetWriter:
         self._settings, self._cell_rates = settings, rates
         self._io: Any = None
         self._sequence = self._rates = 0
-        self._awaited = 0  # a sequence number that has not come back yet
-        self._awaited_since = 0.0
+        # sequence numbers that have not come back, and when each left, s monotonic
+        self._unanswered: deque[tuple[int, float]] = deque()
         self._echo = 0
         self._program = 0
         self._applied: Sequence[float] | np.ndarray = ()
@@ -228,6 +230,13 @@ class OffsetWriter:
     def note_answer(self, echo: int, program: int, applied: Sequence[float] | np.ndarray) -> None:
         """Take what the robot's program says: last number accepted, its state, offset (6,)."""
         self._echo, self._program, self._applied = echo, program, applied
+        unanswered = self._unanswered
+        while unanswered and registers.reached(echo, unanswered[0][0]):
+            unanswered.popleft()
+
+    def unanswered_since(self) -> float:
+        """Return when the oldest offset left that has not come back, s; infinite: none."""
+        return self._unanswered[0][1] if self._unanswered else math.inf
 
     def arm(self, state: RobotState, look: Callable[[], None]) -> None:
         """Open the registers and send the rates. Raises WriteError where the program is not there.
@@ -251,7 +260,7 @@ class OffsetWriter:
             self._io = self._open()
         # a number that the program cannot take for the one it has seen last
         self._sequence = (self._echo + registers.LAST_SEQUENCE // 4) % registers.LAST_SEQUENCE
-        self._awaited = 0
+        self._unanswered.clear()
         self._announce(look)
 
     def _open(self) -> AllowedInputs:
@@ -299,16 +308,21 @@ class OffsetWriter:
                 )
 
     def keep_alive(self) -> None:
-        """Do nothing: the sequence number of each offset is the heartbeat."""
+        """Raise WriteError where an offset sent has not been taken in time.
+
+        The sequence number of each offset is the heartbeat.
+        """
+        late = self._now() - self.unanswered_since()
+        if late > self._settings.echo:
+            raise WriteError(f"{self._silence()} (sent {late:.3f} s ago)")
 
     def write(self, setpoint: Setpoint, state: RobotState) -> None:
         """Send one offset. Raises WriteError where the program stopped taking them."""
         if self._io is None:
             raise WriteError(f"{self._settings.host}: found no registers, expected arm() first")
-        self._check_echo()
+        self.keep_alive()  # for who does not call it
         self._sequence = registers.next_sequence(self._sequence)
-        if not self._awaited:
-            self._awaited, self._awaited_since = self._sequence, self._now()
+        self._unanswered.append((self._sequence, self._now()))
         self._send(registers.counts(setpoint.offset_in_base.tolist()))
 
     def _send(self, units: list[int]) -> None:
@@ -333,23 +347,12 @@ class OffsetWriter:
         if not fine:
             raise WriteError(f"{self._settings.host}: the library refused a register")
 
-    def _check_echo(self) -> None:
-        """Raise WriteError where an offset sent has not been taken in time."""
-        if not self._awaited:
-            return
-        if registers.reached(self._echo, self._awaited):
-            self._awaited = 0
-            return
-        late = self._now() - self._awaited_since
-        if late > self._settings.echo:
-            raise WriteError(f"{self._silence()} (sent {late:.3f} s ago)")
-
     def _silence(self) -> str:
         reason = Program(self._program).name if self._program in (0, 1, 2, 3) else self._program
+        number = self._unanswered[0][0] if self._unanswered else self._sequence
         return (
-            f"{self._settings.host}: offsets do not arrive: number "
-            f"{self._awaited or self._sequence} was sent, {self._echo} came back last, the robot's "
-            f"program says {reason}"
+            f"{self._settings.host}: offsets do not arrive: number {number} was sent, "
+            f"{self._echo} came back last, the robot's program says {reason}"
         )
 
     def release(self) -> None:

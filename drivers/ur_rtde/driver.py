@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -96,6 +97,14 @@ class UrRtdeDriver(Driver):
     def way(self) -> float:
         """Return the round trip when the arm was armed; see Driver.way."""
         return self._way
+
+    def unanswered_since(self) -> float:
+        """Return when the oldest offset left that the robot's program has not accepted, s.
+
+        See Driver.unanswered_since; servoJ has no answer.
+        """
+        writer = self._writer
+        return writer.unanswered_since() if isinstance(writer, OffsetWriter) else math.inf
 
     def mismatch(self) -> str | None:
         """Return in words how the controller's TCP differs from the cell's; see Driver.mismatch.

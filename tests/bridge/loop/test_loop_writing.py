@@ -193,6 +193,22 @@ def test_what_takes_the_watchdog_too_long_to_notice_lets_nothing_old_leave(bench
     assert bench.count("late") == 1
 
 
+def test_nothing_leaves_while_a_setpoint_is_unanswered_for_longer_than_a_state_may_be_old(
+    bench: Bench,
+) -> None:
+    """500 Hz: 40 ms. A sample that does not know of that setpoint was taken before it came."""
+    since = time.monotonic()
+    bench.driver.unanswered_since = lambda: since - 0.041  # type: ignore[method-assign]
+    state = bench.state()
+    assert bench.writing.write(state, Q, bench.loads.update(state)) is None
+    assert not bench.driver.sent
+    assert bench.count("late") == 1
+    assert bench.supervisor.state == State.COMPENSATING  # the driver says when it is too long
+    bench.driver.unanswered_since = lambda: time.monotonic() - 0.02  # type: ignore[method-assign]
+    bench.cycles(1)
+    assert len(bench.driver.sent) == 1
+
+
 def test_a_process_that_was_stopped_after_the_judgement_sends_nothing_old(bench: Bench) -> None:
     bench.cycles(50)
     sent, limit = len(bench.driver.sent), bench.stream.limiter.limit

@@ -9,7 +9,12 @@ import pytest
 from driver_runs import Bench, offset_program, run_driver
 from simulated_controller import SimulatedController
 
+from gapbridge.core.errors import WriteError
+from gapbridge.core.state import RobotState, Setpoint
+from gapbridge.drivers.clock import Clock
 from gapbridge.drivers.ur_rtde import registers
+from gapbridge.drivers.ur_rtde.command import OffsetWriter
+from gapbridge.drivers.ur_rtde.settings import UrRtdeSettings
 
 OFFSET = [1.0e-3, -5.0e-4, 2.0e-3, 1.0e-3, -4.0e-4, -2.0e-3]
 ARMED = """
@@ -162,7 +167,12 @@ def test_a_program_that_takes_no_rates_is_refused_when_arming(
     out = run_driver(
         offset_robot.host,
         """
-        from gapbridge.drivers.ur_rtde import registers
+        from gapbridge.core.errors import WriteError
+from gapbridge.core.state import RobotState, Setpoint
+from gapbridge.drivers.clock import Clock
+from gapbridge.drivers.ur_rtde import registers
+from gapbridge.drivers.ur_rtde.command import OffsetWriter
+from gapbridge.drivers.ur_rtde.settings import UrRtdeSettings
         right, registers.checksum = registers.checksum, lambda u, s, r: right(u, s, r + 1)
         driver.connect()
         out["error"] = error_of(driver.arm, read_for(20))
@@ -176,7 +186,12 @@ def test_a_wrong_checksum_moves_nothing_and_is_reported(offset_robot: SimulatedC
     out = run(
         offset_robot.host,
         f"""
-        from gapbridge.drivers.ur_rtde import registers
+        from gapbridge.core.errors import WriteError
+from gapbridge.core.state import RobotState, Setpoint
+from gapbridge.drivers.clock import Clock
+from gapbridge.drivers.ur_rtde import registers
+from gapbridge.drivers.ur_rtde.command import OffsetWriter
+from gapbridge.drivers.ur_rtde.settings import UrRtdeSettings
         right, registers.checksum = registers.checksum, lambda *a: right(*a) + 1
         error, count = "", 0
         while not error and count < 400:
@@ -294,3 +309,51 @@ def test_registers_that_another_client_holds_are_refused_in_one_line(
     assert "expected arm() first" in str(out["unarmed"])
     assert str(out["error"]).startswith("WriteError: ")
     assert "in use" in str(out["error"])
+
+
+def test_the_oldest_offset_that_has_not_come_back_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Inputs:
+        setInputDoubleRegister = staticmethod(lambda register, value: True)
+        setInputIntRegister = staticmethod(
+            lambda register, value: sent.update({register: value}) is None
+        )
+
+    sent: dict[int, int] = {}
+    clock, rates = Clock(), (0.05, 0.1)
+    clock.monotonic = lambda: now
+    settings = UrRtdeSettings(mode="offset")
+    writer = OffsetWriter(settings, lambda: rates, clock)
+    monkeypatch.setattr(OffsetWriter, "_open", lambda _: Inputs())
+    q, zero = np.zeros(6), np.zeros(6)
+    state = RobotState(
+        1.0, 1.0, q, zero, q, zero, robot_mode=7, safety_mode=1, runtime_state=2
+    )  # fmt: skip
+
+    def answer(number: int) -> None:
+        writer.note_answer(number, registers.Program.RUNNING, zero)
+
+    def write() -> int:
+        writer.write(Setpoint(q, zero, q, 1.0, 1.0), state)
+        return sent[registers.SEQUENCE]
+
+    now = 100.0
+    answer(0)
+    writer.arm(state, lambda: answer(sent[registers.SEQUENCE]))
+    assert writer.unanswered_since() == np.inf
+    first = write()
+    now = 100.002
+    second = write()
+    assert writer.unanswered_since() == 100.0
+    answer(first)
+    assert writer.unanswered_since() == 100.002
+    writer.keep_alive()
+    answer(second)
+    assert writer.unanswered_since() == np.inf
+    now = 101.0
+    writer.keep_alive()
+    write()
+    now = 101.0 + settings.echo + 0.001
+    with pytest.raises(WriteError, match=r"offsets do not arrive: number .*\(sent 0\.101 s ago\)"):
+        writer.keep_alive()
+    writer.arm(state, lambda: answer(sent[registers.SEQUENCE]))
+    writer.keep_alive()

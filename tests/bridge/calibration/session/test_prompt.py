@@ -5,12 +5,11 @@ from __future__ import annotations
 import os
 import pty
 import sys
-import threading
-import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import pytest
 
+from gapbridge.bridge.calibration.session import prompt
 from gapbridge.bridge.calibration.session.prompt import Prompt, SessionCommand
 
 
@@ -24,36 +23,48 @@ def keyboard(monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
     os.close(ours)
 
 
-def typed_later(keyboard: int, *lines: str) -> None:
-    """Type lines, each some time after the one before."""
+@pytest.fixture
+def types(keyboard: int, monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """Return who types lines one by one, each when a question waits for it."""
+    flush, line = prompt._Lines.flush, prompt._Lines.line
+    left: list[str] = []
+    asked = [False]
 
-    def run() -> None:
-        for line in lines:
-            time.sleep(0.4)
-            os.write(keyboard, f"{line}\n".encode())
+    def flushed(self: prompt._Lines) -> str:
+        asked[0] = True
+        return flush(self)
 
-    threading.Thread(target=run, daemon=True).start()
+    def waits(self: prompt._Lines, seconds: float) -> str | None:
+        if asked[0] and left:
+            os.write(keyboard, f"{left.pop(0)}\n".encode())
+        asked[0] = False
+        return line(self, seconds)
+
+    monkeypatch.setattr(prompt._Lines, "flush", flushed)
+    monkeypatch.setattr(prompt._Lines, "line", waits)
+    return lambda *lines: left.extend(lines)
 
 
 def test_what_was_typed_before_a_question_does_not_answer_it(
-    keyboard: int, capsys: pytest.CaptureFixture[str]
+    keyboard: int, types: Callable[..., None], capsys: pytest.CaptureFixture[str]
 ) -> None:
     os.write(keyboard, b"yes\n1.0 2.0 3.0\nhalf a li")
-    time.sleep(0.1)
-    typed_later(keyboard, "no")
+    types("no")
     assert not Prompt().confirm("Write the cell?")
     assert "discarded input typed before the question: yes ⏎ 1.0 2.0 3.0" in capsys.readouterr().out
 
 
-def test_enter_is_enter_and_nothing_else(keyboard: int, capsys: pytest.CaptureFixture[str]) -> None:
-    typed_later(keyboard, "no", "wait", "")
+def test_enter_is_enter_and_nothing_else(
+    types: Callable[..., None], capsys: pytest.CaptureFixture[str]
+) -> None:
+    types("no", "wait", "")
     Prompt().enter("Enter when it is mounted")
     said = capsys.readouterr().out
     assert "found 'no', expected Enter" in said
     assert "found 'wait', expected Enter" in said
 
 
-def test_words_of_the_session_work_where_enter_is_asked(keyboard: int) -> None:
-    typed_later(keyboard, "undo")
+def test_words_of_the_session_work_where_enter_is_asked(types: Callable[..., None]) -> None:
+    types("undo")
     with pytest.raises(SessionCommand, match="undo"):
         Prompt().enter("Enter when it is mounted")
