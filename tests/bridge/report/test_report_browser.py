@@ -5,7 +5,7 @@ import shutil
 from contextlib import contextmanager
 
 import pytest
-from on_a_phone import CUT
+from on_a_phone import CUT, PATIENCE
 from report_cases import CASES, diagnosed
 
 from gapbridge.bridge.report import write_report
@@ -31,13 +31,14 @@ def browser():
 def opened(browser, path, width=1200, height=900):
     """Give the page once all of its figures are drawn, and what it asked and complained about."""
     page = browser.new_page(viewport={"width": width, "height": height})
+    page.set_default_timeout(PATIENCE)
     asked, complaints = [], []
     page.on("request", lambda request: asked.append(request.url))
     page.on("pageerror", lambda error: complaints.append(str(error)))
     page.on("console", lambda m: complaints.append(m.text) if m.type == "error" else None)
     page.route(lambda url: not url.startswith(LOCAL), lambda route: route.abort())
     page.goto(path.as_uri())
-    page.wait_for_function(DRAWN, timeout=60_000)
+    page.wait_for_function(DRAWN)
     try:
         yield page, asked, complaints
     finally:
@@ -133,6 +134,7 @@ def test_the_reader_chooses_what_the_gap_is_drawn_against(browser, explained):
 
 def test_a_dark_screen_shows_a_dark_page(browser, explained):
     page = browser.new_page(color_scheme="dark")
+    page.set_default_timeout(PATIENCE)
     page.goto(explained.as_uri())
     ground = page.evaluate("getComputedStyle(document.querySelector('section')).backgroundColor")
     ink = page.evaluate("getComputedStyle(document.querySelector('svg text')).fill")

@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from daemon_cell import Robot, Run
+from on_a_phone import PATIENCE
 from ports import free_port
 
 from gapbridge.bridge.cell.sections import SetpointSettings
@@ -139,10 +140,11 @@ def test_a_strangers_page_in_a_browser_is_no_planner(target: Target) -> None:
         with playwright.sync_playwright() as started:
             browser = started.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
             page = browser.new_page()
+            page.set_default_timeout(PATIENCE)
             sent: list[str] = []
             page.on("request", lambda r: sent.append(r.method) if "127.0.0.1" in r.url else None)
             page.goto(f"http://localhost:{server.server_port}/#{target.port}")
-            page.wait_for_function("document.title !== ''", timeout=60_000)
+            page.wait_for_function("document.title !== ''")
             browser.close()
     finally:
         server.shutdown()

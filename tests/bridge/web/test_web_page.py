@@ -6,7 +6,7 @@ import time
 from contextlib import contextmanager
 
 import pytest
-from on_a_phone import CUT
+from on_a_phone import CUT, PATIENCE
 from watched_feed import Feed
 
 from gapbridge.bridge.ipc.shared_memory import Phase
@@ -32,6 +32,7 @@ def opened(browser, feed, viewport=None, **keys):
     """Give the page, live, and what it asked for and complained about."""
     context = browser.new_context(viewport=viewport or {"width": 1280, "height": 900}, **keys)
     page = context.new_page()
+    page.set_default_timeout(PATIENCE)
     asked, complaints = [], []
     page.on("request", lambda request: asked.append(request.url))
     page.on("pageerror", lambda error: complaints.append(str(error)))
@@ -43,8 +44,8 @@ def opened(browser, feed, viewport=None, **keys):
         context.close()
 
 
-def live(page, limit=60_000):
-    page.wait_for_selector('body[data-connection="live"]', timeout=limit)
+def live(page):
+    page.wait_for_selector('body[data-connection="live"]')
 
 
 def state_of(page):
@@ -67,13 +68,10 @@ def test_a_change_of_state_shows_within_a_second_with_its_reason(browser, feed):
         ):  # fmt: skip
             feed.change(to, cause, "safety_mode 3" if to is State.FAULT else "")
             begun = time.monotonic()
-            page.wait_for_function(
-                "s => document.body.dataset.state === s", arg=to.name.lower(), timeout=15_000
-            )
+            page.wait_for_function("s => document.body.dataset.state === s", arg=to.name.lower())
             took.append(time.monotonic() - begun)
             page.wait_for_function(
-                "c => document.querySelector('#why').textContent.includes(c)", arg=cause,
-                timeout=10_000,
+                "c => document.querySelector('#why').textContent.includes(c)", arg=cause
             )  # fmt: skip
         # a machine that is busy with something else may hold one of them up
         assert sorted(took)[1] < 1.0, took
@@ -109,7 +107,7 @@ def test_figures_lines_and_health_are_those_of_the_cycles(browser, feed):
 def test_the_arm_its_joints_tcp_and_load_are_shown_and_it_can_be_turned(browser, feed):
     with opened(browser, feed) as (page, _, complaints):
         live(page)
-        page.wait_for_selector("#arm[data-drawn=yes]", timeout=60_000)
+        page.wait_for_selector("#arm[data-drawn=yes]")
         assert page.evaluate(COLOURS, "arm") >= 3
         assert "times larger" in page.locator("#arm-caption").inner_text()
         figures = page.locator("#arm-figures").inner_text()
@@ -135,9 +133,9 @@ def test_a_loop_that_was_killed_is_shown_with_time_and_cause_until_the_next_one_
     with opened(browser, feed) as (page, _, _):
         live(page)
         feed.change(State.COMPENSATING, "writing")
-        page.wait_for_selector('body[data-state="compensating"]', timeout=15_000)
+        page.wait_for_selector('body[data-state="compensating"]')
         feed.emit(kind="fault", cause="loop", detail="the loop's process was ended by SIGKILL")
-        page.wait_for_selector('body[data-state="disconnected"]', timeout=15_000)
+        page.wait_for_selector('body[data-state="disconnected"]')
         shown = "c => document.querySelector('#why').textContent.includes(c)"
         page.wait_for_function(shown, arg="because: the loop's process was ended by SIGKILL")
         since = page.locator("#why").inner_text().split(" (")[0]
@@ -148,7 +146,7 @@ def test_a_loop_that_was_killed_is_shown_with_time_and_cause_until_the_next_one_
         assert "starting" not in page.locator("#meaning").inner_text()
         feed.page.enter(Phase.RUNNING)
         feed.change(State.OBSERVING, "connected")
-        page.wait_for_selector('body[data-state="observing"]', timeout=15_000)
+        page.wait_for_selector('body[data-state="observing"]')
 
 
 COLOURS = """name => {
@@ -171,14 +169,14 @@ def test_the_page_goes_on_by_itself_after_a_restart_of_the_daemon(browser, tmp_p
         page, _, complaints = context.__enter__()
         live(page)
         first.change(State.COMPENSATING, "writing")
-        page.wait_for_selector('body[data-state="compensating"]', timeout=15_000)
+        page.wait_for_selector('body[data-state="compensating"]')
         assert complaints == []
-    page.wait_for_selector('body[data-connection="lost"]', timeout=30_000)
+    page.wait_for_selector('body[data-connection="lost"]')
     assert page.locator("#banner").is_visible()
     with Feed(tmp_path, "web", session="run-20260101-130000", port=first.port) as second:
         second.wait("status")
         live(page)
-        page.wait_for_selector('body[data-state="observing"]', timeout=15_000)
+        page.wait_for_selector('body[data-state="observing"]')
         assert not page.locator("#banner").is_visible()
         assert "run-20260101-130000" in page.locator("footer").inner_text()
         # what is drawn goes back to before the restart
@@ -198,7 +196,7 @@ def test_the_page_comes_back_when_its_own_process_was_killed(browser, tmp_path):
         with opened(browser, feed) as (page, _, _):
             live(page)
             os.kill(feed.side.pid, 9)
-            page.wait_for_selector('body[data-connection="lost"]', timeout=30_000)
+            page.wait_for_selector('body[data-connection="lost"]')
             until = time.monotonic() + 60
             while page.evaluate("document.body.dataset.connection") != "live":
                 feed.side.check()
@@ -253,7 +251,7 @@ def test_a_cell_that_was_read_again_shows_its_envelope(browser, tmp_path):
             live(page)
             feed.change_cell("limits: {offset: 0.004}\n")
             gauge = page.locator("#gauge-offset-text")
-            gauge.filter(has_text="of 4.00 mm").wait_for(timeout=15_000)
+            gauge.filter(has_text="of 4.00 mm").wait_for()
             assert "the cell was read again" in page.locator("#events").inner_text()
             assert complaints == []
 
@@ -263,7 +261,7 @@ def test_text_from_the_robot_is_shown_and_never_run(browser, feed):
         live(page)
         feed.emit(kind="fault", detail="<img src=x onerror=document.title='run'>")
         page.wait_for_function(
-            "() => document.querySelector('#events').textContent.includes('<img')", timeout=15_000
+            "() => document.querySelector('#events').textContent.includes('<img')"
         )
         assert page.locator("#events img").count() == 0
         assert complaints == []

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 from daemon_cell import Robot
+from on_a_phone import PATIENCE
 from watched_daemon import Watched
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
@@ -66,7 +67,7 @@ def _opened(browser, url, width, height, theme):
     """Return a live page of a size and theme, and what it complains of as long as it is open."""
     context = browser.new_context(viewport={"width": width, "height": height}, color_scheme=theme)
     page = context.new_page()
-    page.set_default_timeout(120_000)  # a busy machine draws slowly
+    page.set_default_timeout(PATIENCE)
     complaints = []
     page.on("pageerror", lambda e: complaints.append(str(e)))
     page.on("console", lambda m: complaints.append(m.text) if m.type == "error" else None)
