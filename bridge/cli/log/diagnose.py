@@ -12,7 +12,7 @@ import click
 from gapbridge.bridge.api.found_spread import accused, intervals_applied, spread_of
 from gapbridge.bridge.cell import Cell, save_cell
 from gapbridge.bridge.cell.opened_log import open_simulated
-from gapbridge.bridge.cli.log.answer import answer
+from gapbridge.bridge.cli.log.answer import answer, other_arm
 from gapbridge.bridge.cli.options import (
     FILE,
     cell_option,
@@ -24,6 +24,7 @@ from gapbridge.bridge.cli.options import (
 )
 from gapbridge.bridge.cli.progress import status
 from gapbridge.bridge.document.diagnosis_json import document
+from gapbridge.bridge.document.log_findings import log_finding_text
 from gapbridge.bridge.document.output_file import require_folder, require_writable, write_text
 from gapbridge.bridge.document.provenance import fitted, provenance
 from gapbridge.core.diagnosis.diagnosis import Diagnosis
@@ -108,6 +109,8 @@ def diagnose(
     with status("diagnosing") as emit:
         metrology = replace(opened.metrology, remounted=remounted)
         found = _diagnose(opened, rows, metrology, withhold, simulated, emit)
+    for finding in other_arm(found):
+        click.echo(f"warning: {rows.path}: {log_finding_text(finding)}", err=True)
     click.echo(answer(found))
     origin = provenance({"log": logs, "cell": [cell], "sim": [sim] if sim else []})
     for file in output.write(found, opened, rows, origin):
