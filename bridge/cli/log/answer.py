@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from gapbridge.bridge.document.findings import clock, finding_text
-from gapbridge.bridge.report.labels import unit_of
+from gapbridge.bridge.report.labels import parameter_unit, unit_of
 from gapbridge.core.diagnosis.causes import Cause
 from gapbridge.core.diagnosis.channel_diagnosis import ChannelDiagnosis
 from gapbridge.core.diagnosis.diagnosis import Diagnosis
@@ -174,8 +174,9 @@ def _shrink(cause: Cause) -> str:
 def _parameter(parameter: Reported) -> str:
     if parameter.name.endswith("_time"):
         return f"{parameter.name} = {clock(parameter.value, dated=True)}"
-    spread = "" if parameter.std is None else f" ± {parameter.std:.2g}"
-    return f"{parameter.name} = {parameter.value:.5g}{spread} {parameter.unit}".rstrip()
+    unit, factor = parameter_unit(parameter.name, parameter.unit)
+    spread = "" if parameter.std is None else f" ± {factor * parameter.std:.2g}"
+    return f"{parameter.name} = {factor * parameter.value:.5g}{spread} {unit}".rstrip()
 
 
 def _measurement(m: Measurement) -> str:

@@ -52,7 +52,7 @@ def test_what_is_found_is_reported_written_and_predicts(tmp_path: Path) -> None:
     assert reported["schema"] == "gapbridge.diagnosis/1"
     (cause,) = reported["channels"][0]["causes"]
     assert (cause["effect"], cause["joints"]) == ("axial_compliance", [2])
-    for words in ("verdict: explained", "axial_compliance of joint 2", "rad/Nm", "±", "shrinks"):
+    for words in ("verdict: explained", "axial_compliance of joint 2", "µrad/Nm", "±", "shrinks"):
         assert words in answer.out
     assert "wrench: not observable here; needs ft_raw_wrench" in answer.out
     assert new.read_text(encoding="utf-8").startswith(CELL)
