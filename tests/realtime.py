@@ -5,6 +5,7 @@ from __future__ import annotations
 REALTIME = (
     "bridge/calibration/report/test_calibration_report_browser.py",
     "bridge/cli/test_cli_check.py",
+    "bridge/cli/test_cli_init.py",
     "bridge/daemon/test_configuration_that_runs.py",
     "bridge/daemon/test_control.py",
     "bridge/daemon/test_daemon_checks.py",

@@ -10,6 +10,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from gapbridge.bridge.api.records import Corrected, Diagnosed, Fitted, Predicted
 from gapbridge.bridge.cell import Cell, load_cell
 from gapbridge.bridge.cell.opened_log import at_joints_of, open_log
@@ -61,9 +63,15 @@ def predict(cell: Cell, log: Log, *, channels: bool = False) -> Predicted:
 
 
 def compensate(cell: Cell, log: Log) -> Corrected:
-    """Return the setpoint of every row whose predicted real pose is the rigid arm's at it."""
+    """Return the setpoint of every row whose predicted real pose is the rigid arm's at it.
+
+    Raises InputError where the arm finds no equilibrium in a row.
+    """
     loads = log.loads(by_approach(cell.model.terms))
     found = correct(cell.model, log.require("target_q", "actual_q"), loads)
+    lost = np.flatnonzero(~np.isfinite(found.residual))
+    if len(lost):
+        raise InputError(f"{log.path}: row {log.line(lost[0])}: {EquilibriumError.text}")
     return Corrected(found.q, found.residual, _sources(cell, log))  # type: ignore[arg-type]  # of N
 
 
@@ -107,7 +115,6 @@ def diagnose(
     ``withhold`` names effects to take out of the catalogue; ``simulated`` is the log of another
     simulator, row by row, whose values are the prediction.
     """
-    from gapbridge.bridge.api.found_spread import accused, intervals_applied, spread_of
     from gapbridge.bridge.document.diagnosis_json import document
     from gapbridge.core.diagnosis.diagnosis import diagnose as diagnose_log
     from gapbridge.core.effects import effect_named
@@ -121,12 +128,7 @@ def diagnose(
     metrology = replace(cell.metrology, remounted=remounted)
     found = diagnose_log(cell.model, log, metrology, withhold=withhold, simulated=simulated)
     origin = provenance(read, "diagnose", withhold=list(withhold), remounted=remounted)
-    content = document(found) | {"provenance": origin}
-    applied = fitted(
-        origin, range_of(log), spread_of(found).beside(cell.spread),
-        cell.intervals | intervals_applied(found), accused(found, cell.accused),
-    )  # fmt: skip
-    return Diagnosed(cell, found.model, str(found.verdict), content, applied)
+    return Diagnosed(cell, log, found, document(found) | {"provenance": origin})
 
 
 def _sources(cell: Cell, log: Log, simulated: Log | None = None) -> dict[str, list[Path]]:

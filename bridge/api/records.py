@@ -2,18 +2,31 @@
 
 from __future__ import annotations
 
+import json
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from gapbridge.bridge.cell import Cell, save_cell
-from gapbridge.bridge.document.output_file import require_writable
-from gapbridge.bridge.document.provenance import provenance
+from gapbridge.bridge.document.output_file import (
+    require_folder,
+    require_table,
+    require_writable,
+    write_table,
+    write_text,
+)
+from gapbridge.bridge.document.provenance import fitted, provenance
 from gapbridge.core.arrays import Array, Mask
+from gapbridge.core.fitted_range import range_of
+from gapbridge.core.log.log import Log
 from gapbridge.core.model import Model
+
+if TYPE_CHECKING:
+    from gapbridge.core.diagnosis.diagnosis import Diagnosis
 
 
 @dataclass(frozen=True)
@@ -39,6 +52,10 @@ class Predicted:
         }  # fmt: skip
         return {name: values for name, values in found.items() if values is not None}
 
+    def save(self, path: Path | str) -> None:
+        """Write the columns as CSV or Parquet, as ``gapbridge predict`` does."""
+        write_table(require_table(Path(path)), *as_table(self.columns))
+
     def to_json(self) -> dict[str, Any]:
         """Return the predictions as lists, by the command's names, null where there is none.
 
@@ -56,6 +73,10 @@ class Corrected:
     q: Array  # (N, n) rad
     residual: Array  # (N,) m: distance of the predicted from the wanted pose
     sources: dict[str, list[Path]] = field(default_factory=dict)  # log and cell, by role
+
+    def save(self, path: Path | str) -> None:
+        """Write the setpoints as CSV or Parquet, as ``gapbridge compensate`` does."""
+        write_table(require_table(Path(path)), *as_table({"corrected_q": self.q}))
 
     def to_json(self) -> dict[str, Any]:
         """Return setpoints and residuals as lists, and their provenance; see Predicted."""
@@ -104,24 +125,75 @@ class Diagnosed:
     """The diagnosis of a log: the document that ``gapbridge diagnose --json`` writes."""
 
     cell: Cell  # that was diagnosed
-    model: Model  # with the causes added
-    verdict: str
-    document: dict[str, Any]
-    provenance: dict[str, Any]  # of the cell that `save` writes
+    log: Log
+    found: Diagnosis = field(repr=False)  # as the core has it
+    document: dict[str, Any] = field(repr=False)  # schema gapbridge.diagnosis/1, with provenance
+
+    @property
+    def verdict(self) -> str:
+        """Return no_gap, explained, partly_explained or unexplained."""
+        return str(self.found.verdict)
+
+    @property
+    def model(self) -> Model:
+        """Return the model with the causes added."""
+        return self.found.model
 
     @property
     def causes(self) -> tuple[str, ...]:
         """Return the effects that are accused, strongest channel first, each once."""
-        found = [c["effect"] for channel in self.document["channels"] for c in channel["causes"]]
-        return tuple(dict.fromkeys(found))
+        return self._effects("causes")
 
-    def save(self, path: Path | str) -> None:
-        """Write the cell with the causes added, as ``--apply`` does."""
-        _save(self.cell, path, self.model, self.provenance)
+    @property
+    def stand_ins(self) -> tuple[str, ...]:
+        """Return the effects that are not proved, but shrink the gap in regions not fitted."""
+        return self._effects("stand_ins")
+
+    def save(self, path: Path | str, *, stand_ins: bool = False) -> None:
+        """Write the cell with the causes added, as ``--apply`` (``--stand-ins``) does."""
+        from gapbridge.bridge.api.found_spread import accused, intervals_applied, spread_of
+
+        found, cell = self.found, self.cell
+        origin = fitted(
+            self.document["provenance"], range_of(self.log), spread_of(found).beside(cell.spread),
+            cell.intervals | intervals_applied(found, stand_ins=stand_ins),
+            accused(found, cell.accused),
+        )  # fmt: skip
+        _save(cell, path, found.with_stand_ins if stand_ins else found.model, origin)
+
+    def write_report(self, folder: Path | str) -> list[Path]:
+        """Write diagnosis.json and report.html, as ``--out`` does; returns their paths."""
+        from gapbridge.bridge.report import write_report  # only here
+
+        folder = Path(folder)
+        require_folder(folder, "the report", above=False)
+        self.write_json(folder / "diagnosis.json")
+        origin, name = self.document["provenance"], str(self.cell.path)
+        report = write_report(self.found, name, self.log, self.cell.model, folder, origin)
+        return [folder / "diagnosis.json", report]
+
+    def write_json(self, path: Path | str) -> None:
+        """Write the document, as ``--json`` does."""
+        write_text(
+            require_writable(Path(path)),
+            json.dumps(self.document, indent=1, allow_nan=False) + "\n",
+        )
 
     def to_json(self) -> dict[str, Any]:
         """Return the document, schema ``gapbridge.diagnosis/1``."""
         return self.document
+
+    def _effects(self, key: str) -> tuple[str, ...]:
+        found = [c["effect"] for channel in self.document["channels"] for c in channel[key]]
+        return tuple(dict.fromkeys(found))
+
+
+def as_table(columns: Mapping[str, Array]) -> tuple[list[str], Array]:
+    """Return the names (k) and values (N, k) of columns by the names of their vectors."""
+    names: list[str] = []
+    for name, values in columns.items():
+        names += [name] if values.ndim == 1 else [f"{name}_{i}" for i in range(values.shape[1])]
+    return names, np.column_stack(list(columns.values()))
 
 
 def _save(cell: Cell, path: Path | str, model: Model, origin: dict[str, Any]) -> None:

@@ -1,4 +1,4 @@
-"""The first cell of an arm: what its controller says of itself, as a file with comments."""
+"""The first cell of an arm: what its controller reports, as a file with comments."""
 
 from __future__ import annotations
 
@@ -18,15 +18,16 @@ from gapbridge.drivers.controller_facts import ControllerFacts
 
 @dataclass(frozen=True)
 class Asked:
-    """What whoever starts a cell says: the link's keys, and the arm where it is not known."""
+    """What the user gives: the link's keys, and the arm where the controller does not report it."""
 
     link: Mapping[str, Any]
     model: str | None = None
     urdf: str | None = None
+    tip: str | None = None  # the URDF's link that is the flange
 
 
 def first_cell(facts: ControllerFacts, asked: Asked) -> str:
-    """Return the text of a cell. Raises InputError where nobody says which arm it is."""
+    """Return the text of a cell. Raises InputError where nobody reports which arm it is."""
     return "\n".join(
         line
         for part in (_head(facts, asked), _robot(facts, asked), _tool(facts), _payload(facts),
@@ -39,7 +40,7 @@ def _head(facts: ControllerFacts, asked: Asked) -> Iterator[str]:
     link = asked.link
     where = link.get("host") or link.get("channel") or link.get("serial")
     software = f", software {facts.version}" if facts.version else ""
-    yield f"# Written by `gapbridge init` from what the controller at {where} says{software}."
+    yield f"# Written by `gapbridge init` from what the controller at {where} reports{software}."
     yield "# Next: gapbridge check CELL --live, then gapbridge run CELL --observe."
     yield ""
 
@@ -48,16 +49,18 @@ def _robot(facts: ControllerFacts, asked: Asked) -> Iterator[str]:
     yield "robot:"
     if asked.urdf is not None:
         yield f"  urdf: {asked.urdf}"
+        if asked.tip is not None:
+            yield f"  tip: {asked.tip}"
     else:
         model = asked.model or facts.model
         if model is None:
             raise InputError(
-                "--model: found nothing, and the controller does not say which arm it moves; "
+                "--model: found nothing, and the controller does not report which arm it moves; "
                 "expected --model (a built-in arm) or --urdf FILE"
             )
         if facts.model is not None and model != facts.model:
             raise InputError(
-                f"--model: found {model}, expected {facts.model}, as the controller says"
+                f"--model: found {model}, expected {facts.model}, as the controller reports"
             )
         if builtin_arm(model).n != facts.n:
             raise InputError(f"--model: found {model}, expected an arm of {facts.n} joints")
@@ -67,7 +70,7 @@ def _robot(facts: ControllerFacts, asked: Asked) -> Iterator[str]:
             for key in DELTAS:
                 yield f"    {key}: {_list(facts.calibration[key])}"
         elif not facts.calibration:
-            yield "  # the controller does not say its factory calibration; where you have it:"
+            yield "  # the controller does not report its factory calibration; where you have it:"
             yield "  # calibration: calibration.conf"
         yield from _limits(facts, model)
     yield ""
@@ -87,7 +90,7 @@ def _limits(facts: ControllerFacts, model: str) -> Iterator[str]:
 
 def _tool(facts: ControllerFacts) -> Iterator[str]:
     if facts.tcp is None:
-        yield "tool:  # the controller does not say its TCP: put yours in"
+        yield "tool:  # the controller does not report its TCP: fill in yours"
         yield "  tcp: {xyz: [0.0, 0.0, 0.0], rpy: [0.0, 0.0, 0.0]}  # in the flange frame, m, rad"
     else:
         yield "tool:"
@@ -103,7 +106,7 @@ def _payload(facts: ControllerFacts) -> Iterator[str]:
         f"payload: {{mass: {number_text(mass)}, cog: {_list(np.zeros(3) if cog is None else cog)}}}"
     )
     what = "kg, m in the flange frame; tool included"
-    yield f"{text}  # {what}" + ("" if known else ": not said by the controller, put yours in")
+    yield f"{text}  # {what}" + ("" if known else ": not reported by the controller, fill in yours")
     yield ""
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 GIVES = 5.0e-3  # rad: what servos that give way come to at most
 SHIFTS = (1.0e-3, 2.5e-3)  # m, of a tool that hit something
+ZEROS, ZERO_JOINTS = (2.5e-3, 4.0e-3), (2, 4, 5)  # rad, of a joint whose encoder was replaced
 TRUE_ANYWAY = ("axial_compliance", "radial_compliance")  # the arm bends, and a fit is not exact
 SIGMAS = 4.0  # of its own, within which a found value holds the truth
 FLOOR = 2e-5  # SI: what flexibilities fitted beside the effect, not with it, leave in its value
@@ -41,8 +42,8 @@ class Hidden:
     @classmethod
     def drawn(cls, seed: int, among: tuple[str, ...]) -> Hidden:
         """Return one of the effects ``among``, which and how large drawn from the seed."""
-        rng = np.random.default_rng((seed, 29))
-        return DRAWS[among[int(rng.integers(len(among)))]](rng)
+        which = np.random.default_rng((seed, 37)).integers(len(among))
+        return DRAWS[among[int(which)]](np.random.default_rng((seed, 29)))
 
     def beside(self, other: Hidden) -> Hidden:
         """Return what is hidden where both are."""
@@ -81,6 +82,13 @@ def _bent_tool(rng: np.random.Generator) -> Hidden:
     return Hidden(("tool_frame",), "the tool was bent, too", truth, {"tool_shift": shift})
 
 
+def _lost_zero(rng: np.random.Generator) -> Hidden:
+    joint, value = int(rng.choice(ZERO_JOINTS)), float(rng.choice([-1, 1]) * rng.uniform(*ZEROS))
+    zero = tuple(value if i + 1 == joint else 0.0 for i in range(6))
+    truth = {f"joint_offset_{joint}": value}
+    return Hidden(("joint_offset",), "the zero of a joint was off, too", truth, {"zero": zero})
+
+
 def soft_servos(seed: int, held: Sequence[float]) -> Hidden:
     """Return servos that give way by some 5 mrad, and less, where they hold ``held`` (n,), Nm.
 
@@ -95,8 +103,10 @@ def soft_servos(seed: int, held: Sequence[float]) -> Hidden:
     return Hidden(("servo_droop",), "its servos give way", truth, {"droop": droop})
 
 
-DRAWS: dict[str, Callable[[np.random.Generator], Hidden]] = {"bent_tool": _bent_tool}
-"""What may be hidden: that whose effect the diagnosis names rightly whatever the seed."""
+DRAWS: dict[str, Callable[[np.random.Generator], Hidden]] = {
+    "bent_tool": _bent_tool, "lost_zero": _lost_zero,
+}  # fmt: skip
+"""What may be hidden: what the diagnosis names rightly whatever the seed."""
 
 
 def accused_in(document: Mapping[str, Any]) -> tuple[Accused, ...]:

@@ -7,6 +7,7 @@ from rich.table import Table
 from rich.text import Text
 
 from gapbridge.bridge.demo.result import Result, visits_of_poses
+from gapbridge.bridge.report.labels import unit_of
 
 WIDTH, NARROW = 32, 8  # characters of the longest bar, where there is room and where there is none
 BESIDE = 68  # characters of a row beside its bars
@@ -93,7 +94,7 @@ def truth_rows(result: Result) -> list[tuple[str, str, str]]:
             rows.append((name, f"{true:+.3g}", ""))
             continue
         value, std, unit = found[name]
-        times, unit = (1e3, "mm") if unit == "m" else (1.0, unit)
+        unit, times = unit_of(unit)
         deviation = f"{value * times:+.3g} ± {std * times:.1g} {unit}"
         rows.append((name, f"{true * times:+.3g} {unit}", deviation))
     return rows

@@ -102,6 +102,11 @@ def unit_of(unit: str) -> tuple[str, float]:
     return UNITS.get(unit, (unit, 1.0))
 
 
+def parameter_unit(name: str, unit: str) -> tuple[str, float]:
+    """Return the unit in which a parameter (by its public name) is shown, and its factor."""
+    return ("deg", 180 / math.pi) if name.endswith("_phase") else unit_of(unit)
+
+
 def fixed(value: float, decimals: int) -> str:
     """Return a number with so many decimals, with a true minus sign, never minus nothing."""
     if not math.isfinite(value):

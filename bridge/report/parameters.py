@@ -21,7 +21,7 @@ from gapbridge.bridge.report.labels import (
     joint_list,
     listed,
     number,
-    unit_of,
+    parameter_unit,
 )
 from gapbridge.bridge.report.material import Material
 from gapbridge.core.diagnosis.causes import Cause
@@ -62,9 +62,7 @@ def _parameters(causes: list[Cause]) -> list[Block]:
 def _value(p: Reported) -> tuple[str, str, str]:
     if p.name.endswith("_time"):
         return clock(p.value, dated=True), "between two rows of the log", ""
-    name, factor = unit_of(p.unit)
-    if p.name.endswith("_phase"):
-        name, factor = "deg", float(180 / np.pi)
+    name, factor = parameter_unit(p.name, p.unit)
     value = p.value * factor
     if p.std is None or not np.isfinite(p.std):
         return number(value), "unknown", name

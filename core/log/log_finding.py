@@ -61,6 +61,12 @@ class LogCheck(Enum):
     MISSING_FLEXIBILITY = auto()  # flexibilities, gap before and after their fit (m)
 
 
+OTHER_ARM_CHECKS = (
+    LogCheck.NOT_IN_BASE, LogCheck.POSITIONS_OFF, LogCheck.POSITIONS_OFF_BY, LogCheck.ROTATIONS_OFF,
+    LogCheck.ROLL_PITCH_YAW, LogCheck.TARGET_AXES,
+)  # fmt: skip
+"""The measured poses are not those of the cell's arm: nothing that is fitted to them holds."""
+
 Value = Union[str, int, float, "LogFinding", tuple["Value", ...]]
 
 

@@ -7,6 +7,7 @@ setters are not, because each blocks for up to a second.
 from __future__ import annotations
 
 import contextlib
+import logging
 import time
 from collections.abc import Callable
 from typing import Any
@@ -28,6 +29,7 @@ from gapbridge.drivers.canopen.profile import CanopenProfile
 from gapbridge.drivers.canopen.settings import CanopenSettings
 from gapbridge.drivers.canopen.sync_set import SyncCollector
 
+logging.getLogger("canopen").setLevel(logging.CRITICAL)  # reported by our own errors instead
 ABSENT = (0x06020000, 0x06090011)  # SDO aborts: no such object, no such subindex
 OPERATIONAL_STATE = 5
 ALWAYS: tuple[Address, ...] = (

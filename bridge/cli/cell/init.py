@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,18 +14,23 @@ from pydantic import ValidationError
 
 from gapbridge import drivers
 from gapbridge.bridge.cell import load_cell
+from gapbridge.bridge.cell.document import parse
 from gapbridge.bridge.cell.first_cell import Asked, first_cell
 from gapbridge.bridge.cell.live import whole_state
-from gapbridge.bridge.cell.sections import link_settings
+from gapbridge.bridge.cell.message import message
+from gapbridge.bridge.cell.schema import CellFile
+from gapbridge.bridge.cell.sections import LinkSettings
 from gapbridge.bridge.cli.options import FILE
 from gapbridge.bridge.document.output_file import require_writable, write_text
 from gapbridge.core.arm import builtin_arm
-from gapbridge.core.errors import GapbridgeError, InputError
+from gapbridge.core.errors import GapbridgeError, Implausible, InputError, InvalidStateError
 from gapbridge.core.model import Model
 from gapbridge.core.urdf import arm_from_urdf
 from gapbridge.drivers import make_driver
 from gapbridge.drivers.controller_facts import ControllerFacts
 from gapbridge.drivers.ur_rtde.enquiry import enquire
+
+CAN_INTERFACE = re.compile(r"[a-z]*can[0-9]+")  # of the kernel: can0, vcan0, slcan1
 
 
 @click.command()
@@ -34,8 +41,8 @@ from gapbridge.drivers.ur_rtde.enquiry import enquire
     type=click.Choice(["ur_rtde", "modbus", "can", "canopen"]),
     default="ur_rtde",
     show_default=True,
-    help="How the controller is reached; for can and canopen HOST is the channel (can0), or the "
-    "address of a socketcand server.",
+    help="How the controller is reached. HOST of can and canopen: the interface (can0), the serial "
+    "port of an slcan adapter, or the address of a socketcand server; of modbus: address or port.",
 )
 @click.option(
     "--profile", help="modbus, can, canopen: the profile of the controller (docs/porting.md)."
@@ -43,9 +50,17 @@ from gapbridge.drivers.ur_rtde.enquiry import enquire
 @click.option("--port", type=click.IntRange(1, 65535), help="modbus, socketcand: its port.")
 @click.option("--model", help="A built-in arm, where the controller does not say which it moves.")
 @click.option("--urdf", type=FILE, help="The arm's URDF, instead of --model.")
+@click.option("--tip", help="The URDF's link that is the flange, where it has several ends.")
+@click.option(
+    "--link",
+    "keys",
+    multiple=True,
+    metavar="KEY=VALUE",
+    help="A further key of the cell's link, as gear=[50,50,50,20,20,20] or bitrate=500000.",
+)
 def init(
     host: str, out: Path, driver: str, profile: str | None, port: int | None,
-    model: str | None, urdf: Path | None,
+    model: str | None, urdf: Path | None, tip: str | None, keys: tuple[str, ...],
 ) -> None:  # fmt: skip
     """Write a cell file from what a controller reports; never moves the arm.
 
@@ -60,9 +75,13 @@ def init(
         raise InputError(f"{out}: found a file that is already there, expected a new one")
     if model is not None and urdf is not None:
         raise InputError("--model: found beside --urdf, expected one of them")
-    link = _link(host, driver, profile, port)
-    facts = enquire(host) if driver == "ur_rtde" else _read(link, model, urdf)
-    text = first_cell(facts, Asked(link, model, None if urdf is None else _beside(urdf, out)))
+    link = _link(host, driver, profile, port) | _further(keys)
+    settings = _settings(link)
+    facts = enquire(host) if driver == "ur_rtde" else _read(settings, model, urdf, tip)
+    if str(link.get("profile")).endswith(".yaml"):
+        link["profile"] = _beside(Path(link["profile"]), out)
+    asked = Asked(link, model, None if urdf is None else _beside(urdf, out), tip)
+    text = first_cell(facts, asked)
     _check(text, out)
     write_text(out, text)
     click.echo(f"{out}: written, {_known_text(facts)}")
@@ -78,49 +97,74 @@ def _link(host: str, driver: str, profile: str | None, port: int | None) -> dict
             f"--profile: found nothing with --driver {driver}, expected its map: one of {known}, "
             "or a file (docs/porting.md)"
         )
-    link: dict[str, Any] = {"driver": driver}
-    if profile is not None and driver != "ur_rtde":
-        link["profile"] = profile
-    if driver in ("can", "canopen"):
-        served = "." in host
-        link |= (
-            {"interface": "socketcand", "host": host} if served
-            else {"interface": "socketcan", "channel": host}
-        )  # fmt: skip
-    else:
-        link["host"] = host
-    if port is not None:
-        if driver == "ur_rtde":
+    if driver == "ur_rtde":
+        if port is not None:
             raise InputError("--port: found with --driver ur_rtde, expected none: it is 30004")
-        link["port"] = port
+        return {"driver": driver, "host": host}
+    link: dict[str, Any] = {"driver": driver, "profile": profile}
+    if driver == "modbus":
+        link |= {"transport": "rtu", "serial": host} if "/" in host else {"host": host}
+    elif "/" in host:
+        link |= {"interface": "slcan", "channel": host}
+    elif CAN_INTERFACE.fullmatch(host):
+        link |= {"interface": "socketcan", "channel": host}
+    else:
+        link |= {"interface": "socketcand", "host": host}
+    return link if port is None else {**link, "port": port}
+
+
+def _further(keys: Sequence[str]) -> dict[str, Any]:
+    """Return the keys given with --link; values are YAML. Raises InputError."""
+    for key in keys:
+        if not re.match(r"\w+=.", key):
+            raise InputError(f"--link: found {key!r}, expected KEY=VALUE")
+    if not keys:
+        return {}
+    return parse("\n".join(key.replace("=", ": ", 1) for key in keys), Path("--link")).data
+
+
+def _settings(link: dict[str, Any]) -> LinkSettings:
+    """Return the settings of a link, with paths from here. Raises InputError."""
     try:
-        link_settings(**link)
+        found = CellFile.model_validate({"robot": {"model": "ur10e"}, "link": link}).link
     except ValidationError as error:
-        first = error.errors()[0]
-        key = str(first["loc"][-1]) if first["loc"] else "link"
-        raise InputError(f"link.{key}: found {first['input']!r}: {first['msg']}") from None
-    return link
+        line = message(parse(f"link: {{driver: {link['driver']}}}", Path()), CellFile, error)
+        raise InputError(line.split(": ", 1)[1]) from None
+    assert found is not None
+    return found.located(Path.cwd())
 
 
-def _read(link: dict[str, Any], model: str | None, urdf: Path | None) -> ControllerFacts:
+def _read(
+    link: LinkSettings, model: str | None, urdf: Path | None, tip: str | None
+) -> ControllerFacts:
     """Return what a profile reads of an arm; needs the arm's joints to know which there are."""
     if urdf is None and model is None:
         raise InputError(
-            f"--model: found nothing with --driver {link['driver']}, expected --model or --urdf "
-            "FILE: its controller does not say which arm it moves"
+            f"--model: found nothing with --driver {link.driver}, expected --model or --urdf "
+            "FILE: its controller does not report which arm it moves"
         )
-    arm = arm_from_urdf(urdf) if urdf is not None else builtin_arm(str(model))
-    settings = link_settings(**link).located(Path.cwd())
-    with make_driver(settings, Model(arm=arm)) as driver:
-        return driver.facts(whole_state(driver))
+    arm = arm_from_urdf(urdf, tip) if urdf is not None else builtin_arm(str(model))
+    with make_driver(link, Model(arm=arm)) as driver:
+        try:
+            return driver.facts(whole_state(driver))
+        except InvalidStateError as error:
+            if error.reason is not Implausible.VALUE:
+                raise
+            raise InputError(f"{urdf or f'--model {model}'}: {error}{_cure(link)}") from None
 
 
-def _beside(urdf: Path, out: Path) -> str:
-    """Return the URDF's path as the cell's folder sees it."""
+def _cure(link: LinkSettings) -> str:
+    """Return what may be said of a link whose joints are read outside the arm's limits."""
+    keys = [key for key in ("gear", "zero", "direction") if hasattr(link, key)]
+    return f" (--link sets {', '.join(keys)})" if keys else " (the profile's unit and zero)"
+
+
+def _beside(path: Path, out: Path) -> str:
+    """Return a path relative to the cell's folder, or absolute where it is outside."""
     try:
-        return str(urdf.resolve().relative_to(out.parent.resolve()))
+        return str(path.resolve().relative_to(out.parent.resolve()))
     except ValueError:
-        return str(urdf.resolve())
+        return str(path.resolve())
 
 
 def _check(text: str, out: Path) -> None:
@@ -137,7 +181,7 @@ def _check(text: str, out: Path) -> None:
 
 
 def _known_text(facts: ControllerFacts) -> str:
-    """Return in words what the controller has said."""
+    """Return in words what the controller has reported."""
     names = {
         "model": facts.model, "factory calibration": facts.calibration or None, "TCP": facts.tcp,
         "payload": facts.payload, "gravity": facts.gravity, "joint limits": facts.lower,
@@ -146,8 +190,8 @@ def _known_text(facts: ControllerFacts) -> str:
     known = [name for name, value in names.items() if value is not None]
     missing = [name for name, value in names.items() if value is None]
     joints = f"{facts.n} joints" if facts.q is None else f"{facts.n} joints at {_degrees(facts.q)}"
-    return f"{joints}; said: {', '.join(known) or 'nothing else'}" + (
-        f"; not said: {', '.join(missing)}" if missing else ""
+    return f"{joints}; reported: {', '.join(known) or 'nothing else'}" + (
+        f"; not reported: {', '.join(missing)}" if missing else ""
     )
 
 

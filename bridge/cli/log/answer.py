@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from gapbridge.bridge.document.findings import clock, finding_text
-from gapbridge.bridge.report.labels import unit_of
+from gapbridge.bridge.report.labels import parameter_unit, unit_of
 from gapbridge.core.diagnosis.causes import Cause
 from gapbridge.core.diagnosis.channel_diagnosis import ChannelDiagnosis
 from gapbridge.core.diagnosis.diagnosis import Diagnosis
 from gapbridge.core.diagnosis.separation import Measurement
 from gapbridge.core.effects import Reported
 from gapbridge.core.log.columns import label
+from gapbridge.core.log.log_finding import OTHER_ARM_CHECKS, LogFinding
 
 VERDICTS = {
     "no_gap": "no gap: nothing stands above the noise",
@@ -34,14 +35,21 @@ def answer(diagnosis: Diagnosis) -> str:
         lines.append("")
     for hidden in diagnosis.not_observable:
         lines.append(f"{hidden.channel}: not observable here; needs {', '.join(hidden.needs)}")
-    if diagnosis.findings:
-        lines += ["", *(f"note: {finding_text(finding)}" for finding in diagnosis.findings)]
+    notes = [finding_text(f) for f in diagnosis.findings if f not in other_arm(diagnosis)]
+    if notes:
+        lines += ["", *(f"note: {note}" for note in notes)]
     if diagnosis.next_measurements:
         lines += ["", "worth measuring next:"]
         lines += [f"  {_measurement(m)}" for m in diagnosis.next_measurements[:SHOWN]]
         more = len(diagnosis.next_measurements) - SHOWN
         lines += [f"  ... and {more} more in the JSON"] if more > 0 else []
     return "\n".join(lines)
+
+
+def other_arm(diagnosis: Diagnosis) -> list[LogFinding]:
+    """Return where the measured poses are not those of the cell's arm: warnings, not notes."""
+    own = [f for f in diagnosis.findings if isinstance(f, LogFinding)]
+    return [f for f in own if f.check in OTHER_ARM_CHECKS]
 
 
 def size(value: float | None, unit: str) -> str:
@@ -166,8 +174,9 @@ def _shrink(cause: Cause) -> str:
 def _parameter(parameter: Reported) -> str:
     if parameter.name.endswith("_time"):
         return f"{parameter.name} = {clock(parameter.value, dated=True)}"
-    spread = "" if parameter.std is None else f" ± {parameter.std:.2g}"
-    return f"{parameter.name} = {parameter.value:.5g}{spread} {parameter.unit}".rstrip()
+    unit, factor = parameter_unit(parameter.name, parameter.unit)
+    spread = "" if parameter.std is None else f" ± {factor * parameter.std:.2g}"
+    return f"{parameter.name} = {factor * parameter.value:.5g}{spread} {unit}".rstrip()
 
 
 def _measurement(m: Measurement) -> str:

@@ -18,9 +18,6 @@ from gapbridge.bridge.cli.options import (
 )
 from gapbridge.bridge.cli.progress import progress
 from gapbridge.bridge.document.output_file import require_table, writing_table
-from gapbridge.core.arrays import Array
-from gapbridge.core.errors import EquilibriumError, InputError
-from gapbridge.core.log.log import Log
 
 MISSED = 1e-6  # m: a corrected setpoint that leaves more than this is reported
 
@@ -45,7 +42,6 @@ def compensate(log: Path, cell: Path, out: Path) -> None:
     with writing_table(out) as append, progress("correcting") as advance:
         for piece in looked_over(pieces_of(log, given), given):
             found = corrected(given, piece)
-            _require_equilibrium(piece, found.residual)
             append(names, found.q)
             missed += int(np.sum(found.residual > MISSED))
             most = int(found.residual.argmax())
@@ -60,9 +56,3 @@ def compensate(log: Path, cell: Path, out: Path) -> None:
             err=True,
         )
     click.echo(f"{out}: {rows} corrected setpoints")
-
-
-def _require_equilibrium(log: Log, residual: Array) -> None:
-    lost = np.flatnonzero(~np.isfinite(residual))
-    if len(lost):
-        raise InputError(f"{log.path}: row {log.line(lost[0])}: {EquilibriumError.text}")

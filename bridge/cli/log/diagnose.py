@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from gapbridge.bridge.api.found_spread import accused, intervals_applied, spread_of
-from gapbridge.bridge.cell import Cell, save_cell
+from gapbridge.bridge.api.records import Diagnosed
+from gapbridge.bridge.cell import Cell
 from gapbridge.bridge.cell.opened_log import open_simulated
-from gapbridge.bridge.cli.log.answer import answer
+from gapbridge.bridge.cli.log.answer import answer, other_arm
 from gapbridge.bridge.cli.options import (
     FILE,
     cell_option,
@@ -24,13 +23,13 @@ from gapbridge.bridge.cli.options import (
 )
 from gapbridge.bridge.cli.progress import status
 from gapbridge.bridge.document.diagnosis_json import document
-from gapbridge.bridge.document.output_file import require_folder, require_writable, write_text
-from gapbridge.bridge.document.provenance import fitted, provenance
+from gapbridge.bridge.document.log_findings import log_finding_text
+from gapbridge.bridge.document.output_file import require_folder, require_writable
+from gapbridge.bridge.document.provenance import provenance
 from gapbridge.core.diagnosis.diagnosis import Diagnosis
 from gapbridge.core.diagnosis.diagnosis import diagnose as diagnose_log
 from gapbridge.core.effects import effect_named
 from gapbridge.core.errors import InputError, LogError
-from gapbridge.core.fitted_range import range_of
 from gapbridge.core.log.log import Log
 from gapbridge.core.metrology import Metrology
 
@@ -108,9 +107,12 @@ def diagnose(
     with status("diagnosing") as emit:
         metrology = replace(opened.metrology, remounted=remounted)
         found = _diagnose(opened, rows, metrology, withhold, simulated, emit)
+    for finding in other_arm(found):
+        click.echo(f"warning: {rows.path}: {log_finding_text(finding)}", err=True)
     click.echo(answer(found))
     origin = provenance({"log": logs, "cell": [cell], "sim": [sim] if sim else []})
-    for file in output.write(found, opened, rows, origin):
+    whole = Diagnosed(opened, rows, found, document(found) | {"provenance": origin})
+    for file in output.write(whole):
         click.echo(f"{file}: written")
 
 
@@ -133,21 +135,13 @@ class _Output:
         if self.out is not None:
             require_folder(self.out, "--out", above=False)
 
-    def write(
-        self, found: Diagnosis, cell: Cell, log: Log, origin: dict[str, Any]
-    ) -> list[Path]:  # fmt: skip
+    def write(self, found: Diagnosed) -> list[Path]:
         """Write what was asked for and return its files."""
-        reported = document(found) | {"provenance": origin}
         if self.json_file is not None:
-            write_text(self.json_file, _json(reported))
+            found.write_json(self.json_file)
         if self.new_cell is not None:
-            applied = found.with_stand_ins if self.stand_ins else found.model
-            spread = spread_of(found).beside(cell.spread)
-            intervals = cell.intervals | intervals_applied(found, stand_ins=self.stand_ins)
-            causes = accused(found, cell.accused)
-            written_by = fitted(origin, range_of(log), spread, intervals, causes)
-            save_cell(cell, self.new_cell, applied, {"provenance": written_by})
-        folder = [] if self.out is None else _write_folder(self.out, reported, found, cell, log)
+            found.save(self.new_cell, stand_ins=self.stand_ins)
+        folder = [] if self.out is None else found.write_report(self.out)
         return [*folder, *(f for f in (self.json_file, self.new_cell) if f is not None)]
 
 
@@ -169,20 +163,3 @@ def _check_effects(names: tuple[str, ...]) -> None:
             effect_named(name)
         except InputError as error:
             raise InputError(f"--withhold: {error}") from None
-
-
-def _json(reported: dict[str, Any]) -> str:
-    return json.dumps(reported, indent=1, allow_nan=False) + "\n"
-
-
-def _write_folder(
-    folder: Path, reported: dict[str, Any], found: Diagnosis, cell: Cell, log: Log
-) -> list[Path]:
-    """Write diagnosis.json and report.html; returns their paths."""
-    from gapbridge.bridge.report import write_report  # only --out needs it
-
-    written = [folder / "diagnosis.json"]
-    write_text(written[0], _json(reported))
-    origin = reported["provenance"]
-    written.append(write_report(found, str(cell.path), log, cell.model, folder, origin))
-    return written

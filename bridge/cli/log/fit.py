@@ -72,7 +72,9 @@ def fit(logs: tuple[Path, ...], cell: Path, remounted: bool, out: Path) -> None:
     intervals = given.intervals | fit_intervals(found)
     origin = fitted(provenance({"log": logs, "cell": [cell]}), ranges, spread, intervals)
     save_cell(given, out, found.written, {"provenance": origin})
-    print_identification(found, wrong)
+    for line in wrong:
+        click.echo(f"warning: {', '.join(map(str, logs))}: {line}", err=True)
+    print_identification(found)
     click.echo(f"{out}: written")
 
 
@@ -107,7 +109,7 @@ def _identified(
     return found, pose_findings(cell, rows), range_of(rows)
 
 
-def print_identification(found: Identification, wrong: Sequence[str]) -> None:
+def print_identification(found: Identification) -> None:
     """Print flexibilities with their spread, how far they carry, and what stays unknown."""
     table = Table(title="joint flexibility, 1e-6 rad/Nm", title_justify="left")
     for column in ("joint", "axial", "±", "radial", "±"):
@@ -134,7 +136,7 @@ def print_identification(found: Identification, wrong: Sequence[str]) -> None:
     ):
         if np.isfinite(left):
             click.echo(f"to expect in {where}, mm rms per coordinate (in space): {_mm(left)}")
-    for line in (*wrong, *note_texts((*found.notes, *found.combinations))):
+    for line in note_texts((*found.notes, *found.combinations)):
         click.echo(f"note: {line}")
 
 

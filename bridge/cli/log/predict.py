@@ -11,7 +11,7 @@ import click
 import numpy as np
 
 from gapbridge.bridge.api.functions import predict as predicted
-from gapbridge.bridge.api.records import Predicted
+from gapbridge.bridge.api.records import Predicted, as_table
 from gapbridge.bridge.cell import Cell
 from gapbridge.bridge.cli.log.large_log import pieces_of
 from gapbridge.bridge.cli.options import (
@@ -58,7 +58,7 @@ def predict(log: Path, cell: Path, out: Path, channels: bool) -> None:
     summary = _Summary()
     with writing_table(out) as append, progress("predicting") as advance:
         for piece, found in _predicted(given, log, channels):
-            append(*_table(found))
+            append(*as_table(found.columns))
             summary.add(piece, found)
             advance(len(piece))
     click.echo(f"{out}: {summary.rows} predicted poses")
@@ -77,14 +77,6 @@ def _predicted(cell: Cell, log: Path, channels: bool) -> Iterator[tuple[Log, Pre
         further, needs = predicted_channels(cell.model, around)
         further = {name: values[own] for name, values in further.items()}
         yield piece, replace(predicted(cell, piece), channels=further, needs=needs)
-
-
-def _table(found: Predicted) -> tuple[list[str], Array]:
-    """Return the names (k) and values (N, k) of all columns."""
-    names: list[str] = []
-    for name, values in found.columns.items():
-        names += [name] if values.ndim == 1 else [f"{name}_{i}" for i in range(values.shape[1])]
-    return names, np.column_stack(list(found.columns.values()))
 
 
 class _Summary:

@@ -28,6 +28,7 @@ class UrRtdeLink(DemoLink):
     template = "cell.yaml"
     ports = (RTDE_PORT, DASHBOARD_PORT, SCRIPT_PORT, PRIMARY_PORT, BENCH_PORT)
     scene = UR10E
+    hides = ("bent_tool", "lost_zero")
 
     def bench(self) -> Bench:
         """Return a connection to the bench, with the pendant."""

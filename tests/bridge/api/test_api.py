@@ -44,6 +44,9 @@ def test_predict_and_compensate_are_what_the_commands_write(desk: Path) -> None:
     poses, corrected = api.predict(cell, log), api.compensate(cell, log)
     np.testing.assert_allclose(poses.position, table_of(desk / "p.csv")[1][:, :3], atol=1e-12)
     np.testing.assert_allclose(corrected.q, table_of(desk / "c.csv")[1], atol=1e-12)
+    for found, name in ((poses, "p"), (corrected, "c")):
+        found.save(desk / "saved.csv")
+        assert (desk / "saved.csv").read_bytes() == (desk / f"{name}.csv").read_bytes()
     json.dumps([poses.to_json(), corrected.to_json()], allow_nan=False)
     for found in (poses.to_json(), corrected.to_json()):
         files = {file["role"]: file for file in found["provenance"]["files"]}
@@ -71,6 +74,25 @@ def test_a_cell_written_from_python_tells_what_was_done_with_which_files(desk: P
     told = gapbridge("diff", desk / "cell.yaml", desk / "fitted.yaml").out
     assert "fitted.yaml was written by fit" in told
     assert "from log.csv, more.csv" in told
+
+
+def test_a_diagnosis_writes_what_the_command_writes(desk: Path) -> None:
+    paths = desk / "log.csv", "--cell", desk / "cell.yaml", "--out", desk / "told"
+    new = "--apply", desk / "told.yaml", "--stand-ins"
+    assert gapbridge("diagnose", *paths, *new).code == 0
+    cell = api.load_cell(desk / "cell.yaml")
+    found = api.diagnose(cell, api.read_log(desk / "log.csv", cell))
+    report = found.write_report(desk / "own")
+    found.save(desk / "own.yaml", stand_ins=True)
+    assert [path.name for path in report] == ["diagnosis.json", "report.html"]
+    assert found.stand_ins == ()
+    own, theirs = (json.loads((desk / d / "diagnosis.json").read_text()) for d in ("own", "told"))
+    assert own.pop("provenance")["files"] == theirs.pop("provenance")["files"]
+    assert own == theirs
+    models = [api.load_cell(desk / f"{name}.yaml").model for name in ("own", "told")]
+    np.testing.assert_array_equal(*(np.concatenate(m.compliance()) for m in models))
+    with pytest.raises(api.InputError, match="found no folder"):
+        found.write_report(desk / "no" / "folder")
 
 
 def test_what_cannot_be_used_raises_the_line_of_the_command(desk: Path) -> None:
@@ -103,6 +125,7 @@ def test_the_examples_of_the_page_run(desk: Path, monkeypatch: pytest.MonkeyPatc
     assert isinstance(reported, api.Diagnosed)
     assert found.remaining_rms < 0.1 * found.gap_rms
     json.dumps([found.to_json(), reported.to_json()], allow_nan=False)
-    assert (desk / "diagnosed.yaml").exists()
+    for name in ("diagnosed.yaml", "with_stand_ins.yaml", "report/report.html", "predicted.csv"):
+        assert (desk / name).exists()
     driver, wanted = names["driver"], names["wanted"]
     assert 1e-5 < np.abs(driver.q - wanted).max() < 0.01  # type: ignore[attr-defined]

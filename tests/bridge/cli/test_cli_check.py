@@ -165,12 +165,23 @@ def test_a_log_that_no_command_can_use_does_not_pass(
     assert phrase in refused("check", path, "--log", log)
 
 
-def test_a_fit_of_another_arm_reports_the_mistake(tmp_path: Path) -> None:
-    path, log = tmp_path / "cell.yaml", measured_log(tmp_path, (2, 1, 0, 3, 4, 5))
+@pytest.mark.parametrize(
+    ("order", "phrase"),
+    [((2, 1, 0, 3, 4, 5), "joints 1 and 3 look swapped (a UR's"),
+     ((0, 1, 2, 4, 3, 5), "joints 4 and 5 look swapped")],
+)  # fmt: skip
+def test_fit_and_diagnose_of_another_arm_warn_with_the_mistake(
+    tmp_path: Path, order: tuple[int, ...], phrase: str
+) -> None:
+    path, log = tmp_path / "cell.yaml", measured_log(tmp_path, order)
     path.write_text("robot: {model: ur10e}\n")
-    answer = gapbridge("fit", log, "--cell", path, "--out", tmp_path / "new.yaml")
-    assert answer.code == 0
-    assert "joints 1 and 3 look swapped" in answer.out
+    for command in (("fit", "--out", tmp_path / "new.yaml"), ("diagnose",)):
+        answer = gapbridge(command[0], log, "--cell", path, *command[1:])
+        assert answer.code == 0  # a cell is always written
+        (line,) = answer.err.splitlines()
+        assert line.startswith(f"warning: {log}: the measured positions do not follow the arm: ")
+        assert phrase in line
+        assert phrase not in answer.out
 
 
 def test_every_command_refuses_it_in_one_line(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ import pytest
 
 from gapbridge.bridge.cell import Cell, load_cell, save_cell
 from gapbridge.bridge.cell.simulation import _plant
-from gapbridge.bridge.demo.hidden import Accused
+from gapbridge.bridge.demo.hidden import Accused, Hidden
 from gapbridge.bridge.demo.job import _fit_again
 from gapbridge.bridge.demo.links import LINKS, DemoLink
 from gapbridge.bridge.demo.links.can import SOFTNESS
@@ -111,6 +111,12 @@ def test_what_is_hidden_is_named_on_every_link(tmp_path: Path, name: str, seed: 
     alone, both = (errors(link, plant, cell) for cell in (calibrated, corrected))
     assert np.sqrt(np.mean(alone**2)) > 1e-3
     assert np.sqrt(np.mean(both**2)) < 5e-5
+
+
+def test_seeds_hide_different_effects_over_rtde() -> None:
+    drawn = [Hidden.drawn(seed, LINKS["ur_rtde"].hides) for seed in range(1, 9)]
+    assert {hidden.effects for hidden in drawn} == {("tool_frame",), ("joint_offset",)}
+    assert drawn[0].truth["tool_frame_z"] == pytest.approx(1.413e-3, rel=1e-3)  # as README shows
 
 
 def test_simulated_zeros_and_a_bent_tool_move_the_true_tcp(tmp_path: Path) -> None:
