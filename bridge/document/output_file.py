@@ -20,8 +20,9 @@ import numpy as np
 
 from gapbridge.core.arrays import Array
 from gapbridge.core.errors import InputError, RunError
+from gapbridge.core.log.columns import PARQUET
 
-CSV, PARQUET = ".csv", (".parquet", ".pq")
+CSV = ".csv"
 LONG = 50_000  # numbers from which a library writes a table as text: ten times as fast
 MODE = 0o640  # of a new file
 FOLDER_MODE = 0o750  # of a new folder of recordings, sessions and the like

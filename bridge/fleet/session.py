@@ -10,8 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from gapbridge.core.errors import InputError
+from gapbridge.core.log.columns import PARQUET
 
-LOGS = (".csv", ".parquet", ".pq")
+LOGS = (".csv", *PARQUET)
 WILDCARDS = re.compile(r"[*?\[]")
 
 

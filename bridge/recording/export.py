@@ -15,7 +15,7 @@ import numpy as np
 from gapbridge.bridge.document.output_file import replacing_bytes
 from gapbridge.bridge.recording.finishing import finish_recording
 from gapbridge.core.errors import InputError, LogError
-from gapbridge.core.log.columns import COLUMNS
+from gapbridge.core.log.columns import COLUMNS, PARQUET
 from gapbridge.core.log.mcap_reading import Batch, read_batches
 from gapbridge.core.log.mcap_schema import ENUM_FIELD
 
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     import pyarrow
 
 BESIDE = ("nominal_q", "corrected_q", "offset", "written", "age", "residual", "clamped", "number")
-PARQUET = (".parquet", ".pq")
 GROUP = 20_000  # rows of a Parquet row group at least
 
 

@@ -9,6 +9,7 @@ import difflib
 import re
 from collections.abc import Sequence
 
+PARQUET = (".parquet", ".pq")  # endings of a name
 # name -> number of columns: 0 = one column without index, None = one per joint
 COLUMNS: dict[str, int | None] = {
     "timestamp": 0,

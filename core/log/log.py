@@ -24,6 +24,7 @@ from gapbridge.core.loads import Loads
 from gapbridge.core.log.columns import (
     COLUMNS,
     INDEXED,
+    PARQUET,
     did_you_mean,
     is_known,
     nearest,
@@ -174,7 +175,7 @@ def read_log(path: Path | str, n: int) -> Log:
     path = Path(path)
     if not is_file(path):
         raise no_file(path)
-    if path.suffix.lower() in (".parquet", ".pq"):
+    if path.suffix.lower() in PARQUET:
         file = ParquetColumns(path)
         names, lines, rows = file.names, None, file.rows
         read: Callable[[int], Array] = file.column

@@ -15,7 +15,7 @@ import numpy as np
 
 from gapbridge.core.arrays import Array, Index
 from gapbridge.core.errors import LogError
-from gapbridge.core.log.columns import is_known
+from gapbridge.core.log.columns import PARQUET, is_known
 from gapbridge.core.log.log import (
     GZIP,
     Log,
@@ -34,7 +34,6 @@ from gapbridge.core.log.parquet_tables import ParquetColumns
 Table = tuple[list[str], Array, Index | None]
 ROWS = 16_384  # of a piece
 RECORDING = ".mcap"
-PARQUET = (".parquet", ".pq")
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,9 @@ import click
 
 from gapbridge.bridge.cell.opened_log import joint_names
 from gapbridge.bridge.cli.options import FILE, open_cell
-from gapbridge.bridge.document.output_file import PARQUET, require_table, write_table
+from gapbridge.bridge.document.output_file import require_table, write_table
 from gapbridge.core.errors import InputError, LogError
+from gapbridge.core.log.columns import PARQUET
 from gapbridge.core.log.sources import SOURCES, SourceOptions, source_of
 from gapbridge.core.log.sources.ros_bag import TYPES, WRENCHES
 

@@ -10,8 +10,9 @@ from gapbridge.bridge.cell import Cell
 from gapbridge.bridge.cell.opened_log import check_log, open_log
 from gapbridge.core.effects import by_approach
 from gapbridge.core.errors import LogError
+from gapbridge.core.log.columns import PARQUET
 from gapbridge.core.log.log import Log
-from gapbridge.core.log.pieces import PARQUET, ROWS, LogPieces
+from gapbridge.core.log.pieces import ROWS, LogPieces
 from gapbridge.core.log.sources import source_of
 from gapbridge.core.log.sources.recording import Recording
 
