@@ -167,12 +167,7 @@ def test_a_program_that_takes_no_rates_is_refused_when_arming(
     out = run_driver(
         offset_robot.host,
         """
-        from gapbridge.core.errors import WriteError
-from gapbridge.core.state import RobotState, Setpoint
-from gapbridge.drivers.clock import Clock
-from gapbridge.drivers.ur_rtde import registers
-from gapbridge.drivers.ur_rtde.command import OffsetWriter
-from gapbridge.drivers.ur_rtde.settings import UrRtdeSettings
+        from gapbridge.drivers.ur_rtde import registers
         right, registers.checksum = registers.checksum, lambda u, s, r: right(u, s, r + 1)
         driver.connect()
         out["error"] = error_of(driver.arm, read_for(20))
@@ -186,12 +181,7 @@ def test_a_wrong_checksum_moves_nothing_and_is_reported(offset_robot: SimulatedC
     out = run(
         offset_robot.host,
         f"""
-        from gapbridge.core.errors import WriteError
-from gapbridge.core.state import RobotState, Setpoint
-from gapbridge.drivers.clock import Clock
-from gapbridge.drivers.ur_rtde import registers
-from gapbridge.drivers.ur_rtde.command import OffsetWriter
-from gapbridge.drivers.ur_rtde.settings import UrRtdeSettings
+        from gapbridge.drivers.ur_rtde import registers
         right, registers.checksum = registers.checksum, lambda *a: right(*a) + 1
         error, count = "", 0
         while not error and count < 400:
