@@ -109,6 +109,7 @@ def diagnose(
     """
     from gapbridge.bridge.api.found_spread import accused, intervals_applied, spread_of
     from gapbridge.bridge.document.diagnosis_json import document
+    from gapbridge.core.diagnosis.diagnosis import channels_of
     from gapbridge.core.diagnosis.diagnosis import diagnose as diagnose_log
     from gapbridge.core.effects import effect_named
     from gapbridge.core.log.alignment import aligned
@@ -119,7 +120,10 @@ def diagnose(
     if simulated is not None:
         simulated = at_joints_of(log, aligned(simulated, log), cell)
     metrology = replace(cell.metrology, remounted=remounted)
-    found = diagnose_log(cell.model, log, metrology, withhold=withhold, simulated=simulated)
+    found = diagnose_log(
+        cell.model, log, metrology, withhold=withhold, simulated=simulated,
+        observers=channels_of(cell.uncertain),
+    )  # fmt: skip
     origin = provenance(read, "diagnose", withhold=list(withhold), remounted=remounted)
     content = document(found) | {"provenance": origin}
     applied = fitted(

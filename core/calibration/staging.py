@@ -16,7 +16,7 @@ from gapbridge.core.arrays import Array, Index, Mask
 from gapbridge.core.calibration.parameters import Parameters
 from gapbridge.core.calibration.readings import Readings
 from gapbridge.core.effects import CATALOGUE
-from gapbridge.core.estimation.identification import pose_groups
+from gapbridge.core.estimation.held_out import pose_groups
 from gapbridge.core.estimation.linear_system import Bounds, System, posterior, solve
 
 AT_ODDS = 1e-3  # chance below which differences and everything together count as at odds
