@@ -91,8 +91,9 @@ def diagnosed(model: Model, found: Identification, log: Log, truth: Truth) -> It
     for channel in diagnose(cell, log, KNOWN, observers=channels_of(uncertain)).channels:
         for cause in channel.causes:
             for p in cause.parameters:
-                true = truth.get(p.name, 0.0) - there.get(p.name, 0.0)
-                yield "diagnose", cause.effect, float((p.value - true) / (p.std or np.inf))
+                if p.name in truth:  # positions alone do not show how the tool is turned
+                    true = truth[p.name] - there.get(p.name, 0.0)
+                    yield "diagnose", cause.effect, float((p.value - true) / (p.std or np.inf))
 
 
 def calibrated(model: Model, log: Log, truth: Truth) -> Iterator[Held]:
