@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -20,6 +20,8 @@ from gapbridge.core.loads import Loads
 SETTLING = 10  # times that servos are looked at where they have given way
 CONVERGED = 1e-10  # rad: less is no change
 STANDARD_GRAVITY = (0.0, 0.0, -9.80665)
+Uncertain = Callable[[Array, Loads, Sequence[Term]], Array]
+"""q (N, n), loads, terms known -> (N, 6, r): 1 sigma of poses by a model's own numbers, m, rad."""
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,8 @@ import yaml
 from benchmarks.evidence import DATA
 from gapbridge.bridge.cell import load_cell
 from gapbridge.core.errors import InputError
-from gapbridge.core.estimation.identification import identify_compliance, pose_groups
+from gapbridge.core.estimation.held_out import pose_groups
+from gapbridge.core.estimation.identification import identify_compliance
 from gapbridge.core.estimation.registration import Registration, frame_columns, register_robustly
 from gapbridge.core.log.log import Log, read_log
 from gapbridge.core.metrology import Metrology

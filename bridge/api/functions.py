@@ -116,6 +116,7 @@ def diagnose(
     simulator, row by row, whose values are the prediction.
     """
     from gapbridge.bridge.document.diagnosis_json import document
+    from gapbridge.core.diagnosis.diagnosis import channels_of
     from gapbridge.core.diagnosis.diagnosis import diagnose as diagnose_log
     from gapbridge.core.effects import effect_named
     from gapbridge.core.log.alignment import aligned
@@ -126,7 +127,10 @@ def diagnose(
     if simulated is not None:
         simulated = at_joints_of(log, aligned(simulated, log), cell)
     metrology = replace(cell.metrology, remounted=remounted)
-    found = diagnose_log(cell.model, log, metrology, withhold=withhold, simulated=simulated)
+    found = diagnose_log(
+        cell.model, log, metrology, withhold=withhold, simulated=simulated,
+        observers=channels_of(cell.uncertain),
+    )  # fmt: skip
     origin = provenance(read, "diagnose", withhold=list(withhold), remounted=remounted)
     return Diagnosed(cell, log, found, document(found) | {"provenance": origin})
 

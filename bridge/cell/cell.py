@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +31,7 @@ from gapbridge.core.calibration.spread import Spread
 from gapbridge.core.errors import ArmError, CellError, InputError
 from gapbridge.core.load_bounds import HEAVIEST
 from gapbridge.core.metrology import Metrology
-from gapbridge.core.model import Model
+from gapbridge.core.model import Model, Uncertain
 from gapbridge.core.rotation import rpy_matrix, transform
 from gapbridge.drivers.ft_sensor.settings import FtSensorSettings
 
@@ -118,6 +119,11 @@ class Cell:
         if origin is None or not origin.parameters:
             return Spread.none()
         return Spread(tuple(origin.parameters), np.array(origin.covariance, dtype=float))
+
+    @property
+    def uncertain(self) -> Uncertain | None:
+        """Return what the diagnosis asks of how unsure the model's numbers are; None: not known."""
+        return partial(self.spread.sigma_columns, self.model) if self.spread.names else None
 
     @property
     def accused(self) -> tuple[Accused, ...]:

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 
+from gapbridge.bridge.api.found_spread import fit_intervals
 from gapbridge.bridge.cell import Cell, load_cell, save_cell
 from gapbridge.bridge.demo.hidden import accused_in
 from gapbridge.bridge.demo.links import DemoLink, demo_link
@@ -22,12 +23,14 @@ from gapbridge.bridge.demo.result import Result
 from gapbridge.bridge.demo.session import Session
 from gapbridge.bridge.demo.terminal import show
 from gapbridge.bridge.document.output_file import write_text
-from gapbridge.bridge.document.provenance import provenance
+from gapbridge.bridge.document.provenance import fitted, provenance
 from gapbridge.bridge.document.svg import svg_file
 from gapbridge.bridge.loop.warm_up import warm_up
 from gapbridge.core.arrays import Array
+from gapbridge.core.calibration.spread import Spread
 from gapbridge.core.errors import RunError
 from gapbridge.core.estimation.identification import identify_compliance
+from gapbridge.core.fitted_range import range_of
 from gapbridge.core.log.log import read_log
 
 
@@ -70,10 +73,14 @@ def _job(
     session = Session(link, out, console.print)
     planned = plan(cell.model, link.home, seed, scene)
     log = _calibrate(link, session, planned, out, console)
-    found = identify_compliance(cell.model, read_log(log, cell.arm.n), cell.metrology)
+    rows = read_log(log, cell.arm.n)
+    found = identify_compliance(cell.model, rows, cell.metrology)
     # the flexibilities alone: the diagnosis is to find what else is wrong, the bent tool with it
     flexible = cell.model.with_compliance(found.axial, found.radial)
-    save_cell(cell, out / "calibrated.yaml", flexible)
+    origin = provenance({"log": [log], "cell": [cell.path]})
+    spread = Spread.of_fit(found.identifiable, found.covariance)
+    written_by = fitted(origin, range_of(rows), spread, fit_intervals(found))
+    save_cell(cell, out / "calibrated.yaml", flexible, {"provenance": written_by})
     calibrated = load_cell(out / "calibrated.yaml")
     console.print(
         f"fitted on {found.samples} poses: gap in space {3**0.5 * found.gap_rms * 1e3:.3f} mm rms "

@@ -11,7 +11,7 @@ import numpy as np
 
 from gapbridge.bridge.cell import Cell
 from gapbridge.bridge.document.diagnosis_json import document
-from gapbridge.core.diagnosis.diagnosis import diagnose
+from gapbridge.core.diagnosis.diagnosis import channels_of, diagnose
 from gapbridge.core.estimation.compliance_fit import flexibilities, usual_flexibility
 from gapbridge.core.estimation.hierarchical_evidence import evidence
 from gapbridge.core.log.log import Log
@@ -22,7 +22,13 @@ EPOCH = 1.0e9  # s: timestamps beyond count from 1970, those below from some sta
 def diagnose_session(cell: Cell, log: Log, options: Mapping[str, Any]) -> dict[str, Any]:
     """Return the diagnosis as facts of the session, its channels, and a row per parameter."""
     found = document(
-        diagnose(cell.model, log, cell.metrology, withhold=options.get("withhold", ()))
+        diagnose(
+            cell.model,
+            log,
+            cell.metrology,
+            withhold=options.get("withhold", ()),
+            observers=channels_of(cell.uncertain),
+        )
     )
     rows = [row for channel in found["channels"] for row in _rows(channel)]
     return {

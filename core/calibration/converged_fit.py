@@ -29,7 +29,7 @@ from gapbridge.core.calibration.problem import (
 from gapbridge.core.calibration.readings import Readings
 from gapbridge.core.calibration.staging import staged_step, stages_of
 from gapbridge.core.errors import InputError
-from gapbridge.core.estimation.linear_system import System, posterior, solve
+from gapbridge.core.estimation.linear_system import System, joint_covariance, posterior, solve
 from gapbridge.core.metrology import Metrology
 
 NOISES = 6  # times at most that the noise is estimated anew
@@ -108,7 +108,9 @@ def converged_fit(
         before, at = at.noise, converge(problem, at, _noise(problem, at))
         if np.abs(at.noise.sizes / before.sizes - 1).max() < SAME:
             break
-    return problem, at
+    covariance = joint_covariance(at.system, bounds, readings.repeats())
+    p = len(parameters)
+    return problem, replace(at, covariance=covariance[:p, :p])
 
 
 def _staged(problem: Problem, at: FitState) -> FitState:

@@ -68,7 +68,8 @@ def predicted(problem: Problem, rest: FitState, readings: Readings) -> Array:
     given = problem.parameters, rest.values, readings, rest.nuisance, layout
     J, F = problem.observable.columns(*given)
     X = np.hstack([J, F]).reshape(len(readings), problem.observable.equations, -1)
-    return np.asarray(X @ joint_covariance(rest.system, problem.bounds) @ np.swapaxes(X, 1, 2))
+    C = joint_covariance(rest.system, problem.bounds, problem.readings.repeats())
+    return np.asarray(X @ C @ np.swapaxes(X, 1, 2))
 
 
 def repeatability_of(problem: Problem, rest: FitState, found: Model, readings: Readings) -> float:

@@ -19,8 +19,7 @@ from gapbridge.core.calibration.converged_fit import FitState
 from gapbridge.core.calibration.parameters import Parameters
 from gapbridge.core.calibration.problem import HELD, Problem
 from gapbridge.core.effects import CATALOGUE
-from gapbridge.core.estimation.held_out import missed, random_folds
-from gapbridge.core.estimation.identification import pose_groups
+from gapbridge.core.estimation.held_out import missed, pose_groups, random_folds
 from gapbridge.core.estimation.least_squares import basis_of, projected_out
 
 MOST = 3  # effects at most

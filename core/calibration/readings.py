@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapbridge.core.arrays import Array, Index
+from gapbridge.core.estimation.held_out import pose_groups
 from gapbridge.core.loads import Loads
 
 
@@ -36,6 +37,11 @@ class Readings:
     def __len__(self) -> int:
         """Return the number of readings."""
         return len(self.q)
+
+    def repeats(self) -> Index:
+        """Return a number a reading (N,): the same pose to the same target from the same place."""
+        same = np.column_stack([pose_groups(self.q), self.station, self.target])
+        return np.asarray(np.unique(same, axis=0, return_inverse=True)[1].reshape(-1))
 
     def __getitem__(self, rows: NDArray[Any]) -> Readings:
         """Return some of the readings."""

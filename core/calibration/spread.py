@@ -67,6 +67,23 @@ class Spread:
         names = (*self.names, *(earlier.names[i] for i in kept))
         return Spread(names, _blocks([self.covariance, earlier.covariance[np.ix_(kept, kept)]]))
 
+    def sigma_columns(
+        self, model: Model, q: Array, loads: Loads | None, known: Sequence[Term]
+    ) -> Array:
+        """Return 1 sigma (N, 6, r) of the poses, m and rad, base axes, along r directions.
+
+        Those of what the fit left open, the numbers of the terms ``known`` left out. Raises as
+        ``poses_and_std``.
+        """
+        every = parameters_named(model, self.names, "provenance")
+        own = {(term.effect, term.site) for term in known}
+        sites = [(every.terms[t].effect, every.terms[t].site) for t, _ in every.place]
+        rest = [i for i, site in enumerate(sites) if site not in own]
+        value, V = np.linalg.eigh(self.covariance[np.ix_(rest, rest)])
+        found = every.part(rest).pose_columns(np.zeros(len(rest)), q, loads)
+        root = V * np.sqrt(np.maximum(value, 0.0))
+        return np.asarray(found.jacobian.transpose(2, 0, 1) @ root)
+
     def poses_and_std(self, model: Model, q: Array, loads: Loads | None) -> tuple[Poses, Array]:
         """Return the poses, and 1 sigma (N, 3), m, base axes, of positions; one parameter at least.
 

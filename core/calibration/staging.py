@@ -16,7 +16,6 @@ from gapbridge.core.arrays import Array, Index, Mask
 from gapbridge.core.calibration.parameters import Parameters
 from gapbridge.core.calibration.readings import Readings
 from gapbridge.core.effects import CATALOGUE
-from gapbridge.core.estimation.identification import pose_groups
 from gapbridge.core.estimation.linear_system import Bounds, System, posterior, solve
 
 AT_ODDS = 1e-3  # chance below which differences and everything together count as at odds
@@ -39,9 +38,7 @@ def stages_of(parameters: Parameters, readings: Readings) -> Stages:
     """Return the stages that these readings allow."""
     effects = [CATALOGUE[parameters.terms[t].effect] for t, _ in parameters.place]
     elastic = np.array([effect.softens or effect.needs_softness for effect in effects], dtype=bool)
-    same = np.column_stack([pose_groups(readings.q), readings.station, readings.target])
-    _, group = np.unique(same, axis=0, return_inverse=True)
-    group = group.reshape(-1).astype(np.int64)
+    group = readings.repeats()
     load = _heaviness(readings)
     for one in np.unique(group):
         own = group == one

@@ -65,7 +65,7 @@ from gapbridge.core.log.columns import COLUMNS, did_you_mean
 from gapbridge.core.log.log import Log
 from gapbridge.core.log.log_finding import LogCheck, LogFinding
 from gapbridge.core.metrology import Metrology
-from gapbridge.core.model import Model
+from gapbridge.core.model import Model, Uncertain
 from gapbridge.core.sessions import session_of, sessions_in, with_sessions
 
 Depends = tuple[tuple[str, float], ...]  # quantity, share
@@ -101,6 +101,25 @@ class Diagnosis:
     def terms(self) -> tuple[Term, ...]:
         """Return the terms of all causes."""
         return tuple(t for c in self.channels for cause in c.causes for t in cause.terms)
+
+
+def channels_of(uncertain: Uncertain | None) -> Mapping[str, Observe]:
+    """Return the channels' observers, where ``uncertain`` says how unsure the model's poses are.
+
+    By what its own fitted numbers leave open, those of further terms known: causes are as unsure.
+    """
+    if uncertain is None:
+        return CHANNELS
+
+    def observe(model: Model, log: Log, metrology: Metrology) -> Observation | NotObservable:
+        seen = position.observe(model, log, metrology)
+        if isinstance(seen, NotObservable):
+            return seen
+        q, rows, k = log.require("actual_q", "target_q"), seen.rows, seen.measured.shape[1]
+        loads = log.loads()[rows]
+        return replace(seen, uncertain=lambda terms: uncertain(q[rows], loads, terms)[:, :k])
+
+    return {**CHANNELS, "position": observe}
 
 
 def diagnose(

@@ -57,8 +57,15 @@ class Observation:
     # 1 sigma (k,) measured by neighbouring samples, where a recording shows it
     instrument: Callable[[], Array | None] | None = None
     fewer: Callable[[NDArray[np.int64]], Observation] | None = None  # of some samples only
+    # (N, k, r) 1 sigma of the prediction by what the cell's own numbers leave open beside terms
+    uncertain: Callable[[Sequence[Term]], Array] | None = None
     session: NDArray[np.int64] | None = None  # (N,) session of each sample; None: there is one
     nuisance_session: tuple[int, ...] = ()  # (p,) session of each nuisance column, where several
+
+    def rebased(self, step: Array, terms: Sequence[Term]) -> Observation:
+        """Return the same with the nuisance moved (p,), its columns those at these terms."""
+        assert self.rebase is not None
+        return replace(self.rebase(step, terms), uncertain=self.uncertain)
 
     def axial_columns(self) -> Array:
         """Return d prediction / d axial compliance (N, k, n), to first order."""

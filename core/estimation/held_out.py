@@ -14,6 +14,7 @@ from gapbridge.core.arrays import Array, Index
 from gapbridge.core.estimation.least_squares import SUMS_RANK, unit_of
 
 FOLDS = 5
+SAME_POSE = 1e-3  # rad, of every joint
 
 
 def random_folds(groups: Index, count: int = FOLDS, seed: int = 0) -> Index:
@@ -57,6 +58,18 @@ def jackknife(without: Array) -> Array:
     """
     away = without - without.mean(axis=0)
     return np.asarray((len(without) - 1) / len(without) * away.T @ away)
+
+
+def pose_groups(q: Array) -> Index:
+    """Return a number per row (N,): rows within SAME_POSE of each other share one."""
+    groups = np.full(len(q), -1)
+    count = 0
+    for row in range(len(q)):
+        if groups[row] < 0:
+            close = (np.abs(q[row:] - q[row]).max(axis=1) < SAME_POSE) & (groups[row:] < 0)
+            groups[row:][close] = count
+            count += 1
+    return groups
 
 
 def joint_regions(q: Array, count: int, seed: int = 0) -> Index:

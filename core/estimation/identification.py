@@ -33,8 +33,9 @@ from gapbridge.core.estimation.compliance_fit import (
     weighed,
 )
 from gapbridge.core.estimation.geometry import TOOL, Geometry
-from gapbridge.core.estimation.held_out import FOLDS, joint_regions, random_folds
+from gapbridge.core.estimation.held_out import FOLDS, joint_regions, pose_groups, random_folds
 from gapbridge.core.estimation.least_squares import basis_of, projected_out
+from gapbridge.core.estimation.pose_scatter import by_poses
 from gapbridge.core.estimation.registration import IDENTITY, Registration
 from gapbridge.core.log.log import Log
 from gapbridge.core.metrology import Metrology
@@ -43,7 +44,6 @@ from gapbridge.core.notes import Note, Reason
 from gapbridge.core.rotation import rotation_matrix
 from gapbridge.core.sessions import session_of
 
-SAME_POSE = 1e-3  # rad, of every joint
 TOOL_KNOWN = 2e-4  # m, 1 sigma: a tool point that is known worse stays the cell's
 TOOL_NEAR = (
     3 * TOOL
@@ -144,6 +144,7 @@ def identify_compliance(
         held = held_out[1] > held_out[0]  # the cell would be worse without the links found
         if not held:
             fit, shown = other, other_shown
+    shown = by_poses(fit, data, shown, prior[1])
     inlier = fit.weights > 0
     if fit.geometry is None:
         held_out = _held_out(data, rest, (before, fit), inlier)
@@ -251,18 +252,6 @@ def _distinct(data: Data, enough: int) -> int:
 def _any_payload(model: Model, data: Data) -> bool:
     mass = data.loads.payload_mass
     return bool(model.payload_mass > 0 if mass is None else (mass > 0).any())
-
-
-def pose_groups(q: Array) -> NDArray[np.int64]:
-    """Return a number per row (N,): rows within SAME_POSE of each other share one."""
-    groups = np.full(len(q), -1)
-    count = 0
-    for row in range(len(q)):
-        if groups[row] < 0:
-            close = (np.abs(q[row:] - q[row]).max(axis=1) < SAME_POSE) & (groups[row:] < 0)
-            groups[row:][close] = count
-            count += 1
-    return groups
 
 
 def _held_out(data: Data, task: _Task, whole: tuple[Fit, Fit], inlier: Mask) -> tuple[float, float]:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gapbridge.core.arrays import Array, Mask
+from gapbridge.core.arrays import Array, Index, Mask
 from gapbridge.core.estimation.least_squares import bounded, inverse
 
 
@@ -77,10 +77,40 @@ def posterior(system: System, bounds: Bounds) -> tuple[Array, float, Array]:
     return np.asarray((covariance + covariance.T) / 2), float(share.sum()), share
 
 
-def joint_covariance(system: System, bounds: Bounds) -> Array:
-    """Return the covariance of parameters and nuisances together (p + m, p + m)."""
-    _, core, size = _scaled_covariance(system, bounds)
+def joint_covariance(system: System, bounds: Bounds, repeat: Index) -> Array:
+    """Return the covariance of parameters and nuisances together (p + m, p + m).
+
+    ``repeat`` (N,) numbers the readings that may share an error: a joint that is rounded, or off,
+    is so at all repeats of a pose.
+    """
+    A, core, size = _scaled_covariance(system, bounds)
+    core = core + _shared(A, system.residual, core, repeat)
     return np.asarray(core / np.outer(size, size))
+
+
+def _shared(A: Array, residual: Array, core: Array, repeat: Index) -> Array:
+    """Return what errors that repeats share add to the covariance ``core`` of a fit.
+
+    Errors of one reading have variance 1, those of two repeats a correlation that is estimated by
+    the products of their residuals, what the fit took of these put back (analysis of variance).
+    """
+    number, count = np.unique(repeat, return_inverse=True, return_counts=True)[1:]
+    k = len(residual) // len(number)
+    sums, left = np.zeros((len(count), k, A.shape[1])), np.zeros((len(count), k))
+    np.add.at(sums, number, A.reshape(len(number), k, -1))
+    np.add.at(left, number, residual.reshape(-1, k))
+    square = A.T @ A
+    pairs = np.einsum("gki,gkj->ij", sums, sums) - square
+    twice = np.einsum("g,gki,gkj->ij", count - 2.0, sums, sums) + square
+    taken = core @ pairs
+    # products of repeats' residuals by white noise, and how these grow with the correlation
+    white = -float(np.trace(taken))
+    slope = k * float(np.sum(count * (count - 1.0)))
+    slope += float(np.sum(taken * taken.T)) - 2 * float(np.sum(core * twice))
+    if slope <= 1.0:
+        return np.zeros_like(core)
+    found = float(np.sum(left**2) - np.sum(residual**2))
+    return np.clip((found - white) / slope, 0.0, 1.0) * (taken @ core)
 
 
 def _scaled_covariance(system: System, bounds: Bounds) -> tuple[Array, Array, Array]:

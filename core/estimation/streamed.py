@@ -43,6 +43,7 @@ from gapbridge.core.estimation.identification import (
     require_excitation,
     tool_known,
 )
+from gapbridge.core.estimation.pose_scatter import by_poses
 from gapbridge.core.estimation.row_store import RowStore
 from gapbridge.core.estimation.streamed_fit import (
     NONE,
@@ -140,6 +141,10 @@ class _Found:
     shown: base_parameters.Shown
     geometry: Geometry | None = None  # in the models of both fits
 
+    def scattered(self, rows: Data, sigma: float) -> base_parameters.Shown:
+        """Return what is shown, as surely as some rows say by poses left out."""
+        return by_poses(replace(self.fit, geometry=self.geometry), rows, self.shown, sigma)
+
     def written(self, fit: Fit, rows: Data) -> Fit:
         """Return a fit as a cell has it, its frame and tool point fitted to some rows."""
         return as_written(replace(fit, geometry=self.geometry), rows)
@@ -178,6 +183,7 @@ def identify_streamed(
     if held:  # the cell would be worse without the links found
         found = task.run(task.near(before, stream.sample), stream)
         held_out = _held_out(stream, task, before, found)
+    found = replace(found, shown=found.scattered(stream.sample, prior[1]))
     return _result(model, stream, before, found, held_out, held)
 
 

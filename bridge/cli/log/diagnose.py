@@ -26,7 +26,7 @@ from gapbridge.bridge.document.diagnosis_json import document
 from gapbridge.bridge.document.log_findings import log_finding_text
 from gapbridge.bridge.document.output_file import require_folder, require_writable
 from gapbridge.bridge.document.provenance import provenance
-from gapbridge.core.diagnosis.diagnosis import Diagnosis
+from gapbridge.core.diagnosis.diagnosis import Diagnosis, channels_of
 from gapbridge.core.diagnosis.diagnosis import diagnose as diagnose_log
 from gapbridge.core.effects import effect_named
 from gapbridge.core.errors import InputError, LogError
@@ -151,7 +151,10 @@ def _diagnose(
 ) -> Diagnosis:  # fmt: skip
     extra: dict[str, Any] = {} if simulated is None else {"simulated": simulated}
     try:
-        return diagnose_log(cell.model, log, metrology, withhold=withhold, progress=emit, **extra)
+        return diagnose_log(
+            cell.model, log, metrology, withhold=withhold, progress=emit,
+            observers=channels_of(cell.uncertain), **extra,
+        )  # fmt: skip
     except InputError as error:
         text = str(error)
         raise LogError(text if text.startswith(log.path) else f"{log.path}: {text}") from None

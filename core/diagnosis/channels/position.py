@@ -15,7 +15,7 @@ from gapbridge.core.diagnosis.selection.unnamed import unnamed_rivals
 from gapbridge.core.effects import Term
 from gapbridge.core.errors import LogError
 from gapbridge.core.estimation.compliance_fit import Data, fit_nuisances
-from gapbridge.core.estimation.identification import pose_groups
+from gapbridge.core.estimation.held_out import pose_groups
 from gapbridge.core.estimation.registration import (
     IDENTITY,
     Registration,

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from gapbridge.core.arrays import Array, Index
 from gapbridge.core.derivatives import signal_noise
 from gapbridge.core.diagnosis.observation import HELD
-from gapbridge.core.estimation.identification import pose_groups
+from gapbridge.core.estimation.held_out import pose_groups
 from gapbridge.core.log.log import Log
 from gapbridge.core.motion import Motion
 

@@ -93,4 +93,4 @@ def _with_prediction(seen: Observation, values: Array) -> Observation:
         else lambda step, terms: _with_prediction(rebase(step, terms), values)
     )
     thinned = None if fewer is None else lambda take: _with_prediction(fewer(take), values)
-    return replace(seen, predict=predict, rebase=moved, fewer=thinned)
+    return replace(seen, predict=predict, rebase=moved, fewer=thinned, uncertain=None)

@@ -195,4 +195,4 @@ def _placed(whole: Observation, terms: Sequence[Term]) -> Observation:
     weight = whole.weight[: gap.shape[1]]
     A, b = (whole.nuisance * weight[:, None]).reshape(gap.size, -1), gap * weight
     row = np.repeat(start_weights(b), gap.shape[1])
-    return whole.rebase(solve(A * row[:, None], b.ravel() * row), terms)
+    return whole.rebased(solve(A * row[:, None], b.ravel() * row), terms)

@@ -103,7 +103,7 @@ def refit(
         if observation.rebase is not None:
             moved_terms = tuple(freed[c].term(v) for c, v in zip(index, x, strict=True))
             left = observation.measured - observation.predict(moved_terms)
-            state.observation = observation.rebase(
+            state.observation = observation.rebased(
                 _along(extra, nuisance, left, state), moved_terms
             )
         if moved < 1e-6:
@@ -112,7 +112,9 @@ def refit(
     variance = max(residual_ss / max(len(b) - A.shape[1], 1), space.floor)
     whole, right = np.vstack([A, pull]), np.concatenate([b, towards])
     region = None if remainder is None or not len(index) else remainder.region
-    covariance = _covariances(whole, right, variance, sizes, region)
+    terms = tuple(freed[c].term(v) for c, v in zip(index, x, strict=True))
+    unsure = _uncertain(state, terms, len(whole))
+    covariance = _covariances(whole, right, variance, sizes, region, unsure)
     x, covariance = _as_one_delay([freed[c] for c in index], x, covariance)
     terms = tuple(freed[c].term(v) for c, v in zip(index, x, strict=True))
     gap = state.observation.measured - state.observation.predict(terms)
@@ -182,14 +184,30 @@ def _as_one_delay(
 
 def _covariances(
     rows: Array, right: Array, variance: float, sizes: list[int],
-    region: NDArray[np.int64] | None,
+    region: NDArray[np.int64] | None, unsure: Array | None = None,
 ) -> list[Array]:  # fmt: skip
-    """Return the covariance (d, d) of each term by the rows (m, p) of the regression."""
-    spread = inverse(rows.T @ rows) * variance
+    """Return the covariance (d, d) of each term by the rows (m, p) of the regression.
+
+    ``unsure`` (m, r) is 1 sigma of the rows by what the model's own numbers leave open.
+    """
+    white = inverse(rows.T @ rows)
+    spread = white * variance
     if region is not None:
         spread = _cluster_covariance(spread, rows, right, region)
+    if unsure is not None:
+        moved = white @ (rows.T @ unsure)
+        spread = spread + moved @ moved.T
     begin = np.concatenate([[0], np.cumsum(sizes)]).astype(int)
     return [spread[i:j, i:j] for i, j in itertools.pairwise(begin)]
+
+
+def _uncertain(state: SelectionState, terms: tuple[Term, ...], rows: int) -> Array | None:
+    """Return 1 sigma (rows, r) by what the cell's numbers leave open; of a prior's rows none."""
+    uncertain = state.observation.uncertain
+    if uncertain is None or not terms:
+        return None
+    own = flat(uncertain(terms), state)
+    return np.vstack([own, np.zeros((rows - len(own), own.shape[1]))])
 
 
 def _cluster_covariance(white: Array, A: Array, b: Array, region: NDArray[np.int64]) -> Array:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 import small_arm as small
 
-from gapbridge.core.diagnosis.diagnosis import diagnose
+from gapbridge.core.calibration.spread import Spread
+from gapbridge.core.diagnosis.diagnosis import channels_of, diagnose
 from gapbridge.core.estimation.identification import identify_compliance
 from gapbridge.core.metrology import Metrology
 
@@ -72,6 +74,33 @@ def test_zeros_that_are_off_become_no_flexibilities(tool: bool, registered: bool
     (zero,) = (p for p in causes["joint_offset"].parameters if p.name == "joint_offset_2")
     assert zero.value == pytest.approx(ZEROS[1], abs=3e-5)
     assert channel.remaining_rms < 1.15 * small.FLOOR
+
+
+def test_a_cause_is_as_unsure_as_the_flexibilities_that_it_stands_on():
+    """By how far it moves with them; a flexibility that is accused itself makes nothing unsure."""
+    session = small.session_of(11)
+    real = moved(tool=False, zeros=True)
+    log = small.log_of(session, small.readings(real, session, 11, True))
+    cell = small.model_of().with_compliance(SOFT.axial, SOFT.radial)
+    sigma = 2e-7  # rad/Nm
+    softer = cell.with_compliance(SOFT.axial + np.array([0.0, sigma, 0.0]), SOFT.radial)
+    spread = Spread(("axial_compliance_2",), np.array([[sigma**2]]))
+    unsure = channels_of(partial(spread.sigma_columns, cell))
+    metrology = Metrology(True, small.SIGMA)
+
+    def zero_2(model, **more):
+        (channel,) = diagnose(model, log, metrology, **more).channels
+        assert {c.effect for c in channel.causes} == {"joint_offset"}
+        return next(p for p in channel.causes[0].parameters if p.name == "joint_offset_2")
+
+    known, moves, found = zero_2(cell), zero_2(softer), zero_2(cell, observers=unsure)
+    assert found.value == pytest.approx(known.value, rel=1e-6)
+    wider = np.sqrt(found.std**2 - known.std**2)
+    assert wider == pytest.approx(abs(moves.value - known.value), rel=0.1)
+    q, loads = log.columns["actual_q"], log.loads()
+    (term,) = (t for t in cell.terms if (t.effect, t.site.joint) == ("axial_compliance", 2))
+    assert spread.sigma_columns(cell, q, loads, ()).shape == (len(q), 6, 1)
+    assert spread.sigma_columns(cell, q, loads, (term,)).shape == (len(q), 6, 0)
 
 
 def test_an_arm_as_drawn_is_fitted_as_if_its_links_were_known(monkeypatch):

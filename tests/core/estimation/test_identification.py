@@ -24,12 +24,13 @@ NOISE, TURN_NOISE = 2e-5, 1e-4
 KNOWN = Metrology(registered=True, sigma=NOISE)
 
 
-def truth(n, count, seed, noise=NOISE, rotation=True, pull=40.0, still=()):
+def truth(n, count, seed, noise=NOISE, rotation=True, pull=40.0, still=(), places=None):
     """Return planted flexibilities (2n,) and the columns that other code makes of them."""
     rng = np.random.default_rng(seed)
     planted = rng.uniform(2e-6, 1.5e-5, 2 * n)
     q, mass = rng.uniform(-2, 2, (count, n)), rng.uniform(0, 8, count)
     q[:, list(still)] = 0.7
+    q = q if places is None else places
     wrench = rng.normal(size=(count, 6)) * pull * np.array([1, 1, 1, 0.1, 0.1, 0.1])
     cog = np.tile([0.01, 0.0, 0.05], (count, 1))
     position, turn = np.empty((count, 3)), np.empty((count, 3, 3))
@@ -90,6 +91,23 @@ def test_errors_of_the_flexibilities_are_as_large_as_their_intervals_say():
         np.testing.assert_allclose(np.sqrt(np.diag(found.covariance)), std)
     assert 0.75 < np.sqrt(np.mean(np.square(z))) < 1.3
     assert np.abs(z).max() < 4
+
+
+@pytest.mark.parametrize("repeats", [1, 3])
+def test_intervals_hold_where_joints_are_off_at_all_repeats_of_a_pose(repeats):
+    """Rounded or imprecise joints move whole poses, the farther the longer the lever."""
+    z = []
+    for seed in range(8):
+        places = np.random.default_rng(seed).uniform(-2, 2, (60 // repeats, 6))
+        planted, columns = truth(6, 60, 40 + seed, rotation=False, places=np.repeat(
+            places, repeats, axis=0))  # fmt: skip
+        off = np.random.default_rng((seed, 1)).normal(size=places.shape) * 2e-4
+        columns["actual_q"] = columns["actual_q"] + np.repeat(off, repeats, axis=0)
+        found = identify_compliance(model_of(6), log_of(6, columns), KNOWN)
+        std = np.concatenate([found.std_axial, found.std_radial])
+        off_by = np.concatenate([found.axial, found.radial]) - planted
+        z.append((off_by / std)[found.identifiable])
+    assert 0.7 < np.sqrt(np.mean(np.square(np.concatenate(z)))) < 1.2
 
 
 def test_a_frame_that_nobody_registered_is_found_along():
