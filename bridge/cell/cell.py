@@ -175,7 +175,7 @@ def complaints(path: Path) -> list[str]:
         if not found:
             cell_of(file, document)
     except (ArmError, CellError) as error:
-        found = [_placed(document, str(error))]
+        found = [placed(document, str(error))]
     return found
 
 
@@ -194,7 +194,7 @@ def cell_of(file: CellFile, document: Document) -> Cell:
             term_of(entry, arm, f"effects entry {i + 1}") for i, entry in enumerate(file.effects)
         )
     except (ArmError, CellError) as error:
-        raise type(error)(_placed(document, str(error))) from None
+        raise type(error)(placed(document, str(error))) from None
     model = Model(
         arm=arm,
         tool_in_flange=_transform(file.tool.tcp),
@@ -212,18 +212,20 @@ def cell_of(file: CellFile, document: Document) -> Cell:
         document,
         model,
         metrology,
-        (*found.warnings, *(f"{path}: {w}" for w in warnings)),
+        (*found.warnings, *(placed(document, w) for w in warnings)),
     )
 
 
-def _placed(document: Document, text: str) -> str:
+def placed(document: Document, text: str) -> str:
     """Return a message with its file, and the line of the key that it begins with."""
     path = str(document.path)
     if text.startswith(path):
         return text
     name = text.partition(":")[0]
-    named = [keys for keys in _paths((), document.data) if key_path(keys) == name]
-    return f"{path}, line {document.line(named[0])}: {text}" if named else f"{path}: {text}"
+    # the key itself, or the nearest that holds it
+    named = [k for k in _paths((), document.data) if f"{name}.".startswith(f"{key_path(k)}.")]
+    line = document.line(max(named, key=len)) if named else None
+    return f"{path}: {text}" if line is None else f"{path}, line {line}: {text}"
 
 
 def _paths(keys: tuple[str | int, ...], value: object) -> Iterator[tuple[str | int, ...]]:

@@ -11,6 +11,7 @@ from gapbridge.bridge.document.log_findings import log_finding_text
 from gapbridge.core.diagnosis.log_checks.frames import frame_findings
 from gapbridge.core.diagnosis.log_checks.units_and_clocks import findings
 from gapbridge.core.errors import LogError
+from gapbridge.core.log.columns import did_you_mean
 from gapbridge.core.log.log import Log
 from gapbridge.core.sessions import sessions_in
 
@@ -24,9 +25,10 @@ def log_findings(cell: Cell, path: Path) -> Findings:
     """
     log = open_log(path, cell)
     if not log.has(MEASURED):
+        hint = did_you_mean(log.unknown, [MEASURED], log.n)
         raise LogError(
             f"{path}: columns {MEASURED}_0..2: not found, expected them: without measured "
-            "positions nothing shows which arm it was"
+            f"positions nothing shows which arm it was{hint}"
         )
     log.require("actual_q", "target_q")
     log.loads()

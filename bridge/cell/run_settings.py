@@ -11,6 +11,7 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from gapbridge.bridge.cell import Cell, load_cell
+from gapbridge.bridge.cell.cell import placed
 from gapbridge.bridge.cell.daemon_settings import DaemonSettings
 from gapbridge.bridge.cell.runtime_folder import cell_key, runtime_folder
 from gapbridge.bridge.cell.sections import SetpointSettings
@@ -92,7 +93,7 @@ def settings_of(cell: Cell) -> DaemonSettings:
         )  # fmt: skip
     except ValidationError as error:
         message = str(error.errors()[0]["msg"]).removeprefix("Value error, ")
-        raise CellError(f"{cell.path}: {message}") from None
+        raise CellError(placed(cell.document, message)) from None
 
 
 def _setpoints_of(cell: Cell) -> SetpointSettings:

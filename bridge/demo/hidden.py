@@ -83,7 +83,7 @@ def _bent_tool(rng: np.random.Generator) -> Hidden:
 
 
 def _lost_zero(rng: np.random.Generator) -> Hidden:
-    joint, value = int(rng.choice(ZERO_JOINTS)), float(rng.choice([-1, 1]) * rng.uniform(*ZEROS))
+    joint, value = int(rng.choice(ZERO_JOINTS)), float(rng.uniform(*ZEROS))  # lower, as it bends
     zero = tuple(value if i + 1 == joint else 0.0 for i in range(6))
     truth = {f"joint_offset_{joint}": value}
     return Hidden(("joint_offset",), "the zero of a joint was off, too", truth, {"zero": zero})

@@ -91,7 +91,7 @@ def nearest(names: Sequence[str]) -> str:
     """Return what a file without any known column may mean, or what was expected."""
     for name in names:
         stem = re.sub(r"_\d+$", "", name)
-        near = difflib.get_close_matches(stem, COLUMNS, n=1, cutoff=0.6)
+        near = difflib.get_close_matches(stem.lower(), COLUMNS, n=1, cutoff=0.6)
         if near:
             return f"; found {name!r}, did you mean {near[0]!r}?"
     more = ", ..." if len(names) > 6 else ""

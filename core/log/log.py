@@ -11,6 +11,7 @@ import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import dropwhile
 from pathlib import Path
 from typing import Any
 
@@ -226,12 +227,12 @@ def _read_csv(path: Path) -> tuple[list[str], Array, Index | None]:
     """Return the names of all columns, those that are known (rows, known columns), and the lines.
 
     Lines of the rows in the file, or None where they follow each other from 2. Lines that begin
-    with # are comments; with semicolons between the cells a comma may stand for the decimal point.
+    with # are comments, blank ones before the header are left out; with semicolons between the
+    cells a comma may stand for the decimal point.
     """
-    every = _text(path).split("\n")
-    while every and not every[-1].strip():
-        every.pop()
+    every = _text(path).rstrip().split("\n")
     kept = [number for number, line in enumerate(every, start=1) if not is_comment(line)]
+    kept = list(dropwhile(lambda number: not every[number - 1].strip(), kept))
     lines = [every[number - 1] for number in kept]
     if not lines:
         raise LogError(f"{path}: found an empty file, expected a CSV header")
@@ -336,7 +337,8 @@ def grouped(
                     f"{path}: column {name}_{index}: found one too many, expected {what}{per}"
                 )
             if index not in indices:
-                raise LogError(f"{path}: column {name}_{index}: not found, expected {what}")
+                first = f"; they count from {min(indices)} here" if min(indices) else ""
+                raise LogError(f"{path}: column {name}_{index}: not found, expected {what}{first}")
         columns[name] = np.empty((rows, expected))
         for k in range(expected):
             columns[name][:, k] = column(indices[k])

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
-from itertools import islice
+from itertools import dropwhile, islice
 from pathlib import Path
 
 import numpy as np
@@ -114,7 +114,7 @@ def _tables(path: Path, rows: int) -> Iterator[Table]:
 
 def _csv(path: Path, rows: int, encoding: str) -> Iterator[Table]:
     with path.open(encoding=encoding) as file:
-        kept = _lines(file)
+        kept = dropwhile(lambda one: not one[1].strip(), _lines(file))
         header = next(kept, (1, ""))[1]
         delimiter = delimiter_of(header)
         names = [name.strip().strip('"') for name in header.strip().split(delimiter)]

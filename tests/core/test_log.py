@@ -56,6 +56,15 @@ def test_semicolons_line_ends_marks_and_blank_ends_do_not_matter(tmp_path, delim
     np.testing.assert_allclose(read_log(path, 6).require("actual_q"), joints())
 
 
+def test_blanks_in_the_header_and_blank_lines_before_it_do_not_matter(tmp_path):
+    text = table(JOINTS, joints())
+    path = write(tmp_path, "\n \n" + text.replace(",actual", " , actual"))
+    for log in (read_log(path, 6), *LogPieces(path, 6)):
+        np.testing.assert_allclose(log.require("actual_q"), joints())
+        assert log.line(0) == 4
+    assert source_of(path) is None  # no recording of UR's, which has blanks alone
+
+
 def test_decimal_commas_comments_and_gzip_are_read(tmp_path):
     rows = [[str(v).replace(".", ",") for v in r] for r in joints()]
     lines = table(JOINTS, rows, ";").splitlines()
@@ -190,6 +199,9 @@ UNUSABLE = {
     "gap": (table([*JOINTS[:3], *JOINTS[4:]], [[1] * 5]),
             "column actual_q_3: not found, expected 6 columns actual_q_0..5"),
     "first missing": (table(JOINTS[1:], [[1] * 5]), "column actual_q_0: not found"),
+    "from 1": (table([f"actual_q_{i}" for i in range(1, 7)], [[1] * 6]),
+               "actual_q_0: not found, expected 6 columns actual_q_0..5; they count from 1 here"),
+    "capitals": (table(["ACTUAL_Q_0"], [[1]]), "found 'ACTUAL_Q_0', did you mean 'actual_q'"),
     "too few joints": (table(JOINTS[:5], [[1] * 5]), "column actual_q_5: not found"),
     "seven joints": (table([*JOINTS, "actual_q_6"], [[1] * 7]),
                      "column actual_q_6: found one too many, expected 6 columns actual_q_0..5 of a "

@@ -7,13 +7,15 @@ from pathlib import Path
 import click
 
 from gapbridge.bridge.cell import Cell, load_cell
-from gapbridge.bridge.cell.cell import complaints
+from gapbridge.bridge.cell.cell import complaints, placed
 from gapbridge.bridge.cell.live import live_findings
 from gapbridge.bridge.cell.log_fit import log_findings
 from gapbridge.bridge.cell.run_settings import read_configuration
 from gapbridge.bridge.cli.options import FILE, cell_argument
 from gapbridge.bridge.setpoint_source import make_source
 from gapbridge.core.errors import InputError
+from gapbridge.drivers import make_driver
+from gapbridge.drivers.link_settings import ProfileSettings
 
 
 @click.command()
@@ -70,8 +72,10 @@ def _of_a_run(cell: Cell) -> list[str]:
     """Return what is wrong with the files that only a run reads: profiles, tokens, a trajectory."""
     try:
         settings = read_configuration(cell.path).settings
+        if isinstance(settings.link, ProfileSettings):
+            make_driver(settings.link, cell.model)  # holds the profile to the arm; opens nothing
     except InputError as error:
-        return [str(error)]
+        return [placed(cell.document, str(error))]
     try:
         make_source(settings.setpoints, cell.arm.n, True, cell.path.parent, settings.link.rate)
     except InputError as error:

@@ -37,9 +37,10 @@ def demo(seed: int, out: Path, link: str) -> None:  # fmt: skip
     Connects over the real protocol to a simulated controller whose true flexibilities are drawn
     from the seed and hidden, measures poses, fits, compensates, diagnoses, and writes a report: a
     UR10e over RTDE, a compliant AgileX PiPER on CAN, or a UR10e that is moved by its own program,
-    over Modbus. The arm also has a bent tool, which the fit of flexibilities does not model: the
-    diagnosis must identify it, and the test poses are measured again with it in the model. The demo
-    fails if the diagnosis names a cause that the simulated arm does not have.
+    over Modbus. The arm also has a bent tool (over RTDE, with some seeds, a joint whose zero is off
+    instead), which the fit of flexibilities does not model: the diagnosis must identify it, and the
+    test poses are measured again with it in the model. The demo fails if the diagnosis names a
+    cause that the simulated arm does not have.
 
     Example: gapbridge demo --seed 3
     Example: gapbridge demo --link can --out out/demo_can

@@ -100,10 +100,11 @@ class RosBag(Source):
 
 
 def _is_ros_mcap(path: Path) -> bool:
-    from mcap.exceptions import McapError
     from mcap.reader import make_reader
     from mcap.records import Schema
     from mcap.stream_reader import StreamReader
+
+    from gapbridge.core.log.mcap_records import BROKEN  # as late as its library
 
     try:
         with path.open("rb") as file:
@@ -113,7 +114,7 @@ def _is_ros_mcap(path: Path) -> bool:
             for record in StreamReader(file, emit_chunks=False).records:
                 if isinstance(record, Schema):
                     return record.encoding in ("ros2msg", "ros2idl")
-    except (McapError, OSError):
+    except (*BROKEN, OSError):
         pass
     return False
 

@@ -49,7 +49,8 @@ class UrRecorder(Source):
     def holds(self, path: Path) -> bool:
         """Return whether the header is RTDE's, with spaces."""
         names = _header(path, None)
-        return len(names) > 1 and ("actual_q_0" in names or "target_q_0" in names)
+        between = any(mark in name for name in names for mark in ",;")  # a table, with blanks
+        return len(names) > 1 and not between and ("actual_q_0" in names or "target_q_0" in names)
 
     def read(self, path: Path, arm_joints: Sequence[str], options: SourceOptions) -> Converted:
         """Return the log; see ``Source.read``."""

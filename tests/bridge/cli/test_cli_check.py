@@ -79,6 +79,8 @@ def test_a_fit_cell_ends_with_zero_and_says_so(tmp_path: Path) -> None:
     ("lines", "place"),
     [
         ("payload: {mass: 5000}", "line 2: payload.mass: found 5000 kg"),
+        ("effects:\n  - {effect: backlash, parameters: {value: 1e-4}}",
+         "line 3: effects entry 1.joint: found none"),
         ("effects:\n  - {effect: backlash, joint: 9, parameters: {value: 1}}",
          "line 3: effects entry 1.joint: found 9"),
     ],
@@ -150,6 +152,12 @@ def test_the_arm_that_was_measured_fits_its_log(tmp_path: Path) -> None:
     ("before", "after", "phrase"),
     [
         ("actual_q_", "q_", "columns: found no actual_q_0..5 or target_q_0..5"),
+        (
+            "measured_position_0",
+            "measured_position[0]",
+            "expected 3 columns measured_position_0..2",
+        ),
+        ("measured", "mesured", "found mesured_position_0; did you mean measured_position_0?"),
         ("\n", ",payload\n", "row 2, column payload: found -1, expected 0 or more kg"),
     ],
 )
@@ -191,6 +199,29 @@ def test_every_command_refuses_it_in_one_line(tmp_path: Path) -> None:
     for command in (("predict", tmp_path / "log.csv", "--out", tmp_path / "o.csv", "--cell"),
                     ("run",), ("simulate",)):  # fmt: skip
         assert f"{path}, line 2: tool.tcp.xyz: found 180 m" in refused(*command, path)
+
+
+@pytest.mark.parametrize(
+    ("lines", "message"),
+    [
+        ("link: {driver: can, profile: openarm}", "line 2: link.profile: found 7 joints in"),
+        ("link: {host: 127.0.0.2}\nsetpoints: {source: trajectory}",
+         "line 3: setpoints.file: found nothing"),
+    ],
+)  # fmt: skip
+def test_what_only_a_run_would_refuse_is_named_with_its_line(
+    tmp_path: Path, lines: str, message: str
+) -> None:
+    path = tmp_path / "cell.yaml"
+    path.write_text(f"robot: {{model: ur10e}}\n{lines}\n")
+    assert f"error: {path}, {message}" in refused("check", path)
+
+
+def test_a_recording_that_is_none_is_refused_in_one_line(tmp_path: Path) -> None:
+    path, log = tmp_path / "cell.yaml", tmp_path / "log.mcap"
+    path.write_text("robot: {model: ur10e}\n")
+    log.write_bytes(b"hello")
+    assert f"{log}: found no MCAP file" in refused("check", path, "--log", log)
 
 
 def test_the_controller_reports_what_it_is(host: str) -> None:
