@@ -21,23 +21,8 @@ from reportlab.platypus import (
 )
 from reportlab.platypus import Paragraph as Text
 
+from gapbridge.bridge.document import blocks
 from gapbridge.bridge.document import drawing as drawn
-from gapbridge.bridge.document.blocks import (
-    Beside,
-    Block,
-    Bullets,
-    Columns,
-    Document,
-    Gallery,
-    Heading,
-    Paragraph,
-    Part,
-    Pictures,
-    Table,
-    Tiles,
-    Verdict,
-    View,
-)
 from gapbridge.bridge.document.pdf_table import beside_table, columns_table, table, tiles_table
 from gapbridge.bridge.document.pdf_text import BOLD, PLAIN, STYLES, badge_markup, load_fonts, markup
 
@@ -78,7 +63,7 @@ class DrawnRow(Flowable):
             x += drawing.width * self.scale + self.gap
 
 
-def pdf(document: Document) -> bytes:
+def pdf(document: blocks.Document) -> bytes:
     """Return the whole file."""
     load_fonts()
     file = io.BytesIO()
@@ -133,7 +118,7 @@ class _Numbered(Canvas):
         super().save()
 
 
-def _part(part: Part) -> list[Flowable]:
+def _part(part: blocks.Part) -> list[Flowable]:
     """Return a section; its heading never stands alone at the foot of a page."""
     head: list[Flowable] = [Text(markup(part.title), STYLES["h2"])]
     if part.about:
@@ -141,7 +126,7 @@ def _part(part: Part) -> list[Flowable]:
     kept: list[list[Flowable]] = [head]
     for block in part.blocks:
         groups = _block(block)
-        if isinstance(block, Table) and len(block.rows) > WHOLE:
+        if isinstance(block, blocks.Table) and len(block.rows) > WHOLE:
             # its head begins where some of its rows have room, and the rest goes on
             loose = kept.pop() if kept[-1] is head or _is_heading(kept[-1][-1]) else []
             kept += [[CondPageBreak(ROOM)], *[[f] for f in loose], *groups]
@@ -156,36 +141,36 @@ def _is_heading(flowable: Flowable) -> bool:
     return isinstance(flowable, Text) and flowable.style is STYLES["h3"]
 
 
-def _block(block: Block) -> list[list[Flowable]]:
+def _block(block: blocks.Block) -> list[list[Flowable]]:
     """Return what a block is made of, in groups that no page's end divides."""
-    if isinstance(block, Paragraph):
+    if isinstance(block, blocks.Paragraph):
         return [[Text(markup(block.text), STYLES[block.kind or "text"])]]
-    if isinstance(block, Heading):
+    if isinstance(block, blocks.Heading):
         return [[Text(markup(block.text), STYLES["h3"])]]
-    if isinstance(block, Bullets):
+    if isinstance(block, blocks.Bullets):
         return [[Text(markup(i), STYLES["bullet"], bulletText="•")] for i in block.items]
-    if isinstance(block, Verdict):
+    if isinstance(block, blocks.Verdict):
         badges = " ".join(badge_markup(badge) for badge in (block.badge, *block.more))
         word = Text(badges, STYLES["verdict"])
         return [[word, Text(markup(block.text), STYLES["lead"])]]
-    if isinstance(block, Tiles):
+    if isinstance(block, blocks.Tiles):
         return [[tiles_table(block, WIDTH), Spacer(1, 8)]]
-    if isinstance(block, Columns):
+    if isinstance(block, blocks.Columns):
         return [[columns_table(block, WIDTH), Spacer(1, 6)]]
-    if isinstance(block, Beside):
+    if isinstance(block, blocks.Beside):
         return [[beside_table(block, WIDTH), Spacer(1, 8)]]
-    if isinstance(block, Gallery):
-        return _pictures(Pictures(block.drawings[:1], block.caption))
-    if isinstance(block, View):
-        return _pictures(Pictures((block.scene.drawing(),), block.caption))
-    if isinstance(block, Table):
+    if isinstance(block, blocks.Gallery):
+        return _pictures(blocks.Pictures(block.drawings[:1], block.caption))
+    if isinstance(block, blocks.View):
+        return _pictures(blocks.Pictures((block.scene.drawing(),), block.caption))
+    if isinstance(block, blocks.Table):
         long = len(block.rows) > WHOLE
         grid, space = table(block, WIDTH), Spacer(1, 8)
         return [[grid], [space]] if long else [[grid, space]]
     return _pictures(block)
 
 
-def _pictures(block: Pictures) -> list[list[Flowable]]:
+def _pictures(block: blocks.Pictures) -> list[list[Flowable]]:
     """Return the drawings, two in a row; the caption stays with the last row."""
     rows: list[list[Flowable]] = [
         [DrawnRow(block.drawings[i : i + 2])] for i in range(0, len(block.drawings), 2)
