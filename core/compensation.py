@@ -55,18 +55,18 @@ class Correction(NamedTuple):
 
 
 @njit(**JIT)
-def _pose_error(shape, position, rotation, lever, error):  # type: ignore[no-untyped-def]
+def _pose_error(shape, pose, error):  # type: ignore[no-untyped-def]
     """Write wanted minus predicted pose (6,), rotation part times the lever; returns its length."""
     for k in range(3):
-        error[k] = position[k] - shape.tcp_position[k]
+        error[k] = pose[k] - shape.tcp_position[k]
         error[3 + k] = 0.0
     # for small angles the rotation vector of R_wanted R^T is half the sum of the axes' products
-    R = shape.tcp_rotation
+    R, rotation = shape.tcp_rotation, pose[3:].reshape((3, 3))
     for column in range(3):
         for k in range(3):
             a, b = (k + 1) % 3, (k + 2) % 3
             error[3 + k] += (
-                0.5 * lever * (R[a, column] * rotation[b, column]
+                0.5 * LEVER * (R[a, column] * rotation[b, column]
                                - R[b, column] * rotation[a, column])
             )  # fmt: skip
     square = 0.0
@@ -76,89 +76,44 @@ def _pose_error(shape, position, rotation, lever, error):  # type: ignore[no-unt
 
 
 @njit(**JIT)
-def next_offset(chain, rows, r, shape, position, rotation, lever, offset):  # type: ignore[no-untyped-def]  # noqa: PLR0913 (compiled)
-    """Write the next joint offset of row r, given the one that its q holds; returns the distance.
+def next_offset(chain_block, row_block, shape_block, pose, offset):  # type: ignore[no-untyped-def]
+    """Write the next joint offset (n,), given the one that the row's q holds; returns the distance.
 
-    The distance (m) is that of the present shape from the wanted pose; -1 where the arm has no
-    equilibrium or a number is not finite. The whole offset is solved for anew, not a step on top:
-    what turns joints without moving the tool cannot pile up from setpoint to setpoint.
+    The distance (m) is that of the present shape from the wanted pose (12,); -1 where the arm has
+    no equilibrium or a number is not finite. The whole offset is solved for anew, not a step on
+    top: what turns joints without moving the tool cannot pile up from setpoint to setpoint.
     """
-    n = chain.mass.shape[0]
-    if kernel.equilibrium(chain, rows, r, shape) < 0:
+    n = offset.shape[0]
+    shape = shape_of(shape_block, n)
+    if kernel.equilibrium(chain_of(chain_block, n), row_of(row_block, n), ROW(0), shape) < 0:
         return -1.0
     error, J = np.empty(6), np.empty((6, n))
-    distance = _pose_error(shape, position, rotation, lever, error)
+    distance = _pose_error(shape, pose, error)
     if not np.isfinite(distance):
         return -1.0
     kernel.jacobian(shape, J)
     for k in range(6):
         for i in range(n):
             if k > 2:
-                J[k, i] *= lever
+                J[k, i] *= LEVER
             error[k] += J[k, i] * offset[i]
     smallest_offset(J, error, offset)
     return distance
 
 
 @njit(**JIT)
-def _turned(A, B, out):  # type: ignore[no-untyped-def]
-    """Write the rotation vector of A B^T; accurate at zero, where it is needed."""
-    x = y = z = trace = 0.0
-    for k in range(3):
-        x += A[2, k] * B[1, k] - A[1, k] * B[2, k]
-        y += A[0, k] * B[2, k] - A[2, k] * B[0, k]
-        z += A[1, k] * B[0, k] - A[0, k] * B[1, k]
-        trace += A[0, k] * B[0, k] + A[1, k] * B[1, k] + A[2, k] * B[2, k]
-    twice_sine = np.sqrt(x * x + y * y + z * z)
-    angle = np.arctan2(twice_sine, trace - 1.0)
-    # offsets are small: half turns, where the sine alone says nothing, do not occur
-    scale = angle / twice_sine if twice_sine > 1e-12 else 0.5
-    out[0], out[1], out[2] = scale * x, scale * y, scale * z
-
-
-@njit(**JIT)
-def _moved(wanted, pose, offset, moved):  # type: ignore[no-untyped-def]
-    """Write how far (6,) a pose (12,) is from the wanted one; no offset, no motion."""
-    moves = False
-    for i in range(offset.shape[0]):
-        moves = moves or offset[i] != 0.0
-    for k in range(3):
-        moved[k] = pose[k] - wanted[k] if moves else 0.0
-        moved[3 + k] = 0.0
-    if moves:
-        _turned(pose[3:].reshape((3, 3)), wanted[3:].reshape((3, 3)), moved[3:])
-
-
-@njit(**JIT)
-def _rigid_pose(rigid, row, shape, q, pose):  # type: ignore[no-untyped-def]
-    """Write the rigid TCP pose (12,) at q (n,), position first; nothing in ``shape`` bends."""
-    for i in range(q.shape[0]):
+def _rigid_pose(rigid_block, row_block, shape_block, q, pose):  # type: ignore[no-untyped-def]
+    """Write the rigid TCP pose (12,) at q (n,), position first; nothing of the shape bends."""
+    n = q.shape[0]
+    row, shape = row_of(row_block, n), shape_of(shape_block, n)
+    for i in range(n):
         row.q[0, i] = q[i]
     A, B, base_rotation = np.empty((3, 3)), np.empty((3, 3)), np.zeros(3)
-    kernel.place(rigid, row, ROW(0), shape, base_rotation, A, B)
+    kernel.place(chain_of(rigid_block, n), row, ROW(0), shape, base_rotation, A, B)
     for i in range(3):
         pose[i] = shape.tcp_position[i]
         for j in range(3):
             pose[3 + 3 * i + j] = shape.tcp_rotation[i, j]
-
-
-@njit(**JIT)
-def _want(rigid_block, row_block, shape_block, q, pose):  # type: ignore[no-untyped-def]
-    """``_rigid_pose`` of packed records."""
-    n = q.shape[0]
-    _rigid_pose(
-        chain_of(rigid_block, n), row_of(row_block, n), shape_of(shape_block, n), q, pose
-    )  # fmt: skip
-
-
-@njit(**JIT)
-def _step(chain_block, row_block, shape_block, pose, offset):  # type: ignore[no-untyped-def]
-    """``next_offset`` of packed records."""
-    n = offset.shape[0]
-    return next_offset(
-        chain_of(chain_block, n), row_of(row_block, n), ROW(0), shape_of(shape_block, n), pose[:3],
-        pose[3:].reshape((3, 3)), LEVER, offset,
-    )  # fmt: skip
 
 
 def block_of(chain: Chain, rigid: Chain) -> Array:
@@ -219,12 +174,12 @@ class Compensator:
             )  # fmt: skip
         else:
             rigid = self._rigid
-            _want(rigid, self._rigid_row, self._rigid_shape, nominal, self._wanted)
+            _rigid_pose(rigid, self._rigid_row, self._rigid_shape, nominal, self._wanted)
             best, steps = self._solve_conditioned(nominal, loads, q)
             self._offset[:] = q - nominal if best < np.inf else 0.0
             self._lead(loads, q)
-            _want(rigid, self._rigid_row, self._rigid_shape, q, self._pose)
-            _moved(self._wanted, self._pose, q - nominal, moved)
+            _rigid_pose(rigid, self._rigid_row, self._rigid_shape, q, self._pose)
+            single.motion(self._wanted, self._pose, bool((q != nominal).any()), moved)
         return Correction(q, moved, best, steps)
 
     def correct_rows(self, nominal_q: Array, loads: Loads) -> Correction:
@@ -234,7 +189,7 @@ class Compensator:
         found, residual = np.empty((count, n + 6)), np.empty(count)
         steps = np.empty(count, dtype=np.int64)
         if self._plain:
-            self._plain_rows(nominal, loads, found, residual, steps)
+            self._plain_rows(nominal, loads, (found, residual, steps))
         else:
             for r in range(count):
                 one = self.correct(nominal[r], loads[r : r + 1])
@@ -242,9 +197,7 @@ class Compensator:
                 residual[r], steps[r] = one.residual, one.steps
         return Correction(found[:, :n], found[:, n:], residual, steps)
 
-    def _plain_rows(
-        self, nominal: Array, loads: Loads, found: Array, residual: Array, steps: Index
-    ) -> None:
+    def _plain_rows(self, nominal: Array, loads: Loads, out: tuple[Array, Array, Index]) -> None:
         """Write the corrections of rows that nothing but the chain's bending changes.
 
         In blocks; then, one after the other, those that the blocks leave: near singularities.
@@ -253,14 +206,15 @@ class Compensator:
         rigid = self.model.without_terms().chain()
 
         def work(first: int, last: int) -> None:
-            correct_blocks(chain, rigid, rows, first, last, found, residual, steps)
+            correct_blocks(chain, rigid, rows, first, last, out)
 
         in_ranges(work, len(nominal))
-        left = np.flatnonzero(steps == 0)
+        left = np.flatnonzero(out[2] == 0)
         if len(left):
-            some = [part[left] for part in (*rows[:1], *rows[2:], found, residual, steps)]
-            single.correct_rows(self._block, *some)
-            for part, values in zip((found, residual, steps), some[-3:], strict=True):
+            some = tuple(part[left] for part in out)
+            given = [part[left] for part in (rows.q, *rows[2:])]
+            single.correct_rows(self._block, *given, some)
+            for part, values in zip(out, some, strict=True):
                 part[left] = values
 
     def forget(self) -> None:
@@ -277,7 +231,7 @@ class Compensator:
             self._load(loads)
             row.q[0], row.growth[0] = tried, 1.0
             self.model.condition(row, loads, tried[None], self._conditions)
-            distance = _step(self._chain, self._row, self._shape, self._wanted, offset)
+            distance = next_offset(self._chain, self._row, self._shape, self._wanted, offset)
             if distance < 0:
                 break
             if distance < best:

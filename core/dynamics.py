@@ -15,7 +15,8 @@ ch. 5.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -29,8 +30,7 @@ from gapbridge.core.motion import Motion, Pieces
 LIGHTEST = 1e-6  # kg, of a link whose centre of gravity is anywhere
 
 
-@dataclass(frozen=True)
-class Frames:
+class Frames(NamedTuple):
     """Where the frames of N rows are and how they move, base axes."""
 
     origin: Array  # (N, n+1, 3) m: joints, then the flange
@@ -57,10 +57,7 @@ def frames_of(chain: Chain, q: Array, qd: Array, qdd: Array) -> Frames:
         np.empty((count, n + 1, 3)), np.empty((count, n + 1, 3, 3)), np.empty((count, n, 3)),
         np.empty((count, n, 3)), np.empty((count, n + 1, 3)),
     )  # fmt: skip
-    rigid.frames_of_rows(
-        chain, np.stack([q, qd, qdd]), found.origin, found.rotation, found.omega, found.alpha,
-        found.acceleration,
-    )  # fmt: skip
+    rigid.frames_of_rows(chain, np.stack([q, qd, qdd]), found)
     return found
 
 
@@ -84,10 +81,7 @@ def pieces_of(model: Model, motion: Motion) -> Pieces:
         """Return the torques (N, n) of one link with its centre of gravity at ``cog`` (3,)."""
         body = np.vstack([cog, [chain.mass[i], 0.0, 0.0], model.arm.inertia[i]])
         point, force, moment = (np.empty((count, 3)) for _ in range(3))
-        rigid.taken_by_link(
-            i, body, gravity, frames.origin, frames.rotation, frames.omega, frames.alpha,
-            frames.acceleration, point, force, moment,
-        )  # fmt: skip
+        rigid.taken_by_link(i, body, gravity, frames, point, force, moment)
         torque = np.zeros((count, n))
         torque[:, : i + 1] = _about_axes(frames, i + 1, point, force, moment)
         return torque
@@ -138,7 +132,7 @@ def _bent_flange(model: Model, motion: Motion, frames: Frames) -> Frames:
     deflected = model.predict(motion.q, motion.loads).rotation @ chain.tool_rotation.T
     rotation = frames.rotation.copy()
     rotation[:, -1] = deflected
-    return replace(frames, rotation=rotation)
+    return frames._replace(rotation=rotation)
 
 
 def _times(matrix: Array, vector: Array) -> Array:
@@ -149,7 +143,7 @@ def _about_axes(frames: Frames, joints: int, point: Array, force: Array, moment:
     """Return the torques (N, joints) that hold ``force`` at ``point`` and ``moment``."""
     torque = np.empty((len(point), joints))
     force, moment = np.ascontiguousarray(force), np.ascontiguousarray(moment)  # as compiled for
-    rigid.about_axes(frames.origin, frames.rotation, point, force, moment, torque)
+    rigid.about_axes(frames, point, force, moment, torque)
     return torque
 
 

@@ -222,23 +222,26 @@ def _share(vector, first, last, most):  # type: ignore[no-untyped-def]
 
 
 @njit(**JIT)
-def _check(numbers, bounds, nominal, corrected, offset, ramp, actual, dt, q, before):  # type: ignore[no-untyped-def]  # noqa: PLR0913 (compiled)
-    """Return the reason why nothing may leave, or _FINE."""
-    n = q.shape[0]
+def _finite(q, nominal, corrected, actual, offset, ramp, dt):  # type: ignore[no-untyped-def]
+    """Return whether all is a number, and none of them huge."""
     fine = np.isfinite(ramp) and np.isfinite(dt)
-    for i in range(n):
+    for i in range(q.shape[0]):
         fine = fine and abs(nominal[i]) < HUGE and abs(corrected[i]) < HUGE
         fine = fine and abs(actual[i]) < HUGE and np.isfinite(q[i])
     for k in range(6):
         fine = fine and abs(offset[k]) < HUGE
-    if not fine:
-        return _NOT_FINITE
+    return fine
+
+
+@njit(**JIT)
+def _check(bounds, nominal, before, dt):  # type: ignore[no-untyped-def]
+    """Return the reason why nothing may leave, or _FINE."""
     if dt <= 0.0:
         return _BAD_GAP
-    for i in range(n):
+    for i in range(nominal.shape[0]):
         if nominal[i] < bounds[0, i] or nominal[i] > bounds[1, i]:
             return _NOMINAL_OUTSIDE
-    for i in range(n):
+    for i in range(nominal.shape[0]):
         # twice: a source may catch up a cycle; what is between is slowed down, not refused
         if abs(nominal[i] - before[i]) > 2.0 * bounds[2, i] * dt:
             return _JUMP
@@ -275,7 +278,9 @@ def _limit(block, nominal, corrected, offset, ramp, actual, dt):  # type: ignore
     q, before, delta, applied = _kept_of(block)
     n = q.shape[0]
     numbers, bounds = block[:NUMBERS], block[NUMBERS : NUMBERS + 3 * n].reshape((3, n))
-    code = _check(numbers, bounds, nominal, corrected, offset, ramp, actual, dt, q, before)
+    if not _finite(q, nominal, corrected, actual, offset, ramp, dt):
+        return _NOT_FINITE, 0
+    code = _check(bounds, nominal, before, dt)
     if code != _FINE:
         return code, 0
     gap = min(dt, numbers[6])

@@ -58,38 +58,12 @@ def left_jacobian(vector: Array) -> Array:
 
 def rotation_vector(matrix: Array) -> Array:
     """Return the rotation vectors (..., 3), angle in [0, pi], of rotation matrices (..., 3, 3)."""
-    R = np.asarray(matrix, dtype=float)
-    # through the quaternion of the largest component: accurate at 0 and at pi
-    trace = np.trace(R, axis1=-2, axis2=-1)
-    diagonal = np.diagonal(R, axis1=-2, axis2=-1)
-    squares = np.concatenate([(1 + trace)[..., None], 1 + 2 * diagonal - trace[..., None]], axis=-1)
-    x, y, z = (
-        R[..., 2, 1] - R[..., 1, 2],
-        R[..., 0, 2] - R[..., 2, 0],
-        R[..., 1, 0] - R[..., 0, 1],
-    )
-    xy, xz, yz = (
-        R[..., 0, 1] + R[..., 1, 0],
-        R[..., 0, 2] + R[..., 2, 0],
-        R[..., 1, 2] + R[..., 2, 1],
-    )
-    candidates = np.stack(
-        [
-            np.stack([squares[..., 0], x, y, z], -1),
-            np.stack([x, squares[..., 1], xy, xz], -1),
-            np.stack([y, xy, squares[..., 2], yz], -1),
-            np.stack([z, xz, yz, squares[..., 3]], -1),
-        ],
-        axis=-2,
-    )
-    best = np.argmax(squares, axis=-1)[..., None, None]
-    quaternion = np.take_along_axis(candidates, best, axis=-2)[..., 0, :]
-    quaternion = quaternion / np.linalg.norm(quaternion, axis=-1, keepdims=True)
-    quaternion = np.where(quaternion[..., :1] < 0, -quaternion, quaternion)
-    sine = np.linalg.norm(quaternion[..., 1:], axis=-1, keepdims=True)
-    angle = 2 * np.arctan2(sine, quaternion[..., :1])
-    scale = np.where(sine > 1e-12, angle / np.where(sine > 1e-12, sine, 1), 2.0)
-    return np.asarray(scale * quaternion[..., 1:])
+    from gapbridge.core.kernels.turns import rotation_vectors
+
+    R = np.ascontiguousarray(matrix, dtype=float)
+    vectors = np.empty(R.shape[:-1])
+    rotation_vectors(R.reshape(-1, 3, 3), vectors.reshape(-1, 3))
+    return vectors
 
 
 def mean_rotation(vectors: Array) -> Array:

@@ -131,7 +131,7 @@ def _attributes_set(function: ast.AST) -> set[str]:
     ["bridge/loop", "bridge/daemon", "bridge/ipc", "bridge/recording/recorder.py", "bridge/served",
      "bridge/setpoint_source", "bridge/calibration", "bridge/web", "bridge/metrics", "bridge/cell",
      "core/urdf.py", "core/estimation", "core/calibration", "core/effects", "core/log",
-     "core/planning",
+     "core/planning", "core/diagnosis",
      *(str(p.relative_to(ROOT)) for p in (ROOT / "drivers").iterdir() if p.name != "simulated")],
 )  # fmt: skip
 def test_no_part_sets_attributes_of_another(folder: str) -> None:

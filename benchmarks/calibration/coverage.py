@@ -19,15 +19,8 @@ from rich.progress import track
 from rich.table import Table
 
 from benchmarks.blind.arms import ARMS
+from benchmarks.calibration import laid_out
 from benchmarks.calibration.drawings import model_of, real_arm
-from benchmarks.calibration.laid_out import (
-    Layout,
-    arm_with,
-    draw_values,
-    instrument_for,
-    lay_out,
-    readings_of,
-)
 from gapbridge.core.calibration.converged_fit import converged_fit
 from gapbridge.core.calibration.fit import estimates_of
 from gapbridge.core.calibration.held_out_check import predicted
@@ -38,9 +31,9 @@ from gapbridge.core.metrology import Metrology
 from gapbridge.core.model import Model
 
 LAYOUTS = {
-    "position": Layout(),
-    "position, registered": Layout(registered=True),
-    "pose": Layout(pose_kind=True),
+    "position": laid_out.Layout(),
+    "position, registered": laid_out.Layout(registered=True),
+    "pose": laid_out.Layout(pose_kind=True),
 }
 
 
@@ -87,11 +80,11 @@ def run(setting: Setting, seed: int) -> Outcome:
     """Return the outcome of one session."""
     rng = np.random.default_rng([seed, 77])
     kind, layout = ARMS[setting.arm], LAYOUTS[setting.layout]
-    truth = draw_values(kind, setting.parameters.names, rng)
-    real, laid = arm_with(kind, truth), lay_out(kind, layout, rng)
-    instrument = instrument_for(kind, layout, rng)
-    readings = readings_of(real, laid, instrument, rng)
-    exact = readings_of(real, laid, instrument, None)
+    truth = laid_out.draw_values(kind, setting.parameters.names, rng)
+    real, laid = laid_out.arm_with(kind, truth), laid_out.lay_out(kind, layout, rng)
+    instrument = laid_out.instrument_for(kind, layout, rng)
+    readings = laid_out.readings_of(real, laid, instrument, rng)
+    exact = laid_out.readings_of(real, laid, instrument, None)
     metrology = Metrology(layout.registered, layout.sigma)
     how = make_observable(readings.kind, registered=layout.registered)
     begun = time.perf_counter()

@@ -23,16 +23,9 @@ from rich.table import Table
 
 from benchmarks.blind.arms import ARMS
 from benchmarks.blind.mechanics import Array
+from benchmarks.calibration import laid_out
 from benchmarks.calibration.dh_fit import fit_dh
 from benchmarks.calibration.drawings import model_of, real_arm
-from benchmarks.calibration.laid_out import (
-    Layout,
-    arm_with,
-    draw_values,
-    instrument_for,
-    lay_out,
-    readings_of,
-)
 from benchmarks.calibration.urdf import urdf_of
 from gapbridge.bridge.cell import load_cell
 from gapbridge.core.calibration.fit import fit_session, judged
@@ -81,13 +74,16 @@ def simulated(arm: str, seed: int, *, loads: bool = True) -> DataSet:
     ``loads``: three, else the lightest alone, with as many poses.
     """
     rng, kind = np.random.default_rng([seed, 5]), ARMS[arm]
-    layout = Layout(held_out=60) if loads else Layout(poses=60, held_out=180)
+    layout = laid_out.Layout(held_out=60) if loads else laid_out.Layout(poses=60, held_out=180)
     model = model_of(real_arm(kind))
     names = [n for n in Parameters.every(model, DEFAULT).names if "tool_frame_r" not in n]
-    real, laid = arm_with(kind, draw_values(kind, names, rng)), lay_out(kind, layout, rng)
-    instrument = instrument_for(kind, layout, rng)
-    readings = readings_of(real, laid, instrument, rng)
-    exact = readings_of(real, laid, instrument, None)
+    real, laid = (
+        laid_out.arm_with(kind, laid_out.draw_values(kind, names, rng)),
+        laid_out.lay_out(kind, layout, rng),
+    )
+    instrument = laid_out.instrument_for(kind, layout, rng)
+    readings = laid_out.readings_of(real, laid, instrument, rng)
+    exact = laid_out.readings_of(real, laid, instrument, None)
     kept = np.flatnonzero(readings.load >= 0 if loads else readings.load == 0)
     readings, exact = readings[kept], exact[kept]
     floor = float(np.sqrt(np.mean((readings.value - exact.value)[readings.held_out] ** 2)))

@@ -21,15 +21,8 @@ from rich.progress import track
 from rich.table import Table
 
 from benchmarks.blind.arms import ARMS
+from benchmarks.calibration import laid_out
 from benchmarks.calibration.drawings import model_of, real_arm
-from benchmarks.calibration.laid_out import (
-    Layout,
-    arm_with,
-    draw_values,
-    instrument_for,
-    lay_out,
-    readings_of,
-)
 from gapbridge.core.calibration.budget.budget import budget
 from gapbridge.core.calibration.fit import fit_session, judged
 from gapbridge.core.calibration.identifiability import identifiable_parameters
@@ -56,20 +49,20 @@ class Outcome:
 def run(arm: str, repeats: str, seed: int) -> Outcome:
     """Return the outcome of one session."""
     rng = np.random.default_rng([seed, 4411])
-    kind, layout = ARMS[arm], Layout(registered=True, repeated=REPEATED[repeats])
+    kind, layout = ARMS[arm], laid_out.Layout(registered=True, repeated=REPEATED[repeats])
     model = model_of(real_arm(kind))
     parameters = identifiable_parameters(
         model, observable=make_observable("position", registered=True)
     )
-    real = arm_with(kind, draw_values(kind, parameters.names, rng))
-    instrument = instrument_for(kind, layout, rng)
-    readings = readings_of(real, lay_out(kind, layout, rng), instrument, rng)
+    real = laid_out.arm_with(kind, laid_out.draw_values(kind, parameters.names, rng))
+    instrument = laid_out.instrument_for(kind, layout, rng)
+    readings = laid_out.readings_of(real, laid_out.lay_out(kind, layout, rng), instrument, rng)
     metrology = Metrology(True, layout.sigma)
     found = judged(model, fit_session(readings, parameters, metrology), diagnose=False)
     given = budget(found)
     # the arm alone: it comes to rest as it repeats, seen by an instrument without noise
-    visits = lay_out(kind, replace(layout, held_out=AWAY), rng)
-    there = readings_of(real, visits, replace(instrument, sigma=0.0), rng)
+    visits = laid_out.lay_out(kind, replace(layout, held_out=AWAY), rng)
+    there = laid_out.readings_of(real, visits, replace(instrument, sigma=0.0), rng)
     away = there[there.held_out]
     error = away.value - found.model.predict(away.q, away.loads).position
     return Outcome(

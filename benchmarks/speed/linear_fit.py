@@ -87,7 +87,7 @@ def _factored(model: Model, q: Array, loads: Loads, gap: Array) -> Array:
         for at in range(first, last, CHUNK):
             part = slice(at, min(at + CHUNK, last))
             rows, right = given(part), np.ascontiguousarray(gap[part])
-            bad = factor_blocks(chain, rows, right, ones, 0, 0, part.stop - at, own)
+            bad = factor_blocks(chain, rows, right, ones, 0, part.stop - at, own)
             if bad >= 0:
                 raise InputError(f"row {at + bad + 1}: the arm finds no equilibrium under its load")
         with lock:

@@ -24,8 +24,7 @@ from gapbridge.bridge.cell.sections import (
     SetpointSettings,
 )
 from gapbridge.bridge.cell.settings.calibration import CalibrationSettings
-from gapbridge.bridge.cell.settings.metrics import MetricsSettings
-from gapbridge.bridge.cell.settings.web import WebSettings
+from gapbridge.bridge.cell.settings.web import MetricsSettings, WebSettings
 from gapbridge.core.arm import Arm
 from gapbridge.core.calibration.spread import Spread
 from gapbridge.core.errors import ArmError, CellError, InputError

@@ -12,8 +12,7 @@ from gapbridge.bridge.cell.sections import (
     RecordingSettings,
     SetpointSettings,
 )
-from gapbridge.bridge.cell.settings.metrics import MetricsSettings
-from gapbridge.bridge.cell.settings.web import WebSettings
+from gapbridge.bridge.cell.settings.web import MetricsSettings, WebSettings
 from gapbridge.drivers.ft_sensor.settings import AnyFtSensor
 from gapbridge.drivers.section import Section
 from gapbridge.drivers.ur_rtde.settings import UrRtdeSettings

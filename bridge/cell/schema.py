@@ -13,8 +13,7 @@ from gapbridge.bridge.cell.sections import (
     SetpointSettings,
 )
 from gapbridge.bridge.cell.settings.calibration import CalibrationSettings
-from gapbridge.bridge.cell.settings.metrics import MetricsSettings
-from gapbridge.bridge.cell.settings.web import WebSettings
+from gapbridge.bridge.cell.settings.web import MetricsSettings, WebSettings
 from gapbridge.drivers.ft_sensor.settings import AnyFtSensor
 from gapbridge.drivers.section import Section
 

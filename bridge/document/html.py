@@ -7,37 +7,18 @@ from collections.abc import Callable
 from html import escape
 from importlib.resources import files
 
-from gapbridge.bridge.document.blocks import (
-    Badge,
-    Bar,
-    Beside,
-    Block,
-    Bullets,
-    Cell,
-    Columns,
-    Document,
-    Gallery,
-    Heading,
-    Named,
-    Pairs,
-    Paragraph,
-    Part,
-    Pictures,
-    Strong,
-    Table,
-    Tiles,
-    Verdict,
-    View,
-)
+from gapbridge.bridge.document import blocks
 from gapbridge.bridge.document.svg import colours, svg
 
 
-def html(document: Document) -> str:
+def html(document: blocks.Document) -> str:
     """Return the whole page."""
     links = "".join(f'<a href="#{p.key}">{escape(p.title)}</a>' for p in document.parts)
     body = "".join(_part(part) for part in document.parts)
     title = escape(document.title)
-    moving = any(isinstance(b, Gallery | View) for p in document.parts for b in p.blocks)
+    moving = any(
+        isinstance(b, blocks.Gallery | blocks.View) for p in document.parts for b in p.blocks
+    )
     script = f'<script type="module">{_own("view.js")}{_own("page.js")}</script>' if moving else ""
     return (
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
@@ -57,53 +38,53 @@ def _own(name: str) -> str:
     return files("gapbridge.bridge.document").joinpath(name).read_text(encoding="utf-8")
 
 
-def _part(part: Part) -> str:
-    blocks = "".join(_block(block) for block in part.blocks)
+def _part(part: blocks.Part) -> str:
+    content = "".join(_block(block) for block in part.blocks)
     if part.folded:
-        blocks = f"<details><summary>Show</summary>{blocks}</details>"
+        content = f"<details><summary>Show</summary>{content}</details>"
     return (
         f'<section id="{part.key}"><h2>{escape(part.title)}</h2>'
-        f'<p class="about">{escape(part.about)}</p>{blocks}</section>'
+        f'<p class="about">{escape(part.about)}</p>{content}</section>'
     )
 
 
-def _block(block: Block) -> str:
+def _block(block: blocks.Block) -> str:
     return _WRITERS[type(block)](block)
 
 
-def _paragraph(block: Paragraph) -> str:
+def _paragraph(block: blocks.Paragraph) -> str:
     css = f' class="{block.kind}"' if block.kind else ""
     return f"<p{css}>{escape(block.text)}</p>"
 
 
-def _heading(block: Heading) -> str:
+def _heading(block: blocks.Heading) -> str:
     return f"<h3>{escape(block.text)}</h3>"
 
 
-def _bullets(block: Bullets) -> str:
+def _bullets(block: blocks.Bullets) -> str:
     return "<ul>" + "".join(f"<li>{escape(i)}</li>" for i in block.items) + "</ul>"
 
 
-def _verdict(block: Verdict) -> str:
+def _verdict(block: blocks.Verdict) -> str:
     badges = " ".join(_cell(badge) for badge in (block.badge, *block.more))
     return f'<p class="verdict">{badges}</p><p class="lead">{escape(block.text)}</p>'
 
 
-def _columns(block: Columns) -> str:
+def _columns(block: blocks.Columns) -> str:
     return f'<div class="columns">{"".join(_pairs(p) for p in block.columns)}</div>'
 
 
-def _beside(block: Beside) -> str:
+def _beside(block: blocks.Beside) -> str:
     return f'<div class="grid">{"".join(f"<div>{_table(t)}</div>" for t in block.tables)}</div>'
 
 
-def _pairs(block: Pairs) -> str:
+def _pairs(block: blocks.Pairs) -> str:
     title = f"<h3>{escape(block.title)}</h3>" if block.title else ""
     pairs = "".join(f"<dt>{escape(k)}</dt><dd>{escape(v)}</dd>" for k, v in block.pairs)
     return f'<div>{title}<dl class="pairs">{pairs}</dl></div>'
 
 
-def _tiles(block: Tiles) -> str:
+def _tiles(block: blocks.Tiles) -> str:
     tiles = "".join(
         f'<div class="tile"><span class="label">{escape(t.label)}</span>'
         f'<span class="value">{escape(t.value)}</span>'
@@ -113,12 +94,12 @@ def _tiles(block: Tiles) -> str:
     return f'<div class="tiles">{tiles}</div>'
 
 
-def _pictures(block: Pictures) -> str:
+def _pictures(block: blocks.Pictures) -> str:
     drawings = "".join(svg(drawing) for drawing in block.drawings)
     return _figure(f'<div class="drawings">{drawings}</div>', block.caption)
 
 
-def _gallery(block: Gallery) -> str:
+def _gallery(block: blocks.Gallery) -> str:
     menus = "".join(
         f"<label>{escape(title)} <select>"
         + "".join(f"<option>{escape(entry)}</option>" for entry in entries)
@@ -134,7 +115,7 @@ def _gallery(block: Gallery) -> str:
     return _figure(f"{menu}{shown}", block.caption, "gallery")
 
 
-def _view(block: View) -> str:
+def _view(block: blocks.View) -> str:
     data = json.dumps(block.scene.document(), separators=(",", ":")).replace("<", "\\u003c")
     return _figure(
         f'<canvas class="view" tabindex="0" role="img" aria-label="{escape(block.scene.title)}">'
@@ -150,7 +131,7 @@ def _figure(body: str, caption: str, kind: str = "") -> str:
     return f"<figure{css}>{body}{text}</figure>"
 
 
-def _table(block: Table) -> str:
+def _table(block: blocks.Table) -> str:
     right = [' class="number"' if i in block.numbers else "" for i in range(len(block.heads))]
     head = "".join(f"<th{r}>{escape(h)}</th>" for h, r in zip(block.heads, right, strict=True))
     first_sum = len(block.rows) - block.sums
@@ -173,17 +154,17 @@ def _table(block: Table) -> str:
     )
 
 
-def _cell(cell: Cell) -> str:
-    if isinstance(cell, Strong):
+def _cell(cell: blocks.Cell) -> str:
+    if isinstance(cell, blocks.Strong):
         return f"<b>{escape(cell.text)}</b>"
-    if isinstance(cell, Badge):
+    if isinstance(cell, blocks.Badge):
         return f'<span class="badge {cell.kind}">{escape(cell.text)}</span>'
-    if isinstance(cell, Bar):
+    if isinstance(cell, blocks.Bar):
         return (
             f'<span class="share"><span class="bar"><i style="width:{cell.filled * 100:.0f}%;'
             f'background:var(--{cell.colour})"></i></span>{escape(cell.text)}</span>'
         )
-    if isinstance(cell, Named):
+    if isinstance(cell, blocks.Named):
         text = f"<b>{escape(cell.text)}</b>{escape(cell.more)}" if cell.text else ""
         line = "<br>" if text and cell.code else ""
         return text + (f"{line}<code>{escape(cell.code)}</code>" if cell.code else "")
@@ -191,7 +172,8 @@ def _cell(cell: Cell) -> str:
 
 
 _WRITERS: dict[type, Callable[..., str]] = {
-    Verdict: _verdict, Tiles: _tiles, Heading: _heading, Paragraph: _paragraph, Bullets: _bullets,
-    Columns: _columns, Table: _table, Beside: _beside, Pictures: _pictures, Gallery: _gallery,
-    View: _view,
+    blocks.Verdict: _verdict, blocks.Tiles: _tiles, blocks.Heading: _heading,
+    blocks.Paragraph: _paragraph, blocks.Bullets: _bullets, blocks.Columns: _columns,
+    blocks.Table: _table, blocks.Beside: _beside, blocks.Pictures: _pictures,
+    blocks.Gallery: _gallery, blocks.View: _view,
 }  # fmt: skip

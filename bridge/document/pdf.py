@@ -21,25 +21,10 @@ from reportlab.platypus import (
 )
 from reportlab.platypus import Paragraph as Text
 
-from gapbridge.bridge.document.blocks import (
-    Beside,
-    Block,
-    Bullets,
-    Columns,
-    Document,
-    Gallery,
-    Heading,
-    Paragraph,
-    Part,
-    Pictures,
-    Table,
-    Tiles,
-    Verdict,
-    View,
-)
-from gapbridge.bridge.document.pdf_drawing import DrawnRow
+from gapbridge.bridge.document import blocks
+from gapbridge.bridge.document import drawing as drawn
 from gapbridge.bridge.document.pdf_table import beside_table, columns_table, table, tiles_table
-from gapbridge.bridge.document.pdf_text import PLAIN, STYLES, badge_markup, load_fonts, markup
+from gapbridge.bridge.document.pdf_text import BOLD, PLAIN, STYLES, badge_markup, load_fonts, markup
 
 SIDE, TOP, BOTTOM = 18 * mm, 16 * mm, 18 * mm
 WIDTH = A4[0] - 2 * SIDE
@@ -47,7 +32,38 @@ ROOM = 120  # pt, for a heading and the first rows of a long table
 WHOLE = 14  # rows of a table up to which it is not divided between pages
 
 
-def pdf(document: Document) -> bytes:
+class DrawnRow(Flowable):
+    """Drawings side by side, made smaller together where they are wider than the page."""
+
+    def __init__(
+        self, drawings: tuple[drawn.Drawing, ...], gap: float = 16.0, largest: float = 0.76
+    ):
+        super().__init__()
+        self.drawings, self.gap, self.scale = drawings, gap, largest
+
+    def wrap(self, available_width: float, available_height: float) -> tuple[float, float]:
+        """Return the size that the row takes, pt."""
+        gaps = self.gap * (len(self.drawings) - 1)
+        wanted = sum(d.width for d in self.drawings)
+        self.scale = min(self.scale, (available_width - gaps) / wanted)
+        return available_width, max(d.height for d in self.drawings) * self.scale + 4
+
+    def draw(self) -> None:
+        """Draw the row on the canvas that the page gives."""
+        canvas: Canvas = self.canv
+        tallest = max(d.height for d in self.drawings) * self.scale
+        x = 0.0
+        for drawing in self.drawings:
+            canvas.saveState()
+            canvas.translate(x, tallest)
+            canvas.scale(self.scale, self.scale)
+            for shape in drawing.shapes:
+                _shape(canvas, shape)
+            canvas.restoreState()
+            x += drawing.width * self.scale + self.gap
+
+
+def pdf(document: blocks.Document) -> bytes:
     """Return the whole file."""
     load_fonts()
     file = io.BytesIO()
@@ -102,7 +118,7 @@ class _Numbered(Canvas):
         super().save()
 
 
-def _part(part: Part) -> list[Flowable]:
+def _part(part: blocks.Part) -> list[Flowable]:
     """Return a section; its heading never stands alone at the foot of a page."""
     head: list[Flowable] = [Text(markup(part.title), STYLES["h2"])]
     if part.about:
@@ -110,7 +126,7 @@ def _part(part: Part) -> list[Flowable]:
     kept: list[list[Flowable]] = [head]
     for block in part.blocks:
         groups = _block(block)
-        if isinstance(block, Table) and len(block.rows) > WHOLE:
+        if isinstance(block, blocks.Table) and len(block.rows) > WHOLE:
             # its head begins where some of its rows have room, and the rest goes on
             loose = kept.pop() if kept[-1] is head or _is_heading(kept[-1][-1]) else []
             kept += [[CondPageBreak(ROOM)], *[[f] for f in loose], *groups]
@@ -125,36 +141,36 @@ def _is_heading(flowable: Flowable) -> bool:
     return isinstance(flowable, Text) and flowable.style is STYLES["h3"]
 
 
-def _block(block: Block) -> list[list[Flowable]]:
+def _block(block: blocks.Block) -> list[list[Flowable]]:
     """Return what a block is made of, in groups that no page's end divides."""
-    if isinstance(block, Paragraph):
+    if isinstance(block, blocks.Paragraph):
         return [[Text(markup(block.text), STYLES[block.kind or "text"])]]
-    if isinstance(block, Heading):
+    if isinstance(block, blocks.Heading):
         return [[Text(markup(block.text), STYLES["h3"])]]
-    if isinstance(block, Bullets):
+    if isinstance(block, blocks.Bullets):
         return [[Text(markup(i), STYLES["bullet"], bulletText="•")] for i in block.items]
-    if isinstance(block, Verdict):
+    if isinstance(block, blocks.Verdict):
         badges = " ".join(badge_markup(badge) for badge in (block.badge, *block.more))
         word = Text(badges, STYLES["verdict"])
         return [[word, Text(markup(block.text), STYLES["lead"])]]
-    if isinstance(block, Tiles):
+    if isinstance(block, blocks.Tiles):
         return [[tiles_table(block, WIDTH), Spacer(1, 8)]]
-    if isinstance(block, Columns):
+    if isinstance(block, blocks.Columns):
         return [[columns_table(block, WIDTH), Spacer(1, 6)]]
-    if isinstance(block, Beside):
+    if isinstance(block, blocks.Beside):
         return [[beside_table(block, WIDTH), Spacer(1, 8)]]
-    if isinstance(block, Gallery):
-        return _pictures(Pictures(block.drawings[:1], block.caption))
-    if isinstance(block, View):
-        return _pictures(Pictures((block.scene.drawing(),), block.caption))
-    if isinstance(block, Table):
+    if isinstance(block, blocks.Gallery):
+        return _pictures(blocks.Pictures(block.drawings[:1], block.caption))
+    if isinstance(block, blocks.View):
+        return _pictures(blocks.Pictures((block.scene.drawing(),), block.caption))
+    if isinstance(block, blocks.Table):
         long = len(block.rows) > WHOLE
         grid, space = table(block, WIDTH), Spacer(1, 8)
         return [[grid], [space]] if long else [[grid, space]]
     return _pictures(block)
 
 
-def _pictures(block: Pictures) -> list[list[Flowable]]:
+def _pictures(block: blocks.Pictures) -> list[list[Flowable]]:
     """Return the drawings, two in a row; the caption stays with the last row."""
     rows: list[list[Flowable]] = [
         [DrawnRow(block.drawings[i : i + 2])] for i in range(0, len(block.drawings), 2)
@@ -162,3 +178,56 @@ def _pictures(block: Pictures) -> list[list[Flowable]]:
     if block.caption:
         rows[-1].append(Text(markup(block.caption), STYLES["note"]))
     return rows
+
+
+def _shape(canvas: Canvas, shape: drawn.Shape) -> None:
+    """Draw one shape; a page counts y upwards."""
+    if isinstance(shape, drawn.Line):
+        _stroke(canvas, shape.stroke)
+        path = canvas.beginPath()
+        path.moveTo(shape.points[0][0], -shape.points[0][1])
+        for x, y in shape.points[1:]:
+            path.lineTo(x, -y)
+        canvas.drawPath(path)
+    elif isinstance(shape, drawn.Rectangle):
+        canvas.setFillColor(HexColor(drawn.PALETTE[shape.fill]))
+        canvas.rect(shape.x, -shape.y - shape.height, shape.width, shape.height, 0, 1)
+    elif isinstance(shape, drawn.Dots):
+        _stroke(canvas, drawn.Stroke(shape.fill, 2 * shape.radius))
+        canvas.setLineCap(1)
+        canvas.setStrokeAlpha(shape.opacity)
+        canvas.lines([(x, -y, x, -y) for x, y in shape.points])
+        canvas.setStrokeAlpha(1.0)
+        canvas.setLineCap(0)
+    elif isinstance(shape, drawn.Circle):
+        if shape.stroke:
+            _stroke(canvas, shape.stroke)
+        if shape.fill:
+            canvas.setFillColor(HexColor(drawn.PALETTE[shape.fill]))
+            canvas.setFillAlpha(shape.opacity)
+        canvas.circle(
+            shape.x, -shape.y, shape.radius, int(bool(shape.stroke)), int(bool(shape.fill))
+        )
+        canvas.setFillAlpha(1.0)
+    else:
+        _text(canvas, shape)
+
+
+def _text(canvas: Canvas, shape: drawn.Text) -> None:
+    canvas.saveState()
+    canvas.setFillColor(HexColor(drawn.PALETTE[shape.colour]))
+    canvas.setFont(BOLD if shape.bold else PLAIN, shape.size)
+    canvas.translate(shape.x, -shape.y)
+    if shape.turned:
+        canvas.rotate(90)
+    draw = {"start": canvas.drawString, "middle": canvas.drawCentredString,
+            "end": canvas.drawRightString}[shape.anchor]  # fmt: skip
+    draw(0, 0, shape.text)
+    canvas.restoreState()
+
+
+def _stroke(canvas: Canvas, stroke: drawn.Stroke) -> None:
+    canvas.setStrokeColor(HexColor(drawn.PALETTE[stroke.colour]))
+    canvas.setLineWidth(stroke.width)
+    canvas.setLineJoin(1)
+    canvas.setDash([4, 3] if stroke.dashed else [])

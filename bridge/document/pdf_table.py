@@ -8,18 +8,7 @@ from reportlab.lib.colors import HexColor
 from reportlab.platypus import Flowable, Paragraph, TableStyle
 from reportlab.platypus import Table as Grid
 
-from gapbridge.bridge.document.blocks import (
-    Badge,
-    Bar,
-    Beside,
-    Cell,
-    Columns,
-    Named,
-    Pairs,
-    Strong,
-    Table,
-    Tiles,
-)
+from gapbridge.bridge.document import blocks
 from gapbridge.bridge.document.drawing import PALETTE
 from gapbridge.bridge.document.pdf_text import STYLES, badge_markup, markup
 
@@ -28,7 +17,7 @@ Command = tuple[str, tuple[int, int], tuple[int, int], *tuple[Any, ...]]
 BAR = 38.0  # pt, a full bar
 
 
-def table(block: Table, width: float) -> Flowable:
+def table(block: blocks.Table, width: float) -> Flowable:
     """Return a table whose head is repeated on every page that it reaches."""
     shares = block.widths or (1.0,) * len(block.heads)
     widths = [width * share / sum(shares) for share in shares]
@@ -53,7 +42,7 @@ def table(block: Table, width: float) -> Flowable:
     return Grid([heads, *rows], widths, repeatRows=1, style=TableStyle(style))
 
 
-def tiles_table(block: Tiles, width: float) -> Flowable:
+def tiles_table(block: blocks.Tiles, width: float) -> Flowable:
     """Return large figures in boxes, four in a row."""
     rows = [block.tiles[i : i + 4] for i in range(0, len(block.tiles), 4)]
     cells = [
@@ -78,7 +67,7 @@ def tiles_table(block: Tiles, width: float) -> Flowable:
     return Grid(cells, [width / columns] * columns, style=TableStyle(style))
 
 
-def beside_table(block: Beside, width: float) -> Flowable:
+def beside_table(block: blocks.Beside, width: float) -> Flowable:
     """Return small tables side by side."""
     each = width / len(block.tables)
     style: list[Command] = [
@@ -89,7 +78,7 @@ def beside_table(block: Beside, width: float) -> Flowable:
     return Grid([cells], [each] * len(cells), style=TableStyle(style))
 
 
-def columns_table(block: Columns, width: float) -> Flowable:
+def columns_table(block: blocks.Columns, width: float) -> Flowable:
     """Return pairs side by side."""
     each = width / len(block.columns)
     cells = [
@@ -104,7 +93,7 @@ def columns_table(block: Columns, width: float) -> Flowable:
     return Grid([cells], [each] * len(cells), style=TableStyle(style))
 
 
-def _pairs(block: Pairs, width: float) -> Flowable:
+def _pairs(block: blocks.Pairs, width: float) -> Flowable:
     rows = [
         [Paragraph(markup(k), STYLES["name"]), Paragraph(markup(v), STYLES["cell"])]
         for k, v in block.pairs
@@ -116,17 +105,17 @@ def _pairs(block: Pairs, width: float) -> Flowable:
     return Grid(rows, [width * 0.34, width * 0.66], style=TableStyle(style))
 
 
-def _cell(cell: Cell, number: bool, strong: bool) -> Flowable:
-    if isinstance(cell, Bar):
+def _cell(cell: blocks.Cell, number: bool, strong: bool) -> Flowable:
+    if isinstance(cell, blocks.Bar):
         return _Bar(cell)
-    if isinstance(cell, Badge):
+    if isinstance(cell, blocks.Badge):
         return Paragraph(badge_markup(cell), STYLES["cell"])
-    if isinstance(cell, Named):
+    if isinstance(cell, blocks.Named):
         name = f"<b>{markup(cell.text)}</b>{markup(cell.more)}" if cell.text else ""
         code = f'<font color="#5b6770">{markup(cell.code)}</font>' if cell.code else ""
         return Paragraph(f"{name}{'<br/>' if name and code else ''}{code}", STYLES["cell"])
-    text = markup(cell.text if isinstance(cell, Strong) else cell)
-    if strong or isinstance(cell, Strong):
+    text = markup(cell.text if isinstance(cell, blocks.Strong) else cell)
+    if strong or isinstance(cell, blocks.Strong):
         text = f"<b>{text}</b>"
     return Paragraph(text, STYLES["number" if number else "cell"])
 
@@ -134,7 +123,7 @@ def _cell(cell: Cell, number: bool, strong: bool) -> Flowable:
 class _Bar(Flowable):
     """A share as a bar with its figure beside it."""
 
-    def __init__(self, bar: Bar) -> None:
+    def __init__(self, bar: blocks.Bar) -> None:
         super().__init__()
         self.share, self.colour = bar.filled, HexColor(PALETTE[bar.colour])
         self.text = Paragraph(markup(bar.text), STYLES["cell"])

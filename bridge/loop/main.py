@@ -15,6 +15,7 @@ import json
 import os
 import pickle
 import signal
+import struct
 import sys
 import traceback
 from collections.abc import Callable
@@ -29,7 +30,6 @@ from gapbridge.bridge.ipc.command_page import Commands
 from gapbridge.bridge.ipc.sealed_memory import all_bytes
 from gapbridge.bridge.ipc.shared_memory import Phase, SharedMemory
 from gapbridge.bridge.loop.loop import Exit, Loop
-from gapbridge.bridge.loop.realtime import become_ordinary, become_realtime
 from gapbridge.bridge.loop.replay import ReplayedLoop
 from gapbridge.bridge.loop.setpoint_stream import SetpointStream, gate_bounds
 from gapbridge.bridge.setpoint_source import make_source
@@ -45,6 +45,14 @@ from gapbridge.drivers.driver import Driver
 from gapbridge.drivers.ft_sensor.joined import DriverWithSensor
 from gapbridge.drivers.replay.driver import ReplayDriver
 
+TIMER_SLACK = 29  # prctl's PR_SET_TIMERSLACK
+SLACK = 1000  # ns
+PRIORITY = 30  # SCHED_FIFO: below interrupt threads (50) and a simulated controller (40)
+LOCK_ALL = 3  # MCL_CURRENT | MCL_FUTURE
+LATENCY = "/dev/cpu_dma_latency"  # the kernel's PM QoS interface
+IDLE_DRIVER = "/sys/devices/system/cpu/cpuidle/current_driver"  # what the kernel sleeps by
+FAST = 0.005  # s: loops with this cycle or a shorter one keep the processors awake
+_held: list[int] = []  # files whose closing would take a measure back
 _PR_SET_PDEATHSIG = 1
 LONGEST_DETAIL = 1000  # of an event
 
@@ -165,6 +173,66 @@ def _end_with_parent(parent: int) -> None:
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0)
     if os.getppid() != parent:
         os._exit(Exit.DONE)
+
+
+def become_realtime(cycle: float) -> list[str]:
+    """Prepare this thread, and those it starts from now on; returns what was granted.
+
+    ``cycle`` is that of the loop, s. Afterwards Python collects no garbage by itself.
+    """
+    granted = []
+    sys.setswitchinterval(1e-4)
+    with contextlib.suppress(OSError, AttributeError):
+        if ctypes.CDLL(None).prctl(TIMER_SLACK, SLACK, 0, 0, 0) == 0:
+            granted.append("timer slack")
+    if _may_lock():
+        with contextlib.suppress(OSError, AttributeError):
+            if ctypes.CDLL(None).mlockall(LOCK_ALL) == 0:
+                granted.append("locked memory")
+    if cycle <= FAST and _keep_awake():
+        granted.append("processors awake")
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+    # last: locking memory takes some 100 ms, for which nothing else would run on this processor
+    with contextlib.suppress(OSError, AttributeError):
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
+        granted.append("real-time priority")
+    return granted
+
+
+def become_ordinary() -> None:
+    """Give real-time priority back: ending a process frees its memory, which takes its time."""
+    with contextlib.suppress(OSError, AttributeError):
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+
+
+def _keep_awake() -> bool:
+    """Have idle processors wait without sleep until this process ends; returns whether they do.
+
+    A processor that sleeps wakes late, and with cold caches; kept awake it takes more power. Only
+    root may ask for it, unless the system's owner lets others write to LATENCY. Without a driver
+    that knows kinds of sleep, as in many virtual machines, the request would change nothing.
+    """
+    with contextlib.suppress(OSError):
+        with open(IDLE_DRIVER, encoding="ascii") as kinds:
+            if kinds.read().strip() in ("", "none"):
+                return False
+        file = os.open(LATENCY, os.O_WRONLY | os.O_CLOEXEC)
+        _held.append(file)
+        return os.write(file, struct.pack("@i", 0)) > 0  # us until a processor must be awake
+    return False
+
+
+def _may_lock() -> bool:
+    """Return whether locking has no limit: below one, later allocations would fail."""
+    try:
+        import resource
+
+        limit = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0]
+        return os.geteuid() == 0 or limit == resource.RLIM_INFINITY
+    except (ImportError, AttributeError, OSError):
+        return False
 
 
 if __name__ == "__main__":

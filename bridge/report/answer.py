@@ -2,18 +2,7 @@
 
 from __future__ import annotations
 
-from gapbridge.bridge.document.blocks import (
-    BAD,
-    DOUBTFUL,
-    GOOD,
-    Badge,
-    Block,
-    Bullets,
-    Heading,
-    Paragraph,
-    Pictures,
-    Verdict,
-)
+from gapbridge.bridge.document import blocks
 from gapbridge.bridge.document.drawing import (
     AFTER,
     BAD_DOT,
@@ -43,7 +32,12 @@ from gapbridge.core.diagnosis.causes import Cause
 from gapbridge.core.diagnosis.channel_diagnosis import ChannelDiagnosis
 from gapbridge.core.diagnosis.diagnosis import Diagnosis
 
-KINDS = {"no_gap": GOOD, "explained": GOOD, "partly_explained": DOUBTFUL, "unexplained": BAD}
+KINDS = {
+    "no_gap": blocks.GOOD,
+    "explained": blocks.GOOD,
+    "partly_explained": blocks.DOUBTFUL,
+    "unexplained": blocks.BAD,
+}
 CAPTION = (
     "Gap per coordinate (rms) before and after the found causes are put into the model, on "
     "measurements the fit did not see, beside the noise. Below, how the gap divides up; squares "
@@ -53,20 +47,20 @@ WIDTH, LABELS = 390.0, 152.0  # of the drawing, and beside the bars
 ROW, BAR = 24.0, 15.0
 
 
-def answer(material: Material) -> list[Block]:
+def answer(material: Material) -> list[blocks.Block]:
     """Return the blocks; further channels have a line each."""
     diagnosis = material.diagnosis
     main = chosen_channel(diagnosis)
-    verdict = Badge(VERDICTS[diagnosis.verdict], KINDS[diagnosis.verdict])
+    verdict = blocks.Badge(VERDICTS[diagnosis.verdict], KINDS[diagnosis.verdict])
     others = [
-        Paragraph(f"{CHANNELS[c.channel]}: {one_line(c)}")
+        blocks.Paragraph(f"{CHANNELS[c.channel]}: {one_line(c)}")
         for c in diagnosis.channels
         if c is not main
     ]
     return [
-        Verdict(verdict, " ".join(sentences(main))), *others,
-        Heading("What to do now"), Bullets(tuple(next_steps(diagnosis))),
-        Pictures(tuple(picture(c) for c in diagnosis.channels), CAPTION),
+        blocks.Verdict(verdict, " ".join(sentences(main))), *others,
+        blocks.Heading("What to do now"), blocks.Bullets(tuple(next_steps(diagnosis))),
+        blocks.Pictures(tuple(picture(c) for c in diagnosis.channels), CAPTION),
     ]  # fmt: skip
 
 

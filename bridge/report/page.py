@@ -8,16 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from gapbridge.bridge.document.blocks import (
-    Block,
-    Bullets,
-    Document,
-    Heading,
-    Paragraph,
-    Section,
-    Table,
-    parts,
-)
+from gapbridge.bridge.document import blocks
 from gapbridge.bridge.document.findings import finding_text
 from gapbridge.bridge.document.html import html
 from gapbridge.bridge.document.output_file import write_text
@@ -53,15 +44,15 @@ def write_report(
     return path
 
 
-def document(material: Material) -> Document:
+def document(material: Material) -> blocks.Document:
     """Return the report as blocks."""
     name, arm = _cell_title(material.cell_name), material.model.arm
     kind = "Arm of DH rows" if arm.name == "dh" else f"Arm {arm.name}"
     log = f"log {Path(material.log.path).name}, {len(material.log)} rows"
-    return Document(
+    return blocks.Document(
         f"{name}: the robot against its model",
         f"{kind}, {arm.n} joints · {log} · {origin_line(material.origin)}",
-        parts(SECTIONS, material),
+        blocks.parts(SECTIONS, material),
         f"Gap between model and robot, {name} · {origin_line(material.origin)}",
     )
 
@@ -71,7 +62,7 @@ def _cell_title(name: str) -> str:
     return Path(name).stem if name.endswith((".yaml", ".yml")) else name
 
 
-def data_quality(material: Material) -> list[Block]:
+def data_quality(material: Material) -> list[blocks.Block]:
     """Return rows used, findings, outliers, channels that the log does not show, origin."""
     diagnosis = material.diagnosis
     rows = [
@@ -82,26 +73,26 @@ def data_quality(material: Material) -> list[Block]:
     ]  # fmt: skip
     heads = ("channel", "rows in the log", "samples used", "excluded as outliers",
              "different poses or stretches of time")  # fmt: skip
-    blocks: list[Block] = [Table(heads, rows), Heading("Findings")]
-    blocks.append(
-        Bullets(tuple(finding_text(f) for f in diagnosis.findings)) if diagnosis.findings
-        else Paragraph("No check of the log found anything odd.")
+    shown: list[blocks.Block] = [blocks.Table(heads, rows), blocks.Heading("Findings")]
+    shown.append(
+        blocks.Bullets(tuple(finding_text(f) for f in diagnosis.findings)) if diagnosis.findings
+        else blocks.Paragraph("No check of the log found anything odd.")
     )  # fmt: skip
     for channel in diagnosis.channels:
-        blocks += _outliers(channel, material.log)
+        shown += _outliers(channel, material.log)
     if diagnosis.not_observable:
         hidden = [
             [CHANNELS.get(h.channel, h.channel), ", ".join(h.needs)]
             for h in diagnosis.not_observable
         ]
-        blocks += [
-            Heading("What this log cannot show"),
-            Table(("channel", "columns it would need"), hidden),
+        shown += [
+            blocks.Heading("What this log cannot show"),
+            blocks.Table(("channel", "columns it would need"), hidden),
         ]
-    return blocks + origin_blocks(material.origin)
+    return shown + origin_blocks(material.origin)
 
 
-def _outliers(channel: ChannelDiagnosis, log: Log) -> list[Block]:
+def _outliers(channel: ChannelDiagnosis, log: Log) -> list[blocks.Block]:
     outliers = np.flatnonzero(~channel.selection.kept)
     if not len(outliers):
         return []
@@ -114,24 +105,24 @@ def _outliers(channel: ChannelDiagnosis, log: Log) -> list[Block]:
     count = len(channel.outliers)
     more = f" The {len(worst)} largest of {count}:" if count > len(worst) else ""
     return [
-        Heading(f"Outliers: {CHANNELS[channel.channel]}"),
-        Paragraph(
+        blocks.Heading(f"Outliers: {CHANNELS[channel.channel]}"),
+        blocks.Paragraph(
             f"They fit nothing around them and were excluded before any effect was judged.{more}"
         ),
-        Table(("line of the file", "distance from the model"), rows),
+        blocks.Table(("line of the file", "distance from the model"), rows),
     ]
 
 
-SECTIONS: tuple[Section[Material], ...] = (
-    Section("answer", "The answer", answer),
-    Section("where", "Where the gap lies", where,
+SECTIONS: tuple[blocks.Section[Material], ...] = (
+    blocks.Section("answer", "The answer", answer),
+    blocks.Section("where", "Where the gap lies", where,
             "Which joints and axes it comes from, and what it follows."),
-    Section("which", "Which effect causes it", which,
+    blocks.Section("which", "Which effect causes it", which,
             "Every effect that was tried, with the evidence for and against."),
-    Section("how_far", "How far it shrinks", how_far,
+    blocks.Section("how_far", "How far it shrinks", how_far,
             "Judged only on measurements that the fit did not see."),
-    Section("parameters", "Parameters and next measurements", parameters,
+    blocks.Section("parameters", "Parameters and next measurements", parameters,
             "What goes into the model, how surely, and what would settle the open questions."),
-    Section("data_quality", "Data quality", data_quality,
+    blocks.Section("data_quality", "Data quality", data_quality,
             "What was used, what was excluded, what could not be seen."),
 )  # fmt: skip

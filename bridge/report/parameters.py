@@ -4,15 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gapbridge.bridge.document.blocks import (
-    Block,
-    Bullets,
-    Cell,
-    Heading,
-    Named,
-    Paragraph,
-    Table,
-)
+from gapbridge.bridge.document import blocks
 from gapbridge.bridge.document.findings import clock
 from gapbridge.bridge.report.labels import (
     decimals_of,
@@ -32,31 +24,35 @@ SIDE = 1.96  # standard deviations of a 95 % interval
 SHOWN = 12
 
 
-def parameters(material: Material) -> list[Block]:
+def parameters(material: Material) -> list[blocks.Block]:
     """Return the parameters, the ties and the next measurements."""
     causes = [c for channel in material.diagnosis.channels for c in channel.causes]
     return [
-        *_parameters(causes), *_ties(causes), Heading("What to measure next"),
+        *_parameters(causes), *_ties(causes), blocks.Heading("What to measure next"),
         *_next(material.diagnosis.next_measurements),
     ]  # fmt: skip
 
 
-def _parameters(causes: list[Cause]) -> list[Block]:
+def _parameters(causes: list[Cause]) -> list[blocks.Block]:
     if not causes:
-        return [Paragraph("No effect was accused, so there are no parameters to add to the model.")]
-    rows: list[list[Cell]] = []
+        return [
+            blocks.Paragraph(
+                "No effect was accused, so there are no parameters to add to the model."
+            )
+        ]
+    rows: list[list[blocks.Cell]] = []
     for cause in causes:
         where = f", {joint_list(cause.joints)}" if cause.joints else ""
-        first: Cell = Named(effect_title(cause.effect), where)
+        first: blocks.Cell = blocks.Named(effect_title(cause.effect), where)
         for p in cause.parameters:
-            rows.append([first, Named("", code=p.name), *_value(p)])
+            rows.append([first, blocks.Named("", code=p.name), *_value(p)])
             first = ""
     note = (
         "Each is what the real arm has more than the model; the interval holds it in 19 of 20 "
         "cases."
     )
     heads = ("cause", "parameter", "value", "95 % interval", "unit")
-    return [Table(heads, rows, (2.2, 2.2, 1, 1.6, 0.8)), Paragraph(note, "note")]
+    return [blocks.Table(heads, rows, (2.2, 2.2, 1, 1.6, 0.8)), blocks.Paragraph(note, "note")]
 
 
 def _value(p: Reported) -> tuple[str, str, str]:
@@ -72,35 +68,39 @@ def _value(p: Reported) -> tuple[str, str, str]:
     return fixed(value, digits), f"{low} to {high}", name
 
 
-def _ties(causes: list[Cause]) -> list[Block]:
+def _ties(causes: list[Cause]) -> list[blocks.Block]:
     ties = tuple(
         f"{effect_title(c.effect).capitalize()} ({c.effect}) explains these data no better than "
         f"{listed([f'{effect_title(n)} ({n})' for n in c.indistinguishable_from], 'or')}. "
         "The simpler or likelier one is named; a measurement below would decide."
         for c in causes if c.indistinguishable_from
     )  # fmt: skip
-    return [Heading("What these data cannot separate"), Bullets(ties)] if ties else []
+    return [blocks.Heading("What these data cannot separate"), blocks.Bullets(ties)] if ties else []
 
 
-def _next(measurements: tuple[Measurement, ...]) -> list[Block]:
+def _next(measurements: tuple[Measurement, ...]) -> list[blocks.Block]:
     if not measurements:
         text = "No question is open that another pose under another load would settle."
-        return [Paragraph(text)]
+        return [blocks.Paragraph(text)]
     moving = any(m.velocity for m in measurements)
     text = (
         "Move to these poses with these loads and add the rows to the log"
         f"{'; record a motion through those with a speed' if moving else ''}. Check each for free "
         "space first: the poses keep the joint limits, but nothing here knows your cell."
     )
-    blocks: list[Block] = [Paragraph(text), measurements_table(measurements, SHOWN)]
+    content: list[blocks.Block] = [blocks.Paragraph(text), measurements_table(measurements, SHOWN)]
     more = len(measurements) - SHOWN
-    return [*blocks, Paragraph(f"{more} more stand in the JSON.", "note")] if more > 0 else blocks
+    return (
+        [*content, blocks.Paragraph(f"{more} more stand in the JSON.", "note")]
+        if more > 0
+        else content
+    )
 
 
-def measurements_table(measurements: tuple[Measurement, ...], most: int) -> Table:
+def measurements_table(measurements: tuple[Measurement, ...], most: int) -> blocks.Table:
     """Return what to measure next as a table; speeds and approaches only where there are any."""
     shown = measurements[:most]
-    columns: list[tuple[str, float, list[Cell]]] = [
+    columns: list[tuple[str, float, list[blocks.Cell]]] = [
         ("", 0.3, [str(i) for i in range(1, len(shown) + 1)]),
         ("joint angles (deg)", 2.6, [_degrees(m.q, 1) for m in shown]),
     ]
@@ -114,7 +114,7 @@ def measurements_table(measurements: tuple[Measurement, ...], most: int) -> Tabl
         ("expected difference", 1.2, [f"{number(m.expected_gain, 2)} × noise" for m in shown]),
     ]
     heads, widths, cells = zip(*columns, strict=True)
-    return Table(heads, list(zip(*cells, strict=True)), widths)
+    return blocks.Table(heads, list(zip(*cells, strict=True)), widths)
 
 
 def _approach(m: Measurement) -> str:

@@ -4,22 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from gapbridge.bridge.document import blocks
 from gapbridge.bridge.document.axes import Chart, scale
-from gapbridge.bridge.document.blocks import (
-    DOUBTFUL,
-    GOOD,
-    QUIET,
-    Badge,
-    Bar,
-    Beside,
-    Block,
-    Cell,
-    Gallery,
-    Named,
-    Paragraph,
-    Table,
-    View,
-)
 from gapbridge.bridge.document.drawing import EDGE, SOFT, Drawing
 from gapbridge.bridge.document.findings import considered_text
 from gapbridge.bridge.document.scene import Arrows, Path, Scene, base
@@ -61,43 +47,45 @@ NOTE = (
 )
 
 
-def where(material: Material) -> list[Block]:
+def where(material: Material) -> list[blocks.Block]:
     """Return shares by joint and axis, the gap against quantities, and the arm in space."""
-    blocks: list[Block] = []
+    shown: list[blocks.Block] = []
     for channel in material.diagnosis.channels:
-        blocks += channel_heading(material.diagnosis, channel)
-        blocks += [Beside((_joints(channel), _axes(channel), _depends(channel)))]
-        blocks.append(_against(channel))
+        shown += channel_heading(material.diagnosis, channel)
+        shown += [blocks.Beside((_joints(channel), _axes(channel), _depends(channel)))]
+        shown.append(_against(channel))
         if channel.channel == "position":
-            blocks.append(arm_view(channel, material))
-    return blocks
+            shown.append(arm_view(channel, material))
+    return shown
 
 
-def _joints(channel: ChannelDiagnosis) -> Table:
-    rows: list[list[Cell]] = [
-        [f"joint {j}", Bar(s, percent(s))] for j, s in channel.where.joints if s >= 0.005
+def _joints(channel: ChannelDiagnosis) -> blocks.Table:
+    rows: list[list[blocks.Cell]] = [
+        [f"joint {j}", blocks.Bar(s, percent(s))] for j, s in channel.where.joints if s >= 0.005
     ]
     title = "share of the gap" if channel.causes else "gap this joint alone could make"
-    return Table(("joint", title), rows or [["none", "no single joint stands out"]])
+    return blocks.Table(("joint", title), rows or [["none", "no single joint stands out"]])
 
 
-def _axes(channel: ChannelDiagnosis) -> Table:
+def _axes(channel: ChannelDiagnosis) -> blocks.Table:
     names = channel.selection.observation.axes
-    rows: list[list[Cell]] = [
-        [names[i], Bar(s, percent(s))] for i, s in enumerate(channel.where.axes)
+    rows: list[list[blocks.Cell]] = [
+        [names[i], blocks.Bar(s, percent(s))] for i, s in enumerate(channel.where.axes)
     ]
     frame = {"position": "axis of base", "wrench": "axis of the flange"}.get(
         channel.channel, "axis"
     )
-    return Table((frame, "share of the gap"), rows)
+    return blocks.Table((frame, "share of the gap"), rows)
 
 
-def _depends(channel: ChannelDiagnosis) -> Table:
-    rows: list[list[Cell]] = [
-        [quantity_title(n), Bar(s, percent(s))] for n, s in channel.where.depends_on if s > STATED
+def _depends(channel: ChannelDiagnosis) -> blocks.Table:
+    rows: list[list[blocks.Cell]] = [
+        [quantity_title(n), blocks.Bar(s, percent(s))]
+        for n, s in channel.where.depends_on
+        if s > STATED
     ]
     heads = ("the gap depends on", "which predicts")
-    return Table(heads, rows or [["none", "no single quantity of the log"]])
+    return blocks.Table(heads, rows or [["none", "no single quantity of the log"]])
 
 
 def _quantities(channel: ChannelDiagnosis) -> list[str]:
@@ -111,7 +99,7 @@ def _quantities(channel: ChannelDiagnosis) -> list[str]:
     return [n for n in names if n in have][:MOST_QUANTITIES]
 
 
-def _against(channel: ChannelDiagnosis) -> Gallery:
+def _against(channel: ChannelDiagnosis) -> blocks.Gallery:
     """Return the gap of every sample against what it may depend on, one drawing a choice."""
     kept = channel.selection.kept
     gap, after = channel.gap[kept], channel.remaining[kept]
@@ -128,7 +116,7 @@ def _against(channel: ChannelDiagnosis) -> Gallery:
         ("Show", tuple(label for label, _, _ in upwards)),
         ("Against", tuple(label for label, _, _ in across)),
     )
-    return Gallery(
+    return blocks.Gallery(
         menus, tuple(drawings), "The gap of the samples against what it may depend on; choose "
         "above. What the causes explain is gone from “after”."
         + (f" {len(keep)} of {len(gap)} samples are drawn." if len(keep) < len(gap) else ""),
@@ -185,7 +173,7 @@ def _ordinates(
     return [*single[:1], size, *single[1:]]
 
 
-def arm_view(channel: ChannelDiagnosis, material: Material) -> View:
+def arm_view(channel: ChannelDiagnosis, material: Material) -> blocks.View:
     """Return the arm at a few poses, with the TCP's error before and after at many."""
     selection = channel.selection
     gap, after = channel.gap[selection.kept][:, :3], channel.remaining[selection.kept][:, :3]
@@ -209,7 +197,7 @@ def arm_view(channel: ChannelDiagnosis, material: Material) -> View:
         (("arm", SOFT), *((f"error {name}", colour) for name, _, colour in errors)),
     )
     drawn = f" {len(keep)} of {len(gap)} samples are drawn." if len(keep) < len(gap) else ""
-    return View(
+    return blocks.View(
         scene,
         f"The arm at {len(chosen)} of its poses; arrows show where the tool really was, drawn "
         f"{factor:,.0f} times larger than they are. Drag to turn; click, then scroll to zoom. "
@@ -217,27 +205,27 @@ def arm_view(channel: ChannelDiagnosis, material: Material) -> View:
     )
 
 
-def which(material: Material) -> list[Block]:
+def which(material: Material) -> list[blocks.Block]:
     """Return one table per channel."""
-    blocks: list[Block] = [Paragraph(NOTE, "note")]
+    shown: list[blocks.Block] = [blocks.Paragraph(NOTE, "note")]
     for channel in material.diagnosis.channels:
-        blocks += [*channel_heading(material.diagnosis, channel), _table(channel)]
-    return blocks
+        shown += [*channel_heading(material.diagnosis, channel), _table(channel)]
+    return shown
 
 
-def _table(channel: ChannelDiagnosis) -> Table:
+def _table(channel: ChannelDiagnosis) -> blocks.Table:
     rows = [_accused(c) for c in channel.causes]
     losers = sorted(channel.considered, key=lambda k: (not k.excited, -(k.shrink_alone or 0.0)))
     tied = {name for c in channel.causes for name in c.indistinguishable_from}
     rows += [_considered(k, k.effect in tied, bool(channel.causes)) for k in losers]
-    return Table(HEADS, rows, (2.2, 1.1, 1.1, 0.9, 3))
+    return blocks.Table(HEADS, rows, (2.2, 1.1, 1.1, 0.9, 3))
 
 
-def _name(effect: str, joints: tuple[int, ...] = ()) -> Named:
-    return Named(effect_title(effect), f", {joint_list(joints)}" if joints else "", effect)
+def _name(effect: str, joints: tuple[int, ...] = ()) -> blocks.Named:
+    return blocks.Named(effect_title(effect), f", {joint_list(joints)}" if joints else "", effect)
 
 
-def _accused(cause: Cause) -> list[Cell]:
+def _accused(cause: Cause) -> list[blocks.Cell]:
     why = "needed: without it the gap stays larger"
     if cause.shrink is not None:
         low, high = cause.shrink.interval
@@ -249,27 +237,29 @@ def _accused(cause: Cause) -> list[Cell]:
         ties = listed([effect_title(n) for n in cause.indistinguishable_from], "or")
         why += f"; these data cannot separate it from: {ties}"
     tied = bool(cause.indistinguishable_from)
-    verdict = Badge("cause, tied", DOUBTFUL) if tied else Badge("cause", GOOD)
-    alone = Bar(cause.shrink_alone, percent(cause.shrink_alone))
+    verdict = (
+        blocks.Badge("cause, tied", blocks.DOUBTFUL) if tied else blocks.Badge("cause", blocks.GOOD)
+    )
+    alone = blocks.Bar(cause.shrink_alone, percent(cause.shrink_alone))
     return [_name(cause.effect, cause.joints), verdict, alone, likelihood(cause.probability), why]
 
 
-def _considered(considered: Considered, tied: bool, beside: bool) -> list[Cell]:
+def _considered(considered: Considered, tied: bool, beside: bool) -> list[blocks.Cell]:
     """Return the row of an effect that is not accused; ``beside``: others are."""
     if considered.outcome is Outcome.NOT_EXCITED:
         why = f"this log does not show it; it needs {considered.needs}"
-        return [_name(considered.effect), Badge("not excited", QUIET), "–", "–", why]
+        return [_name(considered.effect), blocks.Badge("not excited", blocks.QUIET), "–", "–", why]
     if tied:
-        verdict = Badge("tied", DOUBTFUL)
+        verdict = blocks.Badge("tied", blocks.DOUBTFUL)
         why = "would explain these data as well as the cause named above"
     elif considered.outcome is Outcome.WITHDRAWN:
-        verdict = Badge("withdrawn", DOUBTFUL)
+        verdict = blocks.Badge("withdrawn", blocks.DOUBTFUL)
         why = f"looked like a cause, but is not accused: {considered_text(considered)}"
     else:
-        verdict = Badge("no", QUIET)
+        verdict = blocks.Badge("no", blocks.QUIET)
         others = ", beside the causes found," if beside else ""
         why = f"explains too little{' more' if beside else ''}{others} for the numbers it adds"
-    alone: Cell = "–"
+    alone: blocks.Cell = "–"
     if considered.shrink_alone is not None:
-        alone = Bar(considered.shrink_alone, percent(considered.shrink_alone), EDGE)
+        alone = blocks.Bar(considered.shrink_alone, percent(considered.shrink_alone), EDGE)
     return [_name(considered.effect), verdict, alone, likelihood(considered.probability), why]

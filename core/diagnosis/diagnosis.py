@@ -13,7 +13,7 @@ from threadpoolctl import threadpool_limits
 from gapbridge.core.arrays import Array
 from gapbridge.core.diagnosis.across_sessions import carried
 from gapbridge.core.diagnosis.causes import Considered, causes_of, considered_of
-from gapbridge.core.diagnosis.channel_diagnosis import ChannelDiagnosis
+from gapbridge.core.diagnosis.channel_diagnosis import ChannelDiagnosis, Where, locate
 from gapbridge.core.diagnosis.channels import position, torque, tracking, wrench
 from gapbridge.core.diagnosis.channels.simulation import joined, predicted_by
 from gapbridge.core.diagnosis.criteria import UNRESOLVED
@@ -45,7 +45,6 @@ from gapbridge.core.diagnosis.judgement import (
     still_sure,
     with_stand_ins,
 )
-from gapbridge.core.diagnosis.location import Where, locate
 from gapbridge.core.diagnosis.log_checks.missing_flexibility import softness_findings
 from gapbridge.core.diagnosis.log_checks.units_and_clocks import check_units, findings
 from gapbridge.core.diagnosis.noise_floor import (

@@ -330,7 +330,7 @@ def add_rows(model: Model, data: Data, gap: Array, cells: Array, R: Array) -> No
         def work(first: int, last: int) -> int:
             own = np.zeros_like(R)
             parts.append(own)
-            return int(factor_blocks(chain, rows, gap, cells, nuisances, first, last, own))
+            return int(factor_blocks(chain, rows, gap, cells, first, last, own))
 
         stopped = in_ranges(work, len(gap))
         if max(stopped) < 0:

@@ -130,18 +130,14 @@ def _swept(
     if bool(chain.flexibility.any()) or bool(getattr(config, "DISABLE_JIT", 0)):
         return None
     count = len(rows.q)
-    position, rotation = np.empty((count, 3)), np.empty((count, 3, 3))
+    found = np.empty((count, 3)), np.empty((count, 3, 3)), jacobian
 
     def work(first: int, last: int) -> int:
-        return int(
-            jacobian_blocks(
-                chain, rows, *entries, first, last, position, rotation, jacobian, converged
-            )
-        )
+        return int(jacobian_blocks(chain, rows, entries, first, last, found, converged))
 
     if any(bad >= 0 for bad in in_ranges(work, count)):
         return None
-    return Poses(position, rotation)
+    return Poses(*found[:2])
 
 
 def _moved(model: Model, t: int, k: int, step: float) -> Model:

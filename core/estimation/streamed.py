@@ -7,9 +7,11 @@ of rows, poses are not separated. They are judged on the sample's rows, some twe
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from itertools import islice
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,7 +46,6 @@ from gapbridge.core.estimation.identification import (
     tool_known,
 )
 from gapbridge.core.estimation.pose_scatter import by_poses
-from gapbridge.core.estimation.row_store import RowStore
 from gapbridge.core.estimation.streamed_fit import (
     NONE,
     Pass,
@@ -61,12 +62,55 @@ from gapbridge.core.log.log import Log
 from gapbridge.core.metrology import Metrology
 from gapbridge.core.model import Model
 
+KEPT = 128 << 20  # bytes in memory
 Rows = NDArray[np.int64]
 SAMPLE = 20_000  # rows kept at most, for the first guess and the look whether anything bends
 MANY_OUTLIERS = 100_000  # rows that are named at most
 ENOUGH = 0.2  # sigmas of a last step, which leaves some percent of itself, with many rows
 LINK_ROWS = 2000  # of them that determine the links, where these are off
 NEAR = 1e-3  # relative step on the sample, which is only where the passes over all rows begin
+
+
+class RowStore:
+    """Blocks of rows with measured poses, and where each row stands in the log."""
+
+    def __init__(self, kept: int = KEPT) -> None:
+        self.count = 0
+        self._free = kept
+        self._blocks: list[tuple[Data, NDArray[np.int64]]] = []
+        self._file: Any = None
+
+    def append(self, data: Data, rows: NDArray[np.int64]) -> None:
+        """Keep a block; ``rows`` (k,) are the numbers of its rows, from 0."""
+        given = {f.name: getattr(data.loads, f.name) for f in fields(Loads)}
+        loads = Loads(**{k: None if v is None else self._kept(v) for k, v in given.items()})
+        self._blocks.append((
+            replace(
+                data, q=self._kept(data.q), position=self._kept(data.position), loads=loads,
+                rotation=None if data.rotation is None else self._kept(data.rotation),
+            ),
+            self._kept(rows),
+        ))  # fmt: skip
+        self.count += len(rows)
+
+    def __iter__(self) -> Iterator[tuple[Data, NDArray[np.int64]]]:
+        """Yield the blocks in the order in which they came."""
+        return iter(self._blocks)
+
+    def _kept(self, values: NDArray[Any]) -> NDArray[Any]:
+        if (
+            len(values) and (values == values[0]).all()
+        ):  # one payload's centre: a row counts for all
+            return np.broadcast_to(values[:1].copy(), values.shape)
+        if values.nbytes <= self._free:
+            self._free -= values.nbytes
+            return values
+        if self._file is None:
+            self._file = tempfile.TemporaryFile(prefix="gapbridge-")  # noqa: SIM115 - lives as long
+        at = self._file.seek(0, 2)
+        self._file.write(np.ascontiguousarray(values).tobytes())
+        self._file.flush()
+        return np.memmap(self._file, values.dtype, "r", at, values.shape)
 
 
 @dataclass(frozen=True)

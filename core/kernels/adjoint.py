@@ -27,6 +27,7 @@ from gapbridge.core.kernels.layout import (
     WRENCH,
     U,
 )
+from gapbridge.core.kernels.mechanics import change_to, in_axes, put, three
 from gapbridge.core.kernels.reference import INNER
 
 # slots of a record of this workspace; records as in layout
@@ -68,11 +69,8 @@ def _hang(w, s, record, c, fx, fy, fz):  # type: ignore[no-untyped-def]
     cx, cy, cz = c[0], c[1], c[2]
     for k in range(_L):
         for i in range(3):
-            r = w[U(a + (ORIGIN + i) * _L + k)] + (
-                w[U(a + (ROTATION + 3 * i) * _L + k)] * cx
-                + w[U(a + (ROTATION + 3 * i + 1) * _L + k)] * cy
-                + w[U(a + (ROTATION + 3 * i + 2) * _L + k)] * cz
-            )
+            r0, r1, r2 = three(w, a + (ROTATION + 3 * i) * _L, k)
+            r = w[U(a + (ORIGIN + i) * _L + k)] + (r0 * cx + r1 * cy + r2 * cz)
             s[U((OUTER + 3 * i) * _L + k)] += r * fx
             s[U((OUTER + 3 * i + 1) * _L + k)] += r * fy
             s[U((OUTER + 3 * i + 2) * _L + k)] += r * fz
@@ -86,19 +84,14 @@ def _hang_tool(w, v, s, n, g):  # type: ignore[no-untyped-def]
     for k in range(_L):
         m = v[U(MASS * _L + k)]
         wx, wy, wz = m * gx, m * gy, m * gz
-        cx, cy, cz = v[U(COG * _L + k)], v[U((COG + 1) * _L + k)], v[U((COG + 2) * _L + k)]
-        fx, fy = v[U(WRENCH * _L + k)], v[U((WRENCH + 1) * _L + k)]
-        fz = v[U((WRENCH + 2) * _L + k)]
+        cx, cy, cz = three(v, COG * _L, k)
+        fx, fy, fz = three(v, WRENCH * _L, k)
         for i in range(3):
             p = v[U((TCP + i) * _L + k)]
-            r = w[U(a + (ORIGIN + i) * _L + k)] + (
-                w[U(a + (ROTATION + 3 * i) * _L + k)] * cx
-                + w[U(a + (ROTATION + 3 * i + 1) * _L + k)] * cy
-                + w[U(a + (ROTATION + 3 * i + 2) * _L + k)] * cz
-            )
-            s[U((OUTER + 3 * i) * _L + k)] = p * fx + r * wx
-            s[U((OUTER + 3 * i + 1) * _L + k)] = p * fy + r * wy
-            s[U((OUTER + 3 * i + 2) * _L + k)] = p * fz + r * wz
+            r0, r1, r2 = three(w, a + (ROTATION + 3 * i) * _L, k)
+            r = w[U(a + (ORIGIN + i) * _L + k)] + (r0 * cx + r1 * cy + r2 * cz)
+            x, y, z = p * fx + r * wx, p * fy + r * wy, p * fz + r * wz
+            put(s, (OUTER + 3 * i) * _L, k, x, y, z)
 
 
 @njit(**FAST)
@@ -107,19 +100,12 @@ def _softness(w, u, record, compliance, softening):  # type: ignore[no-untyped-d
     a, b = record * RECORD * _L, record * OWN * _L
     c0, c1, c2 = compliance[0], compliance[1], compliance[2]
     for k in range(_L):
-        mx, my = w[U(a + MOMENT * _L + k)], w[U(a + (MOMENT + 1) * _L + k)]
-        mz = w[U(a + (MOMENT + 2) * _L + k)]
-        for j in range(3):
-            u[U(b + (BODY + j) * _L + k)] = w[U(a + (ROTATION + j) * _L + k)] * mx + (
-                w[U(a + (ROTATION + 3 + j) * _L + k)] * my
-                + w[U(a + (ROTATION + 6 + j) * _L + k)] * mz
-            )
-        z = u[U(b + (BODY + 2) * _L + k)]
+        mx, my, mz = three(w, a + MOMENT * _L, k)
+        x, y, z = in_axes(w, a, k, mx, my, mz)
+        put(u, b + BODY * _L, k, x, y, z)
         share = 1.0 / np.sqrt(1.0 + softening * z * z)
         u[U(b + SHARE * _L + k)] = share
-        u[U(b + GIVE * _L + k)] = c0
-        u[U(b + (GIVE + 1) * _L + k)] = c1
-        u[U(b + (GIVE + 2) * _L + k)] = c2 * share * share * share
+        put(u, b + GIVE * _L, k, c0, c1, c2 * share * share * share)
 
 
 @njit(**INNER)
@@ -153,24 +139,20 @@ def _out(w, v, u, s, record, axis, turning):  # type: ignore[no-untyped-def]
     ez = 1.0 if axis == 2 else 0.0
     moved, turned = 0.0 if turning else 1.0, 1.0 if turning else 0.0
     for k in range(_L):
-        px, py, pz = s[U(SUM * _L + k)], s[U((SUM + 1) * _L + k)], s[U((SUM + 2) * _L + k)]
-        fx, fy = w[U(a + TOTAL * _L + k)], w[U(a + (TOTAL + 1) * _L + k)]
-        fz = w[U(a + (TOTAL + 2) * _L + k)]
-        u[U(b + SHIFT * _L + k)] = moved * ex + fy * pz - fz * py
-        u[U(b + (SHIFT + 1) * _L + k)] = moved * ey + fz * px - fx * pz
-        u[U(b + (SHIFT + 2) * _L + k)] = moved * ez + fx * py - fy * px
-        x = v[U(TCP * _L + k)] - w[U(a + ORIGIN * _L + k)]
-        y = v[U((TCP + 1) * _L + k)] - w[U(a + (ORIGIN + 1) * _L + k)]
-        z = v[U((TCP + 2) * _L + k)] - w[U(a + (ORIGIN + 2) * _L + k)]
-        u[U(b + TWIST * _L + k)] = turned * ex + moved * (y * ez - z * ey)
-        u[U(b + (TWIST + 1) * _L + k)] = turned * ey + moved * (z * ex - x * ez)
-        u[U(b + (TWIST + 2) * _L + k)] = turned * ez + moved * (x * ey - y * ex)
+        px, py, pz = three(s, SUM * _L, k)
+        fx, fy, fz = three(w, a + TOTAL * _L, k)
+        x, y, z = moved * ex + fy * pz, moved * ey + fz * px, moved * ez + fx * py
+        put(u, b + SHIFT * _L, k, x - fz * py, y - fx * pz, z - fy * px)
+        ox, oy, oz = three(w, a + ORIGIN * _L, k)
+        x, y, z = three(v, TCP * _L, k)
+        x, y, z = x - ox, y - oy, z - oz
+        tx = turned * ex + moved * (y * ez - z * ey)
+        ty = turned * ey + moved * (z * ex - x * ez)
+        tz = turned * ez + moved * (x * ey - y * ex)
+        put(u, b + TWIST * _L, k, tx, ty, tz)
         for j in range(3):
-            u[U(b + (TWIST + j) * _L + k)] += (
-                u[U(b + (MOMENT_RATE + 3 * j) * _L + k)] * px
-                + u[U(b + (MOMENT_RATE + 3 * j + 1) * _L + k)] * py
-                + u[U(b + (MOMENT_RATE + 3 * j + 2) * _L + k)] * pz
-            )
+            m0, m1, m2 = three(u, b + (MOMENT_RATE + 3 * j) * _L, k)
+            u[U(b + (TWIST + j) * _L + k)] += m0 * px + m1 * py + m2 * pz
             s[U((SUM + j) * _L + k)] += u[U(b + (PUSH + j) * _L + k)]
 
 
@@ -180,16 +162,12 @@ def _back(w, u, s, record):  # type: ignore[no-untyped-def]
     a, b = record * RECORD * _L, record * OWN * _L
     turns = 1.0 if record > 0 else 0.0  # the base's moment counts about axes that do not turn
     for k in range(_L):
-        px, py = u[U(b + PUSH * _L + k)], u[U(b + (PUSH + 1) * _L + k)]
-        pz = u[U(b + (PUSH + 2) * _L + k)]
-        mx, my = turns * w[U(a + MOMENT * _L + k)], turns * w[U(a + (MOMENT + 1) * _L + k)]
-        mz = turns * w[U(a + (MOMENT + 2) * _L + k)]
+        px, py, pz = three(u, b + PUSH * _L, k)
+        mx, my, mz = three(w, a + MOMENT * _L, k)
+        mx, my, mz = turns * mx, turns * my, turns * mz
         for j in range(3):
-            s[U((SUM + j) * _L + k)] += (
-                u[U(b + (MOMENT_RATE + 3 * j) * _L + k)] * px
-                + u[U(b + (MOMENT_RATE + 3 * j + 1) * _L + k)] * py
-                + u[U(b + (MOMENT_RATE + 3 * j + 2) * _L + k)] * pz
-            )
+            m0, m1, m2 = three(u, b + (MOMENT_RATE + 3 * j) * _L, k)
+            s[U((SUM + j) * _L + k)] += m0 * px + m1 * py + m2 * pz
         s[U(SUM * _L + k)] -= my * pz - mz * py
         s[U((SUM + 1) * _L + k)] -= mz * px - mx * pz
         s[U((SUM + 2) * _L + k)] -= mx * py - my * px
@@ -205,25 +183,9 @@ def _pulled(w, u, s, record):  # type: ignore[no-untyped-def]
     """
     a, b = record * RECORD * _L, record * OWN * _L
     for k in range(_L):
-        gx, gy = u[U(b + TWIST * _L + k)], u[U(b + (TWIST + 1) * _L + k)]
-        gz = u[U(b + (TWIST + 2) * _L + k)]
-        x, y = w[U(a + BEND * _L + k)], w[U(a + (BEND + 1) * _L + k)]
-        z = w[U(a + (BEND + 2) * _L + k)]
-        r00, r01, r02 = (
-            w[U(a + ROTATION * _L + k)], w[U(a + (ROTATION + 1) * _L + k)],
-            w[U(a + (ROTATION + 2) * _L + k)],
-        )  # fmt: skip
-        r10, r11, r12 = (
-            w[U(a + (ROTATION + 3) * _L + k)], w[U(a + (ROTATION + 4) * _L + k)],
-            w[U(a + (ROTATION + 5) * _L + k)],
-        )  # fmt: skip
-        r20, r21, r22 = (
-            w[U(a + (ROTATION + 6) * _L + k)], w[U(a + (ROTATION + 7) * _L + k)],
-            w[U(a + (ROTATION + 8) * _L + k)],
-        )  # fmt: skip
-        tx = r00 * gx + r10 * gy + r20 * gz
-        ty = r01 * gx + r11 * gy + r21 * gz
-        tz = r02 * gx + r12 * gy + r22 * gz
+        x, y, z = three(u, b + TWIST * _L, k)
+        tx, ty, tz = in_axes(w, a, k, x, y, z)
+        x, y, z = three(w, a + BEND * _L, k)
         q = x * x + y * y + z * z
         second = 0.5 * (1.0 - q / 12.0 * (1.0 - q / 30.0 * (1.0 - q / 56.0 * (
             1.0 - q / 90.0 * (1.0 - q / 132.0)))))  # fmt: skip
@@ -233,32 +195,23 @@ def _pulled(w, u, s, record):  # type: ignore[no-untyped-def]
         px = tx + second * cx + third * (y * cz - z * cy)
         py = ty + second * cy + third * (z * cx - x * cz)
         pz = tz + second * cz + third * (x * cy - y * cx)
-        change = s[U(CHANGED * _L + k)]
-        d = abs(px - u[U(b + PULL * _L + k)])
-        change = d if d > change else change
-        d = abs(py - u[U(b + (PULL + 1) * _L + k)])
-        change = d if d > change else change
-        d = abs(pz - u[U(b + (PULL + 2) * _L + k)])
-        s[U(CHANGED * _L + k)] = d if d > change else change
-        u[U(b + PULL * _L + k)] = px
-        u[U(b + (PULL + 1) * _L + k)] = py
-        u[U(b + (PULL + 2) * _L + k)] = pz
-        px *= u[U(b + GIVE * _L + k)]
-        py *= u[U(b + (GIVE + 1) * _L + k)]
-        pz *= u[U(b + (GIVE + 2) * _L + k)]
+        change_to(s, CHANGED * _L, u, b + PULL * _L, k, (px, py, pz))
+        put(u, b + PULL * _L, k, px, py, pz)
+        gx, gy, gz = three(u, b + GIVE * _L, k)
+        px, py, pz = px * gx, py * gy, pz * gz
         if record > 0:
-            u[U(b + PUSH * _L + k)] = r00 * px + r01 * py + r02 * pz
-            u[U(b + (PUSH + 1) * _L + k)] = r10 * px + r11 * py + r12 * pz
-            u[U(b + (PUSH + 2) * _L + k)] = r20 * px + r21 * py + r22 * pz
+            for j in range(3):
+                r0, r1, r2 = three(w, a + (ROTATION + 3 * j) * _L, k)
+                u[U(b + (PUSH + j) * _L + k)] = r0 * px + r1 * py + r2 * pz
         else:
-            u[U(b + PUSH * _L + k)] = px
-            u[U(b + (PUSH + 1) * _L + k)] = py
-            u[U(b + (PUSH + 2) * _L + k)] = pz
+            put(u, b + PUSH * _L, k, px, py, pz)
 
 
 @njit(**INNER)
-def solve(w, v, u, s, n, axis, turning, deflected, converged):  # type: ignore[no-untyped-def]
+def solve(lanes, axis, turning, deflected, converged):  # type: ignore[no-untyped-def]
     """Write the derivatives of one coordinate by twists, and the adjoints; whether it settled."""
+    w, v, u, s = lanes
+    n = u.shape[0] // (OWN * _L) - 2
     for record in range(n + 2):
         a = record * OWN * _L
         for k in range(PULL * _L, SHIFT * _L):

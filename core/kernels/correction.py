@@ -22,8 +22,9 @@ from gapbridge.core.kernels.layout import (
     U,
 )
 from gapbridge.core.kernels.least_offset import LARGEST_OFFSET, REGULAR
+from gapbridge.core.kernels.mechanics import put, three
 from gapbridge.core.kernels.reference import INNER, JIT
-from gapbridge.core.kernels.single import LEVER, TOLERANCE
+from gapbridge.core.kernels.single import LEVER, TOLERANCE, motion
 
 STEPS = 4  # of Newton's: what takes more is near a singularity
 # slots of a workspace of its own, before those whose number depends on the joints
@@ -43,15 +44,16 @@ _L = LANES
 
 
 @njit(**JIT)
-def correct_blocks(chain, rigid, rows, first, last, found, residual, steps):  # type: ignore[no-untyped-def]
-    """Write the corrected setpoints of rows first..last: found (N, n + 6), residual and steps (N,).
+def correct_blocks(chain, rigid, rows, first, last, out):  # type: ignore[no-untyped-def]
+    """Write corrected setpoints of rows first..last: found (N, n + 6), residual, steps (N,).
 
     As ``kernels.single.correct_rows`` does; ``rows.q`` are the nominal setpoints, ``rigid`` is the
     effect-free arm. Rows that are left to it come back with no steps.
     """
     n = chain.mass.shape[0]
+    found, residual, steps = out
     w, v = lanes_of(n)
-    x = np.zeros((OFFSET + 8 * n) * _L)
+    x, wanted, reached = np.zeros((OFFSET + 8 * n) * _L), np.empty(12), np.empty(12)
     deflected = bends(chain)
     for r in range(first, last, _L):
         count = min(_L, last - r)
@@ -71,7 +73,9 @@ def correct_blocks(chain, rigid, rows, first, last, found, residual, steps):  # 
                 steps[r + k], residual[r + k] = taken, x[DISTANCE * _L + k]
                 for i in range(n):
                     found[r + k, i] = w[((i + 1) * RECORD + ANGLE) * _L + k]
-                _motion(v, x, k, found[r + k, n:])
+                for s in range(12):
+                    wanted[s], reached[s] = x[(WANTED + s) * _L + k], v[(TCP + s) * _L + k]
+                motion(wanted, reached, True, found[r + k, n:])
 
 
 @njit(**INNER)
@@ -143,9 +147,7 @@ def _distance(v, x):  # type: ignore[no-untyped-def]
             e1 += r2 * v0 - r0 * v2
             e2 += r0 * v1 - r1 * v0
         e0, e1, e2 = 0.5 * LEVER * e0, 0.5 * LEVER * e1, 0.5 * LEVER * e2
-        x[U((ERROR + 3) * _L + k)] = e0
-        x[U((ERROR + 4) * _L + k)] = e1
-        x[U((ERROR + 5) * _L + k)] = e2
+        put(x, (ERROR + 3) * _L, k, e0, e1, e2)
         x[U(DISTANCE * _L + k)] = np.sqrt(square + e0 * e0 + e1 * e1 + e2 * e2)
 
 
@@ -157,17 +159,12 @@ def _column(w, v, x, i, n):  # type: ignore[no-untyped-def]
     """
     a, c = (i + 1) * RECORD * _L, (OFFSET + 2 * n + 6 * i) * _L
     for k in range(_L):
-        zx, zy = w[U(a + AXIS * _L + k)], w[U(a + (AXIS + 1) * _L + k)]
-        zz = w[U(a + (AXIS + 2) * _L + k)]
-        px = v[U(TCP * _L + k)] - w[U(a + ORIGIN * _L + k)]
-        py = v[U((TCP + 1) * _L + k)] - w[U(a + (ORIGIN + 1) * _L + k)]
-        pz = v[U((TCP + 2) * _L + k)] - w[U(a + (ORIGIN + 2) * _L + k)]
-        x[U(c + k)] = zy * pz - zz * py
-        x[U(c + _L + k)] = zz * px - zx * pz
-        x[U(c + 2 * _L + k)] = zx * py - zy * px
-        x[U(c + 3 * _L + k)] = LEVER * zx
-        x[U(c + 4 * _L + k)] = LEVER * zy
-        x[U(c + 5 * _L + k)] = LEVER * zz
+        zx, zy, zz = three(w, a + AXIS * _L, k)
+        px, py, pz = three(v, TCP * _L, k)
+        ox, oy, oz = three(w, a + ORIGIN * _L, k)
+        px, py, pz = px - ox, py - oy, pz - oz
+        put(x, c, k, zy * pz - zz * py, zz * px - zx * pz, zx * py - zy * px)
+        put(x, c + 3 * _L, k, LEVER * zx, LEVER * zy, LEVER * zz)
         offset = x[U((OFFSET + i) * _L + k)]
         for j in range(6):
             x[U((ERROR + j) * _L + k)] += x[U(c + j * _L + k)] * offset
@@ -269,22 +266,3 @@ def _mark(x, n):  # type: ignore[no-untyped-def]
             x[U(SINGULAR * _L + k)] = 1.0
             for i in range(n):
                 x[U((OFFSET + i) * _L + k)] = 0.0
-
-
-@njit(**INNER)
-def _motion(v, x, k, out):  # type: ignore[no-untyped-def]
-    """Write the motion (6,) from a lane's wanted pose to the one it stands in; no offset, none."""
-    turn, trace = np.zeros(3), 0.0
-    for c in range(3):
-        for j in range(3):
-            e, f = (j + 1) % 3, (j + 2) % 3
-            turn[j] += (
-                v[(TCP_ROTATION + 3 * f + c) * _L + k] * x[(WANTED + 3 + 3 * e + c) * _L + k]
-                - v[(TCP_ROTATION + 3 * e + c) * _L + k] * x[(WANTED + 3 + 3 * f + c) * _L + k]
-            )
-            trace += v[(TCP_ROTATION + 3 * j + c) * _L + k] * x[(WANTED + 3 + 3 * j + c) * _L + k]
-    twice_sine = np.sqrt(turn[0] * turn[0] + turn[1] * turn[1] + turn[2] * turn[2])
-    scale = np.arctan2(twice_sine, trace - 1.0) / twice_sine if twice_sine > 1e-12 else 0.5
-    for j in range(3):
-        out[j] = v[(TCP + j) * _L + k] - x[(WANTED + j) * _L + k]
-        out[3 + j] = scale * turn[j]

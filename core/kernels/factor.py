@@ -18,6 +18,7 @@ from gapbridge.core.kernels.layout import (
     TCP_ROTATION,
     U,
 )
+from gapbridge.core.kernels.mechanics import put, three
 from gapbridge.core.kernels.reference import INNER, JIT
 
 NUISANCES = 9  # instrument's frame (6), tool point (3)
@@ -37,6 +38,18 @@ def flexibility_columns(w, v, X, first, n, width):  # type: ignore[no-untyped-de
             _turning_columns(w, X, e, f, b)
 
 
+@njit(inline="always", **FAST)
+def _moments(w, b, k):  # type: ignore[no-untyped-def]
+    """Return a joint's moment along its axis, and the rest of it, base axes."""
+    zx = w[U(b + (ROTATION + 2) * LANES + k)]
+    zy = w[U(b + (ROTATION + 5) * LANES + k)]
+    zz = w[U(b + (ROTATION + 8) * LANES + k)]
+    mx, my, mz = three(w, b + MOMENT * LANES, k)
+    along = zx * mx + zy * my + zz * mz
+    ax, ay, az = along * zx, along * zy, along * zz
+    return ax, ay, az, mx - ax, my - ay, mz - az
+
+
 @njit(**FAST)
 def _shift_columns(w, v, X, b, e, f):  # type: ignore[no-untyped-def]
     """Write the position rows of a joint's two columns, which begin at ``e`` and ``f``.
@@ -44,42 +57,21 @@ def _shift_columns(w, v, X, b, e, f):  # type: ignore[no-untyped-def]
     A function of its own: in a loop over joints the compiler makes no vector instructions of it.
     """
     for k in range(LANES):
-        zx = w[U(b + (ROTATION + 2) * LANES + k)]
-        zy = w[U(b + (ROTATION + 5) * LANES + k)]
-        zz = w[U(b + (ROTATION + 8) * LANES + k)]
-        mx = w[U(b + MOMENT * LANES + k)]
-        my = w[U(b + (MOMENT + 1) * LANES + k)]
-        mz = w[U(b + (MOMENT + 2) * LANES + k)]
-        dx = v[U(TCP * LANES + k)] - w[U(b + ORIGIN * LANES + k)]
-        dy = v[U((TCP + 1) * LANES + k)] - w[U(b + (ORIGIN + 1) * LANES + k)]
-        dz = v[U((TCP + 2) * LANES + k)] - w[U(b + (ORIGIN + 2) * LANES + k)]
-        along = zx * mx + zy * my + zz * mz
-        ax, ay, az = along * zx, along * zy, along * zz
-        rx, ry, rz = mx - ax, my - ay, mz - az
-        X[U(e + k)] = ay * dz - az * dy
-        X[U(e + LANES + k)] = az * dx - ax * dz
-        X[U(e + 2 * LANES + k)] = ax * dy - ay * dx
-        X[U(f + k)] = ry * dz - rz * dy
-        X[U(f + LANES + k)] = rz * dx - rx * dz
-        X[U(f + 2 * LANES + k)] = rx * dy - ry * dx
+        ax, ay, az, rx, ry, rz = _moments(w, b, k)
+        x, y, z = three(v, TCP * LANES, k)
+        ox, oy, oz = three(w, b + ORIGIN * LANES, k)
+        dx, dy, dz = x - ox, y - oy, z - oz
+        put(X, e, k, ay * dz - az * dy, az * dx - ax * dz, ax * dy - ay * dx)
+        put(X, f, k, ry * dz - rz * dy, rz * dx - rx * dz, rx * dy - ry * dx)
 
 
 @njit(**FAST)
 def _turning_columns(w, X, e, f, b):  # type: ignore[no-untyped-def]
     """Write the rotation rows of a joint's two columns, which begin at ``e`` and ``f``."""
     for k in range(LANES):
-        zx = w[U(b + (ROTATION + 2) * LANES + k)]
-        zy = w[U(b + (ROTATION + 5) * LANES + k)]
-        zz = w[U(b + (ROTATION + 8) * LANES + k)]
-        mx, my = w[U(b + MOMENT * LANES + k)], w[U(b + (MOMENT + 1) * LANES + k)]
-        mz = w[U(b + (MOMENT + 2) * LANES + k)]
-        along = zx * mx + zy * my + zz * mz
-        X[U(e + 3 * LANES + k)] = along * zx
-        X[U(e + 4 * LANES + k)] = along * zy
-        X[U(e + 5 * LANES + k)] = along * zz
-        X[U(f + 3 * LANES + k)] = mx - along * zx
-        X[U(f + 4 * LANES + k)] = my - along * zy
-        X[U(f + 5 * LANES + k)] = mz - along * zz
+        ax, ay, az, rx, ry, rz = _moments(w, b, k)
+        put(X, e + 3 * LANES, k, ax, ay, az)
+        put(X, f + 3 * LANES, k, rx, ry, rz)
 
 
 @njit(**INNER)
@@ -115,26 +107,26 @@ def _weigh(X, cells, columns, size):  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
-def _cells(per_cell, gap, first, end, width, X, column, cells):  # type: ignore[no-untyped-def]
-    """Write the right side into its column and the weights; lanes that are over weigh nothing."""
-    a = column * width * LANES
-    for j in range(width):
+def _cells(per_cell, gap, first, end, right, cells):  # type: ignore[no-untyped-def]
+    """Write the right side and the weights; lanes that are over weigh nothing."""
+    for j in range(gap.shape[1]):
         for k in range(LANES):
             over = first + k >= end
-            X[a + j * LANES + k] = 0.0 if over else gap[first + k, j]
+            right[j * LANES + k] = 0.0 if over else gap[first + k, j]
             cells[j * LANES + k] = 0.0 if over else per_cell[first + k, j]
 
 
 @njit(**JIT)
-def factor_blocks(chain, rows, gap, per_cell, nuisances, first, last, R):  # type: ignore[no-untyped-def]
+def factor_blocks(chain, rows, gap, per_cell, first, last, R):  # type: ignore[no-untyped-def]
     """Fold rows first..last of [nuisances | flexibilities | gap], weighed, into R.
 
-    ``gap`` and ``per_cell`` (N, 3 or 6); ``nuisances`` 0 or 9 columns; R (k, k) with
-    k = nuisances + 2n + 1. Returns the first row of a block that core.kernels.reference must solve
+    ``gap`` and ``per_cell`` (N, 3 or 6); R (k, k) with k = 2n + 1, and NUISANCES more where there
+    are such columns. Returns the first row of a block that core.kernels.reference must solve
     (a load that bends too far, angles that are no numbers), or -1; R then lacks what follows.
     """
     n, width = chain.mass.shape[0], gap.shape[1]
-    columns, size = nuisances + 2 * n + 1, width * LANES
+    columns, size = R.shape[0], width * LANES
+    nuisances = columns - 2 * n - 1
     w, v = lanes_of(n)
     X, cells = np.empty(columns * size), np.empty(size)
     deflected = bends(chain)
@@ -144,28 +136,30 @@ def factor_blocks(chain, rows, gap, per_cell, nuisances, first, last, R):  # typ
         if nuisances:
             nuisance_columns(v, X, chain.tool_rotation, width)
         flexibility_columns(w, v, X, nuisances, n, width)
-        _cells(per_cell, gap, r, last, width, X, columns - 1, cells)
+        _cells(per_cell, gap, r, last, X[(columns - 1) * size :], cells)
         _weigh(X, cells, columns, size)
         fold(R, X, columns, size)
     return -1
 
 
 @njit(**SUMS)
-def _reflect(X, a, b, size, lead, share, r):  # type: ignore[no-untyped-def]
-    """Reflect the column at ``b``, and its row entry r, on the one at ``a``; returns the entry."""
+def _reflect(X, size, lead, R, j, c):  # type: ignore[no-untyped-def]
+    """Reflect column c, and its entry in row j of R, on column j."""
+    a, b = j * size, c * size
     product = 0.0
     for k in range(size):
         product += X[U(a + k)] * X[U(b + k)]
-    step = share * (r + product / lead)
+    step = -lead / R[j, j] * (R[j, c] + product / lead)
+    R[j, c] -= step
     part = step / lead
     for k in range(size):
         X[U(b + k)] -= part * X[U(a + k)]
-    return r - step
 
 
 @njit(**SUMS)
-def _reflect_four(X, a, b, size, lead, share, R, j, c):  # type: ignore[no-untyped-def]
-    """``_reflect`` four columns at once: the one at ``a`` is read a quarter as often."""
+def _reflect_four(X, size, lead, R, j, c):  # type: ignore[no-untyped-def]
+    """``_reflect`` four columns at once: column j is read a quarter as often."""
+    a, b = j * size, c * size
     p0 = p1 = p2 = p3 = 0.0
     for k in range(size):
         x = X[U(a + k)]
@@ -173,6 +167,7 @@ def _reflect_four(X, a, b, size, lead, share, R, j, c):  # type: ignore[no-untyp
         p1 += x * X[U(b + size + k)]
         p2 += x * X[U(b + 2 * size + k)]
         p3 += x * X[U(b + 3 * size + k)]
+    share = -lead / R[j, j]
     s0, s1 = share * (R[j, c] + p0 / lead), share * (R[j, c + 1] + p1 / lead)
     s2, s3 = share * (R[j, c + 2] + p2 / lead), share * (R[j, c + 3] + p3 / lead)
     R[j, c] -= s0
@@ -206,12 +201,11 @@ def fold(R, X, columns, size):  # type: ignore[no-untyped-def]
         norm = np.sqrt(head * head + square)
         pivot = -norm if head > 0.0 else norm
         lead = head - pivot
-        share = -lead / pivot
         R[j, j] = pivot
         c = j + 1
         while c + 4 <= columns:
-            _reflect_four(X, a, c * size, size, lead, share, R, j, c)
+            _reflect_four(X, size, lead, R, j, c)
             c += 4
         while c < columns:
-            R[j, c] = _reflect(X, a, c * size, size, lead, share, R[j, c])
+            _reflect(X, size, lead, R, j, c)
             c += 1

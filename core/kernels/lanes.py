@@ -27,6 +27,8 @@ from gapbridge.core.kernels.layout import (
     ROTATION,
     ROW,
     STEEPEST,
+    TCP,
+    TCP_ROTATION,
     TOTAL,
     WRENCH,
     U,
@@ -193,6 +195,15 @@ def _change(w, v, n):  # type: ignore[no-untyped-def]
             if not x * x + y * y + z * z < STEEPEST:
                 return -1.0
     return change
+
+
+@njit(**INNER)
+def keep_pose(v, k, position, rotation):  # type: ignore[no-untyped-def]
+    """Write the TCP pose of lane k."""
+    for j in range(3):
+        position[j] = v[(TCP + j) * LANES + k]
+        for i in range(3):
+            rotation[j, i] = v[(TCP_ROTATION + 3 * j + i) * LANES + k]
 
 
 @njit(**INNER)

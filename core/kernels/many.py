@@ -8,9 +8,9 @@ from numba import config, njit
 from gapbridge.core.arrays import Array
 from gapbridge.core.kernels import reference as kernel
 from gapbridge.core.kernels.factor import flexibility_columns
-from gapbridge.core.kernels.lanes import bends, gather, lanes_of, settle
-from gapbridge.core.kernels.layout import AXIS, LANES, MOMENT, ORIGIN, RECORD, TCP, TCP_ROTATION
-from gapbridge.core.kernels.reference import INNER, JIT, Chain, Rows, Shape
+from gapbridge.core.kernels.lanes import bends, gather, keep_pose, lanes_of, settle
+from gapbridge.core.kernels.layout import AXIS, LANES, MOMENT, ORIGIN, RECORD, TCP
+from gapbridge.core.kernels.reference import INNER, JIT, Chain, Rows
 from gapbridge.core.kernels.threads import in_ranges
 
 FEW = 2  # rows that are not worth a block
@@ -72,14 +72,11 @@ def predict_blocks(chain, rows, first, last, position, rotation):  # type: ignor
     for r in range(first, last, LANES):
         end = min(r + LANES, last)
         if not (gather(chain, rows, r, w, v) and settle(chain, w, v, deflected, False)):
-            found = _one_by_one(chain, rows, r, end, position, rotation)
+            found = kernel.predict_range(chain, rows, r, end, position, rotation)
             bad = found if bad < 0 else bad
             continue
         for k in range(end - r):
-            for j in range(3):
-                position[r + k, j] = v[(TCP + j) * LANES + k]
-                for i in range(3):
-                    rotation[r + k, j, i] = v[(TCP_ROTATION + 3 * j + i) * LANES + k]
+            keep_pose(v, k, position[r + k], rotation[r + k])
     return bad
 
 
@@ -117,18 +114,3 @@ def _written(w, v, k, J, moment):  # type: ignore[no-untyped-def]
             J[j, i] = w[a + (AXIS + e) * LANES] * lever_f - w[a + (AXIS + f) * LANES] * lever_e
             J[3 + j, i] = w[a + (AXIS + j) * LANES]
             moment[i, j] = w[a + (MOMENT + j) * LANES]
-
-
-@njit(**INNER)
-def _one_by_one(chain, rows, first, last, position, rotation):  # type: ignore[no-untyped-def]
-    n, bad = chain.mass.shape[0], -1
-    shape = Shape(
-        np.zeros((n + 1, 3)), np.zeros((n + 1, 3, 3)), np.zeros((n, 3)), np.zeros((n, 3)),
-        np.zeros((n, 3)), np.zeros((n, 6)), np.zeros(3), np.zeros((3, 3)),
-    )  # fmt: skip
-    for r in range(first, last):
-        if kernel.equilibrium(chain, rows, r, shape) < 0 and bad < 0:
-            bad = r
-        kernel.copy_vector(shape.tcp_position, position[r])
-        kernel.copy_matrix(shape.tcp_rotation, rotation[r])
-    return bad

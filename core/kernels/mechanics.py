@@ -41,6 +41,60 @@ _QUARTER_1, _QUARTER_2, _QUARTER_3 = (
 _TWO_BY_PI = 0.6366197723675814
 
 
+@njit(inline="always", **FAST)
+def three(w, slot, k):  # type: ignore[no-untyped-def]
+    """Return three numbers of lane k; the first of their slots begins at ``slot``."""
+    return w[U(slot + k)], w[U(slot + LANES + k)], w[U(slot + 2 * LANES + k)]
+
+
+@njit(inline="always", **FAST)
+def put(w, slot, k, x, y, z):  # type: ignore[no-untyped-def]
+    """Write what ``three`` returns."""
+    w[U(slot + k)] = x
+    w[U(slot + LANES + k)] = y
+    w[U(slot + 2 * LANES + k)] = z
+
+
+@njit(inline="always", **FAST)
+def point_of(w, a, k, x, y, z):  # type: ignore[no-untyped-def]
+    """Return where a point in the axes of the record that begins at ``a`` is, base axes."""
+    r00, r01, r02 = three(w, a + ROTATION * LANES, k)
+    r10, r11, r12 = three(w, a + (ROTATION + 3) * LANES, k)
+    r20, r21, r22 = three(w, a + (ROTATION + 6) * LANES, k)
+    ox, oy, oz = three(w, a + ORIGIN * LANES, k)
+    return (
+        ox + (r00 * x + r01 * y + r02 * z),
+        oy + (r10 * x + r11 * y + r12 * z),
+        oz + (r20 * x + r21 * y + r22 * z),
+    )
+
+
+@njit(inline="always", **FAST)
+def in_axes(w, a, k, x, y, z):  # type: ignore[no-untyped-def]
+    """Return a vector in base axes in those of the record that begins at ``a``."""
+    r00, r01, r02 = three(w, a + ROTATION * LANES, k)
+    r10, r11, r12 = three(w, a + (ROTATION + 3) * LANES, k)
+    r20, r21, r22 = three(w, a + (ROTATION + 6) * LANES, k)
+    return (
+        r00 * x + (r10 * y + r20 * z),
+        r01 * x + (r11 * y + r21 * z),
+        r02 * x + (r12 * y + r22 * z),
+    )
+
+
+@njit(inline="always", **FAST)
+def change_to(v, change, w, slot, k, new):  # type: ignore[no-untyped-def]
+    """Keep at ``change`` of v how far three numbers change at most as they become ``new``."""
+    x, y, z = three(w, slot, k)
+    most = v[U(change + k)]
+    d = abs(new[0] - x)
+    most = d if d > most else most
+    d = abs(new[1] - y)
+    most = d if d > most else most
+    d = abs(new[2] - z)
+    v[U(change + k)] = d if d > most else most
+
+
 @njit(**FAST)
 def sines(w, record):  # type: ignore[no-untyped-def]
     """Write sine and cosine of a record's angle.
@@ -86,17 +140,13 @@ def place_joint(w, i, R, p):  # type: ignore[no-untyped-def]
         x, y, z = g * px, g * py, g * pz
         c, s = w[U(b + COSINE * LANES + k)], w[U(b + SINE * LANES + k)]
         for row in range(3):
-            a0 = w[U(a + (ROTATION + 3 * row) * LANES + k)]
-            a1 = w[U(a + (ROTATION + 3 * row + 1) * LANES + k)]
-            a2 = w[U(a + (ROTATION + 3 * row + 2) * LANES + k)]
+            a0, a1, a2 = three(w, a + (ROTATION + 3 * row) * LANES, k)
             o = w[U(a + (ORIGIN + row) * LANES + k)]
             w[U(b + (ORIGIN + row) * LANES + k)] = o + a0 * x + a1 * y + a2 * z
             bx = a0 * r00 + a1 * r10 + a2 * r20
             by = a0 * r01 + a1 * r11 + a2 * r21
             bz = a0 * r02 + a1 * r12 + a2 * r22
-            w[U(b + (ROTATION + 3 * row) * LANES + k)] = c * bx + s * by
-            w[U(b + (ROTATION + 3 * row + 1) * LANES + k)] = c * by - s * bx
-            w[U(b + (ROTATION + 3 * row + 2) * LANES + k)] = bz
+            put(w, b + (ROTATION + 3 * row) * LANES, k, c * bx + s * by, c * by - s * bx, bz)
             w[U(b + (AXIS + row) * LANES + k)] = bz
 
 
@@ -105,9 +155,7 @@ def turn_joint(w, record):  # type: ignore[no-untyped-def]
     """Turn a record by its bending (exact finite rotation; series up to STEEPEST)."""
     b = record * RECORD * LANES
     for k in range(LANES):
-        x = w[U(b + BEND * LANES + k)]
-        y = w[U(b + (BEND + 1) * LANES + k)]
-        z = w[U(b + (BEND + 2) * LANES + k)]
+        x, y, z = three(w, b + BEND * LANES, k)
         q = x * x + y * y + z * z
         first = 1.0 - q / 6.0 * (1.0 - q / 20.0 * (1.0 - q / 42.0 * (1.0 - q / 72.0 * (
             1.0 - q / 110.0 * (1.0 - q / 156.0)))))  # fmt: skip
@@ -122,12 +170,11 @@ def turn_joint(w, record):  # type: ignore[no-untyped-def]
         t02, t20 = second * x * z + first * y, second * x * z - first * y
         t12, t21 = second * y * z - first * x, second * y * z + first * x
         for row in range(3):
-            a0 = w[U(b + (ROTATION + 3 * row) * LANES + k)]
-            a1 = w[U(b + (ROTATION + 3 * row + 1) * LANES + k)]
-            a2 = w[U(b + (ROTATION + 3 * row + 2) * LANES + k)]
-            w[U(b + (ROTATION + 3 * row) * LANES + k)] = a0 * t00 + a1 * t10 + a2 * t20
-            w[U(b + (ROTATION + 3 * row + 1) * LANES + k)] = a0 * t01 + a1 * t11 + a2 * t21
-            w[U(b + (ROTATION + 3 * row + 2) * LANES + k)] = a0 * t02 + a1 * t12 + a2 * t22
+            a0, a1, a2 = three(w, b + (ROTATION + 3 * row) * LANES, k)
+            x = a0 * t00 + a1 * t10 + a2 * t20
+            y = a0 * t01 + a1 * t11 + a2 * t21
+            z = a0 * t02 + a1 * t12 + a2 * t22
+            put(w, b + (ROTATION + 3 * row) * LANES, k, x, y, z)
 
 
 @njit(**FAST)
@@ -147,21 +194,18 @@ def place_flange(w, v, n, chain):  # type: ignore[no-untyped-def]
         g = w[U(a + GROWTH * LANES + k)]
         x, y, z = g * px, g * py, g * pz
         for row in range(3):
-            a0 = w[U(a + (ROTATION + 3 * row) * LANES + k)]
-            a1 = w[U(a + (ROTATION + 3 * row + 1) * LANES + k)]
-            a2 = w[U(a + (ROTATION + 3 * row + 2) * LANES + k)]
+            a0, a1, a2 = three(w, a + (ROTATION + 3 * row) * LANES, k)
             o = w[U(a + (ORIGIN + row) * LANES + k)] + a0 * x + a1 * y + a2 * z
             bx = a0 * r00 + a1 * r10 + a2 * r20
             by = a0 * r01 + a1 * r11 + a2 * r21
             bz = a0 * r02 + a1 * r12 + a2 * r22
             w[U(b + (ORIGIN + row) * LANES + k)] = o
-            w[U(b + (ROTATION + 3 * row) * LANES + k)] = bx
-            w[U(b + (ROTATION + 3 * row + 1) * LANES + k)] = by
-            w[U(b + (ROTATION + 3 * row + 2) * LANES + k)] = bz
+            put(w, b + (ROTATION + 3 * row) * LANES, k, bx, by, bz)
             v[U((TCP + row) * LANES + k)] = o + bx * tx + by * ty + bz * tz
-            v[U((TCP_ROTATION + 3 * row) * LANES + k)] = bx * t00 + by * t10 + bz * t20
-            v[U((TCP_ROTATION + 3 * row + 1) * LANES + k)] = bx * t01 + by * t11 + bz * t21
-            v[U((TCP_ROTATION + 3 * row + 2) * LANES + k)] = bx * t02 + by * t12 + bz * t22
+            x_axis = bx * t00 + by * t10 + bz * t20
+            y_axis = bx * t01 + by * t11 + bz * t21
+            z_axis = bx * t02 + by * t12 + bz * t22
+            put(v, (TCP_ROTATION + 3 * row) * LANES, k, x_axis, y_axis, z_axis)
 
 
 @njit(**FAST)
@@ -170,37 +214,18 @@ def load_flange(w, v, n, g):  # type: ignore[no-untyped-def]
     b = (n + 1) * RECORD * LANES
     gx, gy, gz = g[0], g[1], g[2]
     for k in range(LANES):
-        px, py, pz = v[U(TCP * LANES + k)], v[U((TCP + 1) * LANES + k)], v[U((TCP + 2) * LANES + k)]
-        fx, fy = v[U(WRENCH * LANES + k)], v[U((WRENCH + 1) * LANES + k)]
-        fz = v[U((WRENCH + 2) * LANES + k)]
+        px, py, pz = three(v, TCP * LANES, k)
+        fx, fy, fz = three(v, WRENCH * LANES, k)
+        tx, ty, tz = three(v, (WRENCH + 3) * LANES, k)
         m = v[U(MASS * LANES + k)]
-        cx, cy = v[U(COG * LANES + k)], v[U((COG + 1) * LANES + k)]
-        cz = v[U((COG + 2) * LANES + k)]
-        x = w[U(b + ORIGIN * LANES + k)] + (
-            w[U(b + ROTATION * LANES + k)] * cx + w[U(b + (ROTATION + 1) * LANES + k)] * cy
-            + w[U(b + (ROTATION + 2) * LANES + k)] * cz
-        )  # fmt: skip
-        y = w[U(b + (ORIGIN + 1) * LANES + k)] + (
-            w[U(b + (ROTATION + 3) * LANES + k)] * cx + w[U(b + (ROTATION + 4) * LANES + k)] * cy
-            + w[U(b + (ROTATION + 5) * LANES + k)] * cz
-        )  # fmt: skip
-        z = w[U(b + (ORIGIN + 2) * LANES + k)] + (
-            w[U(b + (ROTATION + 6) * LANES + k)] * cx + w[U(b + (ROTATION + 7) * LANES + k)] * cy
-            + w[U(b + (ROTATION + 8) * LANES + k)] * cz
-        )  # fmt: skip
+        cx, cy, cz = three(v, COG * LANES, k)
+        x, y, z = point_of(w, b, k, cx, cy, cz)
         wx, wy, wz = m * gx, m * gy, m * gz
-        w[U(b + TOTAL * LANES + k)] = fx + wx
-        w[U(b + (TOTAL + 1) * LANES + k)] = fy + wy
-        w[U(b + (TOTAL + 2) * LANES + k)] = fz + wz
-        w[U(b + (TOTAL + 3) * LANES + k)] = (
-            v[U((WRENCH + 3) * LANES + k)] + (py * fz - pz * fy) + (y * wz - z * wy)
-        )
-        w[U(b + (TOTAL + 4) * LANES + k)] = (
-            v[U((WRENCH + 4) * LANES + k)] + (pz * fx - px * fz) + (z * wx - x * wz)
-        )
-        w[U(b + (TOTAL + 5) * LANES + k)] = (
-            v[U((WRENCH + 5) * LANES + k)] + (px * fy - py * fx) + (x * wy - y * wx)
-        )
+        put(w, b + TOTAL * LANES, k, fx + wx, fy + wy, fz + wz)
+        mx = tx + (py * fz - pz * fy) + (y * wz - z * wy)
+        my = ty + (pz * fx - px * fz) + (z * wx - x * wz)
+        mz = tz + (px * fy - py * fx) + (x * wy - y * wx)
+        put(w, b + (TOTAL + 3) * LANES, k, mx, my, mz)
         v[U(CHANGE * LANES + k)] = 0.0
 
 
@@ -212,35 +237,18 @@ def load_joint(w, i, m, c, g):  # type: ignore[no-untyped-def]
     cx, cy, cz = c[0], c[1], c[2]
     wx, wy, wz = m * g[0], m * g[1], m * g[2]
     for k in range(LANES):
-        ox, oy = w[U(b + ORIGIN * LANES + k)], w[U(b + (ORIGIN + 1) * LANES + k)]
-        oz = w[U(b + (ORIGIN + 2) * LANES + k)]
-        x = ox + (
-            w[U(b + ROTATION * LANES + k)] * cx + w[U(b + (ROTATION + 1) * LANES + k)] * cy
-            + w[U(b + (ROTATION + 2) * LANES + k)] * cz
-        )  # fmt: skip
-        y = oy + (
-            w[U(b + (ROTATION + 3) * LANES + k)] * cx + w[U(b + (ROTATION + 4) * LANES + k)] * cy
-            + w[U(b + (ROTATION + 5) * LANES + k)] * cz
-        )  # fmt: skip
-        z = oz + (
-            w[U(b + (ROTATION + 6) * LANES + k)] * cx + w[U(b + (ROTATION + 7) * LANES + k)] * cy
-            + w[U(b + (ROTATION + 8) * LANES + k)] * cz
-        )  # fmt: skip
-        fx = w[U(a + TOTAL * LANES + k)] + wx
-        fy = w[U(a + (TOTAL + 1) * LANES + k)] + wy
-        fz = w[U(a + (TOTAL + 2) * LANES + k)] + wz
-        mx = w[U(a + (TOTAL + 3) * LANES + k)] + (y * wz - z * wy)
-        my = w[U(a + (TOTAL + 4) * LANES + k)] + (z * wx - x * wz)
-        mz = w[U(a + (TOTAL + 5) * LANES + k)] + (x * wy - y * wx)
-        w[U(b + TOTAL * LANES + k)] = fx
-        w[U(b + (TOTAL + 1) * LANES + k)] = fy
-        w[U(b + (TOTAL + 2) * LANES + k)] = fz
-        w[U(b + (TOTAL + 3) * LANES + k)] = mx
-        w[U(b + (TOTAL + 4) * LANES + k)] = my
-        w[U(b + (TOTAL + 5) * LANES + k)] = mz
-        w[U(b + MOMENT * LANES + k)] = mx - (oy * fz - oz * fy)
-        w[U(b + (MOMENT + 1) * LANES + k)] = my - (oz * fx - ox * fz)
-        w[U(b + (MOMENT + 2) * LANES + k)] = mz - (ox * fy - oy * fx)
+        ox, oy, oz = three(w, b + ORIGIN * LANES, k)
+        x, y, z = point_of(w, b, k, cx, cy, cz)
+        fx, fy, fz = three(w, a + TOTAL * LANES, k)
+        fx, fy, fz = fx + wx, fy + wy, fz + wz
+        mx, my, mz = three(w, a + (TOTAL + 3) * LANES, k)
+        mx += y * wz - z * wy
+        my += z * wx - x * wz
+        mz += x * wy - y * wx
+        put(w, b + TOTAL * LANES, k, fx, fy, fz)
+        put(w, b + (TOTAL + 3) * LANES, k, mx, my, mz)
+        mx, my, mz = mx - (oy * fz - oz * fy), my - (oz * fx - ox * fz), mz - (ox * fy - oy * fx)
+        put(w, b + MOMENT * LANES, k, mx, my, mz)
 
 
 @njit(**FAST)
@@ -249,29 +257,12 @@ def bend_joint(w, v, record, compliance, softening):  # type: ignore[no-untyped-
     b = record * RECORD * LANES
     c0, c1, c2 = compliance[0], compliance[1], compliance[2]
     for k in range(LANES):
-        mx, my = w[U(b + MOMENT * LANES + k)], w[U(b + (MOMENT + 1) * LANES + k)]
-        mz = w[U(b + (MOMENT + 2) * LANES + k)]
-        x = w[U(b + ROTATION * LANES + k)] * mx + (
-            w[U(b + (ROTATION + 3) * LANES + k)] * my + w[U(b + (ROTATION + 6) * LANES + k)] * mz
-        )
-        y = w[U(b + (ROTATION + 1) * LANES + k)] * mx + (
-            w[U(b + (ROTATION + 4) * LANES + k)] * my + w[U(b + (ROTATION + 7) * LANES + k)] * mz
-        )
-        z = w[U(b + (ROTATION + 2) * LANES + k)] * mx + (
-            w[U(b + (ROTATION + 5) * LANES + k)] * my + w[U(b + (ROTATION + 8) * LANES + k)] * mz
-        )
+        mx, my, mz = three(w, b + MOMENT * LANES, k)
+        x, y, z = in_axes(w, b, k, mx, my, mz)
         x, y = c0 * x, c1 * y
         z = c2 * z / np.sqrt(1.0 + softening * z * z)
-        change = v[U(CHANGE * LANES + k)]
-        d = abs(x - w[U(b + BEND * LANES + k)])
-        change = d if d > change else change
-        d = abs(y - w[U(b + (BEND + 1) * LANES + k)])
-        change = d if d > change else change
-        d = abs(z - w[U(b + (BEND + 2) * LANES + k)])
-        v[U(CHANGE * LANES + k)] = d if d > change else change
-        w[U(b + BEND * LANES + k)] = x
-        w[U(b + (BEND + 1) * LANES + k)] = y
-        w[U(b + (BEND + 2) * LANES + k)] = z
+        change_to(v, CHANGE * LANES, w, b + BEND * LANES, k, (x, y, z))
+        put(w, b + BEND * LANES, k, x, y, z)
 
 
 @njit(**FAST)

@@ -34,81 +34,75 @@ def turn(x, y, z):  # type: ignore[no-untyped-def]
     return np.sin(angle) / angle, 2.0 * half * half
 
 
+@njit(inline="always", **FAST)
+def _matrix(x, y, z):  # type: ignore[no-untyped-def]
+    """Return the rotation matrix of a rotation vector, by rows."""
+    first, second = turn(x, y, z)
+    return (
+        1.0 - second * (y * y + z * z), second * x * y - first * z, second * x * z + first * y,
+        second * x * y + first * z, 1.0 - second * (x * x + z * z), second * y * z - first * x,
+        second * x * z - first * y, second * y * z + first * x, 1.0 - second * (x * x + y * y),
+    )  # fmt: skip
+
+
+@njit(inline="always", **FAST)
+def _times(a, b):  # type: ignore[no-untyped-def]
+    """Return the product of two matrices, by rows."""
+    return (
+        a[0] * b[0] + a[1] * b[3] + a[2] * b[6], a[0] * b[1] + a[1] * b[4] + a[2] * b[7],
+        a[0] * b[2] + a[1] * b[5] + a[2] * b[8],
+        a[3] * b[0] + a[4] * b[3] + a[5] * b[6], a[3] * b[1] + a[4] * b[4] + a[5] * b[7],
+        a[3] * b[2] + a[4] * b[5] + a[5] * b[8],
+        a[6] * b[0] + a[7] * b[3] + a[8] * b[6], a[6] * b[1] + a[7] * b[4] + a[8] * b[7],
+        a[6] * b[2] + a[7] * b[5] + a[8] * b[8],
+    )  # fmt: skip
+
+
+@njit(inline="always", **FAST)
+def _nine(b, k):  # type: ignore[no-untyped-def]
+    """Return nine numbers of the block."""
+    return (
+        b[U(k)], b[U(k + 1)], b[U(k + 2)], b[U(k + 3)], b[U(k + 4)], b[U(k + 5)], b[U(k + 6)],
+        b[U(k + 7)], b[U(k + 8)],
+    )  # fmt: skip
+
+
 @njit(**FAST)
 def place(b, n, w, deflected, tx, ty, tz):  # type: ignore[no-untyped-def]
     """Place all frames of the block's row for the present bending and tilt of the base."""
-    first, second = turn(tx, ty, tz)
-    a00, a01, a02 = 1.0 - second * (ty * ty + tz * tz), second * tx * ty - first * tz, (
-        second * tx * tz + first * ty)  # fmt: skip
-    a10, a11, a12 = second * tx * ty + first * tz, 1.0 - second * (tx * tx + tz * tz), (
-        second * ty * tz - first * tx)  # fmt: skip
-    a20, a21, a22 = second * tx * tz - first * ty, second * ty * tz + first * tx, (
-        1.0 - second * (tx * tx + ty * ty))  # fmt: skip
+    a = _matrix(tx, ty, tz)
     ox = oy = oz = 0.0
     shift = 9 * (n + 1)  # from the rotations to the positions
     row = sizes_of(n)[0]
     for i in range(n + 1):
         g = b[U(row + n + i - 1)] if i > 0 else 1.0
-        x, y, z = (
-            g * b[U(shift + 3 * i)], g * b[U(shift + 3 * i + 1)], g * b[U(shift + 3 * i + 2)]
-        )  # fmt: skip
-        ox += a00 * x + a01 * y + a02 * z
-        oy += a10 * x + a11 * y + a12 * z
-        oz += a20 * x + a21 * y + a22 * z
-        k = 9 * i
-        r00, r01, r02 = b[U(k)], b[U(k + 1)], b[U(k + 2)]
-        r10, r11, r12 = b[U(k + 3)], b[U(k + 4)], b[U(k + 5)]
-        r20, r21, r22 = b[U(k + 6)], b[U(k + 7)], b[U(k + 8)]
-        b00, b01, b02 = (
-            a00 * r00 + a01 * r10 + a02 * r20, a00 * r01 + a01 * r11 + a02 * r21,
-            a00 * r02 + a01 * r12 + a02 * r22,
-        )  # fmt: skip
-        b10, b11, b12 = (
-            a10 * r00 + a11 * r10 + a12 * r20, a10 * r01 + a11 * r11 + a12 * r21,
-            a10 * r02 + a11 * r12 + a12 * r22,
-        )  # fmt: skip
-        b20, b21, b22 = (
-            a20 * r00 + a21 * r10 + a22 * r20, a20 * r01 + a21 * r11 + a22 * r21,
-            a20 * r02 + a21 * r12 + a22 * r22,
-        )  # fmt: skip
+        p = shift + 3 * i
+        x, y, z = g * b[U(p)], g * b[U(p + 1)], g * b[U(p + 2)]
+        ox += a[0] * x + a[1] * y + a[2] * z
+        oy += a[3] * x + a[4] * y + a[5] * z
+        oz += a[6] * x + a[7] * y + a[8] * z
+        a = _times(a, _nine(b, 9 * i))
         j = w + RECORD * i
         if i < n:
             c, s = np.cos(b[U(row + i)]), np.sin(b[U(row + i)])
-            b00, b01 = c * b00 + s * b01, c * b01 - s * b00
-            b10, b11 = c * b10 + s * b11, c * b11 - s * b10
-            b20, b21 = c * b20 + s * b21, c * b21 - s * b20
-            b[U(j + AXIS)], b[U(j + AXIS + 1)], b[U(j + AXIS + 2)] = b02, b12, b22
-        if deflected and i < n:
-            x, y, z = b[U(j + BEND)], b[U(j + BEND + 1)], b[U(j + BEND + 2)]
-            first, second = turn(x, y, z)
-            t00, t11, t22 = (
-                1.0 - second * (y * y + z * z), 1.0 - second * (x * x + z * z),
-                1.0 - second * (x * x + y * y),
+            a = (
+                c * a[0] + s * a[1], c * a[1] - s * a[0], a[2],
+                c * a[3] + s * a[4], c * a[4] - s * a[3], a[5],
+                c * a[6] + s * a[7], c * a[7] - s * a[6], a[8],
             )  # fmt: skip
-            t01, t10 = second * x * y - first * z, second * x * y + first * z
-            t02, t20 = second * x * z + first * y, second * x * z - first * y
-            t12, t21 = second * y * z - first * x, second * y * z + first * x
-            a00, a01, a02 = (
-                b00 * t00 + b01 * t10 + b02 * t20, b00 * t01 + b01 * t11 + b02 * t21,
-                b00 * t02 + b01 * t12 + b02 * t22,
-            )  # fmt: skip
-            a10, a11, a12 = (
-                b10 * t00 + b11 * t10 + b12 * t20, b10 * t01 + b11 * t11 + b12 * t21,
-                b10 * t02 + b11 * t12 + b12 * t22,
-            )  # fmt: skip
-            a20, a21, a22 = (
-                b20 * t00 + b21 * t10 + b22 * t20, b20 * t01 + b21 * t11 + b22 * t21,
-                b20 * t02 + b21 * t12 + b22 * t22,
-            )  # fmt: skip
-        else:
-            a00, a01, a02, a10, a11, a12 = b00, b01, b02, b10, b11, b12
-            a20, a21, a22 = b20, b21, b22
-        b[U(j)], b[U(j + 1)], b[U(j + 2)] = a00, a01, a02
-        b[U(j + 3)], b[U(j + 4)], b[U(j + 5)] = a10, a11, a12
-        b[U(j + 6)], b[U(j + 7)], b[U(j + 8)] = a20, a21, a22
+            b[U(j + AXIS)], b[U(j + AXIS + 1)], b[U(j + AXIS + 2)] = a[2], a[5], a[8]
+            if deflected:
+                a = _times(a, _matrix(b[U(j + BEND)], b[U(j + BEND + 1)], b[U(j + BEND + 2)]))
+        b[U(j)], b[U(j + 1)], b[U(j + 2)] = a[0], a[1], a[2]
+        b[U(j + 3)], b[U(j + 4)], b[U(j + 5)] = a[3], a[4], a[5]
+        b[U(j + 6)], b[U(j + 7)], b[U(j + 8)] = a[6], a[7], a[8]
         b[U(j + ORIGIN)], b[U(j + ORIGIN + 1)], b[U(j + ORIGIN + 2)] = ox, oy, oz
-    t = 12 * (n + 1)  # the tool: rotation, position
-    f = w + RECORD * n
+    _place_tool(b, 12 * (n + 1), w + RECORD * n)
+
+
+@njit(inline="always", **FAST)
+def _place_tool(b, t, f):  # type: ignore[no-untyped-def]
+    """Place the TCP; the tool's rotation begins at ``t``, the flange's record at ``f``."""
     x, y, z = b[U(t + 9)], b[U(t + 10)], b[U(t + 11)]
     for k in range(3):
         e0, e1, e2 = b[U(f + 3 * k)], b[U(f + 3 * k + 1)], b[U(f + 3 * k + 2)]
@@ -143,9 +137,7 @@ def load(b, n, w):  # type: ignore[no-untyped-def]
         at = cog + 3 * i if i < n else held + 1
         cx, cy, cz = b[U(at)], b[U(at + 1)], b[U(at + 2)]
         ox, oy, oz = b[U(j + ORIGIN)], b[U(j + ORIGIN + 1)], b[U(j + ORIGIN + 2)]
-        r00, r01, r02 = b[U(j)], b[U(j + 1)], b[U(j + 2)]
-        r10, r11, r12 = b[U(j + 3)], b[U(j + 4)], b[U(j + 5)]
-        r20, r21, r22 = b[U(j + 6)], b[U(j + 7)], b[U(j + 8)]
+        r00, r01, r02, r10, r11, r12, r20, r21, r22 = _nine(b, j)
         x = ox + r00 * cx + r01 * cy + r02 * cz
         y = oy + r10 * cx + r11 * cy + r12 * cz
         z = oz + r20 * cx + r21 * cy + r22 * cz

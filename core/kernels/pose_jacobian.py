@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
 
+from gapbridge.core.arrays import Array
 from gapbridge.core.kernels.adjoint import (
     BESIDE,
     BODY,
@@ -17,7 +20,7 @@ from gapbridge.core.kernels.adjoint import (
     prepare,
     solve,
 )
-from gapbridge.core.kernels.lanes import bends, gather, lanes_of, settle
+from gapbridge.core.kernels.lanes import bends, gather, keep_pose, lanes_of, settle
 from gapbridge.core.kernels.layout import (
     AXIS,
     COG,
@@ -27,17 +30,23 @@ from gapbridge.core.kernels.layout import (
     MASS,
     ORIGIN,
     RECORD,
-    ROTATION,
-    TCP,
-    TCP_ROTATION,
     TOTAL,
     WRENCH,
     U,
 )
+from gapbridge.core.kernels.mechanics import in_axes, point_of, put, three
 from gapbridge.core.kernels.rates import slots
 from gapbridge.core.kernels.reference import INNER, JIT
 
 _L = LANES
+
+
+class Sums(NamedTuple):
+    """Buffers of one coordinate's derivatives: slots of LANES numbers."""
+
+    slots: Array  # of ``rates.ChainRate``, then those that differ from row to row
+    push: Array  # (3 slots) the records' pushes so far
+    turned: Array  # (3 slots) each crossed with its record's origin
 
 
 @njit(**FAST)
@@ -46,35 +55,28 @@ def _in_axes(w, u, B, record, source, slot, grows):  # type: ignore[no-untyped-d
     a = record * RECORD * _L
     for k in range(_L):
         g = w[U(a + GROWTH * _L + k)] if grows else 1.0
-        x, y, z = u[U(source + k)], u[U(source + _L + k)], u[U(source + 2 * _L + k)]
-        for j in range(3):
-            B[U((slot + j) * _L + k)] = g * (
-                w[U(a + (ROTATION + j) * _L + k)] * x
-                + w[U(a + (ROTATION + 3 + j) * _L + k)] * y
-                + w[U(a + (ROTATION + 6 + j) * _L + k)] * z
-            )
+        x, y, z = three(u, source, k)
+        x, y, z = in_axes(w, a, k, x, y, z)
+        put(B, slot * _L, k, g * x, g * y, g * z)
 
 
 @njit(**FAST)
-def _of_tool(w, v, B, n, slot, push, axis, turning):  # type: ignore[no-untyped-def]
-    """Write the derivatives by the tool's shift and turn; ``push`` (3 slots): the joints' sum."""
-    a = (n + 1) * RECORD * _L
+def _of_tool(w, v, sums, n, axis, turning):  # type: ignore[no-untyped-def]
+    """Write the derivatives by the tool's shift and turn."""
+    a, slot, B, push = (n + 1) * RECORD * _L, 6 * (n + 1), sums.slots, sums.push
     ex, ey = 1.0 if axis == 0 else 0.0, 1.0 if axis == 1 else 0.0
     ez = 1.0 if axis == 2 else 0.0
     moved, turned = 0.0 if turning else 1.0, 1.0 if turning else 0.0
     for k in range(_L):
-        px, py, pz = push[U(k)], push[U(_L + k)], push[U(2 * _L + k)]
-        fx, fy = v[U(WRENCH * _L + k)], v[U((WRENCH + 1) * _L + k)]
-        fz = v[U((WRENCH + 2) * _L + k)]
+        px, py, pz = three(push, 0, k)
+        fx, fy, fz = three(v, WRENCH * _L, k)
         x = moved * ex + fy * pz - fz * py
         y = moved * ey + fz * px - fx * pz
         z = moved * ez + fx * py - fy * px
-        for j in range(3):
-            r0 = w[U(a + (ROTATION + j) * _L + k)]
-            r1 = w[U(a + (ROTATION + 3 + j) * _L + k)]
-            r2 = w[U(a + (ROTATION + 6 + j) * _L + k)]
-            B[U((slot + j) * _L + k)] = r0 * x + r1 * y + r2 * z
-            B[U((slot + 3 + j) * _L + k)] = turned * (r0 * ex + r1 * ey + r2 * ez)
+        x, y, z = in_axes(w, a, k, x, y, z)
+        put(B, slot * _L, k, x, y, z)
+        x, y, z = in_axes(w, a, k, ex, ey, ez)
+        put(B, (slot + 3) * _L, k, turned * x, turned * y, turned * z)
 
 
 @njit(**FAST)
@@ -84,96 +86,65 @@ def _of_joint(w, u, B, n, i, p, c2):  # type: ignore[no-untyped-def]
     give, soft, turn = 6 * (n + 2) + 3 * i, 6 * (n + 2) + 3 * n + i, 10 * n + 18 + i
     px, py, pz = p[0], p[1], p[2]
     for k in range(_L):
-        m = u[U(b + (BODY + 2) * _L + k)]
+        mx, my, m = three(u, b + BODY * _L, k)
         share = u[U(b + SHARE * _L + k)]
-        pull = u[U(b + (PULL + 2) * _L + k)]
-        B[U(give * _L + k)] = u[U(b + PULL * _L + k)] * u[U(b + BODY * _L + k)]
-        B[U((give + 1) * _L + k)] = u[U(b + (PULL + 1) * _L + k)] * u[U(b + (BODY + 1) * _L + k)]
-        B[U((give + 2) * _L + k)] = pull * m * share
+        x, y, pull = three(u, b + PULL * _L, k)
+        put(B, give * _L, k, x * mx, y * my, pull * m * share)
         B[U(soft * _L + k)] = -0.5 * c2 * pull * m * m * m * share * share * share
-        B[U(turn * _L + k)] = (
-            w[U(a + AXIS * _L + k)] * u[U(b + TWIST * _L + k)]
-            + w[U(a + (AXIS + 1) * _L + k)] * u[U(b + (TWIST + 1) * _L + k)]
-            + w[U(a + (AXIS + 2) * _L + k)] * u[U(b + (TWIST + 2) * _L + k)]
-        )
-        sx = u[U(b + (OWN + SHIFT) * _L + k)]
-        sy = u[U(b + (OWN + SHIFT + 1) * _L + k)]
-        sz = u[U(b + (OWN + SHIFT + 2) * _L + k)]
-        B[U((turn + n) * _L + k)] = (
-            px * (w[U(a + ROTATION * _L + k)] * sx + w[U(a + (ROTATION + 3) * _L + k)] * sy
-                  + w[U(a + (ROTATION + 6) * _L + k)] * sz)
-            + py * (w[U(a + (ROTATION + 1) * _L + k)] * sx + w[U(a + (ROTATION + 4) * _L + k)] * sy
-                    + w[U(a + (ROTATION + 7) * _L + k)] * sz)
-            + pz * (w[U(a + (ROTATION + 2) * _L + k)] * sx + w[U(a + (ROTATION + 5) * _L + k)] * sy
-                    + w[U(a + (ROTATION + 8) * _L + k)] * sz)
-        )  # fmt: skip
+        x, y, z = three(w, a + AXIS * _L, k)
+        tx, ty, tz = three(u, b + TWIST * _L, k)
+        B[U(turn * _L + k)] = x * tx + y * ty + z * tz
+        x, y, z = three(u, b + (OWN + SHIFT) * _L, k)
+        x, y, z = in_axes(w, a, k, x, y, z)
+        B[U((turn + n) * _L + k)] = px * x + py * y + pz * z
 
 
 @njit(**FAST)
-def _reaction(w, u, push, turned, record):  # type: ignore[no-untyped-def]
+def _reaction(w, u, sums, record):  # type: ignore[no-untyped-def]
     """Add a record's push to the sum, and its push crossed with its origin to the other sum."""
     a, b = record * RECORD * _L, record * OWN * _L
+    push, turned = sums.push, sums.turned
     for k in range(_L):
-        px, py = u[U(b + PUSH * _L + k)], u[U(b + (PUSH + 1) * _L + k)]
-        pz = u[U(b + (PUSH + 2) * _L + k)]
+        px, py, pz = three(u, b + PUSH * _L, k)
         push[U(k)] += px
         push[U(_L + k)] += py
         push[U(2 * _L + k)] += pz
         if record > 0:
-            x, y = w[U(a + ORIGIN * _L + k)], w[U(a + (ORIGIN + 1) * _L + k)]
-            z = w[U(a + (ORIGIN + 2) * _L + k)]
+            x, y, z = three(w, a + ORIGIN * _L, k)
             turned[U(k)] += py * z - pz * y
             turned[U(_L + k)] += pz * x - px * z
             turned[U(2 * _L + k)] += px * y - py * x
 
 
+@njit(inline="always", **FAST)
+def _weight_at(w, sums, a, k, x, y, z):  # type: ignore[no-untyped-def]
+    """Return the derivative by gravity of one kg at a point of the record that begins at ``a``."""
+    px, py, pz = three(sums.push, 0, k)
+    tx, ty, tz = three(sums.turned, 0, k)
+    x, y, z = point_of(w, a, k, x, y, z)
+    return py * z - pz * y - tx, pz * x - px * z - ty, px * y - py * x - tz
+
+
 @njit(**FAST)
-def _add_gravity(w, B, push, turned, record, m, c, slot):  # type: ignore[no-untyped-def]
+def _add_gravity(w, sums, record, m, c, slot):  # type: ignore[no-untyped-def]
     """Add the derivative by gravity of a mass ``m`` at ``c`` (record's axes) to the slots."""
-    a = record * RECORD * _L
+    a, B = record * RECORD * _L, sums.slots
     cx, cy, cz = c[0], c[1], c[2]
     for k in range(_L):
-        px, py, pz = push[U(k)], push[U(_L + k)], push[U(2 * _L + k)]
-        x = w[U(a + ORIGIN * _L + k)] + (
-            w[U(a + ROTATION * _L + k)] * cx + w[U(a + (ROTATION + 1) * _L + k)] * cy
-            + w[U(a + (ROTATION + 2) * _L + k)] * cz
-        )  # fmt: skip
-        y = w[U(a + (ORIGIN + 1) * _L + k)] + (
-            w[U(a + (ROTATION + 3) * _L + k)] * cx + w[U(a + (ROTATION + 4) * _L + k)] * cy
-            + w[U(a + (ROTATION + 5) * _L + k)] * cz
-        )  # fmt: skip
-        z = w[U(a + (ORIGIN + 2) * _L + k)] + (
-            w[U(a + (ROTATION + 6) * _L + k)] * cx + w[U(a + (ROTATION + 7) * _L + k)] * cy
-            + w[U(a + (ROTATION + 8) * _L + k)] * cz
-        )  # fmt: skip
-        B[U(slot * _L + k)] += m * (py * z - pz * y - turned[U(k)])
-        B[U((slot + 1) * _L + k)] += m * (pz * x - px * z - turned[U(_L + k)])
-        B[U((slot + 2) * _L + k)] += m * (px * y - py * x - turned[U(2 * _L + k)])
+        hx, hy, hz = _weight_at(w, sums, a, k, cx, cy, cz)
+        B[U(slot * _L + k)] += m * hx
+        B[U((slot + 1) * _L + k)] += m * hy
+        B[U((slot + 2) * _L + k)] += m * hz
 
 
 @njit(**FAST)
-def _of_payload(w, v, B, push, turned, n, g, gravity):  # type: ignore[no-untyped-def]
+def _of_payload(w, v, sums, n, g, gravity):  # type: ignore[no-untyped-def]
     """Write the derivative by the payload's mass; add its derivative by gravity."""
-    a, load = (n + 1) * RECORD * _L, 12 * n + 18
+    a, load, B = (n + 1) * RECORD * _L, 12 * n + 18, sums.slots
     gx, gy, gz = g[0], g[1], g[2]
     for k in range(_L):
-        cx, cy, cz = v[U(COG * _L + k)], v[U((COG + 1) * _L + k)], v[U((COG + 2) * _L + k)]
-        px, py, pz = push[U(k)], push[U(_L + k)], push[U(2 * _L + k)]
-        x = w[U(a + ORIGIN * _L + k)] + (
-            w[U(a + ROTATION * _L + k)] * cx + w[U(a + (ROTATION + 1) * _L + k)] * cy
-            + w[U(a + (ROTATION + 2) * _L + k)] * cz
-        )  # fmt: skip
-        y = w[U(a + (ORIGIN + 1) * _L + k)] + (
-            w[U(a + (ROTATION + 3) * _L + k)] * cx + w[U(a + (ROTATION + 4) * _L + k)] * cy
-            + w[U(a + (ROTATION + 5) * _L + k)] * cz
-        )  # fmt: skip
-        z = w[U(a + (ORIGIN + 2) * _L + k)] + (
-            w[U(a + (ROTATION + 6) * _L + k)] * cx + w[U(a + (ROTATION + 7) * _L + k)] * cy
-            + w[U(a + (ROTATION + 8) * _L + k)] * cz
-        )  # fmt: skip
-        hx = py * z - pz * y - turned[U(k)]
-        hy = pz * x - px * z - turned[U(_L + k)]
-        hz = px * y - py * x - turned[U(2 * _L + k)]
+        cx, cy, cz = three(v, COG * _L, k)
+        hx, hy, hz = _weight_at(w, sums, a, k, cx, cy, cz)
         m = v[U(MASS * _L + k)]
         B[U(gravity * _L + k)] += m * hx
         B[U((gravity + 1) * _L + k)] += m * hy
@@ -182,9 +153,10 @@ def _of_payload(w, v, B, push, turned, n, g, gravity):  # type: ignore[no-untype
 
 
 @njit(**INNER)
-def _derivatives(chain, w, v, u, B, push, turned, axis, turning, links, loads):  # type: ignore[no-untyped-def]
+def _derivatives(chain, lanes, sums, axis, turning, links, loads):  # type: ignore[no-untyped-def]
     """Write the slots of one coordinate; those of links, and of tool and weights, where wanted."""
-    n = chain.mass.shape[0]
+    n, B = chain.mass.shape[0], sums.slots
+    w, v, u, _ = lanes
     gravity = 6 * (n + 2) + 4 * n
     if links:
         for j in range(n + 1):
@@ -195,14 +167,14 @@ def _derivatives(chain, w, v, u, B, push, turned, axis, turning, links, loads): 
         _of_joint(w, u, B, n, i, chain.position[i + 1], chain.compliance[i, 2])
     if loads:
         B[gravity * _L : (gravity + 3) * _L] = 0.0
-        push[:] = 0.0
-        turned[:] = 0.0
-        _reaction(w, u, push, turned, 0)
+        sums.push[:] = 0.0
+        sums.turned[:] = 0.0
+        _reaction(w, u, sums, 0)
         for i in range(n):
-            _reaction(w, u, push, turned, i + 1)
-            _add_gravity(w, B, push, turned, i + 1, chain.mass[i], chain.cog[i], gravity)
-        _of_tool(w, v, B, n, 6 * (n + 1), push, axis, turning)
-        _of_payload(w, v, B, push, turned, n, chain.gravity, gravity)
+            _reaction(w, u, sums, i + 1)
+            _add_gravity(w, sums, i + 1, chain.mass[i], chain.cog[i], gravity)
+        _of_tool(w, v, sums, n, axis, turning)
+        _of_payload(w, v, sums, n, chain.gravity, gravity)
     for j in range(3):
         for k in range(_L):
             total = w[RECORD * _L + (TOTAL + 3 + j) * _L + k]
@@ -235,10 +207,9 @@ def _add(B, b, column, rate):  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
-def _columns(B, rates, varying, first, count, J, column):  # type: ignore[no-untyped-def]
+def _columns(B, rates, first, count, J, column):  # type: ignore[no-untyped-def]
     """Write one coordinate's column of each parameter: ``J`` (p, N)."""
-    start, slot, rate = rates
-    row_start, row_slot, row_rate = varying
+    (start, slot, rate), (row_start, row_slot, row_rate) = rates
     for c in range(J.shape[0]):
         column[:] = 0.0
         for e in range(start[c], start[c + 1]):
@@ -252,36 +223,35 @@ def _columns(B, rates, varying, first, count, J, column):  # type: ignore[no-unt
 
 
 @njit(**JIT)
-def jacobian_blocks(chain, rows, rates, varying, first, last, position, rotation, J, converged):  # type: ignore[no-untyped-def]
-    """Write TCP poses of rows first..last, and their derivatives J (3 or 6, p, N).
+def jacobian_blocks(chain, rows, rates, first, last, found, converged):  # type: ignore[no-untyped-def]
+    """Write TCP poses of rows first..last, and derivatives J: ``found`` (position, rotation, J).
 
-    Derivatives by p parameters, of the position (m) and of the turn (rad), base axes. ``rates``:
-    for parameter c the entries start[c]..start[c+1] of (slot, rate); ``varying`` likewise, with a
-    rate per row (entries, N). Slots: ``rates.ChainRate``. ``converged``: of the adjoints (m/rad),
-    how much a last round may change. Returns the first row of a block that does not settle at once,
-    or -1. The arm's links must not bend themselves.
+    J (3 or 6, p, N): derivatives by p parameters, of the position (m) and of the turn (rad), base
+    axes. ``rates``: for parameter c the entries start[c]..start[c+1] of (slot, rate), then likewise
+    those with a rate per row (entries, N). Slots: ``rates.ChainRate``. ``converged``: of the
+    adjoints (m/rad), how much a last round may change. Returns the first row of a block that does
+    not settle at once, or -1. The arm's links must not bend themselves.
     """
     n = chain.mass.shape[0]
+    position, rotation, J = found
     w, v = lanes_of(n)
     u, s = np.empty((n + 2) * OWN * _L), np.empty(BESIDE * _L)
-    B, column = np.zeros(slots(n) * _L), np.empty(_L)
-    push, turned = np.empty(3 * _L), np.empty(3 * _L)
+    lanes, column = (w, v, u, s), np.empty(_L)
+    sums = Sums(np.zeros(slots(n) * _L), np.empty(3 * _L), np.empty(3 * _L))
     deflected = bends(chain)
-    links, loads = _linked(rates[1], n), _loaded(rates[1], n) or _loaded(varying[1], n)
+    links = _linked(rates[0][1], n)
+    loads = _loaded(rates[0][1], n) or _loaded(rates[1][1], n)
     for r in range(first, last, _L):
         if not (gather(chain, rows, r, w, v) and settle(chain, w, v, deflected, False)):
             return r
         count = min(_L, last - r)
         for k in range(count):
-            for j in range(3):
-                position[r + k, j] = v[(TCP + j) * _L + k]
-                for i in range(3):
-                    rotation[r + k, j, i] = v[(TCP_ROTATION + 3 * j + i) * _L + k]
+            keep_pose(v, k, position[r + k], rotation[r + k])
         prepare(chain, w, v, u, s)
         for coordinate in range(J.shape[0]):
             axis, turning = coordinate % 3, coordinate >= 3
-            if not solve(w, v, u, s, n, axis, turning, deflected, converged):
+            if not solve(lanes, axis, turning, deflected, converged):
                 return r
-            _derivatives(chain, w, v, u, B, push, turned, axis, turning, links, loads)
-            _columns(B, rates, varying, r, count, J[coordinate], column)
+            _derivatives(chain, lanes, sums, axis, turning, links, loads)
+            _columns(sums.slots, rates, r, count, J[coordinate], column)
     return -1

@@ -72,6 +72,9 @@ def new_shape(n: int) -> Shape:
     )  # fmt: skip
 
 
+_new_shape = njit(**INNER)(new_shape)
+
+
 @njit(inline="always", **JIT)
 def _times(A, B, out):  # type: ignore[no-untyped-def]
     for i in range(3):
@@ -291,13 +294,14 @@ def equilibrium(chain, rows, r, shape):  # type: ignore[no-untyped-def]
 @njit(**JIT)
 def predict_rows(chain, rows, position, rotation):  # type: ignore[no-untyped-def]
     """Write the TCP pose of every row; returns the first row without equilibrium, or -1."""
-    n = chain.mass.shape[0]
-    shape = Shape(
-        np.zeros((n + 1, 3)), np.zeros((n + 1, 3, 3)), np.zeros((n, 3)), np.zeros((n, 3)),
-        np.zeros((n, 3)), np.zeros((n, 6)), np.zeros(3), np.zeros((3, 3)),
-    )  # fmt: skip
-    bad = -1
-    for r in range(rows.q.shape[0]):
+    return predict_range(chain, rows, 0, rows.q.shape[0], position, rotation)
+
+
+@njit(**INNER)
+def predict_range(chain, rows, first, last, position, rotation):  # type: ignore[no-untyped-def]
+    """``predict_rows`` of rows first..last."""
+    shape, bad = _new_shape(chain.mass.shape[0]), -1
+    for r in range(first, last):
         if equilibrium(chain, rows, r, shape) < 0 and bad < 0:
             bad = r
         copy_vector(shape.tcp_position, position[r])
@@ -327,11 +331,7 @@ def regressor_rows(chain, rows, A, jacobians, moments):  # type: ignore[no-untyp
     axes. Returns the first row without equilibrium, or -1.
     """
     n = chain.mass.shape[0]
-    shape = Shape(
-        np.zeros((n + 1, 3)), np.zeros((n + 1, 3, 3)), np.zeros((n, 3)), np.zeros((n, 3)),
-        np.zeros((n, 3)), np.zeros((n, 6)), np.zeros(3), np.zeros((3, 3)),
-    )  # fmt: skip
-    bad = -1
+    shape, bad = _new_shape(n), -1
     for r in range(rows.q.shape[0]):
         if equilibrium(chain, rows, r, shape) < 0 and bad < 0:
             bad = r

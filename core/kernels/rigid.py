@@ -26,11 +26,10 @@ def _turned(R, vector, out):  # type: ignore[no-untyped-def]
 
 
 @njit(**JIT)
-def frames_of_rows(  # type: ignore[no-untyped-def]
-    chain, motion, origin, rotation, omega, alpha, acceleration
-):
+def frames_of_rows(chain, motion, frames):  # type: ignore[no-untyped-def]
     """Write the frames of N rows (core.dynamics.Frames); ``motion`` (3, N, n): q, qd, qdd."""
     n = motion.shape[2]
+    origin, rotation, omega, alpha, acceleration = frames
     step, turn, frame = np.empty(3), np.empty(3), np.empty((3, 3))
     R, w, dw, o, a = np.empty((3, 3)), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3)
     for r in range(motion.shape[1]):
@@ -71,11 +70,12 @@ def frames_of_rows(  # type: ignore[no-untyped-def]
 
 
 @njit(**JIT)
-def about_axes(origin, rotation, point, force, moment, torque):  # type: ignore[no-untyped-def]
+def about_axes(frames, point, force, moment, torque):  # type: ignore[no-untyped-def]
     """Write the torques (N, joints) about joint axes that hold ``force`` at ``point``, ``moment``.
 
     ``point``, ``force``, ``moment`` (N, 3): m, N, Nm, base axes.
     """
+    origin, rotation = frames.origin, frames.rotation
     arm, whole = np.empty(3), np.empty(3)
     for r in range(torque.shape[0]):
         for j in range(torque.shape[1]):
@@ -91,14 +91,13 @@ def about_axes(origin, rotation, point, force, moment, torque):  # type: ignore[
 
 
 @njit(**JIT)
-def taken_by_link(  # type: ignore[no-untyped-def]
-    i, body, gravity, origin, rotation, omega, alpha, acceleration, point, force, moment
-):
+def taken_by_link(i, body, gravity, frames, point, force, moment):  # type: ignore[no-untyped-def]
     """Write where link i (from 0) is pulled (N, 3), and what force and moment move and hold it.
 
     ``body`` (5, 3): its centre of gravity, its mass in the first of the second row, its inertia.
     """
     cog, mass, inertia = body[0], body[1, 0], body[2:]
+    origin, rotation, omega, alpha, acceleration = frames
     away, turn, own, spun, taken = (
         np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     )  # fmt: skip

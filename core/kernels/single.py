@@ -65,15 +65,17 @@ def next_offset(b, n, w, wanted, k0):  # type: ignore[no-untyped-def]
         o = b[U(at + i)]
         e0, e1, e2 = e0 + b[U(c)] * o, e1 + b[U(c + 1)] * o, e2 + b[U(c + 2)] * o
         e3, e4, e5 = e3 + b[U(c + 3)] * o, e4 + b[U(c + 4)] * o, e5 + b[U(c + 5)] * o
-    if n > 6 or not _shortest(b, n, J, e0, e1, e2, e3, e4, e5):
-        _damped(b, n, J, e0, e1, e2, e3, e4, e5)
+    error = (e0, e1, e2, e3, e4, e5)
+    if n > 6 or not _shortest(b, n, J, error):
+        _damped(b, n, J, error)
     return distance
 
 
 @njit(**FAST)
-def _shortest(b, n, J, e0, e1, e2, e3, e4, e5):  # type: ignore[no-untyped-def]
+def _shortest(b, n, J, error):  # type: ignore[no-untyped-def]
     """Write the offset by Cholesky; returns False where it is near singular, or too long."""
     at = J + 6 * n
+    e0, e1, e2, e3, e4, e5 = error
     G, y = at + n, at + n + 36
     least, most = np.inf, 0.0
     for i in range(n):
@@ -116,9 +118,9 @@ def _shortest(b, n, J, e0, e1, e2, e3, e4, e5):  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
-def _damped(b, n, J, e0, e1, e2, e3, e4, e5):  # type: ignore[no-untyped-def]
+def _damped(b, n, J, error):  # type: ignore[no-untyped-def]
     """Write the offset by core.kernels.least_offset: singular poses, more than six joints."""
-    whole, wanted, found = np.empty((6, n)), np.array([e0, e1, e2, e3, e4, e5]), np.empty(n)
+    whole, wanted, found = np.empty((6, n)), np.array(error), np.empty(n)
     for i in range(n):
         for k in range(6):
             whole[k, i] = b[J + 6 * i + k]
@@ -183,17 +185,18 @@ def correct(b, nominal, mass, cog, wrench, found):  # type: ignore[no-untyped-de
         b[U(at + i)] = found[i] - nominal[i] if best < np.inf else 0.0
         moves = moves or b[U(at + i)] != 0.0
     rigid_pose(r, n, w, found, 0, wanted + 12)
-    _motion(r, wanted, found, n, moves)
+    motion(r[wanted : wanted + 12], r[wanted + 12 : wanted + 24], moves, found[n:])
     return best, steps
 
 
 @njit(**JIT)
-def correct_rows(b, nominal, mass, cog, wrench, found, residual, steps):  # type: ignore[no-untyped-def]
-    """``correct`` row after row: nominal (N, n), found (N, n + 6), residual (N,), steps (N,).
+def correct_rows(b, nominal, mass, cog, wrench, out):  # type: ignore[no-untyped-def]
+    """``correct`` row after row: nominal (N, n), ``out`` found (N, n + 6), residual, steps (N,).
 
     Each from no offset: rows near singularities have little to do with the one before.
     """
     n = nominal.shape[1]
+    found, residual, steps = out
     c, size = sizes_of(n)
     at = c + size + (RECORD + 6) * n + FLANGE
     for r in range(nominal.shape[0]):
@@ -203,23 +206,29 @@ def correct_rows(b, nominal, mass, cog, wrench, found, residual, steps):  # type
         )
 
 
-@njit(**FAST)
-def _motion(r, wanted, found, n, moves):  # type: ignore[no-untyped-def]
-    """Write the motion (6,) from the wanted pose to the reached one behind it; nothing for none."""
-    x = y = z = trace = 0.0
-    u, v = wanted + 15, wanted + 3  # reached and wanted rotation
+@njit(**JIT)
+def motion(wanted, pose, moves, out):  # type: ignore[no-untyped-def]
+    """Write the motion (6,) from the wanted pose (12,) to another; nothing where nothing moves."""
     for k in range(3):
-        found[U(n + k)] = r[U(wanted + 12 + k)] - r[U(wanted + k)] if moves else 0.0
-        x += r[U(u + 6 + k)] * r[U(v + 3 + k)] - r[U(u + 3 + k)] * r[U(v + 6 + k)]
-        y += r[U(u + k)] * r[U(v + 6 + k)] - r[U(u + 6 + k)] * r[U(v + k)]
-        z += r[U(u + 3 + k)] * r[U(v + k)] - r[U(u + k)] * r[U(v + 3 + k)]
-        trace += r[U(u + k)] * r[U(v + k)] + r[U(u + 3 + k)] * r[U(v + 3 + k)]
-        trace += r[U(u + 6 + k)] * r[U(v + 6 + k)]
+        out[k] = pose[k] - wanted[k] if moves else 0.0
+        out[3 + k] = 0.0
+    if moves:
+        _turned(pose[3:], wanted[3:], out)
+
+
+@njit(**INNER)
+def _turned(A, B, out):  # type: ignore[no-untyped-def]
+    """Write the rotation vector of A B^T (9 each, by rows) behind a shift; accurate at zero."""
+    x = y = z = trace = 0.0
+    for k in range(3):
+        x += A[6 + k] * B[3 + k] - A[3 + k] * B[6 + k]
+        y += A[k] * B[6 + k] - A[6 + k] * B[k]
+        z += A[3 + k] * B[k] - A[k] * B[3 + k]
+        trace += A[k] * B[k] + A[3 + k] * B[3 + k] + A[6 + k] * B[6 + k]
     twice_sine = np.sqrt(x * x + y * y + z * z)
+    # offsets are small: half turns, where the sine alone says nothing, do not occur
     scale = np.arctan2(twice_sine, trace - 1.0) / twice_sine if twice_sine > 1e-12 else 0.5
-    if not moves:
-        scale = 0.0
-    found[U(n + 3)], found[U(n + 4)], found[U(n + 5)] = scale * x, scale * y, scale * z
+    out[3], out[4], out[5] = scale * x, scale * y, scale * z
 
 
 @njit(**JIT)

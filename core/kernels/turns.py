@@ -12,8 +12,7 @@ from gapbridge.core.kernels.reference import JIT
 def rotation_vectors(R, vectors):  # type: ignore[no-untyped-def]
     """Write the rotation vectors (N, 3), angle in [0, pi], of matrices (N, 3, 3).
 
-    By the quaternion's largest component, as ``core.rotation.rotation_vector`` does: accurate at 0
-    and at pi.
+    By the quaternion's largest component: accurate at 0 and at pi.
     """
     squares, quaternion = np.empty(4), np.empty(4)
     for r in range(R.shape[0]):

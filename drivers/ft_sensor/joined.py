@@ -24,8 +24,7 @@ from gapbridge.core.state import RobotState, Setpoint
 from gapbridge.drivers.controller_facts import ControllerFacts, Difference
 from gapbridge.drivers.driver import Driver
 from gapbridge.drivers.ft_sensor import make_sensor
-from gapbridge.drivers.ft_sensor.clock_offset import ClockOffset
-from gapbridge.drivers.ft_sensor.sensor import ForceTorqueSensor, Reading
+from gapbridge.drivers.ft_sensor.sensor import ClockOffset, ForceTorqueSensor, Reading
 from gapbridge.drivers.ft_sensor.settings import FtSensorSettings, SensorFrame
 
 KEPT = 64  # samples: enough to look up what was sampled when an arm's state was

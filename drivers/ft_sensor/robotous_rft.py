@@ -15,8 +15,7 @@ import numpy as np
 
 from gapbridge.core.errors import LinkError
 from gapbridge.drivers.can_bus.bus import close_bus, first_line, open_bus
-from gapbridge.drivers.ft_sensor.clock_offset import ClockOffset
-from gapbridge.drivers.ft_sensor.sensor import ForceTorqueSensor, Reading
+from gapbridge.drivers.ft_sensor.sensor import ClockOffset, ForceTorqueSensor, Reading
 from gapbridge.drivers.ft_sensor.settings import RobotousSettings
 
 START, STOP = 0x0B, 0x0C

@@ -4,21 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from gapbridge.bridge.document import blocks
 from gapbridge.bridge.document.axes import Chart, named, scale
-from gapbridge.bridge.document.blocks import (
-    Badge,
-    Bar,
-    Block,
-    Bullets,
-    Cell,
-    Heading,
-    Named,
-    Paragraph,
-    Pictures,
-    Strong,
-    Table,
-    Verdict,
-)
 from gapbridge.bridge.document.drawing import AFTER, LIMIT, PALE, Drawing
 from gapbridge.bridge.fleet.diagnosis_summary import Diagnosed, Onset, Recurrence
 from gapbridge.bridge.fleet.runner import Done
@@ -41,11 +28,11 @@ NAMED = 4  # drifting arms in the answer
 DRAWN = 14  # effects in the picture
 
 
-def answer(together: Diagnosed, done: Done) -> list[Block]:
+def answer(together: Diagnosed, done: Done) -> list[blocks.Block]:
     """Return verdicts, what recurs, drifts and stands out in a few sentences, and what to do."""
     usable = sum(o.state == DONE for o in done.outcomes)
     first, *rest = (
-        Badge(f"{VERDICTS[verdict]}: {count}", KINDS[verdict])
+        blocks.Badge(f"{VERDICTS[verdict]}: {count}", KINDS[verdict])
         for verdict, count in together.verdicts
     )
     sentences = [
@@ -56,8 +43,8 @@ def answer(together: Diagnosed, done: Done) -> list[Block]:
     ]
     text = " ".join(s for s in sentences if s)
     return [
-        Verdict(first, text, tuple(rest)), Heading("What to do now"),
-        Bullets(tuple(_next_steps(together, done, usable))),
+        blocks.Verdict(first, text, tuple(rest)), blocks.Heading("What to do now"),
+        blocks.Bullets(tuple(_next_steps(together, done, usable))),
     ]  # fmt: skip
 
 
@@ -110,31 +97,31 @@ def _skipped(done: Done, usable: int) -> str:
     return f"{counted(left, 'session')} could not be used." if left else ""
 
 
-def recurring(together: Diagnosed) -> list[Block]:
+def recurring(together: Diagnosed) -> list[blocks.Block]:
     """Return the effects with how often they recur."""
     if not together.recurrences:
-        return [Paragraph("No effect is accused in any session.")]
+        return [blocks.Paragraph("No effect is accused in any session.")]
     caption = (
         "Share of the sessions, and of the arms, in which the effect is accused, of those whose "
         "logs could show it."
     )
     heads = ("effect", "sessions", "arms", "always in", "joints (sessions)", "takes off the gap")
     return [
-        Pictures((_picture(together.recurrences[:DRAWN]),), caption),
-        Table(heads, [_row(r) for r in together.recurrences]),
+        blocks.Pictures((_picture(together.recurrences[:DRAWN]),), caption),
+        blocks.Table(heads, [_row(r) for r in together.recurrences]),
     ]
 
 
-def _row(one: Recurrence) -> list[Cell]:
+def _row(one: Recurrence) -> list[blocks.Cell]:
     joints = [f"{j} ({n})" for j, n in one.joints[:JOINTS]]
     tied = f", {one.tied} tied" if one.tied else ""
     return [
-        Named(effect_title(one.effect), code=f"{one.effect}, {one.channel}"),
-        Bar(one.sessions / one.looked, f"{one.sessions} of {one.looked}{tied}"),
-        Bar(one.arms / one.arms_looked, f"{one.arms} of {one.arms_looked}"),
+        blocks.Named(effect_title(one.effect), code=f"{one.effect}, {one.channel}"),
+        blocks.Bar(one.sessions / one.looked, f"{one.sessions} of {one.looked}{tied}"),
+        blocks.Bar(one.arms / one.arms_looked, f"{one.arms} of {one.arms_looked}"),
         counted(one.always, "arm"),
         ", ".join(joints) + (" …" if len(one.joints) > JOINTS else "") or "–",
-        Bar(one.shrink, percent(one.shrink), LIMIT),
+        blocks.Bar(one.shrink, percent(one.shrink), LIMIT),
     ]
 
 
@@ -155,20 +142,20 @@ def _picture(found: Sequence[Recurrence]) -> Drawing:
     return chart.drawing
 
 
-def onsets(found: Sequence[Onset]) -> list[Block]:
+def onsets(found: Sequence[Onset]) -> list[blocks.Block]:
     """Return the effects that arms have from some session on."""
     if not found:
         return []
-    rows: list[list[Cell]] = [
-        [Strong(o.arm), effect_title(o.effect), o.since.removeprefix(f"{o.arm}/"),
+    rows: list[list[blocks.Cell]] = [
+        [blocks.Strong(o.arm), effect_title(o.effect), o.since.removeprefix(f"{o.arm}/"),
          f"{counted(o.before, 'session')} without, {o.after} with"]
         for o in found
     ]  # fmt: skip
     heads = ("arm", "effect", "since session", "")
-    return [Heading("Effects that set in"), Table(heads, rows)]
+    return [blocks.Heading("Effects that set in"), blocks.Table(heads, rows)]
 
 
-def session_cells(outcome: Outcome) -> list[Cell]:
+def session_cells(outcome: Outcome) -> list[blocks.Cell]:
     """Return a session's cells in the table of sessions, of its first channel."""
     result = outcome.result
     channel = result["channels"][0]
@@ -177,7 +164,7 @@ def session_cells(outcome: Outcome) -> list[Cell]:
         f"{effect_title(e)}{', ' + joint_list(j) if j else ''}" for e, j in sorted(causes)
     ]
     return [
-        Badge(VERDICTS[result["verdict"]], KINDS[result["verdict"]]),
+        blocks.Badge(VERDICTS[result["verdict"]], KINDS[result["verdict"]]),
         str(channel["samples"]), with_unit(channel["gap_rms"], channel["unit"]),
         with_unit(channel["remaining_rms"], channel["unit"]), "; ".join(named_causes) or "–",
     ]  # fmt: skip

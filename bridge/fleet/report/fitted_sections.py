@@ -6,18 +6,8 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from gapbridge.bridge.document import blocks
 from gapbridge.bridge.document.axes import Chart, named, scale
-from gapbridge.bridge.document.blocks import (
-    Bar,
-    Block,
-    Bullets,
-    Cell,
-    Gallery,
-    Heading,
-    Paragraph,
-    Strong,
-    Table,
-)
 from gapbridge.bridge.document.drawing import AFTER, BEFORE, EDGE, PALE, Drawing
 from gapbridge.bridge.fleet.fit_summary import Fitted, FittedArm, FittedSession, FittedType
 from gapbridge.bridge.fleet.report.shared_sections import MOST, type_title
@@ -34,10 +24,10 @@ NEXT_STEPS = (
 )
 
 
-def answer(together: Fitted) -> list[Block]:
+def answer(together: Fitted) -> list[blocks.Block]:
     """Return what the fit does to the gap, how alike the arms are, and what to do."""
-    leads = [Paragraph(_lead(kind), "lead") for kind in together.types]
-    return [*leads, Heading("What to do now"), Bullets(NEXT_STEPS)]
+    leads = [blocks.Paragraph(_lead(kind), "lead") for kind in together.types]
+    return [*leads, blocks.Heading("What to do now"), blocks.Bullets(NEXT_STEPS)]
 
 
 def _lead(kind: FittedType) -> str:
@@ -61,21 +51,21 @@ def _lead(kind: FittedType) -> str:
     )
 
 
-def _type_heading(together: Fitted, kind: FittedType) -> list[Block]:
-    return [Heading(type_title(kind.name))] if len(together.types) > 1 else []
+def _type_heading(together: Fitted, kind: FittedType) -> list[blocks.Block]:
+    return [blocks.Heading(type_title(kind.name))] if len(together.types) > 1 else []
 
 
-def types(together: Fitted) -> list[Block]:
+def types(together: Fitted) -> list[blocks.Block]:
     """Return a table of each type's flexibilities."""
-    blocks: list[Block] = []
+    content: list[blocks.Block] = []
     heads = ("flexibility", "of the type", "arms scatter by", "sessions scatter by")
     for kind in together.types:
         rows = [_parameter(kind, j) for j in range(len(kind.parameters))]
-        blocks += [*_type_heading(together, kind), Table(heads, rows)]
-    return blocks
+        content += [*_type_heading(together, kind), blocks.Table(heads, rows)]
+    return content
 
 
-def _parameter(kind: FittedType, j: int) -> list[Cell]:
+def _parameter(kind: FittedType, j: int) -> list[blocks.Cell]:
     scatter = kind.scatter
     if not scatter.shown[j]:
         return [parameter_title(kind.parameters[j]), "not identifiable from any session", "–", "–"]
@@ -85,28 +75,28 @@ def _parameter(kind: FittedType, j: int) -> list[Cell]:
     repeated = scatter.sessions > scatter.arms
     return [
         parameter_title(kind.parameters[j]), f"{number(mean)} ± {number(std, 2)} µrad/Nm",
-        Bar(share[0], percent(share[0])),
-        Bar(share[1], percent(share[1]), EDGE) if repeated else "–",
+        blocks.Bar(share[0], percent(share[0])),
+        blocks.Bar(share[1], percent(share[1]), EDGE) if repeated else "–",
     ]  # fmt: skip
 
 
-def arms(together: Fitted) -> list[Block]:
+def arms(together: Fitted) -> list[blocks.Block]:
     """Return a picture and a table of each type's arms."""
-    blocks: list[Block] = [Paragraph(
+    content: list[blocks.Block] = [blocks.Paragraph(
         "“Own” says how much of an arm's value comes from its own data; the rest is borrowed from "
         "the other arms of its type.", "note",
     )]  # fmt: skip
     heads = ("arm", "sessions", "poses", "own", "farthest from the type")
     for kind in together.types:
-        blocks += [*_type_heading(together, kind), _pictures(kind)]
-        blocks.append(Table(heads, [_arm(kind, arm) for arm in kind.arms[:MOST]]))
+        content += [*_type_heading(together, kind), _pictures(kind)]
+        content.append(blocks.Table(heads, [_arm(kind, arm) for arm in kind.arms[:MOST]]))
         if len(kind.arms) > MOST:
             more = f"{len(kind.arms) - MOST} more are in results.parquet."
-            blocks.append(Paragraph(more, "note"))
-    return blocks
+            content.append(blocks.Paragraph(more, "note"))
+    return content
 
 
-def _arm(kind: FittedType, arm: FittedArm) -> list[Cell]:
+def _arm(kind: FittedType, arm: FittedArm) -> list[blocks.Cell]:
     shown = np.flatnonzero(kind.scatter.shown)
     own = float(np.mean(arm.fit.own[shown])) if len(shown) else 0.0
     far = "–"
@@ -115,8 +105,8 @@ def _arm(kind: FittedType, arm: FittedArm) -> list[Cell]:
         more = arm.fit.flexibility[j] / max(kind.scatter.mean[j], 1e-12) - 1
         far = (f"{parameter_title(kind.parameters[j])}: "
                f"{percent(abs(float(more)))} {'more' if more > 0 else 'less'}")  # fmt: skip
-    return [Strong(arm.name), str(len(arm.sessions)), str(arm.poses),
-            Bar(own, percent(own)), far]  # fmt: skip
+    return [blocks.Strong(arm.name), str(len(arm.sessions)), str(arm.poses),
+            blocks.Bar(own, percent(own)), far]  # fmt: skip
 
 
 def _drawn(kind: FittedType) -> Sequence[FittedArm]:
@@ -134,13 +124,13 @@ def _which(drawn: Sequence[FittedArm], kind: FittedType) -> str:
     return f"The {len(drawn)} arms farthest from their type, of {len(kind.arms)}: each one's"
 
 
-def _pictures(kind: FittedType) -> Gallery:
+def _pictures(kind: FittedType) -> blocks.Gallery:
     """Return each arm's flexibilities with their intervals; the menu says which."""
     drawn = _drawn(kind)
     own = np.mean([arm.fit.own for arm in kind.arms], axis=0)
     order = sorted(range(len(kind.parameters)), key=lambda j: (not kind.scatter.shown[j], -own[j]))
     titles = tuple(parameter_title(kind.parameters[j]) for j in order)
-    return Gallery(
+    return blocks.Gallery(
         (("Show", titles),), tuple(_picture(kind, drawn, j) for j in order),
         f"{_which(drawn, kind)} flexibility with its 95 % interval; the dashed line is the type.",
     )  # fmt: skip
@@ -164,13 +154,13 @@ def _picture(kind: FittedType, drawn: Sequence[FittedArm], j: int) -> Drawing:
     return chart.drawing
 
 
-def session_cells(together: Fitted) -> Callable[[Outcome], Sequence[Cell]]:
+def session_cells(together: Fitted) -> Callable[[Outcome], Sequence[blocks.Cell]]:
     """Return the function that gives a session's cells in the table of sessions."""
     fits: dict[str, FittedSession] = {
         s.outcome.session: s for kind in together.types for arm in kind.arms for s in arm.sessions
     }
 
-    def cells(outcome: Outcome) -> Sequence[Cell]:
+    def cells(outcome: Outcome) -> Sequence[blocks.Cell]:
         one = fits[outcome.session]
         gaps = (one.gap_before, one.gap_after, one.gap_held_out)
         poses = str(outcome.result["evidence"]["poses"])

@@ -6,18 +6,8 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from gapbridge.bridge.document import blocks
 from gapbridge.bridge.document.axes import Chart, scale
-from gapbridge.bridge.document.blocks import (
-    BAD,
-    Badge,
-    Block,
-    Cell,
-    Heading,
-    Paragraph,
-    Pictures,
-    Strong,
-    Table,
-)
 from gapbridge.bridge.document.drawing import AFTER, BAD_DOT, BEFORE, LIMIT, SOFT, VIOLET, Drawing
 from gapbridge.bridge.fleet.drift import ChannelFigure, Drift, Outlier, Quantity
 from gapbridge.bridge.fleet.runner import STATES, Done
@@ -42,21 +32,21 @@ def type_title(name: str) -> str:
     return f"Arms of DH rows ({rest})" if kind == "dh" and rest else name
 
 
-def drifts(found: Sequence[Drift]) -> list[Block]:
+def drifts(found: Sequence[Drift]) -> list[blocks.Block]:
     """Return the table of what drifts, and a picture of the surest."""
     if not found:
-        return [Paragraph("Nothing drifts by more than sessions scatter anyway.")]
-    rows: list[list[Cell]] = [
+        return [blocks.Paragraph("Nothing drifts by more than sessions scatter anyway.")]
+    rows: list[list[blocks.Cell]] = [
         [
-            Strong(d.arm), quantity_title(d.quantity),
+            blocks.Strong(d.arm), quantity_title(d.quantity),
             f"{with_unit(d.slope, d.unit)} a {d.per}", f"± {with_unit(d.std, d.unit)}",
             f"{with_unit(d.change, d.unit)} over {len(d.at)} sessions", _by_chance(d.p_value),
         ]
         for d in found[:MOST]
     ]  # fmt: skip
     heads = ("arm", "what", "changes by", "1 sigma", "in all", "by chance")
-    picture = Pictures((_drawn(found[:DRAWN]),), "The surest drifts.")
-    return [Table(heads, rows), *_rest(len(found)), picture]
+    picture = blocks.Pictures((_drawn(found[:DRAWN]),), "The surest drifts.")
+    return [blocks.Table(heads, rows), *_rest(len(found)), picture]
 
 
 def _by_chance(p_value: float) -> str:
@@ -90,39 +80,41 @@ def _drawn(found: Sequence[Drift]) -> Drawing:
     return chart.drawing
 
 
-def outliers(found: Sequence[Outlier]) -> list[Block]:
+def outliers(found: Sequence[Outlier]) -> list[blocks.Block]:
     """Return the table of what stands out."""
     if not found:
-        return [Paragraph("No arm and no session is far from the others.")]
-    rows: list[list[Cell]] = [
+        return [blocks.Paragraph("No arm and no session is far from the others.")]
+    rows: list[list[blocks.Cell]] = [
         [
-            Strong(o.arm), _short(o.session, o.arm) or "all", quantity_title(o.quantity),
+            blocks.Strong(o.arm), _short(o.session, o.arm) or "all", quantity_title(o.quantity),
             with_unit(o.value, o.unit), with_unit(o.usual, o.unit), f"{abs(o.deviations):.1f}",
         ]
         for o in found[:MOST]
     ]  # fmt: skip
     heads = ("arm", "session", "what", "found", "usual", "deviations away")
-    return [Table(heads, rows, numbers=(3, 4, 5)), *_rest(len(found))]
+    return [blocks.Table(heads, rows, numbers=(3, 4, 5)), *_rest(len(found))]
 
 
 def sessions(
-    done: Done, heads: Sequence[str], cells: Callable[[Outcome], Sequence[Cell]]
-) -> list[Block]:
+    done: Done, heads: Sequence[str], cells: Callable[[Outcome], Sequence[blocks.Cell]]
+) -> list[blocks.Block]:
     """Return the sessions that were skipped, with the reason, and a table of the others."""
     bad = [o for o in done.outcomes if o.state != DONE]
     good = [o for o in done.outcomes if o.state == DONE]
-    blocks: list[Block] = []
+    shown: list[blocks.Block] = []
     if bad:
-        rows = [[*_names(o), Badge(STATES[o.state], BAD), o.error] for o in bad[:MOST]]
-        skipped = Table(("arm", "session", "state", "why"), rows, (1, 1, 1, 4))
-        blocks += [Heading(f"Skipped ({len(bad)})"), skipped, *_rest(len(bad))]
-        blocks.append(Heading(f"Used ({len(good)})"))
+        rows = [
+            [*_names(o), blocks.Badge(STATES[o.state], blocks.BAD), o.error] for o in bad[:MOST]
+        ]
+        skipped = blocks.Table(("arm", "session", "state", "why"), rows, (1, 1, 1, 4))
+        shown += [blocks.Heading(f"Skipped ({len(bad)})"), skipped, *_rest(len(bad))]
+        shown.append(blocks.Heading(f"Used ({len(good)})"))
     used = [[*_names(o), *cells(o)] for o in good[:MOST]]
-    return [*blocks, Table(("arm", "session", *heads), used), *_rest(len(good))]
+    return [*shown, blocks.Table(("arm", "session", *heads), used), *_rest(len(good))]
 
 
-def _names(outcome: Outcome) -> tuple[Cell, Cell]:
-    return Strong(outcome.arm), _short(outcome.session, outcome.arm)
+def _names(outcome: Outcome) -> tuple[blocks.Cell, blocks.Cell]:
+    return blocks.Strong(outcome.arm), _short(outcome.session, outcome.arm)
 
 
 def _short(session: str, arm: str) -> str:
@@ -130,8 +122,8 @@ def _short(session: str, arm: str) -> str:
     return session.removeprefix(f"{arm}/")
 
 
-def _rest(count: int) -> list[Block]:
+def _rest(count: int) -> list[blocks.Block]:
     if count <= MOST:
         return []
     more = f"{count - MOST} more are in results.parquet and sessions.parquet."
-    return [Paragraph(more, "note")]
+    return [blocks.Paragraph(more, "note")]

@@ -74,7 +74,7 @@ def on_every_row(
     state = SelectionState(
         placed, model.arm, candidates, noise, np.ones(len(placed.rows), dtype=bool)
     )
-    state.kept = inliers(state, placed.measured - placed.predict(terms))
+    state = replace(state, kept=inliers(state, placed.measured - placed.predict(terms)))
     columns = [exact_columns(placed, c, terms) for c in candidates]
     space, unprojected = sample_space(state, columns, terms, [])
     links = {p: selection.prior[c] for p, c in enumerate(selection.term_index)
@@ -82,7 +82,7 @@ def on_every_row(
     near = links_of(space, links).beside(space, links) if links else space
     found = fit(near, tuple(p for p in accused if p not in links))
     remainder = None if judgement.remainder is None else _scatter(placed, state.kept)
-    fitted, index, spread, residual = refit(state, space, found, links, remainder)
+    state, fitted, index, spread, residual = refit(state, space, found, links, remainder)
     values, covariance = list(selection.terms), list(selection.covariance)
     for c, term, own in zip(index, fitted, spread, strict=True):
         values[c], covariance[c] = term, own

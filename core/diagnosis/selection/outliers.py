@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -30,7 +32,9 @@ from gapbridge.core.estimation.robust import (
 STARTING, STEPS = 4, 8  # of the fit that looks for outliers
 
 
-def mark_outliers(state: SelectionState, explained_by: list[tuple[Candidate, Array]]) -> None:
+def mark_outliers(
+    state: SelectionState, explained_by: list[tuple[Candidate, Array]]
+) -> SelectionState:
     """Mark outliers before anything is searched: by a fit that can explain nearly anything."""
     observation = state.observation
     gap = observation.measured - observation.predict(())
@@ -54,13 +58,14 @@ def mark_outliers(state: SelectionState, explained_by: list[tuple[Candidate, Arr
         inverse = np.linalg.pinv(G + np.diag(prior**2), rcond=1e-14, hermitian=True)
         r = gap - A @ (inverse @ (M.T @ rhs))
         used = float(np.trace(inverse @ G))
-        state.kept = _keep(state, r)
+        state = replace(state, kept=_keep(state, r))
         if step in (2, 5, STEPS - 1):
-            state.noise = estimate_noise(observation, r, state.kept, 1 - used / (N * k))
+            noise = estimate_noise(observation, r, state.kept, 1 - used / (N * k))
+            state = replace(state, noise=noise)
         white = whitened(state, r)
         distance = distance_of(white, scale_of(white))
         weight = start_weights_of(distance) if step < STARTING else weights_of(distance)
-    state.kept = _keep(state, r)
+    return replace(state, kept=_keep(state, r))
 
 
 def inliers(state: SelectionState, residual: Array) -> NDArray[np.bool_]:
@@ -102,15 +107,14 @@ def readmit_explained_outliers(
     base: tuple[Term, ...],
     smooth: list[tuple[Candidate, Array]],
     known: tuple[SampleSpace, UnprojectedRows, CandidateFit],
-) -> tuple[SampleSpace, UnprojectedRows, CandidateFit]:
+) -> tuple[SelectionState, SampleSpace, UnprojectedRows, CandidateFit]:
     """Take outliers back in where one local or smooth function makes them ordinary.
 
     A chipped tooth or a knocked instrument looks like a few outliers; bad luck has no place.
     """
-    kept, found = state.kept, known[-1]
-    state.kept = np.ones_like(kept)
-    space, unprojected = sample_space(state, columns, base, smooth)
-    outliers = np.flatnonzero(~kept)
+    found, outliers = known[-1], np.flatnonzero(~state.kept)
+    whole = replace(state, kept=np.ones_like(state.kept))
+    space, unprojected = sample_space(whole, columns, base, smooth)
     for _, c in joining(space, found.chosen, 12):
         if space.candidates[c].named:
             continue
@@ -123,9 +127,8 @@ def readmit_explained_outliers(
         A = np.hstack([unprojected.nuisance, unprojected.columns(space, trial.chosen)])
         d = int(space.start[c + 1] - space.start[c])
         if _predicted_without_it(A, unprojected.target, outliers, k, d):
-            return space, unprojected, trial
-    state.kept = kept
-    return known
+            return whole, space, unprojected, trial
+    return state, *known
 
 
 def _predicted_without_it(
@@ -148,10 +151,10 @@ def _predicted_without_it(
     return True
 
 
-def revise_noise_and_outliers(state: SelectionState, residual: Array, free: float) -> bool:
-    """Judge noise and outliers by the best explanation; returns whether those changed."""
+def revise_noise_and_outliers(
+    state: SelectionState, residual: Array, free: float
+) -> SelectionState:
+    """Return the state with noise and outliers judged by the best explanation."""
     kept = _keep(state, residual)
-    changed = bool((kept != state.kept).any())
-    state.kept = kept
-    state.noise = estimate_noise(state.observation, residual, kept, free)
-    return changed
+    noise = estimate_noise(state.observation, residual, kept, free)
+    return replace(state, kept=kept, noise=noise)

@@ -52,11 +52,13 @@ class Remainder:
 
 
 def refit(
-    state: SelectionState, space: SampleSpace, found: CandidateFit,
+    state: SelectionState,
+    space: SampleSpace,
+    found: CandidateFit,
     links: Mapping[int, Array] = NO_PRIOR,
     remainder: Remainder | None = None,
-) -> tuple[tuple[Term, ...], tuple[int, ...], tuple[Array, ...], Array]:  # fmt: skip
-    """Refit the named terms exactly, smooth ones kept linear; moves the frame along.
+) -> tuple[SelectionState, tuple[Term, ...], tuple[int, ...], tuple[Array, ...], Array]:
+    """Refit the named terms exactly, smooth ones kept linear; the state's frame moves along.
 
     ``links`` are further candidates, with 1 sigma of each number: these are kept near nominal.
     Beside a ``remainder`` covariances are those of regions left out in turn (jackknife), where
@@ -103,9 +105,8 @@ def refit(
         if observation.rebase is not None:
             moved_terms = tuple(freed[c].term(v) for c, v in zip(index, x, strict=True))
             left = observation.measured - observation.predict(moved_terms)
-            state.observation = observation.rebased(
-                _along(extra, nuisance, left, state), moved_terms
-            )
+            moved_frame = observation.rebased(_along(extra, nuisance, left, state), moved_terms)
+            state = replace(state, observation=moved_frame)
         if moved < 1e-6:
             break
     residual_ss = float(np.sum((b - A @ step) ** 2))
@@ -121,7 +122,7 @@ def refit(
     nuisance = state.observation.nuisance
     if nuisance.shape[2]:
         gap = gap - nuisance @ _along(extra, flat(nuisance, state), gap, state)
-    return terms, index, tuple(covariance), gap
+    return state, terms, index, tuple(covariance), gap
 
 
 def _standing(

@@ -206,7 +206,7 @@ class Selection:
         near = links_of(space, sigma).beside(space, block)
         found = pruned(near, fit(near, chosen))
         state = SelectionState(self.observation, arm, [], self.noise, self.kept)
-        terms, index, covariance, residual = refit(state, space, found, sigma)
+        state, terms, index, covariance, residual = refit(state, space, found, sigma)
         return replace(
             self, observation=state.observation, prior=sigma, found=found, terms=terms,
             term_index=index, covariance=covariance, residual=residual,
@@ -249,40 +249,40 @@ def select(
         if progress:
             progress(f"{observation.channel}: round {turn + 1}")
         named = _named_candidates(observation, model, withheld, base)
-        state.candidates = [c for c in named if (c.family, c.site) not in none]
+        open_to = [c for c in named if (c.family, c.site) not in none]
+        state = replace(state, candidates=open_to)
         # the last round's are as large as the new ones: not both at a time
         space, near, columns = None, None, []
-        columns = [exact_columns(state.observation, c, base) for c in state.candidates]
+        columns = [exact_columns(state.observation, c, base) for c in open_to]
         if turn == 0:  # the rows after a late slip stand out unless it is among what may be there
             steps = step_candidates(state, columns, base, withheld)
-            mark_outliers(state, [*zip(state.candidates, columns, strict=True), *steps])
-        smooth = _beyond_loads(offered, state.candidates, columns, base)
+            state = mark_outliers(state, [*zip(open_to, columns, strict=True), *steps])
+        smooth = _beyond_loads(offered, open_to, columns, base)
         stepping = step_candidates(state, columns, base, withheld)
-        state.candidates += [candidate for candidate, _ in stepping]
+        state = replace(state, candidates=[*open_to, *(candidate for candidate, _ in stepping)])
         columns += [own for _, own in stepping]
         space, unprojected = sample_space(state, columns, base, smooth)
         inside = [locate(state.candidates, t)[0] for t in base]
         best = one_delay(space, screened_search(space, base=inside))
         if turn > 0 and not state.kept.all():
-            space, unprojected, best = readmit_explained_outliers(
+            state, space, unprojected, best = readmit_explained_outliers(
                 state, columns, base, smooth, (space, unprojected, best)
             )
         near, best, links = with_links(space, best, inside)
-        counted, whitened_by = state.kept.copy(), state.noise
+        counted, whitened_by = state.kept, state.noise
         exact = _exactly(near, best, state)
-        terms, index, covariance, residual = refit(state, space, exact, links)
+        state, terms, index, covariance, residual = refit(state, space, exact, links)
         straight = with_straight_stiffness(space, best.chosen, index, terms, covariance)
         if straight is not None:
             best = pruned(near, fit(near, straight))
-            terms, index, covariance, residual = refit(state, space, best, links)
+            state, terms, index, covariance, residual = refit(state, space, best, links)
         same = terms_alike(terms, base) and turn > 0
         found = best
         used = sum(len(v) for v in best.values) + (links_of(space, links).used if links else 0)
         free = 1 - used / space.freedom
-        changed = revise_noise_and_outliers(
-            state, _without_smooth_part(state, space, best, smooth, residual), free
-        )
-        settled = same and not changed
+        left = _without_smooth_part(state, space, best, smooth, residual)
+        state = revise_noise_and_outliers(state, left, free)
+        settled = same and bool((state.kept == counted).all())
         # beside an unnamed function a value is not yet what it comes to without; but what shows
         # nothing by itself (the scale of a torque that is not there) keeps the place of what does
         named_only = all(space.candidates[c].named for c in best.chosen)
@@ -296,14 +296,14 @@ def select(
             break
     assert space is not None and near is not None and found is not None
     if len(space.y) >= LARGE_SAMPLE and any(not space.candidates[c].named for c in found.chosen):
-        state.kept, state.noise = counted.copy(), whitened_by
+        state = replace(state, kept=counted, noise=whitened_by)
         alone, found = _named_alone(near, found, observation)
-        terms, index, covariance, residual = refit(state, space, alone, links)
+        state, terms, index, covariance, residual = refit(state, space, alone, links)
         while (weakest := _weakest(space, terms, index, covariance, links, NOTHING)) is not None:
             alone, found = (
                 fit(near, [c for c in own.chosen if c != index[weakest]]) for own in (alone, found)
             )
-            terms, index, covariance, residual = refit(state, space, alone, links)
+            state, terms, index, covariance, residual = refit(state, space, alone, links)
     return Selection(
         state.observation, space, found, terms, index, covariance, counted, whitened_by,
         residual, base, unprojected, links,
@@ -452,7 +452,7 @@ def refitted_alone(
     state = SelectionState(selection.observation, arm, [], selection.noise, selection.kept)
     space = selection.working if links else selection.space
     alone = fit(space, [c for c in chosen if c not in links])
-    fitted, index, spread, residual = refit(state, selection.space, alone, links, remainder)
+    state, fitted, index, spread, residual = refit(state, selection.space, alone, links, remainder)
     terms, covariance = list(selection.terms), list(selection.covariance)
     for c, term, own in zip(index, fitted, spread, strict=True):
         position = selection.term_index.index(c)

@@ -24,9 +24,9 @@ from gapbridge.core.effects import CATALOGUE, Term
 DEAD = 1e-7  # share of a column that the nuisance leaves: below, nothing is left
 
 
-@dataclass
+@dataclass(frozen=True)
 class SelectionState:
-    """What a selection works on; candidates, noise and kept samples change from round to round."""
+    """What a selection works on; each round goes on with another."""
 
     observation: Observation
     arm: Arm

@@ -6,7 +6,7 @@ import contextlib
 import threading
 import time
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import canopen
 from canopen.network import MessageListener
@@ -17,10 +17,9 @@ from gapbridge.drivers.canopen.profile import CanopenProfile, read_profile
 from gapbridge.drivers.canopen.settings import CanopenSettings
 from gapbridge.drivers.simulated.can.hub import Hub
 from gapbridge.drivers.simulated.canopen.drive import COMMUNICATION, Drive, Units
-from gapbridge.drivers.simulated.canopen.faults import bench_commands
 from gapbridge.drivers.simulated.canopen.machine import Phase
 from gapbridge.drivers.simulated.server.arm_controller import ArmController
-from gapbridge.drivers.simulated.server.bench import Command
+from gapbridge.drivers.simulated.server.bench import BenchError, Command
 from gapbridge.drivers.simulated.server.protocol_server import ProtocolServer
 
 SYNC = 0x80
@@ -28,6 +27,32 @@ HEARTBEAT = 0x700
 BLOCKED, EMERGENCY, FOLLOWING_ERROR, HEARTBEAT_ERROR = 0x7121, 0x5441, 0x8611, 0x8130
 OFF_BY = 0.05  # rad that a TPDO of a SYNC before is off: who takes it for a new one is found out
 PAUSE = 0.02  # s
+
+
+class Faulty(Protocol):
+    """The drives as these commands need them."""
+
+    profile: CanopenProfile
+
+    def silence(self, node: int) -> None:
+        """Have a node send nothing."""
+        ...
+
+    def speak(self) -> None:
+        """Have all nodes send again."""
+        ...
+
+    def restart(self, node: int) -> None:
+        """Have a node start anew."""
+        ...
+
+    def fail(self, node: int, code: int) -> None:
+        """Have a drive fail."""
+        ...
+
+    def hold_back(self, node: int, delay: float, count: int = 1) -> None:
+        """Have TPDOs of a node come late."""
+        ...
 
 
 class HeldPdo(NamedTuple):
@@ -332,3 +357,41 @@ def make_servers(
 ) -> list[ProtocolServer]:
     """Return the drives of an arm, not yet on a bus. Raises InputError where they do not fit."""
     return [CanopenServer(link, host, controller)]
+
+
+def bench_commands(drives: Faulty) -> Mapping[str, Command]:
+    """Return the commands by name."""
+    nodes = drives.profile.nodes
+
+    def node_of(number: float) -> int:
+        if number not in nodes:
+            raise BenchError(f"found node {number:g}, expected one of {nodes}")
+        return int(number)
+
+    def silence(numbers: list[float]) -> str:
+        drives.silence(node_of(numbers[0]))
+        return "ok"
+
+    def speak(numbers: list[float]) -> str:
+        drives.speak()
+        return "ok"
+
+    def restart(numbers: list[float]) -> str:
+        drives.restart(node_of(numbers[0]))
+        return "ok"
+
+    def fail(numbers: list[float]) -> str:
+        drives.fail(node_of(numbers[0]), int(numbers[1]) & 0xFFFF)
+        return "ok"
+
+    def late(numbers: list[float]) -> str:
+        drives.hold_back(node_of(numbers[0]), max(numbers[1], 0.0))
+        return "ok"
+
+    return {
+        "silence": (1, silence, "NODE: this drive sends nothing any more"),
+        "speak": (0, speak, "all drives send again"),
+        "restart": (1, restart, "NODE: this drive starts anew"),
+        "fail": (2, fail, "NODE CODE: this drive goes to FAULT with an error code"),
+        "late": (2, late, "NODE SECONDS: its next TPDOs come so late"),
+    }

@@ -10,8 +10,7 @@ import can
 import numpy as np
 
 from gapbridge.drivers.can_bus.bus import BusSettings, close_bus, open_bus
-from gapbridge.drivers.simulated.ft_sensor.mounting import Reaction
-from gapbridge.drivers.simulated.ft_sensor.node import SimulatedSensor
+from gapbridge.drivers.simulated.ft_sensor.node import Reaction, SimulatedSensor
 
 RANGE = np.array((600.0, 600.0, 600.0, 60.0, 60.0, 60.0))  # N, Nm at about full gauges
 FULL = 30000.0  # gauge counts

@@ -17,8 +17,7 @@ from pymodbus.server import ModbusSerialServer
 from pymodbus.simulator import DataType, SimData, SimDevice
 
 from gapbridge.core.errors import LinkError
-from gapbridge.drivers.simulated.ft_sensor.mounting import Reaction
-from gapbridge.drivers.simulated.ft_sensor.node import SimulatedSensor
+from gapbridge.drivers.simulated.ft_sensor.node import Reaction, SimulatedSensor
 
 REGISTERS, STREAM_REGISTER, STREAM = 180, 410, 0x0200
 PERIOD = 0.01  # s

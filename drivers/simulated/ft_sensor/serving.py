@@ -19,8 +19,7 @@ from gapbridge.drivers.ft_sensor.settings import (
 from gapbridge.drivers.simulated.can.hub import Hub
 from gapbridge.drivers.simulated.ft_sensor.ati_node import AtiNode, RobotousNode
 from gapbridge.drivers.simulated.ft_sensor.ft300_device import Ft300Device
-from gapbridge.drivers.simulated.ft_sensor.mounting import Reaction, reaction_at
-from gapbridge.drivers.simulated.ft_sensor.node import SimulatedSensor
+from gapbridge.drivers.simulated.ft_sensor.node import Reaction, SimulatedSensor, reaction_at
 
 RETRY = 0.1  # s between two tries at a bus that somebody else serves
 BETWEEN_PROCESSES = ("socketcand", "socketcan")

@@ -16,7 +16,7 @@ from functools import partial
 from gapbridge.core.errors import LinkError
 from gapbridge.drivers.simulated.server.bench import BenchServer
 from gapbridge.drivers.simulated.server.connection import Connection, listen
-from gapbridge.drivers.simulated.server.real_time import become_punctual
+from gapbridge.drivers.simulated.server.protocol_server import become_punctual
 from gapbridge.drivers.simulated.ur.controller import CYCLE, Controller
 from gapbridge.drivers.simulated.ur.programs.script_programs import move_own
 from gapbridge.drivers.simulated.ur.servers.dashboard_server import DashboardServer

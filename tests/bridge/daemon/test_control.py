@@ -35,12 +35,6 @@ def runtime(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.fixture
-def robot(tmp_path: Path) -> Iterator[Robot]:
-    with Robot(tmp_path) as found:
-        yield found
-
-
-@pytest.fixture
 def served(tmp_path: Path) -> Iterator[tuple[Path, list[tuple[str, Peer]]]]:
     asked: list[tuple[str, Peer]] = []
 

@@ -6,7 +6,6 @@ import os
 import signal
 import socket
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -16,18 +15,9 @@ from daemon_cell import Robot, Run, offsets, wait_for
 from gapbridge.bridge.daemon.status_document import lines
 from gapbridge.bridge.loop.supervisor import State
 
+pytestmark = pytest.mark.usefixtures("runtime")
+
 PATIENT = ", state_timeout: 0.2"
-
-
-@pytest.fixture(autouse=True)
-def runtime(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-
-
-@pytest.fixture
-def robot(tmp_path: Path) -> Iterator[Robot]:
-    with Robot(tmp_path) as found:
-        yield found
 
 
 @pytest.mark.slow

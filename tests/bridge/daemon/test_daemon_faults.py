@@ -19,12 +19,6 @@ from gapbridge.bridge.loop.supervisor import State
 from gapbridge.core.errors import CellError, InputError, LinkError
 
 
-@pytest.fixture
-def robot(tmp_path: Path) -> Iterator[Robot]:
-    with Robot(tmp_path) as found:
-        yield found
-
-
 def assert_came_back_observing(run: Run, robot: Robot) -> None:
     """The last words for every fault: observing again, and not a setpoint since."""
     run.wait(State.OBSERVING)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import socket
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -18,12 +17,6 @@ from gapbridge.bridge.loop.supervisor import State
 from gapbridge.bridge.recording.export import export
 from gapbridge.core.log.log import read_log
 from gapbridge.core.log.mcap_reading import read_configuration
-
-
-@pytest.fixture
-def robot(tmp_path: Path) -> Iterator[Robot]:
-    with Robot(tmp_path) as found:
-        yield found
 
 
 def wanted_position(robot: Robot, cell: Path) -> np.ndarray:

@@ -7,7 +7,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -21,16 +20,7 @@ from gapbridge.bridge.loop.supervisor import State
 from gapbridge.core.errors import InputError
 from gapbridge.drivers.controller_address import address_of
 
-
-@pytest.fixture(autouse=True)
-def runtime(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-
-
-@pytest.fixture
-def robot(tmp_path: Path) -> Iterator[Robot]:
-    with Robot(tmp_path) as found:
-        yield found
+pytestmark = pytest.mark.usefixtures("runtime")
 
 
 CELL = Path("cell.yaml")

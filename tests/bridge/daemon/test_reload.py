@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,18 +11,9 @@ from daemon_cell import Robot, Run, offsets, wait_for
 
 from gapbridge.bridge.loop.supervisor import State
 
+pytestmark = pytest.mark.usefixtures("runtime")
+
 PATIENT = ", state_timeout: 0.25"
-
-
-@pytest.fixture(autouse=True)
-def runtime(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-
-
-@pytest.fixture
-def robot(tmp_path: Path) -> Iterator[Robot]:
-    with Robot(tmp_path) as found:
-        yield found
 
 
 def configured(run: Run) -> dict[str, Any]:

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import pytest
 
-from gapbridge.bridge.loop import realtime
+from gapbridge.bridge.loop import main as realtime
 
 ASK = """\
 import sys
-from gapbridge.bridge.loop import realtime
+from gapbridge.bridge.loop import main as realtime
 realtime.LATENCY, realtime.IDLE_DRIVER = sys.argv[1:3]
 print(", ".join(realtime.become_realtime(float(sys.argv[3]))))
 """
@@ -67,7 +67,7 @@ def test_the_kernel_takes_the_request(driver: Path) -> None:
 
 ORDER = """\
 import gc, os
-from gapbridge.bridge.loop import realtime
+from gapbridge.bridge.loop import main as realtime
 def noted(pid, policy, parameters):
     name = "FIFO" if policy == os.SCHED_FIFO else "ordinary"
     print(name, parameters.sched_priority, "collecting" if gc.isenabled() else "collected")

@@ -14,7 +14,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from watched_feed import RATE, Feed
 
 from gapbridge.bridge.loop.supervisor import State
-from gapbridge.bridge.metrics.counts import Buckets
+from gapbridge.bridge.metrics.main import Buckets
 
 
 @pytest.fixture(scope="module")

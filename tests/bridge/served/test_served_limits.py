@@ -12,7 +12,7 @@ import pytest
 from gapbridge.bridge.served.protocol import GuardedProtocol
 from gapbridge.bridge.served.server import listen, serve
 from gapbridge.bridge.served.settings import ServedSettings
-from gapbridge.bridge.web.stream import WAITING, Stream
+from gapbridge.bridge.web.main import WAITING, Stream
 from gapbridge.core.errors import LinkError
 
 

@@ -10,15 +10,8 @@ import pytest
 from benchmarks.blind.arms import ARMS
 from benchmarks.blind.ingredients import backlash
 from benchmarks.blind.measuring import Instrument
+from benchmarks.calibration import laid_out
 from benchmarks.calibration.drawings import model_of, real_arm
-from benchmarks.calibration.laid_out import (
-    Layout,
-    arm_with,
-    draw_values,
-    instrument_for,
-    lay_out,
-    readings_of,
-)
 from gapbridge.core.calibration.fit import fit_session, judged
 from gapbridge.core.calibration.identifiability import identifiable_parameters
 from gapbridge.core.calibration.observables import make_observable
@@ -31,7 +24,7 @@ from gapbridge.core.model import Model
 from gapbridge.core.notes import Note, Reason
 
 KIND = ARMS["cobot10"]
-LAYOUT = Layout(poses=18, held_out=12, repeated=6)
+LAYOUT = laid_out.Layout(poses=18, held_out=12, repeated=6)
 METROLOGY = Metrology(registered=False, sigma=LAYOUT.sigma)
 
 
@@ -53,10 +46,13 @@ def _session(
     parameters: Parameters, seed: int, *, exact: bool = False
 ) -> tuple[Readings, dict[str, float], Instrument]:
     rng = np.random.default_rng(seed)
-    truth = draw_values(KIND, parameters.names, rng)
-    laid, instrument = lay_out(KIND, LAYOUT, rng), instrument_for(KIND, LAYOUT, rng)
-    real = arm_with(KIND, truth)
-    return readings_of(real, laid, instrument, None if exact else rng), truth, instrument
+    truth = laid_out.draw_values(KIND, parameters.names, rng)
+    laid, instrument = (
+        laid_out.lay_out(KIND, LAYOUT, rng),
+        laid_out.instrument_for(KIND, LAYOUT, rng),
+    )
+    real = laid_out.arm_with(KIND, truth)
+    return laid_out.readings_of(real, laid, instrument, None if exact else rng), truth, instrument
 
 
 @pytest.fixture(scope="module")
@@ -169,10 +165,15 @@ def test_outlier_readings_are_listed_and_change_little(
 def test_flexibilities_stay_at_zero_or_above(model: Model, parameters: Parameters) -> None:
     rng = np.random.default_rng(5)
     truth = {
-        n: v for n, v in draw_values(KIND, parameters.names, rng).items() if "compliance" not in n
+        n: v
+        for n, v in laid_out.draw_values(KIND, parameters.names, rng).items()
+        if "compliance" not in n
     }
-    laid, instrument = lay_out(KIND, LAYOUT, rng), instrument_for(KIND, LAYOUT, rng)
-    readings = readings_of(arm_with(KIND, truth), laid, instrument, rng)
+    laid, instrument = (
+        laid_out.lay_out(KIND, LAYOUT, rng),
+        laid_out.instrument_for(KIND, LAYOUT, rng),
+    )
+    readings = laid_out.readings_of(laid_out.arm_with(KIND, truth), laid, instrument, rng)
     stiff = judged(model, fit_session(readings, parameters, METROLOGY), diagnose=False)
     soft = [e for e in stiff.estimates if "compliance" in e.name]
     assert all(e.value >= 0 for e in soft)
@@ -185,12 +186,15 @@ def test_a_load_that_was_wrongly_declared_leaves_differences_at_odds_or_shows_he
     model: Model, parameters: Parameters
 ) -> None:
     rng = np.random.default_rng(6)
-    truth = draw_values(KIND, parameters.names, rng)
-    laid, instrument = lay_out(KIND, LAYOUT, rng), instrument_for(KIND, LAYOUT, rng)
-    real = arm_with(KIND, truth)
+    truth = laid_out.draw_values(KIND, parameters.names, rng)
+    laid, instrument = (
+        laid_out.lay_out(KIND, LAYOUT, rng),
+        laid_out.instrument_for(KIND, LAYOUT, rng),
+    )
+    real = laid_out.arm_with(KIND, truth)
     heavy = laid.load == 2
     session = replace(laid.session, payload_mass=laid.session.payload_mass * np.where(heavy, 0, 1))
-    readings = readings_of(real, replace(laid, session=session), instrument, rng)
+    readings = laid_out.readings_of(real, replace(laid, session=session), instrument, rng)
     declared = replace(readings.loads, payload_mass=laid.session.payload_mass)
     wrong = judged(
         model, fit_session(replace(readings, loads=declared), parameters, METROLOGY), diagnose=False
@@ -202,12 +206,15 @@ def test_what_is_left_to_be_added_is_named_and_then_completes_it(
     model: Model, parameters: Parameters
 ) -> None:
     rng = np.random.default_rng(7)
-    truth = draw_values(KIND, parameters.names, rng)
-    laid, instrument = lay_out(KIND, LAYOUT, rng), instrument_for(KIND, LAYOUT, rng)
+    truth = laid_out.draw_values(KIND, parameters.names, rng)
+    laid, instrument = (
+        laid_out.lay_out(KIND, LAYOUT, rng),
+        laid_out.instrument_for(KIND, LAYOUT, rng),
+    )
     approach = rng.choice([-1.0, 1.0], laid.session.q.shape)
     came = replace(laid.session, approach=approach, from_where=laid.session.q - 0.05 * approach)
-    real = backlash(3, 8e-4).apply(arm_with(KIND, truth))
-    readings = readings_of(real, replace(laid, session=came), instrument, rng)
+    real = backlash(3, 8e-4).apply(laid_out.arm_with(KIND, truth))
+    readings = laid_out.readings_of(real, replace(laid, session=came), instrument, rng)
     readings = replace(readings, loads=replace(readings.loads, approach=approach))
     found = judged(model, fit_session(readings, parameters, METROLOGY), diagnose=False)
     assert not found.complete

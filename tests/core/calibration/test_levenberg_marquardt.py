@@ -9,15 +9,8 @@ import pytest
 
 from benchmarks.blind.arms import ARMS
 from benchmarks.blind.mechanics import RealArm
+from benchmarks.calibration import laid_out
 from benchmarks.calibration.drawings import model_of, real_arm
-from benchmarks.calibration.laid_out import (
-    Layout,
-    draw_values,
-    instrument_for,
-    lay_out,
-    readings_of,
-    with_values,
-)
 from gapbridge.core.calibration.fit import fit_session, judged
 from gapbridge.core.calibration.identifiability import identifiable_parameters
 from gapbridge.core.calibration.observables import make_observable
@@ -29,7 +22,7 @@ from gapbridge.core.metrology import Metrology
 from gapbridge.core.model import Model
 
 KIND = ARMS["cobot5"]
-LAYOUT = Layout(poses=18, held_out=10, repeated=3)
+LAYOUT = laid_out.Layout(poses=18, held_out=10, repeated=3)
 SEED = 6  # undamped steps converged 15 deviations away from it
 POSITION = make_observable("position")
 
@@ -53,11 +46,14 @@ def _session(parameters: Parameters, extra: float) -> Readings:
     """Return readings under loads that are heavier than declared by ``extra`` kg."""
     rng = np.random.default_rng(SEED)
     names = [n for n in parameters.names if n != "payload"]
-    real = with_values(_drawn(), draw_values(KIND, names, rng))
-    laid, instrument = lay_out(KIND, LAYOUT, rng), instrument_for(KIND, LAYOUT, rng)
+    real = laid_out.with_values(_drawn(), laid_out.draw_values(KIND, names, rng))
+    laid, instrument = (
+        laid_out.lay_out(KIND, LAYOUT, rng),
+        laid_out.instrument_for(KIND, LAYOUT, rng),
+    )
     mass = laid.session.payload_mass
     heavy = replace(laid.session, payload_mass=mass + extra)
-    readings = readings_of(real, replace(laid, session=heavy), instrument, rng)
+    readings = laid_out.readings_of(real, replace(laid, session=heavy), instrument, rng)
     return replace(readings, loads=replace(readings.loads, payload_mass=mass))
 
 

@@ -8,15 +8,8 @@ import numpy as np
 import pytest
 
 from benchmarks.blind.arms import ARMS
+from benchmarks.calibration import laid_out
 from benchmarks.calibration.drawings import model_of, real_arm
-from benchmarks.calibration.laid_out import (
-    Layout,
-    arm_with,
-    draw_values,
-    instrument_for,
-    lay_out,
-    readings_of,
-)
 from gapbridge.core.calibration.fit import fit_session
 from gapbridge.core.calibration.identifiability import identifiable_parameters
 from gapbridge.core.calibration.observables import make_observable
@@ -34,13 +27,16 @@ def session(
     poses: int, seed: int, effects: tuple[str, ...] = EFFECTS
 ) -> tuple[Readings, Parameters]:
     """Return a small session of an arm that has nothing but what is fitted."""
-    layout = Layout(poses=poses, held_out=8, repeated=0)
+    layout = laid_out.Layout(poses=poses, held_out=8, repeated=0)
     model = model_of(real_arm(KIND))
     parameters = identifiable_parameters(model, effects, observable=make_observable("position"))
     rng = np.random.default_rng(seed)
-    truth = draw_values(KIND, parameters.names, rng)
-    laid, instrument = lay_out(KIND, layout, rng), instrument_for(KIND, layout, rng)
-    return readings_of(arm_with(KIND, truth), laid, instrument, rng), parameters
+    truth = laid_out.draw_values(KIND, parameters.names, rng)
+    laid, instrument = (
+        laid_out.lay_out(KIND, layout, rng),
+        laid_out.instrument_for(KIND, layout, rng),
+    )
+    return laid_out.readings_of(laid_out.arm_with(KIND, truth), laid, instrument, rng), parameters
 
 
 @pytest.mark.slow

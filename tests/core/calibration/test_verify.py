@@ -12,16 +12,8 @@ import pytest
 from benchmarks.blind.arms import ARMS
 from benchmarks.blind.measuring import Instrument
 from benchmarks.blind.mechanics import RealArm
+from benchmarks.calibration import laid_out
 from benchmarks.calibration.drawings import model_of, real_arm
-from benchmarks.calibration.laid_out import (
-    Layout,
-    arm_with,
-    draw_values,
-    instrument_for,
-    lay_out,
-    readings_of,
-    with_values,
-)
 from gapbridge.bridge.calibration.format import verdict_text
 from gapbridge.core.calibration.accuracy_baseline import baseline_in, document_of
 from gapbridge.core.calibration.fit import fit_session, judged
@@ -35,7 +27,7 @@ from gapbridge.core.errors import ExcitationError, InputError
 from gapbridge.core.metrology import Metrology
 
 KIND = ARMS["cobot10"]
-LAYOUT = Layout(poses=18, held_out=12, repeated=3)
+LAYOUT = laid_out.Layout(poses=18, held_out=12, repeated=3)
 METROLOGY = Metrology(registered=False, sigma=LAYOUT.sigma)
 Calibrated = tuple[Calibration, dict[str, Any], RealArm, Instrument]
 
@@ -45,9 +37,9 @@ def calibrated() -> Calibrated:
     rng = np.random.default_rng(1)
     model = model_of(real_arm(KIND))
     parameters = identifiable_parameters(model, observable=make_observable("position"))
-    real = arm_with(KIND, draw_values(KIND, parameters.names, rng))
-    instrument = instrument_for(KIND, LAYOUT, rng)
-    readings = readings_of(real, lay_out(KIND, LAYOUT, rng), instrument, rng)
+    real = laid_out.arm_with(KIND, laid_out.draw_values(KIND, parameters.names, rng))
+    instrument = laid_out.instrument_for(KIND, LAYOUT, rng)
+    readings = laid_out.readings_of(real, laid_out.lay_out(KIND, LAYOUT, rng), instrument, rng)
     found = judged(model, fit_session(readings, parameters, METROLOGY), diagnose=False)
     document = json.loads(json.dumps(document_of(found, METROLOGY.sigma)))
     return found, document, real, instrument
@@ -56,9 +48,9 @@ def calibrated() -> Calibrated:
 def _again(real: RealArm, instrument: Instrument, seed: int = 0, poses: int = 4) -> Readings:
     """Return readings of a later day: new poses, the instrument elsewhere."""
     rng = np.random.default_rng([seed, 9])
-    laid = lay_out(KIND, Layout(poses=poses, repeated=0, held_out=0), rng)
+    laid = laid_out.lay_out(KIND, laid_out.Layout(poses=poses, repeated=0, held_out=0), rng)
     elsewhere = replace(instrument, position=rng.uniform(-2, 2, 3))
-    return readings_of(real, laid, elsewhere, rng)
+    return laid_out.readings_of(real, laid, elsewhere, rng)
 
 
 def test_an_arm_that_did_not_change_holds(calibrated: Calibrated) -> None:
@@ -73,7 +65,7 @@ def test_an_arm_that_did_not_change_holds(calibrated: Calibrated) -> None:
 
 def test_a_joint_whose_zero_moved_is_named_with_how_far(calibrated: Calibrated) -> None:
     found, document, real, instrument = calibrated
-    bumped = with_values(real, {"joint_offset_3": 4e-4})
+    bumped = laid_out.with_values(real, {"joint_offset_3": 4e-4})
     seen = verify(found.model, _again(bumped, instrument), document, METROLOGY)
     assert not seen.holds
     assert seen.moved is not None
@@ -86,7 +78,7 @@ def test_a_joint_whose_zero_moved_is_named_with_how_far(calibrated: Calibrated) 
 @pytest.mark.parametrize("size", [0.01, 0.05])
 def test_a_zero_that_moved_far_is_named_all_the_same(calibrated: Calibrated, size: float) -> None:
     found, document, real, instrument = calibrated
-    slipped = with_values(real, {"joint_offset_5": size})
+    slipped = laid_out.with_values(real, {"joint_offset_5": size})
     seen = verify(found.model, _again(slipped, instrument, poses=8), document, METROLOGY)
     assert seen.moved is not None
     assert seen.moved.name == "joint_offset_5"
@@ -102,7 +94,7 @@ def test_a_zero_that_the_calibration_left_open_may_be_off_by_as_much(
     covariance = baseline.covariance.copy()
     at = baseline.names.index("joint_offset_3")
     covariance[at, at] += 4e-4**2
-    readings = _again(with_values(real, {"joint_offset_3": 4e-4}), instrument)
+    readings = _again(laid_out.with_values(real, {"joint_offset_3": 4e-4}), instrument)
     stated = verify(found.model, readings, baseline, METROLOGY)
     vague = verify(found.model, readings, replace(baseline, covariance=covariance), METROLOGY)
     assert vague.holds and not stated.holds
@@ -111,7 +103,7 @@ def test_a_zero_that_the_calibration_left_open_may_be_off_by_as_much(
 
 def test_a_tool_that_was_deflected_is_named(calibrated: Calibrated) -> None:
     found, document, real, instrument = calibrated
-    deflected = with_values(real, {"tool_frame_x": 4e-4, "tool_frame_z": -2e-4})
+    deflected = laid_out.with_values(real, {"tool_frame_x": 4e-4, "tool_frame_z": -2e-4})
     seen = verify(found.model, _again(deflected, instrument), document, METROLOGY)
     assert seen.moved is not None
     assert seen.moved.name == "tool_frame"
@@ -131,7 +123,9 @@ def test_one_bad_reading_is_not_blamed_on_the_arm(calibrated: Calibrated) -> Non
 def test_what_no_single_change_explains_asks_for_a_new_calibration(calibrated: Calibrated) -> None:
     found, document, real, instrument = calibrated
     rng = np.random.default_rng(3)
-    other = with_values(real, {f"joint_offset_{j}": 1e-3 * rng.normal() for j in range(2, 6)})
+    other = laid_out.with_values(
+        real, {f"joint_offset_{j}": 1e-3 * rng.normal() for j in range(2, 6)}
+    )
     seen = verify(found.model, _again(other, instrument, poses=6), document, METROLOGY)
     assert not seen.holds
     assert seen.moved is None
@@ -140,10 +134,12 @@ def test_what_no_single_change_explains_asks_for_a_new_calibration(calibrated: C
 
 def test_a_registered_instrument_that_was_knocked_is_named(calibrated: Calibrated) -> None:
     found, document, real, instrument = calibrated
-    laid = lay_out(KIND, Layout(poses=4, repeated=0, held_out=0), np.random.default_rng(4))
+    laid = laid_out.lay_out(
+        KIND, laid_out.Layout(poses=4, repeated=0, held_out=0), np.random.default_rng(4)
+    )
     place = found.stations[0]
     here = replace(instrument, rotation=place.rotation, position=place.position)
-    readings = readings_of(real, laid, here, np.random.default_rng(5))
+    readings = laid_out.readings_of(real, laid, here, np.random.default_rng(5))
     in_base = replace(readings, value=place.in_base(readings.value))
     in_base = replace(in_base, value=in_base.value + np.array([2e-3, 0, 1e-3]))
     seen = verify(found.model, in_base, document, Metrology(True, LAYOUT.sigma))

@@ -14,8 +14,7 @@ from gapbridge.core.arm import builtin_arm
 from gapbridge.core.errors import ExcitationError, LogError
 from gapbridge.core.estimation import streamed
 from gapbridge.core.estimation.identification import data_of, identify_compliance
-from gapbridge.core.estimation.row_store import RowStore
-from gapbridge.core.estimation.streamed import identify_streamed
+from gapbridge.core.estimation.streamed import RowStore, identify_streamed
 from gapbridge.core.estimation.streamed_fit import stretches
 from gapbridge.core.log.log import Log, read_log
 from gapbridge.core.log.pieces import LogPieces

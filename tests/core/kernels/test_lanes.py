@@ -89,7 +89,7 @@ def test_the_factor_without_stored_rows_is_that_of_the_stored_ones(width):
     rng = np.random.default_rng(1)
     gap, cells = rng.normal(0, 1e-3, (COUNT, width)), rng.uniform(0.1, 3, (COUNT, width))
     R = np.zeros((13, 13))
-    assert factor_blocks(chain, rows, gap, cells, 0, 0, COUNT, R) == -1
+    assert factor_blocks(chain, rows, gap, cells, 0, COUNT, R) == -1
     A = plain.solve(chain, rows).regressor[:, :width]
     stored = np.concatenate([A, gap[..., None]], axis=2) * cells[..., None]
     stored = stored.reshape(-1, 13)

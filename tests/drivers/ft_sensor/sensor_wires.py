@@ -20,8 +20,7 @@ from gapbridge.drivers.ft_sensor.sensor import ForceTorqueSensor, Reading
 from gapbridge.drivers.ft_sensor.settings import AnyFtSensor, FtSensorSettings
 from gapbridge.drivers.simulated.ft_sensor.ati_node import AtiNode, RobotousNode
 from gapbridge.drivers.simulated.ft_sensor.ft300_device import Ft300Device
-from gapbridge.drivers.simulated.ft_sensor.mounting import reaction_at
-from gapbridge.drivers.simulated.ft_sensor.node import SimulatedSensor
+from gapbridge.drivers.simulated.ft_sensor.node import SimulatedSensor, reaction_at
 from gapbridge.drivers.simulated.plant.plant_arm import plant_arm
 from gapbridge.drivers.simulated.plant.plant_settings import draw_plant_settings
 from gapbridge.drivers.simulated.server.arm_controller import ArmController, make_controller

@@ -4,20 +4,8 @@ from __future__ import annotations
 
 from gapbridge.bridge.calibration.report.figures import degrees, estimate_texts
 from gapbridge.bridge.calibration.report.material import Material
+from gapbridge.bridge.document import blocks
 from gapbridge.bridge.document.axes import plain
-from gapbridge.bridge.document.blocks import (
-    DOUBTFUL,
-    GOOD,
-    QUIET,
-    Badge,
-    Block,
-    Bullets,
-    Cell,
-    Heading,
-    Paragraph,
-    Table,
-    Verdict,
-)
 from gapbridge.bridge.document.findings import finding_text
 from gapbridge.bridge.document.notes import note_text
 from gapbridge.bridge.report.answer import one_line, sentences
@@ -39,7 +27,7 @@ from gapbridge.core.diagnosis.diagnosis import Diagnosis
 SHOWN = 8  # measurements proposed
 
 
-def parameters(material: Material) -> list[Block]:
+def parameters(material: Material) -> list[blocks.Block]:
     """Return the table and what the readings do not determine."""
     c = material.calibration
     shown = [e for e in c.estimates if e.shown]
@@ -47,33 +35,33 @@ def parameters(material: Material) -> list[Block]:
     named = {note.values[0] for note in c.combinations}
     hidden = [e.name for e in c.estimates if not e.shown and e.name not in named]
     planned = any(e.expected_std is not None for e in shown)
-    blocks: list[Block] = [estimates_table(shown, planned=planned)]
+    content: list[blocks.Block] = [estimates_table(shown, planned=planned)]
     if any(e.on_bound for e in shown):
         text = "* stands on the bound of what is physically possible."
-        blocks.append(Paragraph(text, "note"))
+        content.append(blocks.Paragraph(text, "note"))
     if c.combinations or hidden:
-        blocks.append(Heading("What these readings cannot determine"))
+        content.append(blocks.Heading("What these readings cannot determine"))
         items = [with_titles(note_text(note)) for note in c.combinations]
         items += [
             f"{parameter_title(name)}: these readings do not show it; it stays near where it stood"
             for name in hidden
         ]
-        blocks.append(Bullets(tuple(items)))
-    return blocks
+        content.append(blocks.Bullets(tuple(items)))
+    return content
 
 
-def estimates_table(shown: list[Estimate], *, planned: bool) -> Table:
+def estimates_table(shown: list[Estimate], *, planned: bool) -> blocks.Table:
     """Return values with intervals; ``planned``: beside what the plan expected."""
     heads: tuple[str, ...]
     if not planned:
         heads = ("parameter", "value", "95 % interval", "1 sigma", "unit")
-        return Table(heads, [_row(e) for e in shown], (3.2, 1, 1.8, 1, 0.9), (1, 2, 3))
+        return blocks.Table(heads, [_row(e) for e in shown], (3.2, 1, 1.8, 1, 0.9), (1, 2, 3))
     heads = ("parameter", "value", "95 % interval", "1 sigma", "1 sigma, as planned", "unit")
     rows = [[*_row(e)[:4], _planned(e), _row(e)[4]] for e in shown]
-    return Table(heads, rows, (3.2, 1, 1.8, 0.9, 1.1, 0.9), (1, 2, 3, 4))
+    return blocks.Table(heads, rows, (3.2, 1, 1.8, 0.9, 1.1, 0.9), (1, 2, 3, 4))
 
 
-def _row(e: Estimate) -> list[Cell]:
+def _row(e: Estimate) -> list[blocks.Cell]:
     value, interval, std, unit = estimate_texts(e)
     return [parameter_title(e.name) + (" *" if e.on_bound else ""), value, interval, std, unit]
 
@@ -85,27 +73,33 @@ def _planned(e: Estimate) -> str:
     return fixed(e.expected_std * factor, decimals_of(e.std * factor))
 
 
-def residual(material: Material) -> list[Block]:
+def residual(material: Material) -> list[blocks.Block]:
     """Return the verdict, what was found, and what would settle it."""
     c = material.calibration
     if c.diagnosis is None:
         text = "These readings do not allow to examine the residual."
-        return [Verdict(Badge("Not examined", QUIET), text)]
-    badge = Badge("Complete", GOOD) if c.complete else Badge("Not complete", DOUBTFUL)
+        return [blocks.Verdict(blocks.Badge("Not examined", blocks.QUIET), text)]
+    badge = (
+        blocks.Badge("Complete", blocks.GOOD)
+        if c.complete
+        else blocks.Badge("Not complete", blocks.DOUBTFUL)
+    )
     main = chosen_channel(c.diagnosis)
-    blocks: list[Block] = [Verdict(badge, sentence(note_text(c.remaining)))]
+    content: list[blocks.Block] = [blocks.Verdict(badge, sentence(note_text(c.remaining)))]
     if not c.missing_effects and (c.complete or c.diagnosis.verdict != "no_gap"):
-        blocks.append(Paragraph(" ".join(sentences(main))))
+        content.append(blocks.Paragraph(" ".join(sentences(main))))
     others = [ch for ch in c.diagnosis.channels if ch is not main]
-    blocks += [Paragraph(f"{CHANNELS[ch.channel]}: {one_line(ch)}") for ch in others]
+    content += [blocks.Paragraph(f"{CHANNELS[ch.channel]}: {one_line(ch)}") for ch in others]
     if c.diagnosis.findings:
-        blocks.append(
-            Bullets(tuple(sentence(finding_text(f, rows=False)) for f in c.diagnosis.findings))
+        content.append(
+            blocks.Bullets(
+                tuple(sentence(finding_text(f, rows=False)) for f in c.diagnosis.findings)
+            )
         )
-    return [*blocks, *([] if c.complete else _next(c.diagnosis))]
+    return [*content, *([] if c.complete else _next(c.diagnosis))]
 
 
-def _next(diagnosis: Diagnosis) -> list[Block]:
+def _next(diagnosis: Diagnosis) -> list[blocks.Block]:
     if not diagnosis.next_measurements:
         return []
     rows = [
@@ -114,4 +108,7 @@ def _next(diagnosis: Diagnosis) -> list[Block]:
         for i, m in enumerate(diagnosis.next_measurements[:SHOWN], start=1)
     ]  # fmt: skip
     heads = ("", "joint angles, degrees", "load", "would settle")
-    return [Heading("What to measure next"), Table(heads, rows, (0.3, 2.6, 0.7, 2.4), (2,))]
+    return [
+        blocks.Heading("What to measure next"),
+        blocks.Table(heads, rows, (0.3, 2.6, 0.7, 2.4), (2,)),
+    ]

@@ -9,23 +9,7 @@ import numpy as np
 from gapbridge.bridge.calibration.report.figures import fine, mm
 from gapbridge.bridge.calibration.report.material import Material
 from gapbridge.bridge.cell.settings.calibration import FEWEST_HELD_OUT
-from gapbridge.bridge.document.blocks import (
-    BAD,
-    DOUBTFUL,
-    GOOD,
-    Badge,
-    Bar,
-    Block,
-    Bullets,
-    Cell,
-    Heading,
-    Paragraph,
-    Strong,
-    Table,
-    Tile,
-    Tiles,
-    Verdict,
-)
+from gapbridge.bridge.document import blocks
 from gapbridge.bridge.document.notes import calibration_text
 from gapbridge.bridge.report.labels import (
     listed,
@@ -60,18 +44,23 @@ OUTSIDE = (
 )
 
 
-def summary(material: Material) -> list[Block]:
+def summary(material: Material) -> list[blocks.Block]:
     """Return the verdict and the large figures."""
     c = material.calibration
     before, after = material.judged
-    badge = Badge("Complete", GOOD) if c.complete else Badge("Not complete", DOUBTFUL)
+    badge = (
+        blocks.Badge("Complete", blocks.GOOD)
+        if c.complete
+        else blocks.Badge("Not complete", blocks.DOUBTFUL)
+    )
     if not after.mean < before.mean:
-        badge = Badge("No improvement", BAD)
+        badge = blocks.Badge("No improvement", blocks.BAD)
     tiles = [
-        Tile("mean error before", mm(before.mean), f"at most {mm(before.max)}"),
-        Tile("mean error after", mm(after.mean), f"at most {mm(after.max)}"),
-        Tile("smaller by", _times(before.mean, after.mean), f"over {len(after.norm)} readings"),
-        Tile("expanded uncertainty (k = 2)", f"± {mm(material.budget.expanded)}",
+        blocks.Tile("mean error before", mm(before.mean), f"at most {mm(before.max)}"),
+        blocks.Tile("mean error after", mm(after.mean), f"at most {mm(after.max)}"),
+        blocks.Tile("smaller by", _times(before.mean, after.mean),
+                    f"over {len(after.norm)} readings"),
+        blocks.Tile("expanded uncertainty (k = 2)", f"± {mm(material.budget.expanded)}",
              "of one coordinate of the tool"),
     ]  # fmt: skip
     text = f"Errors are those of {material.judged_on}: {material.error_meaning}."
@@ -89,9 +78,10 @@ def summary(material: Material) -> list[Block]:
         )
     asked = [] if material.session.accuracy is None else [_asked(material)]
     return [
-        Verdict(badge, sentence(calibration_text(c))), *asked,
-        Heading("What to do now"), Bullets(tuple(next_steps(material))), Tiles(tuple(tiles)),
-        Paragraph(text, "note"),
+        blocks.Verdict(badge, sentence(calibration_text(c))), *asked,
+        blocks.Heading("What to do now"), blocks.Bullets(tuple(next_steps(material))),
+        blocks.Tiles(tuple(tiles)),
+        blocks.Paragraph(text, "note"),
     ]  # fmt: skip
 
 
@@ -126,7 +116,7 @@ def next_steps(material: Material) -> list[str]:
     ]
 
 
-def _asked(material: Material) -> Verdict:
+def _asked(material: Material) -> blocks.Verdict:
     """Return whether the accuracy asked for is met: by the farthest pose kept out of the fit."""
     asked = material.session.accuracy or 0.0
     after = material.calibration.held_out_after
@@ -137,31 +127,33 @@ def _asked(material: Material) -> Verdict:
             f"{poses} such poses were measured, expected {FEWEST_HELD_OUT} or more"
             if material.shows_places else "such readings show a part of where the tool is"
         )  # fmt: skip
-        return Verdict(Badge("Not decided", DOUBTFUL), f"{rule} Not decided: {found}.")
+        return blocks.Verdict(
+            blocks.Badge("Not decided", blocks.DOUBTFUL), f"{rule} Not decided: {found}."
+        )
     met = after.max <= asked
-    word = Badge("Pass", GOOD) if met else Badge("Fail", BAD)
+    word = blocks.Badge("Pass", blocks.GOOD) if met else blocks.Badge("Fail", blocks.BAD)
     text = (
         f"{rule} Found: at most {mm(after.max)} over {poses} poses, the instrument's noise in it."
     )
-    return Verdict(word, text)
+    return blocks.Verdict(word, text)
 
 
 def _times(before: float, after: float) -> str:
     return f"{before / after:.1f} times" if after > 0 else "unknown"
 
 
-def uncertainty_budget(material: Material) -> list[Block]:
+def uncertainty_budget(material: Material) -> list[blocks.Block]:
     """Return the result, the budget, its check, what stands behind it and what is not in it."""
     given = material.budget
-    blocks: list[Block] = [Paragraph(_result(given)), _table(given)]
-    blocks.append(Bullets(tuple(f"{INPUTS[i.basis][0]}: {_source(i)}" for i in given.inputs)))
-    blocks.append(Paragraph(_factor(given)))
+    shown: list[blocks.Block] = [blocks.Paragraph(_result(given)), _table(given)]
+    shown.append(blocks.Bullets(tuple(f"{INPUTS[i.basis][0]}: {_source(i)}" for i in given.inputs)))
+    shown.append(blocks.Paragraph(_factor(given)))
     if given.looked_at:
-        blocks += [Heading("Check against the poses kept out of the fit"),
-                   Paragraph(_check(given))]  # fmt: skip
+        shown += [blocks.Heading("Check against the poses kept out of the fit"),
+                   blocks.Paragraph(_check(given))]  # fmt: skip
     if given.parameters is not None:
-        blocks += _behind(given.parameters)
-    return [*blocks, Heading("Not in the budget"), Bullets(OUTSIDE)]
+        shown += _behind(given.parameters)
+    return [*shown, blocks.Heading("Not in the budget"), blocks.Bullets(OUTSIDE)]
 
 
 def _source(i: Input) -> str:
@@ -184,20 +176,21 @@ def _result(given: Budget) -> str:
     )
 
 
-def _table(given: Budget) -> Table:
-    rows: list[list[Cell]] = [_row(i, given.combined) for i in given.inputs]
+def _table(given: Budget) -> blocks.Table:
+    rows: list[list[blocks.Cell]] = [_row(i, given.combined) for i in given.inputs]
     rows.append(
         ["combined standard uncertainty", fine(given.combined), _freedom(given.freedom), ""]
     )
     rows.append(["expanded uncertainty, k\u00a0=\u00a02", fine(given.expanded), "", ""])
     heads = ("input", "standard uncertainty", "degrees of freedom", "share")
-    return Table(heads, rows, (2.5, 1.3, 1.3, 1.5), (1, 2), sums=2)
+    return blocks.Table(heads, rows, (2.5, 1.3, 1.3, 1.5), (1, 2), sums=2)
 
 
-def _row(i: Input, combined: float) -> list[Cell]:
+def _row(i: Input, combined: float) -> list[blocks.Cell]:
     share = (i.std / combined) ** 2 if combined else 0.0
     return [
-        INPUTS[i.basis][0], fine(i.std), _freedom(i.freedom), Bar(share, f"{share * 100:.0f} %")
+        INPUTS[i.basis][0], fine(i.std), _freedom(i.freedom),
+        blocks.Bar(share, f"{share * 100:.0f} %"),
     ]  # fmt: skip
 
 
@@ -232,14 +225,14 @@ def _check(given: Budget) -> str:
     return f"{text}: they agree with the budget."
 
 
-def _behind(given: Sensitivities) -> list[Block]:
-    rows: list[list[Cell]] = [
+def _behind(given: Sensitivities) -> list[blocks.Block]:
+    rows: list[list[blocks.Cell]] = [
         _parameter(s) for s in sorted(given.each, key=lambda s: -s.contribution)
     ]
     size = math.sqrt(abs(given.correlation))
     sign = "+" if given.correlation >= 0 else "−"
     rows.append(["correlations between them", "", "", f"{sign} {fine(size)}"])
-    rows.append([Strong("together"), "", "", fine(given.combined)])
+    rows.append([blocks.Strong("together"), "", "", fine(given.combined)])
     heads = ("parameter", "standard uncertainty", "sensitivity", "contribution")
     note = (
         "Sensitivity is how far the tool moves along an axis, rms over the poses that judge the "
@@ -247,13 +240,13 @@ def _behind(given: Sensitivities) -> list[Block]:
         "correlations take away again; contributions add in squares."
     )
     return [
-        Heading("Behind “parameters of the model”"),
-        Table(heads, rows, (3, 1.6, 1.6, 1.2), (1, 2, 3), sums=2),
-        Paragraph(note, "note"),
+        blocks.Heading("Behind “parameters of the model”"),
+        blocks.Table(heads, rows, (3, 1.6, 1.6, 1.2), (1, 2, 3), sums=2),
+        blocks.Paragraph(note, "note"),
     ]
 
 
-def _parameter(s: Sensitivity) -> list[Cell]:
+def _parameter(s: Sensitivity) -> list[blocks.Cell]:
     unit, factor = unit_of(s.unit)
     coefficient = s.coefficient * 1e3 / factor
     small = coefficient < 1e-3

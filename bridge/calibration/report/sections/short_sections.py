@@ -12,22 +12,8 @@ from gapbridge.bridge.calibration.report.facts import SessionFacts
 from gapbridge.bridge.calibration.report.figures import mm
 from gapbridge.bridge.calibration.report.sections.parameters_section import estimates_table
 from gapbridge.bridge.calibration.report.sections.session_section import facts_blocks
+from gapbridge.bridge.document import blocks
 from gapbridge.bridge.document.axes import Chart, named, scale
-from gapbridge.bridge.document.blocks import (
-    DOUBTFUL,
-    GOOD,
-    Badge,
-    Block,
-    Bullets,
-    Heading,
-    Paragraph,
-    Pictures,
-    Section,
-    Table,
-    Tile,
-    Tiles,
-    Verdict,
-)
 from gapbridge.bridge.document.drawing import AFTER, BAD_DOT, BEFORE, Drawing
 from gapbridge.bridge.document.notes import note_texts, short_text
 from gapbridge.bridge.report.labels import fixed, sentence
@@ -49,14 +35,19 @@ class ShortMaterial(Generic[F]):
 
 
 def _result(
-    found: PayloadCalibration | ToolCalibration, tiles: tuple[Tile, ...], before: str
-) -> list[Block]:
+    found: PayloadCalibration | ToolCalibration, tiles: tuple[blocks.Tile, ...], before: str
+) -> list[blocks.Block]:
     """Return the verdict, what to do, the large figures, and what the cell had."""
-    badge = Badge("Found, see remarks", DOUBTFUL) if found.notes else Badge("Found", GOOD)
+    badge = (
+        blocks.Badge("Found, see remarks", blocks.DOUBTFUL)
+        if found.notes
+        else blocks.Badge("Found", blocks.GOOD)
+    )
     return [
-        Verdict(badge, sentence(short_text(found))),
-        Heading("What to do now"), Bullets(tuple(_next_steps(found))), Tiles(tiles),
-        *([Paragraph(before)] if before else []),
+        blocks.Verdict(badge, sentence(short_text(found))),
+        blocks.Heading("What to do now"), blocks.Bullets(tuple(_next_steps(found))),
+        blocks.Tiles(tiles),
+        *([blocks.Paragraph(before)] if before else []),
     ]  # fmt: skip
 
 
@@ -100,18 +91,18 @@ def _bars(
     return chart
 
 
-def payload_result(material: ShortMaterial[PayloadCalibration]) -> list[Block]:
+def payload_result(material: ShortMaterial[PayloadCalibration]) -> list[blocks.Block]:
     """Return mass, centre of gravity and the sensor's zero."""
     found, nominal = material.found, material.nominal
     mass, *cog = (e for e in found.estimates[:4])
     wide = max((e.interval[1] - e.interval[0]) / 2 for e in cog)
     tiles = (
-        Tile("mass", f"{fixed(mass.value, 3)} kg",
+        blocks.Tile("mass", f"{fixed(mass.value, 3)} kg",
              f"± {fixed((mass.interval[1] - mass.interval[0]) / 2, 3)} kg (95 %)"),
-        Tile("centre of gravity x, y, z, mm", _point(found.cog),
+        blocks.Tile("centre of gravity x, y, z, mm", _point(found.cog),
              f"± {fixed(wide * 1e3, 1)} mm (95 %, the widest)"),
-        Tile("sensor zero of force, N", _point(found.bias[:3], 1.0, 2), "along x, y, z"),
-        Tile("sensor zero of torque, Nm", _point(found.bias[3:], 1.0, 3), "about x, y, z"),
+        blocks.Tile("sensor zero of force, N", _point(found.bias[:3], 1.0, 2), "along x, y, z"),
+        blocks.Tile("sensor zero of torque, Nm", _point(found.bias[3:], 1.0, 3), "about x, y, z"),
     )  # fmt: skip
     before = "" if nominal is None else (
         f"The cell had {fixed(nominal.payload_mass, 3)} kg at "
@@ -120,7 +111,7 @@ def payload_result(material: ShortMaterial[PayloadCalibration]) -> list[Block]:
     return _result(found, tiles, before)
 
 
-def short_facts(material: ShortMaterial[F]) -> list[Block]:
+def short_facts(material: ShortMaterial[F]) -> list[blocks.Block]:
     """Return who, where, when, with what."""
     found = material.found
     what = "orientations" if isinstance(found, PayloadCalibration) else "touches"
@@ -128,12 +119,12 @@ def short_facts(material: ShortMaterial[F]) -> list[Block]:
     return facts_blocks(material.session, counts, 1, note_texts(found.notes))
 
 
-def payload_parameters(material: ShortMaterial[PayloadCalibration]) -> list[Block]:
+def payload_parameters(material: ShortMaterial[PayloadCalibration]) -> list[blocks.Block]:
     """Return all ten numbers."""
     return [estimates_table([e for e in material.found.estimates if e.shown], planned=False)]
 
 
-def payload_residual(material: ShortMaterial[PayloadCalibration]) -> list[Block]:
+def payload_residual(material: ShortMaterial[PayloadCalibration]) -> list[blocks.Block]:
     """Return what the sensor read beyond load and zero, against the noise that was found."""
     found = material.found
     drawings = [
@@ -145,20 +136,20 @@ def payload_residual(material: ShortMaterial[PayloadCalibration]) -> list[Block]
     force, torque = found.noise
     rows = [["force", f"{fixed(force, 3)} N"], ["torque", f"{fixed(torque, 4)} Nm"]]
     caption = "Length of the residual; red: down-weighted as outlier."
-    return [Pictures(tuple(drawings), caption),
-            Table(("noise of one axis, 1 sigma", "found"), rows, (2, 1), (1,))]  # fmt: skip
+    return [blocks.Pictures(tuple(drawings), caption),
+            blocks.Table(("noise of one axis, 1 sigma", "found"), rows, (2, 1), (1,))]  # fmt: skip
 
 
-def tool_result(material: ShortMaterial[ToolCalibration]) -> list[Block]:
+def tool_result(material: ShortMaterial[ToolCalibration]) -> list[blocks.Block]:
     """Return where the tip is."""
     found, nominal = material.found, material.nominal
     wide = max((e.interval[1] - e.interval[0]) / 2 for e in found.estimates)
     tiles = (
-        Tile("tool centre x, y, z, mm", _point(found.tcp, decimals=2),
+        blocks.Tile("tool centre x, y, z, mm", _point(found.tcp, decimals=2),
              f"± {mm(wide)} (95 %, the widest)"),
-        Tile("tips apart before", mm(_rms(found.nominal_residual)), "rms, cell's tool"),
-        Tile("tips apart after", mm(_rms(found.residual)), "rms, tool found"),
-        Tile("noise of one touch", mm(found.noise), "1 sigma of one coordinate"),
+        blocks.Tile("tips apart before", mm(_rms(found.nominal_residual)), "rms, cell's tool"),
+        blocks.Tile("tips apart after", mm(_rms(found.residual)), "rms, tool found"),
+        blocks.Tile("noise of one touch", mm(found.noise), "1 sigma of one coordinate"),
     )  # fmt: skip
     before = "" if nominal is None else (
         f"The cell had the tool at {_point(nominal.chain().tool_position, decimals=2)} mm, in the "
@@ -171,7 +162,7 @@ def _rms(values: Array) -> float:
     return float(np.sqrt(np.mean(np.asarray(values) ** 2)))
 
 
-def tool_parameters(material: ShortMaterial[ToolCalibration]) -> list[Block]:
+def tool_parameters(material: ShortMaterial[ToolCalibration]) -> list[blocks.Block]:
     """Return the tool centre with its intervals, and the touches."""
     found = material.found
     place = f"The fixed place is at {_point(found.point, decimals=2)} mm in the axes of the base."
@@ -180,8 +171,8 @@ def tool_parameters(material: ShortMaterial[ToolCalibration]) -> list[Block]:
         "the one that was found. Red: down-weighted as outlier."
     )
     return [
-        estimates_table(list(found.estimates), planned=False), Paragraph(place),
-        Pictures((_touches(found),), caption),
+        estimates_table(list(found.estimates), planned=False), blocks.Paragraph(place),
+        blocks.Pictures((_touches(found),), caption),
     ]  # fmt: skip
 
 
@@ -192,15 +183,18 @@ def _touches(found: ToolCalibration) -> Drawing:
     return chart.drawing
 
 
-PAYLOAD: tuple[Section[ShortMaterial[PayloadCalibration]], ...] = (
-    Section("result", "Result", payload_result),
-    Section("session", "Session and instrument", short_facts),
-    Section("parameters", "What was found", payload_parameters, "Flange axes; intervals of 95 %."),
-    Section("residual", "The residual", payload_residual,
+PAYLOAD: tuple[blocks.Section[ShortMaterial[PayloadCalibration]], ...] = (
+    blocks.Section("result", "Result", payload_result),
+    blocks.Section("session", "Session and instrument", short_facts),
+    blocks.Section("parameters", "What was found", payload_parameters,
+            "Flange axes; intervals of 95 %."),
+    blocks.Section("residual", "The residual", payload_residual,
             "Reading minus load and sensor zero, orientation by orientation."),
 )  # fmt: skip
-TOOL: tuple[Section[ShortMaterial[ToolCalibration]], ...] = (
-    Section("result", "Result", tool_result),
-    Section("session", "Session and instrument", short_facts),
-    Section("parameters", "What was found", tool_parameters, "Flange axes; intervals of 95 %."),
+TOOL: tuple[blocks.Section[ShortMaterial[ToolCalibration]], ...] = (
+    blocks.Section("result", "Result", tool_result),
+    blocks.Section("session", "Session and instrument", short_facts),
+    blocks.Section(
+        "parameters", "What was found", tool_parameters, "Flange axes; intervals of 95 %."
+    ),
 )

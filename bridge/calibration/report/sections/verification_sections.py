@@ -11,23 +11,8 @@ from gapbridge.bridge.calibration.report.facts import SessionFacts
 from gapbridge.bridge.calibration.report.figures import degrees, mm
 from gapbridge.bridge.calibration.report.sections.parameters_section import estimates_table
 from gapbridge.bridge.calibration.report.sections.session_section import facts_blocks
+from gapbridge.bridge.document import blocks
 from gapbridge.bridge.document.axes import Chart, named, scale
-from gapbridge.bridge.document.blocks import (
-    BAD,
-    GOOD,
-    Badge,
-    Block,
-    Bullets,
-    Cell,
-    Heading,
-    Paragraph,
-    Pictures,
-    Section,
-    Table,
-    Tile,
-    Tiles,
-    Verdict,
-)
 from gapbridge.bridge.document.drawing import AFTER, EDGE, Drawing
 from gapbridge.bridge.document.notes import note_texts
 from gapbridge.bridge.report.labels import (
@@ -63,16 +48,20 @@ class VerificationMaterial:
     readings: Readings | None = None
 
 
-def holds(material: VerificationMaterial) -> list[Block]:
+def holds(material: VerificationMaterial) -> list[blocks.Block]:
     """Return the verdict, the large figures and how it was judged."""
     v = material.verification
-    badge = Badge("Still holds", GOOD) if v.holds else Badge("No longer holds", BAD)
+    badge = (
+        blocks.Badge("Still holds", blocks.GOOD)
+        if v.holds
+        else blocks.Badge("No longer holds", blocks.BAD)
+    )
     predicted = float(np.sqrt(np.mean(v.predicted**2)))
-    tiles = Tiles((
-        Tile("error now, rms", mm(v.errors.rms), f"at most {mm(v.errors.max)}"),
-        Tile("predicted, rms", mm(predicted), "uncertainty, arm and instrument"),
-        Tile("error over prediction", f"{v.ratio:.2f}", "about 1 is as predicted"),
-        Tile("chance", likelihood(v.chance), "of so much, if it still holds"),
+    tiles = blocks.Tiles((
+        blocks.Tile("error now, rms", mm(v.errors.rms), f"at most {mm(v.errors.max)}"),
+        blocks.Tile("predicted, rms", mm(predicted), "uncertainty, arm and instrument"),
+        blocks.Tile("error over prediction", f"{v.ratio:.2f}", "about 1 is as predicted"),
+        blocks.Tile("chance", likelihood(v.chance), "of so much, if it still holds"),
     ))  # fmt: skip
     text = (
         "A few poses were measured again and compared with what the calibration said they "
@@ -81,34 +70,34 @@ def holds(material: VerificationMaterial) -> list[Block]:
     )
     steps = HOLDS if v.holds else BROKEN
     return [
-        Verdict(badge, sentence(verdict_text(v))), Heading("What to do now"), Bullets(steps),
-        tiles, Paragraph(text, "note"),
+        blocks.Verdict(badge, sentence(verdict_text(v))), blocks.Heading("What to do now"),
+        blocks.Bullets(steps), tiles, blocks.Paragraph(text, "note"),
     ]  # fmt: skip
 
 
-def facts(material: VerificationMaterial) -> list[Block]:
+def facts(material: VerificationMaterial) -> list[blocks.Block]:
     """Return the facts."""
     v = material.verification
     counts = [("readings", str(len(v.errors.rows)))]
     return facts_blocks(material.session, counts, len(v.stations), note_texts(v.notes))
 
 
-def poses(material: VerificationMaterial) -> list[Block]:
+def poses(material: VerificationMaterial) -> list[blocks.Block]:
     """Return a picture and a table."""
     v, readings = material.verification, material.readings
-    rows: list[list[Cell]] = []
+    rows: list[list[blocks.Cell]] = []
     for i, row in enumerate(v.errors.rows):
         q = "–" if readings is None else degrees(readings.q[row])
         within = v.errors.norm[i] <= TWICE * v.predicted[i]
         rows.append([
             str(int(row) + 1), q, ",  ".join(fixed(x * 1e3, 3) for x in v.errors.vector[i]),
             mm(float(v.errors.norm[i])), mm(float(v.predicted[i])),
-            Badge("within", GOOD) if within else Badge("beyond", BAD),
+            blocks.Badge("within", blocks.GOOD) if within else blocks.Badge("beyond", blocks.BAD),
         ])  # fmt: skip
     heads = ("no.", "joint angles, degrees", "error along the axes, mm", "error",
              "predicted, 1 sigma", "twice the prediction")  # fmt: skip
-    table = Table(heads, rows, (0.4, 3, 1.9, 0.9, 1, 1), (2, 3, 4))
-    return [Pictures((_picture(v),)), table]
+    table = blocks.Table(heads, rows, (0.4, 3, 1.9, 0.9, 1, 1), (2, 3, 4))
+    return [blocks.Pictures((_picture(v),)), table]
 
 
 def _picture(v: Verification) -> Drawing:
@@ -125,26 +114,28 @@ def _picture(v: Verification) -> Drawing:
     return chart.drawing
 
 
-def moved(material: VerificationMaterial) -> list[Block]:
+def moved(material: VerificationMaterial) -> list[blocks.Block]:
     """Return the suspects; nothing where the calibration holds."""
     v = material.verification
     if v.holds:
         return []
     if v.moved is None:
-        return [Paragraph(
+        return [blocks.Paragraph(
             "No single change (tool, load, one joint's zero, instrument, one bad reading) "
             "explains the errors. Calibrate anew."
         )]  # fmt: skip
-    blocks: list[Block] = [Paragraph(f"What explains it best: {suspect_title(v.moved)}.")]
+    shown: list[blocks.Block] = [
+        blocks.Paragraph(f"What explains it best: {suspect_title(v.moved)}.")
+    ]
     if v.moved.estimates:
-        blocks.append(estimates_table(list(v.moved.estimates), planned=False))
+        shown.append(estimates_table(list(v.moved.estimates), planned=False))
     if v.suspects:
         rows = [[suspect_title(s), likelihood(s.chance)] for s in v.suspects]
-        blocks += [
-            Heading("What explains it nearly as well"),
-            Table(("change", "chance of what is left"), rows, (3, 1), (1,)),
+        shown += [
+            blocks.Heading("What explains it nearly as well"),
+            blocks.Table(("change", "chance of what is left"), rows, (3, 1), (1,)),
         ]
-    return blocks
+    return shown
 
 
 def suspect_title(suspect: Suspect) -> str:
@@ -159,10 +150,10 @@ def suspect_title(suspect: Suspect) -> str:
     return f"another {parameter_title(suspect.name)}"
 
 
-VERIFICATION: tuple[Section[VerificationMaterial], ...] = (
-    Section("result", "Result", holds),
-    Section("session", "Session and instrument", facts),
-    Section("poses", "Every reading", poses,
+VERIFICATION: tuple[blocks.Section[VerificationMaterial], ...] = (
+    blocks.Section("result", "Result", holds),
+    blocks.Section("session", "Session and instrument", facts),
+    blocks.Section("poses", "Every reading", poses,
             "Error of each reading, and twice the calibration's prediction of it."),
-    Section("moved", "What may have moved", moved),
+    blocks.Section("moved", "What may have moved", moved),
 )  # fmt: skip

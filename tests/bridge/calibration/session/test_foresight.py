@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gapbridge.bridge.calibration.session.first_readings import early_check
-from gapbridge.bridge.calibration.session.reading_check import ReadingCheck, Verdict
+from gapbridge.bridge.calibration.session.reading_check import ReadingCheck, Verdict, early_check
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.calibration.parameters import DEFAULT
 from gapbridge.core.calibration.plan import Payload

@@ -43,7 +43,7 @@ def refitted(position, effects, registered=True, left=None, start=None):
     space, *_ = sample_space(state, columns, (), [])
     found = fit(space, tuple(range(len(wanted))))
     begin = found if start is None else replace(found, values=start)
-    terms, _, covariance, residual = refit(state, space, begin)
+    _, terms, _, covariance, residual = refit(state, space, begin)
     spread = [np.sqrt(np.diag(c)) for c in covariance]
     return found, terms, spread, residual
 
@@ -149,7 +149,7 @@ def test_a_number_that_moves_nothing_hides_no_other():
     columns = [named_columns(deaf, c, ()) for c in candidates]
     space, *_ = sample_space(state, columns, (), [])
     alone = [c.family for c in candidates].index("joint_offset")
-    _, _, (expected,), _ = refit(state, space, fit(space, (alone,)))
-    terms, _, covariance, _ = refit(state, space, fit(space, (0, 1)))
+    _, _, _, (expected,), _ = refit(state, space, fit(space, (alone,)))
+    _, terms, _, covariance, _ = refit(state, space, fit(space, (0, 1)))
     assert terms[alone].values[0] == pytest.approx(0.01, abs=1e-6)
     assert covariance[alone][0, 0] == pytest.approx(expected[0, 0], rel=0.05)
