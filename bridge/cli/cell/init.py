@@ -75,6 +75,8 @@ def init(
         raise InputError(f"{out}: found a file that is already there, expected a new one")
     if model is not None and urdf is not None:
         raise InputError("--model: found beside --urdf, expected one of them")
+    if tip is not None and urdf is None:
+        raise InputError("--tip: found without --urdf, expected the URDF whose link it is")
     link = _link(host, driver, profile, port) | _further(keys)
     settings = _settings(link)
     facts = enquire(host) if driver == "ur_rtde" else _read(settings, model, urdf, tip)

@@ -122,6 +122,7 @@ def test_a_profile_beside_the_cell_is_found_from_its_folder(tmp_path: Path) -> N
         ((*ODRIVE, "--link", "gear"), "--link: found 'gear', expected KEY=VALUE"),
         ((*ODRIVE, "--link", "gear=[50"), "--link, line 1: found broken YAML"),
         (("--port", "30004"), "--port: found with --driver ur_rtde"),
+        (("--tip", "tool0"), "--tip: found without --urdf"),
     ],
 )
 def test_a_key_of_the_link_that_is_none_is_refused(
