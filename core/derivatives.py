@@ -66,7 +66,7 @@ def differentiate(signal: Array, step: float, order: int, longest: float = LONGE
     widest = max(min(longest / step, (count - 1) // 4), 3)
     halves = [h for h in HALF_WIDTHS if h <= widest]
     sigma = signal_noise(signal)
-    filters = [_coefficients(h, order, step) for h in halves]
+    filters = [_polynomials(h, order)[h, ::-1] / step**order for h in halves]
     pieces = _pieces(signal)
     tried = [[_filtered(part, h, order, step) for part in pieces] for h in halves]
     value, noise = np.empty((count, n)), np.zeros(n)
@@ -100,27 +100,19 @@ def _pieces(signal: Array) -> list[Array]:
     return [signal[begin : begin + PIECE] for begin in begins]
 
 
-def _polynomial(order: int) -> int:
-    return 2 + order
-
-
 @cache
 def _polynomials(half: int, order: int) -> Array:
     """Return the derivative (2 half + 1, 2 half + 1) at each sample of a window, a step of one.
 
     Row i has what each sample weighs in the ``order``-th derivative, at sample i, of the polynomial
-    that fits the window best.
+    of degree ``order`` + 2 that fits the window best.
     """
-    place, degree = np.arange(-half, half + 1) / half, np.arange(_polynomial(order) + 1)
+    place, degree = np.arange(-half, half + 1) / half, np.arange(order + 3)
     fit = np.linalg.pinv(place[:, None] ** degree)  # (degrees, window)
     left = np.where(degree >= order, degree - order, 0)
     falling = [factorial(d) / factorial(d - order) if d >= order else 0.0 for d in degree]
     found: Array = (np.array(falling) * place[:, None] ** left) @ fit / half**order
     return found
-
-
-def _coefficients(half: int, order: int, step: float) -> Array:
-    return np.asarray(_polynomials(half, order)[half, ::-1] / step**order)
 
 
 def _filtered(signal: Array, half: int, order: int, step: float) -> Array:

@@ -84,7 +84,7 @@ def outside_rows(log: Log, fitted: Range) -> Mask:
 def beyond(name: str, values: Array, fitted: Range) -> Mask:
     """Return which values (N,) of a column lie outside what was fitted; NaN does not."""
     low, high = fitted[name]
-    margin = _margin(name, low, high)
+    margin = max(MARGIN * (high - low), LEAST[stem_of(name)])
     return np.asarray((values < low - margin) | (values > high + margin))
 
 
@@ -112,10 +112,6 @@ def _beyond(log: Log, fitted: Range) -> dict[str, float]:
 def stem_of(name: str) -> str:
     """Return a column's name without its index."""
     return name if name in UNITS else name.rpartition("_")[0]
-
-
-def _margin(name: str, low: float, high: float) -> float:
-    return max(MARGIN * (high - low), LEAST[stem_of(name)])
 
 
 def _columns(log: Log) -> dict[str, Array]:

@@ -19,7 +19,7 @@ from gapbridge.bridge.cell.settings.instruments import Base
 from gapbridge.core.calibration.identifiability import identifiable_parameters
 from gapbridge.core.calibration.observables import make_observable
 from gapbridge.core.calibration.observables.observable import Observable
-from gapbridge.core.calibration.parameters import DEFAULT, Parameters
+from gapbridge.core.calibration.parameters import DEFAULT
 from gapbridge.core.calibration.plan import Payload, Plan
 from gapbridge.core.errors import CellError
 from gapbridge.core.metrology import Metrology
@@ -50,11 +50,6 @@ def observable_of(cell: Cell, instrument: Base, places: int = 1) -> Observable:
     )  # fmt: skip
 
 
-def parameters_of(cell: Cell, observable: Observable) -> Parameters:
-    """Return what is to be found, without what such readings cannot show. Raises CellError."""
-    return identifiable_parameters(cell.model, effects_of(cell), observable=observable)
-
-
 def metrology_of(cell: Cell, instrument: Base, places: int = 1) -> Metrology:
     """Return the instrument as the fit takes it."""
     own = cell.metrology
@@ -77,7 +72,7 @@ def planned(cell: Cell, options: SessionOptions, emit: Callable[[str, float], No
     space = space_of(cell, instrument.measures)
     observable = observable_of(cell, instrument, max(len(space.places), 1))
     return plan(
-        parameters_of(cell, observable),
+        identifiable_parameters(cell.model, effects_of(cell), observable=observable),
         observable,
         loads_of(cell),
         space,

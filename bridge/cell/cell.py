@@ -16,7 +16,7 @@ from gapbridge.bridge.cell.effects import compliance_terms, term_of
 from gapbridge.bridge.cell.message import key_path, message, messages
 from gapbridge.bridge.cell.plausibility import findings
 from gapbridge.bridge.cell.robot import build_arm
-from gapbridge.bridge.cell.schema import Accused, CellFile, Frame, Simulation
+from gapbridge.bridge.cell.schema import Accused, CellFile, Simulation
 from gapbridge.bridge.cell.sections import (
     LimitSettings,
     LinkSettings,
@@ -194,9 +194,10 @@ def cell_of(file: CellFile, document: Document) -> Cell:
         )
     except (ArmError, CellError) as error:
         raise type(error)(placed(document, str(error))) from None
+    tcp = file.tool.tcp
     model = Model(
         arm=arm,
-        tool_in_flange=_transform(file.tool.tcp),
+        tool_in_flange=transform(rpy_matrix(np.array(tcp.rpy)), np.array(tcp.xyz)),
         payload_mass=file.payload.mass,
         payload_cog=np.array(file.payload.cog),
         gravity=np.array(file.gravity),
@@ -237,10 +238,6 @@ def _paths(keys: tuple[str | int, ...], value: object) -> Iterator[tuple[str | i
     for key, own in entries:
         yield (*keys, key)
         yield from _paths((*keys, key), own)
-
-
-def _transform(frame: Frame) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
-    return transform(rpy_matrix(np.array(frame.rpy)), np.array(frame.xyz))
 
 
 def _check_payload(file: CellFile, arm: Arm) -> list[str]:

@@ -86,7 +86,8 @@ def cell_text(
     wanted.update(changes)
     if edited is not None and _reads_as(edited, path, wanted):
         return edited
-    return _dumped(wanted)
+    return yaml.dump(wanted, Dumper=_Dumper, sort_keys=False, allow_unicode=True,
+                     default_flow_style=None, width=100)  # fmt: skip
 
 
 def _rebase(data: dict[str, Any], keys: tuple[str, ...], old: Path, new: Path) -> None:
@@ -168,8 +169,3 @@ def _reads_as(text: str, path: Path, wanted: dict[str, Any]) -> bool:
         return parse(text, path).data == wanted
     except CellError:
         return False
-
-
-def _dumped(data: dict[str, Any]) -> str:
-    return yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=True,
-                     default_flow_style=None, width=100)  # fmt: skip

@@ -127,7 +127,7 @@ class Transport:
             context = client.comm_params.sslctx
             why = context.refused if isinstance(context, CheckedContext) else ""
             raise LinkError(f"{self.name}: cannot be reached: {why or 'no answer or refused'}")
-        if settings_are_tcp(self._settings) and client.socket is not None:
+        if self._settings.transport in ("tcp", "tls") and client.socket is not None:
             client.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._calls = {
             "coil": client.read_coils, "discrete": client.read_discrete_inputs,
@@ -257,11 +257,6 @@ class Transport:
         """Raise; an answer that comes late must not be taken for the next one's."""
         self.close()
         raise error from None
-
-
-def settings_are_tcp(settings: ModbusSettings) -> bool:
-    """Return whether a link goes over TCP, plain or not."""
-    return settings.transport in ("tcp", "tls")
 
 
 def _chunks(address: int, values: Sequence[int], one: bool) -> Iterable[tuple[int, list[int]]]:

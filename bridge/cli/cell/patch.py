@@ -118,7 +118,9 @@ def tie_lines(accused: Sequence[Accused], terms: Sequence[Term]) -> tuple[str, .
             continue
         numbers = ", ".join(f"{p.name} = {p.value:.6g} {p.unit}".rstrip() for p in cause.parameters)
         others = " or ".join(
-            f"{name} ({CATALOGUE[name].instead})" if _instead(name) else name
+            f"{name} ({CATALOGUE[name].instead})"
+            if name in CATALOGUE and CATALOGUE[name].instead
+            else name
             for name in cause.indistinguishable_from
         )
         lines.append(
@@ -126,7 +128,3 @@ def tie_lines(accused: Sequence[Accused], terms: Sequence[Term]) -> tuple[str, .
             f"the other's value: diagnose with --withhold {cause.effect}"
         )
     return tuple(lines)
-
-
-def _instead(name: str) -> str:
-    return CATALOGUE[name].instead if name in CATALOGUE else ""

@@ -52,7 +52,8 @@ class Budget:
     @property
     def coverage(self) -> float:
         """Return the share of cases that k = 2 holds, by Student's distribution."""
-        return _coverage(self.freedom)
+        freedom = self.freedom if np.isfinite(self.freedom) else 1e9
+        return float(1 - 2 * stdtr(freedom, -COVERAGE))
 
     @property
     def needed_factor(self) -> float:
@@ -108,7 +109,3 @@ def _looked_at(calibration: Calibration) -> Array:
 def _effective(inputs: tuple[Input, ...], combined: float) -> float:
     weight = sum(i.std**4 / i.freedom for i in inputs)
     return float(combined**4 / weight) if weight > 0 else float("inf")
-
-
-def _coverage(freedom: float) -> float:
-    return float(1 - 2 * stdtr(freedom if np.isfinite(freedom) else 1e9, -COVERAGE))

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from gapbridge.drivers.modbus import encode
 from gapbridge.drivers.modbus.profile import ECHO_WORDS, MAILBOX_WORDS, addresses
 from gapbridge.drivers.modbus.registers import UNITS, Table
-from gapbridge.drivers.modbus.schema import Condition, Mailbox, ProfileFile, TargetTrigger
+from gapbridge.drivers.modbus.schema import Mailbox, ProfileFile, TargetTrigger
 from gapbridge.drivers.simulated.modbus.image import bad
 from gapbridge.drivers.simulated.plant.kinematics import Joints, offset_frame, solve, tcp_in_base
 from gapbridge.drivers.simulated.plant.motion import Hold, Stop
@@ -195,12 +195,9 @@ class TargetProgram:
             found.append((busy.table, busy.address, bad(busy) if moving else busy.good[0]))
         if result is not None:
             fine = result.good[-1] if self._done else result.good[0]
-            found.append((result.table, result.address, _bad_result(result, self._refused, fine)))
+            value = bad(result) if self._refused else fine
+            found.append((result.table, result.address, value))
         return found
-
-
-def _bad_result(result: Condition, refused: bool, fine: int) -> int:
-    return bad(result) if refused else fine
 
 
 def make_program(profile: ProfileFile) -> MailboxProgram | TargetProgram | NoProgram:

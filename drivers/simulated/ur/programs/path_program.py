@@ -44,10 +44,6 @@ def make_move(controller: Controller, call: Call, start: Joints) -> Motion:
     return MoveJoints(start, joints, speed, acceleration)
 
 
-def _move_from(controller: Controller, call: Call, start: Joints) -> Motion:
-    return make_move(controller, call, start)
-
-
 def path_motion(
     controller: Controller, lines: tuple[str, ...], progress: Callable[[int], None]
 ) -> Motion:
@@ -56,7 +52,7 @@ def path_motion(
     for line in lines:
         call = parse_call(line)
         if call is not None and call.name in MOVES:
-            makers.append(partial(_move_from, controller, call))
+            makers.append(partial(make_move, controller, call))
         elif call is None or "progress" not in call.name:
             log.warning("path: line %r is ignored", line)
 
