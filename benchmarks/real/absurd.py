@@ -53,7 +53,7 @@ def _as_a_whole(cause: dict[str, Any]) -> bool:
     No number of one has to stand out then: without them a Rokae is left at five times the error.
     """
     gain = cause.get("shrink_interval") or [0.0]
-    return cause["effect"] == "link_geometry" and len(cause["joints"]) > 1 and gain[0] > 0
+    return cause["effect"] == "link_geometry" and len(cause.get("joints", ())) > 1 and gain[0] > 0
 
 
 def _why(effect: str, name: str, value: float, least: float, largest: float) -> str | None:

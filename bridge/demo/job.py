@@ -30,7 +30,6 @@ from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.spread import Spread
 from gapbridge.core.errors import RunError
 from gapbridge.core.estimation.identification import identify_compliance
-from gapbridge.core.fitted_range import range_of
 from gapbridge.core.log.log import read_log
 
 
@@ -73,13 +72,12 @@ def _job(
     session = Session(link, out, console.print)
     planned = plan(cell.model, link.home, seed, scene)
     log = _calibrate(link, session, planned, out, console)
-    rows = read_log(log, cell.arm.n)
-    found = identify_compliance(cell.model, rows, cell.metrology)
+    found = identify_compliance(cell.model, read_log(log, cell.arm.n), cell.metrology)
     # the flexibilities alone: the diagnosis is to find what else is wrong, the bent tool with it
     flexible = cell.model.with_compliance(found.axial, found.radial)
     origin = provenance({"log": [log], "cell": [cell.path]})
     spread = Spread.of_fit(found.identifiable, found.covariance)
-    written_by = fitted(origin, range_of(rows), spread, fit_intervals(found))
+    written_by = fitted(origin, {}, spread, fit_intervals(found))
     save_cell(cell, out / "calibrated.yaml", flexible, {"provenance": written_by})
     calibrated = load_cell(out / "calibrated.yaml")
     console.print(

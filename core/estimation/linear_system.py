@@ -110,7 +110,8 @@ def _shared(A: Array, residual: Array, core: Array, repeat: Index) -> Array:
     if slope <= 1.0:
         return np.zeros_like(core)
     found = float(np.sum(left**2) - np.sum(residual**2))
-    return np.asarray(np.clip((found - white) / slope, 0.0, 1.0) * (taken @ core))
+    shared = min(max((found - white) / slope, 0.0), 1.0)
+    return np.asarray(shared * (taken @ core))
 
 
 def _scaled_covariance(system: System, bounds: Bounds) -> tuple[Array, Array, Array]:

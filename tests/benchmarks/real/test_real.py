@@ -130,6 +130,14 @@ def test_a_value_within_its_own_spread_is_absurd():
     assert absurdities([cause], 0, 0) == ["backlash (no number of it over 3 sigma)"]
 
 
+@pytest.mark.parametrize(("gain", "absurd"), [(0.4, False), (-0.1, True)])
+def test_all_links_together_are_judged_by_what_they_gain(gain, absurd):
+    numbers = [{"name": f"link_geometry_{i}_a", "value": 1e-4, "std": 1e-4} for i in (1, 2)]
+    cause = {"effect": "link_geometry", "joints": [1, 2], "parameters": numbers,
+             "shrink_interval": [gain, 0.6]}  # fmt: skip
+    assert bool(absurdities([cause], 0, 0)) is absurd
+
+
 def test_a_line_is_judged_by_its_amplitude_whatever_its_name_holds():
     name = "transmission_error_3_order81"
     line = [{"name": f"{name}_amplitude", "value": 7.2e-5, "std": 6.8e-6},
