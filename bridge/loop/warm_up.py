@@ -72,7 +72,7 @@ def _logs() -> None:
     model.linear_form(FOUR)
     pose_columns(model, FOUR, None, [(0, 0)], np.array([1e-9]))
     gap, factor = np.zeros((1, 3)), np.zeros((2 * N + 1, 2 * N + 1))
-    factor_blocks(model.chain(), model.rows(Q), gap, gap, 0, 0, 1, factor)
+    factor_blocks(model.chain(), model.rows(Q), gap, gap, 0, 1, factor)
     of_rows(N)
     with_pieces(model, motion_of(Log("", {"actual_q": Q}, N)))
     correct(model, np.vstack([Q, 0.0 * Q]))  # a singularity, too, which the blocks leave
