@@ -14,8 +14,8 @@ from gapbridge.core.effects.effect import Effect
 from gapbridge.core.errors import EquilibriumError, InputError
 from gapbridge.core.kernels import many
 from gapbridge.core.kernels.reference import Chain, Rows
+from gapbridge.core.kernels.turns import rotation_vectors
 from gapbridge.core.loads import Loads
-from gapbridge.core.rotation import rotation_vector
 
 SETTLING = 10  # times that servos are looked at where they have given way
 CONVERGED = 1e-10  # rad: less is no change
@@ -34,7 +34,9 @@ class Poses:
     @property
     def rotation_vector(self) -> Array:
         """Return the rotations as rotation vectors (N, 3), rad."""
-        return rotation_vector(self.rotation)
+        vectors = np.empty((len(self.rotation), 3))
+        rotation_vectors(np.ascontiguousarray(self.rotation), vectors)
+        return vectors
 
 
 @dataclass(frozen=True)

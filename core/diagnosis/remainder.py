@@ -202,7 +202,9 @@ class _Beside:
         return np.hstack([self.space.columns(asked), *constants])
 
     def _targets(self, asked: Sequence[int]) -> list[str]:
-        moved = dict.fromkeys(self.space.candidates[c].target for c in asked)
+        """Return what the functions of a quantity move: a joint that bends moves no angle."""
+        functions = [self.space.candidates[c] for c in asked]
+        moved = dict.fromkeys(k.target for k in functions if not k.of_no_quantity)
         return [t for t in moved if t in self._constant]
 
     def _sigma(self, accused: Sequence[int], asked: Sequence[int]) -> Array:
