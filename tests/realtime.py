@@ -42,10 +42,27 @@ REALTIME = (
     "hil/",
 )
 """Files and folders whose tests run processes, buses, browsers or servers against the clock."""
+UNTIMED = (
+    "bridge/demo/test_demo_hidden.py",
+    "bridge/demo/test_demo_parts.py",
+    "bridge/demo/test_droop.py",
+    "drivers/can/test_can_profile.py",
+    "drivers/can/test_can_sample.py",
+    "drivers/canopen/test_canopen_profile.py",
+    "drivers/ft_sensor/test_ft_fuzz.py",
+    "drivers/modbus/test_modbus_profile.py",
+    "drivers/modbus/test_modbus_registers.py",
+    "drivers/modbus/test_modbus_writers.py",
+    "drivers/simulated/test_simulated_plant.py",
+    "drivers/ur_rtde/test_ur_allowed.py",
+    "drivers/ur_rtde/test_ur_nominal.py",
+)
+"""Files in these folders whose tests compute, or have a clock of their own."""
 WAITING = ("gw0", "gw1")  # processes of xdist that run them: they mostly wait
 NICE = 5  # of its other processes, which compute with what is left of the cores
 
 
 def is_realtime(file: str) -> bool:
     """Return whether the tests of a file (or one of them), seen from the root, are in real time."""
-    return file.removeprefix("tests/").startswith(REALTIME)
+    place = file.removeprefix("tests/")
+    return place.startswith(REALTIME) and not place.startswith(UNTIMED)
