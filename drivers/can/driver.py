@@ -152,14 +152,18 @@ class CanDriver(Driver):
         asked = self._now()
         self._ask()
         end = asked + self.settings.state_timeout
-        whole = asked + max(ANSWER, 2.0 / self.rate)
+        patience = max(ANSWER, 2.0 / self.rate)
+        whole = asked + patience
         while (left := end - self._now()) > 0.0:
             sample = self.reader.poll(min(left, SLICE))
             if sample is not None and sample.began >= asked:
                 return sample
-            missing = self.reader.assembler.missing
-            if missing and self._now() > whole:
+            if (now := self._now()) <= whole:
+                continue
+            if missing := self.reader.assembler.missing:
                 raise InvalidStateError(f"{self.profile.name}: no answer of {', '.join(missing)}")
+            whole = now + patience
+            self._ask()  # nobody has heard the question
         raise self._stale()
 
     def _stale(self) -> StaleStateError:

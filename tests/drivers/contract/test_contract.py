@@ -25,6 +25,7 @@ from contract_checks import (
 from contract_table import CASES
 
 from gapbridge.core.errors import WriteError
+from gapbridge.drivers.can.driver import CanDriver
 from gapbridge.drivers.driver import Driver
 
 
@@ -97,3 +98,19 @@ def test_a_controller_that_goes_away_is_reported_and_met_again(case: Case, drive
 def test_a_closed_driver_reads_nothing(driver: Driver) -> None:
     next_state(driver)
     check_closed(driver)
+
+
+def test_a_question_that_nobody_has_heard_is_asked_again() -> None:
+    with CASES["can openarm, socketcand"]() as case, case.driver() as driver:
+        assert isinstance(driver, CanDriver)
+        before, ask, lost = next_state(driver), driver.writer.request, [True]
+
+        def request() -> None:
+            if lost:
+                lost.clear()
+            else:
+                ask()
+
+        driver.writer.request = request  # type: ignore[method-assign]
+        assert next_state(driver).timestamp > before.timestamp
+        assert not lost
