@@ -127,13 +127,6 @@ class MailboxWriter:
             self._rates = encode.rate_counts(self._cell_rates())
         except ValueError as error:
             raise WriteError(f"limits.{error}: what the robot's program can be given") from None
-        number, says = look().answer or (0, 0)
-        if says == encode.ABSENT:
-            raise WriteError(
-                f"{self._transport.name}: {self._box.echo_table} {self._box.echo_address + 1}: "
-                f"found {says}, expected a running mailbox program on the robot "
-                "(docs/porting.md)"
-            )
         number = self._wait_bare(look)
         # a number that the program cannot take for the one it has seen last
         self._sequence = (number + encode.SEQUENCES // 4) % (encode.SEQUENCES - 1) + 1
@@ -157,9 +150,16 @@ class MailboxWriter:
         until = self._now() + self._patience
         while True:
             sample = look()
+            number, says = sample.answer or (0, 0)
+            if says == encode.ABSENT:  # an answer of nothing but zeros is none of no offset
+                raise WriteError(
+                    f"{self._transport.name}: {self._box.echo_table} {self._box.echo_address + 1}: "
+                    f"found {says}, expected a running mailbox program on the robot "
+                    "(docs/porting.md)"
+                )
             length = float(np.abs(sample.vectors["echo"]).max())
             if length == 0.0:
-                return (sample.answer or (0, 0))[0]
+                return number
             if self._now() > until:
                 raise WriteError(
                     f"{self._transport.name}: the robot's program still applies an offset of "

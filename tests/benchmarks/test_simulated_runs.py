@@ -144,6 +144,11 @@ def test_a_clock_set_forward_as_the_next_packet_comes_late_is_no_violation_but_t
     assert "undetectable: a setpoint of a state sampled 0.066 s before" in str(found)
 
 
+def test_an_answer_of_zeros_does_not_say_that_no_offset_is_applied() -> None:
+    """Seed 7061098: over Modbus, after a loop that died; arming announced a zero into an offset."""
+    assert not run(7061098).violations
+
+
 def test_the_first_setpoint_of_a_stream_is_within_the_envelope_whatever_the_model_says() -> None:
     """Seed 5019099: joints 0.5 rad off beside a small offset; the arm went 0.03 rad at once."""
     plan = [(0.1, "disarm"), (0.5, "model no number"), (0.51, "arm")]

@@ -95,7 +95,7 @@ def test_a_cell_with_a_map_of_the_users_is_served_and_run(profile: Path) -> None
             "{driver: telepathy}",
             r"cell\.yaml, line 2: link\.driver: found 'telepathy', expected one",
         ),
-        ("{driver: modbus}", r"line 2: link\.profile: found nothing, expected a shipped register"),
+        ("{driver: modbus}", r"line 2: link\.profile: found nothing, expected a shipped profile"),
         (
             "{driver: modbus, profile: ur, prot: 5}",
             r"link\.prot: found an unknown key 'prot'.*port",
