@@ -1,10 +1,10 @@
 """How the tests are shared out over processes, and what becomes of those in real time.
 
-Tests in real time mostly wait: two processes run them, and more, if there are any, compute all
-others with what is left of the cores (``make test`` has four).
+Tests over wires mostly wait: two processes run them, and more, if there are any, compute all others
+with what is left of the cores (``make test`` has four).
 
-Every test has one chance. A test in real time (marked ``realtime``: it judges threads, signals and
-sockets of real processes) says nothing where the machine itself was late: it is skipped where the
+Every test has one chance, and is patient about time. The few whose subject is time itself are
+marked ``realtime``: such a test says nothing where the machine was late. It is skipped where the
 machine cannot keep any time before it begins, and where it failed while a process beside it on any
 core, which only sleeps, was woken later than a state may be old, or while its own process waited
 for a core for longer than it had one. How late, or how long, is in the skip's reason.
@@ -36,7 +36,7 @@ if str(HERE) not in sys.path:
     sys.path.insert(0, str(HERE))
 
 from lateness import HOPELESS, LIMIT, Witness, core_time, core_times  # noqa: E402
-from realtime import NICE, WAITING, is_realtime  # noqa: E402
+from waiting import NICE, WAITING  # noqa: E402
 
 WITNESS = Witness()
 HAD = pytest.StashKey[dict[str, tuple[float, float]]]()  # s that threads had, before a test
@@ -52,17 +52,10 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
-    """Share out whole files; those in real time to the processes that wait."""
+    """Share out whole files; those that mostly wait to two processes."""
     from shared_out import Scheduling
 
     return Scheduling(config, log)
-
-
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark tests in real time."""
-    for item in items:
-        if is_realtime(item.nodeid):
-            item.add_marker(pytest.mark.realtime)
 
 
 @pytest.hookimpl(hookwrapper=True)

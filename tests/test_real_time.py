@@ -77,7 +77,7 @@ def test_that_fails_without_a_clock():
 def test_a_failure_counts_unless_the_machine_was_late_and_the_test_in_real_time(
     tmp_path: Path,
 ) -> None:
-    for name in ("conftest.py", "lateness.py", "realtime.py"):
+    for name in ("conftest.py", "lateness.py", "waiting.py"):
         (tmp_path / name).write_text((HERE / name).read_text(encoding="utf-8"))
     (tmp_path / "test_it.py").write_text(FAILING)
     options = ["-p", "no:cacheprovider", "-o", "markers=realtime: x", "-rsfp"]
@@ -147,6 +147,17 @@ def test_nothing_gives_a_test_another_chance() -> None:
     for path in HERE.rglob("*.py"):
         if path.name != Path(__file__).name:
             assert not re.search(r"\bflaky\b|\breruns\b", path.read_text(encoding="utf-8")), path
+
+
+def test_few_tests_are_judged_by_the_clock() -> None:
+    marked = [
+        f"{path.name}: {line}"
+        for path in HERE.rglob("test_*.py")
+        if path.name != Path(__file__).name
+        for line in path.read_text(encoding="utf-8").splitlines()
+        if "mark.realtime" in line
+    ]
+    assert 0 < len(marked) <= 20, marked
 
 
 def test_a_core_that_stands_still_is_noticed_while_others_run() -> None:

@@ -1,4 +1,4 @@
-"""Files are shared out whole, and those in real time to two processes only."""
+"""Files are shared out whole, and those that mostly wait to two processes only."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from realtime import REALTIME, UNTIMED, WAITING, is_realtime
+from waiting import COMPUTE, WAIT, WAITING, waits
 
 pytest.importorskip("xdist")
 
@@ -56,7 +56,7 @@ def shared_out(tests: list[str], processes: int) -> dict[str, list[str]]:
 
 
 @pytest.mark.parametrize("processes", [2, 4])
-def test_files_stay_whole_and_real_time_goes_to_those_that_wait(processes: int) -> None:
+def test_files_stay_whole_and_those_that_wait_go_to_two_processes(processes: int) -> None:
     files = ["bridge/web/test_a.py", "drivers/can/test_b.py", "hil/test_c.py"]
     files += [f"core/test_{i}.py" for i in range(8)]
     tests = [f"tests/{file}::test_{i}" for file in files for i in range(5)]
@@ -64,11 +64,11 @@ def test_files_stay_whole_and_real_time_goes_to_those_that_wait(processes: int) 
     assert sorted(test for ran in found.values() for test in ran) == sorted(tests)
     where = {(test.split("::")[0], name) for name, ran in found.items() for test in ran}
     assert len(where) == len(files)
-    assert {name for file, name in where if is_realtime(file)} <= {*WAITING}
+    assert {name for file, name in where if waits(file)} <= {*WAITING}
     for name, ran in found.items():  # who waits takes others only when nothing else is left
-        kinds = [is_realtime(test) for test in ran]
+        kinds = [waits(test) for test in ran]
         assert kinds == sorted(kinds, reverse=True) if name in WAITING else not any(kinds)
 
 
-def test_every_place_in_real_time_is_there() -> None:
-    assert [place for place in (*REALTIME, *UNTIMED) if not (HERE / place).exists()] == []
+def test_every_file_that_waits_is_there() -> None:
+    assert [place for place in (*WAIT, *COMPUTE) if not (HERE / place).exists()] == []

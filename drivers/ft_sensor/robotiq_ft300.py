@@ -25,7 +25,8 @@ HEAD = b"\x20\x4e"
 FRAME = struct.Struct("<2x6h2x")
 QUIET = b"\xff" * 50  # ends the stream
 UNIT = np.array((1e-2, 1e-2, 1e-2, 1e-3, 1e-3, 1e-3))  # N, Nm per count
-RESPONSE = 0.2  # s
+RESPONSE = 0.2  # s: of the registers, which are asked for on and on
+START = 1.0  # s: of the command that starts the stream, which is given once
 TURN = 0.1  # s that the sensor takes from its stream back to Modbus
 BITS = 10.0  # per byte on the line, 8N1
 SILENCE = 0.5  # s without a sample after which the stream is asked for again
@@ -80,9 +81,10 @@ class RobotiqFt300(ForceTorqueSensor):
         from pymodbus.client import ModbusSerialClient
 
         settings = self.settings
+        patience = START if settings.mode == "stream" else RESPONSE
         self._client = ModbusSerialClient(
             settings.port, baudrate=settings.baudrate, bytesize=8, parity="N", stopbits=1,
-            timeout=RESPONSE, retries=0,
+            timeout=patience, retries=0,
         )  # fmt: skip
         if not self._client.connect():
             self._client = None

@@ -41,6 +41,7 @@ def judge(result: Result) -> None:
 CASES = [(name, key) for name, keys in KEYS.items() for key in keys]
 
 
+@pytest.mark.realtime
 @pytest.mark.parametrize(("name", "key"), CASES, ids=[f"{n}-{k}" for n, k in CASES])
 def test_a_fault_is_detected_and_answered(rigs: Rigs, name: str, key: str) -> None:
     judge(make_fault(rigs.of(name), ROW[key]))

@@ -125,12 +125,12 @@ class Ft300Device(SimulatedSensor):
     def _pass_bytes(self) -> None:
         ready, _, _ = select.select([self._outside, self._inside], [], [], 0.0)
         if self._outside in ready:
-            data = _read(self._outside)
-            for byte in data:
+            data, begin = _read(self._outside), 0
+            for end, byte in enumerate(data, 1):
                 self._quiet = self._quiet + 1 if byte == 0xFF else 0
                 if self._quiet >= QUIET:
-                    self.streaming = False
-            kept = data if data.strip(b"\xff") else b""
+                    self.streaming, begin = False, end
+            kept = data[begin:] if data[begin:].strip(b"\xff") else b""
             if kept and not self.streaming and not self.silent:
                 os.write(self._inside, kept)
         if self._inside in ready:

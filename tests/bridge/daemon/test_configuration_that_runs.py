@@ -27,7 +27,7 @@ def test_a_loop_that_is_started_anew_runs_the_cell_that_runs_not_the_edited_one(
         cell = robot.cell(PATIENT)
         text = cell.read_text()
         with Run(cell) as run:
-            run.wait(State.OBSERVING, 90.0)
+            run.wait(State.OBSERVING)
             before = granted(run)
             run.compensate()
             wait_for(lambda: run.daemon.tally.written > 400, 30.0, "a ramp")
@@ -39,8 +39,8 @@ def test_a_loop_that_is_started_anew_runs_the_cell_that_runs_not_the_edited_one(
             pid = run.daemon.loop_pid
             assert pid is not None
             os.kill(pid, 9)
-            run.wait(State.DISCONNECTED, 10.0)
-            run.wait(State.OBSERVING, 90.0)
+            run.wait(State.DISCONNECTED)
+            run.wait(State.OBSERVING)
             written = run.daemon.tally.written
             run.compensate()
             wait_for(lambda: run.daemon.tally.written > written + 400, 30.0, "a ramp")
@@ -69,14 +69,14 @@ def test_a_loop_reads_none_of_the_files_that_a_cell_names_from_the_disk(tmp_path
         np.savetxt(way, rows, "%.9g", ",", header=header, comments="")
         cell = robot.cell(PATIENT, setpoints="{source: trajectory, file: way.csv}")
         with Run(cell) as run:
-            run.wait(State.OBSERVING, 90.0)
+            run.wait(State.OBSERVING)
             way.unlink()
             cell.unlink()
             pid = run.daemon.loop_pid
             assert pid is not None
             os.kill(pid, 9)
-            run.wait(State.DISCONNECTED, 10.0)
-            run.wait(State.OBSERVING, 90.0)
+            run.wait(State.DISCONNECTED)
+            run.wait(State.OBSERVING)
             run.compensate()
 
 

@@ -151,7 +151,7 @@ def test_a_person_arms_and_disarms_a_running_daemon(robot: Robot) -> None:
         def reported() -> list[dict[str, Any]]:
             return [e for e in run.daemon.events_since(0) if e["kind"] == "control"]
 
-        wait_for(lambda: len(reported()) == 4, 2.0, "the last request's event")
+        wait_for(lambda: len(reported()) == 4, 20.0, "the last request's event")
         events = reported()
     assert [(e["command"], e["uid"], e["ok"]) for e in events] == [
         (command, os.getuid(), True) for command in ("disarm", "arm", "arm", "disarm")
@@ -164,14 +164,14 @@ def test_a_fault_waits_for_a_person_and_arming_is_refused_until_then(robot: Robo
     with Run(cell, arm=True) as run:
         run.wait(State.COMPENSATING)
         robot.bench("protective_stop")
-        run.wait(State.FAULT, 2.0)
+        run.wait(State.FAULT)
         with pytest.raises(RunError, match=r"a fault is latched: robot not ready.*safety_mode 3"):
             ask(cell, "arm")
         assert "as soon as the robot is fine" in ask(cell, "disarm")
         assert run.daemon.state == State.FAULT
         robot.bench("unlock")
-        run.wait(State.OBSERVING, 5.0)
-        assert ask(cell, "status")["latched"] == ""
+        run.wait(State.OBSERVING)
+        wait_for(lambda: ask(cell, "status")["latched"] == "", 20.0, "no fault latched")
 
 
 @pytest.mark.slow
@@ -179,16 +179,16 @@ def test_a_latched_fault_outlives_the_loop_that_found_it(robot: Robot) -> None:
     with Run(robot.cell(PATIENT), arm=True) as run:
         run.wait(State.COMPENSATING)
         robot.bench("protective_stop")
-        run.wait(State.FAULT, 2.0)
+        run.wait(State.FAULT)
         pid = run.daemon.loop_pid
         assert pid is not None
         os.kill(pid, 9)
-        run.wait(State.DISCONNECTED, 5.0)
+        run.wait(State.DISCONNECTED)
         run.wait(State.FAULT)
         assert "safety_mode 3" in run.daemon.latched
         robot.bench("unlock")
         run.daemon.disarm()
-        run.wait(State.OBSERVING, 5.0)
+        run.wait(State.OBSERVING)
 
 
 @pytest.mark.slow
@@ -238,19 +238,19 @@ def test_the_same_cell_has_the_same_name_from_everywhere(
 def test_a_disarming_between_two_loops_is_kept_and_answered_by_the_next(robot: Robot) -> None:
     cell = robot.cell(PATIENT)
     with Run(cell, arm=True) as run:
-        run.wait(State.COMPENSATING, 60.0)
+        run.wait(State.COMPENSATING)
         robot.bench("protective_stop")
-        run.wait(State.FAULT, 5.0)
+        run.wait(State.FAULT)
         robot.bench("unlock")
         pid = run.daemon.loop_pid
         assert pid is not None
         os.kill(pid, 9)
-        run.wait(State.DISCONNECTED, 5.0)
+        run.wait(State.DISCONNECTED)
         assert run.daemon.latched
         taken = run.daemon.taken
         assert "acknowledged" in ask(cell, "disarm")  # by a person, while no loop is there
         assert run.daemon.taken > taken
-        run.wait(State.OBSERVING, 60.0)
+        run.wait(State.OBSERVING)
         assert run.daemon.latched == ""
 
 

@@ -73,7 +73,7 @@ def test_a_controller_that_stands_still_is_a_fault(robot: Robot) -> None:
         time.sleep(0.3)
         os.kill(robot.controller.pid, signal.SIGSTOP)
         try:
-            run.wait(State.DISCONNECTED, 3.0)
+            run.wait(State.DISCONNECTED)
         finally:
             os.kill(robot.controller.pid, signal.SIGCONT)
         assert_came_back_observing(run, robot)
@@ -84,9 +84,9 @@ def test_a_clock_that_stands_still_is_seen_though_packets_flow(robot: Robot) -> 
     with Run(robot.cell()) as run:
         run.wait(State.OBSERVING)
         robot.bench("freeze")
-        wait_for(lambda: run.daemon.status()["counts"]["silence"] == 1, 2.0, "silence")
+        wait_for(lambda: run.daemon.status()["counts"]["silence"] == 1, 20.0, "silence")
         robot.bench("thaw")
-        run.wait(State.OBSERVING, 5.0)
+        run.wait(State.OBSERVING)
         assert run.daemon.latched == ""  # nothing was written, so nobody has to look
         summary = run.end()
     assert summary.restarts == 0
@@ -97,7 +97,7 @@ def test_a_clock_that_stands_still_ends_compensating(robot: Robot) -> None:
     with Run(robot.cell(), arm=True) as run:
         run.wait(State.COMPENSATING)
         robot.bench("freeze")
-        wait_for(lambda: "holding" in " ".join(run.output), 2.0, "holding")
+        wait_for(lambda: "holding" in " ".join(run.output), 20.0, "holding")
         assert "state stale" in " ".join(run.output)
         robot.bench("thaw")
         run.end()
@@ -109,7 +109,7 @@ def test_a_short_stall_ramps_out_and_does_not_ramp_in_again(robot: Robot) -> Non
         run.wait(State.COMPENSATING)
         time.sleep(0.8)
         robot.bench("stall 0.08")
-        run.wait(State.OBSERVING, 5.0)
+        run.wait(State.OBSERVING)
         assert_came_back_observing(run, robot)
     moved = offsets(run.cycles())
     steps = np.linalg.norm(np.diff(moved[:, :3], axis=0), axis=1)
@@ -122,7 +122,7 @@ def test_a_dropped_connection_is_replaced_by_a_new_process(robot: Robot) -> None
         run.wait(State.COMPENSATING)
         time.sleep(0.3)
         robot.bench("drop")
-        wait_for(lambda: run.daemon.state != State.COMPENSATING, 2.0, "the fault")
+        wait_for(lambda: run.daemon.state != State.COMPENSATING, 20.0, "the fault")
         assert_came_back_observing(run, robot)
 
 
@@ -156,7 +156,7 @@ def test_a_protective_stop_is_a_fault_and_nobody_writes_after_it(robot: Robot) -
         run.wait(State.COMPENSATING)
         time.sleep(0.3)
         robot.bench("protective_stop")
-        run.wait(State.FAULT, 1.0)
+        run.wait(State.FAULT)
         time.sleep(0.5)
         assert run.daemon.state == State.FAULT
         summary = run.end()
@@ -210,7 +210,7 @@ def test_when_the_daemon_is_killed_its_loop_ramps_out_and_the_recording_is_whole
     killed = time.monotonic()
     run.kill()
     run.wait()
-    wait_for(lambda: "rtde_control ended" in robot.controller.log(), 3.0, "the end of the loop")
+    wait_for(lambda: "rtde_control ended" in robot.controller.log(), 20.0, "the end of the loop")
     assert "watchdog" not in robot.controller.log()  # it ended by itself
     recording = only_recording(robot.folder / "recordings")
     time.sleep(1.5)  # the recorder outlives the loop by a moment

@@ -38,7 +38,7 @@ def test_a_side_process_cannot_arm(
             setpoints=f"{{source: modbus, port: {free_port()}}}",
         )  # fmt: skip
         with Run(cell) as run:
-            run.wait(State.OBSERVING, 60.0)
+            run.wait(State.OBSERVING)
 
             def attacks() -> list[dict[str, Any]]:
                 return [e for e in run.daemon.events_since(0) if "attack" in e]
@@ -69,14 +69,14 @@ def test_every_arming_follows_the_event_that_names_who_asked(
     with Robot(tmp_path) as robot:
         cell = robot.cell(", state_timeout: 0.25")
         with Run(cell, arm=True) as run:
-            run.wait(State.COMPENSATING, 60.0)
+            run.wait(State.COMPENSATING)
             assert "pid" in run.daemon.status()["armed_by"]
             assert ask(cell, "disarm") == "observing"
             assert ask(cell, "arm") == "compensating"
             assert f"uid {os.getuid()}, pid {os.getpid()}" in ask(cell, "status")["armed_by"]
             ask(cell, "disarm")
             run.daemon.arm()
-            run.wait(State.COMPENSATING, 30.0)
+            run.wait(State.COMPENSATING)
         events = run.daemon.events_since(0)
     asked = [e for e in events if e["kind"] == "request" and e["command"] == "arm"]
     assert len(armings(events)) == len(asked) == 3
@@ -88,7 +88,7 @@ def test_every_arming_follows_the_event_that_names_who_asked(
 def test_the_memory_of_a_running_daemon_is_sealed(tmp_path: Path) -> None:
     """Also from within the daemon itself: it can only read what its loop writes."""
     with Robot(tmp_path) as robot, Run(robot.cell()) as run:
-        run.wait(State.OBSERVING, 60.0)
+        run.wait(State.OBSERVING)
         for fd in (run.daemon.page.fd, run.daemon.page.open_for_reading()):
             again = os.open(f"/proc/self/fd/{fd}", os.O_RDWR)
             with pytest.raises(PermissionError):

@@ -120,7 +120,7 @@ def test_it_ends_in_order_with_everything_and_without_secrets(
     count = publisher.end()
     begun = time.monotonic()
     recording.end()
-    assert time.monotonic() - begun < 3.0
+    assert time.monotonic() - begun < 9.0  # it is killed after ten
     assert recording.numbers() == list(range(count))
     assert [event["kind"] for event in read_documents(recording.stem)] == ["transition", "ended"]
     (path,) = recording.stem.parent.glob("*.mcap")

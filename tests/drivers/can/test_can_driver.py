@@ -258,14 +258,16 @@ def test_an_arm_of_another_number_of_joints_is_refused_before_the_bus_is_opened(
         CanDriver(settings, MODEL)
 
 
+@pytest.mark.realtime
 def test_old_samples_are_left_for_the_newest(served):
     next_state(served.driver)
     time.sleep(0.3)
     state = next_state(served.driver)
-    assert time.monotonic() - state.received < 0.05
-    assert next_state(served.driver).received - state.received < 0.05
+    assert time.monotonic() - state.received < 0.2  # not the 0.3 s that it has waited
+    assert next_state(served.driver).received - state.received < 0.2
 
 
+@pytest.mark.realtime
 def test_a_backlog_full_of_others_frames_does_not_keep_old_samples_alive(served):
     stranger = other_bus(served.settings)
     ended = threading.Event()
@@ -282,7 +284,9 @@ def test_a_backlog_full_of_others_frames_does_not_keep_old_samples_alive(served)
             time.sleep(0.05)
             before = np.array(served.controller.q)
             state = next_state(served.driver)
-            assert np.abs(state.actual_q - before).max() < 0.012  # 24 ms at 0.5 rad/s
+            assert (
+                np.abs(state.actual_q - before).max() < 0.06
+            )  # 120 ms at 0.5 rad/s; a backlog is half a second long
     finally:
         ended.set()
         thread.join()

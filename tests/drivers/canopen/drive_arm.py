@@ -64,7 +64,7 @@ def served(profile: str = "cia402", **keys: Any) -> Iterator[DriveArm]:
         yield arm
 
 
-def settled(driver: CanopenDriver, seconds: float = 1.0) -> RobotState:
+def settled(driver: CanopenDriver, seconds: float = 10.0) -> RobotState:
     """Return a state; a machine that is busy may tear a set or two."""
     until = time.monotonic() + seconds
     while True:
@@ -93,7 +93,7 @@ def follow(
     goal: np.ndarray,
     controller: ArmController,
     within: float = 1e-4,
-    seconds: float = 4.0,
+    seconds: float = 20.0,
 ) -> None:
     """Lead the arm to joints at 0.2 rad/s."""
     start, begun = np.array(controller.q), time.monotonic()

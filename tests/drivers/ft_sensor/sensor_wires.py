@@ -79,7 +79,7 @@ def make_wire(kind: str, reaction: Callable[[], Any]) -> Wire:
     return Wire(node, keys)
 
 
-def next_reading(sensor: ForceTorqueSensor, limit: float = 3.0) -> Reading:
+def next_reading(sensor: ForceTorqueSensor, limit: float = 15.0) -> Reading:
     """Return the next sample; a busy machine may take a while."""
     until = time.monotonic() + limit
     while time.monotonic() < until:

@@ -53,7 +53,7 @@ def test_a_silent_sensor_is_seen_and_its_return_is_observed(
         run.wait(State.OBSERVING)
         time.sleep(0.5)
         sensor.silent = True
-        wait_for(lambda: run.daemon.status()["counts"]["silence"] == 1, 2.0, "silence")
+        wait_for(lambda: run.daemon.status()["counts"]["silence"] == 1, 20.0, "silence")
         sensor.silent = False
         run.wait(State.OBSERVING)
         assert run.daemon.latched == ""  # nothing was written, so nobody has to look
@@ -72,7 +72,7 @@ def test_a_sensor_lost_while_writing_ends_the_writing_until_a_person_arms_again(
         run.wait(State.COMPENSATING)
         time.sleep(0.5)
         sensor.silent = True
-        wait_for(lambda: run.daemon.state != State.COMPENSATING, 1.0, "no longer compensating")
+        wait_for(lambda: run.daemon.state != State.COMPENSATING, 20.0, "no longer compensating")
         time.sleep(1.0)
         sensor.silent = False
         run.wait(State.OBSERVING)
@@ -89,7 +89,7 @@ def test_overload_stops_the_writing(robot: Robot, sensor: RobotousNode) -> None:
     with Run(cell_of(robot, sensor), arm=True) as run:
         run.wait(State.COMPENSATING)
         sensor.status = 0x10
-        wait_for(lambda: run.daemon.state != State.COMPENSATING, 1.0, "no longer compensating")
+        wait_for(lambda: run.daemon.state != State.COMPENSATING, 20.0, "no longer compensating")
         run.end()
     assert any("overload" in line for line in run.output), run.output
 
@@ -102,7 +102,7 @@ def test_a_lost_sensor_drops_the_force_and_the_angles_stay_corrected(
         run.wait(State.COMPENSATING)
         time.sleep(1.0)
         sensor.silent = True
-        wait_for(lambda: any("max_age" in line for line in run.output), 2.0, "the event")
+        wait_for(lambda: any("max_age" in line for line in run.output), 20.0, "the event")
         time.sleep(0.5)
         sensor.silent = False
         wait_for(lambda: "the sensor is back" in run.output, 5.0, "the sensor")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 import threading
 import time
 from typing import Any
@@ -9,6 +10,8 @@ from typing import Any
 import can
 import numpy as np
 import pytest
+import serial
+from pymodbus.framer import FramerRTU
 from sensor_wires import (
     COG,
     KINDS,
@@ -164,6 +167,30 @@ def test_a_stream_left_running_does_not_disturb_the_start() -> None:
         device.streaming = True
         device._due = time.monotonic()
         time.sleep(0.05)
+        with make_sensor(wire.settings()) as sensor:
+            assert next_reading(sensor).wrench[2] == pytest.approx(12.25, abs=0.02)
+
+
+def test_a_request_read_together_with_what_ends_the_stream_is_answered() -> None:
+    device = Ft300Device(Reaction())
+    request = struct.pack(">BBHHBH", 9, 16, 410, 1, 2, 0x0200)
+    request += FramerRTU.compute_CRC(request).to_bytes(2, "big")
+    with device, serial.Serial(device.path, timeout=10.0) as line:
+        line.write(b"\xff" * 50 + request)
+        assert line.read(8)[:6] == request[:6]
+
+
+def test_a_stream_that_is_slow_to_start_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    device = Ft300Device(Reaction())
+    wire, pass_bytes, begun = Wire(device, {"driver": "robotiq_ft300"}), device._pass_bytes, []
+
+    def answer_late() -> None:
+        if begun and time.monotonic() > begun[0] + 0.6:
+            pass_bytes()
+
+    monkeypatch.setattr(device, "_pass_bytes", answer_late)
+    with device:
+        begun.append(time.monotonic())
         with make_sensor(wire.settings()) as sensor:
             assert next_reading(sensor).wrench[2] == pytest.approx(12.25, abs=0.02)
 

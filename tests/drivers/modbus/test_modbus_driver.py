@@ -96,6 +96,7 @@ def test_registers_that_a_dead_client_left_move_nothing(ur: ModbusCase) -> None:
         assert driver._look().answer == (0, encode.EXPIRED)
 
 
+@pytest.mark.realtime
 def test_a_client_that_dies_is_withdrawn_at_the_rates_of_its_cell(
     ur: ModbusCase, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -157,14 +158,14 @@ def test_a_stopped_robot_is_not_armed_and_reports_why(ur: ModbusCase) -> None:
     with ur.driver() as driver:
         assert next_state(driver).safety_mode == 1
         ur.controller.protective_stop()
-        wait_for(lambda: next_state(driver).safety_mode == 3, 1.0, "the stop")
+        wait_for(lambda: next_state(driver).safety_mode == 3, 20.0, "the stop")
         with pytest.raises(
             WriteError, match=r"security stopped \(holding 261\): found 1, expected"
         ):
             driver.arm(next_state(driver))
         ur.controller.unlock()
         ur.controller.emergency_stop()
-        wait_for(lambda: next_state(driver).safety_mode == 7, 1.0, "the button")
+        wait_for(lambda: next_state(driver).safety_mode == 7, 20.0, "the button")
 
 
 def test_registers_too_coarse_for_the_offset_are_reported_before_arming(tmp_path: Path) -> None:

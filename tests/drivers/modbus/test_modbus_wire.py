@@ -26,7 +26,7 @@ from gapbridge.drivers.modbus.driver import ModbusDriver
 from gapbridge.drivers.modbus.settings import ModbusSettings
 from gapbridge.drivers.simulated.modbus.server import ModbusServer
 
-QUICK = {"timeout": 0.05, "state_timeout": 0.4}
+QUICK = {"timeout": 0.25, "state_timeout": 0.5}
 
 
 @pytest.fixture
@@ -89,7 +89,7 @@ def test_a_ruined_answer_is_never_taken_and_the_link_recovers(
         for _ in range(3):
             with pytest.raises((InvalidStateError, StaleStateError)):
                 driver.read_state()
-        assert time.monotonic() - begun < 3.0
+        assert time.monotonic() - begun < 10.0
         proxy.ruin = lambda answer: answer
         time.sleep(0.1)
         state = next_state(driver)
@@ -99,7 +99,7 @@ def test_a_ruined_answer_is_never_taken_and_the_link_recovers(
 def test_a_late_answer_is_never_taken_for_the_next_ones(case: ModbusCase, proxy: EvilProxy) -> None:
     with driver_through(case, proxy) as driver:
         next_state(driver)
-        proxy.wait = 0.08  # each comes when its request is given up
+        proxy.wait = 0.35  # each comes when its request is given up
         with pytest.raises(StaleStateError, match="no new sample for"):
             driver.read_state()
         proxy.wait = 0.0

@@ -127,7 +127,7 @@ def test_without_a_heartbeat_the_offset_goes_to_zero(stream: Stream) -> None:
     stream.hold(OFFSET, 100)
     begun = time.monotonic()
     while stream.client.sample()["output_int_register_13"] != 2:
-        assert time.monotonic() - begun < 1.0
+        assert time.monotonic() - begun < 20.0
     assert applied(stream.wait(60)) == [0.0] * 6
     assert stream.hold(OFFSET, 100)["output_int_register_13"] == 1
 

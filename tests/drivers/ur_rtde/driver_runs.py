@@ -59,7 +59,7 @@ def read_for(cycles):
 
 def run_driver(host: str, body: str, timeout: float = 60.0, **link: Any) -> dict[str, Any]:
     """Run ``body`` with a driver, a bench and a few words; returns what it puts into ``out``."""
-    link.setdefault("state_timeout", 0.25)  # a busy machine holds the simulated controller up
+    link.setdefault("state_timeout", 1.0)  # a busy machine holds the simulated controller up
     preamble = PREAMBLE.format(simulated=SIMULATED, link=link)
     return run_client(host, preamble + textwrap.dedent(body), timeout)
 

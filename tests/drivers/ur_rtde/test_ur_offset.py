@@ -71,6 +71,7 @@ def test_an_offset_moves_the_tcp_and_is_taken_out_of_the_nominal_joints(
     assert out["back"] == pytest.approx([0] * 6, abs=1e-9)
 
 
+@pytest.mark.realtime
 def test_the_nominal_joints_are_the_robots_own_while_it_moves(
     offset_robot: SimulatedController,
 ) -> None:
@@ -115,6 +116,7 @@ def test_without_a_heartbeat_the_robots_program_goes_to_zero_and_on(
     assert out["runtime"] == 2
 
 
+@pytest.mark.realtime
 def test_whoever_is_killed_is_withdrawn_at_the_rates_of_the_cell(
     offset_robot: SimulatedController,
 ) -> None:

@@ -1,8 +1,8 @@
-"""Which tests judge real processes by the clock, and which processes of ``make test`` run them."""
+"""Which tests mostly wait for processes and wires, and which of ``make test`` run them."""
 
 from __future__ import annotations
 
-REALTIME = (
+WAIT = (
     "bridge/calibration/report/test_calibration_report_browser.py",
     "bridge/cli/test_cli_check.py",
     "bridge/cli/test_cli_init.py",
@@ -41,8 +41,8 @@ REALTIME = (
     "faults/test_start.py",
     "hil/",
 )
-"""Files and folders whose tests run processes, buses, browsers or servers against the clock."""
-UNTIMED = (
+"""Files and folders whose tests run processes, buses, browsers or servers."""
+COMPUTE = (
     "bridge/demo/test_demo_hidden.py",
     "bridge/demo/test_demo_parts.py",
     "bridge/demo/test_droop.py",
@@ -57,12 +57,12 @@ UNTIMED = (
     "drivers/ur_rtde/test_ur_allowed.py",
     "drivers/ur_rtde/test_ur_nominal.py",
 )
-"""Files in these folders whose tests compute, or have a clock of their own."""
-WAITING = ("gw0", "gw1")  # processes of xdist that run them: they mostly wait
+"""Files in these folders whose tests compute."""
+WAITING = ("gw0", "gw1")  # processes of xdist that run them
 NICE = 5  # of its other processes, which compute with what is left of the cores
 
 
-def is_realtime(file: str) -> bool:
-    """Return whether the tests of a file (or one of them), seen from the root, are in real time."""
+def waits(file: str) -> bool:
+    """Return whether the tests of a file (or one of them), seen from the root, mostly wait."""
     place = file.removeprefix("tests/")
-    return place.startswith(REALTIME) and not place.startswith(UNTIMED)
+    return place.startswith(WAIT) and not place.startswith(COMPUTE)
