@@ -125,6 +125,10 @@ class Drawing:
         """Add a line."""
         self.shapes.append(Line(tuple(points), stroke))
 
+    def extend(self, height: float) -> None:
+        """Make room at the bottom."""
+        self.height += height
+
     def add(self, shape: Shape) -> None:
         """Add a shape."""
         self.shapes.append(shape)

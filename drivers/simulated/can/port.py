@@ -24,7 +24,6 @@ class Port(ABC):
 
     def __init__(self, fd: int) -> None:
         self.fd = fd
-        self.watched = False  # whether the hub waits for room to write
         self._out = bytearray()
         self._in = bytearray()
 

@@ -74,10 +74,14 @@ class _Network(canopen.Network):
     def __init__(self, bus: Any) -> None:
         super().__init__(bus)
         self.silent: set[int] = set()
-        self.mute = False
+        self._mute = False
+
+    def set_mute(self, mute: bool) -> None:
+        """Have all nodes send nothing, or send again."""
+        self._mute = mute
 
     def send_message(self, can_id: int, data: Any, remote: bool = False) -> None:
-        if not self.mute and can_id & 0x7F not in self.silent:
+        if not self._mute and can_id & 0x7F not in self.silent:
             with contextlib.suppress(Exception):  # the bus has gone: the server's cycle notices
                 super().send_message(can_id, data, remote)
 
@@ -159,9 +163,8 @@ class CanopenServer(ProtocolServer):
 
     def _boot(self, joint: int) -> None:
         arm = self._controller.plant.arm
-        drive = self.drives[joint]
-        drive.q = self._controller.q[joint]
-        drive.boot(arm.lower[joint], arm.upper[joint])
+        q = self._controller.q[joint]
+        self.drives[joint].boot(q, arm.lower[joint], arm.upper[joint])
 
     @property
     def port(self) -> int:
@@ -225,9 +228,7 @@ class CanopenServer(ProtocolServer):
         if count > 1:
             self._late[drive.node] = (count - 1, delay)
         due, right = time.monotonic() + delay, drive.samples()
-        drive.q += OFF_BY
-        wrong = drive.samples()
-        drive.q -= OFF_BY
+        wrong = drive.samples_off_by(OFF_BY)
         self._held += [
             HeldPdo(due, self._syncs, cob_id, data, off)
             for (cob_id, data), (_, off) in zip(right, wrong, strict=True)
@@ -252,7 +253,7 @@ class CanopenServer(ProtocolServer):
         with self.lock:
             if self._network is None:
                 return
-            self._network.mute = controller.stalled
+            self._network.set_mute(controller.stalled)
             self._follow_stops(controller)
             self._send_held(time.monotonic())
             self._watch_heartbeats(controller)
@@ -311,11 +312,7 @@ class CanopenServer(ProtocolServer):
     def _feel(self, controller: ArmController) -> None:
         torque = controller.joint_torque
         for joint, drive in enumerate(self.drives):
-            drive.q, drive.qd, drive.torque = (
-                controller.q[joint],
-                controller.qd[joint],
-                torque[joint],
-            )
+            drive.measure(controller.q[joint], controller.qd[joint], torque[joint])
 
     def _beat(self, controller: ArmController) -> None:
         for drive in self.drives:

@@ -231,7 +231,7 @@ class ModbusServer(ProtocolServer):
 
         def program(numbers: list[float]) -> str:
             if isinstance(self.program, MailboxProgram):
-                self.program.running = bool(numbers[0])
+                self.program.run(bool(numbers[0]))
             return "ok"
 
         return {

@@ -21,6 +21,18 @@ class Declared:
     payload_inertia: Vector6 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)  # kg m^2
     gravity: Vector3 = (0.0, 0.0, 9.80665)  # m/s^2, as set_gravity takes it: upward is positive
 
+    def set_payload(self, mass: float, cog: Vector3) -> None:
+        """Declare the payload, kg and m in the flange frame."""
+        self.payload_mass, self.payload_cog = mass, cog
+
+    def set_payload_inertia(self, inertia: Vector6) -> None:
+        """Declare the payload's inertia, kg m^2."""
+        self.payload_inertia = inertia
+
+    def set_gravity(self, gravity: Vector3) -> None:
+        """Declare gravity, m/s^2, upward positive."""
+        self.gravity = gravity
+
     def set_tcp(self, tcp: Vector6) -> None:
         """Declare the TCP."""
         self.tcp, self.tool = tcp, frame_of(tcp)

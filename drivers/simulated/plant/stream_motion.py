@@ -25,6 +25,10 @@ class Servo(Stateless):
         self.lookahead = lookahead
         self._limits = arm.velocity
 
+    def aim(self, goal: Joints, lookahead: float) -> None:
+        """Follow another target from now on."""
+        self.goal, self.lookahead = goal, lookahead
+
     def step(self, q: Joints, qd: Joints, dt: float) -> Joints:
         """Return the next joint target."""
         share = dt / max(0.25 * self.lookahead, dt)
@@ -55,6 +59,10 @@ class SpeedJoints:
         self.acceleration = acceleration
         self._now: Joints | None = None
 
+    def aim(self, goal: Sequence[float], acceleration: float) -> None:
+        """Approach another velocity from now on."""
+        self.goal, self.acceleration = tuple(float(v) for v in goal), acceleration
+
     def restart(self, q: Joints) -> None:
         """Gather speed anew."""
         self._now = (0.0,) * len(q)
@@ -83,6 +91,10 @@ class SpeedTool:
         self.acceleration = acceleration
         self._arm, self._tool = arm, tool
         self._now: Joints = (0.0,) * 6
+
+    def aim(self, goal: Sequence[float], acceleration: float) -> None:
+        """Approach another velocity from now on."""
+        self.goal, self.acceleration = tuple(float(v) for v in goal), acceleration
 
     def restart(self, q: Joints) -> None:
         """Gather speed anew."""

@@ -142,6 +142,10 @@ class ArmController:
             self.let_go()
         self.motion = MoveJoints(self.own_q, goal, OWN_SPEED, OWN_ACCELERATION)
 
+    def stop_own(self) -> None:
+        """Brake what the robot's own program does."""
+        self.motion = Stop(self.target_qd, BRAKING)
+
     # -- stops ------------------------------------------------------------------------------------
 
     def protective_stop(self) -> None:
@@ -164,7 +168,11 @@ class ArmController:
 
     def _brake(self) -> None:
         self.let_go()
-        self.motion = Stop(self.target_qd, BRAKING)
+        self.stop_own()
+
+    def freeze(self, frozen: bool) -> None:
+        """Let the clock stand still, or go on."""
+        self.frozen = frozen
 
     def stall(self, seconds: float) -> None:
         """Send and answer nothing for a while."""
@@ -215,5 +223,5 @@ def make_controller(
     declared = Declared()
     if declare:
         declared.set_tcp(plant.tcp)
-        declared.payload_mass, declared.payload_cog = plant.payload_mass, plant.payload_cog
+        declared.set_payload(plant.payload_mass, plant.payload_cog)
     return ArmController(Plant(arm, plant, start_q), declared, period)

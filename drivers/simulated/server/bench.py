@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from gapbridge.drivers.simulated.plant.kinematics import pose_of
-from gapbridge.drivers.simulated.plant.plant import Load, Plant
+from gapbridge.drivers.simulated.plant.plant import Plant
 from gapbridge.drivers.simulated.plant.plant_arm import place
 from gapbridge.drivers.simulated.plant.rotations import compose, from_vector, to_vector
 from gapbridge.drivers.simulated.server.connection import Connection
@@ -39,8 +39,11 @@ class BenchSubject(Protocol):
 
     plant: Plant
     memory: dict[str, Any]
-    frozen: bool
     largest_servo_step: float
+
+    def freeze(self, frozen: bool) -> None:
+        """Let the clock stand still, or go on."""
+        ...
 
     def stall(self, seconds: float) -> None:
         """Send and answer nothing for a while."""
@@ -139,14 +142,12 @@ class BenchServer:
         mass, x, y, z = numbers
         if not 0.0 <= mass <= HEAVIEST:
             raise BenchError(f"payload: found {mass:g} kg, expected 0 to {HEAVIEST:g}")
-        load = self._controller.plant.load
-        self._controller.plant.load = Load(mass, (x, y, z), load.force, load.torque)
+        self._controller.plant.hang(mass, (x, y, z))
         return "ok"
 
     def _wrench(self, numbers: list[float]) -> str:
         fx, fy, fz, tx, ty, tz = numbers
-        load = self._controller.plant.load
-        self._controller.plant.load = Load(load.mass, load.cog, (fx, fy, fz), (tx, ty, tz))
+        self._controller.plant.pull((fx, fy, fz), (tx, ty, tz))
         return "ok"
 
     def _slip(self, numbers: list[float]) -> str:
@@ -179,11 +180,11 @@ class BenchServer:
     # -- faults of the link -----------------------------------------------------------------------
 
     def _freeze(self, _: list[float]) -> str:
-        self._controller.frozen = True
+        self._controller.freeze(True)
         return "ok"
 
     def _thaw(self, _: list[float]) -> str:
-        self._controller.frozen = False
+        self._controller.freeze(False)
         return "ok"
 
     def _stall(self, numbers: list[float]) -> str:

@@ -19,7 +19,7 @@ from gapbridge.drivers.simulated.plant.motion import (
 )
 from gapbridge.drivers.simulated.plant.plant_arm import BASE, Frame, place
 from gapbridge.drivers.simulated.plant.rotations import Vector3
-from gapbridge.drivers.simulated.plant.stream_motion import Servo, SpeedJoints, SpeedTool
+from gapbridge.drivers.simulated.plant.stream_motion import SpeedJoints, SpeedTool
 from gapbridge.drivers.simulated.ur.controller import (
     CYCLE,
     DEFAULT_STOP,
@@ -85,13 +85,7 @@ def _move_line_to_joints(r: Registers) -> Steps:
 
 
 def _servo_to(r: Registers, goal: Joints) -> None:
-    c, lookahead = r.controller, r.number(9)
-    if isinstance(c.motion, Servo):
-        step = max(abs(b - a) for a, b in zip(c.motion.goal, goal, strict=True))
-        c.largest_servo_step = max(c.largest_servo_step, step)
-        c.motion.goal, c.motion.lookahead = goal, lookahead
-    else:
-        c.motion = Servo(c.plant.arm, goal, lookahead)
+    r.controller.servo(goal, r.number(9))
 
 
 def _servo_joints(r: Registers) -> None:
@@ -104,23 +98,24 @@ def _servo_line(r: Registers) -> None:
 
 def _servo_circle(r: Registers) -> None:
     """servoC: taken as a line to the pose, at its speed and acceleration."""
-    r.controller.motion = _line_motion(r.controller, frame_of(r.pose()), r.number(6), r.number(7))
+    c = r.controller
+    c.start_motion(_line_motion(c, frame_of(r.pose()), r.number(6), r.number(7)))
 
 
 def _speed_joints(r: Registers) -> None:
     c, goal, acceleration = r.controller, r.joints(), _positive(r.number(6))
     if isinstance(c.motion, SpeedJoints):
-        c.motion.goal, c.motion.acceleration = goal, acceleration
+        c.motion.aim(goal, acceleration)
     else:
-        c.motion = SpeedJoints(goal, acceleration)
+        c.start_motion(SpeedJoints(goal, acceleration))
 
 
 def _speed_line(r: Registers) -> None:
     c, goal, acceleration = r.controller, r.joints(), _positive(r.number(6))
     if isinstance(c.motion, SpeedTool):
-        c.motion.goal, c.motion.acceleration = goal, acceleration
+        c.motion.aim(goal, acceleration)
     else:
-        c.motion = SpeedTool(c.plant.arm, c.declared.tool, goal, acceleration)
+        c.start_motion(SpeedTool(c.plant.arm, c.declared.tool, goal, acceleration))
 
 
 def _stop_joints(r: Registers) -> Steps:
@@ -159,7 +154,7 @@ def _jog(r: Registers) -> None:
     shift = place(at, Frame(BASE.rotation, speed[:3])).origin
     spin = place(at, Frame(BASE.rotation, speed[3:])).origin
     acceleration = r.number(7) or JOG_ACCELERATION
-    c.motion = SpeedTool(c.plant.arm, c.declared.tool, (*shift, *spin), acceleration)
+    c.start_motion(SpeedTool(c.plant.arm, c.declared.tool, (*shift, *spin), acceleration))
 
 
 def _move_path(r: Registers) -> Steps:
@@ -172,8 +167,7 @@ def _move_until_contact(r: Registers) -> Steps:
     """Move at a tool speed until something pushes back, then stop."""
     c = r.controller
     speed, acceleration = r.pose(), _positive(r.number(12))
-    motion = SpeedTool(c.plant.arm, c.declared.tool, speed, acceleration)
-    c.motion = motion
+    c.start_motion(SpeedTool(c.plant.arm, c.declared.tool, speed, acceleration))
     yield
     while not touches(r):
         yield

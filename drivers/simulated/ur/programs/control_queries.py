@@ -36,13 +36,12 @@ def _cog(r: Registers) -> Vector3:
 
 
 def _set_payload(r: Registers) -> None:
-    declared = r.controller.declared
-    declared.payload_mass, declared.payload_cog = r.number(0), _cog(r)
+    r.controller.declared.set_payload(r.number(0), _cog(r))
 
 
 def _set_target_payload(r: Registers) -> None:
     _set_payload(r)
-    r.controller.declared.payload_inertia = r.pose(4)
+    r.controller.declared.set_payload_inertia(r.pose(4))
 
 
 def _set_tcp(r: Registers) -> None:
@@ -50,7 +49,7 @@ def _set_tcp(r: Registers) -> None:
 
 
 def _set_gravity(r: Registers) -> None:
-    r.controller.declared.gravity = r.pose()[:3]
+    r.controller.declared.set_gravity(r.pose()[:3])
 
 
 def _protective_stop(r: Registers) -> None:
