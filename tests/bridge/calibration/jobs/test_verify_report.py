@@ -19,7 +19,8 @@ class Heard:
 
 def suspect(joint: int, value: float) -> Suspect:
     name = f"joint_offset_{joint}"
-    return Suspect(name, (Estimate(name, value, 2e-4, "rad"),), 0.4, 30.0)
+    found = (Estimate(name, value, 2e-4, "rad"),)
+    return Suspect(name, found, 0.4, 30.0, effect="joint_offset", joint=joint)
 
 
 def said(*others: Suspect) -> list[str]:
