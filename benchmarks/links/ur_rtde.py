@@ -14,10 +14,11 @@ from typing import Any
 
 from benchmarks.links.case import Cycles, LinkCase, OurCycle, Pause
 from benchmarks.links.serving import served_cell
+from benchmarks.server_thread import OFFSET_SCRIPT
 from gapbridge.bridge.cell.cell import Cell
 from gapbridge.drivers.simulated.ur.settings import SCRIPT_PORT
 from gapbridge.drivers.ur_rtde import registers
-from gapbridge.drivers.ur_rtde.driver import OFFSET_SCRIPT, UrRtdeDriver
+from gapbridge.drivers.ur_rtde.driver import UrRtdeDriver
 from gapbridge.drivers.ur_rtde.settings import UrRtdeSettings
 
 HOST = "127.77.0.5"

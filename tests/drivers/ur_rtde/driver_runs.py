@@ -12,7 +12,7 @@ sys.path.insert(0, SIMULATED)
 
 from simulated_cell import Bench, cell_settings, run_client  # noqa: E402
 
-from gapbridge.drivers.ur_rtde.driver import OFFSET_SCRIPT  # noqa: E402
+from benchmarks.server_thread import OFFSET_SCRIPT  # noqa: E402
 
 __all__ = ["Bench", "cell_settings", "run_driver"]
 
