@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
-from gapbridge.bridge.cell.document import Document, read_document
+from gapbridge.bridge.cell.document import read_document
 from gapbridge.bridge.cell.effects import compliance_terms, term_of
 from gapbridge.bridge.cell.message import key_path, message, messages
 from gapbridge.bridge.cell.plausibility import findings
@@ -32,6 +32,7 @@ from gapbridge.core.load_bounds import HEAVIEST
 from gapbridge.core.metrology import Metrology
 from gapbridge.core.model import Model, Uncertain
 from gapbridge.core.rotation import rpy_matrix, transform
+from gapbridge.core.yaml_document import Document
 from gapbridge.drivers.ft_sensor.settings import FtSensorSettings
 
 FINEST = 1.0e-9  # m: what a sigma of zero counts as

@@ -10,7 +10,7 @@ from typing import Any
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
-from gapbridge.bridge.cell.document import Document, Keys
+from gapbridge.core.yaml_document import Document, Keys
 
 _EXPECTED = {
     "float_type": "a number",

@@ -11,7 +11,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gapbridge.bridge.cell.document import Document
 from gapbridge.bridge.cell.message import key_path
 from gapbridge.bridge.cell.schema import CellFile, Payload
 from gapbridge.bridge.cell.settings.calibration import CalibrationSettings, LoadEntry
@@ -28,6 +27,7 @@ from gapbridge.core.plausibility import (
     reach,
     urdf_oddities,
 )
+from gapbridge.core.yaml_document import Document
 from gapbridge.drivers.ur_rtde.settings import UrRtdeSettings
 
 STANDARD = 9.80665  # m/s2
