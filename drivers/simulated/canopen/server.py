@@ -6,7 +6,7 @@ import contextlib
 import threading
 import time
 from collections.abc import Mapping
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import canopen
 from canopen.network import MessageListener
@@ -27,32 +27,6 @@ HEARTBEAT = 0x700
 BLOCKED, EMERGENCY, FOLLOWING_ERROR, HEARTBEAT_ERROR = 0x7121, 0x5441, 0x8611, 0x8130
 OFF_BY = 0.05  # rad that a TPDO of a SYNC before is off: who takes it for a new one is found out
 PAUSE = 0.02  # s
-
-
-class Faulty(Protocol):
-    """The drives as these commands need them."""
-
-    profile: CanopenProfile
-
-    def silence(self, node: int) -> None:
-        """Have a node send nothing."""
-        ...
-
-    def speak(self) -> None:
-        """Have all nodes send again."""
-        ...
-
-    def restart(self, node: int) -> None:
-        """Have a node start anew."""
-        ...
-
-    def fail(self, node: int, code: int) -> None:
-        """Have a drive fail."""
-        ...
-
-    def hold_back(self, node: int, delay: float, count: int = 1) -> None:
-        """Have TPDOs of a node come late."""
-        ...
 
 
 class HeldPdo(NamedTuple):
@@ -241,10 +215,10 @@ class CanopenServer(ProtocolServer):
             data = held.data if held.sync == self._syncs else held.off
             self._network.send_message(held.cob_id, data)
 
-    def hold_back(self, node: int, delay: float, count: int = 1) -> None:
+    def hold_back(self, node: float, delay: float, count: int = 1) -> None:
         """Have a node's TPDOs come ``delay`` s late, at the next ``count`` SYNCs."""
         with self.lock:
-            self._late[node] = (count, delay)
+            self._late[self.drives[self._joint_of(node)].node] = (count, delay)
 
     # -- the cycle --------------------------------------------------------------------------------
 
@@ -324,29 +298,44 @@ class CanopenServer(ProtocolServer):
 
     # -- the bench --------------------------------------------------------------------------------
 
-    def silence(self, node: int) -> None:
+    def _joint_of(self, node: float) -> int:
+        """Return the joint, from 0, of a node. Raises BenchError."""
+        if node not in self.profile.nodes:
+            raise BenchError(f"found node {node:g}, expected one of {self.profile.nodes}")
+        return self.profile.nodes.index(int(node))
+
+    def silence(self, node: float) -> None:
         """Have a node send nothing, as one whose plug is pulled."""
         with self.lock:
-            self._network.silent.add(node)
+            self._network.silent.add(self.drives[self._joint_of(node)].node)
 
     def speak(self) -> None:
         """Have all nodes send again."""
         with self.lock:
             self._network.silent.clear()
 
-    def restart(self, node: int) -> None:
+    def restart(self, node: float) -> None:
         """Have a node start anew, as after a dip of its supply."""
         with self.lock:
-            self._boot(self.profile.nodes.index(node))
+            self._boot(self._joint_of(node))
 
-    def fail(self, node: int, code: int) -> None:
+    def fail(self, node: float, code: int) -> None:
         """Have a drive fail with an error code."""
         with self.lock:
-            self.drives[self.profile.nodes.index(node)].fail(code)
+            self.drives[self._joint_of(node)].fail(code)
 
     def commands(self, controller: ArmController) -> Mapping[str, Command]:
         """Return the bench commands of drives."""
-        return bench_commands(self)
+        return {
+            "silence": (1, lambda given: self.silence(given[0]),
+                        "NODE: this drive sends nothing any more"),
+            "speak": (0, lambda _: self.speak(), "all drives send again"),
+            "restart": (1, lambda given: self.restart(given[0]), "NODE: this drive starts anew"),
+            "fail": (2, lambda given: self.fail(given[0], int(given[1]) & 0xFFFF),
+                     "NODE CODE: this drive goes to FAULT with an error code"),
+            "late": (2, lambda given: self.hold_back(given[0], max(given[1], 0.0)),
+                     "NODE SECONDS: its next TPDOs come so late"),
+        }  # fmt: skip
 
 
 def make_servers(
@@ -354,41 +343,3 @@ def make_servers(
 ) -> list[ProtocolServer]:
     """Return the drives of an arm, not yet on a bus. Raises InputError where they do not fit."""
     return [CanopenServer(link, host, controller)]
-
-
-def bench_commands(drives: Faulty) -> Mapping[str, Command]:
-    """Return the commands by name."""
-    nodes = drives.profile.nodes
-
-    def node_of(number: float) -> int:
-        if number not in nodes:
-            raise BenchError(f"found node {number:g}, expected one of {nodes}")
-        return int(number)
-
-    def silence(numbers: list[float]) -> str:
-        drives.silence(node_of(numbers[0]))
-        return "ok"
-
-    def speak(numbers: list[float]) -> str:
-        drives.speak()
-        return "ok"
-
-    def restart(numbers: list[float]) -> str:
-        drives.restart(node_of(numbers[0]))
-        return "ok"
-
-    def fail(numbers: list[float]) -> str:
-        drives.fail(node_of(numbers[0]), int(numbers[1]) & 0xFFFF)
-        return "ok"
-
-    def late(numbers: list[float]) -> str:
-        drives.hold_back(node_of(numbers[0]), max(numbers[1], 0.0))
-        return "ok"
-
-    return {
-        "silence": (1, silence, "NODE: this drive sends nothing any more"),
-        "speak": (0, speak, "all drives send again"),
-        "restart": (1, restart, "NODE: this drive starts anew"),
-        "fail": (2, fail, "NODE CODE: this drive goes to FAULT with an error code"),
-        "late": (2, late, "NODE SECONDS: its next TPDOs come so late"),
-    }

@@ -22,7 +22,7 @@ _DIGITAL = {  # mask field: (value field, first bit in actual_digital_output_bit
     "configurable_digital_output_mask": ("configurable_digital_output", 8),
     "tool_digital_output_mask": ("tool_digital_output", 16),
 }
-_WORDS = {"input_bit_registers0_to_31": 0, "input_bit_registers32_to_63": 32}
+_BIT_FIELDS = {"input_bit_registers0_to_31": 0, "input_bit_registers32_to_63": 32}
 log = logging.getLogger("drivers.simulated")
 CYCLE = 0.002  # s
 PROGRAM_START = 0.04  # s between the arrival of a program and its first line
@@ -324,10 +324,10 @@ def apply_inputs(memory: dict[str, Any], values: dict[str, Any]) -> None:
         memory["target_speed_fraction"] = memory["speed_scaling"] = fraction
     if "standard_analog_output_mask" in values:
         _set_analog(memory, values)
-    for word, first in _WORDS.items():
-        if word in values:
+    for field_name, first in _BIT_FIELDS.items():
+        if field_name in values:
             for i in range(32):
-                memory[f"input_bit_register_{first + i}"] = bool(values[word] >> i & 1)
+                memory[f"input_bit_register_{first + i}"] = bool(values[field_name] >> i & 1)
 
 
 def _switch(memory: dict[str, Any], mask: int, value: int, first: int) -> None:

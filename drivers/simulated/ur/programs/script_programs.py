@@ -23,8 +23,8 @@ DEFAULT_SPEED = 0.5  # rad/s
 def script_program(controller: Controller, name: str, lines: tuple[str, ...]) -> Steps:
     """Run the lines of a program; it ends in the cycle of its last line, as clients expect."""
     variables: dict[str, Any] = {"True": True, "False": False}
-    for raw in lines:
-        line = raw.split("#")[0].strip()
+    for text in lines:
+        line = text.split("#")[0].strip()
         if not line:
             continue
         call = parse_call(line, variables)
