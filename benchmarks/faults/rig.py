@@ -54,7 +54,7 @@ class Rig:
         """Return what the checker has found up to now."""
         while self.check():
             time.sleep(0.0005)  # the proxy goes first: who decodes must not slow the wire
-        if self.checker.doubts:
+        if self.checker.suspected:
             time.sleep(REPORTED)
             self.checker.settle([span for run in self._runs for span in run.writing_spans()])
         return self.checker.found

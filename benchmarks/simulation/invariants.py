@@ -98,10 +98,10 @@ class Judge:
         if self._lets_go(seen):
             return
         checker.take([seen])
-        if checker.doubts:  # the loop's state is known exactly here
-            doubt = checker.doubts.pop()
-            checker.doubts.clear()
-            self.violate("state", f"write in state {State(doubt.state).name}")
+        if checker.suspected:  # the loop's state is known exactly here
+            write = checker.suspected.pop()
+            checker.suspected.clear()
+            self.violate("state", f"write in state {State(write.state).name}")
         if isinstance(seen, Write) and seen.kind in ("offset", "joints"):
             self.writes_noted += 1
             self._last = seen.values

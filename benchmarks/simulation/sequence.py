@@ -24,7 +24,7 @@ LINKS: dict[str, type[SimulatedLink]] = {
     "ur_servoj": UrLink, "ur_offset": UrLink, "modbus": ModbusLink, "can": CanLink,
 }  # fmt: skip
 MOST_FAULTS = 4
-CALM, SPAN, REST = 0.3, 0.8, 0.3  # s: until faults begin; over what time they are spread; after
+QUIET, SPAN, REST = 0.3, 0.8, 0.3  # s: until faults begin; over what time they are spread; after
 RECOVERY = 25.0  # s until a healed run compensates again
 ENDING = 8.0  # s until a stopped run is over
 LOOK = 0.02  # s
@@ -138,7 +138,7 @@ class Person(Process):
         run, world, draw = self._of, self.world, self._draw
         self._wait_for(State.OBSERVING, RECOVERY)
         self._ask("arm")
-        begin = world.now + draw.uniform(0.0, CALM)
+        begin = world.now + draw.uniform(0.0, QUIET)
         for moment, fault in self._plan:
             self._until(begin + moment)
             if self._over or not run.loops:

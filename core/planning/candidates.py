@@ -53,7 +53,7 @@ class Candidates:
     """C poses, each under every load and, where joints have play, with opposite approaches."""
 
     q: Array  # (C, n) rad
-    readings: Readings  # (R,) exact readings that the model foresees
+    readings: Readings  # (R,) exact readings that the model predicts
     stop: Index  # (R,) number of the pose
     nuisance: Nuisance
     hindered: Hindered

@@ -177,9 +177,9 @@ def _collect(path: Path, bag: AnyReader, topic: str) -> _Samples:
     connections = [c for c in bag.connections if c.topic == topic]
     read: Callable[[bytes, str], Any] | None = None
     try:
-        for connection, received, raw in bag.messages(connections):
-            read = read or _reader(path, bag, connection.msgtype, raw)
-            message: Any = read(raw, connection.msgtype)
+        for connection, received, data in bag.messages(connections):
+            read = read or _reader(path, bag, connection.msgtype, data)
+            message: Any = read(data, connection.msgtype)
             stamp = message.header.stamp.sec + message.header.stamp.nanosec * 1e-9
             if stamp == 0:
                 stamp, found.received = received * 1e-9, found.received + 1
@@ -193,8 +193,8 @@ def _collect(path: Path, bag: AnyReader, topic: str) -> _Samples:
     return found
 
 
-def _reader(path: Path, bag: AnyReader, kind: str, raw: bytes) -> Callable[[bytes, str], Any]:
-    """Return what reads messages of a type, of which ``raw`` is one.
+def _reader(path: Path, bag: AnyReader, kind: str, data: bytes) -> Callable[[bytes, str], Any]:
+    """Return what reads messages of a type, of which ``data`` is one.
 
     Bags of SQLite before ROS 2 Iron hold no definitions: a controller's state is then read by the
     first layout that fits its bytes. Raises LogError where none does.
@@ -211,7 +211,7 @@ def _reader(path: Path, bag: AnyReader, kind: str, raw: bytes) -> Callable[[byte
         store = get_typestore(Stores.ROS2_HUMBLE)
         store.register(get_types_from_msg("\n".join(lines), kind))
         try:
-            store.deserialize_cdr(raw, kind)
+            store.deserialize_cdr(data, kind)
         except Exception:  # whatever another layout's bytes lead to
             continue
         return store.deserialize_cdr

@@ -9,7 +9,7 @@ from gapbridge.core.calibration.result import Errors, Estimate
 from gapbridge.core.calibration.verify import Suspect, Verification
 
 
-class Heard:
+class Lines:
     def __init__(self) -> None:
         self.lines: list[str] = []
 
@@ -30,9 +30,9 @@ def said(*others: Suspect) -> list[str]:
         chance=1e-9, moved=suspect(4, 0.01), suspects=others, stations=(), notes=(),
     )  # fmt: skip
     job = VerifyJob.__new__(VerifyJob)
-    job.prompt = heard = Heard()  # type: ignore[assignment]
+    job.prompt = prompt = Lines()  # type: ignore[assignment]
     job._report(found)
-    return heard.lines
+    return prompt.lines
 
 
 def test_other_joints_that_explain_as_much_are_named_with_their_size() -> None:
