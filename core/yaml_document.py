@@ -14,6 +14,7 @@ from gapbridge.core.errors import InputError
 from gapbridge.core.files import read_text
 
 Keys = Sequence[str | int]
+LONGEST = 60  # characters of a value that a message quotes
 
 _FLOAT = re.compile(
     r"^(?:[-+]?(?:[0-9][0-9_]*)(?:\.[0-9_]*)?(?:[eE][-+]?[0-9]+)"
@@ -62,6 +63,12 @@ class Kind(NamedTuple):
     keys: str  # robot: ...
     error: type[InputError]
     loaders: tuple[Any, ...]
+
+
+def quoted(value: object) -> str:
+    """Return what was found in a file, in one short line."""
+    text = " ".join(repr(value).split())
+    return text if len(text) <= LONGEST else f"{text[:LONGEST]}..."
 
 
 @dataclass(frozen=True)

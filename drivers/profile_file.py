@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from pydantic import ValidationError
+from pydantic_core import ErrorDetails
+
 from gapbridge.core.errors import InputError
-from gapbridge.core.yaml_document import Document, Keys, Kind, loaders, read_yaml
+from gapbridge.core.yaml_document import Document, Keys, Kind, loaders, quoted, read_yaml
 
 
 class ProfileError(InputError):
@@ -19,6 +22,17 @@ class ProfileDocument(Document):
         """Return the error that says ``message`` about a key path."""
         name = ".".join(str(key + 1) if isinstance(key, int) else key for key in keys)
         return ProfileError(f"{self.path}, line {self.line(keys)}: {name}: {message}")
+
+
+def worst_of(error: ValidationError) -> ErrorDetails:
+    """Return the first of what pydantic says; a misspelt key comes before the one it lacks."""
+    return min(error.errors(), key=lambda detail: detail["type"] != "extra_forbidden")
+
+
+def found_and_expected(detail: ErrorDetails) -> str:
+    """Return what a file has where another value belongs."""
+    expected = detail["msg"].removeprefix("Input should be ")
+    return f"found {quoted(detail['input'])}, expected {expected}"
 
 
 # a signal may be called ``on``

@@ -10,7 +10,7 @@ from typing import Any
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
-from gapbridge.core.yaml_document import Document, Keys
+from gapbridge.core.yaml_document import Document, Keys, quoted
 
 _EXPECTED = {
     "float_type": "a number",
@@ -37,7 +37,6 @@ _EXPECTED = {
     "union_tag_not_found": "a key {discriminator}",
     "enum": "{expected}",
 }
-LONGEST = 60  # characters of a found value that are quoted
 
 
 def key_path(keys: Keys) -> str:
@@ -173,8 +172,7 @@ def _found(error: ErrorDetails) -> str:
         return f"{len(value)} values"
     if value is None:
         return "nothing"
-    text = " ".join(repr(value).split())
-    return text if len(text) <= LONGEST else f"{text[:LONGEST]}..."
+    return quoted(value)
 
 
 def _expected(error: ErrorDetails, description: str) -> str:
