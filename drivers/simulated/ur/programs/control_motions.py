@@ -65,17 +65,9 @@ def _joints_for(c: Controller, goal: Frame, near: Joints | None = None) -> Joint
     return found
 
 
-def _move_joints(r: Registers) -> Steps:
-    return _move(r, _joint_motion(r.controller, r.joints(), r.number(6), r.number(7)))
-
-
 def _move_joints_to_pose(r: Registers) -> Steps:
     goal = _joints_for(r.controller, frame_of(r.pose()))
     return _move(r, _joint_motion(r.controller, goal, r.number(6), r.number(7)))
-
-
-def _move_line(r: Registers) -> Steps:
-    return _move(r, _line_motion(r.controller, frame_of(r.pose()), r.number(6), r.number(7)))
 
 
 def _move_line_to_joints(r: Registers) -> Steps:
@@ -84,16 +76,9 @@ def _move_line_to_joints(r: Registers) -> Steps:
     return _move(r, _line_motion(c, goal, r.number(6), r.number(7)))
 
 
-def _servo_to(r: Registers, goal: Joints) -> None:
-    r.controller.servo(goal, r.number(9))
-
-
-def _servo_joints(r: Registers) -> None:
-    _servo_to(r, r.joints())
-
-
 def _servo_line(r: Registers) -> None:
-    _servo_to(r, _joints_for(r.controller, frame_of(r.pose())))
+    goal = _joints_for(r.controller, frame_of(r.pose()))
+    r.controller.servo(goal, r.number(9))
 
 
 def _servo_circle(r: Registers) -> None:
@@ -116,10 +101,6 @@ def _speed_line(r: Registers) -> None:
         c.motion.aim(goal, acceleration)
     else:
         c.start_motion(SpeedTool(c.plant.arm, c.declared.tool, goal, acceleration))
-
-
-def _stop_joints(r: Registers) -> Steps:
-    return _move(r, Stop(r.controller.target_qd, _positive(r.number(0))))
 
 
 def _stop_line(r: Registers) -> Steps:
@@ -187,16 +168,16 @@ def touches(r: Registers) -> bool:
 
 
 MOTIONS: dict[int, Callable[[Registers], Steps | None]] = {
-    1: _move_joints,
+    1: lambda r: _move(r, _joint_motion(r.controller, r.joints(), r.number(6), r.number(7))),
     2: _move_joints_to_pose,
-    3: _move_line,
+    3: lambda r: _move(r, _line_motion(r.controller, frame_of(r.pose()), r.number(6), r.number(7))),
     4: _move_line_to_joints,
     7: _stop_jog,
     12: _servo_circle,
     15: _stop_line_now,
     16: _stop_line_now,
     33: _stop_line,
-    34: _stop_joints,
+    34: lambda r: _move(r, Stop(r.controller.target_qd, _positive(r.number(0)))),
     41: _jog,
     42: _stop_jog,
     45: _move_path,
@@ -206,6 +187,6 @@ MOTIONS: dict[int, Callable[[Registers], Steps | None]] = {
 REALTIME_MOTIONS: dict[int, Callable[[Registers], None]] = {
     9: _speed_joints,
     10: _speed_line,
-    11: _servo_joints,
+    11: lambda r: r.controller.servo(r.joints(), r.number(9)),
     24: _servo_line,
 }
