@@ -17,7 +17,7 @@ from gapbridge.bridge.cell import load_cell
 from gapbridge.bridge.cell.document import parse
 from gapbridge.bridge.cell.first_cell import Asked, first_cell
 from gapbridge.bridge.cell.live import whole_state
-from gapbridge.bridge.cell.message import message
+from gapbridge.bridge.cell.message import refusals
 from gapbridge.bridge.cell.schema import CellFile
 from gapbridge.bridge.cell.sections import LinkSettings
 from gapbridge.bridge.cli.options import FILE
@@ -140,8 +140,7 @@ def _settings(link: dict[str, Any]) -> LinkSettings:
     try:
         found = CellFile.model_validate({"robot": {"model": "ur10e"}, "link": link}).link
     except ValidationError as error:
-        line = message(parse(f"link: {{driver: {link['driver']}}}", Path()), CellFile, error)
-        raise InputError(line.split(": ", 1)[1]) from None
+        raise InputError(refusals(CellFile, error)[0][1]) from None
     assert found is not None
     return found.located(Path.cwd())
 
