@@ -114,8 +114,7 @@ def _listen(run: Run, judge: Judge, say: Any) -> None:
             say(f"{run.world.now - BEGIN:9.4f} {words}")
 
     def sent(setpoint: Setpoint) -> None:
-        key = setpoint.state_timestamp if isinstance(link, UrLink) else setpoint.state_received
-        sampled = link._sampled.get(key, float("nan"))
+        sampled = link.sampled_at(run.state_behind)
         judge.sent(setpoint, sampled, run.world.now, link.hidden_leap)
 
     events._listeners = (*events._listeners, heard)

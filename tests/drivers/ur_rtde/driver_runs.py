@@ -33,7 +33,7 @@ driver = make_driver(UrRtdeSettings(host=host, **{link!r}), model)
 bench = Bench(host)
 
 def setpoint(state, q, nominal_q, offset=np.zeros(6)):
-    return Setpoint(q, nominal_q, offset, state.timestamp, state.received)
+    return Setpoint(q, nominal_q, offset)
 
 def error_of(action, *arguments):
     try:
