@@ -8,7 +8,7 @@ from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
 from gapbridge.core.errors import InputError
-from gapbridge.core.yaml_document import Document, Keys, Kind, loaders, quoted, read_yaml
+from gapbridge.core.files import Document, Keys, Kind, loaders, quoted, read_yaml
 
 
 class ProfileError(InputError):

@@ -28,11 +28,11 @@ from gapbridge.bridge.cell.settings.web import MetricsSettings, WebSettings
 from gapbridge.core.arm import Arm
 from gapbridge.core.calibration.spread import Spread
 from gapbridge.core.errors import ArmError, CellError, InputError
+from gapbridge.core.files import Document
 from gapbridge.core.load_bounds import HEAVIEST
 from gapbridge.core.metrology import Metrology
 from gapbridge.core.model import Model, Uncertain
 from gapbridge.core.rotation import rpy_matrix, transform
-from gapbridge.core.yaml_document import Document
 from gapbridge.drivers.ft_sensor.settings import FtSensorSettings
 
 FINEST = 1.0e-9  # m: what a sigma of zero counts as

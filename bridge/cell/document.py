@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 
 from gapbridge.core.errors import CellError
-from gapbridge.core.yaml_document import Document, Kind, loaders, parse_yaml, read_yaml
+from gapbridge.core.files import Document, Kind, loaders, parse_yaml, read_yaml
 
 CELL = Kind("cell", "a cell file", "robot: ...", CellError, loaders())
 

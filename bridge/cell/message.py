@@ -10,7 +10,7 @@ from typing import Any
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
-from gapbridge.core.yaml_document import Document, Keys, quoted
+from gapbridge.core.files import Document, Keys, quoted
 
 _EXPECTED = {
     "float_type": "a number",

@@ -15,6 +15,7 @@ from gapbridge.bridge.cell.message import key_path
 from gapbridge.bridge.cell.schema import CellFile, Payload
 from gapbridge.bridge.cell.settings.calibration import CalibrationSettings, LoadEntry
 from gapbridge.core.arm import Arm, builtin_arm
+from gapbridge.core.files import Document
 from gapbridge.core.load_bounds import LEVER, LoadBounds
 from gapbridge.core.model import Model
 from gapbridge.core.plausibility import (
@@ -27,7 +28,6 @@ from gapbridge.core.plausibility import (
     reach,
     urdf_oddities,
 )
-from gapbridge.core.yaml_document import Document
 from gapbridge.drivers.ur_rtde.settings import UrRtdeSettings
 
 STANDARD = 9.80665  # m/s2
