@@ -21,7 +21,7 @@ from gapbridge.core.errors import LinkError
 SOME = 40  # messages decoded at a time
 STARTS = 3
 REPORTED = 1.0  # s within which an event has come from the loop to here, on any machine
-CONVERGED = 0.12  # s of compensating before a fault is made
+WARM_UP = 0.12  # s of compensating before a fault is made
 START_LIMIT, RECOVERY_LIMIT = 180.0, 120.0  # s: on a machine that has much else to do
 
 
@@ -157,7 +157,7 @@ class Rig:
                 self.run.daemon.arm()
             with contextlib.suppress(TimeoutError):
                 self.wait(State.COMPENSATING, 2.0)
-                self.pass_time(CONVERGED)
+                self.pass_time(WARM_UP)
             if self.run.state == State.COMPENSATING:
                 return
             if time.monotonic() > until:

@@ -24,7 +24,7 @@ from gapbridge.drivers.ur_rtde.settings import UrRtdeSettings
 HOST = "127.77.0.5"
 COMMON = f"driver: ur_rtde, host: {HOST}, state_timeout: 0.5"
 STARTED = 0.5  # s in which the robot's program runs
-CONVERGED = 0.0002  # s after which the library has taken the whole packet
+TAKEN = 0.0002  # s after which the library has taken the whole packet
 
 
 class UrOffsetCase(LinkCase):
@@ -81,7 +81,7 @@ def _wait(driver: UrRtdeDriver, pause: Pause) -> Any:
         last, until = receive.getTimestamp(), time.monotonic() + 0.1
         while receive.getTimestamp() == last and time.monotonic() < until:
             pause(0.0001)
-        pause(CONVERGED)
+        pause(TAKEN)
 
     return wait
 

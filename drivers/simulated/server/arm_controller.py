@@ -10,7 +10,7 @@ import logging
 from collections.abc import Sequence
 from typing import Any
 
-from gapbridge.drivers.simulated.plant.declared import Declared
+from gapbridge.drivers.simulated.plant.declared_settings import DeclaredSettings
 from gapbridge.drivers.simulated.plant.kinematics import Joints, within_limits
 from gapbridge.drivers.simulated.plant.motion import Hold, Motion, MoveJoints, Stop
 from gapbridge.drivers.simulated.plant.plant import Plant
@@ -34,7 +34,7 @@ class ArmController:
     until it is released.
     """
 
-    def __init__(self, plant: Plant, declared: Declared, cycle: float) -> None:
+    def __init__(self, plant: Plant, declared: DeclaredSettings, cycle: float) -> None:
         self.plant, self.declared = plant, declared
         self.period = cycle  # s
         self.clock = 0.0  # s, the controller's clock; stands still when frozen
@@ -220,7 +220,7 @@ def make_controller(
 
     With `declare` the controller is given the plant's true TCP and payload.
     """
-    declared = Declared()
+    declared = DeclaredSettings()
     if declare:
         declared.set_tcp(plant.tcp)
         declared.set_payload(plant.payload_mass, plant.payload_cog)

@@ -8,7 +8,7 @@ from collections.abc import Generator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
-from gapbridge.drivers.simulated.plant.declared import Declared
+from gapbridge.drivers.simulated.plant.declared_settings import DeclaredSettings
 from gapbridge.drivers.simulated.plant.kinematics import Joints, within_limits
 from gapbridge.drivers.simulated.plant.motion import Hold, Motion, Stop
 from gapbridge.drivers.simulated.plant.plant import Plant
@@ -50,7 +50,7 @@ class Controller:
     """A UR controller's state; the servers read and write it, ``cycle`` advances it by 2 ms."""
 
     plant: Plant
-    declared: Declared
+    declared: DeclaredSettings
     memory: dict[str, Any] = field(default_factory=dict)
     target_q: Joints = ()
     target_qd: Joints = ()

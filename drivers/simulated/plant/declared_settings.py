@@ -11,7 +11,7 @@ from gapbridge.drivers.simulated.plant.rotations import Vector3
 
 
 @dataclass(slots=True)
-class Declared:
+class DeclaredSettings:
     """The controller's own settings, changed by scripts."""
 
     tcp: Vector6 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)  # m, rad: TCP in the flange frame
