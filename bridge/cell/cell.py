@@ -64,10 +64,7 @@ class Cell:
         try:
             return None if given is None else given.located(self.path.parent)
         except InputError as error:
-            text = str(error)
-            raise type(error)(
-                f"{self.path}: {text}" if text.startswith("link.") else text
-            ) from None
+            raise type(error)(f"{self.path}: {error}") from None
 
     @property
     def ft_sensor(self) -> FtSensorSettings | None:
