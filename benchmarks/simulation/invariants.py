@@ -136,9 +136,9 @@ class Judge:
         if age > most:
             self.violate("age", f"a setpoint of a state sampled {age:.3f} s before")
 
-    # -- what the daemon hears --------------------------------------------------------------------
+    # -- what the daemon reports ------------------------------------------------------------------
 
-    def heard(self, event: dict[str, Any]) -> None:
+    def on_event(self, event: dict[str, Any]) -> None:
         """Take an event of the daemon's log."""
         self._now = float(event["seen"])
         kind = event["kind"]

@@ -105,9 +105,9 @@ def _planned(draw: random.Random, link: str, given: Sequence[tuple[float, str]] 
 def _listen(run: Run, judge: Judge, say: Any) -> None:
     events, link = run.daemon.event_log, run.link
 
-    def heard(event: dict[str, Any]) -> None:
+    def noted(event: dict[str, Any]) -> None:
         whole = {**event, "seen": run.world.now}
-        judge.heard(whole)
+        judge.on_event(whole)
         if say is not None and event["kind"] != "status":
             keys = ("kind", "from", "to", "cause", "command", "detail")
             words = " ".join(str(event[k]) for k in keys if k in event)
@@ -117,7 +117,7 @@ def _listen(run: Run, judge: Judge, say: Any) -> None:
         sampled = link.sampled_at(run.state_behind)
         judge.sent(setpoint, sampled, run.world.now, link.hidden_leap)
 
-    events._listeners = (*events._listeners, heard)
+    events._listeners = (*events._listeners, noted)
     run.on_send = sent
 
 

@@ -73,7 +73,7 @@ class Drive(canopen.LocalNode):
         self.units, self.axis = units, Axis(q)
         self.q, self.qd, self.torque = q, 0.0, 0.0  # of the plant, rad, rad/s, Nm
         self.error_code = 0
-        self.watched: dict[int, float] = {}  # node id -> s it was last heard at
+        self.watched: dict[int, float] = {}  # node id -> s of its last heartbeat
         self._limits = (-LAST, LAST)
         self._received: dict[int, bytes] = {}  # RPDO's COB-ID -> data that waits for a SYNC
         self._mappings: dict[int, Mapping | None] = {}

@@ -72,7 +72,7 @@ class _Listener(MessageListener):
             return
         with self._server.lock:
             super().on_message_received(msg)  # type: ignore[no-untyped-call]
-            self._server.heard(int(msg.arbitration_id), bytes(msg.data))
+            self._server.take_frame(int(msg.arbitration_id), bytes(msg.data))
 
     def on_error(self, exc: Exception) -> None:
         time.sleep(PAUSE)  # the bus has gone: the server's cycle notices
@@ -162,7 +162,7 @@ class CanopenServer(ProtocolServer):
 
     # -- frames -----------------------------------------------------------------------------------
 
-    def heard(self, cob_id: int, data: bytes) -> None:
+    def take_frame(self, cob_id: int, data: bytes) -> None:
         """Act on one frame, after the library has; from the notifier's thread."""
         if self._network is None or self._controller.stalled:
             return
@@ -193,8 +193,8 @@ class CanopenServer(ProtocolServer):
             for cob_id, data in drive.samples():
                 self._network.send_message(cob_id, data)
         for drive in self.drives:
-            heard = drive.operational and drive.node not in self._network.silent
-            if heard and not drive.take_setpoints():
+            listens = drive.operational and drive.node not in self._network.silent
+            if listens and not drive.take_setpoints():
                 drive.fail(FOLLOWING_ERROR)
 
     def _hold(self, drive: Drive) -> None:
@@ -255,8 +255,8 @@ class CanopenServer(ProtocolServer):
     def _watch_heartbeats(self, controller: ArmController) -> None:
         for drive in self.drives:
             limit = 1e-3 * (drive.number(0x1016, 1) & 0xFFFF)
-            for node, heard in list(drive.watched.items()):
-                if limit and controller.running - heard > limit:
+            for node, last in list(drive.watched.items()):
+                if limit and controller.running - last > limit:
                     del drive.watched[node]
                     drive.emcy.send(HEARTBEAT_ERROR, COMMUNICATION)
                     self._abort_connection(drive)
