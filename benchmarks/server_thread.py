@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Self
 
+from gapbridge.drivers import ur_rtde
 from gapbridge.drivers.simulated.server.arm_controller import ArmController
 from gapbridge.drivers.simulated.server.protocol_server import ProtocolServer, ServerLoop
+
+OFFSET_SCRIPT = Path(ur_rtde.__path__[0]) / "gapbridge_offset.script"
 
 
 class ServerThread:

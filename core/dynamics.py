@@ -74,20 +74,12 @@ def pieces_of(model: Model, motion: Motion) -> Pieces:
     chain, rows = geometry.chain(), geometry.rows(motion.q, motion.loads)
     frames = frames_of(chain, rows.q, motion.qd, motion.qdd)
     n, count = model.arm.n, len(motion)
-    gravity = chain.gravity
-    link_torque = np.zeros((count, n, n))
 
     def link_at(i: int, cog: Array) -> Array:
-        """Return the torques (N, n) of one link with its centre of gravity at ``cog`` (3,)."""
         body = np.vstack([cog, [chain.mass[i], 0.0, 0.0], model.arm.inertia[i]])
-        point, force, moment = (np.empty((count, 3)) for _ in range(3))
-        rigid.taken_by_link(i, body, gravity, frames, point, force, moment)
-        torque = np.zeros((count, n))
-        torque[:, : i + 1] = _about_axes(frames, i + 1, point, force, moment)
-        return torque
+        return _link_torque(frames, i, body, chain.gravity)
 
-    for i in range(n):
-        link_torque[:, i] = link_at(i, chain.cog[i])
+    link_torque = np.stack([link_at(i, chain.cog[i]) for i in range(n)], axis=1)
     hand = frames.rotation[:, n]
     sensor = _bent_flange(model, motion, frames)
     tcp_in_hand = sensor.origin[:, n] + sensor.rotation[:, n] @ chain.tool_position
@@ -98,7 +90,7 @@ def pieces_of(model: Model, motion: Motion) -> Pieces:
     def payload_from(shift: Array) -> tuple[Array, Array]:
         cog = rows.payload_cog + shift
         place, acceleration = frames.at(n, _times(hand, cog))
-        force = acceleration - gravity
+        force = acceleration - chain.gravity
         in_hand, _ = sensor.at(n, _times(sensor.rotation[:, n], cog))
         return (
             _about_axes(frames, n, place, force, nothing),
@@ -122,6 +114,16 @@ def pieces_of(model: Model, motion: Motion) -> Pieces:
         payload_from=payload_from,
         link_from=link_from,
     )
+
+
+def _link_torque(frames: Frames, i: int, body: Array, gravity: Array) -> Array:
+    """Return the torques (N, n) of link i: ``body`` has centre of gravity, mass and inertia."""
+    count, n = frames.omega.shape[:2]
+    point, force, moment = (np.empty((count, 3)) for _ in range(3))
+    rigid.taken_by_link(i, body, gravity, frames, point, force, moment)
+    torque = np.zeros((count, n))
+    torque[:, : i + 1] = _about_axes(frames, i + 1, point, force, moment)
+    return torque
 
 
 def _bent_flange(model: Model, motion: Motion, frames: Frames) -> Frames:

@@ -3,6 +3,9 @@
 Every reader of a cell, and of what a cell names, reads through here. A process may record what it
 reads (``recorded``) and hand it to another one, which then reads those bytes and nothing else
 (``read_only_from``): a file that was edited meanwhile does not exist for it.
+
+A ``Document`` is a YAML file with the places of its keys, so that messages and edits can point at
+them.
 """
 
 from __future__ import annotations
@@ -10,9 +13,32 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
-from collections.abc import Iterator, Mapping
+import re
+from collections.abc import Iterator, Mapping, Sequence
 from contextvars import ContextVar
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, NamedTuple
+
+import yaml
+
+from gapbridge.core.errors import InputError
+
+Keys = Sequence[str | int]
+LONGEST = 60  # characters of a value that a message quotes
+
+_FLOAT = re.compile(
+    r"^(?:[-+]?(?:[0-9][0-9_]*)(?:\.[0-9_]*)?(?:[eE][-+]?[0-9]+)"
+    r"|[-+]?\.[0-9][0-9_]*(?:[eE][-+]?[0-9]+)?)$"
+)
+_BOOLEAN = re.compile(r"^(?:true|True|TRUE|false|False|FALSE)$")
+YAML_11_BOOLEAN = "tag:yaml.org,2002:bool"
+# What PyYAML says of common slips, as found and expected.
+PROBLEMS = {
+    r"'\t' that cannot start any token": "found a tab, expected spaces",
+    "found another document": "found a second document (---), expected one {name} in a file",
+    "could not determine a constructor for the tag": "found a tag (!), expected plain values",
+}
 
 _recording: ContextVar[dict[str, bytes] | None] = ContextVar("_recording", default=None)
 _given: Mapping[str, bytes] | None = None
@@ -67,3 +93,155 @@ def read_only_from(files: Mapping[str, bytes]) -> None:
     """Have this process read these files from now on, and no others."""
     global _given
     _given = dict(files)
+
+
+def loaders(*, on_is_text: bool = False) -> tuple[Any, ...]:
+    """Return loaders of YAML 1.1 with the floats of YAML 1.2: PyYAML alone reads 2e-5 as a text.
+
+    ``on_is_text``: with the booleans of 1.2 too. The quickest loader (libyaml's, which saves a
+    tenth of a second for a cell with a fit's covariance) comes first; the last one's messages are
+    those that ``PROBLEMS`` knows.
+    """
+    quick = (yaml.CSafeLoader,) if hasattr(yaml, "CSafeLoader") else ()
+    return tuple(_loader(base, on_is_text) for base in (*quick, yaml.SafeLoader))
+
+
+def _loader(base: Any, on_is_text: bool) -> Any:
+    resolvers = {
+        first: [
+            (tag, found) for tag, found in all_of if not (on_is_text and tag == YAML_11_BOOLEAN)
+        ]
+        for first, all_of in base.yaml_implicit_resolvers.items()
+    }
+    found: Any = type("_Loader", (base,), {"yaml_implicit_resolvers": resolvers})
+    found.add_implicit_resolver("tag:yaml.org,2002:float", _FLOAT, list("-+0123456789."))
+    if on_is_text:
+        found.add_implicit_resolver(YAML_11_BOOLEAN, _BOOLEAN, list("tTfF"))
+    return found
+
+
+class Kind(NamedTuple):
+    """One kind of YAML file: how it is loaded, and what messages call it."""
+
+    name: str  # cell
+    file: str  # a cell file
+    keys: str  # robot: ...
+    error: type[InputError]
+    loaders: tuple[Any, ...]
+
+
+def quoted(value: object) -> str:
+    """Return what was found in a file, in one short line."""
+    text = " ".join(repr(value).split())
+    return text if len(text) <= LONGEST else f"{text[:LONGEST]}..."
+
+
+@dataclass(frozen=True)
+class Document:
+    """One YAML file: its text, its nodes (with their marks) and its data."""
+
+    path: Path
+    text: str
+    root: yaml.MappingNode
+    data: dict[str, Any]
+
+    def node(self, keys: Keys) -> yaml.Node | None:
+        """Return the node at a key path, or None where there is none."""
+        node: yaml.Node | None = self.root
+        for key in keys:
+            if isinstance(node, yaml.MappingNode):
+                node = next((v for k, v in node.value if k.value == str(key)), None)
+            elif isinstance(node, yaml.SequenceNode) and isinstance(key, int):
+                node = node.value[key] if key < len(node.value) else None
+            else:
+                return None
+        return node
+
+    def line(self, keys: Keys) -> int:
+        """Return the line (from 1) of a key path, or of its nearest parent in the file."""
+        for length in range(len(keys), 0, -1):
+            parent = self.node(keys[: length - 1])
+            if isinstance(parent, yaml.MappingNode):
+                for key, _ in parent.value:
+                    if key.value == str(keys[length - 1]):
+                        return int(key.start_mark.line) + 1
+            node = self.node(keys[:length])
+            if node is not None:
+                return int(node.start_mark.line) + 1
+        return int(self.root.start_mark.line) + 1
+
+
+def parse_yaml(text: str, path: Path, kind: Kind) -> Document:
+    """Return the document of a YAML text; ``path`` is for messages.
+
+    Raises the kind's error, naming the line, for broken YAML, for a key that stands twice, and
+    where the top is not a mapping.
+    """
+    try:
+        loader, root = _loaded(text, kind)
+        if not isinstance(root, yaml.MappingNode):
+            where = path if root is None else f"{path}, line {root.start_mark.line + 1}"
+            found = "an empty file" if root is None else "no keys"
+            raise kind.error(f"{where}: found {found}, expected a {kind.name} ({kind.keys})")
+        _refuse_doubles(root, path, kind, set())
+        data = loader.construct_document(root)
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        line = mark.line + 1 if mark else 1
+        what = " ".join(str(error.problem or error.context or "broken YAML").split())
+        for problem, said in PROBLEMS.items():
+            if problem in what:
+                text = said.format(name=kind.name)
+                raise kind.error(f"{path}, line {line}: {text}") from None
+        raise kind.error(f"{path}, line {line}: found broken YAML: {what}") from None
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        what = " ".join(str(error).split())
+        raise kind.error(f"{path}: found broken YAML: {what}") from None
+    return Document(path, text, root, data)
+
+
+def _loaded(text: str, kind: Kind) -> tuple[Any, yaml.Node | None]:
+    """Return a loader of a text, and the text's one node."""
+    for loader_class in kind.loaders[:-1]:
+        try:
+            loader = loader_class(text)
+            return loader, loader.get_single_node()
+        except yaml.YAMLError:
+            pass
+    loader = kind.loaders[-1](text)
+    return loader, loader.get_single_node()
+
+
+def read_yaml(path: Path, kind: Kind) -> Document:
+    """Return the document of a YAML file; raises the kind's error where it cannot be read."""
+    try:
+        text = read_text(path, "utf-8-sig")
+    except FileNotFoundError:
+        raise kind.error(f"{path}: file not found, expected {kind.file} (YAML)") from None
+    except IsADirectoryError:
+        raise kind.error(f"{path}: found a folder, expected {kind.file} (YAML)") from None
+    except UnicodeDecodeError:
+        raise kind.error(f"{path}: found bytes that are no text, expected YAML (UTF-8)") from None
+    except OSError as error:
+        raise kind.error(f"{path}: cannot be read: {error.strerror}") from None
+    return parse_yaml(text, path, kind)
+
+
+def _refuse_doubles(node: yaml.Node, path: Path, kind: Kind, seen: set[int]) -> None:
+    if id(node) in seen:
+        return
+    seen.add(id(node))
+    if isinstance(node, yaml.SequenceNode):
+        for item in node.value:
+            _refuse_doubles(item, path, kind, seen)
+    elif isinstance(node, yaml.MappingNode):
+        keys: set[str] = set()
+        for key, value in node.value:
+            if isinstance(key, yaml.ScalarNode) and key.value != "<<":
+                if key.value in keys:
+                    line = key.start_mark.line + 1
+                    raise kind.error(
+                        f"{path}, line {line}: {key.value}: found twice, expected once"
+                    )
+                keys.add(key.value)
+            _refuse_doubles(value, path, kind, seen)

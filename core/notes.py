@@ -63,6 +63,20 @@ class Reason(Enum):
     SIGHT_UNKNOWN = auto()
     DETOURS = auto()  # pairs of stops, from 1
     FEW_POSES = auto()  # what hinders the others
+    # of a recording that is read as a log
+    NO_STAMPS = auto()  # topic, messages without a stamp, messages
+    NO_TARGET = auto()
+    WRENCH_UNKNOWN = auto()  # topics, columns that it could be
+    POSE_UNNAMED = auto()  # topics
+    TAKEN_AS = auto()  # topic, column, frame
+    EFFORT_UNKNOWN = auto()  # topic
+    NO_COMMON_TIME = auto()  # topic, the other
+    GAPS = auto()  # topic, how many, s of the longest
+    UNCOVERED = auto()  # rows, of how many
+    FRAME_TIMES = auto()  # Hz, ms between two
+    EPISODES = auto()  # how many, s between two
+    MIDDLE_ZERO = auto()
+    BEHIND_GEARS = auto()
 
 
 @dataclass(frozen=True)

@@ -45,5 +45,3 @@ class Setpoint(NamedTuple):
     q: Array  # (n,) rad, the setpoint to be commanded
     nominal_q: Array  # (n,) rad, what was wanted before correction
     offset_in_base: Array  # (6,) m, rad
-    state_timestamp: float  # s, controller clock of the state behind this setpoint
-    state_received: float  # s, time.monotonic() when that state was first seen here

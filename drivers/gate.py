@@ -94,6 +94,53 @@ def _length(vector, first):  # type: ignore[no-untyped-def]
 
 
 @njit(**JIT)
+def _judge_joints(links, joints, numbers, first):  # type: ignore[no-untyped-def]
+    """Return what ``_judge`` does, of joints that are written."""
+    n, travel = joints.shape[1], 0.0
+    q, nominal, last = joints[0], joints[1], joints[2]
+    here, there, was = np.empty((3, 4)), np.empty((3, 4)), np.empty((3, 4))
+    scratch = np.empty((3, 4))
+    _place(links, q, here, scratch)
+    _place(links, nominal, there, scratch)
+    length, turn = _gap(here, there)
+    nearer = True
+    for i in range(n):
+        lag = abs(last[i] - nominal[i])
+        nearer = nearer and abs(q[i] - nominal[i]) <= lag + GRAIN
+        if abs(q[i] - nominal[i]) > max(numbers[4], lag) + GRAIN:
+            return JOINT_OFFSET, i, abs(q[i] - nominal[i]), 0.0
+        if not first:  # it may have given since
+            travel = max(travel, (abs(q[i] - last[i]) - GRAIN) / joints[5, i])
+    if not nearer and (
+        length > numbers[0] * SECOND_ORDER + GRAIN or turn > numbers[1] * SECOND_ORDER + GRAIN
+    ):
+        # a command that its joints' speed holds back may be far from where it goes to,
+        # but it does not go farther
+        _place(links, last, was, scratch)
+        far, turned = _gap(was, there)
+        if length > max(numbers[0] * SECOND_ORDER, far) + GRAIN:
+            return FAR_OFFSET, -1, length, 0.0
+        if turn > max(numbers[1] * SECOND_ORDER, turned) + GRAIN:
+            return FAR_TURN, -1, turn, 0.0
+    return FINE, -1, 0.0, travel
+
+
+@njit(**JIT)
+def _judge_offsets(offsets, numbers, length, turn):  # type: ignore[no-untyped-def]
+    """Return what ``_judge`` does, of an offset that is written."""
+    if length > numbers[0] * (1.0 + GRAIN) + GRAIN:
+        return FAR_OFFSET, -1, length, 0.0
+    if turn > numbers[1] * (1.0 + GRAIN) + GRAIN:
+        return FAR_TURN, -1, turn, 0.0
+    shift, angle = 0.0, 0.0
+    for k in range(3):
+        shift += (offsets[0, k] - offsets[1, k]) ** 2
+        angle += (offsets[0, 3 + k] - offsets[1, 3 + k]) ** 2
+    travel = max((math.sqrt(shift) - GRAIN) / numbers[2], (math.sqrt(angle) - GRAIN) / numbers[3])
+    return FINE, -1, 0.0, travel
+
+
+@njit(**JIT)
 def _judge(links, joints, offsets, numbers, budget, moves, first):  # type: ignore[no-untyped-def]
     """Return (reason, joint, found, s of travel that the step takes).
 
@@ -101,8 +148,7 @@ def _judge(links, joints, offsets, numbers, budget, moves, first):  # type: igno
     envelope, its rotation, its rates, joint offset, longest step (s). first: nothing was sent yet,
     last q is where the arm stood.
     """
-    n, travel = joints.shape[1], 0.0
-    q, nominal, last = joints[0], joints[1], joints[2]
+    n, q, nominal = joints.shape[1], joints[0], joints[1]
     for i in range(n):
         if not (math.isfinite(q[i]) and math.isfinite(nominal[i])):
             return NOT_FINITE, i, q[i], 0.0
@@ -118,42 +164,11 @@ def _judge(links, joints, offsets, numbers, budget, moves, first):  # type: igno
             return FAR_OFFSET, -1, length, 0.0
         if turn > OUTERMOST_TURN * SECOND_ORDER:
             return FAR_TURN, -1, turn, 0.0
-        here, there, was = np.empty((3, 4)), np.empty((3, 4)), np.empty((3, 4))
-        scratch = np.empty((3, 4))
-        _place(links, q, here, scratch)
-        _place(links, nominal, there, scratch)
-        length, turn = _gap(here, there)
-        nearer = True
-        for i in range(n):
-            lag = abs(last[i] - nominal[i])
-            nearer = nearer and abs(q[i] - nominal[i]) <= lag + GRAIN
-            if abs(q[i] - nominal[i]) > max(numbers[4], lag) + GRAIN:
-                return JOINT_OFFSET, i, abs(q[i] - nominal[i]), 0.0
-            if not first:  # it may have given since
-                travel = max(travel, (abs(q[i] - last[i]) - GRAIN) / joints[5, i])
-        if not nearer and (
-            length > numbers[0] * SECOND_ORDER + GRAIN or turn > numbers[1] * SECOND_ORDER + GRAIN
-        ):
-            # a command that its joints' speed holds back may be far from where it goes to,
-            # but it does not go farther
-            _place(links, last, was, scratch)
-            far, turned = _gap(was, there)
-            if length > max(numbers[0] * SECOND_ORDER, far) + GRAIN:
-                return FAR_OFFSET, -1, length, 0.0
-            if turn > max(numbers[1] * SECOND_ORDER, turned) + GRAIN:
-                return FAR_TURN, -1, turn, 0.0
+        reason, joint, found, travel = _judge_joints(links, joints, numbers, first)
     else:
-        if length > numbers[0] * (1.0 + GRAIN) + GRAIN:
-            return FAR_OFFSET, -1, length, 0.0
-        if turn > numbers[1] * (1.0 + GRAIN) + GRAIN:
-            return FAR_TURN, -1, turn, 0.0
-        shift, angle = 0.0, 0.0
-        for k in range(3):
-            shift += (offsets[0, k] - offsets[1, k]) ** 2
-            angle += (offsets[0, 3 + k] - offsets[1, 3 + k]) ** 2
-        travel = max(
-            (math.sqrt(shift) - GRAIN) / numbers[2], (math.sqrt(angle) - GRAIN) / numbers[3]
-        )
+        reason, joint, found, travel = _judge_offsets(offsets, numbers, length, turn)
+    if reason != FINE:
+        return reason, joint, found, 0.0
     if travel > numbers[5] * (1.0 + GRAIN):
         return STEP, -1, travel, 0.0
     if travel > budget:

@@ -135,7 +135,7 @@ def make_case(kind: str, seed: int, folder: Path) -> Label:
         return _channel_label(kind, seed, case)
     drawn, bench = case.drawn, case.drawn.bench
     if case.outliers:
-        measured = special_cases.wild_readings(drawn, rng)
+        measured = special_cases.with_outliers(drawn, rng)
     else:
         misread = case.strange.misread if case.strange else None
         measured = read_arm(drawn.real, bench.session, bench.instrument, rng, misread)

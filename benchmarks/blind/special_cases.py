@@ -131,7 +131,7 @@ def _count(name: str) -> int:
     return ONE_OR_TWO[name]
 
 
-def wild_readings(drawn: Drawn, rng: Generator, share: float = 0.03) -> tuple[Array, Array | None]:
+def with_outliers(drawn: Drawn, rng: Generator, share: float = 0.03) -> tuple[Array, Array | None]:
     """Return readings of which a share (at least one) is off by millimetres."""
     position, rotation = read_arm(drawn.real, drawn.bench.session, drawn.bench.instrument, rng)
     count = max(1, round(share * len(position)))

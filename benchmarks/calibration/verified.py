@@ -57,7 +57,7 @@ class Outcome:
     before: float  # m, rms of one coordinate at held-out poses, nominal model
     after: float
     floor: float  # m, instrument and arm, one coordinate, at the same poses
-    lacking: tuple[str, ...] = ()  # effects that the readings asked for, in turn
+    missing: tuple[str, ...] = ()  # effects that the readings asked for, in turn
     named: bool = True  # what the arm has is among what was fitted
 
     @property
@@ -91,7 +91,7 @@ def draw_case(arm: str, effect: str, rng: Generator) -> tuple[Bench, list[Ingred
 def run(arm: str, effect: str, seed: int, asked: bool = False) -> Outcome:
     """Return the outcome of one arm with one effect among others.
 
-    ``asked``: the fit is not given which, but made again with what it says is lacking.
+    ``asked``: the fit is not given which, but made again with what it says is missing.
     """
     rng = np.random.default_rng([seed, 4711])
     bench, parts = draw_case(arm, effect, rng)

@@ -87,7 +87,7 @@ class Stream:
 
 
 @dataclass(frozen=True)
-class Doubt:
+class Suspected:
     """A write that was seen in a state that forbids it; the loop's word will say more."""
 
     earliest: float
@@ -102,7 +102,7 @@ class Checker:
     def __init__(self, bounds: Bounds) -> None:
         self.bounds = bounds
         self.found = Found()
-        self.doubts: list[Doubt] = []
+        self.suspected: list[Suspected] = []
         self._fresh: Fresh | None = None
         self._unsafe_since: float | None = None
         self._last_writing = -math.inf  # s: when the supervisor was last in a state that writes
@@ -136,14 +136,14 @@ class Checker:
                 self._check(item)
 
     def settle(self, spans: Sequence[tuple[float, float]]) -> None:
-        """Judge what was in doubt by when the loop was writing, s monotonic."""
-        doubts, self.doubts = self.doubts, []
-        for doubt in doubts:
-            if not any(a - SURE <= doubt.time and doubt.earliest <= b + SURE for a, b in spans):
-                late = min((doubt.earliest - b for _, b in spans if b < doubt.time), default=0.0)
-                values = [round(v, 6) for v in doubt.values]
+        """Judge what is suspected by when the loop was writing, s monotonic."""
+        suspected, self.suspected = self.suspected, []
+        for write in suspected:
+            if not any(a - SURE <= write.time and write.earliest <= b + SURE for a, b in spans):
+                late = min((write.earliest - b for _, b in spans if b < write.time), default=0.0)
+                values = [round(v, 6) for v in write.values]
                 self.found.add(
-                    f"write in state {doubt.state}, {late:.3f} s after the last allowed: {values}"
+                    f"write in state {write.state}, {late:.3f} s after the last allowed: {values}"
                 )
 
     def _end_stream(self, time: float) -> None:
@@ -232,7 +232,7 @@ class Checker:
 
     def _check_state(self, write: Write) -> None:
         if write.state not in WRITING:
-            self.doubts.append(Doubt(write.early, write.time, write.state, write.values))
+            self.suspected.append(Suspected(write.early, write.time, write.state, write.values))
         since, b = self._unsafe_since, self.bounds
         if since is not None and write.early - since > max(b.fresh, GRACE + b.cycle):
             self.found.add(

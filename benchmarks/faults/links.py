@@ -19,11 +19,11 @@ from benchmarks.faults.wire.modbus import ModbusDecoder
 from benchmarks.faults.wire.rtde import RtdeDecoder
 from benchmarks.faults.wire.seen import Decoder
 from benchmarks.faults.wire.socketcand import PiperDecoder
+from benchmarks.server_thread import OFFSET_SCRIPT
 from gapbridge.bridge.cell import load_cell
 from gapbridge.drivers.simulated.plant.kinematics import frame_of
 from gapbridge.drivers.simulated.plant.plant_arm import plant_arm
 from gapbridge.drivers.simulated.ur.settings import START_Q
-from gapbridge.drivers.ur_rtde.driver import OFFSET_SCRIPT
 
 CONFIG = Path(__file__).parents[2] / "config"
 CONNECT = 3.0  # s that the library may hang in its constructor before its process is ended

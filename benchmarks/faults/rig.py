@@ -21,7 +21,7 @@ from gapbridge.core.errors import LinkError
 SOME = 40  # messages decoded at a time
 STARTS = 3
 REPORTED = 1.0  # s within which an event has come from the loop to here, on any machine
-CONVERGED = 0.12  # s of compensating before a fault is made
+WARM_UP = 0.12  # s of compensating before a fault is made
 START_LIMIT, RECOVERY_LIMIT = 180.0, 120.0  # s: on a machine that has much else to do
 
 
@@ -54,7 +54,7 @@ class Rig:
         """Return what the checker has found up to now."""
         while self.check():
             time.sleep(0.0005)  # the proxy goes first: who decodes must not slow the wire
-        if self.checker.doubts:
+        if self.checker.suspected:
             time.sleep(REPORTED)
             self.checker.settle([span for run in self._runs for span in run.writing_spans()])
         return self.checker.found
@@ -157,7 +157,7 @@ class Rig:
                 self.run.daemon.arm()
             with contextlib.suppress(TimeoutError):
                 self.wait(State.COMPENSATING, 2.0)
-                self.pass_time(CONVERGED)
+                self.pass_time(WARM_UP)
             if self.run.state == State.COMPENSATING:
                 return
             if time.monotonic() > until:

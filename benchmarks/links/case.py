@@ -93,11 +93,9 @@ class OurCycle:
 
     def write(self) -> None:
         """Send the corrected setpoint."""
-        found, state = self._found, self._state
+        found = self._found
         q = found.q if self.hold is None else self.hold
-        self.driver.write_setpoint(
-            Setpoint(q, self._nominal, found.offset_in_base, state.timestamp, state.received)
-        )
+        self.driver.write_setpoint(Setpoint(q, self._nominal, found.offset_in_base))
 
     @property
     def steps(self) -> tuple[Step, Step, Step]:

@@ -14,16 +14,17 @@ from typing import Any
 
 from benchmarks.links.case import Cycles, LinkCase, OurCycle, Pause
 from benchmarks.links.serving import served_cell
+from benchmarks.server_thread import OFFSET_SCRIPT
 from gapbridge.bridge.cell.cell import Cell
 from gapbridge.drivers.simulated.ur.settings import SCRIPT_PORT
 from gapbridge.drivers.ur_rtde import registers
-from gapbridge.drivers.ur_rtde.driver import OFFSET_SCRIPT, UrRtdeDriver
+from gapbridge.drivers.ur_rtde.driver import UrRtdeDriver
 from gapbridge.drivers.ur_rtde.settings import UrRtdeSettings
 
 HOST = "127.77.0.5"
 COMMON = f"driver: ur_rtde, host: {HOST}, state_timeout: 0.5"
 STARTED = 0.5  # s in which the robot's program runs
-CONVERGED = 0.0002  # s after which the library has taken the whole packet
+TAKEN = 0.0002  # s after which the library has taken the whole packet
 
 
 class UrOffsetCase(LinkCase):
@@ -80,7 +81,7 @@ def _wait(driver: UrRtdeDriver, pause: Pause) -> Any:
         last, until = receive.getTimestamp(), time.monotonic() + 0.1
         while receive.getTimestamp() == last and time.monotonic() < until:
             pause(0.0001)
-        pause(CONVERGED)
+        pause(TAKEN)
 
     return wait
 

@@ -98,10 +98,10 @@ class Judge:
         if self._lets_go(seen):
             return
         checker.take([seen])
-        if checker.doubts:  # the loop's state is known exactly here
-            doubt = checker.doubts.pop()
-            checker.doubts.clear()
-            self.violate("state", f"write in state {State(doubt.state).name}")
+        if checker.suspected:  # the loop's state is known exactly here
+            write = checker.suspected.pop()
+            checker.suspected.clear()
+            self.violate("state", f"write in state {State(write.state).name}")
         if isinstance(seen, Write) and seen.kind in ("offset", "joints"):
             self.writes_noted += 1
             self._last = seen.values
@@ -136,9 +136,9 @@ class Judge:
         if age > most:
             self.violate("age", f"a setpoint of a state sampled {age:.3f} s before")
 
-    # -- what the daemon hears --------------------------------------------------------------------
+    # -- what the daemon reports ------------------------------------------------------------------
 
-    def heard(self, event: dict[str, Any]) -> None:
+    def on_event(self, event: dict[str, Any]) -> None:
         """Take an event of the daemon's log."""
         self._now = float(event["seen"])
         kind = event["kind"]

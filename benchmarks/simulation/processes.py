@@ -19,6 +19,7 @@ from gapbridge.bridge.ipc.command_page import CommandPage, Commands
 from gapbridge.bridge.ipc.shared_memory import Phase, RunPage, SharedMemory
 from gapbridge.bridge.loop.loop import Exit, Loop
 from gapbridge.bridge.loop.offset_in_force import OffsetInForce
+from gapbridge.bridge.loop.setpoint_stream import SetpointStream
 from gapbridge.bridge.loop.supervisor import State
 from gapbridge.bridge.setpoint_source.glide import Glide
 from gapbridge.bridge.setpoint_source.source import Source
@@ -47,6 +48,7 @@ class Run:
         self.events: list[dict[str, Any]] = []
         self.left = 0  # setpoints that have left whole
         self.on_send: Callable[[Setpoint], None] = lambda _: None
+        self.state_behind: RobotState  # the last setpoint
         configuration = link.setting.configuration
         self.daemon = SimulatedDaemon(configuration, self)
         link.supervisor_state = self.state
@@ -106,6 +108,7 @@ class SimulatedLoop(LoopProcess):
                 order["number"],
             )  # fmt: skip
             loop._in_force = loop._writing._in_force = run.offset_in_force
+            _note_states(run, loop._stream)
             commands = Commands(self._fds[1], order["after"])
             code = loop.run(commands, order["may_write"], order["latched"])
         except InputError as error:
@@ -159,6 +162,17 @@ class _Loop(Loop):
 
     def _kept_offset(self) -> OffsetInForce:
         return OffsetInForce(self._driver.n, None)
+
+
+def _note_states(run: Run, stream: SetpointStream) -> None:
+    """Have the run know the state behind each setpoint."""
+    advance = stream.advance
+
+    def noted(state: RobotState, *given: Any) -> Setpoint:
+        run.state_behind = state
+        return advance(state, *given)
+
+    stream.advance = noted  # type: ignore[method-assign]
 
 
 def _watched(run: Run, driver: Driver) -> Driver:

@@ -24,7 +24,7 @@ LINKS: dict[str, type[SimulatedLink]] = {
     "ur_servoj": UrLink, "ur_offset": UrLink, "modbus": ModbusLink, "can": CanLink,
 }  # fmt: skip
 MOST_FAULTS = 4
-CALM, SPAN, REST = 0.3, 0.8, 0.3  # s: until faults begin; over what time they are spread; after
+QUIET, SPAN, REST = 0.3, 0.8, 0.3  # s: until faults begin; over what time they are spread; after
 RECOVERY = 25.0  # s until a healed run compensates again
 ENDING = 8.0  # s until a stopped run is over
 LOOK = 0.02  # s
@@ -105,20 +105,19 @@ def _planned(draw: random.Random, link: str, given: Sequence[tuple[float, str]] 
 def _listen(run: Run, judge: Judge, say: Any) -> None:
     events, link = run.daemon.event_log, run.link
 
-    def heard(event: dict[str, Any]) -> None:
+    def noted(event: dict[str, Any]) -> None:
         whole = {**event, "seen": run.world.now}
-        judge.heard(whole)
+        judge.on_event(whole)
         if say is not None and event["kind"] != "status":
             keys = ("kind", "from", "to", "cause", "command", "detail")
             words = " ".join(str(event[k]) for k in keys if k in event)
             say(f"{run.world.now - BEGIN:9.4f} {words}")
 
     def sent(setpoint: Setpoint) -> None:
-        key = setpoint.state_timestamp if isinstance(link, UrLink) else setpoint.state_received
-        sampled = link._sampled.get(key, float("nan"))
+        sampled = link.sampled_at(run.state_behind)
         judge.sent(setpoint, sampled, run.world.now, link.hidden_leap)
 
-    events._listeners = (*events._listeners, heard)
+    events._listeners = (*events._listeners, noted)
     run.on_send = sent
 
 
@@ -138,7 +137,7 @@ class Person(Process):
         run, world, draw = self._of, self.world, self._draw
         self._wait_for(State.OBSERVING, RECOVERY)
         self._ask("arm")
-        begin = world.now + draw.uniform(0.0, CALM)
+        begin = world.now + draw.uniform(0.0, QUIET)
         for moment, fault in self._plan:
             self._until(begin + moment)
             if self._over or not run.loops:

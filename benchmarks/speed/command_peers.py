@@ -100,8 +100,8 @@ def line(job: str, figures: dict[str, tuple[float, float]], remarks: dict[str, s
     rows = [f"| `{job}` | ours | {own[0]:.2f} | {own[1]:.0f} | 1 | - |"]
     for library, (cpu, memory) in figures.items():
         if library != "ours":
-            told = (PEERS[library], cpu, memory, cpu / own[0], remarks[library])
-            rows.append("| `{}` | {} | {:.2f} | {:.0f} | **{:.1f}** | {} |".format(job, *told))
+            shown = (PEERS[library], cpu, memory, cpu / own[0], remarks[library])
+            rows.append("| `{}` | {} | {:.2f} | {:.0f} | **{:.1f}** | {} |".format(job, *shown))
     return rows
 
 

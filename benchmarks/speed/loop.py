@@ -31,7 +31,7 @@ from gapbridge.core.log.mcap_reading import SUFFIX, read_columns
 from gapbridge.drivers.simulated.ur.settings import simulated_cell
 
 HOST, RATE, SEED = "127.78.0.5", 500.0, 11
-CONVERGED = 5.0  # s of compensating before anything is counted
+WARM_UP = 5.0  # s of compensating before anything is counted
 PATIENCE = 240.0  # s until the daemon compensates
 PAYLOAD, COG = 5.0, (0.0, 0.0, 0.06)
 LOG = "daemon.log"
@@ -54,7 +54,7 @@ def loop(seconds: float) -> dict[str, Any]:
                 with MachineStalls(cores) as stalls:
                     counted = _counted(web, metrics, seconds)
                 _compensating(web, cell)
-                time.sleep(CONVERGED)
+                time.sleep(WARM_UP)
                 first = len(_timed(times))
                 time.sleep(seconds)
                 advance = _timed(times)[first:]
@@ -87,7 +87,7 @@ def loop(seconds: float) -> dict[str, Any]:
 
 def _counted(web: str, metrics: str, seconds: float) -> dict[str, Any]:
     """Return what the daemon counted over ``seconds``, scraped and looked at all the while."""
-    time.sleep(CONVERGED)
+    time.sleep(WARM_UP)
     before, status = _counters(metrics), _status(web)
     process = psutil.Process(status["status"]["loop"]["pid"])
     busy, begin = _busy(process), time.monotonic()

@@ -92,12 +92,11 @@ def verdict_text(found: Verification) -> str:
 
 def moved_text(moved: Suspect) -> str:
     """Return what moved, and by how much."""
-    kind, _, number = moved.name.rpartition("_")
-    if kind == "reading":
-        return f"reading {number} alone does not fit: measure it again"
-    effect = CATALOGUE.get(moved.name) or CATALOGUE.get(kind)
-    if effect is not None:
-        return effect.moved.format(joint=number, size=_size(moved.estimates))
+    if moved.reading is not None:
+        return f"reading {moved.reading} alone does not fit: measure it again"
+    if moved.effect:
+        size = _size(moved.estimates)
+        return CATALOGUE[moved.effect].moved.format(joint=moved.joint, size=size)
     return f"the instrument stands elsewhere, by {_size(moved.estimates)}: register it again"
 
 

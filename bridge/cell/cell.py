@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
-from gapbridge.bridge.cell.document import Document, read_document
+from gapbridge.bridge.cell.document import read_document
 from gapbridge.bridge.cell.effects import compliance_terms, term_of
 from gapbridge.bridge.cell.message import key_path, message, messages
 from gapbridge.bridge.cell.plausibility import findings
@@ -28,6 +28,7 @@ from gapbridge.bridge.cell.settings.web import MetricsSettings, WebSettings
 from gapbridge.core.arm import Arm
 from gapbridge.core.calibration.spread import Spread
 from gapbridge.core.errors import ArmError, CellError, InputError
+from gapbridge.core.files import Document
 from gapbridge.core.load_bounds import HEAVIEST
 from gapbridge.core.metrology import Metrology
 from gapbridge.core.model import Model, Uncertain
@@ -63,10 +64,7 @@ class Cell:
         try:
             return None if given is None else given.located(self.path.parent)
         except InputError as error:
-            text = str(error)
-            raise type(error)(
-                f"{self.path}: {text}" if text.startswith("link.") else text
-            ) from None
+            raise type(error)(f"{self.path}: {error}") from None
 
     @property
     def ft_sensor(self) -> FtSensorSettings | None:

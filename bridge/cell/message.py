@@ -10,7 +10,7 @@ from typing import Any
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
-from gapbridge.bridge.cell.document import Document, Keys
+from gapbridge.core.files import Document, Keys, quoted
 
 _EXPECTED = {
     "float_type": "a number",
@@ -37,7 +37,6 @@ _EXPECTED = {
     "union_tag_not_found": "a key {discriminator}",
     "enum": "{expected}",
 }
-LONGEST = 60  # characters of a found value that are quoted
 
 
 def key_path(keys: Keys) -> str:
@@ -61,34 +60,36 @@ def message(document: Document, schema: type[BaseModel], error: ValidationError)
 
 def messages(document: Document, schema: type[BaseModel], error: ValidationError) -> list[str]:
     """Return a line for everything that is wrong, unknown keys first; see message."""
+    return [
+        f"{document.path}{'' if keys is None else f', line {document.line(keys)}'}: {text}"
+        for keys, text in refusals(schema, error)
+    ]
+
+
+def refusals(schema: type[BaseModel], error: ValidationError) -> list[tuple[Keys | None, str]]:
+    """Return the keys (None: of a key that can be none), and what is wrong with them."""
     details = sorted(error.errors(), key=lambda d: d["type"] != "extra_forbidden")
-    return [_line(document, schema, detail) for detail in details]
+    return [_refusal(schema, detail) for detail in details]
 
 
-def _line(document: Document, schema: type[BaseModel], worst: ErrorDetails) -> str:
+def _refusal(schema: type[BaseModel], worst: ErrorDetails) -> tuple[Keys | None, str]:
     if worst["type"] == "invalid_key":
-        return f"{document.path}: found a key {worst['input']!r}, expected a word"
+        return None, f"found a key {worst['input']!r}, expected a word"
     keys, model = _own_keys(schema, worst["loc"])
     if worst["type"] == "union_tag_invalid":
         keys.append(_chooser(str(worst["ctx"].get("discriminator", ""))))
-        return _not_one_of(document, keys, worst["ctx"]["tag"], worst["ctx"]["expected_tags"])
-    if worst["type"] == "extra_forbidden":
-        return _unknown_key(document, keys, model)
-    found, expected = _found(worst), _expected(worst, _description(schema, keys))
-    where = f"{document.path}, line {document.line(keys)}"
-    return f"{where}: {key_path(keys)}: found {found}, expected {expected}"
+        found, expected = repr(worst["ctx"]["tag"]), f"one of {worst['ctx']['expected_tags']}"
+    elif worst["type"] == "extra_forbidden":
+        found, expected = _unknown_key(keys, model)
+    else:
+        found, expected = _found(worst), _expected(worst, _description(schema, keys))
+    return keys, f"{key_path(keys)}: found {found}, expected {expected}"
 
 
 def _chooser(reported: str) -> str:
     """Return the key that chooses between sections; pydantic quotes it, or names a function."""
     key = reported.strip("'")
     return key if key.isidentifier() else "driver"
-
-
-def _not_one_of(document: Document, keys: list[str | int], found: object, expected: str) -> str:
-    """Return the line for a word that is none of those that choose what else may stand there."""
-    where = f"{document.path}, line {document.line(keys)}"
-    return f"{where}: {key_path(keys)}: found {found!r}, expected one of {expected}"
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
@@ -98,15 +99,14 @@ def nearest(name: str, known: Iterable[str]) -> str:
     return f"did you mean {near[0]!r}?" if near else f"known here: {', '.join(names)}"
 
 
-def _unknown_key(document: Document, keys: Keys, model: type[BaseModel] | None) -> str:
+def _unknown_key(keys: Keys, model: type[BaseModel] | None) -> tuple[str, str]:
+    """Return what was found, and what was expected."""
     known = list(model.model_fields) if model else []
-    line = document.line(keys)
     *parents, key = keys
     inside = f" in {key_path(parents)}" if parents else ""
     return (
-        f"{document.path}, line {line}: {key_path(keys)}: found an unknown key {str(key)!r}"
-        f"{inside}, expected one that is known; {nearest(str(key), known)}"
-    )
+        f"an unknown key {str(key)!r}{inside}", f"one that is known; {nearest(str(key), known)}"
+    )  # fmt: skip
 
 
 def _models(annotation: Any) -> list[type[BaseModel]]:
@@ -173,8 +173,7 @@ def _found(error: ErrorDetails) -> str:
         return f"{len(value)} values"
     if value is None:
         return "nothing"
-    text = " ".join(repr(value).split())
-    return text if len(text) <= LONGEST else f"{text[:LONGEST]}..."
+    return quoted(value)
 
 
 def _expected(error: ErrorDetails, description: str) -> str:

@@ -9,6 +9,7 @@ import click
 import numpy as np
 
 from gapbridge.bridge.cell.cell import Cell
+from gapbridge.bridge.document.notes import note_texts
 from gapbridge.core.diagnosis.log_checks.units_and_clocks import check_units
 from gapbridge.core.errors import LogError
 from gapbridge.core.load_bounds import HEAVIEST
@@ -33,7 +34,7 @@ def open_log(path: Path, cell: Cell) -> Log:
             if "--" not in str(error):
                 raise
             raise LogError(f"{error} (options of gapbridge convert)") from None
-        for note in converted.notes:
+        for note in note_texts(converted.notes):
             click.echo(f"note: {path}: {note}", err=True)
         log = converted.log(path, cell.arm.n)
     check_log(log, cell)

@@ -11,11 +11,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gapbridge.bridge.cell.document import Document
 from gapbridge.bridge.cell.message import key_path
 from gapbridge.bridge.cell.schema import CellFile, Payload
 from gapbridge.bridge.cell.settings.calibration import CalibrationSettings, LoadEntry
 from gapbridge.core.arm import Arm, builtin_arm
+from gapbridge.core.files import Document
 from gapbridge.core.load_bounds import LEVER, LoadBounds
 from gapbridge.core.model import Model
 from gapbridge.core.plausibility import (

@@ -13,10 +13,11 @@ import numpy as np
 import yaml
 
 from gapbridge.bridge.cell.cell import Cell
-from gapbridge.bridge.cell.document import Document, number_text, parse
+from gapbridge.bridge.cell.document import number_text, parse
 from gapbridge.bridge.cell.effects import compliance_entry, effect_entries
 from gapbridge.bridge.document.output_file import write_text
 from gapbridge.core.errors import CellError
+from gapbridge.core.files import Document
 from gapbridge.core.model import Model
 
 PLAIN = re.compile(r"(?!(?:y|n|yes|no|on|off|true|false|null|nan|inf)$)[a-z][a-z_]*", re.IGNORECASE)

@@ -12,7 +12,6 @@ from pydantic import (
     Discriminator,
     Field,
     Tag,
-    TypeAdapter,
     field_validator,
     model_validator,
 )
@@ -45,15 +44,6 @@ LinkSettings = Annotated[
     Discriminator(_driver_of),
 ]
 """Section ``link``: the settings of the driver that it names (left out: ur_rtde)."""
-
-
-def link_settings(**keys: Any) -> LinkSettings:
-    """Return the settings of a link from its keys, as a cell file has them.
-
-    Raises pydantic's ValidationError.
-    """
-    adapter: TypeAdapter[LinkSettings] = TypeAdapter(LinkSettings)
-    return adapter.validate_python(keys)
 
 
 class LimitSettings(Section):

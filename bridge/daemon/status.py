@@ -46,7 +46,7 @@ class DaemonStatus:
         self._heals = False  # it ends with the link
         self._slipped = False  # it is a joint's zero, of which the loop only holds
         self._batches: deque[tuple[float, int]] = deque()  # s, cycles
-        self._heard: float | None = None  # s, monotonic: when the last state was received
+        self._last_state: float | None = None  # s, monotonic: when the last state was received
         self._received = slices["received"].start
         self._flags = slices["flags"].start
         self._residual_at = slices["residual"].start
@@ -58,7 +58,7 @@ class DaemonStatus:
         """Take note of cycles."""
         now = self._now()
         if len(rows):
-            self._heard = float(rows[-1, self._received])
+            self._last_state = float(rows[-1, self._received])
             self._correction = int(rows[-1, self._flags]), float(rows[-1, self._residual_at])
             self._batches.append((now, len(rows)))
         while self._batches and now - self._batches[0][0] > RATE_SPAN:
@@ -129,6 +129,6 @@ class DaemonStatus:
         now, batches = self._now(), tuple(self._batches)
         rate = sum(n for _, n in batches[1:]) / max(now - batches[0][0], 1e-9) if batches else 0.0
         return {
-            "age": None if self._heard is None else now - self._heard,
+            "age": None if self._last_state is None else now - self._last_state,
             "rate_hz": rate if len(batches) > 1 else 0.0,
         }

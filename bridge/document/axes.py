@@ -207,7 +207,7 @@ class Chart:
             y = self.drawing.height + 8
             self.drawing.add(Circle(self.left + 4, y - 3.5, 3.6, colour))
             self.drawing.add(Text(self.left + 13, y, text, 10, SOFT))
-            self.drawing.height += 15
+            self.drawing.extend(15)
 
     def _make_equal(self) -> None:
         """Give both axes the same number of units to the pixel."""

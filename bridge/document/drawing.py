@@ -39,15 +39,21 @@ class Stroke:
 
 
 @dataclass(frozen=True)
-class Line:
-    """A line through points."""
+class _Along:
+    """A shape at several points."""
 
     points: tuple[Point, ...]
-    stroke: Stroke
 
-    def moved(self, x: float, y: float) -> Line:
-        """Return the line elsewhere."""
+    def moved(self, x: float, y: float) -> Self:
+        """Return the shape elsewhere."""
         return replace(self, points=tuple((a + x, b + y) for a, b in self.points))
+
+
+@dataclass(frozen=True)
+class Line(_Along):
+    """A line through points."""
+
+    stroke: Stroke
 
 
 @dataclass(frozen=True)
@@ -84,17 +90,12 @@ class Circle(_At):
 
 
 @dataclass(frozen=True)
-class Dots:
+class Dots(_Along):
     """Many filled circles of one size."""
 
-    points: tuple[Point, ...]
     radius: float
     fill: str
     opacity: float = 1.0
-
-    def moved(self, x: float, y: float) -> Dots:
-        """Return the dots elsewhere."""
-        return replace(self, points=tuple((a + x, b + y) for a, b in self.points))
 
 
 @dataclass(frozen=True)
@@ -124,6 +125,10 @@ class Drawing:
     def line(self, points: Sequence[Point], stroke: Stroke) -> None:
         """Add a line."""
         self.shapes.append(Line(tuple(points), stroke))
+
+    def extend(self, height: float) -> None:
+        """Make room at the bottom."""
+        self.height += height
 
     def add(self, shape: Shape) -> None:
         """Add a shape."""

@@ -102,6 +102,12 @@ class _Formatter(Formatter):
                 return ", ".join(map(str, value)) if several else str(value)
             case "and":
                 return " and ".join(value)
+            case "or":
+                return " or ".join(value)
+            case "hindered":  # a sentence in older journals
+                from gapbridge.core.planning.candidates import Hindered  # a plan's, and large
+
+                return value if isinstance(value, str) else str(Hindered(*value))
             case "place":
                 return " and ".join((*value, "where instrument or target stand"))
             case "kg":

@@ -80,7 +80,24 @@ TEXTS = {
     Reason.SIGHT_UNKNOWN: "nobody said where the instrument stands: whether it sees the target was "
     "not looked at",
     Reason.DETOURS: "no straight way in joint space, go round: stops {0:ways}",
-    Reason.FEW_POSES: "few poses to choose from: {0}",
+    Reason.FEW_POSES: "few poses to choose from: {0:hindered}",
+    Reason.NO_STAMPS: "{0}: {1} of {2} messages have no stamp in their header; the time of "
+    "recording stands in its place",
+    Reason.NO_TARGET: "target_q: no topic has it, so that tracking cannot be observed",
+    Reason.WRENCH_UNKNOWN: "{0}: left out; say what it measures with --wrench {1:or}",
+    Reason.POSE_UNNAMED: "{0}: left out; name the tracker's topic with --topic pose=TOPIC",
+    Reason.TAKEN_AS: "{0}: taken as {1}, its axes are those of {2!r}",
+    Reason.EFFORT_UNKNOWN: "{0}: effort left out; where it is Nm (some drivers report A) say "
+    "--effort-is-torque",
+    Reason.NO_COMMON_TIME: "{0}: shares no time with {1}, left out",
+    Reason.GAPS: "{0}: {1} gaps, the longest {2:.3g} s",
+    Reason.UNCOVERED: "{0} of {1} rows left out: not covered by every topic",
+    Reason.FRAME_TIMES: "timestamp is the frame's number over {0:g} Hz, not measured: a latency "
+    "below {1:.0f} ms cannot be given",
+    Reason.EPISODES: "{0} episodes in a row, {1:g} s between two",
+    Reason.MIDDLE_ZERO: "a joint's zero is the middle of its calibrated range, not the model's",
+    Reason.BEHIND_GEARS: "actual_current_as_torque is tau_J: measured behind the gears, without "
+    "the motor's friction and inertia",
 }
 
 

@@ -126,8 +126,8 @@ def peer_of(connection: socket.socket) -> Peer:
     option = getattr(socket, "SO_PEERCRED", None)
     if option is None:  # not Linux: the folder's and the socket's modes stand alone
         return Peer(0, os.geteuid())
-    raw = connection.getsockopt(socket.SOL_SOCKET, option, _CREDENTIALS.size)
-    pid, uid, _ = _CREDENTIALS.unpack(raw)
+    credentials = connection.getsockopt(socket.SOL_SOCKET, option, _CREDENTIALS.size)
+    pid, uid, _ = _CREDENTIALS.unpack(credentials)
     return Peer(pid, uid)
 
 

@@ -140,7 +140,7 @@ class LinkMonitor:
         self._left = 0.0  # s, monotonic: when the last reading ended
         self._stale = self._silent = False  # has been reported since the last believable state
         self._reported: dict[Implausible, float] = {}  # s, monotonic
-        self._heard = self._now()  # s, of the last believable state
+        self._last_state = self._now()  # s, of the last believable state
         self._has_armed = False
 
     def next(self, has_armed: bool = False) -> RobotState | None:
@@ -162,7 +162,7 @@ class LinkMonitor:
             state = self._driver.read_state()
         except StaleStateError as error:
             if away or self._now() - begun > self._patience + SUSPENDED:
-                self._heard = self._now()  # it was this process that slept: ask once more
+                self._last_state = self._now()  # it was this process that slept: ask once more
                 self._reports.count(Count.LATE)
             else:
                 self._stand_still(str(error))
@@ -189,17 +189,17 @@ class LinkMonitor:
         if self._old:
             self._reports.count(Count.LATE)
             return False
-        self._heard = now
+        self._last_state = now
         self._stale = self._silent = False
         return True
 
     def forget(self) -> None:
         """Take note that nobody asked for states meanwhile."""
-        self._heard = self._left = self._now()
+        self._last_state = self._left = self._now()
 
     def _stand_still(self, detail: str) -> None:
         """Judge a clock that stands still: late at first, then stale, then silent."""
-        if self._now() - self._heard <= self._hold:
+        if self._now() - self._last_state <= self._hold:
             self._reports.count(Count.LATE)
             return
         if not self._stale:
@@ -225,7 +225,7 @@ class LinkMonitor:
         self._fall_silent(detail)
 
     def _fall_silent(self, detail: str) -> None:
-        silent = self._now() - self._heard
+        silent = self._now() - self._last_state
         if silent > SILENCE:
             if not self._silent:
                 self._silent = True

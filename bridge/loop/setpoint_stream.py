@@ -226,7 +226,7 @@ class SetpointStream:
             self._since_start += usable
         self._ramp, self._resumes = ramp, False
         self._last, self.clamped = state.timestamp, limited.clamped
-        return Setpoint(limited.q, nominal, limited.offset_in_base, state.timestamp, state.received)
+        return Setpoint(limited.q, nominal, limited.offset_in_base)
 
     def _share(self, offset_in_base: Array) -> float:
         """Return where the ramp is; at a beginning with an offset in force, its share of this one.

@@ -31,7 +31,7 @@ from starlette.responses import Response
 from starlette.routing import Route
 
 from gapbridge.bridge.cell.daemon_settings import DaemonSettings
-from gapbridge.bridge.cell.reread import RereadSettings
+from gapbridge.bridge.cell.updated_settings import UpdatedSettings
 from gapbridge.bridge.ipc.counts import DROPPED
 from gapbridge.bridge.ipc.shared_memory import SharedMemory
 from gapbridge.bridge.ipc.side_main import Order, run_side
@@ -76,9 +76,9 @@ class Counts:
     def __init__(
         self, page: SharedMemory, settings: DaemonSettings, text: str | None = None
     ) -> None:
-        self._page, self._slices = page, page.slices
-        self._reread = RereadSettings(settings, text)  # text: the cell file's
-        self._reader = page.reader()
+        self.page, self._slices = page, page.slices
+        self._updated = UpdatedSettings(settings, text)  # text: the cell file's
+        self.reader = page.reader()
         self.cycles = self.missed = self.late = self.written = 0
         self.clamped = dict.fromkeys(CLAMPS, 0)
         self.age, self.work = Buckets(AGE_BOUNDS), Buckets(WORK_BOUNDS)
@@ -94,33 +94,18 @@ class Counts:
     @property
     def settings(self) -> DaemonSettings:
         """Return the settings of the run by now."""
-        return self._reread.settings
-
-    @property
-    def lost(self) -> int:
-        """Return the cycles that were overwritten before they could be counted."""
-        return self._reader.lost
+        return self._updated.settings
 
     @property
     def silence(self) -> float:
         """Return s since the last state of the robot; infinite before the first."""
         return time.monotonic() - self.received if self.received else float("inf")
 
-    @property
-    def state(self) -> int:
-        """Return the supervisor's state."""
-        return self._page.state
-
-    @property
-    def heartbeat(self) -> float:
-        """Return s since the loop's last sign of life."""
-        return self._page.silence
-
     def turn(self, events: list[dict[str, Any]]) -> None:
         """Take what has come."""
         for event in events:
             self._on_event(event)
-        rows, s = self._reader.drain(), self._slices
+        rows, s = self.reader.drain(), self._slices
         if not len(rows):
             return
         age = rows[:, s["age"].start]
@@ -138,7 +123,7 @@ class Counts:
 
     def _on_event(self, event: dict[str, Any]) -> None:
         kind = str(event.get("kind", "note"))
-        self._reread.on_event(event)
+        self._updated.on_event(event)
         if kind == "status":
             self.status = event
             return
@@ -194,24 +179,18 @@ class Families(Collector):
         yield from self._processes()
         yield from self._recorder()
         yield _counter(
-            "gapbridge_requests_refused",
-            "Requests for metrics that were refused.",
-            self._refused,
-            "reason",
-        )
+            "gapbridge_requests_refused", "Requests for metrics that were refused.",
+            self._refused, "reason",
+        )  # fmt: skip
 
     def _info(self) -> Metric:
         found = InfoMetricFamily("gapbridge_session", "The run that is counted.")
         configuration = str(self._counts.status.get("configuration_hash", ""))
-        found.add_metric(
-            [],
-            {
-                "session": self._session,
-                "cell": self._counts.settings.cell.stem,
-                "driver": self._counts.settings.link.driver,
-                "configuration_hash": configuration,
-            },
-        )
+        settings = self._counts.settings
+        found.add_metric([], {
+            "session": self._session, "cell": settings.cell.stem, "driver": settings.link.driver,
+            "configuration_hash": configuration,
+        })  # fmt: skip
         return found
 
     def _state(self) -> Metric:
@@ -219,40 +198,31 @@ class Families(Collector):
             "gapbridge_state", "1 for the state that the supervisor is in.", labels=["state"]
         )
         for state in State:
-            found.add_metric([state.name.lower()], float(self._counts.state == state))
+            found.add_metric([state.name.lower()], float(self._counts.page.state == state))
         return found
 
     def _cycles(self) -> Iterator[Metric]:
-        counts = self._counts
+        counts, lost = self._counts, self._counts.reader.lost
         for name, message, value in (
             ("cycles", "Cycles of the controller that were seen.", counts.cycles),
             ("missed_cycles", "Cycles of the controller that were not seen.", counts.missed),
             ("late_cycles", "Cycles finished later than a period after their state.", counts.late),
             ("setpoints_written", "Setpoints that left for the robot.", counts.written),
-            ("uncounted_cycles", "Cycles overwritten before they could be counted.", counts.lost),
+            ("uncounted_cycles", "Cycles overwritten before they could be counted.", lost),
         ):
             yield CounterMetricFamily(f"gapbridge_{name}", message, float(value))
         yield _counter(
-            "gapbridge_setpoints_clamped",
-            "Setpoints that a limit held back.",
-            counts.clamped,
+            "gapbridge_setpoints_clamped", "Setpoints that a limit held back.", counts.clamped,
             "limit",
-        )
-        yield GaugeMetricFamily(
-            "gapbridge_link_rate_hertz",
-            "Cycles a second that the link is to have.",
-            self._counts.settings.link.rate,
-        )
-        yield GaugeMetricFamily(
-            "gapbridge_link_silence_seconds",
-            "Time since the last state of the robot.",
-            counts.silence,
-        )
-        yield GaugeMetricFamily(
-            "gapbridge_loop_heartbeat_age_seconds",
-            "Time since the loop's last sign of life.",
-            counts.heartbeat,
-        )
+        )  # fmt: skip
+        rate = counts.settings.link.rate
+        for name, message, number in (
+            ("link_rate_hertz", "Cycles a second that the link is to have.", rate),
+            ("link_silence_seconds", "Time since the last state of the robot.", counts.silence),
+            ("loop_heartbeat_age_seconds", "Time since the loop's last sign of life.",
+             counts.page.silence),
+        ):  # fmt: skip
+            yield GaugeMetricFamily(f"gapbridge_{name}", message, number)
 
     def _histograms(self) -> Iterator[Metric]:
         counts = self._counts

@@ -11,7 +11,7 @@ import fcntl
 import os
 import struct
 import zlib
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from io import BytesIO
 from pathlib import Path
 from typing import IO
@@ -42,7 +42,7 @@ FOOTER_SIZE = 20
 
 @dataclass
 class _Whole:
-    """What is whole in a file."""
+    """What is whole in a file, record by record."""
 
     schemas: dict[int, Schema] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
@@ -50,6 +50,60 @@ class _Whole:
     counts: dict[int, int] = field(default_factory=dict)  # messages by channel
     end: int = 0  # bytes of the file that stay
     last: dict[int, MessageIndex] = field(default_factory=dict)  # of the last chunk
+    torn: bool = False  # the last chunk's indexes are written anew behind it
+    _chunk: ChunkIndex | None = None  # the last one, its indexes not read yet
+    _indexed: dict[int, int] = field(default_factory=dict)  # where these stand
+    _index_length: int = 0
+
+    def take(self, file: IO[bytes], code: int, at: int, length: int) -> bool:
+        """Take a record over; returns False for a broken chunk, behind which all is lost."""
+        if code == Opcode.CHUNK:
+            unpacked = records.unpacked(file, at, length)
+            if unpacked is None:
+                return False
+            self._close()
+            chunk, data = unpacked
+            self._chunk, self._indexed, self._index_length = _index(chunk, at, length), {}, 0
+            self._take_contents(data)
+        elif code == Opcode.MESSAGE_INDEX and self._chunk is not None:
+            file.seek(at)
+            self._indexed[int.from_bytes(file.read(2), "little")] = at - records.HEAD_SIZE
+            self._index_length += records.HEAD_SIZE + length
+        elif code != Opcode.HEADER:
+            return True
+        self.end = at + length
+        return True
+
+    def finish(self) -> None:
+        """End with the last chunk; its indexes go where they are not whole."""
+        self.torn = self._chunk is not None and set(self._indexed) != set(self.last)
+        if self._chunk is not None and self.torn:
+            self.end = self._chunk.chunk_start_offset + self._chunk.chunk_length
+            self._indexed, self._index_length = {}, 0
+        self._close()
+
+    def _close(self) -> None:
+        if self._chunk is not None:
+            offsets, length = self._indexed, self._index_length
+            self.chunks.append(
+                replace(self._chunk, message_index_offsets=offsets, message_index_length=length)
+            )
+
+    def _take_contents(self, data: bytes) -> None:
+        self.last = {}
+        for code, start, size in records.inner_records(data):
+            body = data[start : start + size]
+            if code == Opcode.MESSAGE:
+                channel, _, log_time, _ = records.message_head(body)
+                index = self.last.setdefault(channel, MessageIndex(channel, []))
+                index.records.append((log_time, start - records.HEAD_SIZE))
+                self.counts[channel] = self.counts.get(channel, 0) + 1
+            elif code == Opcode.SCHEMA:
+                schema = Schema.read(ReadDataStream(BytesIO(body)))
+                self.schemas[schema.id] = schema
+            elif code == Opcode.CHANNEL:
+                reported = Channel.read(ReadDataStream(BytesIO(body)))
+                self.channels[reported.id] = reported
 
 
 def finish(path: Path) -> bool:
@@ -106,59 +160,12 @@ def _finished(path: Path) -> bool:
 
 def _scan(file: IO[bytes], path: Path) -> _Whole:
     """Return what is whole, up to the first record that is not."""
-    whole, chunk = _Whole(), None
-    indexed: dict[int, int] = {}  # where the last chunk's indexes stand
+    whole = _Whole()
     for code, at, length in records.all_records(file, path):
-        if code == Opcode.HEADER:
-            whole.end = at + length
-        elif code == Opcode.CHUNK:
-            found = _chunk(file, at, length, whole)
-            if found is None:
-                break
-            _close(whole, chunk, indexed)
-            chunk, indexed = found, {}
-            whole.end = at + length
-        elif code == Opcode.MESSAGE_INDEX and chunk is not None:
-            file.seek(at)
-            indexed[int.from_bytes(file.read(2), "little")] = at - records.HEAD_SIZE
-            chunk.message_index_length += records.HEAD_SIZE + length
-            whole.end = at + length
-    if chunk is not None and set(indexed) != set(whole.last):
-        whole.end = chunk.chunk_start_offset + chunk.chunk_length  # torn: written anew behind it
-        whole.chunks.append(chunk)
-        chunk.message_index_length = -1
-    else:
-        _close(whole, chunk, indexed)
+        if not whole.take(file, code, at, length):
+            break
+    whole.finish()
     return whole
-
-
-def _close(whole: _Whole, chunk: ChunkIndex | None, indexed: dict[int, int]) -> None:
-    if chunk is not None:
-        chunk.message_index_offsets = indexed
-        whole.chunks.append(chunk)
-
-
-def _chunk(file: IO[bytes], at: int, length: int, whole: _Whole) -> ChunkIndex | None:
-    """Take a chunk's contents over; returns its index, None where it is broken."""
-    unpacked = records.unpacked(file, at, length)
-    if unpacked is None:
-        return None
-    chunk, data = unpacked
-    whole.last = {}
-    for code, start, size in records.inner_records(data):
-        body = data[start : start + size]
-        if code == Opcode.MESSAGE:
-            channel, _, log_time, _ = records.message_head(body)
-            index = whole.last.setdefault(channel, MessageIndex(channel, []))
-            index.records.append((log_time, start - records.HEAD_SIZE))
-            whole.counts[channel] = whole.counts.get(channel, 0) + 1
-        elif code == Opcode.SCHEMA:
-            schema = Schema.read(ReadDataStream(BytesIO(body)))
-            whole.schemas[schema.id] = schema
-        elif code == Opcode.CHANNEL:
-            reported = Channel.read(ReadDataStream(BytesIO(body)))
-            whole.channels[reported.id] = reported
-    return _index(chunk, at, length)
 
 
 def _index(chunk: Chunk, at: int, length: int) -> ChunkIndex:
@@ -173,13 +180,16 @@ def _index(chunk: Chunk, at: int, length: int) -> ChunkIndex:
 def _tail(whole: _Whole) -> bytes:
     """Return what comes behind what is whole: indexes that were torn, summary, footer, magic."""
     data = RecordBuilder()
-    last = whole.chunks[-1] if whole.chunks else None
-    if last is not None and last.message_index_length < 0:
-        last.message_index_offsets = {}
+    chunks = whole.chunks
+    if whole.torn:
+        offsets_of = {}
         for channel, index in whole.last.items():
-            last.message_index_offsets[channel] = whole.end + data.count
+            offsets_of[channel] = whole.end + data.count
             index.write(data)
-        last.message_index_length = data.count
+        chunks = [
+            *chunks[:-1],
+            replace(chunks[-1], message_index_offsets=offsets_of, message_index_length=data.count),
+        ]
     DataEnd(0).write(data)
     begin: bytes = data.end()  # type: ignore[no-untyped-call]
     start = whole.end + len(begin)
@@ -188,7 +198,7 @@ def _tail(whole: _Whole) -> bytes:
         (Opcode.SCHEMA, list(whole.schemas.values())),
         (Opcode.CHANNEL, list(whole.channels.values())),
         (Opcode.STATISTICS, [_statistics(whole)]),
-        (Opcode.CHUNK_INDEX, whole.chunks),
+        (Opcode.CHUNK_INDEX, chunks),
     )
     offsets = []
     for code, group in groups:

@@ -70,12 +70,12 @@ def _outlive(order: Order, recorder: Recorder) -> None:
 def _configuration(order: Order, event: dict[str, Any] | None = None) -> dict[str, Any]:
     """Return what the run is made of, without secrets."""
     cell = order.settings.cell
-    raw = _text_of(cell, (event or order.extra).get("text"))
+    content = _text_of(cell, (event or order.extra).get("text"))
     return {
         "program": f"gapbridge {_version()}",
         "cell": str(cell),
-        "sha256": hashlib.sha256(raw).hexdigest(),
-        "text": redacted(raw.decode("utf-8", "replace")),
+        "sha256": hashlib.sha256(content).hexdigest(),
+        "text": redacted(content.decode("utf-8", "replace")),
         "joints": order.n,
         "driver": order.settings.link.driver,
     }

@@ -64,7 +64,6 @@ class Recorder:
         self._flushed = self._clock.monotonic()
         self._retry_at = 0.0
         self._why_paused = ""
-        self.pauses = 0
         self.lost = 0  # cycles of this process's time that no file holds
         self._next = self._resume()  # number of the first cycle that no whole flush holds
         self._reader = page.reader(self._next)
@@ -209,7 +208,6 @@ class Recorder:
         self._segment = None
         self._retry_at = self._clock.monotonic() + RETRY_EVERY
         if why != self._why_paused:
-            self.pauses += 1
             self._say(f"recording paused: {why}", paused=why, next_cycle=self._next)
         self._why_paused = why
 

@@ -51,8 +51,8 @@ def shares(channel: ChannelDiagnosis) -> Shares:
     floor = channel.noise_floor_rms or 0.0
     noise = min(floor**2 / total, rest)
     # what a quantity predicts of samples that it did not see is no noise, whatever the floor says
-    foreseen = rest * max((share for _, share in channel.depends_on), default=0.0)
-    beyond = min(max(rest - noise, foreseen), rest)
+    predictable = rest * max((share for _, share in channel.depends_on), default=0.0)
+    beyond = min(max(rest - noise, predictable), rest)
     return Shares(1 - rest, rest - beyond, beyond)
 
 

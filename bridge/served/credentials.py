@@ -28,7 +28,7 @@ def read_token(path: Path, key: str) -> str:
     """
     try:
         mode = 0o600 if is_given() else path.stat().st_mode  # else who handed it on has checked
-        raw = read_bytes(path)[: LONGEST_TOKEN + 2]
+        content = read_bytes(path)[: LONGEST_TOKEN + 2]
     except OSError as error:
         raise InputError(f"{key}: {path}: {error.strerror}, expected a file with a token") from None
     if stat.S_IMODE(mode) & 0o077:
@@ -36,7 +36,7 @@ def read_token(path: Path, key: str) -> str:
             f"{key}: {path}: found mode {stat.S_IMODE(mode):04o}, expected 0600: a file that "
             "only its owner reads"
         )
-    token = raw.decode("ascii", "replace").strip()
+    token = content.decode("ascii", "replace").strip()
     if not SHORTEST_TOKEN <= len(token) <= LONGEST_TOKEN or not token.isprintable() or (
         not token.isascii() or " " in token
     ):  # fmt: skip

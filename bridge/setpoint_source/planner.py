@@ -45,7 +45,7 @@ class Connection:
         self._buffer = b""
         self._credit = SPAN * rate
         self._at = self.opened = self._now()
-        self.heard = 0.0  # s, monotonic: of the last good line
+        self.received = 0.0  # s, monotonic: of the last good line
         self.admitted = False  # a token has been given, or none is asked for
         self.closed = False
 
@@ -55,7 +55,7 @@ class Connection:
 
     def note_line(self) -> None:
         """Take note of a good line now."""
-        self.heard = self._now()
+        self.received = self._now()
 
     def lines(self) -> list[bytes]:
         """Return the lines that have arrived, some of them; closes where there is no end."""
@@ -194,7 +194,7 @@ class PlannerSource(GlidingSource):
         planner = self._planner
         if planner is None or planner.closed:
             return False
-        return SYSTEM.monotonic() - planner.heard <= self.settings.timeout
+        return SYSTEM.monotonic() - planner.received <= self.settings.timeout
 
     def _accept(self) -> None:
         if self._listener is None:

@@ -50,7 +50,6 @@ class Stream:
     def __init__(self, most: int) -> None:
         self._most = most
         self._queues: set[asyncio.Queue[str | None]] = set()
-        self.cut_off = 0  # pages that did not keep up
 
     @property
     def full(self) -> bool:
@@ -70,7 +69,6 @@ class Stream:
                 queue.put_nowait(text)
             except asyncio.QueueFull:
                 self._queues.discard(queue)
-                self.cut_off += 1
                 queue.get_nowait()
                 queue.put_nowait(None)  # its end
 

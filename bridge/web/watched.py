@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from gapbridge.bridge.cell.daemon_settings import DaemonSettings
-from gapbridge.bridge.cell.reread import RereadSettings
+from gapbridge.bridge.cell.updated_settings import UpdatedSettings
 from gapbridge.bridge.ipc.shared_memory import ROWS, SharedMemory
 from gapbridge.bridge.loop.supervisor import State
 from gapbridge.bridge.web.prediction import Prediction
@@ -54,7 +54,7 @@ class Watched:
         text: str | None = None,
     ) -> None:
         assert settings.web is not None
-        self._reread = RereadSettings(settings, text)  # text: the cell file's
+        self._updated = UpdatedSettings(settings, text)  # text: the cell file's
         self._session, self._page = session, page
         self._slices, self._n = page.slices, n
         # whoever comes late still shows what the ring holds
@@ -76,14 +76,14 @@ class Watched:
 
     @property
     def _settings(self) -> DaemonSettings:
-        return self._reread.settings
+        return self._updated.settings
 
     # -- in ---------------------------------------------------------------------------------------
 
     def turn(self, events: list[dict[str, Any]]) -> list[Message]:
         """Take what has come; returns messages for the pages that are open."""
         messages = [message for event in events for message in self._on_event(event)]
-        changed = [self._reread.on_event(event) for event in events]
+        changed = [self._updated.on_event(event) for event in events]
         if any(changed):
             self._prediction = Prediction(self._settings, self._slices)
             messages.append(("hello", self.snapshot()))  # limits and rate may be others

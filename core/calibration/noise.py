@@ -27,7 +27,7 @@ SURE_JOINT = 1.5  # of the arm's repeatability where it is not given
 GIVEN = 0.25  # of the arm's repeatability where it is
 SHAKY = 3.0  # times the usual scatter beyond which a reading counts as noisier than others
 ROUNDS = 20
-SETTLED = 1e-3  # of log(variance)
+CONVERGED = 1e-3  # of log(variance)
 ENOUGH = 250  # readings from which the sizes are estimated
 
 
@@ -156,7 +156,7 @@ def estimated(
         curve = curve + np.diag(1 / known.width**2)
         step = np.clip(np.linalg.solve(curve, score), -1.5, 1.5)
         t = t + step
-        if np.abs(step).max() < SETTLED:
+        if np.abs(step).max() < CONVERGED:
             break
     return replace(noise, sizes=np.exp(t / 2))
 

@@ -25,7 +25,7 @@ NAMES = tuple(f"tool_tcp_{k}" for k in "xyz")
 FEWEST = {False: 3, True: 7}  # readings needed: tip on a point, ball on a ball
 TURNED = 0.15  # rad, about: orientations closer together leave a direction of the tool open
 ROUNDS = 30
-SETTLED = 1e-10  # m
+CONVERGED = 1e-10  # m
 
 
 @dataclass(frozen=True)
@@ -138,7 +138,7 @@ def _fitted(
         _require_turning(A, count)
         fit = robust_fit(A, b, unit, row)
         values = values + fit.values
-        if np.abs(fit.values).max() < SETTLED:
+        if np.abs(fit.values).max() < CONVERGED:
             break
     assert fit is not None
     return values, fit

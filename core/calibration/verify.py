@@ -51,6 +51,9 @@ class Suspect:
     estimates: tuple[Estimate, ...]  # how far it moved; none for a bad reading
     chance: float  # of what is left, were it the only change
     chi_square: float  # that it leaves
+    effect: str = ""  # none: the instrument, or a reading
+    joint: int | None = None  # from 1, of the effect
+    reading: int | None = None  # from 1
 
 
 @dataclass(frozen=True)
@@ -168,8 +171,9 @@ def _suspects(
     ``steps``: of Gauss-Newton, for each of them.
     """
     found = []
-    for name, effects in _stories(model, readings):
-        own = Parameters.every(model, effects)
+    for effect, joint in _stories(model, readings):
+        name = effect if joint is None else f"{effect}_{joint}"
+        own = Parameters.every(model, (name,))
         at, where, there = np.zeros(len(own)), nuisance, task
         for step in range(steps):
             if step:
@@ -179,7 +183,8 @@ def _suspects(
             J, F = how.columns(own, at, readings, where)
             there = replace(there, F=F)
             at = at + there.chi_square(J)[2]
-        found.append(_suspect(name, there, J, own.names, own.units, at))
+        suspect, freedom = _suspect(name, there, J, own.names, own.units, at)
+        found.append((replace(suspect, effect=effect, joint=joint), freedom))
     if how.registered and how.frame:
         free = make_observable(readings.kind)
         F = free.nuisance_columns(model.predict(readings.q, readings.loads), readings, nuisance)
@@ -189,22 +194,22 @@ def _suspects(
     for i in range(N):
         columns = np.zeros((N * k, k))
         columns[i * k : i * k + k] = np.eye(k)
-        found.append(_suspect(f"reading_{i + 1}", task, columns, (), ()))
+        suspect, freedom = _suspect(f"reading_{i + 1}", task, columns, (), ())
+        found.append((replace(suspect, reading=i + 1), freedom))
     costs = np.log(len(task.residual))
     return tuple(sorted((s for s, _ in found), key=lambda s: s.chi_square + costs * _cost(s, k)))
 
 
-def _stories(model: Model, readings: Readings) -> list[tuple[str, tuple[str, ...]]]:
+def _stories(model: Model, readings: Readings) -> list[tuple[str, int | None]]:
+    """Return effects, and joints, that may have changed since."""
     mass = readings.loads.payload_mass
     loaded = model.payload_mass > 0 if mass is None else bool((mass > 0).any())
-    stories: list[tuple[str, tuple[str, ...]]] = []
-    for identifier, effect in CATALOGUE.items():
-        if not effect.moved or (effect.adds_mass and not loaded):
-            continue
-        for site in effect.sites(model.arm):
-            name = identifier if site.joint is None else f"{identifier}_{site.joint}"
-            stories.append((name, (name,)))
-    return stories
+    return [
+        (identifier, site.joint)
+        for identifier, effect in CATALOGUE.items()
+        if effect.moved and (loaded or not effect.adds_mass)
+        for site in effect.sites(model.arm)
+    ]
 
 
 def _cost(suspect: Suspect, width: int) -> int:

@@ -47,8 +47,8 @@ class Layout:
             if place.is_enum:
                 found[:, place.start] = part[:, 0].astype(np.uint8)
             else:
-                raw = np.ascontiguousarray(part, "<f8").view(np.uint8)
-                found[:, place.start : place.start + 8 * place.count] = raw
+                stored = np.ascontiguousarray(part, "<f8").view(np.uint8)
+                found[:, place.start : place.start + 8 * place.count] = stored
         data, width = found.tobytes(), len(self.template)
         return [data[at : at + width] for at in range(0, len(data), width)]
 
@@ -63,8 +63,8 @@ class Layout:
             if place.is_enum:
                 found[place.name] = messages[:, place.start].astype(np.float64)
                 continue
-            raw = messages[:, place.start : place.start + 8 * place.count]
-            values = raw.copy().view("<f8").astype(np.float64, copy=False)
+            stored = messages[:, place.start : place.start + 8 * place.count]
+            values = stored.copy().view("<f8").astype(np.float64, copy=False)
             found[place.name] = values[:, 0] if place.is_single else values
         return found
 

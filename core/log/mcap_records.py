@@ -106,9 +106,9 @@ def read_chunk(file: IO[bytes], at: int, length: int) -> Contents | None:
 def unpacked(file: IO[bytes], at: int, length: int) -> tuple[Chunk, bytes] | None:
     """Return a chunk record and its data unpacked, None where it is broken or holds nothing."""
     file.seek(at)
-    raw = file.read(length)
+    content = file.read(length)
     try:
-        chunk = Chunk.read(ReadDataStream(BytesIO(raw)))
+        chunk = Chunk.read(ReadDataStream(BytesIO(content)))
         if chunk.uncompressed_size > LARGEST_CHUNK or not chunk.uncompressed_crc:
             return None
         stream, size = get_chunk_data_stream(chunk, validate_crc=True)

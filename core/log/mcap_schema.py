@@ -73,8 +73,8 @@ def descriptor_set(
         if is_enum:
             field.type_name = f".{PACKAGE}.{MESSAGES[channel]}.Mode"
             kind = message.enum_type.add(name="Mode")
-            for value, words in enumerate(states):
-                kind.value.add(name=words, number=value)
+            for value, state in enumerate(states):
+                kind.value.add(name=state, number=value)
     file = FileDescriptorProto(
         name=f"{PACKAGE}/{MESSAGES[channel]}.proto",
         package=PACKAGE,

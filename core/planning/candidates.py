@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -24,7 +25,7 @@ from gapbridge.core.errors import PlanError
 from gapbridge.core.loads import Loads
 from gapbridge.core.model import Model
 from gapbridge.core.notes import Note, Reason
-from gapbridge.core.planning.workspace import Place, Space
+from gapbridge.core.planning.workspace import Hindrance, Obstacle, Place, Space
 
 STOPS = 900  # candidate poses
 DRAWN = 4000  # random poses looked at in one go
@@ -33,15 +34,29 @@ HOPELESS = 6  # tries without any pose after which none is expected
 BALLS_APART = 0.2  # m, of two balls on the tool where nobody says it
 
 
+class Hindered(NamedTuple):
+    """Random poses that were looked at, and what stands against most of them."""
+
+    looked: int
+    poses: tuple[tuple[str, int, int], ...]  # an Obstacle's name, its number, poses
+
+    def __str__(self) -> str:
+        parts = [
+            f"{100 * n / max(self.looked, 1):.0f} % {Obstacle[name].value.format(number)}"
+            for name, number, n in self.poses
+        ]
+        return f"of {self.looked} random poses " + (", ".join(parts) or "none can be read")
+
+
 @dataclass(frozen=True)
 class Candidates:
     """C poses, each under every load and, where joints have play, with opposite approaches."""
 
     q: Array  # (C, n) rad
-    readings: Readings  # (R,) exact readings that the model foresees
+    readings: Readings  # (R,) exact readings that the model predicts
     stop: Index  # (R,) number of the pose
     nuisance: Nuisance
-    why: str  # what hinders random poses, in words
+    hindered: Hindered
     notes: tuple[Note, ...]
 
 
@@ -55,7 +70,7 @@ class _Sight:
         self._space, self._nuisance = space, nuisance
         self._found: list[tuple[Array, Index, Index]] = []  # joints, place, target
         self._looked = 0
-        self._hindered: Counter[str] = Counter()
+        self._hindered: Counter[Hindrance] = Counter()
 
     @property
     def count(self) -> int:
@@ -63,14 +78,10 @@ class _Sight:
         return sum(len(q) for q, _, _ in self._found)
 
     @property
-    def why(self) -> str:
-        """Return what hinders random poses, in words."""
-        parts = [
-            f"{100 * n / max(self._looked, 1):.0f} % {reason}"
-            for reason, n in self._hindered.most_common(3)
-            if n
-        ]
-        return f"of {self._looked} random poses " + (", ".join(parts) or "none can be read")
+    def hindered(self) -> Hindered:
+        """Return what hinders random poses most."""
+        most = self._hindered.most_common(3)
+        return Hindered(self._looked, tuple((h.obstacle.name, h.number, n) for h, n in most if n))
 
     def first(self, most: int) -> tuple[Array, Index, Index]:
         """Return joints (C, n), place (C,) and target (C,) of the first ``most``."""
@@ -90,11 +101,11 @@ class _Sight:
         if observable.closes:
             readings = empty_readings(observable.kind, q, Loads(), station=station, target=target)
             touching = predicted_readings(observable, self._nominal, readings, nuisance)
-            self._hindered["do not reach the fixed point"] += DRAWN - len(touching)
+            self._hindered[Hindrance(Obstacle.FIXED_POINT)] += DRAWN - len(touching)
             q, station, target = touching.q, touching.station, touching.target
         good = np.ones(len(q), dtype=bool)
-        for reason, hit in _hindrances(observable, self._space, q, station, target).items():
-            self._hindered[reason] += int(hit.sum())
+        for hindrance, hit in _hindrances(observable, self._space, q, station, target).items():
+            self._hindered[hindrance] += int(hit.sum())
             good &= ~hit
         self._found.append((q[good], station[good], target[good]))
 
@@ -124,12 +135,12 @@ def candidates_of(
         if sight.count >= stops or (tried >= HOPELESS and not sight.count):
             break
     if not sight.count:
-        raise PlanError(f"no pose can be reached and seen: {sight.why}")
+        raise PlanError(f"no pose can be reached and seen: {sight.hindered}")
     seen = sight.first(stops)
     readings, stop = _under_loads(parameters, observable, loads, seen, random)
-    notes = () if sight.count >= stops else (Note(Reason.FEW_POSES, (sight.why,)),)
+    notes = () if sight.count >= stops else (Note(Reason.FEW_POSES, (sight.hindered,)),)
     readings = replace(readings, value=observable.predict(parameters.nominal, readings, nuisance))
-    return Candidates(seen[0], readings, stop, nuisance, sight.why, notes)
+    return Candidates(seen[0], readings, stop, nuisance, sight.hindered, notes)
 
 
 def _nuisance(observable: Observable, space: Space) -> Nuisance:
@@ -154,7 +165,7 @@ def readable(observable: Observable, space: Space, readings: Readings) -> Mask:
 
 def _hindrances(
     observable: Observable, space: Space, q: Array, station: Index, target: Index
-) -> dict[str, Mask]:
+) -> dict[Hindrance, Mask]:
     found = space.hindrances(q)
     if space.places and not observable.closes:
         found |= _unseen(space, q, station, np.minimum(target, len(space.targets) - 1))
@@ -168,14 +179,14 @@ def joined(found: Candidates, more: Readings) -> Candidates:
     return replace(found, q=q, readings=beside(found.readings, more), stop=stop)
 
 
-def _unseen(space: Space, q: Array, station: Index, target: Index) -> dict[str, Mask]:
-    """Return by reason which targets are not seen from their places."""
-    found: dict[str, Mask] = {}
+def _unseen(space: Space, q: Array, station: Index, target: Index) -> dict[Hindrance, Mask]:
+    """Return by hindrance which targets are not seen from their places."""
+    found: dict[Hindrance, Mask] = {}
     for s in range(len(space.places)):
         for t in range(len(space.targets)):
             rows = np.flatnonzero((station == s) & (target == t))
-            for reason, missed in space.sees(space.frames(q[rows]), s, t).items():
-                whole = found.setdefault(reason, np.zeros(len(q), dtype=bool))
+            for hindrance, missed in space.sees(space.frames(q[rows]), s, t).items():
+                whole = found.setdefault(hindrance, np.zeros(len(q), dtype=bool))
                 whole[rows] |= missed
     return found
 

@@ -167,7 +167,7 @@ def _require_enough(
     if len(found.readings) < wish.poses + wish.held_out:
         raise PlanError(
             f"poses: {len(found.readings)} can be reached and seen, expected at least "
-            f"{wish.poses + wish.held_out}; {found.why}"
+            f"{wish.poses + wish.held_out}; {found.hindered}"
         )
 
 

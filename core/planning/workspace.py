@@ -9,6 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from enum import Enum
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -22,6 +24,27 @@ THICK = 0.035  # of the arm's stretched length: radius of a link
 TOOL_THICK = 0.03  # of the same: tool and loads
 NEAR_SINGULAR = 0.01  # smallest singular value of the Jacobian, lengths in stretched lengths
 FURTHEST_TURN = np.pi  # rad from zero, where the limits allow more: cables need not wind up
+
+
+class Obstacle(Enum):
+    """What stands against a pose, in the words of a sentence about such poses."""
+
+    LIMITS = "leave the joint limits"
+    BOX = "come into keep-out box {}"
+    FLOOR = "come below the floor"
+    SELF = "come near the arm itself"
+    SINGULAR = "are nearly singular"
+    RANGE = "are out of range from place {}"
+    TURNED = "turn the reflector away from place {}"
+    HIDDEN = "hide the target from place {}"
+    FIXED_POINT = "do not reach the fixed point"
+
+
+class Hindrance(NamedTuple):
+    """An obstacle, and the number (from 1) of its box or place; 0: it has none."""
+
+    obstacle: Obstacle
+    number: int = 0
 
 
 @dataclass(frozen=True)
@@ -143,35 +166,34 @@ class Space:
         """Return at which joints (N, n) nothing is hit: limits, boxes, floor, the arm itself."""
         return np.asarray(~np.any(list(self._hits(q, self.frames(q)).values()), axis=0))
 
-    def _hits(self, q: Array, frames: Frames) -> dict[str, Mask]:
+    def _hits(self, q: Array, frames: Frames) -> dict[Hindrance, Mask]:
         capsules = self.capsules(frames)
         out = (q < self.lower - 1e-9) | (q > self.upper + 1e-9)
-        hits: dict[str, Mask] = {"leave the joint limits": np.asarray(out.any(axis=1))}
+        hits: dict[Hindrance, Mask] = {Hindrance(Obstacle.LIMITS): np.asarray(out.any(axis=1))}
         for number, box in enumerate(self.keep_out, 1):
-            hits[f"come into keep-out box {number}"] = in_box(capsules, box)
+            hits[Hindrance(Obstacle.BOX, number)] = in_box(capsules, box)
         if self.floor is not None:
-            hits["come below the floor"] = below(capsules, self.floor, first=2)
-        hits["come near the arm itself"] = touching(capsules, self.pairs)
+            hits[Hindrance(Obstacle.FLOOR)] = below(capsules, self.floor, first=2)
+        hits[Hindrance(Obstacle.SELF)] = touching(capsules, self.pairs)
         return hits
 
-    def sees(self, frames: Frames, place: int, target: int) -> dict[str, Mask]:
-        """Return by reason at which poses (N,) a target is not seen from a place."""
+    def sees(self, frames: Frames, place: int, target: int) -> dict[Hindrance, Mask]:
+        """Return by hindrance at which poses (N,) a target is not seen from a place."""
         where = self.places[place]
         eye = np.array(where.position)
         ball = frames.tcp + frames.rotation @ self.targets[target]
         apart = np.linalg.norm(ball - eye, axis=1)
-        from_here = f"from place {place + 1}"
         out = np.asarray((apart < where.nearest) | (apart > where.farthest))
-        missed: dict[str, Mask] = {f"are out of range {from_here}": out}
+        missed: dict[Hindrance, Mask] = {Hindrance(Obstacle.RANGE, place + 1): out}
         if self.looks is not None:
             towards = (eye - ball) / np.maximum(apart, 1e-9)[:, None]
             cosine = np.einsum("ni,ni->n", towards, frames.rotation @ self.looks[target])
             turned = np.asarray(cosine < np.cos(self.acceptance))
-            missed[f"turn the reflector away {from_here}"] = turned
+            missed[Hindrance(Obstacle.TURNED, place + 1)] = turned
         links = self.capsules(frames)
         n = self.model.arm.n
         arm = Capsules(links.begin[:, : n + 1], links.end[:, : n + 1], links.radius[: n + 1])
-        missed[f"hide the target {from_here}"] = hidden(arm, eye, ball)
+        missed[Hindrance(Obstacle.HIDDEN, place + 1)] = hidden(arm, eye, ball)
         return missed
 
     def near_singular(self, frames: Frames) -> Mask:
@@ -181,10 +203,11 @@ class Space:
         smallest = np.linalg.svd(J, compute_uv=False)[:, min(6, self.model.arm.n) - 1]
         return np.asarray(smallest < NEAR_SINGULAR)
 
-    def hindrances(self, q: Array) -> dict[str, Mask]:
-        """Return by reason what stands against poses (N, n), whatever the instrument."""
+    def hindrances(self, q: Array) -> dict[Hindrance, Mask]:
+        """Return what stands against which poses (N, n), whatever the instrument."""
         frames = self.frames(q)
-        return {**self._hits(q, frames), "are nearly singular": self.near_singular(frames)}
+        singular = self.near_singular(frames)
+        return {**self._hits(q, frames), Hindrance(Obstacle.SINGULAR): singular}
 
     def draw(self, count: int, random: np.random.Generator) -> Array:
         """Return joints (count, n) anywhere within the limits."""

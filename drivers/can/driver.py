@@ -71,7 +71,7 @@ class CanDriver(Driver):
         found = False
         while not found or self.reader.silent_status():
             if self._now() > end:
-                raise self._nothing_heard(found)
+                raise self._nothing_received(found)
             self._ask()
             found = self.reader.listen(max(1.0 / self.rate, SLICE)) is not None or found
         self._changed = self._now()
@@ -82,7 +82,7 @@ class CanDriver(Driver):
         self._broken, self._kept = self.reader.assembler.broken, None
         self._builder.forget()
 
-    def _nothing_heard(self, complete: bool) -> LinkError:
+    def _nothing_received(self, complete: bool) -> LinkError:
         """Return what was missed, and close: a link that is not there is not half open."""
         received_at = self.reader.assembler.received_at
         missing = [i.name for key, i in self.profile.incoming.items() if key not in received_at]

@@ -24,7 +24,12 @@ from gapbridge.drivers.can.profile import (
     Reading,
 )
 from gapbridge.drivers.can.schema import FrameEntry, ProfileFile, Quantity, Step
-from gapbridge.drivers.profile_file import ProfileDocument, ProfileError, read_profile_document
+from gapbridge.drivers.profile_file import (
+    ProfileDocument,
+    ProfileError,
+    read_profile_document,
+    worst_of,
+)
 
 Keys = tuple[str | int, ...]
 TURN = 2.0 * math.pi
@@ -206,7 +211,7 @@ def read_profile(path: Path, installation: Mapping[str, list[float]] | None = No
 
 def _schema_error(document: ProfileDocument, error: ValidationError) -> ProfileError:
     """Return one line; unknown keys first, since a misspelt key is also a missing one."""
-    worst = min(error.errors(), key=lambda d: d["type"] != "extra_forbidden")
+    worst = worst_of(error)
     keys = tuple(key for key in worst["loc"] if key != "list[constrained-float]")
     found = worst["input"] if not isinstance(worst["input"], dict | list) else "something else"
     if worst["type"] == "missing":

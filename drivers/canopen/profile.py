@@ -9,14 +9,19 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import BaseModel, Field, ValidationError
-from pydantic_core import ErrorDetails
+from pydantic import Field, ValidationError
 
 from gapbridge.core.arrays import Array
 from gapbridge.drivers.canopen.eds import Eds, read_eds
 from gapbridge.drivers.canopen.objects import MODES, OBJECTS, Address, Mode
 from gapbridge.drivers.canopen.pdo import Entry, PdoLayout
-from gapbridge.drivers.profile_file import ProfileDocument, ProfileError, read_profile_document
+from gapbridge.drivers.profile_file import (
+    ProfileDocument,
+    ProfileError,
+    found_and_expected,
+    read_profile_document,
+    worst_of,
+)
 from gapbridge.drivers.section import Number, Positive, Section
 
 NodeId = Annotated[int, Field(ge=1, le=127, strict=True)]
@@ -285,27 +290,13 @@ def _near(name: str, known: Mapping[str, object] | Sequence[str]) -> str:
 
 def _refusal(document: ProfileDocument, error: ValidationError) -> ProfileError:
     """Return one line out of what pydantic says; unknown keys come first."""
-    worst = min(error.errors(), key=lambda detail: detail["type"] != "extra_forbidden")
+    worst = worst_of(error)
     keys: Keys = tuple(key for key in worst["loc"] if key not in ("str", "int", "[key]"))
     if keys and keys[0] in ("tpdo", "rpdo"):
         keys = (keys[0], *(str(key) for key in keys[1:2]), *keys[2:])  # a PDO's number counts as is
     if worst["type"] == "extra_forbidden":
-        names = [name for model in (ProfileFile, Joint, Heartbeat) for name in _names(model)]
+        names = [name for model in (ProfileFile, Joint, Heartbeat) for name in model.model_fields]
         return document.error(keys, f"found an unknown key{_near(str(keys[-1]), names)}")
     if worst["type"] == "missing":
         return document.error(keys, "found nothing, expected this key")
-    return document.error(keys, f"found {_quoted(worst)}, {_expected(worst)}")
-
-
-def _names(model: type[BaseModel]) -> Sequence[str]:
-    return list(model.model_fields)
-
-
-def _quoted(detail: ErrorDetails) -> str:
-    text = " ".join(repr(detail["input"]).split())
-    return text if len(text) <= 60 else f"{text[:60]}..."
-
-
-def _expected(detail: ErrorDetails) -> str:
-    message = detail["msg"]
-    return "expected " + message.removeprefix("Input should be ")
+    return document.error(keys, found_and_expected(worst))

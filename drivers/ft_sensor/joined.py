@@ -69,7 +69,7 @@ class DriverWithSensor(Driver):
         state = self._arm.read_state()
         moment = self._clock.take(state.timestamp, state.received)
         try:
-            raw = self._to_flange @ self._reader.at(moment).wrench
+            wrench = self._to_flange @ self._reader.at(moment).wrench
         except (StaleStateError, InvalidStateError) as error:
             if self.settings.when_lost == "stop":
                 raise
@@ -78,9 +78,9 @@ class DriverWithSensor(Driver):
                 ft_raw_wrench=None, actual_TCP_force=force, sensor_lost=str(error)
             )
         if self._tcp_force is None:
-            return state._replace(ft_raw_wrench=raw)
-        force = self._tcp_force.of(raw, state)
-        return state._replace(ft_raw_wrench=raw, actual_TCP_force=force)
+            return state._replace(ft_raw_wrench=wrench)
+        force = self._tcp_force.of(wrench, state)
+        return state._replace(ft_raw_wrench=wrench, actual_TCP_force=force)
 
     def forget(self) -> None:
         """See Driver.forget."""
@@ -173,10 +173,10 @@ class TcpForce:
         self._place = np.empty((1, 3)), np.empty((1, 3, 3))
         self._flange_in_base()  # loads what is compiled, before the first cycle
 
-    def of(self, raw_in_flange: Array, state: RobotState) -> Array:
+    def of(self, wrench_in_flange: Array, state: RobotState) -> Array:
         """Return force and torque (6,) of the surroundings on the tool, at the TCP, base axes.
 
-        ``raw_in_flange`` is the sensor's wrench (6,), flange axes, about the flange origin. The
+        ``wrench_in_flange`` is the sensor's wrench (6,), flange axes, about the flange origin. The
         payload is the one that the controller declares, else the model's.
         """
         model = self._model
@@ -185,7 +185,7 @@ class TcpForce:
         self._rows.q[0] = state.actual_q
         flange_in_base = self._flange_in_base()
         weight = flange_in_base.T @ (mass * model.gravity)
-        wrench = self._undo @ (raw_in_flange - self._bias)
+        wrench = self._undo @ (wrench_in_flange - self._bias)
         force = wrench[:3] - weight
         torque = wrench[3:] - _cross(cog, weight) - _cross(self._tool[:3, 3], force)
         return np.concatenate([flange_in_base @ force, flange_in_base @ torque])

@@ -13,7 +13,13 @@ from pydantic_core import ErrorDetails
 
 from gapbridge.drivers.modbus.registers import BIT_TABLES, LAST_ADDRESS, UNITS, Table
 from gapbridge.drivers.modbus.schema import Condition, Order, Place, ProfileFile, Turns, Vector
-from gapbridge.drivers.profile_file import ProfileDocument, ProfileError, read_profile_document
+from gapbridge.drivers.profile_file import (
+    ProfileDocument,
+    ProfileError,
+    found_and_expected,
+    read_profile_document,
+    worst_of,
+)
 
 Keys = tuple[str | int, ...]
 MAILBOX_WORDS, ECHO_WORDS = 11, 8
@@ -225,8 +231,7 @@ def _name(keys: Sequence[str | int]) -> str:
 
 def _refusal(document: ProfileDocument, error: ValidationError) -> ProfileError:
     """Return one line out of what pydantic says; unknown keys come first."""
-    details = sorted(error.errors(), key=lambda d: d["type"] != "extra_forbidden")
-    worst = details[0]
+    worst = worst_of(error)
     modes = ("mailbox", "target_trigger", "read_only")
     keys = tuple(k for i, k in enumerate(worst["loc"]) if not (i == 1 and k in modes))
     if worst["type"] == "extra_forbidden":
@@ -238,8 +243,7 @@ def _refusal(document: ProfileDocument, error: ValidationError) -> ProfileError:
         return document.error(
             (*keys, "mode"), f"found {found!r}, expected one of {', '.join(modes)}"
         )
-    expected = str(worst["msg"]).removeprefix("Input should be ")
-    return document.error(keys, f"found {_quoted(worst['input'])}, expected {expected}")
+    return document.error(keys, found_and_expected(worst))
 
 
 def _wanted(keys: Keys) -> str:
@@ -263,8 +267,3 @@ def _hint(worst: ErrorDetails, keys: Keys) -> str:
     return f", expected one that is known: did you mean {near[0]!r}?" if near else (
         ", expected one that is known (docs/porting.md)"
     )  # fmt: skip
-
-
-def _quoted(value: Any) -> str:
-    text = " ".join(repr(value).split())
-    return text if len(text) <= 60 else f"{text[:60]}..."

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
 import numpy as np
 
@@ -22,8 +21,6 @@ from gapbridge.drivers.ur_rtde.enquiry import enquire
 from gapbridge.drivers.ur_rtde.round_trip import round_trip
 from gapbridge.drivers.ur_rtde.settings import UrRtdeSettings
 from gapbridge.drivers.ur_rtde.state import StateReader
-
-OFFSET_SCRIPT = Path(__file__).with_name("gapbridge_offset.script")
 
 
 class UrRtdeDriver(Driver):

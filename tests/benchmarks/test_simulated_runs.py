@@ -122,7 +122,7 @@ def test_a_way_longer_than_a_state_may_be_old_lets_no_setpoint_leave(
 
 
 def test_an_arming_that_a_gap_in_the_states_ends_is_answered() -> None:
-    """Seed 2007469: who had asked waited for 25 s, and was told that nobody had answered."""
+    """Seed 2007469: who had asked waited for 25 s, and then read that nobody had answered."""
     assert not run(2007469).violations
 
 
@@ -136,7 +136,7 @@ def test_a_clock_that_is_set_forward_behind_jitter_makes_no_state_younger(seed: 
     assert not run(seed).violations
 
 
-def test_a_clock_set_forward_as_the_next_packet_comes_late_is_no_violation_but_told() -> None:
+def test_a_clock_set_forward_as_the_next_packet_comes_late_is_no_violation_but_reported() -> None:
     """Seed 5024965: timestamps and arrivals are those of a clock that nobody touched."""
     found = run(5024965)
     assert not found.violations

@@ -61,7 +61,7 @@ def test_what_has_run_counts_until_a_source_that_runs_changes(changed: str, coun
     assert ran.stdout.split() == [str(counts)], ran.stderr
 
 
-def test_a_run_goes_on_where_it_was_left_and_tells_of_what_did_not_hold(
+def test_a_run_goes_on_where_it_was_left_and_reports_what_did_not_hold(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     ran: list[int] = []

@@ -19,13 +19,13 @@ import numpy as np
 from numpy.typing import NDArray
 from simulated_controller import SimulatedController
 
+from benchmarks.server_thread import OFFSET_SCRIPT
 from gapbridge.bridge.cell import load_cell
 from gapbridge.bridge.daemon.daemon import Daemon, settings_of
 from gapbridge.bridge.daemon.summary import RunSummary
 from gapbridge.bridge.loop.supervisor import State
 from gapbridge.core.log.mcap_reading import read_columns
 from gapbridge.drivers.simulated.ur.settings import BENCH_PORT, ServerSettings, simulated_cell
-from gapbridge.drivers.ur_rtde.driver import OFFSET_SCRIPT
 
 Array = NDArray[np.float64]
 TCP = (0.0, 0.0, 0.18, 0.0, 0.0, 0.0)

@@ -138,8 +138,10 @@ def test_reported_spreads_are_those_of_the_values_that_were_fitted(
         )
 
     steps = 1e-6 * np.diag(np.abs(values))
-    slopes = np.stack(
+    jacobian = np.stack(
         [(shown(values + h) - shown(values - h)) / (2 * h.max()) for h in steps], axis=1
     )
     found = [line.std for line in member.reported(UR10E, Term(effect, site, values), covariance)]
-    np.testing.assert_allclose(found, np.sqrt(np.diag(slopes @ covariance @ slopes.T)), rtol=1e-4)
+    np.testing.assert_allclose(
+        found, np.sqrt(np.diag(jacobian @ covariance @ jacobian.T)), rtol=1e-4
+    )

@@ -7,8 +7,8 @@ import sys
 from typing import Any
 
 import pytest
+from link_settings import link_settings
 
-from gapbridge.bridge.cell.sections import link_settings
 from gapbridge.core.arm import Arm, builtin_arm
 from gapbridge.core.errors import LinkError
 from gapbridge.core.model import Model

@@ -45,7 +45,7 @@ def opened(moves_arm: bool, bounds: GateBounds | None = None) -> tuple[Gate, Clo
 
 
 def setpoint(q: Any = Q, nominal: Any = Q, offset: Any = NOTHING) -> Setpoint:
-    return Setpoint(np.asarray(q), np.asarray(nominal), np.asarray(offset), 0.0, 0.0)
+    return Setpoint(np.asarray(q), np.asarray(nominal), np.asarray(offset))
 
 
 def along_x(metres: float) -> np.ndarray:
@@ -241,7 +241,7 @@ def test_the_limiter_at_its_limits_passes_the_gate() -> None:
             limiter.start(nominal)
             found.begin(nominal)
             continue
-        found.check(Setpoint(limited.q, nominal, limited.offset_in_base, 0.0, 0.0))
+        found.check(Setpoint(limited.q, nominal, limited.offset_in_base))
         found.sent()
         clock.now += 1.0 / RATE
 

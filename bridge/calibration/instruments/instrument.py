@@ -84,7 +84,7 @@ class Instrument(ABC, Generic[S]):
         """
 
     def hung(self, load: Payload) -> None:
-        """Be told of the load on the flange, which a simulated one hangs there.
+        """Take the load on the flange, which a simulated one hangs there.
 
         Raises LinkError.
         """

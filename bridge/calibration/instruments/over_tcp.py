@@ -130,7 +130,7 @@ class SimulatedTracker(Instrument[SimulatedTrackerSettings]):
             raise LinkError(f"{self.name}: load: {answer}")
         program = f"def hang():\n  set_payload({numbers[0]}, [{', '.join(numbers[1:])}])\nend\n"
         with (
-            contextlib.suppress(ConnectionError),  # other controllers are told no load
+            contextlib.suppress(ConnectionError),  # other controllers take no load
             socket.create_connection((self._host, SCRIPT_PORT), CONNECTING) as script,
         ):
             script.sendall(program.encode())

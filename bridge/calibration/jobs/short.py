@@ -39,7 +39,7 @@ class _ShortJob(Job):
     from_here = True
 
     def reading_check(self) -> ReadingCheck | None:
-        """Return nobody: there are as many unknowns as a few orientations can tell."""
+        """Return nobody: there are as many unknowns as a few orientations determine."""
         return None
 
 

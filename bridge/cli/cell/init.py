@@ -6,7 +6,7 @@ import re
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import click
 import numpy as np
@@ -17,7 +17,7 @@ from gapbridge.bridge.cell import load_cell
 from gapbridge.bridge.cell.document import parse
 from gapbridge.bridge.cell.first_cell import Asked, first_cell
 from gapbridge.bridge.cell.live import whole_state
-from gapbridge.bridge.cell.message import message
+from gapbridge.bridge.cell.message import refusals
 from gapbridge.bridge.cell.schema import CellFile
 from gapbridge.bridge.cell.sections import LinkSettings
 from gapbridge.bridge.cli.options import FILE
@@ -31,6 +31,14 @@ from gapbridge.drivers.controller_facts import ControllerFacts
 from gapbridge.drivers.ur_rtde.enquiry import enquire
 
 CAN_INTERFACE = re.compile(r"[a-z]*can[0-9]+")  # of the kernel: can0, vcan0, slcan1
+
+
+class GivenArm(NamedTuple):
+    """The arm, where its controller does not report which it is."""
+
+    model: str | None
+    urdf: Path | None
+    tip: str | None
 
 
 @click.command()
@@ -60,7 +68,7 @@ CAN_INTERFACE = re.compile(r"[a-z]*can[0-9]+")  # of the kernel: can0, vcan0, sl
 )
 def init(
     host: str, out: Path, driver: str, profile: str | None, port: int | None,
-    model: str | None, urdf: Path | None, tip: str | None, keys: tuple[str, ...],
+    keys: tuple[str, ...], **arm: Any,
 ) -> None:  # fmt: skip
     """Write a cell file from what a controller reports; never moves the arm.
 
@@ -73,16 +81,18 @@ def init(
     require_writable(out)
     if out.exists():
         raise InputError(f"{out}: found a file that is already there, expected a new one")
-    if model is not None and urdf is not None:
+    given = GivenArm(**arm)
+    if given.model is not None and given.urdf is not None:
         raise InputError("--model: found beside --urdf, expected one of them")
-    if tip is not None and urdf is None:
+    if given.tip is not None and given.urdf is None:
         raise InputError("--tip: found without --urdf, expected the URDF whose link it is")
     link = _link(host, driver, profile, port) | _further(keys)
     settings = _settings(link)
-    facts = enquire(host) if driver == "ur_rtde" else _read(settings, model, urdf, tip)
+    facts = enquire(host) if driver == "ur_rtde" else _read(settings, given)
     if str(link.get("profile")).endswith(".yaml"):
         link["profile"] = _beside(Path(link["profile"]), out)
-    asked = Asked(link, model, None if urdf is None else _beside(urdf, out), tip)
+    urdf = None if given.urdf is None else _beside(given.urdf, out)
+    asked = Asked(link, given.model, urdf, given.tip)
     text = first_cell(facts, asked)
     _check(text, out)
     write_text(out, text)
@@ -130,16 +140,14 @@ def _settings(link: dict[str, Any]) -> LinkSettings:
     try:
         found = CellFile.model_validate({"robot": {"model": "ur10e"}, "link": link}).link
     except ValidationError as error:
-        line = message(parse(f"link: {{driver: {link['driver']}}}", Path()), CellFile, error)
-        raise InputError(line.split(": ", 1)[1]) from None
+        raise InputError(refusals(CellFile, error)[0][1]) from None
     assert found is not None
     return found.located(Path.cwd())
 
 
-def _read(
-    link: LinkSettings, model: str | None, urdf: Path | None, tip: str | None
-) -> ControllerFacts:
+def _read(link: LinkSettings, given: GivenArm) -> ControllerFacts:
     """Return what a profile reads of an arm; needs the arm's joints to know which there are."""
+    model, urdf, tip = given
     if urdf is None and model is None:
         raise InputError(
             f"--model: found nothing with --driver {link.driver}, expected --model or --urdf "

@@ -9,6 +9,7 @@ import click
 
 from gapbridge.bridge.cell.opened_log import joint_names
 from gapbridge.bridge.cli.options import FILE, open_cell
+from gapbridge.bridge.document.notes import note_texts
 from gapbridge.bridge.document.output_file import require_table, write_table
 from gapbridge.core.errors import InputError, LogError
 from gapbridge.core.log.columns import PARQUET
@@ -74,7 +75,7 @@ def convert(source: Path, out: Path, cell: Path | None, **given: Any) -> None:
     write_table(out, names, table)
     order = ", ".join(f"{i + 1} {name}" for i, name in enumerate(converted.joints))
     click.echo(f"{out}: {len(converted)} rows; joints {order}")
-    for note in converted.notes:
+    for note in note_texts(converted.notes):
         click.echo(f"note: {note}")
 
 

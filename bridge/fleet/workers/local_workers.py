@@ -36,6 +36,10 @@ class _Worker:
     ready: bool = False
     tasks: deque[Task] = field(default_factory=deque)  # the first is being done, others wait
 
+    def come_up(self) -> None:
+        """Take tasks from now on."""
+        self.ready = True
+
 
 class LocalWorkers(Workers):
     """Processes on this machine."""
@@ -91,7 +95,8 @@ class LocalWorkers(Workers):
                 yield from self._replaced(worker)
                 continue
             if message == READY:
-                worker.ready, self._stillborn = True, 0
+                worker.come_up()
+                self._stillborn = 0
                 continue
             worker.tasks.popleft()
             yield message

@@ -23,7 +23,7 @@ from gapbridge.core.model import Model, Poses
 from gapbridge.core.rotation import one_rotation_matrix
 
 STEP = 1e-5  # m and rad, of a nuisance: the gap is all but linear in it
-SETTLED = 1e-9  # m and rad: a smaller step moves nothing that anybody measures
+CONVERGED = 1e-9  # m and rad: a smaller step moves nothing that anybody measures
 ROUNDS = 30
 
 
@@ -158,7 +158,7 @@ class Observable(ABC):
             F = F / np.tile(self.sigmas, len(readings))[:, None]
             step = solve(F * root[:, None], gap.ravel() * root)
             nuisance = nuisance.moved(step, layout)
-            if np.abs(step).max() < SETTLED:
+            if np.abs(step).max() < CONVERGED:
                 break
         return nuisance
 

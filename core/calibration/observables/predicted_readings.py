@@ -1,4 +1,4 @@
-"""Readings as a model foresees them: for plans, checks and simulated sessions."""
+"""Readings as a model predicts them: for plans, checks and simulated sessions."""
 
 from __future__ import annotations
 

@@ -13,6 +13,7 @@ from gapbridge.core.arrays import Array
 from gapbridge.core.errors import LogError
 from gapbridge.core.log.sources.joint_order import order_joints
 from gapbridge.core.log.sources.source import Converted, Source, SourceOptions
+from gapbridge.core.notes import Note, Reason
 
 INFO = Path("meta") / "info.json"
 STEPS = 4095  # of an encoder turn, as LeRobot counts its servos' 4096 positions
@@ -49,14 +50,11 @@ class LeRobot(Source):
             columns[column] = table[key][:, [found.index(name) for name in order]] * scale
         fps = float(info.get("fps", 0)) or 30.0
         episodes = len(np.unique(table["episode_index"]))
-        notes = [
-            f"timestamp is the frame's number over {fps:g} Hz, not measured: a latency below "
-            f"{1e3 / fps:.0f} ms cannot be given",
-        ]
+        notes = [Note(Reason.FRAME_TIMES, (fps, 1e3 / fps))]
         if episodes > 1:
-            notes.append(f"{episodes} episodes in a row, {PAUSE:g} s between two")
+            notes.append(Note(Reason.EPISODES, (episodes, PAUSE)))
         if options.calibration is not None:
-            notes.append("a joint's zero is the middle of its calibrated range, not the model's")
+            notes.append(Note(Reason.MIDDLE_ZERO))
         return Converted(columns, order, tuple(notes))
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gapbridge.core.arrays import Array, Mask
+from gapbridge.core.notes import Note, Reason
 
 GAP = 5.0  # times the usual distance of two samples: beyond, nothing is interpolated
 
@@ -56,7 +57,7 @@ class Stream:
         return found, covered
 
 
-def joined(base: Stream, others: list[Stream]) -> tuple[Array, dict[str, Array], list[str]]:
+def joined(base: Stream, others: list[Stream]) -> tuple[Array, dict[str, Array], list[Note]]:
     """Return times (N,), columns and notes: all streams at the times of ``base``.
 
     Rows that another stream does not cover are left out; what the base has already stays the
@@ -68,7 +69,7 @@ def joined(base: Stream, others: list[Stream]) -> tuple[Array, dict[str, Array],
     for other in others:
         found, whole = other.at(base.time)
         if not whole.any():
-            notes.append(f"{other.title}: shares no time with {base.title}, left out")
+            notes.append(Note(Reason.NO_COMMON_TIME, (other.title, base.title)))
             continue
         covered &= whole
         columns = {**found, **columns}
@@ -76,8 +77,7 @@ def joined(base: Stream, others: list[Stream]) -> tuple[Array, dict[str, Array],
         gaps = one.gaps()
         if gaps:
             most = max(length for _, length in gaps)
-            notes.append(f"{one.title}: {len(gaps)} gaps, the longest {most:.3g} s")
+            notes.append(Note(Reason.GAPS, (one.title, len(gaps), most)))
     if not covered.all():
-        notes.append(f"{int(np.sum(~covered))} of {len(covered)} rows left out: "
-                     "not covered by every topic")  # fmt: skip
+        notes.append(Note(Reason.UNCOVERED, (int(np.sum(~covered)), len(covered))))
     return base.time[covered], {k: v[covered] for k, v in columns.items()}, notes

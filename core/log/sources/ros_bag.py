@@ -17,6 +17,7 @@ from gapbridge.core.errors import LogError
 from gapbridge.core.log.sources.joint_order import order_joints
 from gapbridge.core.log.sources.resampling import Stream, joined
 from gapbridge.core.log.sources.source import Converted, Source, SourceOptions
+from gapbridge.core.notes import Note, Reason
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
@@ -71,7 +72,7 @@ class RosBag(Source):
     def read(self, path: Path, arm_joints: Sequence[str], options: SourceOptions) -> Converted:
         """Return the log of a bag; see ``Source.read``."""
         samples = {}
-        notes: list[str] = []
+        notes: list[Note] = []
         with _opened(path) as bag:
             for role in TYPES:
                 topic = _topic(path, bag, role, options, notes)
@@ -85,8 +86,7 @@ class RosBag(Source):
                 "JointTrajectoryControllerState among them"
             )
         notes += [
-            f"{one.topic}: {one.received} of {len(one.time)} messages have no stamp in their "
-            "header; the time of recording stands in its place"
+            Note(Reason.NO_STAMPS, (one.topic, one.received, len(one.time)))
             for one in samples.values()
             if one.received
         ]
@@ -95,7 +95,7 @@ class RosBag(Source):
         time, columns, more = joined(streams[0], streams[1:])
         notes += more
         if "target_q" not in columns:
-            notes.append("target_q: no topic has it, so that tracking cannot be observed")
+            notes.append(Note(Reason.NO_TARGET))
         return Converted({"timestamp": time, **columns}, order, tuple(notes))
 
 
@@ -139,7 +139,7 @@ def _opened(path: Path) -> Iterator[AnyReader]:
 
 
 def _topic(
-    path: Path, bag: AnyReader, role: str, options: SourceOptions, notes: list[str]
+    path: Path, bag: AnyReader, role: str, options: SourceOptions, notes: list[Note]
 ) -> str | None:
     """Return the topic of a role: the one that was asked for, or the only one of its type."""
     found = sorted({c.topic for c in bag.connections if _type(c.msgtype) in TYPES[role]})
@@ -152,12 +152,10 @@ def _topic(
             )
         return asked
     if role == "wrench" and found and not options.wrench:
-        notes.append(f"{', '.join(found)}: left out; say what it measures with --wrench "
-                     f"{' or '.join(WRENCHES)}")  # fmt: skip
+        notes.append(Note(Reason.WRENCH_UNKNOWN, (found, WRENCHES)))
         return None
     if role == "pose" and found:
-        notes.append(f"{', '.join(found)}: left out; name the tracker's topic with --topic "
-                     "pose=TOPIC")  # fmt: skip
+        notes.append(Note(Reason.POSE_UNNAMED, (found,)))
         return None
     if len(found) > 1:
         raise LogError(
@@ -179,9 +177,9 @@ def _collect(path: Path, bag: AnyReader, topic: str) -> _Samples:
     connections = [c for c in bag.connections if c.topic == topic]
     read: Callable[[bytes, str], Any] | None = None
     try:
-        for connection, received, raw in bag.messages(connections):
-            read = read or _reader(path, bag, connection.msgtype, raw)
-            message: Any = read(raw, connection.msgtype)
+        for connection, received, data in bag.messages(connections):
+            read = read or _reader(path, bag, connection.msgtype, data)
+            message: Any = read(data, connection.msgtype)
             stamp = message.header.stamp.sec + message.header.stamp.nanosec * 1e-9
             if stamp == 0:
                 stamp, found.received = received * 1e-9, found.received + 1
@@ -195,8 +193,8 @@ def _collect(path: Path, bag: AnyReader, topic: str) -> _Samples:
     return found
 
 
-def _reader(path: Path, bag: AnyReader, kind: str, raw: bytes) -> Callable[[bytes, str], Any]:
-    """Return what reads messages of a type, of which ``raw`` is one.
+def _reader(path: Path, bag: AnyReader, kind: str, data: bytes) -> Callable[[bytes, str], Any]:
+    """Return what reads messages of a type, of which ``data`` is one.
 
     Bags of SQLite before ROS 2 Iron hold no definitions: a controller's state is then read by the
     first layout that fits its bytes. Raises LogError where none does.
@@ -213,7 +211,7 @@ def _reader(path: Path, bag: AnyReader, kind: str, raw: bytes) -> Callable[[byte
         store = get_typestore(Stores.ROS2_HUMBLE)
         store.register(get_types_from_msg("\n".join(lines), kind))
         try:
-            store.deserialize_cdr(raw, kind)
+            store.deserialize_cdr(data, kind)
         except Exception:  # whatever another layout's bytes lead to
             continue
         return store.deserialize_cdr
@@ -262,7 +260,7 @@ def _names(samples: dict[str, _Samples]) -> tuple[str, ...]:
 
 def _streams(
     path: Path, samples: dict[str, _Samples], order: tuple[str, ...], options: SourceOptions,
-    notes: list[str],
+    notes: list[Note],
 ) -> list[Stream]:  # fmt: skip
     """Return the streams, the one whose times are taken first."""
     streams = [
@@ -280,7 +278,7 @@ def _streams(
         column = options.wrench or WRENCHES[0]
         values = np.array([row["wrench"] for row in one.rows])
         streams.append(Stream(one.topic, np.array(one.time), {column: values}).in_order())
-        notes.append(f"{one.topic}: taken as {column}, its axes are those of {one.frame!r}")
+        notes.append(Note(Reason.TAKEN_AS, (one.topic, column, one.frame)))
     if "pose" in samples:
         from scipy.spatial.transform import Rotation
 
@@ -295,7 +293,7 @@ def _streams(
 
 
 def _joint_stream(
-    samples: _Samples, order: tuple[str, ...], options: SourceOptions, notes: list[str]
+    samples: _Samples, order: tuple[str, ...], options: SourceOptions, notes: list[Note]
 ) -> Iterator[Stream]:
     """Yield the stream of a topic with joints, if a message of it holds all of them."""
     whole = [i for i, row in enumerate(samples.rows) if set(order) <= set(row["names"])]
@@ -308,8 +306,7 @@ def _joint_stream(
         if any(values is None for values in lists):
             continue
         if source == "effort" and not options.effort_is_torque:
-            notes.append(f"{samples.topic}: effort left out; where it is Nm (some drivers report "
-                         "A) say --effort-is-torque")  # fmt: skip
+            notes.append(Note(Reason.EFFORT_UNKNOWN, (samples.topic,)))
             continue
         columns[column] = np.array(lists, dtype=float)
     if columns:

@@ -14,6 +14,7 @@ from gapbridge.core.arrays import Array
 from gapbridge.core.errors import LogError
 from gapbridge.core.log.columns import COLUMNS
 from gapbridge.core.log.log import Log
+from gapbridge.core.notes import Note
 
 
 @dataclass(frozen=True)
@@ -35,7 +36,7 @@ class Converted:
 
     columns: Mapping[str, Array]
     joints: tuple[str, ...]  # the source's names, in the order of the columns' indices
-    notes: tuple[str, ...] = ()
+    notes: tuple[Note, ...] = ()
 
     def __len__(self) -> int:
         return len(next(iter(self.columns.values())))

@@ -12,6 +12,7 @@ from gapbridge.core.arrays import Array
 from gapbridge.core.errors import LogError
 from gapbridge.core.log.columns import COLUMNS, is_known
 from gapbridge.core.log.sources.source import Converted, Source, SourceOptions
+from gapbridge.core.notes import Note, Reason
 
 FRANKA = {  # libfranka's logToCSV -> the log's columns
     "state.q_d": "target_q", "state.q": "actual_q", "state.dq": "actual_qd",
@@ -35,9 +36,8 @@ class Libfranka(Source):
         columns = _vectors(path, ",", FRANKA)
         columns["timestamp"] = _column(path, ",", "time") * 1e-3
         n = columns["actual_q"].shape[1]
-        notes = ("actual_current_as_torque is tau_J: measured behind the gears, without the "
-                 "motor's friction and inertia",)  # fmt: skip
-        return Converted(columns, tuple(f"joint{i + 1}" for i in range(n)), notes)
+        joints = tuple(f"joint{i + 1}" for i in range(n))
+        return Converted(columns, joints, (Note(Reason.BEHIND_GEARS),))
 
 
 class UrRecorder(Source):

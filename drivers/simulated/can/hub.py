@@ -32,6 +32,7 @@ class Hub:
         self.frames = 0  # that went over the bus
         self._selector = selectors.DefaultSelector()
         self._ports: dict[int, Port] = {}
+        self._full: set[int] = set()  # lines of ports that wait for room to write
         self._listener: socket.socket | None = None
         self._thread: threading.Thread | None = None
         self._wake_in, self._wake_out = -1, -1
@@ -164,13 +165,14 @@ class Hub:
         return selectors.EVENT_READ | (selectors.EVENT_WRITE if port.waiting else 0)
 
     def _watch(self, port: Port) -> None:
-        if port.watched != port.waiting:
-            port.watched = port.waiting
+        if port.waiting != (port.fd in self._full):
+            self._full ^= {port.fd}
             self._selector.modify(port.fd, self._wanted(port))
 
     def _drop(self, port: Port) -> None:
         if self._ports.pop(port.fd, None) is None:
             return
+        self._full.discard(port.fd)
         if port.fd >= 0:
             with contextlib.suppress(OSError, KeyError, ValueError):
                 self._selector.unregister(port.fd)

@@ -157,19 +157,11 @@ class CanNodes(ProtocolServer):
 
     def commands(self, controller: ArmController) -> Mapping[str, Command]:
         """Return the bench commands of a bus: frames that get lost."""
-
-        def withhold(numbers: list[float]) -> str:
-            self.withheld.add(int(numbers[0]))
-            return "ok"
-
-        def resume(numbers: list[float]) -> str:
-            self.withheld.clear()
-            return "ok"
-
         return {
-            "withhold": (1, withhold, "withhold ID: frames of this identifier get lost"),
-            "resume": (0, resume, "resume: no frames get lost any more"),
-        }
+            "withhold": (1, lambda given: self.withheld.add(int(given[0])),
+                         "withhold ID: frames of this identifier get lost"),
+            "resume": (0, lambda _: self.withheld.clear(), "resume: no frames get lost any more"),
+        }  # fmt: skip
 
     # -- joints -----------------------------------------------------------------------------------
 

@@ -24,7 +24,6 @@ class Port(ABC):
 
     def __init__(self, fd: int) -> None:
         self.fd = fd
-        self.watched = False  # whether the hub waits for room to write
         self._out = bytearray()
         self._in = bytearray()
 
@@ -77,7 +76,7 @@ class SocketcandPort(Port):
     def __init__(self, link: socket.socket) -> None:
         super().__init__(link.fileno())
         self._link = link
-        self._raw_from = math.inf  # s, monotonic
+        self._frames_from = math.inf  # s, monotonic
         self._write(b"< hi >")
 
     def receive(self) -> list[Frame]:
@@ -97,7 +96,7 @@ class SocketcandPort(Port):
             case ["open", _]:
                 self._write(b"< ok >")
             case ["rawmode"]:
-                self._raw_from = time.monotonic() + QUIET
+                self._frames_from = time.monotonic() + QUIET
                 self._write(b"< ok >")
             case ["echo"]:
                 self._write(b"< echo >")
@@ -112,7 +111,7 @@ class SocketcandPort(Port):
 
     def deliver(self, frame: Frame, stamp: float) -> None:
         """Send ``< frame id seconds.microseconds data >``."""
-        if time.monotonic() >= self._raw_from:
+        if time.monotonic() >= self._frames_from:
             name = f"{frame.id:08X}" if frame.extended else f"{frame.id:03X}"
             self._write(f"< frame {name} {stamp:.6f} {frame.data.hex().upper()} >".encode())
 

@@ -73,7 +73,7 @@ class Drive(canopen.LocalNode):
         self.units, self.axis = units, Axis(q)
         self.q, self.qd, self.torque = q, 0.0, 0.0  # of the plant, rad, rad/s, Nm
         self.error_code = 0
-        self.watched: dict[int, float] = {}  # node id -> s it was last heard at
+        self.watched: dict[int, float] = {}  # node id -> s of its last heartbeat
         self._limits = (-LAST, LAST)
         self._received: dict[int, bytes] = {}  # RPDO's COB-ID -> data that waits for a SYNC
         self._mappings: dict[int, Mapping | None] = {}
@@ -81,15 +81,15 @@ class Drive(canopen.LocalNode):
         self.add_write_callback(self.nmt.on_write)  # type: ignore[no-untyped-call]
         self.add_write_callback(self._written)  # type: ignore[no-untyped-call]
 
-    def boot(self, low: float, high: float) -> None:
-        """Start anew with the EDS's defaults; ``low`` and ``high`` are the joint's limits, rad."""
+    def boot(self, q: float, low: float, high: float) -> None:
+        """Start anew at ``q`` with the EDS's defaults, between the joint's limits (rad)."""
         self.data_store.clear()
         self._mappings.clear()
         self._received.clear()
         self.watched.clear()
         ends = sorted((self.counts(low), self.counts(high)))
         self._limits = (ends[0], ends[1])
-        self.axis = Axis(self.q)
+        self.q, self.axis = q, Axis(q)
         self.error_code = 0
         self.nmt.state = "INITIALISING"  # the library sends the boot-up message
         self.nmt.state = "PRE-OPERATIONAL"
@@ -149,9 +149,9 @@ class Drive(canopen.LocalNode):
         elif index == 0x6060:
             if value not in MODES:
                 raise canopen.SdoAbortedError(BAD_VALUE)
-            self.axis.mode = value
+            self.axis.set_mode(value)
         elif index == 0x605A:
-            self.axis.machine.quick_stop_stays = value >= 5
+            self.axis.machine.set_quick_stop_option(value)
         elif index == 0x1016 and subindex == 1:
             self.watched.clear()  # watching begins with the first heartbeat
 
@@ -223,6 +223,17 @@ class Drive(canopen.LocalNode):
         counts = self.number(0x60C1, 1) if self.axis.mode == 7 else self.number(0x607A)
         return self.axis.setpoint(counts / self.units.per_radian + self.units.zero)
 
+    def measure(self, q: float, qd: float, torque: float) -> None:
+        """Take the plant's joint over: rad, rad/s, Nm."""
+        self.q, self.qd, self.torque = q, qd, torque
+
+    def samples_off_by(self, angle: float) -> list[tuple[int, bytes]]:
+        """Return the frames that a joint ``angle`` (rad) further on would have."""
+        here, self.q = self.q, self.q + angle
+        found = self.samples()
+        self.q = here
+        return found
+
     def samples(self) -> list[tuple[int, bytes]]:
         """Return the frames of all synchronous TPDOs, of this moment."""
         frames = []
@@ -275,6 +286,10 @@ class Axis:
     def holds(self) -> bool:
         """Return whether the drive has power over the axis."""
         return self.machine.phase in (Phase.ENABLED, Phase.QUICK_STOP, Phase.REACTION)
+
+    def set_mode(self, mode: int) -> None:
+        """Change the mode of operation."""
+        self.mode = mode
 
     def setpoint(self, angle: float) -> bool:
         """Take the setpoint of a SYNC; returns False where it is too far away to be followed."""

@@ -23,12 +23,16 @@ REMOTE = 0x0200  # Statusword: the Controlword is obeyed
 
 
 class Machine:
-    """One drive's power state. ``quick_stop_stays``: option codes 5 to 8 of 0x605A."""
+    """One drive's power state."""
 
     def __init__(self) -> None:
         self.phase = Phase.SWITCH_ON_DISABLED
         self.word = 0  # the last Controlword
-        self.quick_stop_stays = False
+        self._quick_stop_stays = False  # option codes 5 to 8 of 0x605A
+
+    def set_quick_stop_option(self, code: int) -> None:
+        """Take over the option code of 0x605A."""
+        self._quick_stop_stays = code >= 5
 
     def control(self, word: int) -> bool:
         """Obey a Controlword; returns whether it resets a fault."""
@@ -71,7 +75,7 @@ class Machine:
             self.phase = Phase.ENABLED
         elif self.phase is Phase.ENABLED and not enable:
             self.phase = Phase.SWITCHED_ON
-        elif self.phase is Phase.QUICK_STOP and enable and self.quick_stop_stays:
+        elif self.phase is Phase.QUICK_STOP and enable and self._quick_stop_stays:
             self.phase = Phase.ENABLED
 
     def fault(self) -> None:
@@ -83,7 +87,7 @@ class Machine:
         """Note that a quick stop or a fault reaction has ended: the axis stands."""
         if self.phase is Phase.REACTION:
             self.phase = Phase.FAULT
-        elif self.phase is Phase.QUICK_STOP and not self.quick_stop_stays:
+        elif self.phase is Phase.QUICK_STOP and not self._quick_stop_stays:
             self.phase = Phase.SWITCH_ON_DISABLED
 
     @property

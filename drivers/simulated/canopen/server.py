@@ -6,7 +6,7 @@ import contextlib
 import threading
 import time
 from collections.abc import Mapping
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import canopen
 from canopen.network import MessageListener
@@ -29,32 +29,6 @@ OFF_BY = 0.05  # rad that a TPDO of a SYNC before is off: who takes it for a new
 PAUSE = 0.02  # s
 
 
-class Faulty(Protocol):
-    """The drives as these commands need them."""
-
-    profile: CanopenProfile
-
-    def silence(self, node: int) -> None:
-        """Have a node send nothing."""
-        ...
-
-    def speak(self) -> None:
-        """Have all nodes send again."""
-        ...
-
-    def restart(self, node: int) -> None:
-        """Have a node start anew."""
-        ...
-
-    def fail(self, node: int, code: int) -> None:
-        """Have a drive fail."""
-        ...
-
-    def hold_back(self, node: int, delay: float, count: int = 1) -> None:
-        """Have TPDOs of a node come late."""
-        ...
-
-
 class HeldPdo(NamedTuple):
     """A TPDO that is held back."""
 
@@ -74,10 +48,14 @@ class _Network(canopen.Network):
     def __init__(self, bus: Any) -> None:
         super().__init__(bus)
         self.silent: set[int] = set()
-        self.mute = False
+        self._mute = False
+
+    def set_mute(self, mute: bool) -> None:
+        """Have all nodes send nothing, or send again."""
+        self._mute = mute
 
     def send_message(self, can_id: int, data: Any, remote: bool = False) -> None:
-        if not self.mute and can_id & 0x7F not in self.silent:
+        if not self._mute and can_id & 0x7F not in self.silent:
             with contextlib.suppress(Exception):  # the bus has gone: the server's cycle notices
                 super().send_message(can_id, data, remote)
 
@@ -94,7 +72,7 @@ class _Listener(MessageListener):
             return
         with self._server.lock:
             super().on_message_received(msg)  # type: ignore[no-untyped-call]
-            self._server.heard(int(msg.arbitration_id), bytes(msg.data))
+            self._server.take_frame(int(msg.arbitration_id), bytes(msg.data))
 
     def on_error(self, exc: Exception) -> None:
         time.sleep(PAUSE)  # the bus has gone: the server's cycle notices
@@ -159,9 +137,8 @@ class CanopenServer(ProtocolServer):
 
     def _boot(self, joint: int) -> None:
         arm = self._controller.plant.arm
-        drive = self.drives[joint]
-        drive.q = self._controller.q[joint]
-        drive.boot(arm.lower[joint], arm.upper[joint])
+        q = self._controller.q[joint]
+        self.drives[joint].boot(q, arm.lower[joint], arm.upper[joint])
 
     @property
     def port(self) -> int:
@@ -185,7 +162,7 @@ class CanopenServer(ProtocolServer):
 
     # -- frames -----------------------------------------------------------------------------------
 
-    def heard(self, cob_id: int, data: bytes) -> None:
+    def take_frame(self, cob_id: int, data: bytes) -> None:
         """Act on one frame, after the library has; from the notifier's thread."""
         if self._network is None or self._controller.stalled:
             return
@@ -216,8 +193,8 @@ class CanopenServer(ProtocolServer):
             for cob_id, data in drive.samples():
                 self._network.send_message(cob_id, data)
         for drive in self.drives:
-            heard = drive.operational and drive.node not in self._network.silent
-            if heard and not drive.take_setpoints():
+            listens = drive.operational and drive.node not in self._network.silent
+            if listens and not drive.take_setpoints():
                 drive.fail(FOLLOWING_ERROR)
 
     def _hold(self, drive: Drive) -> None:
@@ -225,9 +202,7 @@ class CanopenServer(ProtocolServer):
         if count > 1:
             self._late[drive.node] = (count - 1, delay)
         due, right = time.monotonic() + delay, drive.samples()
-        drive.q += OFF_BY
-        wrong = drive.samples()
-        drive.q -= OFF_BY
+        wrong = drive.samples_off_by(OFF_BY)
         self._held += [
             HeldPdo(due, self._syncs, cob_id, data, off)
             for (cob_id, data), (_, off) in zip(right, wrong, strict=True)
@@ -240,10 +215,10 @@ class CanopenServer(ProtocolServer):
             data = held.data if held.sync == self._syncs else held.off
             self._network.send_message(held.cob_id, data)
 
-    def hold_back(self, node: int, delay: float, count: int = 1) -> None:
+    def hold_back(self, node: float, delay: float, count: int = 1) -> None:
         """Have a node's TPDOs come ``delay`` s late, at the next ``count`` SYNCs."""
         with self.lock:
-            self._late[node] = (count, delay)
+            self._late[self.drives[self._joint_of(node)].node] = (count, delay)
 
     # -- the cycle --------------------------------------------------------------------------------
 
@@ -252,7 +227,7 @@ class CanopenServer(ProtocolServer):
         with self.lock:
             if self._network is None:
                 return
-            self._network.mute = controller.stalled
+            self._network.set_mute(controller.stalled)
             self._follow_stops(controller)
             self._send_held(time.monotonic())
             self._watch_heartbeats(controller)
@@ -280,8 +255,8 @@ class CanopenServer(ProtocolServer):
     def _watch_heartbeats(self, controller: ArmController) -> None:
         for drive in self.drives:
             limit = 1e-3 * (drive.number(0x1016, 1) & 0xFFFF)
-            for node, heard in list(drive.watched.items()):
-                if limit and controller.running - heard > limit:
+            for node, last in list(drive.watched.items()):
+                if limit and controller.running - last > limit:
                     del drive.watched[node]
                     drive.emcy.send(HEARTBEAT_ERROR, COMMUNICATION)
                     self._abort_connection(drive)
@@ -311,11 +286,7 @@ class CanopenServer(ProtocolServer):
     def _feel(self, controller: ArmController) -> None:
         torque = controller.joint_torque
         for joint, drive in enumerate(self.drives):
-            drive.q, drive.qd, drive.torque = (
-                controller.q[joint],
-                controller.qd[joint],
-                torque[joint],
-            )
+            drive.measure(controller.q[joint], controller.qd[joint], torque[joint])
 
     def _beat(self, controller: ArmController) -> None:
         for drive in self.drives:
@@ -327,29 +298,44 @@ class CanopenServer(ProtocolServer):
 
     # -- the bench --------------------------------------------------------------------------------
 
-    def silence(self, node: int) -> None:
+    def _joint_of(self, node: float) -> int:
+        """Return the joint, from 0, of a node. Raises BenchError."""
+        if node not in self.profile.nodes:
+            raise BenchError(f"found node {node:g}, expected one of {self.profile.nodes}")
+        return self.profile.nodes.index(int(node))
+
+    def silence(self, node: float) -> None:
         """Have a node send nothing, as one whose plug is pulled."""
         with self.lock:
-            self._network.silent.add(node)
+            self._network.silent.add(self.drives[self._joint_of(node)].node)
 
     def speak(self) -> None:
         """Have all nodes send again."""
         with self.lock:
             self._network.silent.clear()
 
-    def restart(self, node: int) -> None:
+    def restart(self, node: float) -> None:
         """Have a node start anew, as after a dip of its supply."""
         with self.lock:
-            self._boot(self.profile.nodes.index(node))
+            self._boot(self._joint_of(node))
 
-    def fail(self, node: int, code: int) -> None:
+    def fail(self, node: float, code: int) -> None:
         """Have a drive fail with an error code."""
         with self.lock:
-            self.drives[self.profile.nodes.index(node)].fail(code)
+            self.drives[self._joint_of(node)].fail(code)
 
     def commands(self, controller: ArmController) -> Mapping[str, Command]:
         """Return the bench commands of drives."""
-        return bench_commands(self)
+        return {
+            "silence": (1, lambda given: self.silence(given[0]),
+                        "NODE: this drive sends nothing any more"),
+            "speak": (0, lambda _: self.speak(), "all drives send again"),
+            "restart": (1, lambda given: self.restart(given[0]), "NODE: this drive starts anew"),
+            "fail": (2, lambda given: self.fail(given[0], int(given[1]) & 0xFFFF),
+                     "NODE CODE: this drive goes to FAULT with an error code"),
+            "late": (2, lambda given: self.hold_back(given[0], max(given[1], 0.0)),
+                     "NODE SECONDS: its next TPDOs come so late"),
+        }  # fmt: skip
 
 
 def make_servers(
@@ -357,41 +343,3 @@ def make_servers(
 ) -> list[ProtocolServer]:
     """Return the drives of an arm, not yet on a bus. Raises InputError where they do not fit."""
     return [CanopenServer(link, host, controller)]
-
-
-def bench_commands(drives: Faulty) -> Mapping[str, Command]:
-    """Return the commands by name."""
-    nodes = drives.profile.nodes
-
-    def node_of(number: float) -> int:
-        if number not in nodes:
-            raise BenchError(f"found node {number:g}, expected one of {nodes}")
-        return int(number)
-
-    def silence(numbers: list[float]) -> str:
-        drives.silence(node_of(numbers[0]))
-        return "ok"
-
-    def speak(numbers: list[float]) -> str:
-        drives.speak()
-        return "ok"
-
-    def restart(numbers: list[float]) -> str:
-        drives.restart(node_of(numbers[0]))
-        return "ok"
-
-    def fail(numbers: list[float]) -> str:
-        drives.fail(node_of(numbers[0]), int(numbers[1]) & 0xFFFF)
-        return "ok"
-
-    def late(numbers: list[float]) -> str:
-        drives.hold_back(node_of(numbers[0]), max(numbers[1], 0.0))
-        return "ok"
-
-    return {
-        "silence": (1, silence, "NODE: this drive sends nothing any more"),
-        "speak": (0, speak, "all drives send again"),
-        "restart": (1, restart, "NODE: this drive starts anew"),
-        "fail": (2, fail, "NODE CODE: this drive goes to FAULT with an error code"),
-        "late": (2, late, "NODE SECONDS: its next TPDOs come so late"),
-    }

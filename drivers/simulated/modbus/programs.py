@@ -11,9 +11,9 @@ from gapbridge.drivers.modbus.registers import UNITS, Table
 from gapbridge.drivers.modbus.schema import Mailbox, ProfileFile, TargetTrigger
 from gapbridge.drivers.simulated.modbus.image import bad
 from gapbridge.drivers.simulated.plant.kinematics import Joints, offset_frame, solve, tcp_in_base
-from gapbridge.drivers.simulated.plant.motion import Hold, Stop
+from gapbridge.drivers.simulated.plant.motion import Hold
 from gapbridge.drivers.simulated.plant.plant_settings import Vector6
-from gapbridge.drivers.simulated.server.arm_controller import BRAKING, HOLD, ArmController
+from gapbridge.drivers.simulated.server.arm_controller import HOLD, ArmController
 from gapbridge.drivers.simulated.server.bench import BenchError
 from gapbridge.drivers.simulated.ur.programs.offset_program import (
     NOTHING,
@@ -66,6 +66,10 @@ class MailboxProgram:
         self.applied: Vector6 = NOTHING
         self._state = encode.EXPIRED
         self._solved: tuple[Joints, Vector6] | None = None  # what joint offsets were found for
+
+    def run(self, running: bool) -> None:
+        """Start the program, or stop it."""
+        self.running = running
 
     def wrote(
         self, controller: ArmController, table: Table, address: int, values: Sequence[int]
@@ -164,7 +168,8 @@ class TargetProgram:
             if stop and (table, address + i, value) == (
                 stop[-1].table, stop[-1].address, int(stop[-1].value),
             ):  # fmt: skip
-                self._due, controller.motion = False, Stop(controller.target_qd, BRAKING)
+                self._due = False
+                controller.stop_own()
 
     def cycle(self, controller: ArmController, read: Read) -> None:
         """Start the motion that was triggered."""

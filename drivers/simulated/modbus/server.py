@@ -225,19 +225,15 @@ class ModbusServer(ProtocolServer):
     def commands(self, controller: ArmController) -> Mapping[str, Command]:
         """Return bench commands for faults of this protocol."""
 
-        def tear(numbers: list[float]) -> str:
-            self.tear(int(numbers[0]))
-            return "ok"
-
-        def program(numbers: list[float]) -> str:
+        def program(given: list[float]) -> None:
             if isinstance(self.program, MailboxProgram):
-                self.program.running = bool(numbers[0])
-            return "ok"
+                self.program.run(bool(given[0]))
 
         return {
-            "tear": (1, tear, "N: mix two moments in the next N samples"),
+            "tear": (1, lambda given: self.tear(int(given[0])),
+                     "N: mix two moments in the next N samples"),
             "program": (1, program, "0 or 1: stop or start the robot's mailbox program"),
-        }
+        }  # fmt: skip
 
 
 def _troubles(controller: ArmController) -> frozenset[Trouble]:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -125,6 +125,14 @@ class Plant:
     def true_angles(self) -> tuple[float, ...]:
         """Return what the joints really stand at (rad): encoders, zeros, the placement error."""
         return tuple(a + b + c for a, b, c in zip(self.q, self.scatter, self.zero, strict=True))
+
+    def hang(self, mass: float, cog: Vector3) -> None:
+        """Hang a load on the flange: kg, m in the flange frame."""
+        self.load = replace(self.load, mass=mass, cog=cog)
+
+    def pull(self, force: Vector3, torque: Vector3) -> None:
+        """Pull at the TCP, in base axes: N, Nm."""
+        self.load = replace(self.load, force=force, torque=torque)
 
     def slip(self, joint: int, angle: float) -> None:
         """Have the zero of a joint (from 0) slip: its true angle is ``angle`` rad more from now."""

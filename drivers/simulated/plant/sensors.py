@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from gapbridge.drivers.simulated.plant.declared import Declared
+from gapbridge.drivers.simulated.plant.declared_settings import DeclaredSettings
 from gapbridge.drivers.simulated.plant.kinematics import gap, holding_torque, pose_of
 from gapbridge.drivers.simulated.plant.plant import Plant
 from gapbridge.drivers.simulated.plant.plant_arm import Frame, place
@@ -39,7 +39,9 @@ class Sensors:
     the packets have left and does what needs the plant's equilibrium.
     """
 
-    def __init__(self, plant: Plant, declared: Declared, memory: MutableMapping[str, Any]) -> None:
+    def __init__(
+        self, plant: Plant, declared: DeclaredSettings, memory: MutableMapping[str, Any]
+    ) -> None:
         self._plant = plant
         self._declared = declared
         self._memory = memory

@@ -25,6 +25,10 @@ class Servo(Stateless):
         self.lookahead = lookahead
         self._limits = arm.velocity
 
+    def aim(self, goal: Joints, lookahead: float) -> None:
+        """Follow another target from now on."""
+        self.goal, self.lookahead = goal, lookahead
+
     def step(self, q: Joints, qd: Joints, dt: float) -> Joints:
         """Return the next joint target."""
         share = dt / max(0.25 * self.lookahead, dt)
@@ -43,17 +47,30 @@ class Servo(Stateless):
         return tuple(found)
 
 
-class SpeedJoints:
-    """speedJ: joints approach a velocity with an acceleration (leading joint)."""
+class _Speed:
+    """A velocity that is approached with an acceleration."""
 
     failed = False
     scaled = False
     done = False
 
     def __init__(self, goal: Sequence[float], acceleration: float) -> None:
-        self.goal = tuple(float(v) for v in goal)
-        self.acceleration = acceleration
-        self._now: Joints | None = None
+        self.aim(goal, acceleration)
+
+    def aim(self, goal: Sequence[float], acceleration: float) -> None:
+        """Approach another velocity from now on."""
+        self.goal, self.acceleration = tuple(float(v) for v in goal), acceleration
+
+    def _after(self, now: Joints, dt: float) -> Joints:
+        """Return the velocity one step after ``now``."""
+        most = self.acceleration * dt
+        return tuple(v + min(max(g - v, -most), most) for v, g in zip(now, self.goal, strict=True))
+
+
+class SpeedJoints(_Speed):
+    """speedJ: joints approach a velocity with an acceleration (leading joint)."""
+
+    _now: Joints | None = None
 
     def restart(self, q: Joints) -> None:
         """Gather speed anew."""
@@ -61,28 +78,20 @@ class SpeedJoints:
 
     def step(self, q: Joints, qd: Joints, dt: float) -> Joints:
         """Return the next joint target."""
-        now = qd if self._now is None else self._now
-        most = self.acceleration * dt
-        self._now = tuple(
-            v + min(max(g - v, -most), most) for v, g in zip(now, self.goal, strict=True)
-        )
+        self._now = self._after(qd if self._now is None else self._now, dt)
         return tuple(a + v * dt for a, v in zip(q, self._now, strict=True))
 
 
-class SpeedTool:
+class SpeedTool(_Speed):
     """speedL: the TCP approaches a velocity in base axes (m/s, rad/s)."""
 
-    failed = False
-    scaled = False
-    done = False
+    _now: Joints = (0.0,) * 6
 
     def __init__(
         self, arm: PlantArm, tool: Frame, goal: Sequence[float], acceleration: float
     ) -> None:
-        self.goal = tuple(float(v) for v in goal)
-        self.acceleration = acceleration
+        super().__init__(goal, acceleration)
         self._arm, self._tool = arm, tool
-        self._now: Joints = (0.0,) * 6
 
     def restart(self, q: Joints) -> None:
         """Gather speed anew."""
@@ -90,10 +99,7 @@ class SpeedTool:
 
     def step(self, q: Joints, qd: Joints, dt: float) -> Joints:
         """Return the next joint target."""
-        most = self.acceleration * dt
-        self._now = tuple(
-            v + min(max(g - v, -most), most) for v, g in zip(self._now, self.goal, strict=True)
-        )
+        self._now = self._after(self._now, dt)
         J = jacobian(self._arm, q, self._tool)
         rates = J.T @ np.linalg.solve(J @ J.T + 1e-6 * np.eye(6), self._now)
         largest = max(

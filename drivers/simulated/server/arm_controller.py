@@ -10,7 +10,7 @@ import logging
 from collections.abc import Sequence
 from typing import Any
 
-from gapbridge.drivers.simulated.plant.declared import Declared
+from gapbridge.drivers.simulated.plant.declared_settings import DeclaredSettings
 from gapbridge.drivers.simulated.plant.kinematics import Joints, within_limits
 from gapbridge.drivers.simulated.plant.motion import Hold, Motion, MoveJoints, Stop
 from gapbridge.drivers.simulated.plant.plant import Plant
@@ -34,7 +34,7 @@ class ArmController:
     until it is released.
     """
 
-    def __init__(self, plant: Plant, declared: Declared, cycle: float) -> None:
+    def __init__(self, plant: Plant, declared: DeclaredSettings, cycle: float) -> None:
         self.plant, self.declared = plant, declared
         self.period = cycle  # s
         self.clock = 0.0  # s, the controller's clock; stands still when frozen
@@ -142,6 +142,10 @@ class ArmController:
             self.let_go()
         self.motion = MoveJoints(self.own_q, goal, OWN_SPEED, OWN_ACCELERATION)
 
+    def stop_own(self) -> None:
+        """Brake what the robot's own program does."""
+        self.motion = Stop(self.target_qd, BRAKING)
+
     # -- stops ------------------------------------------------------------------------------------
 
     def protective_stop(self) -> None:
@@ -164,7 +168,11 @@ class ArmController:
 
     def _brake(self) -> None:
         self.let_go()
-        self.motion = Stop(self.target_qd, BRAKING)
+        self.stop_own()
+
+    def freeze(self, frozen: bool) -> None:
+        """Let the clock stand still, or go on."""
+        self.frozen = frozen
 
     def stall(self, seconds: float) -> None:
         """Send and answer nothing for a while."""
@@ -212,8 +220,8 @@ def make_controller(
 
     With `declare` the controller is given the plant's true TCP and payload.
     """
-    declared = Declared()
+    declared = DeclaredSettings()
     if declare:
         declared.set_tcp(plant.tcp)
-        declared.payload_mass, declared.payload_cog = plant.payload_mass, plant.payload_cog
+        declared.set_payload(plant.payload_mass, plant.payload_cog)
     return ArmController(Plant(arm, plant, start_q), declared, period)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from gapbridge.drivers.simulated.plant.kinematics import pose_of
-from gapbridge.drivers.simulated.plant.plant import Load, Plant
+from gapbridge.drivers.simulated.plant.plant import Plant
 from gapbridge.drivers.simulated.plant.plant_arm import place
 from gapbridge.drivers.simulated.plant.rotations import compose, from_vector, to_vector
 from gapbridge.drivers.simulated.server.connection import Connection
@@ -26,8 +26,8 @@ HEAVIEST = 200.0  # kg
 LONGEST_LINE = 1000  # characters
 
 Joints = tuple[float, ...]
-Command = tuple[int, Callable[[list[float]], str], str]
-"""How many numbers a command takes, what it does, and what help says of it."""
+Command = tuple[int, Callable[[list[float]], str | None], str]
+"""How many numbers a command takes, what it does (None: the answer is ok), what help says of it."""
 
 
 class BenchError(ValueError):
@@ -39,8 +39,11 @@ class BenchSubject(Protocol):
 
     plant: Plant
     memory: dict[str, Any]
-    frozen: bool
     largest_servo_step: float
+
+    def freeze(self, frozen: bool) -> None:
+        """Let the clock stand still, or go on."""
+        ...
 
     def stall(self, seconds: float) -> None:
         """Send and answer nothing for a while."""
@@ -78,7 +81,6 @@ class BenchServer:
         further: Mapping[str, Command] | None = None,
     ) -> None:
         self._controller = controller
-        self._drop_clients, self._move_own = drop_clients, move_own
         self._random = np.random.default_rng((controller.plant.settings.seed, 2))
         n = len(controller.plant.q)
         self._commands: dict[str, Command] = {
@@ -86,19 +88,24 @@ class BenchServer:
             "payload": (4, self._payload, "MASS CX CY CZ: hang a load on the flange, kg, m"),
             "wrench": (6, self._wrench, "FX FY FZ TX TY TZ: pull at the TCP, base axes, N, Nm"),
             "slip": (2, self._slip, "JOINT ANGLE: the joint's zero slips by ANGLE, rad"),
-            "move": (n, self._move, f"Q1..Q{n}: the robot's own program moves there, rad"),
-            "protective_stop": (0, self._protective_stop, "as a collision would"),
-            "emergency_stop": (0, self._emergency_stop, "press the button"),
-            "release": (0, self._release, "release the emergency stop button"),
-            "unlock": (0, self._unlock, "clear a protective stop, after a look at its cause"),
-            "freeze": (0, self._freeze, "the controller's clock stands still, packets go on"),
-            "thaw": (0, self._thaw, "the clock goes on"),
-            "stall": (1, self._stall, "SECONDS: the controller sends and answers nothing"),
-            "drop": (0, self._drop, "close every client's connection"),
+            "move": (n, lambda q: move_own(tuple(q)),
+                     f"Q1..Q{n}: the robot's own program moves there, rad"),
+            "protective_stop": (0, lambda _: controller.protective_stop(), "as a collision would"),
+            "emergency_stop": (0, lambda _: controller.emergency_stop(), "press the button"),
+            "release": (0, lambda _: controller.release_emergency_stop(),
+                        "release the emergency stop button"),
+            "unlock": (0, lambda _: controller.unlock(),
+                       "clear a protective stop, after a look at its cause"),
+            "freeze": (0, lambda _: controller.freeze(True),
+                       "the controller's clock stands still, packets go on"),
+            "thaw": (0, lambda _: controller.freeze(False), "the clock goes on"),
+            "stall": (1, lambda given: controller.stall(max(given[0], 0.0)),
+                      "SECONDS: the controller sends and answers nothing"),
+            "drop": (0, lambda _: drop_clients(), "close every client's connection"),
             "truth": (0, self._truth, "the hidden plant as JSON, for scoring only"),
             "help": (0, self._help, "this list"),
             **(further or {}),
-        }
+        }  # fmt: skip
 
     def handle(self, connection: Connection) -> None:
         """Answer every whole line."""
@@ -116,7 +123,7 @@ class BenchServer:
             if name not in self._commands:
                 raise BenchError(f"unknown command {name!r}, try help")
             count, action, _ = self._commands[name]
-            return action(_numbers(name, arguments, count))
+            return action(_numbers(name, arguments, count)) or "ok"
         except BenchError as error:
             return f"error: {error}"
 
@@ -135,64 +142,21 @@ class BenchServer:
 
     # -- hands ------------------------------------------------------------------------------------
 
-    def _payload(self, numbers: list[float]) -> str:
+    def _payload(self, numbers: list[float]) -> None:
         mass, x, y, z = numbers
         if not 0.0 <= mass <= HEAVIEST:
             raise BenchError(f"payload: found {mass:g} kg, expected 0 to {HEAVIEST:g}")
-        load = self._controller.plant.load
-        self._controller.plant.load = Load(mass, (x, y, z), load.force, load.torque)
-        return "ok"
+        self._controller.plant.hang(mass, (x, y, z))
 
-    def _wrench(self, numbers: list[float]) -> str:
+    def _wrench(self, numbers: list[float]) -> None:
         fx, fy, fz, tx, ty, tz = numbers
-        load = self._controller.plant.load
-        self._controller.plant.load = Load(load.mass, load.cog, (fx, fy, fz), (tx, ty, tz))
-        return "ok"
+        self._controller.plant.pull((fx, fy, fz), (tx, ty, tz))
 
-    def _slip(self, numbers: list[float]) -> str:
+    def _slip(self, numbers: list[float]) -> None:
         plant, joint = self._controller.plant, numbers[0]
         if joint not in range(1, len(plant.q) + 1):
             raise BenchError(f"slip: found joint {joint:g}, expected 1 to {len(plant.q)}")
         plant.slip(int(joint) - 1, numbers[1])
-        return "ok"
-
-    def _move(self, numbers: list[float]) -> str:
-        self._move_own(tuple(numbers))
-        return "ok"
-
-    def _protective_stop(self, _: list[float]) -> str:
-        self._controller.protective_stop()
-        return "ok"
-
-    def _emergency_stop(self, _: list[float]) -> str:
-        self._controller.emergency_stop()
-        return "ok"
-
-    def _release(self, _: list[float]) -> str:
-        self._controller.release_emergency_stop()
-        return "ok"
-
-    def _unlock(self, _: list[float]) -> str:
-        self._controller.unlock()
-        return "ok"
-
-    # -- faults of the link -----------------------------------------------------------------------
-
-    def _freeze(self, _: list[float]) -> str:
-        self._controller.frozen = True
-        return "ok"
-
-    def _thaw(self, _: list[float]) -> str:
-        self._controller.frozen = False
-        return "ok"
-
-    def _stall(self, numbers: list[float]) -> str:
-        self._controller.stall(max(numbers[0], 0.0))
-        return "ok"
-
-    def _drop(self, _: list[float]) -> str:
-        self._drop_clients()
-        return "ok"
 
     # -- for scoring ------------------------------------------------------------------------------
 

@@ -6,13 +6,14 @@ import logging
 import math
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
-from gapbridge.drivers.simulated.plant.declared import Declared
+from gapbridge.drivers.simulated.plant.declared_settings import DeclaredSettings
 from gapbridge.drivers.simulated.plant.kinematics import Joints, within_limits
 from gapbridge.drivers.simulated.plant.motion import Hold, Motion, Stop
 from gapbridge.drivers.simulated.plant.plant import Plant
 from gapbridge.drivers.simulated.plant.sensors import Sensors
+from gapbridge.drivers.simulated.plant.stream_motion import Servo
 from gapbridge.drivers.simulated.ur import modes
 from gapbridge.drivers.simulated.ur.rtde_names import INPUTS, OUTPUTS, blank
 
@@ -21,7 +22,7 @@ _DIGITAL = {  # mask field: (value field, first bit in actual_digital_output_bit
     "configurable_digital_output_mask": ("configurable_digital_output", 8),
     "tool_digital_output_mask": ("tool_digital_output", 16),
 }
-_WORDS = {"input_bit_registers0_to_31": 0, "input_bit_registers32_to_63": 32}
+_BIT_FIELDS = {"input_bit_registers0_to_31": 0, "input_bit_registers32_to_63": 32}
 log = logging.getLogger("drivers.simulated")
 CYCLE = 0.002  # s
 PROGRAM_START = 0.04  # s between the arrival of a program and its first line
@@ -30,20 +31,16 @@ HOLD = Hold()
 Steps = Generator[None, None, None]
 
 
-@dataclass(slots=True)
-class Program:
+class Program(NamedTuple):
     """A running script: one generator step per cycle."""
 
     name: str
     steps: Steps
-    wait: float = PROGRAM_START
 
 
-@dataclass(slots=True)
-class Watchdog:
+class Watchdog(NamedTuple):
     """Stops the program when a client stops writing an input variable."""
 
-    name: str
     period: float  # s
     left: float  # s
 
@@ -53,7 +50,7 @@ class Controller:
     """A UR controller's state; the servers read and write it, ``cycle`` advances it by 2 ms."""
 
     plant: Plant
-    declared: Declared
+    declared: DeclaredSettings
     memory: dict[str, Any] = field(default_factory=dict)
     target_q: Joints = ()
     target_qd: Joints = ()
@@ -61,6 +58,7 @@ class Controller:
     paused: Motion = HOLD  # what goes on after a pause
     largest_servo_step: float = 0.0  # rad, between two setpoints of a servo stream
     program: Program | None = None
+    starts_in: float = 0.0  # s until the program's first line
     watchdogs: dict[str, Watchdog] = field(default_factory=dict)
     clock: float = 0.0  # s since the controller started; never stands still
     frozen: bool = False  # the timestamp stands still
@@ -95,9 +93,9 @@ class Controller:
         self.refresh(dt)
 
     def _step_program(self, program: Program, dt: float) -> None:
-        if program.wait > 0.0:
-            program.wait -= dt
-            if program.wait <= 0.0:
+        if self.starts_in > 0.0:
+            self.starts_in -= dt
+            if self.starts_in <= 0.0:
                 self.set_runtime(modes.PLAYING)
             return
         if self.memory["runtime_state"] != modes.PLAYING:
@@ -144,10 +142,10 @@ class Controller:
         if self.program is None:
             self.watchdogs.clear()
             return
-        for watchdog in list(self.watchdogs.values()):
-            watchdog.left -= dt
-            if watchdog.left < 0.0:
-                log.warning("watchdog on %s expired, the program stops", watchdog.name)
+        for name, (period, left) in list(self.watchdogs.items()):
+            self.watchdogs[name] = Watchdog(period, left - dt)
+            if left - dt < 0.0:
+                log.warning("watchdog on %s expired, the program stops", name)
                 self.end_program()
                 return
 
@@ -172,7 +170,7 @@ class Controller:
             log.warning("program %s refused: the robot is not running", name)
             return
         log.info("program %s starts", name)
-        self.program = Program(name, steps)
+        self.program, self.starts_in = Program(name, steps), PROGRAM_START
 
     def end_program(self) -> None:
         """End the running script; the arm brakes."""
@@ -191,25 +189,42 @@ class Controller:
 
         Raises ScriptError where the motion cannot be carried on.
         """
-        self.motion = motion
+        self.start_motion(motion)
         yield
         while not motion.done:
             yield
         if motion.failed:
             raise ScriptError("the line leaves the workspace")
 
+    def start_motion(self, motion: Motion) -> None:
+        """Have the arm do this from the next cycle on."""
+        self.motion = motion
+
+    def servo(self, goal: Joints, lookahead: float) -> None:
+        """Follow a streamed setpoint (n, rad), smoothed over ``lookahead`` s."""
+        if isinstance(self.motion, Servo):
+            step = max(abs(b - a) for a, b in zip(self.motion.goal, goal, strict=True))
+            self.largest_servo_step = max(self.largest_servo_step, step)
+            self.motion.aim(goal, lookahead)
+        else:
+            self.motion = Servo(self.plant.arm, goal, lookahead)
+
+    def load_program(self, name: str) -> None:
+        """Load a program from the controller's own store; it is not started."""
+        self.loaded_program = name
+
     def set_watchdog(self, name: str, frequency: float) -> None:
         """Watch that `name` is written at least at `frequency` (Hz); 0 switches it off."""
         self.watchdogs.pop(name, None)
         if frequency > 0.0:
-            self.watchdogs[name] = Watchdog(name, 1.0 / frequency, 1.0 / frequency)
+            self.watchdogs[name] = Watchdog(1.0 / frequency, 1.0 / frequency)
 
     def write_inputs(self, values: dict[str, Any]) -> None:
         """Take the input fields that a client has sent."""
         apply_inputs(self.memory, values)
-        for name, watchdog in self.watchdogs.items():
+        for name, (period, _) in self.watchdogs.items():
             if name in values:
-                watchdog.left = watchdog.period
+                self.watchdogs[name] = Watchdog(period, period)
 
     # -- modes ----------------------------------------------------------------------------------
 
@@ -282,6 +297,10 @@ class Controller:
         """Let no RTDE packet leave for `seconds`."""
         self.stall_until = self.clock + seconds
 
+    def freeze(self, frozen: bool) -> None:
+        """Let the timestamp stand still, or go on."""
+        self.frozen = frozen
+
     def finite(self, values: Sequence[float], what: str) -> Joints:
         """Return `values` as joints or pose; raises ScriptError where one is not finite."""
         found = tuple(float(v) for v in values)
@@ -305,10 +324,10 @@ def apply_inputs(memory: dict[str, Any], values: dict[str, Any]) -> None:
         memory["target_speed_fraction"] = memory["speed_scaling"] = fraction
     if "standard_analog_output_mask" in values:
         _set_analog(memory, values)
-    for word, first in _WORDS.items():
-        if word in values:
+    for field_name, first in _BIT_FIELDS.items():
+        if field_name in values:
             for i in range(32):
-                memory[f"input_bit_register_{first + i}"] = bool(values[word] >> i & 1)
+                memory[f"input_bit_register_{first + i}"] = bool(values[field_name] >> i & 1)
 
 
 def _switch(memory: dict[str, Any], mask: int, value: int, first: int) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 
 from gapbridge.core.arm import Arm, builtin_names, builtin_rows
 from gapbridge.core.errors import ArmError
-from gapbridge.drivers.simulated.plant.declared import Declared
+from gapbridge.drivers.simulated.plant.declared_settings import DeclaredSettings
 from gapbridge.drivers.simulated.plant.kinematics import within_limits
 from gapbridge.drivers.simulated.plant.plant import Plant
 from gapbridge.drivers.simulated.plant.plant_arm import PlantArm, plant_arm
@@ -110,7 +110,7 @@ def simulated_arm(
 
 def make_controller(settings: ServerSettings) -> Controller:
     """Return the controller at rest in its start position, brakes released."""
-    declared = Declared()
+    declared = DeclaredSettings()
     if settings.declare:
         declared.set_tcp(settings.plant.tcp)
         declared.payload_mass = settings.plant.payload_mass

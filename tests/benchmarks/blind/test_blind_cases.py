@@ -95,10 +95,10 @@ def test_the_noise_of_clean_data_is_the_floor_of_the_label(tmp_path):
 
 def test_hard_data_hold_outlier_readings(tmp_path):
     from benchmarks.blind.cases import draw_case, generator_of
-    from benchmarks.blind.special_cases import wild_readings
+    from benchmarks.blind.special_cases import with_outliers
 
     drawn = draw_case("hard:none", generator_of("hard:none", 0)).drawn
-    position, _ = wild_readings(drawn, np.random.default_rng(1))
+    position, _ = with_outliers(drawn, np.random.default_rng(1))
     instrument = drawn.bench.instrument
     truth = drawn.bench.model.tcp @ instrument.rotation.T + instrument.position
     off = np.linalg.norm(position - truth, axis=1)

@@ -55,7 +55,7 @@ def test_predict_and_compensate_are_what_the_commands_write(desk: Path) -> None:
             assert files[role]["sha256"] == true
 
 
-def test_a_cell_written_from_python_tells_what_was_done_with_which_files(desk: Path) -> None:
+def test_a_cell_written_from_python_holds_what_was_done_with_which_files(desk: Path) -> None:
     q, loads = poses_and_loads(40, 5)
     more = columns_of(q, loads) | measured(bent_model(), q, loads, noise=2e-5)
     logs = [desk / "log.csv", log_in(desk, more, "more.csv")]
@@ -71,14 +71,14 @@ def test_a_cell_written_from_python_tells_what_was_done_with_which_files(desk: P
     ]  # fmt: skip
     true = [hashlib.sha256(log.read_bytes()).hexdigest() for log in logs]
     assert [f.sha256 for f in origin.files][:2] == true
-    told = gapbridge("diff", desk / "cell.yaml", desk / "fitted.yaml").out
-    assert "fitted.yaml was written by fit" in told
-    assert "from log.csv, more.csv" in told
+    shown = gapbridge("diff", desk / "cell.yaml", desk / "fitted.yaml").out
+    assert "fitted.yaml was written by fit" in shown
+    assert "from log.csv, more.csv" in shown
 
 
 def test_a_diagnosis_writes_what_the_command_writes(desk: Path) -> None:
-    paths = desk / "log.csv", "--cell", desk / "cell.yaml", "--out", desk / "told"
-    new = "--apply", desk / "told.yaml", "--stand-ins"
+    paths = desk / "log.csv", "--cell", desk / "cell.yaml", "--out", desk / "command"
+    new = "--apply", desk / "command.yaml", "--stand-ins"
     assert gapbridge("diagnose", *paths, *new).code == 0
     cell = api.load_cell(desk / "cell.yaml")
     found = api.diagnose(cell, api.read_log(desk / "log.csv", cell))
@@ -86,10 +86,12 @@ def test_a_diagnosis_writes_what_the_command_writes(desk: Path) -> None:
     found.save(desk / "own.yaml", stand_ins=True)
     assert [path.name for path in report] == ["diagnosis.json", "report.html"]
     assert found.stand_ins == ()
-    own, theirs = (json.loads((desk / d / "diagnosis.json").read_text()) for d in ("own", "told"))
+    own, theirs = (
+        json.loads((desk / d / "diagnosis.json").read_text()) for d in ("own", "command")
+    )
     assert own.pop("provenance")["files"] == theirs.pop("provenance")["files"]
     assert own == theirs
-    models = [api.load_cell(desk / f"{name}.yaml").model for name in ("own", "told")]
+    models = [api.load_cell(desk / f"{name}.yaml").model for name in ("own", "command")]
     np.testing.assert_array_equal(*(np.concatenate(m.compliance()) for m in models))
     with pytest.raises(api.InputError, match="found no folder"):
         found.write_report(desk / "no" / "folder")

@@ -97,12 +97,12 @@ def finds_the_arm(session: Session, played: Played, of: str = "") -> None:
     assert (session.folder / "s" / "calibration.html").exists()
     assert "kept" in played.out
     reported = json.loads((session.folder / "s" / "promise.json").read_text())
-    promise = baseline_in(reported)
+    baseline = baseline_in(reported)
     true = {**OFFSETS, **{f"axial_compliance_{i + 1}": c for i, c in enumerate(AXIAL)}}
-    apart = promise.values - [true.get(name, 0.0) for name in promise.names]
-    own = np.array([name.startswith(of) for name in promise.names])
-    assert (np.abs(apart) < 5.0 * np.sqrt(np.diag(promise.covariance)))[own].all(), promise.names
-    assert {"axial_compliance_2", "axial_compliance_3"} <= set(promise.names)
+    apart = baseline.values - [true.get(name, 0.0) for name in baseline.names]
+    own = np.array([name.startswith(of) for name in baseline.names])
+    assert (np.abs(apart) < 5.0 * np.sqrt(np.diag(baseline.covariance)))[own].all(), baseline.names
+    assert {"axial_compliance_2", "axial_compliance_3"} <= set(baseline.names)
 
 
 def at_the_point(length: float = 0.0, balls: int = 1) -> Nuisance:

@@ -45,9 +45,14 @@ def cell(folder: Path, host: str, tcp: str = "0.18", more: str = "") -> Path:
     return path
 
 
+def cell_of(folder: Path, lines: str) -> Path:
+    path = folder / "cell.yaml"
+    path.write_text(f"robot: {{model: ur10e}}\n{lines}\n")
+    return path
+
+
 def test_a_cell_that_is_wrong_ends_with_two_and_every_line(tmp_path: Path) -> None:
-    path = tmp_path / "cell.yaml"
-    path.write_text("robot: {model: ur10e}\ngravity: [0, 0, -1]\nreference_temperature: 298\n")
+    path = cell_of(tmp_path, "gravity: [0, 0, -1]\nreference_temperature: 298")
     answer = gapbridge("check", path)
     assert answer.code == 2
     lines = answer.err.splitlines()
@@ -67,8 +72,7 @@ def test_a_trajectory_that_cannot_be_run_is_named(tmp_path: Path) -> None:
 
 
 def test_a_fit_cell_ends_with_zero_and_says_so(tmp_path: Path) -> None:
-    path = tmp_path / "cell.yaml"
-    path.write_text("robot: {model: ur10e}\nmetrology: {sigma: 0.005}\n")
+    path = cell_of(tmp_path, "metrology: {sigma: 0.005}")
     answer = gapbridge("check", path)
     assert answer.code == 0
     assert answer.out == f"{path}: fit to be used, 1 warning\n"
@@ -88,8 +92,7 @@ def test_a_fit_cell_ends_with_zero_and_says_so(tmp_path: Path) -> None:
 def test_what_does_not_fit_the_arm_is_named_with_its_line(
     tmp_path: Path, lines: str, place: str
 ) -> None:
-    path = tmp_path / "cell.yaml"
-    path.write_text(f"robot: {{model: ur10e}}\n{lines}\n")
+    path = cell_of(tmp_path, lines)
     assert f"error: {path}, {place}" in gapbridge("check", path).err
     assert f"{path}, {place}" in refused("simulate", path)
 
@@ -193,8 +196,7 @@ def test_fit_and_diagnose_of_another_arm_warn_with_the_mistake(
 
 
 def test_every_command_refuses_it_in_one_line(tmp_path: Path) -> None:
-    path = tmp_path / "cell.yaml"
-    path.write_text("robot: {model: ur10e}\ntool: {tcp: {xyz: [0, 0, 180]}}\nlink: {}\n")
+    path = cell_of(tmp_path, "tool: {tcp: {xyz: [0, 0, 180]}}\nlink: {}")
     (tmp_path / "log.csv").write_text("actual_q_0\n0\n")
     for command in (("predict", tmp_path / "log.csv", "--out", tmp_path / "o.csv", "--cell"),
                     ("run",), ("simulate",)):  # fmt: skip
@@ -212,8 +214,7 @@ def test_every_command_refuses_it_in_one_line(tmp_path: Path) -> None:
 def test_what_only_a_run_would_refuse_is_named_with_its_line(
     tmp_path: Path, lines: str, message: str
 ) -> None:
-    path = tmp_path / "cell.yaml"
-    path.write_text(f"robot: {{model: ur10e}}\n{lines}\n")
+    path = cell_of(tmp_path, lines)
     assert f"error: {path}, {message}" in refused("check", path)
 
 

@@ -51,7 +51,7 @@ def simulated(folder: Path, config: str, **link: object) -> Iterator[str]:
         served.communicate(timeout=10)
 
 
-def observes(folder: Path, *arguments: object) -> Path:
+def init_check_and_observe(folder: Path, *arguments: object) -> Path:
     """Return the cell that init writes, after check --live and run --observe have taken it."""
     path = folder / "cell.yaml"
     answer = gapbridge("init", *arguments, "--out", path)
@@ -68,7 +68,7 @@ def observes(folder: Path, *arguments: object) -> Path:
 def test_an_arm_on_a_socketcand_server(tmp_path: Path) -> None:
     port = free_port()
     with simulated(tmp_path, "piper_can_simulated.yaml", port=port) as host:
-        path = observes(tmp_path, host, *PIPER, "--port", port)
+        path = init_check_and_observe(tmp_path, host, *PIPER, "--port", port)
     assert load_cell(path).file.robot.tip == "link6"
 
 
@@ -76,21 +76,21 @@ def test_an_arm_on_a_socketcand_server(tmp_path: Path) -> None:
 def test_an_arm_on_an_slcan_adapter(tmp_path: Path) -> None:
     line = tmp_path / "tty"
     with simulated(tmp_path, "piper_can_simulated.yaml", interface="slcan", channel=str(line)):
-        observes(tmp_path, line, *PIPER)
+        init_check_and_observe(tmp_path, line, *PIPER)
 
 
 @pytest.mark.slow
 def test_cia_402_drives(tmp_path: Path) -> None:
     port = free_port()
     with simulated(tmp_path, "lwa4p_canopen_simulated.yaml", port=port) as host:
-        observes(tmp_path, host, *LWA4P, "--port", port)
+        init_check_and_observe(tmp_path, host, *LWA4P, "--port", port)
 
 
 @pytest.mark.slow
 def test_a_modbus_controller(tmp_path: Path) -> None:
     port = free_port()
     with simulated(tmp_path, "ur10e_modbus_simulated.yaml", port=port) as host:
-        observes(tmp_path, host, *MODBUS, "--port", port)
+        init_check_and_observe(tmp_path, host, *MODBUS, "--port", port)
 
 
 @pytest.mark.slow
@@ -101,7 +101,7 @@ def test_gears_that_only_the_builder_knows(tmp_path: Path) -> None:
         line = refused("init", *given, "--out", tmp_path / "cell.yaml")
         assert "--model ur10e: actual_q_1: found -15" in line
         assert "--link sets gear, zero, direction" in line
-        path = observes(tmp_path, *given, *GEARS)
+        path = init_check_and_observe(tmp_path, *given, *GEARS)
     assert load_cell(path).file.link.gear == (50, 50, 50, 20, 20, 20)
 
 

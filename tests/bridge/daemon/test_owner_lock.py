@@ -12,8 +12,8 @@ from typing import Any
 
 import pytest
 from daemon_cell import Robot, Run, gapbridge, wait_for
+from link_settings import link_settings
 
-from gapbridge.bridge.cell.sections import link_settings
 from gapbridge.bridge.daemon.host import OwnerLock
 from gapbridge.bridge.ipc.control_client import ask
 from gapbridge.bridge.loop.supervisor import State

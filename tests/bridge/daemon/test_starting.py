@@ -9,19 +9,19 @@ from gapbridge.bridge.loop.supervisor import State
 
 
 def test_compiling_is_a_state_until_the_loop_connects() -> None:
-    told: list[dict[str, object]] = []
-    began = _report_compiling(told.append)
+    events: list[dict[str, object]] = []
+    began = _report_compiling(events.append)
     for functions in range(1, 13):
         began(functions)
-    assert [event["detail"] for event in told] == [
+    assert [event["detail"] for event in events] == [
         "starting: compiling for this machine, once",
         "starting: compiling for this machine, once (11 functions)",
     ]
     status = DaemonStatus(slices_of(6))
     assert status.named(State.DISCONNECTED) == "disconnected"
-    for event in told:
+    for event in events:
         status.on_event(event)
-    assert status.named(State.DISCONNECTED) == told[-1]["detail"]
+    assert status.named(State.DISCONNECTED) == events[-1]["detail"]
     status.on_event({"kind": "granted"})
     assert status.named(State.DISCONNECTED) == "disconnected"
 

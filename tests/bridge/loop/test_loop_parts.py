@@ -51,7 +51,7 @@ def test_a_load_beyond_the_arms_bounds_is_not_taken_and_the_last_one_stays() -> 
     loads = LiveLoads(3, True, 0.0, LoadBounds(5.0))
     cog = np.array([0, 0, 0.1])
     pull = np.array([0.0, 0, -30, 0, 0, 0])
-    for at, mass, force, doubt in (
+    for at, mass, force, expected in (
         (1.0, 4.0, pull, None),
         (1.1, 400.0, pull, "payload: found 400 kg"),
         (1.2, 4.0, 300 * pull, "force: found 9000 N"),
@@ -61,8 +61,8 @@ def test_a_load_beyond_the_arms_bounds_is_not_taken_and_the_last_one_stays() -> 
         found = loads.update(state(at, payload=mass, payload_cog=cog, actual_TCP_force=force))
         assert found.payload_mass == pytest.approx([4.0])
         assert found.wrench[0] == pytest.approx(pull)
-        assert (loads.problem is None) == (doubt is None)
-        assert (doubt or "") in (loads.problem or "")
+        assert (loads.problem is None) == (expected is None)
+        assert (expected or "") in (loads.problem or "")
 
 
 def test_a_first_payload_that_cannot_be_leaves_the_models_own() -> None:

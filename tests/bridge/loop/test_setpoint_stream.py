@@ -49,7 +49,7 @@ class Run:
             found = self.stream.advance(state(self.at, self.q), source, LIGHT, goal)
             self.q = found.q.copy()
             copy = found.offset_in_base.copy()
-            self.sent.append(Setpoint(self.q, found.nominal_q.copy(), copy, self.at, self.at))
+            self.sent.append(Setpoint(self.q, found.nominal_q.copy(), copy))
             self.at += gap
         return self.sent[-1]
 

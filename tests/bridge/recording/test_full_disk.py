@@ -63,7 +63,6 @@ def test_a_write_that_fails_in_its_middle_loses_nothing_that_the_ring_holds(
     publish(desk.page, 200)
     recorder.take({"time": 5.0, "kind": "note", "detail": "while the disk was full"})
     recorder.step(flush=True)
-    assert recorder.pauses == 1
     assert recorder.path is None
     assert "paused" in desk.events[-1]
     assert desk.files[0].stat().st_size == whole
@@ -91,7 +90,6 @@ def test_a_disk_that_stays_full_is_reported_once_and_what_is_lost_is_counted(
         publish(desk.page, 20)
         recorder.step(flush=True)
     recorder.close()
-    assert recorder.pauses == 1
     assert recorder.lost == 100
     assert sum("paused" in event for event in desk.events) == 1
     assert numbers(desk.files[0]) == list(range(20))

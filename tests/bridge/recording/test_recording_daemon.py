@@ -113,7 +113,7 @@ def test_the_daemon_runs_on_a_recording_and_makes_the_same_offsets(robot: Robot)
     assert expected["written"].sum() > 300
 
 
-def is_told_to_be_over(session: Path) -> bool:
+def says_it_is_over(session: Path) -> bool:
     """Return whether the recorder has written that the daemon is gone."""
     events = read_documents(session)
     return bool(events) and "gone" in events[-1]["detail"]
@@ -136,7 +136,7 @@ def kill_daemons(robot: Robot, times: int) -> None:
         wait_for(lambda at=k: robot.controller.log().count("rtde_control ended") > at, 10.0,
                  "the end of the loop")  # type: ignore[misc]  # fmt: skip
         (session,) = {p.name.rsplit("-", 1)[0] for p in folder.glob("*.mcap")} - before
-        wait_for(lambda at=folder / session: is_told_to_be_over(at), 20.0, "the recording's end")  # type: ignore[misc]
+        wait_for(lambda at=folder / session: says_it_is_over(at), 20.0, "the recording's end")  # type: ignore[misc]
         columns = read_columns(folder / session)
         numbers = columns["number"]
         assert np.array_equal(numbers, np.arange(len(numbers)))

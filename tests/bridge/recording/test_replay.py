@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from link_settings import link_settings
 from recorded import Desk
 
 from gapbridge.bridge.cell import load_cell
-from gapbridge.bridge.cell.sections import link_settings
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.errors import LogError
 from gapbridge.core.model import Model

@@ -101,7 +101,7 @@ def test_angles_of_another_arm_are_refused(model: Model) -> None:
         calibrate_tool(model, np.zeros((6, 7)))
 
 
-def test_planned_touches_stay_on_the_point_and_promise_what_comes(model: Model) -> None:
+def test_planned_touches_stay_on_the_point_and_are_as_accurate_as_predicted(model: Model) -> None:
     plan = plan_tool(model, BEGIN, poses=8, noise=2e-4)
     q = np.array(plan.poses)
     assert np.ptp(model.predict(q).position, axis=0).max() < 1e-5

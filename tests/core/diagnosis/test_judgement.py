@@ -64,7 +64,7 @@ def test_every_term_is_accused_or_withdrawn(effect):
     assert named == sorted(channel.selection.terms[p].effect for p in accused)
 
 
-def test_an_accusation_beside_a_leftover_is_withdrawn_and_reported_so():
+def test_an_accusation_beside_residual_structure_is_withdrawn_and_reported_so():
     found = small.diagnosed("cross_coupling")
     (channel,) = found.channels
     assert channel.judgement.structured

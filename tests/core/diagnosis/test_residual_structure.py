@@ -72,7 +72,7 @@ def test_structure_in_some_rows_shows_in_those_alone():
 
 @settings(max_examples=15, deadline=None)
 @given(seed=st.integers(0, 999), planted=st.sampled_from([3, 4, 5, TIME]))
-def test_what_the_leftover_follows_comes_first(seed, planted):
+def test_what_the_residual_depends_on_comes_first(seed, planted):
     reported = dependence(space(seed, (planted,)), FRAME, (), GROUPS)
     name, share = reported[0]
     assert name == CANDIDATES[planted].quantity

@@ -73,7 +73,7 @@ def test_flexibilities_of_an_independent_truth_are_found_exactly_without_noise(n
 
 @pytest.mark.parametrize("n", [6, 7])
 @pytest.mark.parametrize("rotation", [False, True])
-def test_with_noise_the_leftover_is_the_noise_and_held_out_poses_are_met(n, rotation):
+def test_with_noise_the_residual_is_the_noise_and_held_out_poses_are_met(n, rotation):
     _, columns = truth(n, 80, 2, rotation=rotation)
     found = identify_compliance(model_of(n), log_of(n, columns), KNOWN)
     assert 0.85 * NOISE < found.remaining_rms < 1.15 * NOISE

@@ -22,7 +22,7 @@ def test_covariances_are_those_of_fits_to_many_draws(shared: float, nuisances: i
     A = A.reshape(count * WIDTH, NUMBERS)
     wide = np.full(NUMBERS - nuisances, 1e6)
     bounds = Bounds(-wide, wide, wide, 0 * wide)
-    found, told = [], []
+    found, covariances = [], []
     for _ in range(300):
         common = rng.normal(size=(POSES, WIDTH))[pose]
         own = rng.normal(size=(count, WIDTH))
@@ -31,8 +31,8 @@ def test_covariances_are_those_of_fits_to_many_draws(shared: float, nuisances: i
         split = NUMBERS - nuisances
         system = System(A[:, :split], A[:, split:], e - A @ x)
         found.append(x)
-        told.append(np.diag(joint_covariance(system, bounds, pose)))
-    ratio = np.sqrt(np.mean(told, axis=0)) / np.std(found, axis=0)
+        covariances.append(np.diag(joint_covariance(system, bounds, pose)))
+    ratio = np.sqrt(np.mean(covariances, axis=0)) / np.std(found, axis=0)
     np.testing.assert_allclose(ratio, 1.0, atol=0.12)
 
 

@@ -145,10 +145,10 @@ def test_what_is_loaded_compiles_nothing_of_numbas_own(package: Package) -> None
 from llvmlite import binding
 from numba.core.runtime import nrtdynmod
 for place, name in ((nrtdynmod, "create_nrt_module"), (binding, "parse_bitcode")):
-    def told(*given, called=getattr(place, name), name=name):
+    def reported(*given, called=getattr(place, name), name=name):
         print(name)
         return called(*given)
-    setattr(place, name, told)
+    setattr(place, name, reported)
 """
     path.write_text(heard + path.read_text())
     assert "create_nrt_module" in package.run().split()

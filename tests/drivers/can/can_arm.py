@@ -66,7 +66,7 @@ def joints_frame(first: int, a: float, b: float) -> tuple[int, bytes]:
 
 
 def setpoint_of(q) -> Setpoint:
-    return Setpoint(q, q, np.zeros(6), 0.0, 0.0)
+    return Setpoint(q, q, np.zeros(6))
 
 
 def other_bus(settings: CanSettings) -> can.BusABC:

@@ -85,7 +85,7 @@ def read_on(driver: CanopenDriver, seconds: float = 2.0) -> None:
 
 def setpoint(q: np.ndarray, state: RobotState) -> Setpoint:
     """Return a setpoint as the limiter hands it on."""
-    return Setpoint(q, q, np.zeros(6), state.timestamp, state.received)
+    return Setpoint(q, q, np.zeros(6))
 
 
 def follow(

@@ -293,4 +293,4 @@ def setpoint_of(
 ) -> Setpoint:
     """Return a setpoint as the limiter hands it on."""
     assert all(map(math.isfinite, q))
-    return Setpoint(q, nominal, np.array(offset), state.timestamp, state.received)
+    return Setpoint(q, nominal, np.array(offset))

@@ -300,7 +300,7 @@ def test_setpoints_and_the_arms_own_wishes_pass_through() -> None:
     with wire.device, joined(wire, controller) as driver:
         state = driver.read_state()
         driver.arm(state)
-        setpoint = Setpoint(state.target_q, state.target_q, np.zeros(6), state.timestamp, 0.0)
+        setpoint = Setpoint(state.target_q, state.target_q, np.zeros(6))
         driver.write_setpoint(setpoint)
         assert isinstance(driver._arm, ControllerDriver)
         assert driver._arm.written == [setpoint]

@@ -68,7 +68,7 @@ def opened(name: str) -> tuple[Any, Wire, ByHand]:
 
 
 def offset(x: float) -> Setpoint:
-    return Setpoint(NOTHING, NOTHING, np.array([x, 0.0, 0.0, 0.0, 0.0, 0.0]), 0.0, 0.0)
+    return Setpoint(NOTHING, NOTHING, np.array([x, 0.0, 0.0, 0.0, 0.0, 0.0]))
 
 
 def test_an_offset_that_does_not_come_back_ends_the_writing_in_time() -> None:
@@ -128,8 +128,8 @@ def test_a_target_waits_while_the_robot_is_busy_and_the_newest_goes_out_after() 
         before = len(wire.written)
         for k in range(3):
             q = np.full(6, 0.01 * (k + 1))
-            writer.write(Setpoint(q, q, NOTHING, 0.0, 0.0), wire.sample(busy=True, q=q))
+            writer.write(Setpoint(q, q, NOTHING), wire.sample(busy=True, q=q))
         assert len(wire.written) == before, name
-        writer.write(Setpoint(q, q, NOTHING, 0.0, 0.0), wire.sample(q=q))
+        writer.write(Setpoint(q, q, NOTHING), wire.sample(q=q))
         assert len(wire.written) > before
         np.testing.assert_allclose(writer.target(), q, atol=abs(writer._size))

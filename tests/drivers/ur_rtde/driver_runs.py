@@ -12,7 +12,7 @@ sys.path.insert(0, SIMULATED)
 
 from simulated_cell import Bench, cell_settings, run_client  # noqa: E402
 
-from gapbridge.drivers.ur_rtde.driver import OFFSET_SCRIPT  # noqa: E402
+from benchmarks.server_thread import OFFSET_SCRIPT  # noqa: E402
 
 __all__ = ["Bench", "cell_settings", "run_driver"]
 
@@ -33,7 +33,7 @@ driver = make_driver(UrRtdeSettings(host=host, **{link!r}), model)
 bench = Bench(host)
 
 def setpoint(state, q, nominal_q, offset=np.zeros(6)):
-    return Setpoint(q, nominal_q, offset, state.timestamp, state.received)
+    return Setpoint(q, nominal_q, offset)
 
 def error_of(action, *arguments):
     try:

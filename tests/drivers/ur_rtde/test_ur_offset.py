@@ -325,7 +325,7 @@ def test_the_oldest_offset_that_has_not_come_back_is_known(monkeypatch: pytest.M
         writer.note_answer(number, registers.Program.RUNNING, zero)
 
     def write() -> int:
-        writer.write(Setpoint(q, zero, q, 1.0, 1.0), state)
+        writer.write(Setpoint(q, zero, q), state)
         return sent[registers.SEQUENCE]
 
     now = 100.0

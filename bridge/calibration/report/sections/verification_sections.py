@@ -24,7 +24,6 @@ from gapbridge.bridge.report.labels import (
 )
 from gapbridge.core.calibration.readings import Readings
 from gapbridge.core.calibration.verify import Suspect, Verification
-from gapbridge.core.effects import CATALOGUE
 
 HOLDS = (
     "Nothing: use the cell as it is. Check it again after some months, and after every collision, "
@@ -140,13 +139,12 @@ def moved(material: VerificationMaterial) -> list[blocks.Block]:
 
 def suspect_title(suspect: Suspect) -> str:
     """Return what may have moved, for people."""
-    kind, _, number = suspect.name.rpartition("_")
-    if kind == "reading":
-        return f"reading {number} alone is wrong"
-    if suspect.name in CATALOGUE:
-        return effect_title(suspect.name)
-    if suspect.name == "instrument":
+    if suspect.reading is not None:
+        return f"reading {suspect.reading} alone is wrong"
+    if not suspect.effect:
         return "the instrument stands elsewhere"
+    if suspect.joint is None:
+        return effect_title(suspect.effect)
     return f"another {parameter_title(suspect.name)}"
 
 

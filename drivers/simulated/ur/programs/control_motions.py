@@ -19,7 +19,7 @@ from gapbridge.drivers.simulated.plant.motion import (
 )
 from gapbridge.drivers.simulated.plant.plant_arm import BASE, Frame, place
 from gapbridge.drivers.simulated.plant.rotations import Vector3
-from gapbridge.drivers.simulated.plant.stream_motion import Servo, SpeedJoints, SpeedTool
+from gapbridge.drivers.simulated.plant.stream_motion import SpeedJoints, SpeedTool
 from gapbridge.drivers.simulated.ur.controller import (
     CYCLE,
     DEFAULT_STOP,
@@ -65,17 +65,9 @@ def _joints_for(c: Controller, goal: Frame, near: Joints | None = None) -> Joint
     return found
 
 
-def _move_joints(r: Registers) -> Steps:
-    return _move(r, _joint_motion(r.controller, r.joints(), r.number(6), r.number(7)))
-
-
 def _move_joints_to_pose(r: Registers) -> Steps:
     goal = _joints_for(r.controller, frame_of(r.pose()))
     return _move(r, _joint_motion(r.controller, goal, r.number(6), r.number(7)))
-
-
-def _move_line(r: Registers) -> Steps:
-    return _move(r, _line_motion(r.controller, frame_of(r.pose()), r.number(6), r.number(7)))
 
 
 def _move_line_to_joints(r: Registers) -> Steps:
@@ -84,47 +76,31 @@ def _move_line_to_joints(r: Registers) -> Steps:
     return _move(r, _line_motion(c, goal, r.number(6), r.number(7)))
 
 
-def _servo_to(r: Registers, goal: Joints) -> None:
-    c, lookahead = r.controller, r.number(9)
-    if isinstance(c.motion, Servo):
-        step = max(abs(b - a) for a, b in zip(c.motion.goal, goal, strict=True))
-        c.largest_servo_step = max(c.largest_servo_step, step)
-        c.motion.goal, c.motion.lookahead = goal, lookahead
-    else:
-        c.motion = Servo(c.plant.arm, goal, lookahead)
-
-
-def _servo_joints(r: Registers) -> None:
-    _servo_to(r, r.joints())
-
-
 def _servo_line(r: Registers) -> None:
-    _servo_to(r, _joints_for(r.controller, frame_of(r.pose())))
+    goal = _joints_for(r.controller, frame_of(r.pose()))
+    r.controller.servo(goal, r.number(9))
 
 
 def _servo_circle(r: Registers) -> None:
     """servoC: taken as a line to the pose, at its speed and acceleration."""
-    r.controller.motion = _line_motion(r.controller, frame_of(r.pose()), r.number(6), r.number(7))
+    c = r.controller
+    c.start_motion(_line_motion(c, frame_of(r.pose()), r.number(6), r.number(7)))
 
 
 def _speed_joints(r: Registers) -> None:
     c, goal, acceleration = r.controller, r.joints(), _positive(r.number(6))
     if isinstance(c.motion, SpeedJoints):
-        c.motion.goal, c.motion.acceleration = goal, acceleration
+        c.motion.aim(goal, acceleration)
     else:
-        c.motion = SpeedJoints(goal, acceleration)
+        c.start_motion(SpeedJoints(goal, acceleration))
 
 
 def _speed_line(r: Registers) -> None:
     c, goal, acceleration = r.controller, r.joints(), _positive(r.number(6))
     if isinstance(c.motion, SpeedTool):
-        c.motion.goal, c.motion.acceleration = goal, acceleration
+        c.motion.aim(goal, acceleration)
     else:
-        c.motion = SpeedTool(c.plant.arm, c.declared.tool, goal, acceleration)
-
-
-def _stop_joints(r: Registers) -> Steps:
-    return _move(r, Stop(r.controller.target_qd, _positive(r.number(0))))
+        c.start_motion(SpeedTool(c.plant.arm, c.declared.tool, goal, acceleration))
 
 
 def _stop_line(r: Registers) -> Steps:
@@ -159,7 +135,7 @@ def _jog(r: Registers) -> None:
     shift = place(at, Frame(BASE.rotation, speed[:3])).origin
     spin = place(at, Frame(BASE.rotation, speed[3:])).origin
     acceleration = r.number(7) or JOG_ACCELERATION
-    c.motion = SpeedTool(c.plant.arm, c.declared.tool, (*shift, *spin), acceleration)
+    c.start_motion(SpeedTool(c.plant.arm, c.declared.tool, (*shift, *spin), acceleration))
 
 
 def _move_path(r: Registers) -> Steps:
@@ -172,8 +148,7 @@ def _move_until_contact(r: Registers) -> Steps:
     """Move at a tool speed until something pushes back, then stop."""
     c = r.controller
     speed, acceleration = r.pose(), _positive(r.number(12))
-    motion = SpeedTool(c.plant.arm, c.declared.tool, speed, acceleration)
-    c.motion = motion
+    c.start_motion(SpeedTool(c.plant.arm, c.declared.tool, speed, acceleration))
     yield
     while not touches(r):
         yield
@@ -193,16 +168,16 @@ def touches(r: Registers) -> bool:
 
 
 MOTIONS: dict[int, Callable[[Registers], Steps | None]] = {
-    1: _move_joints,
+    1: lambda r: _move(r, _joint_motion(r.controller, r.joints(), r.number(6), r.number(7))),
     2: _move_joints_to_pose,
-    3: _move_line,
+    3: lambda r: _move(r, _line_motion(r.controller, frame_of(r.pose()), r.number(6), r.number(7))),
     4: _move_line_to_joints,
     7: _stop_jog,
     12: _servo_circle,
     15: _stop_line_now,
     16: _stop_line_now,
     33: _stop_line,
-    34: _stop_joints,
+    34: lambda r: _move(r, Stop(r.controller.target_qd, _positive(r.number(0)))),
     41: _jog,
     42: _stop_jog,
     45: _move_path,
@@ -212,6 +187,6 @@ MOTIONS: dict[int, Callable[[Registers], Steps | None]] = {
 REALTIME_MOTIONS: dict[int, Callable[[Registers], None]] = {
     9: _speed_joints,
     10: _speed_line,
-    11: _servo_joints,
+    11: lambda r: r.controller.servo(r.joints(), r.number(9)),
     24: _servo_line,
 }

@@ -82,7 +82,7 @@ class Registers:
 
     def start_operation(self, motion: Motion) -> None:
         """Run a motion beside the script and report it."""
-        self.controller.motion = motion
+        self.controller.start_motion(motion)
         self._running = motion
         self.progress(0)
 

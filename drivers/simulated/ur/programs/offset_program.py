@@ -24,7 +24,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from gapbridge.drivers.simulated.plant.kinematics import Joints, offset_frame, solve, tcp_in_base
-from gapbridge.drivers.simulated.plant.motion import Hold, Motion
+from gapbridge.drivers.simulated.plant.motion import Hold, Motion, MoveJoints
 from gapbridge.drivers.simulated.plant.plant_settings import Vector6
 from gapbridge.drivers.simulated.ur.controller import CYCLE, Controller, ScriptError, Steps
 
@@ -58,6 +58,14 @@ class OffsetMotion:
         self._controller = controller
         self._nominal: Joints = controller.target_q
         self._rate: Joints = (0.0,) * len(self._nominal)
+
+    def apply(self, offset: Vector6) -> None:
+        """Put another offset on top: m, rad, base axes."""
+        self.applied = offset
+
+    def move_own(self, goal: Joints, speed: float, acceleration: float) -> None:
+        """Have the own motion go to `goal` (n, rad)."""
+        self.own = MoveJoints(self._nominal, goal, speed, acceleration)
 
     @property
     def nominal(self) -> Joints:
@@ -154,11 +162,11 @@ def offset_program(controller: Controller) -> Steps:
     registers = OffsetRegisters(memory)
     motion = OffsetMotion(controller, Hold())
     memory["output_int_register_12"] = 0
-    controller.motion = motion
+    controller.start_motion(motion)
     try:
         while True:
             state = registers.cycle(CYCLE)
-            motion.applied = approach(motion.applied, registers.wanted, registers.steps)
+            motion.apply(approach(motion.applied, registers.wanted, registers.steps))
             memory["output_int_register_13"] = state
             memory.update(zip(_APPLIED, motion.applied, strict=True))
             yield

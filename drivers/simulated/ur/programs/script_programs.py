@@ -23,8 +23,8 @@ DEFAULT_SPEED = 0.5  # rad/s
 def script_program(controller: Controller, name: str, lines: tuple[str, ...]) -> Steps:
     """Run the lines of a program; it ends in the cycle of its last line, as clients expect."""
     variables: dict[str, Any] = {"True": True, "False": False}
-    for raw in lines:
-        line = raw.split("#")[0].strip()
+    for text in lines:
+        line = text.split("#")[0].strip()
         if not line:
             continue
         call = parse_call(line, variables)
@@ -62,9 +62,9 @@ def _set(controller: Controller, call: Call) -> bool:
         kind = {"integer": "int", "float": "double", "boolean": "bit"}[call.name.split("_")[2]]
         memory[f"output_{kind}_register_{int(first)}"] = call.get(1, "value", 0)
     elif call.name in ("set_payload", "set_target_payload"):
-        declared.payload_mass = float(call.get(0, "m", 0.0))
         x, y, z = call.get(1, "cog", declared.payload_cog)
-        declared.payload_cog = (float(x), float(y), float(z))
+        mass = float(call.get(0, "m", 0.0))
+        declared.set_payload(mass, (float(x), float(y), float(z)))
     elif call.name == "set_tcp":
         a, b, c, d, e, f = controller.finite(call.get(0, "pose", ()), "set_tcp")
         declared.set_tcp((a, b, c, d, e, f))
@@ -89,8 +89,8 @@ def move_own(controller: Controller, goal: Joints) -> None:
         raise BenchError("move: the robot is not running")
     motion = controller.motion
     if isinstance(motion, OffsetMotion):
-        motion.own = MoveJoints(motion.nominal, goal, DEFAULT_SPEED, 2.0 * DEFAULT_SPEED)
+        motion.move_own(goal, DEFAULT_SPEED, 2.0 * DEFAULT_SPEED)
         return
     if controller.program is not None:
         raise BenchError("move: another program runs")
-    controller.motion = MoveJoints(controller.target_q, goal, DEFAULT_SPEED, 1.0)
+    controller.start_motion(MoveJoints(controller.target_q, goal, DEFAULT_SPEED, 1.0))

@@ -105,7 +105,7 @@ class DashboardServer:
     def _load(self, name: str) -> str:
         if not name.endswith((".urp", ".script")):
             return f"File not found: {name}"
-        self._controller.loaded_program = name
+        self._controller.load_program(name)
         return f"Loading program: {name}"
 
     def _loaded(self) -> str:

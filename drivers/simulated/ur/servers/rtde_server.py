@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import socket
 import struct
+from typing import Any
 
 from gapbridge.drivers.simulated.server.connection import Connection
 from gapbridge.drivers.simulated.ur.controller import Controller
@@ -32,6 +33,46 @@ class RtdeSession(Connection):
         self.unread = 0.0  # s for which the client has not taken anything
         self.odd_lengths: set[int] = set()
 
+    def speak_version(self, version: int) -> None:
+        """Speak another version of the protocol from now on."""
+        self.version = version
+
+    def set_outputs(self, recipe: wire.OutputRecipe) -> None:
+        """Take another recipe of packets; they start when the client asks for them."""
+        self.recipe, self.started = recipe, False
+
+    def start(self) -> bool:
+        """Begin to send packets; returns whether there is a recipe for them."""
+        self.started = self.recipe is not None and self.recipe.complete
+        self.countdown = 0
+        return self.started
+
+    def pause(self) -> None:
+        """Send no more packets."""
+        self.started = False
+
+    def publish(self, memory: dict[str, Any], dt: float) -> None:
+        """Send the cycle's packet where it is due and there is room."""
+        if self.pending:
+            self.flush()
+        if not self.started or self.recipe is None:
+            return
+        self.countdown -= 1
+        if self.countdown > 0:
+            return
+        self.countdown = self.recipe.every
+        if self.pending:  # never queue: this packet is dropped
+            self._count_unread(dt * self.recipe.every)
+            return
+        self.unread = 0.0
+        self.send(self.recipe.encode(memory))
+
+    def _count_unread(self, dt: float) -> None:
+        self.unread += dt
+        if self.unread > UNREAD_LIMIT:
+            log.warning("an RTDE client has not read for %.0f s and is closed", self.unread)
+            self.close()
+
 
 class RtdeServer:
     """All RTDE clients of one controller."""
@@ -49,30 +90,10 @@ class RtdeServer:
 
     def publish(self, dt: float) -> None:
         """Send the cycle's packet to every client that is due and has room."""
-        memory = self._controller.memory
         if self._controller.clock < self._controller.stall_until:
             return
         for session in self.sessions:
-            if session.pending:
-                session.flush()
-            if not session.started or session.recipe is None:
-                continue
-            session.countdown -= 1
-            if session.countdown > 0:
-                continue
-            session.countdown = session.recipe.every
-            if session.pending:  # never queue: this packet is dropped
-                self._count_unread(session, dt * session.recipe.every)
-                continue
-            session.unread = 0.0
-            session.send(session.recipe.encode(memory))
-
-    @staticmethod
-    def _count_unread(session: RtdeSession, dt: float) -> None:
-        session.unread += dt
-        if session.unread > UNREAD_LIMIT:
-            log.warning("an RTDE client has not read for %.0f s and is closed", session.unread)
-            session.close()
+            session.publish(self._controller.memory, dt)
 
     def close_all(self) -> None:
         """Close every client's connection."""
@@ -105,11 +126,9 @@ class RtdeServer:
         elif kind == wire.SETUP_INPUTS:
             self._set_up_inputs(session, payload)
         elif kind == wire.START:
-            session.started = session.recipe is not None and session.recipe.complete
-            session.countdown = 0
-            session.send(wire.frame(kind, bytes([session.started])))
+            session.send(wire.frame(kind, bytes([session.start()])))
         elif kind == wire.PAUSE:
-            session.started = False
+            session.pause()
             session.send(wire.frame(kind, b"\x01"))
         elif kind == wire.TEXT:
             log.info("RTDE text from a client: %r", payload)
@@ -120,7 +139,7 @@ class RtdeServer:
         asked = struct.unpack_from(">H", payload)[0] if len(payload) >= 2 else 0
         accepted = asked in VERSIONS
         if accepted:
-            session.version = asked
+            session.speak_version(asked)
         session.send(wire.frame(wire.REQUEST_VERSION, bytes([accepted])))
 
     def _set_up_outputs(self, session: RtdeSession, payload: bytes) -> None:
@@ -132,7 +151,7 @@ class RtdeServer:
                 every = max(int(FREQUENCY / frequency), 1)
         names = wire.split_names(payload)
         recipe = wire.output_recipe(names, session.version, every)
-        session.recipe, session.started = recipe, False
+        session.set_outputs(recipe)
         head = bytes([recipe.complete]) if session.version == 2 else b""
         session.send(wire.frame(wire.SETUP_OUTPUTS, head + ",".join(recipe.types).encode()))
 

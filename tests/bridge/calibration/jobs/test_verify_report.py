@@ -9,7 +9,7 @@ from gapbridge.core.calibration.result import Errors, Estimate
 from gapbridge.core.calibration.verify import Suspect, Verification
 
 
-class Heard:
+class Lines:
     def __init__(self) -> None:
         self.lines: list[str] = []
 
@@ -19,7 +19,8 @@ class Heard:
 
 def suspect(joint: int, value: float) -> Suspect:
     name = f"joint_offset_{joint}"
-    return Suspect(name, (Estimate(name, value, 2e-4, "rad"),), 0.4, 30.0)
+    found = (Estimate(name, value, 2e-4, "rad"),)
+    return Suspect(name, found, 0.4, 30.0, effect="joint_offset", joint=joint)
 
 
 def said(*others: Suspect) -> list[str]:
@@ -29,9 +30,9 @@ def said(*others: Suspect) -> list[str]:
         chance=1e-9, moved=suspect(4, 0.01), suspects=others, stations=(), notes=(),
     )  # fmt: skip
     job = VerifyJob.__new__(VerifyJob)
-    job.prompt = heard = Heard()  # type: ignore[assignment]
+    job.prompt = prompt = Lines()  # type: ignore[assignment]
     job._report(found)
-    return heard.lines
+    return prompt.lines
 
 
 def test_other_joints_that_explain_as_much_are_named_with_their_size() -> None:

@@ -35,8 +35,8 @@ def verification(moved: bool) -> tuple[Verification, Readings]:
     frame = c.stations[0]
     readings = replace(taken, value=tip @ frame.rotation.T + frame.position)
     metrology = Metrology(sigma=SIGMA)
-    promise = document_of(c, sigma=SIGMA)
-    return verify(c.model, readings, promise, metrology), readings
+    baseline = document_of(c, sigma=SIGMA)
+    return verify(c.model, readings, baseline, metrology), readings
 
 
 @cache

@@ -19,7 +19,7 @@ from gapbridge.core.effects import CATALOGUE
 from gapbridge.core.model import Model
 
 
-def test_every_parameter_that_a_session_can_find_has_words_of_its_own():
+def test_every_parameter_that_a_session_can_find_has_a_title_of_its_own():
     effects = [e for e, effect in CATALOGUE.items() if effect.calibratable]
     names = Parameters.every(Model(builtin_arm("ur10e")), effects).names
     words = [parameter_title(name) for name in names]
@@ -27,7 +27,7 @@ def test_every_parameter_that_a_session_can_find_has_words_of_its_own():
     assert not [w for w in words if "_" in w or w.endswith((":", "("))]
 
 
-def test_a_few_names_as_they_are_told():
+def test_a_few_names_as_they_are_shown():
     assert parameter_title("joint_offset_3") == "zero of joint 3"
     assert parameter_title("link_geometry_2_alpha") == "twist alpha of link 2"
     assert parameter_title("tool_frame_rx") == "tool turn about x"
@@ -35,7 +35,7 @@ def test_a_few_names_as_they_are_told():
     assert parameter_title("made_up") == "made_up"
 
 
-def test_names_inside_texts_are_told_in_words_and_common_words_stay():
+def test_names_inside_texts_become_titles_and_common_nouns_stay():
     text = "joint_offset_1 and link_geometry_3_d: backlash and payload stay"
     assert with_titles(text) == "zero of joint 1 and offset d of link 3: backlash and payload stay"
     assert sentence("the error falls") == "The error falls."
@@ -46,7 +46,7 @@ def test_names_inside_texts_are_told_in_words_and_common_words_stay():
     (0.0, "0.000 mm"), (5.4e-6, "0.0054 mm"), (41.3e-6, "0.041 mm"), (1.5894e-3, "1.589 mm"),
     (0.0314159, "31.42 mm"), (-2e-5, "−0.020 mm"), (math.nan, "unknown"),
 ])  # fmt: skip
-def test_lengths_are_told_to_the_micrometre(length, text):
+def test_lengths_are_shown_to_the_micrometre(length, text):
     assert mm(length) == text
 
 

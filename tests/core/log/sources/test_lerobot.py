@@ -10,6 +10,7 @@ import pyarrow
 import pytest
 from pyarrow import parquet
 
+from gapbridge.bridge.document.notes import note_texts
 from gapbridge.core.errors import LogError
 from gapbridge.core.log.sources import SourceOptions, source_of
 
@@ -70,7 +71,7 @@ def test_joints_are_found_by_name_and_scaled_by_the_calibration(
     state = np.column_stack([numbers(0)[name] for name in JOINTS])
     assert np.allclose(found.columns["actual_q"][:FRAMES], state * rad)
     assert np.allclose(found.columns["target_q"][:FRAMES], (state + 0.5) * rad)
-    assert any("latency below 33 ms" in note for note in found.notes)
+    assert any("latency below 33 ms" in note for note in note_texts(found.notes))
 
 
 def test_episodes_follow_one_another_in_time(dataset: Path) -> None:

@@ -13,6 +13,7 @@ import pytest
 from gapbridge.core.errors import LogError
 from gapbridge.core.log.sources import SourceOptions, source_of
 from gapbridge.core.log.sources.joint_order import UR_JOINTS, order_joints
+from gapbridge.core.notes import Reason
 
 rosbags = pytest.importorskip("rosbags")
 
@@ -118,8 +119,8 @@ def test_joints_are_ordered_by_name_and_times_are_the_headers(bag: Bag, tmp_path
     assert np.allclose(found.columns["actual_q"][7], [angles(7)[name] for name in UR_JOINTS])
     assert np.allclose(found.columns["timestamp"], 100 + 0.01 * np.arange(ROWS))
     assert "target_q" not in found.columns
-    assert any("target_q" in note for note in found.notes)
-    assert any("effort" in note for note in found.notes)
+    assert Reason.NO_TARGET in [note.reason for note in found.notes]
+    assert Reason.EFFORT_UNKNOWN in [note.reason for note in found.notes]
 
 
 def test_one_mcap_file_of_a_bag_is_read_too(tmp_path: Path) -> None:
@@ -155,7 +156,7 @@ def test_a_tracker_is_interpolated_to_the_joints_times(bag: Bag, tmp_path: Path)
     assert time[-1] <= 0.02 * (ROWS // 2 - 6) + 1e-9  # rows without a measurement are left out
     assert np.allclose(found.columns["measured_position"][:, 0], 0.1 * time / 0.02)
     assert np.allclose(found.columns["measured_rotation"][:, 2], 0.01 * time / 0.02)
-    assert any("left out" in note for note in found.notes)
+    assert Reason.UNCOVERED in [note.reason for note in found.notes]
 
 
 def test_a_gap_of_the_tracker_is_no_measurement(bag: Bag, tmp_path: Path) -> None:
@@ -168,7 +169,7 @@ def test_a_gap_of_the_tracker_is_no_measurement(bag: Bag, tmp_path: Path) -> Non
     found = source_of(tmp_path / "bag").read(tmp_path / "bag", UR_JOINTS, options)
     time = found.columns["timestamp"] - 100
     assert not ((time > 0.2 + 1e-6) & (time < 0.6 - 1e-6)).any()
-    assert any("gap" in note for note in found.notes)
+    assert Reason.GAPS in [note.reason for note in found.notes]
 
 
 def test_a_tracker_that_nobody_named_is_left_out_and_reported(bag: Bag, tmp_path: Path) -> None:
@@ -178,7 +179,7 @@ def test_a_tracker_that_nobody_named_is_left_out_and_reported(bag: Bag, tmp_path
             bag.pose(k)
     found = source_of(tmp_path / "bag").read(tmp_path / "bag", UR_JOINTS, SourceOptions())
     assert "measured_position" not in found.columns
-    assert any("/tracker/pose" in note for note in found.notes)
+    assert Reason.POSE_UNNAMED in [note.reason for note in found.notes]
 
 
 def test_two_topics_of_a_type_have_to_be_named(bag: Bag, tmp_path: Path) -> None:
@@ -199,7 +200,7 @@ def test_messages_without_stamps_count_at_their_time_of_recording(bag: Bag, tmp_
             bag.joint_state(k, stamp=0.0)
     found = source_of(tmp_path / "bag").read(tmp_path / "bag", UR_JOINTS, SourceOptions())
     assert np.allclose(found.columns["timestamp"], 100.5 + 0.01 * np.arange(ROWS))
-    assert any("no stamp" in note for note in found.notes)
+    assert Reason.NO_STAMPS in [note.reason for note in found.notes]
 
 
 HUMBLE = ("reference", "feedback", "error", "output", "desired", "actual")

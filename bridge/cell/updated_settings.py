@@ -12,11 +12,11 @@ from gapbridge.core.errors import GapbridgeError
 KEPT = ("web", "metrics", "recording", "model_source")  # belongs to this run's processes
 
 
-class RereadSettings:
+class UpdatedSettings:
     """The settings that a run has by now, from those that it began with.
 
-    ``text`` is the cell file that those were read from. A process that was started anew hears of a
-    later file by the daemon's status.
+    ``text`` is the cell file that those were read from. The daemon's status reports a later file to
+    a process that was started anew.
     """
 
     def __init__(self, settings: DaemonSettings, text: str | None) -> None:

@@ -11,7 +11,7 @@ from gapbridge.drivers.simulated.plant.rotations import Vector3
 
 
 @dataclass(slots=True)
-class Declared:
+class DeclaredSettings:
     """The controller's own settings, changed by scripts."""
 
     tcp: Vector6 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)  # m, rad: TCP in the flange frame
@@ -20,6 +20,18 @@ class Declared:
     payload_cog: Vector3 = (0.0, 0.0, 0.0)  # m, in the flange frame
     payload_inertia: Vector6 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)  # kg m^2
     gravity: Vector3 = (0.0, 0.0, 9.80665)  # m/s^2, as set_gravity takes it: upward is positive
+
+    def set_payload(self, mass: float, cog: Vector3) -> None:
+        """Declare the payload, kg and m in the flange frame."""
+        self.payload_mass, self.payload_cog = mass, cog
+
+    def set_payload_inertia(self, inertia: Vector6) -> None:
+        """Declare the payload's inertia, kg m^2."""
+        self.payload_inertia = inertia
+
+    def set_gravity(self, gravity: Vector3) -> None:
+        """Declare gravity, m/s^2, upward positive."""
+        self.gravity = gravity
 
     def set_tcp(self, tcp: Vector6) -> None:
         """Declare the TCP."""
