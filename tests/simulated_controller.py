@@ -19,7 +19,7 @@ from gapbridge.core.errors import GapbridgeError, LinkError
 from gapbridge.drivers.simulated.ur.server import serve
 from gapbridge.drivers.simulated.ur.settings import ServerSettings
 
-START_LIMIT = 20.0  # s
+START_LIMIT = 90.0  # s
 STOP_LIMIT = 3.0  # s
 
 

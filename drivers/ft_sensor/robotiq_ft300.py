@@ -26,7 +26,8 @@ FRAME = struct.Struct("<2x6h2x")
 QUIET = b"\xff" * 50  # ends the stream
 UNIT = np.array((1e-2, 1e-2, 1e-2, 1e-3, 1e-3, 1e-3))  # N, Nm per count
 RESPONSE = 0.2  # s: of the registers, which are asked for on and on
-START = 1.0  # s: of the command that starts the stream, which is given once
+START = 1.0  # s: of the command that starts the stream
+TRIES = 3  # that it is given when connecting, where nobody answers
 TURN = 0.1  # s that the sensor takes from its stream back to Modbus
 BITS = 10.0  # per byte on the line, 8N1
 SILENCE = 0.5  # s without a sample after which the stream is asked for again
@@ -90,12 +91,22 @@ class RobotiqFt300(ForceTorqueSensor):
             self._client = None
             raise LinkError(f"{self.name}: the serial line cannot be opened")
         try:
-            self._quieten()
-            if settings.mode == "stream":
-                self._start_stream()
+            self._begin(TRIES)
         except LinkError:
             self.close()
             raise
+
+    def _begin(self, tries: int) -> None:
+        """End a stream that runs, and start ours; again where that fails and tries are left."""
+        self._quieten()
+        if self.settings.mode != "stream":
+            return
+        try:
+            self._start_stream()
+        except LinkError:
+            if tries == 1:
+                raise
+            self._begin(tries - 1)
 
     def _quieten(self) -> None:
         """End a stream and drop what is left of it."""

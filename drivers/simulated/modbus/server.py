@@ -37,7 +37,7 @@ FUNCTIONS: dict[int, Table] = {
     3: "holding", 6: "holding", 16: "holding", 22: "holding", 23: "holding",
 }  # fmt: skip
 WRITES = (5, 6, 15, 16, 22, 23)
-START_LIMIT = 5.0  # s
+START_LIMIT = 20.0  # s
 TORN_APART = 2.0  # rad between the two moments that a torn image mixes
 MOST_WRITES = 10000  # kept between two cycles
 

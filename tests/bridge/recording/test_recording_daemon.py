@@ -54,6 +54,7 @@ def test_a_recorder_that_is_killed_amidst_a_run_loses_nothing(robot: Robot) -> N
 
 
 @pytest.mark.slow
+@pytest.mark.realtime
 def test_a_full_disk_pauses_the_recording_and_not_the_run(robot: Robot) -> None:
     with Run(robot.cell(), arm=True) as run:
         run.wait(State.COMPENSATING)

@@ -180,12 +180,15 @@ def test_a_request_read_together_with_what_ends_the_stream_is_answered() -> None
         assert line.read(8)[:6] == request[:6]
 
 
-def test_a_stream_that_is_slow_to_start_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("late", [0.6, 1.8])
+def test_a_stream_that_is_slow_to_start_is_waited_for(
+    late: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
     device = Ft300Device(Reaction())
     wire, pass_bytes, begun = Wire(device, {"driver": "robotiq_ft300"}), device._pass_bytes, []
 
     def answer_late() -> None:
-        if begun and time.monotonic() > begun[0] + 0.6:
+        if begun and time.monotonic() > begun[0] + late:
             pass_bytes()
 
     monkeypatch.setattr(device, "_pass_bytes", answer_late)

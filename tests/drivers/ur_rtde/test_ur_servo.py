@@ -195,6 +195,7 @@ def test_a_robot_that_another_client_controls_is_refused_in_one_line(
 
 
 @pytest.mark.slow
+@pytest.mark.realtime
 def test_an_emergency_stop_ends_the_stream_and_arming_is_refused(
     controller: SimulatedController,
 ) -> None:
