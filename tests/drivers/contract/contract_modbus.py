@@ -35,7 +35,7 @@ class ModbusCase(Case):
 
     def __init__(self, profile: str) -> None:
         self._profile = profile
-        self.settings = ModbusSettings(profile=profile, port=next(_ports), rate=50.0, timeout=0.3)
+        self.settings = ModbusSettings(profile=profile, port=next(_ports), rate=50.0, timeout=1.0)
         self.file = file = read_profile(self.settings.profile_path)
         self.n = file.joints
         self.resolution = (_half_a_count(file.state.position) or 0.0) + 1e-9

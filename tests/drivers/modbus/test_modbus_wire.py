@@ -284,7 +284,7 @@ def test_the_contract_holds_over_a_serial_line() -> None:
     ours, theirs = cable.ports
     server = ModbusServer(case.file, case.host, 502, serial=theirs, baudrate=115200)
     settings = ModbusSettings(
-        profile="ur", transport="rtu", serial=ours, baudrate=115200, rate=20.0, timeout=0.3
+        profile="ur", transport="rtu", serial=ours, baudrate=115200, rate=20.0, timeout=1.0
     )
     with (
         ServerThread(case.controller, [server], case.host),
