@@ -37,6 +37,7 @@ WITHDRAWN = {
     Check.COMPANION: "no load is declared, and none is accused",
     Check.SEPARATED: "the flange hardly turns against gravity here, so that it may as well be "
     "{quantity}",
+    Check.NOT_A_LEVEL: "it steps as {quantity} changes, so that it may as well go by that",
     Check.HELD_OUT_GAIN: "it does not shrink the gap on samples that its fit did not see",
     Check.ALL_ROWS_GAIN: "over all rows the gap does not shrink by it",
 }

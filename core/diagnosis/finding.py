@@ -21,6 +21,7 @@ class Check(Enum):
     CONSTANT = auto()  # its value does not go by a quantity of the log
     COMPANION = auto()  # what shows it is declared, or accused beside it
     SEPARATED = auto()  # the log does not show that it is no load: the flange turns
+    NOT_A_LEVEL = auto()  # it does not step where a quantity of the log leaves all its levels
     HELD_OUT_GAIN = auto()  # it shrinks the gap on samples that its fit did not see
     ALL_ROWS_GAIN = auto()  # the same over all rows of the log
 
@@ -30,7 +31,7 @@ class Withdrawal:
     """Why a selected term is not accused."""
 
     failed: Check
-    quantity: str = ""  # CONSTANT: what the value goes by; SEPARATED: what it may be instead
+    quantity: str = ""  # CONSTANT: what the value goes by; SEPARATED, NOT_A_LEVEL: instead of what
 
 
 class ParameterState(Enum):

@@ -49,6 +49,7 @@ from gapbridge.core.diagnosis.selection.local_search import forward_selected, ri
 from gapbridge.core.diagnosis.selection.problem import CandidateFit, SampleSpace, fit
 from gapbridge.core.diagnosis.selection.refit import Remainder, worth
 from gapbridge.core.diagnosis.selection.selection import Selection, refitted_alone
+from gapbridge.core.diagnosis.selection.smooth import KNOTS
 from gapbridge.core.diagnosis.selection.stiffness_curves import without_curvature
 from gapbridge.core.errors import InputError
 from gapbridge.core.estimation.least_squares import basis_of, projected_out
@@ -88,6 +89,8 @@ def judge(selection: Selection, held: HeldOut) -> Judgement:
     withdrawn |= dict.fromkeys(bumps(selection), Withdrawal(Check.NOT_LOCALISED))
     for c, loads in _like_a_load(selection).items():
         withdrawn.setdefault(c, Withdrawal(Check.SEPARATED, loads))
+    for c, quantity in _like_a_level(selection).items():
+        withdrawn.setdefault(c, Withdrawal(Check.NOT_A_LEVEL, quantity))
     believed = [
         c for c in selection.term_index if c not in withdrawn and c not in selection.block
     ]  # fmt: skip
@@ -252,6 +255,27 @@ def _like_a_load(selection: Selection) -> dict[int, str]:
                 alike.append(candidate.family)
         if alike:
             found[c] = " or ".join(dict.fromkeys(alike))
+    return found
+
+
+def _like_a_level(selection: Selection) -> dict[int, str]:
+    """Return what steps as a quantity leaves all its levels that something unnamed goes by, too.
+
+    A tool that seats differently under each load is no target that moves as one is changed.
+    """
+    observation, found = selection.observation, {}
+    goes_by = dict.fromkeys(
+        k.quantity for c in selection.found.chosen
+        if (k := selection.space.candidates[c]).quantity
+    )  # fmt: skip
+    for c, term in zip(selection.term_index, selection.terms, strict=True):
+        if observation.times is None or not selection.space.candidates[c].effect.at_moment:
+            continue
+        after = observation.times > term.values[-1]
+        for name in goes_by:
+            z = observation.quantities[name]
+            if len(np.unique(z)) <= KNOTS and not np.isin(z[after], z[~after]).any():
+                found[c] = name
     return found
 
 

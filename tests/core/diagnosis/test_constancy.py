@@ -11,6 +11,7 @@ import small_arm as small
 
 from benchmarks.blind.measuring import axial_moments
 from benchmarks.blind.session import play
+from gapbridge.core.diagnosis.bump import bumps
 from gapbridge.core.diagnosis.constancy import not_constant
 from gapbridge.core.diagnosis.diagnosis import diagnose
 from gapbridge.core.diagnosis.every_row.refitted import on_every_row, refitted, still_accused
@@ -87,6 +88,25 @@ def line_of(fades):
 def test_a_gears_line_is_the_same_in_every_part_of_the_range():
     assert line_of(0.0) == {}
     assert [*line_of(1.0).values()] == ["actual_q_1"]
+
+
+@pytest.mark.parametrize("beside", [True, False])
+def test_less_than_a_period_is_no_line_beside_the_unknown(beside):
+    """Any curve of one bend is a sine's piece; alone, an eccentric gear is the usual guess."""
+    selection = fading(0.0)
+    space = selection.space
+    slow = next(
+        c for c, k in enumerate(space.candidates)
+        if k.periodic and k.site.joint == 2 and k.site.order == 1.0
+    )  # fmt: skip
+    unnamed = next(c for c, k in enumerate(space.candidates) if k.quantity == "timestamp")
+    chosen = [slow, line_in(selection), *([unnamed] if beside else [])]
+    found = fit(space, chosen)
+    selection = replace(selection, found=found)
+    q = selection.observation.quantities["actual_q_1"]
+    assert np.ptp(q) / (2 * np.pi) < 0.75
+    assert (slow in bumps(selection)) is beside
+    assert line_in(selection) not in bumps(selection)
 
 
 def test_only_numbers_of_poses_are_judged():

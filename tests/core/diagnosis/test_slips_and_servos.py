@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,6 +12,10 @@ from gapbridge.bridge.document.findings import finding_text
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.diagnosis.channel_diagnosis import ChannelDiagnosis
 from gapbridge.core.diagnosis.diagnosis import diagnose
+from gapbridge.core.diagnosis.finding import Check
+from gapbridge.core.diagnosis.held_out import HeldOut
+from gapbridge.core.diagnosis.judgement import judge
+from gapbridge.core.diagnosis.selection.problem import fit
 from gapbridge.core.effects import Site, Term
 from gapbridge.core.loads import Loads
 from gapbridge.core.log.log import Log
@@ -105,6 +110,29 @@ def test_a_slip_beside_an_offset_that_was_there_all_the_time() -> None:
     channel, _ = position(sampled(terms, seed=2))
     found = {(c.effect, c.joints) for c in channel.causes}
     assert found == {("joint_slip", (4,)), ("joint_offset", (2,))}
+
+
+@pytest.mark.parametrize(("goes_by", "other"), [("payload", "payload"), ("actual_q_1", None)])
+def test_a_target_that_moves_as_the_load_changes_goes_by_the_load(goes_by, other) -> None:
+    """Only beside something unnamed that goes by the load, too: else a slip comes when it comes."""
+    log = sampled([Term("target_slip", Site(), (1e-3, -5e-4, 2e-3))], at=0.5)
+    late = np.arange(70) >= 35
+    log.columns["payload"] = np.where(late, 8.0, np.where(np.arange(70) >= 20, 1.0, 4.0))
+    found, _ = position(log)
+    selection, time = found.selection, log.columns["timestamp"]
+    candidates = selection.space.candidates
+    slip = next(
+        c for c, k in enumerate(candidates)
+        if k.family == "target_slip" and time[34] < k.fixed[-1] < time[35]
+    )  # fmt: skip
+    unnamed = next(c for c, k in enumerate(candidates) if k.quantity == goes_by)
+    both = replace(
+        selection, found=fit(selection.space, (slip, unnamed)), term_index=(slip,),
+        terms=(candidates[slip].term(np.array([1e-3, -5e-4, 2e-3])),),
+        covariance=(1e-12 * np.eye(3),),
+    )  # fmt: skip
+    withdrawn = [why for _, why in judge(both, HeldOut(both)).withdrawn]
+    assert [w.quantity for w in withdrawn if w.failed is Check.NOT_A_LEVEL] == [other] * bool(other)
 
 
 def test_nothing_slips_in_noise() -> None:
