@@ -70,11 +70,11 @@ def make_wire(kind: str, reaction: Callable[[], Any]) -> Wire:
     """Return a device of a kind on a wire of its own, not yet started."""
     name, *mode = kind.split()
     if name == "robotiq_ft300":
-        keys: dict[str, Any] = {"driver": name, "mode": (mode or ["stream"])[0], "max_age": 0.2}
+        keys: dict[str, Any] = {"driver": name, "mode": (mode or ["stream"])[0], "max_age": 1.0}
         return Wire(Ft300Device(reaction), keys)
     channel = f"ft-{os.getpid()}-{next(_channels)}"
     bus = BusSettings(interface="virtual", channel=channel)
-    keys = {"driver": name, "interface": "virtual", "channel": channel, "max_age": 0.2}
+    keys = {"driver": name, "interface": "virtual", "channel": channel, "max_age": 1.0}
     node = RobotousNode(reaction, bus) if name == "robotous_rft" else AtiNode(reaction, bus, seed=5)
     return Wire(node, keys)
 

@@ -180,7 +180,7 @@ def test_a_request_read_together_with_what_ends_the_stream_is_answered() -> None
         assert line.read(8)[:6] == request[:6]
 
 
-@pytest.mark.parametrize("late", [0.6, 1.8])
+@pytest.mark.parametrize("late", [0.6, 1.3])
 def test_a_stream_that_is_slow_to_start_is_waited_for(
     late: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -210,7 +210,10 @@ def test_garbage_on_the_line_is_dropped_and_the_stream_goes_on() -> None:
             device.put(garbage)
             for _ in range(5):
                 assert np.allclose(next_reading(sensor).wrench, Reaction().wrench, atol=0.01)
-        assert sensor.dropped >= 33
+        until = time.monotonic() + 15.0
+        while sensor.dropped < 33:  # behind what a busy machine has not read yet
+            next_reading(sensor)
+            assert time.monotonic() < until
 
 
 def flood(wire: Wire, stop: threading.Event, rng: np.random.Generator) -> None:
