@@ -136,7 +136,7 @@ class Run:
         self._thread.join(20)
         assert not self._thread.is_alive()
 
-    def wait(self, state: State, limit: float = 30.0) -> float:
+    def wait(self, state: State, limit: float = 120.0) -> float:
         """Wait until the loop is in a state; returns how long it took, s."""
 
         def there() -> bool:
@@ -145,7 +145,7 @@ class Run:
 
         return wait_for(there, limit, f"{state.name} ({self.output})")
 
-    def compensate(self, limit: float = 60.0) -> None:
+    def compensate(self, limit: float = 120.0) -> None:
         """Arm, again as a person does where a busy machine ended the motion at once."""
         until, asked = time.monotonic() + limit, 0.0
         while self.daemon.state != State.COMPENSATING:

@@ -162,7 +162,7 @@ def test_a_person_arms_and_disarms_a_running_daemon(robot: Robot) -> None:
 def test_a_fault_waits_for_a_person_and_arming_is_refused_until_then(robot: Robot) -> None:
     cell = robot.cell(PATIENT)
     with Run(cell, arm=True) as run:
-        run.wait(State.COMPENSATING)
+        run.compensate()
         robot.bench("protective_stop")
         run.wait(State.FAULT)
         with pytest.raises(RunError, match=r"a fault is latched: robot not ready.*safety_mode 3"):
@@ -177,7 +177,7 @@ def test_a_fault_waits_for_a_person_and_arming_is_refused_until_then(robot: Robo
 @pytest.mark.slow
 def test_a_latched_fault_outlives_the_loop_that_found_it(robot: Robot) -> None:
     with Run(robot.cell(PATIENT), arm=True) as run:
-        run.wait(State.COMPENSATING)
+        run.compensate()
         robot.bench("protective_stop")
         run.wait(State.FAULT)
         pid = run.daemon.loop_pid
@@ -238,7 +238,7 @@ def test_the_same_cell_has_the_same_name_from_everywhere(
 def test_a_disarming_between_two_loops_is_kept_and_answered_by_the_next(robot: Robot) -> None:
     cell = robot.cell(PATIENT)
     with Run(cell, arm=True) as run:
-        run.wait(State.COMPENSATING)
+        run.compensate()
         robot.bench("protective_stop")
         run.wait(State.FAULT)
         robot.bench("unlock")

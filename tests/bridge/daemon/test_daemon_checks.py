@@ -24,7 +24,7 @@ PATIENT = ", state_timeout: 0.2"
 def test_an_offset_that_stands_at_its_limit_ends_the_compensation(robot: Robot) -> None:
     cell = robot.cell(PATIENT, limits="{offset: 0.0002}")
     with Run(cell, arm=True) as run:
-        run.wait(State.COMPENSATING)
+        run.compensate()
 
         def saturated() -> bool:
             if run.daemon.state == State.OBSERVING:
@@ -43,7 +43,7 @@ def test_an_offset_that_stands_at_its_limit_ends_the_compensation(robot: Robot) 
 @pytest.mark.slow
 def test_a_loop_that_was_suspended_begins_anew_and_observes(robot: Robot) -> None:
     with Run(robot.cell(PATIENT), arm=True) as run:
-        run.wait(State.COMPENSATING)
+        run.compensate()
         time.sleep(0.5)
         pid = run.daemon.loop_pid
         assert pid is not None
@@ -115,7 +115,7 @@ def test_arming_warns_of_what_differs_from_the_controller_and_is_no_reason_to_re
     cell = robot.cell(PATIENT)
     changed(cell, "mass: 5.0", "mass: 4.5")
     with Run(cell, arm=True) as run:
-        run.wait(State.COMPENSATING)
+        run.compensate()
         run.end()
     warned = [line for line in run.output if "payload.mass" in line]
     assert warned == ["payload.mass: found 4.5 kg, expected 5 kg, as the controller has it"]

@@ -37,7 +37,7 @@ def assert_came_back_observing(run: Run, robot: Robot) -> None:
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSEGV])
 def test_a_loop_that_dies_comes_back_observing(robot: Robot, number: signal.Signals) -> None:
     with Run(robot.cell(), arm=True) as run:
-        run.wait(State.COMPENSATING)
+        run.compensate()
         time.sleep(0.3)
         pid = run.daemon.loop_pid
         assert pid is not None
@@ -55,7 +55,7 @@ def test_a_loop_that_dies_comes_back_observing(robot: Robot, number: signal.Sign
 @pytest.mark.slow
 def test_a_loop_that_hangs_is_ended_and_comes_back_observing(robot: Robot) -> None:
     with Run(robot.cell(), arm=True) as run:
-        run.wait(State.COMPENSATING)
+        run.compensate()
         time.sleep(0.3)
         pid = run.daemon.loop_pid
         assert pid is not None
@@ -69,7 +69,7 @@ def test_a_loop_that_hangs_is_ended_and_comes_back_observing(robot: Robot) -> No
 
 def test_a_controller_that_stands_still_is_a_fault(robot: Robot) -> None:
     with Run(robot.cell(), arm=True) as run:
-        run.wait(State.COMPENSATING)
+        run.compensate()
         time.sleep(0.3)
         os.kill(robot.controller.pid, signal.SIGSTOP)
         try:
@@ -95,7 +95,7 @@ def test_a_clock_that_stands_still_is_seen_though_packets_flow(robot: Robot) -> 
 
 def test_a_clock_that_stands_still_ends_compensating(robot: Robot) -> None:
     with Run(robot.cell(), arm=True) as run:
-        run.wait(State.COMPENSATING)
+        run.compensate()
         robot.bench("freeze")
         wait_for(lambda: "holding" in " ".join(run.output), 20.0, "holding")
         assert "state stale" in " ".join(run.output)
@@ -106,7 +106,7 @@ def test_a_clock_that_stands_still_ends_compensating(robot: Robot) -> None:
 @pytest.mark.slow
 def test_a_short_stall_ramps_out_and_does_not_ramp_in_again(robot: Robot) -> None:
     with Run(robot.cell(), arm=True) as run:
-        run.wait(State.COMPENSATING)
+        run.compensate()
         time.sleep(0.8)
         robot.bench("stall 0.08")
         run.wait(State.OBSERVING)
@@ -119,7 +119,7 @@ def test_a_short_stall_ramps_out_and_does_not_ramp_in_again(robot: Robot) -> Non
 @pytest.mark.slow
 def test_a_dropped_connection_is_replaced_by_a_new_process(robot: Robot) -> None:
     with Run(robot.cell(), arm=True) as run:
-        run.wait(State.COMPENSATING)
+        run.compensate()
         time.sleep(0.3)
         robot.bench("drop")
         wait_for(lambda: run.daemon.state != State.COMPENSATING, 20.0, "the fault")
@@ -129,7 +129,7 @@ def test_a_dropped_connection_is_replaced_by_a_new_process(robot: Robot) -> None
 @pytest.mark.slow
 def test_a_controller_that_is_started_anew_is_found_again(tmp_path: Path) -> None:
     with Robot(tmp_path) as robot, Run(robot.cell(), arm=True) as run:
-        run.wait(State.COMPENSATING)
+        run.compensate()
         time.sleep(0.3)
         os.kill(robot.controller.pid, signal.SIGKILL)
         wait_for(lambda: run.daemon.state == State.DISCONNECTED, 5.0, "the loss of the link")
@@ -153,7 +153,7 @@ def test_a_run_of_given_length_ends_also_where_its_controller_has_gone(tmp_path:
 
 def test_a_protective_stop_is_a_fault_and_nobody_writes_after_it(robot: Robot) -> None:
     with Run(robot.cell(), arm=True) as run:
-        run.wait(State.COMPENSATING)
+        run.compensate()
         time.sleep(0.3)
         robot.bench("protective_stop")
         run.wait(State.FAULT)

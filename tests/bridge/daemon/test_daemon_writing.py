@@ -56,7 +56,7 @@ def test_compensation_brings_the_tcp_to_where_it_was_wanted_without_a_jump(robot
     wanted = wanted_position(robot, cell)
     without = np.linalg.norm(robot.tcp() - wanted)
     with Run(cell, arm=True) as run:
-        run.wait(State.COMPENSATING)
+        run.compensate()
         time.sleep(1.5)
         with_compensation = np.linalg.norm(robot.tcp() - wanted)
         summary = run.end()
@@ -77,7 +77,7 @@ def test_compensation_brings_the_tcp_to_where_it_was_wanted_without_a_jump(robot
 @pytest.mark.slow
 def test_after_a_run_the_arm_is_where_it_was_and_no_program_is_left(robot: Robot) -> None:
     with Run(robot.cell(), arm=True) as run:
-        run.wait(State.COMPENSATING)
+        run.compensate()
         time.sleep(0.7)
         run.end()
     truth = robot.truth()
@@ -154,7 +154,7 @@ def test_offset_mode_corrects_under_the_robots_own_program(robot: Robot) -> None
     wanted = wanted_position(robot, cell)
     without = np.linalg.norm(robot.tcp() - wanted)
     with Run(cell, arm=True) as run:
-        run.wait(State.COMPENSATING)
+        run.compensate()
         with_compensation = settled_error(robot, wanted)
         start = robot.settings.start_q
         robot.bench("move 0.2 " + " ".join(map(str, start[1:])))

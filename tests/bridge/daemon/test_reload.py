@@ -27,7 +27,7 @@ def configured(run: Run) -> dict[str, Any]:
 def test_a_wrong_cell_changes_nothing_and_everything_wrong_is_reported(robot: Robot) -> None:
     cell = robot.cell(PATIENT)
     with Run(cell, arm=True) as run:
-        run.wait(State.COMPENSATING)
+        run.compensate()
         pid, before = run.daemon.loop_pid, run.daemon.status()["configuration_hash"]
         text = cell.read_text().replace("mass: 5.0", "mass: heavy") + "limits: {offset: -1}\n"
         cell.write_text(text + "recoding: {}\n")
@@ -62,7 +62,7 @@ def test_a_changed_cell_is_ramped_out_of_and_into(robot: Robot, arms: bool) -> N
     section = "{arm: true}" if arms else "{arm: false}"
     cell = robot.cell(PATIENT, setpoints=section)
     with Run(cell, arm=True) as run:
-        run.wait(State.COMPENSATING)
+        run.compensate()
         time.sleep(0.8)
         first, before = run.daemon.loop_pid, run.daemon.status()["configuration_hash"]
         cell.write_text(cell.read_text() + "limits: {offset_rate: 0.02}\n")

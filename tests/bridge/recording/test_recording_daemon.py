@@ -16,7 +16,6 @@ import yaml
 from daemon_cell import Robot, Run, gapbridge, only_recording, wait_for
 from recorded_documents import read_documents
 
-from gapbridge.bridge.loop.supervisor import State
 from gapbridge.bridge.recording.export import export
 from gapbridge.core.log.mcap_reading import read_columns
 
@@ -34,7 +33,7 @@ def recorder_pid(run: Run) -> int | None:
 @pytest.mark.slow
 def test_a_recorder_that_is_killed_amidst_a_run_loses_nothing(robot: Robot) -> None:
     with Run(robot.cell(), arm=True) as run:
-        run.wait(State.COMPENSATING)
+        run.compensate()
         for _ in range(2):
             wait_for(lambda: recorder_pid(run) is not None, 20.0, "a recorder")
             pid = recorder_pid(run)
@@ -57,7 +56,7 @@ def test_a_recorder_that_is_killed_amidst_a_run_loses_nothing(robot: Robot) -> N
 @pytest.mark.realtime
 def test_a_full_disk_pauses_the_recording_and_not_the_run(robot: Robot) -> None:
     with Run(robot.cell(), arm=True) as run:
-        run.wait(State.COMPENSATING)
+        run.compensate()
         wait_for(lambda: "recording into" in " ".join(run.output), 20.0, "a file")
         pid = recorder_pid(run)
         assert pid is not None

@@ -27,6 +27,7 @@ OFFSET = (4e-4, -3e-4, 5e-4, 1e-3, 0.0, -1e-3)  # m, rad: what a write of offset
 STEP = 0.02  # rad: what a write of joints moves each joint by
 PACE = 0.1  # rad/s
 LATE = 0.05  # s that a sample may be older than the plant
+IN_TIME = 3  # states in a row that came within LATE: none of them has waited for this process
 
 
 def next_state(driver: Driver, seconds: float = 15.0) -> RobotState:
@@ -93,24 +94,36 @@ def check_angles(case: Case, driver: Driver) -> None:
             zip(start, controller.plant.arm.lower, controller.plant.arm.upper, strict=True)
         )
     )
+    until, fastest = time.monotonic() + 60.0, _fastest_on_the_way(case, driver, goal)
+    while case.speed_resolution is not None and fastest <= 0.1:  # a busy machine has missed it
+        assert time.monotonic() < until, "no speed was ever reported"
+        _fastest_on_the_way(case, driver, start)
+        fastest = _fastest_on_the_way(case, driver, goal)
+
+
+def _fastest_on_the_way(case: Case, driver: Driver, goal: tuple[float, ...]) -> float:
+    """Have the plant go to joints, and compare where states come in time; returns rad/s."""
+    controller = case.controller
     controller.move_own(goal)
-    fastest = 0.0
-    for _ in range(200):
-        state = next_state(driver)
-        speed = np.array(controller.qd)
-        slack = case.resolution + LATE * np.abs(speed).max() + 0.005
-        assert np.abs(state.actual_q - controller.q).max() <= slack + 0.02
+    fastest, in_time, until = 0.0, 0, time.monotonic() + 30.0
+    while max(map(abs, controller.qd)) > 1e-6 or not np.allclose(controller.q, goal, atol=1e-6):
+        asked = time.monotonic()
+        assert asked < until, "the plant never came there"
+        state, speed = next_state(driver), np.array(controller.qd)
+        away = np.abs(state.actual_q - controller.q).max()
+        in_time = in_time + 1 if time.monotonic() - asked < LATE else 0
+        if in_time < IN_TIME:
+            continue
+        assert away <= case.resolution + LATE * np.abs(speed).max() + 0.025
         if case.speed_resolution is not None and np.abs(speed).min() > 0.05:
             assert (np.sign(state.actual_qd) == np.sign(speed)).all()
             assert state.actual_qd == pytest.approx(speed, abs=0.1 + case.speed_resolution)
             fastest = max(fastest, float(np.abs(state.actual_qd).max()))
-        if max(map(abs, controller.qd)) < 1e-6 and np.allclose(controller.q, goal, atol=1e-6):
-            break
     wait_for(
         lambda: bool(np.abs(next_state(driver).actual_q - goal).max() <= case.resolution * 1.01),
-        2.0, "the joints that the plant has come to",
+        20.0, "the joints that the plant has come to",
     )  # fmt: skip
-    assert case.speed_resolution is None or fastest > 0.1
+    return fastest
 
 
 def check_force(case: Case, driver: Driver) -> None:

@@ -69,7 +69,7 @@ def test_a_sensor_lost_while_writing_ends_the_writing_until_a_person_arms_again(
     robot: Robot, sensor: RobotousNode
 ) -> None:
     with Run(cell_of(robot, sensor), arm=True) as run:
-        run.wait(State.COMPENSATING)
+        run.compensate()
         time.sleep(0.5)
         sensor.silent = True
         wait_for(lambda: run.daemon.state != State.COMPENSATING, 20.0, "no longer compensating")
@@ -87,7 +87,7 @@ def test_a_sensor_lost_while_writing_ends_the_writing_until_a_person_arms_again(
 
 def test_overload_stops_the_writing(robot: Robot, sensor: RobotousNode) -> None:
     with Run(cell_of(robot, sensor), arm=True) as run:
-        run.wait(State.COMPENSATING)
+        run.compensate()
         sensor.status = 0x10
         wait_for(lambda: run.daemon.state != State.COMPENSATING, 20.0, "no longer compensating")
         run.end()
@@ -99,7 +99,7 @@ def test_a_lost_sensor_drops_the_force_and_the_angles_stay_corrected(
     robot: Robot, sensor: RobotousNode
 ) -> None:
     with Run(cell_of(robot, sensor, "degrade"), arm=True) as run:
-        run.wait(State.COMPENSATING)
+        run.compensate()
         time.sleep(1.0)
         sensor.silent = True
         wait_for(lambda: any("max_age" in line for line in run.output), 20.0, "the event")
