@@ -11,7 +11,7 @@ from gapbridge.bridge.cell.sections import LimitSettings
 from gapbridge.bridge.loop.offset_in_force import InForce
 from gapbridge.core.arm import Arm
 from gapbridge.core.arrays import Array
-from gapbridge.core.compensation import Compensator, Correction
+from gapbridge.core.compensation import Compensator, Correction, wanted_pose
 from gapbridge.core.errors import StaleStateError
 from gapbridge.core.kernels.reference import JIT
 from gapbridge.core.limits import LONGEST_GAP, Limiter, Limits
@@ -24,6 +24,8 @@ from gapbridge.drivers.gate import GateBounds
 DECELERATION = 8.0  # rad/s^2 of the fastest joint
 SMOOTHING = 0.02  # s: over which the velocity is averaged
 PLACE, RATE, LIMIT = range(3)  # rows of what is kept
+STEEPEST = 1.5  # of a smooth step's mean slope
+LEADING = 0.5  # of an offset's rate, to where a source begins: the offset changes meanwhile
 SOLVED = 1e-5  # m: corrections that miss the wanted pose by more are not used
 USUAL_VELOCITY = np.pi  # rad/s: of joints whose limit is not known
 
@@ -133,6 +135,8 @@ class SetpointStream:
         self._resumes = False  # begun with an offset in force, which the ramp goes on from
         self._last = 0.0  # s, controller time of the last setpoint
         self._start_gap: Array | None = None  # rad: where the arm stood minus the first setpoint
+        self._lead_time = 0.0  # s that the way over it takes at least
+        self._time_over(np.zeros(model.arm.n))  # compiled now
         self._since_start = 0.0  # s
         self.residual = 0.0  # m, of the last correction
         self.finite = True  # the last correction is numbers
@@ -263,11 +267,25 @@ class SetpointStream:
         """Return the source's setpoint, led over to from where the arm stood: no first jump."""
         if self._start_gap is None:
             self._start_gap = self._nominal.q - source_q
-        share = (self._since_start + gap) / self._ramp_time
+            self._lead_time = self._time_over(source_q)
+        share = (self._since_start + gap) / max(self._ramp_time, self._lead_time)
         if share >= 1.0:
             return source_q
         left = 1.0 - share * share * (3.0 - 2.0 * share)
         return source_q + left * self._start_gap
+
+    def _time_over(self, source_q: Array) -> float:
+        """Return the time (s) from the nominal joints to a source's, slower than an offset changes.
+
+        Where an offset was left in the arm, a source that begins where the arm stands is that far
+        from what was wanted.
+        """
+        poses = wanted_pose(self._compensator.model, np.stack([self._nominal.q, source_q]))
+        away = float(np.linalg.norm(poses.position[1] - poses.position[0]))
+        cosine = 0.5 * (np.sum(poses.rotation[0] * poses.rotation[1]) - 1.0)
+        turn, limits = float(np.arccos(np.clip(cosine, -1.0, 1.0))), self.limiter.limits
+        mean = max(away / limits.offset_rate, turn / limits.offset_rotation_rate)
+        return STEEPEST / LEADING * mean
 
     @property
     def rests(self) -> bool:

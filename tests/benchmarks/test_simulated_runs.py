@@ -144,6 +144,10 @@ def test_a_clock_set_forward_as_the_next_packet_comes_late_is_no_violation_but_r
     assert "undetectable: a setpoint of a state sampled 0.066 s before" in str(found)
 
 
+def test_a_planner_that_begins_where_an_offset_was_left_is_led_over_no_faster_than_it() -> None:
+    assert not run(8022740).violations
+
+
 def test_an_answer_of_zeros_does_not_say_that_no_offset_is_applied() -> None:
     """Seed 7061098: over Modbus, after a loop that died; arming announced a zero into an offset."""
     assert not run(7061098).violations
