@@ -10,6 +10,8 @@ from __future__ import annotations
 
 # An accusation beside the unnamed functions that the residual asks for
 SIGMAS = 6.0  # of its value; 4 gives 11 false of 72 unknown alone, 6 to 8 7, 12 loses weak ones
+FURTHER = 0.3  # of what one number takes, for each further number of a cause: chance exceeds 9.0,
+# 11.8 and 14.2 alike with 1, 2 and 3; with 1 steps of a target and centres of loads are lost
 SIBLING = 3.0  # at further joints of an effect that stays at one: 7 of 218 true terms lost without
 MAX_DRIFT = 1.5  # times, of its value: 2 gives one false more, 1.3 loses real friction
 ALIKE = 0.1  # 1 sigma of a joint's delay about the median of all, in shares of it, at least: a

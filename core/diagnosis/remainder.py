@@ -17,6 +17,7 @@ from gapbridge.core.arrays import Array
 from gapbridge.core.diagnosis.criteria import (
     CLOSED_SHARE,
     DEGENERATE,
+    FURTHER,
     HELD_WHOLLY,
     HOPELESS,
     MAX_DRIFT,
@@ -164,7 +165,10 @@ class _Beside:
                 steady.append(0.0)
                 continue
             square = sigmas_square(b, spread[np.ix_(own, own)])
-            sigmas.append(float(np.sqrt(max(square, 0.0) / len(own))))
+            numbers = float(len(own))
+            if not self.space.candidates[c].periodic:  # a line has the phase that suits a shape
+                numbers = 1 + FURTHER * (numbers - 1)
+            sigmas.append(float(np.sqrt(max(square, 0.0) / numbers)))
             steady.append(min(share * MAX_DRIFT, MAX_DRIFT / share))
         return self._with_siblings(accused, np.array(sigmas), np.array(steady))
 

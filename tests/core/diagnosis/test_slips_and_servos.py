@@ -206,3 +206,16 @@ def test_a_joint_that_holds_the_same_all_the_time_shows_no_droop_and_the_motion_
     (droop,) = [c for c in channel.considered if c.effect == "servo_droop"]
     assert not droop.excited
     assert "change the torque that the joint holds" in droop.needs
+
+
+def test_a_small_slip_of_the_target_is_named_beside_a_tool_that_bends() -> None:
+    """Of three numbers that are sure together none has to be as sure as one by itself."""
+    log = sampled([Term("target_slip", Site(), (2e-4, -1.2e-4, 1e-4))], seed=1)
+    loads = Loads(payload_mass=log.columns["payload"])
+    rotation = MODEL.predict(log.columns["actual_q"], loads).rotation
+    x, y = -rotation[:, 2, 0], -rotation[:, 2, 1]
+    bent = 8e-4 * np.stack([x * np.abs(x), 1.5 * y * x**2, 0 * x], axis=1)
+    log.columns["measured_position"] += np.einsum("nij,nj->ni", rotation, bent)
+    channel, _ = position(log)
+    assert [c.effect for c in channel.causes] == ["target_slip"]
+    assert channel.structured
