@@ -17,6 +17,7 @@ from gapbridge.core.kernels.reference import JIT
 from gapbridge.core.limits import LONGEST_GAP, Limiter, Limits
 from gapbridge.core.loads import Loads
 from gapbridge.core.model import Model
+from gapbridge.core.rotation import rotation_vector
 from gapbridge.core.state import RobotState, Setpoint
 from gapbridge.drivers.clock import SYSTEM, Clock
 from gapbridge.drivers.gate import GateBounds
@@ -282,8 +283,8 @@ class SetpointStream:
         """
         poses = wanted_pose(self._compensator.model, np.stack([self._nominal.q, source_q]))
         away = float(np.linalg.norm(poses.position[1] - poses.position[0]))
-        cosine = 0.5 * (np.sum(poses.rotation[0] * poses.rotation[1]) - 1.0)
-        turn, limits = float(np.arccos(np.clip(cosine, -1.0, 1.0))), self.limiter.limits
+        turn = float(np.linalg.norm(rotation_vector(poses.rotation[0].T @ poses.rotation[1])))
+        limits = self.limiter.limits
         mean = max(away / limits.offset_rate, turn / limits.offset_rotation_rate)
         return STEEPEST / LEADING * mean
 

@@ -15,7 +15,7 @@ from gapbridge.core.estimation.least_squares import basis_of, projected_out
 from gapbridge.core.estimation.nelder_mead import nelder_mead
 
 LEAST_PERIOD = 0.75  # of a line, beside something unknown: a sine's less than two extremes are any
-# curve's. False lines showed 0.26 to 0.54, true ones 0.79 and more
+# curve's. False lines showed 0.26 to 0.54, true ones beside an unknown 0.89 and more
 PLACES, WIDTHS = 13, (0.05, 0.1, 0.2)  # where a bump is first looked for, in shares of the range
 
 
