@@ -66,6 +66,7 @@ class Assembler:
         self.enabled: dict[tuple[Key, str], bool] = {}
         self.received_at: dict[Key, float] = {}  # s, monotonic, of each message that we read
         self.troubled: set[tuple[Key, str]] = set()  # members of ``status`` that report trouble
+        self.passed: dict[tuple[Key, str], tuple[float, str, bool]] = {}  # trouble that has ended
         self._seen: dict[Key, bytes] = {}  # last bytes of messages beside the sample
 
     @property
@@ -115,11 +116,12 @@ class Assembler:
             value = values[check.signal]
             trouble = check.trouble(int(value)) if math.isfinite(value) else check.otherwise
             place = (incoming.key, check.signal)
-            self.status[place] = (value, trouble, check.while_writing)
             if trouble:
                 self.troubled.add(place)
-            else:
+            elif place in self.troubled:
                 self.troubled.discard(place)
+                self.passed[place] = self.status[place]
+            self.status[place] = (value, trouble, check.while_writing)
         for signal in incoming.enabled:
             self.enabled[incoming.key, signal] = values[signal] in self._profile.enabled_values
 

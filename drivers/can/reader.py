@@ -166,7 +166,20 @@ class FrameReader:
         """Return what is wrong with the arm and the words for it; empty where nothing is."""
         if not self.assembler.troubled:
             return "", ""
-        for (key, signal), (value, trouble, only_writing) in self.assembler.status.items():
+        return self._first_trouble(self.assembler.status, writing)
+
+    def passed_trouble(self, writing: bool) -> str:
+        """Return what was wrong since ``forget_passed`` and is no longer; empty: nothing."""
+        return self._first_trouble(self.assembler.passed, writing)[0]
+
+    def forget_passed(self) -> None:
+        """Let trouble that has ended be: it has been reported, or nobody was to act on it."""
+        self.assembler.passed.clear()
+
+    def _first_trouble(
+        self, status: dict[tuple[Key, str], tuple[float, str, bool]], writing: bool
+    ) -> tuple[str, str]:
+        for (key, signal), (value, trouble, only_writing) in status.items():
             if trouble and (writing or not only_writing):
                 name = self._profile.incoming[key].name
                 return trouble, f"{name}.{signal} is {value:g}"

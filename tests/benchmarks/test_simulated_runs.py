@@ -358,3 +358,8 @@ def test_a_broken_product_is_found(
 
 def test_every_invariant_has_a_break() -> None:
     assert [name for name, *_ in BREAKS] == list(INVARIANTS)
+
+
+def test_a_stop_that_comes_and_goes_while_frames_are_out_of_order_is_a_fault() -> None:
+    found = run(8072455)
+    assert not found.violations

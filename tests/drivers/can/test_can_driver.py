@@ -1,6 +1,7 @@
 import struct
 import threading
 import time
+from contextlib import suppress
 
 import can
 import numpy as np
@@ -217,6 +218,28 @@ def test_the_stop_button_is_an_emergency_stop_and_keeps_us_from_arming(served):
     assert state.safety_status_bits != 1
     with pytest.raises(WriteError, match=r"emergency_stop: ArmStatus.arm_status is 1"):
         served.driver.arm(state)
+
+
+def test_a_stop_that_comes_and_goes_while_frames_make_no_sample_is_reported_once(served):
+    driver, controller = served.driver, served.controller
+
+    def read_until_stopped(stopped):
+        until = time.monotonic() + 5.0
+        while bool(driver.reader.trouble(writing=False)[0]) != stopped:
+            assert time.monotonic() < until
+            with suppress(InvalidStateError, StaleStateError):
+                driver.read_state()
+
+    next_state(driver)
+    served.nodes.withheld.add(0x2A6)
+    controller.emergency_stop()
+    read_until_stopped(True)
+    controller.release_emergency_stop()
+    controller.unlock()
+    read_until_stopped(False)
+    served.nodes.withheld.clear()
+    assert next_state(driver).safety_mode == 7
+    assert next_state(driver).safety_mode == 1
 
 
 def test_status_that_falls_silent_while_joints_go_on_is_stale(served):
