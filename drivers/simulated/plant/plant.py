@@ -15,7 +15,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gapbridge.drivers.simulated.plant.kinematics import holding_torque
 from gapbridge.drivers.simulated.plant.plant_arm import Frame, PlantArm, place
 from gapbridge.drivers.simulated.plant.plant_settings import PlantSettings
 from gapbridge.drivers.simulated.plant.rotations import (
@@ -74,6 +73,7 @@ class Plant:
         self._random = np.random.default_rng(settings.seed)
         self._moving = False
         self._still = 0.0
+        self._bend: list[Vector3] = [(0.0, 0.0, 0.0)] * len(q)  # rad, where the servos hold it
         self.scatter: tuple[float, ...] = self._draw_scatter()
 
     def _draw_scatter(self) -> tuple[float, ...]:
@@ -101,14 +101,17 @@ class Plant:
         self._follow_rest(dt)
 
     def _given_way(self, target: Sequence[float]) -> Sequence[float]:
-        """Return where the servos rest (n, rad) for `target`, by what they hold where they are."""
-        s, load = self.settings, self.load
-        if not any(s.droop):
+        """Return where the servos rest (n, rad) for `target`, by what they hold where they are.
+
+        The bent arm's weight, one step nearer to its equilibrium each time: a cycle has no time for
+        all steps, and an arm at rest comes to it within some cycles.
+        """
+        droop = self.settings.droop
+        if not any(droop):
             return target
-        held = holding_torque(
-            self.arm, self.q, s.gravity, load.mass, load.cog, (*load.force, *load.torque), self.tool
-        )
-        return tuple(t - c * m for t, c, m in zip(target, s.droop, held, strict=True))
+        moments = self._bent(self.true_angles(), self._bend, self.load).moments
+        self._bend = self._turns(moments)
+        return tuple(t + c * m[2] for t, c, m in zip(target, droop, moments, strict=True))
 
     def _follow_rest(self, dt: float) -> None:
         """Draw a new placement error each time the arm comes to rest after a move."""
@@ -143,14 +146,10 @@ class Plant:
     def shape(self, angles: Sequence[float], load: Load | None = None) -> Shape:
         """Return the equilibrium of the arm at joint `angles` (n, rad)."""
         load = self.load if load is None else load
-        axial, radial = self.settings.axial, self.settings.radial
         bend: list[Vector3] = [(0.0, 0.0, 0.0)] * len(angles)
         for _ in range(ITERATIONS):
             shape = self._bent(angles, bend, load)
-            new = [
-                (c_r * m[0], c_r * m[1], c_a * m[2])
-                for m, c_a, c_r in zip(shape.moments, axial, radial, strict=True)
-            ]
+            new = self._turns(shape.moments)
             change = max(
                 abs(a - b)
                 for v, w in zip(new, bend, strict=True)
@@ -160,6 +159,14 @@ class Plant:
             if change < CONVERGED:
                 break
         return shape
+
+    def _turns(self, moments: Sequence[Vector3]) -> list[Vector3]:
+        """Return how far the joints bend under moments, in their own frames."""
+        axial, radial = self.settings.axial, self.settings.radial
+        return [
+            (c_r * m[0], c_r * m[1], c_a * m[2])
+            for m, c_a, c_r in zip(moments, axial, radial, strict=True)
+        ]
 
     def _bent(self, angles: Sequence[float], bend: Sequence[Vector3], load: Load) -> Shape:
         """Return frames and moments of the arm with given joint deflections."""

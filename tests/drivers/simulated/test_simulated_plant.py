@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from gapbridge.core.arm import builtin_arm
+from gapbridge.core.effects import Site, Term
 from gapbridge.core.errors import ArmError
 from gapbridge.core.loads import Loads
 from gapbridge.core.model import Model
@@ -48,6 +49,29 @@ def test_the_plant_and_the_model_agree_though_they_share_no_mathematics(name: st
         pose = model.predict(q[None], loads)
         assert found.origin == pytest.approx(pose.position[0], abs=1e-9)
         assert found.rotation == pytest.approx(pose.rotation[0].ravel(), abs=1e-9)
+
+
+def test_servos_give_way_by_what_the_bent_arm_holds() -> None:
+    """As the model has it; a rigid arm's torques are 4 % others at joint 2, 20 % at joint 4."""
+    soft, droop = (0.0, 3e-4, 3e-4, 8e-4, 8e-4, 8e-4), (0.0, 2e-5, 5e-5, 1e-3, 1e-3, 0.0)
+    plant = make_plant(axial=soft, radial=soft, droop=droop)
+    plant.hang(8.0, (0.05, 0.02, 0.1))
+    plant.pull((20.0, -10.0, -30.0), (0.0, 2.0, 0.0))
+    tool = np.eye(4)
+    tool[:3, :3] = np.reshape(rot.from_vector(TCP[3:]), (3, 3))
+    tool[:3, 3] = TCP[:3]
+    model = Model(builtin_arm("ur10e"), tool).with_compliance(np.array(soft), np.array(soft))
+    terms = [Term("servo_droop", Site(i + 1), (c,)) for i, c in enumerate(droop) if c]
+    loads = Loads(
+        payload_mass=np.array([8.0]), payload_cog=np.array([[0.05, 0.02, 0.1]]),
+        wrench=np.array([[20.0, -10.0, -30.0, 0.0, 2.0, 0.0]]),
+    )  # fmt: skip
+    for _ in range(300):  # 2.4 s
+        plant.step(START, 0.008)
+        plant.scatter = (0.0,) * 6
+    expected = model.with_terms(terms).settled(np.array([START]), loads)[0]
+    assert np.abs(expected - START).max() > 1e-3
+    assert plant.q == pytest.approx(expected, abs=1e-9)
 
 
 def test_one_soft_joint_sags_as_reckoned_by_hand() -> None:
