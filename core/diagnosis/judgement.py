@@ -219,11 +219,15 @@ def still_sure(selection: Selection, judgement: Judgement, arm: Arm) -> tuple[Se
         )  # fmt: skip
         if not weakest or max(share[p] for p in weakest) >= 1:
             return found, judgement
+        inside = found.term_index[weakest[0]] in found.block
         # of friction beside the links more rows may still be sure
-        reason = VAGUE if found.term_index[weakest[0]] in found.block else BESIDE
+        reason = VAGUE if inside else BESIDE
+        # a joint's zero among the links that shows nothing leaves nothing behind
+        left = not inside or found.is_link(weakest[0])
         judgement = replace(
             judgement, accused=tuple(p for p in judgement.accused if p not in weakest),
-            withdrawn=(*judgement.withdrawn, *((p, reason) for p in weakest)), structured=True,
+            withdrawn=(*judgement.withdrawn, *((p, reason) for p in weakest)),
+            structured=judgement.structured or left,
             ties={p: names for p, names in judgement.ties.items() if p not in weakest},
         )  # fmt: skip
 

@@ -106,12 +106,20 @@ class Selection:
         """Return positions of terms in the groups of which one term has to be sure by itself.
 
         The links' geometry is accused as a whole, the joints' zeros in it: without these a UR10's
-        links stand for them. Everything else, first moments and friction too, goes by joints.
+        links stand for them. Everything else goes by joints: these zeros once more, first moments
+        and friction too.
         """
-        shape = self.observation.channel == "position"
-        whole = tuple(p for p in positions if shape and self.term_index[p] in self.prior)
-        single: list[tuple[int, ...]] = [(p,) for p in positions if p not in whole]
-        return [*single, whole] if whole else single
+        whole = tuple(p for p in positions if self._in_geometry(p))
+        single = [(p,) for p in positions if not self.is_link(p)]
+        return [*single, whole] if whole else list(single)
+
+    def is_link(self, position: int) -> bool:
+        """Return whether a term is of the links' geometry, where that is a cause as a whole."""
+        together = self.space.candidates[self.term_index[position]].effect.together
+        return self._in_geometry(position) and together
+
+    def _in_geometry(self, position: int) -> bool:
+        return self.observation.channel == "position" and self.term_index[position] in self.prior
 
     @cached_property
     def links(self) -> Links | None:

@@ -30,7 +30,7 @@ from gapbridge.core.diagnosis.held_out import HeldOut
 from gapbridge.core.diagnosis.judgement import Judgement, judge, pure_error, still_sure, ties_of
 from gapbridge.core.diagnosis.selection.problem import fit
 from gapbridge.core.diagnosis.selection.selection import Selection
-from gapbridge.core.effects import CATALOGUE, Site, Term
+from gapbridge.core.effects import CATALOGUE, Site, Term, effect_named
 from gapbridge.core.metrology import Metrology
 
 LOGS = ("none", "backlash", "tool_frame", "cross_coupling", "thermal_drift")
@@ -242,6 +242,7 @@ def test_links_as_a_whole_stand_only_where_one_of_them_is_sure(monkeypatch, thir
     found = SimpleNamespace(
         terms=terms, covariance=[np.eye(1), *[1e-8 * np.eye(3)] * 2], term_index=(7, 8, 9),
         prior=dict.fromkeys((8, 9), np.full(3, 5e-4)), block=(8, 9),
+        is_link=lambda p: p > 0, _in_geometry=lambda p: p > 0,
         observation=SimpleNamespace(channel="position"),
     )  # fmt: skip
     found.judged_together = partial(Selection.judged_together, found)
@@ -256,6 +257,29 @@ def test_links_as_a_whole_stand_only_where_one_of_them_is_sure(monkeypatch, thir
     assert judgement.structured == (stays == (0,))
 
 
+@pytest.mark.parametrize(("offset", "stays"), [(2.9e-4, (0, 1)), (3.1e-4, (0, 1, 2))])
+def test_of_joints_zeros_among_the_links_each_has_to_be_sure_by_itself(monkeypatch, offset, stays):
+    """Series of a UR10 and a Motoman named all joints, with not one number over three sigmas."""
+    terms = (
+        Term("link_geometry", Site(2), (1e-3, 1e-3, 1e-3)),
+        Term("joint_offset", Site(1), (1e-3,)),
+        Term("joint_offset", Site(2), (offset,)),
+    )
+    own = (effect_named(t.effect) for t in terms)
+    found = SimpleNamespace(
+        terms=terms, covariance=[1e-8 * np.eye(len(t.values)) for t in terms], term_index=(0, 1, 2),
+        prior=dict.fromkeys(range(3), np.full(3, 5e-4)), block=(0, 1, 2),
+        observation=SimpleNamespace(channel="position"),
+        space=SimpleNamespace(candidates=[SimpleNamespace(effect=e) for e in own]),
+    )  # fmt: skip
+    for name in ("_in_geometry", "is_link", "judged_together", "far_off"):
+        setattr(found, name, partial(getattr(Selection, name), found))
+    monkeypatch.setattr(judging, "refitted_alone", lambda *_: found)
+    _, judgement = still_sure(found, Judgement((0, 1, 2), False, None, (), {}, ()), None)
+    assert judgement.accused == stays
+    assert not judgement.structured
+
+
 @pytest.mark.parametrize(("spread", "held"), [(9e-3, True), (5e-3, False)])
 def test_a_twist_far_from_all_others_has_to_be_sure_by_itself(monkeypatch, spread, held):
     """A WAM's wrist: 41 mrad beside links of 2 mrad, where its joints turn each other. A UR5's
@@ -264,6 +288,7 @@ def test_a_twist_far_from_all_others_has_to_be_sure_by_itself(monkeypatch, sprea
     found = SimpleNamespace(
         terms=(Term("link_geometry", Site(5), tuple(sizes)),), term_index=(4,), block=(4,),
         covariance=[np.diag([1e-4, 1e-4, spread]) ** 2], prior={4: prior}, held={},
+        is_link=lambda p: True, _in_geometry=lambda p: True,
         observation=SimpleNamespace(channel="position"),
     )  # fmt: skip
     again = SimpleNamespace(
