@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.random import Generator
@@ -23,6 +25,8 @@ TORQUE = (
     "payload", "payload_cog", "torque_offset", "stribeck_friction", "load_friction", "link_cog",
 )  # fmt: skip
 TORQUE_OUTSIDE = ("cogging", "warm_friction")
+Move = Callable[[ArmKind, Generator], Motion]
+draw_tracking_motion: Move = partial(draw_motion, swift=1.5)
 
 
 @dataclass(frozen=True)
@@ -52,11 +56,13 @@ def _clock(rng: Generator, seconds: float) -> Array:
     return np.asarray(np.arange(int(seconds * rate)) / rate)
 
 
-def draw_tracking_cell(rng: Generator, seconds: float = 30.0) -> MovingCell:
+def draw_tracking_cell(
+    rng: Generator, seconds: float = 30.0, move: Move = draw_tracking_motion
+) -> MovingCell:
     """Return a cell whose joints follow their commands late."""
     bench = draw_bench(rng, Plan(poses=12, blocks=1), with_rotation=False, compliant=False)
     kind = bench.kind
-    motion, time = draw_motion(kind, rng, swift=1.5), _clock(rng, seconds)
+    motion, time = move(kind, rng), _clock(rng, seconds)
     encoder = 2 * np.pi / 2 ** int(rng.integers(17, 21))
     shake = float(rng.uniform(5e-6, 3e-5))
     candidates: dict[Place, Candidate] = {
@@ -116,12 +122,15 @@ def resting(target: Array, band: Array) -> Array:
     return stand
 
 
-def draw_torque_cell(rng: Generator, seconds: float = 30.0) -> MovingCell:
+def draw_torque_cell(
+    rng: Generator, seconds: float = 30.0, move: Move = draw_motion,
+    knee: tuple[float, float] = (0.04, 0.15),
+) -> MovingCell:  # fmt: skip
     """Return a cell whose joint torques are measured along an exciting motion."""
     arm = str(rng.choice(list(ARMS)))
     bench = draw_bench(rng, Plan(poses=12, blocks=1), arm=arm, with_rotation=False, compliant=False)
     kind, session = bench.kind, bench.session
-    motion, time = draw_motion(kind, rng), _clock(rng, seconds)
+    motion, time = move(kind, rng), _clock(rng, seconds)
     q, qd, qdd = (motion.at(time, k) for k in range(3))
     mass = float(session.payload_mass[0])
     links, carried = torque_shares(
@@ -157,7 +166,7 @@ def draw_torque_cell(rng: Generator, seconds: float = 30.0) -> MovingCell:
         candidates[("link_cog", j)] = Candidate(
             tuple(f"link_cog_{j}_{k}" for k in "xyz"), np.full(3, 0.02 * kind.rows[j - 1].mass), 5
         )
-    slow = peak * rng.uniform(0.04, 0.15, kind.n)  # rad/s, where Stribeck's curve falls
+    slow = peak * rng.uniform(*knee, kind.n)  # rad/s, where Stribeck's curve falls
 
     def read(values: Values) -> Array:
         def of(effect: str, j: int) -> float:

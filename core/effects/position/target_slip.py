@@ -33,7 +33,7 @@ class TargetSlip(Effect):
     motion = "poses before and after the moment, that differ in the orientation of the flange"
     alike: ClassVar = {
         "tool_frame": "no pose before the moment",
-        "joint_slip": "one orientation of the flange after the moment",
+        "joint_slip": "no joint beyond the slipped one moves after the moment",
     }
     of_the_arm = False
     instead = "none needed: a simulated target does not move"

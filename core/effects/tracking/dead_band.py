@@ -30,8 +30,8 @@ class DeadBand(ServoEffect):
     by_approach = True
     motion = "the joint moved both ways, or poses reached from both sides"
     alike: ClassVar = {
-        "latency": "motion at one speed each way",
-        "tracking_lag": "motion at one speed each way",
+        "latency": "motion one way at one speed",
+        "tracking_lag": "motion one way at one speed",
     }
     instead = "in the controller's settings, or a second, limited joint behind each servo"
 
