@@ -21,11 +21,10 @@ MAX_TAKEN = 0.3  # share of a number that directions of the unnamed functions ma
 SEVERAL_AT_A_TIME = 900  # rows of the sample space from which the weakest eighth goes at once,
 HOPELESS = 0.6  # as far as its strength is below this: a matter of time, not of the answer
 MAX_UNNAMED = 6  # unnamed functions asked for at a time: more span the short logs
-VARIES = (
-    1 / 3
-)  # of a number's constant, how far it may go by a quantity: unknowns that an effect is
-# the first order of go by 0.39 to 0.87; lines of a UR10 by quarters of their joint's range: 0.23
-# the one that helps in three later series, 0.39 one that worsens all three
+# of a number's constant, how far it may go by a quantity: unknowns that an effect is the first
+# order of go by 0.39 to 0.87; by quarters of its joint's range goes the UR10's line that helps in
+# three later series by 0.23, one that worsens all three by 0.39
+VARIES = 1 / 3
 # An accusation by itself
 OWN_SIGMAS = 3.0  # of at least one of its numbers: what an engineer calls a finding
 NEGLIGIBLE = 1e-3  # of its parameters' usual sizes: the tail of a servo is a dead band of 5e-9 rad
@@ -38,10 +37,9 @@ TIMES_SET = tuple(2.0**k for k in range(6))  # times an angle of machining, of j
 FEW_LINKS = 3  # joints with a first moment, friction or zero singly, from which all are tried: four
 # logs of a UR10e then agree on what is there, and one moves from 1.07 to 0.97 of base parameters;
 # or with a flexibility: in 33 rows of a soft arm links were accused that do not bend
-CLOSED_SHARE = (
-    1 / 3
-)  # of what is left in every part not fitted: the Motoman cube keeps 0.20 to 0.27, a UR5's grid
-# 0.18 to 0.21, unknown causes 0.42 at least in some part, nearly always all of the gap
+# of what is left in every part not fitted: the Motoman cube keeps 0.20 to 0.27, a UR5's grid 0.18
+# to 0.21, unknown causes 0.42 at least in some part, nearly always all of the gap
+CLOSED_SHARE = 1 / 3
 MIN_GEOMETRIC_CAUSES = 2  # geometric causes from which all links are tried as a whole
 # A residual with structure
 SURE_P = 0.002  # probability below which it is sure: chance says so of one clean log in 500

@@ -55,7 +55,8 @@ from gapbridge.core.diagnosis.noise_floor import (
 from gapbridge.core.diagnosis.observation import NotObservable, Observation, thinned
 from gapbridge.core.diagnosis.residual_structure import dependence
 from gapbridge.core.diagnosis.selection.moments import slips
-from gapbridge.core.diagnosis.selection.selection import Selection, refitted_alone, select
+from gapbridge.core.diagnosis.selection.rounds import select
+from gapbridge.core.diagnosis.selection.selection import Selection, refitted_alone
 from gapbridge.core.diagnosis.separation import Measurement, next_measurements
 from gapbridge.core.effects import CATALOGUE, Term, correcting, flexibility_effects
 from gapbridge.core.errors import LogError
@@ -206,8 +207,8 @@ def _diagnose(
         terms = [_slipped(term, log) for term in terms]
     return Diagnosis(
         _overall(observed), tuple(observed), tuple(hidden),
-        next_measurements(model, log, observed), tuple(notes), with_found(model, terms),
-        with_found(model, _and_stand_ins(observed, terms)),
+        next_measurements(model, log, observed), tuple(notes), model.with_terms(terms),
+        model.with_terms(_and_stand_ins(observed, terms)),
         log.session_names, log.one_clock,
     )  # fmt: skip
 
@@ -278,11 +279,6 @@ def _thinned(
     part = observe(model, replace(log, columns=columns).select(seen.rows[take]), metrology)
     assert isinstance(part, Observation)
     return replace(part, rows=seen.rows[take])
-
-
-def with_found(model: Model, terms: Sequence[Term]) -> Model:
-    """Return the model with found terms added."""
-    return model.with_terms(terms)
 
 
 def _for_the_model(channels: Sequence[ChannelDiagnosis]) -> list[Term]:

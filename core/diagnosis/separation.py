@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -258,14 +259,11 @@ def _positions(model: Model, trials: Trials) -> Predict:
     return lambda terms: model.with_terms(terms).predict(trials.q, trials.loads).position
 
 
-def _wrenches(model: Model, trials: Trials) -> Predict:
+def _loads_of_motion(
+    predict: Callable[[Model, Motion, Sequence[Term]], Array], model: Model, trials: Trials
+) -> Predict:
     motion = with_pieces(model, _motion(model, trials))
-    return lambda terms: predict_wrench(model, motion, terms)
-
-
-def _torques(model: Model, trials: Trials) -> Predict:
-    motion = with_pieces(model, _motion(model, trials))
-    return lambda terms: predict_torque(model, motion, terms)
+    return lambda terms: predict(model, motion, terms)
 
 
 def _motion(model: Model, trials: Trials) -> Motion:
@@ -304,7 +302,7 @@ def _followings(model: Model, trials: Trials) -> Predict:
 
 PREDICTED: dict[str, Callable[[Model, Trials], Predict]] = {
     "position": _positions,
-    "wrench": _wrenches,
+    "wrench": partial(_loads_of_motion, predict_wrench),
     "tracking": _followings,
-    "torque": _torques,
+    "torque": partial(_loads_of_motion, predict_torque),
 }

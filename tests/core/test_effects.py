@@ -2,6 +2,8 @@
 
 import importlib
 import inspect
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -157,3 +159,14 @@ def test_what_no_simulator_holds_says_what_to_do_instead(name):
     in_chain = type(effect).shape is not Effect.shape
     asked = type(effect).simulator is not Effect.simulator
     assert in_chain or asked or effect.simulated_as or effect.instead
+
+
+def test_each_effect_stands_on_the_page_of_conventions_in_the_order_in_which_it_acts():
+    page = (Path(__file__).parents[2] / "docs" / "conventions.md").read_text(encoding="utf-8")
+    table = page[page.index("## Signs") : page.index("## Torques and wrenches")]
+    rows = [line.split("|")[1] for line in table.splitlines() if line.startswith("| `")]
+    named = [name for row in rows for name in re.findall(r"`(\w+)`", row)]
+    assert sorted(named) == sorted(CATALOGUE)
+    for channel in ("wrench", "tracking", "torque"):
+        orders = [CATALOGUE[n].order for n in named if channel in CATALOGUE[n].channels]
+        assert orders == sorted(orders)

@@ -19,8 +19,8 @@ STRETCHES = 24  # conditions of a recording: even stretches of time
 FEWEST_CONDITIONS = 5
 SMALLEST_TORQUE = 1e-3  # Nm
 HARDLY = 1e-3  # share of the largest held torque by which one has to change to count
-OVER_REPEAT_SCATTER = 0.5  # distinct values over samples below which a signal comes in steps
-VARIES = 1e-9  # spread below which a quantity counts as constant
+STEPPED_SHARE = 0.5  # distinct values over samples below which a signal comes in steps
+CONSTANT_SPREAD = 1e-9  # spread below which a quantity counts as constant
 
 
 def subsampled(usable: NDArray[np.bool_], most: int = MOST_SAMPLES) -> Index:
@@ -74,7 +74,7 @@ def varying(columns: Mapping[str, Array | None]) -> dict[str, Array]:
             continue
         table = values.reshape(len(values), -1)
         for i in range(table.shape[1]):
-            if np.isfinite(table[:, i]).all() and np.ptp(table[:, i]) > VARIES:
+            if np.isfinite(table[:, i]).all() and np.ptp(table[:, i]) > CONSTANT_SPREAD:
                 found[name if values.ndim == 1 else f"{name}_{i}"] = table[:, i]
     return found
 
@@ -109,7 +109,7 @@ def signal_step(signal: Array) -> Array:
     for j, values in enumerate(signal.T):
         distinct = np.unique(values)
         # a continuous signal repeats no value; a stepped one has far fewer values than samples
-        if 2 < len(distinct) < OVER_REPEAT_SCATTER * len(values):
+        if 2 < len(distinct) < STEPPED_SHARE * len(values):
             steps[j] = float(np.diff(distinct).min())
     return steps
 

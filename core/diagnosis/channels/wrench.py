@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from gapbridge.core.arrays import Array
 from gapbridge.core.derivatives import signal_noise
 from gapbridge.core.diagnosis.channels.recording import (
-    VARIES,
+    CONSTANT_SPREAD,
     conditions,
     instrument_noise,
     quantities,
@@ -89,7 +89,7 @@ def _observed(
 def _readings(wrench: Array) -> dict[str, Array]:
     """Return the expected readings (N, 6) as quantities: a bad sensor errs by what it carries."""
     spread = np.ptp(wrench, axis=0)
-    return {f"ft_raw_wrench_{i}": wrench[:, i] for i in np.flatnonzero(spread > VARIES)}
+    return {f"ft_raw_wrench_{i}": wrench[:, i] for i in np.flatnonzero(spread > CONSTANT_SPREAD)}
 
 
 def torque_weight(noise: Array, wrench: Array) -> float:

@@ -18,6 +18,7 @@ from gapbridge.core.diagnosis.log_checks.kinematics import (
     other_arms,
     other_models,
 )
+from gapbridge.core.diagnosis.log_checks.signs import spread_of
 from gapbridge.core.errors import InputError
 from gapbridge.core.estimation.registration import register_robustly
 from gapbridge.core.log.log import Log
@@ -103,7 +104,7 @@ def _mistakes(
         inside = inside[np.isfinite(measured[inside + step]).all(axis=1)]
         yield LogFinding(check), model, q[inside], measured[inside + step]
     predicted = model.rigid_pose(q[rows]).position
-    size = _size(seen) / max(_size(predicted), 1e-9)
+    size = spread_of(seen) / max(spread_of(predicted), 1e-9)
     for unit, factor in (("centimetres", 100.0), ("inches", 1 / 0.0254), ("feet", 1 / 0.3048)):
         if 0.82 < size / factor < 1.22:
             yield LogFinding(LogCheck.LENGTH_UNIT, (unit,)), model, q[rows], seen / factor
@@ -119,10 +120,6 @@ def _mistakes(
     if found is None or not np.isfinite(found).all():
         found = rotation_vector(np.swapaxes(model.rigid_pose(q[rows]).rotation, 1, 2))
     yield LogFinding(LogCheck.INVERTED), model, q[rows], inverted(seen, found)
-
-
-def _size(position: Array) -> float:
-    return float(np.median(np.linalg.norm(position - np.median(position, axis=0), axis=1)))
 
 
 def _rotations(

@@ -142,7 +142,7 @@ def _predicted(
     return how(replace(model, terms=()), motion)
 
 
-def _spread(values: Array) -> float:
+def spread_of(values: Array) -> float:
     """Return how far values (N, k) scatter about a constant."""
     return float(np.median(np.linalg.norm(values - np.median(values, axis=0), axis=1)))
 
@@ -161,7 +161,7 @@ def _sensed(name: str) -> Callable[[Model, Log, Array, Array], LogCheck | None]:
         left = {}
         for check, variant in _variants(model, q[pulled], pull[pulled]).items():
             predicted = _predicted(model, log, q, name, variant, pulled)
-            left[check] = _spread(column[pulled] - predicted)
+            left[check] = spread_of(column[pulled] - predicted)
         return _best(left)
 
     return judge
@@ -177,5 +177,5 @@ def _reads_turned_round(model: Model, log: Log, q: Array, name: str) -> bool:
     if len(rows) < FEWEST:
         return False
     expected = _predicted(model, log, q, name, None if pull is None else pull[rows], rows)
-    asked, other = (_spread(sign * column[rows] - expected) for sign in (1.0, -1.0))
-    return _spread(expected) >= LEAST and other <= HALF * asked
+    asked, other = (spread_of(sign * column[rows] - expected) for sign in (1.0, -1.0))
+    return spread_of(expected) >= LEAST and other <= HALF * asked

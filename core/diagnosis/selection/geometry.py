@@ -236,7 +236,7 @@ def _geometric(candidate: Candidate) -> bool:
 
 def _of_mass(candidate: Candidate) -> bool:
     """Return whether a link's numbers are first moments: one link can well be off alone."""
-    return any(p.unit == "kg m" for p in candidate.parameters)
+    return candidate.effect.carried
 
 
 def _beside_set(space: SampleSpace, rest: Sequence[int], links: Links) -> float:

@@ -17,7 +17,7 @@ from gapbridge.core.diagnosis.observation import Observation
 from gapbridge.core.estimation.nelder_mead import nelder_mead
 from gapbridge.core.estimation.robust import scale_of
 
-LARGE_SAMPLE = 150  # samples from which every coordinate is taken to scatter alike
+ALIKE_SAMPLES = 150  # samples from which every coordinate is taken to scatter alike
 ENOUGH = 400  # samples from which the sizes are estimated
 
 
@@ -49,7 +49,7 @@ def estimate_noise(
     block = blocks(observation)
     count = int(block.max()) + 1
     # a large log is asked for many causes: joint noise would swallow those not yet found
-    J = observation.joint_columns if len(kept) < LARGE_SAMPLE else None
+    J = observation.joint_columns if len(kept) < ALIKE_SAMPLES else None
     use = np.flatnonzero(kept)
     if len(use) > ENOUGH:
         use = use[:: len(use) // ENOUGH + 1]

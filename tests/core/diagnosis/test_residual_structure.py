@@ -60,16 +60,6 @@ def test_what_the_frame_takes_up_is_no_structure():
     )
 
 
-def test_structure_in_some_rows_shows_in_those_alone():
-    mixed = space(4)
-    odd = np.arange(ROWS) % 2 == 1
-    y = mixed.y + np.where(odd, mixed.columns([TIME]) @ np.full(4, 1.5), 0.0)
-    mixed = replace(mixed, y=y)
-    none = np.zeros((ROWS, 0))
-    assert structure_p_value(mixed, none, (), rows=odd) < 0.002
-    assert structure_p_value(mixed, none, (), rows=~odd) > 0.02
-
-
 @settings(max_examples=15, deadline=None)
 @given(seed=st.integers(0, 999), planted=st.sampled_from([3, 4, 5, TIME]))
 def test_what_the_residual_depends_on_comes_first(seed, planted):
