@@ -9,10 +9,13 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Literal, NamedTuple
 
+from gapbridge.core.state import RobotState
+
 POWER_OFF, IDLE, RUNNING = 3, 5, 7  # robot_mode
 NORMAL, REDUCED, PROTECTIVE_STOP, EMERGENCY_STOP, FAULT = 1, 2, 3, 7, 9  # safety_mode
 STOPPED = 1 << 10
-
+STOPS = 0b111_1111_1100  # safety_status_bits: all but normal and reduced mode
+PLAYING = 2  # runtime_state
 
 Trouble = Literal["not_ready", "protective_stop", "emergency_stop", "fault"]
 """What keeps a robot from moving, as profiles name it."""
@@ -34,6 +37,15 @@ MODES: dict[str, Modes] = {
     "fault": Modes(RUNNING, FAULT, 1 << 9 | STOPPED),
 }
 """Trouble, as profiles name it -> what every driver reports."""
+
+
+def why_not_ready(state: RobotState) -> str:
+    """Return in words what keeps the robot from moving; empty: nothing does."""
+    stops = state.safety_status_bits & STOPS
+    if state.robot_mode == RUNNING and state.safety_mode in (NORMAL, REDUCED) and not stops:
+        return ""
+    detail = f"robot_mode {state.robot_mode}, safety_mode {state.safety_mode}"
+    return f"{detail}, safety_status_bits {state.safety_status_bits:#b}" if stops else detail
 
 
 def modes_of(troubles: Iterable[str]) -> Modes:

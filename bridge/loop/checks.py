@@ -16,11 +16,8 @@ from gapbridge.core.arrays import Array
 from gapbridge.core.limits import ENVELOPE, JOINT_LIMIT, JOINT_OFFSET
 from gapbridge.core.state import RobotState
 from gapbridge.drivers.driver import Driver
-from gapbridge.drivers.robot_modes import NORMAL, REDUCED, RUNNING
+from gapbridge.drivers.robot_modes import PLAYING, why_not_ready
 
-SAFE = (NORMAL, REDUCED)  # safety_mode
-STOPS = 0b111_1111_1100  # safety_status_bits: all but normal and reduced mode
-PLAYING = 2  # runtime_state
 SLOWED = 0.95  # speed_scaling: slower, an arm that we move falls behind its setpoints
 FASTEST = 2.0  # speed_scaling: more is a mistake
 LONG_GAP = 10.0  # cycles: after a longer one, what was before means nothing
@@ -174,8 +171,7 @@ class LoopChecks:
         self._settings_at = -1.0  # s, controller clock: of the next look
         self._lasting: set[Count] = set()
         self._last: float | None = None  # s, controller clock
-        self.fine = False  # the robot can move
-        self.robot = ""  # what is wrong with it
+        self.not_ready = "no state has been read"  # why the robot cannot move; empty: it can
 
     def forget(self) -> None:
         """Begin anew: the loop did something else meanwhile."""
@@ -202,7 +198,8 @@ class LoopChecks:
             self._judge(Count.OVERRUN, self._overrun.update(state.timestamp, missed), Cause.OVERRUN)
         self._judge(Count.SENSOR_LOST, state.sensor_lost or None, None)
         self.rate.take(state.timestamp)
-        self._check_robot(state)
+        self.not_ready = why_not_ready(state)
+        self._judge(Count.UNSAFE, self.not_ready or None, Cause.UNSAFE)
         self._check_following(state)
         return flags
 
@@ -229,19 +226,6 @@ class LoopChecks:
         # its own work only: what a controller sends late or never is the link's affair
         detail = self._overrun.update(state.timestamp, int(duration / self._period))
         self._judge(Count.OVERRUN, detail, Cause.OVERRUN)
-
-    def _check_robot(self, state: RobotState) -> None:
-        """Take note of a robot that cannot move."""
-        stops = state.safety_status_bits & STOPS
-        self.fine = state.robot_mode == RUNNING and state.safety_mode in SAFE and not stops
-        if self.fine:
-            self.robot = ""
-            self._lasting.discard(Count.UNSAFE)
-            return
-        self.robot = f"robot_mode {state.robot_mode}, safety_mode {state.safety_mode}"
-        if stops:
-            self.robot += f", safety_status_bits {state.safety_status_bits:#b}"
-        self._judge(Count.UNSAFE, self.robot, Cause.UNSAFE)
 
     def _check_following(self, state: RobotState) -> None:
         """Hold where the robot's program does not play, or plays slower than we move the arm."""

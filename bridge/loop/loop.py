@@ -165,8 +165,8 @@ class Loop:
         """Arm where a robot is that can move, and nothing that waits for a person."""
         if self._supervisor.state == State.FAULT:
             detail = "a fault is latched: acknowledge it first (gapbridge disarm)"
-        elif not self._checks.fine:
-            detail = f"the robot is not ready: {self._checks.robot}"
+        elif self._checks.not_ready:
+            detail = f"the robot is not ready: {self._checks.not_ready}"
         elif not_ready := self._not_ready():
             detail = not_ready
         else:
@@ -301,7 +301,8 @@ class Loop:
 
     def _acknowledge(self) -> None:
         """Leave a fault that a person has acknowledged, once the robot is fine."""
-        if self._acknowledged and self._supervisor.state == State.FAULT and self._checks.fine:
+        fault = self._supervisor.state == State.FAULT
+        if self._acknowledged and fault and not self._checks.not_ready:
             self._acknowledged = False
             self._supervisor.take(Cause.ACKNOWLEDGED)
 

@@ -24,7 +24,7 @@ from gapbridge.drivers.modbus.settings import ModbusSettings
 from gapbridge.drivers.modbus.transport import Transport
 from gapbridge.drivers.modbus.write import make_writer
 from gapbridge.drivers.offset_inverse import Nominal
-from gapbridge.drivers.robot_modes import NORMAL, REDUCED, RUNNING, modes_of
+from gapbridge.drivers.robot_modes import modes_of, why_not_ready
 
 SLOW_EVERY = 0.2  # s between two readings of conditions that lie apart
 LONGEST_ANSWER, LEAST_ANSWER = 4.0, 0.03  # cycles, s: an older answer is not fresh
@@ -219,7 +219,7 @@ class ModbusDriver(Driver):
         """Check robot and resolution, and make ready for writing; moves nothing."""
         name = self.transport.name
         if self.profile.write.mode != "read_only":
-            if state.robot_mode != RUNNING or state.safety_mode not in (NORMAL, REDUCED):
+            if why_not_ready(state):
                 problem = (
                     "; ".join(text for _, text in self._sample.troubles) if self._sample else ""
                 )

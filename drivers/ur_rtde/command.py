@@ -17,14 +17,13 @@ import numpy as np
 from gapbridge.core.errors import WriteError
 from gapbridge.core.state import RobotState, Setpoint
 from gapbridge.drivers.clock import SYSTEM, Clock
+from gapbridge.drivers.robot_modes import PLAYING, why_not_ready
 from gapbridge.drivers.ur_rtde import registers
 from gapbridge.drivers.ur_rtde.allowed import AllowedControl, AllowedInputs
 from gapbridge.drivers.ur_rtde.no_delay import send_at_once
 from gapbridge.drivers.ur_rtde.registers import Program
 from gapbridge.drivers.ur_rtde.settings import UrRtdeSettings
 
-ROBOT_RUNNING, PLAYING = 7, 2
-SAFE = (1, 2)  # safety_mode: normal, reduced
 NO_REMOTE_CHECK = 0x80  # FLAG_DISABLE_REMOTE_CONTROL_CHECK
 KICK = 0.02  # s between kicks of the watchdog
 FOLLOWING = 0.02  # rad: how near the controller's target must come to a setpoint
@@ -58,13 +57,10 @@ kept until its end, which must be ``os._exit``."""
 
 def check_ready(host: str, state: RobotState) -> None:
     """Refuse a robot that cannot move. Raises WriteError."""
-    if state.robot_mode != ROBOT_RUNNING:
+    if detail := why_not_ready(state):
         raise WriteError(
-            f"{host}: robot_mode: found {state.robot_mode}, expected {ROBOT_RUNNING} (running)"
-        )
-    if state.safety_mode not in SAFE:
-        raise WriteError(
-            f"{host}: safety_mode: found {state.safety_mode}, expected 1 (normal) or 2 (reduced)"
+            f"{host}: found {detail}, expected robot_mode 7 (running), safety_mode 1 (normal) or "
+            "2 (reduced), and no stop"
         )
 
 

@@ -23,7 +23,7 @@ from gapbridge.bridge.daemon.control import Control
 from gapbridge.bridge.daemon.processes import LoopProcess
 from gapbridge.bridge.daemon.status import DaemonStatus
 from gapbridge.bridge.ipc.command_page import Command, Commands
-from gapbridge.bridge.loop.checks import LoopChecks
+from gapbridge.bridge.loop import checks
 from gapbridge.bridge.loop.link_monitor import ControllerClock, LinkMonitor
 from gapbridge.bridge.loop.loop import Loop
 from gapbridge.bridge.loop.supervisor import Cause, State, Supervisor
@@ -222,10 +222,7 @@ def _writes_whenever_it_reads(patch: Patch) -> None:
 
 
 def _sees_no_stop(patch: Patch) -> None:
-    def check(self: Any, state: Any) -> None:
-        self.fine, self.robot = True, ""
-
-    patch.setattr(LoopChecks, "_check_robot", check)
+    patch.setattr(checks, "why_not_ready", lambda _: "")
     patch.setattr(OffsetWriter, "unanswered_since", lambda _: math.inf)
 
 

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
+
 import numpy as np
 import pytest
 
 from gapbridge.core.arm import builtin_arm
-from gapbridge.core.errors import Implausible, InvalidStateError
+from gapbridge.core.errors import Implausible, InvalidStateError, WriteError
 from gapbridge.core.state import RobotState
-from gapbridge.drivers.robot_modes import MODES, modes_of
+from gapbridge.drivers.robot_modes import MODES, modes_of, why_not_ready
 from gapbridge.drivers.simulated.ur.modes import SAFETY_BITS
 from gapbridge.drivers.state_check import BEYOND, FASTEST, HASTE, JITTER, SampleCheck
+from gapbridge.drivers.ur_rtde.command import check_ready
 
 ARM = builtin_arm("ur10e")
 
@@ -27,6 +30,18 @@ def test_of_several_troubles_the_gravest_counts_and_no_bit_is_lost() -> None:
     assert (both.robot_mode, both.safety_mode) == (5, 9)
     assert both.safety_status_bits == 1 << 2 | 1 << 9 | 1 << 10
     assert modes_of([]) == MODES[""]
+
+
+@pytest.mark.parametrize("bit", range(11))
+def test_a_stop_in_the_safety_bits_alone_keeps_every_driver_from_arming(bit: int) -> None:
+    normal = state(np.zeros(6))
+    found = normal._replace(safety_status_bits=1 | 1 << bit)
+    ready = bit < 2  # normal and reduced mode
+    assert bool(why_not_ready(found)) != ready
+    with nullcontext() if ready else pytest.raises(WriteError, match="safety_status_bits"):
+        check_ready("the robot", found)
+    assert "robot_mode 5" in why_not_ready(normal._replace(robot_mode=5))
+    assert "safety_mode 9" in why_not_ready(normal._replace(safety_mode=9))
 
 
 def state(q: np.ndarray, at: float = 0.0) -> RobotState:

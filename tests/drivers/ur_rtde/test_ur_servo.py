@@ -93,7 +93,7 @@ def test_a_protective_stop_refuses_the_next_setpoint(controller: SimulatedContro
     )
     assert str(out["error"]).startswith("WriteError: ")
     assert out["after"] < 50  # type: ignore[operator]
-    assert "safety_mode: found 3" in str(out["rearm"])
+    assert "found robot_mode 7, safety_mode 3" in str(out["rearm"])
 
 
 @pytest.mark.slow
