@@ -19,7 +19,7 @@ from gapbridge.core.diagnosis.finding import Check, Withdrawal
 from gapbridge.core.diagnosis.held_out import HeldOut
 from gapbridge.core.diagnosis.judgement import Judgement, judge, judge_geometry, still_sure
 from gapbridge.core.diagnosis.remainder import closes_everywhere, withstanding
-from gapbridge.core.diagnosis.selection import selection
+from gapbridge.core.diagnosis.selection import rounds
 from gapbridge.core.diagnosis.selection.candidate import named_candidates, with_what_it_needs
 from gapbridge.core.diagnosis.selection.refit import Remainder, _cluster_covariance, worth
 from gapbridge.core.effects import CATALOGUE, Site, Term
@@ -294,12 +294,12 @@ def test_what_the_exact_refit_takes_back_gives_its_place_to_another(monkeypatch)
     real = small.turned(2, lambda s, q: np.full(len(q), -4.5e-4))
     log = small.log_of(one_sided, small.readings(real, one_sided, 3))
     seen = observe_position(small.model_of(), log, Metrology(registered=True, sigma=small.SIGMA))
-    (first,) = selection.select(seen, small.model_of()).terms
+    (first,) = rounds.select(seen, small.model_of()).terms
 
     def worthless(term, spread):
         return 0.0 if term.effect == first.effect else worth(term, spread)
 
-    monkeypatch.setattr(selection, "worth", worthless)
-    (instead,) = selection.select(seen, small.model_of()).terms
+    monkeypatch.setattr(rounds, "worth", worthless)
+    (instead,) = rounds.select(seen, small.model_of()).terms
     assert {first.effect, instead.effect} == {"joint_offset", "backlash"}
     assert instead.site.joint == 2
