@@ -137,12 +137,17 @@ def still_accused(
 def _sure(selection: Selection, judgement: Judgement, alone: Alone) -> tuple[Selection, Judgement]:
     """Return what stays: values of three sigmas, of what was vague on some rows of many.
 
-    Of the links, accused as a whole, one term at least has to be sure. The weakest goes first, by
-    its own evidence: of two that can stand for each other the one with more of it is judged last.
+    Of the links, accused as a whole, one term at least has to be sure, and no number far off that
+    is not. The weakest goes first, by its own evidence: of two that can stand for each other the
+    one with more of it is judged last.
     """
     accused, withdrawn = list(judgement.accused), list(judgement.withdrawn)
-    least = dict.fromkeys(judgement.vague, (SIGMAS / OWN_SIGMAS) ** 2)
+    beside_links = {p for p in accused if p in selection.prior}  # of known size: three sigmas do
+    least = dict.fromkeys(set(judgement.vague) - beside_links, (SIGMAS / OWN_SIGMAS) ** 2)
     while True:
+        if far := selection.far_off(accused):
+            selection = alone(selection.with_nominal(far), accused)
+            continue
         sure = {p: worth(selection.terms[p], selection.covariance[p]) for p in accused}
         unsure = [
             kind for kind in selection.judged_together(accused)
