@@ -26,6 +26,8 @@ SCALE = {"m": (1e3, "mm"), "rad": (1e3, "mrad"), "N": (1.0, "N"), "Nm": (1.0, "N
               help="Only this half.")  # fmt: skip
 @click.option("--carried/--no-carried", default=True, help="Also carry answers to later logs.")
 @click.option("--command", default="gapbridge", show_default=True, help="The program to judge.")
+@click.option("--draw", type=int, default=0, show_default=True,
+              help="Seed of the poses that are judged; of a recording it is its end.")  # fmt: skip
 @click.option("--stand-ins", "stand_ins", is_flag=True,
               help="Judge the model with stand-ins, not accusations alone.")  # fmt: skip
 @click.option("--json", "file", type=click.Path(path_type=Path), default=None,
@@ -36,6 +38,7 @@ def main(
     split: str | None,
     carried: bool,
     command: str,
+    draw: int,
     stand_ins: bool,
     file: Path | None,
 ) -> None:
@@ -60,7 +63,7 @@ def main(
 
     program = Program(command, stand_ins)
     jobs: list[tuple[str, Iterable[Outcome]]] = []
-    jobs += [(name, judge_log(found[name], program)) for name in found if chosen(name)]
+    jobs += [(name, judge_log(found[name], program, draw)) for name in found if chosen(name)]
     for first in dict.fromkeys(a for a, _ in CARRIED) if carried else ():
         later = [found[b] for a, b in CARRIED
                  if a == first and {a, b} <= set(found) and chosen(f"{a} > {b}")]  # fmt: skip

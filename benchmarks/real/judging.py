@@ -112,10 +112,10 @@ class Answer:
     seconds: float
 
 
-def judge_log(folder: Path, program: Program) -> Iterator[Outcome]:
-    """Yield the outcomes of one log: four fifths fitted, one fifth judged."""
+def judge_log(folder: Path, program: Program, draw: int = 0) -> Iterator[Outcome]:
+    """Yield the outcomes of one log: four fifths fitted, one fifth (drawn by a seed) judged."""
     table = read_table(folder / "log.csv").with_approach()
-    fitted, judged = (table.rows(keep) for keep in halves(table))
+    fitted, judged = (table.rows(keep) for keep in halves(table, draw))
     with tempfile.TemporaryDirectory(prefix="real-") as scratch:
         answer = _answer(folder, fitted, Path(scratch), program)
         yield from _judge(folder.name, answer, judged, program)

@@ -95,10 +95,11 @@ def judge(selection: Selection, held: HeldOut) -> Judgement:
         c for c in selection.term_index if c not in withdrawn and c not in selection.block
     ]  # fmt: skip
     stays, remainder = withstanding(selection, believed)
+    while varying := not_constant(selection, stays, remainder.columns):
+        withdrawn |= {c: Withdrawal(Check.CONSTANT, by) for c, by in varying.items()}
+        believed = [c for c in believed if c not in varying]
+        stays, remainder = withstanding(selection, believed)
     withdrawn |= {c: BESIDE for c in believed if c not in stays}
-    for c, quantity in not_constant(selection, stays, remainder.columns).items():
-        withdrawn[c] = Withdrawal(Check.CONSTANT, quantity)
-        stays.remove(c)
     for c in _without_companion(selection, stays):
         withdrawn[c] = Withdrawal(Check.COMPANION)
         stays.remove(c)

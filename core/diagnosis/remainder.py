@@ -8,13 +8,14 @@ region of the log. The weakest goes first, and what it took is then left for the
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gapbridge.core.arrays import Array
 from gapbridge.core.diagnosis.criteria import (
+    CLOSED_IN_A_PART,
     CLOSED_SHARE,
     DEGENERATE,
     FURTHER,
@@ -47,20 +48,24 @@ def withstanding(selection: Selection, believed: Sequence[int]) -> tuple[list[in
 
     Where all links are a cause the tool's point is one more number of the same geometry: hardly
     ever sure beside unnamed functions, it is judged by what it does in regions that its fit did not
-    see. Until then it stays: without it nothing else would keep its value.
+    see. Until then it stays: without it nothing else would keep its value. So does what it takes to
+    close the gap everywhere.
     """
     remainder = _Beside(selection)
     accused = list(believed)
     point = _tool_point(selection, accused)
+    closing = _Closing(selection)
     while accused:
         strength = remainder.strengths(accused)
-        strength[[c in point for c in accused]] = np.inf
+        strength[[c in point or c in closing.needed for c in accused]] = np.inf
         if strength.min() >= 1:
             break
         out = {int(np.argmin(strength))}
         if len(remainder.space.y) > SEVERAL_AT_A_TIME:
             worst = np.argsort(strength)[: max(1, len(accused) // 8)]
             out |= {int(i) for i in worst if strength[i] < HOPELESS}
+        if closing.takes(accused, [accused[i] for i in sorted(out)]):
+            continue
         accused = [c for i, c in enumerate(accused) if i not in out]
         sized = selection.sized_beside(accused)
         if sized is not selection:
@@ -96,6 +101,41 @@ def _gains(selection: Selection, stays: Sequence[int], point: Sequence[int]) -> 
     held = HeldOut(selection, parts=parts(selection.observation, selection.kept))
     rest = [*stays, *selection.block]
     return held.possible and held.shrink([*rest, *point], rest).interval[0] > STAND_IN_GAIN
+
+
+class _Closing:
+    """Whether accusations close the gap in every part of a log, and which of them that takes.
+
+    Each part is predicted by a fit that did not see it. Causes that show only together (a tool and
+    what bends under it) leave each other no value that is sure beside unnamed functions; what
+    imitates an unknown closes its gap in some parts, not in all. Periodic lines are not asked: a
+    line has the phase that suits a shape.
+    """
+
+    def __init__(self, selection: Selection) -> None:
+        self.needed: set[int] = set()
+        self._block, self._candidates = selection.block, selection.space.candidates
+        self._part = parts(selection.observation, selection.kept)
+        self._held = HeldOut(selection, parts=self._part)
+        self._closes = self._held.possible  # until accusations are found that do not
+
+    def takes(self, accused: Sequence[int], out: Iterable[int]) -> bool:
+        """Return whether closing the gap takes one of ``out``, which is then among the needed."""
+        self._closes = self._closes and self._closed(accused)
+        for c in out if self._closes else ():
+            rest = [o for o in accused if o != c]
+            if not (self._candidates[c].periodic or self._closed(rest)):
+                self.needed.add(c)
+                return True
+        return False
+
+    def _closed(self, accused: Sequence[int]) -> bool:
+        left, gap = (
+            np.bincount(self._part, self._held.squares(chosen))
+            for chosen in ([*accused, *self._block], self._block)
+        )
+        worst = float(np.max(left[gap > 0] / gap[gap > 0], initial=0.0))
+        return left.sum() <= CLOSED_SHARE**2 * gap.sum() and worst <= CLOSED_IN_A_PART**2
 
 
 def closes_everywhere(selection: Selection, accused: Sequence[int]) -> bool:
