@@ -8,6 +8,7 @@ import numpy as np
 
 from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.tool_session import NAMES, touch_columns
+from gapbridge.core.effects import CATALOGUE
 from gapbridge.core.errors import ExcitationError
 from gapbridge.core.model import Model
 from gapbridge.core.planning.payload_plan import ROOM, greedy, tour
@@ -81,7 +82,7 @@ def _candidates(model: Model, begin: Array, rng: np.random.Generator) -> Array:
 def _reach(model: Model, q: Array, position: Array, rotation: Array) -> Array | None:
     """Return joint angles of a pose, near ``q``; None where Newton's steps do not get there."""
     q = q.copy()
-    rigid = replace(model, terms=tuple(t for t in model.terms if "compliance" not in t.effect))
+    rigid = replace(model, terms=tuple(t for t in model.terms if not CATALOGUE[t.effect].softens))
     for _ in range(ROUNDS):
         pose = rigid.predict(q)
         error = np.concatenate(
