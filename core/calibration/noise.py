@@ -17,6 +17,7 @@ from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.observables.nuisance import Nuisance
 from gapbridge.core.calibration.observables.observable import Observable
 from gapbridge.core.calibration.readings import Readings
+from gapbridge.core.estimation.least_squares import inverse
 from gapbridge.core.metrology import Metrology
 from gapbridge.core.model import Model
 
@@ -169,11 +170,7 @@ def _likelihood(
     V = sum(np.exp(one) * shape for one, shape in zip(t, shapes, strict=True))
     W = np.linalg.inv(np.linalg.cholesky(V))
     Xw = (W @ X).reshape(N * k, p)
-    size = np.maximum(np.linalg.norm(Xw, axis=0), np.sqrt(precision))
-    size = np.where(size > 0, size, 1.0)
-    Xw, held = Xw / size, precision / size**2
-    inner = Xw.T @ Xw + np.diag(held)
-    core = np.linalg.pinv(inner, rcond=1e-13, hermitian=True)
+    core = inverse(Xw.T @ Xw + np.diag(precision))
     yw = (W @ y[..., None]).reshape(-1)
     Py = yw - Xw @ (core @ (Xw.T @ yw))
     P = np.eye(N * k) - Xw @ core @ Xw.T
