@@ -11,7 +11,7 @@ from gapbridge.core.arm import Arm, JointLimits, arm_from_dh, builtin_arm
 from gapbridge.core.calibration.plan import Payload
 from gapbridge.core.model import Model
 from gapbridge.core.planning.capsules import Box
-from gapbridge.core.planning.workspace import Place, Reflector, Space, reach
+from gapbridge.core.planning.workspace import Place, Reflector, Space
 from gapbridge.core.rotation import rotation_matrix
 
 Array = NDArray[np.float64]
@@ -52,7 +52,7 @@ def _loads(arm: Arm, random: np.random.Generator) -> tuple[Payload, ...]:
 
 def _room(model: Model, random: np.random.Generator) -> Space:
     """Return a floor, a box and a tracker that sees a reflector within a cone."""
-    long = reach(model)
+    long = model.length
     angle, far = random.uniform(-np.pi, np.pi), random.uniform(1.5, 3.0) * long
     place = (far * np.cos(angle), far * np.sin(angle), random.uniform(0.2, 1.0) * long)
     middle = random.uniform(-np.pi, np.pi)

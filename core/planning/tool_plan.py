@@ -11,7 +11,8 @@ from gapbridge.core.calibration.tool_session import NAMES, touch_columns
 from gapbridge.core.effects import CATALOGUE
 from gapbridge.core.errors import ExcitationError
 from gapbridge.core.model import Model
-from gapbridge.core.planning.payload_plan import ROOM, greedy, tour
+from gapbridge.core.planning.payload_plan import ROOM, greedy
+from gapbridge.core.planning.travel import in_order
 from gapbridge.core.rotation import rotation_matrix, rotation_vector
 
 CANDIDATES = 80
@@ -60,7 +61,7 @@ def plan_tool(
             "tool session: the arm cannot turn the tool far enough about that point within its "
             "joint limits; expected a point in front of the arm, tool pointing down"
         )
-    return ToolPlan(tuple(tour(begin, reached[chosen])), NAMES, std, tuple(bought))
+    return ToolPlan(tuple(in_order(reached[chosen], begin)), NAMES, std, tuple(bought))
 
 
 def _candidates(model: Model, begin: Array, rng: np.random.Generator) -> Array:

@@ -22,6 +22,7 @@ from gapbridge.core.planning.capsules import Box, Capsules, below, hidden, in_bo
 
 THICK = 0.035  # of the arm's stretched length: radius of a link
 TOOL_THICK = 0.03  # of the same: tool and loads
+SHORTEST = 1e-3  # m: an arm without length divides nothing by zero
 NEAR_SINGULAR = 0.01  # smallest singular value of the Jacobian, lengths in stretched lengths
 FURTHEST_TURN = np.pi  # rad from zero, where the limits allow more: cables need not wind up
 
@@ -119,8 +120,8 @@ class Space:
                     f"keep-out box {number}: found lower {box.lower} and upper {box.upper}, "
                     "expected lower below upper in x, y and z"
                 )
-        stretched = reach(model)
-        radius = np.full(model.arm.n + 1, THICK * stretched)
+        length = max(model.length, SHORTEST)
+        radius = np.full(model.arm.n + 1, THICK * length)
         seen = reflector or Reflector()
         points = np.atleast_2d(np.array(seen.targets, dtype=float))
         axes = None
@@ -129,7 +130,7 @@ class Space:
             axes = axes / np.linalg.norm(axes, axis=1, keepdims=True)
         space = cls(
             model, low, high, tuple(keep_out), floor, tuple(places), points, axes, seen.acceptance,
-            radius, TOOL_THICK * stretched,
+            radius, TOOL_THICK * length,
         )  # fmt: skip
         return replace(space, pairs=_pairs(space))
 
@@ -198,7 +199,8 @@ class Space:
 
     def near_singular(self, frames: Frames) -> Mask:
         """Return at which poses (N,) the arm can hardly move in some direction."""
-        lever = (frames.tcp[:, None] - frames.origin[:, 1:-1]) / reach(self.model)
+        length = max(self.model.length, SHORTEST)
+        lever = (frames.tcp[:, None] - frames.origin[:, 1:-1]) / length
         J = np.concatenate([np.cross(frames.axis, lever), frames.axis], axis=2)
         smallest = np.linalg.svd(J, compute_uv=False)[:, min(6, self.model.arm.n) - 1]
         return np.asarray(smallest < NEAR_SINGULAR)
@@ -212,12 +214,6 @@ class Space:
     def draw(self, count: int, random: np.random.Generator) -> Array:
         """Return joints (count, n) anywhere within the limits."""
         return random.uniform(self.lower, self.upper, (count, len(self.lower)))
-
-
-def reach(model: Model) -> float:
-    """Return the stretched length of arm and tool (m)."""
-    links = np.linalg.norm(model.arm.link_in_link[:, :3, 3], axis=1).sum()
-    return max(float(links + np.linalg.norm(model.tool_in_flange[:3, 3])), 1e-3)
 
 
 def _limits(
