@@ -26,7 +26,7 @@ SURE_INSTRUMENT = 0.5  # 1 sigma of log(noise): what a data sheet is worth
 SURE_TURN = 1.0  # of the noise of rotations, which nobody states
 SURE_JOINT = 1.5  # of the arm's repeatability where it is not given
 GIVEN = 0.25  # of the arm's repeatability where it is
-SHAKY = 3.0  # times the usual scatter beyond which a reading counts as noisier than others
+NOISIER = 3.0  # times the usual scatter beyond which a reading counts as noisier than others
 ROUNDS = 20
 CONVERGED = 1e-3  # of log(variance)
 ENOUGH = 250  # readings from which the sizes are estimated
@@ -127,7 +127,7 @@ def _shakiness(readings: Readings) -> Array:
     if known.sum() < 5:
         return np.ones(len(readings))
     ratio = np.where(known, scatter, 0.0) / np.median(scatter[known])
-    return np.where(ratio > SHAKY, ratio, 1.0) ** 2
+    return np.where(ratio > NOISIER, ratio, 1.0) ** 2
 
 
 def estimated(

@@ -1,4 +1,4 @@
-"""Linear least squares: one solution with a prior, one within bounds, one projection.
+"""Linear least squares: with a prior, within bounds, and with nuisance columns projected out.
 
 Columns are scaled to one length before anything is decomposed, so that metres, radians and
 flexibilities have one meaning of rank. A prior is rows of its own.

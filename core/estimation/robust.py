@@ -1,4 +1,4 @@
-"""What a reading counts: one scale, one weight, one weight to begin with; and a fit by them.
+"""Robust estimation: noise scale, outlier weights, starting weights, and a fit by them.
 
 Distances are root mean squares over a reading's cells, in units of their noise. From ``FULL`` on a
 reading counts less, from ``OUTLIER`` on nothing (Tukey's biweight; Beaton, Tukey, Technometrics 16

@@ -78,8 +78,8 @@ class Frames:
 
 
 @dataclass(frozen=True)
-class Space:
-    """The poses at which measuring is possible. Make it by ``Space.of``."""
+class Workspace:
+    """The poses at which measuring is possible. Make it by ``Workspace.of``."""
 
     model: Model
     lower: Array  # (n,) rad
@@ -106,8 +106,8 @@ class Space:
         floor: float | None = None,
         places: Sequence[Place] = (),
         reflector: Reflector | None = None,
-    ) -> Space:
-        """Return the space of an arm in its cell.
+    ) -> Workspace:
+        """Return the workspace of an arm in its cell.
 
         ``lower``, ``upper`` (n, rad) tighten the arm's own joint limits; without a ``reflector``
         the one target is the TCP, seen from all around.
@@ -128,11 +128,11 @@ class Space:
         if seen.looks is not None:
             axes = np.broadcast_to(np.atleast_2d(np.array(seen.looks, dtype=float)), points.shape)
             axes = axes / np.linalg.norm(axes, axis=1, keepdims=True)
-        space = cls(
+        workspace = cls(
             model, low, high, tuple(keep_out), floor, tuple(places), points, axes, seen.acceptance,
             radius, TOOL_THICK * length,
         )  # fmt: skip
-        return replace(space, pairs=_pairs(space))
+        return replace(workspace, pairs=_pairs(workspace))
 
     def frames(self, q: Array) -> Frames:
         """Return where everything is at joints ``q`` (N, n), rigid."""
@@ -242,12 +242,12 @@ def _limits(
     return low, high
 
 
-def _pairs(space: Space) -> tuple[tuple[int, int], ...]:
+def _pairs(workspace: Workspace) -> tuple[tuple[int, int], ...]:
     """Return the capsules far enough along the chain to hit each other in some poses only."""
-    frames = space.frames(np.zeros((1, space.model.arm.n)))
-    capsules = space.capsules(frames)
+    frames = workspace.frames(np.zeros((1, workspace.model.arm.n)))
+    capsules = workspace.capsules(frames)
     long = np.linalg.norm(capsules.end - capsules.begin, axis=2)[0]
-    n = space.model.arm.n
+    n = workspace.model.arm.n
     pairs = []
     for j in range(2, len(long)):
         for i in range(min(j - 1, n)):
