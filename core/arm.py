@@ -57,6 +57,11 @@ class Arm:
         """Return the number of joints."""
         return len(self.mass)
 
+    @property
+    def length(self) -> float:
+        """Return the length of the stretched arm (m), base to flange."""
+        return float(np.linalg.norm(self.link_in_link[:, :3, 3], axis=1).sum())
+
 
 def dh_transform(a: float, alpha: float, d: float) -> Array:
     """Return Tz(d) Tx(a) Rx(alpha) (4, 4): a standard DH row behind the joint's own rotation."""

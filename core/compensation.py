@@ -229,7 +229,7 @@ class Compensator:
         for steps in range(1, MAX_STEPS + 1):  # noqa: B007
             tried = nominal + offset
             self._load(loads)
-            row.q[0], row.growth[0] = tried, 1.0
+            row.q[0], row.link_scale[0] = tried, 1.0
             self.model.condition(row, loads, tried[None], self._conditions)
             distance = next_offset(self._chain, self._row, self._shape, self._wanted, offset)
             if distance < 0:

@@ -60,6 +60,11 @@ class Model:
     reference_temperature: float = 25.0  # °C
     terms: tuple[Term, ...] = ()
 
+    @property
+    def length(self) -> float:
+        """Return the length of the stretched arm with its tool (m)."""
+        return self.arm.length + float(np.linalg.norm(self.tool_in_flange[:3, 3]))
+
     def with_terms(self, terms: Sequence[Term]) -> Model:
         """Return the model with further effects in it."""
         return replace(self, terms=self.terms + tuple(terms))

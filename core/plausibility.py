@@ -18,6 +18,7 @@ from gapbridge.core.arm import Arm
 from gapbridge.core.arrays import Array
 from gapbridge.core.files import read_text
 
+URDF = ("robot", "urdf")  # key of the cell that names the file
 POSES = 64
 LONGEST, LONG, SHORT = 20.0, 5.0, 0.05  # m of reach: no arm, few arms, few arms
 TURN = 6.4  # rad: a little more than one turn; a fixed angle beyond is in degrees
@@ -28,8 +29,8 @@ DENSEST = 2000.0  # kg of the arm by the cube of its reach, m: arms have 10 to 2
 
 
 @dataclass(frozen=True)
-class Oddity:
-    """One value that cannot be meant as it stands, or hardly.
+class Implausible:
+    """One implausible value: surely a mistake, or only one that few arms have.
 
     ``keys`` is its path in the cell, where it stands there; ``where`` a place in another file.
     """
@@ -62,64 +63,65 @@ def flange_in_first(arm: Arm, q: Array) -> Array:
     return np.asarray(frame)
 
 
-def arm_oddities(arm: Arm, keys: tuple[str | int, ...]) -> Iterator[Oddity]:
-    """Yield what is odd about an arm as a whole; ``keys`` is where the cell names it."""
+def implausible_in_arm(arm: Arm, keys: tuple[str | int, ...]) -> Iterator[Implausible]:
+    """Yield what is implausible about an arm as a whole; ``keys`` is where the cell names it."""
     far = reach(arm)
     if far > LONGEST:
-        yield Oddity(keys, f"an arm of {far:.4g} m reach", "lengths in m (these look like mm)")
+        yield Implausible(keys, f"an arm of {far:.4g} m reach", "lengths in m (these look like mm)")
     elif not SHORT <= far <= LONG:
-        yield Oddity(keys, f"an arm of {far:.3g} m reach", "0.05 to 5 m", sure=False)
+        yield Implausible(keys, f"an arm of {far:.3g} m reach", "0.05 to 5 m", sure=False)
     for i, mass in enumerate(arm.mass):
         if mass < 0 or mass > HEAVIEST:
-            yield Oddity(keys, f"{mass:.4g} kg of link {i + 1}", "kg, 0 or more (grams?)")
+            yield Implausible(keys, f"{mass:.4g} kg of link {i + 1}", "kg, 0 or more (grams?)")
         elif mass > HEAVY:
-            yield Oddity(keys, f"{mass:.4g} kg of link {i + 1}", "at most 500 kg", sure=False)
+            yield Implausible(keys, f"{mass:.4g} kg of link {i + 1}", "at most 500 kg", sure=False)
         away = float(np.linalg.norm(arm.cog[i])) if mass > 0 else 0.0
         if far <= LONGEST and away > 2.0 * far + 1.0:
-            yield Oddity(keys, f"a centre of gravity of link {i + 1} {away:.4g} m off", "m (mm?)")
+            yield Implausible(
+                keys, f"a centre of gravity of link {i + 1} {away:.4g} m off", "m (mm?)"
+            )
     if (mass := float(arm.mass.sum())) > DENSEST * far**3 and mass > HEAVY:
-        yield Oddity(keys, f"an arm of {mass:.4g} kg and {far:.3g} m reach", "kg (grams?)")
+        yield Implausible(keys, f"an arm of {mass:.4g} kg and {far:.3g} m reach", "kg (grams?)")
     weightless = [str(i + 1) for i in range(arm.n) if arm.mass[i] == 0]
     if len(weightless) == arm.n:
-        yield Oddity(
+        yield Implausible(
             keys, "an arm without masses", "the links' masses: without them only payload and "
             "pulls bend the model", sure=False,
         )  # fmt: skip
     elif weightless:
-        yield Oddity(keys, f"no mass of link {', '.join(weightless)}", "one", sure=False)
+        yield Implausible(keys, f"no mass of link {', '.join(weightless)}", "one", sure=False)
 
 
-def urdf_oddities(
-    path: Path, arm: Arm | None = None, keys: tuple[str | int, ...] = ("robot", "urdf")
-) -> Iterator[Oddity]:
-    """Yield what cannot be meant in a URDF; ``arm``: the arm that was made of it."""
+def implausible_in_urdf(path: Path, arm: Arm) -> Iterator[Implausible]:
+    """Yield implausible values in a URDF, of which ``arm`` was made."""
     text = read_text(path)
     try:
         root = ElementTree.fromstring(text)
     except ElementTree.ParseError:
         return
-    used = () if arm is None else arm.joint_names
     for joint in root.findall("joint"):
         name = str(joint.get("name"))
         found = re.search(rf"<joint\b[^>]*\bname\s*=\s*[\"']{re.escape(name)}[\"']", text)
         line = 1 + text.count("\n", 0, found.start()) if found else 1
         where = f"{path}, line {line}: joint {name!r}"
-        if name in used and joint.find("mimic") is not None:
-            yield Oddity(
-                keys, "<mimic>", "a motor of its own for every joint between base and flange: "
+        if name in arm.joint_names and joint.find("mimic") is not None:
+            yield Implausible(
+                URDF, "<mimic>", "a motor of its own for every joint between base and flange: "
                 "this one follows another", where=where,
             )  # fmt: skip
         origin, limit = joint.find("origin"), joint.find("limit")
         if (far := _largest(origin, "xyz")) > LONGEST:
-            yield Oddity(keys, f"origin xyz {far:g}", "m (it looks like mm)", where=where)
+            yield Implausible(URDF, f"origin xyz {far:g}", "m (it looks like mm)", where=where)
         if (angle := _largest(origin, "rpy")) > TURN:
-            yield Oddity(keys, f"origin rpy {angle:g}", "rad (it looks like degrees)", where=where)
+            yield Implausible(
+                URDF, f"origin rpy {angle:g}", "rad (it looks like degrees)", where=where
+            )
         if joint.get("type") != "revolute":
             continue
         for key, most in (("lower", TURNS), ("upper", TURNS), ("velocity", QUICK)):
             if (value := _largest(limit, key)) > most:
-                yield Oddity(
-                    keys, f"limit {key} {value:g}", "rad (it looks like degrees)", where=where
+                yield Implausible(
+                    URDF, f"limit {key} {value:g}", "rad (it looks like degrees)", where=where
                 )
 
 

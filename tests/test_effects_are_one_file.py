@@ -28,6 +28,7 @@ LABELS = {
     },
 }
 ASKED = {"effect", "family", "identifier"}  # attributes whose text is an identifier
+PARTS = {"startswith", "endswith", "removeprefix", "removesuffix", "partition", "find", "count"}
 TAKING = {"Term", "effect_named", "joints"}  # calls whose first argument is one
 
 
@@ -70,6 +71,20 @@ def _asked(tree: ast.AST) -> Iterator[str]:
             yield from (t for t in _texts(node.slice) if t in CATALOGUE)
 
 
+def _asked_in_part(tree: ast.AST) -> Iterator[str]:
+    """Yield pieces of text that an identifier is searched for: ``"compliance" in term.effect``."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Compare):
+            sides = zip([node.left, *node.comparators], node.ops, node.comparators, strict=False)
+            for left, op, right in sides:
+                if isinstance(op, ast.In | ast.NotIn) and getattr(right, "attr", "") in ASKED:
+                    yield from (t for t in _texts(left) if t not in CATALOGUE)
+        method = getattr(node, "func", None)
+        owner = getattr(getattr(method, "value", None), "attr", "")
+        if isinstance(node, ast.Call) and owner in ASKED and getattr(method, "attr", "") in PARTS:
+            yield from (t for argument in node.args for t in _texts(argument))
+
+
 def _found(source: str) -> list[str]:
     """Return the effects that a source names, docstrings left aside."""
     tree = ast.parse(source)
@@ -80,7 +95,7 @@ def _found(source: str) -> list[str]:
         and node.body
         and isinstance(node.body[0], ast.Expr)
     }
-    found = list(_asked(tree))
+    found = [*_asked(tree), *_asked_in_part(tree)]
     for node in ast.walk(tree):
         if isinstance(node, ast.Constant) and id(node) not in prose:
             name = _named(node.value)
@@ -115,5 +130,7 @@ def test_the_search_finds_what_it_looks_for() -> None:
     assert _found('x = f"{kind}_compliance_{i}"') == ["axial_compliance"]
     assert _found('if term.effect == "payload": pass') == ["payload"]
     assert _found('kept = [t for t in terms if t.effect not in ("payload",)]') == ["payload"]
+    assert _found('x = [t for t in terms if "compliance" not in t.effect]') == ["compliance"]
+    assert _found('if term.effect.endswith(("_friction",)): pass') == ["_friction"]
     assert _found("from gapbridge.core.effects.position.backlash import Backlash") == ["backlash"]
     assert _found('"""What ``backlash`` is."""\nlog.get("payload")') == []

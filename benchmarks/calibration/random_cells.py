@@ -11,7 +11,7 @@ from gapbridge.core.arm import Arm, JointLimits, arm_from_dh, builtin_arm
 from gapbridge.core.calibration.plan import Payload
 from gapbridge.core.model import Model
 from gapbridge.core.planning.capsules import Box
-from gapbridge.core.planning.workspace import Place, Reflector, Space, reach
+from gapbridge.core.planning.workspace import Place, Reflector, Workspace
 from gapbridge.core.rotation import rotation_matrix
 
 Array = NDArray[np.float64]
@@ -26,7 +26,7 @@ class RandomCell:
     name: str
     model: Model
     loads: tuple[Payload, ...]
-    space: Space
+    space: Workspace
 
 
 def random_cell(seed: int) -> RandomCell:
@@ -50,16 +50,16 @@ def _loads(arm: Arm, random: np.random.Generator) -> tuple[Payload, ...]:
     return tuple(loads)
 
 
-def _room(model: Model, random: np.random.Generator) -> Space:
+def _room(model: Model, random: np.random.Generator) -> Workspace:
     """Return a floor, a box and a tracker that sees a reflector within a cone."""
-    long = reach(model)
+    long = model.length
     angle, far = random.uniform(-np.pi, np.pi), random.uniform(1.5, 3.0) * long
     place = (far * np.cos(angle), far * np.sin(angle), random.uniform(0.2, 1.0) * long)
     middle = random.uniform(-np.pi, np.pi)
     at = np.array([np.cos(middle), np.sin(middle)]) * 0.7 * long
     size = 0.15 * long
     box = Box((at[0] - size, at[1] - size, -1.0), (at[0] + size, at[1] + size, 0.2 * long))
-    return Space.of(
+    return Workspace.of(
         model, floor=0.0, keep_out=(box,), places=(Place(place, nearest=0.3),),
         reflector=Reflector(
             looks=(0.3, 0.0, 1.0), acceptance=np.radians(random.uniform(30, 80))

@@ -25,7 +25,7 @@ from gapbridge.core.errors import CellError
 from gapbridge.core.metrology import Metrology
 from gapbridge.core.planning.capsules import Box
 from gapbridge.core.planning.design import Wish, far_end, plan
-from gapbridge.core.planning.workspace import Place, Reflector, Space
+from gapbridge.core.planning.workspace import Place, Reflector, Workspace
 
 REPEATABILITY = 5e-5  # m, 1 sigma of one coordinate, where the cell does not report it
 NEEDS_PLACE = {"distance": "fixed end", "sphere": "sphere", "point": "point"}
@@ -88,12 +88,12 @@ def planned(cell: Cell, options: SessionOptions, emit: Callable[[str, float], No
     )  # fmt: skip
 
 
-def space_of(cell: Cell, kind: str) -> Space:
+def space_of(cell: Cell, kind: str) -> Workspace:
     """Return where the arm may be measured. Raises CellError."""
     given, seen = cell.calibration, cell.calibration.reflector
     places = _places(cell, kind)
     lower, upper = _range(cell, given.joint_range)
-    return Space.of(
+    return Workspace.of(
         cell.model, lower=lower, upper=upper, floor=given.floor, places=places,
         keep_out=[Box(_three(b.lower), _three(b.upper)) for b in _boxes(cell, given)],
         reflector=None if seen is None else Reflector(looks=seen.looks, acceptance=seen.acceptance),
@@ -137,7 +137,7 @@ def _places(cell: Cell, kind: str) -> list[Place]:
     ]
 
 
-def with_loads(space: Space, loads: Sequence[Payload]) -> Space:
+def with_loads(space: Workspace, loads: Sequence[Payload]) -> Workspace:
     """Return the space of an arm on whose flange such loads hang, in turn."""
     return replace(space, hung=(*space.hung, *(far_end(load) for load in loads)))
 

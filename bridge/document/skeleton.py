@@ -23,7 +23,7 @@ def skeleton(model: Model, q: Array, loads: Loads | None = None) -> Array:
 
 def reach(model: Model) -> float:
     """Return the length of the stretched arm, m, without its tool."""
-    return max(float(np.linalg.norm(model.arm.link_in_link[:, :3, 3], axis=1).sum()), 0.1)
+    return max(model.arm.length, 0.1)
 
 
 def round_factor(wanted: float) -> float:

@@ -44,7 +44,7 @@ KEPT = 0.1  # share of the predicted decrease that an accepted step must reach
 POOR = 0.5  # share below which the next step is shorter, with new derivatives
 GOOD = 0.8  # share above which the next step may be longer
 LEAST, MOST = 1e-4, 1e8  # damping: below it is none; above it nothing is gained any more
-GROWTH = 8.0
+DAMPING_FACTOR = 8.0  # by which damping grows after a refused step, and falls after a good one
 NOTHING = 1e-6  # of the sum of squares, in which one is a standard deviation: rounding
 
 
@@ -203,7 +203,7 @@ def _stepped(problem: Problem, at: FitState, damping: float) -> tuple[FitState, 
                 return at, damping, True
             if small and damping == 0.0:
                 return replace(at, stuck=stuck, converged=True), damping, False
-            damping = max(GROWTH * damping, LEAST)
+            damping = max(DAMPING_FACTOR * damping, LEAST)
             if damping > MOST:
                 return at, damping, False
             continue
@@ -214,7 +214,7 @@ def _stepped(problem: Problem, at: FitState, damping: float) -> tuple[FitState, 
         if kept < POOR:
             return at, max(damping * 2, LEAST), True
         if kept > GOOD:
-            damping = damping / GROWTH if damping > LEAST else 0.0
+            damping = damping / DAMPING_FACTOR if damping > LEAST else 0.0
     converged = size < LOOSE and damping == 0.0
     return replace(at, converged=converged), damping, not converged
 

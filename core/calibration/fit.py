@@ -30,7 +30,7 @@ from gapbridge.core.model import Model
 from gapbridge.core.notes import Note, Reason
 
 Progress = Callable[[str], None]
-TELLING = 1.0  # usual sizes: a parameter that is known no better counts as not identifiable
+IDENTIFIABLE = 1.0  # usual sizes: a parameter that is known no better counts as not identifiable
 
 
 @dataclass(frozen=True)
@@ -176,7 +176,7 @@ def estimates_of(
             Estimate(
                 name, float(rest.values[i]), float(std[i]), parameters.units[i],
                 None if planned_std is None else float(planned_std),
-                shown=bool(std[i] < TELLING * parameters.scales[i]),
+                shown=bool(std[i] < IDENTIFIABLE * parameters.scales[i]),
                 on_bound=bool(rest.stuck[i]), freedom=rest.freedom,
             )
         )  # fmt: skip

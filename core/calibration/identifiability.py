@@ -45,7 +45,6 @@ def identifiable_parameters(
     *,
     observable: Observable,
     pulls: bool = False,
-    seed: int = 0,
 ) -> Parameters:
     """Return the parameters of some effects, redundant ones left out, earlier effects first.
 
@@ -54,7 +53,7 @@ def identifiable_parameters(
     Raises InputError for an effect that positions do not show.
     """
     parameters = Parameters.every(model, effects)
-    readings, nuisance = _anywhere(model, observable, pulls, seed)
+    readings, nuisance = _anywhere(model, observable, pulls)
     J, F = _columns(parameters, observable, readings, nuisance)
     weight = np.tile(1 / observable.sigmas, len(readings))[:, None]
     J, F = J * parameters.scales * weight, F * weight
@@ -117,7 +116,7 @@ def _redundant(name: str, column: Array, F: Array, J: Array, names: list[str]) -
 
 
 def _anywhere(
-    model: Model, observable: Observable, pulls: bool, seed: int
+    model: Model, observable: Observable, pulls: bool, seed: int = 0
 ) -> tuple[Readings, Nuisance]:
     """Return readings at random poses under random loads, taken by an instrument somewhere."""
     random = np.random.default_rng(seed)

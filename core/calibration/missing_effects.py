@@ -88,7 +88,7 @@ def _likely(
 class _Folds:
     """The fit's linear system with its poses left out in turn."""
 
-    A: Array  # (M, c) columns of parameters and instrument, divided by their usual sizes
+    A: Array  # (M, c) columns of parameters and instrument
     target: Array  # (M,) residual, where each number begins taken off
     hold: Array  # (c,) how firmly each number is held there
     pose: NDArray[np.int64]  # (M,) number of each row's pose
@@ -98,19 +98,17 @@ class _Folds:
     def of(cls, problem: Problem, rest: FitState) -> _Folds:
         """Return the folds of a converged fit; repeats and loads of a pose stay together."""
         system, held = rest.system, problem.bounds.held
-        size = np.maximum(np.linalg.norm(system.F, axis=0), 1e-300)
-        A = np.hstack([system.J * held, system.F / size])
+        A = np.hstack([system.J, system.F])
         target = system.residual - system.J @ (problem.bounds.begin - rest.values)
-        hold = np.concatenate([np.ones(len(held)), np.full(len(size), np.sqrt(FREE))])
+        hold = np.concatenate([1 / held, np.sqrt(FREE) * np.linalg.norm(system.F, axis=0)])
         pose = np.repeat(pose_groups(problem.readings.q), problem.observable.equations)
         return cls(A, target, hold, pose, random_folds(pose, FOLDS))
 
     def beside(self, candidate: Candidate) -> _Folds:
         """Return the folds of the fit with a further effect in it."""
         columns, sizes = candidate
-        hold = np.concatenate([self.hold, np.ones(len(sizes))])
-        A = np.hstack([self.A, columns * HELD * sizes])
-        return replace(self, A=A, hold=hold)
+        hold = np.concatenate([self.hold, 1 / (HELD * sizes)])
+        return replace(self, A=np.hstack([self.A, columns]), hold=hold)
 
     def gain(self, candidate: Candidate) -> float:
         """Return the share of the squares that an effect takes off poses left out of its fit.

@@ -17,6 +17,7 @@ from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.observables.nuisance import Nuisance
 from gapbridge.core.calibration.observables.observable import Observable
 from gapbridge.core.calibration.readings import Readings
+from gapbridge.core.estimation.least_squares import inverse
 from gapbridge.core.metrology import Metrology
 from gapbridge.core.model import Model
 
@@ -25,7 +26,7 @@ SURE_INSTRUMENT = 0.5  # 1 sigma of log(noise): what a data sheet is worth
 SURE_TURN = 1.0  # of the noise of rotations, which nobody states
 SURE_JOINT = 1.5  # of the arm's repeatability where it is not given
 GIVEN = 0.25  # of the arm's repeatability where it is
-SHAKY = 3.0  # times the usual scatter beyond which a reading counts as noisier than others
+NOISIER = 3.0  # times the usual scatter beyond which a reading counts as noisier than others
 ROUNDS = 20
 CONVERGED = 1e-3  # of log(variance)
 ENOUGH = 250  # readings from which the sizes are estimated
@@ -126,7 +127,7 @@ def _shakiness(readings: Readings) -> Array:
     if known.sum() < 5:
         return np.ones(len(readings))
     ratio = np.where(known, scatter, 0.0) / np.median(scatter[known])
-    return np.where(ratio > SHAKY, ratio, 1.0) ** 2
+    return np.where(ratio > NOISIER, ratio, 1.0) ** 2
 
 
 def estimated(
@@ -169,11 +170,7 @@ def _likelihood(
     V = sum(np.exp(one) * shape for one, shape in zip(t, shapes, strict=True))
     W = np.linalg.inv(np.linalg.cholesky(V))
     Xw = (W @ X).reshape(N * k, p)
-    size = np.maximum(np.linalg.norm(Xw, axis=0), np.sqrt(precision))
-    size = np.where(size > 0, size, 1.0)
-    Xw, held = Xw / size, precision / size**2
-    inner = Xw.T @ Xw + np.diag(held)
-    core = np.linalg.pinv(inner, rcond=1e-13, hermitian=True)
+    core = inverse(Xw.T @ Xw + np.diag(precision))
     yw = (W @ y[..., None]).reshape(-1)
     Py = yw - Xw @ (core @ (Xw.T @ yw))
     P = np.eye(N * k) - Xw @ core @ Xw.T

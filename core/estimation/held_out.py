@@ -1,4 +1,4 @@
-"""What a fit did not see: folds, solutions with each left out, and how those scatter.
+"""Cross-validation: folds, solutions with each fold left out, and the jackknife of those.
 
 A pose's repeats and neighbours lie in one fold; regions of joint space hold out whole
 neighbourhoods, so that nothing near a judged pose is in its fit.

@@ -248,9 +248,9 @@ def _without(data: Information, now: Type) -> Array:
     return np.asarray(np.einsum("sij,sj->si", own, now.mean + now.tau * k))
 
 
-def draws(data: Information, begin: Type, centre: Array, seed: int = 0) -> list[Type]:
+def draws(data: Information, begin: Type, centre: Array) -> list[Type]:
     """Return types with scatters drawn from their posterior, each with its own mean."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     repeated = len(data.arm) > data.arms
     size, seen = size_of(begin), shown(begin.covariance)
     now = begin

@@ -1,4 +1,4 @@
-"""Linear least squares: one solution with a prior, one within bounds, one projection.
+"""Linear least squares: with a prior, within bounds, and with nuisance columns projected out.
 
 Columns are scaled to one length before anything is decomposed, so that metres, radians and
 flexibilities have one meaning of rank. A prior is rows of its own.
@@ -20,6 +20,11 @@ def unit_of(columns: Array, hold: Array | None = None) -> Array:
     """Return one over the length of each column (p,), with what holds it; 0 of an empty one."""
     square = np.einsum("ij,ij->j", columns, columns)
     size = np.sqrt(square if hold is None else square + hold**2)
+    return _inverted(size)
+
+
+def _inverted(size: Array) -> Array:
+    """Return one over sizes (p,), 0 where there is nothing."""
     return np.where(size > 1e-150, 1 / np.maximum(size, 1e-150), 0.0)
 
 
@@ -47,8 +52,7 @@ def inverse(sums: Array, rank: float = SUMS_RANK) -> Array:
 
     Zero along what the rows do not show.
     """
-    size = np.sqrt(np.maximum(np.diag(sums), 0.0))
-    unit = np.where(size > 1e-150, 1 / np.maximum(size, 1e-150), 0.0)
+    unit = _inverted(np.sqrt(np.maximum(np.diag(sums), 0.0)))
     scaled = np.outer(unit, unit)
     return np.asarray(np.linalg.pinv(sums * scaled, rcond=rank, hermitian=True) * scaled)
 

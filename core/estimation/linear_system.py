@@ -71,9 +71,9 @@ def posterior(system: System, bounds: Bounds) -> tuple[Array, float, Array]:
     nuisances are projected out.
     """
     p = system.J.shape[1]
-    A, core, _ = _scaled_covariance(system, bounds)
-    share = np.einsum("ij,jk,ik->i", A, core, A)
-    covariance = core[:p, :p] * np.outer(bounds.held, bounds.held)
+    A, whole = columns_and_covariance(system, bounds)
+    share = np.einsum("ij,jk,ik->i", A, whole, A)
+    covariance = whole[:p, :p]
     return np.asarray((covariance + covariance.T) / 2), float(share.sum()), share
 
 
@@ -83,9 +83,8 @@ def joint_covariance(system: System, bounds: Bounds, repeat: Index) -> Array:
     ``repeat`` (N,) numbers the readings that may share an error: a joint that is rounded, or off,
     is so at all repeats of a pose.
     """
-    A, core, size = _scaled_covariance(system, bounds)
-    core = core + _shared(A, system.residual, core, repeat)
-    return np.asarray(core / np.outer(size, size))
+    A, covariance = columns_and_covariance(system, bounds)
+    return covariance + _shared(A, system.residual, covariance, repeat)
 
 
 def _shared(A: Array, residual: Array, core: Array, repeat: Index) -> Array:
@@ -114,13 +113,11 @@ def _shared(A: Array, residual: Array, core: Array, repeat: Index) -> Array:
     return np.asarray(shared * (taken @ core))
 
 
-def _scaled_covariance(system: System, bounds: Bounds) -> tuple[Array, Array, Array]:
-    """Return the columns over their ``size``, the covariance of what they multiply, and the size.
+def columns_and_covariance(system: System, bounds: Bounds) -> tuple[Array, Array]:
+    """Return the columns of parameters and nuisances (M, p + m), and their covariance.
 
-    A parameter's size is one over how firmly it is held, a nuisance's the length of its column.
+    Zero along what neither the equations nor the parameters' usual sizes hold.
     """
-    nuisances = np.maximum(np.linalg.norm(system.F, axis=0), 1e-300)
-    size = np.concatenate([1 / bounds.held, nuisances])
-    A = np.hstack([system.J, system.F]) / size
-    ridge = np.concatenate([np.ones(len(bounds.held)), np.zeros(len(nuisances))])
-    return A, inverse(A.T @ A + np.diag(ridge)), size
+    A = np.hstack([system.J, system.F])
+    held = np.concatenate([1 / bounds.held**2, np.zeros(system.F.shape[1])])
+    return A, inverse(A.T @ A + np.diag(held))

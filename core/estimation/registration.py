@@ -10,6 +10,8 @@ from gapbridge.core.arrays import Array
 from gapbridge.core.estimation.robust import start_weights
 from gapbridge.core.rotation import rotation_matrix, skew
 
+ROUNDS = 8
+
 
 @dataclass(frozen=True)
 class Registration:
@@ -51,10 +53,10 @@ def register(measured: Array, predicted: Array, weights: Array | None = None) ->
     return Registration(rotation, centre_m - rotation @ centre_p)
 
 
-def register_robustly(measured: Array, predicted: Array, rounds: int = 8) -> Registration:
+def register_robustly(measured: Array, predicted: Array) -> Registration:
     """Return the frame with outliers down-weighted, for a fit to begin with."""
     frame = register(measured, predicted)
-    for _ in range(rounds):
+    for _ in range(ROUNDS):
         gap = frame.in_base(measured) - predicted
         frame = register(measured, predicted, start_weights(gap))
     return frame

@@ -1,4 +1,4 @@
-"""What a reading counts: one scale, one weight, one weight to begin with; and a fit by them.
+"""Robust estimation: noise scale, outlier weights, starting weights, and a fit by them.
 
 Distances are root mean squares over a reading's cells, in units of their noise. From ``FULL`` on a
 reading counts less, from ``OUTLIER`` on nothing (Tukey's biweight; Beaton, Tukey, Technometrics 16
@@ -60,9 +60,9 @@ def start_weights(residual: Array) -> Array:
     return start_weights_of(distance_of(residual, scale_of(residual)))
 
 
-def start_weights_of(distance: Array) -> Array:
-    """Return the same for distances (N,)."""
-    return np.asarray(1 / (1 + (distance / START) ** 2))
+def start_weights_of(distance: Array, half: float = START) -> Array:
+    """Return the same for distances (N,); at ``half`` the weight is one half."""
+    return np.asarray(1 / (1 + (distance / half) ** 2))
 
 
 def robust_fit(A: Array, b: Array, unit: Index, row: Index, rounds: int = ROUNDS) -> RobustFit:

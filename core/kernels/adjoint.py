@@ -31,7 +31,7 @@ from gapbridge.core.kernels.mechanics import change_to, in_axes, put, three
 from gapbridge.core.kernels.reference import INNER
 
 # slots of a record of this workspace; records as in layout
-MOMENT_RATE, GIVE, BODY, PULL, PUSH, SHIFT, TWIST = 0, 9, 12, 15, 18, 21, 24
+MOMENT_RATE, GIVE, BODY, ADJOINT, REACTION, SHIFT, TWIST = 0, 9, 12, 15, 18, 21, 24
 SHARE = 27
 OWN = 28
 # slots beside the records: sums on the way
@@ -153,7 +153,7 @@ def _out(w, v, u, s, record, axis, turning):  # type: ignore[no-untyped-def]
         for j in range(3):
             m0, m1, m2 = three(u, b + (MOMENT_RATE + 3 * j) * _L, k)
             u[U(b + (TWIST + j) * _L + k)] += m0 * px + m1 * py + m2 * pz
-            s[U((SUM + j) * _L + k)] += u[U(b + (PUSH + j) * _L + k)]
+            s[U((SUM + j) * _L + k)] += u[U(b + (REACTION + j) * _L + k)]
 
 
 @njit(**FAST)
@@ -162,7 +162,7 @@ def _back(w, u, s, record):  # type: ignore[no-untyped-def]
     a, b = record * RECORD * _L, record * OWN * _L
     turns = 1.0 if record > 0 else 0.0  # the base's moment counts about axes that do not turn
     for k in range(_L):
-        px, py, pz = three(u, b + PUSH * _L, k)
+        px, py, pz = three(u, b + REACTION * _L, k)
         mx, my, mz = three(w, a + MOMENT * _L, k)
         mx, my, mz = turns * mx, turns * my, turns * mz
         for j in range(3):
@@ -176,8 +176,8 @@ def _back(w, u, s, record):  # type: ignore[no-untyped-def]
 
 
 @njit(**FAST)
-def _pulled(w, u, s, record):  # type: ignore[no-untyped-def]
-    """Write a record's adjoint (by its bending, own axes) and its push (by its moment, base axes).
+def _adjoint(w, u, s, record):  # type: ignore[no-untyped-def]
+    """Write a record's adjoint (by its bending, own axes), its reaction (by its moment, base axes).
 
     The turn that a changed bending makes is its right Jacobian (series as in ``turn_joint``).
     """
@@ -195,32 +195,32 @@ def _pulled(w, u, s, record):  # type: ignore[no-untyped-def]
         px = tx + second * cx + third * (y * cz - z * cy)
         py = ty + second * cy + third * (z * cx - x * cz)
         pz = tz + second * cz + third * (x * cy - y * cx)
-        change_to(s, CHANGED * _L, u, b + PULL * _L, k, (px, py, pz))
-        put(u, b + PULL * _L, k, px, py, pz)
+        change_to(s, CHANGED * _L, u, b + ADJOINT * _L, k, (px, py, pz))
+        put(u, b + ADJOINT * _L, k, px, py, pz)
         gx, gy, gz = three(u, b + GIVE * _L, k)
         px, py, pz = px * gx, py * gy, pz * gz
         if record > 0:
             for j in range(3):
                 r0, r1, r2 = three(w, a + (ROTATION + 3 * j) * _L, k)
-                u[U(b + (PUSH + j) * _L + k)] = r0 * px + r1 * py + r2 * pz
+                u[U(b + (REACTION + j) * _L + k)] = r0 * px + r1 * py + r2 * pz
         else:
-            put(u, b + PUSH * _L, k, px, py, pz)
+            put(u, b + REACTION * _L, k, px, py, pz)
 
 
 @njit(**INNER)
 def solve(lanes, axis, turning, deflected, converged):  # type: ignore[no-untyped-def]
-    """Write the derivatives of one coordinate by twists, and the adjoints; whether it settled."""
+    """Write the derivatives of one coordinate by twists, and adjoints; whether they converged."""
     w, v, u, s = lanes
     n = u.shape[0] // (OWN * _L) - 2
     for record in range(n + 2):
         a = record * OWN * _L
-        for k in range(PULL * _L, SHIFT * _L):
+        for k in range(ADJOINT * _L, SHIFT * _L):
             u[a + k] = 0.0
     for _ in range(ROUNDS if deflected else 1):
         for k in range(_L):
             s[CHANGED * _L + k] = 0.0
             for j in range(3):
-                s[(SUM + j) * _L + k] = u[(PUSH + j) * _L + k]
+                s[(SUM + j) * _L + k] = u[(REACTION + j) * _L + k]
         for record in range(1, n + 2):
             _out(w, v, u, s, record, axis, turning)
         _base(v, u, axis, turning)
@@ -229,7 +229,7 @@ def solve(lanes, axis, turning, deflected, converged):  # type: ignore[no-untype
         for record in range(n, -1, -1):
             _back(w, u, s, record)
         for record in range(n + 1):
-            _pulled(w, u, s, record)
+            _adjoint(w, u, s, record)
         change = 0.0
         for k in range(_L):
             change = max(change, s[CHANGED * _L + k])

@@ -1,4 +1,4 @@
-"""Who is informed while functions are compiled for this machine: once per installation.
+"""Listeners informed of each function that is compiled for this machine: once per installation.
 
 Apart from ``machine_code``, so that nobody imports numba only to be informed.
 """

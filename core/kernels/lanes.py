@@ -19,8 +19,8 @@ from gapbridge.core.kernels.layout import (
     COG,
     FARTHEST,
     FAST,
-    GROWTH,
     LANES,
+    LINK_SCALE,
     MASS,
     MOST_ROUNDS,
     RECORD,
@@ -56,12 +56,12 @@ def lanes_of(n):  # type: ignore[no-untyped-def]
 
 @njit(**INNER)
 def _level(w):  # type: ignore[no-untyped-def]
-    """Write the base's record as it stands without tilt."""
+    """Write the base's record as it stands without turning."""
     for s in range(RECORD * LANES):
         w[s] = 0.0
     for k in range(LANES):
         w[ROTATION * LANES + k] = w[(ROTATION + 4) * LANES + k] = 1.0
-        w[(ROTATION + 8) * LANES + k] = w[GROWTH * LANES + k] = 1.0
+        w[(ROTATION + 8) * LANES + k] = w[LINK_SCALE * LANES + k] = 1.0
 
 
 @njit(**INNER)
@@ -77,7 +77,7 @@ def gather(chain, rows, first, w, v):  # type: ignore[no-untyped-def]
         a = ((i + 1) * RECORD + ANGLE) * LANES
         for k in range(LANES):
             far += 0 if abs(w[U(a + k)]) < FARTHEST else 1  # what is no number is far, too
-    _spread(rows.growth, first, n, w, (RECORD + GROWTH) * LANES, RECORD * LANES)
+    _spread(rows.link_scale, first, n, w, (RECORD + LINK_SCALE) * LANES, RECORD * LANES)
     _spread(rows.payload_mass.reshape((-1, 1)), first, 1, v, MASS * LANES, LANES)
     _spread(rows.payload_cog, first, 3, v, COG * LANES, LANES)
     _spread(rows.wrench, first, 6, v, WRENCH * LANES, LANES)
@@ -113,7 +113,7 @@ def settle(chain, w, v, deflected, warm):  # type: ignore[no-untyped-def]
     lanes have settled.
     """
     n = chain.mass.shape[0]
-    tilts = _tilts(chain)
+    soft_base = _soft_base(chain)
     if not warm:
         _level(w)
         if deflected:
@@ -123,7 +123,7 @@ def settle(chain, w, v, deflected, warm):  # type: ignore[no-untyped-def]
     before = 0.0
     for step in range(MOST_ROUNDS):
         turned = deflected and (warm or step > 0)
-        _place(chain, w, v, n, tilts and turned, turned)
+        _place(chain, w, v, n, soft_base and turned, turned)
         load_flange(w, v, n, chain.gravity)
         for i in range(n - 1, -1, -1):
             load_joint(w, i, chain.mass[i], chain.cog[i], chain.gravity)
@@ -131,7 +131,7 @@ def settle(chain, w, v, deflected, warm):  # type: ignore[no-untyped-def]
                 bend_joint(w, v, i + 1, chain.compliance[i], chain.softening[i])
         if not deflected:
             return True
-        if tilts:
+        if soft_base:
             bend_base(w, v, chain.base_compliance)
         change = _change(w, v, n)
         if change < 0.0:
@@ -139,16 +139,16 @@ def settle(chain, w, v, deflected, warm):  # type: ignore[no-untyped-def]
         if change < TOLERANCE:
             return True
         if change * change < TOLERANCE * before:  # as it shrinks, the next is below the tolerance
-            _place(chain, w, v, n, tilts, True)
+            _place(chain, w, v, n, soft_base, True)
             return True
         before = change
     return False
 
 
 @njit(**INNER)
-def _place(chain, w, v, n, tilted, turned):  # type: ignore[no-untyped-def]
+def _place(chain, w, v, n, soft_base, turned):  # type: ignore[no-untyped-def]
     """Place everything from the base to the TCP; ``turned``: with the joints' bending."""
-    if tilted:
+    if soft_base:
         _upright(w)
         turn_joint(w, 0)
     for i in range(n):
@@ -213,11 +213,11 @@ def bends(chain):  # type: ignore[no-untyped-def]
         for k in range(3):
             if chain.compliance[i, k] != 0.0:
                 return True
-    return _tilts(chain)
+    return _soft_base(chain)
 
 
 @njit(**INNER)
-def _tilts(chain):  # type: ignore[no-untyped-def]
-    """Return whether the base tilts (np.any would bring scipy.linalg into each process)."""
+def _soft_base(chain):  # type: ignore[no-untyped-def]
+    """Return whether the base turns (np.any would bring scipy.linalg into each process)."""
     c = chain.base_compliance
     return c[0] != 0.0 or c[1] != 0.0 or c[2] != 0.0

@@ -4,6 +4,9 @@ Numba keeps what it compiled beside the sources. Before it takes that again it l
 function's own file has changed, not whether another has whose functions were compiled into it
 (numba issue 1833). The correction of a setpoint has the statics in it, and those the placing of
 frames: after an update of the one, the other would go on as before, and say nothing.
+
+This replaces private parts of numba (``PRIVATE``). Where a numba has them no more, nothing is kept:
+each process compiles what it calls.
 """
 
 from __future__ import annotations
@@ -26,6 +29,16 @@ CORE = Path(__file__).resolve().parents[1]
 FOLDERS = (CORE, CORE / "kernels")  # where compiled functions are that others have inside them
 OURS = tuple(CORE.parent / name for name in ("core", "drivers", "bridge"))
 MARK = b"njit"
+PRIVATE: tuple[tuple[Any, str], ...] = (
+    (config, "CACHE_LOCATOR_CLASSES"), (dispatcher, "FunctionCache"),
+    (caching.Cache, "_load_overload"),
+    (codegen.JITCodeLibrary, "_get_module_for_linking"),
+    (codegen.JITCodeLibrary, "_set_compiled_object"),
+    (codegen.JITCodeLibrary, "_finalize_final_module"),
+    (compiler, "compile_result"), (nrtdynmod, "compile_nrt_functions"),
+    (nrtdynmod, "create_nrt_module"), (environment, "_rebuild_env"),
+    (environment, "lookup_environment"), (environment.Environment, "_memo"),
+)  # fmt: skip
 USUAL = ("UserProvided", "InTree", "UserWide", "IPython", "Zip")
 
 
@@ -240,15 +253,18 @@ class _Compiling(event.Listener):
         """Do nothing: the next begins at once."""
 
 
-def keep_by_all_sources() -> None:
+def keep_by_all_sources() -> bool:
     """Have numba ask for all compiled sources from now on; before the first compiled function.
 
-    From then on ``compiling.listeners`` hear of what is compiled.
+    From then on ``compiling.listeners`` hear of what is compiled. Returns whether machine code can
+    be kept at all: not where this numba lacks one of its private parts.
     """
+    if not all(hasattr(owner, name) for owner, name in PRIVATE):
+        return False
     settings: Any = config  # its values are made when it is imported
     ours = [f"{__name__}.{one.__name__}" for one in (UserProvided, InTree, UserWide)]
     if ours[0] in settings.CACHE_LOCATOR_CLASSES:
-        return
+        return True
     event.register("numba:compile", _Compiling())  # type: ignore[no-untyped-call]
     kept: Any = dispatcher
     kept.FunctionCache = _cache_of
@@ -261,3 +277,4 @@ def keep_by_all_sources() -> None:
         f"{caching.__name__}.{name}" for name in names if hasattr(caching, name)
     )
     settings.CACHE_LOCATOR_CLASSES = ",".join([*ours, others])
+    return True

@@ -17,8 +17,8 @@ from gapbridge.core.kernels.layout import (
     COG,
     COSINE,
     FAST,
-    GROWTH,
     LANES,
+    LINK_SCALE,
     MASS,
     MOMENT,
     ORIGIN,
@@ -136,7 +136,7 @@ def place_joint(w, i, R, p):  # type: ignore[no-untyped-def]
     r20, r21, r22 = R[2, 0], R[2, 1], R[2, 2]
     px, py, pz = p[0], p[1], p[2]
     for k in range(LANES):
-        g = w[U(a + GROWTH * LANES + k)]
+        g = w[U(a + LINK_SCALE * LANES + k)]
         x, y, z = g * px, g * py, g * pz
         c, s = w[U(b + COSINE * LANES + k)], w[U(b + SINE * LANES + k)]
         for row in range(3):
@@ -191,7 +191,7 @@ def place_flange(w, v, n, chain):  # type: ignore[no-untyped-def]
     t20, t21, t22 = T[2, 0], T[2, 1], T[2, 2]
     px, py, pz, tx, ty, tz = p[0], p[1], p[2], t[0], t[1], t[2]
     for k in range(LANES):
-        g = w[U(a + GROWTH * LANES + k)]
+        g = w[U(a + LINK_SCALE * LANES + k)]
         x, y, z = g * px, g * py, g * pz
         for row in range(3):
             a0, a1, a2 = three(w, a + (ROTATION + 3 * row) * LANES, k)
@@ -267,7 +267,7 @@ def bend_joint(w, v, record, compliance, softening):  # type: ignore[no-untyped-
 
 @njit(**FAST)
 def bend_base(w, v, compliance):  # type: ignore[no-untyped-def]
-    """Write the base's tilt and turn record 0 by it."""
+    """Write the base's rotation and turn record 0 by it."""
     c = RECORD * LANES
     for axis in range(3):
         for k in range(LANES):

@@ -69,7 +69,7 @@ def _nine(b, k):  # type: ignore[no-untyped-def]
 
 @njit(**FAST)
 def place(b, n, w, deflected, tx, ty, tz):  # type: ignore[no-untyped-def]
-    """Place all frames of the block's row for the present bending and tilt of the base."""
+    """Place all frames of the block's row for the present bending and rotation of the base."""
     a = _matrix(tx, ty, tz)
     ox = oy = oz = 0.0
     shift = 9 * (n + 1)  # from the rotations to the positions

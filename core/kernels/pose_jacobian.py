@@ -9,11 +9,11 @@ from numba import njit
 
 from gapbridge.core.arrays import Array
 from gapbridge.core.kernels.adjoint import (
+    ADJOINT,
     BESIDE,
     BODY,
     OWN,
-    PULL,
-    PUSH,
+    REACTION,
     SHARE,
     SHIFT,
     TWIST,
@@ -25,8 +25,8 @@ from gapbridge.core.kernels.layout import (
     AXIS,
     COG,
     FAST,
-    GROWTH,
     LANES,
+    LINK_SCALE,
     MASS,
     ORIGIN,
     RECORD,
@@ -45,16 +45,16 @@ class Sums(NamedTuple):
     """Buffers of one coordinate's derivatives: slots of LANES numbers."""
 
     slots: Array  # of ``rates.ChainRate``, then those that differ from row to row
-    push: Array  # (3 slots) the records' pushes so far
+    reaction: Array  # (3 slots) the records' pushes so far
     turned: Array  # (3 slots) each crossed with its record's origin
 
 
 @njit(**FAST)
-def _in_axes(w, u, B, record, source, slot, grows):  # type: ignore[no-untyped-def]
+def _in_axes(w, u, B, record, source, slot, scaled):  # type: ignore[no-untyped-def]
     """Write three numbers of the next record (from ``source``) in a record's axes."""
     a = record * RECORD * _L
     for k in range(_L):
-        g = w[U(a + GROWTH * _L + k)] if grows else 1.0
+        g = w[U(a + LINK_SCALE * _L + k)] if scaled else 1.0
         x, y, z = three(u, source, k)
         x, y, z = in_axes(w, a, k, x, y, z)
         put(B, slot * _L, k, g * x, g * y, g * z)
@@ -63,12 +63,12 @@ def _in_axes(w, u, B, record, source, slot, grows):  # type: ignore[no-untyped-d
 @njit(**FAST)
 def _of_tool(w, v, sums, n, axis, turning):  # type: ignore[no-untyped-def]
     """Write the derivatives by the tool's shift and turn."""
-    a, slot, B, push = (n + 1) * RECORD * _L, 6 * (n + 1), sums.slots, sums.push
+    a, slot, B, reaction = (n + 1) * RECORD * _L, 6 * (n + 1), sums.slots, sums.reaction
     ex, ey = 1.0 if axis == 0 else 0.0, 1.0 if axis == 1 else 0.0
     ez = 1.0 if axis == 2 else 0.0
     moved, turned = 0.0 if turning else 1.0, 1.0 if turning else 0.0
     for k in range(_L):
-        px, py, pz = three(push, 0, k)
+        px, py, pz = three(reaction, 0, k)
         fx, fy, fz = three(v, WRENCH * _L, k)
         x = moved * ex + fy * pz - fz * py
         y = moved * ey + fz * px - fx * pz
@@ -81,14 +81,14 @@ def _of_tool(w, v, sums, n, axis, turning):  # type: ignore[no-untyped-def]
 
 @njit(**FAST)
 def _of_joint(w, u, B, n, i, p, c2):  # type: ignore[no-untyped-def]
-    """Write the derivatives by joint i's compliance and softening, its angle, its link's growth."""
+    """Write the derivatives by joint i's compliance and softening, its angle, its link's scale."""
     a, b = (i + 1) * RECORD * _L, (i + 1) * OWN * _L
     give, soft, turn = 6 * (n + 2) + 3 * i, 6 * (n + 2) + 3 * n + i, 10 * n + 18 + i
     px, py, pz = p[0], p[1], p[2]
     for k in range(_L):
         mx, my, m = three(u, b + BODY * _L, k)
         share = u[U(b + SHARE * _L + k)]
-        x, y, pull = three(u, b + PULL * _L, k)
+        x, y, pull = three(u, b + ADJOINT * _L, k)
         put(B, give * _L, k, x * mx, y * my, pull * m * share)
         B[U(soft * _L + k)] = -0.5 * c2 * pull * m * m * m * share * share * share
         x, y, z = three(w, a + AXIS * _L, k)
@@ -101,14 +101,14 @@ def _of_joint(w, u, B, n, i, p, c2):  # type: ignore[no-untyped-def]
 
 @njit(**FAST)
 def _reaction(w, u, sums, record):  # type: ignore[no-untyped-def]
-    """Add a record's push to the sum, and its push crossed with its origin to the other sum."""
+    """Add a record's reaction, and its reaction crossed with its origin, to the two sums."""
     a, b = record * RECORD * _L, record * OWN * _L
-    push, turned = sums.push, sums.turned
+    reaction, turned = sums.reaction, sums.turned
     for k in range(_L):
-        px, py, pz = three(u, b + PUSH * _L, k)
-        push[U(k)] += px
-        push[U(_L + k)] += py
-        push[U(2 * _L + k)] += pz
+        px, py, pz = three(u, b + REACTION * _L, k)
+        reaction[U(k)] += px
+        reaction[U(_L + k)] += py
+        reaction[U(2 * _L + k)] += pz
         if record > 0:
             x, y, z = three(w, a + ORIGIN * _L, k)
             turned[U(k)] += py * z - pz * y
@@ -119,7 +119,7 @@ def _reaction(w, u, sums, record):  # type: ignore[no-untyped-def]
 @njit(inline="always", **FAST)
 def _weight_at(w, sums, a, k, x, y, z):  # type: ignore[no-untyped-def]
     """Return the derivative by gravity of one kg at a point of the record that begins at ``a``."""
-    px, py, pz = three(sums.push, 0, k)
+    px, py, pz = three(sums.reaction, 0, k)
     tx, ty, tz = three(sums.turned, 0, k)
     x, y, z = point_of(w, a, k, x, y, z)
     return py * z - pz * y - tx, pz * x - px * z - ty, px * y - py * x - tz
@@ -167,7 +167,7 @@ def _derivatives(chain, lanes, sums, axis, turning, links, loads):  # type: igno
         _of_joint(w, u, B, n, i, chain.position[i + 1], chain.compliance[i, 2])
     if loads:
         B[gravity * _L : (gravity + 3) * _L] = 0.0
-        sums.push[:] = 0.0
+        sums.reaction[:] = 0.0
         sums.turned[:] = 0.0
         _reaction(w, u, sums, 0)
         for i in range(n):
@@ -178,7 +178,7 @@ def _derivatives(chain, lanes, sums, axis, turning, links, loads):  # type: igno
     for j in range(3):
         for k in range(_L):
             total = w[RECORD * _L + (TOTAL + 3 + j) * _L + k]
-            B[(gravity + 3 + j) * _L + k] = u[(PULL + j) * _L + k] * total
+            B[(gravity + 3 + j) * _L + k] = u[(ADJOINT + j) * _L + k] * total
 
 
 @njit(**INNER)

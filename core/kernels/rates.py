@@ -3,7 +3,7 @@
 A parameter of a model moves some of these numbers; its column is the sum of their slots, each times
 its rate. Slots of an arm of n joints, in this order: links (position and turn of the next joint's
 frame, in the axes of the link before), tool, compliances, softening, gravity, the base's compliance
-(those hold for all rows); joint angles, growths, payload mass (those differ from row to row).
+(those hold for all rows); joint angles, link scales, payload mass (those differ from row to row).
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class ChainRate(NamedTuple):
 
 @njit(inline="always", **JIT)
 def of_rows(n):  # type: ignore[no-untyped-def]
-    """Return the first slot that differs from row to row: n angles, n growths, a mass."""
+    """Return the first slot that differs from row to row: n angles, n link scales, a mass."""
     return 10 * n + 18
 
 

@@ -13,11 +13,15 @@ import numpy as np
 from numba import njit
 
 from gapbridge.core.arrays import Array
-from gapbridge.core.kernels.machine_code import keep_by_all_sources
 
-keep_by_all_sources()
+try:
+    from gapbridge.core.kernels.machine_code import keep_by_all_sources
+
+    KEPT = keep_by_all_sources()
+except (ImportError, AttributeError):  # another numba: plain, and compiled in each process
+    KEPT = False
 JIT: dict[str, Any] = {
-    "cache": True, "nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True,
+    "cache": KEPT, "nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True,
 }  # fmt: skip
 INNER = {**JIT, "no_cpython_wrapper": True}
 """What only compiled functions call: what Python would call it by takes a third of compiling."""
@@ -45,7 +49,7 @@ class Rows(NamedTuple):
     """What changes from row to row. N rows, contiguous."""
 
     q: Array  # (N, n) rad, true joint angles
-    growth: Array  # (N, n) factor on link i's length
+    link_scale: Array  # (N, n) factor on link i's length
     payload_mass: Array  # (N,) kg
     payload_cog: Array  # (N, 3) m, flange axes
     wrench: Array  # (N, 6) N, Nm: surroundings on the tool at the TCP, base axes
@@ -132,7 +136,7 @@ def place(chain, rows, r, shape, base_rotation, A, B):  # type: ignore[no-untype
     for i in range(n + 1):
         g = 1.0
         if i > 0:
-            g = rows.growth[r, i - 1]
+            g = rows.link_scale[r, i - 1]
         vx, vy, vz = g * chain.position[i, 0], g * chain.position[i, 1], g * chain.position[i, 2]
         if i > 0 and i < n and chain.flexibility[i - 1] != 0.0:
             t = shape.tip[i - 1]
@@ -182,7 +186,7 @@ def _add_load(total, fx, fy, fz, px, py, pz):  # type: ignore[no-untyped-def]
 def _load(chain, rows, r, shape, base_rotation, total):  # type: ignore[no-untyped-def]
     """Newton-Euler statics from tip to base (paper eqs. 6-8) and the bending it makes.
 
-    Returns the largest change of the bending; ``tilt`` gets the base's own.
+    Returns the largest change of the bending; ``base_rotation`` gets the base's own.
     """
     n = chain.mass.shape[0]
     g = chain.gravity
@@ -243,7 +247,7 @@ def _flex(chain, rows, r, shape, i, total, link):  # type: ignore[no-untyped-def
     for k in range(3):
         f[k] = R[0, k] * total[0] + R[1, k] * total[1] + R[2, k] * total[2]
         M[k] = R[0, k] * mx + R[1, k] * my + R[2, k] * mz
-        u[k] = chain.position[i + 1, k] * rows.growth[r, i]
+        u[k] = chain.position[i + 1, k] * rows.link_scale[r, i]
         length += u[k] * u[k]
     length = np.sqrt(length)
     if length < 1e-9:

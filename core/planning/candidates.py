@@ -25,7 +25,7 @@ from gapbridge.core.errors import PlanError
 from gapbridge.core.loads import Loads
 from gapbridge.core.model import Model
 from gapbridge.core.notes import Note, Reason
-from gapbridge.core.planning.workspace import Hindrance, Obstacle, Place, Space
+from gapbridge.core.planning.workspace import Hindrance, Obstacle, Place, Workspace
 
 STOPS = 900  # candidate poses
 DRAWN = 4000  # random poses looked at in one go
@@ -64,10 +64,10 @@ class _Sight:
     """Random poses that can be read, found so far, and what hindered the others."""
 
     def __init__(
-        self, nominal: Model, observable: Observable, space: Space, nuisance: Nuisance
+        self, nominal: Model, observable: Observable, workspace: Workspace, nuisance: Nuisance
     ) -> None:
         self._nominal, self._observable = nominal, observable
-        self._space, self._nuisance = space, nuisance
+        self._workspace, self._nuisance = workspace, nuisance
         self._found: list[tuple[Array, Index, Index]] = []  # joints, place, target
         self._looked = 0
         self._hindered: Counter[Hindrance] = Counter()
@@ -93,7 +93,7 @@ class _Sight:
     def look(self, random: np.random.Generator) -> None:
         """Look at some random poses, each from a random place at a random target."""
         observable, nuisance = self._observable, self._nuisance
-        q = self._space.draw(DRAWN, random)
+        q = self._workspace.draw(DRAWN, random)
         self._looked += DRAWN
         first = 1 if observable.kind == "relative" else 0
         station = random.integers(0, len(nuisance.stations), DRAWN)
@@ -104,7 +104,7 @@ class _Sight:
             self._hindered[Hindrance(Obstacle.FIXED_POINT)] += DRAWN - len(touching)
             q, station, target = touching.q, touching.station, touching.target
         good = np.ones(len(q), dtype=bool)
-        for hindrance, hit in _hindrances(observable, self._space, q, station, target).items():
+        for hindrance, hit in _hindrances(observable, self._workspace, q, station, target).items():
             self._hindered[hindrance] += int(hit.sum())
             good &= ~hit
         self._found.append((q[good], station[good], target[good]))
@@ -114,7 +114,7 @@ def candidates_of(
     parameters: Parameters,
     observable: Observable,
     loads: Sequence[Payload],
-    space: Space,
+    workspace: Workspace,
     seed: int,
     stops: int = STOPS,
 ) -> Candidates:
@@ -122,14 +122,14 @@ def candidates_of(
 
     Raises PlanError where no pose is reachable and seen.
     """
-    if observable.unknown and not space.places:
+    if observable.unknown and not workspace.places:
         raise PlanError(
             f"places: found none, expected where in base the fixed point of the {observable.kind} "
             "readings is"
         )
-    nuisance = _nuisance(observable, space)
+    nuisance = _nuisance(observable, workspace)
     random = np.random.default_rng(seed)
-    sight = _Sight(parameters.nominal, observable, space, nuisance)
+    sight = _Sight(parameters.nominal, observable, workspace, nuisance)
     for tried in range(TRIES):
         sight.look(random)
         if sight.count >= stops or (tried >= HOPELESS and not sight.count):
@@ -143,10 +143,10 @@ def candidates_of(
     return Candidates(seen[0], readings, stop, nuisance, sight.hindered, notes)
 
 
-def _nuisance(observable: Observable, space: Space) -> Nuisance:
+def _nuisance(observable: Observable, workspace: Workspace) -> Nuisance:
     """Return where the instruments are meant to stand, and the balls on the tool."""
-    places = space.places or (Place((0.0, 0.0, 0.0)),)
-    targets = space.targets
+    places = workspace.places or (Place((0.0, 0.0, 0.0)),)
+    targets = workspace.targets
     if observable.kind == "relative" and len(targets) < 2:
         targets = np.vstack([targets, targets[0] + [BALLS_APART, 0, 0]])
     radius = getattr(observable, "radius", None)
@@ -157,18 +157,18 @@ def _nuisance(observable: Observable, space: Space) -> Nuisance:
     )  # fmt: skip
 
 
-def readable(observable: Observable, space: Space, readings: Readings) -> Mask:
+def readable(observable: Observable, workspace: Workspace, readings: Readings) -> Mask:
     """Return which readings (N,) can be taken: nothing in the way, nothing hit."""
-    hits = _hindrances(observable, space, readings.q, readings.station, readings.target)
+    hits = _hindrances(observable, workspace, readings.q, readings.station, readings.target)
     return np.asarray(~np.any(list(hits.values()), axis=0))
 
 
 def _hindrances(
-    observable: Observable, space: Space, q: Array, station: Index, target: Index
+    observable: Observable, workspace: Workspace, q: Array, station: Index, target: Index
 ) -> dict[Hindrance, Mask]:
-    found = space.hindrances(q)
-    if space.places and not observable.closes:
-        found |= _unseen(space, q, station, np.minimum(target, len(space.targets) - 1))
+    found = workspace.hindrances(q)
+    if workspace.places and not observable.closes:
+        found |= _unseen(workspace, q, station, np.minimum(target, len(workspace.targets) - 1))
     return found
 
 
@@ -179,13 +179,13 @@ def joined(found: Candidates, more: Readings) -> Candidates:
     return replace(found, q=q, readings=beside(found.readings, more), stop=stop)
 
 
-def _unseen(space: Space, q: Array, station: Index, target: Index) -> dict[Hindrance, Mask]:
+def _unseen(workspace: Workspace, q: Array, station: Index, target: Index) -> dict[Hindrance, Mask]:
     """Return by hindrance which targets are not seen from their places."""
     found: dict[Hindrance, Mask] = {}
-    for s in range(len(space.places)):
-        for t in range(len(space.targets)):
+    for s in range(len(workspace.places)):
+        for t in range(len(workspace.targets)):
             rows = np.flatnonzero((station == s) & (target == t))
-            for hindrance, missed in space.sees(space.frames(q[rows]), s, t).items():
+            for hindrance, missed in workspace.sees(workspace.frames(q[rows]), s, t).items():
                 whole = found.setdefault(hindrance, np.zeros(len(q), dtype=bool))
                 whole[rows] |= missed
     return found

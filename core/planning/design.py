@@ -18,7 +18,12 @@ from gapbridge.core.errors import PlanError
 from gapbridge.core.loads import Loads
 from gapbridge.core.notes import Note, Reason
 from gapbridge.core.planning.candidates import STOPS, Candidates, candidates_of, joined
-from gapbridge.core.planning.exchange import Choice, exchanged, grown, shrunk
+from gapbridge.core.planning.exchange import (
+    Choice,
+    backward_eliminated,
+    exchanged,
+    forward_selected,
+)
 from gapbridge.core.planning.information import (
     Reference,
     blocks,
@@ -29,7 +34,7 @@ from gapbridge.core.planning.information import (
 from gapbridge.core.planning.refinement import Refined, Refiner, evened, leaning
 from gapbridge.core.planning.route import Stop, itinerary
 from gapbridge.core.planning.travel import joint_speed, leg_times
-from gapbridge.core.planning.workspace import Space
+from gapbridge.core.planning.workspace import Workspace
 
 REFERENCE = 200  # poses over which the predicted TCP is judged
 BOUGHT_ROUNDS = 3
@@ -54,18 +59,18 @@ def plan(
     parameters: Parameters,
     observable: Observable,
     loads: Sequence[Payload],
-    space: Space,
+    workspace: Workspace,
     wish: Wish,
     progress: Progress | None = None,
 ) -> Plan:
     """Return the most informative poses, loads and approaches, in the order of travel.
 
     Chosen so that the TCP predicted by the calibrated model is known best over the whole reachable
-    space and under all ``loads``, the worst places before the others.
+    workspace and under all ``loads``, the worst places before the others.
     Raises PlanError where no pose is reachable and seen, or where the poses cannot be enough.
     """
     with threadpool_limits(1, "blas"):  # matrices of this size gain nothing from threads
-        return _planned(parameters, observable, loads, space, wish, progress or _silent)
+        return _planned(parameters, observable, loads, workspace, wish, progress or _silent)
 
 
 def _silent(text: str, share: float) -> None:
@@ -76,26 +81,26 @@ def _planned(
     parameters: Parameters,
     observable: Observable,
     loads: Sequence[Payload],
-    space: Space,
+    workspace: Workspace,
     wish: Wish,
     emit: Progress,
 ) -> Plan:
     loads = _in_order(parameters, loads)
     _require_numbers(parameters, observable, wish)
     emit("looking for poses", 0.0)
-    space = replace(space, hung=(*space.hung, *(far_end(load) for load in loads)))
-    found = candidates_of(parameters, observable, loads, space, wish.seed, wish.stops)
+    workspace = replace(workspace, hung=(*workspace.hung, *(far_end(load) for load in loads)))
+    found = candidates_of(parameters, observable, loads, workspace, wish.seed, wish.stops)
     _require_enough(parameters, observable, found, wish)
     emit("working out what each pose contributes", 0.1)
     rows = blocks(parameters, observable, found.readings, found.nuisance, wish.sigma)
-    reference = reference_of(parameters, loads, space, wish.seed)
+    reference = reference_of(parameters, loads, workspace, wish.seed)
     cost = _cost(parameters, found, wish)
     choice = Choice.of(rows, reference.weight(rows.shape[2]), cost)
     chosen = _chosen(choice, wish, lambda share: emit("choosing poses", 0.2 + 0.3 * share))
     share = leaning(reference, rows[chosen])
     weight = reference.weight(rows.shape[2], share)
     chosen = exchanged(Choice.of(rows, weight, cost), chosen)
-    refiner = Refiner(parameters, observable, space, found, weight, wish.sigma)
+    refiner = Refiner(parameters, observable, workspace, found, weight, wish.sigma)
     best, weight = evened(
         refiner, reference, Refined(found.readings[np.array(chosen)], rows[chosen]), share,
         wish.seed, lambda share: emit("moving poses to more informative places", 0.5 + 0.2 * share),
@@ -108,13 +113,13 @@ def _planned(
     checks = [Stop(row, held_out=True) for row in _held_out(found, chosen, wish)]
     found = joined(found, best.readings)
     fit = [Stop(len(rows) + i) for i in range(wish.poses)]
-    way = itinerary(found, fit + checks, space, wish.repeats)
+    way = itinerary(found, fit + checks, workspace, wish.repeats)
     again = [stop.row - len(rows) for stop in way.stops if stop.repeat]
     measured = np.concatenate([best.rows, best.rows[again]])
     expected = expectation_of(parameters, measured, reference)
     emit("planned", 1.0)
     hung = set(found.readings.load[len(rows) :])
-    unseen = () if space.places or observable.unknown else (Note(Reason.SIGHT_UNKNOWN),)
+    unseen = () if workspace.places or observable.unknown else (Note(Reason.SIGHT_UNKNOWN),)
     notes = (*found.notes, *unseen, *way.notes, *_notes(parameters, loads, hung, expected.std))
     return Plan(
         tuple(loads), way.poses(found), expected, tuple(sorted(bought.items())), way.travel, notes
@@ -172,12 +177,12 @@ def _require_enough(
 
 
 def reference_of(
-    parameters: Parameters, loads: Sequence[Payload], space: Space, seed: int
+    parameters: Parameters, loads: Sequence[Payload], workspace: Workspace, seed: int
 ) -> Reference:
     """Return poses anywhere in the cell, seen by the instrument or not, under the loads in turn."""
     random = np.random.default_rng(seed + 1)
-    drawn = space.draw(20 * REFERENCE, random)
-    clear = drawn[space.clear(drawn)]
+    drawn = workspace.draw(20 * REFERENCE, random)
+    clear = drawn[workspace.clear(drawn)]
     q = clear[:REFERENCE] if len(clear) else drawn[:REFERENCE]
     turn = np.arange(len(q)) % len(loads)
     approach = random.choice([-1.0, 1.0], q.shape) if parameters.sided() else None
@@ -215,7 +220,7 @@ def _rms(reference: Reference, rows: Array) -> float:
 
 def _chosen(choice: Choice, wish: Wish, report: Callable[[float], None]) -> list[int]:
     size, k = choice.rows.shape[2], choice.rows.shape[1]
-    return exchanged(choice, grown(choice, [], wish.poses, -(-size // k)), report=report)
+    return exchanged(choice, forward_selected(choice, [], wish.poses, -(-size // k)), report=report)
 
 
 def _bought(
@@ -229,7 +234,11 @@ def _bought(
         if count == len(chosen):
             continue
         fewer = count < len(chosen)
-        some = shrunk(choice, chosen, count) if fewer else grown(choice, chosen, count, 0)
+        some = (
+            backward_eliminated(choice, chosen, count)
+            if fewer
+            else forward_selected(choice, chosen, count, 0)
+        )
         some = exchanged(choice, some, rounds=1)
         readings = refiner.found.readings[np.array(some)]
         random = np.random.default_rng(wish.seed)

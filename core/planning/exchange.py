@@ -72,8 +72,8 @@ class Choice:
         return score
 
 
-def grown(choice: Choice, chosen: Sequence[int], count: int, volume: int) -> list[int]:
-    """Return a choice grown to ``count``; up to ``volume`` candidates go for the volume."""
+def forward_selected(choice: Choice, chosen: Sequence[int], count: int, volume: int) -> list[int]:
+    """Return a choice of ``count``, the best added in turn: the first ``volume`` by the volume."""
     found = list(chosen)
     while len(found) < count:
         score = choice.volumes(found) if len(found) < volume else choice.gains(found)
@@ -107,7 +107,7 @@ def exchanged(
     return found
 
 
-def shrunk(choice: Choice, chosen: Sequence[int], count: int) -> list[int]:
+def backward_eliminated(choice: Choice, chosen: Sequence[int], count: int) -> list[int]:
     """Return a choice of ``count`` of the chosen: those that are missed least are given up."""
     found = list(chosen)
     while len(found) > count:

@@ -10,6 +10,7 @@ from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.payload_session import NAMES, UNITS, weight_columns
 from gapbridge.core.errors import ExcitationError
 from gapbridge.core.model import Model
+from gapbridge.core.planning.travel import in_order
 
 WRIST = 3  # joints at the end that turn the flange and hardly move the arm
 CANDIDATES = 600
@@ -69,8 +70,7 @@ def plan_payload(
             "payload session: within the joint limits the wrist cannot turn the flange far enough "
             "to separate load from sensor bias; begin elsewhere"
         )
-    order = tour(begin, candidates[chosen])
-    return PayloadPlan(tuple(order), NAMES, UNITS, std, tuple(bought))
+    return PayloadPlan(tuple(in_order(candidates[chosen], begin)), NAMES, UNITS, std, tuple(bought))
 
 
 def _candidates(model: Model, begin: Array, rng: np.random.Generator) -> Array:
@@ -108,13 +108,3 @@ def _std(columns: Array) -> Array:
     if values[0] <= 1e-9 * values[-1]:
         return np.full(len(values), np.inf)
     return np.asarray(np.sqrt(np.einsum("ik,ik->i", vectors / values, vectors)))
-
-
-def tour(begin: Array, poses: Array) -> list[Array]:
-    """Return the poses each next to the one before: the nearest one still to visit."""
-    left, at, order = list(poses), begin, []
-    while left:
-        far = [float(np.abs(q - at).max()) for q in left]
-        at = left.pop(int(np.argmin(far)))
-        order.append(at)
-    return order

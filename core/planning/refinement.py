@@ -25,7 +25,7 @@ from gapbridge.core.calibration.readings import Readings
 from gapbridge.core.planning.candidates import Candidates, readable
 from gapbridge.core.planning.exchange import Choice
 from gapbridge.core.planning.information import Reference, blocks, information_of, inverse
-from gapbridge.core.planning.workspace import Space
+from gapbridge.core.planning.workspace import Workspace
 
 NUDGE = 0.02  # rad, for the gradient
 LENGTHS = (0.03, 0.06, 0.12, 0.25, 0.5)  # rad, down the gradient
@@ -50,7 +50,7 @@ class Refiner:
 
     parameters: Parameters
     observable: Observable
-    space: Space
+    workspace: Workspace
     found: Candidates
     weight: Array  # (P, P)
     sigma: float
@@ -124,7 +124,7 @@ class Refiner:
         whole = replace(readings[own], q=q)
         at = self.observable.brought(nominal, q, whole, nuisance)
         there = np.flatnonzero(np.isfinite(at).all(axis=1))
-        there = there[readable(self.observable, self.space, replace(whole, q=at)[there])]
+        there = there[readable(self.observable, self.workspace, replace(whole, q=at)[there])]
         part = replace(whole, q=at)[there]
         return replace(part, value=self.observable.predict(nominal, part, nuisance)), there
 

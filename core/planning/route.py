@@ -13,7 +13,7 @@ from gapbridge.core.calibration.plan import PlannedPose
 from gapbridge.core.notes import Note, Reason
 from gapbridge.core.planning.candidates import Candidates
 from gapbridge.core.planning.travel import joint_speed, leg_times, shortest_way
-from gapbridge.core.planning.workspace import Space
+from gapbridge.core.planning.workspace import Workspace
 
 BETWEEN = 9  # poses looked at on a leg
 ROUNDABOUT = 3.0  # times as long a leg counts on which the arm would hit something
@@ -54,13 +54,15 @@ class Itinerary:
         return tuple(poses)
 
 
-def itinerary(found: Candidates, stops: Sequence[Stop], space: Space, repeats: int) -> Itinerary:
+def itinerary(
+    found: Candidates, stops: Sequence[Stop], workspace: Workspace, repeats: int
+) -> Itinerary:
     """Return the way through all stops and ``repeats`` second visits.
 
     A load's first pose is visited again at its end, which shows whether the instrument was moved.
     """
     readings = found.readings
-    speed = joint_speed(space.model.arm.limits.velocity)
+    speed = joint_speed(workspace.model.arm.limits.velocity)
     blocks = _blocks(found, stops)
     share = _shares([sum(not stop.held_out for stop in block) for block in blocks], repeats)
     at, travel = None, 0.0
@@ -68,7 +70,7 @@ def itinerary(found: Candidates, stops: Sequence[Stop], space: Space, repeats: i
     hit: list[tuple[int, int]] = []
     for block, again in zip(blocks, share, strict=True):
         q = readings.q[[stop.row for stop in block]]
-        legs, blocked = _legs(q, space, speed)
+        legs, blocked = _legs(q, workspace, speed)
         first = np.zeros(len(q)) if at is None else leg_times(at[None], q, speed)[0]
         order = shortest_way(np.where(blocked, ROUNDABOUT * legs + 1.0, legs), first)
         own = [block[i] for i in order]
@@ -115,7 +117,7 @@ def _blocks(found: Candidates, stops: Sequence[Stop]) -> list[list[Stop]]:
     return [groups[key] for key in sorted(groups, key=turn)]
 
 
-def _legs(q: Array, space: Space, speed: Array) -> tuple[Array, Mask]:
+def _legs(q: Array, workspace: Workspace, speed: Array) -> tuple[Array, Mask]:
     """Return the times (B, B) between poses, and where the straight way hits something."""
     count = len(q)
     legs = leg_times(q, q, speed)
@@ -124,6 +126,6 @@ def _legs(q: Array, space: Space, speed: Array) -> tuple[Array, Mask]:
     if len(one):
         share = np.linspace(0, 1, BETWEEN + 2)[1:-1]
         between = q[one][:, None] + share[:, None] * (q[other] - q[one])[:, None]
-        clear = space.clear(between.reshape(-1, q.shape[1])).reshape(-1, BETWEEN)
+        clear = workspace.clear(between.reshape(-1, q.shape[1])).reshape(-1, BETWEEN)
         blocked[one, other] = blocked[other, one] = ~clear.all(axis=1)
     return legs, blocked

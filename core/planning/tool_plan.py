@@ -8,9 +8,11 @@ import numpy as np
 
 from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.tool_session import NAMES, touch_columns
+from gapbridge.core.effects import CATALOGUE
 from gapbridge.core.errors import ExcitationError
 from gapbridge.core.model import Model
-from gapbridge.core.planning.payload_plan import ROOM, greedy, tour
+from gapbridge.core.planning.payload_plan import ROOM, greedy
+from gapbridge.core.planning.travel import in_order
 from gapbridge.core.rotation import rotation_matrix, rotation_vector
 
 CANDIDATES = 80
@@ -59,7 +61,7 @@ def plan_tool(
             "tool session: the arm cannot turn the tool far enough about that point within its "
             "joint limits; expected a point in front of the arm, tool pointing down"
         )
-    return ToolPlan(tuple(tour(begin, reached[chosen])), NAMES, std, tuple(bought))
+    return ToolPlan(tuple(in_order(reached[chosen], begin)), NAMES, std, tuple(bought))
 
 
 def _candidates(model: Model, begin: Array, rng: np.random.Generator) -> Array:
@@ -81,7 +83,7 @@ def _candidates(model: Model, begin: Array, rng: np.random.Generator) -> Array:
 def _reach(model: Model, q: Array, position: Array, rotation: Array) -> Array | None:
     """Return joint angles of a pose, near ``q``; None where Newton's steps do not get there."""
     q = q.copy()
-    rigid = replace(model, terms=tuple(t for t in model.terms if "compliance" not in t.effect))
+    rigid = replace(model, terms=tuple(t for t in model.terms if not CATALOGUE[t.effect].softens))
     for _ in range(ROUNDS):
         pose = rigid.predict(q)
         error = np.concatenate(

@@ -21,6 +21,12 @@ def leg_times(q: Array, to: Array, speed: Array) -> Array:
     return np.asarray((np.abs(q[:, None] - to[None]) / speed).max(axis=2, initial=0.0))
 
 
+def in_order(q: Array, begin: Array) -> Array:
+    """Return poses (N, n) in an order of short moves from ``begin`` (n,), rad."""
+    speed = np.ones(q.shape[1])
+    return q[shortest_way(leg_times(q, q, speed), leg_times(begin[None], q, speed)[0])]
+
+
 def shortest_way(legs: Array, first: Array) -> list[int]:
     """Return an order of B stops with short legs (B, B); ``first`` (B,) leads to each from before.
 

@@ -22,6 +22,7 @@ from gapbridge.core.planning.capsules import Box, Capsules, below, hidden, in_bo
 
 THICK = 0.035  # of the arm's stretched length: radius of a link
 TOOL_THICK = 0.03  # of the same: tool and loads
+SHORTEST = 1e-3  # m: an arm without length divides nothing by zero
 NEAR_SINGULAR = 0.01  # smallest singular value of the Jacobian, lengths in stretched lengths
 FURTHEST_TURN = np.pi  # rad from zero, where the limits allow more: cables need not wind up
 
@@ -77,8 +78,8 @@ class Frames:
 
 
 @dataclass(frozen=True)
-class Space:
-    """The poses at which measuring is possible. Make it by ``Space.of``."""
+class Workspace:
+    """The poses at which measuring is possible. Make it by ``Workspace.of``."""
 
     model: Model
     lower: Array  # (n,) rad
@@ -105,8 +106,8 @@ class Space:
         floor: float | None = None,
         places: Sequence[Place] = (),
         reflector: Reflector | None = None,
-    ) -> Space:
-        """Return the space of an arm in its cell.
+    ) -> Workspace:
+        """Return the workspace of an arm in its cell.
 
         ``lower``, ``upper`` (n, rad) tighten the arm's own joint limits; without a ``reflector``
         the one target is the TCP, seen from all around.
@@ -119,19 +120,19 @@ class Space:
                     f"keep-out box {number}: found lower {box.lower} and upper {box.upper}, "
                     "expected lower below upper in x, y and z"
                 )
-        stretched = reach(model)
-        radius = np.full(model.arm.n + 1, THICK * stretched)
+        length = max(model.length, SHORTEST)
+        radius = np.full(model.arm.n + 1, THICK * length)
         seen = reflector or Reflector()
         points = np.atleast_2d(np.array(seen.targets, dtype=float))
         axes = None
         if seen.looks is not None:
             axes = np.broadcast_to(np.atleast_2d(np.array(seen.looks, dtype=float)), points.shape)
             axes = axes / np.linalg.norm(axes, axis=1, keepdims=True)
-        space = cls(
+        workspace = cls(
             model, low, high, tuple(keep_out), floor, tuple(places), points, axes, seen.acceptance,
-            radius, TOOL_THICK * stretched,
+            radius, TOOL_THICK * length,
         )  # fmt: skip
-        return replace(space, pairs=_pairs(space))
+        return replace(workspace, pairs=_pairs(workspace))
 
     def frames(self, q: Array) -> Frames:
         """Return where everything is at joints ``q`` (N, n), rigid."""
@@ -198,7 +199,8 @@ class Space:
 
     def near_singular(self, frames: Frames) -> Mask:
         """Return at which poses (N,) the arm can hardly move in some direction."""
-        lever = (frames.tcp[:, None] - frames.origin[:, 1:-1]) / reach(self.model)
+        length = max(self.model.length, SHORTEST)
+        lever = (frames.tcp[:, None] - frames.origin[:, 1:-1]) / length
         J = np.concatenate([np.cross(frames.axis, lever), frames.axis], axis=2)
         smallest = np.linalg.svd(J, compute_uv=False)[:, min(6, self.model.arm.n) - 1]
         return np.asarray(smallest < NEAR_SINGULAR)
@@ -212,12 +214,6 @@ class Space:
     def draw(self, count: int, random: np.random.Generator) -> Array:
         """Return joints (count, n) anywhere within the limits."""
         return random.uniform(self.lower, self.upper, (count, len(self.lower)))
-
-
-def reach(model: Model) -> float:
-    """Return the stretched length of arm and tool (m)."""
-    links = np.linalg.norm(model.arm.link_in_link[:, :3, 3], axis=1).sum()
-    return max(float(links + np.linalg.norm(model.tool_in_flange[:3, 3])), 1e-3)
 
 
 def _limits(
@@ -246,12 +242,12 @@ def _limits(
     return low, high
 
 
-def _pairs(space: Space) -> tuple[tuple[int, int], ...]:
+def _pairs(workspace: Workspace) -> tuple[tuple[int, int], ...]:
     """Return the capsules far enough along the chain to hit each other in some poses only."""
-    frames = space.frames(np.zeros((1, space.model.arm.n)))
-    capsules = space.capsules(frames)
+    frames = workspace.frames(np.zeros((1, workspace.model.arm.n)))
+    capsules = workspace.capsules(frames)
     long = np.linalg.norm(capsules.end - capsules.begin, axis=2)[0]
-    n = space.model.arm.n
+    n = workspace.model.arm.n
     pairs = []
     for j in range(2, len(long)):
         for i in range(min(j - 1, n)):

@@ -72,7 +72,7 @@ def _placed(chain: Chain, rows: Rows, bend: Array, base_rotation: Array) -> dict
     R, o = _turned(base_rotation), np.zeros((count, 3))
     origin, rotation, axis = np.empty((count, n, 3)), np.empty((count, n, 3, 3)), []
     for i in range(n):
-        length = rows.growth[:, i - 1, None] if i else 1.0
+        length = rows.link_scale[:, i - 1, None] if i else 1.0
         o = o + np.einsum("nij,nj->ni", R, length * np.tile(chain.position[i], (count, 1)))
         c, s, zero = np.cos(rows.q[:, i]), np.sin(rows.q[:, i]), np.zeros(count)
         about_z = np.array([[c, -s, zero], [s, c, zero], [zero, zero, zero + 1]])
@@ -80,7 +80,7 @@ def _placed(chain: Chain, rows: Rows, bend: Array, base_rotation: Array) -> dict
         axis.append(R[:, :, 2])
         R = R @ _turned(bend[:, i])
         origin[:, i], rotation[:, i] = o, R
-    o = o + np.einsum("nij,nj->ni", R, rows.growth[:, n - 1, None] * chain.position[n])
+    o = o + np.einsum("nij,nj->ni", R, rows.link_scale[:, n - 1, None] * chain.position[n])
     R = R @ chain.rotation[n]
     return {
         "origin": origin, "rotation": rotation, "axis": np.stack(axis, axis=1),

@@ -115,8 +115,7 @@ def _within(values: Array, most: float) -> bool:
 
 
 def _reach(model: Model) -> float:
-    reach = float(np.linalg.norm(model.arm.link_in_link[:, :3, 3], axis=1).sum())
-    return max(reach + float(np.linalg.norm(model.tool_in_flange[:3, 3])), 0.05)
+    return max(model.length, 0.05)
 
 
 def _usual_load(model: Model) -> float:

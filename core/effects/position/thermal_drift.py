@@ -36,4 +36,4 @@ class ThermalDrift(Effect):
     def condition(self, term: Term, arm: Arm, rows: Rows, loads: Loads, q: Array) -> None:
         """Lengthen the links."""
         if loads.temperature is not None:
-            rows.growth[:, :] += term.values[0] * loads.temperature
+            rows.link_scale[:, :] += term.values[0] * loads.temperature

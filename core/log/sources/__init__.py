@@ -1,4 +1,4 @@
-"""What people have instead of a log, each kind in a file of its own; one table."""
+"""Recordings in other formats, read as logs: one class a format, and the table of them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The base of what people have instead of a log: one file or folder, read as a log's columns."""
+"""The base of other recording formats: one file or folder, read as the columns of a log."""
 
 from __future__ import annotations
 

@@ -13,7 +13,7 @@ from gapbridge.core.calibration.plan import Payload, Plan
 from gapbridge.core.calibration.readings import Readings
 from gapbridge.core.loads import Loads
 from gapbridge.core.model import Model
-from gapbridge.core.planning.workspace import Place, Space
+from gapbridge.core.planning.workspace import Place, Workspace
 
 SIGMA = 3e-5
 LOADS = (Payload(4.0, (0.0, 0.02, 0.06), "plate"), Payload(0.0))
@@ -27,10 +27,10 @@ def small_model() -> Model:
     return Model(builtin_arm("ur5e"), tool)
 
 
-def small_space(model: Model, **given: object) -> Space:
+def small_space(model: Model, **given: object) -> Workspace:
     """Return a floor and a tracker."""
     room = {"floor": 0.0, "places": [Place((2.0, 0.5, 0.6), 0.3)], **given}
-    return Space.of(model, **room)  # type: ignore[arg-type]
+    return Workspace.of(model, **room)  # type: ignore[arg-type]
 
 
 def small_parameters(model: Model) -> Parameters:

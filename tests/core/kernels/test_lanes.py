@@ -30,7 +30,7 @@ def case(stiff: bool, count: int = COUNT, seed: int = 0) -> tuple[Chain, Rows]:
         wrench=rng.normal(0, 20, (count, 6)),
     )
     chain, rows = model.chain(), model.rows(rng.uniform(-7, 7, (count, 6)), loads)
-    rows.growth[:] = rng.uniform(0.999, 1.001, rows.growth.shape)
+    rows.link_scale[:] = rng.uniform(0.999, 1.001, rows.link_scale.shape)
     if not stiff:
         chain.compliance[:] = rng.uniform(0, 3e-5, (6, 3))
         chain.softening[:] = rng.uniform(0, 1e-5, 6)

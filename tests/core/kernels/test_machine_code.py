@@ -187,3 +187,20 @@ def test_a_prediction_needs_no_linear_algebra_of_scipy() -> None:
             check=True,
         )  # fmt: skip
     assert done.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize(
+    "missing",
+    ["environment._rebuild_env", "caching.CodeLibraryCacheImpl", "config.CACHE_LOCATOR_CLASSES"],
+)
+def test_another_numba_keeps_no_machine_code_but_computes(missing: str) -> None:
+    # what is kept without these parts would not notice that a source has changed
+    program = f"""
+from numba.core import caching, config, environment
+del {missing}
+from numba import njit
+from gapbridge.core.kernels.reference import JIT
+print(JIT["cache"], njit(**JIT)(lambda x: 2 * x)(3))
+"""
+    done = subprocess.run([sys.executable, "-c", program], text=True, capture_output=True)
+    assert done.stdout.split() == ["False", "6"], done.stderr

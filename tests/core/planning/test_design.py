@@ -26,9 +26,14 @@ from gapbridge.core.notes import Note, Reason
 from gapbridge.core.planning import design
 from gapbridge.core.planning.candidates import candidates_of
 from gapbridge.core.planning.design import reference_of
-from gapbridge.core.planning.exchange import Choice, exchanged, grown, shrunk
+from gapbridge.core.planning.exchange import (
+    Choice,
+    backward_eliminated,
+    exchanged,
+    forward_selected,
+)
 from gapbridge.core.planning.information import blocks, information_of, inverse
-from gapbridge.core.planning.workspace import Place, Reflector, Space
+from gapbridge.core.planning.workspace import Place, Reflector, Workspace
 
 
 def plan(*given, progress=None, **wishes) -> Plan:
@@ -42,7 +47,7 @@ def model() -> Model:
 
 
 @pytest.fixture(scope="module")
-def space(model: Model) -> Space:
+def space(model: Model) -> Workspace:
     return small_space(model, reflector=Reflector(looks=[(0, 0, 1)], acceptance=np.radians(60)))
 
 
@@ -52,7 +57,7 @@ def parameters(model: Model) -> Parameters:
 
 
 @pytest.fixture(scope="module")
-def planned(parameters: Parameters, space: Space) -> Plan:
+def planned(parameters: Parameters, space: Workspace) -> Plan:
     return plan(
         parameters, POSITION, LOADS, space, poses=12, held_out=4, repeats=3, sigma=SIGMA, seed=3
     )
@@ -84,14 +89,16 @@ def test_held_out_poses_are_poses_of_their_own(planned: Plan) -> None:
     assert not fitted & {p.q.tobytes() for p in planned.poses if p.held_out}
 
 
-def test_every_planned_pose_can_be_reached_and_seen(planned: Plan, space: Space) -> None:
+def test_every_planned_pose_can_be_reached_and_seen(planned: Plan, space: Workspace) -> None:
     q = np.array([p.q for p in planned.poses])
     assert space.clear(q).all()
     for missed in space.sees(space.frames(q), 0, 0).values():
         assert not missed.any()
 
 
-def test_the_same_seed_plans_the_same(planned: Plan, parameters: Parameters, space: Space) -> None:
+def test_the_same_seed_plans_the_same(
+    planned: Plan, parameters: Parameters, space: Workspace
+) -> None:
     again = plan(
         parameters, POSITION, LOADS, space, poses=12, held_out=4, repeats=3, sigma=SIGMA, seed=3
     )
@@ -108,7 +115,7 @@ def test_more_poses_buy_less_uncertainty(planned: Plan) -> None:
 
 
 def test_planned_poses_beat_more_random_ones(
-    planned: Plan, parameters: Parameters, space: Space
+    planned: Plan, parameters: Parameters, space: Workspace
 ) -> None:
     found = candidates_of(parameters, POSITION, LOADS, space, 11, 400)
     rows = blocks(parameters, POSITION, found.readings, found.nuisance, SIGMA)
@@ -125,7 +132,7 @@ def test_planned_poses_beat_more_random_ones(
     assert planned.expected.tcp_std_worst < np.median([std.max() for std in twice])
 
 
-def test_travel_counts(parameters: Parameters, space: Space) -> None:
+def test_travel_counts(parameters: Parameters, space: Workspace) -> None:
     far, near = (
         plan(parameters, POSITION, LOADS, space, poses=12, held_out=0, repeats=0, travel_weight=w)
         for w in (0.0, 3.0)
@@ -133,7 +140,7 @@ def test_travel_counts(parameters: Parameters, space: Space) -> None:
     assert near.travel < far.travel
 
 
-def test_joints_with_play_are_approached_from_both_sides(model: Model, space: Space) -> None:
+def test_joints_with_play_are_approached_from_both_sides(model: Model, space: Workspace) -> None:
     loose = identifiable_parameters(
         model, ("tool_frame", "backlash_2", "backlash_3"), observable=POSITION
     )
@@ -170,7 +177,7 @@ def test_a_gauge_keeps_within_its_range(model: Model) -> None:
     assert long.min() >= 0.15 and long.max() <= 0.4
 
 
-def test_progress_is_reported_from_nothing_to_all(parameters: Parameters, space: Space) -> None:
+def test_progress_is_reported_from_nothing_to_all(parameters: Parameters, space: Workspace) -> None:
     reported: list[float] = []
     plan(
         parameters, POSITION, LOADS, space, poses=8, held_out=0, repeats=0,
@@ -181,7 +188,7 @@ def test_progress_is_reported_from_nothing_to_all(parameters: Parameters, space:
 
 
 def test_one_load_alone_and_an_unknown_place_are_reported(
-    parameters: Parameters, space: Space
+    parameters: Parameters, space: Workspace
 ) -> None:
     space = replace(space, places=())
     planned = plan(parameters, POSITION, LOADS[:1], space, poses=8, held_out=0, repeats=0)
@@ -198,7 +205,7 @@ def test_one_load_alone_and_an_unknown_place_are_reported(
     ],
 )
 def test_wishes_that_cannot_be_met_are_declined_in_one_line(
-    parameters: Parameters, space: Space, changed, expected
+    parameters: Parameters, space: Workspace, changed, expected
 ) -> None:
     loads = changed.pop("loads", LOADS)
     with pytest.raises(PlanError, match=expected) as caught:
@@ -206,7 +213,9 @@ def test_wishes_that_cannot_be_met_are_declined_in_one_line(
     assert "\n" not in str(caught.value)
 
 
-def test_where_nothing_is_seen_the_reason_is_reported(parameters: Parameters, space: Space) -> None:
+def test_where_nothing_is_seen_the_reason_is_reported(
+    parameters: Parameters, space: Workspace
+) -> None:
     blind = replace(space, places=(Place((9.0, 0.0, 0.5), farthest=1.0),))
     with pytest.raises(PlanError, match=r"no pose can be reached and seen: .* out of range"):
         plan(parameters, POSITION, LOADS, blind)
@@ -216,7 +225,7 @@ def test_a_fixed_point_without_a_place_is_asked_for(model: Model) -> None:
     observable = make_observable("sphere")
     parameters = identifiable_parameters(model, ("tool_frame",), observable=observable)
     with pytest.raises(PlanError, match="places: found none, expected where in base"):
-        plan(parameters, observable, LOADS, Space.of(model))
+        plan(parameters, observable, LOADS, Workspace.of(model))
 
 
 def test_exchange_finds_the_ends_of_a_straight_line() -> None:
@@ -224,9 +233,9 @@ def test_exchange_finds_the_ends_of_a_straight_line() -> None:
     x = np.linspace(-1, 1, 21).repeat(2)
     rows = 100 * np.stack([np.ones(42), x], axis=1)[:, None]
     choice = Choice.of(rows, np.diag([1.0, 1 / 3]), lambda chosen: np.zeros(42))
-    chosen = exchanged(choice, grown(choice, [], 4, 2))
+    chosen = exchanged(choice, forward_selected(choice, [], 4, 2))
     assert sorted(x[chosen]) == [-1, -1, 1, 1]
-    assert len(shrunk(choice, chosen, 3)) == 3
+    assert len(backward_eliminated(choice, chosen, 3)) == 3
 
 
 def test_gains_are_what_adding_a_candidate_brings() -> None:
@@ -253,7 +262,7 @@ def test_two_places_and_two_balls_are_visited_one_place_after_the_other(
     assert turns <= 3  # a load is not hung anew for the second place
 
 
-def test_a_load_that_shows_nothing_is_named(parameters: Parameters, space: Space) -> None:
+def test_a_load_that_shows_nothing_is_named(parameters: Parameters, space: Workspace) -> None:
     loads = [Payload(0.0), Payload(0.01), Payload(4.0, (0.0, 0.02, 0.06))]
     planned = plan(parameters, POSITION, loads, space, poses=9, held_out=3, repeats=0)
     hung = {planned.loads[pose.load].mass for pose in planned.poses}
@@ -263,7 +272,7 @@ def test_a_load_that_shows_nothing_is_named(parameters: Parameters, space: Space
 
 
 def test_too_few_poses_are_said_before_any_is_looked_for(
-    parameters: Parameters, space: Space, monkeypatch: pytest.MonkeyPatch
+    parameters: Parameters, space: Workspace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("gapbridge.core.planning.design.candidates_of", None)
     with pytest.raises(PlanError, match="too few poses: found 3, expected at least"):

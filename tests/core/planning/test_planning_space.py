@@ -13,7 +13,7 @@ from gapbridge.core.arm import builtin_arm
 from gapbridge.core.errors import PlanError
 from gapbridge.core.model import Model
 from gapbridge.core.planning.capsules import Box, segment_distance
-from gapbridge.core.planning.workspace import Hindrance, Obstacle, Place, Reflector, Space
+from gapbridge.core.planning.workspace import Hindrance, Obstacle, Place, Reflector, Workspace
 
 UP = np.array([[0.0, -np.pi / 2, 0.0, -np.pi / 2, 0.0, 0.0]])  # a UR stretched upwards
 OUT = np.zeros((1, 6))  # a UR stretched out along -x
@@ -27,7 +27,7 @@ def model() -> Model:
 
 
 def test_frames_are_the_rigid_models(model: Model) -> None:
-    space = Space.of(model)
+    space = Workspace.of(model)
     q = space.draw(50, np.random.default_rng(0))
     frames, poses = space.frames(q), model.rigid_pose(q)
     assert frames.tcp == pytest.approx(poses.position, abs=1e-12)
@@ -35,9 +35,9 @@ def test_frames_are_the_rigid_models(model: Model) -> None:
 
 
 def test_joints_that_turn_further_than_once_round_need_not_wind_up(model: Model) -> None:
-    space = Space.of(model)
+    space = Workspace.of(model)
     assert space.lower == pytest.approx(-np.pi)
-    tight = Space.of(model, lower=[-1] * 6, upper=[0.5, 1, 1, 1, 1, 1])
+    tight = Workspace.of(model, lower=[-1] * 6, upper=[0.5, 1, 1, 1, 1, 1])
     drawn = tight.draw(200, np.random.default_rng(0))
     assert drawn.min() >= -1
     assert drawn[:, 0].max() <= 0.5
@@ -47,18 +47,18 @@ def test_joints_that_turn_further_than_once_round_need_not_wind_up(model: Model)
 def test_a_box_is_hit_by_the_arm_that_reaches_into_it(model: Model) -> None:
     tip = model.rigid_pose(OUT).position[0]
     box = Box(tuple(tip - 0.05), tuple(tip + 0.05))
-    assert Space.of(model).clear(OUT).all()
-    assert not Space.of(model, keep_out=[box]).clear(OUT).any()
-    assert Space.of(model, keep_out=[box]).clear(UP).all()
+    assert Workspace.of(model).clear(OUT).all()
+    assert not Workspace.of(model, keep_out=[box]).clear(OUT).any()
+    assert Workspace.of(model, keep_out=[box]).clear(UP).all()
 
 
 def test_a_thin_wall_between_the_joints_is_seen(model: Model) -> None:
     wall = Box((-0.31, -1.0, 0.0), (-0.30, 1.0, 1.0))  # across the middle of the upper arm
-    assert not Space.of(model, keep_out=[wall]).clear(OUT).any()
+    assert not Workspace.of(model, keep_out=[wall]).clear(OUT).any()
 
 
 def test_the_floor_stops_the_forearm_and_not_the_foot(model: Model) -> None:
-    space = Space.of(model, floor=0.0)
+    space = Workspace.of(model, floor=0.0)
     assert space.clear(UP).all()
     down = np.array([[0.0, 0.6, 0.0, 0.0, 0.0, 0.0]])
     assert space.hindrances(down)[Hindrance(Obstacle.FLOOR)].all()
@@ -66,20 +66,20 @@ def test_the_floor_stops_the_forearm_and_not_the_foot(model: Model) -> None:
 
 def test_a_folded_arm_is_near_itself(model: Model) -> None:
     folded = np.array([[0.0, -np.pi / 2, np.pi - 0.15, 0.0, 0.5, 0.0]])
-    assert Space.of(model).hindrances(folded)[Hindrance(Obstacle.SELF)].all()
+    assert Workspace.of(model).hindrances(folded)[Hindrance(Obstacle.SELF)].all()
 
 
 def test_the_load_is_part_of_the_arm(model: Model) -> None:
     tip = model.rigid_pose(OUT)
     below = tip.position[0] + tip.rotation[0] @ [0, 0, 0.35]
     box = Box(tuple(below - 0.03), tuple(below + 0.03))
-    space = Space.of(model, keep_out=[box])
+    space = Workspace.of(model, keep_out=[box])
     assert space.clear(OUT).all()
     assert not replace(space, hung=((0.0, 0.0, 0.55),)).clear(OUT).any()
 
 
 def test_a_straight_arm_is_nearly_singular(model: Model) -> None:
-    space = Space.of(model)
+    space = Workspace.of(model)
     deflected = np.array([[0.3, -1.2, 1.3, -1.0, 1.2, 0.4]])
     assert space.near_singular(space.frames(np.vstack([OUT, deflected]))).tolist() == [True, False]
 
@@ -87,9 +87,9 @@ def test_a_straight_arm_is_nearly_singular(model: Model) -> None:
 def test_the_tracker_sees_what_is_before_the_arm_and_not_what_is_behind_it(model: Model) -> None:
     tip = model.rigid_pose(OUT).position[0]
     before = Place((tip[0] - 1.0, tip[1], tip[2]))
-    wrist = Space.of(model).frames(OUT).origin[0, 4]
+    wrist = Workspace.of(model).frames(OUT).origin[0, 4]
     behind = Place(tuple(tip + 3.0 * (wrist - tip)))
-    space = Space.of(model, places=[before, behind])
+    space = Workspace.of(model, places=[before, behind])
     frames = space.frames(OUT)
     assert not space.sees(frames, 0, 0)[Hindrance(Obstacle.HIDDEN, 1)].any()
     assert space.sees(frames, 1, 0)[Hindrance(Obstacle.HIDDEN, 2)].any()
@@ -99,7 +99,7 @@ def test_a_reflector_is_seen_within_its_cone_and_the_instruments_range(model: Mo
     tip = model.rigid_pose(OUT)
     axis = tip.rotation[0] @ [0, 0, 1.0]
     place = Place(tuple(tip.position[0] + 2.0 * axis), nearest=0.5, farthest=3.0)
-    space = Space.of(
+    space = Workspace.of(
         model, places=[place], reflector=Reflector(looks=[(0, 0, 1)], acceptance=np.radians(30))
     )
     turned = Hindrance(Obstacle.TURNED, 1)
@@ -120,7 +120,7 @@ def test_a_reflector_is_seen_within_its_cone_and_the_instruments_range(model: Mo
 )
 def test_rooms_that_cannot_be_are_declined(model: Model, given_to_space, expected) -> None:
     with pytest.raises(PlanError, match=expected):
-        Space.of(model, **given_to_space)
+        Workspace.of(model, **given_to_space)
 
 
 coordinate = st.floats(-2, 2, allow_nan=False)

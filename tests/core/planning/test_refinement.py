@@ -58,5 +58,5 @@ def test_the_worst_place_gets_better_and_the_mean_hardly_pays_for_it(
     assert np.sqrt(np.mean(even**2)) < 1.05 * np.sqrt(np.mean(usual**2))
     assert reported == sorted(reported) and reported[-1] == 1.0
     # the weight that comes with them is the one that they were judged by last
-    last = Refiner(refiner.parameters, POSITION, refiner.space, refiner.found, weight, SIGMA)
+    last = Refiner(refiner.parameters, POSITION, refiner.workspace, refiner.found, weight, SIGMA)
     assert last.value(found.rows) <= last.value(by_mean.rows)

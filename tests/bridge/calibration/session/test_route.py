@@ -13,7 +13,7 @@ from gapbridge.bridge.calibration.session.positioning import all_free, route
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.model import Model
 from gapbridge.core.planning.capsules import Box
-from gapbridge.core.planning.workspace import Space
+from gapbridge.core.planning.workspace import Workspace
 
 BEGIN, END = np.array([-1.0, 0.0]), np.array([1.0, 0.0])
 ABOVE, LEFT, RIGHT = np.array([0.0, 2.0]), np.array([-1.0, 1.5]), np.array([1.0, 1.5])
@@ -49,7 +49,7 @@ def test_where_no_pose_leads_round_no_way_is_reported() -> None:
 @given(st.integers(0, 50))
 def test_an_arm_goes_round_a_pillar_without_coming_into_it(seed: int) -> None:
     pillar = Box((-1.5, -0.15, -1.0), (-0.5, 0.15, 1.0))  # where the arm points
-    space = Space.of(Model(builtin_arm("ur10e")), keep_out=(pillar,), floor=0.0)
+    space = Workspace.of(Model(builtin_arm("ur10e")), keep_out=(pillar,), floor=0.0)
 
     def clear(q: np.ndarray) -> np.ndarray:
         return space.clear(q).astype(float)
