@@ -31,11 +31,11 @@ from gapbridge.bridge.daemon.status import DaemonStatus
 from gapbridge.bridge.daemon.status_document import SCHEMA
 from gapbridge.bridge.daemon.summary import RunSummary, Tally
 from gapbridge.bridge.document.output_file import private, require_folder
-from gapbridge.bridge.ipc.command_page import Command, CommandPage
+from gapbridge.bridge.ipc.command_memory import Command, CommandMemory
 from gapbridge.bridge.ipc.control_socket import ControlSocket
-from gapbridge.bridge.ipc.counts import DROPPED
 from gapbridge.bridge.ipc.events import Event, EventLog
-from gapbridge.bridge.ipc.shared_memory import Phase, RunPage
+from gapbridge.bridge.ipc.loop_counters import DROPPED
+from gapbridge.bridge.ipc.shared_memory import Phase, RunMemory
 from gapbridge.bridge.loop.loop import LONGEST_STOP, Exit
 from gapbridge.bridge.loop.setpoint_stream import longest_withdrawal
 from gapbridge.bridge.loop.supervisor import Cause, State
@@ -75,12 +75,12 @@ class Daemon:
         settings = given.settings
         self.may_write, self._say = may_write, say
         n = self.configuration.n
-        self.page = RunPage(n, clock)  # of the loop's process, one after the other
-        self._commands = CommandPage()  # one for the whole run; nobody else can write to it
+        self.memory = RunMemory(n, clock)  # of the loop's process, one after the other
+        self._commands = CommandMemory()  # one for the whole run; nobody else can write to it
         self._requests: queue.SimpleQueue[tuple[int, Command, str]] = queue.SimpleQueue()
         self._taken = 0
         self._request_lock = threading.RLock()
-        self._reader = self.page.reader()
+        self._reader = self.memory.reader()
         self._output: IO[bytes] | int = subprocess.DEVNULL  # of all processes of the run
         self.sides = Sides(clock)
         self.tally = Tally(n, settings.link.rate)
@@ -89,8 +89,8 @@ class Daemon:
         self._posted: queue.SimpleQueue[Event] = queue.SimpleQueue()  # by other threads
         self.manager = ServiceManager(clock)
         self.session = ""
-        self._status = DaemonStatus(self.page.slices, clock)
-        self._fitted = FittedWatch(given.fitted, self.page.slices)
+        self._status = DaemonStatus(self.memory.slices, clock)
+        self._fitted = FittedWatch(given.fitted, self.memory.slices)
         self._slips = self._slip_watch()
         self._status_at = 0.0
         self._reload = Reload(self.manager, self.event_log)
@@ -123,7 +123,7 @@ class Daemon:
     @property
     def phase(self) -> Phase:
         """Return what the loop's process is at."""
-        return self.page.phase
+        return self.memory.phase
 
     @property
     def latched(self) -> str:
@@ -159,7 +159,7 @@ class Daemon:
     def status(self) -> dict[str, Any]:
         """Return the status document; may be called from any thread."""
         status, tally, recording = self._status, self.tally, self.recording
-        counted = self.page.counts()
+        counted = self.memory.counts()
         return {
             "schema": SCHEMA,
             "time": self._clock.time(),
@@ -201,7 +201,7 @@ class Daemon:
 
     def _slip_watch(self) -> SlipWatch:
         smallest = self.settings.limits.zero_slip
-        return SlipWatch(self.configuration.model, self.page.slices, smallest)
+        return SlipWatch(self.configuration.model, self.memory.slices, smallest)
 
     def note(self, event: Event) -> None:
         """Emit an event from the daemon's own thread."""
@@ -268,7 +268,7 @@ class Daemon:
                 self._run_loop((by or PROGRAM) if arm else "", duration)
                 swap = self._reload.swap()
                 self.configuration = swap.configuration or self.configuration
-                self._fitted = FittedWatch(self.configuration.fitted, self.page.slices)
+                self._fitted = FittedWatch(self.configuration.fitted, self.memory.slices)
                 self._slips = self._slip_watch()
                 arm = swap.rearms  # else only a person starts the writing again
                 by = "the cell file" if arm else ""
@@ -286,7 +286,7 @@ class Daemon:
         """
         settings = self.settings
         stack.callback(self._commands.close)
-        stack.callback(self.page.close)
+        stack.callback(self.memory.close)
         lock = stack.enter_context(OwnerLock(address_of(settings.link), settings.cell))
         folder = settings.recording.folder
         if folder is not None:
@@ -300,7 +300,7 @@ class Daemon:
             "session": self.session, "extra": {"text": self.configuration.text},
         }  # fmt: skip
         stack.callback(self.sides.close)
-        self.sides.start(settings, order, self.page, self._output)
+        self.sides.start(settings, order, self.memory, self._output)
         stack.callback(lambda: self.event_log.add({"kind": "ended"}))
         path = runtime_folder() / f"{cell_key(settings.cell)}.sock"
         try:
@@ -335,8 +335,8 @@ class Daemon:
             self._stopping.set()
         self._take()
         self._pass_on()
-        if self.page.promote():
-            self.sides.show(self.page)
+        if self.memory.promote():
+            self.sides.show(self.memory)
         for event in self.sides.check():
             self.event_log.add(event)
         while not self._posted.empty():
@@ -358,13 +358,13 @@ class Daemon:
             while loop.exit_code is None:
                 self._clock.sleep(TICK)
                 self._tick()
-                if self.page.seen and first_cycle is None:
+                if self.memory.seen and first_cycle is None:
                     first_cycle = self._clock.monotonic()
                     if duration is not None and not self._seen:
                         self._ends_at = first_cycle + duration
                     self._seen = True
                     self.manager.ready()
-                if self.page.ended and duration is None:
+                if self.memory.ended and duration is None:
                     self._stopping.set()
                 if self._reload.step(self.state, self.phase, self.configuration):
                     self._commands.ask(Command.RAMP_OUT)  # by nobody's wish
@@ -375,7 +375,7 @@ class Daemon:
                         self.manager.stopping()
                     loop.ask_to_stop()
                 if loop.hangs or (stop_by is not None and self._clock.monotonic() > stop_by):
-                    detail = f"the loop stood still for {self.page.silence:.2f} s and was ended"
+                    detail = f"the loop stood still for {self.memory.silence:.2f} s and was ended"
                     loop.kill()  # reported when it is over: nothing is written after that
                     self._fault("hang", detail)
             self._take()
@@ -399,23 +399,23 @@ class Daemon:
             "after": after,
         }  # fmt: skip
         for command in (Command.DISARM, Command.RAMP_OUT):
-            if self._commands.last_of(command) > self.page.taken:
+            if self._commands.last_of(command) > self.memory.taken:
                 self._commands.ask(command)
         if armed_by and self.may_write:
             self._request(Command.ARM, armed_by)
             self._pass_on()
         self._loops += 1
         return self.loop_process(
-            self.configuration, self.page, self._commands, order, self._output, self._clock
+            self.configuration, self.memory, self._commands, order, self._output, self._clock
         )
 
     def _take(self) -> None:
         """Take cycles and events over from the loop."""
-        taken = self.page.taken
+        taken = self.memory.taken
         # in this order: who has heard of a change finds the state changed, and its rows counted
         events = [] if self.loop is None else self.loop.events()
         if self.loop is not None:
-            self._last_state = State(self.page.state)
+            self._last_state = State(self.memory.state)
         self._taken = taken
         rows = self._reader.drain()
         self.tally.add(rows)

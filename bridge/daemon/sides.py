@@ -32,18 +32,18 @@ class Sides:
         self,
         settings: DaemonSettings,
         order: dict[str, Any],
-        page: SharedMemory,
+        memory: SharedMemory,
         log: IO[Any] | int,
     ) -> None:
         """Start those that the settings want."""
         for name, (module, wanted) in SIDES.items():
             if wanted(settings):
-                self._running[name] = SideProcess(module, order, page, log, self._clock)
+                self._running[name] = SideProcess(module, order, memory, log, self._clock)
 
-    def show(self, page: SharedMemory) -> None:
-        """Have all change over to a page that the daemon shows."""
+    def show(self, memory: SharedMemory) -> None:
+        """Have all change over to another memory."""
         for side in self._running.values():
-            side.show(page)
+            side.show(memory)
 
     def emit(self, event: dict[str, Any]) -> None:
         """Pass an event on to each; never blocks."""

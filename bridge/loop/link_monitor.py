@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from gapbridge.bridge.ipc.counts import DROPPED, Count
+from gapbridge.bridge.ipc.loop_counters import DROPPED, LoopCounter
 from gapbridge.bridge.loop.reports import Reports
 from gapbridge.bridge.loop.supervisor import Cause, Supervisor
 from gapbridge.core.errors import Implausible, InvalidStateError, LinkError, StaleStateError
@@ -163,7 +163,7 @@ class LinkMonitor:
         except StaleStateError as error:
             if away or self._now() - begun > self._patience + SUSPENDED:
                 self._last_state = self._now()  # it was this process that slept: ask once more
-                self._reports.count(Count.LATE)
+                self._reports.count(LoopCounter.LATE)
             else:
                 self._stand_still(str(error))
         except InvalidStateError as error:
@@ -187,7 +187,7 @@ class LinkMonitor:
             self._stand_still(f"states are {now - expiry + self._hold:.3f} s old as they come")
             return False
         if self._old:
-            self._reports.count(Count.LATE)
+            self._reports.count(LoopCounter.LATE)
             return False
         self._last_state = now
         self._stale = self._silent = False
@@ -200,11 +200,11 @@ class LinkMonitor:
     def _stand_still(self, detail: str) -> None:
         """Judge a clock that stands still: late at first, then stale, then silent."""
         if self._now() - self._last_state <= self._hold:
-            self._reports.count(Count.LATE)
+            self._reports.count(LoopCounter.LATE)
             return
         if not self._stale:
             self._stale = True
-            self._reports.count(Count.STALE)
+            self._reports.count(LoopCounter.STALE)
             if not self._supervisor.take(Cause.STALE, detail):
                 self._reports.emit({"kind": "link", "what": "stale", "detail": detail})
         self._fall_silent(detail)
@@ -229,7 +229,7 @@ class LinkMonitor:
         if silent > SILENCE:
             if not self._silent:
                 self._silent = True
-                self._reports.count(Count.SILENCE)
+                self._reports.count(LoopCounter.SILENCE)
             self._supervisor.take(Cause.SILENCE, detail)
         if silent > (LOST_AFTER_WRITING if self._has_armed else LOST):
             self.lost = detail

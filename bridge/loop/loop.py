@@ -13,10 +13,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gapbridge.bridge.cell.daemon_settings import DaemonSettings
-from gapbridge.bridge.ipc.command_page import Command, Commands
-from gapbridge.bridge.ipc.counts import Count
-from gapbridge.bridge.ipc.cycle_row import write_cycle
-from gapbridge.bridge.ipc.shared_memory import Phase, SharedMemory
+from gapbridge.bridge.ipc.command_memory import Command, Commands
+from gapbridge.bridge.ipc.loop_counters import LoopCounter
+from gapbridge.bridge.ipc.shared_memory import Phase, SharedMemory, write_cycle
 from gapbridge.bridge.loop.checks import NOTHING, RAMPING_OUT, RESYNC, UNSOLVED, LoopChecks
 from gapbridge.bridge.loop.link_monitor import ControllerClock, LinkMonitor, hold_time
 from gapbridge.bridge.loop.live_loads import LiveLoads
@@ -74,13 +73,13 @@ class Loop:
         model: Model,
         driver: Driver,
         source: Source,
-        page: SharedMemory,
+        memory: SharedMemory,
         emit: Emit,
         number: int = 0,
     ) -> None:
         self._number = number  # which process of the loop this is, from 0
         self._settings, self._driver, self._source = settings, driver, source
-        self._page, self._emit = page, emit
+        self._memory, self._emit = memory, emit
         clock, self._now = driver.clock, driver.clock.monotonic
         self._stream = SetpointStream(model, settings.limits, driver.rate, clock)
         self._loads = LiveLoads(
@@ -90,7 +89,7 @@ class Loop:
         self._acting = Loads()  # of the last cycle
         self._model_check = ModelCheck(model, settings.setpoints.use_force)
         self._clock = ControllerClock(driver.rate, hold_time(driver.rate), clock)
-        reports = Reports(page, emit)
+        reports = Reports(memory, emit)
         self._supervisor = Supervisor(reports.transition)
         patience = settings.link.state_timeout
         self._watch = LinkMonitor(driver, self._supervisor, reports, patience)
@@ -126,7 +125,7 @@ class Loop:
         ``commands``: the daemon's, and the only way to arm. ``may_write`` False: nothing can arm.
         ``latched``: the fault of a loop before this one that nobody has acknowledged.
         """
-        self._page.enter(Phase.CONNECTING)
+        self._memory.enter(Phase.CONNECTING)
         try:
             self._driver.connect()
         except LinkError as error:
@@ -136,10 +135,10 @@ class Loop:
         self._supervisor.take(Cause.CONNECTED)
         if latched:
             self._supervisor.take(Cause.LATCHED, latched)
-        self._page.enter(Phase.RUNNING)
+        self._memory.enter(Phase.RUNNING)
         wanted = False
         while self._exit is None:
-            self._page.beat()
+            self._memory.beat()
             asked = commands.take()
             for command in asked:
                 wanted = command == Command.ARM
@@ -148,16 +147,16 @@ class Loop:
                 if command == Command.ZERO_MOVED:
                     self._hold_for_zero()
             if asked:
-                self._page.note_taken(commands.taken)
+                self._memory.note_taken(commands.taken)
             if self._stop_requested or commands.stop:
                 self._stop()
-            seen = self._page.seen and self._checks.rate.known
+            seen = self._memory.seen and self._checks.rate.known
             if wanted and may_write and seen and self._stop_by is None:
                 wanted = False
                 self._arm()
             if self._exit is None:
                 self._cycle()
-        self._page.enter(Phase.ENDING)
+        self._memory.enter(Phase.ENDING)
         self._source.close()
         return self._exit
 
@@ -199,7 +198,7 @@ class Loop:
     def _hold_for_zero(self) -> None:
         """Ramp out: every pose is off by what the zero has moved."""
         self._zero_moved = True
-        self._page.count(Count.ZERO_MOVED)
+        self._memory.count(LoopCounter.ZERO_MOVED)
         self._supervisor.take(Cause.ZERO_MOVED, "the slip was reported just before")
 
     def _disarm(self, by_a_person: bool) -> None:
@@ -241,7 +240,7 @@ class Loop:
         """Give the process up where a link broke (``detail``): it is only safe in a new one."""
         if detail is None or self._exit is not None:
             return
-        self._page.count(Count.LINK_LOST)
+        self._memory.count(LoopCounter.LINK_LOST)
         self._supervisor.take(Cause.LINK_LOST, detail)
         self._emit({"kind": "failure", "detail": detail})
         self._exit = Exit.LINK
@@ -263,7 +262,7 @@ class Loop:
         expiry = self._clock.expiry(state) - self._writing.way
         is_fresh = self._watch.believe(expiry)
         self._give_up(self._watch.lost)
-        self._page.note_seen()
+        self._memory.note_seen()
         flags = self._checks.begin(state, missed)
         if flags & RESYNC:
             self._loads.forget()
@@ -315,7 +314,7 @@ class Loop:
         at: float | None = None,
     ) -> None:
         """Publish a cycle: ``setpoint`` was computed for writing, and has ``left`` or not."""
-        page, stream = self._page, self._stream
+        memory, stream = self._memory, self._stream
         state, missed, own, loads, flags = given
         if setpoint is None:
             correction = stream.correct(own, loads)
@@ -330,7 +329,7 @@ class Loop:
             flags |= UNSOLVED
         clamped = stream.clamped if setpoint is not None else 0
         late = 0.0 if at is None else self._now() - at  # arming: no part of the cycle
-        row, slices = page.next_row(), page.slices
+        row, slices = memory.next_row(), memory.slices
         write_cycle(row, slices, state, nominal, corrected, offset)
         row[2] = self._supervisor.state
         row[3] = left
@@ -344,7 +343,7 @@ class Loop:
         last = slices["attempted"].start
         kind = UNSENT if setpoint is not None and not left else int(attempted)
         row[last : last + 4] = (kind, stream.ramp_time, self._driver.rate, self._number)
-        page.publish()
+        memory.publish()
         self._source.emit(
             SourceStatus(self._supervisor.state, nominal, corrected, offset, left, clamped)
         )

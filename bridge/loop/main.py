@@ -26,7 +26,7 @@ import numpy as np
 
 from gapbridge.bridge.cell.daemon_settings import DaemonSettings
 from gapbridge.bridge.cell.sections import SetpointSettings
-from gapbridge.bridge.ipc.command_page import Commands
+from gapbridge.bridge.ipc.command_memory import Commands
 from gapbridge.bridge.ipc.sealed_memory import all_bytes
 from gapbridge.bridge.ipc.shared_memory import Phase, SharedMemory
 from gapbridge.bridge.loop.loop import Exit, Loop
@@ -81,15 +81,15 @@ def main() -> None:
 
 
 def _run(order: dict[str, Any], emit: Callable[[dict[str, Any]], None]) -> Exit:
-    page = SharedMemory(order["n"], order["page"])
-    page.enter(Phase.STARTING)
+    memory = SharedMemory(order["n"], order["memory"])
+    memory.enter(Phase.STARTING)
     files = pickle.loads(all_bytes(order["files"]))  # by the daemon, which started this process
     read_only_from(files)  # the disk is the daemon's to read, at start and reload
     settings = DaemonSettings.model_validate(order["settings"])
     model = _read_model(settings)
     driver = make_driver(settings.link, model, gate_bounds(settings.limits))
     source = _make_source(settings, model, driver)
-    loop = _make_loop(settings, model, driver, source, page, emit, order["number"])
+    loop = _make_loop(settings, model, driver, source, memory, emit, order["number"])
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: loop.request_stop())
     _end_with_parent(order["parent"])

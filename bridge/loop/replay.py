@@ -48,7 +48,7 @@ class ReplayedLoop(Loop):
         try:
             state = self._recording.read_state()
         except EndOfRecordingError as error:
-            self._page.note_ended()
+            self._memory.note_ended()
             self._emit({"kind": "note", "detail": str(error)})
             self._exit = Exit.DONE
             return
@@ -57,7 +57,7 @@ class ReplayedLoop(Loop):
         if cycle.loop != self._process:
             self._renew(cycle.loop)
         missed = self._clock.take(state)
-        self._page.note_seen()
+        self._memory.note_seen()
         if cycle.flags & RESYNC:
             self._loads.forget()
         loads = self._loads.update(state)

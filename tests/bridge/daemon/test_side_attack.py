@@ -89,7 +89,7 @@ def test_the_memory_of_a_running_daemon_is_sealed(tmp_path: Path) -> None:
     """Also from within the daemon itself: it can only read what its loop writes."""
     with Robot(tmp_path) as robot, Run(robot.cell()) as run:
         run.wait(State.OBSERVING)
-        for fd in (run.daemon.page.fd, run.daemon.page.open_for_reading()):
+        for fd in (run.daemon.memory.fd, run.daemon.memory.open_for_reading()):
             again = os.open(f"/proc/self/fd/{fd}", os.O_RDWR)
             with pytest.raises(PermissionError):
                 mmap.mmap(again, 4096)
