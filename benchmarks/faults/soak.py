@@ -39,7 +39,9 @@ class Memory:
     def look(self, rig: Rig, begun: float) -> None:
         """Take down what each process of the daemon holds now."""
         pids = {f"loop {rig.run.daemon.loop_pid}": rig.run.daemon.loop_pid}
-        pids |= {f"{name}": side["pid"] for name, side in rig.run.daemon.sides.status().items()}
+        pids |= {
+            f"{name}": side["pid"] for name, side in rig.run.daemon.side_processes.status().items()
+        }
         for name, pid in pids.items():
             if pid is None:
                 continue

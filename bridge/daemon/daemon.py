@@ -21,11 +21,11 @@ from gapbridge.bridge.cell.run_settings import Configuration, configuration_for,
 from gapbridge.bridge.cell.runtime_folder import cell_key, runtime_folder
 from gapbridge.bridge.daemon.control import Control
 from gapbridge.bridge.daemon.fitted_watch import FittedWatch
-from gapbridge.bridge.daemon.host import OwnerLock
+from gapbridge.bridge.daemon.owner_lock import OwnerLock
 from gapbridge.bridge.daemon.processes import LoopProcess
 from gapbridge.bridge.daemon.reload import Reload
 from gapbridge.bridge.daemon.service_manager import ServiceManager
-from gapbridge.bridge.daemon.sides import Sides
+from gapbridge.bridge.daemon.side_processes import SideProcesses
 from gapbridge.bridge.daemon.slip_watch import Slip, SlipWatch
 from gapbridge.bridge.daemon.status import DaemonStatus
 from gapbridge.bridge.daemon.status_document import SCHEMA
@@ -82,9 +82,9 @@ class Daemon:
         self._request_lock = threading.RLock()
         self._reader = self.memory.reader()
         self._output: IO[bytes] | int = subprocess.DEVNULL  # of all processes of the run
-        self.sides = Sides(clock)
+        self.side_processes = SideProcesses(clock)
         self.tally = Tally(n, settings.link.rate)
-        listeners = [self._on_event, self.sides.emit]
+        listeners = [self._on_event, self.side_processes.emit]
         self.event_log = EventLog(*listeners, *([log] if log else []), clock=clock)
         self._posted: queue.SimpleQueue[Event] = queue.SimpleQueue()  # by other threads
         self.manager = ServiceManager(clock)
@@ -194,7 +194,7 @@ class Daemon:
             },
             "counts": counted,
             "events": dict(self.event_log.counts),
-            "sides": self.sides.status(),
+            "sides": self.side_processes.status(),
             "recording": None if recording is None else str(recording),
             "lost_rows": self.lost_rows,
         }
@@ -299,8 +299,8 @@ class Daemon:
             "settings": settings.model_dump(mode="json"), "n": self.configuration.n,
             "session": self.session, "extra": {"text": self.configuration.text},
         }  # fmt: skip
-        stack.callback(self.sides.close)
-        self.sides.start(settings, order, self.memory, self._output)
+        stack.callback(self.side_processes.close)
+        self.side_processes.start(settings, order, self.memory, self._output)
         stack.callback(lambda: self.event_log.add({"kind": "ended"}))
         path = runtime_folder() / f"{cell_key(settings.cell)}.sock"
         try:
@@ -336,14 +336,14 @@ class Daemon:
         self._take()
         self._pass_on()
         if self.memory.promote():
-            self.sides.show(self.memory)
-        for event in self.sides.check():
+            self.side_processes.show(self.memory)
+        for event in self.side_processes.check():
             self.event_log.add(event)
         while not self._posted.empty():
             self.event_log.add(self._posted.get())
         if self._clock.monotonic() >= self._status_at:
             self._status_at = self._clock.monotonic() + STATUS_EVERY
-            self.sides.emit({"kind": "status", **self.status()})
+            self.side_processes.emit({"kind": "status", **self.status()})
         loop = self.loop
         if loop is None or not loop.hangs:
             self.manager.kick()

@@ -66,7 +66,7 @@ class Assembler:
         self.enabled: dict[tuple[Key, str], bool] = {}
         self.received_at: dict[Key, float] = {}  # s, monotonic, of each message that we read
         self.troubled: set[tuple[Key, str]] = set()  # members of ``status`` that report trouble
-        self.passed: dict[tuple[Key, str], tuple[float, str, bool]] = {}  # trouble that has ended
+        self.cleared: dict[tuple[Key, str], tuple[float, str, bool]] = {}  # trouble that has ended
         self._seen: dict[Key, bytes] = {}  # last bytes of messages beside the sample
 
     @property
@@ -120,7 +120,7 @@ class Assembler:
                 self.troubled.add(place)
             elif place in self.troubled:
                 self.troubled.discard(place)
-                self.passed[place] = self.status[place]
+                self.cleared[place] = self.status[place]
             self.status[place] = (value, trouble, check.while_writing)
         for signal in incoming.enabled:
             self.enabled[incoming.key, signal] = values[signal] in self._profile.enabled_values

@@ -81,7 +81,7 @@ class CanDriver(Driver):
         """Let what came while nobody asked for states be: torn frames, trouble that is over."""
         self._broken, self._kept = self.reader.assembler.broken, None
         self._builder.forget()
-        self.reader.forget_passed()
+        self.reader.forget_cleared()
 
     def _nothing_received(self, complete: bool) -> LinkError:
         """Return what was missed, and close: a link that is not there is not half open."""
@@ -110,7 +110,7 @@ class CanDriver(Driver):
         self._check_frozen(sample)
         armed = self._armed_at is not None
         # a stop that came and went while frames made no sample was a stop
-        trouble = self.reader.trouble(armed)[0] or self.reader.passed_trouble(armed)
+        trouble = self.reader.trouble(armed)[0] or self.reader.cleared_trouble(armed)
         ready = not armed or not self.profile.enabled_values or self.reader.enabled
         return self._builder.build(sample, self._target(), trouble, ready)
 
@@ -118,7 +118,7 @@ class CanDriver(Driver):
         """See Driver._validate."""
         super()._validate(state)
         self._builder.remember()
-        self.reader.forget_passed()
+        self.reader.forget_cleared()
 
     def _awaited(self) -> Sample:
         """Return the next sample of an arm that sends by itself; slower where we want fewer."""

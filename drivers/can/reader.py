@@ -20,7 +20,7 @@ BACKLOG_TIME = 0.05  # s that reading what has piled up may take
 
 
 @dataclass(frozen=True, slots=True)
-class Foreign:
+class ForeignCommand:
     """A frame that only a commander sends, and that we did not send."""
 
     key: Key
@@ -35,7 +35,7 @@ class FrameReader:
         self._settings, self._profile = settings, profile
         self.bus: Any = None
         self.assembler = Assembler(profile)
-        self.foreign: Foreign | None = None
+        self.foreign: ForeignCommand | None = None
         self.error_frames = 0
         self.identifiers: set[int] = set()  # heard at all, for messages
         self._targets = {f.key: f for f in profile.setpoint if f.joints}
@@ -122,12 +122,12 @@ class FrameReader:
         key = (frame.arbitration_id, frame.is_extended_id)
         self.identifiers.add(key[0])
         if key in self._profile.control:
-            self.foreign = Foreign(key, now)
-            self._overhear(key, bytes(frame.data))
+            self.foreign = ForeignCommand(key, now)
+            self._decode_foreign_target(key, bytes(frame.data))
             return None
         return self.assembler.take(key, bytes(frame.data), frame.timestamp or now, now)
 
-    def _overhear(self, key: Key, data: bytes) -> None:
+    def _decode_foreign_target(self, key: Key, data: bytes) -> None:
         """Note what another commander has the arm do."""
         target = self._targets.get(key)
         if target is None or len(data) != target.message.length:
@@ -168,13 +168,13 @@ class FrameReader:
             return "", ""
         return self._first_trouble(self.assembler.status, writing)
 
-    def passed_trouble(self, writing: bool) -> str:
+    def cleared_trouble(self, writing: bool) -> str:
         """Return what was wrong since ``forget_passed`` and is no longer; empty: nothing."""
-        return self._first_trouble(self.assembler.passed, writing)[0]
+        return self._first_trouble(self.assembler.cleared, writing)[0]
 
-    def forget_passed(self) -> None:
+    def forget_cleared(self) -> None:
         """Let trouble that has ended be: it has been reported, or nobody was to act on it."""
-        self.assembler.passed.clear()
+        self.assembler.cleared.clear()
 
     def _first_trouble(
         self, status: dict[tuple[Key, str], tuple[float, str, bool]], writing: bool

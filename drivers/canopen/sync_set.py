@@ -34,11 +34,11 @@ class SyncCollector:
         self._open = False
         self._trouble = ""  # why this set cannot be believed
         self._synced = self._received = 0.0
-        self._owed: set[int] = set()  # COB-IDs that a torn set lacked, and that may still come
+        self._missing: set[int] = set()  # COB-IDs that a torn set lacked, and that may still come
         self.dropped: Counter[str] = Counter()  # reason -> frames or sets
         self.stray = ""  # a TPDO that came to no SYNC since the last look; empty: none
 
-    def forget_stray(self) -> None:
+    def clear_stray(self) -> None:
         """Take note that somebody has looked at ``stray``."""
         self.stray = ""
 
@@ -46,7 +46,7 @@ class SyncCollector:
         """Forget what was collected: a SYNC leaves at ``now`` (s, monotonic)."""
         with self._changed:
             self._held, self._trouble, self._open = {}, "", True
-            self._owed.clear()
+            self._missing.clear()
             self._synced = self._received = now
 
     def end(self) -> None:
@@ -79,17 +79,17 @@ class SyncCollector:
                 self._changed.notify_all()
 
     def _take_late(self, cob_id: int, who: str) -> None:
-        if cob_id in self._owed:
-            self._owed.discard(cob_id)
+        if cob_id in self._missing:
+            self._missing.discard(cob_id)
             self.dropped["late"] += 1
         else:
             self.dropped["no SYNC"] += 1
             self.stray = who
 
     @property
-    def owed(self) -> bool:
+    def awaits_late(self) -> bool:
         """Return whether TPDOs of a torn set may still come: they must not meet the next SYNC's."""
-        return bool(self._owed)
+        return bool(self._missing)
 
     def _refuse(self, reason: str, message: str) -> None:
         self.dropped[reason] += 1
@@ -103,7 +103,7 @@ class SyncCollector:
             self._open = False
             if self._trouble or len(self._held) < len(self._members):
                 self.dropped["torn"] += 1
-                self._owed = set(self._members) - set(self._held)
+                self._missing = set(self._members) - set(self._held)
                 return None
             counts: list[dict[str, int]] = [{} for _ in self._nodes]
             for cob_id, found in self._held.items():

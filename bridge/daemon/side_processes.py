@@ -10,7 +10,7 @@ from gapbridge.bridge.ipc.shared_memory import SharedMemory
 from gapbridge.bridge.ipc.side_process import SideProcess
 from gapbridge.drivers.clock import SYSTEM, Clock
 
-SIDES: dict[str, tuple[str, Callable[[DaemonSettings], bool]]] = {
+SIDE_PROCESSES: dict[str, tuple[str, Callable[[DaemonSettings], bool]]] = {
     "recorder": ("gapbridge.bridge.recording.main", lambda s: s.recording.folder is not None),
     "web": ("gapbridge.bridge.web.main", lambda s: s.web is not None),
     "metrics": ("gapbridge.bridge.metrics.main", lambda s: s.metrics is not None),
@@ -21,7 +21,7 @@ PATIENCE = {"recorder": 10.0}  # s to finish in, where it is not LITTLE
 LITTLE = 0.3
 
 
-class Sides:
+class SideProcesses:
     """All side processes of a run."""
 
     def __init__(self, clock: Clock = SYSTEM) -> None:
@@ -36,7 +36,7 @@ class Sides:
         log: IO[Any] | int,
     ) -> None:
         """Start those that the settings want."""
-        for name, (module, wanted) in SIDES.items():
+        for name, (module, wanted) in SIDE_PROCESSES.items():
             if wanted(settings):
                 self._running[name] = SideProcess(module, order, memory, log, self._clock)
 
