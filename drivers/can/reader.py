@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 
 from gapbridge.core.arrays import Array
-from gapbridge.core.errors import LinkError
+from gapbridge.core.errors import LinkError, first_line
 from gapbridge.drivers.can.assembler import Assembler, Sample
 from gapbridge.drivers.can.profile import CanProfile, Key
 from gapbridge.drivers.can.settings import CanSettings
-from gapbridge.drivers.can_bus.bus import close_bus, first_line, open_bus
+from gapbridge.drivers.can_bus.bus import close_bus, open_bus
 from gapbridge.drivers.clock import SYSTEM, Clock
 
 LONGEST_WAY, LEAST_WAY = 4.0, 0.03  # cycles, s: what has lain here for longer is not fresh

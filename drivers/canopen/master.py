@@ -14,8 +14,8 @@ from typing import Any
 
 import canopen
 
-from gapbridge.core.errors import LinkError, WriteError
-from gapbridge.drivers.can_bus.bus import close_bus, first_line, open_bus
+from gapbridge.core.errors import LinkError, WriteError, first_line
+from gapbridge.drivers.can_bus.bus import close_bus, open_bus
 from gapbridge.drivers.canopen.listening import BusListener, HeartbeatMonitor
 from gapbridge.drivers.canopen.objects import (
     HEARTBEAT_BASE,

@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 
 from gapbridge.core.arrays import Array
-from gapbridge.core.errors import LinkError
-from gapbridge.drivers.can_bus.bus import close_bus, first_line, open_bus
+from gapbridge.core.errors import LinkError, first_line
+from gapbridge.drivers.can_bus.bus import close_bus, open_bus
 from gapbridge.drivers.ft_sensor.sensor import ForceTorqueSensor, Reading
 from gapbridge.drivers.ft_sensor.settings import AtiSettings
 
