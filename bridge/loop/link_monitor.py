@@ -70,10 +70,10 @@ class ControllerClock:
             drifted = self._lead + DRIFT * (gap if gap <= self._hold else 0.0)
             elapsed = 0.0 if before is None else state.received - before[1]
             leapt = gap - 1.0 / self._rate if gap - elapsed > LEAP else 0.0
-            self._lead = min(lead, self._doubted(lead, drifted, leapt))
+            self._lead = min(lead, self._lead_after_leap(lead, drifted, leapt))
         return max(round(gap * self._rate) - 1, 0) if counts and before is not None else 0
 
-    def _doubted(self, lead: float, drifted: float, leapt: float) -> float:
+    def _lead_after_leap(self, lead: float, drifted: float, leapt: float) -> float:
         """Return the lead (s) that counts where the controller's clock may have leapt.
 
         ``leapt``: by how much (s) at this sample, zero where it has not; ``drifted``: the lead
@@ -165,7 +165,7 @@ class LinkMonitor:
                 self._last_state = self._now()  # it was this process that slept: ask once more
                 self._reports.count(LoopCounter.LATE)
             else:
-                self._stand_still(str(error))
+                self._judge_stale(str(error))
         except InvalidStateError as error:
             self.drop(error)
         except LinkError as error:
@@ -174,7 +174,7 @@ class LinkMonitor:
             return state
         return None
 
-    def believe(self, expiry: float = math.inf) -> bool:
+    def accept(self, expiry: float = math.inf) -> bool:
         """Take note of a state that is fine; returns whether it is fresh enough to write by.
 
         One that was too old (``expiry``, s monotonic) when it could be used is late, and several
@@ -184,7 +184,7 @@ class LinkMonitor:
         self._old = self._old + 1 if now > expiry else 0
         self._invalid = 0
         if self._old >= OLD_IN_A_ROW:
-            self._stand_still(f"states are {now - expiry + self._hold:.3f} s old as they come")
+            self._judge_stale(f"states are {now - expiry + self._hold:.3f} s old as they come")
             return False
         if self._old:
             self._reports.count(LoopCounter.LATE)
@@ -197,7 +197,7 @@ class LinkMonitor:
         """Take note that nobody asked for states meanwhile."""
         self._last_state = self._left = self._now()
 
-    def _stand_still(self, detail: str) -> None:
+    def _judge_stale(self, detail: str) -> None:
         """Judge a clock that stands still: late at first, then stale, then silent."""
         if self._now() - self._last_state <= self._hold:
             self._reports.count(LoopCounter.LATE)
@@ -207,7 +207,7 @@ class LinkMonitor:
             self._reports.count(LoopCounter.STALE)
             if not self._supervisor.take(Cause.STALE, detail):
                 self._reports.emit({"kind": "link", "what": "stale", "detail": detail})
-        self._fall_silent(detail)
+        self._judge_silence(detail)
 
     def drop(self, error: InvalidStateError) -> None:
         """Drop a state that cannot be believed; several in a row end the compensation."""
@@ -222,9 +222,9 @@ class LinkMonitor:
         if self._invalid >= INVALID_IN_A_ROW:
             self._supervisor.take(Cause.IMPLAUSIBLE, detail)
             self._driver.forget()  # the arm may well be there: judge what comes by itself
-        self._fall_silent(detail)
+        self._judge_silence(detail)
 
-    def _fall_silent(self, detail: str) -> None:
+    def _judge_silence(self, detail: str) -> None:
         silent = self._now() - self._last_state
         if silent > SILENCE:
             if not self._silent:

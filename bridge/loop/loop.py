@@ -59,7 +59,7 @@ class CycleInput(NamedTuple):
 
     state: RobotState
     missed: int  # cycles before it
-    own: Array  # (n,) rad: nominal joints of the robot's own program
+    nominal_q: Array  # (n,) rad: of the robot's own program
     loads: Loads
     flags: int
 
@@ -253,14 +253,14 @@ class Loop:
             self._give_up(self._watch.lost)
             return
         try:
-            own = self._driver.nominal_q(state)
+            nominal_q = self._driver.nominal_q(state)
         except InvalidStateError as error:
             self._watch.drop(error)
             self._give_up(self._watch.lost)
             return
         missed = self._clock.take(state, self._supervisor.state.writes)
         expiry = self._clock.expiry(state) - self._writing.way
-        is_fresh = self._watch.believe(expiry)
+        is_fresh = self._watch.accept(expiry)
         self._give_up(self._watch.lost)
         self._memory.note_seen()
         flags = self._checks.begin(state, missed)
@@ -275,24 +275,24 @@ class Loop:
         self._checks.judge_settings(state, self._driver)
         seen = self._now()
         if is_fresh and supervisor.state == State.ARMED:
-            used_up = writing.start(state, own)
+            used_up = writing.start(state, nominal_q)
             self._look_after_writing()
             if used_up:  # the state is old by now
-                self._record(CycleInput(state, missed, own, loads, flags), None, at=seen)
+                self._record(CycleInput(state, missed, nominal_q, loads, flags), None, at=seen)
                 return
         holding = supervisor.state == State.HOLDING
         writes = supervisor.state.writes
         written = None
         if writes:
-            written = writing.write(state, own, loads, expiry if is_fresh else -np.inf)
+            written = writing.write(state, nominal_q, loads, expiry if is_fresh else -np.inf)
             self._look_after_writing()
         if writes and writing.ramps_out:
             flags |= RAMPING_OUT
         setpoint = writing.unsent if writes and written is None else written
-        given = CycleInput(state, missed, own, loads, flags)
+        given = CycleInput(state, missed, nominal_q, loads, flags)
         self._record(given, setpoint, writes, written is not None)
         clamped = 0 if written is None else self._stream.clamped
-        commanded = own if written is None else written.q
+        commanded = nominal_q if written is None else written.q
         self._checks.end(state, commanded, clamped, self._now() - state.received)
         if written is not None and holding and writing.at_rest(written, state):
             self._release()  # takes a moment: after the cycle has been timed
@@ -315,22 +315,22 @@ class Loop:
     ) -> None:
         """Publish a cycle: ``setpoint`` was computed for writing, and has ``left`` or not."""
         memory, stream = self._memory, self._stream
-        state, missed, own, loads, flags = given
+        state, missed, nominal_q, loads, flags = given
         if setpoint is None:
-            correction = stream.correct(own, loads)
-            nominal, corrected, offset = own, correction.q, correction.offset_in_base
+            correction = stream.correct(nominal_q, loads)
+            wanted, corrected, offset = nominal_q, correction.q, correction.offset_in_base
             if not stream.finite:
                 self._supervisor.take(Cause.BAD_OUTPUT, "the model's correction is no number")
             elif not self._model_check.corrects(loads):
                 flags |= NOTHING
         else:
-            nominal, corrected, offset = setpoint.nominal_q, setpoint.q, setpoint.offset_in_base
+            wanted, corrected, offset = setpoint.nominal_q, setpoint.q, setpoint.offset_in_base
         if stream.unsolved:
             flags |= UNSOLVED
         clamped = stream.clamped if setpoint is not None else 0
         late = 0.0 if at is None else self._now() - at  # arming: no part of the cycle
         row, slices = memory.next_row(), memory.slices
-        write_cycle(row, slices, state, nominal, corrected, offset)
+        write_cycle(row, slices, state, wanted, corrected, offset)
         row[2] = self._supervisor.state
         row[3] = left
         row[4] = missed
@@ -338,14 +338,14 @@ class Loop:
         row[6] = self._now() - state.received - late
         row[7] = clamped
         row[8] = stream.residual
-        row[slices["own_q"]] = own
+        row[slices["own_q"]] = nominal_q
         row[slices["flags"].start] = flags
         last = slices["attempted"].start
         kind = UNSENT if setpoint is not None and not left else int(attempted)
         row[last : last + 4] = (kind, stream.ramp_time, self._driver.rate, self._number)
         memory.publish()
         self._source.emit(
-            SourceStatus(self._supervisor.state, nominal, corrected, offset, left, clamped)
+            SourceStatus(self._supervisor.state, wanted, corrected, offset, left, clamped)
         )
 
 

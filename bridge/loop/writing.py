@@ -71,17 +71,17 @@ class Writing:
         """Take note that the driver is not armed any more: its watchdog, or a person, has it."""
         self.ready = False
 
-    def start(self, state: RobotState, own: Array) -> bool:
+    def start(self, state: RobotState, nominal_q: Array) -> bool:
         """Begin writing once the source has a first setpoint and the driver is ready.
 
         Returns whether it took so long that a fresh state is needed.
         """
-        first = self._source.first(own)
+        first = self._source.first(nominal_q)
         if first is None:
             if self.ready:
                 self._refuse_start("the source fell silent before the first setpoint")
             return False
-        away = np.abs(first - own)
+        away = np.abs(first - nominal_q)
         tolerance = self._settings.start_tolerance
         if not (away <= tolerance).all():
             joint = int(np.argmax(away))
@@ -94,14 +94,14 @@ class Writing:
             if not self.ready:
                 self._arm_driver(state)
                 return True
-            in_force = self._in_force.at(own) if self._driver.moves_arm else None
-            nominal = self._stream.start(own, state.timestamp, in_force=in_force)
+            in_force = self._in_force.at(nominal_q) if self._driver.moves_arm else None
+            start_q = self._stream.start(nominal_q, state.timestamp, in_force=in_force)
         except (WriteError, LimitError) as error:
             if isinstance(error, ForeignCommandError):
                 self._reports.count(LoopCounter.FOREIGN)
             self._refuse_start(str(error))
             return True
-        self._source.begin(state.timestamp, nominal)
+        self._source.begin(state.timestamp, start_q)
         self._failed = 0
         self._supervisor.take(Cause.WRITING)
         return False
@@ -134,7 +134,7 @@ class Writing:
         self._supervisor.take(Cause.START_REFUSED, detail)
 
     def write(
-        self, state: RobotState, own: Array, loads: Loads, expiry: float = np.inf
+        self, state: RobotState, nominal_q: Array, loads: Loads, expiry: float = np.inf
     ) -> Setpoint | None:
         """Send one setpoint; returns it, or None where none has left.
 
@@ -145,7 +145,7 @@ class Writing:
         if self._now() > expiry:
             stream.forget()
             return None
-        source_q = self._next(state, own)
+        source_q = self._next(state, nominal_q)
         self.ramps_out = self._supervisor.state == State.HOLDING
         goal = 0.0 if self.ramps_out else 1.0
         try:
@@ -246,16 +246,16 @@ class Writing:
             return True
         return False
 
-    def _next(self, state: RobotState, own: Array) -> Array | None:
+    def _next(self, state: RobotState, nominal_q: Array) -> Array | None:
         """Return the source's setpoint; None: the motion must brake."""
         if self._supervisor.state == State.HOLDING:
-            return None if self._driver.moves_arm else own
+            return None if self._driver.moves_arm else nominal_q
         try:
-            found = self._source.sample(state.timestamp, own)
+            found = self._source.sample(state.timestamp, nominal_q)
         except SourceDryError as error:
             self._reports.count(LoopCounter.SOURCE_DRY)
             self._supervisor.take(Cause.SOURCE_DRY, str(error))
-            return None if self._driver.moves_arm else own
+            return None if self._driver.moves_arm else nominal_q
         if self._source.ended and not self._reports.memory.ended:
             self._reports.memory.note_ended()
             detail = "the source has come to its end; the arm stays there"

@@ -259,7 +259,7 @@ def test_two_bad_samples_are_dropped_and_three_in_a_row_hold(memory: SharedMemor
         assert supervisor.state == after
         driver.next = good
         assert watch.next() is not None
-        watch.believe()
+        watch.accept()
     assert memory.counts()["dropped_torn"] == 5
     assert [event["what"] for event in events] == ["dropped_torn"]  # not five times
 
@@ -396,5 +396,5 @@ def test_a_hiccup_while_observing_latches_no_fault(memory: SharedMemory) -> None
     assert [event["what"] for event in events] == ["stale"]
     driver.next = good
     assert watch.next() is not None
-    watch.believe()
+    watch.accept()
     assert supervisor.state == State.OBSERVING
