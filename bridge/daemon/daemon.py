@@ -33,7 +33,7 @@ from gapbridge.bridge.daemon.summary import RunSummary, Tally
 from gapbridge.bridge.document.output_file import private, require_folder
 from gapbridge.bridge.ipc.command_memory import Command, CommandMemory
 from gapbridge.bridge.ipc.control_socket import ControlSocket
-from gapbridge.bridge.ipc.events import Event, EventLog
+from gapbridge.bridge.ipc.events import Event, EventKind, EventLog
 from gapbridge.bridge.ipc.loop_counters import DROPPED
 from gapbridge.bridge.ipc.shared_memory import Phase, RunMemory
 from gapbridge.bridge.loop.loop import LONGEST_STOP, Exit
@@ -51,6 +51,9 @@ HEALTHY = 10.0  # s after which a restart counts as the first again
 STOP_MARGIN = 0.4  # s on top of the loop's own time: then it is ended by force
 STATUS_EVERY = 0.5  # s
 PROGRAM = f"the daemon's own program (pid {os.getpid()})"
+
+UNSPOKEN = (EventKind.FAILURE, EventKind.GRANTED, EventKind.SUMMARY, EventKind.REQUEST)
+"""Kinds of events that the terminal does not show: after a failure a fault follows."""
 
 Say = Callable[[str], None]
 
@@ -250,7 +253,7 @@ class Daemon:
             name = "arm" if command == Command.ARM else "disarm"
             detail = f"{name} asked for by {by}"
             self.event_log.add(
-                {"kind": "request", "command": name, "number": number, "by": by,
+                {"kind": EventKind.REQUEST, "command": name, "number": number, "by": by,
                  "acknowledges": command == Command.DISARM, "detail": detail}
             )  # fmt: skip
             self._commands.ask(command, number)
@@ -301,24 +304,25 @@ class Daemon:
         }  # fmt: skip
         stack.callback(self.side_processes.close)
         self.side_processes.start(settings, order, self.memory, self._output)
-        stack.callback(lambda: self.event_log.add({"kind": "ended"}))
+        stack.callback(lambda: self.event_log.add({"kind": EventKind.ENDED}))
         path = runtime_folder() / f"{cell_key(settings.cell)}.sock"
         try:
             stack.enter_context(ControlSocket(path, self.control.answer))
         except OSError as error:
             raise InputError(f"{path}: {error.strerror}, expected a socket to listen on") from None
         if settings.web is not None:
-            self.event_log.add({"kind": "note", "detail": f"status page: {settings.web.url}"})
+            where = f"status page: {settings.web.url}"
+            self.event_log.add({"kind": EventKind.NOTE, "detail": where})
         if settings.setpoints.source == "planner":
             where = f"setpoints: a planner writes to {settings.setpoints.socket}"
-            self.event_log.add({"kind": "note", "detail": where})
+            self.event_log.add({"kind": EventKind.NOTE, "detail": where})
         # a person at the terminal may arm after a crash; a service that was started anew may not
         if arm and lock.before and (by != "--arm" or self.manager.present):
             detail = (
                 f"the run before (process {lock.before.get('pid')}) did not end in order: "
                 "not arming by itself; gapbridge arm"
             )
-            self.event_log.add({"kind": "refused", "detail": detail})
+            self.event_log.add({"kind": EventKind.REFUSED, "detail": detail})
             return False
         return arm
 
@@ -343,7 +347,7 @@ class Daemon:
             self.event_log.add(self._posted.get())
         if self._clock.monotonic() >= self._status_at:
             self._status_at = self._clock.monotonic() + STATUS_EVERY
-            self.side_processes.emit({"kind": "status", **self.status()})
+            self.side_processes.emit({"kind": EventKind.STATUS, **self.status()})
         loop = self.loop
         if loop is None or not loop.hangs:
             self.manager.kick()
@@ -423,7 +427,9 @@ class Daemon:
         for event in events:
             self.event_log.add(event)
         for detail in self._fitted.take(rows, self._clock.monotonic()):
-            self.event_log.add({"kind": "warning", "what": "outside_fitted", "detail": detail})
+            self.event_log.add(
+                {"kind": EventKind.WARNING, "what": "outside_fitted", "detail": detail}
+            )
         for found in self._slips.take(rows):
             self.event_log.add(found.event)
             if isinstance(found, Slip):
@@ -433,20 +439,20 @@ class Daemon:
         """Act on an event, and report it to the person at the terminal."""
         kind, detail = event["kind"], str(event.get("detail", ""))
         self._status.on_event(event)
-        if kind == "failure":
+        if kind == EventKind.FAILURE:
             self._failure = event
-        if kind == "refused":
+        if kind == EventKind.REFUSED:
             self._refused = True
-        if kind == "recorder":
+        if kind == EventKind.RECORDER:
             self._lost_rows += int(event.get("lost", 0))
-        if kind == "transition":
+        if kind == EventKind.TRANSITION:
             tail = f": {detail}" if detail else ""
             text = f"{event['from'].lower()} -> {event['to'].lower()} ({event['cause']}){tail}"
             self._say(text)
             self._refused |= event["cause"] == Cause.START_REFUSED
             if detail:
                 self._faults.append(text)
-        elif detail and kind not in ("failure", "granted", "summary", "request"):  # a fault follows
+        elif detail and kind not in UNSPOKEN:
             self._say(detail)
 
     def _after(self, loop: LoopProcess) -> None:
@@ -469,7 +475,7 @@ class Daemon:
 
     def _fault(self, cause: str, detail: str) -> None:
         self._faults.append(detail)
-        self.event_log.add({"kind": "fault", "cause": cause, "detail": detail})
+        self.event_log.add({"kind": EventKind.FAULT, "cause": cause, "detail": detail})
 
     def _summary(self) -> RunSummary:
         state = self._last_state
@@ -484,5 +490,5 @@ class Daemon:
             exit_code=1 if wrong else 0,
             recording=self.recording,
         )
-        self.event_log.add({"kind": "summary", "summary": summary.to_json()})
+        self.event_log.add({"kind": EventKind.SUMMARY, "summary": summary.to_json()})
         return summary

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import IO, Any
 
 from gapbridge.bridge.cell.daemon_settings import DaemonSettings
+from gapbridge.bridge.ipc.events import EventKind
 from gapbridge.bridge.ipc.shared_memory import SharedMemory
 from gapbridge.bridge.ipc.side_process import SideProcess
 from gapbridge.drivers.clock import SYSTEM, Clock
@@ -59,9 +60,9 @@ class SideProcesses:
                     found.append(event)
                 else:  # states and requests are not a side process's to emit
                     detail = f"{name} emitted {str(event.get('kind'))[:40]!r}, which is not its own"
-                    found.append({"kind": "side", "side": name, "detail": detail})
+                    found.append({"kind": EventKind.SIDE, "side": name, "detail": detail})
             if (wrong := side.check()) is not None:
-                found.append({"kind": "side", "side": name, "detail": wrong})
+                found.append({"kind": EventKind.SIDE, "side": name, "detail": wrong})
         return found
 
     def status(self) -> dict[str, dict[str, int | None]]:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy import float64
 from numpy.typing import NDArray
 
+from gapbridge.bridge.ipc.events import EventKind
 from gapbridge.bridge.ipc.loop_counters import LoopCounter
 from gapbridge.bridge.loop.link_monitor import hold_time
 from gapbridge.bridge.loop.reports import Reports
@@ -257,7 +258,7 @@ class LoopChecks:
                 self._lasting.discard(what)
                 if what == LoopCounter.SENSOR_LOST:
                     self._reports.emit(
-                        {"kind": "degraded", "what": "", "detail": "the sensor is back"}
+                        {"kind": EventKind.DEGRADED, "what": "", "detail": "the sensor is back"}
                     )
             return
         changed = cause is not None and self._supervisor.take(cause, detail)
@@ -266,5 +267,6 @@ class LoopChecks:
         self._lasting.add(what)
         self._reports.count(what)
         if not changed and self._supervisor.state != State.FAULT:
-            kind = "degraded" if what == LoopCounter.SENSOR_LOST else "warning"
+            lost = what == LoopCounter.SENSOR_LOST
+            kind = EventKind.DEGRADED if lost else EventKind.WARNING
             self._reports.emit({"kind": kind, "what": what.label, "detail": detail})

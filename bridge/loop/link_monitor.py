@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+from gapbridge.bridge.ipc.events import EventKind
 from gapbridge.bridge.ipc.loop_counters import DROPPED, LoopCounter
 from gapbridge.bridge.loop.reports import Reports
 from gapbridge.bridge.loop.supervisor import Cause, Supervisor
@@ -206,7 +207,7 @@ class LinkMonitor:
             self._stale = True
             self._reports.count(LoopCounter.STALE)
             if not self._supervisor.take(Cause.STALE, detail):
-                self._reports.emit({"kind": "link", "what": "stale", "detail": detail})
+                self._reports.emit({"kind": EventKind.LINK, "what": "stale", "detail": detail})
         self._judge_silence(detail)
 
     def drop(self, error: InvalidStateError) -> None:
@@ -218,7 +219,7 @@ class LinkMonitor:
         now = self._now()
         if now - self._reported.get(reason, -REPORT_EVERY) >= REPORT_EVERY:
             self._reported[reason] = now
-            self._reports.emit({"kind": "dropped", "what": count.label, "detail": detail})
+            self._reports.emit({"kind": EventKind.DROPPED, "what": count.label, "detail": detail})
         if self._invalid >= INVALID_IN_A_ROW:
             self._supervisor.take(Cause.IMPLAUSIBLE, detail)
             self._driver.forget()  # the arm may well be there: judge what comes by itself

@@ -14,6 +14,7 @@ import numpy as np
 
 from gapbridge.bridge.cell.daemon_settings import DaemonSettings
 from gapbridge.bridge.ipc.command_memory import Command, Commands
+from gapbridge.bridge.ipc.events import EventKind
 from gapbridge.bridge.ipc.loop_counters import LoopCounter
 from gapbridge.bridge.ipc.shared_memory import Phase, SharedMemory, write_cycle
 from gapbridge.bridge.loop.checks import NOTHING, RAMPING_OUT, RESYNC, UNSOLVED, LoopChecks
@@ -129,7 +130,7 @@ class Loop:
         try:
             self._driver.connect()
         except LinkError as error:
-            self._emit({"kind": "failure", "detail": str(error)})
+            self._emit({"kind": EventKind.FAILURE, "detail": str(error)})
             return Exit.LINK
         self._watch.forget()
         self._supervisor.take(Cause.CONNECTED)
@@ -172,7 +173,7 @@ class Loop:
             if self._supervisor.take(Cause.ARM):
                 self._skip()
             return
-        self._emit({"kind": "refused", "what": "arm", "detail": detail})
+        self._emit({"kind": EventKind.REFUSED, "what": "arm", "detail": detail})
 
     def _not_ready(self) -> str:
         """Return in words why writing could come to nothing here; empty: it can."""
@@ -242,7 +243,7 @@ class Loop:
             return
         self._memory.count(LoopCounter.LINK_LOST)
         self._supervisor.take(Cause.LINK_LOST, detail)
-        self._emit({"kind": "failure", "detail": detail})
+        self._emit({"kind": EventKind.FAILURE, "detail": detail})
         self._exit = Exit.LINK
 
     # -- one cycle --------------------------------------------------------------------------------

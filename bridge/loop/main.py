@@ -27,6 +27,7 @@ import numpy as np
 from gapbridge.bridge.cell.daemon_settings import DaemonSettings
 from gapbridge.bridge.cell.sections import SetpointSettings
 from gapbridge.bridge.ipc.command_memory import Commands
+from gapbridge.bridge.ipc.events import EventKind
 from gapbridge.bridge.ipc.sealed_memory import all_bytes
 from gapbridge.bridge.ipc.shared_memory import Phase, SharedMemory
 from gapbridge.bridge.loop.loop import Exit, Loop
@@ -67,14 +68,15 @@ def main() -> None:
     try:
         code = _run(order, emit)
     except InputError as error:
-        emit({"kind": "failure", "detail": str(error), "input": True})
+        emit({"kind": EventKind.FAILURE, "detail": str(error), "input": True})
         code = Exit.INPUT
     except GapbridgeError as error:
-        emit({"kind": "failure", "detail": str(error)})
+        emit({"kind": EventKind.FAILURE, "detail": str(error)})
         code = Exit.LINK
     except BaseException as error:
         traceback.print_exc()
-        emit({"kind": "failure", "detail": f"the loop failed: {type(error).__name__}: {error}"})
+        detail = f"the loop failed: {type(error).__name__}: {error}"
+        emit({"kind": EventKind.FAILURE, "detail": detail})
     sys.stderr.flush()
     become_ordinary()
     os._exit(code)
@@ -97,7 +99,7 @@ def _run(order: dict[str, Any], emit: Callable[[dict[str, Any]], None]) -> Exit:
     if order["may_write"]:
         source.open()
     granted = ", ".join(become_realtime(1.0 / driver.rate))
-    emit({"kind": "granted", "hash": order["hash"], "detail": granted})
+    emit({"kind": EventKind.GRANTED, "hash": order["hash"], "detail": granted})
     commands = Commands(order["commands"], order["after"])
     return loop.run(commands, order["may_write"], order["latched"])
 
@@ -139,7 +141,7 @@ def _report_compiling(emit: Callable[[dict[str, Any]], None]) -> Callable[[int],
     def began(functions: int) -> None:
         if functions % 10 == 1:
             far = "" if functions == 1 else f" ({functions} functions)"
-            emit({"kind": "compiling", "detail": f"starting: {compiling.ABOUT}{far}"})
+            emit({"kind": EventKind.COMPILING, "detail": f"starting: {compiling.ABOUT}{far}"})
 
     return began
 

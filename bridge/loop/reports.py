@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+from gapbridge.bridge.ipc.events import EventKind
 from gapbridge.bridge.ipc.loop_counters import LoopCounter
 from gapbridge.bridge.ipc.shared_memory import SharedMemory
 from gapbridge.bridge.loop.supervisor import Cause, State
@@ -26,6 +27,6 @@ class Reports:
         """Report a change of state: listener of a Supervisor."""
         self.memory.note_state(after)
         self.emit(
-            {"kind": "transition", "from": before.name, "to": after.name, "cause": cause.value,
-             "detail": detail, "cycle": self.memory.written}
+            {"kind": EventKind.TRANSITION, "from": before.name, "to": after.name,
+             "cause": cause.value, "detail": detail, "cycle": self.memory.written}
         )  # fmt: skip

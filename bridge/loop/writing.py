@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from gapbridge.bridge.cell.sections import SetpointSettings
+from gapbridge.bridge.ipc.events import EventKind
 from gapbridge.bridge.ipc.loop_counters import LoopCounter
 from gapbridge.bridge.ipc.shared_memory import Phase
 from gapbridge.bridge.loop.link_monitor import hold_time
@@ -113,7 +114,8 @@ class Writing:
         try:
             self._check_way()
             for found in self._driver.arm(state):
-                self._reports.emit({"kind": "warning", "what": "cell", "detail": str(found)})
+                detail = str(found)
+                self._reports.emit({"kind": EventKind.WARNING, "what": "cell", "detail": detail})
             self.ready = True
         finally:
             self._reports.memory.enter(Phase.RUNNING)
@@ -259,7 +261,7 @@ class Writing:
         if self._source.ended and not self._reports.memory.ended:
             self._reports.memory.note_ended()
             detail = "the source has come to its end; the arm stays there"
-            self._reports.emit({"kind": "source", "what": "ended", "detail": detail})
+            self._reports.emit({"kind": EventKind.SOURCE, "what": "ended", "detail": detail})
         return found
 
     def release(self) -> None:
@@ -272,7 +274,7 @@ class Writing:
         try:
             self._driver.release()
         except WriteError as error:
-            self._reports.emit({"kind": "link", "what": "release", "detail": str(error)})
+            self._reports.emit({"kind": EventKind.LINK, "what": "release", "detail": str(error)})
         self._reports.memory.enter(Phase.RUNNING)
         self._paused = True
 

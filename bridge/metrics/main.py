@@ -32,6 +32,7 @@ from starlette.routing import Route
 
 from gapbridge.bridge.cell.daemon_settings import DaemonSettings
 from gapbridge.bridge.cell.updated_settings import UpdatedSettings
+from gapbridge.bridge.ipc.events import EventKind
 from gapbridge.bridge.ipc.loop_counters import DROPPED
 from gapbridge.bridge.ipc.shared_memory import SharedMemory
 from gapbridge.bridge.ipc.side_main import Order, run_side
@@ -122,16 +123,16 @@ class Counts:
         self.received = float(rows[-1, s["received"].start])
 
     def _on_event(self, event: dict[str, Any]) -> None:
-        kind = str(event.get("kind", "note"))
+        kind = str(event.get("kind", EventKind.NOTE))
         self._updated.on_event(event)
-        if kind == "status":
+        if kind == EventKind.STATUS:
             self.status = event
             return
         self.events[kind] += 1
-        if kind == "recorder":
+        if kind == EventKind.RECORDER:
             self.recorder_paused = bool(event.get("paused"))
             self.recorder_lost += int(event.get("lost") or 0)
-        if kind == "fault":
+        if kind == EventKind.FAULT:
             self.faults[str(event.get("cause") or "other")[:60]] += 1
         if "to" in event:
             to, cause = str(event["to"]).lower(), str(event.get("cause", ""))

@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 
-from gapbridge.core.errors import LinkError
 from gapbridge.drivers.can_bus.bus import open_bus
 from gapbridge.drivers.ft_sensor.can_sensor import CanSensor
 from gapbridge.drivers.ft_sensor.sensor import ClockOffset, Reading
