@@ -393,7 +393,7 @@ class Daemon:
     def _start_loop(self, armed_by: str) -> LoopProcess:
         """Start a process of the loop, for which only requests count that are still to come.
 
-        Beside them, a disarming that no loop has taken: whoever asked for it is owed it.
+        Beside them, a disarming that no loop has taken: who asked for it still waits.
         """
         with self._request_lock:  # none is numbered and not yet written
             self._pass_on()
