@@ -162,27 +162,27 @@ class FrameReader:
         motors = self.assembler.enabled
         return bool(motors) and not any(motors.values())
 
-    def trouble(self, writing: bool) -> tuple[str, str]:
+    def stop_reason(self, writing: bool) -> tuple[str, str]:
         """Return what is wrong with the arm and the words for it; empty where nothing is."""
-        if not self.assembler.troubled:
+        if not self.assembler.stopping:
             return "", ""
-        return self._first_trouble(self.assembler.status, writing)
+        return self._first_stop_reason(self.assembler.status, writing)
 
-    def cleared_trouble(self, writing: bool) -> str:
-        """Return what was wrong since ``forget_passed`` and is no longer; empty: nothing."""
-        return self._first_trouble(self.assembler.cleared, writing)[0]
+    def cleared_stop_reason(self, writing: bool) -> str:
+        """Return what was wrong since ``forget_cleared`` and is no longer; empty: nothing."""
+        return self._first_stop_reason(self.assembler.cleared, writing)[0]
 
     def forget_cleared(self) -> None:
-        """Let trouble that has ended be: it has been reported, or nobody was to act on it."""
+        """Forget stops that have ended: they have been reported, or nobody was to act on them."""
         self.assembler.cleared.clear()
 
-    def _first_trouble(
+    def _first_stop_reason(
         self, status: dict[tuple[Key, str], tuple[float, str, bool]], writing: bool
     ) -> tuple[str, str]:
-        for (key, signal), (value, trouble, only_writing) in status.items():
-            if trouble and (writing or not only_writing):
+        for (key, signal), (value, reason, only_writing) in status.items():
+            if reason and (writing or not only_writing):
                 name = self._profile.incoming[key].name
-                return trouble, f"{name}.{signal} is {value:g}"
+                return reason, f"{name}.{signal} is {value:g}"
         return "", ""
 
     def silent_status(self) -> str:
