@@ -24,6 +24,7 @@
 
 from __future__ import annotations
 
+import errno
 from enum import StrEnum
 
 
@@ -121,3 +122,11 @@ class GateError(WriteError):
 
 class LimitError(RunError):
     """A setpoint that must not leave: not finite, or outside its limits."""
+
+
+def first_line(error: BaseException) -> str:
+    """Return the first line of what an error says, or its kind."""
+    if isinstance(error, OSError) and error.errno in errno.errorcode:
+        return error.strerror or type(error).__name__
+    lines = str(error).strip().splitlines()
+    return lines[0].strip() if lines else type(error).__name__

@@ -6,7 +6,6 @@ from pkgutil import resolve_name
 from typing import TYPE_CHECKING, cast
 
 from gapbridge.core.errors import LinkError
-from gapbridge.drivers.clock import SYSTEM, Clock
 
 if TYPE_CHECKING:
     from gapbridge.core.model import Model
@@ -24,12 +23,7 @@ DRIVERS: dict[str, str] = {
 """Driver name in a cell file -> ``module:Class``, imported when it is used."""
 
 
-def make_driver(
-    settings: DriverSettings,
-    model: Model,
-    bounds: GateBounds | None = None,
-    clock: Clock = SYSTEM,
-) -> Driver:
+def make_driver(settings: DriverSettings, model: Model, bounds: GateBounds | None = None) -> Driver:
     """Return the driver that the settings name, not yet connected.
 
     ``model`` gives it the arm and the tool, ``bounds`` what its gate lets pass (left out: the
@@ -42,7 +36,7 @@ def make_driver(
         found = resolve_name(DRIVERS[name])
     except ImportError as error:
         raise LinkError(f"link.driver {name}: its library cannot be imported: {error}") from None
-    driver = cast("Driver", found(settings, model, clock))
+    driver = cast("Driver", found(settings, model))
     if bounds is not None:
         driver.gate.hold_to(bounds)
     return driver

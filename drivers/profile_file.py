@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import TypeVar
 
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
 from gapbridge.core.errors import InputError
@@ -20,13 +22,17 @@ class ProfileDocument(Document):
 
     def error(self, keys: Keys, message: str) -> ProfileError:
         """Return the error that says ``message`` about a key path."""
-        name = ".".join(str(key + 1) if isinstance(key, int) else key for key in keys)
-        return ProfileError(f"{self.path}, line {self.line(keys)}: {name}: {message}")
+        return ProfileError(f"{self.path}, line {self.line(keys)}: {name_of(keys)}: {message}")
+
+    def require_joints(self, found: int, expected: int | None) -> None:
+        """Raise ProfileError where a profile has not as many joints as the arm; None: any."""
+        if expected is not None and found != expected:
+            raise self.error(("joints",), f"found {found}, expected {expected}: the arm has those")
 
 
-def worst_of(error: ValidationError) -> ErrorDetails:
-    """Return the first of what pydantic says; a misspelt key comes before the one it lacks."""
-    return min(error.errors(), key=lambda detail: detail["type"] != "extra_forbidden")
+def name_of(keys: Keys) -> str:
+    """Return a key path as messages have it, items of lists counted from 1."""
+    return ".".join(str(key + 1) if isinstance(key, int) else key for key in keys)
 
 
 def found_and_expected(detail: ErrorDetails) -> str:
@@ -35,11 +41,25 @@ def found_and_expected(detail: ErrorDetails) -> str:
     return f"found {quoted(detail['input'])}, expected {expected}"
 
 
+Schema = TypeVar("Schema", bound=BaseModel)
 # a signal may be called ``on``
 PROFILE = Kind("profile", "a profile", "dbc: ...", ProfileError, loaders(on_is_text=True))
 
 
-def read_profile_document(path: Path) -> ProfileDocument:
-    """Return a profile's YAML. Raises ProfileError where it cannot be read or is broken."""
+def read_profile_file(
+    path: Path,
+    schema: type[Schema],
+    refusal: Callable[[ProfileDocument, ErrorDetails], ProfileError],
+) -> tuple[ProfileDocument, Schema]:
+    """Return a profile's YAML and what ``schema`` makes of it.
+
+    ``refusal`` makes an error of the first thing that pydantic objects to; a misspelt key comes
+    before the one it lacks. Raises ProfileError, also where the file cannot be read or is broken.
+    """
     found = read_yaml(path, PROFILE)
-    return ProfileDocument(found.path, found.text, found.root, found.data)
+    document = ProfileDocument(found.path, found.text, found.root, found.data)
+    try:
+        return document, schema.model_validate(document.data)
+    except ValidationError as error:
+        worst = min(error.errors(), key=lambda detail: detail["type"] != "extra_forbidden")
+        raise refusal(document, worst) from None

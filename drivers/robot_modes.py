@@ -17,7 +17,7 @@ STOPPED = 1 << 10
 STOPS = 0b111_1111_1100  # safety_status_bits: all but normal and reduced mode
 PLAYING = 2  # runtime_state
 
-Trouble = Literal["not_ready", "protective_stop", "emergency_stop", "fault"]
+StopReason = Literal["not_ready", "protective_stop", "emergency_stop", "fault"]
 """What keeps a robot from moving, as profiles name it."""
 
 
@@ -36,7 +36,7 @@ MODES: dict[str, Modes] = {
     "emergency_stop": Modes(POWER_OFF, EMERGENCY_STOP, 1 << 6 | 1 << 7 | STOPPED),
     "fault": Modes(RUNNING, FAULT, 1 << 9 | STOPPED),
 }
-"""Trouble, as profiles name it -> what every driver reports."""
+"""A reason to stop, as profiles name it -> what every driver reports."""
 
 
 def why_not_ready(state: RobotState) -> str:
@@ -48,11 +48,11 @@ def why_not_ready(state: RobotState) -> str:
     return f"{detail}, safety_status_bits {state.safety_status_bits:#b}" if stops else detail
 
 
-def modes_of(troubles: Iterable[str]) -> Modes:
-    """Return the modes of all ``troubles`` at once: the gravest of each, all stops' bits."""
+def modes_of(stop_reasons: Iterable[str]) -> Modes:
+    """Return the modes of all ``stop_reasons`` at once: the gravest of each, all stops' bits."""
     found = MODES[""]
-    for trouble in troubles:
-        mode = MODES[trouble]
+    for reason in stop_reasons:
+        mode = MODES[reason]
         bits = found.safety_status_bits | mode.safety_status_bits
         found = Modes(
             min(found.robot_mode, mode.robot_mode),

@@ -11,7 +11,7 @@ import pytest
 from benchmarks.mutants.mutant import Mutant, read_mutants
 from gapbridge.bridge.cell.simulation import SIMULATORS
 from gapbridge.bridge.cli.table import COMMANDS
-from gapbridge.bridge.daemon.sides import SIDES
+from gapbridge.bridge.daemon.side_processes import SIDE_PROCESSES
 from gapbridge.bridge.setpoint_source import SOURCES
 from gapbridge.drivers import DRIVERS
 from gapbridge.drivers.ft_sensor import FT_SENSORS
@@ -32,7 +32,7 @@ def test_a_named_member_is_where_its_table_says(name: str) -> None:
     assert callable(getattr(importlib.import_module(module), member))
 
 
-@pytest.mark.parametrize("name", [module for module, _ in SIDES.values()])
+@pytest.mark.parametrize("name", [module for module, _ in SIDE_PROCESSES.values()])
 def test_a_side_process_is_a_module_that_can_be_run(name: str) -> None:
     file = importlib.import_module(name).__file__
     assert file is not None

@@ -29,7 +29,7 @@ def _make(rig: Rig, row: Row, witness: Witness) -> Result:
     assert row.inject is not None
     found = rig.found
     found.largest_step, before = 0.0, found.violated
-    counts, first = rig.run.page.counts(), rig.run.page.written
+    counts, first = rig.run.memory.counts(), rig.run.memory.written
     moment = time.time()
     row.inject(rig)
     detected = _await(rig, row, moment, counts)
@@ -100,7 +100,7 @@ def _left(rig: Rig, moment: float) -> float | None:
 
 def _counted(rig: Rig, row: Row, before: dict[str, int]) -> float | None:
     names = row.sign.split("|")
-    now = rig.run.page.counts()
+    now = rig.run.memory.counts()
     return time.time() if any(now[name] > before[name] for name in names) else None
 
 
@@ -122,9 +122,9 @@ def _settle(rig: Rig, row: Row) -> str:
 
 def _missed(rig: Rig, first: int) -> int:
     """Return how many states the loop has missed since its cycle number ``first``."""
-    page = rig.run.page
-    rows, _ = page.rows(first, page.written)
-    return int(rows[:, page.slices["missed"].start].sum())
+    memory = rig.run.memory
+    rows, _ = memory.rows(first, memory.written)
+    return int(rows[:, memory.slices["missed"].start].sum())
 
 
 def _judge(rig: Rig, row: Row, detected: float | None, end: str, missed: int) -> list[str]:

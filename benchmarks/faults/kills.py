@@ -100,9 +100,9 @@ class Scene:
 
     def last_cycle(self) -> float:
         """Return the controller's time of the newest cycle that the loop has handed over, s."""
-        page = self.run.page
-        rows, _ = page.rows(max(page.written - 20, 0), page.written)
-        return float(rows[-1, page.slices["timestamp"].start]) if len(rows) else 0.0
+        memory = self.run.memory
+        rows, _ = memory.rows(max(memory.written - 20, 0), memory.written)
+        return float(rows[-1, memory.slices["timestamp"].start]) if len(rows) else 0.0
 
     def recorded(self) -> float:
         """Return the controller's time of the newest cycle that can be read of the recording, s."""

@@ -30,7 +30,7 @@ def emit(event):
 sys.exit(run_cell(Path(sys.argv[1]), arm=True, log=emit))
 """
 PAGE_LIMIT = 90.0  # s
-LOOK_EVERY = 0.02  # s between two looks for the page of a new loop
+LOOK_EVERY = 0.02  # s between two looks for the memory of a new loop
 END_LIMIT = 6.0  # s for every process of a run to be gone
 
 
@@ -42,8 +42,8 @@ class ProcessRun(SourceStatus):
         self.events: list[Event] = []
         self.error: BaseException | None = None
         self.output = ""
-        self._page: SharedMemory | None = None
-        self._looked = 0.0  # s, monotonic: when the newest page was last looked for
+        self._memory: SharedMemory | None = None
+        self._looked = 0.0  # s, monotonic: when the newest memory was last looked for
         self._process: subprocess.Popen[str] | None = None
 
     def start(self) -> None:
@@ -56,7 +56,7 @@ class ProcessRun(SourceStatus):
         )  # fmt: skip
         go_first(self.pid)
         threading.Thread(target=self._listen, daemon=True).start()
-        self._page = self._join(time.monotonic() + PAGE_LIMIT)
+        self._memory = self._join(time.monotonic() + PAGE_LIMIT)
 
     def _listen(self) -> None:
         assert self._process is not None and self._process.stderr is not None
@@ -67,7 +67,7 @@ class ProcessRun(SourceStatus):
                 self.output += line
 
     def _join(self, until: float) -> SharedMemory:
-        """Return the newest page of the daemon; raises TimeoutError where there is none."""
+        """Return the newest memory of the daemon; raises TimeoutError where there is none."""
         while time.monotonic() < until:
             found = self._newest()
             if found is not None:
@@ -78,26 +78,26 @@ class ProcessRun(SourceStatus):
         raise TimeoutError(f"the daemon did not start: {self.output[-300:]}")
 
     def _newest(self) -> int | None:
-        """Return a descriptor of the page of the newest loop: memory is numbered as it is made."""
+        """Return a descriptor of the memory of the newest loop: it is numbered as it is made."""
         folder, found = Path(f"/proc/{self.pid}/fd"), dict[int, str]()
         with contextlib.suppress(OSError):
             for name in os.listdir(folder):
                 if os.readlink(folder / name).startswith(f"/memfd:{NAME}"):
                     found[os.stat(folder / name).st_ino] = name
-            if found and (self._page is None or max(found) != os.fstat(self._page.fd).st_ino):
+            if found and (self._memory is None or max(found) != os.fstat(self._memory.fd).st_ino):
                 return os.open(folder / found[max(found)], os.O_RDONLY)
         return None
 
     @property
-    def page(self) -> SharedMemory:
-        """Return the shared page of the run's newest loop."""
-        assert self._page is not None
+    def memory(self) -> SharedMemory:
+        """Return the shared memory of the run's newest loop."""
+        assert self._memory is not None
         now = time.monotonic()
         if now - self._looked > LOOK_EVERY:
             self._looked = now
             if (fd := self._newest()) is not None:
-                self._page = SharedMemory(self._n, fd, writable=False)
-        return self._page
+                self._memory = SharedMemory(self._n, fd, writable=False)
+        return self._memory
 
     @property
     def pid(self) -> int:
@@ -121,8 +121,8 @@ class ProcessRun(SourceStatus):
         return State(max(self.state_word(), 0))
 
     def state_word(self) -> int:
-        """Return the supervisor's state from the shared page, -1 where there is none yet."""
-        return -1 if self._page is None else self.page.state
+        """Return the supervisor's state from the shared memory, -1 where there is none yet."""
+        return -1 if self._memory is None else self.memory.state
 
     def processes(self) -> dict[str, psutil.Process]:
         """Return the processes of the run by the module that they run, ``daemon`` itself too."""

@@ -55,7 +55,7 @@ class Running(SourceStatus):
         settings = settings_of(load_cell(cell)).model_copy(update=given)
         self.events: list[Event] = []
         self.daemon = Daemon(settings, may_write=not observe, log=self.events.append)
-        self.page = self.daemon.page
+        self.memory = self.daemon.memory
         self.summary: RunSummary | None = None
         self.error: BaseException | None = None
         self._thread = threading.Thread(target=self._run, daemon=True, name="daemon")
@@ -79,12 +79,12 @@ class Running(SourceStatus):
     @property
     def state(self) -> State:
         """Return the loop's state at this moment."""
-        return State(self.page.state) if self.daemon.loop_pid else State.DISCONNECTED
+        return State(self.memory.state) if self.daemon.loop_pid else State.DISCONNECTED
 
     def state_word(self) -> int:
-        """Return the supervisor's state from the shared page, -1 where that is gone."""
+        """Return the supervisor's state from the shared memory, -1 where that is gone."""
         try:
-            return self.page.state
+            return self.memory.state
         except (IndexError, ValueError):
             return -1
 

@@ -39,7 +39,9 @@ class Memory:
     def look(self, rig: Rig, begun: float) -> None:
         """Take down what each process of the daemon holds now."""
         pids = {f"loop {rig.run.daemon.loop_pid}": rig.run.daemon.loop_pid}
-        pids |= {f"{name}": side["pid"] for name, side in rig.run.daemon.sides.status().items()}
+        pids |= {
+            f"{name}": side["pid"] for name, side in rig.run.daemon.side_processes.status().items()
+        }
         for name, pid in pids.items():
             if pid is None:
                 continue
@@ -72,7 +74,7 @@ class Quiet:
     missed: list[Missed] = field(default_factory=list)
 
     def take(self, rows: Array, slices: Mapping[str, slice]) -> None:
-        """Count the cycles of some rows of the shared page."""
+        """Count the cycles of some rows of the shared memory."""
         self.cycles += len(rows)
         missed, received = (rows[:, slices[name].start] for name in ("missed", "received"))
         for row in np.flatnonzero(missed):
@@ -94,7 +96,7 @@ def soak(
     rows = [row for row in rows_of(link) if row.inject is not None]
     with Rig(LINKS[link](rate), folder, RECORDED) as rig:
         begun = time.monotonic()
-        reader = rig.run.page.reader()
+        reader = rig.run.memory.reader()
         while time.monotonic() - begun < 60.0 * minutes:
             rig.compensate()
             rig.pass_time(QUIET)
@@ -102,7 +104,7 @@ def soak(
             until, looked = time.monotonic() + draw.uniform(0.5, 1.5) * every, 0.0
             while time.monotonic() < until:
                 rig.pass_time(0.1)
-                quiet.take(reader.drain(), rig.run.page.slices)
+                quiet.take(reader.drain(), rig.run.memory.slices)
                 if time.monotonic() - looked > SAMPLE:
                     looked = time.monotonic()
                     memory.look(rig, begun)

@@ -119,14 +119,14 @@ class _Sides:
             self._network.subscribers.pop(pdo.cob_id, None)
             if not is_ours:
                 pdo.subscribe()
-        self._driver.rhythm._torn = False
-        self._driver.master.collector.forget_stray()
+        self._driver.sync_cycle._torn = False
+        self._driver.master.collector.clear_stray()
 
     def _wait(self) -> None:
         self._due = max(self._due + PACE, time.monotonic())
         self._pause(max(self._due - time.monotonic(), 0.0))
         self._driver.master.beat()  # else the drives miss our heartbeat in the library's turn
-        self._driver.rhythm._due = 0.0  # no pacing inside the cycle
+        self._driver.sync_cycle._due = 0.0  # no pacing inside the cycle
 
     def _count(self, _: Any) -> None:
         self._missing -= 1

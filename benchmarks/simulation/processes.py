@@ -15,8 +15,8 @@ from benchmarks.simulation.world import Process, SimulatedClock, World
 from gapbridge.bridge.cell.run_settings import Configuration
 from gapbridge.bridge.daemon.daemon import Daemon
 from gapbridge.bridge.daemon.processes import LoopProcess
-from gapbridge.bridge.ipc.command_page import CommandPage, Commands
-from gapbridge.bridge.ipc.shared_memory import Phase, RunPage, SharedMemory
+from gapbridge.bridge.ipc.command_memory import CommandMemory, Commands
+from gapbridge.bridge.ipc.shared_memory import Phase, RunMemory, SharedMemory
 from gapbridge.bridge.loop.loop import Exit, Loop
 from gapbridge.bridge.loop.offset_in_force import OffsetInForce
 from gapbridge.bridge.loop.setpoint_stream import SetpointStream
@@ -80,18 +80,18 @@ class SimulatedLoop(LoopProcess):
     """One process of the loop: the product's loop, driver and source, in the world's time."""
 
     def __init__(
-        self, run: Run, configuration: Configuration, page: RunPage, commands: CommandPage,
+        self, run: Run, configuration: Configuration, memory: RunMemory, commands: CommandMemory,
         order: dict[str, Any], *_: Any,
     ) -> None:  # fmt: skip
-        page.renew()
+        memory.renew()
         self._now = run.clock.monotonic
-        self._run, self.page, self._commands = run, page, commands
+        self._run, self.memory, self._commands = run, memory, commands
         self._settings = configuration.settings
         self._order, self._reported = order, list[dict[str, Any]]()
         self.started = run.world.now
         self.loop: Loop | None = None
         self.killed = False
-        self._fds = os.dup(page.fd), os.dup(commands.fd)
+        self._fds = os.dup(memory.fd), os.dup(commands.fd)
         run.loops.append(self)
         self.process = Process(run.world, f"loop {len(run.loops)}", self._main)
 
@@ -99,12 +99,12 @@ class SimulatedLoop(LoopProcess):
         run, order = self._run, self._order
         run.clock.sleep(run.world.random.uniform(*STARTING))
         try:
-            page = SharedMemory(self.page.n, self._fds[0], clock=run.clock)
-            page.enter(Phase.STARTING)
+            memory = SharedMemory(self.memory.n, self._fds[0], clock=run.clock)
+            memory.enter(Phase.STARTING)
             driver = _watched(run, run.link.driver())
             source = _source(run)
             loop = self.loop = _Loop(
-                self._settings, run.link.setting.cell.model, driver, source, page, self._emit,
+                self._settings, run.link.setting.cell.model, driver, source, memory, self._emit,
                 order["number"],
             )  # fmt: skip
             loop._in_force = loop._writing._in_force = run.offset_in_force

@@ -86,7 +86,7 @@ def run(seed: int, say: Any = None, plan: Sequence[tuple[float, str]] | None = N
             for loop in found.loops:
                 loop.let_go()
             found.daemon._commands.close()
-            found.daemon.page.close()
+            found.daemon.memory.close()
     outcome.violations, outcome.writes = judge.violations, judge.writes_noted
     outcome.oldest, outcome.hidden = judge.oldest, judge.hidden
     outcome.seconds = world.now - BEGIN
@@ -226,9 +226,9 @@ def _judge_end(run: Run, judge: Judge, person: Person) -> None:
     taken, last = run.daemon.taken, run.daemon._commands.last
     if person.done and taken > last:
         judge.violate("taken", f"{taken} taken of {last}")
-    slices = run.daemon.page.slices
-    written = run.daemon.page.written
-    rows, _ = run.daemon.page.rows(0, written)
+    slices = run.daemon.memory.slices
+    written = run.daemon.memory.written
+    rows, _ = run.daemon.memory.rows(0, written)
     left = int((rows[:, slices["written"]] == 1.0).sum())
     deaths = sum(loop.process.dead for loop in run.loops)
     if not left <= run.left <= left + deaths:

@@ -32,7 +32,7 @@ from gapbridge.drivers.simulated.ur.programs.offset_program import (
 )
 from gapbridge.drivers.ur_rtde import command, registers
 from gapbridge.drivers.ur_rtde.driver import UrRtdeDriver
-from gapbridge.drivers.ur_rtde.round_trip import TRIES
+from gapbridge.drivers.ur_rtde.enquiry import TRIES
 
 UPLOAD = 0.1  # s that uploading a script takes
 DEAD_AFTER = 0.3  # s of a broken connection until the library says so

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any, Protocol
 
 from gapbridge.bridge.ipc.control_socket import Peer, refusal
-from gapbridge.bridge.ipc.events import Event
+from gapbridge.bridge.ipc.events import Event, EventKind
 from gapbridge.bridge.ipc.shared_memory import Phase
 from gapbridge.bridge.loop.supervisor import Cause, State
 from gapbridge.drivers.clock import SYSTEM, Clock
@@ -75,7 +75,7 @@ class Control:
         by = f"uid {peer.uid}, pid {peer.pid}"
         reply = self._arm(by) if command == "arm" else self._disarm(by)
         self._daemon.note(
-            {"kind": "control", "command": command, "uid": peer.uid, "pid": peer.pid,
+            {"kind": EventKind.CONTROL, "command": command, "uid": peer.uid, "pid": peer.pid,
              "ok": reply["ok"],
              "detail": f"{command} by {by}: {reply.get('answer') or reply.get('error')}"}
         )  # fmt: skip
@@ -102,7 +102,7 @@ class Control:
         daemon, begun, waiting = self._daemon, self._clock.monotonic(), None
         while self._clock.monotonic() - begun < LONGEST_ARMING:
             for event in daemon.events_since(mark):
-                if event["kind"] == "refused" or event.get("cause") == Cause.START_REFUSED:
+                if event["kind"] == EventKind.REFUSED or event.get("cause") == Cause.START_REFUSED:
                     return refusal(f"refused: {event['detail']}")
                 given_up = (event.get("from"), event.get("to")) == (ARMED, State.OBSERVING.name)
                 if given_up or event.get("to") in (State.FAULT.name, State.DISCONNECTED.name):

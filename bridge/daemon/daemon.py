@@ -21,21 +21,21 @@ from gapbridge.bridge.cell.run_settings import Configuration, configuration_for,
 from gapbridge.bridge.cell.runtime_folder import cell_key, runtime_folder
 from gapbridge.bridge.daemon.control import Control
 from gapbridge.bridge.daemon.fitted_watch import FittedWatch
-from gapbridge.bridge.daemon.host import OwnerLock
+from gapbridge.bridge.daemon.owner_lock import OwnerLock
 from gapbridge.bridge.daemon.processes import LoopProcess
 from gapbridge.bridge.daemon.reload import Reload
 from gapbridge.bridge.daemon.service_manager import ServiceManager
-from gapbridge.bridge.daemon.sides import Sides
+from gapbridge.bridge.daemon.side_processes import SideProcesses
 from gapbridge.bridge.daemon.slip_watch import Slip, SlipWatch
 from gapbridge.bridge.daemon.status import DaemonStatus
 from gapbridge.bridge.daemon.status_document import SCHEMA
 from gapbridge.bridge.daemon.summary import RunSummary, Tally
 from gapbridge.bridge.document.output_file import private, require_folder
-from gapbridge.bridge.ipc.command_page import Command, CommandPage
+from gapbridge.bridge.ipc.command_memory import Command, CommandMemory
 from gapbridge.bridge.ipc.control_socket import ControlSocket
-from gapbridge.bridge.ipc.counts import DROPPED
-from gapbridge.bridge.ipc.events import Event, EventLog
-from gapbridge.bridge.ipc.shared_memory import Phase, RunPage
+from gapbridge.bridge.ipc.events import Event, EventKind, EventLog
+from gapbridge.bridge.ipc.loop_counters import DROPPED
+from gapbridge.bridge.ipc.shared_memory import Phase, RunMemory
 from gapbridge.bridge.loop.loop import LONGEST_STOP, Exit
 from gapbridge.bridge.loop.setpoint_stream import longest_withdrawal
 from gapbridge.bridge.loop.supervisor import Cause, State
@@ -51,6 +51,9 @@ HEALTHY = 10.0  # s after which a restart counts as the first again
 STOP_MARGIN = 0.4  # s on top of the loop's own time: then it is ended by force
 STATUS_EVERY = 0.5  # s
 PROGRAM = f"the daemon's own program (pid {os.getpid()})"
+
+UNSPOKEN = (EventKind.FAILURE, EventKind.GRANTED, EventKind.SUMMARY, EventKind.REQUEST)
+"""Kinds of events that the terminal does not show: after a failure a fault follows."""
 
 Say = Callable[[str], None]
 
@@ -75,22 +78,22 @@ class Daemon:
         settings = given.settings
         self.may_write, self._say = may_write, say
         n = self.configuration.n
-        self.page = RunPage(n, clock)  # of the loop's process, one after the other
-        self._commands = CommandPage()  # one for the whole run; nobody else can write to it
+        self.memory = RunMemory(n, clock)  # of the loop's process, one after the other
+        self._commands = CommandMemory()  # one for the whole run; nobody else can write to it
         self._requests: queue.SimpleQueue[tuple[int, Command, str]] = queue.SimpleQueue()
         self._taken = 0
         self._request_lock = threading.RLock()
-        self._reader = self.page.reader()
+        self._reader = self.memory.reader()
         self._output: IO[bytes] | int = subprocess.DEVNULL  # of all processes of the run
-        self.sides = Sides(clock)
+        self.side_processes = SideProcesses(clock)
         self.tally = Tally(n, settings.link.rate)
-        listeners = [self._on_event, self.sides.emit]
+        listeners = [self._on_event, self.side_processes.emit]
         self.event_log = EventLog(*listeners, *([log] if log else []), clock=clock)
         self._posted: queue.SimpleQueue[Event] = queue.SimpleQueue()  # by other threads
         self.manager = ServiceManager(clock)
         self.session = ""
-        self._status = DaemonStatus(self.page.slices, clock)
-        self._fitted = FittedWatch(given.fitted, self.page.slices)
+        self._status = DaemonStatus(self.memory.slices, clock)
+        self._fitted = FittedWatch(given.fitted, self.memory.slices)
         self._slips = self._slip_watch()
         self._status_at = 0.0
         self._reload = Reload(self.manager, self.event_log)
@@ -123,7 +126,7 @@ class Daemon:
     @property
     def phase(self) -> Phase:
         """Return what the loop's process is at."""
-        return self.page.phase
+        return self.memory.phase
 
     @property
     def latched(self) -> str:
@@ -159,7 +162,7 @@ class Daemon:
     def status(self) -> dict[str, Any]:
         """Return the status document; may be called from any thread."""
         status, tally, recording = self._status, self.tally, self.recording
-        counted = self.page.counts()
+        counted = self.memory.counts()
         return {
             "schema": SCHEMA,
             "time": self._clock.time(),
@@ -194,14 +197,14 @@ class Daemon:
             },
             "counts": counted,
             "events": dict(self.event_log.counts),
-            "sides": self.sides.status(),
+            "sides": self.side_processes.status(),
             "recording": None if recording is None else str(recording),
             "lost_rows": self.lost_rows,
         }
 
     def _slip_watch(self) -> SlipWatch:
         smallest = self.settings.limits.zero_slip
-        return SlipWatch(self.configuration.model, self.page.slices, smallest)
+        return SlipWatch(self.configuration.model, self.memory.slices, smallest)
 
     def note(self, event: Event) -> None:
         """Emit an event from the daemon's own thread."""
@@ -250,7 +253,7 @@ class Daemon:
             name = "arm" if command == Command.ARM else "disarm"
             detail = f"{name} asked for by {by}"
             self.event_log.add(
-                {"kind": "request", "command": name, "number": number, "by": by,
+                {"kind": EventKind.REQUEST, "command": name, "number": number, "by": by,
                  "acknowledges": command == Command.DISARM, "detail": detail}
             )  # fmt: skip
             self._commands.ask(command, number)
@@ -268,7 +271,7 @@ class Daemon:
                 self._run_loop((by or PROGRAM) if arm else "", duration)
                 swap = self._reload.swap()
                 self.configuration = swap.configuration or self.configuration
-                self._fitted = FittedWatch(self.configuration.fitted, self.page.slices)
+                self._fitted = FittedWatch(self.configuration.fitted, self.memory.slices)
                 self._slips = self._slip_watch()
                 arm = swap.rearms  # else only a person starts the writing again
                 by = "the cell file" if arm else ""
@@ -286,7 +289,7 @@ class Daemon:
         """
         settings = self.settings
         stack.callback(self._commands.close)
-        stack.callback(self.page.close)
+        stack.callback(self.memory.close)
         lock = stack.enter_context(OwnerLock(address_of(settings.link), settings.cell))
         folder = settings.recording.folder
         if folder is not None:
@@ -299,26 +302,27 @@ class Daemon:
             "settings": settings.model_dump(mode="json"), "n": self.configuration.n,
             "session": self.session, "extra": {"text": self.configuration.text},
         }  # fmt: skip
-        stack.callback(self.sides.close)
-        self.sides.start(settings, order, self.page, self._output)
-        stack.callback(lambda: self.event_log.add({"kind": "ended"}))
+        stack.callback(self.side_processes.close)
+        self.side_processes.start(settings, order, self.memory, self._output)
+        stack.callback(lambda: self.event_log.add({"kind": EventKind.ENDED}))
         path = runtime_folder() / f"{cell_key(settings.cell)}.sock"
         try:
             stack.enter_context(ControlSocket(path, self.control.answer))
         except OSError as error:
             raise InputError(f"{path}: {error.strerror}, expected a socket to listen on") from None
         if settings.web is not None:
-            self.event_log.add({"kind": "note", "detail": f"status page: {settings.web.url}"})
+            where = f"status page: {settings.web.url}"
+            self.event_log.add({"kind": EventKind.NOTE, "detail": where})
         if settings.setpoints.source == "planner":
             where = f"setpoints: a planner writes to {settings.setpoints.socket}"
-            self.event_log.add({"kind": "note", "detail": where})
+            self.event_log.add({"kind": EventKind.NOTE, "detail": where})
         # a person at the terminal may arm after a crash; a service that was started anew may not
         if arm and lock.before and (by != "--arm" or self.manager.present):
             detail = (
                 f"the run before (process {lock.before.get('pid')}) did not end in order: "
                 "not arming by itself; gapbridge arm"
             )
-            self.event_log.add({"kind": "refused", "detail": detail})
+            self.event_log.add({"kind": EventKind.REFUSED, "detail": detail})
             return False
         return arm
 
@@ -335,15 +339,15 @@ class Daemon:
             self._stopping.set()
         self._take()
         self._pass_on()
-        if self.page.promote():
-            self.sides.show(self.page)
-        for event in self.sides.check():
+        if self.memory.promote():
+            self.side_processes.show(self.memory)
+        for event in self.side_processes.check():
             self.event_log.add(event)
         while not self._posted.empty():
             self.event_log.add(self._posted.get())
         if self._clock.monotonic() >= self._status_at:
             self._status_at = self._clock.monotonic() + STATUS_EVERY
-            self.sides.emit({"kind": "status", **self.status()})
+            self.side_processes.emit({"kind": EventKind.STATUS, **self.status()})
         loop = self.loop
         if loop is None or not loop.hangs:
             self.manager.kick()
@@ -358,13 +362,13 @@ class Daemon:
             while loop.exit_code is None:
                 self._clock.sleep(TICK)
                 self._tick()
-                if self.page.seen and first_cycle is None:
+                if self.memory.seen and first_cycle is None:
                     first_cycle = self._clock.monotonic()
                     if duration is not None and not self._seen:
                         self._ends_at = first_cycle + duration
                     self._seen = True
                     self.manager.ready()
-                if self.page.ended and duration is None:
+                if self.memory.ended and duration is None:
                     self._stopping.set()
                 if self._reload.step(self.state, self.phase, self.configuration):
                     self._commands.ask(Command.RAMP_OUT)  # by nobody's wish
@@ -375,7 +379,7 @@ class Daemon:
                         self.manager.stopping()
                     loop.ask_to_stop()
                 if loop.hangs or (stop_by is not None and self._clock.monotonic() > stop_by):
-                    detail = f"the loop stood still for {self.page.silence:.2f} s and was ended"
+                    detail = f"the loop stood still for {self.memory.silence:.2f} s and was ended"
                     loop.kill()  # reported when it is over: nothing is written after that
                     self._fault("hang", detail)
             self._take()
@@ -389,7 +393,7 @@ class Daemon:
     def _start_loop(self, armed_by: str) -> LoopProcess:
         """Start a process of the loop, for which only requests count that are still to come.
 
-        Beside them, a disarming that no loop has taken: whoever asked for it is owed it.
+        Beside them, a disarming that no loop has taken: who asked for it still waits.
         """
         with self._request_lock:  # none is numbered and not yet written
             self._pass_on()
@@ -399,23 +403,23 @@ class Daemon:
             "after": after,
         }  # fmt: skip
         for command in (Command.DISARM, Command.RAMP_OUT):
-            if self._commands.last_of(command) > self.page.taken:
+            if self._commands.last_of(command) > self.memory.taken:
                 self._commands.ask(command)
         if armed_by and self.may_write:
             self._request(Command.ARM, armed_by)
             self._pass_on()
         self._loops += 1
         return self.loop_process(
-            self.configuration, self.page, self._commands, order, self._output, self._clock
+            self.configuration, self.memory, self._commands, order, self._output, self._clock
         )
 
     def _take(self) -> None:
         """Take cycles and events over from the loop."""
-        taken = self.page.taken
+        taken = self.memory.taken
         # in this order: who has heard of a change finds the state changed, and its rows counted
         events = [] if self.loop is None else self.loop.events()
         if self.loop is not None:
-            self._last_state = State(self.page.state)
+            self._last_state = State(self.memory.state)
         self._taken = taken
         rows = self._reader.drain()
         self.tally.add(rows)
@@ -423,7 +427,9 @@ class Daemon:
         for event in events:
             self.event_log.add(event)
         for detail in self._fitted.take(rows, self._clock.monotonic()):
-            self.event_log.add({"kind": "warning", "what": "outside_fitted", "detail": detail})
+            self.event_log.add(
+                {"kind": EventKind.WARNING, "what": "outside_fitted", "detail": detail}
+            )
         for found in self._slips.take(rows):
             self.event_log.add(found.event)
             if isinstance(found, Slip):
@@ -433,20 +439,20 @@ class Daemon:
         """Act on an event, and report it to the person at the terminal."""
         kind, detail = event["kind"], str(event.get("detail", ""))
         self._status.on_event(event)
-        if kind == "failure":
+        if kind == EventKind.FAILURE:
             self._failure = event
-        if kind == "refused":
+        if kind == EventKind.REFUSED:
             self._refused = True
-        if kind == "recorder":
+        if kind == EventKind.RECORDER:
             self._lost_rows += int(event.get("lost", 0))
-        if kind == "transition":
+        if kind == EventKind.TRANSITION:
             tail = f": {detail}" if detail else ""
             text = f"{event['from'].lower()} -> {event['to'].lower()} ({event['cause']}){tail}"
             self._say(text)
             self._refused |= event["cause"] == Cause.START_REFUSED
             if detail:
                 self._faults.append(text)
-        elif detail and kind not in ("failure", "granted", "summary", "request"):  # a fault follows
+        elif detail and kind not in UNSPOKEN:
             self._say(detail)
 
     def _after(self, loop: LoopProcess) -> None:
@@ -469,7 +475,7 @@ class Daemon:
 
     def _fault(self, cause: str, detail: str) -> None:
         self._faults.append(detail)
-        self.event_log.add({"kind": "fault", "cause": cause, "detail": detail})
+        self.event_log.add({"kind": EventKind.FAULT, "cause": cause, "detail": detail})
 
     def _summary(self) -> RunSummary:
         state = self._last_state
@@ -484,5 +490,5 @@ class Daemon:
             exit_code=1 if wrong else 0,
             recording=self.recording,
         )
-        self.event_log.add({"kind": "summary", "summary": summary.to_json()})
+        self.event_log.add({"kind": EventKind.SUMMARY, "summary": summary.to_json()})
         return summary

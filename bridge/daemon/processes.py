@@ -13,9 +13,9 @@ import sys
 from typing import IO, Any
 
 from gapbridge.bridge.cell.run_settings import Configuration
-from gapbridge.bridge.ipc.command_page import Command, CommandPage
+from gapbridge.bridge.ipc.command_memory import Command, CommandMemory
 from gapbridge.bridge.ipc.sealed_memory import sealed_bytes
-from gapbridge.bridge.ipc.shared_memory import Phase, RunPage
+from gapbridge.bridge.ipc.shared_memory import Phase, RunMemory
 from gapbridge.bridge.ipc.side_process import environment
 from gapbridge.bridge.loop.loop import Exit
 from gapbridge.drivers.clock import SYSTEM, Clock
@@ -34,12 +34,12 @@ class LoopProcess:
     """
 
     def __init__(
-        self, configuration: Configuration, page: RunPage, commands: CommandPage,
+        self, configuration: Configuration, memory: RunMemory, commands: CommandMemory,
         order: dict[str, Any], log: IO[Any] | int, clock: Clock = SYSTEM,
     ) -> None:  # fmt: skip
         self._now = clock.monotonic
-        page.renew()
-        self.page, self._commands = page, commands
+        memory.renew()
+        self.memory, self._commands = memory, commands
         self._settings = settings = configuration.settings
         files = sealed_bytes("gapbridge-files", pickle.dumps(dict(configuration.files)))
         # sockets, not pipes: nobody can open them a second time through /proc
@@ -49,8 +49,8 @@ class LoopProcess:
         ours.setblocking(False)
         self.started = self._now()
         order = {
-            **order, "settings": settings.model_dump(mode="json"), "n": page.n,
-            "page": page.fd, "commands": commands.fd, "events": theirs.fileno(),
+            **order, "settings": settings.model_dump(mode="json"), "n": memory.n,
+            "memory": memory.fd, "commands": commands.fd, "events": theirs.fileno(),
             "files": files, "hash": configuration.hash,
             "parent": os.getpid(),
         }  # fmt: skip
@@ -60,7 +60,7 @@ class LoopProcess:
             self._process = subprocess.Popen(
                 [sys.executable, "-X", "faulthandler", "-m", "gapbridge.bridge.loop.main"],
                 stdin=stdin.fileno(), stdout=log, stderr=log, env=environment(),
-                pass_fds=(page.fd, commands.fd, files, theirs.fileno()), start_new_session=True,
+                pass_fds=(memory.fd, commands.fd, files, theirs.fileno()), start_new_session=True,
             )  # fmt: skip
         finally:
             os.close(files)
@@ -82,15 +82,15 @@ class LoopProcess:
     @property
     def hangs(self) -> bool:
         """Return whether its heartbeat has stood still for longer than what it is at may take."""
-        page, settings = self.page, self._settings
+        memory, settings = self.memory, self._settings
         limit = {
             Phase.STARTING: STARTING_LIMIT,
             Phase.CONNECTING: settings.link.connect_timeout,
             Phase.RUNNING: settings.hang_timeout,
             Phase.ARMING: settings.link.connect_timeout,
             Phase.ENDING: ENDING_LIMIT,
-        }[page.phase]
-        silence = page.silence or self._now() - self.started
+        }[memory.phase]
+        silence = memory.silence or self._now() - self.started
         return silence > limit
 
     def events(self) -> list[dict[str, Any]]:
@@ -104,7 +104,7 @@ class LoopProcess:
     def ask_to_stop(self) -> None:
         """Ask it to ramp out and end."""
         self._commands.ask(Command.STOP)
-        if self.page.phase in (Phase.STARTING, Phase.CONNECTING):
+        if self.memory.phase in (Phase.STARTING, Phase.CONNECTING):
             self.kill()  # nothing is written yet, and a constructor cannot be interrupted
 
     def kill(self) -> None:

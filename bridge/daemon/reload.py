@@ -14,7 +14,7 @@ from typing import NamedTuple
 from gapbridge.bridge.cell.cell import complaints
 from gapbridge.bridge.cell.run_settings import Configuration, read_configuration
 from gapbridge.bridge.daemon.service_manager import ServiceManager
-from gapbridge.bridge.ipc.events import EventLog
+from gapbridge.bridge.ipc.events import EventKind, EventLog
 from gapbridge.bridge.ipc.shared_memory import Phase
 from gapbridge.bridge.loop.supervisor import State
 from gapbridge.core.errors import GapbridgeError
@@ -93,7 +93,7 @@ class Reload:
 
     def _report(self, fine: bool, taken: Configuration, detail: str) -> None:
         self._event_log.add(
-            {"kind": "configuration", "ok": fine, "hash": taken.hash, "detail": detail}
+            {"kind": EventKind.CONFIGURATION, "ok": fine, "hash": taken.hash, "detail": detail}
         )
 
 

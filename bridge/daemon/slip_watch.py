@@ -23,7 +23,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gapbridge.bridge.daemon.rest_model import Place, RestModel
-from gapbridge.bridge.ipc.events import Event
+from gapbridge.bridge.ipc.events import Event, EventKind
 from gapbridge.core.arrays import Array
 from gapbridge.core.model import Model
 
@@ -66,7 +66,7 @@ class Slip:
     def event(self) -> Event:
         """Return the event of the run that reports it."""
         return {
-            "kind": "slip", "joints": list(self.joints), "size": self.size, "std": self.std,
+            "kind": EventKind.SLIP, "joints": list(self.joints), "size": self.size, "std": self.std,
             "since": self.since, "detail": self.detail,
         }  # fmt: skip
 
@@ -83,8 +83,8 @@ class Force:
     def event(self) -> Event:
         """Return the event of the run that reports it."""
         return {
-            "kind": "warning", "what": "unexpected_force", "size": self.size, "since": self.since,
-            "detail": self.detail,
+            "kind": EventKind.WARNING, "what": "unexpected_force", "size": self.size,
+            "since": self.since, "detail": self.detail,
         }  # fmt: skip
 
 

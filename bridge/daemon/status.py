@@ -6,7 +6,7 @@ import math
 from collections import deque
 from typing import Any
 
-from gapbridge.bridge.ipc.events import Event
+from gapbridge.bridge.ipc.events import Event, EventKind
 from gapbridge.bridge.loop.checks import NOTHING, UNSOLVED
 from gapbridge.bridge.loop.supervisor import HEALED_BY_RECONNECTING, Cause, State
 from gapbridge.core.arrays import Array
@@ -66,23 +66,23 @@ class DaemonStatus:
 
     def on_event(self, event: Event) -> None:
         """Take note of an event."""
-        if event["kind"] == "configuration":
+        if event["kind"] == EventKind.CONFIGURATION:
             self.configured = event
-        if event["kind"] == "request" and event["command"] == "arm":
+        if event["kind"] == EventKind.REQUEST and event["command"] == "arm":
             self._asked_by = event["by"]
-        if event["kind"] == "slip":
+        if event["kind"] == EventKind.SLIP:
             self.latched, self._heals, self._slipped = event["detail"], False, True
-        if event["kind"] == "request" and event["acknowledges"] and self._slipped:
+        if event["kind"] == EventKind.REQUEST and event["acknowledges"] and self._slipped:
             self.latched, self._slipped = "", False
-        if event["kind"] == "compiling":
+        if event["kind"] == EventKind.COMPILING:
             self._compiling = event["detail"]
-        if event["kind"] == "granted":  # compiled, and about to connect
+        if event["kind"] == EventKind.GRANTED:  # compiled, and about to connect
             self._compiling = ""
-        if event["kind"] in ("fault", "failure"):  # the loop's process ends
+        if event["kind"] in (EventKind.FAULT, EventKind.FAILURE):  # the loop's process ends
             if not self._down:
                 self._since, self._down = event["time"], True
             self._why = event["detail"]
-        if event["kind"] != "transition":
+        if event["kind"] != EventKind.TRANSITION:
             return
         self._compiling = ""
         to, cause, detail = event["to"], event["cause"], event["detail"]

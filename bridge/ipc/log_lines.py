@@ -14,12 +14,14 @@ from collections.abc import Mapping
 from datetime import UTC, datetime
 from typing import IO, Any
 
+from gapbridge.bridge.ipc.events import EventKind
+
 HIDDEN = re.compile(
     r"token|password|secret|passwd|api_?key|private|credential|^key$", re.IGNORECASE
 )
 LEFT_OUT = ("text", "monotonic", "kind", "time", "detail")  # text: the whole cell file
 LONGEST = 2000  # characters of one value
-_GRAVE = ("fault", "refused")
+_GRAVE = (EventKind.FAULT, EventKind.REFUSED)
 
 
 def log_line(event: Mapping[str, Any]) -> str:
@@ -28,7 +30,7 @@ def log_line(event: Mapping[str, Any]) -> str:
     found: dict[str, Any] = {
         "time": at.isoformat(timespec="milliseconds").replace("+00:00", "Z"),
         "level": _level(event),
-        "event": str(event.get("kind", "note")),
+        "event": str(event.get("kind", EventKind.NOTE)),
         "message": _message(event),
     }
     for key, value in event.items():
@@ -55,7 +57,7 @@ def _level(event: Mapping[str, Any]) -> str:
         return "error"
     if str(event.get("to", "")).lower() == "fault":
         return "error"
-    if event.get("kind") == "side" or "paused" in event or "lost" in event:
+    if event.get("kind") == EventKind.SIDE or "paused" in event or "lost" in event:
         return "warning"
     return "info"
 
@@ -67,7 +69,7 @@ def _message(event: Mapping[str, Any]) -> str:
     for key in ("detail", "failure", "fault", "ended"):
         if event.get(key):
             return str(event[key])[:LONGEST]
-    return str(event.get("kind", "note"))
+    return str(event.get("kind", EventKind.NOTE))
 
 
 def _shown(key: str, value: Any) -> Any:

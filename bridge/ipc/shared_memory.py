@@ -4,10 +4,10 @@ One writer, words of 8 bytes each, and no locks: whichever side dies, stands sti
 others go on. Cycles go through a ring; each row begins with its own number, so that a reader knows
 a row that is not whole, or was overwritten.
 
-A process of the loop maps its page and seals it (sealed_memory.py): nobody else can write to it.
-The next process gets a page of its own that begins as a copy, so cycles and counts go on over all
-processes of a run; the daemon and who reads along change over to it (RunPage, FollowedPage).
-Nothing is asked for through this memory: commands have their own (command_page.py).
+A process of the loop maps its memory and seals it (sealed_memory.py): nobody else can write to it.
+The next process gets a memory of its own that begins as a copy, so cycles and counts go on over all
+processes of a run; the daemon and who reads along change over to it (RunMemory, FollowedMemory).
+Nothing is asked for through this memory: commands have their own (command_memory.py).
 """
 
 from __future__ import annotations
@@ -16,11 +16,12 @@ import contextlib
 import functools
 import os
 import socket
+from collections.abc import Mapping
 from enum import IntEnum
 
 import numpy as np
 
-from gapbridge.bridge.ipc.counts import Count
+from gapbridge.bridge.ipc.loop_counters import LoopCounter
 from gapbridge.bridge.ipc.sealed_memory import (
     is_sealed,
     make_memory,
@@ -29,6 +30,7 @@ from gapbridge.bridge.ipc.sealed_memory import (
     seal,
 )
 from gapbridge.core.arrays import Array
+from gapbridge.core.state import RobotState
 from gapbridge.drivers.clock import SYSTEM, Clock
 
 WORDS = 128
@@ -37,7 +39,9 @@ NAME = "gapbridge-cycles"  # of the memory, as /proc shows it
 # words; the heartbeat's time is a float in a word of its own
 _BEATS, _PHASE, _STATE, _TAKEN, _WRITTEN, _ENDED, _SEEN = range(7)
 _BEAT_TIME = 32
-_COUNTS = 64  # from here on one word for each Count, over all processes of the loop
+_COUNTS = 64  # from here on one word for each counter, over all processes of the loop
+OPTIONAL = ("ft_raw_wrench", "joint_temperatures", "actual_current_as_torque", "payload_cog")
+"""Fields of a state that not every controller has."""
 
 
 class Phase(IntEnum):
@@ -68,6 +72,36 @@ def slices_of(n: int) -> dict[str, slice]:
         found[name] = slice(at, at + size)
         at += size
     return found
+
+
+def write_cycle(
+    row: Array,
+    slices: Mapping[str, slice],
+    state: RobotState,
+    nominal_q: Array,
+    corrected_q: Array,
+    offset_in_base: Array,
+) -> None:
+    """Write a state and its setpoint into ``row``; NaN where the controller lacks a field."""
+    row[1] = state.timestamp
+    row[slices["target_q"]] = state.target_q
+    row[slices["actual_q"]] = state.actual_q
+    row[slices["actual_qd"]] = state.actual_qd
+    row[slices["actual_TCP_force"]] = state.actual_TCP_force
+    row[slices["payload"]] = np.nan if state.payload is None else state.payload
+    for name in OPTIONAL:
+        value = getattr(state, name)
+        row[slices[name]] = np.nan if value is None else value
+    row[slices["nominal_q"]] = nominal_q
+    row[slices["corrected_q"]] = corrected_q
+    row[slices["offset"]] = offset_in_base
+    at = slices["received"].start
+    row[at] = state.received
+    at = slices["robot_mode"].start
+    row[at : at + 5] = (
+        state.robot_mode, state.safety_mode, state.runtime_state, state.safety_status_bits,
+        state.speed_scaling,
+    )  # fmt: skip
 
 
 class SharedMemory:
@@ -120,7 +154,7 @@ class SharedMemory:
         """Report that a state has been read: the link works."""
         self._words[_SEEN] = 1
 
-    def count(self, what: Count, times: int = 1) -> None:
+    def count(self, what: LoopCounter, times: int = 1) -> None:
         """Count an event."""
         self._words[_COUNTS + what] += times
 
@@ -137,16 +171,16 @@ class SharedMemory:
         self._words[_WRITTEN] = written + 1
 
     def note_taken(self, number: int) -> None:
-        """Report up to which number requests have been taken; see command_page.py."""
+        """Report up to which number requests have been taken; see command_memory.py."""
         self._words[_TAKEN] = number
 
     # -- who reads --------------------------------------------------------------------------------
 
     def follow(self) -> None:
-        """Change over to the page of the newest process of the loop, where there is another."""
+        """Change over to the memory of the newest process of the loop, where there is another."""
 
     def open_for_reading(self) -> int:
-        """Return a further descriptor of the page, to be closed by the caller; read-only."""
+        """Return a further descriptor of the memory, to be closed by the caller; read-only."""
         return _read_only(self.fd)
 
     @property
@@ -186,12 +220,12 @@ class SharedMemory:
         return int(self._words[_WRITTEN])
 
     def counts(self) -> dict[str, int]:
-        """Return how often each Count has happened since the daemon's start."""
-        return {what.label: int(self._words[_COUNTS + what]) for what in Count}
+        """Return how often each LoopCounter has happened since the daemon's start."""
+        return {what.label: int(self._words[_COUNTS + what]) for what in LoopCounter}
 
-    def reader(self, first: int = 0) -> PageReader:
+    def reader(self, first: int = 0) -> CycleReader:
         """Return a reader of its own cursor that begins at row number ``first``."""
-        return PageReader(self, first)
+        return CycleReader(self, first)
 
     def rows(self, first: int, last: int) -> tuple[Array, int]:
         """Return copies of the rows (k, width) of numbers first..last-1, and how many are gone."""
@@ -210,8 +244,8 @@ class SharedMemory:
         os.close(self.fd)
 
 
-class RunPage(SharedMemory):
-    """The daemon's view, for reading only: one page after the other, cycles and counts going on."""
+class RunMemory(SharedMemory):
+    """The daemon's view, for reading only: one loop after the other, cycles and counts go on."""
 
     def __init__(self, n: int, clock: Clock = SYSTEM) -> None:
         super().__init__(n, writable=False, clock=clock)
@@ -220,7 +254,7 @@ class RunPage(SharedMemory):
         self._is_shown = True
 
     def renew(self) -> None:
-        """Make a page for a new process of the loop, the former being dead; cycles go on."""
+        """Make memory for a new process of the loop, the former being dead; cycles go on."""
         fd = make_memory(NAME, self._size)
         head = self._words.copy()
         head[[_BEATS, _PHASE, _STATE, _ENDED, _SEEN]] = 0
@@ -234,7 +268,7 @@ class RunPage(SharedMemory):
         os.close(before)
 
     def promote(self) -> bool:
-        """Show the page to who reads along once its loop has sealed it; returns whether it has."""
+        """Show the memory to readers once its loop has sealed it; returns whether it has."""
         if self._is_shown or not is_sealed(self.fd):
             return False
         os.close(self._shown)
@@ -242,7 +276,7 @@ class RunPage(SharedMemory):
         return True
 
     def open_for_reading(self) -> int:
-        """Return a descriptor of the page that is shown, to be closed by the caller."""
+        """Return a descriptor of the memory that is shown, to be closed by the caller."""
         return _read_only(self._shown)
 
     def close(self) -> None:
@@ -251,8 +285,8 @@ class RunPage(SharedMemory):
         os.close(self._shown)
 
 
-class FollowedPage(SharedMemory):
-    """A side process's view: it changes over to each page that the daemon sends it."""
+class FollowedMemory(SharedMemory):
+    """A side process's view: it changes over to each memory that the daemon sends it."""
 
     def __init__(self, n: int, fd: int, successors: socket.socket) -> None:
         super().__init__(n, fd, writable=False)
@@ -260,7 +294,7 @@ class FollowedPage(SharedMemory):
         successors.setblocking(False)
 
     def follow(self) -> None:
-        """Change over to the newest page that has come."""
+        """Change over to the newest memory that has come."""
         with contextlib.suppress(OSError):
             while True:
                 data, found, _, _ = socket.recv_fds(self._successors, 1, 4)
@@ -272,21 +306,21 @@ class FollowedPage(SharedMemory):
                     os.close(before)
 
 
-class PageReader:
-    """One reader of a page's cycles; any number of them read side by side."""
+class CycleReader:
+    """One reader of the cycles; any number of them read side by side."""
 
-    def __init__(self, page: SharedMemory, first: int) -> None:
-        self._page = page
+    def __init__(self, memory: SharedMemory, first: int) -> None:
+        self._memory = memory
         self.next = first  # number of the first row that it has not read
         self.lost = 0  # rows overwritten before they were read
 
     def drain(self) -> Array:
         """Return a copy of the rows (k, width) that came since the last call."""
-        self._page.follow()
-        last = self._page.written
+        self._memory.follow()
+        last = self._memory.written
         if last < self.next:
-            return np.empty((0, self._page.width))
-        rows, gone = self._page.rows(self.next, last)
+            return np.empty((0, self._memory.width))
+        rows, gone = self._memory.rows(self.next, last)
         self.lost += gone
         self.next = last
         return rows

@@ -1,4 +1,4 @@
-"""A side process's own half: its order, the shared page, the daemon's events.
+"""A side process's own half: its order, the shared memory, the daemon's events.
 
 Recorder, status page and metrics are such processes. They read along and never hold up the loop;
 the daemon starts them (side_process.py). A module for one of them begins with ``take_order()`` and
@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from gapbridge.bridge.cell.daemon_settings import DaemonSettings
-from gapbridge.bridge.ipc.shared_memory import FollowedPage, SharedMemory
+from gapbridge.bridge.ipc.shared_memory import FollowedMemory, SharedMemory
 from gapbridge.core.errors import GapbridgeError
 from gapbridge.drivers.clock import SYSTEM
 
@@ -105,7 +105,7 @@ class Order:
     settings: DaemonSettings
     n: int  # joints
     session: str  # name of the daemon's run, run-YYYYmmdd-HHMMSS
-    page: SharedMemory  # for reading only
+    memory: SharedMemory  # for reading only
     events: EventLines
     up: EventWriter
     extra: dict[str, Any]
@@ -126,7 +126,9 @@ def take_order() -> Order:
         settings=DaemonSettings.model_validate(given["settings"]),
         n=given["n"],
         session=given["session"],
-        page=FollowedPage(given["n"], given["page"], socket.socket(fileno=given["pages"])),
+        memory=FollowedMemory(
+            given["n"], given["memory"], socket.socket(fileno=given["successors"])
+        ),
         events=events,
         up=EventWriter(given["up"]),
         extra=given.get("extra", {}),

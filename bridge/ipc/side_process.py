@@ -34,7 +34,7 @@ class SideProcess:
     """
 
     def __init__(
-        self, module: str, order: dict[str, Any], page: SharedMemory, log: IO[Any] | int = -3,
+        self, module: str, order: dict[str, Any], memory: SharedMemory, log: IO[Any] | int = -3,
         clock: Clock = SYSTEM,
     ) -> None:  # fmt: skip
         self._now = clock.monotonic
@@ -42,7 +42,7 @@ class SideProcess:
         self.restarts = 0
         self.stalls = 0
         self._dropped = 0
-        self._page, self._log = page, log
+        self._memory, self._log = memory, log
         self._process: subprocess.Popen[bytes] | None = None
         self._wait = BACKOFF[0]
         self._retry_at = 0.0  # s, monotonic
@@ -65,13 +65,13 @@ class SideProcess:
         else:
             self._down.emit(event)
 
-    def show(self, page: SharedMemory) -> None:
-        """Have it change over to another page; one that does not look gets it when it is anew."""
+    def show(self, memory: SharedMemory) -> None:
+        """Have it change over to another memory; a restarted one begins with it."""
         if self._process is None:
             return
-        fd = page.open_for_reading()
+        fd = memory.open_for_reading()
         with contextlib.suppress(OSError):
-            socket.send_fds(self._pages, [b"p"], [fd])
+            socket.send_fds(self._successors, [b"p"], [fd])
         os.close(fd)
 
     def events(self) -> list[dict[str, Any]]:
@@ -118,10 +118,10 @@ class SideProcess:
         up_ours, up_theirs = os.pipe()
         with contextlib.suppress(OSError):
             fcntl.fcntl(ours, fcntl.F_SETPIPE_SZ, PIPE_SIZE)
-        page = self._page.open_for_reading()
-        self._pages, pages = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        self._pages.setblocking(False)
-        passed = (theirs, up_theirs, page, pages.detach())
+        memory = self._memory.open_for_reading()
+        self._successors, successors = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._successors.setblocking(False)
+        passed = (theirs, up_theirs, memory, successors.detach())
         try:
             # spawned, never forked; in a session of its own, so that a Ctrl-C reaches the daemon
             # only, which then ends it in order
@@ -138,7 +138,8 @@ class SideProcess:
         self._started = self._read_at = self._now()
         self._has_read = False
         order = {
-            **self.order, "page": page, "events": theirs, "up": up_theirs, "pages": passed[3],
+            **self.order, "memory": memory, "events": theirs, "up": up_theirs,
+            "successors": passed[3],
         }  # fmt: skip
         assert self._process.stdin is not None
         with contextlib.suppress(BrokenPipeError):  # gone already, which check() sees
@@ -173,7 +174,7 @@ class SideProcess:
         self._process = None
         self._close_down()
         self._up.close()
-        self._pages.close()
+        self._successors.close()
 
 
 def environment() -> dict[str, str]:

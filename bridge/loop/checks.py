@@ -8,7 +8,8 @@ import numpy as np
 from numpy import float64
 from numpy.typing import NDArray
 
-from gapbridge.bridge.ipc.counts import Count
+from gapbridge.bridge.ipc.events import EventKind
+from gapbridge.bridge.ipc.loop_counters import LoopCounter
 from gapbridge.bridge.loop.link_monitor import hold_time
 from gapbridge.bridge.loop.reports import Reports
 from gapbridge.bridge.loop.supervisor import Cause, State, Supervisor
@@ -169,7 +170,7 @@ class LoopChecks:
         self.rate = RateCheck(rate)
         self._not_following: float | None = None  # s, controller clock: since when
         self._settings_at = -1.0  # s, controller clock: of the next look
-        self._lasting: set[Count] = set()
+        self._lasting: set[LoopCounter] = set()
         self._last: float | None = None  # s, controller clock
         self.not_ready = "no state has been read"  # why the robot cannot move; empty: it can
 
@@ -185,27 +186,29 @@ class LoopChecks:
         """
         flags = (LATE if missed else 0) | (DEGRADED if state.sensor_lost else 0)
         if missed:
-            self._reports.count(Count.LATE, missed)
+            self._reports.count(LoopCounter.LATE, missed)
         gap = 0.0 if self._last is None else state.timestamp - self._last
         self._last = state.timestamp
         resync = gap > self._longest_gap
         detail = f"found a gap of {gap:.3f} s between two states: begun anew" if resync else None
-        self._judge(Count.RESYNC, detail, Cause.RESYNC)
+        self._judge(LoopCounter.RESYNC, detail, Cause.RESYNC)
         if resync:
             flags |= RESYNC
             self._overrun.forget()
         else:
-            self._judge(Count.OVERRUN, self._overrun.update(state.timestamp, missed), Cause.OVERRUN)
-        self._judge(Count.SENSOR_LOST, state.sensor_lost or None, None)
+            self._judge(
+                LoopCounter.OVERRUN, self._overrun.update(state.timestamp, missed), Cause.OVERRUN
+            )
+        self._judge(LoopCounter.SENSOR_LOST, state.sensor_lost or None, None)
         self.rate.take(state.timestamp)
         self.not_ready = why_not_ready(state)
-        self._judge(Count.UNSAFE, self.not_ready or None, Cause.UNSAFE)
+        self._judge(LoopCounter.UNSAFE, self.not_ready or None, Cause.UNSAFE)
         self._check_following(state)
         return flags
 
     def judge_loads(self, detail: str | None) -> None:
         """Hold where a payload or a force is none that the arm can bear."""
-        self._judge(Count.LOAD, detail, Cause.LOAD)
+        self._judge(LoopCounter.LOAD, detail, Cause.LOAD)
 
     def judge_settings(self, state: RobotState, driver: Driver) -> None:
         """Compare the controller's own settings with the cell's, once a second while armed."""
@@ -213,19 +216,21 @@ class LoopChecks:
         if not armed or 0.0 <= self._settings_at - state.timestamp <= SETTINGS_EVERY:
             return
         self._settings_at = state.timestamp + SETTINGS_EVERY
-        self._judge(Count.MISMATCH, driver.mismatch(), Cause.MISMATCH)
+        self._judge(LoopCounter.MISMATCH, driver.mismatch(), Cause.MISMATCH)
 
     def end(
         self, state: RobotState, commanded: NDArray[float64], clamped: int, duration: float
     ) -> None:
         """Check a cycle after its setpoint; ``commanded`` (n,) rad, ``duration`` s."""
-        self._judge(Count.FROZEN, self._frozen.update(state, commanded), Cause.FROZEN)
+        self._judge(LoopCounter.FROZEN, self._frozen.update(state, commanded), Cause.FROZEN)
         self._judge(
-            Count.SATURATED, self._saturation.update(state.timestamp, clamped), Cause.SATURATED
+            LoopCounter.SATURATED,
+            self._saturation.update(state.timestamp, clamped),
+            Cause.SATURATED,
         )
         # its own work only: what a controller sends late or never is the link's affair
         detail = self._overrun.update(state.timestamp, int(duration / self._period))
-        self._judge(Count.OVERRUN, detail, Cause.OVERRUN)
+        self._judge(LoopCounter.OVERRUN, detail, Cause.OVERRUN)
 
     def _check_following(self, state: RobotState) -> None:
         """Hold where the robot's program does not play, or plays slower than we move the arm."""
@@ -244,16 +249,16 @@ class LoopChecks:
             self._not_following = state.timestamp
         since = self._not_following
         lasts = since is not None and state.timestamp - since > self._patience
-        self._judge(Count.NOT_FOLLOWING, detail if lasts else None, Cause.NOT_FOLLOWING)
+        self._judge(LoopCounter.NOT_FOLLOWING, detail if lasts else None, Cause.NOT_FOLLOWING)
 
-    def _judge(self, what: Count, detail: str | None, cause: Cause | None) -> None:
+    def _judge(self, what: LoopCounter, detail: str | None, cause: Cause | None) -> None:
         """Notify the supervisor of a finding; count and report it once for as long as it lasts."""
         if detail is None:
             if what in self._lasting:
                 self._lasting.discard(what)
-                if what == Count.SENSOR_LOST:
+                if what == LoopCounter.SENSOR_LOST:
                     self._reports.emit(
-                        {"kind": "degraded", "what": "", "detail": "the sensor is back"}
+                        {"kind": EventKind.DEGRADED, "what": "", "detail": "the sensor is back"}
                     )
             return
         changed = cause is not None and self._supervisor.take(cause, detail)
@@ -262,5 +267,6 @@ class LoopChecks:
         self._lasting.add(what)
         self._reports.count(what)
         if not changed and self._supervisor.state != State.FAULT:
-            kind = "degraded" if what == Count.SENSOR_LOST else "warning"
+            lost = what == LoopCounter.SENSOR_LOST
+            kind = EventKind.DEGRADED if lost else EventKind.WARNING
             self._reports.emit({"kind": kind, "what": what.label, "detail": detail})

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 
-from gapbridge.bridge.ipc.counts import DROPPED, Count
+from gapbridge.bridge.ipc.events import EventKind
+from gapbridge.bridge.ipc.loop_counters import DROPPED, LoopCounter
 from gapbridge.bridge.loop.reports import Reports
 from gapbridge.bridge.loop.supervisor import Cause, Supervisor
 from gapbridge.core.errors import Implausible, InvalidStateError, LinkError, StaleStateError
@@ -70,10 +71,10 @@ class ControllerClock:
             drifted = self._lead + DRIFT * (gap if gap <= self._hold else 0.0)
             elapsed = 0.0 if before is None else state.received - before[1]
             leapt = gap - 1.0 / self._rate if gap - elapsed > LEAP else 0.0
-            self._lead = min(lead, self._doubted(lead, drifted, leapt))
+            self._lead = min(lead, self._lead_after_leap(lead, drifted, leapt))
         return max(round(gap * self._rate) - 1, 0) if counts and before is not None else 0
 
-    def _doubted(self, lead: float, drifted: float, leapt: float) -> float:
+    def _lead_after_leap(self, lead: float, drifted: float, leapt: float) -> float:
         """Return the lead (s) that counts where the controller's clock may have leapt.
 
         ``leapt``: by how much (s) at this sample, zero where it has not; ``drifted``: the lead
@@ -163,9 +164,9 @@ class LinkMonitor:
         except StaleStateError as error:
             if away or self._now() - begun > self._patience + SUSPENDED:
                 self._last_state = self._now()  # it was this process that slept: ask once more
-                self._reports.count(Count.LATE)
+                self._reports.count(LoopCounter.LATE)
             else:
-                self._stand_still(str(error))
+                self._judge_stale(str(error))
         except InvalidStateError as error:
             self.drop(error)
         except LinkError as error:
@@ -174,7 +175,7 @@ class LinkMonitor:
             return state
         return None
 
-    def believe(self, expiry: float = math.inf) -> bool:
+    def accept(self, expiry: float = math.inf) -> bool:
         """Take note of a state that is fine; returns whether it is fresh enough to write by.
 
         One that was too old (``expiry``, s monotonic) when it could be used is late, and several
@@ -184,10 +185,10 @@ class LinkMonitor:
         self._old = self._old + 1 if now > expiry else 0
         self._invalid = 0
         if self._old >= OLD_IN_A_ROW:
-            self._stand_still(f"states are {now - expiry + self._hold:.3f} s old as they come")
+            self._judge_stale(f"states are {now - expiry + self._hold:.3f} s old as they come")
             return False
         if self._old:
-            self._reports.count(Count.LATE)
+            self._reports.count(LoopCounter.LATE)
             return False
         self._last_state = now
         self._stale = self._silent = False
@@ -197,17 +198,17 @@ class LinkMonitor:
         """Take note that nobody asked for states meanwhile."""
         self._last_state = self._left = self._now()
 
-    def _stand_still(self, detail: str) -> None:
+    def _judge_stale(self, detail: str) -> None:
         """Judge a clock that stands still: late at first, then stale, then silent."""
         if self._now() - self._last_state <= self._hold:
-            self._reports.count(Count.LATE)
+            self._reports.count(LoopCounter.LATE)
             return
         if not self._stale:
             self._stale = True
-            self._reports.count(Count.STALE)
+            self._reports.count(LoopCounter.STALE)
             if not self._supervisor.take(Cause.STALE, detail):
-                self._reports.emit({"kind": "link", "what": "stale", "detail": detail})
-        self._fall_silent(detail)
+                self._reports.emit({"kind": EventKind.LINK, "what": "stale", "detail": detail})
+        self._judge_silence(detail)
 
     def drop(self, error: InvalidStateError) -> None:
         """Drop a state that cannot be believed; several in a row end the compensation."""
@@ -218,18 +219,18 @@ class LinkMonitor:
         now = self._now()
         if now - self._reported.get(reason, -REPORT_EVERY) >= REPORT_EVERY:
             self._reported[reason] = now
-            self._reports.emit({"kind": "dropped", "what": count.label, "detail": detail})
+            self._reports.emit({"kind": EventKind.DROPPED, "what": count.label, "detail": detail})
         if self._invalid >= INVALID_IN_A_ROW:
             self._supervisor.take(Cause.IMPLAUSIBLE, detail)
             self._driver.forget()  # the arm may well be there: judge what comes by itself
-        self._fall_silent(detail)
+        self._judge_silence(detail)
 
-    def _fall_silent(self, detail: str) -> None:
+    def _judge_silence(self, detail: str) -> None:
         silent = self._now() - self._last_state
         if silent > SILENCE:
             if not self._silent:
                 self._silent = True
-                self._reports.count(Count.SILENCE)
+                self._reports.count(LoopCounter.SILENCE)
             self._supervisor.take(Cause.SILENCE, detail)
         if silent > (LOST_AFTER_WRITING if self._has_armed else LOST):
             self.lost = detail

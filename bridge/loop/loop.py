@@ -13,10 +13,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gapbridge.bridge.cell.daemon_settings import DaemonSettings
-from gapbridge.bridge.ipc.command_page import Command, Commands
-from gapbridge.bridge.ipc.counts import Count
-from gapbridge.bridge.ipc.cycle_row import write_cycle
-from gapbridge.bridge.ipc.shared_memory import Phase, SharedMemory
+from gapbridge.bridge.ipc.command_memory import Command, Commands
+from gapbridge.bridge.ipc.events import EventKind
+from gapbridge.bridge.ipc.loop_counters import LoopCounter
+from gapbridge.bridge.ipc.shared_memory import Phase, SharedMemory, write_cycle
 from gapbridge.bridge.loop.checks import NOTHING, RAMPING_OUT, RESYNC, UNSOLVED, LoopChecks
 from gapbridge.bridge.loop.link_monitor import ControllerClock, LinkMonitor, hold_time
 from gapbridge.bridge.loop.live_loads import LiveLoads
@@ -60,7 +60,7 @@ class CycleInput(NamedTuple):
 
     state: RobotState
     missed: int  # cycles before it
-    own: Array  # (n,) rad: nominal joints of the robot's own program
+    nominal_q: Array  # (n,) rad: of the robot's own program
     loads: Loads
     flags: int
 
@@ -74,13 +74,13 @@ class Loop:
         model: Model,
         driver: Driver,
         source: Source,
-        page: SharedMemory,
+        memory: SharedMemory,
         emit: Emit,
         number: int = 0,
     ) -> None:
         self._number = number  # which process of the loop this is, from 0
         self._settings, self._driver, self._source = settings, driver, source
-        self._page, self._emit = page, emit
+        self._memory, self._emit = memory, emit
         clock, self._now = driver.clock, driver.clock.monotonic
         self._stream = SetpointStream(model, settings.limits, driver.rate, clock)
         self._loads = LiveLoads(
@@ -90,7 +90,7 @@ class Loop:
         self._acting = Loads()  # of the last cycle
         self._model_check = ModelCheck(model, settings.setpoints.use_force)
         self._clock = ControllerClock(driver.rate, hold_time(driver.rate), clock)
-        reports = Reports(page, emit)
+        reports = Reports(memory, emit)
         self._supervisor = Supervisor(reports.transition)
         patience = settings.link.state_timeout
         self._watch = LinkMonitor(driver, self._supervisor, reports, patience)
@@ -126,20 +126,20 @@ class Loop:
         ``commands``: the daemon's, and the only way to arm. ``may_write`` False: nothing can arm.
         ``latched``: the fault of a loop before this one that nobody has acknowledged.
         """
-        self._page.enter(Phase.CONNECTING)
+        self._memory.enter(Phase.CONNECTING)
         try:
             self._driver.connect()
         except LinkError as error:
-            self._emit({"kind": "failure", "detail": str(error)})
+            self._emit({"kind": EventKind.FAILURE, "detail": str(error)})
             return Exit.LINK
         self._watch.forget()
         self._supervisor.take(Cause.CONNECTED)
         if latched:
             self._supervisor.take(Cause.LATCHED, latched)
-        self._page.enter(Phase.RUNNING)
+        self._memory.enter(Phase.RUNNING)
         wanted = False
         while self._exit is None:
-            self._page.beat()
+            self._memory.beat()
             asked = commands.take()
             for command in asked:
                 wanted = command == Command.ARM
@@ -148,16 +148,16 @@ class Loop:
                 if command == Command.ZERO_MOVED:
                     self._hold_for_zero()
             if asked:
-                self._page.note_taken(commands.taken)
+                self._memory.note_taken(commands.taken)
             if self._stop_requested or commands.stop:
                 self._stop()
-            seen = self._page.seen and self._checks.rate.known
+            seen = self._memory.seen and self._checks.rate.known
             if wanted and may_write and seen and self._stop_by is None:
                 wanted = False
                 self._arm()
             if self._exit is None:
                 self._cycle()
-        self._page.enter(Phase.ENDING)
+        self._memory.enter(Phase.ENDING)
         self._source.close()
         return self._exit
 
@@ -173,7 +173,7 @@ class Loop:
             if self._supervisor.take(Cause.ARM):
                 self._skip()
             return
-        self._emit({"kind": "refused", "what": "arm", "detail": detail})
+        self._emit({"kind": EventKind.REFUSED, "what": "arm", "detail": detail})
 
     def _not_ready(self) -> str:
         """Return in words why writing could come to nothing here; empty: it can."""
@@ -199,7 +199,7 @@ class Loop:
     def _hold_for_zero(self) -> None:
         """Ramp out: every pose is off by what the zero has moved."""
         self._zero_moved = True
-        self._page.count(Count.ZERO_MOVED)
+        self._memory.count(LoopCounter.ZERO_MOVED)
         self._supervisor.take(Cause.ZERO_MOVED, "the slip was reported just before")
 
     def _disarm(self, by_a_person: bool) -> None:
@@ -241,9 +241,9 @@ class Loop:
         """Give the process up where a link broke (``detail``): it is only safe in a new one."""
         if detail is None or self._exit is not None:
             return
-        self._page.count(Count.LINK_LOST)
+        self._memory.count(LoopCounter.LINK_LOST)
         self._supervisor.take(Cause.LINK_LOST, detail)
-        self._emit({"kind": "failure", "detail": detail})
+        self._emit({"kind": EventKind.FAILURE, "detail": detail})
         self._exit = Exit.LINK
 
     # -- one cycle --------------------------------------------------------------------------------
@@ -254,16 +254,16 @@ class Loop:
             self._give_up(self._watch.lost)
             return
         try:
-            own = self._driver.nominal_q(state)
+            nominal_q = self._driver.nominal_q(state)
         except InvalidStateError as error:
             self._watch.drop(error)
             self._give_up(self._watch.lost)
             return
         missed = self._clock.take(state, self._supervisor.state.writes)
         expiry = self._clock.expiry(state) - self._writing.way
-        is_fresh = self._watch.believe(expiry)
+        is_fresh = self._watch.accept(expiry)
         self._give_up(self._watch.lost)
-        self._page.note_seen()
+        self._memory.note_seen()
         flags = self._checks.begin(state, missed)
         if flags & RESYNC:
             self._loads.forget()
@@ -276,24 +276,24 @@ class Loop:
         self._checks.judge_settings(state, self._driver)
         seen = self._now()
         if is_fresh and supervisor.state == State.ARMED:
-            used_up = writing.start(state, own)
+            used_up = writing.start(state, nominal_q)
             self._look_after_writing()
             if used_up:  # the state is old by now
-                self._record(CycleInput(state, missed, own, loads, flags), None, at=seen)
+                self._record(CycleInput(state, missed, nominal_q, loads, flags), None, at=seen)
                 return
         holding = supervisor.state == State.HOLDING
         writes = supervisor.state.writes
         written = None
         if writes:
-            written = writing.write(state, own, loads, expiry if is_fresh else -np.inf)
+            written = writing.write(state, nominal_q, loads, expiry if is_fresh else -np.inf)
             self._look_after_writing()
         if writes and writing.ramps_out:
             flags |= RAMPING_OUT
         setpoint = writing.unsent if writes and written is None else written
-        given = CycleInput(state, missed, own, loads, flags)
+        given = CycleInput(state, missed, nominal_q, loads, flags)
         self._record(given, setpoint, writes, written is not None)
         clamped = 0 if written is None else self._stream.clamped
-        commanded = own if written is None else written.q
+        commanded = nominal_q if written is None else written.q
         self._checks.end(state, commanded, clamped, self._now() - state.received)
         if written is not None and holding and writing.at_rest(written, state):
             self._release()  # takes a moment: after the cycle has been timed
@@ -315,23 +315,23 @@ class Loop:
         at: float | None = None,
     ) -> None:
         """Publish a cycle: ``setpoint`` was computed for writing, and has ``left`` or not."""
-        page, stream = self._page, self._stream
-        state, missed, own, loads, flags = given
+        memory, stream = self._memory, self._stream
+        state, missed, nominal_q, loads, flags = given
         if setpoint is None:
-            correction = stream.correct(own, loads)
-            nominal, corrected, offset = own, correction.q, correction.offset_in_base
+            correction = stream.correct(nominal_q, loads)
+            wanted, corrected, offset = nominal_q, correction.q, correction.offset_in_base
             if not stream.finite:
                 self._supervisor.take(Cause.BAD_OUTPUT, "the model's correction is no number")
             elif not self._model_check.corrects(loads):
                 flags |= NOTHING
         else:
-            nominal, corrected, offset = setpoint.nominal_q, setpoint.q, setpoint.offset_in_base
+            wanted, corrected, offset = setpoint.nominal_q, setpoint.q, setpoint.offset_in_base
         if stream.unsolved:
             flags |= UNSOLVED
         clamped = stream.clamped if setpoint is not None else 0
         late = 0.0 if at is None else self._now() - at  # arming: no part of the cycle
-        row, slices = page.next_row(), page.slices
-        write_cycle(row, slices, state, nominal, corrected, offset)
+        row, slices = memory.next_row(), memory.slices
+        write_cycle(row, slices, state, wanted, corrected, offset)
         row[2] = self._supervisor.state
         row[3] = left
         row[4] = missed
@@ -339,14 +339,14 @@ class Loop:
         row[6] = self._now() - state.received - late
         row[7] = clamped
         row[8] = stream.residual
-        row[slices["own_q"]] = own
+        row[slices["own_q"]] = nominal_q
         row[slices["flags"].start] = flags
         last = slices["attempted"].start
         kind = UNSENT if setpoint is not None and not left else int(attempted)
         row[last : last + 4] = (kind, stream.ramp_time, self._driver.rate, self._number)
-        page.publish()
+        memory.publish()
         self._source.emit(
-            SourceStatus(self._supervisor.state, nominal, corrected, offset, left, clamped)
+            SourceStatus(self._supervisor.state, wanted, corrected, offset, left, clamped)
         )
 
 

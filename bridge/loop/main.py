@@ -26,7 +26,8 @@ import numpy as np
 
 from gapbridge.bridge.cell.daemon_settings import DaemonSettings
 from gapbridge.bridge.cell.sections import SetpointSettings
-from gapbridge.bridge.ipc.command_page import Commands
+from gapbridge.bridge.ipc.command_memory import Commands
+from gapbridge.bridge.ipc.events import EventKind
 from gapbridge.bridge.ipc.sealed_memory import all_bytes
 from gapbridge.bridge.ipc.shared_memory import Phase, SharedMemory
 from gapbridge.bridge.loop.loop import Exit, Loop
@@ -67,29 +68,30 @@ def main() -> None:
     try:
         code = _run(order, emit)
     except InputError as error:
-        emit({"kind": "failure", "detail": str(error), "input": True})
+        emit({"kind": EventKind.FAILURE, "detail": str(error), "input": True})
         code = Exit.INPUT
     except GapbridgeError as error:
-        emit({"kind": "failure", "detail": str(error)})
+        emit({"kind": EventKind.FAILURE, "detail": str(error)})
         code = Exit.LINK
     except BaseException as error:
         traceback.print_exc()
-        emit({"kind": "failure", "detail": f"the loop failed: {type(error).__name__}: {error}"})
+        detail = f"the loop failed: {type(error).__name__}: {error}"
+        emit({"kind": EventKind.FAILURE, "detail": detail})
     sys.stderr.flush()
     become_ordinary()
     os._exit(code)
 
 
 def _run(order: dict[str, Any], emit: Callable[[dict[str, Any]], None]) -> Exit:
-    page = SharedMemory(order["n"], order["page"])
-    page.enter(Phase.STARTING)
+    memory = SharedMemory(order["n"], order["memory"])
+    memory.enter(Phase.STARTING)
     files = pickle.loads(all_bytes(order["files"]))  # by the daemon, which started this process
     read_only_from(files)  # the disk is the daemon's to read, at start and reload
     settings = DaemonSettings.model_validate(order["settings"])
     model = _read_model(settings)
     driver = make_driver(settings.link, model, gate_bounds(settings.limits))
     source = _make_source(settings, model, driver)
-    loop = _make_loop(settings, model, driver, source, page, emit, order["number"])
+    loop = _make_loop(settings, model, driver, source, memory, emit, order["number"])
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: loop.request_stop())
     _end_with_parent(order["parent"])
@@ -97,7 +99,7 @@ def _run(order: dict[str, Any], emit: Callable[[dict[str, Any]], None]) -> Exit:
     if order["may_write"]:
         source.open()
     granted = ", ".join(become_realtime(1.0 / driver.rate))
-    emit({"kind": "granted", "hash": order["hash"], "detail": granted})
+    emit({"kind": EventKind.GRANTED, "hash": order["hash"], "detail": granted})
     commands = Commands(order["commands"], order["after"])
     return loop.run(commands, order["may_write"], order["latched"])
 
@@ -139,7 +141,7 @@ def _report_compiling(emit: Callable[[dict[str, Any]], None]) -> Callable[[int],
     def began(functions: int) -> None:
         if functions % 10 == 1:
             far = "" if functions == 1 else f" ({functions} functions)"
-            emit({"kind": "compiling", "detail": f"starting: {compiling.ABOUT}{far}"})
+            emit({"kind": EventKind.COMPILING, "detail": f"starting: {compiling.ABOUT}{far}"})
 
     return began
 

@@ -11,6 +11,7 @@ from typing import Any, cast
 
 import numpy as np
 
+from gapbridge.bridge.ipc.events import EventKind
 from gapbridge.bridge.loop.checks import RAMPING_OUT, RESYNC
 from gapbridge.bridge.loop.live_loads import LiveLoads
 from gapbridge.bridge.loop.loop import UNSENT, CycleInput, Exit, Loop
@@ -48,8 +49,8 @@ class ReplayedLoop(Loop):
         try:
             state = self._recording.read_state()
         except EndOfRecordingError as error:
-            self._page.note_ended()
-            self._emit({"kind": "note", "detail": str(error)})
+            self._memory.note_ended()
+            self._emit({"kind": EventKind.NOTE, "detail": str(error)})
             self._exit = Exit.DONE
             return
         cycle = self._recording.cycle
@@ -57,7 +58,7 @@ class ReplayedLoop(Loop):
         if cycle.loop != self._process:
             self._renew(cycle.loop)
         missed = self._clock.take(state)
-        self._page.note_seen()
+        self._memory.note_seen()
         if cycle.flags & RESYNC:
             self._loads.forget()
         loads = self._loads.update(state)
@@ -120,6 +121,6 @@ class ReplayedLoop(Loop):
                 self._in_force.note(setpoint.q, stream.joint_offset, setpoint.offset_in_base)
         except (LimitError, GateError) as error:  # of another cell than it was then
             stream.forget()
-            self._emit({"kind": "refused", "detail": str(error)})
+            self._emit({"kind": EventKind.REFUSED, "detail": str(error)})
             return None
         return setpoint

@@ -6,7 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from gapbridge.bridge.ipc.counts import Count
+from gapbridge.bridge.ipc.events import EventKind
+from gapbridge.bridge.ipc.loop_counters import LoopCounter
 from gapbridge.bridge.ipc.shared_memory import SharedMemory
 from gapbridge.bridge.loop.supervisor import Cause, State
 
@@ -15,17 +16,17 @@ from gapbridge.bridge.loop.supervisor import Cause, State
 class Reports:
     """What every part of the loop reports by."""
 
-    page: SharedMemory
+    memory: SharedMemory
     emit: Callable[[dict[str, Any]], None]  # one event; never blocks
 
-    def count(self, what: Count, times: int = 1) -> None:
+    def count(self, what: LoopCounter, times: int = 1) -> None:
         """Count an event."""
-        self.page.count(what, times)
+        self.memory.count(what, times)
 
     def transition(self, before: State, after: State, cause: Cause, detail: str) -> None:
         """Report a change of state: listener of a Supervisor."""
-        self.page.note_state(after)
+        self.memory.note_state(after)
         self.emit(
-            {"kind": "transition", "from": before.name, "to": after.name, "cause": cause.value,
-             "detail": detail, "cycle": self.page.written}
+            {"kind": EventKind.TRANSITION, "from": before.name, "to": after.name,
+             "cause": cause.value, "detail": detail, "cycle": self.memory.written}
         )  # fmt: skip

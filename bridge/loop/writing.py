@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from gapbridge.bridge.cell.sections import SetpointSettings
-from gapbridge.bridge.ipc.counts import Count
+from gapbridge.bridge.ipc.events import EventKind
+from gapbridge.bridge.ipc.loop_counters import LoopCounter
 from gapbridge.bridge.ipc.shared_memory import Phase
 from gapbridge.bridge.loop.link_monitor import hold_time
 from gapbridge.bridge.loop.offset_in_force import OffsetInForce
@@ -71,17 +72,17 @@ class Writing:
         """Take note that the driver is not armed any more: its watchdog, or a person, has it."""
         self.ready = False
 
-    def start(self, state: RobotState, own: Array) -> bool:
+    def start(self, state: RobotState, nominal_q: Array) -> bool:
         """Begin writing once the source has a first setpoint and the driver is ready.
 
         Returns whether it took so long that a fresh state is needed.
         """
-        first = self._source.first(own)
+        first = self._source.first(nominal_q)
         if first is None:
             if self.ready:
                 self._refuse_start("the source fell silent before the first setpoint")
             return False
-        away = np.abs(first - own)
+        away = np.abs(first - nominal_q)
         tolerance = self._settings.start_tolerance
         if not (away <= tolerance).all():
             joint = int(np.argmax(away))
@@ -94,29 +95,30 @@ class Writing:
             if not self.ready:
                 self._arm_driver(state)
                 return True
-            in_force = self._in_force.at(own) if self._driver.moves_arm else None
-            nominal = self._stream.start(own, state.timestamp, in_force=in_force)
+            in_force = self._in_force.at(nominal_q) if self._driver.moves_arm else None
+            start_q = self._stream.start(nominal_q, state.timestamp, in_force=in_force)
         except (WriteError, LimitError) as error:
             if isinstance(error, ForeignCommandError):
-                self._reports.count(Count.FOREIGN)
+                self._reports.count(LoopCounter.FOREIGN)
             self._refuse_start(str(error))
             return True
-        self._source.begin(state.timestamp, nominal)
+        self._source.begin(state.timestamp, start_q)
         self._failed = 0
         self._supervisor.take(Cause.WRITING)
         return False
 
     def _arm_driver(self, state: RobotState) -> None:
         """Make the driver ready, which takes a moment: a fresh state is needed after it."""
-        self._reports.page.enter(Phase.ARMING)
+        self._reports.memory.enter(Phase.ARMING)
         self.has_armed = True
         try:
             self._check_way()
             for found in self._driver.arm(state):
-                self._reports.emit({"kind": "warning", "what": "cell", "detail": str(found)})
+                detail = str(found)
+                self._reports.emit({"kind": EventKind.WARNING, "what": "cell", "detail": detail})
             self.ready = True
         finally:
-            self._reports.page.enter(Phase.RUNNING)
+            self._reports.memory.enter(Phase.RUNNING)
             self._paused = True
 
     def _check_way(self) -> None:
@@ -134,7 +136,7 @@ class Writing:
         self._supervisor.take(Cause.START_REFUSED, detail)
 
     def write(
-        self, state: RobotState, own: Array, loads: Loads, expiry: float = np.inf
+        self, state: RobotState, nominal_q: Array, loads: Loads, expiry: float = np.inf
     ) -> Setpoint | None:
         """Send one setpoint; returns it, or None where none has left.
 
@@ -145,7 +147,7 @@ class Writing:
         if self._now() > expiry:
             stream.forget()
             return None
-        source_q = self._next(state, own)
+        source_q = self._next(state, nominal_q)
         self.ramps_out = self._supervisor.state == State.HOLDING
         goal = 0.0 if self.ramps_out else 1.0
         try:
@@ -154,7 +156,7 @@ class Writing:
             setpoint = stream.advance(state, source_q, loads, goal, expiry)
         except StaleStateError:
             stream.forget()
-            self._reports.count(Count.LATE)
+            self._reports.count(LoopCounter.LATE)
             return None
         except WriteError as error:
             stream.forget()
@@ -162,16 +164,16 @@ class Writing:
             return None
         except LimitError as error:
             stream.forget()
-            self._end(Count.SETPOINT_REFUSED, Cause.SETPOINT_REFUSED, str(error))
+            self._end(LoopCounter.SETPOINT_REFUSED, Cause.SETPOINT_REFUSED, str(error))
             return None
         try:
             if not stream.finite:
                 self.unsent = _copied(setpoint)
                 detail = "the model's correction is no number"
-                self._end(Count.BAD_OUTPUT, Cause.BAD_OUTPUT, detail)
+                self._end(LoopCounter.BAD_OUTPUT, Cause.BAD_OUTPUT, detail)
             elif self._now() > expiry:  # the system stopped this process since it was judged
                 self.unsent = _copied(setpoint)
-                self._reports.count(Count.LATE)
+                self._reports.count(LoopCounter.LATE)
             else:
                 self._driver.write_setpoint(setpoint)
                 self._in_force.note(setpoint.q, stream.joint_offset, setpoint.offset_in_base)
@@ -188,41 +190,41 @@ class Writing:
         """End the motion where the model has no correction; the offset is on its way out."""
         detail = self._stream.unsolved
         if detail and self._supervisor.take(Cause.UNSOLVED, detail):
-            self._reports.count(Count.UNSOLVED)
+            self._reports.count(LoopCounter.UNSOLVED)
 
     def _judge_sending(self, expiry: float) -> None:
         """End the motion where the system stopped this process between judging and sending."""
         late = self._now() - expiry
         if late > 0.0:
             detail = f"a setpoint left {1e3 * late:.0f} ms after its state was too old"
-            self._reports.count(Count.OVERRUN)
+            self._reports.count(LoopCounter.OVERRUN)
             self._supervisor.take(Cause.OVERRUN, detail)
 
     def _fail(self, error: WriteError) -> None:
         """Act on a setpoint that could not be delivered."""
         if isinstance(error, GateError):
-            self._end(Count.SETPOINT_REFUSED, Cause.SETPOINT_REFUSED, str(error))
+            self._end(LoopCounter.SETPOINT_REFUSED, Cause.SETPOINT_REFUSED, str(error))
         elif isinstance(error, PartialWriteError):
             self._repeat(str(error))
         elif isinstance(error, IneffectiveWriteError):
-            self._end(Count.WRITE_INEFFECTIVE, Cause.INEFFECTIVE, str(error))
+            self._end(LoopCounter.WRITE_INEFFECTIVE, Cause.INEFFECTIVE, str(error))
         elif isinstance(error, ForeignCommandError):
-            self._end(Count.FOREIGN, Cause.FOREIGN, str(error))
+            self._end(LoopCounter.FOREIGN, Cause.FOREIGN, str(error))
         else:
-            self._reports.count(Count.WRITE_FAILED)
+            self._reports.count(LoopCounter.WRITE_FAILED)
             self._supervisor.take(Cause.WRITE_FAILED, str(error))
             self.ready = False
             self.lost = str(error)
 
     def _repeat(self, detail: str) -> None:
         """Leave it to the next cycle, whose setpoint goes out whole; after some, end the motion."""
-        self._reports.count(Count.WRITE_PARTIAL)
+        self._reports.count(LoopCounter.WRITE_PARTIAL)
         self._failed += 1
         if self._failed >= PARTS_IN_A_ROW:
             self._failed = 0
-            self._end(Count.WRITE_INEFFECTIVE, Cause.INEFFECTIVE, detail)
+            self._end(LoopCounter.WRITE_INEFFECTIVE, Cause.INEFFECTIVE, detail)
 
-    def _end(self, what: Count, cause: Cause, detail: str) -> None:
+    def _end(self, what: LoopCounter, cause: Cause, detail: str) -> None:
         """End the motion as the table says; let go where it says that nothing more is written."""
         self._reports.count(what)
         self._supervisor.take(cause, detail)
@@ -246,20 +248,20 @@ class Writing:
             return True
         return False
 
-    def _next(self, state: RobotState, own: Array) -> Array | None:
+    def _next(self, state: RobotState, nominal_q: Array) -> Array | None:
         """Return the source's setpoint; None: the motion must brake."""
         if self._supervisor.state == State.HOLDING:
-            return None if self._driver.moves_arm else own
+            return None if self._driver.moves_arm else nominal_q
         try:
-            found = self._source.sample(state.timestamp, own)
+            found = self._source.sample(state.timestamp, nominal_q)
         except SourceDryError as error:
-            self._reports.count(Count.SOURCE_DRY)
+            self._reports.count(LoopCounter.SOURCE_DRY)
             self._supervisor.take(Cause.SOURCE_DRY, str(error))
-            return None if self._driver.moves_arm else own
-        if self._source.ended and not self._reports.page.ended:
-            self._reports.page.note_ended()
+            return None if self._driver.moves_arm else nominal_q
+        if self._source.ended and not self._reports.memory.ended:
+            self._reports.memory.note_ended()
             detail = "the source has come to its end; the arm stays there"
-            self._reports.emit({"kind": "source", "what": "ended", "detail": detail})
+            self._reports.emit({"kind": EventKind.SOURCE, "what": "ended", "detail": detail})
         return found
 
     def release(self) -> None:
@@ -268,12 +270,12 @@ class Writing:
         if not self.ready:
             return
         self.ready = False
-        self._reports.page.enter(Phase.ARMING)
+        self._reports.memory.enter(Phase.ARMING)
         try:
             self._driver.release()
         except WriteError as error:
-            self._reports.emit({"kind": "link", "what": "release", "detail": str(error)})
-        self._reports.page.enter(Phase.RUNNING)
+            self._reports.emit({"kind": EventKind.LINK, "what": "release", "detail": str(error)})
+        self._reports.memory.enter(Phase.RUNNING)
         self._paused = True
 
 

@@ -32,7 +32,8 @@ from starlette.routing import Route
 
 from gapbridge.bridge.cell.daemon_settings import DaemonSettings
 from gapbridge.bridge.cell.updated_settings import UpdatedSettings
-from gapbridge.bridge.ipc.counts import DROPPED
+from gapbridge.bridge.ipc.events import EventKind
+from gapbridge.bridge.ipc.loop_counters import DROPPED
 from gapbridge.bridge.ipc.shared_memory import SharedMemory
 from gapbridge.bridge.ipc.side_main import Order, run_side
 from gapbridge.bridge.loop.supervisor import State
@@ -44,7 +45,7 @@ from gapbridge.core.limits import CLAMPS
 
 AGE_BOUNDS = (0.00025, 0.0005, 0.001, 0.002, 0.004, 0.008, 0.016, 0.032, 0.064, 0.128)  # s
 WORK_BOUNDS = (0.00005, 0.0001, 0.0002, 0.0004, 0.0008, 0.0016, 0.0032, 0.0064, 0.0128)  # s
-TURN = 0.25  # s between two looks at the shared page
+TURN = 0.25  # s between two looks at the shared memory
 TEXT = "text/plain; version=0.0.4; charset=utf-8"
 AXES = ("x", "y", "z")
 
@@ -74,11 +75,11 @@ class Counts:
     """Everything that is counted since this process began to read, and the last of what changes."""
 
     def __init__(
-        self, page: SharedMemory, settings: DaemonSettings, text: str | None = None
+        self, memory: SharedMemory, settings: DaemonSettings, text: str | None = None
     ) -> None:
-        self.page, self._slices = page, page.slices
+        self.memory, self._slices = memory, memory.slices
         self._updated = UpdatedSettings(settings, text)  # text: the cell file's
-        self.reader = page.reader()
+        self.reader = memory.reader()
         self.cycles = self.missed = self.late = self.written = 0
         self.clamped = dict.fromkeys(CLAMPS, 0)
         self.age, self.work = Buckets(AGE_BOUNDS), Buckets(WORK_BOUNDS)
@@ -122,16 +123,16 @@ class Counts:
         self.received = float(rows[-1, s["received"].start])
 
     def _on_event(self, event: dict[str, Any]) -> None:
-        kind = str(event.get("kind", "note"))
+        kind = str(event.get("kind", EventKind.NOTE))
         self._updated.on_event(event)
-        if kind == "status":
+        if kind == EventKind.STATUS:
             self.status = event
             return
         self.events[kind] += 1
-        if kind == "recorder":
+        if kind == EventKind.RECORDER:
             self.recorder_paused = bool(event.get("paused"))
             self.recorder_lost += int(event.get("lost") or 0)
-        if kind == "fault":
+        if kind == EventKind.FAULT:
             self.faults[str(event.get("cause") or "other")[:60]] += 1
         if "to" in event:
             to, cause = str(event["to"]).lower(), str(event.get("cause", ""))
@@ -146,7 +147,7 @@ def run(order: Order) -> None:
     assert settings is not None
     path = settings.token_file
     token = None if path is None else read_token(path, "metrics.token_file")
-    counts = Counts(order.page, order.settings, order.extra.get("text"))
+    counts = Counts(order.memory, order.settings, order.extra.get("text"))
     registry = CollectorRegistry(auto_describe=False)
 
     async def metrics(request: Request) -> Response:
@@ -198,7 +199,7 @@ class Families(Collector):
             "gapbridge_state", "1 for the state that the supervisor is in.", labels=["state"]
         )
         for state in State:
-            found.add_metric([state.name.lower()], float(self._counts.page.state == state))
+            found.add_metric([state.name.lower()], float(self._counts.memory.state == state))
         return found
 
     def _cycles(self) -> Iterator[Metric]:
@@ -220,7 +221,7 @@ class Families(Collector):
             ("link_rate_hertz", "Cycles a second that the link is to have.", rate),
             ("link_silence_seconds", "Time since the last state of the robot.", counts.silence),
             ("loop_heartbeat_age_seconds", "Time since the loop's last sign of life.",
-             counts.page.silence),
+             counts.memory.silence),
         ):  # fmt: skip
             yield GaugeMetricFamily(f"gapbridge_{name}", message, number)
 

@@ -1,6 +1,6 @@
 """The recorder's process: ``python -m gapbridge.bridge.recording.main``, started by the daemon.
 
-It reads along in the shared page and can be stalled, killed and started anew without the loop
+It reads along in the shared memory and can be stalled, killed and started anew without the loop
 noticing. It outlives a daemon that was killed for as long as the loop still ramps out.
 """
 
@@ -33,7 +33,7 @@ def main() -> None:
         signal.signal(number, signal.SIG_IGN)
     order = take_order()
     recorder = Recorder(
-        order.settings.recording, order.session, order.page, _configuration(order), order.emit
+        order.settings.recording, order.session, order.memory, _configuration(order), order.emit
     )
     ended = _follow(order, recorder)
     if not ended:
@@ -62,7 +62,7 @@ def _outlive(order: Order, recorder: Recorder) -> None:
     recorder.take(
         {"time": SYSTEM.time(), "kind": "recorder", "detail": "the daemon is gone without an end"}
     )
-    while order.page.silence < QUIET and SYSTEM.monotonic() < until:
+    while order.memory.silence < QUIET and SYSTEM.monotonic() < until:
         recorder.step()
         SYSTEM.sleep(LOOK_EVERY)
 

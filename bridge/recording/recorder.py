@@ -1,4 +1,4 @@
-"""The recorder: from the shared page into files, whatever happens to the disk or to itself.
+"""The recorder: from the shared memory into files, whatever happens to the disk or to itself.
 
 What counts is the number of the last cycle that a whole flush has written. After a failure, or in a
 new process, reading goes on behind it as long as the ring still holds what comes next; what it no
@@ -48,7 +48,7 @@ class Recorder:
         self,
         settings: RecordingSettings,
         session: str,
-        page: SharedMemory,
+        memory: SharedMemory,
         configuration: Mapping[str, Any],
         emit: Emit,
         clock: Clock = SYSTEM,
@@ -56,7 +56,7 @@ class Recorder:
         self._clock = clock
         assert settings.folder is not None
         self._settings, self._folder, self._session = settings, settings.folder, session
-        self._page, self._emit = page, emit
+        self._memory, self._emit = memory, emit
         self.configuration: dict[str, Any] = dict(configuration)
         self._states = [state.name for state in State]
         self._segment: Segment | None = None
@@ -66,7 +66,7 @@ class Recorder:
         self._why_paused = ""
         self.lost = 0  # cycles of this process's time that no file holds
         self._next = self._resume()  # number of the first cycle that no whole flush holds
-        self._reader = page.reader(self._next)
+        self._reader = memory.reader(self._next)
         self._cut_off = unfinished(self._folder)  # files of recorders that were killed
 
     def _resume(self) -> int:
@@ -87,7 +87,7 @@ class Recorder:
         self._events.append(event)
 
     def step(self, flush: bool = False) -> int:
-        """Take what the page has; flush, rotate, pause, resume. Returns the cycles taken."""
+        """Take the new cycles; flush, rotate, pause, resume. Returns the cycles taken."""
         now = self._clock.monotonic()
         if self._segment is None and now < self._retry_at and not flush:
             return 0
@@ -118,7 +118,7 @@ class Recorder:
         """Write what is there and finish the file."""
         self.step(flush=True)
         if self._segment is None:
-            self._report_lost(max(self._page.written - self._next, 0))
+            self._report_lost(max(self._memory.written - self._next, 0))
         else:
             try:
                 self._segment.close()
@@ -172,14 +172,14 @@ class Recorder:
             if self._room() < self._settings.keep_free:
                 raise OSError(0, f"less than {self._settings.keep_free:g} MB free")
             path = next_path(self._folder, self._session)
-            self._segment = Segment(path, self._page.slices, self._states, self._clock)
+            self._segment = Segment(path, self._memory.slices, self._states, self._clock)
             self._describe()
             self._segment.flush()
         except OSError as error:
             self._pause(error.strerror or str(error))
             return False
         self._why_paused = ""
-        self._reader = self._page.reader(self._next)
+        self._reader = self._memory.reader(self._next)
         self._flushed = self._clock.monotonic()
         self._say(f"recording into {path}", file=str(path))
         return True
@@ -214,7 +214,7 @@ class Recorder:
     def _report_lost(self, lost: int) -> None:
         if lost:
             self.lost += lost
-            self._say(f"{lost} cycles lost before cycle {self._page.written}", lost=lost)
+            self._say(f"{lost} cycles lost before cycle {self._memory.written}", lost=lost)
 
     def _say(self, message: str, **more: Any) -> None:
         event = {

@@ -12,7 +12,7 @@ import numpy as np
 
 from gapbridge.bridge.cell.sections import SetpointSettings
 from gapbridge.bridge.setpoint_source.glide import GlidingSource
-from gapbridge.bridge.setpoint_source.modbus_page import MOST_JOINTS, PlcPage
+from gapbridge.bridge.setpoint_source.plc_memory import MOST_JOINTS, PlcMemory
 from gapbridge.bridge.setpoint_source.source import SourceStatus
 from gapbridge.core.errors import InputError, RunError
 
@@ -35,7 +35,7 @@ class ModbusSource(GlidingSource):
         super().__init__(settings, n, moves_arm, folder, rate)
         if n > MOST_JOINTS:
             raise InputError(f"setpoints.source modbus: found {n} joints, expected {MOST_JOINTS}")
-        self._page: PlcPage | None = None
+        self._memory: PlcMemory | None = None
         self._server: subprocess.Popen[str] | None = None
         self._sequence: int | None = None
         self._cycle = 0
@@ -43,23 +43,23 @@ class ModbusSource(GlidingSource):
 
     def open(self) -> None:
         """Start the server. Raises RunError where the address is taken."""
-        page = self._page = PlcPage(self.n)
+        memory = self._memory = PlcMemory(self.n)
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
         server = self._server = subprocess.Popen(
             [sys.executable, "-m", SERVER],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment,
-            pass_fds=page.fds,
+            pass_fds=memory.fds,
         )  # fmt: skip
         assert server.stdin is not None
         assert server.stdout is not None
         order = {"host": self.settings.host, "port": self.settings.port, "n": self.n}
-        server.stdin.write(json.dumps({**order, "pages": page.fds}) + "\n")
+        server.stdin.write(json.dumps({**order, "memory": memory.fds}) + "\n")
         server.stdin.flush()
         reply = json.loads(server.stdout.readline() or '{"failure": "its server ended"}')
         if "failure" in reply:
             self.close()
             raise RunError(f"setpoints: {reply['failure']}")
-        if not page.is_sealed:
+        if not memory.is_sealed:
             self.close()
             raise RunError("setpoints: its server did not seal what it writes to")
         self.port = int(reply["port"])
@@ -73,12 +73,12 @@ class ModbusSource(GlidingSource):
             for stream in (server.stdin, server.stdout):
                 if stream is not None:
                     stream.close()
-        page, self._page = self._page, None
-        if page is not None:
-            page.close()
+        memory, self._memory = self._memory, None
+        if memory is not None:
+            memory.close()
 
     def _receive(self) -> bool:
-        found = None if self._page is None else self._page.setpoint()
+        found = None if self._memory is None else self._memory.setpoint()
         if found is None or found[0] == self._sequence:
             return False
         self._sequence = found[0]
@@ -87,11 +87,11 @@ class ModbusSource(GlidingSource):
 
     def emit(self, reported: SourceStatus) -> None:
         """Hand state, corrected and nominal joints on to the PLC."""
-        if self._page is None:
+        if self._memory is None:
             return
         self._cycle += 1
         flags = (WRITTEN if reported.written else 0) | (LIMITED if reported.clamped else 0)
-        self._page.put_status(
+        self._memory.put_status(
             (int(reported.state), self._sequence or 0, self._cycle, flags),
             np.concatenate([reported.corrected_q, reported.nominal_q, reported.offset_in_base]),
         )

@@ -32,7 +32,7 @@ import numpy as np
 from pymodbus.server import ModbusTcpServer
 from pymodbus.simulator import DataType, SimData, SimDevice
 
-from gapbridge.bridge.setpoint_source.modbus_page import PlcPage
+from gapbridge.bridge.setpoint_source.plc_memory import PlcMemory
 from gapbridge.drivers.modbus.registers import Coding
 
 VERSION = 1
@@ -46,9 +46,9 @@ LIMIT = 2147.0  # rad or m: what a number can hold
 class PlcServer:
     """Holds the registers; answers from the newest record of the loop."""
 
-    def __init__(self, page: PlcPage) -> None:
-        self._page = page
-        self._holding = [0] * (JOINTS + 2 * page.n)
+    def __init__(self, memory: PlcMemory) -> None:
+        self._memory = memory
+        self._holding = [0] * (JOINTS + 2 * memory.n)
 
     def device(self) -> SimDevice:
         """Return the library's device: any unit id, two tables."""
@@ -72,13 +72,13 @@ class PlcServer:
         self._holding[address : address + len(values)] = values
         if self._holding[0] != before:
             counts = CODING.decode(self._holding[JOINTS:])
-            self._page.put_setpoint(self._holding[0], np.array(counts) * UNIT)
+            self._memory.put_setpoint(self._holding[0], np.array(counts) * UNIT)
 
     def _inputs(self) -> list[int]:
         found = [0] * INPUTS
-        n = self._page.n
+        n = self._memory.n
         found[0], found[1] = VERSION, n
-        reported = self._page.status()
+        reported = self._memory.status()
         if reported is None:
             return found
         (state, sequence, cycle, flags), values = reported
@@ -91,9 +91,9 @@ class PlcServer:
         return found
 
 
-async def serve(page: PlcPage, host: str, port: int) -> None:
+async def serve(memory: PlcMemory, host: str, port: int) -> None:
     """Serve until the process ends; reports the port, or the reason, in a line on stdout."""
-    server = ModbusTcpServer(PlcServer(page).device(), address=(host, port))
+    server = ModbusTcpServer(PlcServer(memory).device(), address=(host, port))
     try:
         await server.serve_forever(background=True)
     except (RuntimeError, OSError):
@@ -116,11 +116,11 @@ def _end_with_parent() -> None:
 
 
 def main() -> None:
-    """Serve as one line of JSON on stdin says: host, port, n, pages."""
+    """Serve as one line of JSON on stdin says: host, port, n, memory (descriptors)."""
     logging.getLogger("pymodbus").setLevel(logging.CRITICAL)
     order = json.loads(sys.stdin.readline())
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    asyncio.run(serve(PlcPage(order["n"], tuple(order["pages"])), order["host"], order["port"]))
+    asyncio.run(serve(PlcMemory(order["n"], tuple(order["memory"])), order["host"], order["port"]))
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """The status page's process: ``python -m gapbridge.bridge.web.main``, started by the daemon.
 
-It reads along - the shared page through a descriptor that cannot be written to - and answers
+It reads along - the shared memory through a descriptor that cannot be written to - and answers
 browsers: the page itself, /status, /events, /history. All of them only read: it has no way to the
 robot and none to arm anything.
 """
@@ -33,7 +33,7 @@ from gapbridge.bridge.web.watched import Watched
 WAITING = 100  # messages that a page may be behind
 RETRY = 1000  # ms after which a browser tries again
 COMMENT = 5.0  # s without a message after which a sign of life is sent
-TURN = 0.1  # s between two looks at the shared page
+TURN = 0.1  # s between two looks at the shared memory
 FILES = {
     "index.html": "text/html", "style.css": "text/css", "page.js": "text/javascript",
     "drawing.js": "text/javascript", "view.js": "text/javascript",
@@ -104,7 +104,7 @@ def run(order: Order) -> None:
     assert settings is not None
     path = settings.token_file
     token = None if path is None else read_token(path, "web.token_file")
-    watched = Watched(order.settings, order.n, order.session, order.page, order.extra.get("text"))
+    watched = Watched(order.settings, order.n, order.session, order.memory, order.extra.get("text"))
     stream = Stream(settings.clients)
 
     def turn() -> None:

@@ -24,7 +24,7 @@ DRAWN = 0.15  # of the reach: how far the stretched arm's bend is drawn
 
 
 class Prediction:
-    """Predicts for rows of the shared page, in this process and never in the loop's.
+    """Predicts for rows of the shared memory, in this process and never in the loop's.
 
     The model is read in a thread of its own, which takes a moment; until then, and where it cannot
     be read, there is no prediction.

@@ -1,4 +1,4 @@
-"""All that the page shows, kept up to date from the shared page and the daemon's events.
+"""All that the page shows, kept up to date from the shared memory and the daemon's events.
 
 What it draws over time is thinned to a few points a second.
 """
@@ -50,16 +50,16 @@ class Watched:
         settings: DaemonSettings,
         n: int,
         session: str,
-        page: SharedMemory,
+        memory: SharedMemory,
         text: str | None = None,
     ) -> None:
         assert settings.web is not None
         self._updated = UpdatedSettings(settings, text)  # text: the cell file's
-        self._session, self._page = session, page
-        self._slices, self._n = page.slices, n
+        self._session, self._memory = session, memory
+        self._slices, self._n = memory.slices, n
         # whoever comes late still shows what the ring holds
-        self._reader = page.reader(max(page.written - ROWS + ROWS // 4, 0))
-        self._prediction = Prediction(settings, page.slices)
+        self._reader = memory.reader(max(memory.written - ROWS + ROWS // 4, 0))
+        self._prediction = Prediction(settings, memory.slices)
         self._history = History(settings.web.history)
         self._timing = Timing()
         self._timing_at = self._arm_at = 0.0
@@ -152,11 +152,11 @@ class Watched:
         rate = (len(times) - 1) / (times[-1] - times[0]) if alive else 0.0
         return {
             "time": time.time(),
-            "state": (State.DISCONNECTED if self._down else State(self._page.state)).name.lower(),
-            "phase": self._page.phase.name.lower(),
+            "state": (State.DISCONNECTED if self._down else State(self._memory.state)).name.lower(),
+            "phase": self._memory.phase.name.lower(),
             "why": {k: v for k, v in self._why.items() if k in ("cause", "detail", "time")},
             "silence": silence,  # s since the last state of the robot
-            "heartbeat": self._page.silence,  # s since the loop's last sign of life
+            "heartbeat": self._memory.silence,  # s since the loop's last sign of life
             "rate": rate,
             "sensor": self._sensor,
             "clamped": self._clamped,

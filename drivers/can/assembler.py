@@ -65,8 +65,8 @@ class Assembler:
         self.status: dict[tuple[Key, str], tuple[float, str, bool]] = {}
         self.enabled: dict[tuple[Key, str], bool] = {}
         self.received_at: dict[Key, float] = {}  # s, monotonic, of each message that we read
-        self.troubled: set[tuple[Key, str]] = set()  # members of ``status`` that report trouble
-        self.passed: dict[tuple[Key, str], tuple[float, str, bool]] = {}  # trouble that has ended
+        self.stopping: set[tuple[Key, str]] = set()  # members of ``status`` that report a stop
+        self.cleared: dict[tuple[Key, str], tuple[float, str, bool]] = {}  # those that have ended
         self._seen: dict[Key, bytes] = {}  # last bytes of messages beside the sample
 
     @property
@@ -114,14 +114,14 @@ class Assembler:
         """Remember what a message says about the arm's health."""
         for check in incoming.checks:
             value = values[check.signal]
-            trouble = check.trouble(int(value)) if math.isfinite(value) else check.otherwise
+            reason = check.stop_reason(int(value)) if math.isfinite(value) else check.otherwise
             place = (incoming.key, check.signal)
-            if trouble:
-                self.troubled.add(place)
-            elif place in self.troubled:
-                self.troubled.discard(place)
-                self.passed[place] = self.status[place]
-            self.status[place] = (value, trouble, check.while_writing)
+            if reason:
+                self.stopping.add(place)
+            elif place in self.stopping:
+                self.stopping.discard(place)
+                self.cleared[place] = self.status[place]
+            self.status[place] = (value, reason, check.while_writing)
         for signal in incoming.enabled:
             self.enabled[incoming.key, signal] = values[signal] in self._profile.enabled_values
 

@@ -78,10 +78,10 @@ class CanDriver(Driver):
         self._begin_anew()
 
     def _begin_anew(self) -> None:
-        """Let what came while nobody asked for states be: torn frames, trouble that is over."""
+        """Let what came while nobody asked for states be: torn frames, stops that are over."""
         self._broken, self._kept = self.reader.assembler.broken, None
         self._builder.forget()
-        self.reader.forget_passed()
+        self.reader.forget_cleared()
 
     def _nothing_received(self, complete: bool) -> LinkError:
         """Return what was missed, and close: a link that is not there is not half open."""
@@ -110,15 +110,15 @@ class CanDriver(Driver):
         self._check_frozen(sample)
         armed = self._armed_at is not None
         # a stop that came and went while frames made no sample was a stop
-        trouble = self.reader.trouble(armed)[0] or self.reader.passed_trouble(armed)
+        stop_reason = self.reader.stop_reason(armed)[0] or self.reader.cleared_stop_reason(armed)
         ready = not armed or not self.profile.enabled_values or self.reader.enabled
-        return self._builder.build(sample, self._target(), trouble, ready)
+        return self._builder.build(sample, self._target(), stop_reason, ready)
 
     def _validate(self, state: RobotState) -> None:
         """See Driver._validate."""
         super()._validate(state)
         self._builder.remember()
-        self.reader.forget_passed()
+        self.reader.forget_cleared()
 
     def _awaited(self) -> Sample:
         """Return the next sample of an arm that sends by itself; slower where we want fewer."""
@@ -213,9 +213,9 @@ class CanDriver(Driver):
         if foreign is not None and self._now() - foreign.seen < quiet:
             raise self._commanded_by_another()
         self._kept = None
-        trouble, message = self.reader.trouble(writing=False)
-        if trouble:
-            raise WriteError(f"{self.profile.name}: {trouble}: {message}")
+        reason, message = self.reader.stop_reason(writing=False)
+        if reason:
+            raise WriteError(f"{self.profile.name}: {reason}: {message}")
         start = self._present()
         try:
             self.writer.run(self.profile.enable, self._present, self._listen, self._reached)
@@ -251,7 +251,7 @@ class CanDriver(Driver):
         if goal == "disabled":
             return self.reader.disabled
         detail = not self.profile.enabled_values or self.reader.enabled
-        return detail and (goal == "enabled" or not self.reader.trouble(writing=True)[0])
+        return detail and (goal == "enabled" or not self.reader.stop_reason(writing=True)[0])
 
     def _commanded_by_another(self) -> ForeignCommandError:
         foreign = self.reader.foreign

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import ValidationError
+from pydantic_core import ErrorDetails
 
 from gapbridge.core.arrays import Array
 from gapbridge.drivers.can.dbc import Dbc, read_dbc
@@ -27,8 +27,7 @@ from gapbridge.drivers.can.schema import FrameEntry, ProfileFile, Quantity, Step
 from gapbridge.drivers.profile_file import (
     ProfileDocument,
     ProfileError,
-    read_profile_document,
-    worst_of,
+    read_profile_file,
 )
 
 Keys = tuple[str | int, ...]
@@ -200,18 +199,13 @@ def read_profile(path: Path, installation: Mapping[str, list[float]] | None = No
 
     ``installation`` replaces its direction, zero and gear.
     """
-    document = read_profile_document(path)
-    try:
-        file = ProfileFile.model_validate(document.data)
-    except ValidationError as error:
-        raise _schema_error(document, error) from None
+    document, file = read_profile_file(path, ProfileFile, _schema_error)
     file = file.model_copy(update=dict(installation or {}))
     return _Loading(document, file, read_dbc(path.parent / file.dbc)).profile()
 
 
-def _schema_error(document: ProfileDocument, error: ValidationError) -> ProfileError:
-    """Return one line; unknown keys first, since a misspelt key is also a missing one."""
-    worst = worst_of(error)
+def _schema_error(document: ProfileDocument, worst: ErrorDetails) -> ProfileError:
+    """Return one line out of what pydantic says."""
     keys = tuple(key for key in worst["loc"] if key != "list[constrained-float]")
     found = worst["input"] if not isinstance(worst["input"], dict | list) else "something else"
     if worst["type"] == "missing":

@@ -32,7 +32,7 @@ class Check:
     otherwise: str
     while_writing: bool = False  # counts only then
 
-    def trouble(self, value: int) -> str:
+    def stop_reason(self, value: int) -> str:
         """Return what a value means; empty where the arm is well."""
         return NORMAL if value in self.normal else self.values.get(value, self.otherwise)
 

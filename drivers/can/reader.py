@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 
 from gapbridge.core.arrays import Array
-from gapbridge.core.errors import LinkError
+from gapbridge.core.errors import LinkError, first_line
 from gapbridge.drivers.can.assembler import Assembler, Sample
 from gapbridge.drivers.can.profile import CanProfile, Key
 from gapbridge.drivers.can.settings import CanSettings
-from gapbridge.drivers.can_bus.bus import close_bus, first_line, open_bus
+from gapbridge.drivers.can_bus.bus import close_bus, open_bus
 from gapbridge.drivers.clock import SYSTEM, Clock
 
 LONGEST_WAY, LEAST_WAY = 4.0, 0.03  # cycles, s: what has lain here for longer is not fresh
@@ -20,7 +20,7 @@ BACKLOG_TIME = 0.05  # s that reading what has piled up may take
 
 
 @dataclass(frozen=True, slots=True)
-class Foreign:
+class ForeignCommand:
     """A frame that only a commander sends, and that we did not send."""
 
     key: Key
@@ -35,7 +35,7 @@ class FrameReader:
         self._settings, self._profile = settings, profile
         self.bus: Any = None
         self.assembler = Assembler(profile)
-        self.foreign: Foreign | None = None
+        self.foreign: ForeignCommand | None = None
         self.error_frames = 0
         self.identifiers: set[int] = set()  # heard at all, for messages
         self._targets = {f.key: f for f in profile.setpoint if f.joints}
@@ -122,12 +122,12 @@ class FrameReader:
         key = (frame.arbitration_id, frame.is_extended_id)
         self.identifiers.add(key[0])
         if key in self._profile.control:
-            self.foreign = Foreign(key, now)
-            self._overhear(key, bytes(frame.data))
+            self.foreign = ForeignCommand(key, now)
+            self._decode_foreign_target(key, bytes(frame.data))
             return None
         return self.assembler.take(key, bytes(frame.data), frame.timestamp or now, now)
 
-    def _overhear(self, key: Key, data: bytes) -> None:
+    def _decode_foreign_target(self, key: Key, data: bytes) -> None:
         """Note what another commander has the arm do."""
         target = self._targets.get(key)
         if target is None or len(data) != target.message.length:
@@ -162,27 +162,27 @@ class FrameReader:
         motors = self.assembler.enabled
         return bool(motors) and not any(motors.values())
 
-    def trouble(self, writing: bool) -> tuple[str, str]:
+    def stop_reason(self, writing: bool) -> tuple[str, str]:
         """Return what is wrong with the arm and the words for it; empty where nothing is."""
-        if not self.assembler.troubled:
+        if not self.assembler.stopping:
             return "", ""
-        return self._first_trouble(self.assembler.status, writing)
+        return self._first_stop_reason(self.assembler.status, writing)
 
-    def passed_trouble(self, writing: bool) -> str:
-        """Return what was wrong since ``forget_passed`` and is no longer; empty: nothing."""
-        return self._first_trouble(self.assembler.passed, writing)[0]
+    def cleared_stop_reason(self, writing: bool) -> str:
+        """Return what was wrong since ``forget_cleared`` and is no longer; empty: nothing."""
+        return self._first_stop_reason(self.assembler.cleared, writing)[0]
 
-    def forget_passed(self) -> None:
-        """Let trouble that has ended be: it has been reported, or nobody was to act on it."""
-        self.assembler.passed.clear()
+    def forget_cleared(self) -> None:
+        """Forget stops that have ended: they have been reported, or nobody was to act on them."""
+        self.assembler.cleared.clear()
 
-    def _first_trouble(
+    def _first_stop_reason(
         self, status: dict[tuple[Key, str], tuple[float, str, bool]], writing: bool
     ) -> tuple[str, str]:
-        for (key, signal), (value, trouble, only_writing) in status.items():
-            if trouble and (writing or not only_writing):
+        for (key, signal), (value, reason, only_writing) in status.items():
+            if reason and (writing or not only_writing):
                 name = self._profile.incoming[key].name
-                return trouble, f"{name}.{signal} is {value:g}"
+                return reason, f"{name}.{signal} is {value:g}"
         return "", ""
 
     def silent_status(self) -> str:

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from gapbridge.drivers.robot_modes import Trouble
+from gapbridge.drivers.robot_modes import StopReason
 from gapbridge.drivers.section import Number, Section
 
 Identifier = Annotated[int, Field(ge=0, le=0x1FFFFFFF)]
@@ -44,8 +44,8 @@ class StatusEntry(Section):
 
     signal: str
     normal: list[int] = Field(min_length=1, description="values of an arm that is well")
-    values: dict[int, Trouble] = Field(default={}, description="what single other values mean")
-    otherwise: Trouble = Field(default="fault", description="what every other value means")
+    values: dict[int, StopReason] = Field(default={}, description="what single other values mean")
+    otherwise: StopReason = Field(default="fault", description="what every other value means")
     while_writing: bool = Field(default=False, description="counts only while we write")
 
 

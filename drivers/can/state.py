@@ -26,7 +26,7 @@ class StateBuilder:
         """Take velocities from the state last made on: it can be believed."""
         self._before = self._last
 
-    def build(self, sample: Sample, target: Array | None, trouble: str, ready: bool) -> RobotState:
+    def build(self, sample: Sample, target: Array | None, reason: str, ready: bool) -> RobotState:
         """Return the state of a sample.
 
         ``target`` (n,) is what the arm was last commanded, where anyone commanded it.
@@ -37,7 +37,7 @@ class StateBuilder:
         if qd is None:
             qd = self._differences(sample, self._before)
         self._last = sample
-        modes = modes_of((trouble, "" if ready else "not_ready"))
+        modes = modes_of((reason, "" if ready else "not_ready"))
         return RobotState(
             timestamp=sample.received,
             received=sample.received,

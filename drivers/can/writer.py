@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 
 from gapbridge.core.arrays import Array
-from gapbridge.core.errors import PartialWriteError, WriteError
+from gapbridge.core.errors import PartialWriteError, WriteError, first_line
 from gapbridge.drivers.can.profile import Action, CanProfile, Key, Outgoing
 from gapbridge.drivers.can.settings import CanSettings
-from gapbridge.drivers.can_bus.bus import first_line
 from gapbridge.drivers.clock import SYSTEM, Clock
 
 Frames = list[tuple[Key, bytes]]

@@ -7,14 +7,13 @@ bus is opened, so that a cell is read without it.
 from __future__ import annotations
 
 import contextlib
-import errno
 import os
 import socket
 from typing import TYPE_CHECKING, Any
 
 from pydantic import BaseModel, Field, field_validator
 
-from gapbridge.core.errors import LinkError
+from gapbridge.core.errors import LinkError, first_line
 
 if TYPE_CHECKING:
     import can
@@ -155,11 +154,3 @@ def close_bus(bus: Any) -> None:
     if port is not None:
         with contextlib.suppress(Exception):
             port.close()
-
-
-def first_line(error: BaseException) -> str:
-    """Return the first line of what an error says, or its kind."""
-    if isinstance(error, OSError) and error.errno in errno.errorcode:
-        return error.strerror or type(error).__name__
-    lines = str(error).strip().splitlines()
-    return lines[0].strip() if lines else type(error).__name__

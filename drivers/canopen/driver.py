@@ -24,12 +24,11 @@ from gapbridge.drivers.canopen.configure import (
     interpolation_period,
     set_up,
 )
-from gapbridge.drivers.canopen.listening import OPERATIONAL, Emergency, Foreign
+from gapbridge.drivers.canopen.listening import OPERATIONAL, Emergency, ForeignCommand
 from gapbridge.drivers.canopen.master import Master
 from gapbridge.drivers.canopen.objects import FAULTS
 from gapbridge.drivers.canopen.power import Power
 from gapbridge.drivers.canopen.profile import WINDOW, read_profile
-from gapbridge.drivers.canopen.rhythm import Rhythm
 from gapbridge.drivers.canopen.settings import CanopenSettings
 from gapbridge.drivers.canopen.state import StateBuilder, not_following, positions, states
 from gapbridge.drivers.canopen.sync_set import SyncSet
@@ -38,6 +37,7 @@ from gapbridge.drivers.driver import Driver
 
 log = logging.getLogger("drivers.canopen")
 
+MOST_LEFT_OUT = 3  # SYNCs after a torn set
 STARTING = 2.0  # s in which drives must be OPERATIONAL and answer a SYNC
 
 
@@ -63,8 +63,8 @@ class CanopenDriver(Driver):
         self.writer = RpdoWriter(self.master, self.profile)
         self._period = 1.0 / self.rate
         window = self.profile.file.sync_window or WINDOW * self._period
-        self.rhythm = Rhythm(self.master, self.writer, self._period, window)
-        self.power = Power(self.master, self.profile, self.writer, self.rhythm.exchange)
+        self.sync_cycle = SyncCycle(self.master, self.writer, self._period, window, clock)
+        self.power = Power(self.master, self.profile, self.writer, self.sync_cycle.exchange)
         self._arm, self._builder = model.arm, StateBuilder(self.profile)
         self._fresh_at = 0.0  # s, monotonic: of the last whole sample
         self._connected_at = 0.0
@@ -87,9 +87,9 @@ class CanopenDriver(Driver):
                 master.command(node, "PRE-OPERATIONAL")
                 set_up(master, self.profile, node, self._period)
             check_units(master, self.profile, self._arm)
-            assert master.life is not None
-            master.life.started()
-            master.collector.forget_stray()
+            assert master.heartbeats is not None
+            master.heartbeats.started()
+            master.collector.clear_stray()
             for node in self.profile.nodes:
                 master.command(node, "OPERATIONAL")
             self._first_sample()
@@ -103,14 +103,14 @@ class CanopenDriver(Driver):
 
     def _first_sample(self) -> None:
         """Wait until all drives are OPERATIONAL and answer a SYNC. Raises LinkError."""
-        life = self.master.life
-        assert life is not None
+        heartbeats = self.master.heartbeats
+        assert heartbeats is not None
         end = self._now() + min(STARTING, self.settings.connect_timeout)
-        while (found := self.rhythm.exchange()) is None or not life.all_operational:
+        while (found := self.sync_cycle.exchange()) is None or not heartbeats.all_operational:
             if self._now() > end:
                 why = self.master.collector.why() + " after a SYNC"
                 if found is not None:
-                    silent = [n for n in self.profile.nodes if life.nmt.get(n) != OPERATIONAL]
+                    silent = [n for n in self.profile.nodes if heartbeats.nmt.get(n) != OPERATIONAL]
                     why = f"found no heartbeat in OPERATIONAL of nodes {silent}"
                 raise LinkError(f"{self.master.where}: {why}")
         try:
@@ -128,8 +128,8 @@ class CanopenDriver(Driver):
         """
         while True:
             stray = self.master.collector.stray
-            found = self.rhythm.exchange()
-            self._check_lives()
+            found = self.sync_cycle.exchange()
+            self._check_heartbeats()
             if found is not None and not stray:
                 self._fresh_at = found.received
                 return self._state(found)
@@ -142,18 +142,22 @@ class CanopenDriver(Driver):
             if stray or not self.master.collector.empty:
                 raise InvalidStateError(f"{self.master.where}: torn sample: {why}")
 
-    def _check_lives(self) -> None:
+    def _check_heartbeats(self) -> None:
         """Raise where a drive's heartbeat has ended, or where it has restarted."""
-        life = self.master.life
-        assert life is not None
-        if life.log and life.log[-1] is not self._reported:
-            self._reported = life.log[-1]
+        heartbeats = self.master.heartbeats
+        assert heartbeats is not None
+        if heartbeats.log and heartbeats.log[-1] is not self._reported:
+            self._reported = heartbeats.log[-1]
             log.warning("%s: %s", self.master.where, self._reported)
-        node = life.not_operational()
+        node = heartbeats.not_operational()
         if node is not None:
-            why = "has restarted" if node in life.restarted else f"NMT state {life.nmt[node]}"
+            why = (
+                "has restarted"
+                if node in heartbeats.restarted
+                else f"NMT state {heartbeats.nmt[node]}"
+            )
             raise LinkError(f"{self.master.where}: node {node}: {why}, expected OPERATIONAL")
-        node = life.lost()
+        node = heartbeats.lost()
         if node is not None:
             raise StaleStateError(
                 f"{self.master.where}: node {node}: no heartbeat for "
@@ -188,11 +192,11 @@ class CanopenDriver(Driver):
     # -- writing ----------------------------------------------------------------------------------
 
     @property
-    def foreign(self) -> Foreign | None:
+    def foreign(self) -> ForeignCommand | None:
         """Return the last frame of another master; None: there was none."""
         return self.master.listener.foreign if self.master.listener is not None else None
 
-    def _two_masters(self, foreign: Foreign) -> str:
+    def _two_masters(self, foreign: ForeignCommand) -> str:
         return (
             f"{self.master.where}: another master sent {foreign.what} "
             f"{self._now() - foreign.seen:.2f} s ago: found two masters, expected one"
@@ -225,8 +229,8 @@ class CanopenDriver(Driver):
             foreign, now = self.foreign, self._now()
             if foreign is not None and (foreign.seen > begun or now - foreign.seen < quiet):
                 raise WriteError(self._two_masters(foreign))
-            found = self.rhythm.exchange()
-            self._check_lives()
+            found = self.sync_cycle.exchange()
+            self._check_heartbeats()
             if found is not None and now - self._connected_at >= quiet:
                 return found
             if found is None and now - self._fresh_at > quiet + self.settings.state_timeout:
@@ -237,8 +241,8 @@ class CanopenDriver(Driver):
         try:
             self.power.prepare()
             hold = self.power.enable(found, self.settings.arming_time, self.settings.clear_faults)
-            assert self.rhythm.sample is not None
-            gave = float(np.abs(positions(self.profile, self.rhythm.sample) - start).max())
+            assert self.sync_cycle.sample is not None
+            gave = float(np.abs(positions(self.profile, self.sync_cycle.sample) - start).max())
             if gave > self.settings.arming_distance:
                 raise WriteError(f"{self.profile.name}: the arm gave {gave:.3f} rad when enabled")
             self.writer.send([self.power.following] * self.n, hold)
@@ -252,7 +256,7 @@ class CanopenDriver(Driver):
 
     def _send(self, setpoint: Setpoint) -> None:
         """Send one setpoint, which counts at the next SYNC; needs ``arm`` before."""
-        sample = self.rhythm.sample
+        sample = self.sync_cycle.sample
         if self._armed_at is None or sample is None:
             raise WriteError(f"{self.master.where}: found a setpoint, expected arm() first")
         foreign = self.foreign
@@ -291,3 +295,52 @@ class CanopenDriver(Driver):
             for node in self.profile.nodes:
                 self.master.command(node, "PRE-OPERATIONAL")
         self.master.close()
+
+
+class SyncCycle:
+    """Sends SYNCs at absolute deadlines and takes what answers them."""
+
+    def __init__(
+        self, master: Master, writer: RpdoWriter, period: float, window: float, clock: Clock
+    ) -> None:
+        self._master, self._writer, self._clock = master, writer, clock
+        self._period, self._window = period, window  # s
+        self._due = 0.0  # s, monotonic: of the next SYNC
+        self._torn = False  # the last set was not whole
+        self.sample: SyncSet | None = None  # the last that was whole
+
+    def exchange(self) -> SyncSet | None:
+        """Send one SYNC when it is due and return its TPDOs, None where they are torn.
+
+        Raises LinkError where the bus has gone, or where a part of a setpoint stands in the drives.
+        """
+        if self._torn:
+            self._skip_syncs()
+        self._wait_for_slot()
+        self._writer.make_whole()
+        collector = self._master.collector
+        collector.clear_stray()
+        found = collector.wait(self._master.sync() + self._window)
+        self._torn = found is None
+        if found is not None:
+            self.sample = found
+        return found
+
+    def _wait_for_slot(self) -> None:
+        now = self._clock.monotonic()
+        self._due += self._period
+        if self._due < now - 0.5 * self._period:
+            self._due = now  # too late for the slot: no burst
+        if self._due > now:
+            self._clock.sleep(self._due - now)
+
+    def _skip_syncs(self) -> None:
+        """Leave SYNCs out after a torn set: one, and up to three while TPDOs are missing.
+
+        Else what comes late would be taken for the next SYNC's.
+        """
+        for _ in range(MOST_LEFT_OUT):
+            self._wait_for_slot()
+            self._master.beat()
+            if not self._master.collector.awaits_late:
+                return

@@ -8,8 +8,8 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+from gapbridge.core.errors import first_line
 from gapbridge.core.files import read_text
-from gapbridge.drivers.can_bus.bus import first_line
 from gapbridge.drivers.canopen.objects import Address
 from gapbridge.drivers.profile_file import ProfileError
 

@@ -1,4 +1,4 @@
-"""What is heard on the bus: our TPDOs, lives, emergencies, and who else commands our drives."""
+"""What is heard on the bus: TPDOs, heartbeats, emergencies, and who else commands the drives."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ OPERATIONAL = 5  # NMT state
 
 
 @dataclass(frozen=True, slots=True)
-class Foreign:
+class ForeignCommand:
     """A frame that only a master sends, and that we did not send."""
 
     what: str
@@ -54,7 +54,7 @@ class BusListener(MessageListener):
         super().__init__(network)
         self._collector = collector
         self._commands = _commands(profile)
-        self.foreign: Foreign | None = None
+        self.foreign: ForeignCommand | None = None
         self.error_frames = 0
 
     def on_message_received(self, msg: Any) -> None:
@@ -67,7 +67,7 @@ class BusListener(MessageListener):
         now, cob_id = time.monotonic(), int(msg.arbitration_id)
         what = self._commands.get(cob_id)
         if what is not None:
-            self.foreign = Foreign(what, now)
+            self.foreign = ForeignCommand(what, now)
             return
         self._collector.take(cob_id, bytes(msg.data), now)
         super().on_message_received(msg)  # type: ignore[no-untyped-call]
@@ -91,7 +91,7 @@ def _commands(profile: CanopenProfile) -> dict[int, str]:
     return found
 
 
-class Life:
+class HeartbeatMonitor:
     """When each drive was last heard, in which NMT state, and what it complained of."""
 
     def __init__(self, network: Network, profile: CanopenProfile) -> None:
@@ -129,7 +129,7 @@ class Life:
         return note
 
     def started(self) -> None:
-        """Forget restarts: the drives have just been set up; count their lives from now."""
+        """Forget restarts: the drives have just been set up, and count from now on."""
         self.restarted.clear()
         self.nmt.clear()
         now = time.monotonic()

@@ -14,9 +14,9 @@ from typing import Any
 
 import canopen
 
-from gapbridge.core.errors import LinkError, WriteError
-from gapbridge.drivers.can_bus.bus import close_bus, first_line, open_bus
-from gapbridge.drivers.canopen.listening import BusListener, Life
+from gapbridge.core.errors import LinkError, WriteError, first_line
+from gapbridge.drivers.can_bus.bus import close_bus, open_bus
+from gapbridge.drivers.canopen.listening import BusListener, HeartbeatMonitor
 from gapbridge.drivers.canopen.objects import (
     HEARTBEAT_BASE,
     NMT,
@@ -69,7 +69,7 @@ class Master:
         self.collector = SyncCollector(profile)
         self.network: Any = None
         self.listener: BusListener | None = None
-        self.life: Life | None = None
+        self.heartbeats: HeartbeatMonitor | None = None
         self._beat_at = 0.0  # s, monotonic: when our next heartbeat is due
 
     @property
@@ -86,7 +86,7 @@ class Master:
         for node in self._profile.nodes:
             remote = network.add_node(node, self._profile.eds.dictionary(node))
             remote.sdo.RESPONSE_TIMEOUT = self._settings.sdo_timeout
-        self.life = Life(network, self._profile)
+        self.heartbeats = HeartbeatMonitor(network, self._profile)
         self._beat_at = 0.0
         network.connect()
         self.network = network

@@ -124,8 +124,8 @@ class Power:
 
     def complaint(self, node: int) -> str:
         """Return what a node complained of last, for messages."""
-        life = self._master.life
-        emergency = life.active.get(node) if life is not None else None
+        heartbeats = self._master.heartbeats
+        emergency = heartbeats.active.get(node) if heartbeats is not None else None
         return f" ({emergency})" if emergency is not None else ""
 
     def disable(self) -> None:

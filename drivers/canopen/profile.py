@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import Field, ValidationError
+from pydantic import Field
+from pydantic_core import ErrorDetails
 
 from gapbridge.core.arrays import Array
 from gapbridge.drivers.canopen.eds import Eds, read_eds
@@ -19,8 +20,7 @@ from gapbridge.drivers.profile_file import (
     ProfileDocument,
     ProfileError,
     found_and_expected,
-    read_profile_document,
-    worst_of,
+    read_profile_file,
 )
 from gapbridge.drivers.section import Number, Positive, Section
 
@@ -150,15 +150,8 @@ def read_profile(path: Path, joints: int | None = None) -> CanopenProfile:
     ``joints`` is the number that the arm has; None: any. Raises ProfileError, one line that names
     file, line and key, what was found and what was expected.
     """
-    document = read_profile_document(path)
-    try:
-        file = ProfileFile.model_validate(document.data)
-    except ValidationError as error:
-        raise _refusal(document, error) from None
-    if joints is not None and len(file.joints) != joints:
-        raise document.error(
-            ("joints",), f"found {len(file.joints)}, expected {joints}: the arm has those"
-        )
+    document, file = read_profile_file(path, ProfileFile, _refusal)
+    document.require_joints(len(file.joints), joints)
     _check_nodes(document, file)
     _check_times(document, file)
     try:
@@ -288,9 +281,8 @@ def _near(name: str, known: Mapping[str, object] | Sequence[str]) -> str:
     return f" (did you mean {near[0]!r}?)" if near else ""
 
 
-def _refusal(document: ProfileDocument, error: ValidationError) -> ProfileError:
-    """Return one line out of what pydantic says; unknown keys come first."""
-    worst = worst_of(error)
+def _refusal(document: ProfileDocument, worst: ErrorDetails) -> ProfileError:
+    """Return one line out of what pydantic says."""
     keys: Keys = tuple(key for key in worst["loc"] if key not in ("str", "int", "[key]"))
     if keys and keys[0] in ("tpdo", "rpdo"):
         keys = (keys[0], *(str(key) for key in keys[1:2]), *keys[2:])  # a PDO's number counts as is

@@ -64,7 +64,7 @@ class StateBuilder:
         of its SYNC, at which all drives latched their positions.
         """
         q = positions(self._profile, found)
-        modes = modes_of([self._trouble(found, armed)])
+        modes = modes_of([self._stop_reason(found, armed)])
         return RobotState(
             timestamp=found.synced,
             received=found.received,
@@ -78,7 +78,7 @@ class StateBuilder:
             safety_status_bits=modes.safety_status_bits,
         )
 
-    def _trouble(self, found: SyncSet, armed: bool) -> str:
+    def _stop_reason(self, found: SyncSet, armed: bool) -> str:
         reported = states(found)
         if "FAULT" in reported or "FAULT REACTION ACTIVE" in reported:
             return "fault"

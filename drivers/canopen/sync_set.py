@@ -32,21 +32,21 @@ class SyncCollector:
         self._changed = threading.Condition()
         self._held: dict[int, dict[str, int]] = {}
         self._open = False
-        self._trouble = ""  # why this set cannot be believed
+        self._rejected = ""  # why this set cannot be believed
         self._synced = self._received = 0.0
-        self._owed: set[int] = set()  # COB-IDs that a torn set lacked, and that may still come
+        self._missing: set[int] = set()  # COB-IDs that a torn set lacked, and that may still come
         self.dropped: Counter[str] = Counter()  # reason -> frames or sets
         self.stray = ""  # a TPDO that came to no SYNC since the last look; empty: none
 
-    def forget_stray(self) -> None:
+    def clear_stray(self) -> None:
         """Take note that somebody has looked at ``stray``."""
         self.stray = ""
 
     def begin(self, now: float) -> None:
         """Forget what was collected: a SYNC leaves at ``now`` (s, monotonic)."""
         with self._changed:
-            self._held, self._trouble, self._open = {}, "", True
-            self._owed.clear()
+            self._held, self._rejected, self._open = {}, "", True
+            self._missing.clear()
             self._synced = self._received = now
 
     def end(self) -> None:
@@ -79,21 +79,21 @@ class SyncCollector:
                 self._changed.notify_all()
 
     def _take_late(self, cob_id: int, who: str) -> None:
-        if cob_id in self._owed:
-            self._owed.discard(cob_id)
+        if cob_id in self._missing:
+            self._missing.discard(cob_id)
             self.dropped["late"] += 1
         else:
             self.dropped["no SYNC"] += 1
             self.stray = who
 
     @property
-    def owed(self) -> bool:
+    def awaits_late(self) -> bool:
         """Return whether TPDOs of a torn set may still come: they must not meet the next SYNC's."""
-        return bool(self._owed)
+        return bool(self._missing)
 
     def _refuse(self, reason: str, message: str) -> None:
         self.dropped[reason] += 1
-        self._trouble = self._trouble or message
+        self._rejected = self._rejected or message
         self._changed.notify_all()
 
     def wait(self, until: float) -> SyncSet | None:
@@ -101,9 +101,9 @@ class SyncCollector:
         with self._changed:
             self._changed.wait_for(self._over, max(until - time.monotonic(), 0.0))
             self._open = False
-            if self._trouble or len(self._held) < len(self._members):
+            if self._rejected or len(self._held) < len(self._members):
                 self.dropped["torn"] += 1
-                self._owed = set(self._members) - set(self._held)
+                self._missing = set(self._members) - set(self._held)
                 return None
             counts: list[dict[str, int]] = [{} for _ in self._nodes]
             for cob_id, found in self._held.items():
@@ -111,17 +111,17 @@ class SyncCollector:
             return SyncSet(tuple(counts), self._synced, self._received)
 
     def _over(self) -> bool:
-        return bool(self._trouble) or len(self._held) == len(self._members)
+        return bool(self._rejected) or len(self._held) == len(self._members)
 
     @property
     def empty(self) -> bool:
         """Return whether nothing at all has come since the SYNC."""
-        return not self._held and not self._trouble
+        return not self._held and not self._rejected
 
     def why(self) -> str:
         """Return what is wrong with the set at hand."""
-        if self._trouble:
-            return self._trouble
+        if self._rejected:
+            return self._rejected
         missing = [
             f"{layout.name} of node {self._nodes[joint]}"
             for cob_id, (joint, layout) in self._members.items()

@@ -17,8 +17,9 @@ import numpy as np
 
 from gapbridge.core.arrays import Array
 from gapbridge.core.errors import LinkError
-from gapbridge.drivers.can_bus.bus import close_bus, first_line, open_bus
-from gapbridge.drivers.ft_sensor.sensor import ForceTorqueSensor, Reading
+from gapbridge.drivers.can_bus.bus import open_bus
+from gapbridge.drivers.ft_sensor.can_sensor import CanSensor
+from gapbridge.drivers.ft_sensor.sensor import Reading
 from gapbridge.drivers.ft_sensor.settings import AtiSettings
 
 GAUGES, MATRIX, COUNTS, UNITS = 0x0, 0x2, 0x7, 0x8
@@ -83,7 +84,7 @@ class AnswerDecoder:
         self._found = []
 
 
-class AtiNetCanOem(ForceTorqueSensor):
+class AtiNetCanOem(CanSensor):
     """The sensor on its bus."""
 
     def __init__(self, settings: AtiSettings) -> None:
@@ -91,7 +92,6 @@ class AtiNetCanOem(ForceTorqueSensor):
         self.settings = settings
         self.name = f"ati_netcanoem at {settings.where()}"
         self._base = settings.base_id << 4
-        self._bus: Any = None
         self._matrix: Array = np.zeros((6, 6))  # N, Nm per gauge count
         self._due = 0.0  # s, monotonic: when the next sample is asked for
 
@@ -129,7 +129,7 @@ class AtiNetCanOem(ForceTorqueSensor):
         """Return the frames of an answer, of these lengths; asks again where none comes."""
         for _ in range(ATTEMPTS):
             self._drain()
-            self._send(operation, data)
+            self._send(self._base | operation, data)
             answer = self._answer(operation, len(lengths), time.monotonic() + ANSWER)
             if answer is not None and tuple(map(len, answer)) == lengths:
                 return answer
@@ -158,8 +158,7 @@ class AtiNetCanOem(ForceTorqueSensor):
 
     def read(self, timeout: float) -> Reading | None:
         """Ask for a sample when it is due and return it; see ForceTorqueSensor.read."""
-        if self._bus is None:
-            raise LinkError(f"{self.name}: found no connection, expected connect() first")
+        self._connected()
         until = time.monotonic() + timeout
         time.sleep(max(min(self._due, until) - time.monotonic(), 0.0))
         if self._due > until:
@@ -167,7 +166,7 @@ class AtiNetCanOem(ForceTorqueSensor):
         self._drain()
         asked = time.monotonic()
         self._due = max(self._due + 1.0 / self.settings.rate, asked)
-        self._send(GAUGES)
+        self._send(self._base | GAUGES, b"")
         answer = self._answer(GAUGES, 2, asked + SAMPLE, TOGETHER)
         received = time.monotonic()
         if answer is None:
@@ -180,30 +179,6 @@ class AtiNetCanOem(ForceTorqueSensor):
         # it samples between question and answer, whose ways are taken for equally long
         return Reading(0.5 * (asked + received), received, self._matrix @ np.array(gauges), status)
 
-    def _send(self, operation: int, data: bytes = b"") -> None:
-        import can
-
-        frame = can.Message(arbitration_id=self._base | operation, data=data, is_extended_id=False)
-        try:
-            self._bus.send(frame, timeout=0.1)
-        except (can.CanError, OSError) as error:
-            raise LinkError(f"{self.name}: cannot be written to: {first_line(error)}") from None
-
-    def _receive(self, timeout: float) -> Any:
-        """Return the next data frame with a standard id, or None."""
-        import can
-
-        until = time.monotonic() + timeout
-        while True:
-            try:
-                frame = self._bus.recv(max(until - time.monotonic(), 0.0))
-            except (can.CanError, OSError, ValueError) as error:
-                raise LinkError(f"{self.name}: {first_line(error)}") from None
-            if frame is None:
-                return None
-            if not (frame.is_error_frame or frame.is_remote_frame or frame.is_extended_id):
-                return frame
-
     def _drain(self) -> None:
         """Drop late answers to former questions."""
         while self._receive(0.0) is not None:
@@ -213,12 +188,6 @@ class AtiNetCanOem(ForceTorqueSensor):
         """Return the bits of the status in words."""
         faults = [word for i, word in enumerate(STATUS) if status >> i & 1]
         return f"status 0x{status & 0xFFFF:04X}: {', '.join(faults)}"
-
-    def close(self) -> None:
-        """Leave the bus."""
-        if self._bus is not None:
-            close_bus(self._bus)
-            self._bus = None
 
 
 def _rank(matrix: Array) -> int:

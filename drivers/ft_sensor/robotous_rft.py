@@ -7,15 +7,16 @@ across the border of the frames. Source: CORC, src/hardware/IO/RobotousRFT.cpp.
 
 from __future__ import annotations
 
+import contextlib
 import struct
 import time
 from typing import Any
 
 import numpy as np
 
-from gapbridge.core.errors import LinkError
-from gapbridge.drivers.can_bus.bus import close_bus, first_line, open_bus
-from gapbridge.drivers.ft_sensor.sensor import ClockOffset, ForceTorqueSensor, Reading
+from gapbridge.drivers.can_bus.bus import open_bus
+from gapbridge.drivers.ft_sensor.can_sensor import CanSensor
+from gapbridge.drivers.ft_sensor.sensor import ClockOffset, Reading
 from gapbridge.drivers.ft_sensor.settings import RobotousSettings
 
 START, STOP = 0x0B, 0x0C
@@ -52,7 +53,7 @@ class PairDecoder:
         return LAYOUT.unpack(first[0] + data)[1:]
 
 
-class RobotousRft(ForceTorqueSensor):
+class RobotousRft(CanSensor):
     """The sensor on its bus."""
 
     def __init__(self, settings: RobotousSettings) -> None:
@@ -61,7 +62,6 @@ class RobotousRft(ForceTorqueSensor):
         self.name = f"robotous_rft at {settings.where()}"
         counts = 3 * (settings.force_counts,) + 3 * (settings.torque_counts,)
         self._unit = settings.sign / np.array(counts)
-        self._bus: Any = None
         self._decoder = PairDecoder(settings.reply_ids, 0.5 / settings.rate)
         self._clock = ClockOffset()
         self._last_received = 0.0  # s, monotonic
@@ -77,34 +77,16 @@ class RobotousRft(ForceTorqueSensor):
         self._command(START)
 
     def _command(self, code: int) -> None:
-        import can
-
-        frame = can.Message(
-            arbitration_id=self.settings.command_id, data=bytes([code]) + bytes(7),
-            is_extended_id=False,
-        )  # fmt: skip
         self._last_received = time.monotonic()
-        try:
-            self._bus.send(frame, timeout=0.1)
-        except (can.CanError, OSError) as error:
-            raise LinkError(f"{self.name}: cannot be written to: {first_line(error)}") from None
+        self._send(self.settings.command_id, bytes([code]) + bytes(7))
 
     def read(self, timeout: float) -> Reading | None:
         """Return the next sample; see ForceTorqueSensor.read."""
-        import can
-
-        if self._bus is None:
-            raise LinkError(f"{self.name}: found no connection, expected connect() first")
         until = time.monotonic() + timeout
         while (left := until - time.monotonic()) > 0.0:
-            try:
-                frame = self._bus.recv(left)
-            except (can.CanError, OSError, ValueError) as error:
-                raise LinkError(f"{self.name}: {first_line(error)}") from None
+            frame = self._receive(left)
             if frame is None:
                 break
-            if frame.is_error_frame or frame.is_remote_frame or frame.is_extended_id:
-                continue
             received = time.monotonic()
             stamp = frame.timestamp or received
             found = self._decoder.take(frame.arbitration_id, bytes(frame.data), stamp)
@@ -123,12 +105,7 @@ class RobotousRft(ForceTorqueSensor):
 
     def close(self) -> None:
         """Stop the stream and leave the bus."""
-        if self._bus is None:
-            return
-        try:
-            self._command(STOP)
-        except LinkError:
-            pass
-        finally:
-            close_bus(self._bus)
-            self._bus = None
+        if self._bus is not None:
+            with contextlib.suppress(Exception):
+                self._command(STOP)
+        super().close()

@@ -17,7 +17,7 @@ from gapbridge.drivers.modbus.map import RegisterMap, place_in
 from gapbridge.drivers.modbus.profile import ECHO_WORDS, addresses, turns_of, vectors
 from gapbridge.drivers.modbus.registers import BIT_TABLES, UNITS, Coding, words_in
 from gapbridge.drivers.modbus.schema import Condition, Mailbox, Place, ProfileFile, Vector
-from gapbridge.drivers.robot_modes import Trouble
+from gapbridge.drivers.robot_modes import StopReason
 
 Registers = Sequence[bytes]  # of each of RegisterMap.blocks, two bytes each, as on the wire
 Spot = tuple[int, int, Coding]  # a number's block and its first register there
@@ -30,7 +30,7 @@ class Sample(NamedTuple):
 
     vectors: dict[str, Array]  # by the profile's names, SI; echo (6,) m, rad: offset applied
     clock: float | None  # counts of the clock register
-    troubles: tuple[tuple[Trouble, str], ...]  # conditions that are not met
+    stop_reasons: tuple[tuple[StopReason, str], ...]  # conditions that are not met
     motion: tuple[tuple[str, str], ...]  # of the last target: ("busy" or "result", what it says)
     answer: tuple[int, int] | None  # the mailbox's: number of the offset applied, what it says
 
@@ -66,7 +66,7 @@ class Decoder:
         self._conditions = [(self._spot(c), c) for c in profile.status]
         self._looked = _getters(spot for spot, _ in self._conditions)
         self._last_bytes: list[Any] = []  # bytes of the conditions, last time
-        self._troubles: tuple[tuple[Trouble, str], ...] = ()
+        self._stop_reasons: tuple[tuple[StopReason, str], ...] = ()
         clock, write = profile.clock, profile.write
         self._motion: list[tuple[str, Spot, Condition]] = []
         if write.mode == "target_trigger":
@@ -125,7 +125,7 @@ class Decoder:
         return Sample(
             {field.name: self._vector(field, registers) for field in self._fields},
             clock,
-            self._troubles_of(registers),
+            self._stop_reasons_of(registers),
             tuple(
                 (name, _words(condition, count))
                 for name, spot, condition in self._motion
@@ -134,17 +134,17 @@ class Decoder:
             None if self._answer is None else _answer_of(registers, *self._answer),
         )
 
-    def _troubles_of(self, registers: Registers) -> tuple[tuple[Trouble, str], ...]:
+    def _stop_reasons_of(self, registers: Registers) -> tuple[tuple[StopReason, str], ...]:
         """Return the conditions that are not met; looked at anew where a register has changed."""
         found = [bytes_of(registers[block]) for block, bytes_of in self._looked]
         if found != self._last_bytes:
-            self._troubles = tuple(
+            self._stop_reasons = tuple(
                 (condition.otherwise, _words(condition, count))
                 for spot, condition in self._conditions
                 if not condition.fine(count := int(_number(registers, spot)))
             )
             self._last_bytes = found
-        return self._troubles
+        return self._stop_reasons
 
     def _check_lengths(self, registers: Registers) -> None:
         for (block, size), found in zip(self._sizes, registers, strict=True):

@@ -187,7 +187,7 @@ class ModbusDriver(Driver):
             force[:3] = found["force"]
         if "moment" in found:
             force[3:] = found["moment"]
-        modes = modes_of(trouble for trouble, _ in sample.troubles)
+        modes = modes_of(reason for reason, _ in sample.stop_reasons)
         return RobotState(
             timestamp, received, q, velocity, target, force,
             joint_temperatures=found.get("temperature"),
@@ -221,7 +221,7 @@ class ModbusDriver(Driver):
         if self.profile.write.mode != "read_only":
             if why_not_ready(state):
                 problem = (
-                    "; ".join(text for _, text in self._sample.troubles) if self._sample else ""
+                    "; ".join(text for _, text in self._sample.stop_reasons) if self._sample else ""
                 )
                 raise WriteError(f"{name}: the robot is not ready: {problem}")
             self._check_resolution(state.actual_q)

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
 from gapbridge.drivers.modbus.registers import BIT_TABLES, LAST_ADDRESS, UNITS, Table
@@ -17,8 +16,8 @@ from gapbridge.drivers.profile_file import (
     ProfileDocument,
     ProfileError,
     found_and_expected,
-    read_profile_document,
-    worst_of,
+    name_of,
+    read_profile_file,
 )
 
 Keys = tuple[str | int, ...]
@@ -51,18 +50,11 @@ def read_profile(path: Path, joints: int | None = None) -> ProfileFile:
     ``joints`` is the number that the arm has; None: any. Raises ProfileError, one line that names
     file, line and key, what was found and what was expected.
     """
-    document = read_profile_document(path)
-    try:
-        profile = ProfileFile.model_validate(document.data)
-    except ValidationError as error:
-        raise _refusal(document, error) from None
+    document, profile = read_profile_file(path, ProfileFile, _refusal)
     _check_vectors(document, profile)
     _check_places(document, profile)
     _check_overlap(document, profile)
-    if joints is not None and profile.joints != joints:
-        raise document.error(
-            ("joints",), f"found {profile.joints}, expected {joints}: the arm has those"
-        )
+    document.require_joints(profile.joints, joints)
     return profile
 
 
@@ -210,7 +202,7 @@ def _check_overlap(document: ProfileDocument, profile: ProfileFile) -> None:
             raise document.error(
                 keys,
                 f"found {high.table} registers {high.first} to {high.end - 1}, which overlap "
-                f"{_name(low.keys)} ({low.first} to {low.end - 1}, line "
+                f"{name_of(low.keys)} ({low.first} to {low.end - 1}, line "
                 f"{document.line(low.keys)}), expected registers of their own",
             )
 
@@ -225,13 +217,8 @@ def _may_share(one: Span, other: Span) -> bool:
     return same and bool(conditions or orders or echoed or watched)
 
 
-def _name(keys: Sequence[str | int]) -> str:
-    return ".".join(str(key + 1) if isinstance(key, int) else key for key in keys)
-
-
-def _refusal(document: ProfileDocument, error: ValidationError) -> ProfileError:
-    """Return one line out of what pydantic says; unknown keys come first."""
-    worst = worst_of(error)
+def _refusal(document: ProfileDocument, worst: ErrorDetails) -> ProfileError:
+    """Return one line out of what pydantic says."""
     modes = ("mailbox", "target_trigger", "read_only")
     keys = tuple(k for i, k in enumerate(worst["loc"]) if not (i == 1 and k in modes))
     if worst["type"] == "extra_forbidden":

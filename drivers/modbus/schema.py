@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from gapbridge.drivers.modbus.registers import LAST_ADDRESS, Coding, Table, TypeName, WordOrder
-from gapbridge.drivers.robot_modes import Trouble
+from gapbridge.drivers.robot_modes import StopReason
 from gapbridge.drivers.section import Number, Positive, Section
 
 Address = Annotated[int, Field(ge=0, le=LAST_ADDRESS, strict=True)]
@@ -76,7 +76,7 @@ class Condition(Place):
     name: str = Field(min_length=1, description="what messages call it")
     good: list[int] = Field(min_length=1, description="counts that are fine")
     mask: int | None = Field(default=None, ge=1, description="bits that count")
-    otherwise: Trouble = "not_ready"
+    otherwise: StopReason = "not_ready"
 
     def fine(self, count: int) -> bool:
         """Return whether the register says what it must."""

@@ -7,20 +7,22 @@ follow a setpoint, the sequence number that comes back.
 
 from __future__ import annotations
 
+import contextlib
 import math
+import os
+import socket
 from collections import deque
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 
-from gapbridge.core.errors import WriteError
+from gapbridge.core.errors import WriteError, first_line
 from gapbridge.core.state import RobotState, Setpoint
 from gapbridge.drivers.clock import SYSTEM, Clock
 from gapbridge.drivers.robot_modes import PLAYING, why_not_ready
 from gapbridge.drivers.ur_rtde import registers
-from gapbridge.drivers.ur_rtde.allowed import AllowedControl, AllowedInputs
-from gapbridge.drivers.ur_rtde.no_delay import send_at_once
 from gapbridge.drivers.ur_rtde.registers import Program
 from gapbridge.drivers.ur_rtde.settings import UrRtdeSettings
 
@@ -29,6 +31,23 @@ KICK = 0.02  # s between kicks of the watchdog
 FOLLOWING = 0.02  # rad: how near the controller's target must come to a setpoint
 LOOKS, ANNOUNCED = 8, 0.3  # samples in which a first offset comes back; s until it is given up
 DECIMATION, KEPT = 5, 64  # setpoints between two remembered ones; how many are remembered
+DESCRIPTORS = Path("/proc/self/fd")  # the open sockets of this process
+CONTROL = (
+    "setWatchdog", "kickWatchdog", "servoJ", "servoStop", "stopScript", "reuploadScript",
+    "isConnected", "isProgramRunning",
+)  # fmt: skip
+DOUBLES = frozenset(registers.OFFSET_DOUBLES)
+INTEGERS = frozenset(
+    (
+        registers.OFFSET_RZ,
+        registers.SEQUENCE,
+        registers.CHECKSUM,
+        registers.HEARTBEAT,
+        registers.RATES,
+    )
+)
+"""Calls and registers that may be used. The library's control script can run any motion and set any
+output, and RTDE inputs are anybody's: whatever these lists lack raises before the socket."""
 
 
 class Writer(Protocol):
@@ -110,8 +129,7 @@ class ServoWriter:
             send_at_once()
             return AllowedControl(settings.host, library)
         except Exception as error:
-            message = str(error).strip().splitlines() or [type(error).__name__]
-            raise WriteError(f"{settings.host}: {message[0].strip()}") from None
+            raise WriteError(f"{settings.host}: {first_line(error)}") from None
 
     def _wait_running(self) -> None:
         """Wait until an uploaded script runs: the library returns before it does."""
@@ -267,8 +285,7 @@ class OffsetWriter:
             io = AllowedInputs(host, RTDEIOInterface(host))
             send_at_once()
         except Exception as error:
-            message = str(error).strip().splitlines() or [type(error).__name__]
-            raise WriteError(f"{host}: {message[0].strip()}") from None
+            raise WriteError(f"{host}: {first_line(error)}") from None
         return io
 
     def _wait_bare(self, look: Callable[[], None]) -> None:
@@ -362,3 +379,65 @@ class OffsetWriter:
         if self._io is not None:
             _ABANDONED.append(self._io)
             self._io = None
+
+
+class AllowedControl:
+    """The library's control interface with the calls of CONTROL and no others."""
+
+    def __init__(self, host: str, library: Any) -> None:
+        self._host, self._library = host, library  # kept: its end is not safe
+        for name in CONTROL:
+            setattr(self, name, getattr(library, name))
+
+    def __getattr__(self, name: str) -> Any:
+        """Refuse every other call. Raises WriteError."""
+        raise WriteError(f"{self._host}: {name}: is not among the calls that may be made")
+
+
+class AllowedInputs:
+    """The library's inputs with the registers of the offset and no others."""
+
+    def __init__(self, host: str, library: Any) -> None:
+        self._host, self._library = host, library
+        self._double: Callable[[int, float], bool] = library.setInputDoubleRegister
+        self._integer: Callable[[int, int], bool] = library.setInputIntRegister
+
+    def setInputDoubleRegister(self, register: int, value: float) -> bool:
+        """Write a double register. Raises WriteError for one that is not allowed."""
+        if register not in DOUBLES:
+            self._refuse("input_double_register", register)
+        return self._double(register, value)
+
+    def setInputIntRegister(self, register: int, value: int) -> bool:
+        """Write an integer register. Raises WriteError for one that is not allowed."""
+        if register not in INTEGERS:
+            self._refuse("input_int_register", register)
+        return self._integer(register, value)
+
+    def _refuse(self, kind: str, register: int) -> None:
+        raise WriteError(f"{self._host}: {kind}_{register}: is not among the registers written")
+
+
+def send_at_once() -> int:
+    """Have every TCP connection of this process send at once; returns how many there are.
+
+    The library leaves Nagle's algorithm on, under which a setpoint waits up to 40 ms until the one
+    before is acknowledged, and gives no access to its sockets; the system does. Does nothing where
+    the system does not list descriptors.
+    """
+    if not DESCRIPTORS.is_dir():
+        return 0
+    return sum(_send_at_once(int(name)) for name in os.listdir(DESCRIPTORS))
+
+
+def _send_at_once(descriptor: int) -> bool:
+    with contextlib.suppress(OSError):
+        if not os.readlink(DESCRIPTORS / str(descriptor)).startswith("socket:"):
+            return False
+        with socket.socket(fileno=os.dup(descriptor)) as end:  # a copy of the descriptor only
+            if end.family not in (socket.AF_INET, socket.AF_INET6):
+                return False
+            end.getpeername()  # raises for one that only listens
+            end.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            return True
+    return False

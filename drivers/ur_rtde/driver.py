@@ -17,8 +17,7 @@ from gapbridge.drivers.controller_facts import TCP_TURNED, ControllerFacts, Diff
 from gapbridge.drivers.driver import Driver
 from gapbridge.drivers.offset_inverse import Nominal
 from gapbridge.drivers.ur_rtde.command import OffsetWriter, ServoWriter, Writer
-from gapbridge.drivers.ur_rtde.enquiry import enquire
-from gapbridge.drivers.ur_rtde.round_trip import round_trip
+from gapbridge.drivers.ur_rtde.enquiry import enquire, round_trip
 from gapbridge.drivers.ur_rtde.settings import UrRtdeSettings
 from gapbridge.drivers.ur_rtde.state import StateReader
 

@@ -4,6 +4,9 @@ Reads only: no input is claimed, no program touched. Sources: Universal Robots, 
 30004), and the client interfaces' description of the primary interface (port 30001): packages of
 int32 size and int8 type, robot states (16) of sub-packages, kinematics info (5) with the factory
 calibration, configuration data (6) with joint limits and nominal DH rows; big-endian.
+
+RTDE's samples come by themselves, so that nothing in them says how long they were under way:
+``round_trip`` measures it on a connection of its own.
 """
 
 from __future__ import annotations
@@ -19,7 +22,7 @@ import numpy as np
 
 from gapbridge.core.arm import builtin_arm, builtin_names, builtin_rows
 from gapbridge.core.arrays import Array
-from gapbridge.core.errors import LinkError
+from gapbridge.core.errors import LinkError, WriteError
 from gapbridge.core.rotation import rotation_matrix, transform
 from gapbridge.drivers.controller_facts import ControllerFacts
 
@@ -27,8 +30,11 @@ RTDE, PRIMARY = 30004, 30001
 N = 6
 SAME = 1e-3  # m, rad: nominal DH rows of one model
 TIMEOUT = 2.0  # s for each of the two
+LONGEST = 1.0  # s that the answer of a round trip may take
+TRIES = 5  # the median counts: neither a busy moment of this process nor one lucky answer does
 STATE, KINEMATICS, CONFIGURATION = 16, 5, 6  # types of a package and its sub-packages
 LARGEST = 1 << 20  # bytes of a package
+_VERSION = struct.pack(">H", 2)  # of the protocol
 _FIELDS = {
     "tcp_offset": 6, "payload": 1, "payload_cog": 3, "target_gravity": 3, "actual_q": 6,
 }  # fmt: skip
@@ -43,19 +49,19 @@ class PrimaryFacts:
     limits: Array | None = None  # (6, 3): lower, upper (rad), velocity (rad/s)
 
 
-def enquire(host: str, rtde_port: int = RTDE, primary_port: int = PRIMARY) -> ControllerFacts:
+def enquire(host: str) -> ControllerFacts:
     """Return what a UR controller says of itself.
 
     Where its primary interface cannot be read, model, calibration and limits stay None. Raises
     LinkError where RTDE cannot.
     """
     try:
-        version, fields = _rtde(host, rtde_port)
+        version, fields = _rtde(host)
     except (OSError, EOFError, struct.error) as error:
         message = getattr(error, "strerror", None) or str(error) or type(error).__name__
-        raise LinkError(f"{host}: found no answer on RTDE's port {rtde_port}: {message}") from None
+        raise LinkError(f"{host}: found no answer on RTDE's port {RTDE}: {message}") from None
     try:
-        primary = read_primary(host, primary_port)
+        primary = read_primary(host)
     except (OSError, EOFError, struct.error):
         primary = PrimaryFacts()
     model = None if primary.nominal is None else model_of(primary.nominal)
@@ -84,15 +90,37 @@ def enquire(host: str, rtde_port: int = RTDE, primary_port: int = PRIMARY) -> Co
     )
 
 
-def require_listening(host: str, port: int = RTDE) -> None:
+def require_listening(host: str) -> None:
     """Raise LinkError where nobody listens: ur_rtde would print lines of its own."""
     try:
-        socket.create_connection((host, port), TIMEOUT).close()
+        socket.create_connection((host, RTDE), TIMEOUT).close()
     except OSError:
         raise LinkError(
-            f"could not connect to {host}, port {port}: is this the controller's address, and "
+            f"could not connect to {host}, port {RTDE}: is this the controller's address, and "
             "does it run?"
         ) from None
+
+
+def round_trip(host: str) -> float:
+    """Return the median time of some questions and their answers, s: what bounds a sample's age.
+
+    Raises WriteError where none comes.
+    """
+    question = struct.pack(">HB", 3 + len(_VERSION), ord("V")) + _VERSION
+    times = []
+    try:
+        with socket.create_connection((host, RTDE), LONGEST) as link:
+            link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            with link.makefile("rb") as answers:
+                for _ in range(TRIES):
+                    begun = time.monotonic()
+                    link.sendall(question)
+                    _answer(answers, "V")
+                    times.append(time.monotonic() - begun)
+    except (OSError, EOFError) as error:
+        message = getattr(error, "strerror", None) or str(error)
+        raise WriteError(f"{host}: found no answer on RTDE's port {RTDE}: {message}") from None
+    return sorted(times)[TRIES // 2]
 
 
 def nominal_rows(model: str) -> Array:
@@ -113,15 +141,15 @@ def model_of(nominal: Array) -> str | None:
 # -- RTDE ---------------------------------------------------------------------------------------
 
 
-def _rtde(host: str, port: int) -> tuple[tuple[int, ...], dict[str, Array]]:
+def _rtde(host: str) -> tuple[tuple[int, ...], dict[str, Array]]:
     """Return the controller's version and one sample of the fields that it has."""
-    with socket.create_connection((host, port), TIMEOUT) as link, link.makefile("rb") as answers:
+    with socket.create_connection((host, RTDE), TIMEOUT) as link, link.makefile("rb") as answers:
 
         def ask(kind: str, payload: bytes = b"") -> bytes:
             link.sendall(struct.pack(">HB", 3 + len(payload), ord(kind)) + payload)
             return _answer(answers, kind)
 
-        ask("V", struct.pack(">H", 2))
+        ask("V", _VERSION)
         version = struct.unpack(">4I", ask("v")[:16])
         names = list(_FIELDS)
         for _ in range(2):
@@ -161,13 +189,13 @@ def _exactly(stream: Any, count: int) -> bytes:
 # -- the primary interface ----------------------------------------------------------------------
 
 
-def read_primary(host: str, port: int = PRIMARY) -> PrimaryFacts:
+def read_primary(host: str) -> PrimaryFacts:
     """Return geometry and limits from the primary interface.
 
     Raises OSError, EOFError where it cannot be read, struct.error where it is another thing.
     """
     until, found = time.monotonic() + TIMEOUT, PrimaryFacts()
-    with socket.create_connection((host, port), TIMEOUT) as link, link.makefile("rb") as stream:
+    with socket.create_connection((host, PRIMARY), TIMEOUT) as link, link.makefile("rb") as stream:
         while time.monotonic() < until:
             size, kind = struct.unpack(">ib", _exactly(stream, 5))
             if not 5 <= size <= LARGEST:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from gapbridge.core.arrays import Array
-from gapbridge.core.errors import InvalidStateError, LinkError, StaleStateError
+from gapbridge.core.errors import InvalidStateError, LinkError, StaleStateError, first_line
 from gapbridge.core.state import RobotState
 from gapbridge.drivers.clock import SYSTEM, Clock
 from gapbridge.drivers.ur_rtde.registers import APPLIED, ECHO, PROGRAM
@@ -88,7 +88,7 @@ class StateReader:
                         "controller's address, and does it run?"
                     ) from None
                 if not optional:
-                    raise LinkError(f"{settings.host}: {_first_line(error)}") from None
+                    raise LinkError(f"{settings.host}: {first_line(error)}") from None
                 names = [name for name in names if name not in optional]
         self._lay_out(names)
         if not self._receive.isConnected() or not self._receive.getTimestamp():
@@ -217,8 +217,3 @@ class StateReader:
 
 def _is_optional(name: str) -> bool:
     return name == POSE or (name in _VECTORS and _VECTORS[name][2])
-
-
-def _first_line(error: Exception) -> str:
-    lines = str(error).strip().splitlines()
-    return lines[0].strip() if lines else type(error).__name__

@@ -22,7 +22,7 @@ from gapbridge.bridge.daemon import daemon as daemon_module
 from gapbridge.bridge.daemon.control import Control
 from gapbridge.bridge.daemon.processes import LoopProcess
 from gapbridge.bridge.daemon.status import DaemonStatus
-from gapbridge.bridge.ipc.command_page import Command, Commands
+from gapbridge.bridge.ipc.command_memory import Command, Commands
 from gapbridge.bridge.loop import checks
 from gapbridge.bridge.loop.link_monitor import ControllerClock, LinkMonitor
 from gapbridge.bridge.loop.loop import Loop

@@ -9,16 +9,18 @@ from pathlib import Path
 
 from side_attacker import attack
 
-from gapbridge.bridge.setpoint_source.modbus_page import PlcPage
+from gapbridge.bridge.setpoint_source.plc_memory import PlcMemory
 
 
 def main() -> None:
     order = json.loads(sys.stdin.readline())
-    page = PlcPage(order["n"], tuple(order["pages"]))  # seals what is the server's own to write
+    memory = PlcMemory(
+        order["n"], tuple(order["memory"])
+    )  # seals what is the server's own to write
     Path(os.environ["ATTACK_FOUND"]).write_text(json.dumps(attack(os.getppid())))
     print(json.dumps({"port": 1}), flush=True)
     sys.stdin.read()
-    page.close()
+    memory.close()
 
 
 if __name__ == "__main__":

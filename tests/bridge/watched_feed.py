@@ -1,4 +1,4 @@
-"""A daemon's half without a robot: a shared page that fills, events, and a side process on it."""
+"""A daemon's half without a robot: shared memory that fills, events, and a side process on it."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class Feed:
         self.folder = folder
         scheme = "https" if keys.get("certificate") else "http"
         self.url = f"{scheme}://127.0.0.1:{self.port}/"
-        self.page = SharedMemory(N)
+        self.memory = SharedMemory(N)
         self.state = State.OBSERVING
         self.restarts = 0
         self.counts: dict[str, int] = {"late": 1, "stale": 2, "overrun": 0}
@@ -70,9 +70,9 @@ class Feed:
             "settings": self.settings.model_dump(mode="json"), "n": N, "session": self.session,
             "extra": {"text": CELL},
         }  # fmt: skip
-        self.side = SideProcess(f"bridge.{self.section}.main", order, self.page, self.log)
-        self.page.enter(Phase.RUNNING)
-        self.page.note_state(self.state)
+        self.side = SideProcess(f"bridge.{self.section}.main", order, self.memory, self.log)
+        self.memory.enter(Phase.RUNNING)
+        self.memory.note_state(self.state)
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
         return self
@@ -82,7 +82,7 @@ class Feed:
         self._thread.join()
         assert self.side is not None
         self.side.close()
-        self.page.close()
+        self.memory.close()
         self.log.close()
 
     def wait(self, path: str = "", limit: float = 60.0, **keys: Any) -> httpx.Response:
@@ -112,7 +112,7 @@ class Feed:
     def change(self, to: State, cause: str, detail: str = "") -> None:
         """Go into a state as the loop does."""
         before, self.state = self.state, to
-        self.page.note_state(to)
+        self.memory.note_state(to)
         self.emit(kind="transition", **{"from": before.name, "to": to.name}, cause=cause,
                   detail=detail)  # fmt: skip
 
@@ -131,8 +131,8 @@ class Feed:
             "state": self.state.name.lower(), "since": time.time(), "why": "connected",
             "armed_by": "operator", "latched": "", "loop": {"pid": 4243, "restarts": self.restarts},
             "link": {
-                "age": 0.004, "rate_hz": RATE, "cycles": self.page.written, "missed": 3, "late": 1,
-                "written": 0, "dropped": {"stale": 2, "not finite": 1},
+                "age": 0.004, "rate_hz": RATE, "cycles": self.memory.written, "missed": 3,
+                "late": 1, "written": 0, "dropped": {"stale": 2, "not finite": 1},
             },
             "sides": {
                 "recorder": {"pid": 4244, "restarts": 0}, "web": {"pid": 4245, "restarts": 0},
@@ -159,7 +159,7 @@ class Feed:
 
     def row(self, number: int, t: float, rng: np.random.Generator) -> None:
         """Write one cycle: an arm that swings, and an offset that goes with it."""
-        s, row = self.page.slices, self.page.next_row()
+        s, row = self.memory.slices, self.memory.next_row()
         writing = self.state in (State.COMPENSATING, State.HOLDING)
         q = HOME + 0.35 * np.sin(0.5 * t + np.arange(N))
         row[1:] = 0.0
@@ -183,8 +183,8 @@ class Feed:
         row[s["received"]] = time.monotonic() - 2e-4
         row[s["rate"]] = RATE
         row[s["robot_mode"]], row[s["safety_mode"]] = 7, 1
-        self.page.beat()
-        self.page.publish()
+        self.memory.beat()
+        self.memory.publish()
 
     def wrench(self, q: Array, pull: Array) -> Array:
         """Return what a flange sensor reads that carries 0.4 kg more than is declared."""

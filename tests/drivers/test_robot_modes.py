@@ -18,14 +18,14 @@ from gapbridge.drivers.ur_rtde.command import check_ready
 ARM = builtin_arm("ur10e")
 
 
-@pytest.mark.parametrize("trouble", ["", "protective_stop", "emergency_stop"])
-def test_every_driver_reports_a_stop_as_a_ur_controller_does(trouble: str) -> None:
-    modes = modes_of([trouble])
-    assert modes == MODES[trouble]
+@pytest.mark.parametrize("stop_reason", ["", "protective_stop", "emergency_stop"])
+def test_every_driver_reports_a_stop_as_a_ur_controller_does(stop_reason: str) -> None:
+    modes = modes_of([stop_reason])
+    assert modes == MODES[stop_reason]
     assert modes.safety_status_bits == SAFETY_BITS[modes.safety_mode]
 
 
-def test_of_several_troubles_the_gravest_counts_and_no_bit_is_lost() -> None:
+def test_of_several_stops_the_gravest_counts_and_no_bit_is_lost() -> None:
     both = modes_of(["not_ready", "protective_stop", "fault"])
     assert (both.robot_mode, both.safety_mode) == (5, 9)
     assert both.safety_status_bits == 1 << 2 | 1 << 9 | 1 << 10

@@ -154,7 +154,7 @@ def _limit_disk(size: int) -> Any:
     """Return an injection: the system refuses what the recorder writes beyond ``size`` bytes."""
 
     def inject(rig: Rig) -> None:
-        pid = rig.run.daemon.sides.status()["recorder"]["pid"]
+        pid = rig.run.daemon.side_processes.status()["recorder"]["pid"]
         assert pid is not None
         resource.prlimit(pid, resource.RLIMIT_FSIZE, (size, resource.RLIM_INFINITY))
 

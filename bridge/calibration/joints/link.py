@@ -22,7 +22,7 @@ from gapbridge.bridge.cell.daemon_settings import DaemonSettings
 from gapbridge.bridge.cell.sections import SetpointSettings
 from gapbridge.bridge.cell.settings.recording import RecordingSettings
 from gapbridge.bridge.daemon.daemon import Daemon, settings_of
-from gapbridge.bridge.ipc.shared_memory import PageReader, Phase
+from gapbridge.bridge.ipc.shared_memory import CycleReader, Phase
 from gapbridge.bridge.loop.supervisor import State
 from gapbridge.bridge.setpoint_source.quintic import quintic, quintic_time, write_trajectory
 from gapbridge.core.arrays import Array
@@ -136,7 +136,7 @@ class LinkedJoints(JointSource):
                 raise RunError(f"the move broke off: {why}")
             now = self.now()
             there = now is not None and np.abs(now - pose.q).max() < NEAR / 10
-            if begun and there and run.daemon.page.ended and self._rests():
+            if begun and there and run.daemon.memory.ended and self._rests():
                 break
             if time.monotonic() > until:
                 run.end()
@@ -234,11 +234,11 @@ class WatchedRun:
 
     def __init__(self, settings: DaemonSettings, write: bool) -> None:
         self.daemon = Daemon(settings, may_write=write, say=self._say)
-        self.slices = self.daemon.page.slices
-        self.rows = np.empty((0, self.daemon.page.width))
-        self.approach = np.zeros(self.daemon.page.n)
+        self.slices = self.daemon.memory.slices
+        self.rows = np.empty((0, self.daemon.memory.width))
+        self.approach = np.zeros(self.daemon.memory.n)
         self._turned_at: Array | None = None
-        self._reader: PageReader | None = self.daemon.page.reader()
+        self._reader: CycleReader | None = self.daemon.memory.reader()
         self._messages: list[str] = []
         self._error: BaseException | None = None
         self._thread = threading.Thread(target=self._main, args=(write,), daemon=True)
@@ -277,7 +277,7 @@ class WatchedRun:
             return
         try:
             new = self._reader.drain()
-        except (IndexError, ValueError):  # the page was closed meanwhile
+        except (IndexError, ValueError):  # the memory was closed meanwhile
             return
         if not len(new):
             return

@@ -89,7 +89,7 @@ class MappedNodes(CanNodes):
             scale = profile.joints.scale[reading.quantity][reading.joint]
             values[reading.signal] = reported[reading.quantity][reading.joint] / scale
         for check in incoming.checks:
-            bad = [v for v, trouble in check.values.items() if trouble == "emergency_stop"]
+            bad = [v for v, reason in check.values.items() if reason == "emergency_stop"]
             values[check.signal] = (bad or [1])[0] if not controller.can_move else min(check.normal)
         for signal in incoming.enabled:
             yes = min(profile.enabled_values)

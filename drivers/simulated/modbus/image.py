@@ -8,7 +8,7 @@ from gapbridge.drivers.modbus.encode import vector_registers
 from gapbridge.drivers.modbus.profile import addresses, spans, turns_of
 from gapbridge.drivers.modbus.registers import BIT_TABLES, UNITS, Table
 from gapbridge.drivers.modbus.schema import Clock, Condition, Place, ProfileFile, Vector
-from gapbridge.drivers.robot_modes import Trouble
+from gapbridge.drivers.robot_modes import StopReason
 from gapbridge.drivers.simulated.server.arm_controller import ArmController
 
 Image = dict[Table, dict[int, int]]
@@ -54,9 +54,9 @@ def _cut(entry: Vector, numbers: Sequence[float]) -> list[float]:
 
 
 def condition_registers(
-    conditions: Iterable[Condition], active: frozenset[Trouble]
+    conditions: Iterable[Condition], active: frozenset[StopReason]
 ) -> list[tuple[Table, int, int]]:
-    """Return table, address and register of conditions: fine, unless their trouble is active."""
+    """Return table, address and register of conditions: fine, unless their stop is active."""
     found: dict[tuple[Table, int], int] = {}
     for condition in conditions:
         spot = (condition.table, condition.address)

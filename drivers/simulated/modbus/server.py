@@ -24,7 +24,7 @@ from gapbridge.drivers.modbus.profile import read_profile
 from gapbridge.drivers.modbus.registers import BIT_TABLES, Table
 from gapbridge.drivers.modbus.schema import ProfileFile
 from gapbridge.drivers.modbus.settings import ModbusSettings
-from gapbridge.drivers.robot_modes import Trouble
+from gapbridge.drivers.robot_modes import StopReason
 from gapbridge.drivers.simulated.modbus import image
 from gapbridge.drivers.simulated.modbus.image import Image
 from gapbridge.drivers.simulated.modbus.programs import MailboxProgram, make_program
@@ -204,7 +204,7 @@ class ModbusServer(ProtocolServer):
         for table, registers in image.state_registers(profile, values).items():
             new[table].update(registers)
         found = image.condition_registers(
-            [*profile.identity, *profile.status], _troubles(controller)
+            [*profile.identity, *profile.status], _stop_reasons(controller)
         )
         found += image.clock_registers(profile, controller.clock)
         found += self.program.registers(controller)
@@ -236,8 +236,8 @@ class ModbusServer(ProtocolServer):
         }  # fmt: skip
 
 
-def _troubles(controller: ArmController) -> frozenset[Trouble]:
-    found: set[Trouble] = set()
+def _stop_reasons(controller: ArmController) -> frozenset[StopReason]:
+    found: set[StopReason] = set()
     if controller.protective:
         found |= {"protective_stop", "fault"}
     if controller.emergency:

@@ -14,7 +14,7 @@ import pytest
 from daemon_cell import Robot, Run, gapbridge, wait_for
 from link_settings import link_settings
 
-from gapbridge.bridge.daemon.host import OwnerLock
+from gapbridge.bridge.daemon.owner_lock import OwnerLock
 from gapbridge.bridge.ipc.control_client import ask
 from gapbridge.bridge.loop.supervisor import State
 from gapbridge.core.errors import InputError
@@ -27,7 +27,7 @@ CELL = Path("cell.yaml")
 HOLD = """
 import sys, time
 from pathlib import Path
-from gapbridge.bridge.daemon.host import OwnerLock
+from gapbridge.bridge.daemon.owner_lock import OwnerLock
 OwnerLock("host 192.0.2.7", Path("first.yaml")).acquire()
 print("held", flush=True)
 time.sleep(1000)

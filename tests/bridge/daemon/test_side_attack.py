@@ -12,11 +12,11 @@ import pytest
 from daemon_cell import Robot, Run, wait_for
 from ports import free_port
 
-from gapbridge.bridge.daemon import sides as daemon_sides
+from gapbridge.bridge.daemon import side_processes
 from gapbridge.bridge.ipc.control_client import ask
 from gapbridge.bridge.loop.supervisor import State
 
-SIDES = tuple(daemon_sides.SIDES)
+SIDES = tuple(side_processes.SIDE_PROCESSES)
 
 
 def armings(events: list[dict[str, Any]]) -> list[int]:
@@ -29,8 +29,8 @@ def test_a_side_process_cannot_arm(
 ) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     monkeypatch.delenv("RUNTIME_DIRECTORY", raising=False)
-    _, wanted = daemon_sides.SIDES[side]
-    monkeypatch.setitem(daemon_sides.SIDES, side, ("side_attacker", wanted))
+    _, wanted = side_processes.SIDE_PROCESSES[side]
+    monkeypatch.setitem(side_processes.SIDE_PROCESSES, side, ("side_attacker", wanted))
     with Robot(tmp_path) as robot:
         cell = robot.cell(
             ", state_timeout: 0.25", web=f"{{port: {free_port()}}}",
@@ -89,7 +89,7 @@ def test_the_memory_of_a_running_daemon_is_sealed(tmp_path: Path) -> None:
     """Also from within the daemon itself: it can only read what its loop writes."""
     with Robot(tmp_path) as robot, Run(robot.cell()) as run:
         run.wait(State.OBSERVING)
-        for fd in (run.daemon.page.fd, run.daemon.page.open_for_reading()):
+        for fd in (run.daemon.memory.fd, run.daemon.memory.open_for_reading()):
             again = os.open(f"/proc/self/fd/{fd}", os.O_RDWR)
             with pytest.raises(PermissionError):
                 mmap.mmap(again, 4096)

@@ -133,7 +133,7 @@ def rides_on_a_program(seed: int = 3) -> Iterator[tuple[SimulatedRun, World]]:
         finally:
             world.end()
             run.daemon._commands.close()
-            run.daemon.page.close()
+            run.daemon.memory.close()
 
 
 def until(world: World, over: Callable[[], bool], limit: float = 30.0) -> None:

@@ -25,7 +25,7 @@ ECHO = """
     from gapbridge.bridge.ipc.side_main import take_order
 
     order = take_order()
-    reader = order.page.reader()
+    reader = order.memory.reader()
     order.emit({"kind": "hello", "session": order.session, "extra": order.extra,
                 "cell": str(order.settings.cell), "n": order.n})
     while not order.events.closed:
@@ -58,7 +58,7 @@ def wait_for(what: Callable[[], Any], limit: float = 20.0) -> Any:
 
 
 @pytest.fixture
-def page() -> Iterator[SharedMemory]:
+def memory() -> Iterator[SharedMemory]:
     found = SharedMemory(2)
     yield found
     found.close()
@@ -75,14 +75,14 @@ def order(tmp_path: Path) -> dict[str, Any]:
 
 @pytest.fixture
 def start(
-    page: SharedMemory, order: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    memory: SharedMemory, order: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> Iterator[Callable[[str], SideProcess]]:
     monkeypatch.syspath_prepend(str(tmp_path))
     started: list[SideProcess] = []
 
     def begin(text: str) -> SideProcess:
         (tmp_path / "side_under_test.py").write_text(textwrap.dedent(text), encoding="utf-8")
-        started.append(SideProcess("side_under_test", order, page, sys.stderr))
+        started.append(SideProcess("side_under_test", order, memory, sys.stderr))
         return started[-1]
 
     yield begin
@@ -102,15 +102,15 @@ def hear(side: SideProcess, kind: str) -> dict[str, Any]:
 
 
 def test_it_gets_its_order_the_cycles_and_the_events_and_answers(
-    start: Callable[[str], SideProcess], page: SharedMemory, tmp_path: Path
+    start: Callable[[str], SideProcess], memory: SharedMemory, tmp_path: Path
 ) -> None:
     side = start(ECHO)
     hello = hear(side, "hello")
     assert (hello["session"], hello["n"]) == ("run-1", 2)
     assert hello["cell"] == str(tmp_path / "cell.yaml")
     assert abs(hello["time"] - time.time()) < 60
-    page.next_row()[1:] = 5.0
-    page.publish()
+    memory.next_row()[1:] = 5.0
+    memory.publish()
     assert hear(side, "rows")["timestamps"] == [5.0]
     side.emit({"kind": "transition", "to": "armed"})
     assert hear(side, "heard")["of"] == {"kind": "transition", "to": "armed"}

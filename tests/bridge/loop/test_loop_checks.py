@@ -151,66 +151,68 @@ def test_an_offset_at_its_limit_for_a_second_is_saturated_and_a_ramp_is_not() ->
 class Bench:
     """Checks with a supervisor in a state, and what they have reported."""
 
-    def __init__(self, page: SharedMemory, at: State) -> None:
+    def __init__(self, memory: SharedMemory, at: State) -> None:
         self.events: list[dict[str, Any]] = []
-        self.page = page
+        self.memory = memory
         self.supervisor = Supervisor(lambda *change: self.changes.append(change))
         self.changes: list[Any] = []
         self.supervisor.state = at
-        self.checks = LoopChecks(500.0, self.supervisor, Reports(page, self.events.append))
+        self.checks = LoopChecks(500.0, self.supervisor, Reports(memory, self.events.append))
 
 
 @pytest.fixture
-def page() -> Iterator[SharedMemory]:
+def memory() -> Iterator[SharedMemory]:
     found = SharedMemory(6)
     yield found
     found.close()
 
 
-def test_a_stop_of_the_robot_is_a_fault_counted_and_reported_once(page: SharedMemory) -> None:
-    bench = Bench(page, State.COMPENSATING)
+def test_a_stop_of_the_robot_is_a_fault_counted_and_reported_once(memory: SharedMemory) -> None:
+    bench = Bench(memory, State.COMPENSATING)
     bench.checks.begin(state(1.0), 0)
     for k in range(100):
         bench.checks.begin(state(1.0 + T * (k + 1), safety_mode=3), 0)
     assert bench.supervisor.state == State.FAULT
     assert len(bench.changes) == 1
     assert bench.events == []
-    assert page.counts()["unsafe"] == 1
+    assert memory.counts()["unsafe"] == 1
     assert "safety_mode 3" in bench.checks.not_ready
     bench.checks.begin(state(2.0), 0)
     assert not bench.checks.not_ready
 
 
-def test_a_gap_of_more_than_ten_cycles_and_the_hold_time_begins_anew(page: SharedMemory) -> None:
-    bench = Bench(page, State.COMPENSATING)
+def test_a_gap_of_more_than_ten_cycles_and_the_hold_time_begins_anew(memory: SharedMemory) -> None:
+    bench = Bench(memory, State.COMPENSATING)
     assert bench.checks.begin(state(1.0), 0) == 0
     assert bench.checks.begin(state(1.03), 14) == LATE
     assert bench.supervisor.state == State.COMPENSATING
     assert bench.checks.begin(state(1.10), 34) == LATE | RESYNC
     assert bench.supervisor.state == State.HOLDING
     assert bench.checks.begin(state(1.102), 0) == 0
-    assert page.counts()["resync"] == 1
-    assert page.counts()["late"] == 48
+    assert memory.counts()["resync"] == 1
+    assert memory.counts()["late"] == 48
 
 
-def test_a_lost_sensor_is_flagged_in_every_cycle_and_reported_twice(page: SharedMemory) -> None:
-    bench = Bench(page, State.COMPENSATING)
+def test_a_lost_sensor_is_flagged_in_every_cycle_and_reported_twice(memory: SharedMemory) -> None:
+    bench = Bench(memory, State.COMPENSATING)
     for k in range(10):
         sample = state(1.0 + k * T, sensor_lost="silent" if 3 <= k < 7 else "")
         flags = (DEGRADED if 3 <= k < 7 else 0) | (LATE if k == 5 else 0)
         assert bench.checks.begin(sample, k == 5) == flags
     assert [event["detail"] for event in bench.events] == ["silent", "the sensor is back"]
     assert bench.supervisor.state == State.COMPENSATING
-    assert page.counts()["sensor_lost"] == 1
+    assert memory.counts()["sensor_lost"] == 1
 
 
-def test_while_only_observing_a_finding_is_reported_and_changes_nothing(page: SharedMemory) -> None:
-    bench = Bench(page, State.OBSERVING)
+def test_while_only_observing_a_finding_is_reported_and_changes_nothing(
+    memory: SharedMemory,
+) -> None:
+    bench = Bench(memory, State.OBSERVING)
     for k in range(2000):
         bench.checks.end(state(k * T), Q + 1e-5 * k, 0, 1e-4)
     assert bench.supervisor.state == State.OBSERVING
     assert [event["what"] for event in bench.events] == ["frozen"]
-    assert page.counts()["frozen"] == 1
+    assert memory.counts()["frozen"] == 1
 
 
 class Scripted(Driver):
@@ -234,7 +236,7 @@ class Scripted(Driver):
 
 
 def watched(
-    page: SharedMemory, now: list[float] | None = None
+    memory: SharedMemory, now: list[float] | None = None
 ) -> tuple[Scripted, Supervisor, LinkMonitor, list[dict[str, Any]]]:
     """``now``: the time, s, where it is not the system's."""
     events: list[dict[str, Any]] = []
@@ -243,12 +245,12 @@ def watched(
         clock.monotonic = lambda: now[0]
     driver, supervisor = Scripted(clock), Supervisor(lambda *_: None)
     supervisor.state = State.COMPENSATING
-    watch = LinkMonitor(driver, supervisor, Reports(page, events.append))
+    watch = LinkMonitor(driver, supervisor, Reports(memory, events.append))
     return driver, supervisor, watch, events
 
 
-def test_two_bad_samples_are_dropped_and_three_in_a_row_hold(page: SharedMemory) -> None:
-    driver, supervisor, watch, events = watched(page)
+def test_two_bad_samples_are_dropped_and_three_in_a_row_hold(memory: SharedMemory) -> None:
+    driver, supervisor, watch, events = watched(memory)
     good = driver.next
     for times, after in ((2, State.COMPENSATING), (3, State.HOLDING)):
         driver.next = InvalidStateError("torn")
@@ -257,14 +259,14 @@ def test_two_bad_samples_are_dropped_and_three_in_a_row_hold(page: SharedMemory)
         assert supervisor.state == after
         driver.next = good
         assert watch.next() is not None
-        watch.believe()
-    assert page.counts()["dropped_torn"] == 5
+        watch.accept()
+    assert memory.counts()["dropped_torn"] == 5
     assert [event["what"] for event in events] == ["dropped_torn"]  # not five times
 
 
-def test_a_state_that_is_late_is_counted_and_only_a_stale_one_holds(page: SharedMemory) -> None:
+def test_a_state_that_is_late_is_counted_and_only_a_stale_one_holds(memory: SharedMemory) -> None:
     clock = [100.0]
-    driver, supervisor, watch, _ = watched(page, clock)
+    driver, supervisor, watch, _ = watched(memory, clock)
     driver.next = StaleStateError("the clock stands still")
     seen = []
     for _ in range(30):
@@ -275,7 +277,7 @@ def test_a_state_that_is_late_is_counted_and_only_a_stale_one_holds(page: Shared
     assert hold_time(500.0) < 0.0101 * (held + 1) <= hold_time(500.0) + 0.0101
     fault = seen.index(State.FAULT)
     assert 0.2 < 0.0101 * (fault + 1) <= 0.22
-    counts = page.counts()
+    counts = memory.counts()
     assert (counts["late"], counts["stale"], counts["silence"]) == (held, 1, 1)
 
 
@@ -288,8 +290,8 @@ def test_the_hold_time_is_five_cycles_or_forty_milliseconds(rate: float, hold: f
 
 
 @pytest.mark.parametrize("bits", [1 << bit for bit in range(2, 11)])
-def test_a_stop_in_the_safety_bits_alone_is_a_fault(page: SharedMemory, bits: int) -> None:
-    bench = Bench(page, State.COMPENSATING)
+def test_a_stop_in_the_safety_bits_alone_is_a_fault(memory: SharedMemory, bits: int) -> None:
+    bench = Bench(memory, State.COMPENSATING)
     bench.checks.begin(state(1.0), 0)
     bench.checks.begin(state(1.0 + T, safety_status_bits=1 | bits), 0)
     assert bench.supervisor.state == State.FAULT
@@ -297,8 +299,8 @@ def test_a_stop_in_the_safety_bits_alone_is_a_fault(page: SharedMemory, bits: in
 
 
 @pytest.mark.parametrize("bits", [1, 2])
-def test_normal_and_reduced_mode_are_no_stop(page: SharedMemory, bits: int) -> None:
-    bench = Bench(page, State.COMPENSATING)
+def test_normal_and_reduced_mode_are_no_stop(memory: SharedMemory, bits: int) -> None:
+    bench = Bench(memory, State.COMPENSATING)
     bench.checks.begin(state(1.0, safety_status_bits=bits), 0)
     assert bench.supervisor.state == State.COMPENSATING
 
@@ -316,40 +318,40 @@ def test_normal_and_reduced_mode_are_no_stop(page: SharedMemory, bits: int) -> N
     ],
 )
 def test_a_robot_that_does_not_follow_for_the_hold_time_is_held(
-    page: SharedMemory, found: dict[str, Any], moves_arm: bool, holds: bool
+    memory: SharedMemory, found: dict[str, Any], moves_arm: bool, holds: bool
 ) -> None:
-    bench = Bench(page, State.COMPENSATING)
+    bench = Bench(memory, State.COMPENSATING)
     bench.checks = LoopChecks(
-        500.0, bench.supervisor, Reports(page, bench.events.append), moves_arm=moves_arm
+        500.0, bench.supervisor, Reports(memory, bench.events.append), moves_arm=moves_arm
     )
     for k in range(40):
         bench.checks.begin(state(1.0 + k * T, **(found if k >= 10 else {})), 0)
         if k == 10 + round(0.9 * hold_time(500.0) / T):
             assert bench.supervisor.state == State.COMPENSATING  # a moment is none
     assert (bench.supervisor.state == State.HOLDING) == holds
-    assert page.counts()["not_following"] == holds
+    assert memory.counts()["not_following"] == holds
 
 
 def test_a_program_that_does_not_play_is_nobodys_fault_while_nothing_is_written(
-    page: SharedMemory,
+    memory: SharedMemory,
 ) -> None:
-    bench = Bench(page, State.OBSERVING)
+    bench = Bench(memory, State.OBSERVING)
     for k in range(100):
         bench.checks.begin(state(1.0 + k * T, runtime_state=1), 0)
-    assert page.counts()["not_following"] == 0
+    assert memory.counts()["not_following"] == 0
     bench.supervisor.state = State.COMPENSATING  # as it was armed: the program has just begun
     bench.checks.begin(state(1.0 + 100 * T, runtime_state=1), 0)
     bench.checks.begin(state(1.0 + 101 * T), 0)
     assert bench.supervisor.state == State.COMPENSATING
 
 
-def test_a_load_that_cannot_be_holds_and_is_reported_with_its_reason(page: SharedMemory) -> None:
-    bench = Bench(page, State.COMPENSATING)
+def test_a_load_that_cannot_be_holds_and_is_reported_with_its_reason(memory: SharedMemory) -> None:
+    bench = Bench(memory, State.COMPENSATING)
     for _ in range(3):
         bench.checks.judge_loads("payload: found 400 kg, expected 0 to 7.5 kg")
     assert bench.supervisor.state == State.HOLDING
     assert bench.changes[0][3] == "payload: found 400 kg, expected 0 to 7.5 kg"
-    assert page.counts()["load"] == 1
+    assert memory.counts()["load"] == 1
 
 
 class Otherwise(Scripted):
@@ -362,8 +364,10 @@ class Otherwise(Scripted):
         return self.phrase or None
 
 
-def test_the_controllers_settings_are_compared_every_second_while_armed(page: SharedMemory) -> None:
-    bench, driver = Bench(page, State.OBSERVING), Otherwise()
+def test_the_controllers_settings_are_compared_every_second_while_armed(
+    memory: SharedMemory,
+) -> None:
+    bench, driver = Bench(memory, State.OBSERVING), Otherwise()
     for k in range(1000):
         bench.checks.judge_settings(state(1.0 + k * T), driver)
     assert driver.asked == 0
@@ -378,9 +382,9 @@ def test_the_controllers_settings_are_compared_every_second_while_armed(page: Sh
     assert bench.changes[0][3] == driver.phrase
 
 
-def test_a_hiccup_while_observing_latches_no_fault(page: SharedMemory) -> None:
+def test_a_hiccup_while_observing_latches_no_fault(memory: SharedMemory) -> None:
     clock = [100.0]
-    driver, supervisor, watch, events = watched(page, clock)
+    driver, supervisor, watch, events = watched(memory, clock)
     supervisor.state = State.OBSERVING
     good = driver.next
     driver.next = StaleStateError("the clock stands still")
@@ -388,9 +392,9 @@ def test_a_hiccup_while_observing_latches_no_fault(page: SharedMemory) -> None:
         clock[0] += 0.0101
         assert watch.next() is None
     assert supervisor.state == State.OBSERVING
-    assert page.counts()["silence"] == 1
+    assert memory.counts()["silence"] == 1
     assert [event["what"] for event in events] == ["stale"]
     driver.next = good
     assert watch.next() is not None
-    watch.believe()
+    watch.accept()
     assert supervisor.state == State.OBSERVING

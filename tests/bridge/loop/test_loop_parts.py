@@ -10,8 +10,7 @@ import time
 import numpy as np
 import pytest
 
-from gapbridge.bridge.ipc.cycle_row import write_cycle
-from gapbridge.bridge.ipc.shared_memory import ROWS, Phase, RunPage, SharedMemory
+from gapbridge.bridge.ipc.shared_memory import ROWS, Phase, RunMemory, SharedMemory, write_cycle
 from gapbridge.bridge.loop.link_monitor import DRIFT, ControllerClock
 from gapbridge.bridge.loop.live_loads import LiveLoads
 from gapbridge.core.load_bounds import LoadBounds
@@ -206,71 +205,76 @@ def test_what_a_stalled_link_hands_on_at_once_is_old_until_the_newest_has_come()
 
 
 @pytest.fixture
-def page():
+def memory():
     found = SharedMemory(3)
     yield found
     found.close()
 
 
-def put(page: SharedMemory, timestamp: float) -> None:
-    row = page.next_row()
-    write_cycle(row, page.slices, state(timestamp), Q, Q + 1, np.arange(6.0))
+def put(memory: SharedMemory, timestamp: float) -> None:
+    row = memory.next_row()
+    write_cycle(row, memory.slices, state(timestamp), Q, Q + 1, np.arange(6.0))
     row[2:9] = 0
-    page.publish()
+    memory.publish()
 
 
-def test_rows_come_through_once_and_in_order(page: SharedMemory) -> None:
-    reader = page.reader()
+def test_rows_come_through_once_and_in_order(memory: SharedMemory) -> None:
+    reader = memory.reader()
     for k in range(5):
-        put(page, float(k))
+        put(memory, float(k))
     rows = reader.drain()
     assert rows[:, 1].tolist() == [0, 1, 2, 3, 4]
-    assert rows[0, page.slices["corrected_q"]] == pytest.approx(Q + 1)
-    assert rows[0, page.slices["offset"]] == pytest.approx(np.arange(6))
-    assert np.isnan(rows[0, page.slices["ft_raw_wrench"]]).all()
-    assert np.isnan(rows[0, page.slices["payload"]]).all()
+    assert rows[0, memory.slices["corrected_q"]] == pytest.approx(Q + 1)
+    assert rows[0, memory.slices["offset"]] == pytest.approx(np.arange(6))
+    assert np.isnan(rows[0, memory.slices["ft_raw_wrench"]]).all()
+    assert np.isnan(rows[0, memory.slices["payload"]]).all()
     assert len(reader.drain()) == 0
-    put(page, 5.0)
+    put(memory, 5.0)
     assert reader.drain()[:, 1].tolist() == [5]
 
 
-def test_rows_that_were_overwritten_are_counted_not_invented(page: SharedMemory) -> None:
-    reader = page.reader()
+def test_rows_that_were_overwritten_are_counted_not_invented(memory: SharedMemory) -> None:
+    reader = memory.reader()
     for k in range(2 * ROWS):
-        put(page, float(k))
+        put(memory, float(k))
     rows = reader.drain()
     assert rows[-1, 1] == 2 * ROWS - 1
     assert (np.diff(rows[:, 1]) == 1).all()
     assert len(rows) + reader.lost == 2 * ROWS
 
 
-def test_a_row_that_was_not_finished_is_not_read(page: SharedMemory) -> None:
-    reader = page.reader()
-    put(page, 1.0)
-    page.next_row()[1] = 99.0  # the loop was killed here
+def test_a_row_that_was_not_finished_is_not_read(memory: SharedMemory) -> None:
+    reader = memory.reader()
+    put(memory, 1.0)
+    memory.next_row()[1] = 99.0  # the loop was killed here
     assert reader.drain()[:, 1].tolist() == [1]
 
 
-def test_another_process_sees_the_same_page_and_its_death_leaves_it_whole() -> None:
-    page = RunPage(3)
-    page.renew()
+def test_another_process_sees_the_same_memory_and_its_death_leaves_it_whole() -> None:
+    memory = RunMemory(3)
+    memory.renew()
     code = f"""
 import os, time
 from gapbridge.bridge.ipc.shared_memory import SharedMemory, Phase
-page = SharedMemory(3, {page.fd})
-page.enter(Phase.RUNNING)
-page.note_state(3)
-page.note_seen()
+memory = SharedMemory(3, {memory.fd})
+memory.enter(Phase.RUNNING)
+memory.note_state(3)
+memory.note_seen()
 for k in range(10):
-    page.next_row()[1] = k
-    page.publish()
-page.next_row()[1] = 77
+    memory.next_row()[1] = k
+    memory.publish()
+memory.next_row()[1] = 77
 os.abort()
 """
-    done = subprocess.run([sys.executable, "-c", code], pass_fds=[page.fd], check=False)
+    done = subprocess.run([sys.executable, "-c", code], pass_fds=[memory.fd], check=False)
     assert done.returncode == -6
-    assert (page.phase, page.state, page.seen, page.ended) == (Phase.RUNNING, 3, True, False)
-    assert page.reader().drain()[:, 1].tolist() == list(range(10))
-    assert 0 < page.silence < 30
-    assert os.fstat(page.fd).st_nlink == 0
-    page.close()
+    assert (memory.phase, memory.state, memory.seen, memory.ended) == (
+        Phase.RUNNING,
+        3,
+        True,
+        False,
+    )
+    assert memory.reader().drain()[:, 1].tolist() == list(range(10))
+    assert 0 < memory.silence < 30
+    assert os.fstat(memory.fd).st_nlink == 0
+    memory.close()

@@ -87,8 +87,8 @@ class Stream(SetpointStream):
 class Bench:
     """A loop's writing half, compensating."""
 
-    def __init__(self, page: SharedMemory) -> None:
-        self.page, self.driver = page, Failing()
+    def __init__(self, memory: SharedMemory) -> None:
+        self.memory, self.driver = memory, Failing()
         self.changes: list[tuple[str, str]] = []  # cause and detail
         self.supervisor = Supervisor(lambda *change: self.changes.append(change[2:]))
         self.supervisor.state = State.ARMED
@@ -96,7 +96,7 @@ class Bench:
         self.loads = LiveLoads(6, True, 0.0)
         settings = SetpointSettings()
         source = make_source(settings, 6, True, Path())
-        reports = Reports(page, lambda _: None)
+        reports = Reports(memory, lambda _: None)
         self.writing = Writing(settings, self.driver, source, self.stream, self.supervisor, reports)
         self.at, self.q = 1.0, Q
         self.writing.start(self.state(), Q)
@@ -122,14 +122,14 @@ class Bench:
                 self.driver.gate.count_by(lambda: self.at)
 
     def count(self, name: str) -> int:
-        return self.page.counts()[name]
+        return self.memory.counts()[name]
 
 
 @pytest.fixture
 def bench() -> Iterator[Bench]:
-    page = SharedMemory(6)
-    yield Bench(page)
-    page.close()
+    memory = SharedMemory(6)
+    yield Bench(memory)
+    memory.close()
 
 
 def test_a_correction_that_is_no_number_never_leaves_and_is_a_fault(bench: Bench) -> None:

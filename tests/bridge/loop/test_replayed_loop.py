@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from gapbridge.bridge.cell.run_settings import read_configuration
 from gapbridge.bridge.cell.settings.recording import RecordingSettings
 from gapbridge.bridge.daemon.processes import LoopProcess
-from gapbridge.bridge.ipc.command_page import Command, CommandPage
-from gapbridge.bridge.ipc.shared_memory import RunPage
+from gapbridge.bridge.ipc.command_memory import Command, CommandMemory
+from gapbridge.bridge.ipc.shared_memory import RunMemory
 from gapbridge.bridge.loop.supervisor import State
 from gapbridge.bridge.recording.recorder import Recorder
 from gapbridge.core.log.mcap_reading import read_columns
@@ -36,15 +36,19 @@ def robot(tmp_path: Path) -> Iterator[Robot]:
 
 
 class Loops:
-    """Processes of the loop on one page, and a recorder of what they do."""
+    """Processes of the loop on one memory, and a recorder of what they do."""
 
     def __init__(self, cell: Path, session: str, arm: bool = False) -> None:
         self.configuration = read_configuration(cell)
-        self.page, self.commands = RunPage(6), CommandPage()
+        self.memory, self.commands = RunMemory(6), CommandMemory()
         folder = cell.parent / "recordings"
         self.stem = folder / session
         self.recorder = Recorder(
-            RecordingSettings(folder=folder, keep_free=0.0), session, self.page, {}, lambda _: None
+            RecordingSettings(folder=folder, keep_free=0.0),
+            session,
+            self.memory,
+            {},
+            lambda _: None,
         )
         self._number = 0
         self.start(arm)
@@ -54,7 +58,7 @@ class Loops:
                  "after": self.commands.number()}  # fmt: skip
         if arm:
             self.commands.ask(Command.ARM)
-        self.loop = LoopProcess(self.configuration, self.page, self.commands, order, -3)
+        self.loop = LoopProcess(self.configuration, self.memory, self.commands, order, -3)
         self._number += 1
 
     def until(self, what: Callable[[], bool], limit: float = 120.0) -> None:
@@ -62,14 +66,14 @@ class Loops:
             self.recorder.step()
             return what()
 
-        wait_for(holds, limit, f"state {self.page.state}")
+        wait_for(holds, limit, f"state {self.memory.state}")
 
     def during(self, seconds: float) -> None:
         end = time.monotonic() + seconds
         self.until(lambda: time.monotonic() > end)
 
     def state(self, state: State) -> None:
-        self.until(lambda: self.page.state == state)
+        self.until(lambda: self.memory.state == state)
 
     def end(self) -> dict[str, NDArray[np.float64]]:
         self.until(lambda: self.loop.exit_code is not None)
@@ -118,7 +122,7 @@ def test_a_run_with_writing_and_two_loops_is_replayed_bit_for_bit(robot: Robot) 
     loops.loop.close()
     time.sleep(0.5)
     loops.start(arm=True)
-    loops.until(lambda: loops.page.seen and loops.page.state == State.COMPENSATING)
+    loops.until(lambda: loops.memory.seen and loops.memory.state == State.COMPENSATING)
     loops.during(0.4)
     loops.loop.ask_to_stop()
     then = loops.end()
@@ -136,7 +140,7 @@ def test_a_run_with_writing_and_two_loops_is_replayed_bit_for_bit(robot: Robot) 
 
 def test_another_model_makes_other_offsets_of_the_same_states(robot: Robot) -> None:
     loops = Loops(robot.cell(), "run-then")
-    loops.until(lambda: loops.page.written > 300)
+    loops.until(lambda: loops.memory.written > 300)
     loops.loop.ask_to_stop()
     then = loops.end()
     again = replay(robot.cell(), loops.stem, compliance={"axial": [0.0] * 6, "radial": [0.0] * 6})

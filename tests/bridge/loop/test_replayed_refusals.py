@@ -14,7 +14,7 @@ from gapbridge.bridge.cell import load_cell
 from gapbridge.bridge.cell.daemon_settings import DaemonSettings
 from gapbridge.bridge.cell.sections import SetpointSettings
 from gapbridge.bridge.cell.settings.recording import RecordingSettings
-from gapbridge.bridge.ipc.command_page import Command, CommandPage, Commands
+from gapbridge.bridge.ipc.command_memory import Command, CommandMemory, Commands
 from gapbridge.bridge.ipc.shared_memory import SharedMemory
 from gapbridge.bridge.loop.loop import Exit, Loop
 from gapbridge.bridge.loop.main import _compile
@@ -40,7 +40,7 @@ HOME = np.array([0.3, -1.2, 1.4, -0.6, 0.4, 0.2])
 class Scripted(Driver):
     """A controller whose own program swings the arm, with mishaps at known cycles."""
 
-    def __init__(self, cycles: int, commands: CommandPage, model: Model) -> None:
+    def __init__(self, cycles: int, commands: CommandMemory, model: Model) -> None:
         super().__init__(20.0, model, moves_arm=False)  # no deadline that a busy machine misses
         self._now = 0.0  # s, of the script
         self.gate.count_by(lambda: self._now)
@@ -80,10 +80,10 @@ class Scripted(Driver):
 
 
 def run(
-    loop: Loop, page: SharedMemory, commands: CommandPage, folder: Path, name: str
+    loop: Loop, memory: SharedMemory, commands: CommandMemory, folder: Path, name: str
 ) -> dict[str, Any]:
     settings = RecordingSettings(folder=folder, keep_free=0.0)
-    recorder = Recorder(settings, name, page, {}, lambda _: None)
+    recorder = Recorder(settings, name, memory, {}, lambda _: None)
     assert loop.run(Commands(commands.fd), True) in (Exit.LINK, Exit.DONE)
     recorder.close()
     return read_columns(folder / name)
@@ -94,11 +94,11 @@ def test_refused_and_half_sent_setpoints_gaps_and_lost_sensors_are_replayed(tmp_
     cell.write_text(CELL)
     model = load_cell(cell).model
     settings = DaemonSettings(cell=cell)
-    page, commands, events = SharedMemory(N), CommandPage(), []
+    memory, commands, events = SharedMemory(N), CommandMemory(), []
     source = TargetSource(SetpointSettings(), N, False, tmp_path, 20.0)
-    loop = Loop(settings, model, Scripted(1800, commands, model), source, page, events.append)
+    loop = Loop(settings, model, Scripted(1800, commands, model), source, memory, events.append)
     _compile(settings, model)  # else the first cycles are late
-    then = run(loop, page, commands, tmp_path, "then")
+    then = run(loop, memory, commands, tmp_path, "then")
     flags = then["flags"].astype(int)
     assert {0.0, 1.0, 2.0} == set(then["attempted"])
     refused = (then["attempted"] == 1) & (then["written"] == 0)
@@ -108,7 +108,7 @@ def test_refused_and_half_sent_setpoints_gaps_and_lost_sensors_are_replayed(tmp_
     assert (flags & 8).any()  # ramping out
     assert then["written"].sum() > 500
 
-    page, commands = SharedMemory(N), CommandPage()
+    memory, commands = SharedMemory(N), CommandMemory()
     driver = ReplayDriver(ReplaySettings(file=tmp_path / "then", speed=100.0), model)
-    again = ReplayedLoop(settings, model, driver, source, page, lambda _: None)
-    assert_same_bits(run(again, page, commands, tmp_path, "again"), then, len(then["number"]))
+    again = ReplayedLoop(settings, model, driver, source, memory, lambda _: None)
+    assert_same_bits(run(again, memory, commands, tmp_path, "again"), then, len(then["number"]))

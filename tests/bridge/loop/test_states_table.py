@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from gapbridge.bridge.ipc.counts import Count
+from gapbridge.bridge.ipc.loop_counters import LoopCounter
 from gapbridge.bridge.loop.supervisor import TRANSITIONS, State, states_table
 
 PAGE = (Path(__file__).parents[3] / "docs" / "daemon.md").read_text(encoding="utf-8")
-ELSEWHERE = {Count.SILENCE, Count.LINK_LOST}  # what stale comes to, reported in its row
+ELSEWHERE = {LoopCounter.SILENCE, LoopCounter.LINK_LOST}  # what stale comes to, reported in its row
 
 
 def test_the_page_has_the_table_as_it_is() -> None:
@@ -23,8 +23,8 @@ def test_the_page_has_the_table_as_it_is() -> None:
     assert filled == len(TRANSITIONS)
 
 
-@pytest.mark.parametrize("count", sorted(set(Count) - ELSEWHERE))
-def test_the_page_explains_every_counter(count: Count) -> None:
+@pytest.mark.parametrize("count", sorted(set(LoopCounter) - ELSEWHERE))
+def test_the_page_explains_every_counter(count: LoopCounter) -> None:
     assert f"`{count.label}`" in PAGE
 
 

@@ -19,41 +19,41 @@ CONFIGURATION = {"program": "test", "cell": "cell.yaml", "sha256": "00", "text":
 Array = NDArray[np.float64]
 
 
-def publish(page: SharedMemory, count: int, seed: int = 0) -> Array:
+def publish(memory: SharedMemory, count: int, seed: int = 0) -> Array:
     """Have a loop publish cycles of random numbers; returns them as rows (count, width)."""
     random = np.random.default_rng(seed)
     rows = []
     for _ in range(count):
-        row = page.next_row()
-        number = page.written
-        row[1:] = random.standard_normal(page.width - 1)
-        row[page.slices["timestamp"]] = 0.002 * number
-        row[page.slices["received"]] = 1000.0 + 0.002 * number
-        row[page.slices["state"]] = State.OBSERVING
-        row[page.slices["joint_temperatures"]] = np.nan
-        page.publish()
+        row = memory.next_row()
+        number = memory.written
+        row[1:] = random.standard_normal(memory.width - 1)
+        row[memory.slices["timestamp"]] = 0.002 * number
+        row[memory.slices["received"]] = 1000.0 + 0.002 * number
+        row[memory.slices["state"]] = State.OBSERVING
+        row[memory.slices["joint_temperatures"]] = np.nan
+        memory.publish()
         rows.append(row.copy())
     return np.array(rows)
 
 
 class Desk:
-    """A page, and recorders on it one after the other."""
+    """Shared memory, and recorders on it one after the other."""
 
     def __init__(self, folder: Path, **settings: Any) -> None:
         self.folder = folder
-        self.page = SharedMemory(N)
+        self.memory = SharedMemory(N)
         self.events: list[dict[str, Any]] = []
         self.settings = RecordingSettings(folder=folder, **{"keep_free": 0.0, **settings})
 
     def recorder(self) -> Recorder:
-        return Recorder(self.settings, SESSION, self.page, CONFIGURATION, self.events.append)
+        return Recorder(self.settings, SESSION, self.memory, CONFIGURATION, self.events.append)
 
     def record(self, *counts: int) -> Array:
         """Record so many cycles, a flush after each; returns the rows."""
         recorder = self.recorder()
         rows = []
         for k, count in enumerate(counts):
-            rows.append(publish(self.page, count, seed=k))
+            rows.append(publish(self.memory, count, seed=k))
             recorder.step(flush=True)
         recorder.close()
         return np.concatenate(rows)

@@ -33,7 +33,7 @@ def test_the_log_holds_the_contracts_columns_bit_for_bit(
     assert export(desk.stem, out).rows == 80
     log = read_log(out, N)
     for name in ("timestamp", "actual_q", "target_q", "payload_cog", "ft_raw_wrench", "payload"):
-        expected = rows[:, desk.page.slices[name]].reshape(log.require(name).shape)
+        expected = rows[:, desk.memory.slices[name]].reshape(log.require(name).shape)
         assert same_bits(log.require(name), expected.copy()), name
     assert not log.has("joint_temperatures")  # no cycle has them
     beside = ("nominal_q_5", "corrected_q_0", "offset_5", "written", "state")
@@ -80,13 +80,13 @@ def test_bounds_that_mean_nothing_are_refused() -> None:
 
 def test_gaps_and_a_clock_that_goes_back_are_reported(desk: Desk, tmp_path: Path) -> None:
     recorder = desk.recorder()
-    publish(desk.page, 10)
+    publish(desk.memory, 10)
     recorder.step(flush=True)
-    publish(desk.page, 5)
+    publish(desk.memory, 5)
     recorder._reader.next += 5  # as if the ring had been overwritten
-    first = publish(desk.page, 1)
+    first = publish(desk.memory, 1)
     assert first[0, 0] == 15
-    desk.page._rows[15, 1] = 0.0
+    desk.memory._rows[15, 1] = 0.0
     recorder.close()
     runner = CliRunner()
     done = runner.invoke(gapbridge, ["export", str(desk.stem), "--out", str(tmp_path / "l.csv")])
@@ -132,7 +132,7 @@ def test_what_cannot_be_exported_is_one_line(desk: Desk, arguments: list[str], p
 def test_a_long_recording_is_exported_in_pieces(desk: Desk, tmp_path: Path) -> None:
     recorder = desk.recorder()
     for _ in range(6):
-        publish(desk.page, 5000)
+        publish(desk.memory, 5000)
         recorder.step(flush=True)
     recorder.close()
     export(desk.stem, tmp_path / "log.parquet")

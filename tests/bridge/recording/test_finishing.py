@@ -31,7 +31,7 @@ def cut_off(desk: Desk, behind: bytes = b"") -> Path:
     """Record some flushes and end as a kill does: without a summary, with whatever is behind."""
     recorder = desk.recorder()
     for _ in range(4):
-        publish(desk.page, 90)
+        publish(desk.memory, 90)
         recorder.take({"kind": "note", "detail": "a word"})
         recorder.step(flush=True)
     path = recorder.path
@@ -103,7 +103,7 @@ def test_garbage_behind_the_last_flush_goes(desk: Desk) -> None:
 
 def test_a_file_that_is_being_written_stays_as_it_is(desk: Desk) -> None:
     recorder = desk.recorder()
-    publish(desk.page, 90)
+    publish(desk.memory, 90)
     recorder.step(flush=True)
     path = recorder.path
     assert path is not None
@@ -119,7 +119,7 @@ def test_the_next_run_finishes_what_the_last_one_left(desk: Desk) -> None:
     path.rename(other)
     recorder = desk.recorder()
     for _ in range(3):
-        publish(desk.page, 30)
+        publish(desk.memory, 30)
         recorder.step(flush=True)
     recorder.close()
     assert is_whole(other)
@@ -142,7 +142,7 @@ sys.path.insert(0, {here!r})
 from recorded import Desk, publish
 desk = Desk(Path({folder!r}))
 recorder = desk.recorder()
-publish(desk.page, 120)
+publish(desk.memory, 120)
 recorder.step(flush=True)
 os.kill(os.getpid(), 9)
 """
@@ -161,7 +161,7 @@ def test_a_process_that_was_killed_holds_no_lock(tmp_path: Path) -> None:
 def test_a_file_with_nothing_but_its_head_is_finished_too(desk: Desk) -> None:
     path = desk.folder / "run-20200101-000000-001.mcap"
     path.parent.mkdir(parents=True, exist_ok=True)
-    segment = Segment(path, desk.page.slices, [state.name for state in State])
+    segment = Segment(path, desk.memory.slices, [state.name for state in State])
     segment._file.flush()
     segment.abandon()
     assert finish(path)

@@ -56,11 +56,11 @@ def test_a_write_that_fails_in_its_middle_loses_nothing_that_the_ring_holds(
 ) -> None:
     desk = Desk(tmp_path)
     recorder = desk.recorder()
-    publish(desk.page, 100)
+    publish(desk.memory, 100)
     recorder.step(flush=True)
     whole = desk.files[0].stat().st_size
     allow(whole + 5000)  # amidst the next chunk
-    publish(desk.page, 200)
+    publish(desk.memory, 200)
     recorder.take({"time": 5.0, "kind": "note", "detail": "while the disk was full"})
     recorder.step(flush=True)
     assert recorder.path is None
@@ -68,7 +68,7 @@ def test_a_write_that_fails_in_its_middle_loses_nothing_that_the_ring_holds(
     assert desk.files[0].stat().st_size == whole
     assert numbers(desk.stem) == list(range(100))
     allow(resource.RLIM_INFINITY)
-    publish(desk.page, 50)
+    publish(desk.memory, 50)
     recorder.step(flush=True)
     recorder.close()
     assert numbers(desk.stem) == list(range(350))
@@ -83,11 +83,11 @@ def test_a_disk_that_stays_full_is_reported_once_and_what_is_lost_is_counted(
 ) -> None:
     desk = Desk(tmp_path)
     recorder = desk.recorder()
-    publish(desk.page, 20)
+    publish(desk.memory, 20)
     recorder.step(flush=True)
     allow(100)
     for _ in range(5):
-        publish(desk.page, 20)
+        publish(desk.memory, 20)
         recorder.step(flush=True)
     recorder.close()
     assert recorder.lost == 100
@@ -103,12 +103,12 @@ def test_recording_pauses_before_the_disk_is_full(
     room = {"free": 1000.0}
     recorder = desk.recorder()
     monkeypatch.setattr(recorder, "_room", lambda: room["free"])
-    publish(desk.page, 20)
+    publish(desk.memory, 20)
     recorder.step(flush=True)
     room["free"] = 40.0
-    publish(desk.page, 20)
+    publish(desk.memory, 20)
     recorder.step(flush=True)  # this one still fits; then the file is finished
-    publish(desk.page, 20)
+    publish(desk.memory, 20)
     recorder.step(flush=True)
     assert recorder.path is None
     assert numbers(desk.stem) == list(range(40))

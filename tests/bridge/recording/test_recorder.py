@@ -46,8 +46,8 @@ def numbers(path: Path) -> list[int]:
 def test_every_number_of_every_cycle_comes_back_bit_for_bit(desk: Desk) -> None:
     rows = desk.record(300, 1, 250)
     columns = read_columns(desk.stem)
-    assert set(columns) == set(desk.page.slices)
-    for name, part in desk.page.slices.items():
+    assert set(columns) == set(desk.memory.slices)
+    for name, part in desk.memory.slices.items():
         found = columns[name].reshape(len(rows), -1)
         assert same_bits(found, np.ascontiguousarray(rows[:, part])), name
 
@@ -55,7 +55,7 @@ def test_every_number_of_every_cycle_comes_back_bit_for_bit(desk: Desk) -> None:
 def test_mcaps_own_readers_and_protobufs_own_decoder_read_the_same(desk: Desk) -> None:
     desk.recorder().close()
     recorder = desk.recorder()
-    rows = publish(desk.page, 120)
+    rows = publish(desk.memory, 120)
     for event in EVENTS:
         recorder.take({"time": 5.0, "monotonic": 1.0, "sequence": 1, **event})
     recorder.close()
@@ -81,7 +81,7 @@ def test_mcaps_own_readers_and_protobufs_own_decoder_read_the_same(desk: Desk) -
         assert {topic: len(found) for topic, found in seen.items()} == {
             "/state": 120, "/setpoint": 120, "/loop": 120,
         }  # fmt: skip
-        part = desk.page.slices
+        part = desk.memory.slices
         state, setpoint, loop = (seen[topic][7] for topic in ("/state", "/setpoint", "/loop"))
         assert list(state.actual_q) == list(rows[7, part["actual_q"]])  # type: ignore[attr-defined]
         assert state.timestamp == rows[7, 1]  # type: ignore[attr-defined]
@@ -119,7 +119,7 @@ def test_events_and_configuration_stand_beside_the_cycles(desk: Desk) -> None:
 
 def test_what_was_flushed_is_there_before_the_file_is_closed(desk: Desk) -> None:
     recorder = desk.recorder()
-    publish(desk.page, 40)
+    publish(desk.memory, 40)
     recorder.step(flush=True)
     assert not is_whole(desk.files[0])
     assert numbers(desk.stem) == list(range(40))
@@ -187,7 +187,7 @@ def test_a_byte_that_changed_on_the_disk_hides_cycles_and_never_alters_one(
     flipped.write_bytes(raw)
     found = read_columns(flipped)["actual_q"]
     assert len(found) in (20, 60)
-    expected = rows[: len(found), desk.page.slices["actual_q"]]
+    expected = rows[: len(found), desk.memory.slices["actual_q"]]
     assert same_bits(found, np.ascontiguousarray(expected))
 
 
@@ -217,7 +217,7 @@ def test_files_change_by_size_and_a_run_reads_as_a_whole(tmp_path: Path) -> None
     assert len(desk.files) >= 3
     assert all(is_whole(path) for path in desk.files)
     columns = read_columns(desk.stem)
-    assert same_bits(columns["corrected_q"], rows[:, desk.page.slices["corrected_q"]].copy())
+    assert same_bits(columns["corrected_q"], rows[:, desk.memory.slices["corrected_q"]].copy())
     first = [int(last.columns["number"][-1]) for path in desk.files if (last := last_batch(path))]
     assert first == sorted(set(first))
     assert all(read_configuration(path)["segment"] == k + 1 for k, path in enumerate(desk.files))
@@ -229,9 +229,9 @@ def test_files_change_by_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     recorder.step(flush=True)
     assert recorder._segment is not None
     recorder._segment.opened -= 2.0
-    publish(desk.page, 5)
+    publish(desk.memory, 5)
     recorder.step(flush=True)
-    publish(desk.page, 5)
+    publish(desk.memory, 5)
     recorder.close()
     assert [numbers(path) for path in desk.files] == [[0, 1, 2, 3, 4], [5, 6, 7, 8, 9]]
 
@@ -270,11 +270,11 @@ def test_every_so_manieth_cycle_is_counted_over_files(tmp_path: Path) -> None:
 
 def test_a_recorder_that_comes_after_a_killed_one_goes_on_behind_it(desk: Desk) -> None:
     first = desk.recorder()
-    publish(desk.page, 30)
+    publish(desk.memory, 30)
     first.step(flush=True)
-    publish(desk.page, 20)
+    publish(desk.memory, 20)
     first.step()  # taken, not flushed: the process dies with them
-    publish(desk.page, 10)
+    publish(desk.memory, 10)
     second = desk.recorder()
     second.close()
     assert [numbers(path) for path in desk.files] == [list(range(30)), list(range(30, 60))]
@@ -285,9 +285,9 @@ def test_what_the_ring_no_longer_holds_is_reported(desk: Desk) -> None:
     from gapbridge.bridge.ipc.shared_memory import ROWS
 
     recorder = desk.recorder()
-    publish(desk.page, 10)
+    publish(desk.memory, 10)
     recorder.step(flush=True)
-    publish(desk.page, ROWS)
+    publish(desk.memory, ROWS)
     recorder.step(flush=True)
     recorder.close()
     found = numbers(desk.stem)

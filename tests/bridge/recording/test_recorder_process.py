@@ -28,10 +28,10 @@ CELL = "robot: {model: ur10e}\nweb: {token: squeamish}\n"
 
 
 class Publisher:
-    """A loop's half of a page, in a thread of the test: 500 cycles a second."""
+    """A loop's half of the shared memory, in a thread of the test: 500 cycles a second."""
 
     def __init__(self) -> None:
-        self.page = SharedMemory(N)
+        self.memory = SharedMemory(N)
         self.stop = threading.Event()
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
@@ -39,21 +39,21 @@ class Publisher:
     def _run(self) -> None:
         random, begun = np.random.default_rng(0), time.monotonic()
         while not self.stop.is_set():
-            self.page.beat()
-            for _ in range(int((time.monotonic() - begun) * RATE) - self.page.written):
-                row = self.page.next_row()
-                row[1:] = random.standard_normal(self.page.width - 1)
-                row[1] = self.page.written / RATE
-                row[self.page.slices["state"]] = State.OBSERVING
-                row[self.page.slices["received"]] = time.monotonic()
-                self.page.publish()
+            self.memory.beat()
+            for _ in range(int((time.monotonic() - begun) * RATE) - self.memory.written):
+                row = self.memory.next_row()
+                row[1:] = random.standard_normal(self.memory.width - 1)
+                row[1] = self.memory.written / RATE
+                row[self.memory.slices["state"]] = State.OBSERVING
+                row[self.memory.slices["received"]] = time.monotonic()
+                self.memory.publish()
             time.sleep(0.005)
 
     def end(self) -> int:
         """Stop publishing; returns how many cycles there were."""
         self.stop.set()
         self._thread.join()
-        return self.page.written
+        return self.memory.written
 
 
 class Recording:
@@ -68,7 +68,7 @@ class Recording:
         )
         order = {"settings": settings.model_dump(mode="json"), "n": N, "session": SESSION,
                  "extra": {}}  # fmt: skip
-        self.process = SideProcess("gapbridge.bridge.recording.main", order, publisher.page)
+        self.process = SideProcess("gapbridge.bridge.recording.main", order, publisher.memory)
         self._seen = 0  # files of former lives
 
     def wait_for_file(self) -> None:
@@ -97,7 +97,7 @@ def publisher() -> Iterator[Publisher]:
     found = Publisher()
     yield found
     found.end()
-    found.page.close()
+    found.memory.close()
 
 
 @pytest.fixture
@@ -138,7 +138,7 @@ def kill_at_random_moments(recording: Recording, publisher: Publisher, times: in
         time.sleep(random.uniform(0.0, 1.8))
         assert recording.process.pid is not None
         os.kill(recording.process.pid, signal.SIGKILL)
-        published = publisher.page.written
+        published = publisher.memory.written
         alive = time.monotonic() - begun
         numbers = recording.numbers()
         assert numbers == list(range(len(numbers)))

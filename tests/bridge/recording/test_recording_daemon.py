@@ -27,7 +27,7 @@ def robot(tmp_path: Path) -> Iterator[Robot]:
 
 
 def recorder_pid(run: Run) -> int | None:
-    return run.daemon.sides.status()["recorder"]["pid"]
+    return run.daemon.side_processes.status()["recorder"]["pid"]
 
 
 @pytest.mark.slow

@@ -33,7 +33,7 @@ def driver(desk: Desk, speed: float = 100.0) -> ReplayDriver:
 
 def test_states_come_back_as_they_were_and_then_there_is_an_end(desk: Desk) -> None:
     rows = desk.record(30, 20)
-    part = desk.page.slices
+    part = desk.memory.slices
     with driver(desk) as replay:
         assert replay.n == 6
         assert replay.rate == rows[0, part["rate"].start]

@@ -12,12 +12,12 @@ LOOP = """
 import sys
 from pathlib import Path
 from gapbridge.bridge.cell.sections import SetpointSettings
-from gapbridge.bridge.ipc.command_page import Command, CommandPage, Commands
+from gapbridge.bridge.ipc.command_memory import Command, CommandMemory, Commands
 from gapbridge.bridge.ipc.shared_memory import SharedMemory
 from gapbridge.bridge.setpoint_source import modbus
 
 modbus.SERVER = "plc_attacker"
-requests, cycles = CommandPage(), SharedMemory(6)
+requests, cycles = CommandMemory(), SharedMemory(6)
 commands = Commands(requests.fd)
 settings = SetpointSettings(source="modbus", port=1)
 source = modbus.ModbusSource(settings, 6, False, Path(sys.argv[1]), 500.0)

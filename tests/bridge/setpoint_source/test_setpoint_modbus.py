@@ -18,7 +18,7 @@ from gapbridge.bridge.cell.sections import SetpointSettings
 from gapbridge.bridge.loop.supervisor import State
 from gapbridge.bridge.setpoint_source import make_source
 from gapbridge.bridge.setpoint_source.modbus import ModbusSource
-from gapbridge.bridge.setpoint_source.modbus_page import PlcPage
+from gapbridge.bridge.setpoint_source.plc_memory import PlcMemory
 from gapbridge.bridge.setpoint_source.source import SourceDryError, SourceStatus
 from gapbridge.core.errors import InputError, RunError
 
@@ -151,26 +151,26 @@ def test_an_arm_of_too_many_joints_is_refused() -> None:
 
 
 def test_a_record_that_is_half_written_is_not_seen() -> None:
-    page = PlcPage(3)
-    server = PlcPage(3, page.fds)
+    memory = PlcMemory(3)
+    server = PlcMemory(3, memory.fds)
     server.put_setpoint(1, HERE)
-    assert page.setpoint() is not None
+    assert memory.setpoint() is not None
     server._setpoint._map[:8] = (3).to_bytes(8, "little")  # a version that says: being written
-    assert page.setpoint() is None
+    assert memory.setpoint() is None
     server._setpoint._map.close()
     server._status._map.close()
-    page.close()
+    memory.close()
 
 
 def test_neither_side_can_write_what_is_the_others() -> None:
-    page = PlcPage(3)
-    server = PlcPage(3, page.fds)
-    assert page.is_sealed
+    memory = PlcMemory(3)
+    server = PlcMemory(3, memory.fds)
+    assert memory.is_sealed
     with pytest.raises((TypeError, ValueError)):
-        page.put_setpoint(1, HERE)
+        memory.put_setpoint(1, HERE)
     with pytest.raises((TypeError, ValueError)):
         server.put_status((3, 0, 0, 0), np.zeros(12))
-    for fd in page.fds:
+    for fd in memory.fds:
         with pytest.raises(PermissionError):
             os.pwrite(fd, b"x", 0)
         again = os.open(f"/proc/self/fd/{fd}", os.O_RDWR)

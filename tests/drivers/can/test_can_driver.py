@@ -225,7 +225,7 @@ def test_a_stop_that_comes_and_goes_while_frames_make_no_sample_is_reported_once
 
     def read_until_stopped(stopped):
         until = time.monotonic() + 5.0
-        while bool(driver.reader.trouble(writing=False)[0]) != stopped:
+        while bool(driver.reader.stop_reason(writing=False)[0]) != stopped:
             assert time.monotonic() < until
             with suppress(InvalidStateError, StaleStateError):
                 driver.read_state()

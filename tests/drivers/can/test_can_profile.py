@@ -92,7 +92,7 @@ YAML = [
     ("a constant left out", "{message: GoHand, signals: {mode: 3}}", "{message: GoHand}",
      ["setpoint.frames.2.signals", "no mode"]),
     ("a constant that does not fit", "signals: {wanted: 1}", "signals: {wanted: 2}", ["Power"]),
-    ("a trouble that we do not know", "2: emergency_stop", "2: explosion", ["status.1.values"]),
+    ("a stop that we do not know", "2: emergency_stop", "2: explosion", ["status.1.values"]),
     ("broken YAML", "joints: 6", "joints: [6", ["broken YAML"]),
     ("a key twice", "rate: 250", "joints: 6", ["joints: found twice"]),
     ("another DBC", "dbc: invented.dbc", "dbc: other.dbc", ["other.dbc: file not found"]),

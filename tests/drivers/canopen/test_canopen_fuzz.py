@@ -11,7 +11,7 @@ from canopen import Network
 
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.errors import InvalidStateError
-from gapbridge.drivers.canopen.listening import BusListener, Life
+from gapbridge.drivers.canopen.listening import BusListener, HeartbeatMonitor
 from gapbridge.drivers.canopen.profile import CanopenProfile, read_profile
 from gapbridge.drivers.canopen.settings import CanopenSettings
 from gapbridge.drivers.canopen.state import StateBuilder
@@ -73,7 +73,7 @@ def test_a_million_frames_give_no_exception_and_no_wrong_sample() -> None:
     network = Network()
     for node in profile.nodes:
         network.add_node(node, profile.eds.dictionary(node))
-    life = Life(network, profile)
+    heartbeats = HeartbeatMonitor(network, profile)
     listener = BusListener(network, profile, collector)
     random, good = np.random.default_rng(4), good_frames(profile)
     count = taken = refused = 0
@@ -107,7 +107,7 @@ def test_a_million_frames_give_no_exception_and_no_wrong_sample() -> None:
         assert np.abs(state.actual_q - Q).max() < 1e-6
     assert taken > 10_000
     assert refused > 10_000
-    assert len(life.log) <= 64
+    assert len(heartbeats.log) <= 64
     assert time.monotonic() - begun < 60.0
 
 

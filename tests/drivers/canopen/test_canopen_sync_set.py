@@ -64,7 +64,7 @@ def test_a_frame_before_any_sync_or_after_the_set_is_a_stray() -> None:
     collector = SyncCollector(PROFILE)
     collector.take(COB_IDS[0], frame_of(COB_IDS[0], 0), 0.0)
     assert collector.stray == "TPDO1 of node 1"
-    collector.forget_stray()
+    collector.clear_stray()
     collector.begin(0.0)
     for cob_id in COB_IDS:
         collector.take(cob_id, frame_of(cob_id, 0), 0.0)
@@ -80,9 +80,9 @@ def test_what_a_torn_set_lacked_may_come_late_once() -> None:
         collector.take(cob_id, frame_of(cob_id, 0), 0.0)
     assert collector.wait(time.monotonic()) is None
     assert collector.why() == "found 11 of 12 TPDOs, without TPDO1 of node 1"
-    assert collector.owed
+    assert collector.awaits_late
     collector.take(COB_IDS[0], frame_of(COB_IDS[0], 0), 0.0)
-    assert not collector.owed
+    assert not collector.awaits_late
     assert not collector.stray
     collector.take(COB_IDS[0], frame_of(COB_IDS[0], 0), 0.0)
     assert collector.stray == "TPDO1 of node 1"

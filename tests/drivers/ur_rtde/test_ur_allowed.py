@@ -4,7 +4,7 @@ import pytest
 
 from gapbridge.core.errors import WriteError
 from gapbridge.drivers.ur_rtde import registers
-from gapbridge.drivers.ur_rtde.allowed import CONTROL, AllowedControl, AllowedInputs
+from gapbridge.drivers.ur_rtde.command import CONTROL, AllowedControl, AllowedInputs
 
 
 class Library:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import socket
 
-from gapbridge.drivers.ur_rtde.no_delay import send_at_once
+from gapbridge.drivers.ur_rtde.command import send_at_once
 
 
 def test_connections_of_this_process_send_at_once_and_stay_open() -> None:

@@ -10,8 +10,8 @@ import pytest
 from simulated_controller import SimulatedController
 
 from gapbridge.core.errors import WriteError
-from gapbridge.drivers.ur_rtde import round_trip as module
-from gapbridge.drivers.ur_rtde.round_trip import round_trip
+from gapbridge.drivers.ur_rtde import enquiry
+from gapbridge.drivers.ur_rtde.enquiry import round_trip
 
 DELAY = 0.06  # s
 
@@ -37,12 +37,12 @@ def slow_server(delay: float, answers: int) -> int:
 
 
 def test_a_long_way_counts_whole(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "PORT", slow_server(DELAY, module.TRIES))
+    monkeypatch.setattr(enquiry, "RTDE", slow_server(DELAY, enquiry.TRIES))
     assert DELAY <= round_trip("127.0.0.1") < DELAY + 0.05
 
 
 @pytest.mark.parametrize("answers", [0, 1])
 def test_no_answer_is_one_line(monkeypatch: pytest.MonkeyPatch, answers: int) -> None:
-    monkeypatch.setattr(module, "PORT", slow_server(0.0, answers))
+    monkeypatch.setattr(enquiry, "RTDE", slow_server(0.0, answers))
     with pytest.raises(WriteError, match=r"127.0.0.1: found no answer on RTDE's port"):
         round_trip("127.0.0.1")

@@ -34,7 +34,7 @@ class BrokenRun:
                 run._said = LINES[: {State.COMPENSATING: 1, State.OBSERVING: 3}.get(found, 0)]
                 return found
 
-        self.daemon = Daemon(page=SimpleNamespace(ended=False))
+        self.daemon = Daemon(memory=SimpleNamespace(ended=False))
 
     def check(self) -> None:
         pass

@@ -1,4 +1,4 @@
-"""What the loop counts, by kind: words of the shared page, so that no crash loses a count."""
+"""What the loop counts, by kind: words of the shared memory, so that no crash loses a count."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from enum import IntEnum
 from gapbridge.core.errors import Implausible
 
 
-class Count(IntEnum):
+class LoopCounter(IntEnum):
     """Places of the counters; the name in small letters is what people read."""
 
     LATE = 0  # no new state by the deadline; the last offset stays
@@ -45,10 +45,10 @@ class Count(IntEnum):
 
 
 DROPPED = {
-    Implausible.TORN: Count.DROPPED_TORN,
-    Implausible.NOT_FINITE: Count.DROPPED_NOT_FINITE,
-    Implausible.VALUE: Count.DROPPED_IMPLAUSIBLE,
-    Implausible.STEP: Count.DROPPED_STEP,
-    Implausible.BACKWARDS: Count.DROPPED_BACKWARDS,
+    Implausible.TORN: LoopCounter.DROPPED_TORN,
+    Implausible.NOT_FINITE: LoopCounter.DROPPED_NOT_FINITE,
+    Implausible.VALUE: LoopCounter.DROPPED_IMPLAUSIBLE,
+    Implausible.STEP: LoopCounter.DROPPED_STEP,
+    Implausible.BACKWARDS: LoopCounter.DROPPED_BACKWARDS,
 }
 """Why a sample could not be believed -> where it is counted."""

@@ -6,11 +6,12 @@ from collections.abc import Callable
 from typing import IO, Any
 
 from gapbridge.bridge.cell.daemon_settings import DaemonSettings
+from gapbridge.bridge.ipc.events import EventKind
 from gapbridge.bridge.ipc.shared_memory import SharedMemory
 from gapbridge.bridge.ipc.side_process import SideProcess
 from gapbridge.drivers.clock import SYSTEM, Clock
 
-SIDES: dict[str, tuple[str, Callable[[DaemonSettings], bool]]] = {
+SIDE_PROCESSES: dict[str, tuple[str, Callable[[DaemonSettings], bool]]] = {
     "recorder": ("gapbridge.bridge.recording.main", lambda s: s.recording.folder is not None),
     "web": ("gapbridge.bridge.web.main", lambda s: s.web is not None),
     "metrics": ("gapbridge.bridge.metrics.main", lambda s: s.metrics is not None),
@@ -21,7 +22,7 @@ PATIENCE = {"recorder": 10.0}  # s to finish in, where it is not LITTLE
 LITTLE = 0.3
 
 
-class Sides:
+class SideProcesses:
     """All side processes of a run."""
 
     def __init__(self, clock: Clock = SYSTEM) -> None:
@@ -32,18 +33,18 @@ class Sides:
         self,
         settings: DaemonSettings,
         order: dict[str, Any],
-        page: SharedMemory,
+        memory: SharedMemory,
         log: IO[Any] | int,
     ) -> None:
         """Start those that the settings want."""
-        for name, (module, wanted) in SIDES.items():
+        for name, (module, wanted) in SIDE_PROCESSES.items():
             if wanted(settings):
-                self._running[name] = SideProcess(module, order, page, log, self._clock)
+                self._running[name] = SideProcess(module, order, memory, log, self._clock)
 
-    def show(self, page: SharedMemory) -> None:
-        """Have all change over to a page that the daemon shows."""
+    def show(self, memory: SharedMemory) -> None:
+        """Have all change over to another memory."""
         for side in self._running.values():
-            side.show(page)
+            side.show(memory)
 
     def emit(self, event: dict[str, Any]) -> None:
         """Pass an event on to each; never blocks."""
@@ -59,9 +60,9 @@ class Sides:
                     found.append(event)
                 else:  # states and requests are not a side process's to emit
                     detail = f"{name} emitted {str(event.get('kind'))[:40]!r}, which is not its own"
-                    found.append({"kind": "side", "side": name, "detail": detail})
+                    found.append({"kind": EventKind.SIDE, "side": name, "detail": detail})
             if (wrong := side.check()) is not None:
-                found.append({"kind": "side", "side": name, "detail": wrong})
+                found.append({"kind": EventKind.SIDE, "side": name, "detail": wrong})
         return found
 
     def status(self) -> dict[str, dict[str, int | None]]:

@@ -30,7 +30,7 @@ class Command(IntEnum):
     ZERO_MOVED = 5  # ramp out, observe, and refuse to arm until a person has sent DISARM
 
 
-class CommandPage:
+class CommandMemory:
     """The daemon's side: numbers requests and writes them. From any of its threads."""
 
     def __init__(self) -> None:

@@ -1,4 +1,4 @@
-"""The page that outlives the loop's processes, and its readers."""
+"""The memory that outlives the loop's processes, and its readers."""
 
 from __future__ import annotations
 
@@ -11,54 +11,54 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from gapbridge.bridge.ipc.counts import Count
-from gapbridge.bridge.ipc.shared_memory import ROWS, FollowedPage, Phase, RunPage, SharedMemory
+from gapbridge.bridge.ipc.loop_counters import LoopCounter
+from gapbridge.bridge.ipc.shared_memory import ROWS, FollowedMemory, Phase, RunMemory, SharedMemory
 
 
 @pytest.fixture
-def page() -> Iterator[SharedMemory]:
+def memory() -> Iterator[SharedMemory]:
     found = SharedMemory(2)
     yield found
     found.close()
 
 
-def put(page: SharedMemory, timestamp: float) -> None:
-    page.next_row()[1:] = timestamp
-    page.publish()
+def put(memory: SharedMemory, timestamp: float) -> None:
+    memory.next_row()[1:] = timestamp
+    memory.publish()
 
 
-def test_each_reader_has_its_own_place(page: SharedMemory) -> None:
-    early = page.reader()
-    put(page, 0.0)
+def test_each_reader_has_its_own_place(memory: SharedMemory) -> None:
+    early = memory.reader()
+    put(memory, 0.0)
     assert early.drain()[:, 1].tolist() == [0]
-    put(page, 1.0)
-    late = page.reader(first=1)
+    put(memory, 1.0)
+    late = memory.reader(first=1)
     assert early.drain()[:, 1].tolist() == [1]
     assert late.drain()[:, 1].tolist() == [1]
     assert early.lost == late.lost == 0
 
 
-def loop_of(run: RunPage) -> SharedMemory:
-    """Return the page as the next process of the loop joins it."""
+def loop_of(run: RunMemory) -> SharedMemory:
+    """Return the memory as the next process of the loop joins it."""
     run.renew()
     return SharedMemory(2, os.dup(run.fd))
 
 
 @pytest.fixture
-def run() -> Iterator[RunPage]:
-    found = RunPage(2)
+def run() -> Iterator[RunMemory]:
+    found = RunMemory(2)
     yield found
     found.close()
 
 
-def test_a_new_process_of_the_loop_goes_on_counting_and_nothing_else_stays(run: RunPage) -> None:
+def test_a_new_process_of_the_loop_goes_on_counting_and_nothing_else_stays(run: RunMemory) -> None:
     reader, loop = run.reader(), loop_of(run)
     loop.enter(Phase.RUNNING)
     loop.note_state(3)
     loop.note_seen()
     loop.note_ended()
     loop.note_taken(7)
-    loop.count(Count.LATE, 4)
+    loop.count(LoopCounter.LATE, 4)
     put(loop, 0.0)
     loop.next_row()[1] = 99.0  # killed here
     loop.close()
@@ -66,15 +66,15 @@ def test_a_new_process_of_the_loop_goes_on_counting_and_nothing_else_stays(run: 
     assert (run.phase, run.state, run.seen, run.ended) == (Phase.STARTING, 0, False, False)
     assert run.silence == 0.0
     assert run.taken == 7
-    loop.count(Count.LATE)
+    loop.count(LoopCounter.LATE)
     put(loop, 1.0)
     assert reader.drain()[:, 1].tolist() == [0, 1]
     assert run.written == 2
-    assert run.counts()[Count.LATE.label] == 5
+    assert run.counts()[LoopCounter.LATE.label] == 5
     loop.close()
 
 
-def test_a_page_is_shown_once_its_loop_alone_can_write_to_it(run: RunPage) -> None:
+def test_memory_is_shown_once_its_loop_alone_can_write_to_it(run: RunMemory) -> None:
     assert not run.promote()
     first = run.open_for_reading()
     run.renew()
@@ -89,9 +89,9 @@ def test_a_page_is_shown_once_its_loop_alone_can_write_to_it(run: RunPage) -> No
     loop.close()
 
 
-def test_who_reads_along_changes_over_and_misses_nothing(run: RunPage) -> None:
+def test_who_reads_along_changes_over_and_misses_nothing(run: RunMemory) -> None:
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    side = FollowedPage(2, run.open_for_reading(), theirs)
+    side = FollowedMemory(2, run.open_for_reading(), theirs)
     reader = side.reader()
     for k in range(3):
         loop = loop_of(run)
@@ -101,7 +101,7 @@ def test_who_reads_along_changes_over_and_misses_nothing(run: RunPage) -> None:
         socket.send_fds(ours, [b"p"], [fd])
         os.close(fd)
         put(loop, 2.0 * k + 1)
-        if k != 1:  # it may be slow, and two pages come at once
+        if k != 1:  # it may be slow, and two memories come at once
             assert reader.drain()[-1, 1] == 2.0 * k + 1
         loop.note_state(k)
         loop.close()
@@ -113,25 +113,25 @@ def test_who_reads_along_changes_over_and_misses_nothing(run: RunPage) -> None:
     side.close()
 
 
-def test_a_reader_that_starts_late_counts_what_is_gone(page: SharedMemory) -> None:
+def test_a_reader_that_starts_late_counts_what_is_gone(memory: SharedMemory) -> None:
     for k in range(ROWS + 10):
-        put(page, float(k))
-    reader = page.reader(first=5)
+        put(memory, float(k))
+    reader = memory.reader(first=5)
     rows = reader.drain()
     assert len(rows) + reader.lost == ROWS + 5
     assert (np.diff(rows[:, 0]) == 1).all()
 
 
-def test_who_only_reads_cannot_write(page: SharedMemory) -> None:
-    put(page, 7.0)
-    fd = page.open_for_reading()
+def test_who_only_reads_cannot_write(memory: SharedMemory) -> None:
+    put(memory, 7.0)
+    fd = memory.open_for_reading()
     code = f"""
 import mmap, os
 from gapbridge.bridge.ipc.shared_memory import SharedMemory
-page = SharedMemory(2, {fd}, writable=False)
-assert page.reader().drain()[:, 1].tolist() == [7.0]
+memory = SharedMemory(2, {fd}, writable=False)
+assert memory.reader().drain()[:, 1].tolist() == [7.0]
 again = os.open("/proc/self/fd/{fd}", os.O_RDWR)
-ways = (lambda: page.note_state(3), lambda: os.write({fd}, b"x"), lambda: mmap.mmap({fd}, 64),
+ways = (lambda: memory.note_state(3), lambda: os.write({fd}, b"x"), lambda: mmap.mmap({fd}, 64),
         lambda: os.pwrite(again, b"x", 0), lambda: mmap.mmap(again, 64),
         lambda: os.ftruncate(again, 0), lambda: SharedMemory(2, again))
 for way in ways:
@@ -146,4 +146,4 @@ for way in ways:
     )
     os.close(fd)
     assert done.returncode == 0, done.stderr
-    assert page.state == 0
+    assert memory.state == 0

@@ -51,7 +51,7 @@ class Record:
         os.close(self.fd)
 
 
-class PlcPage:
+class PlcMemory:
     """Two records, one a direction: each side writes its own and only reads the other's.
 
     Without descriptors it is the loop's side, which makes both; with the two (setpoint, status) it

@@ -1,0 +1,58 @@
+"""What force-torque sensors on a CAN bus share: sending, receiving and leaving the bus."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+from gapbridge.core.errors import LinkError, first_line
+from gapbridge.drivers.can_bus.bus import close_bus
+from gapbridge.drivers.ft_sensor.sensor import ForceTorqueSensor
+
+
+class CanSensor(ForceTorqueSensor):
+    """A sensor that speaks in standard frames; ``connect`` opens ``_bus``."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._bus: Any = None
+
+    def _connected(self) -> Any:
+        """Return the bus. Raises LinkError where there is none."""
+        if self._bus is None:
+            raise LinkError(f"{self.name}: found no connection, expected connect() first")
+        return self._bus
+
+    def _send(self, identifier: int, data: bytes) -> None:
+        """Send one frame. Raises LinkError."""
+        import can
+
+        frame = can.Message(arbitration_id=identifier, data=data, is_extended_id=False)
+        try:
+            self._connected().send(frame, timeout=0.1)
+        except (can.CanError, OSError) as error:
+            raise LinkError(f"{self.name}: cannot be written to: {first_line(error)}") from None
+
+    def _receive(self, timeout: float) -> Any:
+        """Return the next data frame with a standard id within ``timeout`` s, or None.
+
+        Raises LinkError.
+        """
+        import can
+
+        bus, until = self._connected(), time.monotonic() + timeout
+        while True:
+            try:
+                frame = bus.recv(max(until - time.monotonic(), 0.0))
+            except (can.CanError, OSError, ValueError) as error:
+                raise LinkError(f"{self.name}: {first_line(error)}") from None
+            if frame is None:
+                return None
+            if not (frame.is_error_frame or frame.is_remote_frame or frame.is_extended_id):
+                return frame
+
+    def close(self) -> None:
+        """Leave the bus."""
+        if self._bus is not None:
+            close_bus(self._bus)
+            self._bus = None
