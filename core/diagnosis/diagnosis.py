@@ -257,13 +257,13 @@ def _log_findings(model: Model, log: Log, metrology: Metrology) -> list[LogFindi
         return findings(log, model, metrology)
     sessions: dict[LogFinding, list[str]] = {}
     for name, part in zip(log.session_names, sessions_in(log), strict=True):
-        own = position.session_model(model, part, metrology)
-        for finding in findings(part, own, metrology):
+        session_model = position.session_model(model, part, metrology)
+        for finding in findings(part, session_model, metrology):
             sessions.setdefault(finding, []).append(name)
-    found = [replace(finding, sessions=tuple(names)) for finding, names in sessions.items()]
+    log_findings = [replace(finding, sessions=tuple(names)) for finding, names in sessions.items()]
     if not log.one_clock:
-        found.append(LogFinding(LogCheck.CLOCKS_OVERLAP))
-    return found + outside_findings(log)
+        log_findings.append(LogFinding(LogCheck.CLOCKS_OVERLAP))
+    return log_findings + outside_findings(log)
 
 
 def _thinned(
@@ -373,23 +373,24 @@ def _decided(found: _Searched, model: Model, streamed: Streamed | None) -> Chann
     held_rms = held.rms(chosen) if held.possible else None
     if not causes:  # nothing was fitted but the frame, before as well as after
         held_rms = sizes.gap_rms
-    if sizes.left < UNRESOLVED:
+    if sizes.remaining_rms < UNRESOLVED:
         verdict = replace(verdict, structured=False, depends_on=())
     structured = verdict.structured
     named = "explained" if causes else "no_gap"
     if structured:
         named = "partly_explained" if causes else "unexplained"
-    own = held if streamed is None else HeldOut(shown)
+    per_sample = held if streamed is None else HeldOut(shown)
     return ChannelDiagnosis(
         channel=seen.channel, unit=seen.unit, samples=sizes.samples, gap_rms=sizes.gap_rms,
-        gap_max=sizes.gap_max, noise_floor_rms=floor.rms, remaining_rms=sizes.left,
+        gap_max=sizes.gap_max, noise_floor_rms=floor.rms, remaining_rms=sizes.remaining_rms,
         remaining_rms_held_out=held_rms, where=found.where, causes=causes,
         considered=found.considered,
-        unexplained_rms=_unexplained(sizes.left, floor.rms, verdict), structured=structured,
-        p_value=verdict.p_value, depends_on=verdict.depends_on, verdict=named,
-        selection=shown, judgement=verdict, gap=gap, remaining=remaining,
-        held_out=np.sqrt(own.squares(chosen)) if own.possible else None, outliers=sizes.outliers,
-        elsewhere=generalisation(decided, chosen), carried=carried(decided, chosen, model.arm),
+        unexplained_rms=_unexplained(sizes.remaining_rms, floor.rms, verdict),
+        structured=structured, p_value=verdict.p_value, depends_on=verdict.depends_on,
+        verdict=named, selection=shown, judgement=verdict, gap=gap, remaining=remaining,
+        held_out=np.sqrt(per_sample.squares(chosen)) if per_sample.possible else None,
+        outliers=sizes.outliers, elsewhere=generalisation(decided, chosen),
+        carried=carried(decided, chosen, model.arm),
         noise_floor_source=floor.source, **found.stood_in,
     )  # fmt: skip
 
@@ -429,7 +430,7 @@ def _stood_in(
     }
 
 
-def _unexplained(left: float, floor: float | None, verdict: Judgement) -> float:
+def _unexplained(remaining: float, floor: float | None, verdict: Judgement) -> float:
     """Return the rms of what is left beyond the noise; of a residual without structure 0.
 
     Where no floor is known, or one no lower than what is left, what the residual depends on says
@@ -437,11 +438,11 @@ def _unexplained(left: float, floor: float | None, verdict: Judgement) -> float:
     """
     if not verdict.structured:
         return 0.0
-    beyond = float(np.sqrt(max(left**2 - floor**2, 0.0))) if floor is not None else 0.0
+    beyond = float(np.sqrt(max(remaining**2 - floor**2, 0.0))) if floor is not None else 0.0
     if beyond > 0:
         return beyond
     share = max((share for _, share in verdict.depends_on), default=1.0)
-    return left * float(np.sqrt(np.clip(share, 0.0, 1.0)))
+    return remaining * float(np.sqrt(np.clip(share, 0.0, 1.0)))
 
 
 def _overall(channels: Sequence[ChannelDiagnosis]) -> str:

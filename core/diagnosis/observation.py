@@ -122,8 +122,8 @@ def stacked(parts: Sequence[Observation], quantities: Mapping[str, Array]) -> Ob
     group_ends = np.cumsum([0, *(int(part.groups.max()) + 1 for part in parts)])
 
     def together(name: str) -> Array | None:
-        found = [getattr(part, name) for part in parts]
-        return None if any(f is None for f in found) else np.concatenate(found)
+        columns = [getattr(part, name) for part in parts]
+        return None if any(f is None for f in columns) else np.concatenate(columns)
 
     def predict(terms: Sequence[Term]) -> Array:
         return np.concatenate([part.predict(terms) for part in parts])

@@ -75,10 +75,10 @@ def observe(model: Model, log: Log, metrology: Metrology) -> Observation | NotOb
     if len(log.session_names) < 2:
         return replace(parts[0], session=None)
     rows = np.concatenate([part.rows for part in parts])
-    found = quantities(log, rows) | approaches(log.loads().approach, rows)
+    together = quantities(log, rows) | approaches(log.loads().approach, rows)
     for k in range(3):  # the sessions' frames differ: positions compare in base only
-        found[f"measured_position_{k}"] = np.concatenate([p.measured[:, k] for p in parts])
-    return stacked(parts, found)
+        together[f"measured_position_{k}"] = np.concatenate([p.measured[:, k] for p in parts])
+    return stacked(parts, together)
 
 
 def _numbered(seen: Observation, session: int, rows: NDArray[np.int64]) -> Observation:

@@ -47,9 +47,9 @@ def conditions(motion: Motion) -> Index:
     given = [loads.payload_mass, loads.payload_cog, loads.wrench]
     columns = [np.asarray(c).reshape(len(motion), -1) for c in given if c is not None]
     table = np.column_stack([groups, *columns])
-    found = np.unique(np.round(table, 6), axis=0, return_inverse=True)[1].reshape(-1)
-    if found.max() + 1 >= FEWEST_CONDITIONS:
-        return np.asarray(found)
+    condition = np.unique(np.round(table, 6), axis=0, return_inverse=True)[1].reshape(-1)
+    if condition.max() + 1 >= FEWEST_CONDITIONS:
+        return np.asarray(condition)
     return np.arange(len(motion))
 
 
@@ -68,15 +68,15 @@ def quantities(log: Log, motion: Motion) -> dict[str, Array]:
 
 def varying(columns: Mapping[str, Array | None]) -> dict[str, Array]:
     """Return each scalar (N,) of columns (N,) or (N, k) that varies, by its name in the log."""
-    found: dict[str, Array] = {}
+    varied: dict[str, Array] = {}
     for name, values in columns.items():
         if values is None:
             continue
         table = values.reshape(len(values), -1)
         for i in range(table.shape[1]):
             if np.isfinite(table[:, i]).all() and np.ptp(table[:, i]) > CONSTANT_SPREAD:
-                found[name if values.ndim == 1 else f"{name}_{i}"] = table[:, i]
-    return found
+                varied[name if values.ndim == 1 else f"{name}_{i}"] = table[:, i]
+    return varied
 
 
 def held_torques(motion: Motion) -> dict[str, Array]:

@@ -78,7 +78,7 @@ class Columns:
 
     def of(self, seen: Observation, bare: Array, gap: Array) -> Array:
         """Return the columns (N, k, width) of an observation; ``bare`` is its gap without terms."""
-        own = [
+        columns = [
             self._candidate(seen, c, chord)
             for c, chord in zip(self.candidates, self._chords, strict=True)
         ]
@@ -87,12 +87,12 @@ class Columns:
             target = gap
             for term in self.terms:
                 c, x = locate(list(self.candidates), term)
-                target = target + own[c] @ x
+                target = target + columns[c] @ x
         jacobian = [
             exact_jacobian(seen, c, x, self.terms[:i] + self.terms[i + 1 :])
             for i, (c, x) in enumerate(zip(self.freed, self.x, strict=True))
         ]
-        return np.concatenate([*own, target[..., None], *jacobian, gap[..., None]], axis=2)
+        return np.concatenate([*columns, target[..., None], *jacobian, gap[..., None]], axis=2)
 
     def _candidate(self, seen: Observation, c: Candidate, chord: float | None) -> Array:
         if chord is not None:
@@ -120,8 +120,8 @@ class Streamed:
         terms, covariance = list(self.excerpt.terms), list(self.excerpt.covariance)
         values, spread = self._fitted(accused)
         freed = dict(zip(self.columns.accused, self.columns.freed, strict=True))
-        for p, value, own in zip(accused, values, spread, strict=True):
-            terms[p], covariance[p] = freed[p].term(value), own
+        for p, value, term_covariance in zip(accused, values, spread, strict=True):
+            terms[p], covariance[p] = freed[p].term(value), term_covariance
         space, unprojected = self._space()
         observation, noise = self._samples()
         return Selection(
@@ -144,36 +144,36 @@ class Streamed:
             np.array(selection.terms[p].values)[: len(freed[p].parameters)] - x[p] for p in accused
         ]
         away = mix @ np.concatenate([*(-m for m in moved), [1.0]])
-        at = [*self.columns.jacobian, self.columns.width - 1]
-        sums = self.sums.sum(axis=0)[:, at][:, :, at]
+        used = [*self.columns.jacobian, self.columns.width - 1]
+        sums = self.sums.sum(axis=0)[:, used][:, :, used]
         squares = np.einsum("i,kij,j->k", away, sums, away) / self.white**2
-        own = own_coordinates(self.excerpt.observation)
-        return np.maximum(squares, 0.0), (self.means @ away / self.white)[:, :own]
+        in_unit = own_coordinates(self.excerpt.observation)
+        return np.maximum(squares, 0.0), (self.means @ away / self.white)[:, :in_unit]
 
     def _mix(self, accused: Sequence[int]) -> Array:
         """Return Jacobian and gap of some terms alone (p + 1, d + 1): others put back."""
         size = len(self.columns.jacobian) + 1
-        kept, gap, at = [], np.zeros(size), 0
+        kept, gap, start = [], np.zeros(size), 0
         gap[-1] = 1.0
         for p, x in zip(self.columns.accused, self.columns.x, strict=True):
             if p in accused:
-                kept.append((p, np.eye(size)[:, at : at + len(x)]))
+                kept.append((p, np.eye(size)[:, start : start + len(x)]))
             else:
-                gap[at : at + len(x)] = x
-            at += len(x)
+                gap[start : start + len(x)] = x
+            start += len(x)
         order = dict(kept)
         return np.hstack([*(order[p] for p in accused), gap[:, None]])
 
     def _fitted(self, accused: Sequence[int]) -> tuple[list[Array], list[Array]]:
         if not accused:
             return [], []
-        mix, at = self._mix(accused), [*self.columns.jacobian, self.columns.width - 1]
+        mix, used = self._mix(accused), [*self.columns.jacobian, self.columns.width - 1]
         span = max(float(np.ptp(self.time)), 1e-9)
         part = ((self.time - self.time.min()) / span * REGIONS).astype(np.int64)
         part = np.minimum(part, REGIONS - 1) if self.by_region else np.zeros_like(part)
         names = np.unique(part)
         sums = np.stack([self.sums[part == name].sum(axis=(0, 1)) for name in names])
-        rows = rows_of(mix.T @ sums[:, at][:, :, at] @ mix)
+        rows = rows_of(mix.T @ sums[:, used][:, :, used] @ mix)
         flat = rows.reshape(-1, rows.shape[2])
         known = dict(zip(self.columns.accused, range(len(self.columns.accused)), strict=True))
         return step_on(

@@ -50,17 +50,17 @@ def frame_findings(model: Model, log: Log, metrology: Metrology) -> list[LogFind
         return []
     seen = measured[rows]
     distance = _off(seen, predicted)
-    found = []
+    findings = []
     if distance > FAR:
-        found.append(_why(model, q, measured, rows, distance, log.get("measured_rotation")))
+        findings.append(_why(model, q, measured, rows, distance, log.get("measured_rotation")))
     elif metrology.registered:
         here = float(np.median(np.linalg.norm(seen - predicted, axis=1)))
         if here > FAR and distance < BETTER * here:
-            found.append(LogFinding(LogCheck.NOT_IN_BASE, (here,)))
+            findings.append(LogFinding(LogCheck.NOT_IN_BASE, (here,)))
     turned = log.get("measured_rotation")
-    if turned is not None and not found:
-        found += _rotations(model, q[rows], seen, turned[rows], metrology)
-    return found
+    if turned is not None and not findings:
+        findings += _rotations(model, q[rows], seen, turned[rows], metrology)
+    return findings
 
 
 def _off(measured: Array, predicted: Array) -> float:

@@ -108,14 +108,14 @@ def named_candidates(
     What ``base`` holds already comes with its own period or curve. ``turns`` (n,) says how many
     turns each joint's poses span.
     """
-    found = []
+    candidates = []
     for identifier, effect in CATALOGUE.items():
         if channel not in effect.channels or identifier in set(withheld) or effect.at_moment:
             continue
         for site in effect.sites(arm):
             inside = [t for t in base if t.effect == identifier and t.site.joint == site.joint]
-            found += _at(arm, effect, site, with_rotation, inside, turns)
-    return found
+            candidates += _at(arm, effect, site, with_rotation, inside, turns)
+    return candidates
 
 
 def _at(

@@ -125,21 +125,21 @@ def as_one_delay(values: Array, variances: Array) -> tuple[Array, Array]:
     return centre + own * (values - centre), np.where(known, own * variances, prior)
 
 
-def one_delay(space: SampleSpace, found: CandidateFit) -> CandidateFit:
+def one_delay(space: SampleSpace, best: CandidateFit) -> CandidateFit:
     """Return the set with all joints that answer late as one effect of the controller.
 
     Latency or lag, whichever fits all of these joints better: each joint by itself decides little.
     """
-    return min(delayed_by(space, found).values(), key=lambda f: f.score, default=found)
+    return min(delayed_by(space, best).values(), key=lambda f: f.score, default=best)
 
 
-def delayed_by(space: SampleSpace, found: CandidateFit) -> dict[str, CandidateFit]:
+def delayed_by(space: SampleSpace, best: CandidateFit) -> dict[str, CandidateFit]:
     """Return the set with each of the delays at all joints that answer late; none for one joint."""
     site = {(k.family, k.site.joint): c for c, k in enumerate(space.candidates) if k.effect.delays}
-    late = [c for c in found.chosen if space.candidates[c].effect.delays]
+    late = [c for c in best.chosen if space.candidates[c].effect.delays]
     if len(late) < 2:
         return {}
-    rest = [c for c in found.chosen if c not in late]
+    rest = [c for c in best.chosen if c not in late]
     joints = sorted({space.candidates[c].site.joint or 0 for c in late})
     return {
         effect: fit(space, (*rest, *(site[effect, j] for j in joints)))

@@ -74,7 +74,7 @@ def additions(
     gain, sign = gains(space, state.r, state.along)
     score = space.misfit(np.maximum(state.rss - gain, 1e-300)) + space.penalty
     score += space.penalty[list(state.chosen)].sum()
-    found: list[tuple[float, int]] = []
+    ranked: list[tuple[float, int]] = []
     for c in np.argsort(score):
         candidate = space.candidates[c]
         if c in state.chosen or (named_only and not candidate.named):
@@ -84,10 +84,10 @@ def additions(
         single = candidate.named and len(candidate.parameters) == 1
         if single and candidate.parameters[0].lower == 0 and sign[c] < 0:
             continue
-        found.append((float(score[c]), int(c)))
-        if len(found) >= width:
+        ranked.append((float(score[c]), int(c)))
+        if len(ranked) >= width:
             break
-    return found
+    return ranked
 
 
 def joining(space: SampleSpace, chosen: Sequence[int], width: int) -> list[tuple[float, int]]:

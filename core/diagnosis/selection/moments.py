@@ -1,4 +1,4 @@
-"""Moments at which something stepped once: by likelihood over all of them, in one pass.
+"""Moments at which something steps once: by likelihood over all of them, in one pass.
 
 Every site of every effect that steps is tried at every moment between two rows. The columns of a
 step are those of the same change in all rows, cut off before the moment, so that inner products
@@ -47,7 +47,7 @@ def step_candidates(
         return []
     still = tuple(t for t in base if not CATALOGUE[t.effect].at_moment)
     target, basis = _integrated(state, columns, still)
-    found: list[Pair] = []
+    pairs: list[Pair] = []
     for effect in effects:
         sites = effect.sites(state.arm)
         for site in sites:
@@ -59,8 +59,8 @@ def step_candidates(
             for moment in (*(_between(times, k) for k in kept), *had):
                 candidate = _candidate(state.arm, effect, site, moment, tried)
                 after = (times > moment).astype(float)
-                found.append((candidate, always * after[:, None, None]))
-    return found
+                pairs.append((candidate, always * after[:, None, None]))
+    return pairs
 
 
 def _candidate(arm: Arm, effect: Effect, site: Site, moment: float, tried: int) -> Candidate:
@@ -149,9 +149,9 @@ def slips(terms: Sequence[Term], times: Array | None) -> list[tuple[Term, float,
     """Return each term that steps, and the times of the last row before and the first row after."""
     if times is None:
         return []
-    found = []
+    steps = []
     for term in terms:
         if CATALOGUE[term.effect].at_moment:
             k = int(np.searchsorted(times, term.values[-1], side="right"))
-            found.append((term, float(times[max(k - 1, 0)]), float(times[min(k, len(times) - 1)])))
-    return found
+            steps.append((term, float(times[max(k - 1, 0)]), float(times[min(k, len(times) - 1)])))
+    return steps

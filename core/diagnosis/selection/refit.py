@@ -54,7 +54,7 @@ class Remainder:
 def refit(
     state: SelectionState,
     space: SampleSpace,
-    found: CandidateFit,
+    linear_fit: CandidateFit,
     links: Mapping[int, Array] = NO_PRIOR,
     remainder: Remainder | None = None,
 ) -> tuple[SelectionState, tuple[Term, ...], tuple[int, ...], tuple[Array, ...], Array]:
@@ -64,12 +64,12 @@ def refit(
     Beside a ``remainder`` covariances are those of regions left out in turn (jackknife), where
     these are wider than those of white noise: what is unknown is not the same everywhere.
     """
-    index = (*(c for c in found.chosen if space.candidates[c].named), *links)
+    index = (*(c for c in linear_fit.chosen if space.candidates[c].named), *links)
     freed = {c: freed_of(state.arm, space.candidates[c]) for c in index}
-    smooth = [c for c in found.chosen if not space.candidates[c].named]
+    smooth = [c for c in linear_fit.chosen if not space.candidates[c].named]
     x = [
         np.array(space.candidates[c].term(v).values)[: len(freed[c].parameters)]
-        for c, v in zip(found.chosen, found.values, strict=True)
+        for c, v in zip(linear_fit.chosen, linear_fit.values, strict=True)
         if c in index
     ] + [np.zeros(len(space.candidates[c].parameters)) for c in links]
     x = _standing(state, freed, index, x)
@@ -164,8 +164,8 @@ def step_on(
         _within(c, v + part)
         for c, v, part in zip(freed, x, np.split(step, np.cumsum(sizes)[:-1]), strict=True)
     ]
-    left = float(np.sum((rows.b - rows.A @ step) ** 2))
-    variance = max(left / max(rows.count - rows.A.shape[1], 1), floor)
+    residual_ss = float(np.sum((rows.b - rows.A @ step) ** 2))
+    variance = max(residual_ss / max(rows.count - rows.A.shape[1], 1), floor)
     spread = _covariances(whole, right, variance, sizes, rows.region)
     return _as_one_delay(freed, values, spread)
 
@@ -178,8 +178,8 @@ def _as_one_delay(
     variances = np.array([covariance[k][0, 0] for k in late])
     values, variances = as_one_delay(np.array([x[k][0] for k in late]), variances)
     x, covariance = list(x), list(covariance)
-    for k, value, own in zip(late, values, variances, strict=True):
-        x[k], covariance[k] = np.array([value]), np.array([[own]])
+    for k, value, variance in zip(late, values, variances, strict=True):
+        x[k], covariance[k] = np.array([value]), np.array([[variance]])
     return x, covariance
 
 
@@ -207,8 +207,8 @@ def _uncertain(state: SelectionState, terms: tuple[Term, ...], rows: int) -> Arr
     uncertain = state.observation.uncertain
     if uncertain is None or not terms:
         return None
-    own = flat(uncertain(terms), state)
-    return np.vstack([own, np.zeros((rows - len(own), own.shape[1]))])
+    sigmas = flat(uncertain(terms), state)
+    return np.vstack([sigmas, np.zeros((rows - len(sigmas), sigmas.shape[1]))])
 
 
 def _cluster_covariance(white: Array, A: Array, b: Array, region: NDArray[np.int64]) -> Array:
@@ -248,8 +248,8 @@ def worth(term: Term, spread: Array) -> float:
     if effect.periodic:
         single = float(value @ value) ** 2 / max(float(value @ spread @ value), 1e-300)
     else:
-        own = slice(0, 1) if effect.curved or effect.shapes else slice(None)
-        single = float(np.max(value[own] ** 2 / np.maximum(np.diag(spread)[own], 1e-300)))
+        judged = slice(0, 1) if effect.curved or effect.shapes else slice(None)
+        single = float(np.max(value[judged] ** 2 / np.maximum(np.diag(spread)[judged], 1e-300)))
     return min(whole, single) / OWN_SIGMAS**2
 
 
@@ -267,8 +267,8 @@ def _step(
     free = np.ones(len(unit), dtype=bool)
     step = np.zeros(len(unit))
     for _ in range(1 + len(now)):
-        own = unit * free
-        step = np.linalg.lstsq(A * own, b, rcond=1e-9)[0] * own
+        unit_of_free = unit * free
+        step = np.linalg.lstsq(A * unit_of_free, b, rcond=1e-9)[0] * unit_of_free
         ahead = step[: len(now)]
         stuck = ((now <= lower) & (ahead < 0)) | ((now >= upper) & (ahead > 0))
         if not stuck.any():
@@ -323,7 +323,7 @@ def _share(
     linear = A[:, sum(len(v) for v in x) :]  # smooth terms and nuisance, refitted for each trial
     Q = basis_of(linear)
 
-    def left(share: float) -> float:
+    def objective(share: float) -> float:
         ahead = [_within(freed[c], v + share * part)
                  for c, v, part in zip(index, x, parts, strict=False)]  # fmt: skip
         terms = [freed[c].term(v) for c, v in zip(index, ahead, strict=True)]
@@ -336,9 +336,9 @@ def _share(
         off = np.concatenate([v / size for v, size in zip(ahead, near, strict=True)])
         return float(r @ r + off @ off)
 
-    now = left(0.0)
+    now = objective(0.0)
     for share in (1.0, 0.5, 0.25, 0.1, 0.03):
-        if left(share) <= now:
+        if objective(share) <= now:
             return share
     return 0.0
 

@@ -188,7 +188,7 @@ def test_repeats_show_the_noise_whatever_the_poses_are_off_by(seed, sigma, pairs
 def test_a_cause_that_is_needed_is_more_probable_than_not(effect):
     channel = channel_of(effect)
     assert 0.99 < channel.causes[0].probability <= 1
-    own = set(channel.selection.found.chosen)
+    own = set(channel.selection.best.chosen)
     assert probability(channel.selection, own) == channel.causes[0].probability
 
 
