@@ -8,14 +8,12 @@ from __future__ import annotations
 import numpy as np
 
 from gapbridge.core.arrays import Array
-from gapbridge.core.diagnosis.criteria import SMOOTH_PENALTY
+from gapbridge.core.diagnosis.criteria import MIN_PERIODS, SMOOTH_PENALTY
 from gapbridge.core.diagnosis.selection.candidate import joint_quantity
 from gapbridge.core.diagnosis.selection.selection import Selection
 from gapbridge.core.estimation.least_squares import basis_of, projected_out
 from gapbridge.core.estimation.nelder_mead import nelder_mead
 
-LEAST_PERIOD = 0.75  # of a line, beside something unknown: a sine's less than two extremes are any
-# curve's. False lines showed 0.26 to 0.54, true ones beside an unknown 0.89 and more
 PLACES, WIDTHS = 13, (0.05, 0.1, 0.2)  # where a bump is first looked for, in shares of the range
 
 
@@ -30,7 +28,7 @@ def bumps(selection: Selection) -> set[int]:
     chosen = [c for c in selection.best.chosen if space.candidates[c].named]
     bump_like: set[int] = set()
     if len(chosen) < len(selection.best.chosen):
-        bump_like = {c for c in chosen if _periods(selection, c) < LEAST_PERIOD}
+        bump_like = {c for c in chosen if _periods(selection, c) < MIN_PERIODS}
     for i in range(observation.joint_columns.shape[2]):
         here = [c for c in chosen if space.candidates[c].site.joint == i + 1]
         lines = [c for c in here if space.candidates[c].periodic]

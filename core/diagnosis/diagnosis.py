@@ -16,7 +16,7 @@ from gapbridge.core.diagnosis.causes import Considered, causes_of, considered_of
 from gapbridge.core.diagnosis.channel_diagnosis import ChannelDiagnosis, Where, locate
 from gapbridge.core.diagnosis.channels import position, torque, tracking, wrench
 from gapbridge.core.diagnosis.channels.simulation import joined, predicted_by
-from gapbridge.core.diagnosis.criteria import UNRESOLVED
+from gapbridge.core.diagnosis.criteria import MIN_CONDITIONS, MIN_FREEDOM, UNRESOLVED
 from gapbridge.core.diagnosis.every_row.gap_sizes import gaps, sizes_of, streamed_sizes
 from gapbridge.core.diagnosis.every_row.long_recording import LongRecording, long_recording
 from gapbridge.core.diagnosis.every_row.refitted import (
@@ -324,7 +324,7 @@ def _lacks_much(channel: ChannelDiagnosis) -> bool:
 def _too_few(observation: Observation) -> bool:
     """Return whether there are too few samples for a diagnosis."""
     N, k, p = observation.nuisance.shape
-    return N * k < p + 6 or len(np.unique(observation.groups)) < 4
+    return N * k < p + MIN_FREEDOM or len(np.unique(observation.groups)) < MIN_CONDITIONS
 
 
 def _searched(

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapbridge.core.arrays import Array, Index
-from gapbridge.core.diagnosis.criteria import PRIOR_REACH
+from gapbridge.core.diagnosis.criteria import MIN_FREEDOM_OF_SESSION, PRIOR_REACH
 from gapbridge.core.diagnosis.observation import Observation
 from gapbridge.core.diagnosis.selection.selection import Selection
 from gapbridge.core.estimation.held_out import joint_regions
@@ -112,7 +112,7 @@ class _Problem:
     def _enough(self, session: int, fitted: NDArray[np.bool_]) -> bool:
         unknowns = int((self._owner == session).sum())
         samples = int((fitted & (self._session == session)).sum())
-        return bool(self._k * samples >= unknowns + 3)
+        return bool(self._k * samples >= unknowns + MIN_FREEDOM_OF_SESSION)
 
     def _rows(self, samples: NDArray[np.bool_]) -> NDArray[np.bool_]:
         return np.repeat(samples, self._k)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from gapbridge.core.arrays import Array
 from gapbridge.core.diagnosis.channels.recording import varying
+from gapbridge.core.diagnosis.criteria import MIN_APPROACHES, MIN_FREEDOM_OF_SESSION
 from gapbridge.core.diagnosis.observation import NotObservable, Observation, Predict, stacked
 from gapbridge.core.diagnosis.selection.unnamed import unnamed_rivals
 from gapbridge.core.effects import Term
@@ -98,10 +99,11 @@ def _numbered(seen: Observation, session: int, rows: NDArray[np.int64]) -> Obser
 def _check_enough(seen: Observation, log: Log, name: str) -> None:
     """Raise LogError where a session of several has too few poses for its nuisances."""
     N, k, p = seen.nuisance.shape
-    if name and N * k < p + 3:
+    least = p + MIN_FREEDOM_OF_SESSION
+    if name and N * k < least:
         raise LogError(
             f"{log.path}: session {name}: found {N} measured pose(s), expected at least "
-            f"{-(-(p + 3) // k)}: its frame{' and tool point' if p > 6 else ''} are fitted on them"
+            f"{-(-least // k)}: its frame{' and tool point' if p > 6 else ''} are fitted on them"
         )
 
 
@@ -243,5 +245,5 @@ def approaches(approach: Array | None, rows: NDArray[np.int64] | None = None) ->
     if approach is None:
         return {}
     approach = approach if rows is None else approach[rows]
-    both = (np.sum(approach > 0, axis=0) >= 4) & (np.sum(approach < 0, axis=0) >= 4)
+    both = np.minimum((approach > 0).sum(axis=0), (approach < 0).sum(axis=0)) >= MIN_APPROACHES
     return {f"approach_{i}": approach[:, i] for i in np.flatnonzero(both)}

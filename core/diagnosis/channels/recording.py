@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from gapbridge.core.arrays import Array, Index
 from gapbridge.core.derivatives import signal_noise
+from gapbridge.core.diagnosis.criteria import MIN_TORQUE_CHANGE, STEPPED_SHARE
 from gapbridge.core.diagnosis.observation import HELD
 from gapbridge.core.estimation.held_out import pose_groups
 from gapbridge.core.log.log import Log
@@ -18,8 +19,6 @@ MOST_SAMPLES = 30_000  # poses at rest, evenly picked: what memory holds
 STRETCHES = 24  # conditions of a recording: even stretches of time
 FEWEST_CONDITIONS = 5
 SMALLEST_TORQUE = 1e-3  # Nm
-HARDLY = 1e-3  # share of the largest held torque by which one has to change to count
-STEPPED_SHARE = 0.5  # distinct values over samples below which a signal comes in steps
 CONSTANT_SPREAD = 1e-9  # spread below which a quantity counts as constant
 
 
@@ -86,7 +85,7 @@ def held_torques(motion: Motion) -> dict[str, Array]:
     largest = max(float(np.abs(motion.held).max(initial=0.0)), SMALLEST_TORQUE)
     return {
         f"{HELD}_{i}": motion.held[:, i]
-        for i in np.flatnonzero(np.ptp(motion.held, axis=0) > HARDLY * largest)
+        for i in np.flatnonzero(np.ptp(motion.held, axis=0) > MIN_TORQUE_CHANGE * largest)
     }
 
 

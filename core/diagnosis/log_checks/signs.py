@@ -13,6 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from gapbridge.core.arrays import Array, Index
+from gapbridge.core.diagnosis.criteria import SIGN_LEAVES
 from gapbridge.core.dynamics import predict_torque, predict_wrench
 from gapbridge.core.errors import InputError
 from gapbridge.core.estimation.least_squares import bounded
@@ -27,7 +28,6 @@ from gapbridge.core.motion import Motion
 MOST = 200  # rows looked at
 FEWEST = 6  # pulled rows from which a sign is judged
 LEAST = 1.0  # N, Nm: less is no pull
-HALF = 0.5  # what must be left, at most, of what the column as it stands leaves
 ROUNDS = 4
 SHOWN_BY = {
     "ft_raw_wrench": LogCheck.WRENCH_SIGN,
@@ -87,7 +87,7 @@ def _variants(model: Model, q: Array, pull: Array) -> dict[LogCheck | None, Arra
 def _best(residual: dict[LogCheck | None, float]) -> LogCheck | None:
     """Return the variant that leaves far less than the column as it stands, or None."""
     least = min(residual, key=lambda key: residual[key])
-    return least if residual[least] < HALF * residual[None] else None
+    return least if residual[least] < SIGN_LEAVES * residual[None] else None
 
 
 def _compliance_rivals(model: Model, log: Log, q: Array, pull: Array) -> LogCheck | None:
@@ -178,4 +178,4 @@ def _reads_turned_round(model: Model, log: Log, q: Array, name: str) -> bool:
         return False
     expected = _predicted(model, log, q, name, None if pull is None else pull[rows], rows)
     asked, other = (spread_of(sign * column[rows] - expected) for sign in (1.0, -1.0))
-    return spread_of(expected) >= LEAST and other <= HALF * asked
+    return spread_of(expected) >= LEAST and other <= SIGN_LEAVES * asked

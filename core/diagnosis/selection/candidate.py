@@ -15,13 +15,13 @@ import numpy as np
 
 from gapbridge.core.arm import Arm
 from gapbridge.core.arrays import Array
+from gapbridge.core.diagnosis.criteria import MIN_CYCLES
 from gapbridge.core.diagnosis.observation import HELD, Observation
 from gapbridge.core.effects import CATALOGUE, Effect, Parameter, Site, Term
 from gapbridge.core.errors import InputError
 
 STEP = 1e-2  # of a parameter's usual scale, for central differences
 WHOLE_ORDERS = 128  # cycles a turn that are looked through one by one
-CYCLES = 1.5  # of a periodic line over the joint's range, at least
 HALF_ORDERS = 40  # up to here also the halves
 # (typical moment / M0)^2 that a nonlinear stiffness curve starts from
 SOFTENING = tuple(float(v) for v in np.geomspace(0.1, 3000, 13))
@@ -136,7 +136,7 @@ def _at(
         )
         # one cycle a turn is a usual period; of others, more than one has to be seen
         seen = turns[site.joint - 1] if site.joint and turns else 1.0
-        least = CYCLES / max(seen, 1e-6)
+        least = MIN_CYCLES / max(seen, 1e-6)
         return [
             Candidate(effect.identifier, Site(site.joint, float(o)), parameters, free)
             for o in orders

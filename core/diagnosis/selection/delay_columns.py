@@ -11,14 +11,13 @@ from collections.abc import Sequence
 import numpy as np
 
 from gapbridge.core.arrays import Array
-from gapbridge.core.diagnosis.criteria import ALIKE
+from gapbridge.core.diagnosis.criteria import ALIKE, MIN_DELAYS
 from gapbridge.core.diagnosis.observation import Observation
 from gapbridge.core.diagnosis.selection.candidate import Candidate, named_columns
 from gapbridge.core.diagnosis.selection.problem import CandidateFit, SampleSpace, fit
 from gapbridge.core.effects import CATALOGUE, Term
 from gapbridge.core.estimation.robust import scale_of
 
-FEW_DELAYS = 3  # below, nobody knows which joint is the odd one
 SHORTEST = 1e-3  # usual sizes of the value: a chord needs a length
 
 
@@ -116,7 +115,7 @@ def as_one_delay(values: Array, variances: Array) -> tuple[Array, Array]:
     it. Fewer than three known ones say nothing of each other.
     """
     known = np.isfinite(variances)
-    if known.sum() < FEW_DELAYS:
+    if known.sum() < MIN_DELAYS:
         return values, variances
     centre = float(np.median(values[known]))
     scatter = scale_of(values[known] - centre)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gapbridge.core.arrays import Array
-from gapbridge.core.diagnosis.criteria import MAX_LINES, MAX_SMOOTH_TERMS
+from gapbridge.core.diagnosis.criteria import MAX_LINES, MAX_SMOOTH_TERMS, MIN_ORDERS_APART
 from gapbridge.core.diagnosis.selection.problem import CandidateFit, SampleSpace, fit, gains
 from gapbridge.core.estimation.least_squares import basis_of, projected_out
 
@@ -44,7 +44,8 @@ def exclusive(space: SampleSpace, chosen: Sequence[int], new: int) -> bool:
             continue
         if a.family == b.family and a.periodic:
             lines += 1
-            if abs((a.site.order or 0) - (b.site.order or 0)) < 0.75 or lines >= MAX_LINES:
+            apart = abs((a.site.order or 0) - (b.site.order or 0))
+            if apart < MIN_ORDERS_APART or lines >= MAX_LINES:
                 return True
         elif a.family in (b.family, b.effect.contains) or b.family == a.effect.contains:
             return True

@@ -15,7 +15,7 @@ import numpy as np
 
 from gapbridge.core.arm import Arm
 from gapbridge.core.arrays import Array
-from gapbridge.core.diagnosis.criteria import LOOSE_PRIOR
+from gapbridge.core.diagnosis.criteria import LOOSE_PRIOR, MIN_ROWS_BESIDE_STEP
 from gapbridge.core.diagnosis.selection.candidate import Candidate
 from gapbridge.core.diagnosis.selection.state import SelectionState, flat
 from gapbridge.core.effects import CATALOGUE, Effect, Site, Term
@@ -23,7 +23,6 @@ from gapbridge.core.effects import CATALOGUE, Effect, Site, Term
 Pair = tuple[Candidate, Array]
 FREE = 1e6  # usual sizes of a nuisance: nothing is known of it
 MOMENTS = 3  # of a site that the search looks at
-FEWEST = 3  # rows on either side of a moment
 
 
 def step_candidates(
@@ -43,7 +42,7 @@ def step_candidates(
         e for name, e in CATALOGUE.items()
         if e.at_moment and channel in e.channels and name not in set(withheld)
     ]  # fmt: skip
-    if times is None or not effects or len(times) < 2 * FEWEST + 2:
+    if times is None or not effects or len(times) < 2 * MIN_ROWS_BESIDE_STEP + 2:
         return []
     still = tuple(t for t in base if not CATALOGUE[t.effect].at_moment)
     target, basis = _integrated(state, columns, still)
@@ -135,7 +134,7 @@ def _gains(state: SelectionState, always: Array, target: Array, C: Array) -> Arr
 def _best(gain: Array, times: Array) -> list[int]:
     """Return the rows with which the best moments begin."""
     allowed = np.zeros(len(gain), dtype=bool)
-    allowed[FEWEST : len(gain) - FEWEST + 1] = True
+    allowed[MIN_ROWS_BESIDE_STEP : len(gain) - MIN_ROWS_BESIDE_STEP + 1] = True
     allowed[1:] &= np.diff(times) > 0  # no moment between rows of one time
     order = np.argsort(-np.where(allowed, gain, -np.inf))
     return [int(k) for k in order[:MOMENTS] if allowed[k]]

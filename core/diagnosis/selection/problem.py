@@ -15,7 +15,9 @@ from gapbridge.core.diagnosis.criteria import (
     ACCUSATION_PENALTY,
     MAX_SOFTENING,
     MAX_TIMES_USUAL,
+    OUT_OF_BOUNDS_SIGMAS,
     SMOOTH_PENALTY,
+    TOO_LARGE_SIGMAS,
 )
 from gapbridge.core.diagnosis.selection.candidate import Candidate
 
@@ -187,11 +189,11 @@ def _plausible(candidate: Candidate, x: Array, s: Array) -> bool:
         return False
     for parameter, value, deviation in zip(candidate.parameters, x, s, strict=True):
         lower = -np.inf if candidate.curve is not None else parameter.lower
-        if value < lower - 2.5 * deviation or value > parameter.upper:
+        if value < lower - OUT_OF_BOUNDS_SIGMAS * deviation or value > parameter.upper:
             return False
         most = (
             MAX_SOFTENING if parameter.name == "softening" else MAX_TIMES_USUAL
         ) * parameter.scale
-        if parameter.unit not in SENSED and abs(value) - 3 * deviation > most:
+        if parameter.unit not in SENSED and abs(value) - TOO_LARGE_SIGMAS * deviation > most:
             return False
     return True

@@ -16,6 +16,7 @@ from gapbridge.core.diagnosis.criteria import (
     HEAVIEST,
     HELD_WHOLLY,
     LARGE_SAMPLE,
+    NO_WORTH,
     UNDETERMINED,
 )
 from gapbridge.core.diagnosis.observation import Observation
@@ -57,7 +58,6 @@ from gapbridge.core.load_bounds import LoadBounds
 from gapbridge.core.model import Model
 
 ROUNDS = 8
-NOTHING = 1e-4  # worth of a value: a thirtieth of its sigma
 
 
 def select(
@@ -85,7 +85,7 @@ def select(
         # beside an unnamed function a value is not yet what it comes to without; but what shows
         # nothing by itself (the scale of a torque that is not there) keeps the place of what does
         named_only = all(space.candidates[c].named for c in last.best.chosen)
-        weakest = last.weakest(1.0 if settled and named_only else NOTHING)
+        weakest = last.weakest(1.0 if settled and named_only else NO_WORTH)
         if weakest is not None:
             none.add((base[weakest].effect, base[weakest].site))
             base = base[:weakest] + base[weakest + 1 :]
@@ -187,7 +187,7 @@ def _named_refit(last: _Round) -> _Round:
             last, state=state, best=best, terms=terms, index=index, covariance=covariance,
             residual=residual,
         )  # fmt: skip
-        weakest = last.weakest(NOTHING)
+        weakest = last.weakest(NO_WORTH)
         if weakest is None:
             return last
         alone, best = (
