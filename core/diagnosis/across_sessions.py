@@ -57,7 +57,7 @@ def _compared(
 ) -> Carried | None:
     space, unprojected = selection.space, selection.unprojected
     columns = unprojected.columns(space, members)
-    usual = np.concatenate([[p.scale for p in space.candidates[c].parameters] for c in members])
+    usual = np.concatenate([space.candidates[c].scales for c in members])
     shown = [
         int(s) for s in np.unique(of_row)
         if np.sqrt(np.sum((columns[of_row == s] * usual) ** 2, axis=0)).max() > EXCITED

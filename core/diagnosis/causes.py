@@ -156,9 +156,8 @@ def probability(selection: Selection, members: set[int]) -> float:
 
 
 def considered_of(
-    selection: Selection, judgement: Judgement, held: HeldOut, arm: Arm,
-    withhold: Iterable[str] = (),
-) -> tuple[Considered, ...]:  # fmt: skip
+    selection: Selection, judgement: Judgement, held: HeldOut, withhold: Iterable[str] = ()
+) -> tuple[Considered, ...]:
     """Return every other effect of the channel's catalogue, and why it is not accused."""
     space, channel = selection.working, selection.observation.channel
     accused = {selection.terms[p].effect for p in judgement.accused}
@@ -203,8 +202,7 @@ def _first_variants(selection: Selection, variants: list[int]) -> list[int]:
 
 def _shown(selection: Selection, c: int) -> bool:
     space = selection.space
-    usual = np.array([p.scale for p in space.candidates[c].parameters])
-    columns = space.X[:, space.start[c] : space.start[c + 1]] * usual
+    columns = space.columns([c]) * space.candidates[c].scales
     return bool(np.sqrt(np.sum(columns**2, axis=0)).max() > EXCITED)
 
 

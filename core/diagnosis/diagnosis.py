@@ -338,7 +338,7 @@ def _searched(
     verdict = with_stand_ins(searched, verdict)
     stood_in = _stood_in(searched, verdict, held, model)
     searched, verdict = still_sure(searched, verdict, model.arm)
-    considered = considered_of(searched, verdict, held, model.arm, withhold)
+    considered = considered_of(searched, verdict, held, withhold)
     chosen = [searched.term_index[p] for p in verdict.accused]
     where = locate(searched, gaps(searched, chosen)[0][searched.kept], chosen)
     selection = searched

@@ -186,9 +186,9 @@ def _no_value(selection: Selection) -> dict[int, Withdrawal]:
             withdrawn[position] = Withdrawal(Check.INSIDE_BOUNDS)
         if worth(term, spread) < 1:
             withdrawn[position] = VAGUE
-        usual = [p.scale for p in candidate.parameters]
+        least = NEGLIGIBLE * candidate.scales
         if candidate.curve is None and all(
-            abs(v) < NEGLIGIBLE * size for v, size in zip(term.values, usual, strict=False)
+            abs(v) < size for v, size in zip(term.values, least, strict=False)
         ):
             withdrawn[position] = Withdrawal(Check.USUAL_SIZE)
     return withdrawn

@@ -20,11 +20,11 @@ from gapbridge.core.diagnosis.every_row.long_recording import Block, LongRecordi
 from gapbridge.core.diagnosis.noise_floor import BLOCK, own_coordinates
 from gapbridge.core.diagnosis.observation import NotObservable, Observation
 from gapbridge.core.diagnosis.regions import REGIONS
-from gapbridge.core.diagnosis.selection.candidate import Candidate, named_columns
+from gapbridge.core.diagnosis.selection.candidate import Candidate, jacobian, named_columns
 from gapbridge.core.diagnosis.selection.delay_columns import chord_columns, chord_value
 from gapbridge.core.diagnosis.selection.noise import Noise
 from gapbridge.core.diagnosis.selection.problem import SampleSpace, fit, penalties
-from gapbridge.core.diagnosis.selection.refit import Reduced, exact_jacobian, freed_of, step_on
+from gapbridge.core.diagnosis.selection.refit import Reduced, freed_of, step_on
 from gapbridge.core.diagnosis.selection.selection import Selection
 from gapbridge.core.diagnosis.selection.state import UnprojectedRows, chords_only, locate
 from gapbridge.core.effects import Term
@@ -88,11 +88,11 @@ class Columns:
             for term in self.terms:
                 c, x = locate(list(self.candidates), term)
                 target = target + columns[c] @ x
-        jacobian = [
-            exact_jacobian(seen, c, x, self.terms[:i] + self.terms[i + 1 :])
+        blocks = [
+            jacobian(seen, c, x, self.terms[:i] + self.terms[i + 1 :])
             for i, (c, x) in enumerate(zip(self.freed, self.x, strict=True))
         ]
-        return np.concatenate([*columns, target[..., None], *jacobian, gap[..., None]], axis=2)
+        return np.concatenate([*columns, target[..., None], *blocks, gap[..., None]], axis=2)
 
     def _candidate(self, seen: Observation, c: Candidate, chord: float | None) -> Array:
         if chord is not None:

@@ -50,7 +50,7 @@ def _beside_twin(observation: Observation, candidate: Candidate, base: Sequence[
         return named_columns(observation, candidate, base)
     others = [t for t in base if t not in twins]
     columns, nothing = named_columns(observation, candidate, others), observation.predict(others)
-    usual = np.array([p.scale for p in candidate.parameters])
+    usual = candidate.scales
     rows = (columns * usual).reshape(-1, len(usual))
     gap = (observation.measured - nothing).ravel()
     x = np.linalg.lstsq(rows, gap, rcond=1e-6)[0]

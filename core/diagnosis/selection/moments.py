@@ -96,7 +96,7 @@ def _integrated(
         if candidate.periodic and (candidate.site.order or 0.0) > 2.0:
             continue
         blocks.append(block)
-        prior.append(np.array([LOOSE_PRIOR * p.scale for p in candidate.parameters]))
+        prior.append(LOOSE_PRIOR * candidate.scales)
     A = flat(np.concatenate(blocks, axis=2), state)
     spread = np.concatenate(prior)
     spread[: observation.nuisance.shape[2]] /= np.maximum(

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from gapbridge.core.arm import Arm
 from gapbridge.core.arrays import Array
 from gapbridge.core.diagnosis.criteria import OWN_SIGMAS, PRIOR_REACH
-from gapbridge.core.diagnosis.observation import Observation
-from gapbridge.core.diagnosis.selection.candidate import Candidate
+from gapbridge.core.diagnosis.selection.candidate import Candidate, jacobian
 from gapbridge.core.diagnosis.selection.delay_columns import as_one_delay
 from gapbridge.core.diagnosis.selection.problem import CandidateFit, SampleSpace
 from gapbridge.core.diagnosis.selection.state import SelectionState, flat
@@ -67,7 +66,7 @@ def refit(
     """
     index = (*(c for c in linear_fit.chosen if space.candidates[c].named), *links)
     freed = [freed_of(state.arm, space.candidates[c]) for c in index]
-    usual = [links[c] if c in links else _wide(k) for c, k in zip(index, freed, strict=True)]
+    usual = [links.get(c, PRIOR_REACH * k.scales) for c, k in zip(index, freed, strict=True)]
     near = [links.get(c, np.inf) for c in index]
     extra = space.columns([c for c in linear_fit.chosen if not space.candidates[c].named])
     if remainder is not None:
@@ -160,12 +159,12 @@ def _linearised(
     """Return the regression at the values ``x``, unnamed functions ``extra`` (m, e) beside them."""
     observation, terms = state.observation, _terms(freed, x)
     gap = observation.measured - observation.predict(terms)
-    jacobian = [
-        flat(exact_jacobian(observation, c, x[k], terms[:k] + terms[k + 1 :]), state)
+    blocks = [
+        flat(jacobian(observation, c, x[k], terms[:k] + terms[k + 1 :]), state)
         for k, c in enumerate(freed)
     ]
     nuisance = flat(observation.nuisance, state)
-    A = np.hstack([*jacobian, extra, nuisance])
+    A = np.hstack([*blocks, extra, nuisance])
     pull, towards = _pull(usual, x, A.shape[1], remainder, nuisance.shape[1])
     return _Linearised(A, flat(gap[..., None], state)[:, 0], pull, towards)
 
@@ -181,8 +180,7 @@ def _frame_moved(state: SelectionState, extra: Array, terms: tuple[Term, ...]) -
 
 def _largest_step(freed: list[Candidate], parts: list[Array]) -> float:
     """Return the largest part (d,) of a step, in its parameter's usual sizes."""
-    sizes = ([p.scale for p in c.parameters] for c in freed)
-    each = (float(np.abs(part / np.array(s)).max()) for part, s in zip(parts, sizes, strict=True))
+    each = (float(np.abs(part / c.scales).max()) for c, part in zip(freed, parts, strict=True))
     return max(each, default=0.0)
 
 
@@ -200,7 +198,7 @@ def step_on(
     rows: Reduced, freed: list[Candidate], x: list[Array], floor: float
 ) -> tuple[list[Array], list[Array]]:
     """Return values (d,) and covariances (d, d) of terms after one step from ``x``, near there."""
-    pull, towards = _pull([_wide(c) for c in freed], x, rows.A.shape[1], None, 0)
+    pull, towards = _pull([PRIOR_REACH * c.scales for c in freed], x, rows.A.shape[1], None, 0)
     whole, right = np.vstack([rows.A, pull]), np.concatenate([rows.b, towards])
     unit = 1 / np.sqrt(np.einsum("ij,ij->j", whole, whole))
     step = _step(whole, right, unit, freed, x)
@@ -347,11 +345,6 @@ def _pull(
     return np.vstack([rows, more]), np.concatenate([towards, np.zeros(len(known))])
 
 
-def _wide(candidate: Candidate) -> Array:
-    """Return how far (d,) the data may take a cause that stands for itself."""
-    return np.array([PRIOR_REACH * p.scale for p in candidate.parameters])
-
-
 def _share(
     state: SelectionState, freed: list[Candidate], x: list[Array], parts: list[Array],
     near: list[Array | float], A: Array,
@@ -388,23 +381,6 @@ def freed_of(arm: Arm, candidate: Candidate) -> Candidate:
         return candidate
     parameters = candidate.effect.parameters(arm, candidate.site)
     return replace(candidate, parameters=parameters, fixed=(None,) * len(parameters), curve=None)
-
-
-def exact_jacobian(
-    observation: Observation, candidate: Candidate, x: Array, others: tuple[Term, ...]
-) -> Array:
-    """Return d prediction / d parameter (N, k, d) at the term's present values."""
-    columns = []
-    for k, parameter in enumerate(candidate.parameters):
-        h = np.zeros(len(x))
-        h[k] = 1e-2 * parameter.scale
-        try:
-            ahead = observation.predict([*others, candidate.term(x + h)])
-            behind = observation.predict([*others, candidate.term(x - h)])
-        except EquilibriumError:  # on the edge of buckling: the prior alone leads back
-            ahead = behind = observation.measured
-        columns.append((ahead - behind) / (2 * h[k]))
-    return np.stack(columns, axis=-1)
 
 
 def _within(candidate: Candidate, x: Array) -> Array:

@@ -129,7 +129,7 @@ class _Round:
         share = {}
         for p, c in enumerate(self.index):
             if c not in self.links:
-                size = np.array([k.scale for k in self.space.candidates[c].parameters])
+                size = self.space.candidates[c].scales
                 sigma = np.sqrt(np.diag(self.covariance[p]))
                 unknown = float((sigma / size[: len(sigma)]).min()) / UNDETERMINED
                 share[p] = -unknown if unknown > 1 else worth(self.terms[p], self.covariance[p])

@@ -219,8 +219,7 @@ def test_what_a_log_cannot_show_reports_what_it_needs():
     assert rigid["joint_offset"].excited
     channel = channel_of("none")
     held = HeldOut(channel.selection)
-    arm = small.model_of().arm
-    reported = considered_of(channel.selection, channel.judgement, held, arm, ("payload",))
+    reported = considered_of(channel.selection, channel.judgement, held, ("payload",))
     assert "payload" not in {c.effect for c in reported}
     cold = small.session_of(0)
     without = small.log_of(
