@@ -55,6 +55,7 @@ def carried(selection: Selection, chosen: Sequence[int], arm: Arm) -> tuple[Carr
 def _compared(
     selection: Selection, members: list[int], rest: list[int], of_row: NDArray[np.int64], arm: Arm
 ) -> Carried | None:
+    """Return how one effect carries; None where fewer than two sessions show it."""
     space, unprojected = selection.space, selection.unprojected
     columns = unprojected.columns(space, members)
     usual = np.concatenate([space.candidates[c].scales for c in members])
@@ -64,24 +65,9 @@ def _compared(
     ]  # fmt: skip
     if len(shown) < 2:
         return None
-    width = columns.shape[1]
-    split = np.hstack([columns * (of_row == s)[:, None] for s in shown])
     beside = np.hstack([unprojected.columns(space, rest), unprojected.nuisance])
-    A = np.hstack([split, beside])
-    size = np.sqrt(np.einsum("ij,ij->j", A, A))
-    alive = size > DEAD * np.concatenate(
-        [np.tile(np.sqrt(np.einsum("ij,ij->j", columns, columns)), len(shown)),
-         size[split.shape[1] :]]
-    )  # fmt: skip
-    A = A * alive
-    solution = solve(A, unprojected.target)
-    residual = unprojected.target - A @ solution
-    freedom = max(len(residual) * selection.rows_each - A.shape[1], 1)
-    variance = max(float(residual @ residual) / freedom, space.floor)
-    of_members = slice(0, split.shape[1])
-    covariance = inverse(A.T @ A)[of_members, of_members] * variance
-    values = solution[of_members].reshape(len(shown), width)
-    everywhere = alive[of_members].reshape(len(shown), width).all(axis=0)
+    values, covariance, alive = _fitted_by_session(selection, columns, beside, of_row, shown)
+    everywhere = alive.all(axis=0)
     if not everywhere.any():
         return None
     compared = np.flatnonzero(np.tile(everywhere, len(shown)))
@@ -89,7 +75,7 @@ def _compared(
         values[:, everywhere], covariance[np.ix_(compared, compared)],
         columns[:, everywhere], of_row, shown,
     )  # fmt: skip
-    reported = []
+    reported, width = [], columns.shape[1]
     for i, s in enumerate(shown):
         block = slice(i * width, (i + 1) * width)
         reported.append(
@@ -97,6 +83,29 @@ def _compared(
         )
     effect = space.candidates[members[0]].family
     return Carried(effect, not (p_value < CHANCE and matters), p_value, tuple(reported))
+
+
+def _fitted_by_session(
+    selection: Selection, columns: Array, beside: Array, of_row: NDArray[np.int64],
+    shown: list[int],
+) -> tuple[Array, Array, Array]:  # fmt: skip
+    """Return the values (S, d) of an effect in each session, what is ``beside`` shared by all.
+
+    With them their covariance (S d, S d), and which of them (S, d) the session shows at all.
+    """
+    target, count = selection.unprojected.target, len(shown) * columns.shape[1]
+    A = np.hstack([*(columns * (of_row == s)[:, None] for s in shown), beside])
+    size = np.sqrt(np.einsum("ij,ij->j", A, A))
+    whole = np.sqrt(np.einsum("ij,ij->j", columns, columns))
+    alive = size > DEAD * np.concatenate([np.tile(whole, len(shown)), size[count:]])
+    A = A * alive
+    solution = solve(A, target)
+    residual = target - A @ solution
+    freedom = max(len(residual) * selection.rows_each - A.shape[1], 1)
+    variance = max(float(residual @ residual) / freedom, selection.space.floor)
+    covariance = inverse(A.T @ A)[:count, :count] * variance
+    shape = (len(shown), columns.shape[1])
+    return solution[:count].reshape(shape), covariance, alive[:count].reshape(shape)
 
 
 def _differing(
