@@ -305,7 +305,7 @@ def _and_stand_ins(channels: Sequence[ChannelDiagnosis], proved: Sequence[Term])
     """Return the proved terms and the stand-ins, with the values that they have together."""
     terms = {(t.effect, t.site): t for t in proved}
     for channel in channels:
-        terms |= {(t.effect, t.site): t for t in channel.along}
+        terms |= {(t.effect, t.site): t for t in channel.fitted_together}
     return list(terms.values())
 
 
@@ -435,7 +435,7 @@ def _stood_in(
     marked = [replace(along.terms[p], stand_in=p in verdict.stand_ins) for p in both]
     return {
         "stand_ins": causes_of(along, notes, held, model.arm, verdict.stand_ins),
-        "along": tuple(marked),
+        "fitted_together": tuple(marked),
     }
 
 

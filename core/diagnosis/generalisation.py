@@ -67,7 +67,7 @@ class _Problem:
         self._owner = np.array(observation.nuisance_session or (0,) * unprojected.nuisance.shape[1])
         whole = observation.session
         self._session = np.zeros(int(kept.sum()), dtype=np.int64) if whole is None else whole[kept]
-        self._fold, self._near = regions(observation, kept)
+        self._fold, self._near = held_out_regions(observation, kept)
 
     def new_region(self) -> float | None:
         """Return the rms over regions left out in turn, frames from the fitted poses."""
@@ -125,7 +125,7 @@ class _Problem:
         )
 
 
-def regions(
+def held_out_regions(
     observation: Observation, kept: NDArray[np.bool_], seed: int = 0
 ) -> tuple[Index, NDArray[np.bool_]]:
     """Return the region (n,) of each kept sample, and what else lies too near each (folds, n)."""

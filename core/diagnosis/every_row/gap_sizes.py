@@ -51,7 +51,7 @@ def sizes_of(selection: Selection, gap: Array, remaining: Array) -> Sizes:
 def streamed_sizes(streamed: Streamed, decided: Selection, accused: Sequence[int]) -> Sizes:
     """Return the sizes over all rows of a long recording, under the ``accused`` terms."""
     weight, gap = decided.observation.weight, streamed.gap
-    squares, means = streamed.left(decided, accused)
+    squares, means = streamed.remaining(decided, accused)
 
     def rms(values: Array) -> float:
         return float(np.sqrt(np.sum(values * weight**2) / (gap.kept * len(weight))))

@@ -26,7 +26,7 @@ from gapbridge.core.diagnosis.selection.noise import Noise
 from gapbridge.core.diagnosis.selection.problem import SampleSpace, fit, penalties
 from gapbridge.core.diagnosis.selection.refit import Reduced, freed_of, step_on
 from gapbridge.core.diagnosis.selection.selection import Selection
-from gapbridge.core.diagnosis.selection.state import UnprojectedRows, chords_only, locate
+from gapbridge.core.diagnosis.selection.state import UnprojectedRows, candidate_of, chords_only
 from gapbridge.core.effects import Term
 from gapbridge.core.estimation.robust import OUTLIER, distance_of, scale_of
 from gapbridge.core.log.log import Log
@@ -76,7 +76,7 @@ class Columns:
         """Return how many columns there are."""
         return int(self.start[-1]) + 2 + len(self.jacobian)
 
-    def of(self, seen: Observation, bare: Array, gap: Array) -> Array:
+    def at_samples(self, seen: Observation, bare: Array, gap: Array) -> Array:
         """Return the columns (N, k, width) of an observation; ``bare`` is its gap without terms."""
         columns = [
             self._candidate(seen, c, chord)
@@ -86,7 +86,7 @@ class Columns:
         if not self._from_nothing:  # the terms' part is put back, in the linear form at hand
             target = gap
             for term in self.terms:
-                c, x = locate(list(self.candidates), term)
+                c, x = candidate_of(list(self.candidates), term)
                 target = target + columns[c] @ x
         blocks = [
             jacobian(seen, c, x, self.terms[:i] + self.terms[i + 1 :])
@@ -135,7 +135,7 @@ class Streamed:
         """Return the selection of some of the terms; another selection's space is the same."""
         return self.selection(accused)
 
-    def left(self, selection: Selection, accused: Sequence[int]) -> tuple[Array, Array]:
+    def remaining(self, selection: Selection, accused: Sequence[int]) -> tuple[Array, Array]:
         """Return what terms leave: squares (k,) summed over rows, means (bins, k) over time."""
         mix = self._mix(accused)
         freed = dict(zip(self.columns.accused, self.columns.freed, strict=True))
@@ -266,7 +266,7 @@ class RowSums:
         bare = seen.measured - seen.predict(())
         terms = self._columns.terms
         gap = seen.measured - seen.predict(terms) if terms else bare
-        whole = self._columns.of(seen, bare, gap)[inside] * self._white[:, None]
+        whole = self._columns.at_samples(seen, bare, gap)[inside] * self._white[:, None]
         kept = np.sqrt(np.mean(whole[:, :, -1] ** 2, axis=1)) <= self._limit
         whole, bare = whole[kept], bare[inside][kept]
         self._samples += len(rows)

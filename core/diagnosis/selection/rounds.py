@@ -47,8 +47,8 @@ from gapbridge.core.diagnosis.selection.smooth import Pair, smooth_candidates, u
 from gapbridge.core.diagnosis.selection.state import (
     SelectionState,
     UnprojectedRows,
+    candidate_of,
     flat,
-    locate,
     sample_space,
 )
 from gapbridge.core.diagnosis.selection.stiffness_curves import with_straight_stiffness
@@ -154,7 +154,7 @@ def _round(
     state = replace(state, candidates=[*open_to, *(candidate for candidate, _ in stepping)])
     columns += [step_columns for _, step_columns in stepping]
     space, unprojected = sample_space(state, columns, base, smooth)
-    inside = [locate(state.candidates, t)[0] for t in base]
+    inside = [candidate_of(state.candidates, t)[0] for t in base]
     best = one_delay(space, screened_search(space, base=inside))
     if not first and not state.kept.all():
         state, space, unprojected, best = readmit_explained_outliers(
