@@ -12,7 +12,7 @@ from threadpoolctl import threadpool_limits
 
 from gapbridge.core.arrays import Array
 from gapbridge.core.diagnosis.across_sessions import carried
-from gapbridge.core.diagnosis.causes import Considered, causes_of, considered_of
+from gapbridge.core.diagnosis.causes import Cause, Considered, causes_of, considered_of
 from gapbridge.core.diagnosis.channel_diagnosis import ChannelDiagnosis, Where, locate
 from gapbridge.core.diagnosis.channels import position, torque, tracking, wrench
 from gapbridge.core.diagnosis.channels.simulation import joined, predicted_by
@@ -246,7 +246,8 @@ class _Searched:
     depends: Callable[[Sequence[int]], Depends]
     where: Where
     considered: tuple[Considered, ...]
-    stood_in: dict[str, Any]
+    stand_ins: tuple[Cause, ...]
+    fitted_together: tuple[Term, ...]  # causes and stand-ins
 
     def without_columns(self) -> _Searched:
         """Return the same without the columns of all candidates: 50 MB that no row asks for."""
@@ -336,7 +337,7 @@ def _searched(
     searched, verdict = judge_geometry(searched, judge(searched, HeldOut(searched)), model.arm)
     held = HeldOut(searched)
     verdict = with_stand_ins(searched, verdict)
-    stood_in = _stood_in(searched, verdict, held, model)
+    stand_ins = _stand_ins(searched, verdict, held, model)
     searched, verdict = still_sure(searched, verdict, model.arm)
     considered = considered_of(searched, verdict, held, withhold)
     chosen = [searched.term_index[p] for p in verdict.accused]
@@ -354,7 +355,7 @@ def _searched(
         return tuple(dependence(searched.space, basis, fitted, searched.groups))
 
     more = selection is not searched
-    return _Searched(observation, selection, more, verdict, follows, where, considered, stood_in)
+    return _Searched(observation, selection, more, verdict, follows, where, considered, *stand_ins)
 
 
 def _decided(searched: _Searched, model: Model, streamed: Streamed | None) -> ChannelDiagnosis:
@@ -400,7 +401,8 @@ def _decided(searched: _Searched, model: Model, streamed: Streamed | None) -> Ch
         held_out=np.sqrt(per_sample.squares(chosen)) if per_sample.possible else None,
         outliers=sizes.outliers, elsewhere=generalisation(decided, chosen),
         carried=carried(decided, chosen, model.arm),
-        noise_floor_source=floor.source, **searched.stood_in,
+        noise_floor_source=floor.source, stand_ins=searched.stand_ins,
+        fitted_together=searched.fitted_together,
     )  # fmt: skip
 
 
@@ -423,20 +425,17 @@ def _with_whiteness(
     return verdict, noise_floor(selection, True)
 
 
-def _stood_in(
+def _stand_ins(
     selection: Selection, verdict: Judgement, held: HeldOut, model: Model
-) -> dict[str, Any]:
+) -> tuple[tuple[Cause, ...], tuple[Term, ...]]:
     """Return the stand-ins as causes, and the terms of causes and stand-ins fitted together."""
     if not verdict.stand_ins:
-        return {}
+        return (), ()
     both = (*verdict.accused, *verdict.stand_ins)
-    along = refitted_alone(selection, model.arm, both)
+    together = refitted_alone(selection, model.arm, both)
     notes = replace(verdict, accused=both, ties={})
-    marked = [replace(along.terms[p], stand_in=p in verdict.stand_ins) for p in both]
-    return {
-        "stand_ins": causes_of(along, notes, held, model.arm, verdict.stand_ins),
-        "fitted_together": tuple(marked),
-    }
+    marked = [replace(together.terms[p], stand_in=p in verdict.stand_ins) for p in both]
+    return causes_of(together, notes, held, model.arm, verdict.stand_ins), tuple(marked)
 
 
 def _unexplained(remaining: float, floor: float | None, verdict: Judgement) -> float:
