@@ -18,7 +18,7 @@ from gapbridge.core.arrays import Array
 from gapbridge.core.diagnosis.criteria import CHANCE, EXCITED, MATERIAL_SHARE
 from gapbridge.core.diagnosis.selection.candidate import Candidate
 from gapbridge.core.diagnosis.selection.selection import Selection
-from gapbridge.core.effects import CATALOGUE, Reported
+from gapbridge.core.effects import Reported
 from gapbridge.core.estimation.least_squares import inverse, sigmas_square, solve
 
 DEAD = 1e-7  # share of a parameter's column that a session has: below, it shows nothing of it
@@ -42,47 +42,32 @@ def carried(selection: Selection, chosen: Sequence[int], arm: Arm) -> tuple[Carr
     of_row = np.repeat(session[selection.kept], selection.observation.measured.shape[1])
     space = selection.space
     effects = dict.fromkeys(space.candidates[c].family for c in chosen)
-    found = []
+    effects_carried = []
     for effect in effects:
-        own = [c for c in chosen if space.candidates[c].family == effect]
-        rest = [c for c in chosen if c not in own]
-        one = _compared(selection, own, rest, of_row, arm)
-        if one is not None:
-            found.append(one)
-    return tuple(found)
+        members = [c for c in chosen if space.candidates[c].family == effect]
+        rest = [c for c in chosen if c not in members]
+        compared = _compared(selection, members, rest, of_row, arm)
+        if compared is not None:
+            effects_carried.append(compared)
+    return tuple(effects_carried)
 
 
 def _compared(
-    selection: Selection, own: list[int], rest: list[int], of_row: NDArray[np.int64], arm: Arm
+    selection: Selection, members: list[int], rest: list[int], of_row: NDArray[np.int64], arm: Arm
 ) -> Carried | None:
+    """Return how one effect carries; None where fewer than two sessions show it."""
     space, unprojected = selection.space, selection.unprojected
-    columns = unprojected.columns(space, own)
-    usual = np.concatenate([[p.scale for p in space.candidates[c].parameters] for c in own])
+    columns = unprojected.columns(space, members)
+    usual = np.concatenate([space.candidates[c].scales for c in members])
     shown = [
         int(s) for s in np.unique(of_row)
         if np.sqrt(np.sum((columns[of_row == s] * usual) ** 2, axis=0)).max() > EXCITED
     ]  # fmt: skip
     if len(shown) < 2:
         return None
-    width = columns.shape[1]
-    split = np.hstack([columns * (of_row == s)[:, None] for s in shown])
     beside = np.hstack([unprojected.columns(space, rest), unprojected.nuisance])
-    A = np.hstack([split, beside])
-    size = np.sqrt(np.einsum("ij,ij->j", A, A))
-    alive = size > DEAD * np.concatenate(
-        [np.tile(np.sqrt(np.einsum("ij,ij->j", columns, columns)), len(shown)),
-         size[split.shape[1] :]]
-    )  # fmt: skip
-    A = A * alive
-    solution = solve(A, unprojected.target)
-    left = unprojected.target - A @ solution
-    variance = max(
-        float(left @ left) / max(len(left) * selection.rows_each - A.shape[1], 1), space.floor
-    )
-    own_part = slice(0, split.shape[1])
-    covariance = inverse(A.T @ A)[own_part, own_part] * variance
-    values = solution[own_part].reshape(len(shown), width)
-    everywhere = alive[own_part].reshape(len(shown), width).all(axis=0)
+    values, covariance, alive = _fitted_by_session(selection, columns, beside, of_row, shown)
+    everywhere = alive.all(axis=0)
     if not everywhere.any():
         return None
     compared = np.flatnonzero(np.tile(everywhere, len(shown)))
@@ -90,14 +75,37 @@ def _compared(
         values[:, everywhere], covariance[np.ix_(compared, compared)],
         columns[:, everywhere], of_row, shown,
     )  # fmt: skip
-    reported = []
+    reported, width = [], columns.shape[1]
     for i, s in enumerate(shown):
         block = slice(i * width, (i + 1) * width)
         reported.append(
-            (s, _reported(space.candidates, own, values[i], covariance[block, block], arm))
+            (s, _reported(space.candidates, members, values[i], covariance[block, block], arm))
         )
-    effect = space.candidates[own[0]].family
+    effect = space.candidates[members[0]].family
     return Carried(effect, not (p_value < CHANCE and matters), p_value, tuple(reported))
+
+
+def _fitted_by_session(
+    selection: Selection, columns: Array, beside: Array, of_row: NDArray[np.int64],
+    shown: list[int],
+) -> tuple[Array, Array, Array]:  # fmt: skip
+    """Return the values (S, d) of an effect in each session, what is ``beside`` shared by all.
+
+    With them their covariance (S d, S d), and which of them (S, d) the session shows at all.
+    """
+    target, count = selection.unprojected.target, len(shown) * columns.shape[1]
+    A = np.hstack([*(columns * (of_row == s)[:, None] for s in shown), beside])
+    size = np.sqrt(np.einsum("ij,ij->j", A, A))
+    whole = np.sqrt(np.einsum("ij,ij->j", columns, columns))
+    alive = size > DEAD * np.concatenate([np.tile(whole, len(shown)), size[count:]])
+    A = A * alive
+    solution = solve(A, target)
+    residual = target - A @ solution
+    freedom = max(len(residual) * selection.rows_each - A.shape[1], 1)
+    variance = max(float(residual @ residual) / freedom, selection.space.floor)
+    covariance = inverse(A.T @ A)[:count, :count] * variance
+    shape = (len(shown), columns.shape[1])
+    return solution[:count].reshape(shape), covariance, alive[:count].reshape(shape)
 
 
 def _differing(
@@ -121,14 +129,13 @@ def _differing(
 
 
 def _reported(
-    candidates: Sequence[Candidate], own: list[int], x: Array, covariance: Array, arm: Arm
+    candidates: Sequence[Candidate], members: list[int], x: Array, covariance: Array, arm: Arm
 ) -> tuple[Reported, ...]:
     reported: list[Reported] = []
-    at = 0
-    for c in own:
+    start = 0
+    for c in members:
         candidate = candidates[c]
-        d = len(candidate.parameters)
-        part = covariance[at : at + d, at : at + d]
-        reported += CATALOGUE[candidate.family].reported(arm, candidate.term(x[at : at + d]), part)
-        at += d
+        part = slice(start, start + len(candidate.parameters))
+        reported += candidate.effect.reported(arm, candidate.term(x[part]), covariance[part, part])
+        start = part.stop
     return tuple(reported)

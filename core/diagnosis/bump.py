@@ -8,14 +8,12 @@ from __future__ import annotations
 import numpy as np
 
 from gapbridge.core.arrays import Array
-from gapbridge.core.diagnosis.criteria import SMOOTH_PENALTY
+from gapbridge.core.diagnosis.criteria import MIN_PERIODS, SMOOTH_PENALTY
 from gapbridge.core.diagnosis.selection.candidate import joint_quantity
 from gapbridge.core.diagnosis.selection.selection import Selection
 from gapbridge.core.estimation.least_squares import basis_of, projected_out
 from gapbridge.core.estimation.nelder_mead import nelder_mead
 
-LEAST_PERIOD = 0.75  # of a line, beside something unknown: a sine's less than two extremes are any
-# curve's. False lines showed 0.26 to 0.54, true ones beside an unknown 0.89 and more
 PLACES, WIDTHS = 13, (0.05, 0.1, 0.2)  # where a bump is first looked for, in shares of the range
 
 
@@ -27,10 +25,10 @@ def bumps(selection: Selection) -> set[int]:
     space, observation = selection.working, selection.observation
     if observation.channel != "position" or observation.joint_columns is None:
         return set()
-    chosen = [c for c in selection.found.chosen if space.candidates[c].named]
-    found: set[int] = set()
-    if len(chosen) < len(selection.found.chosen):
-        found = {c for c in chosen if _periods(selection, c) < LEAST_PERIOD}
+    chosen = [c for c in selection.best.chosen if space.candidates[c].named]
+    bump_like: set[int] = set()
+    if len(chosen) < len(selection.best.chosen):
+        bump_like = {c for c in chosen if _periods(selection, c) < MIN_PERIODS}
     for i in range(observation.joint_columns.shape[2]):
         here = [c for c in chosen if space.candidates[c].site.joint == i + 1]
         lines = [c for c in here if space.candidates[c].periodic]
@@ -44,8 +42,8 @@ def bumps(selection: Selection) -> set[int]:
         bump = float(space.misfit(np.array(_best_bump(selection, i, rest, y))))
         penalty = 3 * np.log(space.freedom) + 2 * np.log(len(space.candidates)) + SMOOTH_PENALTY
         if bump + penalty <= lines_score + float(space.penalty[group].sum()):
-            found |= set(group)
-    return found
+            bump_like |= set(group)
+    return bump_like
 
 
 def _periods(selection: Selection, c: int) -> float:
@@ -65,8 +63,8 @@ def _best_bump(selection: Selection, i: int, rest: Array, y: Array) -> float:
     z = observation.quantities[joint_quantity(observation, i)]
     low, span = float(z.min()), float(np.ptp(z))
 
-    def left(at: Array) -> float:
-        bump = np.exp(-0.5 * ((z - at[0]) / np.exp(at[1])) ** 2)
+    def rest_squares(place_width: Array) -> float:
+        bump = np.exp(-0.5 * ((z - place_width[0]) / np.exp(place_width[1])) ** 2)
         x = selection.rows_of(joint * bump[:, None, None])[:, 0]
         x = projected_out(rest, x)
         size = float(x @ x)
@@ -74,5 +72,5 @@ def _best_bump(selection: Selection, i: int, rest: Array, y: Array) -> float:
 
     tries = [np.array([low + s * span, np.log(w * span)])
              for s in np.linspace(0, 1, PLACES) for w in WIDTHS]  # fmt: skip
-    best = min(tries, key=left)
-    return nelder_mead(left, best, 120)[1]
+    best = min(tries, key=rest_squares)
+    return nelder_mead(rest_squares, best, 120)[1]

@@ -85,10 +85,10 @@ def _cause(
     effect: str, positions: list[int], everything: list[int], selection: Selection,
     judgement: Judgement, held: HeldOut, arm: Arm,
 ) -> Cause:  # fmt: skip
-    own = {selection.term_index[p] for p in positions}
-    rest = [c for c in everything if c not in own]
+    members = {selection.term_index[p] for p in positions}
+    rest = [c for c in everything if c not in members]
     shrink = held.shrink(everything, rest) if held.possible else None
-    alone = held.shrink(sorted(own), ()).shrink if held.possible else None
+    alone = held.shrink(sorted(members), ()).shrink if held.possible else None
     listed: list[Reported] = []
     notes: list[ParameterNote] = []
     relative = []
@@ -107,7 +107,7 @@ def _cause(
     ties = tuple(dict.fromkeys(n for p in positions for n in judgement.ties.get(p, ())))
     return Cause(
         effect, tuple(joints), tuple(listed), shrink, alone,
-        probability(selection, own), ties,
+        probability(selection, members), ties,
         tuple(selection.terms[p] for p in positions), tuple(relative), tuple(notes),
     )  # fmt: skip
 
@@ -140,25 +140,24 @@ def _not_identifiable(
     return notes
 
 
-def probability(selection: Selection, own: set[int]) -> float:
+def probability(selection: Selection, members: set[int]) -> float:
     """Return the probability that the effect is needed: against the best set without it."""
-    found, space = selection.found, selection.working
-    if own & set(selection.block):  # they won over the best set without them by more than chance
+    best, space = selection.best, selection.working
+    if members & set(selection.block):  # these won over the best set without them
         return 1.0
-    rest = fit(space, tuple(c for c in found.chosen if c not in own))
-    best = rest.score
-    families = {space.candidates[c].family for c in own}
+    rest = fit(space, tuple(c for c in best.chosen if c not in members))
+    without = rest.score
+    families = {space.candidates[c].family for c in members}
     for score, c in joining(space, rest.chosen, 12):
         if space.candidates[c].family not in families:
-            best = min(best, score)
-    odds = np.exp(-0.5 * min(max(best - found.score, 0.0), 700.0))
+            without = min(without, score)
+    odds = np.exp(-0.5 * min(max(without - best.score, 0.0), 700.0))
     return float(1 / (1 + odds))
 
 
 def considered_of(
-    selection: Selection, judgement: Judgement, held: HeldOut, arm: Arm,
-    withhold: Iterable[str] = (),
-) -> tuple[Considered, ...]:  # fmt: skip
+    selection: Selection, judgement: Judgement, held: HeldOut, withhold: Iterable[str] = ()
+) -> tuple[Considered, ...]:
     """Return every other effect of the channel's catalogue, and why it is not accused."""
     space, channel = selection.working, selection.observation.channel
     accused = {selection.terms[p].effect for p in judgement.accused}
@@ -171,15 +170,15 @@ def considered_of(
     for identifier, effect in CATALOGUE.items():
         if channel not in effect.channels or identifier in accused or identifier in withhold:
             continue
-        own = [c for c, k in enumerate(space.candidates) if k.family == identifier]
-        own = _first_variants(selection, own)
-        excited = any(_shown(selection, c) for c in own)
-        if not own or not excited:
+        variants = [c for c, k in enumerate(space.candidates) if k.family == identifier]
+        variants = _first_variants(selection, variants)
+        excited = any(_shown(selection, c) for c in variants)
+        if not variants or not excited:
             needs = effect.motion or ", ".join(effect.needs)
             listed.append(Considered(identifier, None, 0.0, Outcome.NOT_EXCITED, needs))
             continue
-        alone = held.shrink(own, ()).shrink if held.possible and len(own) < 40 else None
-        better = min(_score_with(selection, base, c) for c in own)
+        alone = held.shrink(variants, ()).shrink if held.possible and len(variants) < 40 else None
+        better = min(_score_with(selection, base, c) for c in variants)
         odds = float(np.exp(-0.5 * min(max(better - base.score, -700.0), 700.0)))
         withdrawal = reasons.get(identifier)
         outcome = Outcome.NOT_NEEDED if withdrawal is None else Outcome.WITHDRAWN
@@ -189,11 +188,11 @@ def considered_of(
     return tuple(listed)
 
 
-def _first_variants(selection: Selection, own: list[int]) -> list[int]:
+def _first_variants(selection: Selection, variants: list[int]) -> list[int]:
     """Return one candidate per site: periods and curves come in many variants."""
     seen: set[int | None] = set()
     first = []
-    for c in own:
+    for c in variants:
         joint = selection.space.candidates[c].site.joint
         if joint not in seen:
             seen.add(joint)
@@ -203,8 +202,7 @@ def _first_variants(selection: Selection, own: list[int]) -> list[int]:
 
 def _shown(selection: Selection, c: int) -> bool:
     space = selection.space
-    usual = np.array([p.scale for p in space.candidates[c].parameters])
-    columns = space.X[:, space.start[c] : space.start[c + 1]] * usual
+    columns = space.columns([c]) * space.candidates[c].scales
     return bool(np.sqrt(np.sum(columns**2, axis=0)).max() > EXCITED)
 
 

@@ -56,7 +56,7 @@ class ChannelDiagnosis:
     held_out: Array | None = field(repr=False)  # (kept,) rms of each held-out sample
     outliers: NDArray[np.int64] = field(repr=False)  # rows of the log that were excluded
     stand_ins: tuple[Cause, ...] = ()  # not proved, but useful where nothing was fitted
-    along: tuple[Term, ...] = ()  # causes and stand-ins, fitted together
+    fitted_together: tuple[Term, ...] = ()  # causes and stand-ins
     elsewhere: Generalisation = NOWHERE  # new region, new session
     noise_floor_source: str = "unknown"  # what measured it
     carried: tuple[Carried, ...] = ()  # of causes, where several sessions show them

@@ -38,14 +38,14 @@ def not_constant(
     unnamed = selection.working.X[:, :0] if beside is None else beside
     if selection.links is not None:
         unnamed = selection.links.whitened(unnamed)
-    single, found = [c for c in accused if c not in selection.block], {}
+    single, goes_by = [c for c in accused if c not in selection.block], {}
     for c in single:
         candidate = selection.working.candidates[c]
         if candidate.periodic or (beside is not None and _is_a_number(candidate)):
             quantity, share = _variation(selection, c, single, unnamed)
             if share > VARIES:
-                found[c] = quantity
-    return found
+                goes_by[c] = quantity
+    return goes_by
 
 
 def _is_a_number(candidate: Candidate) -> bool:
@@ -66,19 +66,20 @@ def _variation(
     ("", 0) where the residual asks for no variation at the price of chance.
     """
     space, observation = selection.working, selection.observation
-    own = exact_columns(observation, space.candidates[c], _others(selection, c))
-    constant = selection.rows_of(_by_session(own, observation.quantities.get("session")))
+    jacobian = exact_columns(observation, space.candidates[c], _others(selection, c))
+    constant = selection.rows_of(_by_session(jacobian, observation.quantities.get("session")))
     rest = np.hstack([space.columns([o for o in accused if o != c]), beside])
     basis = basis_of(_unit(np.hstack([constant, rest])))
-    left = projected_out(basis, space.y)
-    variance = max(float(left @ left) / max(space.freedom - basis.shape[1], 1.0), space.floor)
+    residual = projected_out(basis, space.y)
+    freedom = max(space.freedom - basis.shape[1], 1.0)
+    variance = max(float(residual @ residual) / freedom, space.floor)
     shapes = _shapes(selection, space.candidates[c])
     most, name, varying = 0.0, "", constant[:, :0]
     for quantity, shape in shapes.items():
-        columns = own[:, :, :, None] * shape[:, None, None, :]
-        rows = _unit(selection.rows_of(columns.reshape(*own.shape[:2], -1)))
+        columns = jacobian[:, :, :, None] * shape[:, None, None, :]
+        rows = _unit(selection.rows_of(columns.reshape(*jacobian.shape[:2], -1)))
         further = basis_of(projected_out(basis, rows))
-        gain = float(np.sum((further.T @ left) ** 2)) / variance
+        gain = float(np.sum((further.T @ residual) ** 2)) / variance
         gain -= further.shape[1] * np.log(space.freedom) + 2 * np.log(len(shapes))
         if gain > most:
             most, name, varying = gain, quantity, rows
@@ -93,12 +94,13 @@ def _variation(
     return name, share
 
 
-def _by_session(own: Array, session: Array | None) -> Array:
+def _by_session(columns: Array, session: Array | None) -> Array:
     """Return the columns (N, k, d) with a number for each session: what changed is no variation."""
     if session is None:
-        return own
+        return columns
     each = (session[:, None] == np.unique(session)).astype(float)
-    return np.asarray((own[:, :, :, None] * each[:, None, None, :]).reshape(*own.shape[:2], -1))
+    split = columns[:, :, :, None] * each[:, None, None, :]
+    return np.asarray(split.reshape(*columns.shape[:2], -1))
 
 
 def _others(selection: Selection, c: int) -> list[Term]:
@@ -111,8 +113,8 @@ def _shapes(selection: Selection, candidate: Candidate) -> dict[str, Array]:
     if not candidate.periodic:
         return {name: spline_basis(z) for name, z in quantities.items()}
     assert candidate.site.joint is not None
-    own = joint_quantity(selection.observation, candidate.site.joint - 1)
-    return {own: _quarters(quantities[own])} if own in quantities else {}
+    angle = joint_quantity(selection.observation, candidate.site.joint - 1)
+    return {angle: _quarters(quantities[angle])} if angle in quantities else {}
 
 
 def _quarters(z: Array) -> Array:
@@ -128,12 +130,13 @@ def _quantities(selection: Selection, candidate: Candidate) -> dict[str, Array]:
     Not by session, nor by time where there are several: what changed between them is reported so.
     """
     observation, joint = selection.observation, candidate.site.joint
-    found = dict(observation.quantities)
-    if "session" in found:
-        found = {name: z for name, z in found.items() if name not in ("session", "timestamp")}
+    quantities = dict(observation.quantities)
+    if "session" in quantities:
+        del quantities["session"]
+        quantities.pop("timestamp", None)
     if observation.axial_moment is not None and joint is not None:
-        found["load"] = np.abs(observation.axial_moment[:, joint - 1])
-    return {name: z for name, z in found.items() if len(np.unique(z)) > 2}
+        quantities["load"] = np.abs(observation.axial_moment[:, joint - 1])
+    return {name: z for name, z in quantities.items() if len(np.unique(z)) > 2}
 
 
 def _unit(columns: Array) -> Array:

@@ -58,6 +58,14 @@ REPEATS_MEASURE = 10  # degrees of freedom from which repeats measure it: to a q
 RESIDUAL_MEASURES = 400  # samples from which the residual's own rms is the better estimate
 # What a log shows
 EXCITED = 3.0  # whitened length of an effect of usual size: an engineer's three sigmas
+MIN_FREEDOM = 6  # readings beyond the unknowns of the frame, for a channel to be diagnosed
+MIN_CONDITIONS = 4  # different poses, or stretches of a recording, for the same
+MIN_FREEDOM_OF_SESSION = 3  # readings beyond the unknowns of a session's own frame
+MIN_APPROACHES = 4  # rows that come from either side, for a quantity to be a joint's last motion
+MIN_TORQUE_CHANGE = 1e-3  # share of the largest held torque by which one has to change to count
+STEPPED_SHARE = 0.5  # distinct values over samples below which a signal comes in steps
+MIN_CYCLES = 1.5  # of a periodic line over the joint's range
+MIN_ROWS_BESIDE_STEP = 3  # on either side of a moment at which something steps
 DECISIVE = 1.0  # times the noise: a proposed measurement that differs by less decides nothing
 MAIN_SHARE = 0.5  # of the gap on unseen poses: where a fit of flexibilities leaves more, they are
 # not the main thing
@@ -73,11 +81,18 @@ FAMILY_PENALTY = 4.0  # score that one kind of effect at two places may cost bey
 NO_REVERSAL_PENALTY = 3.0  # of play in a log without reversals: it stands behind the offset
 ANY_CONSTANT_PENALTY = 1e-3  # of a sensor's constant: decides exact ties, which rounding did
 MAX_LINES = 4  # periodic lines a joint may have: more are the Fourier series of something else
+MIN_ORDERS_APART = 0.75  # cycles a turn between two lines of a joint
+MIN_PERIODS = 0.75  # of a line, beside something unknown: a sine's less than two extremes are any
+# curve's. False lines showed 0.26 to 0.54, true ones beside an unknown 0.89 and more
+MIN_DELAYS = 3  # known ones: below, nobody knows which joint is the odd one
+NO_WORTH = 1e-4  # worth of a value below which it goes at once: a thirtieth of its sigma
 MAX_SMOOTH_TERMS = 2  # unnamed functions of a set: more add nothing
 LARGE_SAMPLE = 450  # rows of the sample space from which many causes are looked for, one by one
 # Sizes of an arm, by what Effect.parameters calls usual
 MAX_TIMES_USUAL = 200.0  # times the usual size: beyond, a fit is no explanation
 MAX_SOFTENING = 6000.0  # times the usual softening of a stiffness curve
+TOO_LARGE_SIGMAS = 3.0  # by which a linear value has to be beyond those sizes
+OUT_OF_BOUNDS_SIGMAS = 2.5  # by which it has to be below its lower bound
 PRIOR_REACH = 100.0  # times the usual size: how far the data may take a number against nothing
 UNDETERMINED = 30.0  # times the usual size: with a wider spread nothing is known of a number
 LOOSE_PRIOR = 5.0  # times the usual size: 1 sigma of what else may be there (outliers, steps)
@@ -99,3 +114,8 @@ UNPREDICTED_SHARE = 0.5  # share of an outlier that may be left where something 
 # Several sessions
 CHANCE = 0.001  # probability below which the values of sessions differ by more than chance
 MATERIAL_SHARE = 0.2  # share of a cause's size: sessions that differ by less are alike for a model
+# Mistakes of frames and signs in a log
+NOT_THE_ARM = 0.02  # m and rad: more than any arm errs
+MISTAKE_LEAVES = 0.1  # share of the distance that may be left for a mistake to be named
+CLEARLY_BETTER = 0.8  # of what the best mistake before leaves, for another to be named instead
+SIGN_LEAVES = 0.5  # of what the pull leaves as the log has it, for another sign to be named

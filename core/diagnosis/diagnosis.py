@@ -12,13 +12,13 @@ from threadpoolctl import threadpool_limits
 
 from gapbridge.core.arrays import Array
 from gapbridge.core.diagnosis.across_sessions import carried
-from gapbridge.core.diagnosis.causes import Considered, causes_of, considered_of
+from gapbridge.core.diagnosis.causes import Cause, Considered, causes_of, considered_of
 from gapbridge.core.diagnosis.channel_diagnosis import ChannelDiagnosis, Where, locate
 from gapbridge.core.diagnosis.channels import position, torque, tracking, wrench
 from gapbridge.core.diagnosis.channels.simulation import joined, predicted_by
-from gapbridge.core.diagnosis.criteria import UNRESOLVED
+from gapbridge.core.diagnosis.criteria import MIN_CONDITIONS, MIN_FREEDOM, UNRESOLVED
 from gapbridge.core.diagnosis.every_row.gap_sizes import gaps, sizes_of, streamed_sizes
-from gapbridge.core.diagnosis.every_row.long_recording import long_recording
+from gapbridge.core.diagnosis.every_row.long_recording import LongRecording, long_recording
 from gapbridge.core.diagnosis.every_row.refitted import (
     on_every_row,
     refitted,
@@ -154,63 +154,71 @@ def _diagnose(
 ) -> Diagnosis:  # fmt: skip
     check_units(model, log)
     notes: list[Finding] = [*_log_findings(model, log, metrology)]
-    observed: list[ChannelDiagnosis] = []
-    searched: list[tuple[_Searched, RowSums]] = []
-    hidden: list[NotObservable] = []
     if simulated is not None:
         log = joined(log, simulated)
         observers = {name: predicted_by(name, o) for name, o in observers.items()}
     long = long_recording(log)
+    channels: list[ChannelDiagnosis] = []
+    streaming: list[tuple[_Searched, RowSums]] = []
+    hidden: list[NotObservable] = []
     for name, observe in observers.items():
         sampled = None if name == "position" else long
-        looked_at = log if sampled is None else sampled.excerpt
-        seen = observe(model, looked_at, metrology)
-        if isinstance(seen, NotObservable):
-            hidden.append(seen)
-            continue
-        whole = seen
-        if len(seen.rows) > MOST[seen.channel]:
-            seen = _thinned(seen, model, looked_at, metrology, observe)
-        if _too_few(seen):
-            notes.append(ChannelFinding(seen.channel, TooFewRows(len(seen.rows))))
-            hidden.append(NotObservable(seen.channel, ("more rows",)))
-            continue
-        if sampled is not None:
-            seen, whole = (replace(o, rows=sampled.rows[o.rows]) for o in (seen, whole))
-        found = _searched(seen, whole, model, withhold, progress)
-        if sampled is None:
-            observed.append(_decided(found, model, None))
+        samples = _samples(observe, model, log, metrology, sampled)
+        if isinstance(samples, NotObservable):
+            hidden.append(samples)
+        elif _too_few(samples[0]):
+            notes.append(ChannelFinding(name, TooFewRows(len(samples[0].rows))))
+            hidden.append(NotObservable(name, ("more rows",)))
+        elif sampled is None:
+            searched = _searched(*samples, model, withhold, progress)
+            channels.append(_decided(searched, model, None))
         else:
+            searched = _searched(*samples, model, withhold, progress).without_columns()
             streamed = partial(_observed_in, observe, model, metrology)
-            found = found.without_columns()
-            searched.append((found, found.row_sums(streamed, model)))
-    if long is not None and searched:
+            streaming.append((searched, searched.row_sums(streamed, model)))
+    if long is not None and streaming:
         if progress:
             progress(f"all {len(log)} rows")
         for block in long:
-            for _, sums in searched:
+            for _, sums in streaming:
                 sums.add(long, block)
-        observed += [_decided(found, model, sums.streamed()) for found, sums in searched]
-    for channel in observed:
-        most = MOST[channel.channel]
-        if channel.samples > most:
-            notes.append(ChannelFinding(channel.channel, Thinned(most, channel.samples)))
-    if not observed:
+        channels += [_decided(searched, model, sums.streamed()) for searched, sums in streaming]
+    if not channels:
         raise _no_channel(log, hidden)
-    for channel in observed:
+    notes += [
+        ChannelFinding(c.channel, Thinned(MOST[c.channel], c.samples))
+        for c in channels if c.samples > MOST[c.channel]
+    ]  # fmt: skip
+    soft = {*flexibility_effects().values()} - {*withhold}
+    for channel in channels:
         notes += [ChannelFinding(channel.channel, fact) for fact in _facts(channel, log)]
-        soft = {*flexibility_effects().values()} - {*withhold}
         if simulated is None and len(soft) == 2 and _lacks_much(channel):
             notes += softness_findings(model, log, metrology)
-    terms = _for_the_model(observed)
+    terms = _for_the_model(channels)
     if not log.one_clock:
         terms = [_slipped(term, log) for term in terms]
     return Diagnosis(
-        _overall(observed), tuple(observed), tuple(hidden),
-        next_measurements(model, log, observed), tuple(notes), model.with_terms(terms),
-        model.with_terms(_and_stand_ins(observed, terms)),
+        _overall(channels), tuple(channels), tuple(hidden),
+        next_measurements(model, log, channels), tuple(notes), model.with_terms(terms),
+        model.with_terms(_and_stand_ins(channels, terms)),
         log.session_names, log.one_clock,
     )  # fmt: skip
+
+
+def _samples(
+    observe: Observe, model: Model, log: Log, metrology: Metrology, long: LongRecording | None
+) -> tuple[Observation, Observation] | NotObservable:
+    """Return the samples of a channel to search in, and all of them, by their rows in the log."""
+    excerpt = log if long is None else long.excerpt
+    whole = observe(model, excerpt, metrology)
+    if isinstance(whole, NotObservable):
+        return whole
+    fewer = whole
+    if len(whole.rows) > MOST[whole.channel]:
+        fewer = _thinned(whole, model, excerpt, metrology, observe)
+    if long is None:
+        return fewer, whole
+    return replace(fewer, rows=long.rows[fewer.rows]), replace(whole, rows=long.rows[whole.rows])
 
 
 def _no_channel(log: Log, hidden: Sequence[NotObservable]) -> LogError:
@@ -230,7 +238,7 @@ def _observed_in(
 class _Searched:
     """What a search in a channel's samples found, before more rows judge."""
 
-    seen: Observation
+    observation: Observation
     selection: Selection  # on all samples of the channel
     more: bool  # these are more than were searched
     verdict: Judgement
@@ -238,7 +246,8 @@ class _Searched:
     depends: Callable[[Sequence[int]], Depends]
     where: Where
     considered: tuple[Considered, ...]
-    stood_in: dict[str, Any]
+    stand_ins: tuple[Cause, ...]
+    fitted_together: tuple[Term, ...]  # causes and stand-ins
 
     def without_columns(self) -> _Searched:
         """Return the same without the columns of all candidates: 50 MB that no row asks for."""
@@ -257,28 +266,28 @@ def _log_findings(model: Model, log: Log, metrology: Metrology) -> list[LogFindi
         return findings(log, model, metrology)
     sessions: dict[LogFinding, list[str]] = {}
     for name, part in zip(log.session_names, sessions_in(log), strict=True):
-        own = position.session_model(model, part, metrology)
-        for finding in findings(part, own, metrology):
+        session_model = position.session_model(model, part, metrology)
+        for finding in findings(part, session_model, metrology):
             sessions.setdefault(finding, []).append(name)
-    found = [replace(finding, sessions=tuple(names)) for finding, names in sessions.items()]
+    log_findings = [replace(finding, sessions=tuple(names)) for finding, names in sessions.items()]
     if not log.one_clock:
-        found.append(LogFinding(LogCheck.CLOCKS_OVERLAP))
-    return found + outside_findings(log)
+        log_findings.append(LogFinding(LogCheck.CLOCKS_OVERLAP))
+    return log_findings + outside_findings(log)
 
 
 def _thinned(
-    seen: Observation, model: Model, log: Log, metrology: Metrology, observe: Observe
+    observation: Observation, model: Model, log: Log, metrology: Metrology, observe: Observe
 ) -> Observation:
     """Return the channel with fewer samples; poses are looked at anew, so that frames stay free."""
-    if seen.channel != "position":
-        return thinned(seen, MOST[seen.channel])
-    take = np.unique(np.linspace(0, len(seen.rows) - 1, MOST["position"]).astype(int))
+    if observation.channel != "position":
+        return thinned(observation, MOST[observation.channel])
+    take = np.unique(np.linspace(0, len(observation.rows) - 1, MOST["position"]).astype(int))
     # last motions come from neighbouring rows: they are reported before rows are left out
     approach = log.approach()
     columns = dict(log.columns) | ({} if approach is None else {"approach": approach})
-    part = observe(model, replace(log, columns=columns).select(seen.rows[take]), metrology)
+    part = observe(model, replace(log, columns=columns).select(observation.rows[take]), metrology)
     assert isinstance(part, Observation)
-    return replace(part, rows=seen.rows[take])
+    return replace(part, rows=observation.rows[take])
 
 
 def _for_the_model(channels: Sequence[ChannelDiagnosis]) -> list[Term]:
@@ -297,7 +306,7 @@ def _and_stand_ins(channels: Sequence[ChannelDiagnosis], proved: Sequence[Term])
     """Return the proved terms and the stand-ins, with the values that they have together."""
     terms = {(t.effect, t.site): t for t in proved}
     for channel in channels:
-        terms |= {(t.effect, t.site): t for t in channel.along}
+        terms |= {(t.effect, t.site): t for t in channel.fitted_together}
     return list(terms.values())
 
 
@@ -313,30 +322,30 @@ def _lacks_much(channel: ChannelDiagnosis) -> bool:
     return channel.channel == "position" and channel.verdict in ("unexplained", "partly_explained")
 
 
-def _too_few(seen: Observation) -> bool:
+def _too_few(observation: Observation) -> bool:
     """Return whether there are too few samples for a diagnosis."""
-    N, k, p = seen.nuisance.shape
-    return N * k < p + 6 or len(np.unique(seen.groups)) < 4
+    N, k, p = observation.nuisance.shape
+    return N * k < p + MIN_FREEDOM or len(np.unique(observation.groups)) < MIN_CONDITIONS
 
 
 def _searched(
-    seen: Observation, whole: Observation, model: Model, withhold: tuple[str, ...],
+    observation: Observation, whole: Observation, model: Model, withhold: tuple[str, ...],
     progress: Callable[[str], None] | None,
 ) -> _Searched:  # fmt: skip
-    """Return what a search in ``seen`` found, refitted on all samples of ``whole``."""
-    searched = select(seen, model, withhold, progress)
+    """Return what a search in ``observation`` found, refitted on all samples of ``whole``."""
+    searched = select(observation, model, withhold, progress)
     searched, verdict = judge_geometry(searched, judge(searched, HeldOut(searched)), model.arm)
     held = HeldOut(searched)
     verdict = with_stand_ins(searched, verdict)
-    stood_in = _stood_in(searched, verdict, held, model)
+    stand_ins = _stand_ins(searched, verdict, held, model)
     searched, verdict = still_sure(searched, verdict, model.arm)
-    considered = considered_of(searched, verdict, held, model.arm, withhold)
+    considered = considered_of(searched, verdict, held, withhold)
     chosen = [searched.term_index[p] for p in verdict.accused]
     where = locate(searched, gaps(searched, chosen)[0][searched.kept], chosen)
     selection = searched
-    if len(whole.rows) > len(seen.rows):
+    if len(whole.rows) > len(observation.rows):
         if progress:
-            progress(f"{seen.channel}: all {len(whole.rows)} rows")
+            progress(f"{observation.channel}: all {len(whole.rows)} rows")
         verdict = with_uncertain_terms(verdict)
         selection = on_every_row(searched, verdict, whole, model)
 
@@ -346,15 +355,16 @@ def _searched(
         return tuple(dependence(searched.space, basis, fitted, searched.groups))
 
     more = selection is not searched
-    return _Searched(seen, selection, more, verdict, follows, where, considered, stood_in)
+    return _Searched(observation, selection, more, verdict, follows, where, considered, *stand_ins)
 
 
-def _decided(found: _Searched, model: Model, streamed: Streamed | None) -> ChannelDiagnosis:
+def _decided(searched: _Searched, model: Model, streamed: Streamed | None) -> ChannelDiagnosis:
     """Return what all rows leave of what was found; ``streamed`` are those of a long recording."""
-    seen, shown, verdict = found.seen, found.selection, found.verdict
+    observation, shown = searched.observation, searched.selection
+    verdict = searched.verdict
     decided = shown if streamed is None else streamed.selection(verdict.accused)
     held = HeldOut(decided)
-    if found.more or streamed is not None:
+    if searched.more or streamed is not None:
         unknown = verdict.remainder is not None
         alone = partial(refitted, model, unknown) if streamed is None else streamed.alone
         decided, verdict = still_accused(decided, verdict, held, alone)
@@ -369,28 +379,30 @@ def _decided(found: _Searched, model: Model, streamed: Streamed | None) -> Chann
     else:
         sizes = streamed_sizes(streamed, decided, verdict.accused)
     causes = causes_of(decided, verdict, held, model.arm)
-    verdict, floor = _with_whiteness(verdict, shown, sizes.means, found.depends)
+    verdict, floor = _with_whiteness(verdict, shown, sizes.means, searched.depends)
     held_rms = held.rms(chosen) if held.possible else None
     if not causes:  # nothing was fitted but the frame, before as well as after
         held_rms = sizes.gap_rms
-    if sizes.left < UNRESOLVED:
+    if sizes.remaining_rms < UNRESOLVED:
         verdict = replace(verdict, structured=False, depends_on=())
     structured = verdict.structured
     named = "explained" if causes else "no_gap"
     if structured:
         named = "partly_explained" if causes else "unexplained"
-    own = held if streamed is None else HeldOut(shown)
+    per_sample = held if streamed is None else HeldOut(shown)
     return ChannelDiagnosis(
-        channel=seen.channel, unit=seen.unit, samples=sizes.samples, gap_rms=sizes.gap_rms,
-        gap_max=sizes.gap_max, noise_floor_rms=floor.rms, remaining_rms=sizes.left,
-        remaining_rms_held_out=held_rms, where=found.where, causes=causes,
-        considered=found.considered,
-        unexplained_rms=_unexplained(sizes.left, floor.rms, verdict), structured=structured,
-        p_value=verdict.p_value, depends_on=verdict.depends_on, verdict=named,
-        selection=shown, judgement=verdict, gap=gap, remaining=remaining,
-        held_out=np.sqrt(own.squares(chosen)) if own.possible else None, outliers=sizes.outliers,
-        elsewhere=generalisation(decided, chosen), carried=carried(decided, chosen, model.arm),
-        noise_floor_source=floor.source, **found.stood_in,
+        channel=observation.channel, unit=observation.unit, samples=sizes.samples,
+        gap_rms=sizes.gap_rms, gap_max=sizes.gap_max, noise_floor_rms=floor.rms,
+        remaining_rms=sizes.remaining_rms, remaining_rms_held_out=held_rms,
+        where=searched.where, causes=causes, considered=searched.considered,
+        unexplained_rms=_unexplained(sizes.remaining_rms, floor.rms, verdict),
+        structured=structured, p_value=verdict.p_value, depends_on=verdict.depends_on,
+        verdict=named, selection=shown, judgement=verdict, gap=gap, remaining=remaining,
+        held_out=np.sqrt(per_sample.squares(chosen)) if per_sample.possible else None,
+        outliers=sizes.outliers, elsewhere=generalisation(decided, chosen),
+        carried=carried(decided, chosen, model.arm),
+        noise_floor_source=floor.source, stand_ins=searched.stand_ins,
+        fitted_together=searched.fitted_together,
     )  # fmt: skip
 
 
@@ -413,23 +425,20 @@ def _with_whiteness(
     return verdict, noise_floor(selection, True)
 
 
-def _stood_in(
+def _stand_ins(
     selection: Selection, verdict: Judgement, held: HeldOut, model: Model
-) -> dict[str, Any]:
+) -> tuple[tuple[Cause, ...], tuple[Term, ...]]:
     """Return the stand-ins as causes, and the terms of causes and stand-ins fitted together."""
     if not verdict.stand_ins:
-        return {}
+        return (), ()
     both = (*verdict.accused, *verdict.stand_ins)
-    along = refitted_alone(selection, model.arm, both)
+    together = refitted_alone(selection, model.arm, both)
     notes = replace(verdict, accused=both, ties={})
-    marked = [replace(along.terms[p], stand_in=p in verdict.stand_ins) for p in both]
-    return {
-        "stand_ins": causes_of(along, notes, held, model.arm, verdict.stand_ins),
-        "along": tuple(marked),
-    }
+    marked = [replace(together.terms[p], stand_in=p in verdict.stand_ins) for p in both]
+    return causes_of(together, notes, held, model.arm, verdict.stand_ins), tuple(marked)
 
 
-def _unexplained(left: float, floor: float | None, verdict: Judgement) -> float:
+def _unexplained(remaining: float, floor: float | None, verdict: Judgement) -> float:
     """Return the rms of what is left beyond the noise; of a residual without structure 0.
 
     Where no floor is known, or one no lower than what is left, what the residual depends on says
@@ -437,11 +446,11 @@ def _unexplained(left: float, floor: float | None, verdict: Judgement) -> float:
     """
     if not verdict.structured:
         return 0.0
-    beyond = float(np.sqrt(max(left**2 - floor**2, 0.0))) if floor is not None else 0.0
+    beyond = float(np.sqrt(max(remaining**2 - floor**2, 0.0))) if floor is not None else 0.0
     if beyond > 0:
         return beyond
     share = max((share for _, share in verdict.depends_on), default=1.0)
-    return left * float(np.sqrt(np.clip(share, 0.0, 1.0)))
+    return remaining * float(np.sqrt(np.clip(share, 0.0, 1.0)))
 
 
 def _overall(channels: Sequence[ChannelDiagnosis]) -> str:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapbridge.core.arrays import Array, Index
-from gapbridge.core.diagnosis.criteria import PRIOR_REACH
+from gapbridge.core.diagnosis.criteria import MIN_FREEDOM_OF_SESSION, PRIOR_REACH
 from gapbridge.core.diagnosis.observation import Observation
 from gapbridge.core.diagnosis.selection.selection import Selection
 from gapbridge.core.estimation.held_out import joint_regions
@@ -43,9 +43,9 @@ def generalisation(selection: Selection, chosen: Sequence[int]) -> Generalisatio
     problem = _Problem(selection, tuple(chosen))
     new_region = problem.new_region()
     each = problem.by_session()
-    left = np.concatenate([r for _, r in each]) if each else None
+    pooled = np.concatenate([r for _, r in each]) if each else None
     return Generalisation(
-        new_region, None if left is None else _rms(left), tuple((s, _rms(r)) for s, r in each)
+        new_region, None if pooled is None else _rms(pooled), tuple((s, _rms(r)) for s, r in each)
     )
 
 
@@ -67,11 +67,11 @@ class _Problem:
         self._owner = np.array(observation.nuisance_session or (0,) * unprojected.nuisance.shape[1])
         whole = observation.session
         self._session = np.zeros(int(kept.sum()), dtype=np.int64) if whole is None else whole[kept]
-        self._fold, self._near = regions(observation, kept)
+        self._fold, self._near = held_out_regions(observation, kept)
 
     def new_region(self) -> float | None:
         """Return the rms over regions left out in turn, frames from the fitted poses."""
-        left = []
+        residuals = []
         for fold in range(int(self._fold.max()) + 1):
             out = self._fold == fold
             fitted = ~out & ~self._near[fold]
@@ -85,46 +85,47 @@ class _Problem:
                 continue
             x = solve(A[self._rows(fitted)], self._gap[self._rows(fitted)], self._hold)
             rows = self._rows(judged)
-            left.append(self._in_unit(self._gap[rows] - A[rows] @ x, judged))
-        if len(left) < 2:
+            residuals.append(self._in_unit(self._gap[rows] - A[rows] @ x, judged))
+        if len(residuals) < 2:
             return None
-        return _rms(np.concatenate(left))
+        return _rms(np.concatenate(residuals))
 
     def by_session(self) -> list[tuple[int, Array]]:
         """Return each session's remainder (n, own) under a fit of the others, itself placed."""
         sessions = np.unique(self._session)
-        found = []
+        residuals = []
         for s in sessions if len(sessions) > 1 else ():
             out = self._session == s
-            rest, own = self._owner != s, self._owner == s
-            A = np.hstack([self._causes, self._nuisance[:, rest]])
+            other_frames, own_frame = self._owner != s, self._owner == s
+            A = np.hstack([self._causes, self._nuisance[:, other_frames]])
             rows = self._rows(~out)
             if len(self._gap[rows]) <= A.shape[1]:
                 continue
             x = solve(A[rows], self._gap[rows], self._hold)[: self._causes.shape[1]]
             rows = self._rows(out)
-            left, N = self._gap[rows] - self._causes[rows] @ x, self._nuisance[rows][:, own]
-            left = left - N @ solve(N, left)
-            found.append((int(s), self._in_unit(left, out)))
-        return found
+            N = self._nuisance[rows][:, own_frame]
+            residual = self._gap[rows] - self._causes[rows] @ x
+            residual = residual - N @ solve(N, residual)
+            residuals.append((int(s), self._in_unit(residual, out)))
+        return residuals
 
     def _enough(self, session: int, fitted: NDArray[np.bool_]) -> bool:
-        own = int((self._owner == session).sum())
-        found = int((fitted & (self._session == session)).sum())
-        return bool(self._k * found >= own + 3)
+        unknowns = int((self._owner == session).sum())
+        samples = int((fitted & (self._session == session)).sum())
+        return bool(self._k * samples >= unknowns + MIN_FREEDOM_OF_SESSION)
 
     def _rows(self, samples: NDArray[np.bool_]) -> NDArray[np.bool_]:
         return np.repeat(samples, self._k)
 
-    def _in_unit(self, left: Array, samples: NDArray[np.bool_]) -> Array:
+    def _in_unit(self, residual: Array, samples: NDArray[np.bool_]) -> Array:
         """Return whitened residuals as the channel's own coordinates (n, own)."""
         return np.asarray(
-            (self._unwhiten[samples] @ left.reshape(-1, self._k, 1))[:, : self._own, 0]
+            (self._unwhiten[samples] @ residual.reshape(-1, self._k, 1))[:, : self._own, 0]
             * self._weight
         )
 
 
-def regions(
+def held_out_regions(
     observation: Observation, kept: NDArray[np.bool_], seed: int = 0
 ) -> tuple[Index, NDArray[np.bool_]]:
     """Return the region (n,) of each kept sample, and what else lies too near each (folds, n)."""

@@ -121,16 +121,16 @@ def judge_geometry(
     What the accusations leave it has to close in every part of the log, each predicted by a fit
     that did not see it.
     """
-    own = [selection.term_index[p] for p in judgement.accused]
-    found = [*own, *(selection.term_index[p] for p, _ in judgement.withdrawn)]
-    single = any(selection.space.candidates[c].effect.together for c in found)
+    accused_before = [selection.term_index[p] for p in judgement.accused]
+    suspected = [*accused_before, *(selection.term_index[p] for p, _ in judgement.withdrawn)]
+    single = any(selection.space.candidates[c].effect.together for c in suspected)
     if selection.block or not (single and judgement.structured):
         return selection, judgement
     try:
         whole = selection.with_all_links(arm)
     except InputError:  # no arm of such links stands
         return selection, judgement
-    if whole is None or not closes_everywhere(whole, own):
+    if whole is None or not closes_everywhere(whole, accused_before):
         return selection, judgement
     again = judge(whole, HeldOut(whole))
     accused = {whole.term_index[p] for p in again.accused}
@@ -149,14 +149,14 @@ def _verdict(
     p_value = min(p_value, _too_much_left(whole))
     if np.mean(~whole.kept) > OUTLIER_SHARE:  # no bad luck: something befalls the log
         p_value = 0.0
-    unnamed = any(not space.candidates[c].named for c in selection.found.chosen)
+    unnamed = any(not space.candidates[c].named for c in selection.best.chosen)
     if unnamed:
-        p_value = min(p_value, _needless(space, selection.found))
+        p_value = min(p_value, _needless(space, selection.best))
     structured = p_value < (HINT_P if unnamed or fallen else SURE_P)
     depends: tuple[tuple[str, float], ...] = ()
     if structured or not stays:
         depends = tuple(dependence(space, nuisance, single, selection.groups))
-    ties = ties_of(space, selection.found, single)
+    ties = ties_of(space, selection.best, single)
     return Judgement(
         tuple(place[c] for c in stays), structured, p_value, depends,
         {place[c]: names for c, names in ties.items()},
@@ -164,16 +164,16 @@ def _verdict(
     )  # fmt: skip
 
 
-def _needless(space: SampleSpace, found: CandidateFit) -> float:
+def _needless(space: SampleSpace, best: CandidateFit) -> float:
     """Return the probability that named causes alone would do, of a set with unnamed functions."""
-    named = fit(space, [c for c in found.chosen if space.candidates[c].named])
+    named = fit(space, [c for c in best.chosen if space.candidates[c].named])
     alone = forward_selected(space, named, named_only=True)
-    return float(1 / (1 + np.exp(0.5 * np.clip(alone.score - found.score, -700.0, 700.0))))
+    return float(1 / (1 + np.exp(0.5 * np.clip(alone.score - best.score, -700.0, 700.0))))
 
 
 def _no_value(selection: Selection) -> dict[int, Withdrawal]:
     """Return positions of terms that only a bound holds, or whose value may as well be none."""
-    found = dict.fromkeys(
+    withdrawn = dict.fromkeys(
         without_curvature(selection.terms, selection.covariance), Withdrawal(Check.CURVED)
     )
     for position, (c, term) in enumerate(zip(selection.term_index, selection.terms, strict=True)):
@@ -184,15 +184,15 @@ def _no_value(selection: Selection) -> dict[int, Withdrawal]:
             min(abs(v - p.lower), abs(v - p.upper)) < 1e-6 * p.scale
             for p, v in zip(candidate.parameters, term.values, strict=False)
         ):
-            found[position] = Withdrawal(Check.INSIDE_BOUNDS)
+            withdrawn[position] = Withdrawal(Check.INSIDE_BOUNDS)
         if worth(term, spread) < 1:
-            found[position] = VAGUE
-        usual = [p.scale for p in candidate.parameters]
+            withdrawn[position] = VAGUE
+        least = NEGLIGIBLE * candidate.scales
         if candidate.curve is None and all(
-            abs(v) < NEGLIGIBLE * size for v, size in zip(term.values, usual, strict=False)
+            abs(v) < size for v, size in zip(term.values, least, strict=False)
         ):
-            found[position] = Withdrawal(Check.USUAL_SIZE)
-    return found
+            withdrawn[position] = Withdrawal(Check.USUAL_SIZE)
+    return withdrawn
 
 
 def still_sure(selection: Selection, judgement: Judgement, arm: Arm) -> tuple[Selection, Judgement]:
@@ -203,41 +203,41 @@ def still_sure(selection: Selection, judgement: Judgement, arm: Arm) -> tuple[Se
     itself: else the data show none of their numbers; and none may be far off without being sure.
     """
     while True:
-        found = refitted_alone(selection, arm, judgement.accused, judgement.remainder)
-        if far := found.far_off(judgement.accused):
+        refit = refitted_alone(selection, arm, judgement.accused, judgement.remainder)
+        if far := refit.far_off(judgement.accused):
             selection = selection.with_nominal(far)
             continue
         straight = {
-            p for p in without_curvature(found.terms, found.covariance) if judgement.remainder
+            p for p in without_curvature(refit.terms, refit.covariance) if judgement.remainder
         }
         share = {
-            p: 0.0 if p in straight else worth(found.terms[p], found.covariance[p])
+            p: 0.0 if p in straight else worth(refit.terms[p], refit.covariance[p])
             for p in judgement.accused
         }
         weakest = min(
-            found.judged_together(judgement.accused),
+            refit.judged_together(judgement.accused),
             key=lambda kind: max(share[p] for p in kind), default=(),
         )  # fmt: skip
         if not weakest or max(share[p] for p in weakest) >= 1:
-            return found, judgement
-        inside = found.term_index[weakest[0]] in found.block
+            return refit, judgement
+        inside = refit.term_index[weakest[0]] in refit.block
         # of friction beside the links more rows may still be sure
         reason = VAGUE if inside else BESIDE
         # a joint's zero among the links that shows nothing leaves nothing behind
-        left = not inside or found.is_link(weakest[0])
+        structured = not inside or refit.is_link(weakest[0])
         judgement = replace(
             judgement, accused=tuple(p for p in judgement.accused if p not in weakest),
             withdrawn=(*judgement.withdrawn, *((p, reason) for p in weakest)),
-            structured=judgement.structured or left,
+            structured=judgement.structured or structured,
             ties={p: names for p, names in judgement.ties.items() if p not in weakest},
         )  # fmt: skip
 
 
 def _without_companion(selection: Selection, stays: Sequence[int]) -> list[int]:
     """Return the candidates that show nothing without an effect that is not accused beside them."""
-    own = selection.space.candidates
-    families = {"", *(own[c].family for c in stays)}
-    return [c for c in stays if own[c].beside not in families]
+    candidates = selection.space.candidates
+    families = {"", *(candidates[c].family for c in stays)}
+    return [c for c in stays if candidates[c].beside not in families]
 
 
 def _like_a_load(selection: Selection) -> dict[int, str]:
@@ -245,7 +245,7 @@ def _like_a_load(selection: Selection) -> dict[int, str]:
 
     As long as the flange does not turn against gravity a weight is a constant reading.
     """
-    space, found = selection.working, {}
+    space, loads_of = selection.working, {}
     for c in selection.term_index:
         if not space.candidates[c].effect.any_constant:
             continue
@@ -259,8 +259,8 @@ def _like_a_load(selection: Selection) -> dict[int, str]:
             if whole > 0 and float(np.sum(projected_out(U, x) ** 2)) < SAME_SPAN * whole:
                 alike.append(candidate.family)
         if alike:
-            found[c] = " or ".join(dict.fromkeys(alike))
-    return found
+            loads_of[c] = " or ".join(dict.fromkeys(alike))
+    return loads_of
 
 
 def _like_a_level(selection: Selection) -> dict[int, str]:
@@ -268,9 +268,9 @@ def _like_a_level(selection: Selection) -> dict[int, str]:
 
     A tool that seats differently under each load is no target that moves as one is changed.
     """
-    observation, found = selection.observation, {}
+    observation, quantity_of = selection.observation, {}
     goes_by = dict.fromkeys(
-        k.quantity for c in selection.found.chosen
+        k.quantity for c in selection.best.chosen
         if (k := selection.space.candidates[c]).quantity
     )  # fmt: skip
     for c, term in zip(selection.term_index, selection.terms, strict=True):
@@ -280,26 +280,26 @@ def _like_a_level(selection: Selection) -> dict[int, str]:
         for name in goes_by:
             z = observation.quantities[name]
             if len(np.unique(z)) <= KNOTS and not np.isin(z[after], z[~after]).any():
-                found[c] = name
-    return found
+                quantity_of[c] = name
+    return quantity_of
 
 
 def gainless(selection: Selection, stays: Sequence[int], held: HeldOut) -> list[int]:
     """Return the candidates of effects that do not shrink the held-out gap, the weakest first."""
     if not held.possible:
         return list(stays)
-    left, fallen = list(stays), []
-    while left:
-        kinds = _by_effect(selection, left)
+    staying, fallen = list(stays), []
+    while staying:
+        kinds = _by_effect(selection, staying)
         low = {
-            kind: held.shrink(left, [c for c in left if c not in own]).interval[0]
-            for kind, own in kinds.items()
+            kind: held.shrink(staying, [c for c in staying if c not in members]).interval[0]
+            for kind, members in kinds.items()
         }
         worst = min(low, key=lambda kind: low[kind])
         if low[worst] > 0:
             break
         fallen += kinds[worst]
-        left = [c for c in left if c not in kinds[worst]]
+        staying = [c for c in staying if c not in kinds[worst]]
     return fallen
 
 
@@ -352,10 +352,10 @@ def _too_much_left(selection: Selection) -> float:
     observation, k = selection.observation, selection.observation.measured.shape[1]
     if observation.sigma <= 0 or observation.channel != "position":
         return 1.0
-    left = selection.residual[selection.kept][:, : min(k, 3)]
-    freedom = max(left.size - selection.used, 1.0)
-    variance = float(np.sum(left**2)) / freedom
-    pure, repeats = pure_error(left, observation.groups[selection.kept])
+    residual = selection.residual[selection.kept][:, : min(k, 3)]
+    freedom = max(residual.size - selection.used, 1.0)
+    variance = float(np.sum(residual**2)) / freedom
+    pure, repeats = pure_error(residual, observation.groups[selection.kept])
     if observation.sigma_is_whole:
         least, times = observation.sigma**2, OVER_STATED_NOISE
     elif repeats >= REPEATS_REFUTE:
@@ -369,59 +369,59 @@ def _too_much_left(selection: Selection) -> float:
     return float(gammaincc(freedom / 2, freedom * variance / least / 2))
 
 
-def pure_error(left: Array, groups: NDArray[np.int64]) -> tuple[float, int]:
+def pure_error(residual: Array, groups: NDArray[np.int64]) -> tuple[float, int]:
     """Return the variance of one coordinate among repeats of a pose, and its degrees of freedom.
 
     Repeats under other loads count too: the residual of a good model does not depend on them.
     """
     total, freedom = 0.0, 0
     for group in np.unique(groups):
-        part = left[groups == group]
+        part = residual[groups == group]
         if len(part) > 1:
             total += float(np.sum((part - part.mean(axis=0)) ** 2))
-            freedom += (len(part) - 1) * left.shape[1]
+            freedom += (len(part) - 1) * residual.shape[1]
     return total / max(freedom, 1), freedom
 
 
 def ties_of(
-    space: SampleSpace, found: CandidateFit, accused: Sequence[int]
+    space: SampleSpace, best: CandidateFit, accused: Sequence[int]
 ) -> dict[int, tuple[str, ...]]:
     """Return the effects that would do as well as each accused one, at its place.
 
     Another delay has to do so at all joints: they have one effect together.
     """
     listed: dict[int, tuple[str, ...]] = {}
-    delayed = delayed_by(space, found)
-    as_well = {name for name, f in delayed.items() if f.score <= found.score + TIE_SCORE}
+    delayed = delayed_by(space, best)
+    as_well = {name for name, f in delayed.items() if f.score <= best.score + TIE_SCORE}
     for c in accused:
-        own = space.candidates[c].family
-        near = [other for _, other in rivals(space, found, c, TIE_SCORE)]
+        kind = space.candidates[c].family
+        near = [other for _, other in rivals(space, best, c, TIE_SCORE)]
         names: list[str] = []
-        for other in [*near, *covering_effects(space, found, c)]:
+        for other in [*near, *covering_effects(space, best, c)]:
             family = space.candidates[other].family
-            if not space.candidates[other].named or family in (own, *names):
+            if not space.candidates[other].named or family in (kind, *names):
                 continue
             if delayed and space.candidates[other].effect.delays and family not in as_well:
                 continue
-            if space.candidates[other].effect.contains != own:  # a curve holds its line: no rival
+            if space.candidates[other].effect.contains != kind:  # a curve holds its line: no rival
                 names.append(family)
         listed[c] = tuple(names)
     return listed
 
 
-def covering_effects(space: SampleSpace, found: CandidateFit, c: int) -> list[int]:
+def covering_effects(space: SampleSpace, best: CandidateFit, c: int) -> list[int]:
     """Return the named effects that do all that a candidate does, and more: nothing decides.
 
     The zero of the last joint is a shift of the tool, and a heavier link 1 of an upright arm one
     whose centre of gravity is further out; each is the simpler guess, and no surer.
     """
-    rest = basis_of(space.columns([o for o in found.chosen if o != c]))
+    rest = basis_of(space.columns([o for o in best.chosen if o != c]))
     x = space.columns([c])
     x = projected_out(rest, x)
     whole = float(np.sum(x**2))
     listed = []
     for other, k in enumerate(space.candidates):
-        if other == c or other in found.chosen or not _geometric(k):
+        if other == c or other in best.chosen or not _geometric(k):
             continue
         U = space.columns([other])
         U = basis_of(projected_out(rest, U))

@@ -44,24 +44,23 @@ def noise_floor(selection: Selection, structured: bool) -> Floor:
     observation = selection.observation
     if observation.sigma_is_whole:
         return Floor(observation.sigma, "stated")
-    own = own_coordinates(observation)
+    in_unit = own_coordinates(observation)
     variance, freedom = repeat_variance(observation, selection.residual, selection.kept)
     if freedom >= REPEATS_MEASURE:
         return Floor(float(np.sqrt(max(variance, observation.sigma**2))), "repeats")
     instrument = observation.instrument and observation.instrument()
     if instrument is not None:
-        measured = float(np.sqrt(np.mean(instrument[:own] ** 2)))
+        measured = float(np.sqrt(np.mean(instrument[:in_unit] ** 2)))
         floor = max(measured, observation.sigma)
         return Floor(floor or None, "neighbouring samples" if floor else "unknown")
     if not structured:
         covariance = np.linalg.inv(selection.noise.whitener)
-        each = np.einsum("nij,nij->ni", covariance, covariance)[:, :own]
+        each = np.einsum("nij,nij->ni", covariance, covariance)[:, :in_unit]
         estimated = float(np.mean(each))
-        left = selection.residual[selection.kept][:, :own]
-        if len(left) >= RESIDUAL_MEASURES:  # the estimate rests on fewer rows
-            estimated = max(
-                float(np.sum(left**2)) / max(left.size - selection.used, 1), observation.sigma**2
-            )
+        residual = selection.residual[selection.kept][:, :in_unit]
+        if len(residual) >= RESIDUAL_MEASURES:  # the estimate rests on fewer rows
+            freedom_left = max(residual.size - selection.used, 1)
+            estimated = max(float(np.sum(residual**2)) / freedom_left, observation.sigma**2)
         return Floor(float(np.sqrt(estimated)), "residual")
     if observation.sigma > 0:
         return Floor(observation.sigma, "stated")
@@ -83,7 +82,7 @@ def repeat_variance(
     """
     if observation.order_in_time:
         return 0.0, 0
-    own = own_coordinates(observation)
+    in_unit = own_coordinates(observation)
     alike = [
         z for name, z in observation.quantities.items()
         if name.startswith(("payload", "actual_TCP_force", "approach_", "session"))
@@ -91,10 +90,10 @@ def repeat_variance(
     table = np.column_stack([observation.groups, *(np.round(z, 3) for z in alike)])[kept]
     condition = np.unique(table, axis=0, return_inverse=True)[1].reshape(-1)
     count = np.bincount(condition)
-    left = residual[kept][:, :own]
-    mean = np.stack([np.bincount(condition, left[:, j]) / count for j in range(own)], axis=1)
-    away = left - mean[condition]
-    freedom = int((count - 1).sum()) * own
+    residual = residual[kept][:, :in_unit]
+    mean = np.stack([np.bincount(condition, column) / count for column in residual.T], axis=1)
+    away = residual - mean[condition]
+    freedom = int((count - 1).sum()) * in_unit
     return float(np.sum(away**2)) / max(freedom, 1), freedom
 
 

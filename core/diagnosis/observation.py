@@ -115,15 +115,13 @@ def stacked(parts: Sequence[Observation], quantities: Mapping[str, Array]) -> Ob
     """
     size = [len(part.rows) for part in parts]
     width = [part.nuisance.shape[2] for part in parts]
-    ends, columns = np.cumsum([0, *size]), np.cumsum([0, *width])
-    nuisance = np.zeros((int(ends[-1]), parts[0].nuisance.shape[1], int(columns[-1])))
-    for i, part in enumerate(parts):
-        nuisance[ends[i] : ends[i + 1], :, columns[i] : columns[i + 1]] = part.nuisance
+    session = [0 if part.session is None else int(part.session[0]) for part in parts]
+    columns = np.cumsum([0, *width])
     group_ends = np.cumsum([0, *(int(part.groups.max()) + 1 for part in parts)])
 
     def together(name: str) -> Array | None:
-        found = [getattr(part, name) for part in parts]
-        return None if any(f is None for f in found) else np.concatenate(found)
+        columns = [getattr(part, name) for part in parts]
+        return None if any(f is None for f in columns) else np.concatenate(columns)
 
     def predict(terms: Sequence[Term]) -> Array:
         return np.concatenate([part.predict(terms) for part in parts])
@@ -152,7 +150,7 @@ def stacked(parts: Sequence[Observation], quantities: Mapping[str, Array]) -> Ob
         parts[0],
         measured=np.concatenate([part.measured for part in parts]),
         predict=predict,
-        nuisance=nuisance,
+        nuisance=_block_diagonal([part.nuisance for part in parts]),
         quantities=quantities,
         groups=np.concatenate([p.groups + g for p, g in zip(parts, group_ends, strict=False)]),
         rows=np.concatenate([part.rows for part in parts]),
@@ -162,7 +160,16 @@ def stacked(parts: Sequence[Observation], quantities: Mapping[str, Array]) -> Ob
         axial_moment=together("axial_moment"),
         times=together("times"),
         rebase=rebase if columns[-1] else None,
-        session=np.repeat([int(p.session[0]) if p.session is not None else 0 for p in parts], size),
-        nuisance_session=tuple(int(s) for s in np.repeat(
-            [int(p.session[0]) if p.session is not None else 0 for p in parts], width)),
-    )  # fmt: skip
+        session=np.repeat(session, size),
+        nuisance_session=tuple(int(s) for s in np.repeat(session, width)),
+    )
+
+
+def _block_diagonal(parts: Sequence[Array]) -> Array:
+    """Return columns (N, k, p) of several parts as those of all samples, zero beyond each part."""
+    rows = np.cumsum([0, *(len(part) for part in parts)])
+    columns = np.cumsum([0, *(part.shape[2] for part in parts)])
+    whole = np.zeros((int(rows[-1]), parts[0].shape[1], int(columns[-1])))
+    for i, part in enumerate(parts):
+        whole[rows[i] : rows[i + 1], :, columns[i] : columns[i + 1]] = part
+    return whole

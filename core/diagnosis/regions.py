@@ -46,5 +46,5 @@ def regions(observation: Observation, kept: NDArray[np.bool_]) -> NDArray[np.int
         return np.asarray(conditions)
     poses = np.stack([observation.quantities[q][kept] for q in names], axis=1)
     count = min(REGIONS, max(4, (int(conditions.max()) + 1) // 3))
-    found = k_means(poses, count, seed=0, rounds=30)
-    return np.asarray(np.unique(found, return_inverse=True)[1].reshape(-1))
+    region = k_means(poses, count, seed=0, rounds=30)
+    return np.asarray(np.unique(region, return_inverse=True)[1].reshape(-1))

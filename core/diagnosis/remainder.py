@@ -82,7 +82,7 @@ def links_withstand(selection: Selection) -> bool:
     None of its numbers is sure by itself, so what they do together is judged: it has to gain.
     """
     space = selection.space
-    named = [c for c in selection.found.chosen if space.candidates[c].named]
+    named = [c for c in selection.best.chosen if space.candidates[c].named]
     held = HeldOut(selection, parts=parts(selection.observation, selection.kept))
     if not held.possible:
         return False
@@ -150,7 +150,7 @@ def closes_everywhere(selection: Selection, accused: Sequence[int]) -> bool:
         return False
     count = np.bincount(part)
     candidates = selection.space.candidates
-    point = [c for c in selection.found.chosen if candidates[c].effect.beside_links]  # of the tool
+    point = [c for c in selection.best.chosen if candidates[c].effect.beside_links]  # of the tool
     left, gap = (
         np.bincount(part, held.squares(c)) for c in ([*selection.block, *point], accused)
     )  # fmt: skip
@@ -169,7 +169,7 @@ class _Beside:
         self._index = np.array(unnamed, dtype=np.int64)
         size = np.diff(self.space.start)[self._index]
         self._price = size * np.log(self.space.freedom) + 2 * np.log(max(len(unnamed), 2))
-        self._asked = [c for c in selection.found.chosen if c in set(unnamed)]
+        self._asked = [c for c in selection.best.chosen if c in set(unnamed)]
         self._first = self._asked  # beside which the accused were found
         self.beside = self._asked  # those of the last question
         # a constant is part of any function that moves a joint; of a sensor's axis it is a bias,
@@ -188,24 +188,24 @@ class _Beside:
         if len(self.space.y) > SEVERAL_AT_A_TIME:
             self._asked = asked
         value, spread, shown = self._values(accused, *self._beyond(accused, asked))
-        found = [self._unit(accused), self.space.columns(self._first), self._zero(accused)]
+        together = [self._unit(accused), self.space.columns(self._first), self._zero(accused)]
         # what the rows leave open goes by these columns' own lengths: not to unit ones
-        alone = np.linalg.lstsq(np.hstack(found), self.space.y, rcond=1e-9)[0]
+        alone = np.linalg.lstsq(np.hstack(together), self.space.y, rcond=1e-9)[0]
         begin = 0
         sigmas: list[float] = []
         steady: list[float] = []
         for c in accused:
             size = int(self.space.start[c + 1] - self.space.start[c])
-            own = np.arange(begin, begin + size)[shown[begin : begin + size]]
+            index = np.arange(begin, begin + size)[shown[begin : begin + size]]
             begin += size
-            a, b = alone[own], value[own]
+            a, b = alone[index], value[index]
             share = float(a @ b) / max(float(a @ a), 1e-300)
-            if not len(own) or share <= 0:
+            if not len(index) or share <= 0:
                 sigmas.append(0.0)
                 steady.append(0.0)
                 continue
-            square = sigmas_square(b, spread[np.ix_(own, own)])
-            numbers = float(len(own))
+            square = sigmas_square(b, spread[np.ix_(index, index)])
+            numbers = float(len(index))
             if not self.space.candidates[c].periodic:  # a line has the phase that suits a shape
                 numbers = 1 + FURTHER * (numbers - 1)
             sigmas.append(float(np.sqrt(max(square, 0.0) / numbers)))

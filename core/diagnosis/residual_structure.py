@@ -33,28 +33,28 @@ def structure_p_value(
 ) -> float:
     """Return the probability that noise alone leaves as much structure as is left."""
     fitted = basis_of(np.hstack([nuisance, space.columns(chosen)]))
-    left = np.empty((1 + DRAWS, len(space.y)))
-    left[0] = space.y
-    np.random.default_rng(SEED).standard_normal(out=left[1:])
-    left -= (left @ fitted) @ fitted.T
-    whole = np.einsum("ij,ij->i", left, left)
+    residuals = np.empty((1 + DRAWS, len(space.y)))
+    residuals[0] = space.y
+    np.random.default_rng(SEED).standard_normal(out=residuals[1:])
+    residuals -= (residuals @ fitted) @ fitted.T
+    whole = np.einsum("ij,ij->i", residuals, residuals)
     if not whole[0]:  # nothing is left that could have structure
         return 1.0
     worst = []
     for columns, sizes in _families(space, fitted):
         # sums of squares along the family's directions, as a share of everything left
-        share = _squares_along(space.X, columns, sizes, left) / whole
+        share = _squares_along(space.X, columns, sizes, residuals) / whole
         mean, deviation = float(share[1:].mean()), float(share[1:].std()) + 1e-300
         worst.append((share - mean) / deviation)
     top = np.max(np.array(worst), axis=0)  # the most striking family, of data and of each draw
     return float((1 + np.sum(top[1:] >= top[0])) / (1 + DRAWS))
 
 
-def _squares_along(X: Array, columns: NDArray[np.int64], sizes: Array, left: Array) -> Array:
+def _squares_along(X: Array, columns: NDArray[np.int64], sizes: Array, residuals: Array) -> Array:
     """Return the sum of squares of every residual (D, m) along the columns, a few at once."""
-    total = np.zeros(len(left))
+    total = np.zeros(len(residuals))
     for few in np.array_split(np.arange(len(columns)), 1 + len(columns) // AT_ONCE):
-        along = left @ (X[:, columns[few]] / sizes[few])
+        along = residuals @ (X[:, columns[few]] / sizes[few])
         total += np.einsum("ij,ij->i", along, along)
     return total
 

@@ -104,21 +104,21 @@ def _questions(
 ) -> Iterator[_Question]:
     """Yield what is open: effects to be separated, and effects that the log cannot show."""
     selection = channel.selection
-    space, found = selection.working, selection.found
+    space, best = selection.working, selection.best
     for position in channel.judgement.accused:
-        own = selection.term_index[position]
-        if own in selection.block:  # nothing stands for all links but they themselves
+        accused_candidate = selection.term_index[position]
+        if accused_candidate in selection.block:  # nothing stands for all links but they themselves
             continue
         family = selection.terms[position].effect
         chosen = {family}
-        rest = tuple(c for c in found.chosen if c != own)
-        for _, other in rivals(space, found, own, TIE_SCORE):
+        rest = tuple(c for c in best.chosen if c != accused_candidate)
+        for _, other in rivals(space, best, accused_candidate, TIE_SCORE):
             candidate = space.candidates[other]
             if candidate.named and candidate.family not in chosen:
                 chosen.add(candidate.family)
                 swapped = fit(space, (*rest, other))
                 yield _Question(
-                    (family, candidate.family), _named(space, found), _named(space, swapped)
+                    (family, candidate.family), _named(space, best), _named(space, swapped)
                 )
     accused = tuple(selection.terms[p] for p in channel.judgement.accused)
     for considered in channel.considered:
@@ -130,10 +130,10 @@ def _questions(
                     break
 
 
-def _named(space: SampleSpace, found: CandidateFit) -> tuple[Term, ...]:
+def _named(space: SampleSpace, best: CandidateFit) -> tuple[Term, ...]:
     return tuple(
         space.candidates[c].term(x)
-        for c, x in zip(found.chosen, found.values, strict=True)
+        for c, x in zip(best.chosen, best.values, strict=True)
         if space.candidates[c].named
     )
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from gapbridge.core.arrays import Array
 from gapbridge.core.diagnosis.channels.recording import varying
+from gapbridge.core.diagnosis.criteria import MIN_APPROACHES, MIN_FREEDOM_OF_SESSION
 from gapbridge.core.diagnosis.observation import NotObservable, Observation, Predict, stacked
 from gapbridge.core.diagnosis.selection.unnamed import unnamed_rivals
 from gapbridge.core.effects import Term
@@ -75,10 +76,10 @@ def observe(model: Model, log: Log, metrology: Metrology) -> Observation | NotOb
     if len(log.session_names) < 2:
         return replace(parts[0], session=None)
     rows = np.concatenate([part.rows for part in parts])
-    found = quantities(log, rows) | approaches(log.loads().approach, rows)
+    together = quantities(log, rows) | approaches(log.loads().approach, rows)
     for k in range(3):  # the sessions' frames differ: positions compare in base only
-        found[f"measured_position_{k}"] = np.concatenate([p.measured[:, k] for p in parts])
-    return stacked(parts, found)
+        together[f"measured_position_{k}"] = np.concatenate([p.measured[:, k] for p in parts])
+    return stacked(parts, together)
 
 
 def _numbered(seen: Observation, session: int, rows: NDArray[np.int64]) -> Observation:
@@ -98,59 +99,56 @@ def _numbered(seen: Observation, session: int, rows: NDArray[np.int64]) -> Obser
 def _check_enough(seen: Observation, log: Log, name: str) -> None:
     """Raise LogError where a session of several has too few poses for its nuisances."""
     N, k, p = seen.nuisance.shape
-    if name and N * k < p + 3:
+    least = p + MIN_FREEDOM_OF_SESSION
+    if name and N * k < least:
         raise LogError(
             f"{log.path}: session {name}: found {N} measured pose(s), expected at least "
-            f"{-(-(p + 3) // k)}: its frame{' and tool point' if p > 6 else ''} are fitted on them"
+            f"{-(-least // k)}: its frame{' and tool point' if p > 6 else ''} are fitted on them"
         )
 
 
-def _observe_session(
-    model: Model, log: Log, metrology: Metrology, placement: Placement | None = None,
-    terms: Sequence[Term] = (),
-) -> Observation | None:  # fmt: skip
-    """Return the position channel of one session, or None where nothing was measured.
-
-    The tool point's columns are those of the model with ``terms``: at the nominal arm they are off
-    by as much as its joints are, and a joint's turn that they should take up stands as a cause.
-    """
-    q = log.require("actual_q", "target_q")
+def _observe_session(model: Model, log: Log, metrology: Metrology) -> Observation | None:
+    """Return the position channel of one session, or None where nothing was measured."""
     measured, turned = log.columns["measured_position"], log.get("measured_rotation")
     whole_pose = measured if turned is None else np.hstack([measured, turned])
     rows = np.flatnonzero(np.isfinite(whole_pose).all(axis=1))
     if not len(rows):
         return None
-    q, measured, loads = q[rows], measured[rows], log.loads()[rows]
     rotation = None if turned is None else rotation_matrix(turned[rows])
-    if placement is None:
-        placement = _placed(model, Data(q, loads, measured, rotation, metrology.registered),
-                            metrology)  # fmt: skip
-    frame = placement.frame
+    q, loads = log.require("actual_q", "target_q")[rows], log.loads()[rows]
+    data = Data(q, loads, measured[rows], rotation, metrology.registered)
+    return _observed(model, log, metrology, rows, data, _placed(model, data, metrology))
+
+
+def _observed(
+    model: Model, log: Log, metrology: Metrology, rows: NDArray[np.int64], data: Data,
+    placement: Placement, terms: Sequence[Term] = (),
+) -> Observation:  # fmt: skip
+    """Return the position channel of one session at a placement, ``data`` those of its ``rows``.
+
+    The tool point's columns are those of the model with ``terms``: at the nominal arm they are off
+    by as much as its joints are, and a joint's turn that they should take up stands as a cause.
+    """
+    q, loads, k = data.q, data.loads, 3 if data.rotation is None else 6
     model = replace(model, tool_in_flange=placement.tool_in_flange)
     poses = model.with_terms(terms).predict(q, loads)
-    in_base = frame.in_base(measured)
-    reference = None if rotation is None else frame.rotation_in_base(rotation)
-
-    k = 3 if reference is None else 6
-    value = in_base if reference is None else np.hstack([in_base, np.zeros((len(rows), 3))])
+    frame, in_base = placement.frame, placement.frame.in_base(data.position)
+    reference = None if data.rotation is None else frame.rotation_in_base(data.rotation)
     nuisance = np.zeros((len(rows), k, 0))
     if not metrology.registered:
         nuisance = -frame_columns(in_base)[:, :k]
     if metrology.remounted:
         nuisance = np.concatenate([nuisance, _tool_columns(model, poses, k)], axis=2)
     form = model.linear_form(q, loads)
-    placed = placement
 
     def rebase(step: Array, terms: Sequence[Term]) -> Observation:
         whole = np.concatenate([np.zeros(6), step]) if metrology.registered else step
-        moved = _observe_session(model, log, metrology, placed.moved(whole), terms)
-        assert moved is not None
-        return moved
+        return _observed(model, log, metrology, rows, data, placement.moved(whole), terms)
 
     return Observation(
         channel="position",
         unit="m",
-        measured=value,
+        measured=in_base if k == 3 else np.hstack([in_base, np.zeros((len(rows), 3))]),
         predict=_prediction(model, q, loads, reference),
         nuisance=nuisance,
         weight=np.repeat([1.0, LEVER], 3)[:k],
@@ -243,5 +241,5 @@ def approaches(approach: Array | None, rows: NDArray[np.int64] | None = None) ->
     if approach is None:
         return {}
     approach = approach if rows is None else approach[rows]
-    both = (np.sum(approach > 0, axis=0) >= 4) & (np.sum(approach < 0, axis=0) >= 4)
+    both = np.minimum((approach > 0).sum(axis=0), (approach < 0).sum(axis=0)) >= MIN_APPROACHES
     return {f"approach_{i}": approach[:, i] for i in np.flatnonzero(both)}

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from gapbridge.core.arrays import Array, Index
 from gapbridge.core.derivatives import signal_noise
+from gapbridge.core.diagnosis.criteria import MIN_TORQUE_CHANGE, STEPPED_SHARE
 from gapbridge.core.diagnosis.observation import HELD
 from gapbridge.core.estimation.held_out import pose_groups
 from gapbridge.core.log.log import Log
@@ -18,8 +19,6 @@ MOST_SAMPLES = 30_000  # poses at rest, evenly picked: what memory holds
 STRETCHES = 24  # conditions of a recording: even stretches of time
 FEWEST_CONDITIONS = 5
 SMALLEST_TORQUE = 1e-3  # Nm
-HARDLY = 1e-3  # share of the largest held torque by which one has to change to count
-STEPPED_SHARE = 0.5  # distinct values over samples below which a signal comes in steps
 CONSTANT_SPREAD = 1e-9  # spread below which a quantity counts as constant
 
 
@@ -47,9 +46,9 @@ def conditions(motion: Motion) -> Index:
     given = [loads.payload_mass, loads.payload_cog, loads.wrench]
     columns = [np.asarray(c).reshape(len(motion), -1) for c in given if c is not None]
     table = np.column_stack([groups, *columns])
-    found = np.unique(np.round(table, 6), axis=0, return_inverse=True)[1].reshape(-1)
-    if found.max() + 1 >= FEWEST_CONDITIONS:
-        return np.asarray(found)
+    condition = np.unique(np.round(table, 6), axis=0, return_inverse=True)[1].reshape(-1)
+    if condition.max() + 1 >= FEWEST_CONDITIONS:
+        return np.asarray(condition)
     return np.arange(len(motion))
 
 
@@ -68,15 +67,15 @@ def quantities(log: Log, motion: Motion) -> dict[str, Array]:
 
 def varying(columns: Mapping[str, Array | None]) -> dict[str, Array]:
     """Return each scalar (N,) of columns (N,) or (N, k) that varies, by its name in the log."""
-    found: dict[str, Array] = {}
+    varied: dict[str, Array] = {}
     for name, values in columns.items():
         if values is None:
             continue
         table = values.reshape(len(values), -1)
         for i in range(table.shape[1]):
             if np.isfinite(table[:, i]).all() and np.ptp(table[:, i]) > CONSTANT_SPREAD:
-                found[name if values.ndim == 1 else f"{name}_{i}"] = table[:, i]
-    return found
+                varied[name if values.ndim == 1 else f"{name}_{i}"] = table[:, i]
+    return varied
 
 
 def held_torques(motion: Motion) -> dict[str, Array]:
@@ -86,7 +85,7 @@ def held_torques(motion: Motion) -> dict[str, Array]:
     largest = max(float(np.abs(motion.held).max(initial=0.0)), SMALLEST_TORQUE)
     return {
         f"{HELD}_{i}": motion.held[:, i]
-        for i in np.flatnonzero(np.ptp(motion.held, axis=0) > HARDLY * largest)
+        for i in np.flatnonzero(np.ptp(motion.held, axis=0) > MIN_TORQUE_CHANGE * largest)
     }
 
 

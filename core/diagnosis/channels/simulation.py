@@ -38,13 +38,13 @@ def joined(log: Log, simulated: Log) -> Log:
     nothing to compare.
     """
     simulated = aligned(simulated, log)
-    found = {
+    predictions = {
         PREFIX + name: simulated.require(name) for name in SHOWN_BY.values() if simulated.has(name)
     }
-    if not found:
+    if not predictions:
         wanted = ", ".join(f"{name}_0.." for name in SHOWN_BY.values())
         raise LogError(f"{simulated.path}: columns: found no prediction, expected one of {wanted}")
-    return replace(log, columns={**log.columns, **found})
+    return replace(log, columns={**log.columns, **predictions})
 
 
 def predicted_by(channel: str, observe: Observe) -> Observe:
@@ -78,14 +78,14 @@ def _behind(log: Log, channel: str, values: Array | None) -> Log:
 
 
 def _with_prediction(seen: Observation, values: Array) -> Observation:
-    own, rebase, fewer = seen.predict, seen.rebase, seen.fewer
-    nominal = own(())
+    channel_rows, rebase, fewer = seen.predict, seen.rebase, seen.fewer
+    nominal = channel_rows(())
     base = nominal.copy()
     part = values[seen.rows]
     base[:, : part.shape[1]] = part  # rotations, where measured, stay the model's
 
     def predict(terms: Sequence[Term]) -> Array:
-        return np.asarray(base + (own(terms) - nominal)) if terms else base
+        return np.asarray(base + (channel_rows(terms) - nominal)) if terms else base
 
     moved = (
         None

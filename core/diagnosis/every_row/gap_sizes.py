@@ -23,7 +23,7 @@ class Sizes:
     samples: int  # outliers too
     gap_rms: float
     gap_max: float
-    left: float  # rms with the causes in the model
+    remaining_rms: float  # rms with the causes in the model
     outliers: NDArray[np.int64]  # rows of the log
     means: Array | None  # (bins, k) of what is left, over time
 
@@ -37,13 +37,13 @@ def _counted(observation: Observation) -> int:
 def sizes_of(selection: Selection, gap: Array, remaining: Array) -> Sizes:
     """Return the sizes of a gap (N, k) and of what remains of it, in a selection's samples."""
     observation, kept = selection.observation, selection.kept
-    counted, own = _counted(observation), own_coordinates(observation)
+    counted, in_unit = _counted(observation), own_coordinates(observation)
 
     def rms(values: Array) -> float:
         return float(np.sqrt(np.mean((values[kept] * observation.weight)[:, :counted] ** 2)))
 
     return Sizes(
-        len(gap), rms(gap), float(np.linalg.norm(gap[kept][:, :own], axis=1).max()),
+        len(gap), rms(gap), float(np.linalg.norm(gap[kept][:, :in_unit], axis=1).max()),
         rms(remaining), observation.rows[~kept], block_means(selection),
     )  # fmt: skip
 
@@ -51,7 +51,7 @@ def sizes_of(selection: Selection, gap: Array, remaining: Array) -> Sizes:
 def streamed_sizes(streamed: Streamed, decided: Selection, accused: Sequence[int]) -> Sizes:
     """Return the sizes over all rows of a long recording, under the ``accused`` terms."""
     weight, gap = decided.observation.weight, streamed.gap
-    squares, means = streamed.left(decided, accused)
+    squares, means = streamed.remaining(decided, accused)
 
     def rms(values: Array) -> float:
         return float(np.sqrt(np.sum(values * weight**2) / (gap.kept * len(weight))))
@@ -62,9 +62,9 @@ def streamed_sizes(streamed: Streamed, decided: Selection, accused: Sequence[int
 def gaps(selection: Selection, chosen: Sequence[int]) -> tuple[Array, Array]:
     """Return the gap (N, k) without and with the chosen terms, the nuisance fitted each time."""
     observation = selection.observation
-    at = dict(zip(selection.term_index, selection.terms, strict=True))
-    found = []
-    for terms in ([], [at[c] for c in chosen]):
+    term_of = dict(zip(selection.term_index, selection.terms, strict=True))
+    without_and_with = []
+    for terms in ([], [term_of[c] for c in chosen]):
         gap = observation.measured - observation.predict(terms)
         if observation.nuisance.shape[2]:
             W = selection.noise.whitener
@@ -72,5 +72,5 @@ def gaps(selection: Selection, chosen: Sequence[int]) -> tuple[Array, Array]:
             A = (W @ observation.nuisance)[kept].reshape(-1, observation.nuisance.shape[2])
             b = (W @ gap[..., None])[kept].ravel()
             gap = gap - observation.nuisance @ solve(A, b)
-        found.append(gap)
-    return found[0], found[1]
+        without_and_with.append(gap)
+    return without_and_with[0], without_and_with[1]

@@ -80,14 +80,14 @@ def on_every_row(
     links = {p: selection.prior[c] for p, c in enumerate(selection.term_index)
              if c in selection.prior and p in accused}  # fmt: skip
     near = links_of(space, links).beside(space, links) if links else space
-    found = fit(near, tuple(p for p in accused if p not in links))
+    linear = fit(near, tuple(p for p in accused if p not in links))
     remainder = None if judgement.remainder is None else _scatter(placed, state.kept)
-    state, fitted, index, spread, residual = refit(state, space, found, links, remainder)
+    state, fitted, index, spread, residual = refit(state, space, linear, links, remainder)
     values, covariance = list(selection.terms), list(selection.covariance)
-    for c, term, own in zip(index, fitted, spread, strict=True):
-        values[c], covariance[c] = term, own
+    for c, term, term_covariance in zip(index, fitted, spread, strict=True):
+        values[c], covariance[c] = term, term_covariance
     return Selection(
-        state.observation, space, found, tuple(values), tuple(range(len(values))),
+        state.observation, space, linear, tuple(values), tuple(range(len(values))),
         tuple(covariance), state.kept, noise, residual, terms, unprojected, links,
     )  # fmt: skip
 
@@ -130,7 +130,7 @@ def still_accused(
     if fallen:
         selection = alone(selection, accused)
     single = [p for p in accused if p not in selection.prior]
-    ties = ties_of(selection.working, selection.found, single)
+    ties = ties_of(selection.working, selection.best, single)
     return selection, replace(judgement, accused=accused, withdrawn=withdrawn, ties=ties)
 
 
@@ -173,7 +173,7 @@ def refitted(
     links = {p: own for p, own in selection.prior.items() if p in accused}
     whole = replace(whole, prior=links)
     single = tuple(p for p in accused if p not in links)
-    return replace(whole, found=fit(whole.working, single))
+    return replace(whole, best=fit(whole.working, single))
 
 
 def _rivals(selection: Selection, accused: Sequence[int]) -> list[Candidate]:
@@ -184,8 +184,8 @@ def _rivals(selection: Selection, accused: Sequence[int]) -> list[Candidate]:
         if selection.term_index[p] in selection.prior:
             continue
         c = selection.term_index[p]
-        equal = [(0.0, other) for other in covering_effects(space, selection.found, c)]
-        for score, other in [*rivals(space, selection.found, c, TIE_SCORE), *equal]:
+        equal = [(0.0, other) for other in covering_effects(space, selection.best, c)]
+        for score, other in [*rivals(space, selection.best, c, TIE_SCORE), *equal]:
             if space.candidates[other].named and other not in selection.term_index:
                 near[other] = min(score, near.get(other, np.inf))
     best = sorted(near, key=lambda c: near[c])[:MOST_RIVALS]

@@ -20,13 +20,13 @@ from gapbridge.core.diagnosis.every_row.long_recording import Block, LongRecordi
 from gapbridge.core.diagnosis.noise_floor import BLOCK, own_coordinates
 from gapbridge.core.diagnosis.observation import NotObservable, Observation
 from gapbridge.core.diagnosis.regions import REGIONS
-from gapbridge.core.diagnosis.selection.candidate import Candidate, named_columns
+from gapbridge.core.diagnosis.selection.candidate import Candidate, jacobian, named_columns
 from gapbridge.core.diagnosis.selection.delay_columns import chord_columns, chord_value
 from gapbridge.core.diagnosis.selection.noise import Noise
 from gapbridge.core.diagnosis.selection.problem import SampleSpace, fit, penalties
-from gapbridge.core.diagnosis.selection.refit import Reduced, exact_jacobian, freed_of, step_on
+from gapbridge.core.diagnosis.selection.refit import Reduced, freed_of, step_on
 from gapbridge.core.diagnosis.selection.selection import Selection
-from gapbridge.core.diagnosis.selection.state import UnprojectedRows, chords_only, locate
+from gapbridge.core.diagnosis.selection.state import UnprojectedRows, candidate_of, chords_only
 from gapbridge.core.effects import Term
 from gapbridge.core.estimation.robust import OUTLIER, distance_of, scale_of
 from gapbridge.core.log.log import Log
@@ -76,9 +76,9 @@ class Columns:
         """Return how many columns there are."""
         return int(self.start[-1]) + 2 + len(self.jacobian)
 
-    def of(self, seen: Observation, bare: Array, gap: Array) -> Array:
+    def at_samples(self, seen: Observation, bare: Array, gap: Array) -> Array:
         """Return the columns (N, k, width) of an observation; ``bare`` is its gap without terms."""
-        own = [
+        columns = [
             self._candidate(seen, c, chord)
             for c, chord in zip(self.candidates, self._chords, strict=True)
         ]
@@ -86,13 +86,13 @@ class Columns:
         if not self._from_nothing:  # the terms' part is put back, in the linear form at hand
             target = gap
             for term in self.terms:
-                c, x = locate(list(self.candidates), term)
-                target = target + own[c] @ x
-        jacobian = [
-            exact_jacobian(seen, c, x, self.terms[:i] + self.terms[i + 1 :])
+                c, x = candidate_of(list(self.candidates), term)
+                target = target + columns[c] @ x
+        blocks = [
+            jacobian(seen, c, x, self.terms[:i] + self.terms[i + 1 :])
             for i, (c, x) in enumerate(zip(self.freed, self.x, strict=True))
         ]
-        return np.concatenate([*own, target[..., None], *jacobian, gap[..., None]], axis=2)
+        return np.concatenate([*columns, target[..., None], *blocks, gap[..., None]], axis=2)
 
     def _candidate(self, seen: Observation, c: Candidate, chord: float | None) -> Array:
         if chord is not None:
@@ -120,8 +120,8 @@ class Streamed:
         terms, covariance = list(self.excerpt.terms), list(self.excerpt.covariance)
         values, spread = self._fitted(accused)
         freed = dict(zip(self.columns.accused, self.columns.freed, strict=True))
-        for p, value, own in zip(accused, values, spread, strict=True):
-            terms[p], covariance[p] = freed[p].term(value), own
+        for p, value, term_covariance in zip(accused, values, spread, strict=True):
+            terms[p], covariance[p] = freed[p].term(value), term_covariance
         space, unprojected = self._space()
         observation, noise = self._samples()
         return Selection(
@@ -135,7 +135,7 @@ class Streamed:
         """Return the selection of some of the terms; another selection's space is the same."""
         return self.selection(accused)
 
-    def left(self, selection: Selection, accused: Sequence[int]) -> tuple[Array, Array]:
+    def remaining(self, selection: Selection, accused: Sequence[int]) -> tuple[Array, Array]:
         """Return what terms leave: squares (k,) summed over rows, means (bins, k) over time."""
         mix = self._mix(accused)
         freed = dict(zip(self.columns.accused, self.columns.freed, strict=True))
@@ -144,36 +144,36 @@ class Streamed:
             np.array(selection.terms[p].values)[: len(freed[p].parameters)] - x[p] for p in accused
         ]
         away = mix @ np.concatenate([*(-m for m in moved), [1.0]])
-        at = [*self.columns.jacobian, self.columns.width - 1]
-        sums = self.sums.sum(axis=0)[:, at][:, :, at]
+        used = [*self.columns.jacobian, self.columns.width - 1]
+        sums = self.sums.sum(axis=0)[:, used][:, :, used]
         squares = np.einsum("i,kij,j->k", away, sums, away) / self.white**2
-        own = own_coordinates(self.excerpt.observation)
-        return np.maximum(squares, 0.0), (self.means @ away / self.white)[:, :own]
+        in_unit = own_coordinates(self.excerpt.observation)
+        return np.maximum(squares, 0.0), (self.means @ away / self.white)[:, :in_unit]
 
     def _mix(self, accused: Sequence[int]) -> Array:
         """Return Jacobian and gap of some terms alone (p + 1, d + 1): others put back."""
         size = len(self.columns.jacobian) + 1
-        kept, gap, at = [], np.zeros(size), 0
+        kept, gap, start = [], np.zeros(size), 0
         gap[-1] = 1.0
         for p, x in zip(self.columns.accused, self.columns.x, strict=True):
             if p in accused:
-                kept.append((p, np.eye(size)[:, at : at + len(x)]))
+                kept.append((p, np.eye(size)[:, start : start + len(x)]))
             else:
-                gap[at : at + len(x)] = x
-            at += len(x)
+                gap[start : start + len(x)] = x
+            start += len(x)
         order = dict(kept)
         return np.hstack([*(order[p] for p in accused), gap[:, None]])
 
     def _fitted(self, accused: Sequence[int]) -> tuple[list[Array], list[Array]]:
         if not accused:
             return [], []
-        mix, at = self._mix(accused), [*self.columns.jacobian, self.columns.width - 1]
+        mix, used = self._mix(accused), [*self.columns.jacobian, self.columns.width - 1]
         span = max(float(np.ptp(self.time)), 1e-9)
         part = ((self.time - self.time.min()) / span * REGIONS).astype(np.int64)
         part = np.minimum(part, REGIONS - 1) if self.by_region else np.zeros_like(part)
         names = np.unique(part)
         sums = np.stack([self.sums[part == name].sum(axis=(0, 1)) for name in names])
-        rows = rows_of(mix.T @ sums[:, at][:, :, at] @ mix)
+        rows = rows_of(mix.T @ sums[:, used][:, :, used] @ mix)
         flat = rows.reshape(-1, rows.shape[2])
         known = dict(zip(self.columns.accused, range(len(self.columns.accused)), strict=True))
         return step_on(
@@ -266,7 +266,7 @@ class RowSums:
         bare = seen.measured - seen.predict(())
         terms = self._columns.terms
         gap = seen.measured - seen.predict(terms) if terms else bare
-        whole = self._columns.of(seen, bare, gap)[inside] * self._white[:, None]
+        whole = self._columns.at_samples(seen, bare, gap)[inside] * self._white[:, None]
         kept = np.sqrt(np.mean(whole[:, :, -1] ** 2, axis=1)) <= self._limit
         whole, bare = whole[kept], bare[inside][kept]
         self._samples += len(rows)

@@ -11,6 +11,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from gapbridge.core.arrays import Array
+from gapbridge.core.diagnosis.criteria import CLEARLY_BETTER, MISTAKE_LEAVES, NOT_THE_ARM
 from gapbridge.core.diagnosis.log_checks.kinematics import (
     best_order,
     inverted,
@@ -29,9 +30,6 @@ from gapbridge.core.rotation import rotation_matrix, rotation_vector
 
 MOST = 200  # rows looked at
 FEWEST = 6
-FAR = 0.02  # m and rad: more than any arm errs
-CLEARLY = 0.8  # of the best mistake before, for another to be named instead
-BETTER = 0.1  # share of the distance that may be left for a mistake to be named
 
 
 def frame_findings(model: Model, log: Log, metrology: Metrology) -> list[LogFinding]:
@@ -50,17 +48,17 @@ def frame_findings(model: Model, log: Log, metrology: Metrology) -> list[LogFind
         return []
     seen = measured[rows]
     distance = _off(seen, predicted)
-    found = []
-    if distance > FAR:
-        found.append(_why(model, q, measured, rows, distance, log.get("measured_rotation")))
+    findings = []
+    if distance > NOT_THE_ARM:
+        findings.append(_why(model, q, measured, rows, distance, log.get("measured_rotation")))
     elif metrology.registered:
         here = float(np.median(np.linalg.norm(seen - predicted, axis=1)))
-        if here > FAR and distance < BETTER * here:
-            found.append(LogFinding(LogCheck.NOT_IN_BASE, (here,)))
+        if here > NOT_THE_ARM and distance < MISTAKE_LEAVES * here:
+            findings.append(LogFinding(LogCheck.NOT_IN_BASE, (here,)))
     turned = log.get("measured_rotation")
-    if turned is not None and not found:
-        found += _rotations(model, q[rows], seen, turned[rows], metrology)
-    return found
+    if turned is not None and not findings:
+        findings += _rotations(model, q[rows], seen, turned[rows], metrology)
+    return findings
 
 
 def _off(measured: Array, predicted: Array) -> float:
@@ -73,7 +71,7 @@ def _why(
     model: Model, q: Array, measured: Array, rows: Array, distance: float, turned: Array | None
 ) -> LogFinding:
     """Return the finding on positions that do not follow the arm."""
-    others = ((found, arm, q[rows], measured[rows]) for found, arm in other_arms(model))
+    others = ((mistake, arm, q[rows], measured[rows]) for mistake, arm in other_arms(model))
     # another arm only where no mistake about this one says it
     for tried in (_mistakes(model, q, measured, rows, turned), others):
         best, named = distance, None
@@ -81,9 +79,9 @@ def _why(
             if len(trial) < FEWEST:
                 continue
             left = _off(trial, trial_model.rigid_pose(trial_q).position)
-            if left < CLEARLY * best:
+            if left < CLEARLY_BETTER * best:
                 best, named = left, mistake
-        if named is not None and best < BETTER * distance:
+        if named is not None and best < MISTAKE_LEAVES * distance:
             return LogFinding(LogCheck.POSITIONS_OFF_BY, (distance, named, best))
     return LogFinding(LogCheck.POSITIONS_OFF, (distance,))
 
@@ -116,10 +114,10 @@ def _mistakes(
     order = best_order(model, q[rows], seen)
     if order is not None:
         yield order[0], model, order[1], seen
-    found = None if turned is None else turned[rows]
-    if found is None or not np.isfinite(found).all():
-        found = rotation_vector(np.swapaxes(model.rigid_pose(q[rows]).rotation, 1, 2))
-    yield LogFinding(LogCheck.INVERTED), model, q[rows], inverted(seen, found)
+    rotation = None if turned is None else turned[rows]
+    if rotation is None or not np.isfinite(rotation).all():
+        rotation = rotation_vector(np.swapaxes(model.rigid_pose(q[rows]).rotation, 1, 2))
+    yield LogFinding(LogCheck.INVERTED), model, q[rows], inverted(seen, rotation)
 
 
 def _rotations(
@@ -133,11 +131,11 @@ def _rotations(
     frame = register_robustly(seen, poses.position)
     base = np.eye(3) if metrology.registered else frame.rotation
     left, constant = _turned_off(poses.rotation, base, rotation_matrix(turned))
-    if left > 10 * FAR:
-        if _turned_off(poses.rotation, base, _roll_pitch_yaw(turned))[0] < FAR:
+    if left > 10 * NOT_THE_ARM:
+        if _turned_off(poses.rotation, base, _roll_pitch_yaw(turned))[0] < NOT_THE_ARM:
             return [LogFinding(LogCheck.ROLL_PITCH_YAW)]
         return [LogFinding(LogCheck.ROTATIONS_OFF, (left,))]
-    return [LogFinding(LogCheck.TARGET_AXES, (constant,))] if constant > 10 * FAR else []
+    return [LogFinding(LogCheck.TARGET_AXES, (constant,))] if constant > 10 * NOT_THE_ARM else []
 
 
 def _turned_off(predicted: Array, base: Array, measured: Array) -> tuple[float, float]:

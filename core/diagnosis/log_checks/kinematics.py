@@ -75,10 +75,10 @@ def measured_point(model: Model, q: Array, seen: Array) -> tuple[LogFinding, Mod
     flange = bare.rigid_pose(q)
     kept, point = np.ones(len(q), bool), np.zeros(3)
     for _ in range(2):
-        point, left = _point_on_flange(flange.position[kept], flange.rotation[kept], seen[kept])
+        point, distance = _point_on_flange(flange.position[kept], flange.rotation[kept], seen[kept])
         if np.linalg.norm(point) > FARTHEST:
             return None
-        kept[kept] = left <= OUTLYING * np.median(left)
+        kept[kept] = distance <= OUTLYING * np.median(distance)
         if kept.sum() < POINTED:
             return None
     tool = model.tool_in_flange.copy()
@@ -86,8 +86,8 @@ def measured_point(model: Model, q: Array, seen: Array) -> tuple[LogFinding, Mod
     tool[:3, 3] = point
     points = tuple(map(float, point)), tuple(map(float, declared))
     other = LogFinding(LogCheck.OTHER_TCP, points)
-    found = other if np.any(declared) else LogFinding(LogCheck.NO_TCP, points[:1])
-    return found, replace(model, tool_in_flange=tool)
+    finding = other if np.any(declared) else LogFinding(LogCheck.NO_TCP, points[:1])
+    return finding, replace(model, tool_in_flange=tool)
 
 
 def _point_on_flange(position: Array, rotation: Array, seen: Array) -> tuple[Array, Array]:
@@ -95,17 +95,17 @@ def _point_on_flange(position: Array, rotation: Array, seen: Array) -> tuple[Arr
     point = np.zeros(3)
     for _ in range(STEPS):
         there = position + rotation @ point
-        found = register(seen, there).in_base(seen)
-        apart = (found - there).ravel()
-        turn = np.zeros((len(found), 3, 3))  # columns: a small turn of the instrument's frame
+        in_base = register(seen, there).in_base(seen)
+        apart = (in_base - there).ravel()
+        turn = np.zeros((len(in_base), 3, 3))  # columns: a small turn of the instrument's frame
         for k, axis in enumerate(np.eye(3)):
-            turn[:, :, k] = np.cross(axis, found)
+            turn[:, :, k] = np.cross(axis, in_base)
         shift = np.broadcast_to(np.eye(3), turn.shape)
         columns = np.concatenate([rotation, -turn, -shift], axis=2).reshape(-1, 9)
         point = point + solve(columns, apart, rank=1e-6)[:3]
     there = position + rotation @ point
-    left = np.linalg.norm(register(seen, there).in_base(seen) - there, axis=1)
-    return point, np.asarray(left)
+    distance = np.linalg.norm(register(seen, there).in_base(seen) - there, axis=1)
+    return point, np.asarray(distance)
 
 
 def best_order(model: Model, q: Array, seen: Array) -> tuple[LogFinding, Array] | None:

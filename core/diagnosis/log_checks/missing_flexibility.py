@@ -25,11 +25,11 @@ def softness_findings(model: Model, log: Log, metrology: Metrology) -> list[LogF
     if flexibilities(model).any():
         return []
     try:
-        found = identify_compliance(model, log, metrology)
+        fitted = identify_compliance(model, log, metrology)
     except GapbridgeError:
         return []
-    before, after = found.gap_rms_held_out, found.remaining_rms_held_out
+    before, after = fitted.gap_rms_held_out, fitted.remaining_rms_held_out
     if not after < MAIN_SHARE * before:
         return []
-    values = int(found.identifiable.sum()), before, after
+    values = int(fitted.identifiable.sum()), before, after
     return [LogFinding(LogCheck.MISSING_FLEXIBILITY, values)]

@@ -13,6 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from gapbridge.core.arrays import Array, Index
+from gapbridge.core.diagnosis.criteria import SIGN_LEAVES
 from gapbridge.core.dynamics import predict_torque, predict_wrench
 from gapbridge.core.errors import InputError
 from gapbridge.core.estimation.least_squares import bounded
@@ -27,7 +28,6 @@ from gapbridge.core.motion import Motion
 MOST = 200  # rows looked at
 FEWEST = 6  # pulled rows from which a sign is judged
 LEAST = 1.0  # N, Nm: less is no pull
-HALF = 0.5  # what must be left, at most, of what the column as it stands leaves
 ROUNDS = 4
 SHOWN_BY = {
     "ft_raw_wrench": LogCheck.WRENCH_SIGN,
@@ -40,14 +40,14 @@ def sign_findings(model: Model, log: Log) -> list[LogFinding]:
     q = log.get("actual_q") if log.has("actual_q") else log.get("target_q")
     if q is None:
         return []
-    found = []
+    findings = []
     for name, check in SHOWN_BY.items():
         judged = name == "ft_raw_wrench" or model.arm.mass.any()
         if judged and _reads_turned_round(model, log, q, name):
-            found.append(LogFinding(check))
+            findings.append(LogFinding(check))
     pull = log.get("actual_TCP_force")
-    if pull is None or found:
-        return found
+    if pull is None or findings:
+        return findings
     for judge in (_compliance_rivals, *(_sensed(name) for name in SHOWN_BY)):
         pulled = judge(model, log, q, pull)
         if pulled is not None:
@@ -84,10 +84,10 @@ def _variants(model: Model, q: Array, pull: Array) -> dict[LogCheck | None, Arra
     }
 
 
-def _best(left: dict[LogCheck | None, float]) -> LogCheck | None:
+def _best(residual: dict[LogCheck | None, float]) -> LogCheck | None:
     """Return the variant that leaves far less than the column as it stands, or None."""
-    least = min(left, key=lambda key: left[key])
-    return least if left[least] < HALF * left[None] else None
+    least = min(residual, key=lambda key: residual[key])
+    return least if residual[least] < SIGN_LEAVES * residual[None] else None
 
 
 def _compliance_rivals(model: Model, log: Log, q: Array, pull: Array) -> LogCheck | None:
@@ -99,14 +99,14 @@ def _compliance_rivals(model: Model, log: Log, q: Array, pull: Array) -> LogChec
     pulled = np.abs(pull[rows]).max(axis=1, initial=0.0) > LEAST
     if pulled.sum() < FEWEST or 3 * len(rows) < 2 * (3 * model.arm.n + 6):
         return None
-    left = {}
+    residual = {}
     try:
         for check, variant in _variants(model, q[rows], pull[rows]).items():
             off = _compliance_residual(model, q[rows], measured[rows], _loads(log, rows, variant))
-            left[check] = float(np.median(np.linalg.norm(off[pulled], axis=1)))
+            residual[check] = float(np.median(np.linalg.norm(off[pulled], axis=1)))
     except InputError:
         return None
-    return _best(left)
+    return _best(residual)
 
 
 def _compliance_residual(model: Model, q: Array, measured: Array, loads: Loads) -> Array:
@@ -178,4 +178,4 @@ def _reads_turned_round(model: Model, log: Log, q: Array, name: str) -> bool:
         return False
     expected = _predicted(model, log, q, name, None if pull is None else pull[rows], rows)
     asked, other = (spread_of(sign * column[rows] - expected) for sign in (1.0, -1.0))
-    return spread_of(expected) >= LEAST and other <= HALF * asked
+    return spread_of(expected) >= LEAST and other <= SIGN_LEAVES * asked

@@ -136,27 +136,27 @@ def findings(
 
     With ``model`` also mistakes of frames and signs, by what the arm can do at all.
     """
-    found = [*_names(log), *_times(log), *_gaps(log)]
+    listed = [*_names(log), *_times(log), *_gaps(log)]
     measured = log.get("measured_position")
     at_rest = False
     if measured is not None and len(measured) > 3 and np.isfinite(measured).any():
         width = np.fmax.reduce(measured, axis=0) - np.fmin.reduce(measured, axis=0)
         at_rest = float(np.nanmax(width)) < 1e-3
         if at_rest:
-            found.append(LogFinding(LogCheck.POSITIONS_AT_REST))
+            listed.append(LogFinding(LogCheck.POSITIONS_AT_REST))
     warm = log.get("joint_temperatures")
     if warm is not None and np.isfinite(warm).any() and float(np.nanmedian(warm)) > WARM:
-        found.append(LogFinding(LogCheck.FAHRENHEIT))
+        listed.append(LogFinding(LogCheck.FAHRENHEIT))
     if model is None:
-        return found
+        return listed
     # prediction checks units alone, and need not wait for these
     from gapbridge.core.diagnosis.log_checks.frames import frame_findings
     from gapbridge.core.diagnosis.log_checks.signs import sign_findings
 
-    found += [*_limits(model, log), *_poses(log)]
+    listed += [*_limits(model, log), *_poses(log)]
     if not at_rest:
-        found += frame_findings(model, log, metrology or Metrology())
-    return found + sign_findings(model, log)
+        listed += frame_findings(model, log, metrology or Metrology())
+    return listed + sign_findings(model, log)
 
 
 def _names(log: Log) -> list[LogFinding]:
@@ -179,13 +179,13 @@ def _times(log: Log) -> list[LogFinding]:
 
 
 def _gaps(log: Log) -> list[LogFinding]:
-    found = []
+    findings = []
     for name in READINGS:
         column = log.get(name)
         gone = 0 if column is None else int(np.sum(~np.isfinite(column).all(axis=1)))
         if gone:
-            found.append(LogFinding(LogCheck.NO_READING, (gone, name)))
-    return found
+            findings.append(LogFinding(LogCheck.NO_READING, (gone, name)))
+    return findings
 
 
 def _angles(log: Log) -> Array | None:

@@ -15,13 +15,13 @@ import numpy as np
 
 from gapbridge.core.arm import Arm
 from gapbridge.core.arrays import Array
+from gapbridge.core.diagnosis.criteria import MIN_CYCLES
 from gapbridge.core.diagnosis.observation import HELD, Observation
 from gapbridge.core.effects import CATALOGUE, Effect, Parameter, Site, Term
 from gapbridge.core.errors import InputError
 
 STEP = 1e-2  # of a parameter's usual scale, for central differences
 WHOLE_ORDERS = 128  # cycles a turn that are looked through one by one
-CYCLES = 1.5  # of a periodic line over the joint's range, at least
 HALF_ORDERS = 40  # up to here also the halves
 # (typical moment / M0)^2 that a nonlinear stiffness curve starts from
 SOFTENING = tuple(float(v) for v in np.geomspace(0.1, 3000, 13))
@@ -47,6 +47,11 @@ class Candidate:
     def named(self) -> bool:
         """Return whether this is a member of the catalogue."""
         return self.family != "smooth"
+
+    @cached_property
+    def scales(self) -> Array:
+        """Return the usual size (d,) of each parameter."""
+        return np.array([p.scale for p in self.parameters])
 
     @cached_property
     def effect(self) -> Effect:
@@ -108,63 +113,62 @@ def named_candidates(
     What ``base`` holds already comes with its own period or curve. ``turns`` (n,) says how many
     turns each joint's poses span.
     """
-    found = []
+    candidates = []
     for identifier, effect in CATALOGUE.items():
         if channel not in effect.channels or identifier in set(withheld) or effect.at_moment:
             continue
         for site in effect.sites(arm):
             inside = [t for t in base if t.effect == identifier and t.site.joint == site.joint]
-            found += _at(arm, effect, site, with_rotation, inside, turns)
-    return found
+            parameters = effect.parameters(arm, site)
+            candidates += _variants(effect, parameters, site, with_rotation, inside, turns)
+    return candidates
 
 
-def _at(
-    arm: Arm,
-    effect: Effect,
-    site: Site,
-    with_rotation: bool,
-    inside: Sequence[Term],
-    turns: Sequence[float],
-) -> list[Candidate]:
-    parameters = effect.parameters(arm, site)
+def _variants(
+    effect: Effect, parameters: tuple[Parameter, ...], site: Site, with_rotation: bool,
+    inside: Sequence[Term], turns: Sequence[float],
+) -> list[Candidate]:  # fmt: skip
+    """Return an effect's candidates at one site, one for each order, curve or shape it may have.
+
+    ``inside`` are the terms of the effect that the model already has at this joint.
+    """
+    identifier = effect.identifier
     free: tuple[float | None, ...] = (None,) * len(parameters)
     if effect.periodic:
-        orders = sorted(
-            set(np.arange(1, WHOLE_ORDERS + 1).astype(float))
-            | set(np.arange(2, 2 * HALF_ORDERS + 1) / 2)
-            | {t.site.order for t in inside if t.site.order is not None}
-        )
-        # one cycle a turn is a usual period; of others, more than one has to be seen
-        seen = turns[site.joint - 1] if site.joint and turns else 1.0
-        least = CYCLES / max(seen, 1e-6)
         return [
-            Candidate(effect.identifier, Site(site.joint, float(o)), parameters, free)
-            for o in orders
-            if o >= min(least, 3.0) or o in (1.0, 2.0)
+            Candidate(identifier, Site(site.joint, order), parameters, free)
+            for order in _orders(site, inside, turns)
         ]
     if effect.curved and not inside:
+        linear = (replace(parameters[0], lower=-np.inf),) * 2
         return [
-            Candidate(
-                effect.identifier,
-                site,
-                (replace(parameters[0], lower=-np.inf),) * 2,
-                free,
-                curve=s * parameters[1].scale,
-            )
+            Candidate(identifier, site, linear, free, curve=s * parameters[1].scale)
             for s in SOFTENING
         ]
     if effect.shapes:
         had = {t.values[-1] for t in inside}
-        unheld = (None,) * (len(parameters) - 1)
         return [
-            Candidate(effect.identifier, site, parameters[:-1], (*unheld, shape))
+            Candidate(identifier, site, parameters[:-1], (*free[:-1], shape))
             for shape in (*effect.shapes, *(had - {*effect.shapes}))
         ]
     if any(p.of_rotation for p in parameters) and not with_rotation:
         shown = tuple(p for p in parameters if not p.of_rotation)
         held = tuple(0.0 if p.of_rotation else None for p in parameters)
-        return [Candidate(effect.identifier, site, shown, held)]
-    return [Candidate(effect.identifier, site, parameters, free)]
+        return [Candidate(identifier, site, shown, held)]
+    return [Candidate(identifier, site, parameters, free)]
+
+
+def _orders(site: Site, inside: Sequence[Term], turns: Sequence[float]) -> list[float]:
+    """Return the orders, in cycles a turn, of the lines that a joint may have."""
+    orders = {
+        *map(float, range(1, WHOLE_ORDERS + 1)),
+        *(n / 2 for n in range(2, 2 * HALF_ORDERS + 1)),
+        *(float(t.site.order) for t in inside if t.site.order is not None),
+    }
+    # one cycle a turn is a usual period; of others, more than one has to be seen
+    seen = turns[site.joint - 1] if site.joint and turns else 1.0
+    least = min(MIN_CYCLES / max(seen, 1e-6), 3.0)
+    return [order for order in sorted(orders) if order >= least or order in (1.0, 2.0)]
 
 
 def named_columns(observation: Observation, candidate: Candidate, base: Sequence[Term]) -> Array:
@@ -175,16 +179,16 @@ def named_columns(observation: Observation, candidate: Candidate, base: Sequence
             return by_angle
     if candidate.curve is not None:
         return _stiffness_curve_columns(observation, candidate)
-    columns = _differences(observation, candidate, base)
+    columns = _from_nominal(observation, candidate, base)
     mass = candidate.effect.shown_by
     if mass is not None and not columns.any():  # a load without mass has no centre of gravity
-        columns = _differences(observation, candidate, [*base, mass])
+        columns = _from_nominal(observation, candidate, [*base, mass])
     return columns
 
 
 def shows_alone(observation: Observation, candidate: Candidate) -> bool:
     """Return whether an effect changes predictions where no other is in the model."""
-    return bool(_differences(observation, candidate, ()).any())
+    return bool(_from_nominal(observation, candidate, ()).any())
 
 
 def with_what_it_needs(observation: Observation, candidate: Candidate) -> Candidate:
@@ -195,20 +199,29 @@ def with_what_it_needs(observation: Observation, candidate: Candidate) -> Candid
     return replace(candidate, beside=needed.effect)
 
 
-def _differences(observation: Observation, candidate: Candidate, base: Sequence[Term]) -> Array:
-    """Return central differences (N, k, d) of the whole prediction at ``base``."""
+def jacobian(
+    observation: Observation, candidate: Candidate, x: Array, others: Sequence[Term]
+) -> Array:
+    """Return d prediction / d parameter (N, k, d) at values ``x`` (d,), beside other terms.
+
+    Zeros where the arm would buckle: only a prior leads back from there.
+    """
     columns = []
     for k, parameter in enumerate(candidate.parameters):
-        h = STEP * parameter.scale
-        step = np.zeros(len(candidate.parameters))
-        step[k] = h
+        h = np.zeros(len(x))
+        h[k] = STEP * parameter.scale
         try:
-            ahead = observation.predict([*base, candidate.term(step)])
-            behind = observation.predict([*base, candidate.term(-step)])
-        except InputError:  # the arm would buckle: no candidate beside this base
+            ahead = observation.predict([*others, candidate.term(x + h)])
+            behind = observation.predict([*others, candidate.term(x - h)])
+        except InputError:
             ahead = behind = observation.measured
-        columns.append((ahead - behind) / (2 * h))
+        columns.append((ahead - behind) / (2 * h[k]))
     return np.stack(columns, axis=-1)
+
+
+def _from_nominal(observation: Observation, candidate: Candidate, base: Sequence[Term]) -> Array:
+    """Return the Jacobian (N, k, d) of a candidate that is not in the model yet."""
+    return jacobian(observation, candidate, np.zeros(len(candidate.parameters)), base)
 
 
 def angle_columns(observation: Observation, candidate: Candidate) -> Array | None:

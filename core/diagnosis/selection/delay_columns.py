@@ -11,14 +11,13 @@ from collections.abc import Sequence
 import numpy as np
 
 from gapbridge.core.arrays import Array
-from gapbridge.core.diagnosis.criteria import ALIKE
+from gapbridge.core.diagnosis.criteria import ALIKE, MIN_DELAYS
 from gapbridge.core.diagnosis.observation import Observation
 from gapbridge.core.diagnosis.selection.candidate import Candidate, named_columns
 from gapbridge.core.diagnosis.selection.problem import CandidateFit, SampleSpace, fit
 from gapbridge.core.effects import CATALOGUE, Term
 from gapbridge.core.estimation.robust import scale_of
 
-FEW_DELAYS = 3  # below, nobody knows which joint is the odd one
 SHORTEST = 1e-3  # usual sizes of the value: a chord needs a length
 
 
@@ -51,7 +50,7 @@ def _beside_twin(observation: Observation, candidate: Candidate, base: Sequence[
         return named_columns(observation, candidate, base)
     others = [t for t in base if t not in twins]
     columns, nothing = named_columns(observation, candidate, others), observation.predict(others)
-    usual = np.array([p.scale for p in candidate.parameters])
+    usual = candidate.scales
     rows = (columns * usual).reshape(-1, len(usual))
     gap = (observation.measured - nothing).ravel()
     x = np.linalg.lstsq(rows, gap, rcond=1e-6)[0]
@@ -116,7 +115,7 @@ def as_one_delay(values: Array, variances: Array) -> tuple[Array, Array]:
     it. Fewer than three known ones say nothing of each other.
     """
     known = np.isfinite(variances)
-    if known.sum() < FEW_DELAYS:
+    if known.sum() < MIN_DELAYS:
         return values, variances
     centre = float(np.median(values[known]))
     scatter = scale_of(values[known] - centre)
@@ -125,21 +124,21 @@ def as_one_delay(values: Array, variances: Array) -> tuple[Array, Array]:
     return centre + own * (values - centre), np.where(known, own * variances, prior)
 
 
-def one_delay(space: SampleSpace, found: CandidateFit) -> CandidateFit:
+def one_delay(space: SampleSpace, best: CandidateFit) -> CandidateFit:
     """Return the set with all joints that answer late as one effect of the controller.
 
     Latency or lag, whichever fits all of these joints better: each joint by itself decides little.
     """
-    return min(delayed_by(space, found).values(), key=lambda f: f.score, default=found)
+    return min(delayed_by(space, best).values(), key=lambda f: f.score, default=best)
 
 
-def delayed_by(space: SampleSpace, found: CandidateFit) -> dict[str, CandidateFit]:
+def delayed_by(space: SampleSpace, best: CandidateFit) -> dict[str, CandidateFit]:
     """Return the set with each of the delays at all joints that answer late; none for one joint."""
     site = {(k.family, k.site.joint): c for c, k in enumerate(space.candidates) if k.effect.delays}
-    late = [c for c in found.chosen if space.candidates[c].effect.delays]
+    late = [c for c in best.chosen if space.candidates[c].effect.delays]
     if len(late) < 2:
         return {}
-    rest = [c for c in found.chosen if c not in late]
+    rest = [c for c in best.chosen if c not in late]
     joints = sorted({space.candidates[c].site.joint or 0 for c in late})
     return {
         effect: fit(space, (*rest, *(site[effect, j] for j in joints)))

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gapbridge.core.arrays import Array
-from gapbridge.core.diagnosis.criteria import MAX_LINES, MAX_SMOOTH_TERMS
+from gapbridge.core.diagnosis.criteria import MAX_LINES, MAX_SMOOTH_TERMS, MIN_ORDERS_APART
 from gapbridge.core.diagnosis.selection.problem import CandidateFit, SampleSpace, fit, gains
 from gapbridge.core.estimation.least_squares import basis_of, projected_out
 
@@ -44,7 +44,8 @@ def exclusive(space: SampleSpace, chosen: Sequence[int], new: int) -> bool:
             continue
         if a.family == b.family and a.periodic:
             lines += 1
-            if abs((a.site.order or 0) - (b.site.order or 0)) < 0.75 or lines >= MAX_LINES:
+            apart = abs((a.site.order or 0) - (b.site.order or 0))
+            if apart < MIN_ORDERS_APART or lines >= MAX_LINES:
                 return True
         elif a.family in (b.family, b.effect.contains) or b.family == a.effect.contains:
             return True
@@ -74,7 +75,7 @@ def additions(
     gain, sign = gains(space, state.r, state.along)
     score = space.misfit(np.maximum(state.rss - gain, 1e-300)) + space.penalty
     score += space.penalty[list(state.chosen)].sum()
-    found: list[tuple[float, int]] = []
+    ranked: list[tuple[float, int]] = []
     for c in np.argsort(score):
         candidate = space.candidates[c]
         if c in state.chosen or (named_only and not candidate.named):
@@ -84,10 +85,10 @@ def additions(
         single = candidate.named and len(candidate.parameters) == 1
         if single and candidate.parameters[0].lower == 0 and sign[c] < 0:
             continue
-        found.append((float(score[c]), int(c)))
-        if len(found) >= width:
+        ranked.append((float(score[c]), int(c)))
+        if len(ranked) >= width:
             break
-    return found
+    return ranked
 
 
 def joining(space: SampleSpace, chosen: Sequence[int], width: int) -> list[tuple[float, int]]:

@@ -175,17 +175,17 @@ def with_links(
 
 def _sure(space: SampleSpace, chosen: Sequence[int], block: set[int]) -> CandidateFit:
     """Return a set less those numbers of a block that are not sure, the weakest first."""
-    found = fit(space, chosen)
+    current = fit(space, chosen)
     while True:
         strength = {
             c: float(x[0] / max(s[0], 1e-300))
-            for c, x, s in zip(found.chosen, found.values, found.deviations, strict=True)
+            for c, x, s in zip(current.chosen, current.values, current.deviations, strict=True)
             if c in block
         }
         weakest = min(strength, key=lambda c: strength[c], default=None)
         if weakest is None or strength[weakest] >= OWN_SIGMAS:
-            return found
-        found = fit(space, [c for c in found.chosen if c != weakest])
+            return current
+        current = fit(space, [c for c in current.chosen if c != weakest])
 
 
 @dataclass(frozen=True)

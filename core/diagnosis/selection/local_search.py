@@ -18,12 +18,12 @@ MERGED = 9  # terms up to which every pair is tried against one
 GROWTH = 30  # terms added to a set at most
 
 
-def improve(space: SampleSpace, found: CandidateFit, named_only: bool = False) -> CandidateFit:
+def improve(space: SampleSpace, current: CandidateFit, named_only: bool = False) -> CandidateFit:
     """Return the set after dropping and swapping terms as long as that pays."""
     for _ in range(4):
-        better = found
-        for c in found.chosen:
-            rest = tuple(o for o in found.chosen if o != c)
+        better = current
+        for c in current.chosen:
+            rest = tuple(o for o in current.chosen if o != c)
             trial = fit(space, rest)
             if trial.score < better.score:
                 better = trial
@@ -32,20 +32,20 @@ def improve(space: SampleSpace, found: CandidateFit, named_only: bool = False) -
                     trial = fit(space, (*rest, other))
                     if trial.score < better.score - 1e-6:
                         better = trial
-        if better is found and 2 < len(found.chosen) <= MERGED:
-            better = _merged(space, found, named_only)
-        if better is found:
-            return found
-        found = better
-    return found
+        if better is current and 2 < len(current.chosen) <= MERGED:
+            better = _merged(space, current, named_only)
+        if better is current:
+            return current
+        current = better
+    return current
 
 
-def _merged(space: SampleSpace, found: CandidateFit, named_only: bool) -> CandidateFit:
+def _merged(space: SampleSpace, current: CandidateFit, named_only: bool) -> CandidateFit:
     """Return the set with two terms replaced by one, where that pays: two that imitate a third."""
-    better = found
-    for i, one in enumerate(found.chosen):
-        for other in found.chosen[i + 1 :]:
-            rest = tuple(c for c in found.chosen if c not in (one, other))
+    better = current
+    for i, one in enumerate(current.chosen):
+        for other in current.chosen[i + 1 :]:
+            rest = tuple(c for c in current.chosen if c not in (one, other))
             for _, new in additions(space, projected(space, rest), 2, named_only):
                 trial = fit(space, (*rest, new))
                 if trial.score < better.score - 1e-6:
@@ -53,99 +53,99 @@ def _merged(space: SampleSpace, found: CandidateFit, named_only: bool) -> Candid
     return better
 
 
-def pruned(space: SampleSpace, found: CandidateFit) -> CandidateFit:
+def pruned(space: SampleSpace, current: CandidateFit) -> CandidateFit:
     """Return the set without the terms that it is better off without, dropped one by one."""
-    while found.chosen:
+    while current.chosen:
         better = None
-        for score, c in _drops(space, found):
-            if score >= found.score:
+        for score, c in _drops(space, current):
+            if score >= current.score:
                 break
-            better = fit(space, tuple(o for o in found.chosen if o != c))
+            better = fit(space, tuple(o for o in current.chosen if o != c))
             if np.isfinite(better.score):
                 break
-        if better is None or better.score >= found.score:
+        if better is None or better.score >= current.score:
             break
-        found = better
-    return found
+        current = better
+    return current
 
 
-def _drops(space: SampleSpace, found: CandidateFit) -> list[tuple[float, int]]:
+def _drops(space: SampleSpace, current: CandidateFit) -> list[tuple[float, int]]:
     """Return the score of the set less each of its terms, best first, out of one inverse."""
-    X = space.columns(found.chosen)
+    X = space.columns(current.chosen)
     spread = inverse(X.T @ X)
     x = spread @ (X.T @ space.y)
     rss = float(np.sum((space.y - X @ x) ** 2))
-    paid = float(space.penalty[list(found.chosen)].sum())
+    paid = float(space.penalty[list(current.chosen)].sum())
     begin, scores = 0, []
-    for c in found.chosen:
-        own = slice(begin, begin + len(space.candidates[c].parameters))
-        begin = own.stop
-        more = sigmas_square(x[own], spread[own, own])
+    for c in current.chosen:
+        values = slice(begin, begin + len(space.candidates[c].parameters))
+        begin = values.stop
+        more = sigmas_square(x[values], spread[values, values])
         scores.append((float(space.misfit(np.array(rss + more))) + paid - space.penalty[c], c))
     return sorted(scores)
 
 
-def joined_sets(space: SampleSpace, found: CandidateFit) -> list[CandidateFit]:
+def joined_sets(space: SampleSpace, current: CandidateFit) -> list[CandidateFit]:
     """Return the set with one more term, less what that makes needless: unnamed rivals above all.
 
     Named causes that together imitate something unknown fall away where it is given its own term;
     where they stand in each other's way, the set grows from that term anew.
     """
     unnamed = {c for c, k in enumerate(space.candidates) if k.of_no_quantity}
-    joiners = unnamed | {c for _, c in joining(space, found.chosen, 4)}
-    new = sorted(joiners - set(found.chosen))
-    sets = [pruned(space, fit(space, (*found.chosen, c))) for c in new]
-    if found.chosen:
+    joiners = unnamed | {c for _, c in joining(space, current.chosen, 4)}
+    new = sorted(joiners - set(current.chosen))
+    sets = [pruned(space, fit(space, (*current.chosen, c))) for c in new]
+    if current.chosen:
         sets += [forward_selected(space, fit(space, (c,))) for c in sorted(unnamed)]
     return sets
 
 
 def forward_selected(
-    space: SampleSpace, found: CandidateFit, named_only: bool = False
+    space: SampleSpace, current: CandidateFit, named_only: bool = False
 ) -> CandidateFit:
     """Return the set with the best terms added one by one as long as that pays."""
-    state = projected(space, found.chosen)
+    state = projected(space, current.chosen)
     for _ in range(GROWTH):
         nearest = additions(space, state, 1, named_only)
-        if not nearest or nearest[0][0] >= found.score:
+        if not nearest or nearest[0][0] >= current.score:
             break
-        better = fit(space, (*found.chosen, nearest[0][1]))
-        if better.score >= found.score:
+        better = fit(space, (*current.chosen, nearest[0][1]))
+        if better.score >= current.score:
             break
-        state, found = forward_step(space, state, nearest[0][1], better.score), better
-    return found
+        state, current = forward_step(space, state, nearest[0][1], better.score), better
+    return current
 
 
 def rivals(
-    space: SampleSpace, found: CandidateFit, c: int, within: float
+    space: SampleSpace, best: CandidateFit, c: int, within: float
 ) -> list[tuple[float, int]]:
     """Return the candidates that could stand for ``c`` in a set: (score above the best, index)."""
-    rest = tuple(o for o in found.chosen if o != c)
+    rest = tuple(o for o in best.chosen if o != c)
     near = []
     for score, other in additions(space, projected(space, rest), 40):
-        if score > found.score + within:
+        if score > best.score + within:
             break
         if other == c:
             continue
         trial = fit(space, (*rest, other))
-        if trial.score <= found.score + within:
-            near.append((trial.score - found.score, other))
+        if trial.score <= best.score + within:
+            near.append((trial.score - best.score, other))
     return sorted(near)
 
 
-def with_fewest_families(space: SampleSpace, found: CandidateFit) -> CandidateFit:
+def with_fewest_families(space: SampleSpace, best: CandidateFit) -> CandidateFit:
     """Return the set with as few kinds of effects as fit the data about as well.
 
     Which kinds are at work is one guess, at which places another: a kind that is there anyway is
     the simpler guess for a term that could as well be of it.
     """
-    for c in found.chosen:
+    for c in best.chosen:
         family = space.candidates[c].family
-        kinds = {space.candidates[o].family for o in found.chosen if o != c}
+        kinds = {space.candidates[o].family for o in best.chosen if o != c}
         if not space.candidates[c].named or family in kinds:
             continue
-        for _, other in rivals(space, found, c, FAMILY_PENALTY):
+        for _, other in rivals(space, best, c, FAMILY_PENALTY):
             if space.candidates[other].named and space.candidates[other].family in kinds:
-                rest = tuple(o for o in found.chosen if o != c)
+                rest = tuple(o for o in best.chosen if o != c)
                 return with_fewest_families(space, fit(space, (*rest, other)))
-    return found
+    return best

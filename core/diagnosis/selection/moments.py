@@ -1,4 +1,4 @@
-"""Moments at which something stepped once: by likelihood over all of them, in one pass.
+"""Moments at which something steps once: by likelihood over all of them, in one pass.
 
 Every site of every effect that steps is tried at every moment between two rows. The columns of a
 step are those of the same change in all rows, cut off before the moment, so that inner products
@@ -15,7 +15,7 @@ import numpy as np
 
 from gapbridge.core.arm import Arm
 from gapbridge.core.arrays import Array
-from gapbridge.core.diagnosis.criteria import LOOSE_PRIOR
+from gapbridge.core.diagnosis.criteria import LOOSE_PRIOR, MIN_ROWS_BESIDE_STEP
 from gapbridge.core.diagnosis.selection.candidate import Candidate
 from gapbridge.core.diagnosis.selection.state import SelectionState, flat
 from gapbridge.core.effects import CATALOGUE, Effect, Site, Term
@@ -23,7 +23,6 @@ from gapbridge.core.effects import CATALOGUE, Effect, Site, Term
 Pair = tuple[Candidate, Array]
 FREE = 1e6  # usual sizes of a nuisance: nothing is known of it
 MOMENTS = 3  # of a site that the search looks at
-FEWEST = 3  # rows on either side of a moment
 
 
 def step_candidates(
@@ -43,11 +42,11 @@ def step_candidates(
         e for name, e in CATALOGUE.items()
         if e.at_moment and channel in e.channels and name not in set(withheld)
     ]  # fmt: skip
-    if times is None or not effects or len(times) < 2 * FEWEST + 2:
+    if times is None or not effects or len(times) < 2 * MIN_ROWS_BESIDE_STEP + 2:
         return []
     still = tuple(t for t in base if not CATALOGUE[t.effect].at_moment)
     target, basis = _integrated(state, columns, still)
-    found: list[Pair] = []
+    pairs: list[Pair] = []
     for effect in effects:
         sites = effect.sites(state.arm)
         for site in sites:
@@ -59,8 +58,8 @@ def step_candidates(
             for moment in (*(_between(times, k) for k in kept), *had):
                 candidate = _candidate(state.arm, effect, site, moment, tried)
                 after = (times > moment).astype(float)
-                found.append((candidate, always * after[:, None, None]))
-    return found
+                pairs.append((candidate, always * after[:, None, None]))
+    return pairs
 
 
 def _candidate(arm: Arm, effect: Effect, site: Site, moment: float, tried: int) -> Candidate:
@@ -97,7 +96,7 @@ def _integrated(
         if candidate.periodic and (candidate.site.order or 0.0) > 2.0:
             continue
         blocks.append(block)
-        prior.append(np.array([LOOSE_PRIOR * p.scale for p in candidate.parameters]))
+        prior.append(LOOSE_PRIOR * candidate.scales)
     A = flat(np.concatenate(blocks, axis=2), state)
     spread = np.concatenate(prior)
     spread[: observation.nuisance.shape[2]] /= np.maximum(
@@ -135,7 +134,7 @@ def _gains(state: SelectionState, always: Array, target: Array, C: Array) -> Arr
 def _best(gain: Array, times: Array) -> list[int]:
     """Return the rows with which the best moments begin."""
     allowed = np.zeros(len(gain), dtype=bool)
-    allowed[FEWEST : len(gain) - FEWEST + 1] = True
+    allowed[MIN_ROWS_BESIDE_STEP : len(gain) - MIN_ROWS_BESIDE_STEP + 1] = True
     allowed[1:] &= np.diff(times) > 0  # no moment between rows of one time
     order = np.argsort(-np.where(allowed, gain, -np.inf))
     return [int(k) for k in order[:MOMENTS] if allowed[k]]
@@ -149,9 +148,9 @@ def slips(terms: Sequence[Term], times: Array | None) -> list[tuple[Term, float,
     """Return each term that steps, and the times of the last row before and the first row after."""
     if times is None:
         return []
-    found = []
+    steps = []
     for term in terms:
         if CATALOGUE[term.effect].at_moment:
             k = int(np.searchsorted(times, term.values[-1], side="right"))
-            found.append((term, float(times[max(k - 1, 0)]), float(times[min(k, len(times) - 1)])))
-    return found
+            steps.append((term, float(times[max(k - 1, 0)]), float(times[min(k, len(times) - 1)])))
+    return steps

@@ -112,16 +112,16 @@ def readmit_explained_outliers(
 
     A chipped tooth or a knocked instrument looks like a few outliers; bad luck has no place.
     """
-    found, outliers = known[-1], np.flatnonzero(~state.kept)
+    best, outliers = known[-1], np.flatnonzero(~state.kept)
     whole = replace(state, kept=np.ones_like(state.kept))
     space, unprojected = sample_space(whole, columns, base, smooth)
-    for _, c in joining(space, found.chosen, 12):
+    for _, c in joining(space, best.chosen, 12):
         if space.candidates[c].named:
             continue
-        trial = fit(space, (*found.chosen, c))
-        left = space.y - space.columns(trial.chosen) @ np.concatenate(trial.values)
+        trial = fit(space, (*best.chosen, c))
+        residual = space.y - space.columns(trial.chosen) @ np.concatenate(trial.values)
         k = state.observation.measured.shape[1]
-        distance = distance_of(left.reshape(-1, k), scale_of(left))
+        distance = distance_of(residual.reshape(-1, k), scale_of(residual))
         if not (distance[outliers] < OUTLIER).all():
             continue
         A = np.hstack([unprojected.nuisance, unprojected.columns(space, trial.chosen)])

@@ -15,7 +15,9 @@ from gapbridge.core.diagnosis.criteria import (
     ACCUSATION_PENALTY,
     MAX_SOFTENING,
     MAX_TIMES_USUAL,
+    OUT_OF_BOUNDS_SIGMAS,
     SMOOTH_PENALTY,
+    TOO_LARGE_SIGMAS,
 )
 from gapbridge.core.diagnosis.selection.candidate import Candidate
 
@@ -130,15 +132,15 @@ def gains(space: SampleSpace, r: Array, along: Array | None = None) -> tuple[Arr
     g = space.X.T @ r
     gain, sign = np.zeros(len(space.candidates)), np.ones(len(space.candidates))
     for blocks in space.blocks:
-        own = (g[blocks.columns] * blocks.unit).T
+        products = (g[blocks.columns] * blocks.unit).T
         taken = within[:, blocks.columns] * blocks.unit
-        d, n = own.shape
+        d, n = products.shape
         whole = np.zeros((d + 1, d + 1, n))  # products of the columns and, last, of r
         np.subtract(blocks.gram, np.einsum("pci,pcj->ijc", taken, taken), out=whole[:d, :d])
-        whole[d, :d] = whole[:d, d] = own
+        whole[d, :d] = whole[:d, d] = products
         gain[blocks.index] = -_eliminated(whole, RANK if d == 1 else DEPENDENT)
         if d == 1:
-            sign[blocks.index] = np.sign(own[0])
+            sign[blocks.index] = np.sign(products[0])
     return gain, sign
 
 
@@ -169,8 +171,8 @@ def fit(space: SampleSpace, chosen: Sequence[int]) -> CandidateFit:
     deviation = np.sqrt(np.einsum("ij,ij->j", V, V) * variance) * unit
     score = float(space.misfit(np.array(rss)) + space.penalty[list(chosen)].sum())
     ends = np.cumsum([0, *(len(space.candidates[c].parameters) for c in chosen)]).tolist()
-    own = [slice(begin, end) for begin, end in pairwise(ends)]
-    parts, spread = [values[o] for o in own], [deviation[o] for o in own]
+    slices = [slice(begin, end) for begin, end in pairwise(ends)]
+    parts, spread = [values[o] for o in slices], [deviation[o] for o in slices]
     families = {"", *(space.candidates[c].family for c in chosen)}
     for c, x, s in zip(chosen, parts, spread, strict=True):
         if space.candidates[c].beside not in families:
@@ -187,11 +189,11 @@ def _plausible(candidate: Candidate, x: Array, s: Array) -> bool:
         return False
     for parameter, value, deviation in zip(candidate.parameters, x, s, strict=True):
         lower = -np.inf if candidate.curve is not None else parameter.lower
-        if value < lower - 2.5 * deviation or value > parameter.upper:
+        if value < lower - OUT_OF_BOUNDS_SIGMAS * deviation or value > parameter.upper:
             return False
         most = (
             MAX_SOFTENING if parameter.name == "softening" else MAX_TIMES_USUAL
         ) * parameter.scale
-        if parameter.unit not in SENSED and abs(value) - 3 * deviation > most:
+        if parameter.unit not in SENSED and abs(value) - TOO_LARGE_SIGMAS * deviation > most:
             return False
     return True

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from gapbridge.core.arm import Arm
 from gapbridge.core.arrays import Array
 from gapbridge.core.diagnosis.criteria import OWN_SIGMAS, PRIOR_REACH
-from gapbridge.core.diagnosis.observation import Observation
-from gapbridge.core.diagnosis.selection.candidate import Candidate
+from gapbridge.core.diagnosis.selection.candidate import Candidate, jacobian
 from gapbridge.core.diagnosis.selection.delay_columns import as_one_delay
 from gapbridge.core.diagnosis.selection.problem import CandidateFit, SampleSpace
 from gapbridge.core.diagnosis.selection.state import SelectionState, flat
@@ -29,6 +28,7 @@ from gapbridge.core.estimation.least_squares import (
 )
 
 REFITS = 8
+CONVERGED = 1e-6  # usual sizes of a number that the last step moved
 LEAST = 1e-13  # of the largest eigenvalue of a covariance: what is less is rounding
 NO_PRIOR: Mapping[int, Array] = {}
 
@@ -54,7 +54,7 @@ class Remainder:
 def refit(
     state: SelectionState,
     space: SampleSpace,
-    found: CandidateFit,
+    linear_fit: CandidateFit,
     links: Mapping[int, Array] = NO_PRIOR,
     remainder: Remainder | None = None,
 ) -> tuple[SelectionState, tuple[Term, ...], tuple[int, ...], tuple[Array, ...], Array]:
@@ -64,79 +64,124 @@ def refit(
     Beside a ``remainder`` covariances are those of regions left out in turn (jackknife), where
     these are wider than those of white noise: what is unknown is not the same everywhere.
     """
-    index = (*(c for c in found.chosen if space.candidates[c].named), *links)
-    freed = {c: freed_of(state.arm, space.candidates[c]) for c in index}
-    smooth = [c for c in found.chosen if not space.candidates[c].named]
-    x = [
-        np.array(space.candidates[c].term(v).values)[: len(freed[c].parameters)]
-        for c, v in zip(found.chosen, found.values, strict=True)
-        if c in index
-    ] + [np.zeros(len(space.candidates[c].parameters)) for c in links]
-    x = _standing(state, freed, index, x)
-    usual = [links[c] if c in links else _wide(freed[c]) for c in index]
-    extra = space.columns(smooth)
+    index = (*(c for c in linear_fit.chosen if space.candidates[c].named), *links)
+    freed = [freed_of(state.arm, space.candidates[c]) for c in index]
+    usual = [links.get(c, PRIOR_REACH * k.scales) for c, k in zip(index, freed, strict=True)]
+    near = [links.get(c, np.inf) for c in index]
+    extra = space.columns([c for c in linear_fit.chosen if not space.candidates[c].named])
     if remainder is not None:
         extra = np.hstack([extra, remainder.columns])
+    x = _start_values(state, freed, _linear_values(space, linear_fit, freed))
     for _ in range(REFITS):
-        observation = state.observation
-        terms = tuple(freed[c].term(v) for c, v in zip(index, x, strict=True))
-        gap = observation.measured - observation.predict(terms)
-        blocks = []
-        for k, c in enumerate(index):
-            others = terms[:k] + terms[k + 1 :]
-            blocks.append(flat(exact_jacobian(state.observation, freed[c], x[k], others), state))
-        nuisance = flat(observation.nuisance, state)
-        A = np.hstack([*blocks, extra, nuisance])
-        b = flat(gap[..., None], state)[:, 0]
-        pull, towards = _pull(usual, x, A.shape[1], remainder, nuisance.shape[1])
-        # with the pull: what the data do not show is as large as its prior, and hides no other
-        size = np.sqrt(np.einsum("ij,ij->j", A, A) + np.einsum("ij,ij->j", pull, pull))
-        unit = np.where(size > 1e-150, 1 / np.maximum(size, 1e-150), 0.0)  # 0: moves nothing
-        step = _step(np.vstack([A, pull]), np.concatenate([b, towards]), unit, freed, index, x)
-        sizes = [len(v) for v in x]
-        cuts = np.cumsum([*sizes, extra.shape[1]])
-        parts = np.split(step, cuts)
-        near = [links.get(c, np.inf) for c in index]
-        moved, share = 0.0, _share(state, freed, index, x, parts, near, A)
-        for k in range(len(x)):
-            x[k] = _within(freed[index[k]], x[k] + share * parts[k])
-            scale = np.array([p.scale for p in freed[index[k]].parameters])
-            moved = max(moved, float(np.abs(parts[k] / scale).max()))
-        if observation.rebase is not None:
-            moved_terms = tuple(freed[c].term(v) for c, v in zip(index, x, strict=True))
-            left = observation.measured - observation.predict(moved_terms)
-            moved_frame = observation.rebased(_along(extra, nuisance, left, state), moved_terms)
-            state = replace(state, observation=moved_frame)
-        if moved < 1e-6:
+        rows = _linearised(state, freed, x, extra, usual, remainder)
+        step = _step(*rows.with_prior(), rows.unit(), freed, x)
+        parts = np.split(step, np.cumsum([len(v) for v in x]))[: len(x)]
+        share = _share(state, freed, x, parts, near, rows.A)
+        x = [_within(c, v + share * part) for c, v, part in zip(freed, x, parts, strict=True)]
+        state = _frame_moved(state, extra, _terms(freed, x))
+        if _largest_step(freed, parts) < CONVERGED:
             break
-    residual_ss = float(np.sum((b - A @ step) ** 2))
-    variance = max(residual_ss / max(len(b) - A.shape[1], 1), space.floor)
-    whole, right = np.vstack([A, pull]), np.concatenate([b, towards])
-    region = None if remainder is None or not len(index) else remainder.region
-    terms = tuple(freed[c].term(v) for c, v in zip(index, x, strict=True))
-    unsure = _uncertain(state, terms, len(whole))
-    covariance = _covariances(whole, right, variance, sizes, region, unsure)
-    x, covariance = _as_one_delay([freed[c] for c in index], x, covariance)
-    terms = tuple(freed[c].term(v) for c, v in zip(index, x, strict=True))
+    covariance = _covariances(
+        *rows.with_prior(), rows.variance(step, space.floor), [len(v) for v in x],
+        None if remainder is None or not len(index) else remainder.region,
+        _uncertain(state, _terms(freed, x), len(rows.b) + len(rows.towards)),
+    )  # fmt: skip
+    x, covariance = _as_one_delay(freed, x, covariance)
+    terms = _terms(freed, x)
     gap = state.observation.measured - state.observation.predict(terms)
-    nuisance = state.observation.nuisance
-    if nuisance.shape[2]:
-        gap = gap - nuisance @ _along(extra, flat(nuisance, state), gap, state)
+    if state.observation.nuisance.shape[2]:
+        gap = gap - state.observation.nuisance @ _along(extra, gap, state)
     return state, terms, index, tuple(covariance), gap
 
 
-def _standing(
-    state: SelectionState, freed: dict[int, Candidate], index: tuple[int, ...], x: list[Array]
+def _terms(freed: list[Candidate], x: list[Array]) -> tuple[Term, ...]:
+    """Return the terms of candidates at the values ``x`` (d,) of each."""
+    return tuple(c.term(v) for c, v in zip(freed, x, strict=True))
+
+
+def _linear_values(
+    space: SampleSpace, linear_fit: CandidateFit, freed: list[Candidate]
 ) -> list[Array]:
+    """Return the values (d,) of a linear fit's named terms, and nominal ones of the links."""
+    x = [
+        np.array(space.candidates[c].term(v).values)
+        for c, v in zip(linear_fit.chosen, linear_fit.values, strict=True)
+        if space.candidates[c].named
+    ]
+    x += [np.zeros(len(c.parameters)) for c in freed[len(x) :]]
+    return [v[: len(c.parameters)] for c, v in zip(freed, x, strict=True)]
+
+
+def _start_values(state: SelectionState, freed: list[Candidate], x: list[Array]) -> list[Array]:
     """Return start values (d,) of each term: nominal ones where no arm of the linear ones stands.
 
     Linear values of flexibilities may be such that the arm would buckle under its load.
     """
     try:
-        state.observation.predict([freed[c].term(v) for c, v in zip(index, x, strict=True)])
+        state.observation.predict(_terms(freed, x))
     except EquilibriumError:
-        return [_within(freed[c], np.zeros(len(v))) for c, v in zip(index, x, strict=True)]
+        return [_within(c, np.zeros(len(v))) for c, v in zip(freed, x, strict=True)]
     return x
+
+
+@dataclass(frozen=True)
+class _Linearised:
+    """The whitened rows of one Gauss-Newton step, and those of the priors."""
+
+    A: Array  # (m, p) Jacobian: terms, unnamed functions, nuisance
+    b: Array  # (m,) gap
+    pull: Array  # (f, p) priors, which pull towards nominal
+    towards: Array  # (f,)
+
+    def with_prior(self) -> tuple[Array, Array]:
+        """Return all rows (m + f, p) and their right-hand side (m + f,)."""
+        return np.vstack([self.A, self.pull]), np.concatenate([self.b, self.towards])
+
+    def unit(self) -> Array:
+        """Return one over each column's size (p,); 0 of a column that moves nothing.
+
+        Priors count: what the data do not show is as large as its prior, and hides no other.
+        """
+        squares = [np.einsum("ij,ij->j", rows, rows) for rows in (self.A, self.pull)]
+        size = np.sqrt(squares[0] + squares[1])
+        return np.where(size > 1e-150, 1 / np.maximum(size, 1e-150), 0.0)
+
+    def variance(self, step: Array, floor: float) -> float:
+        """Return the variance of a row after a step (p,), no less than ``floor``."""
+        residual_ss = float(np.sum((self.b - self.A @ step) ** 2))
+        return float(max(residual_ss / max(len(self.b) - self.A.shape[1], 1), floor))
+
+
+def _linearised(
+    state: SelectionState, freed: list[Candidate], x: list[Array], extra: Array,
+    usual: list[Array], remainder: Remainder | None,
+) -> _Linearised:  # fmt: skip
+    """Return the regression at the values ``x``, unnamed functions ``extra`` (m, e) beside them."""
+    observation, terms = state.observation, _terms(freed, x)
+    gap = observation.measured - observation.predict(terms)
+    blocks = [
+        flat(jacobian(observation, c, x[k], terms[:k] + terms[k + 1 :]), state)
+        for k, c in enumerate(freed)
+    ]
+    nuisance = flat(observation.nuisance, state)
+    A = np.hstack([*blocks, extra, nuisance])
+    pull, towards = _pull(usual, x, A.shape[1], remainder, nuisance.shape[1])
+    return _Linearised(A, flat(gap[..., None], state)[:, 0], pull, towards)
+
+
+def _frame_moved(state: SelectionState, extra: Array, terms: tuple[Term, ...]) -> SelectionState:
+    """Return the state with its frame where it fits best beside the terms."""
+    observation = state.observation
+    if observation.rebase is None:
+        return state
+    gap = observation.measured - observation.predict(terms)
+    return replace(state, observation=observation.rebased(_along(extra, gap, state), terms))
+
+
+def _largest_step(freed: list[Candidate], parts: list[Array]) -> float:
+    """Return the largest part (d,) of a step, in its parameter's usual sizes."""
+    each = (float(np.abs(part / c.scales).max()) for c, part in zip(freed, parts, strict=True))
+    return max(each, default=0.0)
 
 
 @dataclass(frozen=True)
@@ -153,19 +198,17 @@ def step_on(
     rows: Reduced, freed: list[Candidate], x: list[Array], floor: float
 ) -> tuple[list[Array], list[Array]]:
     """Return values (d,) and covariances (d, d) of terms after one step from ``x``, near there."""
-    usual, index = [_wide(c) for c in freed], tuple(range(len(x)))
-    pull, towards = _pull(usual, x, rows.A.shape[1], None, 0)
+    pull, towards = _pull([PRIOR_REACH * c.scales for c in freed], x, rows.A.shape[1], None, 0)
     whole, right = np.vstack([rows.A, pull]), np.concatenate([rows.b, towards])
     unit = 1 / np.sqrt(np.einsum("ij,ij->j", whole, whole))
-    by_index = dict(enumerate(freed))
-    step = _step(whole, right, unit, by_index, index, x)
+    step = _step(whole, right, unit, freed, x)
     sizes = [len(v) for v in x]
     values = [
         _within(c, v + part)
         for c, v, part in zip(freed, x, np.split(step, np.cumsum(sizes)[:-1]), strict=True)
     ]
-    left = float(np.sum((rows.b - rows.A @ step) ** 2))
-    variance = max(left / max(rows.count - rows.A.shape[1], 1), floor)
+    residual_ss = float(np.sum((rows.b - rows.A @ step) ** 2))
+    variance = max(residual_ss / max(rows.count - rows.A.shape[1], 1), floor)
     spread = _covariances(whole, right, variance, sizes, rows.region)
     return _as_one_delay(freed, values, spread)
 
@@ -178,8 +221,8 @@ def _as_one_delay(
     variances = np.array([covariance[k][0, 0] for k in late])
     values, variances = as_one_delay(np.array([x[k][0] for k in late]), variances)
     x, covariance = list(x), list(covariance)
-    for k, value, own in zip(late, values, variances, strict=True):
-        x[k], covariance[k] = np.array([value]), np.array([[own]])
+    for k, value, variance in zip(late, values, variances, strict=True):
+        x[k], covariance[k] = np.array([value]), np.array([[variance]])
     return x, covariance
 
 
@@ -207,8 +250,8 @@ def _uncertain(state: SelectionState, terms: tuple[Term, ...], rows: int) -> Arr
     uncertain = state.observation.uncertain
     if uncertain is None or not terms:
         return None
-    own = flat(uncertain(terms), state)
-    return np.vstack([own, np.zeros((rows - len(own), own.shape[1]))])
+    sigmas = flat(uncertain(terms), state)
+    return np.vstack([sigmas, np.zeros((rows - len(sigmas), sigmas.shape[1]))])
 
 
 def _cluster_covariance(white: Array, A: Array, b: Array, region: NDArray[np.int64]) -> Array:
@@ -248,27 +291,24 @@ def worth(term: Term, spread: Array) -> float:
     if effect.periodic:
         single = float(value @ value) ** 2 / max(float(value @ spread @ value), 1e-300)
     else:
-        own = slice(0, 1) if effect.curved or effect.shapes else slice(None)
-        single = float(np.max(value[own] ** 2 / np.maximum(np.diag(spread)[own], 1e-300)))
+        judged = slice(0, 1) if effect.curved or effect.shapes else slice(None)
+        single = float(np.max(value[judged] ** 2 / np.maximum(np.diag(spread)[judged], 1e-300)))
     return min(whole, single) / OWN_SIGMAS**2
 
 
-def _step(
-    A: Array, b: Array, unit: Array, freed: dict[int, Candidate], index: tuple[int, ...],
-    x: list[Array],
-) -> Array:  # fmt: skip
+def _step(A: Array, b: Array, unit: Array, freed: list[Candidate], x: list[Array]) -> Array:
     """Return the Gauss-Newton step (k,); what stands on a bound and would pass it stays there.
 
     Cut off afterwards, such a step would no longer be one downhill, and the fit would stand still.
     """
-    parameters = [p for c in index for p in freed[c].parameters]
+    parameters = [p for c in freed for p in c.parameters]
     now = np.concatenate([*x, np.zeros(0)])
     lower, upper = (np.array([getattr(p, end) for p in parameters]) for end in ("lower", "upper"))
     free = np.ones(len(unit), dtype=bool)
     step = np.zeros(len(unit))
     for _ in range(1 + len(now)):
-        own = unit * free
-        step = np.linalg.lstsq(A * own, b, rcond=1e-9)[0] * own
+        unit_of_free = unit * free
+        step = np.linalg.lstsq(A * unit_of_free, b, rcond=1e-9)[0] * unit_of_free
         ahead = step[: len(now)]
         stuck = ((now <= lower) & (ahead < 0)) | ((now >= upper) & (ahead > 0))
         if not stuck.any():
@@ -277,9 +317,9 @@ def _step(
     return step
 
 
-def _along(extra: Array, nuisance: Array, gap: Array, state: SelectionState) -> Array:
+def _along(extra: Array, gap: Array, state: SelectionState) -> Array:
     """Return what of the nuisance (p,) a gap (N, k) asks for, unnamed functions beside it."""
-    b = flat(gap[..., None], state)[:, 0]
+    b, nuisance = flat(gap[..., None], state)[:, 0], flat(state.observation.nuisance, state)
     return solve(np.hstack([extra, nuisance]), b)[extra.shape[1] :]
 
 
@@ -305,40 +345,32 @@ def _pull(
     return np.vstack([rows, more]), np.concatenate([towards, np.zeros(len(known))])
 
 
-def _wide(candidate: Candidate) -> Array:
-    """Return how far (d,) the data may take a cause that stands for itself."""
-    return np.array([PRIOR_REACH * p.scale for p in candidate.parameters])
-
-
 def _share(
-    state: SelectionState, freed: dict[int, Candidate], index: tuple[int, ...], x: list[Array],
-    parts: list[Array], near: list[Array | float], A: Array,
+    state: SelectionState, freed: list[Candidate], x: list[Array], parts: list[Array],
+    near: list[Array | float], A: Array,
 ) -> float:  # fmt: skip
     """Return the share of a Gauss-Newton step to go: less than all where it would overshoot.
 
     ``near`` is the prior 1 sigma of each term's numbers; inf: none that counts.
     """
-    if not index:
+    if not freed:
         return 1.0
     linear = A[:, sum(len(v) for v in x) :]  # smooth terms and nuisance, refitted for each trial
     Q = basis_of(linear)
 
-    def left(share: float) -> float:
-        ahead = [_within(freed[c], v + share * part)
-                 for c, v, part in zip(index, x, parts, strict=False)]  # fmt: skip
-        terms = [freed[c].term(v) for c, v in zip(index, ahead, strict=True)]
+    def objective(share: float) -> float:
+        ahead = [_within(c, v + share * part) for c, v, part in zip(freed, x, parts, strict=True)]
         try:
-            gap = state.observation.measured - state.observation.predict(terms)
+            gap = state.observation.measured - state.observation.predict(_terms(freed, ahead))
         except InputError:
             return float("inf")
-        r = flat(gap[..., None], state)[:, 0]
-        r = projected_out(Q, r)
+        r = projected_out(Q, flat(gap[..., None], state)[:, 0])
         off = np.concatenate([v / size for v, size in zip(ahead, near, strict=True)])
         return float(r @ r + off @ off)
 
-    now = left(0.0)
+    now = objective(0.0)
     for share in (1.0, 0.5, 0.25, 0.1, 0.03):
-        if left(share) <= now:
+        if objective(share) <= now:
             return share
     return 0.0
 
@@ -349,23 +381,6 @@ def freed_of(arm: Arm, candidate: Candidate) -> Candidate:
         return candidate
     parameters = candidate.effect.parameters(arm, candidate.site)
     return replace(candidate, parameters=parameters, fixed=(None,) * len(parameters), curve=None)
-
-
-def exact_jacobian(
-    observation: Observation, candidate: Candidate, x: Array, others: tuple[Term, ...]
-) -> Array:
-    """Return d prediction / d parameter (N, k, d) at the term's present values."""
-    columns = []
-    for k, parameter in enumerate(candidate.parameters):
-        h = np.zeros(len(x))
-        h[k] = 1e-2 * parameter.scale
-        try:
-            ahead = observation.predict([*others, candidate.term(x + h)])
-            behind = observation.predict([*others, candidate.term(x - h)])
-        except EquilibriumError:  # on the edge of buckling: the prior alone leads back
-            ahead = behind = observation.measured
-        columns.append((ahead - behind) / (2 * h[k]))
-    return np.stack(columns, axis=-1)
 
 
 def _within(candidate: Candidate, x: Array) -> Array:

@@ -16,6 +16,7 @@ from gapbridge.core.diagnosis.criteria import (
     HEAVIEST,
     HELD_WHOLLY,
     LARGE_SAMPLE,
+    NO_WORTH,
     UNDETERMINED,
 )
 from gapbridge.core.diagnosis.observation import Observation
@@ -46,8 +47,8 @@ from gapbridge.core.diagnosis.selection.smooth import Pair, smooth_candidates, u
 from gapbridge.core.diagnosis.selection.state import (
     SelectionState,
     UnprojectedRows,
+    candidate_of,
     flat,
-    locate,
     sample_space,
 )
 from gapbridge.core.diagnosis.selection.stiffness_curves import with_straight_stiffness
@@ -57,7 +58,6 @@ from gapbridge.core.load_bounds import LoadBounds
 from gapbridge.core.model import Model
 
 ROUNDS = 8
-NOTHING = 1e-4  # worth of a value: a thirtieth of its sigma
 
 
 def select(
@@ -84,8 +84,8 @@ def select(
         state, base, space = last.state, last.terms, last.space
         # beside an unnamed function a value is not yet what it comes to without; but what shows
         # nothing by itself (the scale of a torque that is not there) keeps the place of what does
-        named_only = all(space.candidates[c].named for c in last.found.chosen)
-        weakest = last.weakest(1.0 if settled and named_only else NOTHING)
+        named_only = all(space.candidates[c].named for c in last.best.chosen)
+        weakest = last.weakest(1.0 if settled and named_only else NO_WORTH)
         if weakest is not None:
             none.add((base[weakest].effect, base[weakest].site))
             base = base[:weakest] + base[weakest + 1 :]
@@ -94,11 +94,11 @@ def select(
     assert last is not None
     space = last.space
     if len(space.y) >= LARGE_SAMPLE and any(
-        not space.candidates[c].named for c in last.found.chosen
+        not space.candidates[c].named for c in last.best.chosen
     ):
         last = _named_refit(last)
     return Selection(
-        last.state.observation, space, last.found, last.terms, last.index, last.covariance,
+        last.state.observation, space, last.best, last.terms, last.index, last.covariance,
         last.counted, last.whitened_by, last.residual, base, last.unprojected, last.links,
     )  # fmt: skip
 
@@ -114,7 +114,7 @@ class _Round:
     near: SampleSpace  # the same, beside the links where their geometry is a cause
     unprojected: UnprojectedRows
     links: dict[int, Array]
-    found: CandidateFit
+    best: CandidateFit
     terms: tuple[Term, ...]
     index: tuple[int, ...]
     covariance: tuple[Array, ...]
@@ -129,10 +129,10 @@ class _Round:
         share = {}
         for p, c in enumerate(self.index):
             if c not in self.links:
-                size = np.array([k.scale for k in self.space.candidates[c].parameters])
-                own = self.covariance[p]
-                unknown = float((np.sqrt(np.diag(own)) / size[: len(own)]).min()) / UNDETERMINED
-                share[p] = -unknown if unknown > 1 else worth(self.terms[p], own)
+                size = self.space.candidates[c].scales
+                sigma = np.sqrt(np.diag(self.covariance[p]))
+                unknown = float((sigma / size[: len(sigma)]).min()) / UNDETERMINED
+                share[p] = -unknown if unknown > 1 else worth(self.terms[p], self.covariance[p])
         weakest = min(share, key=lambda p: share[p], default=None)
         return None if weakest is None or share[weakest] >= least else weakest
 
@@ -152,9 +152,9 @@ def _round(
     smooth = _beyond_loads(offered, open_to, columns, base)
     stepping = step_candidates(state, columns, base, withheld)
     state = replace(state, candidates=[*open_to, *(candidate for candidate, _ in stepping)])
-    columns += [own for _, own in stepping]
+    columns += [step_columns for _, step_columns in stepping]
     space, unprojected = sample_space(state, columns, base, smooth)
-    inside = [locate(state.candidates, t)[0] for t in base]
+    inside = [candidate_of(state.candidates, t)[0] for t in base]
     best = one_delay(space, screened_search(space, base=inside))
     if not first and not state.kept.all():
         state, space, unprojected, best = readmit_explained_outliers(
@@ -169,8 +169,8 @@ def _round(
         best = pruned(near, fit(near, straight))
         state, terms, index, covariance, residual = refit(state, space, best, links)
     used = sum(len(v) for v in best.values) + (links_of(space, links).used if links else 0)
-    left = _without_smooth_part(state, space, best, smooth, residual)
-    state = revise_noise_and_outliers(state, left, 1 - used / space.freedom)
+    noise_residual = _without_smooth_part(state, space, best, smooth, residual)
+    state = revise_noise_and_outliers(state, noise_residual, 1 - used / space.freedom)
     return _Round(
         state, counted, whitened_by, space, near, unprojected, links, best, terms, index,
         covariance, residual,
@@ -180,18 +180,19 @@ def _round(
 def _named_refit(last: _Round) -> _Round:
     """Return a round whose named terms are refitted alone, unnamed functions left in the set."""
     state = replace(last.state, kept=last.counted, noise=last.whitened_by)
-    alone, found = _named_alone(last.near, last.found, last.state.observation)
+    alone, best = _named_alone(last.near, last.best, last.state.observation)
     while True:
         state, terms, index, covariance, residual = refit(state, last.space, alone, last.links)
         last = replace(
-            last, state=state, found=found, terms=terms, index=index, covariance=covariance,
+            last, state=state, best=best, terms=terms, index=index, covariance=covariance,
             residual=residual,
         )  # fmt: skip
-        weakest = last.weakest(NOTHING)
+        weakest = last.weakest(NO_WORTH)
         if weakest is None:
             return last
-        alone, found = (
-            fit(last.near, [c for c in own.chosen if c != index[weakest]]) for own in (alone, found)
+        alone, best = (
+            fit(last.near, [c for c in fitted.chosen if c != index[weakest]])
+            for fitted in (alone, best)
         )
 
 
@@ -212,20 +213,20 @@ def _beyond_loads(
     ]
     if not loads:
         return smooth
-    U, found = basis_of(np.hstack(loads)), []
+    U, remaining = basis_of(np.hstack(loads)), []
     for c, own in smooth:
         if c.of_no_quantity:
             X = basis_of(own.reshape(len(U), -1))
-            _, left, V = np.linalg.svd(projected_out(U, X), full_matrices=False)
-            unknown = left**2 > 1 - HELD_WHOLLY
+            _, share, V = np.linalg.svd(projected_out(U, X), full_matrices=False)
+            unknown = share**2 > 1 - HELD_WHOLLY
             if not unknown.any():
                 continue
             if not unknown.all():
                 rest = (X @ V[unknown].T).reshape(*own.shape[:2], -1)
-                found.append(unnamed("", c.target, rest))
+                remaining.append(unnamed("", c.target, rest))
                 continue
-        found.append((c, own))
-    return found
+        remaining.append((c, own))
+    return remaining
 
 
 def _named_candidates(
@@ -246,7 +247,7 @@ def _named_candidates(
 
 
 def _named_alone(
-    space: SampleSpace, found: CandidateFit, observation: Observation
+    space: SampleSpace, best: CandidateFit, observation: Observation
 ) -> tuple[CandidateFit, CandidateFit]:
     """Return the named part of a set, as it stands without the unnamed functions, and with them.
 
@@ -254,12 +255,12 @@ def _named_alone(
     stand where a named cause would without it: friction of the same joint. What an unknown moves
     one joint, of those that are measured one by one, says nothing of the causes at the others.
     """
-    named = [c for c in found.chosen if space.candidates[c].named]
+    named = [c for c in best.chosen if space.candidates[c].named]
     near = space
     if observation.channel in ("tracking", "torque"):
         near = by_what_is_left(space, named, observation.measured.shape[1])
     alone = pruned(near, forward_selected(near, fit(near, named), named_only=True)).chosen
-    rest = (c for c in found.chosen if c not in named)
+    rest = (c for c in best.chosen if c not in named)
     return fit(space, alone), fit(space, (*alone, *rest))
 
 
@@ -309,9 +310,9 @@ def _bounded(candidate: Candidate, model: Model, observation: Observation) -> Ca
     if not (kind or curved):
         return candidate
     axial, radial = model.compliance()
-    own = radial if kind == "radial" else axial
+    compliance = radial if kind == "radial" else axial
     assert candidate.site.joint is not None
-    lower = -float(own[candidate.site.joint - 1])
+    lower = -float(compliance[candidate.site.joint - 1])
     bounded = replace(candidate.parameters[0], lower=lower)
     return replace(candidate, parameters=(bounded, *candidate.parameters[1:]))
 

@@ -53,8 +53,8 @@ def screened_search(
     keep = screened(space, base)
     place = {int(c): i for i, c in enumerate(keep)}
     near = beside(part(space, keep))
-    found = with_fewest_families(near, search(near, depth, [place[c] for c in base]))
-    return replace(found, chosen=tuple(int(keep[c]) for c in found.chosen))
+    best = with_fewest_families(near, search(near, depth, [place[c] for c in base]))
+    return replace(best, chosen=tuple(int(keep[c]) for c in best.chosen))
 
 
 def search(space: SampleSpace, depth: int = DEPTH, base: Sequence[int] = ()) -> CandidateFit:
@@ -84,24 +84,24 @@ def _deep_search(space: SampleSpace, base: Sequence[int]) -> CandidateFit:
     Terms are added one by one and dropped again where later ones make them needless; an unnamed
     function joins at the end, where one still pays.
     """
-    found = beam_search(space, DEEP, beam=1, named_only=True)[0]
-    found = pruned(space, found)
+    best = beam_search(space, DEEP, beam=1, named_only=True)[0]
+    best = pruned(space, best)
     if base:
         again = forward_selected(space, pruned(space, fit(space, tuple(base))), named_only=True)
-        found = min([found, pruned(space, again)], key=lambda f: f.score)
-    beside = [fit(space, (*found.chosen, c)) for _, c in joining(space, found.chosen, 4)]
-    nearest = min([found, *beside], key=lambda f: f.score)
-    if nearest.score < found.score:  # no named cause goes for an unknown beside them; one that was
+        best = min([best, pruned(space, again)], key=lambda f: f.score)
+    beside = [fit(space, (*best.chosen, c)) for _, c in joining(space, best.chosen, 4)]
+    nearest = min([best, *beside], key=lambda f: f.score)
+    if nearest.score < best.score:  # no named cause goes for an unknown beside them; one that was
         return forward_selected(space, nearest, named_only=True)  # small beside what it took joins
-    return min([found, *joined_sets(space, found)], key=lambda f: f.score)
+    return min([best, *joined_sets(space, best)], key=lambda f: f.score)
 
 
 def by_what_is_left(space: SampleSpace, chosen: Sequence[int], k: int) -> SampleSpace:
     """Return the space with each of its k coordinates weighed by what a set leaves of it."""
     values = np.concatenate([*fit(space, chosen).values, np.zeros(0)])
-    left = (space.y - space.columns(chosen) @ values).reshape(-1, k)
-    size = np.maximum(np.sqrt(np.mean(left**2, axis=0)), 1.0)
-    weight = np.tile(1 / size, len(left))
+    residual = (space.y - space.columns(chosen) @ values).reshape(-1, k)
+    size = np.maximum(np.sqrt(np.mean(residual**2, axis=0)), 1.0)
+    weight = np.tile(1 / size, len(residual))
     return replace(space, y=space.y * weight, X=space.X * weight[:, None])
 
 
@@ -117,8 +117,8 @@ def screened(space: SampleSpace, base: Sequence[int] = ()) -> NDArray[np.int64]:
     single = space.columns(sorted(keep))
     unit = single / (np.sqrt(np.einsum("ij,ij->j", single, single)) + 1e-300)
     ridge = unit.T @ unit + 1e-2 * np.eye(unit.shape[1])
-    left = space.y - unit @ np.linalg.solve(ridge, unit.T @ space.y)
-    targets = [space.y, left]
+    residual = space.y - unit @ np.linalg.solve(ridge, unit.T @ space.y)
+    targets = [space.y, residual]
     if base:
         state = projected(space, base)
         targets.append(state.r)

@@ -41,7 +41,7 @@ class Selection:
 
     observation: Observation  # frame as finally estimated
     space: SampleSpace  # columns at the final model; kept samples only
-    found: CandidateFit  # without the links, where their geometry as a whole is a cause
+    best: CandidateFit  # without the links, where their geometry as a whole is a cause
     terms: tuple[Term, ...]  # the named part, refitted exactly
     term_index: tuple[int, ...]  # candidate index of each term
     covariance: tuple[Array, ...]  # per term (d, d) of its fitted parameters
@@ -96,7 +96,7 @@ class Selection:
 
     @cached_property
     def working(self) -> SampleSpace:
-        """Return the space in which ``found`` won: beside the links, where they are a cause."""
+        """Return the space in which ``best`` won: beside the links, where they are a cause."""
         return self.space if self.links is None else self.links.beside(self.space, self.block)
 
     def rows_of(self, columns: Array) -> Array:
@@ -142,7 +142,7 @@ class Selection:
         Where all others are of one size, a number several times as large is no machining: it
         stands by itself, and has to be as sure as what is accused by itself.
         """
-        found = {}
+        doubtful = {}
         for p in positions:
             c = self.term_index[p]
             if c in self.prior and self.observation.channel == "position":
@@ -150,8 +150,8 @@ class Selection:
                 unsure = size < SIGMAS * np.sqrt(np.diag(self.covariance[p]))
                 far = (size > OWN_SIGMAS * self.prior[c]) & unsure
                 if far.any():
-                    found[c] = far
-        return found
+                    doubtful[c] = far
+        return doubtful
 
     def with_nominal(self, numbers: Mapping[int, Mask]) -> Selection:
         """Return the selection with further numbers of the links (d,) held nominal."""
@@ -163,7 +163,7 @@ class Selection:
         """Return the selection with the links' geometry no cause, the rest as it is."""
         index = [p for p, c in enumerate(self.term_index) if c not in self.block]
         return replace(
-            self, prior={}, found=fit(self.space, self.found.chosen),
+            self, prior={}, best=fit(self.space, self.best.chosen),
             terms=tuple(self.terms[p] for p in index),
             term_index=tuple(self.term_index[p] for p in index),
             covariance=tuple(self.covariance[p] for p in index),
@@ -177,14 +177,14 @@ class Selection:
         space, block = self.space, link_candidates(self.space)
         if len(block) < 2:
             return None
-        chosen = [c for c in self.found.chosen if c not in block]
+        chosen = [c for c in self.best.chosen if c not in block]
         sigma = prior(space, block, chosen)
         near = links_of(space, sigma).beside(space, block)
-        found = pruned(near, fit(near, chosen))
+        best = pruned(near, fit(near, chosen))
         state = SelectionState(self.observation, arm, [], self.noise, self.kept)
-        state, terms, index, covariance, residual = refit(state, space, found, sigma)
+        state, terms, index, covariance, residual = refit(state, space, best, sigma)
         return replace(
-            self, observation=state.observation, prior=sigma, found=found, terms=terms,
+            self, observation=state.observation, prior=sigma, best=best, terms=terms,
             term_index=index, covariance=covariance, residual=residual,
         )  # fmt: skip
 
@@ -193,7 +193,7 @@ class Selection:
         """Return the number of fitted unknowns, nuisance included; of the links what they use."""
         links = 0.0 if self.links is None else self.links.used
         return (
-            float(self.unprojected.nuisance.shape[1] + sum(len(v) for v in self.found.values))
+            float(self.unprojected.nuisance.shape[1] + sum(len(v) for v in self.best.values))
             + links
         )
 
@@ -227,12 +227,12 @@ def refitted_alone(
     alone = fit(space, [c for c in chosen if c not in links])
     state, fitted, index, spread, residual = refit(state, selection.space, alone, links, remainder)
     terms, covariance = list(selection.terms), list(selection.covariance)
-    for c, term, own in zip(index, fitted, spread, strict=True):
+    for c, term, term_covariance in zip(index, fitted, spread, strict=True):
         position = selection.term_index.index(c)
         if (nominal := selection.held.get(c)) is not None:
             term = term.with_values(np.where(nominal, 0.0, term.values))
-            own = own * ~(nominal | nominal[:, None])
-        terms[position], covariance[position] = term, own
+            term_covariance = term_covariance * ~(nominal | nominal[:, None])
+        terms[position], covariance[position] = term, term_covariance
     return replace(
         selection, observation=state.observation, terms=tuple(terms),
         covariance=tuple(covariance), residual=residual,

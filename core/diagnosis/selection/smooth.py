@@ -28,7 +28,7 @@ STEPS = 23  # moments at which something may have jumped
 
 def smooth_candidates(observation: Observation) -> list[Pair]:
     """Return the smooth candidates of an observation with their columns (N, k, d)."""
-    found: list[Pair] = []
+    pairs: list[Pair] = []
     moved = targets(observation)
     for name, z in observation.quantities.items():
         shapes = [linear_basis(z)]
@@ -39,16 +39,16 @@ def smooth_candidates(observation: Observation) -> list[Pair]:
             carries = target == carrying(name)
             for shape in shapes:
                 full = np.hstack([np.ones((len(z), 1)), shape]) if own or carries else shape
-                found.append(_spread(name, target, directions, full))
+                pairs.append(_spread(name, target, directions, full))
             if own:
-                found += _bumps(name, target, z, directions)
+                pairs += _bumps(name, target, z, directions)
         if name == "timestamp":
-            found += _steps(name, z, moved)
-        found += _frictions(name, z, observation)
-    found += _springs(observation)
+            pairs += _steps(name, z, moved)
+        pairs += _frictions(name, z, observation)
+    pairs += _springs(observation)
     for target, columns in observation.unnamed():
-        found.append(unnamed("", target, columns))
-    return found
+        pairs.append(unnamed("", target, columns))
+    return pairs
 
 
 def _springs(observation: Observation) -> list[Pair]:
@@ -67,7 +67,7 @@ def _frictions(name: str, z: Array, observation: Observation) -> list[Pair]:
     """Return friction that changes with time, load, or the joint's own warmth or slowness."""
     if observation.friction is None:
         return []
-    found = []
+    pairs = []
     stem, _, index = name.rpartition("_")
     for j in range(observation.friction.shape[1]):
         shapes = []
@@ -78,8 +78,8 @@ def _frictions(name: str, z: Array, observation: Observation) -> list[Pair]:
             shapes = [np.exp(-slow / share)[:, None] for share in SLOW]
         columns = np.zeros((*observation.friction.shape, 1))
         columns[:, j, 0] = observation.friction[:, j]
-        found += [_spread(name, f"friction_{j + 1}", columns, shape) for shape in shapes]
-    return found
+        pairs += [_spread(name, f"friction_{j + 1}", columns, shape) for shape in shapes]
+    return pairs
 
 
 def targets(observation: Observation) -> dict[str, Array]:
@@ -89,20 +89,20 @@ def targets(observation: Observation) -> dict[str, Array]:
     if J is None:
         return {axis: np.tile(np.eye(k)[:, i : i + 1], (N, 1, 1))
                 for i, axis in enumerate(observation.axes)}  # fmt: skip
-    found = {joint_target(i + 1): J[:, :, i : i + 1] for i in range(J.shape[2])}
+    directions = {joint_target(i + 1): J[:, :, i : i + 1] for i in range(J.shape[2])}
     if observation.channel != "position":  # each coordinate is a joint
-        return found
+        return directions
     shift = np.zeros((N, k, 3))
     shift[:, :3] = np.eye(3)
-    found["position"] = shift
+    directions["position"] = shift
     scale = np.zeros((N, k, 1))
     scale[:, :3, 0] = observation.measured[:, :3]
-    found["scale"] = scale
+    directions["scale"] = scale
     if observation.tool_axes is not None:
         tool = np.zeros((N, k, 3))
         tool[:, :3] = observation.tool_axes
-        found["tool"] = tool
-    return found
+        directions["tool"] = tool
+    return directions
 
 
 def _spread(quantity: str, target: str, directions: Array, shape: Array) -> Pair:
@@ -119,23 +119,23 @@ def unnamed(quantity: str, target: str, columns: Array) -> Pair:
 
 
 def _bumps(name: str, target: str, z: Array, directions: Array) -> list[Pair]:
-    found = []
+    pairs = []
     low, high = float(z.min()), float(z.max())
     for width in ((high - low) / BUMPS, (high - low) / (2.5 * BUMPS), 2.4 * (high - low) / BUMPS):
         for centre in np.arange(low, high, width):
             bump = np.exp(-0.5 * ((z - centre) / width) ** 2)
             if (bump > 0.3).sum() >= 2:
-                found.append(_spread(name, target, directions, bump[:, None]))
-    return found
+                pairs.append(_spread(name, target, directions, bump[:, None]))
+    return pairs
 
 
 def _steps(name: str, z: Array, targets: dict[str, Array]) -> list[Pair]:
-    found = []
+    pairs = []
     for quantile in np.linspace(0.06, 0.94, STEPS):
         after = (z > np.quantile(z, quantile)).astype(float)[:, None]
         if 2 <= after.sum() <= len(z) - 2:
-            found += [_spread(name, target, d, after) for target, d in targets.items()]
-    return found
+            pairs += [_spread(name, target, d, after) for target, d in targets.items()]
+    return pairs
 
 
 def linear_basis(z: Array) -> Array:

@@ -80,7 +80,7 @@ def sample_space(
     gap = (observation.measured - observation.predict(() if chords else base))[..., None]
     # what the terms already in the model explain is put back, in the linear form at hand
     for term in () if chords else base:
-        c, x = locate(state.candidates, term)
+        c, x = candidate_of(state.candidates, term)
         gap = gap + columns[c] @ x[:, None]
     target = flat(gap, state)[:, 0]
     nuisance = flat(observation.nuisance, state)
@@ -125,7 +125,7 @@ def _tie_penalty(candidate: Candidate, observation: Observation) -> float:
     return 0.0 if reversed_ else NO_REVERSAL_PENALTY
 
 
-def locate(candidates: list[Candidate], term: Term) -> tuple[int, Array]:
+def candidate_of(candidates: list[Candidate], term: Term) -> tuple[int, Array]:
     """Return the candidate of a term, and the term's fitted values."""
     for c, candidate in enumerate(candidates):
         if candidate.family == term.effect and candidate.site == term.site:

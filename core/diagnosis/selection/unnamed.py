@@ -41,7 +41,7 @@ def unnamed_rivals(model: Model, q: Array, loads: Loads, k: int) -> tuple[tuple[
 def _compliance_rivals(model: Model, q: Array, loads: Loads, k: int) -> list[tuple[str, Array]]:
     chain, rows = model.chain(), model.rows(q, loads)
     step = 1e-2 * 1e-3 / typical_moment(model.arm)
-    found = []
+    rivals = []
     for i in range(model.arm.n + 1):
         columns = np.zeros((len(q), k, 2))
         for axis in range(2):  # about z it would only blur the catalogue's own stiffness
@@ -55,8 +55,8 @@ def _compliance_rivals(model: Model, q: Array, loads: Loads, k: int) -> list[tup
                 changed = chain._replace(compliance=bent, base_compliance=tilted)
                 ends.append(_poses(changed, rows))
             columns[:, :, axis] = _change(ends, 2 * step, k)
-        found.append((f"joint_{i}" if i else "base", columns))
-    return found
+        rivals.append((f"joint_{i}" if i else "base", columns))
+    return rivals
 
 
 def _links(model: Model, q: Array, loads: Loads, k: int) -> list[tuple[str, Array]]:
@@ -65,7 +65,7 @@ def _links(model: Model, q: Array, loads: Loads, k: int) -> list[tuple[str, Arra
     frames = frames_of(model.chain(), q, still, still)
     tip = model.predict(q, loads).position
     form = model.linear_form(q, loads)
-    found = []
+    rivals = []
     for i in range(model.arm.n - 1):
         near, far = frames.origin[:, i], frames.origin[:, i + 1]
         along = far - near
@@ -73,16 +73,16 @@ def _links(model: Model, q: Array, loads: Loads, k: int) -> list[tuple[str, Arra
         if float(length.min()) < SHORTEST:
             continue
         along = along / length
-        at = (near, (near + far) / 2, far)
+        hinges = (near, (near + far) / 2, far)
         moments = [form.moment[:, i], form.moment[:, i + 1]]
         moments.insert(1, (moments[0] + moments[1]) / 2)
         columns = np.zeros((len(q), 6, 3))
-        for hinge, (place, moment) in enumerate(zip(at, moments, strict=True)):
+        for hinge, (place, moment) in enumerate(zip(hinges, moments, strict=True)):
             turn = moment - along * np.sum(along * moment, axis=1, keepdims=True)
             columns[:, :3, hinge] = np.cross(turn, tip - place)
             columns[:, 3:, hinge] = turn
-        found.append((f"link_{i + 1}", columns[:, :k]))
-    return found
+        rivals.append((f"link_{i + 1}", columns[:, :k]))
+    return rivals
 
 
 def _pulls(model: Model, q: Array, loads: Loads, k: int) -> list[tuple[str, Array]]:
@@ -121,10 +121,10 @@ def unnamed_pulls(model: Model, motion: Motion, channel: str) -> tuple[tuple[str
         pieces = pieces_of(model, pulled)
         columns.append(pieces.external_torque if channel == "torque" else pieces.external_wrench)
     in_base = np.stack(columns, axis=2)
-    found = [("load", _loads_anywhere(model, motion, channel)), ("pull", in_base)]
+    rivals = [("load", _loads_anywhere(model, motion, channel)), ("pull", in_base)]
     if channel == "torque":
-        found.append(("tool pull", in_base @ model.rigid_pose(motion.q).rotation))
-    return tuple(found)
+        rivals.append(("tool pull", in_base @ model.rigid_pose(motion.q).rotation))
+    return tuple(rivals)
 
 
 def _loads_anywhere(model: Model, motion: Motion, channel: str) -> Array:

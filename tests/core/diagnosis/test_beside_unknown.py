@@ -207,9 +207,9 @@ def test_a_tool_point_goes_with_the_links_where_it_helps_elsewhere(monkeypatch):
 def test_links_are_sized_anew_beside_what_stays(links):
     whole, _ = fallen(links)
     wrong = replace(whole, prior={c: 8 * own for c, own in whole.prior.items()})
-    sized = wrong.sized_beside(whole.found.chosen)
+    sized = wrong.sized_beside(whole.best.chosen)
     assert all(np.array_equal(sized.prior[c], own) for c, own in whole.prior.items())
-    assert whole.sized_beside(whole.found.chosen) is whole
+    assert whole.sized_beside(whole.best.chosen) is whole
 
 
 @pytest.mark.parametrize(

@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import small_arm as small
 
-from gapbridge.core.diagnosis.generalisation import regions
+from gapbridge.core.diagnosis.generalisation import held_out_regions
 
 
 def test_regions_are_left_out_whole_and_hold_no_neighbour() -> None:
     observation = small.diagnosed("none").channels[0].selection.observation
     kept = np.ones(len(observation.rows), dtype=bool)
-    fold, near = regions(observation, kept)
+    fold, near = held_out_regions(observation, kept)
     q = np.stack([observation.quantities[f"actual_q_{i}"] for i in range(3)], axis=1)
     assert sorted(set(fold)) == [0, 1, 2, 3, 4]
     assert not near.any()
@@ -26,7 +26,7 @@ def test_stretches_of_a_recording_have_a_gap_to_what_is_fitted() -> None:
     observation = small.diagnosed("none").channels[0].selection.observation
     moving = replace(observation, order_in_time=True)
     count = len(observation.rows)
-    fold, near = regions(moving, np.ones(count, dtype=bool))
+    fold, near = held_out_regions(moving, np.ones(count, dtype=bool))
     assert (np.diff(fold) >= 0).all()
     for f in range(5):
         judged = np.flatnonzero(fold == f)

@@ -42,7 +42,7 @@ def left_of(selection, chosen) -> np.ndarray:
 
 def test_a_sample_never_helps_to_predict_itself(selection):
     """Moving one reading moves its own held-out residual by just as much, and others' by less."""
-    chosen = selection.found.chosen
+    chosen = selection.best.chosen
     before = left_of(selection, chosen)
     for sample in range(0, len(before), 7):
         after = left_of(jolted(selection, sample), chosen)
@@ -52,7 +52,7 @@ def test_a_sample_never_helps_to_predict_itself(selection):
 
 
 def test_repeats_of_a_pose_leave_together(selection):
-    twins, chosen = paired(selection), selection.found.chosen
+    twins, chosen = paired(selection), selection.best.chosen
     before = left_of(twins, chosen)
     for sample in range(0, len(before) - 1, 6):
         mate = sample + 1 if sample % 2 == 0 else sample - 1
@@ -63,8 +63,8 @@ def test_repeats_of_a_pose_leave_together(selection):
 def test_each_sample_is_held_out_with_a_tenth_of_the_others(selection):
     before = left_of(selection, ())
     alike = [
-        int(np.sum(np.abs(left_of(jolted(selection, s), selection.found.chosen)
-                          - left_of(selection, selection.found.chosen)).max(axis=1) < 1e-9))
+        int(np.sum(np.abs(left_of(jolted(selection, s), selection.best.chosen)
+                          - left_of(selection, selection.best.chosen)).max(axis=1) < 1e-9))
         for s in range(0, len(before), 9)
     ]  # fmt: skip
     # besides itself, those of its own fold do not feel it
@@ -72,7 +72,7 @@ def test_each_sample_is_held_out_with_a_tenth_of_the_others(selection):
 
 
 def test_held_out_figures_are_those_of_a_cross_validation_by_hand(selection):
-    chosen = selection.found.chosen
+    chosen = selection.best.chosen
     held = HeldOut(selection)
     assert held.possible
     # noise-free exact linear data: nothing is left, whatever pose was out
@@ -85,7 +85,7 @@ def test_held_out_figures_are_those_of_a_cross_validation_by_hand(selection):
 
 
 def test_a_needless_cause_does_not_shrink_the_held_out_gap(selection):
-    space, chosen = selection.space, selection.found.chosen
+    space, chosen = selection.space, selection.best.chosen
     needless = next(c for c, k in enumerate(space.candidates) if k.family == "link_geometry")
     held = HeldOut(selection)
     more = held.shrink((*chosen, needless), chosen)
@@ -97,7 +97,7 @@ def test_a_needless_cause_does_not_shrink_the_held_out_gap(selection):
 
 
 def test_a_shrink_is_one_less_the_ratio_of_its_gaps_and_repeats(selection):
-    chosen = selection.found.chosen
+    chosen = selection.best.chosen
     reported, again = (HeldOut(selection).shrink(chosen, ()) for _ in range(2))
     assert reported == again
     assert reported.shrink == pytest.approx(1 - reported.gap_with / reported.gap_without)
@@ -113,7 +113,7 @@ def test_a_shrink_is_one_less_the_ratio_of_its_gaps_and_repeats(selection):
 def test_the_interval_of_a_shrink_is_that_of_poses_drawn_anew(selection, twins):
     """95 % over draws of whole conditions, done here the slow way."""
     held = HeldOut(paired(selection) if twins else selection)
-    chosen = selection.found.chosen
+    chosen = selection.best.chosen
     after, before = held.squares(chosen), held.squares(())
     count = 1 + twins
     rng, drawn = np.random.default_rng(5), []
@@ -128,7 +128,7 @@ def test_the_interval_of_a_shrink_is_that_of_poses_drawn_anew(selection, twins):
 
 def test_the_reported_figure_is_the_held_out_one():
     (channel,) = small.diagnosed("backlash").channels
-    chosen = channel.selection.found.chosen
+    chosen = channel.selection.best.chosen
     held = HeldOut(channel.selection)
     assert channel.remaining_rms_held_out == held.rms(chosen)
     assert channel.causes[0].shrink.gap_with == held.rms(chosen)
@@ -147,7 +147,7 @@ def test_two_conditions_are_needed(selection):
 
 def test_a_number_that_moves_nothing_takes_nothing_from_the_others(selection):
     """Of a link kept near nominal that the samples do not show only its prior is there."""
-    chosen = list(selection.found.chosen)
+    chosen = list(selection.best.chosen)
     dead = next(c for c in range(len(selection.space.candidates)) if c not in chosen)
     own = selection.space.column_indices([dead])
     X, taken = selection.space.X.copy(), selection.unprojected.taken.copy()

@@ -188,7 +188,7 @@ def test_repeats_show_the_noise_whatever_the_poses_are_off_by(seed, sigma, pairs
 def test_a_cause_that_is_needed_is_more_probable_than_not(effect):
     channel = channel_of(effect)
     assert 0.99 < channel.causes[0].probability <= 1
-    own = set(channel.selection.found.chosen)
+    own = set(channel.selection.best.chosen)
     assert probability(channel.selection, own) == channel.causes[0].probability
 
 
@@ -219,8 +219,7 @@ def test_what_a_log_cannot_show_reports_what_it_needs():
     assert rigid["joint_offset"].excited
     channel = channel_of("none")
     held = HeldOut(channel.selection)
-    arm = small.model_of().arm
-    reported = considered_of(channel.selection, channel.judgement, held, arm, ("payload",))
+    reported = considered_of(channel.selection, channel.judgement, held, ("payload",))
     assert "payload" not in {c.effect for c in reported}
     cold = small.session_of(0)
     without = small.log_of(

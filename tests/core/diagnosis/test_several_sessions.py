@@ -171,7 +171,7 @@ def test_a_parameter_that_one_session_does_not_show_is_not_compared() -> None:
     logs = [session(small.soft(2, 4e-6), 34), session(small.soft(2, 4e-6), 35)]
     found = diagnose(MODEL, join_sessions(logs, MODEL), Metrology(sigma=small.SIGMA))
     selection = found.channels[0].selection
-    (own,) = selection.found.chosen
+    (own,) = selection.best.chosen
     rows = np.repeat(selection.observation.session[selection.kept], 3)
     X = selection.space.X.copy()
     other = own - 1 if own else own + 1
