@@ -10,7 +10,6 @@ from gapbridge.core.diagnosis.across_sessions import Carried
 from gapbridge.core.diagnosis.causes import Cause
 from gapbridge.core.diagnosis.channel_diagnosis import ChannelDiagnosis
 from gapbridge.core.diagnosis.diagnosis import Diagnosis
-from gapbridge.core.effects import CATALOGUE
 
 SCHEMA = "gapbridge.diagnosis/1"
 
@@ -117,11 +116,10 @@ def _parameters(
 
     That time is no time of any of the sessions' clocks.
     """
-    moment = CATALOGUE[cause.effect].at_moment and not diagnosis.one_clock
     found: list[dict[str, Any]] = []
     for p in cause.parameters:
         entry = {"name": p.name, "value": p.value, "std": p.std, "unit": p.unit}
-        if moment and p.name.endswith("_time"):
+        if p.is_time and not diagnosis.one_clock:
             first = diagnosis.sessions[_first_session(channel, p.value)]
             found.append({**entry, "value": None, "std": None})
             name = p.name.removesuffix("_time") + "_session"

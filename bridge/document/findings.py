@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from datetime import UTC, datetime
 
 import numpy as np
@@ -43,11 +44,14 @@ WITHDRAWN = {
 }
 
 
-def finding_text(finding: Finding, *, rows: bool = True) -> str:
-    """Return a finding as a sentence; without ``rows`` it names no lines of a file."""
+def finding_text(finding: Finding, *, rows: bool = True, title: Callable[[str], str] = str) -> str:
+    """Return a finding as a sentence; without ``rows`` it names no lines of a file.
+
+    ``title``: how a parameter or an effect is named in it.
+    """
     if isinstance(finding, LogFinding):
         return log_finding_text(finding)
-    return f"{finding.channel}: {_fact(finding.fact, rows)}"
+    return f"{finding.channel}: {_fact(finding.fact, rows, title)}"
 
 
 def withdrawal_text(reason: Withdrawal) -> str:
@@ -64,7 +68,7 @@ def considered_text(considered: Considered) -> str:
     return withdrawal_text(considered.withdrawal)
 
 
-def _fact(fact: Fact, rows: bool) -> str:
+def _fact(fact: Fact, rows: bool, title: Callable[[str], str]) -> str:
     match fact:
         case TooFewRows():
             return f"{fact.rows} usable row(s) are too few for a diagnosis"
@@ -76,11 +80,11 @@ def _fact(fact: Fact, rows: bool) -> str:
         case Outliers():
             return _outliers(fact, rows)
         case NotAccused():
-            return _not_accused(fact)
+            return _not_accused(fact, title(fact.term.effect))
         case Slip():
-            return _slip(fact)
+            return f"{title(fact.term.effect)}: {_slip(fact)}"
         case ParameterNote():
-            return _parameter(fact)
+            return f"{title(fact.name)} {_parameter(fact)}"
 
 
 def _outliers(outliers: Outliers, rows: bool) -> str:
@@ -92,11 +96,11 @@ def _outliers(outliers: Outliers, rows: bool) -> str:
     return f"{text} (row {shown}{', ...' if len(outliers.lines) > SHOWN else ''} of the file)"
 
 
-def _not_accused(found: NotAccused) -> str:
+def _not_accused(found: NotAccused, effect: str) -> str:
     term = found.term
     joint = f" of joint {term.site.joint}" if term.site.joint else ""
     rest = "; poses not fitted gain by it: a stand-in" if found.stand_in else ""
-    return f"{term.effect}{joint} is not accused: {withdrawal_text(found.reason)}{rest}"
+    return f"{effect}{joint} is not accused: {withdrawal_text(found.reason)}{rest}"
 
 
 def _slip(slip: Slip) -> str:
@@ -112,7 +116,7 @@ def _slip(slip: Slip) -> str:
         dated = slip.before // DAY != slip.after // DAY
         when = f"{clock(slip.before, dated)} and {clock(slip.after, dated)}"
     rest = "; before and after it nothing else changed" if slip.alone else ""
-    return f"{term.effect}: {what} moved by {far} between {when}{rest}"
+    return f"{what} moved by {far} between {when}{rest}"
 
 
 def clock(time: float, dated: bool = False) -> str:
@@ -126,10 +130,10 @@ def clock(time: float, dated: bool = False) -> str:
 
 def _parameter(note: ParameterNote) -> str:
     if note.state is ParameterState.ON_BOUND:
-        return f"{note.name} stands on its bound ({note.value:g} {note.unit})"
+        return f"stands on its bound ({note.value:g} {note.unit})"
     if note.state is ParameterState.HELD:
         return (
-            f"{note.name} is held nominal: it came out several times as large as its like, and not "
+            "is held nominal: it came out several times as large as its like, and not "
             "surely; something that is not named may stand behind it"
         )
-    return f"{note.name} is not identifiable from these data: others can stand in for it"
+    return "is not identifiable from these data: others can stand in for it"

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from typing import Any
 
 import numpy as np
 
@@ -101,18 +102,27 @@ TEXTS = {
 }
 
 
-def note_text(note: Note) -> str:
-    """Return a note as a sentence."""
-    return FORMATTER.vformat(TEXTS[note.reason], note.values, {})
+def note_text(note: Note, title: Callable[[str], str] = str) -> str:
+    """Return a note as a sentence; ``title``: how a parameter or an effect is named in it."""
+    values = tuple(_titled(value, title) for value in note.values)
+    return FORMATTER.vformat(TEXTS[note.reason], values, {})
 
 
-def note_texts(notes: Iterable[Note]) -> tuple[str, ...]:
-    """Return notes as sentences."""
-    return tuple(note_text(note) for note in notes)
+def note_texts(notes: Iterable[Note], title: Callable[[str], str] = str) -> tuple[str, ...]:
+    """Return notes as sentences; ``title`` as in ``note_text``."""
+    return tuple(note_text(note, title) for note in notes)
 
 
-def calibration_text(found: Calibration) -> str:
-    """Return a calibration in one sentence."""
+def _titled(value: Any, title: Callable[[str], str]) -> Any:
+    if isinstance(value, str):
+        return title(value)
+    if isinstance(value, tuple | list):
+        return tuple(_titled(v, title) for v in value)
+    return value
+
+
+def calibration_text(found: Calibration, title: Callable[[str], str] = str) -> str:
+    """Return a calibration in one sentence; ``title`` as in ``note_text``."""
     held = len(found.held_out_before.rows) > 0
     before, after = (
         (found.held_out_before, found.held_out_after) if held else (found.before, found.after)
@@ -125,7 +135,9 @@ def calibration_text(found: Calibration) -> str:
     )
     if np.isfinite(found.noise_floor):
         text += f" (instrument and arm alone: {1e3 * found.noise_floor:.3f} mm)"
-    return f"{text}; {'' if found.complete else 'not complete: '}{note_text(found.remaining)}"
+    return (
+        f"{text}; {'' if found.complete else 'not complete: '}{note_text(found.remaining, title)}"
+    )
 
 
 def short_text(found: PayloadCalibration | ToolCalibration) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 
-from gapbridge.core.effects import CATALOGUE
+from gapbridge.core.effects import CATALOGUE, ParameterName, Reported, split_name
 
 CHANNELS = {
     "position": "Position of the tool",
@@ -102,9 +102,9 @@ def unit_of(unit: str) -> tuple[str, float]:
     return UNITS.get(unit, (unit, 1.0))
 
 
-def parameter_unit(name: str, unit: str) -> tuple[str, float]:
-    """Return the unit in which a parameter (by its public name) is shown, and its factor."""
-    return ("deg", 180 / math.pi) if name.endswith("_phase") else unit_of(unit)
+def parameter_unit(parameter: Reported) -> tuple[str, float]:
+    """Return the unit in which a parameter is shown, and its factor."""
+    return ("deg", 180 / math.pi) if parameter.part == "phase" else unit_of(parameter.unit)
 
 
 def fixed(value: float, decimals: int) -> str:
@@ -177,50 +177,32 @@ def joint_list(joints: tuple[int, ...]) -> str:
     return f"joint{'s' if len(joints) > 1 else ''} {listed([str(j) for j in joints])}"
 
 
-def patterns() -> dict[str, str]:
-    """Return how parameters are named in words, by the beginning of their public name."""
-    templates = {name: e.label_template for name, e in CATALOGUE.items()}
-    return {name: text for name, text in templates.items() if text} | OF_SESSIONS
-
-
-def effect_of(name: str) -> str:
-    """Return the effect that a parameter's public name begins with; empty for none."""
-    return max((e for e in (*CATALOGUE, *OF_SESSIONS) if name.startswith(e)), key=len, default="")
-
-
 def parameter_title(name: str) -> str:
-    """Return a parameter's public name in words; the name itself where there are none."""
-    effect = effect_of(name)
-    if name == effect and effect in CATALOGUE and "{" in patterns().get(effect, "{"):
-        return effect_title(effect)
-    match = re.fullmatch(r"(?:_(\d+))?(?:_(.+))?", name.removeprefix(effect))
-    if not effect or match is None:
+    """Return the public name of a parameter or an effect in words; any other text as it is."""
+    parts = split_name(name, OF_SESSIONS)
+    if parts is None:
         return name
-    joint, rest = match[1] or "", match[2] or ""
-    part = PARTS.get(rest, re.sub(r"^order(\S+?)_", r"\1 a turn, ", rest).replace("_", " "))
-    pattern = patterns().get(effect)
-    if pattern is None:
-        where = f", joint {joint}" if joint else ""
-        return f"{effect_title(effect)}{where}{', ' + part if part else ''}"
-    return pattern.format(joint=joint, part=part).replace(" ()", "").strip()
+    effect = CATALOGUE.get(parts.effect)
+    pattern = OF_SESSIONS.get(parts.effect) or (effect.label_template if effect else "")
+    if effect and name == parts.effect and (not pattern or "{" in pattern):
+        return effect_title(name)
+    joint, part = "" if parts.joint is None else str(parts.joint), _part_title(parts)
+    if not pattern:
+        pattern = "{effect}" + ", joint {joint}" * bool(joint) + ", {part}" * bool(part)
+    text = pattern.format(effect=effect_title(parts.effect), joint=joint, part=part)
+    return text.replace(" ()", "").strip()
 
 
-def with_titles(text: str) -> str:
-    """Return a text with public names of parameters and effects in words instead."""
-    names = "|".join(sorted((*CATALOGUE, *OF_SESSIONS), key=len, reverse=True))
-    return re.sub(rf"\b(?:{names})(?:_[A-Za-z0-9_.]*\w)?\b", _as_title, text)
+def _part_title(name: ParameterName) -> str:
+    order = "" if name.order is None else f"{name.order:g} a turn, "
+    return order + PARTS.get(name.part, name.part.replace("_", " "))
 
 
 def sentence(text: str) -> str:
     """Return a text that begins with a capital and ends with a full stop."""
-    text = with_titles(text).strip()
+    text = text.strip()
     end = "" if text.endswith((".", "!", "?")) else "."
     return text[:1].upper() + text[1:] + end
-
-
-def _as_title(match: re.Match[str]) -> str:
-    # words of the language are names too ("payload", "backlash"): only what has a _ is a name
-    return parameter_title(match[0]) if "_" in match[0] else match[0]
 
 
 def counted(count: int, one: str, many: str = "") -> str:

@@ -56,9 +56,9 @@ def _parameters(causes: list[Cause]) -> list[blocks.Block]:
 
 
 def _value(p: Reported) -> tuple[str, str, str]:
-    if p.name.endswith("_time"):
+    if p.is_time:
         return clock(p.value, dated=True), "between two rows of the log", ""
-    name, factor = parameter_unit(p.name, p.unit)
+    name, factor = parameter_unit(p)
     value = p.value * factor
     if p.std is None or not np.isfinite(p.std):
         return number(value), "unknown", name

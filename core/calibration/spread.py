@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.parameters import Parameters
-from gapbridge.core.effects import CATALOGUE, Term, flexibility_names
+from gapbridge.core.effects import CATALOGUE, Term, flexibility_names, split_name
 from gapbridge.core.errors import EquilibriumError, InputError
 from gapbridge.core.loads import Loads
 from gapbridge.core.model import Model, Poses
@@ -134,10 +134,10 @@ def effects_of(names: Sequence[str]) -> tuple[str, ...]:
     """Return the effects that parameters with these names belong to, each once."""
     found = []
     for name in names:
-        fitting = [e for e in CATALOGUE if name == e or name.startswith(f"{e}_")]
-        if not fitting:
+        parts = split_name(name)
+        if parts is None:
             raise InputError(f"calibration: found parameter {name!r}, expected one of an effect")
-        found.append(max(fitting, key=len))
+        found.append(parts.effect)
     return tuple(dict.fromkeys(found))
 
 

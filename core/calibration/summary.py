@@ -14,6 +14,7 @@ from gapbridge.core.calibration.problem import Problem
 from gapbridge.core.calibration.result import Estimate
 from gapbridge.core.calibration.staging import AT_ODDS
 from gapbridge.core.diagnosis.diagnosis import Diagnosis
+from gapbridge.core.effects import names_part_of
 from gapbridge.core.estimation.base_parameters import CLOSE, hardly_separated
 from gapbridge.core.notes import Note, Reason
 
@@ -111,6 +112,6 @@ def unsupported(estimates: tuple[Estimate, ...], names: tuple[str, ...]) -> tupl
         if not any(
             abs(e.value) > SIGMAS * e.std and e.shown and not e.on_bound
             for e in estimates
-            if e.name == name or e.name.startswith(f"{name}_")
+            if names_part_of(e.name, name)
         )
     )

@@ -2,9 +2,18 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 
-from gapbridge.core.effects.effect import CHANNELS, Effect, Parameter, Reported, Site, Term
+from gapbridge.core.effects.effect import (
+    CHANNELS,
+    Effect,
+    Parameter,
+    ParameterName,
+    Reported,
+    Site,
+    Term,
+)
 from gapbridge.core.effects.load.payload import Payload
 from gapbridge.core.effects.load.payload_cog import PayloadCog
 from gapbridge.core.effects.position.axial_compliance import AxialCompliance
@@ -141,11 +150,36 @@ def effect_named(identifier: str) -> Effect:
     raise InputError(f"effect: found {identifier!r}, expected one of the catalogue{hint}")
 
 
+def split_name(name: str, beside: Iterable[str] = ()) -> ParameterName | None:
+    """Return the parts of a public name (``backlash``, ``backlash_5``, ``link_geometry_3_a``).
+
+    None for what no effect's name begins. ``beside``: beginnings of other names of parameters.
+    """
+    known = (e for e in (*CATALOGUE, *beside) if f"{name}_".startswith(f"{e}_"))
+    effect = max(known, key=len, default="")
+    rest = r"(?:_(\d+))?(?:_order([\d.]+))?(?:_([\w.]+))?"
+    match = re.fullmatch(rest, name.removeprefix(effect)) if effect else None
+    if match is None:
+        return None
+    joint, order, part = match.groups()
+    return ParameterName(effect, int(joint) if joint else None, float(order) if order else None,
+                         part or "")  # fmt: skip
+
+
+def names_part_of(name: str, whole: str) -> bool:
+    """Return whether a parameter belongs to an effect, or to one at a joint (``backlash_5``)."""
+    own, asked = split_name(name), split_name(whole)
+    if own is None or asked is None:
+        return name == whole
+    return own.effect == asked.effect and asked.joint in (None, own.joint)
+
+
 __all__ = [
     "CATALOGUE",
     "CHANNELS",
     "Effect",
     "Parameter",
+    "ParameterName",
     "Reported",
     "Site",
     "Term",
@@ -156,6 +190,8 @@ __all__ = [
     "effect_named",
     "flexibility_effects",
     "flexibility_names",
+    "names_part_of",
     "settling",
+    "split_name",
     "ties_of",
 ]

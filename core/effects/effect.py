@@ -77,6 +77,18 @@ class Reported:
     value: float
     std: float | None
     unit: str
+    part: str = ""  # which of its effect's numbers it is, as in the name's end
+    is_time: bool = False  # True: a moment on the clock of the log
+
+
+@dataclass(frozen=True)
+class ParameterName:
+    """The public name of a parameter, of an effect, or of an effect at one joint, in its parts."""
+
+    effect: str
+    joint: int | None  # from 1
+    order: float | None  # cycles per turn of the joint
+    part: str
 
 
 class Effect(ABC):
@@ -201,9 +213,11 @@ class Effect(ABC):
             std = None
             if covariance is not None and k < len(covariance):  # the rest was not fitted
                 std = math.sqrt(max(covariance[k, k], 0.0)) or None
+            is_time = self.at_moment and k == len(term.values) - 1
             lines.append(
-                Reported(self.label(term.site, parameter), term.values[k], std, parameter.unit)
-            )
+                Reported(self.label(term.site, parameter), term.values[k], std, parameter.unit,
+                         parameter.name, is_time)
+            )  # fmt: skip
         return tuple(lines)
 
     def label(self, site: Site, parameter: Parameter) -> str:

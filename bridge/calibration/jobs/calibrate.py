@@ -35,6 +35,7 @@ from gapbridge.core.calibration.plan import Plan
 from gapbridge.core.calibration.result import Calibration, Errors
 from gapbridge.core.calibration.spread import Spread
 from gapbridge.core.calibration.summary import unsupported
+from gapbridge.core.effects import names_part_of
 from gapbridge.core.fitted_range import range_of
 from gapbridge.core.log.log import read_log
 
@@ -132,7 +133,7 @@ class WholeJob(Job):
         return fit, fallen
 
     def _report_declined(self, name: str, fit: SessionFit) -> None:
-        own = [e for e in fit.estimates() if e.name == name or e.name.startswith(f"{name}_")]
+        own = [e for e in fit.estimates() if names_part_of(e.name, name)]
         values = ", ".join(f"{e.name} = {parameter(e.value, e.unit)} ± {parameter(e.std, e.unit)}"
                            for e in own)  # fmt: skip
         self.prompt.warn(f"not fitted: {values} is less than three standard deviations from zero")

@@ -132,7 +132,7 @@ def _values(part: Part, one: Arm, other: Arm) -> str:
     texts = []
     for old, new in pairs:
         unit, factor = unit_of(new.unit)
-        name = _own_name(part, new) if len(pairs) > 1 else ""
+        name = new.part if len(pairs) > 1 else ""
         values = [v.value * factor for v in (old, new)]
         if not any(values):
             continue
@@ -145,12 +145,6 @@ def _values(part: Part, one: Arm, other: Arm) -> str:
 
 def _reported(term: Term | None, arm: Arm) -> tuple[Reported, ...]:
     return () if term is None else effect_named(term.effect).reported(arm, term, None)
-
-
-def _own_name(part: Part, value: Reported) -> str:
-    """Return a number's name without its effect and joint: ``a`` of ``link_geometry_3_a``."""
-    joint = "" if part.site is None or part.site.joint is None else f"_{part.site.joint}"
-    return value.name.removeprefix(f"{part.name}{joint}_")
 
 
 def _print_origin(cell: Cell) -> None:

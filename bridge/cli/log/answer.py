@@ -172,9 +172,9 @@ def _shrink(cause: Cause) -> str:
 
 
 def _parameter(parameter: Reported) -> str:
-    if parameter.name.endswith("_time"):
+    if parameter.is_time:
         return f"{parameter.name} = {clock(parameter.value, dated=True)}"
-    unit, factor = parameter_unit(parameter.name, parameter.unit)
+    unit, factor = parameter_unit(parameter)
     spread = "" if parameter.std is None else f" ± {factor * parameter.std:.2g}"
     return f"{parameter.name} = {factor * parameter.value:.5g}{spread} {unit}".rstrip()
 

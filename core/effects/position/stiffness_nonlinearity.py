@@ -74,6 +74,6 @@ class StiffnessNonlinearity(JointEffect):
             spread = [deviation[0], deviation[1] * derivative]
         base = f"{self.identifier}_{term.site.joint}"
         return (
-            Reported(f"{base}_compliance", c, spread[0], "rad/Nm"),
-            Reported(f"{base}_moment", moment, spread[1], "Nm"),
+            Reported(f"{base}_compliance", c, spread[0], "rad/Nm", "compliance"),
+            Reported(f"{base}_moment", moment, spread[1], "Nm", "moment"),
         )

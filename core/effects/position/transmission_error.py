@@ -66,6 +66,6 @@ class TransmissionError(JointEffect):
         order = float(term.site.order or 0)
         name = f"{self.identifier}_{term.site.joint}_order{order:g}"
         return (
-            Reported(f"{name}_amplitude", amplitude, spread[0], "rad"),
-            Reported(f"{name}_phase", float(np.arctan2(cosine, sine)), spread[1], "rad"),
+            Reported(f"{name}_amplitude", amplitude, spread[0], "rad", "amplitude"),
+            Reported(f"{name}_phase", float(np.arctan2(cosine, sine)), spread[1], "rad", "phase"),
         )

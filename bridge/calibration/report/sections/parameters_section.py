@@ -18,7 +18,6 @@ from gapbridge.bridge.report.labels import (
     parameter_title,
     sentence,
     unit_of,
-    with_titles,
 )
 from gapbridge.bridge.report.material import chosen_channel
 from gapbridge.core.calibration.result import Estimate
@@ -41,7 +40,7 @@ def parameters(material: Material) -> list[blocks.Block]:
         content.append(blocks.Paragraph(text, "note"))
     if c.combinations or hidden:
         content.append(blocks.Heading("What these readings cannot determine"))
-        items = [with_titles(note_text(note)) for note in c.combinations]
+        items = [note_text(note, parameter_title) for note in c.combinations]
         items += [
             f"{parameter_title(name)}: these readings do not show it; it stays near where it stood"
             for name in hidden
@@ -85,7 +84,9 @@ def residual(material: Material) -> list[blocks.Block]:
         else blocks.Badge("Not complete", blocks.DOUBTFUL)
     )
     main = chosen_channel(c.diagnosis)
-    content: list[blocks.Block] = [blocks.Verdict(badge, sentence(note_text(c.remaining)))]
+    content: list[blocks.Block] = [
+        blocks.Verdict(badge, sentence(note_text(c.remaining, parameter_title)))
+    ]
     if not c.missing_effects and (c.complete or c.diagnosis.verdict != "no_gap"):
         content.append(blocks.Paragraph(" ".join(sentences(main))))
     others = [ch for ch in c.diagnosis.channels if ch is not main]
@@ -93,7 +94,10 @@ def residual(material: Material) -> list[blocks.Block]:
     if c.diagnosis.findings:
         content.append(
             blocks.Bullets(
-                tuple(sentence(finding_text(f, rows=False)) for f in c.diagnosis.findings)
+                tuple(
+                    sentence(finding_text(f, rows=False, title=parameter_title))
+                    for f in c.diagnosis.findings
+                )
             )
         )
     return [*content, *([] if c.complete else _next(c.diagnosis))]

@@ -78,7 +78,7 @@ def summary(material: Material) -> list[blocks.Block]:
         )
     asked = [] if material.session.accuracy is None else [_asked(material)]
     return [
-        blocks.Verdict(badge, sentence(calibration_text(c))), *asked,
+        blocks.Verdict(badge, sentence(calibration_text(c, parameter_title))), *asked,
         blocks.Heading("What to do now"), blocks.Bullets(tuple(next_steps(material))),
         blocks.Tiles(tuple(tiles)),
         blocks.Paragraph(text, "note"),

@@ -10,7 +10,7 @@ from gapbridge.bridge.calibration.report.material import Material
 from gapbridge.bridge.document.axes import plain
 from gapbridge.bridge.document.blocks import Block, Bullets, Columns, Heading, Pairs
 from gapbridge.bridge.document.notes import note_texts
-from gapbridge.bridge.report.labels import sentence
+from gapbridge.bridge.report.labels import parameter_title, sentence
 
 KINDS = {
     "position": "position of a target on the tool, three coordinates",
@@ -32,7 +32,7 @@ def session_and_instrument(material: Material) -> list[Block]:
         ("readings", _readings_text(material)),
         ("loads", _loads_text(material)),
     ]
-    notes = note_texts((*c.notes, *(material.plan.notes if material.plan else ())))
+    notes = note_texts((*c.notes, *(material.plan.notes if material.plan else ())), parameter_title)
     return facts_blocks(facts, counts, len(c.stations), notes)
 
 

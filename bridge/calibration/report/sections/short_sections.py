@@ -16,7 +16,7 @@ from gapbridge.bridge.document import blocks
 from gapbridge.bridge.document.axes import Chart, named, scale
 from gapbridge.bridge.document.drawing import AFTER, BAD_DOT, BEFORE, Drawing
 from gapbridge.bridge.document.notes import note_texts, short_text
-from gapbridge.bridge.report.labels import fixed, sentence
+from gapbridge.bridge.report.labels import fixed, parameter_title, sentence
 from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.payload_session import PayloadCalibration
 from gapbridge.core.calibration.tool_session import ToolCalibration
@@ -116,7 +116,7 @@ def short_facts(material: ShortMaterial[F]) -> list[blocks.Block]:
     found = material.found
     what = "orientations" if isinstance(found, PayloadCalibration) else "touches"
     counts = [(what, str(len(found.residual)))]
-    return facts_blocks(material.session, counts, 1, note_texts(found.notes))
+    return facts_blocks(material.session, counts, 1, note_texts(found.notes, parameter_title))
 
 
 def payload_parameters(material: ShortMaterial[PayloadCalibration]) -> list[blocks.Block]:

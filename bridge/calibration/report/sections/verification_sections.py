@@ -78,7 +78,9 @@ def facts(material: VerificationMaterial) -> list[blocks.Block]:
     """Return the facts."""
     v = material.verification
     counts = [("readings", str(len(v.errors.rows)))]
-    return facts_blocks(material.session, counts, len(v.stations), note_texts(v.notes))
+    return facts_blocks(
+        material.session, counts, len(v.stations), note_texts(v.notes, parameter_title)
+    )
 
 
 def poses(material: VerificationMaterial) -> list[blocks.Block]:

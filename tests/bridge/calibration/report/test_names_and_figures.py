@@ -11,12 +11,14 @@ from gapbridge.bridge.calibration.report.figures import (
     load_title,
     mm,
 )
-from gapbridge.bridge.report.labels import parameter_title, sentence, with_titles
+from gapbridge.bridge.document.notes import note_text
+from gapbridge.bridge.report.labels import parameter_title, sentence
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.calibration.parameters import Parameters
 from gapbridge.core.calibration.result import Estimate
 from gapbridge.core.effects import CATALOGUE
 from gapbridge.core.model import Model
+from gapbridge.core.notes import Note, Reason
 
 
 def test_every_parameter_that_a_session_can_find_has_a_title_of_its_own():
@@ -35,9 +37,15 @@ def test_a_few_names_as_they_are_shown():
     assert parameter_title("made_up") == "made_up"
 
 
-def test_names_inside_texts_become_titles_and_common_nouns_stay():
-    text = "joint_offset_1 and link_geometry_3_d: backlash and payload stay"
-    assert with_titles(text) == "zero of joint 1 and offset d of link 3: backlash and payload stay"
+def test_reports_name_parameters_by_their_titles_and_commands_by_their_public_names():
+    note = Note(Reason.ONLY_TOGETHER, ("joint_offset_1", ("link_geometry_3_d", "backlash_2")))
+    text = "{}: these readings determine it only together with {}, {}"
+    assert note_text(note) == text.format("joint_offset_1", "link_geometry_3_d", "backlash_2")
+    titles = "zero of joint 1", "offset d of link 3", "play of joint 2"
+    assert note_text(note, parameter_title) == text.format(*titles)
+
+
+def test_a_sentence_begins_with_a_capital_and_ends_with_a_stop():
     assert sentence("the error falls") == "The error falls."
     assert sentence("Done!") == "Done!"
 
