@@ -94,12 +94,17 @@ def judge(selection: Selection, held: HeldOut) -> Judgement:
     believed = [
         c for c in selection.term_index if c not in withdrawn and c not in selection.block
     ]  # fmt: skip
-    stays, remainder = withstanding(selection, believed)
-    while varying := not_constant(selection, stays, remainder.columns):
+    stays, remainder, closing = withstanding(selection, believed)
+    varying = not_constant(selection, stays, remainder.columns)
+    while closing & varying.keys():  # what closed the gap varies: another may do it in its place
         withdrawn |= {c: Withdrawal(Check.CONSTANT, by) for c, by in varying.items()}
         believed = [c for c in believed if c not in varying]
-        stays, remainder = withstanding(selection, believed)
+        stays, remainder, closing = withstanding(selection, believed)
+        varying = not_constant(selection, stays, remainder.columns)
     withdrawn |= {c: BESIDE for c in believed if c not in stays}
+    for c, quantity in varying.items():
+        withdrawn[c] = Withdrawal(Check.CONSTANT, quantity)
+        stays.remove(c)
     for c in _without_companion(selection, stays):
         withdrawn[c] = Withdrawal(Check.COMPANION)
         stays.remove(c)

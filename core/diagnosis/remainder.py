@@ -43,8 +43,12 @@ from gapbridge.core.estimation.held_out import jackknife
 from gapbridge.core.estimation.least_squares import basis_of, projected_out, sigmas_square, solve
 
 
-def withstanding(selection: Selection, believed: Sequence[int]) -> tuple[list[int], Remainder]:
+def withstanding(
+    selection: Selection, believed: Sequence[int]
+) -> tuple[list[int], Remainder, set[int]]:
     """Return the candidates, of those believed, that withstand, and the unnamed beside them.
+
+    Third: which of them stay because it takes them to close the gap.
 
     Where all links are a cause the tool's point is one more number of the same geometry: hardly
     ever sure beside unnamed functions, it is judged by what it does in regions that its fit did not
@@ -73,7 +77,7 @@ def withstanding(selection: Selection, believed: Sequence[int]) -> tuple[list[in
             remainder = _Beside(selection)
     if point and not _gains(selection, [c for c in accused if c not in point], point):
         accused = [c for c in accused if c not in point]
-    return accused, remainder.beside_refit(accused)
+    return accused, remainder.beside_refit(accused), closing.needed & set(accused)
 
 
 def links_withstand(selection: Selection) -> bool:

@@ -197,10 +197,10 @@ def test_a_tool_point_goes_with_the_links_where_it_helps_elsewhere(monkeypatch):
     monkeypatch.setattr(remainder._Beside, "strengths", strengths)
     monkeypatch.setattr(remainder._Closing, "takes", lambda *_: False)  # by their strengths alone
     zero = [c for c, k in enumerate(own) if k.family == "backlash"][:1]
-    stays, _ = withstanding(whole, [*point, *lines, *zero])
+    stays, *_ = withstanding(whole, [*point, *lines, *zero])
     assert asked[1] > {*point}  # the others are judged with the point, not with its gap
     assert {*stays} >= {*point}
-    found, _ = withstanding(replace(whole, prior={}), point)
+    found, *_ = withstanding(replace(whole, prior={}), point)
     assert found == []  # no links are a cause
 
 
