@@ -13,13 +13,12 @@ from rich.table import Table
 from benchmarks.real.judging import Outcome, Program, judge_carried, judge_log
 from benchmarks.real.sets import CARRIED, SPLIT
 
-OWN = Path("../shared/data")
 SCALE = {"m": (1e3, "mm"), "rad": (1e3, "mrad"), "N": (1.0, "N"), "Nm": (1.0, "Nm")}
 
 
 @click.command()
 @click.option("--data", "folders", multiple=True, type=click.Path(path_type=Path),
-              default=(OWN,), show_default=True,
+              required=True,
               help="Folder of logs, one folder each; may be given several times.")  # fmt: skip
 @click.option("--only", "names", default=None, help="Logs by name, by commas.")
 @click.option("--split", type=click.Choice(["tune", "held back"]), default=None,

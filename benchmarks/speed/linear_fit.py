@@ -68,7 +68,7 @@ def _views(model: Model, q: Array, loads: Loads) -> Callable[[slice], Rows]:
 
     return lambda part: Rows(
         view(q, plain.q, part),
-        plain.growth,
+        plain.link_scale,
         view(loads.payload_mass, plain.payload_mass, part),
         view(loads.payload_cog, plain.payload_cog, part),
         view(loads.wrench, plain.wrench, part),

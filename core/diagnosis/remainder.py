@@ -121,7 +121,8 @@ class _Closing:
         self._block, self._candidates = selection.block, selection.space.candidates
         self._part = parts(selection.observation, selection.kept)
         self._held = HeldOut(selection, parts=self._part)
-        self._closes = self._held.possible  # until accusations are found that do not
+        # of poses: a weight's and a gain's trace in one attitude is the same in every part
+        self._closes = selection.observation.channel == "position" and self._held.possible
 
     def takes(self, accused: Sequence[int], out: Iterable[int]) -> bool:
         """Return whether closing the gap takes one of ``out``, which is then among the needed."""

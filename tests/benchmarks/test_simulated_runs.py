@@ -241,7 +241,7 @@ def _takes_old_states(patch: Patch) -> None:
 
     patch.setattr(StateReader, "read", again)
     patch.setattr(ControllerClock, "expiry", lambda *_: math.inf)
-    patch.setattr(LinkMonitor, "believe", lambda *_: True)
+    patch.setattr(LinkMonitor, "accept", lambda *_: True)
     patch.setattr(OffsetWriter, "unanswered_since", lambda _: math.inf)
 
 

@@ -140,12 +140,12 @@ def test_a_loop_that_was_killed_is_shown_with_time_and_cause_until_the_next_one_
         shown = "c => document.querySelector('#why').textContent.includes(c)"
         page.wait_for_function(shown, arg="because: the loop's process was ended by SIGKILL")
         since = page.locator("#why").inner_text().split(" (")[0]
-        feed.page.enter(Phase.STARTING)
+        feed.memory.enter(Phase.STARTING)
         feed.emit(kind="failure", detail="could not connect to 127.0.0.2: refused")
         page.wait_for_function(shown, arg="could not connect to 127.0.0.2: refused")
         assert page.locator("#why").inner_text().split(" (")[0] == since
         assert "starting" not in page.locator("#meaning").inner_text()
-        feed.page.enter(Phase.RUNNING)
+        feed.memory.enter(Phase.RUNNING)
         feed.change(State.OBSERVING, "connected")
         page.wait_for_selector('body[data-state="observing"]')
 

@@ -14,7 +14,7 @@ PARTS = np.repeat(np.arange(4), 5)
 def closing(monkeypatch):
     """Return a maker of a closing by the share (4,) of the gap that sets of candidates leave."""
 
-    def made(shares, periodic=()):
+    def made(shares, periodic=(), channel="position"):
         def squares(chosen):
             return np.asarray(shares.get(frozenset(chosen), np.ones(4)))[PARTS] ** 2
 
@@ -23,7 +23,9 @@ def closing(monkeypatch):
         monkeypatch.setattr(remainder, "parts", lambda observation, kept: PARTS)
         candidates = [SimpleNamespace(periodic=c in periodic) for c in range(4)]
         space = SimpleNamespace(candidates=candidates)
-        selection = SimpleNamespace(block=(), space=space, observation=None, kept=None)
+        selection = SimpleNamespace(
+            block=(), space=space, observation=SimpleNamespace(channel=channel), kept=None
+        )
         return remainder._Closing(selection)
 
     return made
@@ -56,3 +58,7 @@ def test_a_periodic_line_is_not_needed(closing):
     line = closing({frozenset({0, 1}): np.full(4, 0.1)}, periodic=(1,))
     assert not line.takes([0, 1], [1])
     assert line.takes([0, 1], [0])
+
+
+def test_of_other_channels_than_position_nothing_is_needed(closing):
+    assert not closing({frozenset({0}): np.full(4, 0.1)}, channel="wrench").takes([0], [0])

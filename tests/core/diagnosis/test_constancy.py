@@ -102,7 +102,7 @@ def test_less_than_a_period_is_no_line_beside_the_unknown(beside):
     unnamed = next(c for c, k in enumerate(space.candidates) if k.quantity == "timestamp")
     chosen = [slow, line_in(selection), *([unnamed] if beside else [])]
     found = fit(space, chosen)
-    selection = replace(selection, found=found)
+    selection = replace(selection, best=found)
     q = selection.observation.quantities["actual_q_1"]
     assert np.ptp(q) / (2 * np.pi) < 0.75
     assert (slow in bumps(selection)) is beside
@@ -130,7 +130,7 @@ def test_all_rows_judge_whether_a_line_is_one(fades, stays):
     line, space = line_in(selection), selection.space
     found = fit(space, (line,))
     selection = replace(
-        selection, found=found, term_index=(line,), covariance=(1e-12 * np.eye(2),),
+        selection, best=found, term_index=(line,), covariance=(1e-12 * np.eye(2),),
         terms=(space.candidates[line].term(found.values[0]),),
     )  # fmt: skip
     accused = Judgement((0,), True, 0.0, (), {}, ())

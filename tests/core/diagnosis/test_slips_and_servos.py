@@ -127,7 +127,7 @@ def test_a_target_that_moves_as_the_load_changes_goes_by_the_load(goes_by, other
     )  # fmt: skip
     unnamed = next(c for c, k in enumerate(candidates) if k.quantity == goes_by)
     both = replace(
-        selection, found=fit(selection.space, (slip, unnamed)), term_index=(slip,),
+        selection, best=fit(selection.space, (slip, unnamed)), term_index=(slip,),
         terms=(candidates[slip].term(np.array([1e-3, -5e-4, 2e-3])),),
         covariance=(1e-12 * np.eye(3),),
     )  # fmt: skip
