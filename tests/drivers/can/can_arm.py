@@ -40,7 +40,7 @@ class Served(NamedTuple):
 def served_arm(profile: str = "piper", **keys: object) -> Iterator[Served]:
     """Serve an arm and give a driver for it, not connected."""
     channel = f"faults{next(_channels)}"
-    given = {"foreign_quiet": 0.2, "state_timeout": 0.3, **keys}
+    given = {"foreign_quiet": 0.2, "state_timeout": 1.0, **keys}
     settings = CanSettings(profile=profile, interface="virtual", channel=channel, **given)
     controller = make_controller(*simulated_arm(MODEL.arm, seed=5), period=0.004)
     (nodes,) = make_servers(settings, "127.0.0.2", controller)

@@ -256,12 +256,12 @@ def test_a_starved_watchdog_stops_the_program(controller: SimulatedController) -
         controller.host,
         CONTROL
         + """
-c.setWatchdog(20.0)
-for _ in range(20):
+c.setWatchdog(2.0)
+for _ in range(35):
     c.kickWatchdog()
     time.sleep(0.02)
 out["fed"] = r.getRuntimeState()
-time.sleep(0.3)
+time.sleep(0.8)
 out["starved"] = r.getRuntimeState()
 out["servo"] = c.servoJ(q, 0.5, 0.5, 0.002, 0.1, 300)
 """,
