@@ -132,7 +132,7 @@ class Diagnosed:
     @property
     def verdict(self) -> str:
         """Return no_gap, explained, partly_explained or unexplained."""
-        return str(self.found.verdict)
+        return self.found.verdict.value
 
     @property
     def model(self) -> Model:

@@ -18,7 +18,7 @@ def document(diagnosis: Diagnosis) -> dict[str, Any]:
     """Return the diagnosis as JSON-ready values; a figure that cannot be had is None."""
     values: dict[str, Any] = {
         "schema": SCHEMA,
-        "verdict": diagnosis.verdict,
+        "verdict": diagnosis.verdict.value,
         "channels": [_channel(c, diagnosis) for c in diagnosis.channels],
         "not_observable": [
             {"channel": h.channel, "needs": list(h.needs)} for h in diagnosis.not_observable
@@ -47,7 +47,7 @@ def _channel(c: ChannelDiagnosis, diagnosis: Diagnosis) -> dict[str, Any]:
     return {
         "channel": c.channel,
         "unit": c.unit,
-        "verdict": c.verdict,
+        "verdict": c.verdict.value,
         "samples": c.samples,
         "gap_rms": c.gap_rms,
         "gap_max": c.gap_max,

@@ -21,6 +21,7 @@ from gapbridge.bridge.fleet.drift import (
     places,
 )
 from gapbridge.bridge.fleet.task import Outcome, by_arm, usable
+from gapbridge.core.diagnosis.channel_diagnosis import Verdict
 
 GAP = "gap_rms"
 
@@ -61,7 +62,7 @@ class Diagnosed:
     drifts: tuple[Drift, ...]
     onsets: tuple[Onset, ...]
     outliers: tuple[Outlier, ...]
-    verdicts: tuple[tuple[str, int], ...]  # verdict, sessions
+    verdicts: tuple[tuple[Verdict, int], ...]  # verdict, sessions
 
 
 def diagnosed(outcomes: Sequence[Outcome]) -> Diagnosed:
@@ -71,7 +72,7 @@ def diagnosed(outcomes: Sequence[Outcome]) -> Diagnosed:
     return Diagnosed(
         tuple(_recurrences(done)), tuple(drifts(list(_series(arms)))), tuple(_onsets(arms)),
         tuple(_outliers(done)),
-        tuple(Counter(o.result["verdict"] for o in done).most_common()),
+        tuple(Counter(Verdict(o.result["verdict"]) for o in done).most_common()),
     )  # fmt: skip
 
 

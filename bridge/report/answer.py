@@ -29,14 +29,14 @@ from gapbridge.bridge.report.labels import (
 )  # fmt: skip
 from gapbridge.bridge.report.material import Material, after, chosen_channel, shares, unexplained
 from gapbridge.core.diagnosis.causes import Cause
-from gapbridge.core.diagnosis.channel_diagnosis import ChannelDiagnosis
+from gapbridge.core.diagnosis.channel_diagnosis import ChannelDiagnosis, Verdict
 from gapbridge.core.diagnosis.diagnosis import Diagnosis
 
 KINDS = {
-    "no_gap": blocks.GOOD,
-    "explained": blocks.GOOD,
-    "partly_explained": blocks.DOUBTFUL,
-    "unexplained": blocks.BAD,
+    Verdict.NO_GAP: blocks.GOOD,
+    Verdict.EXPLAINED: blocks.GOOD,
+    Verdict.PARTLY_EXPLAINED: blocks.DOUBTFUL,
+    Verdict.UNEXPLAINED: blocks.BAD,
 }
 CAPTION = (
     "Gap per coordinate (rms) before and after the found causes are put into the model, on "
@@ -78,9 +78,9 @@ def next_steps(diagnosis: Diagnosis) -> list[str]:
             "Write the causes into a new cell with --apply NEW_CELL, then diagnose a log with "
             "other poses against that cell: its gap should be that of “after”."
         )
-    elif diagnosis.verdict == "no_gap":
+    elif diagnosis.verdict is Verdict.NO_GAP:
         steps.append("Nothing: use the cell as it is. Diagnose again after a change to the arm.")
-    if any(c.structured or c.verdict == "unexplained" for c in diagnosis.channels):
+    if any(c.structured or c.verdict is Verdict.UNEXPLAINED for c in diagnosis.channels):
         steps.append(
             "Do not compensate what no effect explains. Look at what the remaining gap depends on "
             "(“Where the gap lies”) and at the arm there: wear, a loose part, cables, the "
@@ -101,7 +101,7 @@ def sentences(channel: ChannelDiagnosis) -> list[str]:
 
 def one_line(channel: ChannelDiagnosis) -> str:
     """Return one sentence on a channel that is not the main one."""
-    if channel.verdict == "no_gap":
+    if channel.verdict is Verdict.NO_GAP:
         return f"no gap; {with_unit(channel.gap_rms, channel.unit)} is what noise makes."
     return f"{_causes(channel)} {_left(channel)}"
 
@@ -124,7 +124,7 @@ def _size(channel: ChannelDiagnosis) -> str:
     noise = "" if floor is None else f"; measurement noise makes {with_unit(floor, unit)} of it"
     if floor is not None and floor >= channel.gap_rms:
         noise = f", no more than the measurement noise of {with_unit(floor, unit)}"
-    elif channel.verdict == "no_gap":
+    elif channel.verdict is Verdict.NO_GAP:
         noise = "" if floor is None else f", and noise alone makes {with_unit(floor, unit)}"
     return (
         f"{what} {with_unit(channel.gap_rms, unit)} per {per} (rms over {channel.samples} samples, "
@@ -134,7 +134,7 @@ def _size(channel: ChannelDiagnosis) -> str:
 
 def _causes(channel: ChannelDiagnosis) -> str:
     if not channel.causes:
-        if channel.verdict == "no_gap":
+        if channel.verdict is Verdict.NO_GAP:
             return "Model and measurement agree: no effect is needed to explain the difference."
         return (
             "No known effect explains it: something is going on that is not in the catalogue, "
@@ -176,7 +176,7 @@ def _left(channel: ChannelDiagnosis) -> str:
         on = f" It depends on {listed(names)}." if names else ""
         size = with_unit(unexplained(channel), channel.unit)
         return f"{size} stays unexplained, more than noise.{on}"
-    if channel.verdict == "no_gap":
+    if channel.verdict is Verdict.NO_GAP:
         return "Nothing needs to be changed on account of this log."
     return "What remains looks like measurement noise, with no structure left in it."
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 
+from gapbridge.core.diagnosis.channel_diagnosis import Verdict
 from gapbridge.core.effects import CATALOGUE, ParameterName, Reported, split_name
 
 CHANNELS = {
@@ -14,10 +15,10 @@ CHANNELS = {
     "torque": "Joint torques",
 }
 VERDICTS = {
-    "no_gap": "No gap",
-    "explained": "Explained",
-    "partly_explained": "Partly explained",
-    "unexplained": "Not explained",
+    Verdict.NO_GAP: "No gap",
+    Verdict.EXPLAINED: "Explained",
+    Verdict.PARTLY_EXPLAINED: "Partly explained",
+    Verdict.UNEXPLAINED: "Not explained",
 }
 UNITS: dict[str, tuple[str, float]] = {
     "m": ("mm", 1e3),

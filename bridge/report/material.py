@@ -12,7 +12,7 @@ from gapbridge.bridge.document.blocks import Block, Heading
 from gapbridge.bridge.document.drawing import AFTER, BEFORE
 from gapbridge.bridge.report.labels import CHANNELS
 from gapbridge.core.arrays import Array, Index
-from gapbridge.core.diagnosis.channel_diagnosis import ChannelDiagnosis
+from gapbridge.core.diagnosis.channel_diagnosis import ChannelDiagnosis, Verdict
 from gapbridge.core.diagnosis.diagnosis import Diagnosis
 from gapbridge.core.diagnosis.held_out import HeldOut
 from gapbridge.core.log.log import Log
@@ -103,7 +103,7 @@ def chosen_channel(diagnosis: Diagnosis) -> ChannelDiagnosis:
     def excess(channel: ChannelDiagnosis) -> float:
         return channel.gap_rms / max(channel.noise_floor_rms or channel.gap_rms, 1e-300)
 
-    gaps = [c for c in diagnosis.channels if c.verdict != "no_gap"]
+    gaps = [c for c in diagnosis.channels if c.verdict is not Verdict.NO_GAP]
     return max(gaps or list(diagnosis.channels), key=excess)
 
 

@@ -23,6 +23,7 @@ from gapbridge.core.calibration.readings import Readings
 from gapbridge.core.calibration.result import Calibration, Errors, Estimate
 from gapbridge.core.calibration.staging import at_odds
 from gapbridge.core.calibration.summary import combinations, notes_of, remaining_of
+from gapbridge.core.diagnosis.channel_diagnosis import Verdict
 from gapbridge.core.diagnosis.diagnosis import Diagnosis
 from gapbridge.core.errors import ExcitationError
 from gapbridge.core.metrology import Metrology
@@ -107,7 +108,7 @@ def judged(
     errors = _errors(model, found, how, readings, rest.nuisance)
     odds = _stages_at_odds(problem, rest)
     complete = rest.converged and remainder.is_consistent and not missing
-    complete = complete and (diagnosis is None or diagnosis.verdict == "no_gap")
+    complete = complete and (diagnosis is None or diagnosis.verdict is Verdict.NO_GAP)
     remaining = remaining_of(remainder, diagnosis, complete, missing, rest.converged)
     notes = (*fit.notes, *notes_of(problem, rest, remainder, odds, estimates))
     return Calibration(

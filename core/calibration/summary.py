@@ -13,6 +13,7 @@ from gapbridge.core.calibration.parameters import Parameters
 from gapbridge.core.calibration.problem import Problem
 from gapbridge.core.calibration.result import Estimate
 from gapbridge.core.calibration.staging import AT_ODDS
+from gapbridge.core.diagnosis.channel_diagnosis import Verdict
 from gapbridge.core.diagnosis.diagnosis import Diagnosis
 from gapbridge.core.effects import names_part_of
 from gapbridge.core.estimation.base_parameters import CLOSE, hardly_separated
@@ -95,7 +96,7 @@ def remaining_of(
     left = sorted({cause.effect for c in channels for cause in c.causes})
     if left:
         return Note(Reason.EFFECTS_ACCUSED, (tuple(left),))
-    if diagnosis is not None and diagnosis.verdict != "no_gap":
+    if diagnosis is not None and diagnosis.verdict is not Verdict.NO_GAP:
         return Note(Reason.STRUCTURE)
     return Note(Reason.FAR_OFF, (float(np.sqrt(remainder.ratio)),))
 

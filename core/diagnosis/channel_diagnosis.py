@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,15 @@ from gapbridge.core.diagnosis.selection.candidate import joint_target
 from gapbridge.core.diagnosis.selection.selection import Selection
 from gapbridge.core.effects import Term
 from gapbridge.core.estimation.least_squares import basis_of
+
+
+class Verdict(StrEnum):
+    """What a diagnosis comes to, in one channel or in all; the value is the JSON's word."""
+
+    NO_GAP = "no_gap"
+    EXPLAINED = "explained"
+    PARTLY_EXPLAINED = "partly_explained"
+    UNEXPLAINED = "unexplained"
 
 
 @dataclass(frozen=True)
@@ -48,7 +58,7 @@ class ChannelDiagnosis:
     structured: bool
     p_value: float | None
     depends_on: tuple[tuple[str, float], ...]
-    verdict: str
+    verdict: Verdict
     selection: Selection = field(repr=False)  # of a long recording that of its excerpt
     judgement: Judgement = field(repr=False)
     gap: Array = field(repr=False)  # (N, k) measured - predicted, frame fitted

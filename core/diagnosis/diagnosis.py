@@ -13,7 +13,7 @@ from threadpoolctl import threadpool_limits
 from gapbridge.core.arrays import Array
 from gapbridge.core.diagnosis.across_sessions import carried
 from gapbridge.core.diagnosis.causes import Cause, Considered, causes_of, considered_of
-from gapbridge.core.diagnosis.channel_diagnosis import ChannelDiagnosis, Where, locate
+from gapbridge.core.diagnosis.channel_diagnosis import ChannelDiagnosis, Verdict, Where, locate
 from gapbridge.core.diagnosis.channels import position, torque, tracking, wrench
 from gapbridge.core.diagnosis.channels.simulation import joined, predicted_by
 from gapbridge.core.diagnosis.criteria import MIN_CONDITIONS, MIN_FREEDOM, UNRESOLVED
@@ -87,7 +87,7 @@ MOST = {"position": 1200, "wrench": 300, "tracking": 300, "torque": 300}
 class Diagnosis:
     """What was found in a log."""
 
-    verdict: str
+    verdict: Verdict
     channels: tuple[ChannelDiagnosis, ...]
     not_observable: tuple[NotObservable, ...]
     next_measurements: tuple[Measurement, ...]
@@ -241,7 +241,7 @@ class _Searched:
     observation: Observation
     selection: Selection  # on all samples of the channel
     more: bool  # these are more than were searched
-    verdict: Judgement
+    judgement: Judgement
     # on what the rest depends in the samples that were searched, beside some of the terms
     depends: Callable[[Sequence[int]], Depends]
     where: Where
@@ -251,13 +251,13 @@ class _Searched:
 
     def without_columns(self) -> _Searched:
         """Return the same without the columns of all candidates: 50 MB that no row asks for."""
-        known = self.verdict.depends_on or self.depends(self.verdict.accused)
+        known = self.judgement.depends_on or self.depends(self.judgement.accused)
         return replace(self, depends=lambda _: known)
 
     def row_sums(self, observe: Callable[[Log], Any], model: Model) -> RowSums:
         """Return the sums over all rows of a long recording, at what was found."""
-        by_region = self.verdict.remainder is not None
-        return RowSums(self.selection, self.verdict.accused, observe, model.arm, by_region)
+        by_region = self.judgement.remainder is not None
+        return RowSums(self.selection, self.judgement.accused, observe, model.arm, by_region)
 
 
 def _log_findings(model: Model, log: Log, metrology: Metrology) -> list[LogFinding]:
@@ -319,7 +319,10 @@ def _slipped(term: Term, log: Log) -> Term:
 
 def _lacks_much(channel: ChannelDiagnosis) -> bool:
     """Return whether poses leave a gap that no cause accounts for."""
-    return channel.channel == "position" and channel.verdict in ("unexplained", "partly_explained")
+    return channel.channel == "position" and channel.verdict in (
+        Verdict.UNEXPLAINED,
+        Verdict.PARTLY_EXPLAINED,
+    )
 
 
 def _too_few(observation: Observation) -> bool:
@@ -334,20 +337,20 @@ def _searched(
 ) -> _Searched:  # fmt: skip
     """Return what a search in ``observation`` found, refitted on all samples of ``whole``."""
     searched = select(observation, model, withhold, progress)
-    searched, verdict = judge_geometry(searched, judge(searched, HeldOut(searched)), model.arm)
+    searched, judgement = judge_geometry(searched, judge(searched, HeldOut(searched)), model.arm)
     held = HeldOut(searched)
-    verdict = with_stand_ins(searched, verdict)
-    stand_ins = _stand_ins(searched, verdict, held, model)
-    searched, verdict = still_sure(searched, verdict, model.arm)
-    considered = considered_of(searched, verdict, held, withhold)
-    chosen = [searched.term_index[p] for p in verdict.accused]
+    judgement = with_stand_ins(searched, judgement)
+    stand_ins = _stand_ins(searched, judgement, held, model)
+    searched, judgement = still_sure(searched, judgement, model.arm)
+    considered = considered_of(searched, judgement, held, withhold)
+    chosen = [searched.term_index[p] for p in judgement.accused]
     where = locate(searched, gaps(searched, chosen)[0][searched.kept], chosen)
     selection = searched
     if len(whole.rows) > len(observation.rows):
         if progress:
             progress(f"{observation.channel}: all {len(whole.rows)} rows")
-        verdict = with_uncertain_terms(verdict)
-        selection = on_every_row(searched, verdict, whole, model)
+        judgement = with_uncertain_terms(judgement)
+        selection = on_every_row(searched, judgement, whole, model)
 
     def follows(accused: Sequence[int]) -> Depends:
         fitted = [searched.term_index[p] for p in accused]
@@ -355,49 +358,51 @@ def _searched(
         return tuple(dependence(searched.space, basis, fitted, searched.groups))
 
     more = selection is not searched
-    return _Searched(observation, selection, more, verdict, follows, where, considered, *stand_ins)
+    return _Searched(
+        observation, selection, more, judgement, follows, where, considered, *stand_ins
+    )
 
 
 def _decided(searched: _Searched, model: Model, streamed: Streamed | None) -> ChannelDiagnosis:
     """Return what all rows leave of what was found; ``streamed`` are those of a long recording."""
     observation, shown = searched.observation, searched.selection
-    verdict = searched.verdict
-    decided = shown if streamed is None else streamed.selection(verdict.accused)
+    judgement = searched.judgement
+    decided = shown if streamed is None else streamed.selection(judgement.accused)
     held = HeldOut(decided)
     if searched.more or streamed is not None:
-        unknown = verdict.remainder is not None
+        unknown = judgement.remainder is not None
         alone = partial(refitted, model, unknown) if streamed is None else streamed.alone
-        decided, verdict = still_accused(decided, verdict, held, alone)
+        decided, judgement = still_accused(decided, judgement, held, alone)
     if streamed is None:
         shown = decided
     else:
         shown = replace(shown, terms=decided.terms, covariance=decided.covariance)
-    chosen = [decided.term_index[p] for p in verdict.accused]
+    chosen = [decided.term_index[p] for p in judgement.accused]
     gap, remaining = gaps(shown, chosen)
     if streamed is None:
         sizes = sizes_of(shown, gap, remaining)
     else:
-        sizes = streamed_sizes(streamed, decided, verdict.accused)
-    causes = causes_of(decided, verdict, held, model.arm)
-    verdict, floor = _with_whiteness(verdict, shown, sizes.means, searched.depends)
+        sizes = streamed_sizes(streamed, decided, judgement.accused)
+    causes = causes_of(decided, judgement, held, model.arm)
+    judgement, floor = _with_whiteness(judgement, shown, sizes.means, searched.depends)
     held_rms = held.rms(chosen) if held.possible else None
     if not causes:  # nothing was fitted but the frame, before as well as after
         held_rms = sizes.gap_rms
     if sizes.remaining_rms < UNRESOLVED:
-        verdict = replace(verdict, structured=False, depends_on=())
-    structured = verdict.structured
-    named = "explained" if causes else "no_gap"
+        judgement = replace(judgement, structured=False, depends_on=())
+    structured = judgement.structured
+    verdict = Verdict.EXPLAINED if causes else Verdict.NO_GAP
     if structured:
-        named = "partly_explained" if causes else "unexplained"
+        verdict = Verdict.PARTLY_EXPLAINED if causes else Verdict.UNEXPLAINED
     per_sample = held if streamed is None else HeldOut(shown)
     return ChannelDiagnosis(
         channel=observation.channel, unit=observation.unit, samples=sizes.samples,
         gap_rms=sizes.gap_rms, gap_max=sizes.gap_max, noise_floor_rms=floor.rms,
         remaining_rms=sizes.remaining_rms, remaining_rms_held_out=held_rms,
         where=searched.where, causes=causes, considered=searched.considered,
-        unexplained_rms=_unexplained(sizes.remaining_rms, floor.rms, verdict),
-        structured=structured, p_value=verdict.p_value, depends_on=verdict.depends_on,
-        verdict=named, selection=shown, judgement=verdict, gap=gap, remaining=remaining,
+        unexplained_rms=_unexplained(sizes.remaining_rms, floor.rms, judgement),
+        structured=structured, p_value=judgement.p_value, depends_on=judgement.depends_on,
+        verdict=verdict, selection=shown, judgement=judgement, gap=gap, remaining=remaining,
         held_out=np.sqrt(per_sample.squares(chosen)) if per_sample.possible else None,
         outliers=sizes.outliers, elsewhere=generalisation(decided, chosen),
         carried=carried(decided, chosen, model.arm),
@@ -407,61 +412,61 @@ def _decided(searched: _Searched, model: Model, streamed: Streamed | None) -> Ch
 
 
 def _with_whiteness(
-    verdict: Judgement, selection: Selection, means: Array | None,
+    judgement: Judgement, selection: Selection, means: Array | None,
     depends: Callable[[Sequence[int]], Depends],
 ) -> tuple[Judgement, Floor]:  # fmt: skip
     """Return the judgement with what all rows of a recording say of its residual, and the floor."""
-    floor = noise_floor(selection, verdict.structured)
+    floor = noise_floor(selection, judgement.structured)
     test = whiteness(means, floor.rms)
     if test is None or test.white:
-        return verdict, floor
-    p_value = test.p_value if verdict.p_value is None else min(verdict.p_value, test.p_value)
-    verdict = replace(
-        verdict,
+        return judgement, floor
+    p_value = test.p_value if judgement.p_value is None else min(judgement.p_value, test.p_value)
+    judgement = replace(
+        judgement,
         structured=True,
         p_value=p_value,
-        depends_on=verdict.depends_on or depends(verdict.accused),
+        depends_on=judgement.depends_on or depends(judgement.accused),
     )
-    return verdict, noise_floor(selection, True)
+    return judgement, noise_floor(selection, True)
 
 
 def _stand_ins(
-    selection: Selection, verdict: Judgement, held: HeldOut, model: Model
+    selection: Selection, judgement: Judgement, held: HeldOut, model: Model
 ) -> tuple[tuple[Cause, ...], tuple[Term, ...]]:
     """Return the stand-ins as causes, and the terms of causes and stand-ins fitted together."""
-    if not verdict.stand_ins:
+    if not judgement.stand_ins:
         return (), ()
-    both = (*verdict.accused, *verdict.stand_ins)
+    both = (*judgement.accused, *judgement.stand_ins)
     together = refitted_alone(selection, model.arm, both)
-    notes = replace(verdict, accused=both, ties={})
-    marked = [replace(together.terms[p], stand_in=p in verdict.stand_ins) for p in both]
-    return causes_of(together, notes, held, model.arm, verdict.stand_ins), tuple(marked)
+    notes = replace(judgement, accused=both, ties={})
+    marked = [replace(together.terms[p], stand_in=p in judgement.stand_ins) for p in both]
+    return causes_of(together, notes, held, model.arm, judgement.stand_ins), tuple(marked)
 
 
-def _unexplained(remaining: float, floor: float | None, verdict: Judgement) -> float:
+def _unexplained(remaining: float, floor: float | None, judgement: Judgement) -> float:
     """Return the rms of what is left beyond the noise; of a residual without structure 0.
 
     Where no floor is known, or one no lower than what is left, what the residual depends on says
     its share; where nothing does either, no part of it is known to be noise.
     """
-    if not verdict.structured:
+    if not judgement.structured:
         return 0.0
     beyond = float(np.sqrt(max(remaining**2 - floor**2, 0.0))) if floor is not None else 0.0
     if beyond > 0:
         return beyond
-    share = max((share for _, share in verdict.depends_on), default=1.0)
+    share = max((share for _, share in judgement.depends_on), default=1.0)
     return remaining * float(np.sqrt(np.clip(share, 0.0, 1.0)))
 
 
-def _overall(channels: Sequence[ChannelDiagnosis]) -> str:
+def _overall(channels: Sequence[ChannelDiagnosis]) -> Verdict:
     verdicts = {c.verdict for c in channels}
-    if verdicts == {"no_gap"}:
-        return "no_gap"
-    if verdicts <= {"no_gap", "explained"}:
-        return "explained"
+    if verdicts == {Verdict.NO_GAP}:
+        return Verdict.NO_GAP
+    if verdicts <= {Verdict.NO_GAP, Verdict.EXPLAINED}:
+        return Verdict.EXPLAINED
     if any(c.causes for c in channels):
-        return "partly_explained"
-    return "unexplained"
+        return Verdict.PARTLY_EXPLAINED
+    return Verdict.UNEXPLAINED
 
 
 def _line_of(log: Log, row: int) -> tuple[int, str]:
@@ -480,7 +485,7 @@ def _facts(channel: ChannelDiagnosis, log: Log) -> list[Fact]:
         stand_in = position_ in judgement.stand_ins
         facts.append(NotAccused(selection.terms[position_], reason, stand_in))
     terms = [term for cause in channel.causes for term in cause.terms]
-    seen, alone = selection.observation, channel.verdict == "explained"
+    seen, alone = selection.observation, channel.verdict is Verdict.EXPLAINED
     timed = "timestamp" in seen.quantities
     for term, before, after in slips(terms, seen.times):
         facts.append(Slip(term, before, after, timed, alone))

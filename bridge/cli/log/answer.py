@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from gapbridge.bridge.document.findings import clock, finding_text
 from gapbridge.bridge.report.labels import parameter_unit, unit_of
 from gapbridge.core.diagnosis.causes import Cause
-from gapbridge.core.diagnosis.channel_diagnosis import ChannelDiagnosis
+from gapbridge.core.diagnosis.channel_diagnosis import ChannelDiagnosis, Verdict
 from gapbridge.core.diagnosis.diagnosis import Diagnosis
 from gapbridge.core.diagnosis.separation import Measurement
 from gapbridge.core.effects import Reported
@@ -15,10 +15,10 @@ from gapbridge.core.log.columns import label
 from gapbridge.core.log.log_finding import OTHER_ARM_CHECKS, LogFinding
 
 VERDICTS = {
-    "no_gap": "no gap: nothing stands above the noise",
-    "explained": "explained: causes were found, what is left has no structure",
-    "partly_explained": "partly explained: causes were found, but residual structure remains",
-    "unexplained": "unexplained: there is a gap that no effect of the catalogue accounts for",
+    Verdict.NO_GAP: "no gap: nothing stands above the noise",
+    Verdict.EXPLAINED: "explained: causes were found, what is left has no structure",
+    Verdict.PARTLY_EXPLAINED: "partly explained: causes were found, but residual structure remains",
+    Verdict.UNEXPLAINED: "unexplained: there is a gap that no effect of the catalogue accounts for",
 }
 SHOWN = 6  # next measurements
 CHANGED = 3  # parameters of a cause that changed between sessions

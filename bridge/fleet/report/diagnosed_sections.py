@@ -21,6 +21,7 @@ from gapbridge.bridge.report.labels import (
     percent,
     with_unit,
 )
+from gapbridge.core.diagnosis.channel_diagnosis import Verdict
 
 SESSION_HEADS = ("verdict", "samples", "gap", "unexplained", "causes")
 JOINTS = 4  # named of an effect's joints
@@ -158,13 +159,13 @@ def onsets(found: Sequence[Onset]) -> list[blocks.Block]:
 def session_cells(outcome: Outcome) -> list[blocks.Cell]:
     """Return a session's cells in the table of sessions, of its first channel."""
     result = outcome.result
-    channel = result["channels"][0]
+    verdict, channel = Verdict(result["verdict"]), result["channels"][0]
     causes = {(r["effect"], tuple(r["joints"])) for r in result["rows"] if r["accused"]}
     named_causes = [
         f"{effect_title(e)}{', ' + joint_list(j) if j else ''}" for e, j in sorted(causes)
     ]
     return [
-        blocks.Badge(VERDICTS[result["verdict"]], KINDS[result["verdict"]]),
+        blocks.Badge(VERDICTS[verdict], KINDS[verdict]),
         str(channel["samples"]), with_unit(channel["gap_rms"], channel["unit"]),
         with_unit(channel["remaining_rms"], channel["unit"]), "; ".join(named_causes) or "–",
     ]  # fmt: skip

@@ -21,6 +21,7 @@ from gapbridge.bridge.report.labels import (
 )
 from gapbridge.bridge.report.material import chosen_channel
 from gapbridge.core.calibration.result import Estimate
+from gapbridge.core.diagnosis.channel_diagnosis import Verdict
 from gapbridge.core.diagnosis.diagnosis import Diagnosis
 
 SHOWN = 8  # measurements proposed
@@ -87,7 +88,7 @@ def residual(material: Material) -> list[blocks.Block]:
     content: list[blocks.Block] = [
         blocks.Verdict(badge, sentence(note_text(c.remaining, parameter_title)))
     ]
-    if not c.missing_effects and (c.complete or c.diagnosis.verdict != "no_gap"):
+    if not c.missing_effects and (c.complete or c.diagnosis.verdict is not Verdict.NO_GAP):
         content.append(blocks.Paragraph(" ".join(sentences(main))))
     others = [ch for ch in c.diagnosis.channels if ch is not main]
     content += [blocks.Paragraph(f"{CHANNELS[ch.channel]}: {one_line(ch)}") for ch in others]
