@@ -103,14 +103,14 @@ def _is_right(row: str, column: str) -> bool:
 
 
 def _kinds(scores: Sequence[CaseScore]) -> str:
-    heads = ("kind", "group", "cases", "right", "tie reported", "accused falsely", "owned up",
+    heads = ("kind", "group", "cases", "right", "tie reported", "accused falsely", "admitted",
              "joints right", "depends right", "remainder", "|z| ≥ 3", "median s",
              "outcomes")  # fmt: skip
     rows = []
     for t in by_kind(scores):
         good = t.right + t.tied == t.cases
         texts = (
-            t.group, t.cases, t.right, t.tied, t.false, t.owned, _share(t.joints),
+            t.group, t.cases, t.right, t.tied, t.false, t.admitted, _share(t.joints),
             _share(t.depends), "–" if t.remainder is None else f"{t.remainder:.2f}",
             _share(t.z_far), "–" if t.seconds is None else f"{t.seconds:.2f}",
             ", ".join(f"{k} {v}" for k, v in t.outcomes.items()),

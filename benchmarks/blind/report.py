@@ -59,7 +59,7 @@ def _criteria(scores: Sequence[CaseScore]) -> Table:
 
 def _kinds(scores: Sequence[CaseScore]) -> Table:
     table = Table(title="By kind (joints, depends: % right)")
-    heads = ("kind", "cases", "right", "tie", "false", "owned up", "joints", "depends",
+    heads = ("kind", "cases", "right", "tie", "false", "admitted", "joints", "depends",
              "remainder", "|z|≥3 %", "s", "needless ties")  # fmt: skip
     for k, head in enumerate(heads):
         table.add_column(head, justify="left" if k == 0 else "right", no_wrap=k == 0)
@@ -71,7 +71,7 @@ def _kinds(scores: Sequence[CaseScore]) -> Table:
             str(t.right),
             str(t.tied),
             str(t.false),
-            str(t.owned),
+            str(t.admitted),
             _percent(t.joints),
             _percent(t.depends),
             "–" if t.remainder is None else f"{t.remainder:.2f}",

@@ -36,7 +36,7 @@ class CaseScore:
     # also: first_order (a near twin, or at the same joints with the rest admitted)
     false: tuple[str, ...] = ()  # effects accused that are neither true nor a true twin
     joints_right: bool | None = None
-    owned_up: bool = False  # unexplained and structured
+    admitted: bool = False  # unexplained and structured
     depends_right: bool | None = None
     z: dict[str, float] = field(default_factory=dict)
     remainder: float | None = None  # held out, over the true floor
@@ -92,7 +92,7 @@ def score(label: Label, diagnosis: dict[str, Any], seconds: float | None = None)
     else:
         verdict = _known(label, claims, causes)
         if verdict.outcome == "abstained" and structured and label.facts.get("settling_drift"):
-            verdict = Verdict("right_tie")  # a drift that settles may be owned up to as another
+            verdict = Verdict("right_tie")  # a drift that settles may be reported as another
     explained = group in EXPLAINED and verdict.outcome in ("right", "right_tie")
     held_out = own.get("remaining_rms_held_out") or own.get("remaining_rms")
     reported_beyond = own.get("remaining_rms_new_region") if label.facts.get("beyond") else None
@@ -109,7 +109,7 @@ def score(label: Label, diagnosis: dict[str, Any], seconds: float | None = None)
         outcome=verdict.outcome,
         false=verdict.false,
         joints_right=verdict.joints_right,
-        owned_up=structured,
+        admitted=structured,
         depends_right=_depends(label, unexplained) if unknown else None,
         z=_z_scores(label, _of_named(label, causes) if mixed else causes) if exact or mixed else {},
         remainder=held_out / label.floor_rms if explained and held_out is not None else None,

@@ -27,7 +27,7 @@ class Plan:
     span: float = 1.0  # share of each joint's range that is used
     warming: float = 20.0  # K
     reference_temperature: float = 25.0
-    clusters: int = 0  # poses lie in so many small heaps; 0: all over the range
+    clusters: int = 0  # poses lie in so many small clusters; 0: all over the range
     sessions: int = 1  # the tracker stands elsewhere in each
     doubled: bool = False  # every row stands twice in the log
     beyond: int = 0  # poses kept back: whole regions of joint space that the log does not show
@@ -90,8 +90,8 @@ def _angles(kind: ArmKind, plan: Plan, rng: Generator) -> Array:
     unit = (strata + rng.random((plan.poses, kind.n))) / plan.poses
     q = middle + half * (2 * unit - 1)
     if plan.clusters:
-        heaps = middle + half * rng.uniform(-0.9, 0.9, (plan.clusters, kind.n))
-        near = heaps[rng.integers(0, plan.clusters, plan.poses)]
+        centres = middle + half * rng.uniform(-0.9, 0.9, (plan.clusters, kind.n))
+        near = centres[rng.integers(0, plan.clusters, plan.poses)]
         q = np.clip(near + half * rng.normal(0, 0.06, q.shape), low, high)
     if plan.moving is not None:
         still = [i for i in range(kind.n) if i not in plan.moving]

@@ -101,7 +101,7 @@ ONE_OR_TWO = {"one": 1, "two": 2}
 
 
 def draw_laid_out(name: str, rng: Generator) -> Drawn:
-    """Return one known effect in poses in heaps, in long-tailed noise, or in doubled rows."""
+    """Return one known effect: clustered poses, heavy-tailed noise, or duplicated rows."""
     plan = draw_plan(rng)
     if name == "clustered":
         plan = replace(plan, clusters=int(rng.integers(7, 11)))

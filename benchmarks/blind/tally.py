@@ -55,33 +55,33 @@ def criteria(scores: Sequence[CaseScore]) -> list[Criterion]:
     outside, withheld = _of(scores, "outside"), _of(scores, "withheld")
     unknown, hard = [*outside, *withheld], _of(scores, "hard")
     out = [
-        _criterion("one known effect: named, or its twin with the tie reported", 0.98, known),
+        _criterion("one effect: identified, or its equivalent with the tie reported", 0.98, known),
         Criterion("its joints right", *_at(0.96, _share(
             s.joints_right for s in known if s.ok and s.joints_right is not None))),
-        _criterion("two or three effects: exactly those", 0.93, several),
-        _criterion("clean data: no accusation, no structure", 0.995, _of(scores, "clean")),
-        _criterion("outside the catalogue: owned up, nobody accused", 0.93, outside),
-        Criterion("withheld: owned up, a twin named, or its first order with the rest admitted",
+        _criterion("two or three effects: all of them, no others", 0.93, several),
+        _criterion("clean data: no cause, no structure", 0.995, _of(scores, "clean")),
+        _criterion("outside the catalogue: unexplained, no cause named", 0.93, outside),
+        Criterion("withheld: unexplained, equivalent, or first order with residual structure",
                   *_at(0.95, _share(s.ok or s.outcome == "first_order" for s in withheld))),
-        _criterion("withheld: owned up, nobody accused but a twin", 0.95, withheld),
-        Criterion("what it depends on, among the first three", *_at(0.85, _share(
+        _criterion("withheld: no cause named except an equivalent effect", 0.95, withheld),
+        Criterion("the quantity it depends on is among the first three", *_at(0.85, _share(
             s.depends_right for s in unknown if s.depends_right is not None))),
-        _criterion("hard data: right, or a tie reported", 0.90, hard),
-        Criterion("hard data: false accusations", *_at(0.01, _share(
+        _criterion("hard data: identified, or a tie reported", 0.90, hard),
+        Criterion("hard data: false causes", *_at(0.01, _share(
             bool(s.false) for s in hard), at_least=False)),
     ]  # fmt: skip
     many, mixed = _of(scores, "many"), _of(scores, "mixed")
     out += [
-        _criterion("four and more at once: exactly those", 0.90, many),
-        _criterion("arms drawn at random", 0.95, _of(scores, "arm")),
-        _criterion("two sessions, one frame each", 0.95, _of(scores, "sessions")),
-        _criterion("poses in heaps, long-tailed noise, doubled rows", 0.95,
+        _criterion("four and more at once: all of them, no others", 0.90, many),
+        _criterion("random arms", 0.95, _of(scores, "arm")),
+        _criterion("two sessions, a frame each", 0.95, _of(scores, "sessions")),
+        _criterion("clustered poses, heavy-tailed noise, duplicated rows", 0.95,
                    _of(scores, "laid_out")),
-        Criterion("beside a remainder: known effects named", *_at(0.90, _share(
+        Criterion("beside an unknown effect: known ones identified", *_at(0.90, _share(
             k < s.known_named for s in mixed for k in range(s.known)))),
-        Criterion("beside a remainder: it is admitted", *_at(0.95, _share(
-            s.owned_up for s in mixed))),
-        Criterion("beside a remainder: false accusations", *_at(0.01, _share(
+        Criterion("beside an unknown effect: residual structure reported", *_at(0.95, _share(
+            s.admitted for s in mixed))),
+        Criterion("beside an unknown effect: cases with a false cause", *_at(0.01, _share(
             bool(s.false) for s in mixed), at_least=False)),
     ]  # fmt: skip
     shown = [
@@ -89,16 +89,16 @@ def criteria(scores: Sequence[CaseScore]) -> list[Criterion]:
     ]
     for at_least, target in ((True, 0.8), (False, 1.25)):
         word = "at least" if at_least else "at most"
-        out.append(Criterion(f"reported remainder of a new region over the true one, {word}",
+        out.append(Criterion(f"reported error in a new region over the true one, {word}",
                              float(np.median(shown)) if shown else None, target, at_least,
                              len(shown), "ratio"))  # fmt: skip
     remainders = [s.remainder for s in scores if s.remainder is not None]
-    out.append(_median("held-out remainder over the floor, median", 1.10, remainders, "ratio"))
+    out.append(_median("held-out error over the noise floor, median", 1.10, remainders, "ratio"))
     z = z_scores(scores)
     out.append(Criterion("parameters with |z| < 3", *_at(0.97, _share(abs(x) < 3 for x in z))))
     for at_least, target in ((True, 0.93), (False, 0.97)):
         word = "at least" if at_least else "at most"
-        out.append(Criterion(f"95 % intervals that hold the truth, {word}",
+        out.append(Criterion(f"95 % intervals that contain the true value, {word}",
                              *_at(target, _share(abs(x) < 1.96 for x in z), at_least)))  # fmt: skip
     static = [s.seconds for s in scores if s.channel in ("position", "wrench") and s.seconds]
     moving = [s.seconds for s in scores if s.channel in ("tracking", "torque") and s.seconds]
@@ -149,7 +149,7 @@ def matrix(scores: Sequence[CaseScore]) -> tuple[list[str], list[str], dict[str,
             for name in s.named:
                 row[name] += 1 / len(s.named)
         else:
-            row[NOWHERE if s.owned_up else NONE] += 1
+            row[NOWHERE if s.admitted else NONE] += 1
     named = {c for row in cells.values() for c in row} - {NONE, NOWHERE, "failed"}
     columns = [*sorted(named), NONE, NOWHERE]
     if any("failed" in row for row in cells.values()):
@@ -168,7 +168,7 @@ class KindTally:
     tied: int
     joints: float | None
     false: int
-    owned: int
+    admitted: int
     depends: float | None
     remainder: float | None
     z_far: float | None  # share of |z| >= 3
@@ -196,7 +196,7 @@ def by_kind(scores: Sequence[CaseScore]) -> list[KindTally]:
                 tied=outcomes["right_tie"],
                 joints=_share(s.joints_right for s in own if s.joints_right is not None)[0],
                 false=sum(bool(s.false) for s in own),
-                owned=sum(s.owned_up for s in own),
+                admitted=sum(s.admitted for s in own),
                 depends=_share(s.depends_right for s in own if s.depends_right is not None)[0],
                 remainder=float(np.median(remainders)) if remainders else None,
                 z_far=_share(abs(z) >= 3 for s in own for z in s.z.values())[0],

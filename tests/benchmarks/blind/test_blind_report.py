@@ -20,20 +20,20 @@ SCORES = [
     *(a_score(joints_right=True, remainder=1.02, z={"backlash_2": 0.3}, seconds=1.0),) * 3,
     a_score(outcome="wrong", named=("joint_offset", "backlash"), false=("joint_offset",)),
     *(a_score("none", "clean", named=(), seconds=1.5),) * 2,
-    a_score("outside:hose", "outside", named=(), owned_up=True, depends_right=True),
+    a_score("outside:hose", "outside", named=(), admitted=True, depends_right=True),
     a_score("withheld:payload", "withheld", "missed", named=(), depends_right=False),
 ]
 
 
 def test_the_figures_are_shares_of_their_own_cases():
     found = {c.name.split(":")[0]: c for c in criteria(SCORES)}
-    assert found["one known effect"].value == pytest.approx(0.75)
-    assert found["one known effect"].reached is False
+    assert found["one effect"].value == pytest.approx(0.75)
+    assert found["one effect"].reached is False
     assert found["clean data"].reached is True
     assert found["outside the catalogue"].value == 1.0
     assert found["withheld"].value == 0.0
     assert found["two or three effects"].reached is None
-    remainder = found["held-out remainder over the floor, median"]
+    remainder = found["held-out error over the noise floor, median"]
     assert (remainder.value, remainder.reached) == (pytest.approx(1.02), True)
 
 
@@ -55,7 +55,7 @@ def test_the_tables_say_what_is_reached():
     out = io.StringIO()
     print_report(SCORES, Console(file=out, width=160))
     text = out.getvalue()
-    assert re.search(r"one known effect.*75\.0 %.*not reached", text)
+    assert re.search(r"one effect.*75\.0 %.*not reached", text)
     assert "joint_offset 0.5" in text
 
 

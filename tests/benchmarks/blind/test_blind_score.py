@@ -100,10 +100,10 @@ def test_clean_data_is_right_only_without_accusation_and_structure(case):
     assert (got.outcome, got.false) == ("wrong", ("joint_offset",))
 
 
-def test_an_effect_outside_the_catalogue_must_be_owned_up(case):
+def test_an_effect_outside_the_catalogue_must_be_reported_as_unexplained(case):
     label = case("outside:tool_plate")
-    owned = score(label, answer(label, structured=True, depends=["actual_q_0", "payload"]))
-    assert (owned.outcome, owned.depends_right) == ("right", True)
+    reported = score(label, answer(label, structured=True, depends=["actual_q_0", "payload"]))
+    assert (reported.outcome, reported.depends_right) == ("right", True)
     assert score(label, answer(label)).outcome == "missed"
     blamed = score(label, answer(label, [cause("payload")], structured=True))
     assert (blamed.outcome, blamed.false) == ("wrong", ("payload",))
@@ -115,7 +115,7 @@ def test_what_it_depends_on_counts_among_the_first_three_only(case):
     assert score(label, answer(label, structured=True, depends=reported)).depends_right is False
 
 
-def test_a_withheld_effect_must_be_owned_up_too(case):
+def test_a_withheld_effect_must_be_reported_as_unexplained_too(case):
     label = case("withheld:backlash")
     assert label.withhold == ("backlash",)
     joint = label.causes[0].joints[0]

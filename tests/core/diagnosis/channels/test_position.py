@@ -79,7 +79,7 @@ def test_a_clean_log_accuses_nobody(registered):
     assert found.terms == ()
 
 
-def test_what_stands_in_no_catalogue_is_owned_up_to():
+def test_what_stands_in_no_catalogue_is_reported_as_unexplained():
     found = small.diagnosed("cross_coupling")
     (channel,) = found.channels
     assert (found.verdict, channel.causes) == ("unexplained", ())

@@ -201,7 +201,7 @@ def faded(plant, recorded):
     return nominal + 6.0 * np.sign(qd) * here * fading[:, None]
 
 
-def test_friction_that_fades_is_owned_up_to_and_depends_on_time(plant, recorded):
+def test_friction_that_fades_is_reported_as_unexplained_and_depends_on_time(plant, recorded):
     found = diagnose(plant.model(2.0), log_of(recorded, faded(plant, recorded)))
     (torque,) = (c for c in found.channels if c.channel == "torque")
     assert torque.structured
