@@ -34,7 +34,7 @@ from benchmarks.blind.mechanics import Array
 from benchmarks.blind.outside import OUTSIDE
 from benchmarks.blind.remainders import ALONE, REMAINDERS
 from benchmarks.blind.special_cases import Strange
-from benchmarks.blind.static_cases import Drawn, Wish, causes_of, draw_static, write_static
+from benchmarks.blind.static_cases import Drawn, StaticDraw, causes_of, draw_static, write_static
 from benchmarks.blind.wrench_cases import WrenchCell
 
 CHANNELS = tuple(EFFECTS)
@@ -104,11 +104,11 @@ def draw_case(kind: str, rng: Generator) -> Static | ChannelCase:
     elif group == "hard":
         drawn = special_cases.draw_hard(effects_of(rest, rng), rng)
     elif group == "":
-        drawn = draw_static(Wish(effects_of(rest, rng)), rng)
+        drawn = draw_static(StaticDraw(effects_of(rest, rng)), rng)
     elif group == "size":
         effect, _, ratio = rest.partition("@")
-        wish = Wish(effects_of(effect, rng), ratio=float(ratio), clear=False)
-        drawn = draw_static(wish, rng)
+        asked = StaticDraw(effects_of(effect, rng), ratio=float(ratio), clear=False)
+        drawn = draw_static(asked, rng)
     else:
         raise ValueError(f"kind: found {kind!r}, expected one of those that --list shows")
     return Static(drawn, None, drawn.bench.whitened_gap(drawn.real), outliers=group == "hard")

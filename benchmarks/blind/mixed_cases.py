@@ -22,7 +22,7 @@ from benchmarks.blind.mechanics import Array
 from benchmarks.blind.outside import Outside
 from benchmarks.blind.remainders import REMAINDERS
 from benchmarks.blind.special_cases import Strange, outside_gap, unlike_known
-from benchmarks.blind.static_cases import Drawn, Wish, draw_parts, draw_plan
+from benchmarks.blind.static_cases import Drawn, StaticDraw, draw_parts, draw_plan
 
 SIZE = (0.5, 1.5)  # the remainder over a known effect
 SHOWN = 36.0  # chi-square of a known effect, the remainder counted as noise
@@ -38,7 +38,7 @@ def draw_mixed(count: int, name: str | None, rng: Generator) -> Strange:
         soft = True if set(effects) & set(draws.NEEDS_COMPLIANCE) else None
         bench = draw_bench(rng, replace(draw_plan(rng), beyond=BEYOND), compliant=soft)
         try:
-            bench, parts = draw_parts(bench, Wish(effects), rng)
+            bench, parts = draw_parts(bench, StaticDraw(effects), rng)
             chosen = name or str(rng.choice(list(REMAINDERS)))
             outside = REMAINDERS[chosen](bench, rng)
             strange = _with_remainder(bench, parts, outside, rng)

@@ -15,7 +15,7 @@ from benchmarks.blind.mechanics import Array, RealArm, Session
 from benchmarks.blind.outside import NEED_COMPLIANCE, OUTSIDE, Outside
 from benchmarks.blind.remainders import REMAINDERS
 from benchmarks.blind.session import Plan
-from benchmarks.blind.static_cases import Drawn, Wish, draw_plan, draw_static
+from benchmarks.blind.static_cases import Drawn, StaticDraw, draw_plan, draw_static
 from benchmarks.blind.twins import columns_of, singles
 
 HARD_SIGMA = 5e-5
@@ -93,7 +93,7 @@ def unlike_known(bench: Bench, gap: Array, beside: Array, in_time: bool) -> bool
 def draw_hard(effects: tuple[str, ...], rng: Generator) -> Drawn:
     """Return a cell seen in 30 poses with 50 um of noise."""
     plan = replace(draw_plan(rng, poses=30), blocks=3)
-    return draw_static(Wish(effects, plan, HARD_SIGMA, (5.5e-5, 7e-5)), rng)
+    return draw_static(StaticDraw(effects, plan, HARD_SIGMA, (5.5e-5, 7e-5)), rng)
 
 
 LAID_OUT = ("clustered", "student", "doubled")
@@ -110,19 +110,19 @@ def draw_laid_out(name: str, rng: Generator) -> Drawn:
     elif name != "student":
         raise ValueError(f"kind: found laid_out:{name}, expected one of {', '.join(LAID_OUT)}")
     freedom = 3.0 if name == "student" else None
-    return draw_static(Wish(some_effects(1, rng), plan, freedom=freedom), rng)
+    return draw_static(StaticDraw(some_effects(1, rng), plan, freedom=freedom), rng)
 
 
 def draw_arms(name: str, rng: Generator) -> Drawn:
     """Return one or two known effects of an arm that is drawn at random too."""
-    wish = Wish(some_effects(_count(name), rng), any_arm=True)
-    return draw_static(wish, rng)
+    asked = StaticDraw(some_effects(_count(name), rng), any_arm=True)
+    return draw_static(asked, rng)
 
 
 def draw_sessions(name: str, rng: Generator) -> Drawn:
     """Return one or two known effects in two sessions, the tracker elsewhere in each."""
     plan = replace(draw_plan(rng, poses=90), sessions=2)
-    return draw_static(Wish(some_effects(_count(name), rng), plan), rng)
+    return draw_static(StaticDraw(some_effects(_count(name), rng), plan), rng)
 
 
 def _count(name: str) -> int:
@@ -146,17 +146,19 @@ def draw_bad(name: str, rng: Generator) -> Drawn:
     """Return badly excited data: something that the effect needs does not happen."""
     good = draw_plan(rng)
     if name == "no_reversals":
-        return draw_static(Wish(("backlash",), replace(good, both_sides=False)), rng)
+        return draw_static(StaticDraw(("backlash",), replace(good, both_sides=False)), rng)
     if name == "one_load":
         effect = str(rng.choice(["axial_compliance", "radial_compliance", "link_flexibility"]))
-        return draw_static(Wish((effect,), replace(good, blocks=1, pulled=0.0)), rng)
+        return draw_static(StaticDraw((effect,), replace(good, blocks=1, pulled=0.0)), rng)
     effect = str(rng.choice(["joint_offset", "axial_compliance", "backlash", "transmission_error"]))
     if name == "few_joints":
         # never the same arm twice in number of joints: all have joints 2 and 3
         moving = (1, int(rng.integers(2, 6)))
         joint = int(rng.choice(moving)) + 1
         plan = replace(good, moving=moving, approach_written=True)
-        return draw_static(Wish((effect,), plan, joints={effect: [joint]}), rng)
+        return draw_static(StaticDraw((effect,), plan, joints={effect: [joint]}), rng)
     if name == "tiny_range":
-        return draw_static(Wish((effect,), Plan(poses=70, blocks=1, pulled=0.0, span=0.08)), rng)
+        return draw_static(
+            StaticDraw((effect,), Plan(poses=70, blocks=1, pulled=0.0, span=0.08)), rng
+        )
     raise ValueError(f"kind: found bad:{name}, expected one of {', '.join(BAD)}")

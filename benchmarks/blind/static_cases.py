@@ -50,7 +50,7 @@ def draw_plan(rng: Generator, poses: int = 70) -> Plan:
 
 
 @dataclass(frozen=True)
-class Wish:
+class StaticDraw:
     """What a static case must be like; what is left open is drawn."""
 
     effects: tuple[str, ...]
@@ -64,43 +64,43 @@ class Wish:
     any_arm: bool = False  # an arm drawn at random, of no class
 
 
-def draw_static(wish: Wish, rng: Generator) -> Drawn:
+def draw_static(asked: StaticDraw, rng: Generator) -> Drawn:
     """Return a cell whose real arm has these effects, each clear of the others."""
-    soft = True if set(wish.effects) & set(draws.NEEDS_COMPLIANCE) else None
+    soft = True if set(asked.effects) & set(draws.NEEDS_COMPLIANCE) else None
     for _ in range(200):
         bench = draw_bench(
-            rng, wish.plan or draw_plan(rng), compliant=soft, sigma=wish.sigma,
-            target_floor=wish.floor, drawing=draw_arm(rng) if wish.any_arm else None,
+            rng, asked.plan or draw_plan(rng), compliant=soft, sigma=asked.sigma,
+            target_floor=asked.floor, drawing=draw_arm(rng) if asked.any_arm else None,
         )  # fmt: skip
-        if wish.freedom is not None:
-            bench = replace(bench, instrument=replace(bench.instrument, freedom=wish.freedom))
+        if asked.freedom is not None:
+            bench = replace(bench, instrument=replace(bench.instrument, freedom=asked.freedom))
         try:
-            bench, parts = draw_parts(bench, wish, rng)
+            bench, parts = draw_parts(bench, asked, rng)
         except Redraw:
             continue
-        if parts and wish.clear and not all_clear(bench, parts):
+        if parts and asked.clear and not all_clear(bench, parts):
             continue
         return Drawn(bench, tuple(parts), combined(bench, parts))
-    raise RuntimeError(f"no clear draw of {wish.effects} in 200")
+    raise RuntimeError(f"no clear draw of {asked.effects} in 200")
 
 
-def _places(effect: str, wish: Wish, bench: Bench, rng: Generator) -> list[int] | list[None]:
+def _places(effect: str, asked: StaticDraw, bench: Bench, rng: Generator) -> list[int] | list[None]:
     """Return the joints that an effect is put at."""
     if effect not in draws.PER_JOINT:
         return [None]
     count = int(rng.choice([1, 2, 3], p=[0.55, 0.3, 0.15]))
-    most = 1 if wish.ratio is not None else 3 if len(wish.effects) == 1 else 2
-    most = 1 if len(wish.effects) > MANY else most
+    most = 1 if asked.ratio is not None else 3 if len(asked.effects) == 1 else 2
+    most = 1 if len(asked.effects) > MANY else most
     chosen = [int(j) for j in rng.permutation(draws.sites(effect, bench.kind))]
-    return sorted((wish.joints or {}).get(effect, chosen[: min(count, most)]))
+    return sorted((asked.joints or {}).get(effect, chosen[: min(count, most)]))
 
 
-def draw_parts(bench: Bench, wish: Wish, rng: Generator) -> tuple[Bench, list[Ingredient]]:
+def draw_parts(bench: Bench, asked: StaticDraw, rng: Generator) -> tuple[Bench, list[Ingredient]]:
     """Return the parts, sized. The nominal axial compliance of a stiffening joint is taken out."""
     parts: list[Ingredient] = []
-    for effect in wish.effects:
+    for effect in asked.effects:
         low, high = draws.RATIO.get(effect, (3.0, 18.0))
-        for joint in _places(effect, wish, bench, rng):
+        for joint in _places(effect, asked, bench, rng):
             if effect == "stiffness_nonlinearity" and joint is not None:
                 bench = _stiff_about(bench, joint)
             for part in draws.draw(
@@ -108,7 +108,7 @@ def draw_parts(bench: Bench, wish: Wish, rng: Generator) -> tuple[Bench, list[In
                 bench.instrument.sigma_turn is not None, rng,
             ):  # fmt: skip
                 ratio = float(np.exp(rng.uniform(np.log(low), np.log(high))))
-                parts.append(size(bench, part, wish.ratio or ratio))
+                parts.append(size(bench, part, asked.ratio or ratio))
     return bench, parts
 
 

@@ -38,7 +38,7 @@ from gapbridge.core.calibration.plan import Plan
 from gapbridge.core.calibration.readings import Readings
 from gapbridge.core.loads import Loads
 from gapbridge.core.planning.candidates import candidates_of
-from gapbridge.core.planning.design import Wish, far_end, plan, reference_of
+from gapbridge.core.planning.design import SessionDesign, far_end, plan, reference_of
 from gapbridge.core.planning.information import Reference, blocks, information_of, inverse
 
 Array = NDArray[np.float64]
@@ -96,7 +96,7 @@ def row_of(cell: RandomCell, observable: Observable, poses: int, sessions: int, 
     begin = time.process_time()
     planned = plan(
         parameters, observable, cell.loads, cell.space,
-        Wish(poses=poses, repeats=0, sigma=SIGMA, seed=seed),
+        SessionDesign(poses=poses, repeats=0, sigma=SIGMA, seed=seed),
     )  # fmt: skip
     seconds = time.process_time() - begin
     hung = tuple(far_end(load) for load in planned.loads)

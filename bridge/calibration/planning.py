@@ -24,7 +24,7 @@ from gapbridge.core.calibration.plan import Payload, Plan
 from gapbridge.core.errors import CellError
 from gapbridge.core.metrology import Metrology
 from gapbridge.core.planning.capsules import Box
-from gapbridge.core.planning.design import Wish, far_end, plan
+from gapbridge.core.planning.design import SessionDesign, far_end, plan
 from gapbridge.core.planning.workspace import Place, Reflector, Workspace
 
 REPEATABILITY = 5e-5  # m, 1 sigma of one coordinate, where the cell does not report it
@@ -76,7 +76,7 @@ def planned(cell: Cell, options: SessionOptions, emit: Callable[[str, float], No
         observable,
         loads_of(cell),
         space,
-        Wish(
+        SessionDesign(
             poses=options.poses or given.poses,
             held_out=given.held_out,
             repeats=given.repeats,

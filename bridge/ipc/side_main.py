@@ -1,8 +1,8 @@
-"""A side process's own half: its order, the shared memory, the daemon's events.
+"""A side process's own half: its start data, the shared memory, the daemon's events.
 
 Recorder, status page and metrics are such processes. They read along and never hold up the loop;
-the daemon starts them (side_process.py). A module for one of them begins with ``take_order()`` and
-ends when ``order.events.closed`` says that the daemon is gone.
+the daemon starts them (side_process.py). A module for one of them begins with ``read_start_data()``
+and ends when ``start.events.closed`` says that the daemon is gone.
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ class EventWriter:
 
 
 @dataclass(frozen=True)
-class Order:
+class StartData:
     """What the daemon hands a side process at its start."""
 
     settings: DaemonSettings
@@ -115,14 +115,14 @@ class Order:
         self.up.emit({"time": SYSTEM.time(), "monotonic": SYSTEM.monotonic(), **event})
 
 
-def take_order() -> Order:
+def read_start_data() -> StartData:
     """Return the order that the daemon has written on stdin."""
     given = json.loads(sys.stdin.readline())
     with contextlib.suppress(OSError):
         os.nice(NICENESS)
     events = EventLines(given["events"])
     threading.Thread(target=_end_after_daemon, args=(events.fd,), daemon=True).start()
-    return Order(
+    return StartData(
         settings=DaemonSettings.model_validate(given["settings"]),
         n=given["n"],
         session=given["session"],
@@ -135,13 +135,13 @@ def take_order() -> Order:
     )
 
 
-def run_side(kind: str, run: Callable[[Order], None]) -> int:
+def run_side(kind: str, run: Callable[[StartData], None]) -> int:
     """Run a serving process of the daemon's until the daemon is gone; returns the exit code."""
-    order = take_order()
+    start = read_start_data()
     try:
-        run(order)
+        run(start)
     except GapbridgeError as error:
-        order.emit({"kind": kind, "failure": str(error)})
+        start.emit({"kind": kind, "failure": str(error)})
         sys.stderr.write(f"{error}\n")
         return 1
     return 0

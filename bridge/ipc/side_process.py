@@ -29,16 +29,16 @@ PIPE_SIZE = 1 << 18  # bytes
 class SideProcess:
     """``python -m module``, reading along, restarted with backoff when it died or stands still.
 
-    ``order`` holds ``settings`` (a DaemonSettings as JSON), ``n``, ``session`` and ``extra``; see
-    side_main.Order.
+    ``start_data`` holds ``settings`` (a DaemonSettings as JSON), ``n``, ``session`` and
+    ``extra``; see side_main.StartData.
     """
 
     def __init__(
-        self, module: str, order: dict[str, Any], memory: SharedMemory, log: IO[Any] | int = -3,
-        clock: Clock = SYSTEM,
+        self, module: str, start_data: dict[str, Any], memory: SharedMemory,
+        log: IO[Any] | int = -3, clock: Clock = SYSTEM,
     ) -> None:  # fmt: skip
         self._now = clock.monotonic
-        self.module, self.order = module, order
+        self.module, self.start_data = module, start_data
         self.restarts = 0
         self.stalls = 0
         self._dropped = 0
@@ -137,13 +137,13 @@ class SideProcess:
         self._down, self._up = EventWriter(ours), EventLines(up_ours)
         self._started = self._read_at = self._now()
         self._has_read = False
-        order = {
-            **self.order, "memory": memory, "events": theirs, "up": up_theirs,
+        start_data = {
+            **self.start_data, "memory": memory, "events": theirs, "up": up_theirs,
             "successors": passed[3],
         }  # fmt: skip
         assert self._process.stdin is not None
         with contextlib.suppress(BrokenPipeError):  # gone already, which check() sees
-            self._process.stdin.write((json.dumps(order) + "\n").encode())
+            self._process.stdin.write((json.dumps(start_data) + "\n").encode())
             self._process.stdin.close()
 
     def _check_reading(self, now: float) -> str | None:

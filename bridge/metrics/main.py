@@ -35,7 +35,7 @@ from gapbridge.bridge.cell.updated_settings import UpdatedSettings
 from gapbridge.bridge.ipc.events import EventKind
 from gapbridge.bridge.ipc.loop_counters import DROPPED
 from gapbridge.bridge.ipc.shared_memory import SharedMemory
-from gapbridge.bridge.ipc.side_main import Order, run_side
+from gapbridge.bridge.ipc.side_main import StartData, run_side
 from gapbridge.bridge.loop.supervisor import State
 from gapbridge.bridge.served.credentials import read_token
 from gapbridge.bridge.served.guard import Guard
@@ -141,24 +141,24 @@ class Counts:
                 self.faults[cause] += 1
 
 
-def run(order: Order) -> None:
+def run(start: StartData) -> None:
     """Serve metrics until the daemon is gone. Raises LinkError, InputError."""
-    settings = order.settings.metrics
+    settings = start.settings.metrics
     assert settings is not None
     path = settings.token_file
     token = None if path is None else read_token(path, "metrics.token_file")
-    counts = Counts(order.memory, order.settings, order.extra.get("text"))
+    counts = Counts(start.memory, start.settings, start.extra.get("text"))
     registry = CollectorRegistry(auto_describe=False)
 
     async def metrics(request: Request) -> Response:
-        counts.turn(order.events.poll())
+        counts.turn(start.events.poll())
         return Response(generate_latest(registry), media_type=TEXT)
 
     guard = Guard(Starlette(routes=[Route("/metrics", metrics)]), settings, token)
-    registry.register(Families(order.session, counts, guard.refused))
+    registry.register(Families(start.session, counts, guard.refused))
     serve(
-        guard, settings, "metrics", lambda: order.events.closed,
-        lambda: counts.turn(order.events.poll()), TURN,
+        guard, settings, "metrics", lambda: start.events.closed,
+        lambda: counts.turn(start.events.poll()), TURN,
     )  # fmt: skip
 
 

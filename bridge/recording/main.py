@@ -15,7 +15,7 @@ from typing import Any
 
 import yaml
 
-from gapbridge.bridge.ipc.side_main import Order, take_order
+from gapbridge.bridge.ipc.side_main import StartData, read_start_data
 from gapbridge.bridge.recording.recorder import Recorder
 from gapbridge.drivers.clock import SYSTEM
 
@@ -31,53 +31,53 @@ def main() -> None:
     # a service manager ends all processes at once; this one ends when it has everything
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, signal.SIG_IGN)
-    order = take_order()
+    start = read_start_data()
     recorder = Recorder(
-        order.settings.recording, order.session, order.memory, _configuration(order), order.emit
+        start.settings.recording, start.session, start.memory, _configuration(start), start.emit
     )
-    ended = _follow(order, recorder)
+    ended = _follow(start, recorder)
     if not ended:
-        _outlive(order, recorder)
+        _outlive(start, recorder)
     recorder.close()
 
 
-def _follow(order: Order, recorder: Recorder) -> bool:
+def _follow(start: StartData, recorder: Recorder) -> bool:
     """Record while the daemon is there; returns whether it ended in order."""
     ended = False
-    while not order.events.closed:
-        order.events.wait(LOOK_EVERY)
+    while not start.events.closed:
+        start.events.wait(LOOK_EVERY)
         SYSTEM.sleep(LOOK_EVERY / 2)  # events may come in crowds; cycles wait in the ring
-        for event in order.events.poll():
+        for event in start.events.poll():
             recorder.take(event)
             ended |= event.get("kind") == "ended"
             if event.get("kind") == "configuration":
-                recorder.change_configuration(_configuration(order, event))
+                recorder.change_configuration(_configuration(start, event))
         recorder.step()
     return ended
 
 
-def _outlive(order: Order, recorder: Recorder) -> None:
+def _outlive(start: StartData, recorder: Recorder) -> None:
     """Record on until the loop, which has lost its daemon, has stopped too."""
     until = SYSTEM.monotonic() + LONGEST_FAREWELL
     recorder.take(
         {"time": SYSTEM.time(), "kind": "recorder", "detail": "the daemon is gone without an end"}
     )
-    while order.memory.silence < QUIET and SYSTEM.monotonic() < until:
+    while start.memory.silence < QUIET and SYSTEM.monotonic() < until:
         recorder.step()
         SYSTEM.sleep(LOOK_EVERY)
 
 
-def _configuration(order: Order, event: dict[str, Any] | None = None) -> dict[str, Any]:
+def _configuration(start: StartData, event: dict[str, Any] | None = None) -> dict[str, Any]:
     """Return what the run is made of, without secrets."""
-    cell = order.settings.cell
-    content = _text_of(cell, (event or order.extra).get("text"))
+    cell = start.settings.cell
+    content = _text_of(cell, (event or start.extra).get("text"))
     return {
         "program": f"gapbridge {_version()}",
         "cell": str(cell),
         "sha256": hashlib.sha256(content).hexdigest(),
         "text": redacted(content.decode("utf-8", "replace")),
-        "joints": order.n,
-        "driver": order.settings.link.driver,
+        "joints": start.n,
+        "driver": start.settings.link.driver,
     }
 
 

@@ -24,7 +24,7 @@ from starlette.types import Receive, Scope, Send
 
 from gapbridge.bridge.cell.settings.web import WebSettings
 from gapbridge.bridge.document.json_text import json_text
-from gapbridge.bridge.ipc.side_main import Order, run_side
+from gapbridge.bridge.ipc.side_main import StartData, run_side
 from gapbridge.bridge.served.credentials import read_token
 from gapbridge.bridge.served.guard import WRONG_TOKEN_DELAY, Guard, cookie_name, cookie_of
 from gapbridge.bridge.served.server import serve
@@ -98,24 +98,24 @@ class Stream:
             self._queues.discard(queue)
 
 
-def run(order: Order) -> None:
+def run(start: StartData) -> None:
     """Serve the page until the daemon is gone. Raises LinkError, InputError."""
-    settings = order.settings.web
+    settings = start.settings.web
     assert settings is not None
     path = settings.token_file
     token = None if path is None else read_token(path, "web.token_file")
-    watched = Watched(order.settings, order.n, order.session, order.memory, order.extra.get("text"))
+    watched = Watched(start.settings, start.n, start.session, start.memory, start.extra.get("text"))
     stream = Stream(settings.clients)
 
     def turn() -> None:
-        for kind, data in watched.turn(order.events.poll()):
+        for kind, data in watched.turn(start.events.poll()):
             if stream.is_watched:
                 stream.publish(kind, _text(data))
 
     def over() -> bool:
-        if order.events.closed:
+        if start.events.closed:
             stream.close()
-        return order.events.closed
+        return start.events.closed
 
     serve(make_app(watched, stream, settings, token), settings, "web", over, turn, TURN)
 

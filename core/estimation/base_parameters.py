@@ -28,7 +28,7 @@ MEMBER = 0.1  # share of a combination from which a flexibility is named in it
 
 
 @dataclass(frozen=True)
-class Shown:
+class Identifiable:
     """What a problem shows."""
 
     kept: Mask  # (2n,) fitted; the others stay at the model's value
@@ -72,7 +72,7 @@ def _cost(linear: Linear, kept: Mask, held: int, prior: tuple[Array, float]) -> 
     return float(left @ left + np.sum(((found - prior[0]) / prior[1]) ** 2))
 
 
-def what_is_shown(linear: Linear, kept: Mask, sigma: float) -> Shown:
+def what_is_shown(linear: Linear, kept: Mask, sigma: float) -> Identifiable:
     """Return covariance and notes of the chosen flexibilities; sigma is the prior's (rad/Nm)."""
     count = len(kept)
     covariance = np.diag(np.full(count, sigma**2))
@@ -83,7 +83,7 @@ def what_is_shown(linear: Linear, kept: Mask, sigma: float) -> Shown:
     reported += _faint(columns, kept)
     names = flexibility_names(count // 2)
     reported += hardly_separated(covariance, kept, names)
-    return Shown(kept, covariance, tuple(reported))
+    return Identifiable(kept, covariance, tuple(reported))
 
 
 def _held(i: int, columns: Array, kept: Mask) -> Note:

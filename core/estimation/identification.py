@@ -101,7 +101,7 @@ class _Task:
     converged: float = CONVERGED  # relative step
     look: int = LOOK  # rounds of the fit of everything
 
-    def run(self, before: Fit, data: Data) -> tuple[Fit, base_parameters.Shown]:
+    def run(self, before: Fit, data: Data) -> tuple[Fit, base_parameters.Identifiable]:
         """Fit everything, choose what the data show, fit that alone."""
         centre = self.prior[0]
         everything = np.ones(len(centre), dtype=bool)
@@ -316,7 +316,7 @@ def _rms(gap: Array, spent: int = 0) -> float:
 
 def _result(
     model: Model, data: Data, used: NDArray[np.int64], fits: tuple[Fit, Fit],
-    shown: base_parameters.Shown, held_out: tuple[float, float], held: bool,
+    shown: base_parameters.Identifiable, held_out: tuple[float, float], held: bool,
 ) -> Identification:  # fmt: skip
     n, kept = model.arm.n, shown.kept
     inlier = fits[1].weights > 0

@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from gapbridge.core.arrays import Array
-from gapbridge.core.estimation.base_parameters import Shown
+from gapbridge.core.estimation.base_parameters import Identifiable
 from gapbridge.core.estimation.compliance_fit import (
     Data,
     Fit,
@@ -29,7 +29,7 @@ ROWS = 2000  # rows that show how errors scatter; more cost time and add hardly 
 FEWEST = 2  # times as many coordinates of parts as numbers fitted; of fewer poses noise is white
 
 
-def by_poses(fit: Fit, data: Data, shown: Shown, sigma: float) -> Shown:
+def by_poses(fit: Fit, data: Data, shown: Identifiable, sigma: float) -> Identifiable:
     """Return what is shown, with the covariance (2n, 2n) by fits that left poses out in turn.
 
     Of many rows some say by how much it differs from that of white noise. ``sigma`` (rad/Nm) is the
@@ -56,7 +56,7 @@ def by_poses(fit: Fit, data: Data, shown: Shown, sigma: float) -> Shown:
     return replace(shown, covariance=covariance)
 
 
-def _rows(fit: Fit, data: Data, shown: Shown, sigma: float) -> tuple[Array, Array, Array]:
+def _rows(fit: Fit, data: Data, shown: Identifiable, sigma: float) -> tuple[Array, Array, Array]:
     """Return the rows (m, p) of [geometry | nuisances | kept flexibilities], the gap (m,) they see.
 
     Everything is in units of the noise, the flexibilities in ``sigma``; last comes one over the

@@ -182,10 +182,10 @@ class _Found:
     noise: Array  # (2,) m, rad
     base: Fit  # one step before
     rows: Pass  # at its shape
-    shown: base_parameters.Shown
+    shown: base_parameters.Identifiable
     geometry: Geometry | None = None  # in the models of both fits
 
-    def scattered(self, rows: Data, sigma: float) -> base_parameters.Shown:
+    def scattered(self, rows: Data, sigma: float) -> base_parameters.Identifiable:
         """Return what is shown, as surely as some rows say by poses left out."""
         return by_poses(replace(self.fit, geometry=self.geometry), rows, self.shown, sigma)
 
@@ -239,7 +239,9 @@ class _BesideGeometry:
     free: Linear
     held: Linear
 
-    def widened(self, shown: base_parameters.Shown, sigma: float) -> base_parameters.Shown:
+    def widened(
+        self, shown: base_parameters.Identifiable, sigma: float
+    ) -> base_parameters.Identifiable:
         """Return what all rows show at this geometry, with what it leaves open."""
         wide, narrow = (
             base_parameters.what_is_shown(own, shown.kept, sigma).covariance

@@ -43,8 +43,8 @@ Progress = Callable[[str, float], None]
 
 
 @dataclass(frozen=True)
-class Wish:
-    """What a session shall be like."""
+class SessionDesign:
+    """What a session to plan is asked to be."""
 
     poses: int = 30  # to fit
     held_out: int = 8  # to verify
@@ -60,7 +60,7 @@ def plan(
     observable: Observable,
     loads: Sequence[Payload],
     workspace: Workspace,
-    wish: Wish,
+    asked: SessionDesign,
     progress: Progress | None = None,
 ) -> Plan:
     """Return the most informative poses, loads and approaches, in the order of travel.
@@ -70,7 +70,7 @@ def plan(
     Raises PlanError where no pose is reachable and seen, or where the poses cannot be enough.
     """
     with threadpool_limits(1, "blas"):  # matrices of this size gain nothing from threads
-        return _planned(parameters, observable, loads, workspace, wish, progress or _silent)
+        return _planned(parameters, observable, loads, workspace, asked, progress or _silent)
 
 
 def _silent(text: str, share: float) -> None:
@@ -82,38 +82,39 @@ def _planned(
     observable: Observable,
     loads: Sequence[Payload],
     workspace: Workspace,
-    wish: Wish,
+    asked: SessionDesign,
     emit: Progress,
 ) -> Plan:
     loads = _in_order(parameters, loads)
-    _require_numbers(parameters, observable, wish)
+    _require_numbers(parameters, observable, asked)
     emit("looking for poses", 0.0)
     workspace = replace(workspace, hung=(*workspace.hung, *(far_end(load) for load in loads)))
-    found = candidates_of(parameters, observable, loads, workspace, wish.seed, wish.stops)
-    _require_enough(parameters, observable, found, wish)
+    found = candidates_of(parameters, observable, loads, workspace, asked.seed, asked.stops)
+    _require_enough(parameters, observable, found, asked)
     emit("working out what each pose contributes", 0.1)
-    rows = blocks(parameters, observable, found.readings, found.nuisance, wish.sigma)
-    reference = reference_of(parameters, loads, workspace, wish.seed)
-    cost = _cost(parameters, found, wish)
+    rows = blocks(parameters, observable, found.readings, found.nuisance, asked.sigma)
+    reference = reference_of(parameters, loads, workspace, asked.seed)
+    cost = _cost(parameters, found, asked)
     choice = Choice.of(rows, reference.weight(rows.shape[2]), cost)
-    chosen = _chosen(choice, wish, lambda share: emit("choosing poses", 0.2 + 0.3 * share))
+    chosen = _chosen(choice, asked, lambda share: emit("choosing poses", 0.2 + 0.3 * share))
     share = leaning(reference, rows[chosen])
     weight = reference.weight(rows.shape[2], share)
     chosen = exchanged(Choice.of(rows, weight, cost), chosen)
-    refiner = Refiner(parameters, observable, workspace, found, weight, wish.sigma)
+    refiner = Refiner(parameters, observable, workspace, found, weight, asked.sigma)
     best, weight = evened(
         refiner, reference, Refined(found.readings[np.array(chosen)], rows[chosen]), share,
-        wish.seed, lambda share: emit("moving poses to more informative places", 0.5 + 0.2 * share),
+        asked.seed,
+        lambda share: emit("moving poses to more informative places", 0.5 + 0.2 * share),
     )  # fmt: skip
     choice, refiner = Choice.of(rows, weight, cost), replace(refiner, weight=weight)
     emit("working out what more or fewer poses buy", 0.7)
-    bought = _bought(choice, chosen, wish, refiner, reference)
-    bought[wish.poses] = _rms(reference, best.rows)
+    bought = _bought(choice, chosen, asked, refiner, reference)
+    bought[asked.poses] = _rms(reference, best.rows)
     emit("finding a short way", 0.95)
-    checks = [Stop(row, held_out=True) for row in _held_out(found, chosen, wish)]
+    checks = [Stop(row, held_out=True) for row in _held_out(found, chosen, asked)]
     found = joined(found, best.readings)
-    fit = [Stop(len(rows) + i) for i in range(wish.poses)]
-    way = itinerary(found, fit + checks, workspace, wish.repeats)
+    fit = [Stop(len(rows) + i) for i in range(asked.poses)]
+    way = itinerary(found, fit + checks, workspace, asked.repeats)
     again = [stop.row - len(rows) for stop in way.stops if stop.repeat]
     measured = np.concatenate([best.rows, best.rows[again]])
     expected = expectation_of(parameters, measured, reference)
@@ -145,34 +146,34 @@ def far_end(load: Payload) -> tuple[float, float, float]:
     return (2 * load.cog[0], 2 * load.cog[1], 2 * load.cog[2])
 
 
-def _require_numbers(parameters: Parameters, observable: Observable, wish: Wish) -> None:
+def _require_numbers(parameters: Parameters, observable: Observable, asked: SessionDesign) -> None:
     """Raise PlanError where the poses give no more numbers than there are unknowns.
 
     Arithmetic, before any pose is looked for: the instrument is counted as standing at one place.
     """
     frame = () if observable.registered and not observable.unknown else observable.frame
     layout = Layout(1, 1, frame, observable.free_length, observable.first_target)
-    _require(len(parameters) + layout.size, observable, wish)
+    _require(len(parameters) + layout.size, observable, asked)
 
 
-def _require(unknown: int, observable: Observable, wish: Wish) -> None:
+def _require(unknown: int, observable: Observable, asked: SessionDesign) -> None:
     needed = unknown // observable.equations + 1
-    if wish.poses < needed:
+    if asked.poses < needed:
         raise PlanError(
-            f"too few poses: found {wish.poses}, expected at least {needed}: {unknown} unknowns, "
+            f"too few poses: found {asked.poses}, expected at least {needed}: {unknown} unknowns, "
             f"{observable.equations} number(s) a {observable.kind} reading; plan more poses or "
             "ask for fewer effects"
         )
 
 
 def _require_enough(
-    parameters: Parameters, observable: Observable, found: Candidates, wish: Wish
+    parameters: Parameters, observable: Observable, found: Candidates, asked: SessionDesign
 ) -> None:
-    _require(len(parameters) + observable.layout(found.readings).size, observable, wish)
-    if len(found.readings) < wish.poses + wish.held_out:
+    _require(len(parameters) + observable.layout(found.readings).size, observable, asked)
+    if len(found.readings) < asked.poses + asked.held_out:
         raise PlanError(
             f"poses: {len(found.readings)} can be reached and seen, expected at least "
-            f"{wish.poses + wish.held_out}; {found.hindered}"
+            f"{asked.poses + asked.held_out}; {found.hindered}"
         )
 
 
@@ -191,14 +192,14 @@ def reference_of(
 
 
 def _cost(
-    parameters: Parameters, found: Candidates, wish: Wish
+    parameters: Parameters, found: Candidates, asked: SessionDesign
 ) -> Callable[[Sequence[int]], Array]:
     """Return what adding each candidate costs in travel: its legs to the two nearest stops."""
     speed = joint_speed(parameters.nominal.arm.limits.velocity)
     legs = leg_times(found.q, found.q, speed)
     usual = float(np.median(legs)) or 1.0
     load, stop = found.readings.load, found.stop
-    unit = wish.travel_weight / (2 * usual * wish.poses)
+    unit = asked.travel_weight / (2 * usual * asked.poses)
 
     def cost(chosen: Sequence[int]) -> Array:
         extra = np.full(len(load), 2 * usual)
@@ -218,19 +219,21 @@ def _rms(reference: Reference, rows: Array) -> float:
     return float(np.sqrt(np.mean(reference.std(inverse(information_of(rows))) ** 2)))
 
 
-def _chosen(choice: Choice, wish: Wish, report: Callable[[float], None]) -> list[int]:
+def _chosen(choice: Choice, asked: SessionDesign, report: Callable[[float], None]) -> list[int]:
     size, k = choice.rows.shape[2], choice.rows.shape[1]
-    return exchanged(choice, forward_selected(choice, [], wish.poses, -(-size // k)), report=report)
+    return exchanged(
+        choice, forward_selected(choice, [], asked.poses, -(-size // k)), report=report
+    )
 
 
 def _bought(
-    choice: Choice, chosen: list[int], wish: Wish, refiner: Refiner, reference: Reference
+    choice: Choice, chosen: list[int], asked: SessionDesign, refiner: Refiner, reference: Reference
 ) -> dict[int, float]:
     """Return what fewer and more poses would give, each number's poses chosen anew."""
     size, k = choice.rows.shape[2], choice.rows.shape[1]
     fewest = -(-size // k)
     std_of: dict[int, float] = {}
-    for count in sorted({max(round(share * wish.poses), fewest) for share in BOUGHT}):
+    for count in sorted({max(round(share * asked.poses), fewest) for share in BOUGHT}):
         if count == len(chosen):
             continue
         fewer = count < len(chosen)
@@ -241,21 +244,21 @@ def _bought(
         )
         some = exchanged(choice, some, rounds=1)
         readings = refiner.found.readings[np.array(some)]
-        random = np.random.default_rng(wish.seed)
+        random = np.random.default_rng(asked.seed)
         best = refiner.refined(Refined(readings, choice.rows[some]), BOUGHT_ROUNDS, random)
         std_of[len(some)] = _rms(reference, best.rows)
     return std_of
 
 
-def _held_out(found: Candidates, chosen: list[int], wish: Wish) -> list[int]:
+def _held_out(found: Candidates, chosen: list[int], asked: SessionDesign) -> list[int]:
     """Return candidates at poses that are not fitted, drawn at random, the fitted loads in turn."""
-    random = np.random.default_rng(wish.seed + 2)
+    random = np.random.default_rng(asked.seed + 2)
     used = set(found.stop[chosen])
     loads = np.unique(found.readings.load[chosen])
     picked: list[int] = []
     for row in random.permutation(len(found.readings)):
         wanted = loads[len(picked) % len(loads)]
-        if len(picked) == wish.held_out:
+        if len(picked) == asked.held_out:
             break
         if found.stop[row] not in used and found.readings.load[row] == wanted:
             picked.append(int(row))

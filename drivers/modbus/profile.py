@@ -11,7 +11,14 @@ from typing import Any
 from pydantic_core import ErrorDetails
 
 from gapbridge.drivers.modbus.registers import BIT_TABLES, LAST_ADDRESS, UNITS, Table
-from gapbridge.drivers.modbus.schema import Condition, Order, Place, ProfileFile, Turns, Vector
+from gapbridge.drivers.modbus.schema import (
+    Condition,
+    Place,
+    ProfileFile,
+    RegisterWrite,
+    Turns,
+    Vector,
+)
 from gapbridge.drivers.profile_file import (
     ProfileDocument,
     ProfileError,
@@ -90,8 +97,8 @@ def single_places(profile: ProfileFile) -> Iterator[tuple[Keys, Place]]:
     write = profile.write
     if write.mode == "target_trigger":
         for name in ("before", "trigger", "stop"):
-            for i, order in enumerate(getattr(write, name)):
-                yield ("write", name, i), order
+            for i, one in enumerate(getattr(write, name)):
+                yield ("write", name, i), one
         for name in ("busy", "result"):
             if getattr(write, name) is not None:
                 yield ("write", name), getattr(write, name)
@@ -129,7 +136,7 @@ def _check_places(document: ProfileDocument, profile: ProfileFile) -> None:
                 (*keys, "type"),
                 f"found 'bit' in table {place.table!r}, expected a number's type, with a mask",
             )
-        written = isinstance(place, Order) or keys == ("write", "target")
+        written = isinstance(place, RegisterWrite) or keys == ("write", "target")
         if written and place.table not in ("coil", "holding"):
             raise document.error(
                 (*keys, "table"),
@@ -137,8 +144,8 @@ def _check_places(document: ProfileDocument, profile: ProfileFile) -> None:
             )
         if isinstance(place, Condition) and place.type.startswith("f"):
             raise document.error((*keys, "type"), f"found {place.type!r}, expected whole numbers")
-        if isinstance(place, Order):
-            _check_order(document, keys, place)
+        if isinstance(place, RegisterWrite):
+            _check_write(document, keys, place)
     for span in spans(profile):
         if span.end - 1 > LAST_ADDRESS:
             raise document.error(
@@ -146,11 +153,11 @@ def _check_places(document: ProfileDocument, profile: ProfileFile) -> None:
             )
 
 
-def _check_order(document: ProfileDocument, keys: Keys, order: Order) -> None:
-    low, high = (0, 1) if order.table in BIT_TABLES else order.coding.limits
-    if not low <= order.value <= high:
+def _check_write(document: ProfileDocument, keys: Keys, write: RegisterWrite) -> None:
+    low, high = (0, 1) if write.table in BIT_TABLES else write.coding.limits
+    if not low <= write.value <= high:
         raise document.error(
-            (*keys, "value"), f"found {order.value:g}, expected {low:g} to {high:g}"
+            (*keys, "value"), f"found {write.value:g}, expected {low:g} to {high:g}"
         )
 
 
@@ -211,10 +218,10 @@ def _may_share(one: Span, other: Span) -> bool:
     same = (one.first, one.count) == (other.first, other.count)
     sets = {one.keys[0], other.keys[0]}
     conditions = sets <= {"status", "identity"}
-    orders = sets == {"write"} and one.keys[1] != "target" and other.keys[1] != "target"
+    writes = sets == {"write"} and one.keys[1] != "target" and other.keys[1] != "target"
     echoed = {one.keys, other.keys} == {("write", "target"), ("state", "target")}
     watched = sets == {"status", "write"} and {"busy", "result"} & {*one.keys, *other.keys}
-    return same and bool(conditions or orders or echoed or watched)
+    return same and bool(conditions or writes or echoed or watched)
 
 
 def _refusal(document: ProfileDocument, worst: ErrorDetails) -> ProfileError:

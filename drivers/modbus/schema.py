@@ -83,7 +83,7 @@ class Condition(Place):
         return (count if self.mask is None else count & self.mask) in self.good
 
 
-class Order(Place):
+class RegisterWrite(Place):
     """A number to be written."""
 
     value: Number = Field(description="counts")
@@ -111,9 +111,13 @@ class TargetTrigger(Section):
     mode: Literal["target_trigger"]
     target: Vector = Field(description="the joint targets")
     single: bool = Field(default=False, strict=True, description="only function 6: one at a time")
-    before: list[Order] = Field(default=[], description="written once when arming: speed, ...")
-    trigger: list[Order] = Field(min_length=1, description="written in turn to start the motion")
-    stop: list[Order] = Field(default=[], description="written to stop the motion")
+    before: list[RegisterWrite] = Field(
+        default=[], description="written once when arming: speed, ..."
+    )
+    trigger: list[RegisterWrite] = Field(
+        min_length=1, description="written in turn to start the motion"
+    )
+    stop: list[RegisterWrite] = Field(default=[], description="written to stop the motion")
     busy: Condition | None = Field(default=None, description="no new target until it is fine")
     result: Condition | None = Field(default=None, description="what the last motion came to")
     following: Positive = Field(default=5.0, description="s in which a target must be reached")

@@ -23,7 +23,13 @@ from gapbridge.drivers.clock import SYSTEM, Clock
 from gapbridge.drivers.modbus import encode
 from gapbridge.drivers.modbus.decode import Sample
 from gapbridge.drivers.modbus.registers import UNITS, Table
-from gapbridge.drivers.modbus.schema import Mailbox, Order, ProfileFile, ReadOnly, TargetTrigger
+from gapbridge.drivers.modbus.schema import (
+    Mailbox,
+    ProfileFile,
+    ReadOnly,
+    RegisterWrite,
+    TargetTrigger,
+)
 from gapbridge.drivers.modbus.transport import Transport
 
 Rates = Callable[[], tuple[float, float]]
@@ -266,7 +272,7 @@ class TargetWriter:
 
     def arm(self, state: RobotState, look: Callable[[], Sample]) -> None:
         """Write speed and the like, once; no target, no trigger. Raises WriteError."""
-        self._order(self._entry.before)
+        self._write_all(self._entry.before)
         self._armed, self._sent, self._target = True, {}, None
 
     def write(self, setpoint: Setpoint, sample: Sample) -> None:
@@ -287,7 +293,7 @@ class TargetWriter:
             return
         for first, words in encode.runs(registers):
             self._transport.write(entry.table, first, words, single=self._entry.single)
-        self._order(self._entry.trigger)
+        self._write_all(self._entry.trigger)
         self._sent, self._since = registers, self._now()
         self._target = np.round(setpoint.q / self._size) * self._size
 
@@ -308,11 +314,11 @@ class TargetWriter:
                 f"{away[joint]:.4f} rad from where it was sent {self._entry.following:g} s ago"
             )
 
-    def _order(self, orders: list[Order]) -> None:
-        for order in orders:
-            table: Table = order.table
-            words = [int(order.value)] if table == "coil" else order.coding.encode([order.value])
-            self._transport.write(table, order.address, words, single=self._entry.single)
+    def _write_all(self, writes: list[RegisterWrite]) -> None:
+        for write in writes:
+            table: Table = write.table
+            words = [int(write.value)] if table == "coil" else write.coding.encode([write.value])
+            self._transport.write(table, write.address, words, single=self._entry.single)
 
     def pending(self) -> tuple[int, list[int]] | None:
         """Return None: a target and its trigger are requests of their own."""
@@ -322,7 +328,7 @@ class TargetWriter:
         """Stop the motion where the controller can; else it ends at the last target."""
         if self._armed:
             self._armed = False
-            self._order(self._entry.stop)
+            self._write_all(self._entry.stop)
 
     def target(self) -> Array | None:
         """Return the joints sent last, as the registers hold them."""

@@ -16,7 +16,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from gapbridge.bridge.ipc.side_main import take_order
+from gapbridge.bridge.ipc.side_main import read_start_data
 
 FORGED = [
     {"kind": "request", "command": "arm", "number": 1, "by": "forged", "detail": "forged"},
@@ -86,20 +86,20 @@ def attack(daemon: int) -> dict[str, Any]:
 
 
 def main() -> None:
-    order = take_order()
+    start = read_start_data()
     begun = time.monotonic()
-    while not order.events.closed:
-        order.events.wait(0.2)
-        for event in order.events.poll():
+    while not start.events.closed:
+        start.events.wait(0.2)
+        for event in start.events.poll():
             if event.get("kind") == "status" and event["state"] != "disconnected":
                 found = {
                     **attack(os.getppid()),
                     "loop": event["loop"]["pid"] in family(os.getppid()),
                 }
                 for event_ in FORGED:
-                    order.emit(event_)
+                    start.emit(event_)
                 for kind in ("recorder", "web", "metrics"):
-                    order.emit({"kind": kind, "attack": found})
+                    start.emit({"kind": kind, "attack": found})
         if time.monotonic() - begun > 120.0:
             return
 

@@ -77,7 +77,7 @@ def mean(values: Array) -> Array:
 
 
 @dataclass(frozen=True)
-class Again:
+class Revisit:
     """One pose, before and now."""
 
     before: Reading
@@ -298,7 +298,7 @@ class Measuring:
             return
         limit = max(NOISES * float(np.hypot(self.sigma, REPEATABILITY)), LEAST)
         first = len(session.taken)
-        seen: list[Again] = []
+        seen: list[Revisit] = []
         for before in earlier[:REVISITED]:
             prompt.say(f"  back to stop {before.stop + 1}", "bold")
             seen.append(self._once_more(before))
@@ -326,7 +326,7 @@ class Measuring:
                 found.append(taken)
         return found
 
-    def _once_more(self, before: Reading) -> Again:
+    def _once_more(self, before: Reading) -> Revisit:
         session = self.session
         pose = session.stops[before.stop]
         now, _ = self.measure(before.stop, self.positioning.bring(pose), again=True)
@@ -337,9 +337,9 @@ class Measuring:
             session.readings(kind, [before]), session.readings(kind, [now]),
             session.readings(kind, [t for t in session.taken[:-1] if not t.doubted]),
         )  # fmt: skip
-        return Again(before, now, before.q, shift)
+        return Revisit(before, now, before.q, shift)
 
-    def _decide(self, seen: list[Again], limit: float, first: int) -> None:
+    def _decide(self, seen: list[Revisit], limit: float, first: int) -> None:
         """Say what has moved, have the person agree, and begin a new place."""
         prompt = self.prompt
         stories = self._stories(seen)
@@ -363,7 +363,7 @@ class Measuring:
         if chosen != "keep":
             self.mark_moved(chosen, since=first)
 
-    def _stories(self, seen: list[Again]) -> dict[str, float]:
+    def _stories(self, seen: list[Revisit]) -> dict[str, float]:
         """Return the rms residual of each story, m: a rigid motion, or a shift in tool axes."""
         if len(seen) < REVISITED or len(seen[0].shift) < 3:
             return {}

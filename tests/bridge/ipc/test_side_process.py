@@ -22,29 +22,29 @@ from gapbridge.bridge.ipc.side_process import SideProcess
 
 ECHO = """
     import os
-    from gapbridge.bridge.ipc.side_main import take_order
+    from gapbridge.bridge.ipc.side_main import read_start_data
 
-    order = take_order()
-    reader = order.memory.reader()
-    order.emit({"kind": "hello", "session": order.session, "extra": order.extra,
-                "cell": str(order.settings.cell), "n": order.n})
-    while not order.events.closed:
-        order.events.wait(0.05)
-        for event in order.events.poll():
+    start = read_start_data()
+    reader = start.memory.reader()
+    start.emit({"kind": "hello", "session": start.session, "extra": start.extra,
+                "cell": str(start.settings.cell), "n": start.n})
+    while not start.events.closed:
+        start.events.wait(0.05)
+        for event in start.events.poll():
             event.pop("filling", None)
-            order.emit({"kind": "heard", "of": event})
+            start.emit({"kind": "heard", "of": event})
         rows = reader.drain()
         if len(rows):
-            order.emit({"kind": "rows", "timestamps": rows[:, 1].tolist()})
-    open(order.extra["last"], "w").write("finished")
+            start.emit({"kind": "rows", "timestamps": rows[:, 1].tolist()})
+    open(start.extra["last"], "w").write("finished")
 """
 DEAF = """
     import time
-    from gapbridge.bridge.ipc.side_main import take_order
+    from gapbridge.bridge.ipc.side_main import read_start_data
 
-    order = take_order()
-    order.events.poll()
-    order.emit({"kind": "hello"})
+    start = read_start_data()
+    start.events.poll()
+    start.emit({"kind": "hello"})
     time.sleep(1000)
 """
 
@@ -65,7 +65,7 @@ def memory() -> Iterator[SharedMemory]:
 
 
 @pytest.fixture
-def order(tmp_path: Path) -> dict[str, Any]:
+def start_data(tmp_path: Path) -> dict[str, Any]:
     settings = DaemonSettings(cell=tmp_path / "cell.yaml")
     return {
         "settings": settings.model_dump(mode="json"), "n": 2, "session": "run-1",
@@ -75,14 +75,17 @@ def order(tmp_path: Path) -> dict[str, Any]:
 
 @pytest.fixture
 def start(
-    memory: SharedMemory, order: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    memory: SharedMemory,
+    start_data: dict[str, Any],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> Iterator[Callable[[str], SideProcess]]:
     monkeypatch.syspath_prepend(str(tmp_path))
     started: list[SideProcess] = []
 
     def begin(text: str) -> SideProcess:
         (tmp_path / "side_under_test.py").write_text(textwrap.dedent(text), encoding="utf-8")
-        started.append(SideProcess("side_under_test", order, memory, sys.stderr))
+        started.append(SideProcess("side_under_test", start_data, memory, sys.stderr))
         return started[-1]
 
     yield begin
@@ -183,7 +186,7 @@ def test_a_line_is_never_torn_though_the_pipe_was_full(
 
 @pytest.mark.parametrize("text", [ECHO, DEAF])
 def test_when_the_daemon_is_killed_they_end(
-    text: str, order: dict[str, Any], tmp_path: Path
+    text: str, start_data: dict[str, Any], tmp_path: Path
 ) -> None:
     (tmp_path / "side_under_test.py").write_text(textwrap.dedent(text), encoding="utf-8")
     daemon = f"""
@@ -192,7 +195,7 @@ sys.path.insert(0, {str(tmp_path)!r})
 from gapbridge.bridge.ipc import side_main
 from gapbridge.bridge.ipc.shared_memory import SharedMemory
 from gapbridge.bridge.ipc.side_process import SideProcess
-side = SideProcess("side_under_test", json.loads({json.dumps(order)!r}), SharedMemory(2))
+side = SideProcess("side_under_test", json.loads({json.dumps(start_data)!r}), SharedMemory(2))
 while not side.events():
     time.sleep(0.02)
 print(side.pid, flush=True)

@@ -66,9 +66,9 @@ class Recording:
         settings = DaemonSettings(
             cell=cell, recording=RecordingSettings(folder=self.stem.parent, keep_free=0.0)
         )
-        order = {"settings": settings.model_dump(mode="json"), "n": N, "session": SESSION,
+        start = {"settings": settings.model_dump(mode="json"), "n": N, "session": SESSION,
                  "extra": {}}  # fmt: skip
-        self.process = SideProcess("gapbridge.bridge.recording.main", order, publisher.memory)
+        self.process = SideProcess("gapbridge.bridge.recording.main", start, publisher.memory)
         self._seen = 0  # files of former lives
 
     def wait_for_file(self) -> None:

@@ -36,9 +36,9 @@ from gapbridge.core.planning.information import blocks, information_of, inverse
 from gapbridge.core.planning.workspace import Place, Reflector, Workspace
 
 
-def plan(*given, progress=None, **wishes) -> Plan:
+def plan(*given, progress=None, **asked) -> Plan:
     """Plan from few candidates: a test need not find the very best."""
-    return design.plan(*given, design.Wish(**{"stops": 150} | wishes), progress)
+    return design.plan(*given, design.SessionDesign(**{"stops": 150} | asked), progress)
 
 
 @pytest.fixture(scope="module")

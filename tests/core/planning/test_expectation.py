@@ -13,7 +13,7 @@ from gapbridge.core.calibration.identifiability import identifiable_parameters
 from gapbridge.core.calibration.observables.nuisance import Nuisance
 from gapbridge.core.calibration.parameters import Parameters
 from gapbridge.core.loads import Loads
-from gapbridge.core.planning.design import Wish, plan
+from gapbridge.core.planning.design import SessionDesign, plan
 from gapbridge.core.planning.information import Reference, blocks, expectation_of
 
 
@@ -34,8 +34,8 @@ def parameters() -> Parameters:
 @pytest.fixture(scope="module")
 def planned(parameters: Parameters):
     space = small_space(parameters.nominal)
-    wish = Wish(poses=24, held_out=3, sigma=SIGMA, stops=200)
-    return plan(parameters, POSITION, LOADS, space, wish)
+    asked = SessionDesign(poses=24, held_out=3, sigma=SIGMA, stops=200)
+    return plan(parameters, POSITION, LOADS, space, asked)
 
 
 def test_scatter_over_sessions_is_what_was_expected(parameters, planned) -> None:
