@@ -79,7 +79,10 @@ def prior(
         c: np.array([usual.get(p.unit, p.scale) for p in space.candidates[c].parameters])
         for c in block
     }
-    size |= {c: np.where(nominal, NOMINAL * size[c], size[c]) for c, nominal in held.items()}
+    size |= {
+        c: np.where(nominal, NOMINAL * size[c], size[c])
+        for c, nominal in held.items() if c in size
+    }  # fmt: skip
 
     def sized(links: float, joints: float) -> dict[int, Array]:
         return {

@@ -93,3 +93,13 @@ def test_the_size_of_the_links_errors_is_the_most_likely_one(singles, times, lea
         sigma = geometry.prior(noisy, block, ())
         found.append(float(max(sigma[block[0]]) / 1e-3))
     assert least <= np.median(found) <= most
+
+
+def test_numbers_held_nominal_of_a_link_that_is_accused_no_longer_are_of_no_account(singles):
+    """All rows of a UR10 let a link fall of which a twist had been held."""
+    space, _ = singles
+    gone, kept, *_ = block = geometry.link_candidates(space)
+    held = {c: np.arange(len(space.candidates[c].parameters)) == 0 for c in (gone, kept)}
+    sigma = geometry.prior(space, block[1:], (), held)
+    assert set(sigma) == set(block[1:])
+    assert sigma[kept][0] < 1e-6 * max(sigma[kept])
