@@ -122,25 +122,33 @@ class _Closing:
         self._part = parts(selection.observation, selection.kept)
         self._held = HeldOut(selection, parts=self._part)
         # of poses: a weight's and a gain's trace in one attitude is the same in every part
-        self._closes = selection.observation.channel == "position" and self._held.possible
+        self._possible = selection.observation.channel == "position" and self._held.possible
 
     def takes(self, accused: Sequence[int], out: Iterable[int]) -> bool:
         """Return whether closing the gap takes one of ``out``, which is then among the needed."""
-        self._closes = self._closes and self._closed(accused)
-        for c in out if self._closes else ():
+        self._possible = self.closed(accused)
+        for c in out if self._possible else ():
             rest = [o for o in accused if o != c]
-            if not (self._candidates[c].periodic or self._closed(rest)):
+            if not (self._candidates[c].periodic or self.closed(rest)):
                 self.needed.add(c)
                 return True
         return False
 
-    def _closed(self, accused: Sequence[int]) -> bool:
+    def closed(self, accused: Sequence[int]) -> bool:
+        """Return whether accusations close the gap in every part of the log."""
+        if not self._possible:
+            return False
         left, gap = (
             np.bincount(self._part, self._held.squares(chosen))
             for chosen in ([*accused, *self._block], self._block)
         )
         worst = float(np.max(left[gap > 0] / gap[gap > 0], initial=0.0))
         return left.sum() <= CLOSED_SHARE**2 * gap.sum() and worst <= CLOSED_IN_A_PART**2
+
+
+def closes_gap(selection: Selection, accused: Sequence[int]) -> bool:
+    """Return whether candidates close a gap of poses in every part of the log."""
+    return _Closing(selection).closed(accused)
 
 
 def closes_everywhere(selection: Selection, accused: Sequence[int]) -> bool:

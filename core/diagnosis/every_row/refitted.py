@@ -6,7 +6,7 @@ found, and their rivals, fit into memory for every row. There values, ties and g
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -115,23 +115,33 @@ def still_accused(
     refits some of the selection's terms.
     """
     selection, judgement = _sure(selection, judgement, alone)
-    varying = not_constant(selection, judgement.accused)
-    if varying:
-        changing = tuple((p, Withdrawal(Check.CONSTANT, by)) for p, by in varying.items())
-        judgement = replace(
-            judgement, accused=tuple(p for p in judgement.accused if p not in varying),
-            withdrawn=(*judgement.withdrawn, *changing),
-        )  # fmt: skip
-        selection = alone(selection, judgement.accused)
+    varying = {
+        p: Withdrawal(Check.CONSTANT, by)
+        for p, by in not_constant(selection, judgement.accused).items()
+    }
+    selection, judgement = _without(varying, selection, judgement, alone)
     # in the space of all rows a term's position is its candidate
     fallen = gainless(selection, judgement.accused, held) if held.possible else []
-    accused = tuple(p for p in judgement.accused if p not in fallen)
-    withdrawn = (*judgement.withdrawn, *((p, GAINLESS) for p in fallen))
-    if fallen:
-        selection = alone(selection, accused)
-    single = [p for p in accused if p not in selection.prior]
+    selection, judgement = _without(dict.fromkeys(fallen, GAINLESS), selection, judgement, alone)
+    single = [p for p in judgement.accused if p not in selection.prior]
     ties = ties_of(selection.working, selection.best, single)
-    return selection, replace(judgement, accused=accused, withdrawn=withdrawn, ties=ties)
+    return selection, replace(judgement, ties=ties)
+
+
+def _without(
+    reasons: Mapping[int, Withdrawal], selection: Selection, judgement: Judgement, alone: Alone
+) -> tuple[Selection, Judgement]:
+    """Return selection and judgement without some positions, the others refitted and sure.
+
+    Without its lines a UR10's links take lengths of 55 mm, of which the data show little.
+    """
+    if not reasons:
+        return selection, judgement
+    accused = tuple(p for p in judgement.accused if p not in reasons)
+    judgement = replace(
+        judgement, accused=accused, withdrawn=(*judgement.withdrawn, *reasons.items())
+    )
+    return _sure(alone(selection, accused), judgement, alone)
 
 
 def _sure(selection: Selection, judgement: Judgement, alone: Alone) -> tuple[Selection, Judgement]:
@@ -170,7 +180,7 @@ def refitted(
     """
     remainder = _scatter(selection.observation, selection.kept) if unknown else None
     whole = refitted_alone(selection, model.arm, accused, remainder)
-    links = {p: own for p, own in selection.prior.items() if p in accused}
+    links = {p: own for p, own in whole.prior.items() if p in accused}
     whole = replace(whole, prior=links)
     single = tuple(p for p in accused if p not in links)
     return replace(whole, best=fit(whole.working, single))

@@ -5,7 +5,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from gapbridge.core.diagnosis import remainder
+from gapbridge.core.diagnosis import diagnosis, remainder
+from gapbridge.core.diagnosis.causes import Considered, Outcome
+from gapbridge.core.diagnosis.finding import Check, Withdrawal
+from gapbridge.core.diagnosis.judgement import Judgement
+from gapbridge.core.effects import Site, Term
 
 PARTS = np.repeat(np.arange(4), 5)
 
@@ -62,3 +66,63 @@ def test_a_periodic_line_is_not_needed(closing):
 
 def test_of_other_channels_than_position_nothing_is_needed(closing):
     assert not closing({frozenset({0}): np.full(4, 0.1)}, channel="wrench").takes([0], [0])
+
+
+class Searched:
+    """A search that found one term, or with ``effect`` None nothing."""
+
+    def __init__(self, effect):
+        self.terms = () if effect is None else (Term(effect, Site(2), (1e-3,)),)
+        self.term_index = tuple(range(len(self.terms)))
+
+
+@pytest.fixture
+def two_searches(monkeypatch):
+    """Return a maker of a first search whose line falls and a second one; and what they saw."""
+    asked = []
+
+    def made(closes, channel="position"):
+        stays = Judgement((0,), True, 0.0, (), {}, ())
+        falls = Judgement((), True, 0.0, (), {}, ((0, Withdrawal(Check.STABLE_VALUE)),))
+
+        def select(observation, model, without, progress):
+            asked.append(without)
+            return Searched("axial_compliance" if without else "transmission_error")
+
+        def judge(found, held):
+            return falls if found.terms[0].effect == "transmission_error" else stays
+
+        line = Considered("transmission_error", None, 0.0, Outcome.WITHDRAWN)
+        other = Considered("backlash", None, 0.0, Outcome.NOT_NEEDED)
+        for name, value in {
+            "select": select, "judge": judge, "HeldOut": lambda _: None,
+            "judge_geometry": lambda found, judgement, arm: (found, judgement),
+            "closes_gap": lambda found, accused: closes,
+            "considered_of": lambda *_: (line, other),
+        }.items():  # fmt: skip
+            monkeypatch.setattr(diagnosis, name, value)
+        model = SimpleNamespace(arm=None)
+        found, judgement, fallen = diagnosis._found(
+            SimpleNamespace(channel=channel), model, (), None
+        )
+        return found.terms[0].effect, judgement.accused, [c.effect for c in fallen]
+
+    return made, asked
+
+
+def test_where_nothing_stays_a_second_search_goes_without_what_fell(two_searches):
+    """Of an iiwa under three loads 0.92 mm were left in one draw of the poses in two, not 0.2."""
+    made, asked = two_searches
+    assert made(closes=True) == ("axial_compliance", (0,), ["transmission_error"])
+    assert asked == [(), ("transmission_error",)]
+
+
+def test_a_second_search_that_does_not_close_the_gap_counts_for_nothing(two_searches):
+    made, _ = two_searches
+    assert made(closes=False) == ("transmission_error", (), [])
+
+
+def test_only_poses_are_searched_a_second_time(two_searches):
+    made, asked = two_searches
+    assert made(closes=True, channel="torque") == ("transmission_error", (), [])
+    assert asked == [()]

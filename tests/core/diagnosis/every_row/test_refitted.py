@@ -109,6 +109,24 @@ def test_a_length_that_all_rows_leave_open_is_held_nominal():
     assert decided.accused == (0, 1)
 
 
+def test_what_is_left_once_others_fell_is_asked_anew(monkeypatch):
+    """Without its lines a UR10's link took 55 mm +- 18 mm, after all had been sure."""
+    found = OnAllRows((1e-3, 1e-3, 1e-3), (5e-4,))
+    without_line = OnAllRows((1e-3, 0.055, 1e-3), (5e-4,))
+    monkeypatch.setattr(every_row, "not_constant", lambda *_: {1: "actual_q_1"})
+    monkeypatch.setattr(every_row, "ties_of", lambda *_: {})
+    monkeypatch.setattr(OnAllRows, "working", None, raising=False)
+    monkeypatch.setattr(OnAllRows, "best", None, raising=False)
+
+    def alone(selection, accused):
+        return selection if 1 in accused or selection is not found else without_line
+
+    asked = Judgement((0, 1), True, 0.0, (), {}, ())
+    left, decided = still_accused(found, asked, SimpleNamespace(possible=False), alone)
+    assert decided.accused == (0,)
+    assert left.terms[0].values == (1e-3, 0.0, 1e-3)
+
+
 @pytest.mark.parametrize(("zero", "stays"), [(2.9e-4, (0,)), (3.1e-4, (0, 1))])
 def test_a_zero_among_the_links_that_some_rows_left_open_needs_three_sigmas(zero, stays):
     """It has a prior: without it the links of a UR10 stood for 0.57 mrad +- 0.13 mrad."""
