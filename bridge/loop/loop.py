@@ -267,6 +267,7 @@ class Loop:
         flags = self._checks.begin(state, missed)
         if flags & RESYNC:
             self._loads.forget()
+            is_fresh = False  # how long it lay here only the next one shows: clocks drift meanwhile
         self._acknowledge()
         supervisor, writing = self._supervisor, self._writing
         if supervisor.state == State.FAULT:

@@ -360,3 +360,8 @@ def test_every_invariant_has_a_break() -> None:
 def test_a_stop_that_comes_and_goes_while_frames_are_out_of_order_is_a_fault() -> None:
     found = run(8072455)
     assert not found.violations
+
+
+def test_the_first_state_after_the_loop_stood_still_writes_nothing() -> None:
+    """A controller's clock that runs fast meanwhile makes it look younger than it is."""
+    assert not run(11029317).violations
