@@ -40,7 +40,8 @@ class ControllerClock:
     too old to write by.
     What a stalled link hands on at once is old for a moment only. Where all samples are older than
     that for as long, either the controller's clock has stood still or the way has become longer,
-    which no clock shows: the two are tied anew only while nothing is written.
+    which no clock shows: the two are tied anew only while the driver is not armed, since arming
+    measures the way to the controller and nothing is written before.
     Where the controller's clock passes this machine's, either it has been set forward or the link
     hands on what it held back: the sample counts as the next one after the last, until some in a
     row come as quick as those before.
@@ -56,15 +57,16 @@ class ControllerClock:
         self._agreeing = 0  # samples in a row that are as quick as that
         self._old_since: float | None = None  # s, monotonic: all samples have been old since
 
-    def take(self, state: RobotState, writes: bool = False) -> int:
+    def take(self, state: RobotState, way_known: bool = False) -> int:
         """Take a new sample; returns the cycles missed since the one before.
 
-        ``writes``: setpoints are made of the samples, so that old ones stay old.
+        ``way_known``: arming has measured the way to the controller, beside the samples so far;
+        later ones that are older stay old.
         """
         lead, before, counts = state.received - state.timestamp, self._last, self._counts
         self._last, self._counts = (state.timestamp, state.received), True
         gap = 0.0 if before is None else state.timestamp - before[0]
-        if self._lead is None or (self._stood_still(lead, state.received) and not writes):
+        if self._lead is None or (self._stood_still(lead, state.received) and not way_known):
             self._lead, self._old_since, self._quickest = lead, None, None
         else:
             # not over a break: the first state after it would count as younger than it can be

@@ -259,7 +259,7 @@ class Loop:
             self._watch.drop(error)
             self._give_up(self._watch.lost)
             return
-        missed = self._clock.take(state, self._supervisor.state.writes)
+        missed = self._clock.take(state, way_known=self._writing.ready)
         expiry = self._clock.expiry(state) - self._writing.way
         is_fresh = self._watch.accept(expiry)
         self._give_up(self._watch.lost)

@@ -365,3 +365,8 @@ def test_a_stop_that_comes_and_goes_while_frames_are_out_of_order_is_a_fault() -
 def test_the_first_state_after_the_loop_stood_still_writes_nothing() -> None:
     """A controller's clock that runs fast meanwhile makes it look younger than it is."""
     assert not run(11029317).violations
+
+
+def test_a_way_that_grows_while_the_driver_is_armed_makes_states_old() -> None:
+    """Arming takes 0.3 s on a UR, and the round trip is measured at its begin."""
+    assert not run(11053496).violations
