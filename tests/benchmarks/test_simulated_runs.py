@@ -247,7 +247,7 @@ def _takes_old_states(patch: Patch) -> None:
 
 def _ties_clocks_while_writing(patch: Patch) -> None:
     take = ControllerClock.take
-    patch.setattr(ControllerClock, "take", lambda self, state, writes=False: take(self, state))
+    patch.setattr(ControllerClock, "take", lambda self, state, way_known=False: take(self, state))
     patch.setattr(OffsetWriter, "unanswered_since", lambda _: math.inf)
     patch.setattr(Supervisor, "take", _without(Supervisor.take, Cause.STALE))
 

@@ -330,7 +330,9 @@ d.connect()
 b = socket.create_connection((host, 30100))
 b.sendall(b"protective_stop\\n")
 b.recv(10)
-time.sleep(0.05)
+end = time.monotonic() + 2.0
+while not r.isProtectiveStopped() and time.monotonic() < end:
+    time.sleep(0.01)
 out["bits"] = [r.isProtectiveStopped(), r.getSafetyMode(), r.getRuntimeState()]
 out["servo"] = c.servoJ(q, 0.5, 0.5, 0.002, 0.1, 300)
 out["move"] = c.moveJ([q[0] + 0.1] + q[1:], 1.0, 2.0)
@@ -340,7 +342,9 @@ except Exception as error:
     out["early"] = str(error)
 time.sleep(5.1)
 d.unlockProtectiveStop()
-time.sleep(0.05)
+end = time.monotonic() + 2.0
+while r.isProtectiveStopped() and time.monotonic() < end:
+    time.sleep(0.01)
 out["released"] = [r.isProtectiveStopped(), r.getSafetyMode(), r.getRuntimeState()]
 c.reuploadScript()
 end = time.monotonic() + 2.0
