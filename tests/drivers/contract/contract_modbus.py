@@ -14,9 +14,9 @@ from gapbridge.drivers.driver import Driver
 from gapbridge.drivers.modbus.driver import ModbusDriver
 from gapbridge.drivers.modbus.profile import read_profile
 from gapbridge.drivers.modbus.registers import UNITS
-from gapbridge.drivers.modbus.schema import Vector
+from gapbridge.drivers.modbus.schema import Mailbox, Vector
 from gapbridge.drivers.modbus.settings import ModbusSettings
-from gapbridge.drivers.simulated.modbus.server import ModbusServer, make_servers
+from gapbridge.drivers.simulated.modbus.server import ModbusServer
 from gapbridge.drivers.simulated.server.protocol_server import ProtocolServer
 
 INVENTED = Path(__file__).parents[1] / "modbus" / "invented.yaml"
@@ -31,12 +31,19 @@ def _half_a_count(entry: Vector | None) -> float | None:
 
 
 class ModbusCase(Case):
-    """A controller with a profile's register map."""
+    """A controller with a profile's register map.
 
-    def __init__(self, profile: str) -> None:
-        self._profile = profile
+    ``watchdog``: s that the robot's program waits for a heartbeat; None: as the profile says. A
+    busy machine may write later than that, which is no fault of the driver.
+    """
+
+    def __init__(self, profile: str, watchdog: float | None = 10.0) -> None:
         self.settings = ModbusSettings(profile=profile, port=next(_ports), rate=50.0, timeout=1.0)
         self.file = file = read_profile(self.settings.profile_path)
+        self.robot_file = file
+        if watchdog is not None and isinstance(file.write, Mailbox):
+            box = file.write.model_copy(update={"watchdog": watchdog})
+            self.robot_file = file.model_copy(update={"write": box})
         self.n = file.joints
         self.resolution = (_half_a_count(file.state.position) or 0.0) + 1e-9
         self.speed_resolution = _half_a_count(file.state.velocity)
@@ -49,7 +56,7 @@ class ModbusCase(Case):
 
     def make_servers(self) -> list[ProtocolServer]:
         """Return the Modbus server."""
-        return make_servers(self.settings, self.host, self.controller)
+        return [ModbusServer(self.robot_file, self.host, self.settings.port or self.file.port)]
 
     def driver(self) -> Driver:
         """Return a Modbus driver."""

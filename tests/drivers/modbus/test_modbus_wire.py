@@ -202,7 +202,7 @@ def test_the_contract_holds_over_mutual_tls(keys: Path) -> None:
     context.load_verify_locations(keys / "ca.pem")
     context.verify_mode = ssl.CERT_REQUIRED
     port = free_port(case.host)
-    server = ModbusServer(case.file, case.host, port, tls=context)
+    server = ModbusServer(case.robot_file, case.host, port, tls=context)
     settings = ModbusSettings(
         profile="ur", host=case.host, port=port, transport="tls", rate=50.0,
         authority=keys / "ca.pem", certificate=keys / "client.pem", key=keys / "client.key",
@@ -227,7 +227,7 @@ def test_over_tls_only_the_named_or_the_pinned_controller_is_let_in(keys: Path) 
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.load_cert_chain(keys / "other.pem", keys / "other.key")
     port = free_port(case.host)
-    server = ModbusServer(case.file, case.host, port, tls=context)
+    server = ModbusServer(case.robot_file, case.host, port, tls=context)
     base = {"profile": "ur", "host": case.host, "port": port, "transport": "tls", "rate": 50.0}
     with ServerThread(case.controller, [server], case.host):
         named = ModbusSettings(**base, authority=keys / "ca.pem")
@@ -282,7 +282,7 @@ class Cable:
 def test_the_contract_holds_over_a_serial_line() -> None:
     case, cable = ModbusCase("ur"), Cable()
     ours, theirs = cable.ports
-    server = ModbusServer(case.file, case.host, 502, serial=theirs, baudrate=115200)
+    server = ModbusServer(case.robot_file, case.host, 502, serial=theirs, baudrate=115200)
     settings = ModbusSettings(
         profile="ur", transport="rtu", serial=ours, baudrate=115200, rate=20.0, timeout=1.0
     )
