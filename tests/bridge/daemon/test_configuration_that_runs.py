@@ -28,6 +28,7 @@ def test_a_loop_that_is_started_anew_runs_the_cell_that_runs_not_the_edited_one(
         text = cell.read_text()
         with Run(cell) as run:
             run.wait(State.OBSERVING)
+            wait_for(lambda: granted(run), 10.0, "the grant of the first loop")
             before = granted(run)
             run.compensate()
             wait_for(lambda: run.daemon.tally.written > 400, 30.0, "a ramp")
@@ -45,6 +46,7 @@ def test_a_loop_that_is_started_anew_runs_the_cell_that_runs_not_the_edited_one(
             run.compensate()
             wait_for(lambda: run.daemon.tally.written > written + 400, 30.0, "a ramp")
             assert run.daemon.configuration.text == text
+            assert len(granted(run)) == 2
             assert granted(run)[-1] == before[-1] == run.daemon.configuration.hash
             run.daemon.reload()  # and a reload does take it
             wait_for(lambda: run.daemon.configuration.text != text, 30.0, "the edited cell")

@@ -56,10 +56,15 @@ def run_client(host: str, body: str, timeout: float = 60.0) -> dict[str, Any]:
     """Run ur_rtde code in a process of its own; returns what it puts into `out`.
 
     The library can hang, abort or crash its process, so it never shares one with a test.
+    `until(ready)` is for what comes a while after a command; it waits for 10 s at most.
     """
     code = (
         "import json, os, sys, time, math\n"
         f"host = {host!r}\nout = {{}}\n"
+        "def until(ready):\n"
+        "    end = time.monotonic() + 10.0\n"
+        "    while not ready() and time.monotonic() < end:\n"
+        "        time.sleep(0.01)\n"
         + textwrap.dedent(body)
         + "\nsys.stdout.write('\\n' + json.dumps(out) + '\\n')\nsys.stdout.flush()\nos._exit(0)\n"
     )

@@ -7,7 +7,7 @@ from rtde_client import RtdeClient
 from simulated_cell import Bench, cell_settings, run_client
 from simulated_controller import SimulatedController
 
-NO_HANDSHAKE_WAIT = 2.0  # s: the library gives up on a broken handshake after 4
+NO_HANDSHAKE_WAIT = 3.9  # s: the library gives up on a broken handshake after 4
 
 
 def test_receive_reads_the_whole_default_recipe(controller: SimulatedController) -> None:
@@ -20,9 +20,9 @@ def test_receive_reads_the_whole_default_recipe(controller: SimulatedController)
         out["raw"] = r.getFtRawWrench()
         out["temperatures"] = r.getJointTemperatures()
         out["mode"] = [r.getRobotMode(), r.getSafetyMode(), r.getRuntimeState()]
-        first = r.getTimestamp()
-        time.sleep(0.5)
-        out["advance"] = r.getTimestamp() - first
+        first, begun = r.getTimestamp(), time.monotonic()
+        until(lambda: r.getTimestamp() - first > 0.5)
+        out["slower"] = time.monotonic() - begun - (r.getTimestamp() - first)
         out["connected"] = r.isConnected()
         """,
     )
@@ -30,7 +30,7 @@ def test_receive_reads_the_whole_default_recipe(controller: SimulatedController)
     assert out["raw"] != [0.0] * 6
     assert all(20.0 < t < 40.0 for t in out["temperatures"])
     assert out["mode"] == [7, 1, 1]
-    assert out["advance"] == pytest.approx(0.5, abs=0.1)
+    assert abs(out["slower"]) < 0.4
     assert out["connected"]
 
 
@@ -40,13 +40,11 @@ from rtde_control import RTDEControlInterface
 r = RTDEReceiveInterface(host)
 c = RTDEControlInterface(host)
 q = r.getActualQ()
-def near(goal, limit=2.0):
-    end = time.monotonic() + limit
-    while time.monotonic() < end:
-        if max(abs(a - b) for a, b in zip(r.getActualQ(), goal)) < 1e-6:
-            return True
-        time.sleep(0.01)
-    return False
+def apart(found, expected):
+    return max(abs(a - b) for a, b in zip(found, expected))
+def near(goal):
+    until(lambda: apart(r.getActualQ(), goal) < 1e-6)
+    return apart(r.getActualQ(), goal) < 1e-6
 """
 
 
@@ -61,16 +59,16 @@ pose = r.getTargetTCPPose()
 pose[2] += 0.05
 start = r.getTargetTCPPose()
 out["line"] = c.moveL(pose, 0.25, 1.2)
-time.sleep(0.1)
+until(lambda: apart(r.getActualTCPPose(), pose) < 1e-6)
 out["reached"] = [a - b for a, b in zip(r.getActualTCPPose(), pose)]
 out["to_pose"] = c.moveJ_IK(start, 1.0, 2.0) and near(goal)
 out["fk_line"] = c.moveL_FK(q, 0.5, 1.2) and near(q)
 out["asynchronous"] = c.moveJ(goal, 0.3, 1.0, True)
 out["running"] = c.getAsyncOperationProgress()
-time.sleep(0.2)
+until(lambda: r.getActualQ()[0] < goal[0] - 0.02)
 c.stopJ(4.0)
 out["halfway"] = r.getActualQ()[0] - q[0]
-time.sleep(0.3)
+until(lambda: c.getAsyncOperationProgress() < 0)
 out["progress_after"] = c.getAsyncOperationProgress()
 out["stays"] = r.getActualQ()[0] - q[0] - out["halfway"]
 """,
@@ -98,7 +96,7 @@ for i in range(250):
     goal[0] = q[0] + 0.1 * (i + 1) / 250
     assert c.servoJ(goal, 0.5, 0.5, 0.002, 0.05, 300)
     c.waitPeriod(t)
-out["servo"] = near(goal, 1.0)
+out["servo"] = near(goal)
 out["stopped"] = c.servoStop()
 for i in range(100):
     t = c.initPeriod()
@@ -117,7 +115,7 @@ pose[0] += 0.002
 for i in range(100):
     c.servoL(pose, 0.5, 0.5, 0.002, 0.05, 300)
     time.sleep(0.002)
-time.sleep(0.2)
+until(lambda: abs(r.getActualTCPPose()[0] - pose[0]) < 1e-5)
 out["servo_line"] = r.getActualTCPPose()[0] - pose[0]
 c.servoStop()
 """,
@@ -138,7 +136,7 @@ def test_settings_and_questions_are_answered(controller: SimulatedController) ->
         + """
 begun = time.monotonic()
 out["payload"] = c.setPayload(3.0, [0.0, 0.01, 0.05])
-time.sleep(0.02)
+until(lambda: r.getPayload() == 3.0)
 out["declared"] = [r.getPayload(), *r.getPayloadCog()]
 out["target_payload"] = c.setTargetPayload(2.0, [0.0, 0.0, 0.04], [0.1, 0.1, 0.1, 0, 0, 0])
 c.setTcp([0, 0, 0.1, 0, 0, 0])
@@ -153,15 +151,13 @@ out["pose_safe"] = c.isPoseWithinSafetyLimits(pose)
 has = c.getInverseKinematicsHasSolution
 out["has"] = [has(pose), has([9.0] * 3 + pose[3:])]
 out["steady"] = c.isSteady()
-c.getStepTime()
-time.sleep(0.02)
+until(lambda: abs(c.getStepTime() - 0.002) < 1e-9)
 out["step"] = c.getStepTime()
-c.getJointTorques()
-time.sleep(0.02)
+until(lambda: abs(c.getJointTorques()[1]) > 20.0)
 out["torques"] = c.getJointTorques()
 out["trans"] = c.poseTrans([1, 0, 0, 0, 0, 1.5707963267948966], [1, 0, 0, 0, 0, 0])
 c.zeroFtSensor()
-time.sleep(0.05)
+until(lambda: apart(r.getActualTCPForce()[:3], [0.0] * 3) < 2.0)
 out["force"] = r.getActualTCPForce()
 out["jog"] = c.jogStart([0, 0, 0.02, 0, 0, 0], 0) and c.jogStop()
 out["freedrive"] = c.freedriveMode() and c.endFreedriveMode()
@@ -207,12 +203,10 @@ out["there"] = near(q)
 out["payload"] = r.getPayload()
 out["after"] = c.moveJ(a, 1.0, 2.0) and near(a)
 out["stopped"] = c.stopScript() or True
-time.sleep(0.1)
+until(lambda: r.getRuntimeState() == 1)
 out["state"] = r.getRuntimeState()
 out["reupload"] = c.reuploadScript()
-end = time.monotonic() + 2.0
-while not c.isProgramRunning() and time.monotonic() < end:
-    time.sleep(0.01)
+until(c.isProgramRunning)
 out["again"] = c.moveJ(q, 1.0, 2.0) and near(q)
 """,
     )
@@ -241,7 +235,7 @@ def test_the_upper_register_range_works_as_the_lower_one(controller: SimulatedCo
         begun = time.monotonic()
         out["move"] = c.moveJ([q[0] + 0.05] + q[1:], 1.0, 2.0)
         out["forward"] = c.getForwardKinematics()
-        time.sleep(0.1)
+        until(lambda: max(map(abs, r.getActualQd())) < 1e-9)
         out["pose"] = r.getActualTCPPose()
         out["seconds"] = time.monotonic() - begun
         """,
@@ -261,7 +255,7 @@ for _ in range(35):
     c.kickWatchdog()
     time.sleep(0.02)
 out["fed"] = r.getRuntimeState()
-time.sleep(0.8)
+until(lambda: r.getRuntimeState() == 1)
 out["starved"] = r.getRuntimeState()
 out["servo"] = c.servoJ(q, 0.5, 0.5, 0.002, 0.1, 300)
 """,
@@ -283,7 +277,7 @@ def test_registers_written_by_io_are_seen_on_the_robot(controller: SimulatedCont
             io.setStandardDigitalOut(3, True), io.setConfigurableDigitalOut(1, True),
             io.setToolDigitalOut(0, True), io.setSpeedSlider(0.5),
             io.setAnalogOutputVoltage(0, 0.3)]
-        time.sleep(0.1)
+        until(lambda: abs(r.getStandardAnalogOutput0() - 3.0) < 1e-6)
         out["bits"] = r.getActualDigitalOutputBits()
         out["speed"] = r.getSpeedScaling()
         out["analog"] = r.getStandardAnalogOutput0()
@@ -330,9 +324,7 @@ d.connect()
 b = socket.create_connection((host, 30100))
 b.sendall(b"protective_stop\\n")
 b.recv(10)
-end = time.monotonic() + 2.0
-while not r.isProtectiveStopped() and time.monotonic() < end:
-    time.sleep(0.01)
+until(r.isProtectiveStopped)
 out["bits"] = [r.isProtectiveStopped(), r.getSafetyMode(), r.getRuntimeState()]
 out["servo"] = c.servoJ(q, 0.5, 0.5, 0.002, 0.1, 300)
 out["move"] = c.moveJ([q[0] + 0.1] + q[1:], 1.0, 2.0)
@@ -342,14 +334,10 @@ except Exception as error:
     out["early"] = str(error)
 time.sleep(5.1)
 d.unlockProtectiveStop()
-end = time.monotonic() + 2.0
-while r.isProtectiveStopped() and time.monotonic() < end:
-    time.sleep(0.01)
+until(lambda: not r.isProtectiveStopped())
 out["released"] = [r.isProtectiveStopped(), r.getSafetyMode(), r.getRuntimeState()]
 c.reuploadScript()
-end = time.monotonic() + 2.0
-while not c.isProgramRunning() and time.monotonic() < end:
-    time.sleep(0.01)
+until(c.isProgramRunning)
 out["again"] = c.moveJ([q[0] + 0.1] + q[1:], 1.0, 2.0)
 """,
     )
@@ -378,7 +366,7 @@ def test_the_dashboard_client_gets_every_answer_it_looks_for(
             d.getLoadedProgram()]
         d.loadURP("weld.urp")
         d.play()
-        time.sleep(0.1)
+        until(d.running)
         out["playing"] = d.running()
         d.pause()
         out["paused"] = d.programState()
@@ -431,7 +419,7 @@ def test_two_arms_move_side_by_side_on_their_own_addresses() -> None:
                     assert c[k].servoJ([q[k][0] + sign * 0.05 * i / 199] + q[k][1:],
                                        0.5, 0.5, 0.002, 0.05, 300)
                 c[0].waitPeriod(t)
-            time.sleep(0.4)
+            until(lambda: abs(r[1].getActualQ()[0] - q[1][0] + 0.05) < 1e-6)
             out["moved"] = [x.getActualQ()[0] - y[0] for x, y in zip(r, q)]
             out["poses"] = [x.getActualTCPPose() for x in r]
             """,
