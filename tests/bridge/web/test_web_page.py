@@ -90,7 +90,7 @@ def test_figures_lines_and_health_are_those_of_the_cycles(browser, feed):
         page.wait_for_timeout(2500)
         figures = page.locator("#figures").inner_text()
         rate = float(figures.split("rate\n")[1].split(" ")[0].split("of")[0])
-        assert 100 < rate < 140
+        assert 80 < rate < 180  # 125 Hz; a feed that was late catches up
         health = page.locator("#health").inner_text()
         assert "dropped: stale\n2" in health
         assert "cycles not recorded\n7" in health

@@ -257,6 +257,7 @@ for _ in range(35):
 out["fed"] = r.getRuntimeState()
 until(lambda: r.getRuntimeState() == 1)
 out["starved"] = r.getRuntimeState()
+until(lambda: not c.isProgramRunning())
 out["servo"] = c.servoJ(q, 0.5, 0.5, 0.002, 0.1, 300)
 """,
     )
