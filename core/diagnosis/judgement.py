@@ -18,6 +18,7 @@ from gapbridge.core.arrays import Array
 from gapbridge.core.diagnosis.bump import bumps
 from gapbridge.core.diagnosis.constancy import not_constant
 from gapbridge.core.diagnosis.criteria import (
+    CURVATURE_GAIN,
     HINT_P,
     NEGLIGIBLE,
     OUTLIER_SHARE,
@@ -50,7 +51,8 @@ from gapbridge.core.diagnosis.selection.problem import CandidateFit, SampleSpace
 from gapbridge.core.diagnosis.selection.refit import Remainder, worth
 from gapbridge.core.diagnosis.selection.selection import Selection, refitted_alone
 from gapbridge.core.diagnosis.selection.smooth import KNOTS
-from gapbridge.core.diagnosis.selection.stiffness_curves import without_curvature
+from gapbridge.core.diagnosis.selection.stiffness_curves import straight_curves
+from gapbridge.core.effects import CATALOGUE
 from gapbridge.core.errors import InputError
 from gapbridge.core.estimation.least_squares import basis_of, projected_out
 
@@ -178,13 +180,16 @@ def _needless(space: SampleSpace, best: CandidateFit) -> float:
 
 def _no_value(selection: Selection) -> dict[int, Withdrawal]:
     """Return positions of terms that only a bound holds, or whose value may as well be none."""
-    withdrawn = dict.fromkeys(
-        without_curvature(selection.terms, selection.covariance), Withdrawal(Check.CURVED)
+    withdrawn = {}
+    straight = straight_curves(
+        selection.space, selection.term_index, selection.terms, selection.covariance
     )
     for position, (c, term) in enumerate(zip(selection.term_index, selection.terms, strict=True)):
         if c in selection.block:
             continue
         candidate, spread = selection.space.candidates[c], selection.covariance[position]
+        if c in straight:
+            withdrawn[position] = Withdrawal(Check.CURVED)
         if candidate.curve is None and any(
             min(abs(v - p.lower), abs(v - p.upper)) < 1e-6 * p.scale
             for p, v in zip(candidate.parameters, term.values, strict=False)
@@ -212,9 +217,7 @@ def still_sure(selection: Selection, judgement: Judgement, arm: Arm) -> tuple[Se
         if far := refit.far_off(judgement.accused):
             selection = selection.with_nominal(far)
             continue
-        straight = {
-            p for p in without_curvature(refit.terms, refit.covariance) if judgement.remainder
-        }
+        straight = _straight_beside(refit, judgement)
         share = {
             p: 0.0 if p in straight else worth(refit.terms[p], refit.covariance[p])
             for p in judgement.accused
@@ -236,6 +239,18 @@ def still_sure(selection: Selection, judgement: Judgement, arm: Arm) -> tuple[Se
             structured=judgement.structured or structured,
             ties={p: names for p, names in judgement.ties.items() if p not in weakest},
         )  # fmt: skip
+
+
+def _straight_beside(refit: Selection, judgement: Judgement) -> set[int]:
+    """Return positions of accused stiffness curves that are straight beside the unknown.
+
+    By their sigma over the regions of the log: what scatters among regions has no likelihood.
+    """
+    return {
+        p for p in judgement.accused
+        if judgement.remainder is not None and CATALOGUE[refit.terms[p].effect].curved
+        and refit.terms[p].values[1] ** 2 < CURVATURE_GAIN * refit.covariance[p][1, 1]
+    }  # fmt: skip
 
 
 def _without_companion(selection: Selection, stays: Sequence[int]) -> list[int]:

@@ -51,11 +51,17 @@ def step_candidates(
         sites = effect.sites(state.arm)
         for site in sites:
             always = _always(state, effect, site, still)
-            gain = _gains(state, always, target, basis)
-            kept = _best(gain, times)
-            had = [t.values[-1] for t in base if t.effect == effect.identifier and t.site == site]
-            tried = max(round(len(times) / max(len(kept) + len(had), 1)), 1)
-            for moment in (*(_between(times, k) for k in kept), *had):
+            had = [t for t in base if t.effect == effect.identifier and t.site == site]
+            rest = tuple(t for t in base if t not in had)
+            kept = _best(_gains(state, always, target, basis), times)
+            if rest != still:  # beside a larger step the best moments are that one's
+                beside = _gains(state, always, _gap(state, rest), basis)
+                kept = list(dict.fromkeys([*kept, *_best(beside, times)]))
+            moments = dict.fromkeys(
+                [*(_between(times, k) for k in kept), *(t.values[-1] for t in had)]
+            )
+            tried = max(round(len(times) / max(len(moments), 1)), 1)
+            for moment in moments:
                 candidate = _candidate(state.arm, effect, site, moment, tried)
                 after = (times > moment).astype(float)
                 pairs.append((candidate, always * after[:, None, None]))
@@ -105,8 +111,13 @@ def _integrated(
     A = A * spread
     # R'R = A'A + 1 by QR: squared, wide priors would leave nothing of the narrow ones; R'C = A'
     C = np.linalg.qr(np.vstack([A, np.eye(A.shape[1])]))[0][: len(A)].T
-    gap = flat((observation.measured - observation.predict(base))[..., None], state)[:, 0]
-    return gap, C
+    return _gap(state, base), C
+
+
+def _gap(state: SelectionState, base: Sequence[Term]) -> Array:
+    """Return what a model with ``base`` does not predict (m,)."""
+    observation = state.observation
+    return flat((observation.measured - observation.predict(base))[..., None], state)[:, 0]
 
 
 def _gains(state: SelectionState, always: Array, target: Array, C: Array) -> Array:

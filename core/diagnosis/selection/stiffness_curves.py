@@ -10,17 +10,42 @@ from gapbridge.core.arrays import Array
 from gapbridge.core.diagnosis.criteria import CURVATURE_GAIN
 from gapbridge.core.diagnosis.selection.problem import SampleSpace
 from gapbridge.core.effects import CATALOGUE, Term
+from gapbridge.core.estimation.least_squares import basis_of, projected_out
 
 
-def without_curvature(terms: Sequence[Term], covariance: Sequence[Array]) -> list[int]:
-    """Return positions of stiffness curves that a straight line would fit as well."""
-    straight = []
-    for position, (term, spread) in enumerate(zip(terms, covariance, strict=True)):
-        if not CATALOGUE[term.effect].curved:
+def straight_curves(
+    space: SampleSpace,
+    index: Sequence[int],
+    terms: Sequence[Term],
+    covariance: Sequence[Array],
+    beside: Array | None = None,
+) -> dict[int, int]:
+    """Return the stiffness curves among candidates that a straight line fits as well, and that.
+
+    By the likelihood, since a softening's sigma grows with it; one of less than its sigma is at its
+    bound: what stiffens is no such curve. ``index`` gives the candidate of each term, ``beside``
+    (m, d) stands beside all. Where axial compliance is no candidate, the curve stays.
+    """
+    further = space.X[:, :0] if beside is None else beside
+
+    def misfit(candidates: Sequence[int]) -> float:
+        basis = basis_of(np.hstack([space.columns(candidates), further]))
+        rss = np.sum(projected_out(basis, space.y) ** 2)
+        return float(space.misfit(np.asarray(rss)))
+
+    straight: dict[int, int] = {}
+    for c, term, spread in zip(index, terms, covariance, strict=True):
+        effect = CATALOGUE[term.effect]
+        lines = [
+            other for other, k in enumerate(space.candidates)
+            if k.family == effect.contains and k.site.joint == term.site.joint
+        ]  # fmt: skip
+        if not (effect.curved and lines):
             continue
-        softening, deviation = term.values[1], float(np.sqrt(max(spread[1, 1], 0)))
-        if softening <= 0 or softening < np.sqrt(CURVATURE_GAIN) * deviation:
-            straight.append(position)
+        at_bound = term.values[1] <= float(np.sqrt(max(spread[1, 1], 0.0)))
+        line = [lines[0] if other == c else other for other in index]
+        if at_bound or misfit(line) - misfit(index) < CURVATURE_GAIN:
+            straight[c] = lines[0]
     return straight
 
 
@@ -31,15 +56,7 @@ def with_straight_stiffness(
     terms: Sequence[Term],
     covariance: Sequence[Array],
 ) -> tuple[int, ...] | None:
-    """Return the set with straight curves as axial compliance, or None if there is none.
-
-    ``index`` gives the candidate of each term. Where axial compliance is no candidate, the curve
-    stays.
-    """
-    instead: dict[int, int] = {}
-    for position in without_curvature(terms, covariance):
-        joint, straight = terms[position].site.joint, CATALOGUE[terms[position].effect].contains
-        for c, candidate in enumerate(space.candidates):
-            if candidate.family == straight and candidate.site.joint == joint:
-                instead[index[position]] = c
+    """Return the set with straight curves as axial compliance, or None if there is none."""
+    rest = [c for c in chosen if c not in set(index)]
+    instead = straight_curves(space, index, terms, covariance, space.columns(rest))
     return tuple(instead.get(c, c) for c in chosen) if instead else None

@@ -27,24 +27,28 @@ SIGMA = 3e-5  # m
 
 
 def sampled(
-    terms: list[Term], count: int = 70, seed: int = 0, clock: bool = True, at: float = 0.6
-) -> Log:
+    terms: list[Term], count: int = 70, seed: int = 0, clock: bool = True,
+    at: float | tuple[float, ...] = 0.6,
+) -> Log:  # fmt: skip
     """Return poses at rest, measured in a frame that nobody registered, with ``terms`` in the arm.
 
-    The truth of a slip is put in by hand: rows before and after ``at`` (a share) are two arms.
+    The truth of a slip is put in by hand: rows before and after ``at`` (a share) are two arms. Of
+    several slips ``at`` may give that of each, in order of time.
     """
     rng = np.random.default_rng(seed)
     q = np.array([0.0, -1.2, 1.5, -1.8, -1.5, 0.0]) + rng.uniform(-0.8, 0.8, (count, 6))
     loads = Loads(payload_mass=rng.choice([1.0, 4.0, 8.0], count))
     still = [t for t in terms if not t.effect.endswith("_slip")]
     position = MODEL.with_terms(still).predict(q, loads).position
-    moment = int(at * count)
-    for term in terms:
-        if term not in still:
-            stands = "joint_offset" if term.effect == "joint_slip" else "tool_frame"
-            values = term.values if term.site.joint else (*term.values, 0.0, 0.0, 0.0)
-            after = MODEL.with_terms([*still, Term(stands, term.site, values)])
-            position[moment:] = after.predict(q, loads).position[moment:]
+    slips = [t for t in terms if t not in still]
+    slipped = []
+    for term, share in zip(slips, at if isinstance(at, tuple) else (at,) * len(slips), strict=True):
+        moment = int(share * count)
+        stands = "joint_offset" if term.effect == "joint_slip" else "tool_frame"
+        values = term.values if term.site.joint else (*term.values, 0.0, 0.0, 0.0)
+        slipped.append(Term(stands, term.site, values))
+        after = MODEL.with_terms([*still, *slipped])
+        position[moment:] = after.predict(q, loads).position[moment:]
     position = position + SIGMA * rng.standard_normal(position.shape) + [0.3, -0.2, 0.1]
     columns = {"actual_q": q, "payload": loads.payload_mass, "measured_position": position}
     if clock:
@@ -103,6 +107,16 @@ def test_a_target_that_slips_is_no_joint_that_does() -> None:
     (sentence,) = [f for f in findings if "target_slip" in f]
     (far,) = re.findall(r"the target on the tool moved by (\S+) mm", sentence)
     assert abs(float(far) - 1e3 * np.linalg.norm(shift)) < 0.05
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_slips_beside_larger_ones_are_found_at_their_own_moments(seed: int) -> None:
+    terms = [Term("joint_slip", Site(2), (3e-3,)), Term("joint_slip", Site(5), (6e-4,)),
+             Term("joint_slip", Site(3), (-2e-3,))]  # fmt: skip
+    channel, _ = position(sampled(terms, seed=seed, at=(0.3, 0.5, 0.8)))
+    named = {(c.effect, c.joints): c.parameters for c in channel.causes}
+    assert {joint for (_, joints) in named for joint in joints} == {2, 3, 5}
+    assert {effect for effect, _ in named} == {"joint_slip"}
 
 
 def test_a_slip_beside_an_offset_that_was_there_all_the_time() -> None:
