@@ -204,11 +204,10 @@ class SlipWatch:
         assert self._model is not None
         n = self._n
         size = float(np.linalg.norm(_first_finite(change[n : n + 3], change[n + 6 : n + 9])))
-        slip = LARGEST_SLIP * 9.81 * self._model.payload(mean)[0]
-        self._touched = size > self._force_threshold(slip)
+        self._touched = size > self._threshold(LARGEST_SLIP * 9.81 * self._model.payload(mean)[0])
         return [_force(size, now, "came or went while the arm stood still")] * self._touched
 
-    def _force_threshold(self, slip: float) -> float:
+    def _threshold(self, slip: float) -> float:
         """Return the force, N, above which a change is more than noise and a slip's ``slip``, N."""
         assert self._sigma is not None
         return slip + max(FORCE, FORCE_SIGMAS * float(self._sigma[:3].max()))
@@ -256,7 +255,7 @@ class SlipWatch:
             return None
         size = float(np.linalg.norm((rest.readings - _median(former))[:3]))
         slip = LARGEST_SLIP * np.linalg.norm(self._places[rest.place].slip[:3], axis=0).max()
-        return size if size > self._force_threshold(float(slip)) else None  # NaN: no sensor
+        return size if size > self._threshold(float(slip)) else None  # NaN: no sensor
 
     def _place_of(self, mean: Array) -> int:
         """Return the number of the pose, a new one where it has not been seen yet."""
@@ -339,12 +338,8 @@ class SlipWatch:
         if gains[j] < THRESHOLD or per_number[j] > CONSISTENT or abs(values[j]) < self._smallest:
             return False
         for i in range(len(changes)):  # a hand on the arm is at one pose, a slip at all
-            fewer = _ratios(changes[:i] + changes[i + 1 :])
-            if (
-                fewer is None
-                or fewer[0][j] < WITHOUT_ONE * THRESHOLD
-                or fewer[1][j] * values[j] < 0.0
-            ):
+            part = _ratios(changes[:i] + changes[i + 1 :])
+            if part is None or part[0][j] < WITHOUT_ONE * THRESHOLD or part[1][j] * values[j] < 0.0:
                 return False
         return self._lead_over_steps(length, j) > BEFORE_STEPS * THRESHOLD
 
