@@ -10,7 +10,7 @@ from typing import Any
 from benchmarks.faults.invariants import Checker
 from benchmarks.faults.wire.seen import Fresh, Numbers, Write
 from gapbridge.bridge.loop.link_monitor import DRIFT, hold_time
-from gapbridge.bridge.loop.supervisor import HEALED_BY_RECONNECTING, TRANSITIONS, Cause, State
+from gapbridge.bridge.loop.supervisor import CLEARED_BY_RECONNECTING, TRANSITIONS, Cause, State
 from gapbridge.core.state import Setpoint
 
 MARGIN = 0.01  # s: a cycle of the controller and what computing takes
@@ -161,7 +161,7 @@ class Judge:
             self.violate("asked", f"{before.name} -> {after.name}")
         if after == State.FAULT:
             if cause != Cause.LATCHED:
-                self._fault, self._heals = f"{cause}", cause in HEALED_BY_RECONNECTING
+                self._fault, self._heals = f"{cause}", cause in CLEARED_BY_RECONNECTING
                 self._acknowledged = False
         elif before == State.FAULT:
             if after == State.OBSERVING and not self._acknowledged:

@@ -160,7 +160,7 @@ class SimulatedLoop(LoopProcess):
 class _Loop(Loop):
     """The product's loop, whose offset in force is the run's."""
 
-    def _kept_offset(self) -> OffsetInForce:
+    def _open_offset_in_force(self) -> OffsetInForce:
         return OffsetInForce(self._driver.n, None)
 
 
@@ -258,14 +258,14 @@ class PlannedSource(Source):
         self._glide.take(q)
         self._glide.turn()
 
-    def first(self, own_q: Vector) -> Vector | None:
+    def first(self, robot_q: Vector) -> Vector | None:
         """See Source.first."""
         return self._glide.first()
 
-    def begin(self, timestamp: float, own_q: Vector) -> None:
+    def begin(self, timestamp: float, robot_q: Vector) -> None:
         """See Source.begin."""
-        self._glide.begin(own_q)
+        self._glide.begin(robot_q)
 
-    def sample(self, timestamp: float, own_q: Vector) -> Vector:
+    def sample(self, timestamp: float, robot_q: Vector) -> Vector:
         """See Source.sample."""
         return self._glide.sample()

@@ -223,7 +223,7 @@ def _judge_end(run: Run, judge: Judge, person: Person) -> None:
         judge.violate("ends", f"not over {ENDING:g} s after the stop")
     elif not run.process.error and run.process.result is None:
         judge.violate("ends", "there is no summary")
-    taken, last = run.daemon.taken, run.daemon._commands.last
+    taken, last = run.daemon.last_taken, run.daemon._commands.last
     if person.done and taken > last:
         judge.violate("taken", f"{taken} taken of {last}")
     slices = run.daemon.memory.slices

@@ -49,7 +49,7 @@ class Controlled(Protocol):
         """Return the status document."""
 
     @property
-    def taken(self) -> int:
+    def last_taken(self) -> int:
         """Return the number of the newest request that a loop has taken."""
 
     def arm(self, by: str) -> int:
@@ -124,7 +124,7 @@ class Control:
         observed = daemon.state == State.OBSERVING and not daemon.latched
         fault = daemon.latched
         number = daemon.disarm(by)
-        if not self._comes(lambda: daemon.taken >= number, LONGEST_TAKING):
+        if not self._wait_for(lambda: daemon.last_taken >= number, LONGEST_TAKING):
             return refusal(
                 f"no loop has taken it within {LONGEST_TAKING:g} s (the state is "
                 f"{daemon.state.name.lower()}); it is kept for the next one"
@@ -133,7 +133,7 @@ class Control:
         def observes() -> bool:
             return daemon.state == State.OBSERVING and not daemon.latched
 
-        if self._comes(observes, SOURCE_SILENT if fault else LONGEST_RAMP):
+        if self._wait_for(observes, SOURCE_SILENT if fault else LONGEST_RAMP):
             if observed:
                 return _done("is observing already")
             return _done(f"acknowledged ({fault}); observing" if fault else "observing")
@@ -141,7 +141,7 @@ class Control:
             return _done(f"acknowledged ({fault}); observing as soon as the robot is fine")
         return refusal(f"still {daemon.state.name.lower()} after {LONGEST_RAMP:g} s")
 
-    def _comes(self, what: Callable[[], bool], limit: float) -> bool:
+    def _wait_for(self, what: Callable[[], bool], limit: float) -> bool:
         until = self._clock.monotonic() + limit
         while not what():
             if self._clock.monotonic() > until:

@@ -65,23 +65,23 @@ class Daemon:
 
     def __init__(
         self,
-        given: DaemonSettings | Configuration,
+        configuration: DaemonSettings | Configuration,
         may_write: bool,
         say: Say = lambda _: None,
         log: Callable[[Event], None] | None = None,
         clock: Clock = SYSTEM,
     ) -> None:
         self._clock = clock
-        if not isinstance(given, Configuration):
-            given = configuration_for(given)
-        self.configuration = given  # read once; loops get these very bytes
-        settings = given.settings
+        if not isinstance(configuration, Configuration):
+            configuration = configuration_for(configuration)
+        self.configuration = configuration  # read once; loops get these very bytes
+        settings = configuration.settings
         self.may_write, self._say = may_write, say
         n = self.configuration.n
         self.memory = RunMemory(n, clock)  # of the loop's process, one after the other
         self._commands = CommandMemory()  # one for the whole run; nobody else can write to it
         self._requests: queue.SimpleQueue[tuple[int, Command, str]] = queue.SimpleQueue()
-        self._taken = 0
+        self._last_taken = 0
         self._request_lock = threading.RLock()
         self._reader = self.memory.reader()
         self._output: IO[bytes] | int = subprocess.DEVNULL  # of all processes of the run
@@ -93,7 +93,7 @@ class Daemon:
         self.manager = ServiceManager(clock)
         self.session = ""
         self._status = DaemonStatus(self.memory.slices, clock)
-        self._fitted = FittedWatch(given.fitted, self.memory.slices)
+        self._fitted = FittedWatch(configuration.fitted, self.memory.slices)
         self._slips = self._slip_watch()
         self._status_at = 0.0
         self._reload = Reload(self.manager, self.event_log)
@@ -103,7 +103,7 @@ class Daemon:
         self._faults: list[str] = []
         self._lost_rows = 0
         self._refused = False  # writing was asked for and could not begin
-        self._seen = False  # a state has been read, by this or a former loop
+        self._has_state = False  # a state has been read, by this or a former loop
         self._ends_at = float("inf")  # s, monotonic: when a run of given length is over
         self.restarts = 0
         self._loops = 0  # processes of the loop so far, those of a reload among them
@@ -219,9 +219,9 @@ class Daemon:
         self._reload.ask()
 
     @property
-    def taken(self) -> int:
+    def last_taken(self) -> int:
         """Return the number of the newest request that a loop has taken."""
-        return self._taken
+        return self._last_taken
 
     def arm(self, by: str = PROGRAM) -> int:
         """Ask the loop to write setpoints; returns the request's number, 0 where none is made."""
@@ -243,7 +243,7 @@ class Daemon:
             self._requests.put((number, command, by))
         return number
 
-    def _pass_on(self) -> None:
+    def _forward_requests(self) -> None:
         """Write what was asked for, each request behind the event that says who asked.
 
         There is no other way by which an ARM is written.
@@ -338,7 +338,7 @@ class Daemon:
         if self._clock.monotonic() >= self._ends_at:
             self._stopping.set()
         self._take()
-        self._pass_on()
+        self._forward_requests()
         if self.memory.promote():
             self.side_processes.show(self.memory)
         for event in self.side_processes.check():
@@ -362,11 +362,11 @@ class Daemon:
             while loop.exit_code is None:
                 self._clock.sleep(TICK)
                 self._tick()
-                if self.memory.seen and first_cycle is None:
+                if self.memory.has_state and first_cycle is None:
                     first_cycle = self._clock.monotonic()
-                    if duration is not None and not self._seen:
+                    if duration is not None and not self._has_state:
                         self._ends_at = first_cycle + duration
-                    self._seen = True
+                    self._has_state = True
                     self.manager.ready()
                 if self.memory.ended and duration is None:
                     self._stopping.set()
@@ -396,18 +396,18 @@ class Daemon:
         Beside them, a disarming that no loop has taken: who asked for it still waits.
         """
         with self._request_lock:  # none is numbered and not yet written
-            self._pass_on()
+            self._forward_requests()
             after = self._commands.number()
         order = {
             "may_write": self.may_write, "number": self._loops, "latched": self._status.latched,
             "after": after,
         }  # fmt: skip
         for command in (Command.DISARM, Command.RAMP_OUT):
-            if self._commands.last_of(command) > self.memory.taken:
+            if self._commands.last_of(command) > self.memory.last_taken:
                 self._commands.ask(command)
         if armed_by and self.may_write:
             self._request(Command.ARM, armed_by)
-            self._pass_on()
+            self._forward_requests()
         self._loops += 1
         return self.loop_process(
             self.configuration, self.memory, self._commands, order, self._output, self._clock
@@ -415,12 +415,12 @@ class Daemon:
 
     def _take(self) -> None:
         """Take cycles and events over from the loop."""
-        taken = self.memory.taken
+        last_taken = self.memory.last_taken
         # in this order: who has heard of a change finds the state changed, and its rows counted
         events = [] if self.loop is None else self.loop.events()
         if self.loop is not None:
             self._last_state = State(self.memory.state)
-        self._taken = taken
+        self._last_taken = last_taken
         rows = self._reader.drain()
         self.tally.add(rows)
         self._status.take(rows)
@@ -430,9 +430,9 @@ class Daemon:
             self.event_log.add(
                 {"kind": EventKind.WARNING, "what": "outside_fitted", "detail": detail}
             )
-        for found in self._slips.take(rows):
-            self.event_log.add(found.event)
-            if isinstance(found, Slip):
+        for finding in self._slips.take(rows):
+            self.event_log.add(finding.event)
+            if isinstance(finding, Slip):
                 self._commands.ask(Command.ZERO_MOVED)  # behind the event that says why
 
     def _on_event(self, event: Event) -> None:
@@ -467,9 +467,9 @@ class Daemon:
         detail = str(self._failure.get("detail", "")) or f"the loop's process {loop.describe_end()}"
         if self._stopping.is_set() and not self._failure:
             return
-        if code == Exit.INPUT and not self._seen:
+        if code == Exit.INPUT and not self._has_state:
             raise InputError(detail)  # later, it is a file that somebody is at: tried again
-        if not self._seen:
+        if not self._has_state:
             raise LinkError(detail)
         self._fault("loop", detail)
 
@@ -479,15 +479,15 @@ class Daemon:
 
     def _summary(self) -> RunSummary:
         state = self._last_state
-        wrong = self._refused and not self.tally.written
-        wrong |= state in (State.FAULT, State.DISCONNECTED)
+        failed = self._refused and not self.tally.written
+        failed |= state in (State.FAULT, State.DISCONNECTED)
         summary = RunSummary(
             **self.tally.figures(),
             restarts=self.restarts,
             lost_rows=self.lost_rows,
             faults=tuple(self._faults),
             state=state.name.lower(),
-            exit_code=1 if wrong else 0,
+            exit_code=1 if failed else 0,
             recording=self.recording,
         )
         self.event_log.add({"kind": EventKind.SUMMARY, "summary": summary.to_json()})

@@ -58,9 +58,9 @@ class OwnerLock:
                 self._name.close()
                 raise
 
-    def note(self, more: dict[str, Any]) -> None:
+    def note(self, fields: dict[str, Any]) -> None:
         """Leave word for whoever comes after an end that was not in order."""
-        self._write(json.dumps({"pid": os.getpid(), "cell": str(self._cell), **more}))
+        self._write(json.dumps({"pid": os.getpid(), "cell": str(self._cell), **fields}))
 
     def _write(self, text: str) -> None:
         if self._fd is not None:
@@ -89,7 +89,7 @@ class OwnerLock:
 
 def _read(fd: int) -> dict[str, Any]:
     with contextlib.suppress(OSError, ValueError):
-        found = json.loads(os.pread(fd, 65536, 0))
-        if isinstance(found, dict):
-            return found
+        owner = json.loads(os.pread(fd, 65536, 0))
+        if isinstance(owner, dict):
+            return owner
     return {}

@@ -43,14 +43,14 @@ class LoopProcess:
         self._settings = settings = configuration.settings
         files = sealed_bytes("gapbridge-files", pickle.dumps(dict(configuration.files)))
         # sockets, not pipes: nobody can open them a second time through /proc
-        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        events, remote = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         orders, stdin = socket.socketpair()
-        self._events = ours
-        ours.setblocking(False)
+        self._events = events
+        events.setblocking(False)
         self.started = self._now()
         order = {
             **order, "settings": settings.model_dump(mode="json"), "n": memory.n,
-            "memory": memory.fd, "commands": commands.fd, "events": theirs.fileno(),
+            "memory": memory.fd, "commands": commands.fd, "events": remote.fileno(),
             "files": files, "hash": configuration.hash,
             "parent": os.getpid(),
         }  # fmt: skip
@@ -60,11 +60,11 @@ class LoopProcess:
             self._process = subprocess.Popen(
                 [sys.executable, "-X", "faulthandler", "-m", "gapbridge.bridge.loop.main"],
                 stdin=stdin.fileno(), stdout=log, stderr=log, env=environment(),
-                pass_fds=(memory.fd, commands.fd, files, theirs.fileno()), start_new_session=True,
+                pass_fds=(memory.fd, commands.fd, files, remote.fileno()), start_new_session=True,
             )  # fmt: skip
         finally:
             os.close(files)
-            theirs.close()
+            remote.close()
             stdin.close()
         with orders, contextlib.suppress(OSError):  # it is gone already, which the daemon sees
             orders.sendall((json.dumps(order) + "\n").encode())
@@ -95,11 +95,11 @@ class LoopProcess:
 
     def events(self) -> list[dict[str, Any]]:
         """Return the events that have arrived."""
-        found = []
+        events = []
         with contextlib.suppress(OSError):
             while data := self._events.recv(_LONGEST_EVENT):
-                found.append(json.loads(data))
-        return found
+                events.append(json.loads(data))
+        return events
 
     def ask_to_stop(self) -> None:
         """Ask it to ramp out and end."""

@@ -37,19 +37,19 @@ class Reload:
 
     def __init__(self, manager: ServiceManager, event_log: EventLog) -> None:
         self._manager, self._event_log = manager, event_log
-        self._asked = threading.Event()
+        self._requested = threading.Event()
         self._next: Configuration | None = None
         self._rearm = False  # it was compensating, and the new cell arms by itself
         self.wants_end = False  # the loop is to be stopped: nothing is being written
 
     def ask(self) -> None:
         """Ask for the cell to be read again; from any thread."""
-        self._asked.set()
+        self._requested.set()
 
     def step(self, state: State, phase: Phase, running: Configuration) -> bool:
         """Go on with a reload that was asked for; returns whether the loop is to ramp out now."""
-        if self._asked.is_set():
-            self._asked.clear()
+        if self._requested.is_set():
+            self._requested.clear()
             self._read(state, running)
         if self._next is None or self.wants_end or phase == Phase.ARMING:
             return False
@@ -74,35 +74,35 @@ class Reload:
         before = running.settings
         self._manager.reloading()
         try:
-            found = read_configuration(before.cell)
-            self._next = _fitting(found, running)
+            new = read_configuration(before.cell)
+            self._next = _compatible(new, running)
         except GapbridgeError as error:
             self._manager.ready()
-            detail = "; ".join(_all_of(before.cell, error))
+            detail = "; ".join(_messages(before.cell, error))
             detail = f"the cell file was not taken, the old one stays: {detail}"
             self._report(False, running if self._next is None else self._next, detail)
             return
-        self._rearm = state == State.COMPENSATING and found.settings.setpoints.arm
+        self._rearm = state == State.COMPENSATING and new.settings.setpoints.arm
         changed = [
             name for name in KEPT_UNTIL_RESTART
-            if getattr(found.settings, name) != getattr(before, name)
+            if getattr(new.settings, name) != getattr(before, name)
         ]  # fmt: skip
         later = f"; {', '.join(changed)}: at the daemon's next start" if changed else ""
         detail = f"the cell file was read again and is being taken{later}"
         self._report(True, self._next, detail)
 
-    def _report(self, fine: bool, taken: Configuration, detail: str) -> None:
+    def _report(self, fine: bool, active: Configuration, detail: str) -> None:
         self._event_log.add(
-            {"kind": EventKind.CONFIGURATION, "ok": fine, "hash": taken.hash, "detail": detail}
+            {"kind": EventKind.CONFIGURATION, "ok": fine, "hash": active.hash, "detail": detail}
         )
 
 
-def _fitting(found: Configuration, running: Configuration) -> Configuration:
+def _compatible(new: Configuration, running: Configuration) -> Configuration:
     """Return a configuration that this run can go on with. Raises GapbridgeError."""
-    settings, before = found.settings, running.settings
-    if found.n != running.n:
+    settings, before = new.settings, running.settings
+    if new.n != running.n:
         raise GapbridgeError(
-            f"{settings.cell}: robot: found {found.n} joints, expected {running.n} as before: "
+            f"{settings.cell}: robot: found {new.n} joints, expected {running.n} as before: "
             "stop the daemon and start it anew"
         )
     if address_of(settings.link) != address_of(before.link):
@@ -110,11 +110,11 @@ def _fitting(found: Configuration, running: Configuration) -> Configuration:
             f"{settings.cell}: link: found {address_of(settings.link)}, expected "
             f"{address_of(before.link)} as before: stop the daemon and start it anew"
         )
-    kept = {name: getattr(before, name) for name in ("model_source", "hang_timeout", "backoff")}
-    return replace(found, settings=settings.model_copy(update=kept))
+    fixed = {name: getattr(before, name) for name in ("model_source", "hang_timeout", "backoff")}
+    return replace(new, settings=settings.model_copy(update=fixed))
 
 
-def _all_of(cell: Path, error: GapbridgeError) -> list[str]:
+def _messages(cell: Path, error: GapbridgeError) -> list[str]:
     """Return everything that is wrong with a cell file, where it is more than one thing."""
     try:
         return complaints(cell) or [str(error)]

@@ -21,8 +21,8 @@ class ServiceManager:
         if self._address.startswith("@"):
             self._address = "\0" + self._address[1:]
         wanted = os.environ.get("WATCHDOG_USEC", "0")
-        mine = os.environ.get("WATCHDOG_PID", str(os.getpid())) == str(os.getpid())
-        period = int(wanted) / 1e6 if wanted.isdigit() and mine else 0.0
+        for_this_process = os.environ.get("WATCHDOG_PID", str(os.getpid())) == str(os.getpid())
+        period = int(wanted) / 1e6 if wanted.isdigit() and for_this_process else 0.0
         self._every = period / 3.0  # s between two signs of life; 0: none wanted
         self._kicked = 0.0
 

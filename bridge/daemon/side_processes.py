@@ -53,17 +53,17 @@ class SideProcesses:
 
     def check(self) -> list[dict[str, Any]]:
         """Look after all; returns what they have reported and what became of them, as events."""
-        found = []
+        events = []
         for name, side in self._running.items():
             for event in side.events():
                 if event.get("kind") == name:
-                    found.append(event)
+                    events.append(event)
                 else:  # states and requests are not a side process's to emit
                     detail = f"{name} emitted {str(event.get('kind'))[:40]!r}, which is not its own"
-                    found.append({"kind": EventKind.SIDE, "side": name, "detail": detail})
-            if (wrong := side.check()) is not None:
-                found.append({"kind": EventKind.SIDE, "side": name, "detail": wrong})
-        return found
+                    events.append({"kind": EventKind.SIDE, "side": name, "detail": detail})
+            if (problem := side.check()) is not None:
+                events.append({"kind": EventKind.SIDE, "side": name, "detail": problem})
+        return events
 
     def status(self) -> dict[str, dict[str, int | None]]:
         """Return process id, restarts, stalls and events dropped of each."""

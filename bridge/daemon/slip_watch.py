@@ -43,7 +43,7 @@ BEFORE_STEPS = 0.5  # of the threshold: how far a slip is ahead of any step of z
 WITHOUT_ONE = 0.25  # share of the threshold that a slip keeps whichever pose is left out
 THRESHOLD = 45.0  # of the likelihood ratio (chi-square of one number)
 CONSISTENT = 3.0  # chi-square per number that a slip may leave: more, it is something else
-BESIDE = 9.0  # of the ratio: a joint that explains as much is reported beside the best
+TIE = 9.0  # of the ratio: a joint that explains as much is reported beside the best
 FLOORS = (0.05, 0.005, 0.05)  # N, Nm of the flange sensor, Nm of a motor: 1 sigma at least
 LARGEST_SLIP = 0.05  # rad: what no slip makes is a force
 FORCE = 1.0  # N on top of that
@@ -103,7 +103,7 @@ class _Change(NamedTuple):
     free: Array  # (k, f)
 
 
-class _Standing:
+class _Standstill:
     """The arm since it came to a stop at ``q`` (n,) rad, ``since`` s: means of short windows."""
 
     def __init__(self, q: Array, since: float) -> None:
@@ -146,20 +146,20 @@ class SlipWatch:
         )  # fmt: skip
         n = slices["actual_q"].stop - slices["actual_q"].start
         self._n = n
-        self._taken = np.concatenate([np.arange(slices[k].start, slices[k].stop) for k in names])
+        self._columns = np.concatenate([np.arange(slices[k].start, slices[k].stop) for k in names])
         self._time = slices["timestamp"].start
         self._q = slices["actual_q"]
         self._floor = np.repeat(FLOORS, (3, 3, n))
-        self.forget()
+        self.reset()
 
-    def forget(self) -> None:
+    def reset(self) -> None:
         """Learn anew: the arm is another from now on."""
         self._places: list[Place] = []
         self._rests: deque[_Rest] = deque(maxlen=KEPT)
-        self._standing: _Standing | None = None
+        self._standstill: _Standstill | None = None
         self._touched = False  # a force has come or gone during this rest
-        self._before: Array | None = None  # (n,) rad: the rest before this one
-        self._odd: list[_Rest] = []  # rests in a row under a force
+        self._previous_q: Array | None = None  # (n,) rad: the rest before this one
+        self._under_force: list[_Rest] = []  # rests in a row under a force
         self._sigma: Array | None = None  # (m,) of one rest
 
     @property
@@ -172,80 +172,80 @@ class SlipWatch:
         """Return in words what is watched."""
         if self._model is None:
             return "not watched"
-        seen = len({rest.place for rest in self._rests})
-        detail = f"{len(self._rests)} rests at {seen} poses compared"
+        poses = len({rest.place for rest in self._rests})
+        detail = f"{len(self._rests)} rests at {poses} poses compared"
         return detail if self.learned else f"{detail}; learning, until poses have come back"
 
     def take(self, rows: Array) -> list[Slip | Force]:
         """Return what has just been found. ``rows`` (k, width): cycles of the loop, in order."""
         if self._model is None or not len(rows):
             return []
-        found: list[Slip | Force] = []
+        findings: list[Slip | Force] = []
         q, t = rows[:, self._q], rows[:, self._time]
-        standing = self._standing
+        standing = self._standstill
         if (
             standing is None
             or np.abs(q - standing.q).max() > STILL
             or not standing.since <= t[-1]  # a new clock
         ):
-            found += self._end_rest()
-            self._standing, self._touched = _Standing(q[-1].copy(), float(t[-1])), False
+            findings += self._end_rest()
+            self._standstill, self._touched = _Standstill(q[-1].copy(), float(t[-1])), False
         elif t[0] >= standing.since + SETTLING:
-            window = standing.take(rows[:, self._taken], float(t[0]), float(t[-1]))
-            found += [] if window is None else self._jump(*window, float(t[-1]))
-        return found
+            window = standing.take(rows[:, self._columns], float(t[0]), float(t[-1]))
+            findings += [] if window is None else self._force_step(*window, float(t[-1]))
+        return findings
 
     # -- one rest ---------------------------------------------------------------------------------
 
-    def _jump(self, mean: Array, change: Array, now: float) -> list[Slip | Force]:
+    def _force_step(self, mean: Array, change: Array, now: float) -> list[Slip | Force]:
         """Report a force that comes or goes while the arm stands: nobody's zero, once a rest."""
         if self._touched or self._sigma is None:
             return []
         assert self._model is not None
         n = self._n
         size = float(np.linalg.norm(_first_finite(change[n : n + 3], change[n + 6 : n + 9])))
-        self._touched = size > self._most(LARGEST_SLIP * 9.81 * self._model.payload(mean)[0])
+        self._touched = size > self._threshold(LARGEST_SLIP * 9.81 * self._model.payload(mean)[0])
         return [_force(size, now, "came or went while the arm stood still")] * self._touched
 
-    def _most(self, slip: float) -> float:
+    def _threshold(self, slip: float) -> float:
         """Return the force, N, above which a change is more than noise and a slip's ``slip``, N."""
         assert self._sigma is not None
         return slip + max(FORCE, FORCE_SIGMAS * float(self._sigma[:3].max()))
 
     def _end_rest(self) -> list[Slip | Force]:
         """Take the rest that has ended into the comparison."""
-        standing = self._standing
+        standing = self._standstill
         if standing is None or not standing.windows:
             return []
         assert self._model is not None
         # the middle window: a touch that is shorter than half of the rest leaves no trace
-        mean = _middle(standing.windows)
+        mean = _median(standing.windows)
         place = self._place_of(mean)
         rest = _Rest(place, standing.since, self._model.readings(mean, self._places[place]))
-        self._before = mean[: self._n]
-        found = self._forces(rest)
-        if self._odd:
-            return found
+        self._previous_q = mean[: self._n]
+        findings = self._forces(rest)
+        if self._under_force:
+            return findings
         self._rests.append(rest)
         self._sigma = self._noise()
         slip = self._slip()
         if slip is not None:
-            found.append(slip)
-            self.forget()
-        return found
+            findings.append(slip)
+            self.reset()
+        return findings
 
     def _forces(self, rest: _Rest) -> list[Slip | Force]:
         """Keep rests under a force out, as long as they are few in a row."""
         excess = self._excess(rest)
         if excess is None:
-            self._odd = []
+            self._under_force = []
             return []
-        self._odd.append(rest)
-        if len(self._odd) == 1:
+        self._under_force.append(rest)
+        if len(self._under_force) == 1:
             return [_force(excess, rest.time, "beside what this pose had at its rests before")]
-        if len(self._odd) > LASTING:  # not a touch: a slip, a load, a sensor's new zero
-            self._rests.extend(self._odd[:-1])
-            self._odd = []
+        if len(self._under_force) > LASTING:  # not a touch: a slip, a load, a sensor's new zero
+            self._rests.extend(self._under_force[:-1])
+            self._under_force = []
         return []
 
     def _excess(self, rest: _Rest) -> float | None:
@@ -253,37 +253,37 @@ class SlipWatch:
         former = [r.readings for r in self._rests if r.place == rest.place]
         if self._sigma is None or len(former) < 2:
             return None
-        size = float(np.linalg.norm((rest.readings - _middle(former))[:3]))
+        size = float(np.linalg.norm((rest.readings - _median(former))[:3]))
         slip = LARGEST_SLIP * np.linalg.norm(self._places[rest.place].slip[:3], axis=0).max()
-        return size if size > self._most(float(slip)) else None  # NaN: no sensor
+        return size if size > self._threshold(float(slip)) else None  # NaN: no sensor
 
     def _place_of(self, mean: Array) -> int:
         """Return the number of the pose, a new one where it has not been seen yet."""
         assert self._model is not None
         n = self._n
         q, mass = mean[:n], self._model.payload(mean)[0]
-        way = np.zeros(n) if self._before is None else q - self._before
-        side = np.where(np.abs(way) > TURNED, np.sign(way), 0).astype(np.int8).tobytes()
+        step = np.zeros(n) if self._previous_q is None else q - self._previous_q
+        side = np.where(np.abs(step) > TURNED, np.sign(step), 0).astype(np.int8).tobytes()
         for number, place in enumerate(self._places):
             near = np.abs(place.q - q).max() < SAME_POSE and abs(place.mass - mass) < SAME_MASS
             if near and place.side == side:
                 return number
         if len(self._places) >= PLACES:
-            self._forget_oldest()
+            self._drop_oldest()
         self._places.append(Place(q, mass, side, *self._model.columns(mean)))
         return len(self._places) - 1
 
-    def _forget_oldest(self) -> None:
+    def _drop_oldest(self) -> None:
         """Drop the pose that has not been seen for longest."""
         last = {rest.place: i for i, rest in enumerate(self._rests)}
         oldest = min(range(len(self._places)), key=lambda place: last.get(place, -1))
         del self._places[oldest]
-        kept = [
+        remaining = [
             replace(rest, place=rest.place - (rest.place > oldest))
             for rest in self._rests
             if rest.place != oldest
         ]
-        self._rests = deque(kept, maxlen=KEPT)
+        self._rests = deque(remaining, maxlen=KEPT)
 
     # -- the test ---------------------------------------------------------------------------------
 
@@ -298,27 +298,27 @@ class SlipWatch:
         if len(steps) < LEARNED:
             return None
         # the median: a slip, or a touch, among them does not raise it
-        spread = 1.4826 * _middle(np.abs(steps)) / np.sqrt(2.0)
+        spread = 1.4826 * _median(np.abs(steps)) / np.sqrt(2.0)
         return np.asarray(np.maximum(spread, self._floor))
 
     def _slip(self) -> Slip | None:
         """Return the slip that the rests up to now show."""
-        if self._sigma is None or not any(self._holds(length) for length in SUFFIXES):
+        if self._sigma is None or not any(self._is_significant(length) for length in SUFFIXES):
             return None
         tried = {
             length: _ratios(self._changes(length))
             for length in range(SUFFIXES[0], SUFFIXES[-1] + 1)
         }
-        known = {length: found for length, found in tried.items() if found is not None}
-        ahead = max(known.values(), key=lambda found: float(found[0].max()))
-        left, count = self._left(int(np.argmax(ahead[0]))), len(self._rests)
-        length = min(known, key=lambda one: left(count - one))  # the likeliest moment
+        known = {length: ratios for length, ratios in tried.items() if ratios is not None}
+        strongest = max(known.values(), key=lambda ratios: float(ratios[0].max()))
+        chi_square, count = self._chi_square(int(np.argmax(strongest[0]))), len(self._rests)
+        length = min(known, key=lambda one: chi_square(count - one))  # the likeliest moment
         gains, values, stds, _ = known[length]
         order = np.argsort(-gains)
-        joints = tuple(int(j) + 1 for j in order if gains[j] > gains[order[0]] - BESIDE)
+        joints = tuple(int(j) + 1 for j in order if gains[j] > gains[order[0]] - TIE)
         # as sure as the moment is: other moments that are nearly as likely have sizes of their own
         best = order[0]
-        likely = [f[1][best] for f in known.values() if f[0][best] > gains[best] - BESIDE]
+        likely = [f[1][best] for f in known.values() if f[0][best] > gains[best] - TIE]
         size, std = float(values[best]), float(np.hypot(stds[best], np.std(likely)))
         return Slip(
             joints, size, std, list(self._rests)[-length].time,
@@ -327,32 +327,32 @@ class SlipWatch:
             "a row as that changes it, beside former rests at the same poses",
         )  # fmt: skip
 
-    def _holds(self, length: int) -> bool:
+    def _is_significant(self, length: int) -> bool:
         """Return whether a slip before the last ``length`` rests is beyond doubt."""
         changes = self._changes(length)
-        found = _ratios(changes)
-        if found is None:
+        ratios = _ratios(changes)
+        if ratios is None:
             return False
-        gains, values, _, left = found
+        gains, values, _, per_number = ratios
         j = int(np.argmax(gains))
-        if gains[j] < THRESHOLD or left[j] > CONSISTENT or abs(values[j]) < self._smallest:
+        if gains[j] < THRESHOLD or per_number[j] > CONSISTENT or abs(values[j]) < self._smallest:
             return False
         for i in range(len(changes)):  # a hand on the arm is at one pose, a slip at all
-            rest = _ratios(changes[:i] + changes[i + 1 :])
-            if rest is None or rest[0][j] < WITHOUT_ONE * THRESHOLD or rest[1][j] * values[j] < 0.0:
+            part = _ratios(changes[:i] + changes[i + 1 :])
+            if part is None or part[0][j] < WITHOUT_ONE * THRESHOLD or part[1][j] * values[j] < 0.0:
                 return False
-        return self._ahead_of_steps(length, j) > BEFORE_STEPS * THRESHOLD
+        return self._lead_over_steps(length, j) > BEFORE_STEPS * THRESHOLD
 
-    def _ahead_of_steps(self, length: int, joint: int) -> float:
+    def _lead_over_steps(self, length: int, joint: int) -> float:
         """Return by how much of chi-square a slip beats what is free, at any other moment.
 
         A sensor that was zeroed anew two rests before a moment looks like much at that moment.
         """
         count = len(self._rests)
-        free = self._left(None)
-        return min(map(free, range(2, count - 1))) - self._left(joint)(count - length)
+        free = self._chi_square(None)
+        return min(map(free, range(2, count - 1))) - self._chi_square(joint)(count - length)
 
-    def _left(self, joint: int | None) -> Callable[[int], float]:
+    def _chi_square(self, joint: int | None) -> Callable[[int], float]:
         """Return what gives chi-square of all rests for a step of what is free at a moment.
 
         Each pose's own mean is fitted too, and where one is given the slip of a joint (from 0). A
@@ -361,25 +361,25 @@ class SlipWatch:
         rests = list(self._rests)
         number = np.array([rest.place for rest in rests])
         readings = np.array([rest.readings for rest in rests])
-        seen = np.isfinite(readings).all(axis=0)
+        finite = np.isfinite(readings).all(axis=0)
         assert self._sigma is not None
-        scale = 1.0 / self._sigma[seen]
+        scale = 1.0 / self._sigma[finite]
         places = [self._places[p] for p in number]
-        columns = np.array([place.free[seen] * scale[:, None] for place in places])
+        columns = np.array([place.free[finite] * scale[:, None] for place in places])
         if joint is not None:
-            slip = np.array([place.slip[seen, joint] * scale for place in places])
+            slip = np.array([place.slip[finite, joint] * scale for place in places])
             columns = np.concatenate([columns, slip[:, :, None]], axis=2)
         same = (number[:, None] == number).astype(float)
         same /= same.sum(axis=1, keepdims=True)
-        b = readings[:, seen] * scale
+        b = readings[:, finite] * scale
         b = (b - same @ b).ravel()
 
-        def left(moment: int) -> float:
+        def chi_square(moment: int) -> float:
             stepped = np.where(np.arange(len(rests))[:, None, None] >= moment, columns, 0.0)
             A = (stepped - np.einsum("ij,jkl->ikl", same, stepped)).reshape(len(b), -1)
             return float(np.sum((b - A @ np.linalg.lstsq(A, b, rcond=1e-6)[0]) ** 2))
 
-        return left
+        return chi_square
 
     def _changes(self, length: int) -> list[_Change]:
         """Return how the last rests differ from those before, pose by pose.
@@ -393,28 +393,28 @@ class SlipWatch:
         common = [p for p in new if len(old.get(p, ())) >= 2]
         if self._distinct(common) < FEWEST_PLACES:
             return []
-        found = []
+        changes = []
         for p in common:
             before, after, place = old[p], new[p], self._places[p]
-            change = _middle(after) - _middle(before)
+            change = _median(after) - _median(before)
             # pi / 2: the variance of a median beside that of a mean
             share = np.pi / 2.0 / len(before) + (np.pi / 2.0 if len(after) > 2 else 1.0) / len(
                 after
             )
             scale = 1.0 / (self._sigma * np.sqrt(share))
-            seen = np.isfinite(change)
+            finite = np.isfinite(change)
             slip, free = (scale[:, None] * part for part in (place.slip, place.free))
-            found.append(_Change((change * scale)[seen], slip[seen], free[seen]))
-        return found
+            changes.append(_Change((change * scale)[finite], slip[finite], free[finite]))
+        return changes
 
     def _distinct(self, places: list[int]) -> int:
         """Return how many of the poses differ from each other."""
-        kept: list[Array] = []
+        distinct: list[Array] = []
         for p in places:
             q = self._places[p].q
-            if all(np.abs(q - other).max() > TIPS for other in kept):
-                kept.append(q)
-        return len(kept)
+            if all(np.abs(q - other).max() > TIPS for other in distinct):
+                distinct.append(q)
+        return len(distinct)
 
 
 def _ratios(changes: list[_Change]) -> tuple[Array, Array, Array, Array] | None:
@@ -430,16 +430,16 @@ def _ratios(changes: list[_Change]) -> tuple[Array, Array, Array, Array] | None:
     freedom = len(b) - U.shape[1] - 1
     if freedom < 1:
         return None
-    own = np.linalg.norm(slip, axis=0)
+    unprojected = np.linalg.norm(slip, axis=0)
     b, slip = b - U @ (U.T @ b), slip - U @ (U.T @ slip)
     size = np.linalg.norm(slip, axis=0)
-    seen = size > np.maximum(1e-3 * own, 1e-9)
-    size = np.where(seen, size, 1.0)
-    along = np.where(seen, (slip / size).T @ b, 0.0)
+    visible = size > np.maximum(1e-3 * unprojected, 1e-9)
+    size = np.where(visible, size, 1.0)
+    along = np.where(visible, (slip / size).T @ b, 0.0)
     return along**2, along / size, 1.0 / size, (float(b @ b) - along**2) / freedom
 
 
-def _middle(values: Array | list[Array]) -> Array:
+def _median(values: Array | list[Array]) -> Array:
     """Return the median along the first axis; NaN where there are any. np.median takes longer."""
     ordered = np.sort(values, axis=0)  # NaN last
     half = 0.5 * (ordered[(len(ordered) - 1) // 2] + ordered[len(ordered) // 2])
@@ -447,10 +447,10 @@ def _middle(values: Array | list[Array]) -> Array:
 
 
 def _by_place(rests: list[_Rest]) -> dict[int, list[Array]]:
-    found: dict[int, list[Array]] = {}
+    readings: dict[int, list[Array]] = {}
     for rest in rests:
-        found.setdefault(rest.place, []).append(rest.readings)
-    return found
+        readings.setdefault(rest.place, []).append(rest.readings)
+    return readings
 
 
 def _first_finite(first: Array, second: Array) -> Array:

@@ -8,7 +8,7 @@ from typing import Any
 
 from gapbridge.bridge.ipc.events import Event, EventKind
 from gapbridge.bridge.loop.checks import NOTHING, UNSOLVED
-from gapbridge.bridge.loop.supervisor import HEALED_BY_RECONNECTING, Cause, State
+from gapbridge.bridge.loop.supervisor import CLEARED_BY_RECONNECTING, Cause, State
 from gapbridge.core.arrays import Array
 from gapbridge.drivers.clock import SYSTEM, Clock
 
@@ -43,7 +43,7 @@ class DaemonStatus:
         self.armed_by = ""
         self._asked_by = ""  # of the last request to arm
         self.latched = ""  # the fault that waits for being acknowledged
-        self._heals = False  # it ends with the link
+        self._clears_with_link = False  # it ends with the link
         self._slipped = False  # it is a joint's zero, of which the loop only holds
         self._batches: deque[tuple[float, int]] = deque()  # s, cycles
         self._last_state: float | None = None  # s, monotonic: when the last state was received
@@ -71,7 +71,7 @@ class DaemonStatus:
         if event["kind"] == EventKind.REQUEST and event["command"] == "arm":
             self._asked_by = event["by"]
         if event["kind"] == EventKind.SLIP:
-            self.latched, self._heals, self._slipped = event["detail"], False, True
+            self.latched, self._clears_with_link, self._slipped = event["detail"], False, True
         if event["kind"] == EventKind.REQUEST and event["acknowledges"] and self._slipped:
             self.latched, self._slipped = "", False
         if event["kind"] == EventKind.COMPILING:
@@ -90,7 +90,7 @@ class DaemonStatus:
         self._why = f"{cause}: {detail}" if detail else cause
         if to == State.FAULT.name:
             if cause != Cause.LATCHED:  # else it is the one that is known already
-                self.latched, self._heals = self._why, cause in HEALED_BY_RECONNECTING
+                self.latched, self._clears_with_link = self._why, cause in CLEARED_BY_RECONNECTING
         elif event["from"] == State.FAULT.name and to == State.OBSERVING.name:
             self.latched = ""
         if to == State.DISCONNECTED.name:
@@ -111,8 +111,8 @@ class DaemonStatus:
     def lost_loop(self) -> None:
         """Take note that link and loop are gone: faults of the link end with them."""
         self._compiling = ""
-        if self._heals:
-            self.latched, self._heals = "", False
+        if self._clears_with_link:
+            self.latched, self._clears_with_link = "", False
         self.armed_by = ""
 
     def history(self) -> dict[str, Any]:

@@ -15,7 +15,7 @@ def lines(status: dict[str, Any]) -> list[str]:
     link, loop = status["link"], status["loop"]
     since = time.strftime("%H:%M:%S", time.localtime(status["since"]))
     why = f" ({status['why']})" if status["why"] else ""
-    found = [
+    report = [
         f"{status['cell']}: {status['state']} since {since}{why}",
         f"  process {status['pid']}, loop {loop['pid'] or 'none'} (restarts {loop['restarts']}), "
         f"session {status['session']}",
@@ -24,20 +24,20 @@ def lines(status: dict[str, Any]) -> list[str]:
         f"{link['written']}",
     ]
     if status["armed_by"]:
-        found.append(f"  armed by {status['armed_by']}")
+        report.append(f"  armed by {status['armed_by']}")
     if status["latched"]:
-        found.append(f"  fault: {status['latched']}; acknowledge with `gapbridge disarm`")
+        report.append(f"  fault: {status['latched']}; acknowledge with `gapbridge disarm`")
     if status["correction"]["detail"]:
-        found.append(f"  model: {status['correction']['detail']}")
-    found.append(f"  joints' zeros: {status['zeros']}")
+        report.append(f"  model: {status['correction']['detail']}")
+    report.append(f"  joints' zeros: {status['zeros']}")
     counted = {k: v for k, v in status["counts"].items() if v}
     if counted:
-        found.append("  counted: " + ", ".join(f"{k} {v}" for k, v in counted.items()))
+        report.append("  counted: " + ", ".join(f"{k} {v}" for k, v in counted.items()))
     for name, side in status["sides"].items():
-        found.append(f"  {name}: process {side['pid'] or 'none'} (restarts {side['restarts']})")
+        report.append(f"  {name}: process {side['pid'] or 'none'} (restarts {side['restarts']})")
     if status["recording"]:
-        found.append(f"  recording {status['recording']}")
-    return found
+        report.append(f"  recording {status['recording']}")
+    return report
 
 
 def _last(age: float | None) -> str:

@@ -36,8 +36,8 @@ class Histogram:
         total = self._counts.sum()
         if not total:
             return 0.0
-        at = int(np.searchsorted(np.cumsum(self._counts), share * total))
-        return min((at + 1) * UNIT, self.largest)
+        index = int(np.searchsorted(np.cumsum(self._counts), share * total))
+        return min((index + 1) * UNIT, self.largest)
 
 
 @dataclass(frozen=True)
@@ -66,14 +66,14 @@ class RunSummary:
 
     def to_json(self) -> dict[str, Any]:
         """Return everything as JSON-able data."""
-        found = asdict(self)
-        found["recording"] = None if self.recording is None else str(self.recording)
-        found["missed_share"] = self.missed_share
-        return found
+        document = asdict(self)
+        document["recording"] = None if self.recording is None else str(self.recording)
+        document["missed_share"] = self.missed_share
+        return document
 
     def lines(self) -> list[str]:
         """Return the summary as a person reads it."""
-        found = [
+        lines = [
             f"cycles {self.cycles}, missed {self.missed} ({100 * self.missed_share:.3f} %), "
             f"late {self.late}, rate {self.rate_hz:.2f} Hz",
             f"setpoints written {self.setpoints_written}, age of the state p50 "
@@ -84,14 +84,14 @@ class RunSummary:
         ]
         clamped = ", ".join(f"{name} {count}" for name, count in self.clamped.items() if count)
         if clamped:
-            found.append(f"held back by limits: {clamped}")
+            lines.append(f"held back by limits: {clamped}")
         if self.restarts:
-            found.append(f"the loop's process was restarted {self.restarts} times")
+            lines.append(f"the loop's process was restarted {self.restarts} times")
         if self.lost_rows:
-            found.append(f"{self.lost_rows} cycles could not be recorded")
+            lines.append(f"{self.lost_rows} cycles could not be recorded")
         if self.recording is not None:
-            found.append(f"recorded in {self.recording}")
-        return found
+            lines.append(f"recorded in {self.recording}")
+        return lines
 
 
 @dataclass

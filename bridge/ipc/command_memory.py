@@ -69,9 +69,9 @@ class Commands:
 
     def __init__(self, fd: int, after: int = 0) -> None:
         self._map = map_as_reader(fd, _SIZE)
-        self._seen = b""
-        self._taken = dict.fromkeys(Command, after)
-        self.taken = after  # number of the newest request that was taken
+        self._last_words = b""
+        self._taken_numbers = dict.fromkeys(Command, after)
+        self.last_taken = after  # number of the newest request that was taken
         self.stop = False  # has been asked for, and stays
 
     def take(self) -> list[Command]:
@@ -80,18 +80,18 @@ class Commands:
         An ARM that is older than something taken already is void: what came after it stands.
         """
         words = self._map[: _WORD * (1 + max(Command))]
-        if words == self._seen:
+        if words == self._last_words:
             return []
-        self._seen = words
+        self._last_words = words
         numbers = [int.from_bytes(words[_WORD * c :][:_WORD], sys.byteorder) for c in Command]
-        found = []
+        commands = []
         for number, command in sorted(zip(numbers, Command, strict=True)):
-            if number <= self._taken[command]:
+            if number <= self._taken_numbers[command]:
                 continue
-            self._taken[command] = number
-            if command == Command.ARM and number < self.taken:
+            self._taken_numbers[command] = number
+            if command == Command.ARM and number < self.last_taken:
                 continue
-            self.taken = max(self.taken, number)
+            self.last_taken = max(self.last_taken, number)
             self.stop |= command == Command.STOP
-            found.append(command)
-        return found
+            commands.append(command)
+        return commands

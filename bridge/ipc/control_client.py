@@ -52,10 +52,10 @@ def ask_socket(path: Path, command: str) -> Any:
 
 def running() -> list[Any]:
     """Return the status of every daemon that can be asked."""
-    found = []
+    statuses = []
     for folder in dict.fromkeys(candidates()):
         with contextlib.suppress(OSError):
             for path in sorted(folder.glob("*.sock")):
                 with contextlib.suppress(OSError, RunError):
-                    found.append(ask_socket(path, "status"))
-    return found
+                    statuses.append(ask_socket(path, "status"))
+    return statuses

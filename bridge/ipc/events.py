@@ -47,7 +47,7 @@ class EventLog:
         self._listeners = listeners
         self.sequence = 0
         self.counts: Counter[str] = Counter()  # by kind, transitions also by their cause
-        self.kept: deque[Event] = deque(maxlen=KEPT)
+        self.recent: deque[Event] = deque(maxlen=KEPT)
 
     def add(self, event: Event) -> Event:
         """Take an event; returns it with its number and times."""
@@ -62,11 +62,11 @@ class EventLog:
         self.counts[whole["kind"]] += 1
         if whole["kind"] == EventKind.TRANSITION:
             self.counts[f"transition: {whole['cause']}"] += 1
-        self.kept.append(whole)
+        self.recent.append(whole)
         for listener in self._listeners:
             listener(whole)
         return whole
 
     def since(self, sequence: int) -> list[Event]:
         """Return the kept events after a number, from any thread."""
-        return [event for event in tuple(self.kept) if event["sequence"] > sequence]
+        return [event for event in tuple(self.recent) if event["sequence"] > sequence]

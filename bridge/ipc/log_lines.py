@@ -26,17 +26,17 @@ _GRAVE = (EventKind.FAULT, EventKind.REFUSED)
 
 def log_line(event: Mapping[str, Any]) -> str:
     """Return an event as one line of JSON, without its end."""
-    at = datetime.fromtimestamp(float(event.get("time", 0.0)), UTC)
-    found: dict[str, Any] = {
-        "time": at.isoformat(timespec="milliseconds").replace("+00:00", "Z"),
+    time = datetime.fromtimestamp(float(event.get("time", 0.0)), UTC)
+    line: dict[str, Any] = {
+        "time": time.isoformat(timespec="milliseconds").replace("+00:00", "Z"),
         "level": _level(event),
         "event": str(event.get("kind", EventKind.NOTE)),
         "message": _message(event),
     }
     for key, value in event.items():
         if key not in LEFT_OUT:
-            found.setdefault(key, _shown(key, value))
-    return json.dumps(found, ensure_ascii=True, default=str)
+            line.setdefault(key, _shown(key, value))
+    return json.dumps(line, ensure_ascii=True, default=str)
 
 
 class JsonLines:

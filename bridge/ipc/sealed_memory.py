@@ -34,9 +34,9 @@ def map_as_writer(fd: int, size: int) -> mmap.mmap:
 
     Raises OSError where somebody else has sealed it before.
     """
-    found = mmap.mmap(fd, size, access=mmap.ACCESS_WRITE)
+    memory = mmap.mmap(fd, size, access=mmap.ACCESS_WRITE)
     seal(fd)
-    return found
+    return memory
 
 
 def map_as_reader(fd: int, size: int) -> mmap.mmap:
@@ -54,10 +54,10 @@ def seal(fd: int) -> None:
 def sealed_bytes(name: str, data: bytes) -> int:
     """Return the descriptor of memory that holds ``data`` and that nobody can change."""
     fd = make_memory(name, len(data))
-    rest, at = memoryview(data), 0
-    while rest:
-        done = os.pwrite(fd, rest, at)
-        rest, at = rest[done:], at + done
+    remaining, offset = memoryview(data), 0
+    while remaining:
+        done = os.pwrite(fd, remaining, offset)
+        remaining, offset = remaining[done:], offset + done
     seal(fd)
     return fd
 

@@ -57,7 +57,7 @@ class Phase(IntEnum):
 @functools.cache
 def slices_of(n: int) -> dict[str, slice]:
     """Return where each field of a cycle stands in its row: 1, n, 3 or 6 numbers, n joints."""
-    found, at = {}, 0
+    slices, start = {}, 0
     for name, size in (
         ("number", 1), ("timestamp", 1), ("state", 1), ("written", 1), ("missed", 1),
         ("age", 1), ("duration", 1), ("clamped", 1), ("residual", 1),
@@ -69,9 +69,9 @@ def slices_of(n: int) -> dict[str, slice]:
         ("runtime_state", 1), ("safety_status_bits", 1), ("speed_scaling", 1), ("own_q", n),
         ("attempted", 1), ("ramp_time", 1), ("rate", 1), ("loop", 1),
     ):  # fmt: skip
-        found[name] = slice(at, at + size)
-        at += size
-    return found
+        slices[name] = slice(start, start + size)
+        start += size
+    return slices
 
 
 def write_cycle(
@@ -95,10 +95,10 @@ def write_cycle(
     row[slices["nominal_q"]] = nominal_q
     row[slices["corrected_q"]] = corrected_q
     row[slices["offset"]] = offset_in_base
-    at = slices["received"].start
-    row[at] = state.received
-    at = slices["robot_mode"].start
-    row[at : at + 5] = (
+    start = slices["received"].start
+    row[start] = state.received
+    start = slices["robot_mode"].start
+    row[start : start + 5] = (
         state.robot_mode, state.safety_mode, state.runtime_state, state.safety_status_bits,
         state.speed_scaling,
     )  # fmt: skip
@@ -150,7 +150,7 @@ class SharedMemory:
         """Report that the source has come to its end."""
         self._words[_ENDED] = 1
 
-    def note_seen(self) -> None:
+    def note_state_read(self) -> None:
         """Report that a state has been read: the link works."""
         self._words[_SEEN] = 1
 
@@ -184,7 +184,7 @@ class SharedMemory:
         return _read_only(self.fd)
 
     @property
-    def taken(self) -> int:
+    def last_taken(self) -> int:
         """Return the number of the newest request that the loop has taken."""
         return int(self._words[_TAKEN])
 
@@ -204,7 +204,7 @@ class SharedMemory:
         return bool(self._words[_ENDED])
 
     @property
-    def seen(self) -> bool:
+    def has_state(self) -> bool:
         """Return whether a state has been read."""
         return bool(self._words[_SEEN])
 
@@ -297,10 +297,10 @@ class FollowedMemory(SharedMemory):
         """Change over to the newest memory that has come."""
         with contextlib.suppress(OSError):
             while True:
-                data, found, _, _ = socket.recv_fds(self._successors, 1, 4)
+                data, fds, _, _ = socket.recv_fds(self._successors, 1, 4)
                 if not data:  # the daemon is gone
                     return
-                for fd in found:
+                for fd in fds:
                     before = self.fd
                     self._attach(fd, writable=False)
                     os.close(before)
@@ -336,8 +336,8 @@ def _read_only(fd: int) -> int:
     return os.open(path, os.O_RDONLY) if os.path.exists(path) else os.dup(fd)
 
 
-def _write_whole(fd: int, rows: Array, at: int) -> None:
+def _write_whole(fd: int, rows: Array, offset: int) -> None:
     data = memoryview(rows.tobytes())
     while data:
-        done = os.pwrite(fd, data, at)
-        data, at = data[done:], at + done
+        done = os.pwrite(fd, data, offset)
+        data, offset = data[done:], offset + done

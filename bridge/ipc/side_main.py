@@ -34,7 +34,7 @@ class EventLines:
     def __init__(self, fd: int) -> None:
         self.fd = fd  # for select and event loops
         os.set_blocking(fd, False)
-        self._rest = b""
+        self._buffer = b""
         self.closed = False  # the daemon is gone: finish and end
 
     def poll(self) -> list[dict[str, Any]]:
@@ -45,8 +45,8 @@ class EventLines:
             except BlockingIOError:
                 break
             self.closed = not data
-            self._rest += data
-        *lines, self._rest = self._rest.split(b"\n")
+            self._buffer += data
+        *lines, self._buffer = self._buffer.split(b"\n")
         return [event for event in map(read_event, lines) if event is not None]
 
     def wait(self, timeout: float) -> None:
@@ -66,21 +66,21 @@ class EventWriter:
     def __init__(self, fd: int) -> None:
         self._fd = fd
         os.set_blocking(fd, False)
-        self._rest = b""
+        self._buffer = b""
         self.sent = 0
         self.dropped = 0  # events that found the pipe full
 
     def emit(self, event: dict[str, Any]) -> bool:
         """Write an event; returns False where the pipe is full or nobody reads it."""
         self._flush()
-        if self._rest:
+        if self._buffer:
             self.dropped += 1
             return False
-        self._rest = (json.dumps(event, default=str) + "\n").encode()
-        whole = len(self._rest)
+        self._buffer = (json.dumps(event, default=str) + "\n").encode()
+        whole = len(self._buffer)
         self._flush()
-        if len(self._rest) == whole:  # nothing of it has left: as if it had never been
-            self._rest = b""
+        if len(self._buffer) == whole:  # nothing of it has left: as if it had never been
+            self._buffer = b""
             self.dropped += 1
             return False
         self.sent += 1
@@ -94,8 +94,8 @@ class EventWriter:
     def _flush(self) -> None:
         """Write what is left of an event that has left in part."""
         with contextlib.suppress(OSError):
-            while self._rest:
-                self._rest = self._rest[os.write(self._fd, self._rest) :]
+            while self._buffer:
+                self._buffer = self._buffer[os.write(self._fd, self._buffer) :]
 
 
 @dataclass(frozen=True)
@@ -117,21 +117,21 @@ class StartData:
 
 def read_start_data() -> StartData:
     """Return the order that the daemon has written on stdin."""
-    given = json.loads(sys.stdin.readline())
+    start_data = json.loads(sys.stdin.readline())
     with contextlib.suppress(OSError):
         os.nice(NICENESS)
-    events = EventLines(given["events"])
+    events = EventLines(start_data["events"])
     threading.Thread(target=_end_after_daemon, args=(events.fd,), daemon=True).start()
     return StartData(
-        settings=DaemonSettings.model_validate(given["settings"]),
-        n=given["n"],
-        session=given["session"],
+        settings=DaemonSettings.model_validate(start_data["settings"]),
+        n=start_data["n"],
+        session=start_data["session"],
         memory=FollowedMemory(
-            given["n"], given["memory"], socket.socket(fileno=given["successors"])
+            start_data["n"], start_data["memory"], socket.socket(fileno=start_data["successors"])
         ),
         events=events,
-        up=EventWriter(given["up"]),
-        extra=given.get("extra", {}),
+        up=EventWriter(start_data["up"]),
+        extra=start_data.get("extra", {}),
     )
 
 
@@ -150,10 +150,10 @@ def run_side(kind: str, run: Callable[[StartData], None]) -> int:
 def read_event(line: bytes) -> dict[str, Any] | None:
     """Return the event of a line; None where it is none."""
     try:
-        found = json.loads(line)
+        event = json.loads(line)
     except ValueError:
         return None
-    return found if isinstance(found, dict) else None
+    return event if isinstance(event, dict) else None
 
 
 def _end_after_daemon(fd: int) -> None:

@@ -89,7 +89,7 @@ class SideProcess:
         code = self._process.poll()
         if code is None:
             return self._check_reading(now)
-        self._let_go()
+        self._release()
         if now - self._started > HEALTHY:
             self._wait = BACKOFF[0]
         self._retry_at = now + self._wait
@@ -104,7 +104,7 @@ class SideProcess:
                 self._process.wait(patience)
             self._process.kill()
             self._process.wait()
-            self._let_go()
+            self._release()
 
     def begin_close(self) -> None:
         """Notify it that the daemon ends, without waiting."""
@@ -114,14 +114,14 @@ class SideProcess:
     # -- inside -----------------------------------------------------------------------------------
 
     def _start(self) -> None:
-        theirs, ours = os.pipe()
-        up_ours, up_theirs = os.pipe()
+        down_read, down_write = os.pipe()
+        up_read, up_write = os.pipe()
         with contextlib.suppress(OSError):
-            fcntl.fcntl(ours, fcntl.F_SETPIPE_SZ, PIPE_SIZE)
+            fcntl.fcntl(down_write, fcntl.F_SETPIPE_SZ, PIPE_SIZE)
         memory = self._memory.open_for_reading()
         self._successors, successors = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._successors.setblocking(False)
-        passed = (theirs, up_theirs, memory, successors.detach())
+        passed = (down_read, up_write, memory, successors.detach())
         try:
             # spawned, never forked; in a session of its own, so that a Ctrl-C reaches the daemon
             # only, which then ends it in order
@@ -133,12 +133,12 @@ class SideProcess:
         finally:
             for fd in passed:
                 os.close(fd)
-        self._down_fd: int | None = ours
-        self._down, self._up = EventWriter(ours), EventLines(up_ours)
+        self._down_fd: int | None = down_write
+        self._down, self._up = EventWriter(down_write), EventLines(up_read)
         self._started = self._read_at = self._now()
         self._has_read = False
         start_data = {
-            **self.start_data, "memory": memory, "events": theirs, "up": up_theirs,
+            **self.start_data, "memory": memory, "events": down_read, "up": up_write,
             "successors": passed[3],
         }  # fmt: skip
         assert self._process.stdin is not None
@@ -170,7 +170,7 @@ class SideProcess:
             os.close(self._down_fd)
             self._down_fd = None
 
-    def _let_go(self) -> None:
+    def _release(self) -> None:
         self._process = None
         self._close_down()
         self._up.close()
@@ -179,9 +179,9 @@ class SideProcess:
 
 def environment() -> dict[str, str]:
     """Return the environment with this interpreter's import path, and one thread for algebra."""
-    found = dict(os.environ)
-    found["PYTHONPATH"] = os.pathsep.join(p for p in sys.path if p)
+    variables = dict(os.environ)
+    variables["PYTHONPATH"] = os.pathsep.join(p for p in sys.path if p)
     for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
-        found[name] = "1"
-    found.pop("NOTIFY_SOCKET", None)  # only the daemon itself speaks to the service manager
-    return found
+        variables[name] = "1"
+    variables.pop("NOTIFY_SOCKET", None)  # only the daemon itself speaks to the service manager
+    return variables

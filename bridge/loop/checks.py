@@ -76,7 +76,7 @@ class OverrunWatch:
         self._missed: deque[tuple[float, int]] = deque()  # s, cycles
         self._sum = 0
 
-    def forget(self) -> None:
+    def reset(self) -> None:
         """Begin anew: the loop did something else meanwhile."""
         self._missed.clear()
         self._sum = 0
@@ -94,7 +94,7 @@ class OverrunWatch:
             return None  # a single long one is judged by the gap that it leaves
         cycles = OVERRUN_SPAN * self._rate
         detail = f"{self._sum} of {cycles:.0f} cycles missed within {OVERRUN_SPAN:g} s"
-        self.forget()
+        self.reset()
         return detail
 
 
@@ -174,10 +174,10 @@ class LoopChecks:
         self._last: float | None = None  # s, controller clock
         self.not_ready = "no state has been read"  # why the robot cannot move; empty: it can
 
-    def forget(self) -> None:
+    def reset(self) -> None:
         """Begin anew: the loop did something else meanwhile."""
         self._last = None
-        self._overrun.forget()
+        self._overrun.reset()
 
     def begin(self, state: RobotState, missed: int) -> int:
         """Check a state before it is used; returns the cycle's flags.
@@ -194,7 +194,7 @@ class LoopChecks:
         self._judge(LoopCounter.RESYNC, detail, Cause.RESYNC)
         if resync:
             flags |= RESYNC
-            self._overrun.forget()
+            self._overrun.reset()
         else:
             self._judge(
                 LoopCounter.OVERRUN, self._overrun.update(state.timestamp, missed), Cause.OVERRUN
@@ -251,22 +251,22 @@ class LoopChecks:
         lasts = since is not None and state.timestamp - since > self._patience
         self._judge(LoopCounter.NOT_FOLLOWING, detail if lasts else None, Cause.NOT_FOLLOWING)
 
-    def _judge(self, what: LoopCounter, detail: str | None, cause: Cause | None) -> None:
+    def _judge(self, counter: LoopCounter, detail: str | None, cause: Cause | None) -> None:
         """Notify the supervisor of a finding; count and report it once for as long as it lasts."""
         if detail is None:
-            if what in self._lasting:
-                self._lasting.discard(what)
-                if what == LoopCounter.SENSOR_LOST:
+            if counter in self._lasting:
+                self._lasting.discard(counter)
+                if counter == LoopCounter.SENSOR_LOST:
                     self._reports.emit(
                         {"kind": EventKind.DEGRADED, "what": "", "detail": "the sensor is back"}
                     )
             return
         changed = cause is not None and self._supervisor.take(cause, detail)
-        if what in self._lasting:
+        if counter in self._lasting:
             return
-        self._lasting.add(what)
-        self._reports.count(what)
+        self._lasting.add(counter)
+        self._reports.count(counter)
         if not changed and self._supervisor.state != State.FAULT:
-            lost = what == LoopCounter.SENSOR_LOST
+            lost = counter == LoopCounter.SENSOR_LOST
             kind = EventKind.DEGRADED if lost else EventKind.WARNING
-            self._reports.emit({"kind": kind, "what": what.label, "detail": detail})
+            self._reports.emit({"kind": kind, "what": counter.label, "detail": detail})

@@ -140,7 +140,7 @@ class LinkMonitor:
         self._hold = hold_time(driver.rate)
         self._patience = max(patience, self._hold)  # s that one reading takes at most
         self._invalid = self._old = 0
-        self._left = 0.0  # s, monotonic: when the last reading ended
+        self._last_read_end = 0.0  # s, monotonic: when the last reading ended
         self._stale = self._silent = False  # has been reported since the last believable state
         self._reported: dict[Implausible, float] = {}  # s, monotonic
         self._last_state = self._now()  # s, of the last believable state
@@ -152,19 +152,19 @@ class LinkMonitor:
         ``has_armed``: the writing half of the robot's library exists in this process.
         """
         self._has_armed = has_armed
-        begun, self._left = self._now(), self._left or self._now()
-        away = begun - self._left > self._hold
+        begun, self._last_read_end = self._now(), self._last_read_end or self._now()
+        suspended = begun - self._last_read_end > self._hold
         try:
-            return self._read(begun, away)
+            return self._read(begun, suspended)
         finally:
-            self._left = self._now()
+            self._last_read_end = self._now()
 
-    def _read(self, begun: float, away: bool) -> RobotState | None:
+    def _read(self, begun: float, suspended: bool) -> RobotState | None:
         """Return the next state; ``away``: this process itself stood still before ``begun``."""
         try:
             state = self._driver.read_state()
         except StaleStateError as error:
-            if away or self._now() - begun > self._patience + SUSPENDED:
+            if suspended or self._now() - begun > self._patience + SUSPENDED:
                 self._last_state = self._now()  # it was this process that slept: ask once more
                 self._reports.count(LoopCounter.LATE)
             else:
@@ -196,9 +196,9 @@ class LinkMonitor:
         self._stale = self._silent = False
         return True
 
-    def forget(self) -> None:
+    def reset(self) -> None:
         """Take note that nobody asked for states meanwhile."""
-        self._last_state = self._left = self._now()
+        self._last_state = self._last_read_end = self._now()
 
     def _judge_stale(self, detail: str) -> None:
         """Judge a clock that stands still: late at first, then stale, then silent."""

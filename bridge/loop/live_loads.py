@@ -61,12 +61,12 @@ class LiveLoads:
 
         Together: the controller takes the declared payload off its force.
         """
-        found = None
+        problem = None
         if state.payload is not None and state.payload_cog is not None:
-            found = self._bounds.payload_problem(state.payload, state.payload_cog)
-        if found is None and self._use_force and not state.sensor_lost:
-            found = self._bounds.wrench_problem(state.actual_TCP_force)
-        return found
+            problem = self._bounds.payload_problem(state.payload, state.payload_cog)
+        if problem is None and self._use_force and not state.sensor_lost:
+            problem = self._bounds.wrench_problem(state.actual_TCP_force)
+        return problem
 
     def _take_payload(self, state: RobotState) -> None:
         """Take the declared payload over, where there is one."""
@@ -75,7 +75,7 @@ class LiveLoads:
             self._mass[0] = state.payload
             self._cog[0] = state.payload_cog
 
-    def forget(self) -> None:
+    def reset(self) -> None:
         """Begin anew after a gap: an old force means nothing."""
         self._last = -math.inf
 
@@ -100,8 +100,8 @@ class LiveLoads:
         if before is None:
             self._turned_at = q.copy()
             return
-        way = q - before
-        moved = np.abs(way) > MOVED
+        step = q - before
+        moved = np.abs(step) > MOVED
         if moved.any():
-            self._approach[0, moved] = np.sign(way[moved])
+            self._approach[0, moved] = np.sign(step[moved])
             before[moved] = q[moved]

@@ -87,7 +87,7 @@ class Loop:
             model.arm.n, settings.setpoints.use_force, settings.setpoints.force_filter,
             LoadBounds.of(model),
         )  # fmt: skip
-        self._acting = Loads()  # of the last cycle
+        self._last_loads = Loads()  # of the last cycle
         self._model_check = ModelCheck(model, settings.setpoints.use_force)
         self._clock = ControllerClock(driver.rate, hold_time(driver.rate), clock)
         reports = Reports(memory, emit)
@@ -97,7 +97,7 @@ class Loop:
         self._checks = LoopChecks(
             driver.rate, self._supervisor, reports, patience, driver.moves_arm
         )
-        self._in_force = self._kept_offset()
+        self._in_force = self._open_offset_in_force()
         self._writing = Writing(
             settings.setpoints, driver, source, self._stream, self._supervisor, reports,
             self._in_force,
@@ -108,7 +108,7 @@ class Loop:
         self._exit: Exit | None = None
         self._stop_requested = False
 
-    def _kept_offset(self) -> OffsetInForce:
+    def _open_offset_in_force(self) -> OffsetInForce:
         """Return where the offset that an arm is left with is kept."""
         if not self._driver.moves_arm:  # the robot's own program takes it out
             return OffsetInForce(self._driver.n, None)
@@ -132,7 +132,7 @@ class Loop:
         except LinkError as error:
             self._emit({"kind": EventKind.FAILURE, "detail": str(error)})
             return Exit.LINK
-        self._watch.forget()
+        self._watch.reset()
         self._supervisor.take(Cause.CONNECTED)
         if latched:
             self._supervisor.take(Cause.LATCHED, latched)
@@ -140,19 +140,19 @@ class Loop:
         wanted = False
         while self._exit is None:
             self._memory.beat()
-            asked = commands.take()
-            for command in asked:
+            requests = commands.take()
+            for command in requests:
                 wanted = command == Command.ARM
                 if command in (Command.DISARM, Command.RAMP_OUT):
                     self._disarm(command == Command.DISARM)
                 if command == Command.ZERO_MOVED:
                     self._hold_for_zero()
-            if asked:
-                self._memory.note_taken(commands.taken)
+            if requests:
+                self._memory.note_taken(commands.last_taken)
             if self._stop_requested or commands.stop:
                 self._stop()
-            seen = self._memory.seen and self._checks.rate.known
-            if wanted and may_write and seen and self._stop_by is None:
+            has_states = self._memory.has_state and self._checks.rate.known
+            if wanted and may_write and has_states and self._stop_by is None:
                 wanted = False
                 self._arm()
             if self._exit is None:
@@ -180,7 +180,7 @@ class Loop:
         stream = self._stream
         if self._zero_moved:
             return "a joint's zero has moved: acknowledge it first (gapbridge disarm)"
-        self._model_check.forget()
+        self._model_check.reset()
         if self._checks.rate.problem:
             return self._checks.rate.problem
         if self._loads.problem is not None:
@@ -189,7 +189,7 @@ class Loop:
             return "the model's correction is no number at the present pose"
         if stream.unsolved:
             return f"the correction cannot be solved at the present pose: {stream.unsolved}"
-        if not self._settings.uncorrected and not self._model_check.corrects(self._acting):
+        if not self._settings.uncorrected and not self._model_check.corrects(self._last_loads):
             return (
                 "the model corrects nothing at any pose: found neither compliance nor an effect in "
                 "the cell that moves the TCP under what acts now"
@@ -212,15 +212,15 @@ class Loop:
     def _skip(self) -> None:
         """Do not count what the loop does not see now: it does something else."""
         self._clock.skip()
-        self._checks.forget()
-        self._watch.forget()
+        self._checks.reset()
+        self._watch.reset()
 
     def _stop(self) -> None:
         """Ramp out, then end; a deadline makes sure of the end."""
         if self._stop_by is None:
             needed = LONGEST_STOP + longest_withdrawal(self._settings.limits)
             self._stop_by = self._now() + needed
-            self._stream.hasten(HASTY_RAMP)
+            self._stream.shorten_ramp(HASTY_RAMP)
             self._supervisor.take(Cause.STOP)
         if not self._supervisor.state.writes or self._now() > self._stop_by:
             self._release()
@@ -229,9 +229,9 @@ class Loop:
 
     def _release(self) -> None:
         self._writing.release()
-        self._look_after_writing()
+        self._check_writing()
 
-    def _look_after_writing(self) -> None:
+    def _check_writing(self) -> None:
         """Act on what writing came to: states not looked at meanwhile, or a link that broke."""
         if self._writing.paused():
             self._skip()
@@ -260,39 +260,39 @@ class Loop:
             self._give_up(self._watch.lost)
             return
         missed = self._clock.take(state, way_known=self._writing.ready)
-        expiry = self._clock.expiry(state) - self._writing.way
+        expiry = self._clock.expiry(state) - self._writing.transit_time
         is_fresh = self._watch.accept(expiry)
         self._give_up(self._watch.lost)
-        self._memory.note_seen()
+        self._memory.note_state_read()
         flags = self._checks.begin(state, missed)
         if flags & RESYNC:
-            self._loads.forget()
+            self._loads.reset()
             is_fresh = False  # how long it lay here only the next one shows: clocks drift meanwhile
         self._acknowledge()
         supervisor, writing = self._supervisor, self._writing
         if supervisor.state == State.FAULT:
             writing.abandon()
-        loads = self._acting = self._loads.update(state)
+        loads = self._last_loads = self._loads.update(state)
         self._checks.judge_loads(self._loads.problem)
         self._checks.judge_settings(state, self._driver)
-        seen = self._now()
+        start = self._now()
         if is_fresh and supervisor.state == State.ARMED:
             used_up = writing.start(state, nominal_q)
-            self._look_after_writing()
+            self._check_writing()
             if used_up:  # the state is old by now
-                self._record(CycleInput(state, missed, nominal_q, loads, flags), None, at=seen)
+                self._record(CycleInput(state, missed, nominal_q, loads, flags), None, since=start)
                 return
         holding = supervisor.state == State.HOLDING
         writes = supervisor.state.writes
         written = None
         if writes:
             written = writing.write(state, nominal_q, loads, expiry if is_fresh else -np.inf)
-            self._look_after_writing()
+            self._check_writing()
         if writes and writing.ramps_out:
             flags |= RAMPING_OUT
         setpoint = writing.unsent if writes and written is None else written
-        given = CycleInput(state, missed, nominal_q, loads, flags)
-        self._record(given, setpoint, writes, written is not None)
+        cycle_input = CycleInput(state, missed, nominal_q, loads, flags)
+        self._record(cycle_input, setpoint, writes, written is not None)
         clamped = 0 if written is None else self._stream.clamped
         commanded = nominal_q if written is None else written.q
         self._checks.end(state, commanded, clamped, self._now() - state.received)
@@ -309,15 +309,15 @@ class Loop:
 
     def _record(
         self,
-        given: CycleInput,
+        cycle_input: CycleInput,
         setpoint: Setpoint | None,
         attempted: bool = False,
-        left: bool = False,
-        at: float | None = None,
+        sent: bool = False,
+        since: float | None = None,
     ) -> None:
         """Publish a cycle: ``setpoint`` was computed for writing, and has ``left`` or not."""
         memory, stream = self._memory, self._stream
-        state, missed, nominal_q, loads, flags = given
+        state, missed, nominal_q, loads, flags = cycle_input
         if setpoint is None:
             correction = stream.correct(nominal_q, loads)
             wanted, corrected, offset = nominal_q, correction.q, correction.offset_in_base
@@ -330,11 +330,11 @@ class Loop:
         if stream.unsolved:
             flags |= UNSOLVED
         clamped = stream.clamped if setpoint is not None else 0
-        late = 0.0 if at is None else self._now() - at  # arming: no part of the cycle
+        late = 0.0 if since is None else self._now() - since  # arming: no part of the cycle
         row, slices = memory.next_row(), memory.slices
         write_cycle(row, slices, state, wanted, corrected, offset)
         row[2] = self._supervisor.state
-        row[3] = left
+        row[3] = sent
         row[4] = missed
         row[5] = self._clock.age(state) - late
         row[6] = self._now() - state.received - late
@@ -343,11 +343,11 @@ class Loop:
         row[slices["own_q"]] = nominal_q
         row[slices["flags"].start] = flags
         last = slices["attempted"].start
-        kind = UNSENT if setpoint is not None and not left else int(attempted)
+        kind = UNSENT if setpoint is not None and not sent else int(attempted)
         row[last : last + 4] = (kind, stream.ramp_time, self._driver.rate, self._number)
         memory.publish()
         self._source.emit(
-            SourceStatus(self._supervisor.state, wanted, corrected, offset, left, clamped)
+            SourceStatus(self._supervisor.state, wanted, corrected, offset, sent, clamped)
         )
 
 
@@ -365,14 +365,14 @@ class ModelCheck:
     def corrects(self, loads: Loads) -> bool:
         """Return whether some pose gets an offset under these loads (one row), or under a pull."""
         if self._known is None:
-            self._known = any(self._offset(q, loads) for q in self._poses)
+            self._known = any(self._has_offset(q, loads) for q in self._poses)
         return self._known
 
-    def forget(self) -> None:
+    def reset(self) -> None:
         """Try anew the next time: the loads may be others."""
         self._known = None
 
-    def _offset(self, q: Array, loads: Loads) -> bool:
+    def _has_offset(self, q: Array, loads: Loads) -> bool:
         wrench = np.zeros((1, 6)) if loads.wrench is None else loads.wrench
         tried = [wrench]
         if self._use_force:
@@ -380,13 +380,13 @@ class ModelCheck:
             pulls[range(3), 0, range(3)] = PULL
             tried += [wrench + pull for pull in pulls]
         for pull in tried:
-            found = self._compensator.correct(
+            correction = self._compensator.correct(
                 q,
                 Loads(
                     loads.payload_mass, loads.payload_cog, pull, loads.temperature, loads.approach
                 ),
             )
             # what cannot be solved is not nothing: it is said where it happens
-            if not found.residual < np.inf or np.abs(found.offset_in_base).max() > LEAST:
+            if not correction.residual < np.inf or np.abs(correction.offset_in_base).max() > LEAST:
                 return True
         return False

@@ -53,7 +53,7 @@ LOCK_ALL = 3  # MCL_CURRENT | MCL_FUTURE
 LATENCY = "/dev/cpu_dma_latency"  # the kernel's PM QoS interface
 IDLE_DRIVER = "/sys/devices/system/cpu/cpuidle/current_driver"  # what the kernel sleeps by
 FAST = 0.005  # s: loops with this cycle or a shorter one keep the processors awake
-_held: list[int] = []  # files whose closing would take a measure back
+_open_files: list[int] = []  # files whose closing would take a measure back
 _PR_SET_PDEATHSIG = 1
 LONGEST_DETAIL = 1000  # of an event
 
@@ -112,14 +112,14 @@ def _make_source(settings: DaemonSettings, model: Model, driver: Driver) -> Sour
 
 
 def _make_loop(
-    settings: DaemonSettings, model: Model, driver: Driver, source: Source, *more: Any
+    settings: DaemonSettings, model: Model, driver: Driver, source: Source, *arguments: Any
 ) -> Loop:
     """Return the loop of a link; a recording has the sensor's readings in it."""
     if isinstance(driver, ReplayDriver):
-        return ReplayedLoop(settings, model, driver, source, *more)
+        return ReplayedLoop(settings, model, driver, source, *arguments)
     if settings.ft_sensor is not None:
         driver = DriverWithSensor(driver, settings.ft_sensor, model)
-    return Loop(settings, model, driver, source, *more)
+    return Loop(settings, model, driver, source, *arguments)
 
 
 def _emitter(events: int) -> Callable[[dict[str, Any]], None]:
@@ -147,10 +147,10 @@ def _report_compiling(emit: Callable[[dict[str, Any]], None]) -> Callable[[int],
 
 
 def _read_model(settings: DaemonSettings) -> Model:
-    found = resolve_name(settings.model_source)(settings.cell).model
-    if not isinstance(found, Model):
-        raise InputError(f"{settings.model_source}: found {type(found).__name__}, expected a Model")
-    return found
+    model = resolve_name(settings.model_source)(settings.cell).model
+    if not isinstance(model, Model):
+        raise InputError(f"{settings.model_source}: found {type(model).__name__}, expected a Model")
+    return model
 
 
 def _compile(settings: DaemonSettings, model: Model) -> None:
@@ -221,7 +221,7 @@ def _keep_awake() -> bool:
             if kinds.read().strip() in ("", "none"):
                 return False
         file = os.open(LATENCY, os.O_WRONLY | os.O_CLOEXEC)
-        _held.append(file)
+        _open_files.append(file)
         return os.write(file, struct.pack("@i", 0)) > 0  # us until a processor must be awake
     return False
 

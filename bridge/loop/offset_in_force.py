@@ -51,9 +51,9 @@ class OffsetInForce:
                 self._memory = mmap.mmap(fd, 8 * count)
             finally:
                 os.close(fd)
-        kept = np.frombuffer(self._memory, np.float64)
-        self._which = kept[:1]  # 0: nothing; 1, 2: the place that is whole
-        self._places = kept[1:].reshape(2, size)
+        numbers = np.frombuffer(self._memory, np.float64)
+        self._which = numbers[:1]  # 0: nothing; 1, 2: the place that is whole
+        self._places = numbers[1:].reshape(2, size)
 
     @classmethod
     def of_link(cls, n: int, link: DriverSettings) -> Self:
@@ -68,7 +68,7 @@ class OffsetInForce:
         row[:n], row[n : 2 * n], row[2 * n :] = q, delta, offset_in_base
         self._which[0] = place + 1.0
 
-    def at(self, q: Array) -> InForce | None:
+    def offset_at(self, q: Array) -> InForce | None:
         """Return the offset that an arm at q (n,) still has; None: it has none, or was moved."""
         if self._which[0] not in (1.0, 2.0):
             return None

@@ -26,7 +26,7 @@ from gapbridge.core.state import RobotState, Setpoint
 from gapbridge.drivers.replay.driver import Cycle, EndOfRecordingError, ReplayDriver
 
 
-class _Followed(StrEnum):
+class _ReplayCause(StrEnum):
     """Why a replayed loop changes its state."""
 
     RECORDED = "as recorded"
@@ -35,13 +35,13 @@ class _Followed(StrEnum):
 class ReplayedLoop(Loop):
     """A loop whose driver is a recording."""
 
-    def __init__(self, settings: Any, model: Model, driver: ReplayDriver, *more: Any) -> None:
-        super().__init__(settings, model, driver, *more)
+    def __init__(self, settings: Any, model: Model, driver: ReplayDriver, *arguments: Any) -> None:
+        super().__init__(settings, model, driver, *arguments)
         self._model, self._recording = model, driver
         self._process: int | None = None  # of the loop then
         self._streaming = False  # between the first setpoint of a stream and its last
 
-    def _kept_offset(self) -> OffsetInForce:
+    def _open_offset_in_force(self) -> OffsetInForce:
         """Keep it in memory: a recording leaves no arm anywhere."""
         return OffsetInForce(self._driver.n, None)
 
@@ -58,15 +58,15 @@ class ReplayedLoop(Loop):
         if cycle.loop != self._process:
             self._renew(cycle.loop)
         missed = self._clock.take(state)
-        self._memory.note_seen()
+        self._memory.note_state_read()
         if cycle.flags & RESYNC:
-            self._loads.forget()
+            self._loads.reset()
         loads = self._loads.update(state)
         self._follow(State(cycle.state))
         setpoint = self._write_again(cycle, state, loads)
-        left = cycle.written and setpoint is not None
-        given = CycleInput(state, missed, cycle.own_q, loads, cycle.flags)
-        self._record(given, setpoint, cycle.attempted > 0, left)
+        sent = cycle.written and setpoint is not None
+        cycle_input = CycleInput(state, missed, cycle.own_q, loads, cycle.flags)
+        self._record(cycle_input, setpoint, cycle.attempted > 0, sent)
 
     def _renew(self, process: int) -> None:
         """Begin as a new process of the loop begins, knowing nothing of the former."""
@@ -83,17 +83,17 @@ class ReplayedLoop(Loop):
         self._streaming = False
 
     def _follow(self, state: State) -> None:
-        changed = self._supervisor.follow(state, cast("Cause", _Followed.RECORDED))
+        changed = self._supervisor.follow(state, cast("Cause", _ReplayCause.RECORDED))
         if changed and state == State.ARMED:
             self._skip()
 
     def _began_with(self, cycle: Cycle) -> InForce | None:
         """Return the offset in force that a stream began with: nominal joints are without it."""
-        found = self._in_force.at(cycle.own_q)
-        if found is None:
+        offset = self._in_force.offset_at(cycle.own_q)
+        if offset is None:
             return None
         before = cycle.nominal_q - cycle.own_q
-        return found if np.linalg.norm(before + found.delta) < np.linalg.norm(before) else None
+        return offset if np.linalg.norm(before + offset.delta) < np.linalg.norm(before) else None
 
     def _write_again(self, cycle: Cycle, state: RobotState, loads: Loads) -> Setpoint | None:
         """Compute the setpoint of a cycle that had one; None where none left."""
@@ -111,16 +111,16 @@ class ReplayedLoop(Loop):
                 self._recording.arm(state)
                 self._streaming = True
             if not cycle.written and cycle.attempted != UNSENT:
-                stream.forget()  # it was refused, and left no trace
+                stream.reset_solver()  # it was refused, and left no trace
                 return None
-            stream.hasten(cycle.ramp_time)
+            stream.shorten_ramp(cycle.ramp_time)
             goal = 0.0 if cycle.flags & RAMPING_OUT else 1.0
             setpoint = stream.advance(state, cycle.nominal_q, loads, goal)
             if cycle.written:
                 self._recording.write_setpoint(setpoint)
                 self._in_force.note(setpoint.q, stream.joint_offset, setpoint.offset_in_base)
         except (LimitError, GateError) as error:  # of another cell than it was then
-            stream.forget()
+            stream.reset_solver()
             self._emit({"kind": EventKind.REFUSED, "detail": str(error)})
             return None
         return setpoint

@@ -33,8 +33,8 @@ USUAL_VELOCITY = np.pi  # rad/s: of joints whose limit is not known
 
 def limits_of(settings: LimitSettings, arm: Arm, rate: float) -> Limits:
     """Return the limits of a cell for its arm."""
-    own = np.where(np.isfinite(arm.limits.velocity), arm.limits.velocity, USUAL_VELOCITY)
-    velocity = settings.velocity_share * own
+    velocity_limit = np.where(np.isfinite(arm.limits.velocity), arm.limits.velocity, USUAL_VELOCITY)
+    velocity = settings.velocity_share * velocity_limit
     if settings.joint_velocity is not None:
         velocity = np.minimum(velocity, settings.joint_velocity)
     return Limits(
@@ -69,14 +69,14 @@ def longest_withdrawal(settings: LimitSettings) -> float:
 
 
 @njit(**JIT)
-def _followed(kept, given, gap):  # type: ignore[no-untyped-def]
+def _track(motion, q, gap):  # type: ignore[no-untyped-def]
     """Take a setpoint (n,) over: the velocity to it, averaged, and its place."""
     share = min(gap / SMOOTHING, 1.0)
-    for i in range(kept.shape[1]):
-        most = kept[LIMIT, i]
-        rate = min(max((given[i] - kept[PLACE, i]) / gap, -most), most)
-        kept[RATE, i] += share * (rate - kept[RATE, i])
-        kept[PLACE, i] = given[i]
+    for i in range(motion.shape[1]):
+        most = motion[LIMIT, i]
+        rate = min(max((q[i] - motion[PLACE, i]) / gap, -most), most)
+        motion[RATE, i] += share * (rate - motion[RATE, i])
+        motion[PLACE, i] = q[i]
 
 
 class NominalStream:
@@ -88,11 +88,11 @@ class NominalStream:
 
     def __init__(self, velocity_limit: Array) -> None:
         # one array: each that is handed to compiled code is unwrapped anew in every call
-        self._kept = np.zeros((3, len(velocity_limit)))
-        self._kept[LIMIT] = velocity_limit
-        self.q: Array = self._kept[PLACE]
-        self._rate: Array = self._kept[RATE]
-        _followed(self._kept, self.q.copy(), 1.0)  # compiled now: the loop waits for no compiler
+        self._motion = np.zeros((3, len(velocity_limit)))
+        self._motion[LIMIT] = velocity_limit
+        self.q: Array = self._motion[PLACE]
+        self._rate: Array = self._motion[RATE]
+        _track(self._motion, self.q.copy(), 1.0)  # compiled now: the loop waits for no compiler
 
     def start(self, q: Array) -> None:
         """Begin at rest at ``q`` (n,) rad."""
@@ -101,14 +101,14 @@ class NominalStream:
 
     def follow(self, q: Array, gap: float) -> None:
         """Take the source's setpoint (n,), ``gap`` s after the last one."""
-        _followed(self._kept, q, gap)
+        _track(self._motion, q, gap)
 
     def brake(self, gap: float) -> Array:
         """Return the setpoint ``gap`` s later on the way to rest; it holds until the next call."""
         fastest = float(np.abs(self._rate).max())
         if fastest > 0.0:
-            left = max(fastest - DECELERATION * gap, 0.0)
-            after = self._rate * (left / fastest)
+            speed = max(fastest - DECELERATION * gap, 0.0)
+            after = self._rate * (speed / fastest)
             self.q += 0.5 * gap * (self._rate + after)
             self._rate[:] = after
         return self.q
@@ -175,19 +175,19 @@ class SetpointStream:
         )
 
     def start(
-        self, own_q: Array, timestamp: float, led: bool = False, in_force: InForce | None = None
+        self, start_q: Array, timestamp: float, led: bool = False, in_force: InForce | None = None
     ) -> Array:
         """Begin at rest at ``own_q`` (n,); returns the nominal joints there. Raises LimitError.
 
         ``led``: the setpoints that follow are led over from where the arm stands already.
         ``in_force``: an offset that the arm stands at; left out: there is none.
         """
-        nominal = own_q
+        nominal = start_q
         if in_force is None:
-            self.limiter.start(own_q)
+            self.limiter.start(start_q)
         else:
-            nominal = own_q - in_force.delta
-            self.limiter.start(own_q, in_force.delta, in_force.offset_in_base)
+            nominal = start_q - in_force.delta
+            self.limiter.start(start_q, in_force.delta, in_force.offset_in_base)
         self._nominal.start(nominal)
         self._ramp, self._resumes = 0.0, in_force is not None
         self._solved[:] = 0.0
@@ -241,15 +241,15 @@ class SetpointStream:
         if not self._resumes:
             return self._ramp
         wanted = float(np.linalg.norm(offset_in_base[:3]))
-        held = float(np.linalg.norm(self.limiter.offset_in_base[:3]))
-        return min(held / wanted, 1.0) if wanted > 0.0 else 0.0
+        present = float(np.linalg.norm(self.limiter.offset_in_base[:3]))
+        return min(present / wanted, 1.0) if wanted > 0.0 else 0.0
 
     @property
     def joint_offset(self) -> Array:
         """Return the joint offset (n,) in the last setpoint, rad: read-only, of this moment."""
         return self.limiter.joint_offset
 
-    def forget(self) -> None:
+    def reset_solver(self) -> None:
         """Solve the next correction from nothing: a refused setpoint leaves no trace in it."""
         self._compensator.forget()
 
@@ -272,8 +272,8 @@ class SetpointStream:
         share = (self._since_start + gap) / max(self._ramp_time, self._lead_time)
         if share >= 1.0:
             return source_q
-        left = 1.0 - share * share * (3.0 - 2.0 * share)
-        return source_q + left * self._start_gap
+        remaining = 1.0 - share * share * (3.0 - 2.0 * share)
+        return source_q + remaining * self._start_gap
 
     def _time_over(self, source_q: Array) -> float:
         """Return the time (s) from the nominal joints to a source's, slower than an offset changes.
@@ -293,7 +293,7 @@ class SetpointStream:
         """Return whether no offset is left and the motion has come to rest."""
         return self.is_bare and self._nominal.rests
 
-    def hasten(self, ramp_time: float) -> None:
+    def shorten_ramp(self, ramp_time: float) -> None:
         """Ramp within ``ramp_time`` s from now on, where it was to take longer."""
         self._ramp_time = min(self._ramp_time, ramp_time)
 

@@ -94,7 +94,7 @@ so that nothing found then latches: what still lasts when somebody arms is refus
 left by a person's ACKNOWLEDGED, or with the link.
 """
 
-HEALED_BY_RECONNECTING = (_C.SILENCE, _C.WRITE_FAILED, _C.INEFFECTIVE)
+CLEARED_BY_RECONNECTING = (_C.SILENCE, _C.WRITE_FAILED, _C.INEFFECTIVE)
 """Faults of a link. They end with it: its successor begins by observing. All others stay latched
 over a new link and a new process, until a person acknowledges them."""
 

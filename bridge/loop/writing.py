@@ -64,7 +64,7 @@ class Writing:
         return paused
 
     @property
-    def way(self) -> float:
+    def transit_time(self) -> float:
         """Return how long the last sample may have been under way, s: as measured when arming."""
         return self._driver.way() if self.ready else 0.0
 
@@ -95,7 +95,7 @@ class Writing:
             if not self.ready:
                 self._arm_driver(state)
                 return True
-            in_force = self._in_force.at(nominal_q) if self._driver.moves_arm else None
+            in_force = self._in_force.offset_at(nominal_q) if self._driver.moves_arm else None
             start_q = self._stream.start(nominal_q, state.timestamp, in_force=in_force)
         except (WriteError, LimitError) as error:
             if isinstance(error, ForeignCommandError):
@@ -112,22 +112,22 @@ class Writing:
         self._reports.memory.enter(Phase.ARMING)
         self.has_armed = True
         try:
-            self._check_way()
-            for found in self._driver.arm(state):
-                detail = str(found)
+            self._check_round_trip()
+            for warning in self._driver.arm(state):
+                detail = str(warning)
                 self._reports.emit({"kind": EventKind.WARNING, "what": "cell", "detail": detail})
             self.ready = True
         finally:
             self._reports.memory.enter(Phase.RUNNING)
             self._paused = True
 
-    def _check_way(self) -> None:
+    def _check_round_trip(self) -> None:
         """Refuse a link on which no state can be fresh. Raises WriteError."""
-        taken, rate = self._driver.round_trip(), self._driver.rate
+        round_trip, rate = self._driver.round_trip(), self._driver.rate
         most = hold_time(rate) - 1.0 / rate  # a setpoint leaves within a cycle
-        if taken is not None and taken > most:
+        if round_trip is not None and round_trip > most:
             raise WriteError(
-                f"link: a question and its answer take {1e3 * taken:.0f} ms, expected at most "
+                f"link: a question and its answer take {1e3 * round_trip:.0f} ms, expected at most "
                 f"{1e3 * most:.0f} ms: no state behind a setpoint may be older"
             )
 
@@ -145,7 +145,7 @@ class Writing:
         stream, self.unsent = self._stream, None
         self.ramps_out = self._supervisor.state == State.HOLDING
         if self._now() > expiry:
-            stream.forget()
+            stream.reset_solver()
             return None
         source_q = self._next(state, nominal_q)
         self.ramps_out = self._supervisor.state == State.HOLDING
@@ -155,15 +155,15 @@ class Writing:
             expiry = min(expiry, self._driver.unanswered_since() + self._hold)
             setpoint = stream.advance(state, source_q, loads, goal, expiry)
         except StaleStateError:
-            stream.forget()
+            stream.reset_solver()
             self._reports.count(LoopCounter.LATE)
             return None
         except WriteError as error:
-            stream.forget()
+            stream.reset_solver()
             self._fail(error)
             return None
         except LimitError as error:
-            stream.forget()
+            stream.reset_solver()
             self._end(LoopCounter.SETPOINT_REFUSED, Cause.SETPOINT_REFUSED, str(error))
             return None
         try:
@@ -253,7 +253,7 @@ class Writing:
         if self._supervisor.state == State.HOLDING:
             return None if self._driver.moves_arm else nominal_q
         try:
-            found = self._source.sample(state.timestamp, nominal_q)
+            source_q = self._source.sample(state.timestamp, nominal_q)
         except SourceDryError as error:
             self._reports.count(LoopCounter.SOURCE_DRY)
             self._supervisor.take(Cause.SOURCE_DRY, str(error))
@@ -262,7 +262,7 @@ class Writing:
             self._reports.memory.note_ended()
             detail = "the source has come to its end; the arm stays there"
             self._reports.emit({"kind": EventKind.SOURCE, "what": "ended", "detail": detail})
-        return found
+        return source_q
 
     def release(self) -> None:
         """Leave the robot to itself; the arm has come to rest, or its watchdog stops it."""

@@ -185,22 +185,22 @@ class Families(Collector):
         )  # fmt: skip
 
     def _info(self) -> Metric:
-        found = InfoMetricFamily("gapbridge_session", "The run that is counted.")
+        family = InfoMetricFamily("gapbridge_session", "The run that is counted.")
         configuration = str(self._counts.status.get("configuration_hash", ""))
         settings = self._counts.settings
-        found.add_metric([], {
+        family.add_metric([], {
             "session": self._session, "cell": settings.cell.stem, "driver": settings.link.driver,
             "configuration_hash": configuration,
         })  # fmt: skip
-        return found
+        return family
 
     def _state(self) -> Metric:
-        found = GaugeMetricFamily(
+        family = GaugeMetricFamily(
             "gapbridge_state", "1 for the state that the supervisor is in.", labels=["state"]
         )
         for state in State:
-            found.add_metric([state.name.lower()], float(self._counts.memory.state == state))
-        return found
+            family.add_metric([state.name.lower()], float(self._counts.memory.state == state))
+        return family
 
     def _cycles(self) -> Iterator[Metric]:
         counts, lost = self._counts, self._counts.reader.lost
@@ -290,10 +290,10 @@ class Families(Collector):
         again = CounterMetricFamily(
             "gapbridge_process_restarts", "Restarts by the daemon.", labels=["process"]
         )
-        for name, found in processes.items():
-            if isinstance(found, Mapping):
-                up.add_metric([name], float(bool(found.get("pid"))))
-                again.add_metric([name], float(found.get("restarts") or 0))
+        for name, process in processes.items():
+            if isinstance(process, Mapping):
+                up.add_metric([name], float(bool(process.get("pid"))))
+                again.add_metric([name], float(process.get("restarts") or 0))
         yield up
         yield again
 
@@ -318,25 +318,25 @@ class Families(Collector):
 
 
 def _counter(name: str, message: str, values: Mapping[str, float], label: str) -> Metric:
-    found = CounterMetricFamily(name, message, labels=[label])
+    family = CounterMetricFamily(name, message, labels=[label])
     for key, value in sorted(values.items()):
-        found.add_metric([key], float(value))
-    return found
+        family.add_metric([key], float(value))
+    return family
 
 
 def _histogram(name: str, message: str, buckets: Buckets) -> Metric:
-    found = HistogramMetricFamily(name, message)
-    found.add_metric([], buckets.cumulative(), buckets.sum)
-    return found
+    family = HistogramMetricFamily(name, message)
+    family.add_metric([], buckets.cumulative(), buckets.sum)
+    return family
 
 
-def _numbers(found: Any) -> dict[str, float]:
+def _numbers(part: Any) -> dict[str, float]:
     """Return what of a document's part are numbers."""
-    if not isinstance(found, Mapping):
+    if not isinstance(part, Mapping):
         return {}
     return {
         str(key): float(value)
-        for key, value in found.items()
+        for key, value in part.items()
         if isinstance(value, int | float) and math.isfinite(value)
     }
 

@@ -22,7 +22,7 @@ from gapbridge.core.log.mcap_schema import ENUM_FIELD
 if TYPE_CHECKING:
     import pyarrow
 
-BESIDE = ("nominal_q", "corrected_q", "offset", "written", "age", "residual", "clamped", "number")
+ADDED = ("nominal_q", "corrected_q", "offset", "written", "age", "residual", "clamped", "number")
 GROUP = 20_000  # rows of a Parquet row group at least
 
 
@@ -133,14 +133,14 @@ def _bounds(recording: Path, span: Span) -> tuple[int, int]:
                 begin = int(batch.log_time[0]) if begin is None else begin
                 end = int(batch.log_time[-1])
 
-    def at(bound: float | datetime | None, otherwise: int) -> int:
+    def nanoseconds(bound: float | datetime | None, otherwise: int) -> int:
         if bound is None:
             return otherwise
         if isinstance(bound, datetime):
             return int(bound.timestamp() * 1e9)
         return int(bound * 1e9) + (end if bound < 0 else begin or 0)
 
-    return at(span.start, 0), at(span.stop, 2**63 - 1)
+    return nanoseconds(span.start, 0), nanoseconds(span.stop, 2**63 - 1)
 
 
 def _columns_of(recording: Path, first: int, last: int) -> list[str]:
@@ -149,25 +149,25 @@ def _columns_of(recording: Path, first: int, last: int) -> list[str]:
     empty = True
     for batch in _within(recording, first, last):
         empty = False
-        left = [name for name in batch.columns if name not in carried]
-        carried.update(name for name in left if not np.isnan(batch.columns[name]).all())
+        missing = [name for name in batch.columns if name not in carried]
+        carried.update(name for name in missing if not np.isnan(batch.columns[name]).all())
     if empty:
         raise LogError(f"{recording}: found no cycles there, expected at least one to export")
-    return [name for name in (*COLUMNS, *BESIDE) if name in carried]
+    return [name for name in (*COLUMNS, *ADDED) if name in carried]
 
 
 def _table(batch: Batch, columns: list[str]) -> pyarrow.Table:
     import pyarrow
 
-    found: dict[str, Any] = {}
+    arrays: dict[str, Any] = {}
     for name in columns:
         values = batch.columns[name]
         if values.ndim == 1:
-            found[name] = values
+            arrays[name] = values
         else:
-            found.update((f"{name}_{i}", values[:, i].copy()) for i in range(values.shape[1]))
-    found[ENUM_FIELD] = [_state(batch, value) for value in batch.columns[ENUM_FIELD]]
-    return pyarrow.table(found)
+            arrays.update((f"{name}_{i}", values[:, i].copy()) for i in range(values.shape[1]))
+    arrays[ENUM_FIELD] = [_state(batch, value) for value in batch.columns[ENUM_FIELD]]
+    return pyarrow.table(arrays)
 
 
 def _state(batch: Batch, value: float) -> str:

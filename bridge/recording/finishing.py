@@ -55,23 +55,23 @@ class _Whole:
     _indexed: dict[int, int] = field(default_factory=dict)  # where these stand
     _index_length: int = 0
 
-    def take(self, file: IO[bytes], code: int, at: int, length: int) -> bool:
+    def take(self, file: IO[bytes], code: int, offset: int, length: int) -> bool:
         """Take a record over; returns False for a broken chunk, behind which all is lost."""
         if code == Opcode.CHUNK:
-            unpacked = records.unpacked(file, at, length)
+            unpacked = records.unpacked(file, offset, length)
             if unpacked is None:
                 return False
             self._close()
             chunk, data = unpacked
-            self._chunk, self._indexed, self._index_length = _index(chunk, at, length), {}, 0
+            self._chunk, self._indexed, self._index_length = _index(chunk, offset, length), {}, 0
             self._take_contents(data)
         elif code == Opcode.MESSAGE_INDEX and self._chunk is not None:
-            file.seek(at)
-            self._indexed[int.from_bytes(file.read(2), "little")] = at - records.HEAD_SIZE
+            file.seek(offset)
+            self._indexed[int.from_bytes(file.read(2), "little")] = offset - records.HEAD_SIZE
             self._index_length += records.HEAD_SIZE + length
         elif code != Opcode.HEADER:
             return True
-        self.end = at + length
+        self.end = offset + length
         return True
 
     def finish(self) -> None:
@@ -143,13 +143,13 @@ def finish_recording(recording: Path) -> list[Path]:
 
 def unfinished(folder: Path) -> list[Path]:
     """Return the recordings of a folder that have no summary, oldest first; never raises."""
-    found = []
+    paths = []
     with contextlib.suppress(OSError):
         for path in sorted(folder.iterdir()):
             with contextlib.suppress(OSError):
                 if NAME.match(path.name) and path.is_file() and not records.is_whole(path):
-                    found.append(path)
-    return found
+                    paths.append(path)
+    return paths
 
 
 def _finished(path: Path) -> bool:
@@ -161,16 +161,16 @@ def _finished(path: Path) -> bool:
 def _scan(file: IO[bytes], path: Path) -> _Whole:
     """Return what is whole, up to the first record that is not."""
     whole = _Whole()
-    for code, at, length in records.all_records(file, path):
-        if not whole.take(file, code, at, length):
+    for code, offset, length in records.all_records(file, path):
+        if not whole.take(file, code, offset, length):
             break
     whole.finish()
     return whole
 
 
-def _index(chunk: Chunk, at: int, length: int) -> ChunkIndex:
+def _index(chunk: Chunk, offset: int, length: int) -> ChunkIndex:
     return ChunkIndex(
-        chunk_length=length + records.HEAD_SIZE, chunk_start_offset=at - records.HEAD_SIZE,
+        chunk_length=length + records.HEAD_SIZE, chunk_start_offset=offset - records.HEAD_SIZE,
         compression=chunk.compression, compressed_size=len(chunk.data),
         message_end_time=chunk.message_end_time, message_index_length=0, message_index_offsets={},
         message_start_time=chunk.message_start_time, uncompressed_size=chunk.uncompressed_size,

@@ -32,10 +32,10 @@ def segments(folder: Path, session: str) -> list[Path]:
     """Return the files of a run, in order."""
     if not folder.is_dir():
         return []
-    found = [(path, NAME.match(path.name)) for path in folder.iterdir()]
+    matches = [(path, NAME.match(path.name)) for path in folder.iterdir()]
     numbered = [
         (int(match["number"]), path)
-        for path, match in found
+        for path, match in matches
         if match and match["session"] == session
     ]
     return [path for _, path in sorted(numbered)]
@@ -43,8 +43,8 @@ def segments(folder: Path, session: str) -> list[Path]:
 
 def next_path(folder: Path, session: str) -> Path:
     """Return the name of the next file of a run: SESSION-001.mcap, ..."""
-    taken = segments(folder, session)
-    match = NAME.match(taken[-1].name) if taken else None
+    files = segments(folder, session)
+    match = NAME.match(files[-1].name) if files else None
     return folder / f"{session}-{int(match['number']) + 1 if match else 1:03d}{SUFFIX}"
 
 

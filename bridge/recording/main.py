@@ -37,7 +37,7 @@ def main() -> None:
     )
     ended = _follow(start, recorder)
     if not ended:
-        _outlive(start, recorder)
+        _record_remaining(start, recorder)
     recorder.close()
 
 
@@ -56,7 +56,7 @@ def _follow(start: StartData, recorder: Recorder) -> bool:
     return ended
 
 
-def _outlive(start: StartData, recorder: Recorder) -> None:
+def _record_remaining(start: StartData, recorder: Recorder) -> None:
     """Record on until the loop, which has lost its daemon, has stopped too."""
     until = SYSTEM.monotonic() + LONGEST_FAREWELL
     recorder.take(
@@ -117,21 +117,21 @@ def redacted(text: str) -> str:
     return text
 
 
-def _find(node: yaml.Node | None, spans: set[tuple[int, int]], seen: set[int]) -> None:
+def _find(node: yaml.Node | None, spans: set[tuple[int, int]], visited: set[int]) -> None:
     """Collect where the values of secret keys stand."""
-    if not isinstance(node, yaml.CollectionNode) or id(node) in seen:
+    if not isinstance(node, yaml.CollectionNode) or id(node) in visited:
         return
-    seen.add(id(node))
+    visited.add(id(node))
     for item in node.value:
         if isinstance(item, yaml.Node):
-            _find(item, spans, seen)
+            _find(item, spans, visited)
             continue
         key, value = item
         name = str(key.value)
         if _SECRET.search(name) and not name.lower().endswith("_file"):
             spans.add((value.start_mark.index, value.end_mark.index))
         else:
-            _find(value, spans, seen)
+            _find(value, spans, visited)
 
 
 if __name__ == "__main__":

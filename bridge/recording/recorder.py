@@ -71,11 +71,11 @@ class Recorder:
 
     def _resume(self) -> int:
         """Return where a former process of this run has stopped."""
-        found = 0
+        number = 0
         for path in segments(self._folder, self._session):
             with contextlib.suppress(OSError, LogError):
-                found = max(found, number_after(path))
-        return found
+                number = max(number, number_after(path))
+        return number
 
     @property
     def path(self) -> Path | None:
@@ -112,7 +112,7 @@ class Recorder:
             path = self._cut_off.pop(0)
             with contextlib.suppress(OSError, LogError):
                 if finish(path):
-                    self._say(f"finished {path}, which had been cut off", file=str(path))
+                    self._report(f"finished {path}, which had been cut off", file=str(path))
 
     def close(self) -> None:
         """Write what is there and finish the file."""
@@ -151,18 +151,18 @@ class Recorder:
             self._open()
 
     def _write_event(self, segment: Segment, event: Event) -> None:
-        at = event.get("time")
-        at = at if isinstance(at, int | float) else self._clock.time()
+        time = event.get("time")
+        time = time if isinstance(time, int | float) else self._clock.time()
         if event.get("kind") == "status":
-            segment.emit(STATUS, event, at)
+            segment.emit(STATUS, event, time)
             return
-        segment.emit(EVENTS, event, at)
-        second, rest = divmod(int(at * 1e9), 10**9)
+        segment.emit(EVENTS, event, time)
+        second, nanosecond = divmod(int(time * 1e9), 10**9)
         log = {
-            "timestamp": {"sec": second, "nsec": rest}, "level": LEVELS[level_of(event)],
+            "timestamp": {"sec": second, "nsec": nanosecond}, "level": LEVELS[level_of(event)],
             "message": text_of(event), "name": "gapbridge", "file": "", "line": 0,
         }  # fmt: skip
-        segment.emit(LOG, log, at)
+        segment.emit(LOG, log, time)
 
     def _open(self) -> bool:
         """Begin a new file; returns whether there is one."""
@@ -181,7 +181,7 @@ class Recorder:
         self._why_paused = ""
         self._reader = self._memory.reader(self._next)
         self._flushed = self._clock.monotonic()
-        self._say(f"recording into {path}", file=str(path))
+        self._report(f"recording into {path}", file=str(path))
         return True
 
     def _describe(self) -> None:
@@ -208,25 +208,25 @@ class Recorder:
         self._segment = None
         self._retry_at = self._clock.monotonic() + RETRY_EVERY
         if why != self._why_paused:
-            self._say(f"recording paused: {why}", paused=why, next_cycle=self._next)
+            self._report(f"recording paused: {why}", paused=why, next_cycle=self._next)
         self._why_paused = why
 
     def _report_lost(self, lost: int) -> None:
         if lost:
             self.lost += lost
-            self._say(f"{lost} cycles lost before cycle {self._memory.written}", lost=lost)
+            self._report(f"{lost} cycles lost before cycle {self._memory.written}", lost=lost)
 
-    def _say(self, message: str, **more: Any) -> None:
+    def _report(self, message: str, **fields: Any) -> None:
         event = {
             "time": self._clock.time(), "monotonic": self._clock.monotonic(), "kind": "recorder",
-            "detail": message, **more,
+            "detail": message, **fields,
         }  # fmt: skip
         self._emit(event)
 
     def _room(self) -> float:
         """Return the MB that are free for us."""
-        found = os.statvfs(self._folder)
-        return found.f_bavail * found.f_frsize / MB
+        stats = os.statvfs(self._folder)
+        return stats.f_bavail * stats.f_frsize / MB
 
 
 def level_of(event: Mapping[str, Any]) -> str:

@@ -57,11 +57,11 @@ class _File:
     def flush(self) -> None:
         """Write what waits. Raises OSError; then the file is to be given up."""
         view = memoryview(self._waiting)
-        at = 0
-        while at < len(view):
-            at += os.write(self.fd, view[at:])
+        done = 0
+        while done < len(view):
+            done += os.write(self.fd, view[done:])
         view.release()
-        self.good += at
+        self.good += done
         self._waiting = bytearray()
 
     def close(self) -> None:
@@ -131,14 +131,14 @@ class Segment:
         encoded = [
             (channel, layout.encode(rows, self._slices)) for channel, layout in self._layouts
         ]
-        for k, (number, at) in enumerate(zip(numbers.tolist(), times, strict=True)):
+        for k, (number, time) in enumerate(zip(numbers.tolist(), times, strict=True)):
             for channel, messages in encoded:
-                add(channel, at, messages[k], at, number)
+                add(channel, time, messages[k], time, number)
         self.rows += len(rows)
 
-    def emit(self, topic: str, document: Mapping[str, Any], at: float | None = None) -> None:
+    def emit(self, topic: str, document: Mapping[str, Any], time: float | None = None) -> None:
         """Take a JSON message over; ``at``: s since 1970, else now."""
-        stamp = int((self._clock.time() if at is None else at) * 1e9)
+        stamp = int((self._clock.time() if time is None else time) * 1e9)
         data = json_text(document).encode()
         self._writer.add_message(self._channels[topic], stamp, data, stamp)
 

@@ -81,7 +81,7 @@ class Guard:
         size = len(scope["raw_path"]) + len(scope["query_string"])
         if size + sum(len(k) + len(v) + 4 for k, v in scope["headers"]) > LARGEST_HEAD:
             return self._refuse("size", 431, "the request is too large", connection="close")
-        if not self._host_is_ours(headers):
+        if not self._host_is_known(headers):
             return self._refuse("host", 421, "this server is not known by that name")
         signs_in = scope["path"] == SIGN_IN and scope["method"] == "POST" and self._sign_in
         if signs_in and self._token is not None:
@@ -101,11 +101,11 @@ class Guard:
             "a token is needed\n", 401, {"www-authenticate": 'Bearer realm="gapbridge"'}
         )
 
-    def _host_is_ours(self, headers: Headers) -> bool:
-        given = headers.getlist("host")
-        if len(given) != 1:
+    def _host_is_known(self, headers: Headers) -> bool:
+        hosts = headers.getlist("host")
+        if len(hosts) != 1:
             return False
-        name = given[0].lower()
+        name = hosts[0].lower()
         if name.startswith("["):
             name = name[1:].partition("]")[0]
         elif name.count(":") == 1:
@@ -121,15 +121,15 @@ class Guard:
 
     def _is_known(self, headers: Headers) -> bool:
         assert self._token is not None and self._pass is not None
-        scheme, _, given = headers.get("authorization", "").partition(" ")
-        bearer = given.strip() if scheme.lower() == "bearer" else ""
+        scheme, _, token = headers.get("authorization", "").partition(" ")
+        bearer = token.strip() if scheme.lower() == "bearer" else ""
         cookies: SimpleCookie = SimpleCookie()
         try:
             cookies.load(headers.get("cookie", ""))
         except CookieError:
             cookies.clear()
-        found = cookies.get(cookie_name(self._settings))
-        shown = found.value if found is not None else ""
+        cookie = cookies.get(cookie_name(self._settings))
+        shown = cookie.value if cookie is not None else ""
         # both are compared always, in constant time
         right = hmac.compare_digest(bearer.encode(), self._token)
         return hmac.compare_digest(shown.encode(), self._pass) or right

@@ -39,8 +39,8 @@ class GuardedProtocol(H11Protocol):
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Forget the timers."""
-        self._let_head()
-        self._let_stall()
+        self._cancel_head_timer()
+        self._cancel_stall_timer()
         super().connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:
@@ -49,14 +49,14 @@ class GuardedProtocol(H11Protocol):
         if self.transport.is_closing():
             return
         if self.cycle is not None and not self.cycle.response_complete:
-            self._let_head()
+            self._cancel_head_timer()
         elif self._waiting_for_head is None:
             self._waiting_for_head = self.loop.call_later(self.header_time, self.transport.abort)
 
     def on_response_complete(self) -> None:
         """Go on to the next request."""
         super().on_response_complete()
-        self._let_head()
+        self._cancel_head_timer()
 
     def pause_writing(self) -> None:
         """Give a client that does not take what was sent its last chance."""
@@ -66,15 +66,15 @@ class GuardedProtocol(H11Protocol):
 
     def resume_writing(self) -> None:
         """Go on: the client takes again."""
-        self._let_stall()
+        self._cancel_stall_timer()
         super().resume_writing()
 
-    def _let_head(self) -> None:
+    def _cancel_head_timer(self) -> None:
         timer, self._waiting_for_head = self._waiting_for_head, None
         if timer is not None:
             timer.cancel()
 
-    def _let_stall(self) -> None:
+    def _cancel_stall_timer(self) -> None:
         timer, self._stalled = self._stalled, None
         if timer is not None:
             timer.cancel()

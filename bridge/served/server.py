@@ -63,7 +63,7 @@ def serve(
     Raises LinkError where the address is taken, InputError where certificates cannot be used.
     """
     context = tls_context(settings, section)
-    with listen(settings) as own:
+    with listen(settings) as listener:
         config = _Config(
             app, http=GuardedProtocol, ws="none", loop="asyncio", lifespan="off",
             log_config=None, access_log=False, server_header=False, date_header=False,
@@ -74,17 +74,17 @@ def serve(
         config.context = context
         # strangers must not fill the log: what is refused is counted
         logging.getLogger("uvicorn.error").setLevel(logging.CRITICAL)
-        asyncio.run(_serve(uvicorn.Server(config), own, over, turn, every))
+        asyncio.run(_serve(uvicorn.Server(config), listener, over, turn, every))
 
 
 async def _serve(
     server: uvicorn.Server,
-    own: socket.socket,
+    listener: socket.socket,
     over: Callable[[], bool],
     turn: Callable[[], None],
     every: float,
 ) -> None:
-    serving = asyncio.create_task(server.serve(sockets=[own]))
+    serving = asyncio.create_task(server.serve(sockets=[listener]))
     try:
         while not serving.done():
             turn()

@@ -29,5 +29,5 @@ def make_source(
     relative paths start; ``rate``: of the robot's cycles, Hz. Raises InputError where it cannot be
     used.
     """
-    found = resolve_name(SOURCES[settings.source])
-    return cast("Source", found(settings, n, moves_arm, folder, rate))
+    source_class = resolve_name(SOURCES[settings.source])
+    return cast("Source", source_class(settings, n, moves_arm, folder, rate))

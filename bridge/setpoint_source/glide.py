@@ -43,9 +43,9 @@ class Glide:
             return None
         return self._newest
 
-    def begin(self, own_q: Array) -> None:
+    def begin(self, robot_q: Array) -> None:
         """Start from where the arm stands."""
-        self._present = own_q.copy()
+        self._present = robot_q.copy()
         self.turn()
 
     def turn(self) -> None:
@@ -80,16 +80,16 @@ class GlidingSource(Source):
     def _receive(self) -> bool:
         """Take what has arrived; returns whether there is a new setpoint."""
 
-    def first(self, own_q: Array) -> Array | None:
+    def first(self, robot_q: Array) -> Array | None:
         """Return the newest setpoint where one has come lately."""
         self._receive()
         return self._glide.first()
 
-    def begin(self, timestamp: float, own_q: Array) -> None:
+    def begin(self, timestamp: float, robot_q: Array) -> None:
         """Start from where the arm stands."""
-        self._glide.begin(own_q)
+        self._glide.begin(robot_q)
 
-    def sample(self, timestamp: float, own_q: Array) -> Array:
+    def sample(self, timestamp: float, robot_q: Array) -> Array:
         """Return the setpoint of this moment. Raises SourceDryError where none came in time."""
         if self._receive():
             self._glide.turn()

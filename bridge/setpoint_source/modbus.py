@@ -78,11 +78,11 @@ class ModbusSource(GlidingSource):
             memory.close()
 
     def _receive(self) -> bool:
-        found = None if self._memory is None else self._memory.setpoint()
-        if found is None or found[0] == self._sequence:
+        record = None if self._memory is None else self._memory.setpoint()
+        if record is None or record[0] == self._sequence:
             return False
-        self._sequence = found[0]
-        self._glide.take(found[1])
+        self._sequence = record[0]
+        self._glide.take(record[1])
         return True
 
     def emit(self, reported: SourceStatus) -> None:

@@ -75,20 +75,20 @@ class PlcServer:
             self._memory.put_setpoint(self._holding[0], np.array(counts) * UNIT)
 
     def _inputs(self) -> list[int]:
-        found = [0] * INPUTS
+        registers = [0] * INPUTS
         n = self._memory.n
-        found[0], found[1] = VERSION, n
+        registers[0], registers[1] = VERSION, n
         reported = self._memory.status()
         if reported is None:
-            return found
+            return registers
         (state, sequence, cycle, flags), values = reported
-        found[2:6] = [state, sequence, cycle & 0xFFFF, flags]
+        registers[2:6] = [state, sequence, cycle & 0xFFFF, flags]
         numbers = np.nan_to_num(values, nan=0.0, posinf=LIMIT, neginf=-LIMIT)
         words = CODING.encode((np.clip(numbers, -LIMIT, LIMIT) / UNIT).tolist())
-        found[CORRECTED : CORRECTED + 2 * n] = words[: 2 * n]
-        found[NOMINAL : NOMINAL + 2 * n] = words[2 * n : 4 * n]
-        found[OFFSET:INPUTS] = words[4 * n :]
-        return found
+        registers[CORRECTED : CORRECTED + 2 * n] = words[: 2 * n]
+        registers[NOMINAL : NOMINAL + 2 * n] = words[2 * n : 4 * n]
+        registers[OFFSET:INPUTS] = words[4 * n :]
+        return registers
 
 
 async def serve(memory: PlcMemory, host: str, port: int) -> None:
@@ -97,14 +97,14 @@ async def serve(memory: PlcMemory, host: str, port: int) -> None:
     try:
         await server.serve_forever(background=True)
     except (RuntimeError, OSError):
-        _say({"failure": f"cannot listen on {host}:{port}"})
+        _print({"failure": f"cannot listen on {host}:{port}"})
         return
     transport: Any = server.transport
-    _say({"port": transport.sockets[0].getsockname()[1]})
+    _print({"port": transport.sockets[0].getsockname()[1]})
     await server.serving
 
 
-def _say(what: dict[str, Any]) -> None:
+def _print(what: dict[str, Any]) -> None:
     sys.stdout.write(json.dumps(what) + "\n")
     sys.stdout.flush()
 

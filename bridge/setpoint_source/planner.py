@@ -44,7 +44,7 @@ class Connection:
         self._link, self._rate = link, rate
         self._buffer = b""
         self._credit = SPAN * rate
-        self._at = self.opened = self._now()
+        self._credit_time = self.opened = self._now()
         self.received = 0.0  # s, monotonic: of the last good line
         self.admitted = False  # a token has been given, or none is asked for
         self.closed = False
@@ -61,15 +61,15 @@ class Connection:
         """Return the lines that have arrived, some of them; closes where there is no end."""
         if b"\n" not in self._buffer:
             self._read()
-        *lines, rest = self._buffer.split(b"\n", MOST_LINES)
-        self._buffer = rest
-        if len(rest.split(b"\n", 1)[0]) > LONGEST_LINE:
+        *lines, remainder = self._buffer.split(b"\n", MOST_LINES)
+        self._buffer = remainder
+        if len(remainder.split(b"\n", 1)[0]) > LONGEST_LINE:
             self.refuse("a line without end")
             return []
         now = self._now()
-        self._credit = min(self._credit + (now - self._at) * self._rate, SPAN * self._rate)
+        self._credit = min(self._credit + (now - self._credit_time) * self._rate, SPAN * self._rate)
         self._credit -= len(lines)
-        self._at = now
+        self._credit_time = now
         if self._credit < 0.0:
             self.refuse(f"found more than {self._rate:g} lines per second, the robot's rate")
             return []
@@ -170,9 +170,9 @@ class PlannerSource(GlidingSource):
         listener, self._listener = self._listener, None
         if listener is not None:
             listener.close()
-            self._tidy()
+            self._remove_socket()
 
-    def _tidy(self) -> None:
+    def _remove_socket(self) -> None:
         if self.settings.socket is not None:
             with contextlib.suppress(OSError):
                 self.settings.socket.unlink()
@@ -230,8 +230,8 @@ class PlannerSource(GlidingSource):
 
     def _take(self, connection: Connection, text: bytes) -> bool:
         try:
-            found = json.loads(text)["q"] if text.startswith(b"{") else text.split(b",")
-            values = [float(v) for v in found]
+            numbers = json.loads(text)["q"] if text.startswith(b"{") else text.split(b",")
+            values = [float(v) for v in numbers]
         except (ValueError, KeyError, TypeError, RecursionError):
             shown = text[:60].decode("utf-8", "replace")
             self._end(connection, f'found {shown!r}, expected {{"q": [...]}}')

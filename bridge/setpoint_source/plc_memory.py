@@ -84,10 +84,10 @@ class PlcMemory:
 
     def setpoint(self) -> tuple[int, Array] | None:
         """Return sequence number and joints (n,) rad; None where there are none yet."""
-        found = self._setpoint.read(self.n)
-        if found is None or not found[0][1]:
+        record = self._setpoint.read(self.n)
+        if record is None or not record[0][1]:
             return None
-        return found[0][0], found[1]
+        return record[0][0], record[1]
 
     # -- to the PLC -------------------------------------------------------------------------------
 

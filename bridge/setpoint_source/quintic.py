@@ -10,13 +10,13 @@ from gapbridge.bridge.document.output_file import write_table
 from gapbridge.core.arrays import Array
 
 
-def quintic_time(way: Array, top_speed: Array | float, acceleration: float) -> float:
+def quintic_time(distance: Array, top_speed: Array | float, acceleration: float) -> float:
     """Return s that a move by ``way`` (n,), rad, takes at least, joints together.
 
     ``top_speed`` in rad/s, of each joint or all; ``acceleration`` in rad/s2, of the fastest joint.
     """
-    slowest = float((np.abs(way) / top_speed).max())
-    return max(1.875 * slowest, float(np.sqrt(5.774 * np.abs(way).max() / acceleration)))
+    slowest = float((np.abs(distance) / top_speed).max())
+    return max(1.875 * slowest, float(np.sqrt(5.774 * np.abs(distance).max() / acceleration)))
 
 
 def quintic(begin: Array, end: Array, steps: int) -> Array:

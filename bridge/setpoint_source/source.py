@@ -43,18 +43,18 @@ class Source(ABC):
         """Open what the source listens on. Raises RunError."""
 
     @abstractmethod
-    def first(self, own_q: Array) -> Array | None:
+    def first(self, robot_q: Array) -> Array | None:
         """Return where the source would start (n,), rad; None where it has nothing yet.
 
         ``own_q`` is what the robot itself wants now, (n,) rad. The caller checks that the start is
         near the arm: starting never jumps.
         """
 
-    def begin(self, timestamp: float, own_q: Array) -> None:
+    def begin(self, timestamp: float, robot_q: Array) -> None:
         """Start the motion at controller time ``timestamp`` (s)."""
 
     @abstractmethod
-    def sample(self, timestamp: float, own_q: Array) -> Array:
+    def sample(self, timestamp: float, robot_q: Array) -> Array:
         """Return the setpoint (n,) rad at controller time ``timestamp``. Raises SourceDryError."""
 
     def emit(self, reported: SourceStatus) -> None:

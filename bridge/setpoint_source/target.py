@@ -20,17 +20,17 @@ class TargetSource(Source):
         self, settings: SetpointSettings, n: int, moves_arm: bool, folder: Path, rate: float
     ) -> None:
         super().__init__(settings, n, moves_arm, folder, rate)
-        self._stands = moves_arm
+        self._holds_start = moves_arm
         self._start: Array | None = None
 
-    def first(self, own_q: Array) -> Array | None:
+    def first(self, robot_q: Array) -> Array | None:
         """Return the robot's own target."""
-        return own_q
+        return robot_q
 
-    def begin(self, timestamp: float, own_q: Array) -> None:
+    def begin(self, timestamp: float, robot_q: Array) -> None:
         """Remember where the arm stands."""
-        self._start = own_q.copy() if self._stands else None
+        self._start = robot_q.copy() if self._holds_start else None
 
-    def sample(self, timestamp: float, own_q: Array) -> Array:
+    def sample(self, timestamp: float, robot_q: Array) -> Array:
         """Return the robot's own target, or where the arm stood."""
-        return own_q if self._start is None else self._start
+        return robot_q if self._start is None else self._start

@@ -59,8 +59,8 @@ class TcpSource(PlannerSource):
         return True
 
     def _admit(self, connection: Connection, line: bytes) -> bool:
-        word, _, given = line.partition(b" ")
-        if word == b"token" and hmac.compare_digest(given.strip(), self._token):
+        word, _, token = line.partition(b" ")
+        if word == b"token" and hmac.compare_digest(token.strip(), self._token):
             connection.admit()
         else:
             self._end(connection, "expected the token in the first line: token TOKEN")
@@ -73,5 +73,5 @@ class TcpSource(PlannerSource):
                 self._end(connection, f"no token within {FIRST_LINE:g} s")
         return super()._receive()
 
-    def _tidy(self) -> None:
+    def _remove_socket(self) -> None:
         """Leave nothing: a port needs no tidying."""

@@ -28,41 +28,41 @@ class TrajectorySource(Source):
         log = read_log(path, n)
         self._q: Array = np.ascontiguousarray(log.require("target_q"))
         time = log.require("timestamp")
-        behind = np.flatnonzero(np.diff(time) <= 0.0)
-        if len(behind):
-            row = int(behind[0]) + log.first_row + 1
+        backwards = np.flatnonzero(np.diff(time) <= 0.0)
+        if len(backwards):
+            row = int(backwards[0]) + log.first_row + 1
             raise LogError(
-                f"{path}: row {row}, column timestamp: found {time[behind[0] + 1]:g} after "
-                f"{time[behind[0]]:g}, expected rows in time order"
+                f"{path}: row {row}, column timestamp: found {time[backwards[0] + 1]:g} after "
+                f"{time[backwards[0]]:g}, expected rows in time order"
             )
         self._time = time - time[0]
         self._begun: float | None = None
         self._row = 0
         self._ended = False
 
-    def first(self, own_q: Array) -> Array | None:
+    def first(self, robot_q: Array) -> Array | None:
         """Return the first row."""
         first: Array = self._q[0]
         return first
 
-    def begin(self, timestamp: float, own_q: Array) -> None:
+    def begin(self, timestamp: float, robot_q: Array) -> None:
         """Start the clock: the first row is due at ``timestamp``."""
         self._begun, self._row, self._ended = timestamp, 0, False
 
-    def sample(self, timestamp: float, own_q: Array) -> Array:
+    def sample(self, timestamp: float, robot_q: Array) -> Array:
         """Return the joints at this moment."""
         time, q, row = self._time, self._q, self._row
-        at = timestamp - (timestamp if self._begun is None else self._begun)
-        if at >= time[-1]:
+        elapsed = timestamp - (timestamp if self._begun is None else self._begun)
+        if elapsed >= time[-1]:
             self._ended = True
             last: Array = q[-1]
             return last
-        while time[row + 1] <= at:
+        while time[row + 1] <= elapsed:
             row += 1
         self._row = row
-        share = (at - time[row]) / (time[row + 1] - time[row])
-        found: Array = q[row] + share * (q[row + 1] - q[row])
-        return found
+        share = (elapsed - time[row]) / (time[row + 1] - time[row])
+        joints: Array = q[row] + share * (q[row + 1] - q[row])
+        return joints
 
     @property
     def ended(self) -> bool:

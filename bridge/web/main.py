@@ -127,7 +127,7 @@ def make_app(watched: Watched, stream: Stream, settings: WebSettings, token: str
         return _json(_text(watched.snapshot()))
 
     async def history(request: Request) -> Response:
-        found = {}
+        query = {}
         for name, default, most in (
             ("seconds", 60.0, 86400.0), ("points", 600.0, float(MOST_POINTS)),
         ):  # fmt: skip
@@ -140,8 +140,8 @@ def make_app(watched: Watched, stream: Stream, settings: WebSettings, token: str
                 return PlainTextResponse(
                     f"{name}: found {text[:40]!r}, expected 1 to {most:g}\n", 400
                 )
-            found[name] = value
-        return _json(_text(watched.history(found["seconds"], int(found["points"]))))
+            query[name] = value
+        return _json(_text(watched.history(query["seconds"], int(query["points"]))))
 
     async def events(request: Request) -> Response:
         if stream.full:
@@ -190,10 +190,10 @@ class SignIn:
     async def _take(self, request: Request) -> Response:
         try:
             async with asyncio.timeout(FORM_TIME):
-                given = await self._token_of(request)
+                token = await self._token_of(request)
         except (ClientDisconnect, TimeoutError, ValueError):
             return PlainTextResponse("found no form with a token\n", 400, {"connection": "close"})
-        if not hmac.compare_digest(given.strip().encode(), self._token):
+        if not hmac.compare_digest(token.strip().encode(), self._token):
             await asyncio.sleep(WRONG_TOKEN_DELAY)
             return self._form()
         return Response(status_code=303, headers={"location": "/", "set-cookie": self._cookie})

@@ -232,11 +232,11 @@ class Timing:
 def _of(values: Array) -> dict[str, Any]:
     values = values[np.isfinite(values)]
     counts, _ = np.histogram(np.clip(values, EDGES[0], EDGES[-1]), EDGES)
-    found: dict[str, Any] = {"counts": counts.tolist(), "p50": None, "p99": None, "max": None}
+    figures: dict[str, Any] = {"counts": counts.tolist(), "p50": None, "p99": None, "max": None}
     if len(values):
         p50, p99 = np.quantile(values, (0.5, 0.99))
-        found |= {"p50": float(p50), "p99": float(p99), "max": float(values.max())}
-    return found
+        figures |= {"p50": float(p50), "p99": float(p99), "max": float(values.max())}
+    return figures
 
 
 class History:

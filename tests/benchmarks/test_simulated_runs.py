@@ -292,7 +292,7 @@ def _leaves_the_table(patch: Patch) -> None:
 
 
 def _answers_at_once(patch: Patch) -> None:
-    patch.setattr(Control, "_comes", lambda *_: True)
+    patch.setattr(Control, "_wait_for", lambda *_: True)
 
 
 def _never_stops(patch: Patch) -> None:
@@ -310,8 +310,8 @@ def _fails_at_dropping(patch: Patch) -> None:
 def _records_too_little(patch: Patch) -> None:
     record = Loop._record
 
-    def other(self: Any, given: Any, setpoint: Any, *more: Any, at: float | None = None) -> None:
-        record(self, given, setpoint, bool(more), left=False, at=at)
+    def other(self: Any, given: Any, setpoint: Any, *more: Any, since: float | None = None) -> None:
+        record(self, given, setpoint, bool(more), sent=False, since=since)
 
     patch.setattr(Loop, "_record", other)
 

@@ -247,9 +247,9 @@ def test_a_disarming_between_two_loops_is_kept_and_answered_by_the_next(robot: R
         os.kill(pid, 9)
         run.wait(State.DISCONNECTED)
         assert run.daemon.latched
-        taken = run.daemon.taken
+        taken = run.daemon.last_taken
         assert "acknowledged" in ask(cell, "disarm")  # by a person, while no loop is there
-        assert run.daemon.taken > taken
+        assert run.daemon.last_taken > taken
         run.wait(State.OBSERVING)
         assert run.daemon.latched == ""
 
@@ -258,7 +258,7 @@ class NoLoop:
     """A daemon between two processes of the loop, of which no next one comes."""
 
     state, phase, latched, may_write, sequence = State.DISCONNECTED, Phase.STARTING, "x", True, 0
-    taken, asked = 3, 3
+    last_taken, asked = 3, 3
 
     def disarm(self, by: str) -> int:
         self.asked += 1
@@ -286,7 +286,7 @@ def test_a_disarming_that_no_loop_has_taken_is_not_called_done(
 def test_a_disarming_is_asked_for_though_the_arm_seems_to_observe() -> None:
     """A person's arming may be on its way: what is asked for after it stands."""
     daemon = NoLoop()
-    daemon.state, daemon.latched, daemon.taken = State.OBSERVING, "", 9
+    daemon.state, daemon.latched, daemon.last_taken = State.OBSERVING, "", 9
     reply = control.Control(daemon).answer("disarm", Peer(1, 2))  # type: ignore[arg-type]
     assert reply == {"ok": True, "answer": "is observing already"}
     assert daemon.asked == 4

@@ -151,7 +151,7 @@ def ask(run: SimulatedRun, command: str) -> dict[str, Any]:
 
 
 def causes(run: SimulatedRun) -> list[str]:
-    return [e["cause"] for e in run.daemon.event_log.kept if e["kind"] == "transition"]
+    return [e["cause"] for e in run.daemon.event_log.recent if e["kind"] == "transition"]
 
 
 def test_a_slip_holds_the_run_until_a_person_has_seen_it() -> None:
@@ -162,7 +162,7 @@ def test_a_slip_holds_the_run_until_a_person_has_seen_it() -> None:
         daemon._slips.take = lambda rows: [found] if world.now < begun + 0.02 else []  # type: ignore[method-assign]
         until(world, lambda: daemon.state == State.OBSERVING, 3.0)
         assert causes(run)[-2:] == ["zero moved", "ramped out"]
-        (event,) = [e for e in daemon.event_log.kept if e["kind"] == "slip"]
+        (event,) = [e for e in daemon.event_log.recent if e["kind"] == "slip"]
         assert (event["joints"], event["size"]) == ([4, 3], 0.0098)
         status = daemon.status()
         assert status["counts"]["zero_moved"] == 1  # /metrics: gapbridge_incidents
@@ -216,6 +216,6 @@ def test_a_zero_that_slips_in_a_run_is_found_within_three_rounds_of_its_program(
         assert events.counts["warning"] == events.counts["slip"] == 0
         link.controller.plant.slip(4, 0.010)
         go_round(3)
-        (event,) = [e for e in events.kept if e["kind"] == "slip"]
+        (event,) = [e for e in events.recent if e["kind"] == "slip"]
         assert 5 in event["joints"]
         assert "zero moved" in causes(run)

@@ -32,7 +32,7 @@ def test_each_request_is_taken_once_and_in_the_order_of_asking(memory: CommandMe
     memory.ask(DISARM)
     last = memory.ask(ARM)
     assert loop.take() == [DISARM, ARM]
-    assert loop.taken == last == memory.last
+    assert loop.last_taken == last == memory.last
 
 
 @pytest.mark.parametrize("late", [DISARM, STOP])
@@ -84,7 +84,7 @@ last = dict.fromkeys(Command, 0)
 while not commands.stop:
     for command in commands.take():
         counts[command] += 1
-        last[command] = commands._taken[command]
+        last[command] = commands._taken_numbers[command]
 print(*(last[c] for c in list(Command)[:4]), counts[Command.DISARM])
 """
     with subprocess.Popen(

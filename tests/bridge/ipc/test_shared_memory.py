@@ -55,7 +55,7 @@ def test_a_new_process_of_the_loop_goes_on_counting_and_nothing_else_stays(run: 
     reader, loop = run.reader(), loop_of(run)
     loop.enter(Phase.RUNNING)
     loop.note_state(3)
-    loop.note_seen()
+    loop.note_state_read()
     loop.note_ended()
     loop.note_taken(7)
     loop.count(LoopCounter.LATE, 4)
@@ -63,9 +63,9 @@ def test_a_new_process_of_the_loop_goes_on_counting_and_nothing_else_stays(run: 
     loop.next_row()[1] = 99.0  # killed here
     loop.close()
     loop = loop_of(run)
-    assert (run.phase, run.state, run.seen, run.ended) == (Phase.STARTING, 0, False, False)
+    assert (run.phase, run.state, run.has_state, run.ended) == (Phase.STARTING, 0, False, False)
     assert run.silence == 0.0
-    assert run.taken == 7
+    assert run.last_taken == 7
     loop.count(LoopCounter.LATE)
     put(loop, 1.0)
     assert reader.drain()[:, 1].tolist() == [0, 1]

@@ -259,7 +259,7 @@ from gapbridge.bridge.ipc.shared_memory import SharedMemory, Phase
 memory = SharedMemory(3, {memory.fd})
 memory.enter(Phase.RUNNING)
 memory.note_state(3)
-memory.note_seen()
+memory.note_state_read()
 for k in range(10):
     memory.next_row()[1] = k
     memory.publish()
@@ -268,7 +268,7 @@ os.abort()
 """
     done = subprocess.run([sys.executable, "-c", code], pass_fds=[memory.fd], check=False)
     assert done.returncode == -6
-    assert (memory.phase, memory.state, memory.seen, memory.ended) == (
+    assert (memory.phase, memory.state, memory.has_state, memory.ended) == (
         Phase.RUNNING,
         3,
         True,

@@ -366,14 +366,14 @@ def test_an_offset_in_force_outlives_the_process_that_left_it(tmp_path: Path) ->
     paths = os.pathsep.join(p for p in sys.path if p)
     subprocess.run([sys.executable, "-c", code], env={**os.environ, "PYTHONPATH": paths})
     kept = OffsetInForce(6, path)
-    found = kept.at(np.full(6, 0.4))
+    found = kept.offset_at(np.full(6, 0.4))
     assert found is not None
     assert (found.delta == delta).all() and (found.offset_in_base == offset).all()
-    assert kept.at(np.full(6, 0.3)) is None
+    assert kept.offset_at(np.full(6, 0.3)) is None
     assert path.stat().st_mode & 0o777 == 0o600
     kept.note(np.full(6, 0.4), np.zeros(6), np.zeros(6))
-    assert kept.at(np.full(6, 0.4)) is None
-    assert OffsetInForce(7, path).at(np.zeros(7)) is None  # another arm
+    assert kept.offset_at(np.full(6, 0.4)) is None
+    assert OffsetInForce(7, path).offset_at(np.zeros(7)) is None  # another arm
 
 
 def test_a_clock_that_goes_back_withdraws_the_offset_step_by_step(bench: Bench) -> None:

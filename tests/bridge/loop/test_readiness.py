@@ -40,7 +40,7 @@ def test_what_is_known_is_tried_anew_when_asked() -> None:
     loaded = Loads(payload_mass=np.array([3.0]), payload_cog=np.zeros((1, 3)))
     assert not check.corrects(Loads())
     assert not check.corrects(loaded)  # remembered
-    check.forget()
+    check.reset()
     assert check.corrects(loaded)
 
 

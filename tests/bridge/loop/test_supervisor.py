@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gapbridge.bridge.loop.supervisor import (
-    HEALED_BY_RECONNECTING,
+    CLEARED_BY_RECONNECTING,
     RAMPS_OUT,
     STOPS_AT_ONCE,
     TRANSITIONS,
@@ -144,6 +144,6 @@ def test_every_way_into_writing_passes_a_persons_arming() -> None:
 
 def test_only_faults_of_the_link_end_with_it() -> None:
     robots_own = {Cause.UNSAFE, Cause.BAD_OUTPUT, Cause.FOREIGN, Cause.SETPOINT_REFUSED}
-    assert not robots_own & set(HEALED_BY_RECONNECTING)
+    assert not robots_own & set(CLEARED_BY_RECONNECTING)
     to_fault = {cause for (_, cause), after in TRANSITIONS.items() if after == State.FAULT}
-    assert set(HEALED_BY_RECONNECTING) <= to_fault
+    assert set(CLEARED_BY_RECONNECTING) <= to_fault
