@@ -94,10 +94,11 @@ def test_no_folder_is_flatter_than_a_table_of_contents() -> None:
 
 LIBRARIES_ATTRIBUTES = {
     "bridge/patch/mjcf.py": {  # of MuJoCo's MjSpec
-        "drive.actearly", "drive.biasprm", "drive.delay", "drive.dynprm", "drive.dyntype",
-        "drive.gainprm", "drive.interp", "drive.nsample", "load.explicitinertial", "load.inertia",
-        "load.ipos", "load.mass", "own.armature", "own.damping", "own.frictionloss", "own.inertia",
-        "own.ipos", "own.mass", "scene.spec.option.gravity",
+        "actuator.actearly", "actuator.biasprm", "actuator.delay", "actuator.dynprm",
+        "actuator.dyntype", "actuator.gainprm", "actuator.interp", "actuator.nsample",
+        "element.inertia", "element.ipos", "element.mass", "load.explicitinertial", "load.inertia",
+        "load.ipos", "load.mass", "scene.spec.option.gravity", "spec_joint.armature",
+        "spec_joint.damping", "spec_joint.frictionloss",
     },
     "bridge/patch/mjcf_scene.py": {
         "body.explicitinertial", "body.fullinertia", "body.ialt.type", "body.inertia", "body.ipos",

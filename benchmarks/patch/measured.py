@@ -55,7 +55,7 @@ def compared(name: str, folder: Path) -> Compared:
     (folder / "nominal.urdf").write_text(urdf(arm, names, tcp=tool))
     printed = _gapbridge(folder, "patch", "nominal.urdf", "--cell", "found.yaml", "--out",
                          "patched.urdf", "--tcp", "tool")  # fmt: skip
-    elsewhere = {effect for effect, _ in changes_of(cell.model).not_held}
+    elsewhere = {effect for effect, _ in changes_of(cell.model).unsupported}
     terms = [t for t in cell.model.terms
              if not CATALOGUE[t.effect].softens and t.effect not in elsewhere]  # fmt: skip
     rigid = cell.model.without_terms().with_terms(terms)

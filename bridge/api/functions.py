@@ -33,15 +33,15 @@ def read_log(path: Path | str | Sequence[Path | str], cell: Cell) -> Log:
     paths = [path] if isinstance(path, (str, Path)) else list(path)
     if not paths:
         raise InputError("read_log: found no path, expected a log or several")
-    return join_sessions([open_log(Path(one), cell) for one in paths], cell.model)
+    return join_sessions([open_log(Path(p), cell) for p in paths], cell.model)
 
 
 def predict(cell: Cell, log: Log, *, channels: bool = False) -> Predicted:
     """Return the TCP pose that the cell's model predicts for every row; ``gapbridge predict``.
 
-    Joints are ``actual_q``; where there is none, ``target_q`` less what the servos are known to
-    give way. The standard deviation comes from the covariance of what was fitted, where the cell
-    has it. ``channels``: torque, wrench and tracking are predicted too.
+    Joints are ``actual_q``; where there is none, ``target_q`` less the servos' known droop. The
+    standard deviation comes from the covariance of what was fitted, where the cell has it.
+    ``channels``: torque, wrench and tracking are predicted too.
     """
     q, loads = log.require("actual_q", "target_q"), log.loads(by_approach(cell.model.terms))
     spread, ranges, std = cell.spread, cell.fitted_range, None
@@ -68,20 +68,20 @@ def compensate(cell: Cell, log: Log) -> Corrected:
     Raises InputError where the arm finds no equilibrium in a row.
     """
     loads = log.loads(by_approach(cell.model.terms))
-    found = correct(cell.model, log.require("target_q", "actual_q"), loads)
-    lost = np.flatnonzero(~np.isfinite(found.residual))
-    if len(lost):
-        raise InputError(f"{log.path}: row {log.line(lost[0])}: {EquilibriumError.text}")
-    return Corrected(found.q, found.residual, _sources(cell, log))  # type: ignore[arg-type]  # of N
+    corrected = correct(cell.model, log.require("target_q", "actual_q"), loads)
+    failed = np.flatnonzero(~np.isfinite(corrected.residual))
+    if len(failed):
+        raise InputError(f"{log.path}: row {log.line(failed[0])}: {EquilibriumError.text}")
+    return Corrected(corrected.q, corrected.residual, _sources(cell, log))  # type: ignore[arg-type]  # of N
 
 
 def fit(cell: Cell, log: Log, *, remounted: bool = False) -> Fitted:
-    """Return the joint flexibilities that a log shows; ``gapbridge fit``.
+    """Return the joint flexibilities identified from a log; ``gapbridge fit``.
 
     ``remounted``: the target was taken off between sessions. Raises ExcitationError where nothing
     in the log excites the compliance.
     """
-    from gapbridge.bridge.api.found_spread import fit_intervals
+    from gapbridge.bridge.api.uncertainty import fit_intervals
     from gapbridge.bridge.cell.log_fit import pose_findings
     from gapbridge.bridge.document.notes import note_texts
     from gapbridge.core.estimation.identification import (
@@ -89,19 +89,19 @@ def fit(cell: Cell, log: Log, *, remounted: bool = False) -> Fitted:
     )
 
     metrology = replace(cell.metrology, remounted=remounted)
-    found = identify_compliance(cell.model, log, metrology)
-    held_out = found.remaining_rms_held_out
+    estimate = identify_compliance(cell.model, log, metrology)
+    held_out = estimate.remaining_rms_held_out
     return Fitted(
-        cell=cell, model=found.written,
-        axial=found.axial, radial=found.radial, std_axial=found.std_axial,
-        std_radial=found.std_radial, shown=found.identifiable, samples=found.samples,
-        gap_rms=found.gap_rms, remaining_rms=found.remaining_rms,
+        cell=cell, model=estimate.written,
+        axial=estimate.axial, radial=estimate.radial, std_axial=estimate.std_axial,
+        std_radial=estimate.std_radial, shown=estimate.identifiable, samples=estimate.samples,
+        gap_rms=estimate.gap_rms, remaining_rms=estimate.remaining_rms,
         remaining_rms_held_out=held_out if math.isfinite(held_out) else None,
-        notes=(*pose_findings(cell, log), *note_texts((*found.notes, *found.combinations))),
+        notes=(*pose_findings(cell, log), *note_texts((*estimate.notes, *estimate.combinations))),
         provenance=fitted(
             provenance(_sources(cell, log), "fit", remounted=remounted), range_of(log),
-            Spread.of_fit(found.identifiable, found.covariance).beside(cell.spread),
-            cell.intervals | fit_intervals(found),
+            Spread.of_fit(estimate.identifiable, estimate.covariance).beside(cell.spread),
+            cell.intervals | fit_intervals(estimate),
         ),
     )  # fmt: skip
 
@@ -123,16 +123,16 @@ def diagnose(
 
     for name in withhold:
         effect_named(name)
-    read = _sources(cell, log, simulated)
+    files = _sources(cell, log, simulated)
     if simulated is not None:
         simulated = at_joints_of(log, aligned(simulated, log), cell)
     metrology = replace(cell.metrology, remounted=remounted)
-    found = diagnose_log(
+    diagnosis = diagnose_log(
         cell.model, log, metrology, withhold=withhold, simulated=simulated,
         observers=channels_of(cell.uncertain),
     )  # fmt: skip
-    origin = provenance(read, "diagnose", withhold=list(withhold), remounted=remounted)
-    return Diagnosed(cell, log, found, document(found) | {"provenance": origin})
+    origin = provenance(files, "diagnose", withhold=list(withhold), remounted=remounted)
+    return Diagnosed(cell, log, diagnosis, document(diagnosis) | {"provenance": origin})
 
 
 def _sources(cell: Cell, log: Log, simulated: Log | None = None) -> dict[str, list[Path]]:

@@ -44,13 +44,13 @@ class Predicted:
     @property
     def columns(self) -> dict[str, Array]:
         """Return all predictions by the command's names: (N, k), or (N,) without a number."""
-        found = {
+        columns = {
             "predicted_position": self.position, "predicted_rotation": self.rotation_vector,
             "predicted_position_std": self.position_std,
             "outside_fitted": None if self.outside is None else self.outside.astype(float),
             **self.channels,
         }  # fmt: skip
-        return {name: values for name, values in found.items() if values is not None}
+        return {name: values for name, values in columns.items() if values is not None}
 
     def save(self, path: Path | str) -> None:
         """Write the columns as CSV or Parquet, as ``gapbridge predict`` does."""
@@ -59,11 +59,11 @@ class Predicted:
     def to_json(self) -> dict[str, Any]:
         """Return the predictions as lists, by the command's names, null where there is none.
 
-        Beside them stands the provenance: version, time, arguments, SHA-256 of log and cell.
+        Key ``provenance`` holds version, time, arguments, SHA-256 of log and cell.
         """
-        found: dict[str, Any] = {name: _plain(values) for name, values in self.columns.items()}
+        columns: dict[str, Any] = {name: _plain(values) for name, values in self.columns.items()}
         origin = provenance(self.sources, "predict", channels=bool(self.channels or self.needs))
-        return {**found, "provenance": origin}
+        return {**columns, "provenance": origin}
 
 
 @dataclass(frozen=True)
@@ -88,15 +88,15 @@ class Corrected:
 
 @dataclass(frozen=True)
 class Fitted:
-    """Joint flexibilities found from a log; (n,) each, rad/Nm."""
+    """Joint flexibilities identified from a log; (n,) each, rad/Nm."""
 
     cell: Cell  # that was fitted
-    model: Model  # with the flexibilities
+    model: Model  # the cell's, with the flexibilities
     axial: Array
     radial: Array
     std_axial: Array  # 1 sigma
     std_radial: Array
-    shown: Mask  # (2n,), axial then radial: what the data show; the rest is the cell's
+    shown: Mask  # (2n,), axial then radial: identifiable from the data; the rest is the cell's
     samples: int
     gap_rms: float  # m, one coordinate, before
     remaining_rms: float  # m, after
@@ -126,22 +126,22 @@ class Diagnosed:
 
     cell: Cell  # that was diagnosed
     log: Log
-    found: Diagnosis = field(repr=False)  # as the core has it
+    diagnosis: Diagnosis = field(repr=False)  # as the core has it
     document: dict[str, Any] = field(repr=False)  # schema gapbridge.diagnosis/1, with provenance
 
     @property
     def verdict(self) -> str:
         """Return no_gap, explained, partly_explained or unexplained."""
-        return self.found.verdict.value
+        return self.diagnosis.verdict.value
 
     @property
     def model(self) -> Model:
         """Return the model with the causes added."""
-        return self.found.model
+        return self.diagnosis.model
 
     @property
     def causes(self) -> tuple[str, ...]:
-        """Return the effects that are accused, strongest channel first, each once."""
+        """Return the effects named as causes, strongest channel first, each once."""
         return self._effects("causes")
 
     @property
@@ -151,15 +151,16 @@ class Diagnosed:
 
     def save(self, path: Path | str, *, stand_ins: bool = False) -> None:
         """Write the cell with the causes added, as ``--apply`` (``--stand-ins``) does."""
-        from gapbridge.bridge.api.found_spread import accused, intervals_applied, spread_of
+        from gapbridge.bridge.api.uncertainty import cause_entries, intervals_applied, spread_of
 
-        found, cell = self.found, self.cell
+        diagnosis, cell = self.diagnosis, self.cell
+        spread = spread_of(diagnosis).beside(cell.spread)
         origin = fitted(
-            self.document["provenance"], range_of(self.log), spread_of(found).beside(cell.spread),
-            cell.intervals | intervals_applied(found, stand_ins=stand_ins),
-            accused(found, cell.accused),
+            self.document["provenance"], range_of(self.log), spread,
+            cell.intervals | intervals_applied(diagnosis, stand_ins=stand_ins),
+            cause_entries(diagnosis, cell.causes),
         )  # fmt: skip
-        _save(cell, path, found.with_stand_ins if stand_ins else found.model, origin)
+        _save(cell, path, diagnosis.with_stand_ins if stand_ins else diagnosis.model, origin)
 
     def write_report(self, folder: Path | str) -> list[Path]:
         """Write diagnosis.json and report.html, as ``--out`` does; returns their paths."""
@@ -169,7 +170,7 @@ class Diagnosed:
         require_folder(folder, "the report", above=False)
         self.write_json(folder / "diagnosis.json")
         origin, name = self.document["provenance"], str(self.cell.path)
-        report = write_report(self.found, name, self.log, self.cell.model, folder, origin)
+        report = write_report(self.diagnosis, name, self.log, self.cell.model, folder, origin)
         return [folder / "diagnosis.json", report]
 
     def write_json(self, path: Path | str) -> None:
@@ -184,8 +185,8 @@ class Diagnosed:
         return self.document
 
     def _effects(self, key: str) -> tuple[str, ...]:
-        found = [c["effect"] for channel in self.document["channels"] for c in channel[key]]
-        return tuple(dict.fromkeys(found))
+        effects = [c["effect"] for channel in self.document["channels"] for c in channel[key]]
+        return tuple(dict.fromkeys(effects))
 
 
 def as_table(columns: Mapping[str, Array]) -> tuple[list[str], Array]:

@@ -16,7 +16,7 @@ from gapbridge.bridge.cell.effects import compliance_terms, term_of
 from gapbridge.bridge.cell.message import key_path, message, messages
 from gapbridge.bridge.cell.plausibility import findings
 from gapbridge.bridge.cell.robot import build_arm
-from gapbridge.bridge.cell.schema import Accused, CellFile, Simulation
+from gapbridge.bridge.cell.schema import CauseEntry, CellFile, Simulation
 from gapbridge.bridge.cell.sections import (
     LimitSettings,
     LinkSettings,
@@ -123,7 +123,7 @@ class Cell:
         return partial(self.spread.sigma_columns, self.model) if self.spread.names else None
 
     @property
-    def accused(self) -> tuple[Accused, ...]:
+    def causes(self) -> tuple[CauseEntry, ...]:
         """Return what a diagnosis accused, as the cell's provenance has it."""
         origin = self.file.provenance
         return () if origin is None else tuple(origin.causes)

@@ -139,7 +139,7 @@ class SourceFile(Section):
     sha256: str | None = Field(default=None, description="of its bytes")
 
 
-class AccusedParameter(Section):
+class CauseParameter(Section):
     """A number of a cause, as the diagnosis gave it."""
 
     name: str
@@ -148,13 +148,13 @@ class AccusedParameter(Section):
     unit: str = ""
 
 
-class Accused(Section):
+class CauseEntry(Section):
     """A cause that the diagnosis named, and what it could not distinguish from it."""
 
     effect: str
     joints: list[int] = Field(default=[])
     channel: str = ""
-    parameters: list[AccusedParameter] = Field(default=[])
+    parameters: list[CauseParameter] = Field(default=[])
     indistinguishable_from: list[str] = Field(default=[])
 
 
@@ -176,7 +176,7 @@ class Provenance(Section):
     covariance: list[list[Number]] = Field(
         default=[], description="of those parameters, SI: one row and column each"
     )
-    causes: list[Accused] = Field(default=[], description="that a diagnosis named, with its ties")
+    causes: list[CauseEntry] = Field(default=[], description="named by a diagnosis, with its ties")
 
     @model_validator(mode="after")
     def _square(self) -> Provenance:

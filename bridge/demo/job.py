@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 
-from gapbridge.bridge.api.found_spread import fit_intervals
+from gapbridge.bridge.api.uncertainty import fit_intervals
 from gapbridge.bridge.cell import Cell, load_cell, save_cell
 from gapbridge.bridge.demo.hidden import accused_in
 from gapbridge.bridge.demo.links import DemoLink, demo_link

@@ -16,10 +16,10 @@ FORMATS: tuple[ModelFormat, ...] = (Mjcf(), Urdf(), Usd())
 
 def format_of(path: Path) -> ModelFormat:
     """Return the format of a model by its suffix. Raises InputError naming those known."""
-    for one in FORMATS:
-        if path.suffix.lower() in one.suffixes:
-            return one
-    known = ", ".join(suffix for one in FORMATS for suffix in one.suffixes)
+    for model_format in FORMATS:
+        if path.suffix.lower() in model_format.suffixes:
+            return model_format
+    known = ", ".join(suffix for model_format in FORMATS for suffix in model_format.suffixes)
     raise InputError(f"{path}: found {path.suffix or 'no suffix'}, expected one of {known}")
 
 

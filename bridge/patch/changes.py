@@ -1,7 +1,7 @@
 """What has to change in a model of the nominal arm so that it behaves as the cell's model.
 
 Geometry, tool, gravity and springs are the difference of two chains, with the cell's effects and
-without; the rest is what each effect says in a simulator's terms. No effect is named here.
+without; all else is what each effect sets in a simulator's model. No effect is named here.
 """
 
 from __future__ import annotations
@@ -50,11 +50,11 @@ class ModelChanges:
     shift: Array  # (n+1, 4, 4) what follows each nominal frame: joint_in_base @ shift
     tcp_in_base: Array  # (4, 4) nominal
     tcp_shift: Array  # (4, 4) tool_in_flange's change, flange's included
-    gravity: Array | None  # (3,) m/s2 in base, None where the cell does not turn it
+    gravity: Array | None  # (3,) m/s2 in base, None where the cell does not tilt it
     springs: Springs
     settings: tuple[SimulatorChange, ...]
-    not_held: tuple[tuple[str, str], ...]  # effect, what people do instead: no format holds it
-    left_out: tuple[str, ...] = ()  # effects that were not accused, one line each
+    unsupported: tuple[tuple[str, str], ...]  # effect that no format supports, what to do instead
+    skipped: tuple[str, ...] = ()  # stand-ins, which are not written, one line each
 
     @property
     def n(self) -> int:
@@ -72,13 +72,13 @@ class ModelChanges:
 
     def vector(self, kind: Kind, joint: int | None = None) -> Array:
         """Return the sum (3,) of the settings of a kind that have axes, at a joint (from 1)."""
-        found = np.zeros(3)
+        total = np.zeros(3)
         for s in self.settings:
             if s.axis is not None and (s.kind, s.joint) == (kind, joint):
-                found[s.axis] += s.value
-        return found
+                total[s.axis] += s.value
+        return total
 
-    def moved(self, joint: int, base_in_world: Array) -> Array:
+    def motion(self, joint: int, base_in_world: Array) -> Array:
         """Return the motion (4, 4) in world of everything from joint (from 0; n: flange) on."""
         frame = base_in_world @ self.joint_in_base[joint]
         return np.asarray(frame @ self.shift[joint] @ np.linalg.inv(frame))
@@ -87,10 +87,10 @@ class ModelChanges:
 def changes_of(model: Model) -> ModelChanges:
     """Return what the terms of a model change of its nominal arm; stand-ins are left out."""
     stand_ins = tuple(dict.fromkeys(_named(t) for t in model.terms if t.stand_in))
-    accused = [t for t in model.terms if not t.stand_in]
-    elsewhere = _not_held([t for t in accused if not CATALOGUE[t.effect].of_the_arm], model)
-    kept = [t for t in accused if CATALOGUE[t.effect].of_the_arm]
-    model = model.without_terms().with_terms(kept)
+    causes = [t for t in model.terms if not t.stand_in]
+    outside_arm = _unsupported([t for t in causes if not CATALOGUE[t.effect].of_the_arm], model)
+    arm_terms = [t for t in causes if CATALOGUE[t.effect].of_the_arm]
+    model = model.without_terms().with_terms(arm_terms)
     nominal, real, arm = model.without_terms().chain(), model.chain(), model.arm
     n = arm.n
     steps = [transform(nominal.rotation[i], nominal.position[i]) for i in range(n + 1)]
@@ -111,13 +111,13 @@ def changes_of(model: Model) -> ModelChanges:
         frames.append(frames[-1] @ step)
     tool = transform(nominal.tool_rotation, nominal.tool_position)
     real_tool = transform(real.tool_rotation, real.tool_position)
-    turned = not np.allclose(real.gravity, nominal.gravity, rtol=0, atol=1e-12)
+    tilted = not np.allclose(real.gravity, nominal.gravity, rtol=0, atol=1e-12)
     springs = Springs(real.compliance, real.softening, real.flexibility, real.base_compliance)
     return ModelChanges(
         model, np.array(frames), shift, frames[-1] @ tool,
-        np.linalg.inv(tool) @ shift[n] @ real_tool, real.gravity if turned else None, springs,
-        settings, (*_not_held(kept, model), *elsewhere),
-        tuple(f"{name}: a stand-in, not accused" for name in stand_ins),
+        np.linalg.inv(tool) @ shift[n] @ real_tool, real.gravity if tilted else None, springs,
+        settings, (*_unsupported(arm_terms, model), *outside_arm),
+        tuple(f"{name}: a stand-in, not a confirmed cause" for name in stand_ins),
     )  # fmt: skip
 
 
@@ -125,32 +125,32 @@ def _named(term: Term) -> str:
     return term.effect + ("" if term.site.joint is None else f" of joint {term.site.joint}")
 
 
-def _not_held(terms: Sequence[Term], model: Model) -> tuple[tuple[str, str], ...]:
-    """Return the effects that are neither in the chain nor anything a simulator knows."""
-    found: dict[str, str] = {}
+def _unsupported(terms: Sequence[Term], model: Model) -> tuple[tuple[str, str], ...]:
+    """Return the effects that neither the chain nor a simulator's settings can represent."""
+    texts: dict[str, str] = {}
     for term in terms:
         effect = CATALOGUE[term.effect]
         in_chain = effect.of_the_arm and type(effect).shape is not Effect.shape
         if not in_chain and not effect.simulator(term, model.arm):
-            found[effect.identifier] = effect.instead
-    return tuple(found.items())
+            texts[effect.identifier] = effect.instead
+    return tuple(texts.items())
 
 
-def base_in_world(ours: Axes, theirs: Axes, source: str, names: tuple[str, ...]) -> Array:
-    """Return where the cell's base stands (4, 4) in the world of a user's model.
+def base_in_world(cell_axes: Axes, model_axes: Axes, source: str, names: tuple[str, ...]) -> Array:
+    """Return the pose (4, 4) of the cell's base in the world of a user's model.
 
-    The rotation that brings our axes' directions onto theirs (Kabsch), then the shift that brings
-    the lines together (least squares). Raises InputError, naming the first joint whose axis does
-    not agree: the model is of another arm, or has its zero elsewhere.
+    The rotation that aligns the directions of the cell's axes with the model's (Kabsch), then the
+    shift that aligns the lines (least squares). Raises InputError, naming the first joint whose
+    axis does not agree: the model is of another arm, or has another zero.
     """
-    U, _, Vt = np.linalg.svd(theirs.direction.T @ ours.direction)
+    U, _, Vt = np.linalg.svd(model_axes.direction.T @ cell_axes.direction)
     R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
-    across = np.array([np.eye(3) - np.outer(d, d) for d in theirs.direction])
-    away = theirs.point - ours.point @ R.T
-    t = np.linalg.lstsq(across.reshape(-1, 3), np.einsum("nij,nj->ni", across, away).ravel(),
+    across = np.array([np.eye(3) - np.outer(d, d) for d in model_axes.direction])
+    offset = model_axes.point - cell_axes.point @ R.T
+    t = np.linalg.lstsq(across.reshape(-1, 3), np.einsum("nij,nj->ni", across, offset).ravel(),
                         rcond=1e-9)[0]  # fmt: skip
-    turned, distance = ours.direction @ R.T, np.einsum("nij,nj->ni", across, away - t)
-    for name, a, b, d in zip(names, turned, theirs.direction, distance, strict=True):
+    rotated, distance = cell_axes.direction @ R.T, np.einsum("nij,nj->ni", across, offset - t)
+    for name, a, b, d in zip(names, rotated, model_axes.direction, distance, strict=True):
         angle = float(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b))
         if angle > ANGLE or np.linalg.norm(d) > DISTANCE:
             raise InputError(

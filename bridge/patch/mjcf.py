@@ -1,8 +1,8 @@
 """MJCF through MuJoCo's own MjSpec: what compiles there is what a user's simulation runs.
 
-Flexibility and play are further joints in the joint's own body, named after it; sensors and
-actuators stay on the joint itself, whose angle is the encoder's. What acts before a joint (the
-base's yielding, the bending of the link before it) is a body put between, with hinges.
+Flexibility and play are additional joints in the joint's own body, named after it; sensors and
+actuators stay on the joint itself, whose angle is the encoder's. What acts before a joint (a
+flexible base, bending of the link before it) is an inserted body with hinges.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ from gapbridge.core.effects.simulator import Kind
 from gapbridge.core.errors import InputError
 from gapbridge.core.rotation import rotation_matrix, transform
 
-TAKEN_UP = 0.2  # rad/s2: an arm that slows down no faster leaves its play behind it
+PLAY_DECELERATION = 0.2  # rad/s2: up to this deceleration friction holds the play taken up
 GAUSS = (0.5 - 3**0.5 / 6, 0.5 + 3**0.5 / 6)  # of a length: two points of quadrature
-HEAVY = 1.5  # times a joint's usual moment: up to there a stiffening spring has to hold
+MOMENT_RANGE = 1.5  # times a joint's typical moment: range over which a stiffening spring is fitted
 LINEAR = 1  # of an actuator's interp
-SMALL = 1e-6  # kg m2 of a point mass: MuJoCo asks for more than none
+SMALL = 1e-6  # kg m2 of a point mass: MuJoCo requires more than zero
 
 
 class Mjcf(ModelFormat):
@@ -46,40 +46,40 @@ class Mjcf(ModelFormat):
         scene = Scene(path)
         names = pick_joints(path, scene.hinges(), changes, options)
         world = base_in_world(changes.axes(), scene.axes(names), str(path), names)
-        done = _Patch(scene, names, world, changes, options)
+        model = _Patch(scene, names, world, changes, options)
         for joint, name in enumerate(names, start=1):
-            done.frame(name, joint)
-            done.friction(name, joint)
-            done.actuator(name, joint)
-            done.springs(name, joint)
-            done.inertial(name, joint)
-        done.base()
-        done.links()
-        done.tool()
-        done.sensor()
-        done.load()
+            model.frame(name, joint)
+            model.friction(name, joint)
+            model.actuator(name, joint)
+            model.springs(name, joint)
+            model.inertial(name, joint)
+        model.base()
+        model.links()
+        model.tool()
+        model.sensor()
+        model.load()
         if changes.gravity is not None:
             scene.spec.option.gravity = world[:3, :3] @ changes.gravity
-            done.changed.append("option: gravity")
-        if scene.further:
+            model.changed.append("option: gravity")
+        if scene.added_joints:
             before = scene.compiled.nq
-            done.changed.append(
-                f"nq is {before + scene.further} instead of {before}: actuators stay as they are, "
-                "qpos has the further joints in it"
+            model.changed.append(
+                f"nq is {before + scene.added_joints} instead of {before}: actuators stay as they "
+                "are, qpos has the further joints in it"
             )
-        missing = done.not_held()
-        comment = ["Patched by gapbridge.", *done.changed, *notes,
+        missing = model.unsupported()
+        comment = ["Patched by gapbridge.", *model.changed, *notes,
                    *(f"not in here: {line}" for line in missing)]  # fmt: skip
-        return Patched(scene.text(comment, options.folder), tuple(done.changed), tuple(missing))
+        return Patched(scene.text(comment, options.folder), tuple(model.changed), tuple(missing))
 
 
-def _stiffening(c: float, softening: float, most: float) -> tuple[float, float, float]:
+def _stiffening(c: float, softening: float, moment_limit: float) -> tuple[float, float, float]:
     """Return a spring's polynomial for theta = c M / sqrt(1 + softening M^2), up to ``most`` Nm.
 
-    The law's inverse has no end of odd powers, MuJoCo's spring two of them: linear and cubic. Their
-    factors are those with the least squares of the angle's error.
+    The law's inverse is an infinite series of odd powers; MuJoCo's spring has two of them, linear
+    and cubic, whose factors minimise the squared error of the angle.
     """
-    moment = np.linspace(0.0, most, 200)[1:]
+    moment = np.linspace(0.0, moment_limit, 200)[1:]
     root = np.sqrt(1 + softening * moment**2)
     angle, slope = c * moment / root, c / root**3
     columns = np.column_stack([angle, angle**3]) * slope[:, None]
@@ -105,26 +105,26 @@ class _Patch:
     def frame(self, name: str, joint: int) -> None:
         """Move a joint's body."""
         if not np.allclose(self.changes.shift[joint - 1], np.eye(4), rtol=0, atol=TINY):
-            self.scene.move(self.scene.body_of(name), self.changes.moved(joint - 1, self.world))
+            self.scene.move(self.scene.body_of(name), self.changes.motion(joint - 1, self.world))
             self.changed.append(f"joint {name}: its body's frame")
 
     def friction(self, name: str, joint: int) -> None:
         """Add friction, damping and armature."""
-        own = self.scene.spec.joint(name)
+        spec_joint = self.scene.spec.joint(name)
         friction = self.changes.of_joint(Kind.FRICTION, joint)
         damping = self.changes.of_joint(Kind.DAMPING, joint)
         armature = self.changes.of_joint(Kind.ARMATURE, joint)
         if friction:
-            own.frictionloss += friction
-            self.changed.append(f"joint {name}: frictionloss {own.frictionloss:.6g}")
+            spec_joint.frictionloss += friction
+            self.changed.append(f"joint {name}: frictionloss {spec_joint.frictionloss:.6g}")
         if damping:
-            linear = np.array(own.damping)
+            linear = np.array(spec_joint.damping)
             linear[0] += damping
-            own.damping = linear
+            spec_joint.damping = linear
             self.changed.append(f"joint {name}: damping {linear[0]:.6g}")
         if armature:
-            own.armature += armature
-            self.changed.append(f"joint {name}: armature {own.armature:.6g}")
+            spec_joint.armature += armature
+            self.changed.append(f"joint {name}: armature {spec_joint.armature:.6g}")
 
     def actuator(self, name: str, joint: int) -> None:
         """Set delay, lag and gain of the position actuator of a joint."""
@@ -134,40 +134,41 @@ class _Patch:
         )
         if not (delay or lag or droop):
             return
-        drive = next((a for a in self.scene.spec.actuators if a.target == name), None)
-        if drive is None:
+        actuator = next((a for a in self.scene.spec.actuators if a.target == name), None)
+        if actuator is None:
             self.missing.append(f"delay, lag or gain of {name}: it has no actuator; put them into "
                                 "the controller")  # fmt: skip
             return
         if delay:
-            drive.delay = delay + (drive.delay if self.options.on_top else 0.0)
-            drive.interp = LINEAR  # a held command would come whole steps late
-            drive.nsample = int(np.ceil(drive.delay / self.scene.spec.option.timestep)) + 1
-            self.changed.append(f"actuator of {name}: delay {drive.delay:.6g} s")
+            actuator.delay = delay + (actuator.delay if self.options.on_top else 0.0)
+            actuator.interp = LINEAR  # zero-order hold would delay by whole steps only
+            actuator.nsample = int(np.ceil(actuator.delay / self.scene.spec.option.timestep)) + 1
+            self.changed.append(f"actuator of {name}: delay {actuator.delay:.6g} s")
         if lag:
-            filtered = self.scene.mujoco.mjtDyn.mjDYN_FILTEREXACT
-            parameters = np.array(drive.dynprm)
-            given = parameters[0] if drive.dyntype == filtered and self.options.on_top else 0.0
-            # sampled, the filter answers half a step earlier than its time constant says
-            parameters[0] = lag + (given or self.scene.spec.option.timestep / 2)
-            drive.dyntype, drive.dynprm, drive.actearly = filtered, parameters, 1
+            filter_type = self.scene.mujoco.mjtDyn.mjDYN_FILTEREXACT
+            parameters = np.array(actuator.dynprm)
+            on_top = actuator.dyntype == filter_type and self.options.on_top
+            earlier = parameters[0] if on_top else 0.0
+            # the sampled filter lags half a step less than its time constant
+            parameters[0] = lag + (earlier or self.scene.spec.option.timestep / 2)
+            actuator.dyntype, actuator.dynprm, actuator.actearly = filter_type, parameters, 1
             self.changed.append(f"actuator of {name}: timeconst {parameters[0]:.6g} s")
         if droop:
-            self._soften(drive, droop)
-            self.changed.append(f"actuator of {name}: kp {drive.gainprm[0]:.6g}")
+            self._soften(actuator, droop)
+            self.changed.append(f"actuator of {name}: kp {actuator.gainprm[0]:.6g}")
 
-    def _soften(self, drive: Any, droop: float) -> None:
-        """Set the gain of a position actuator so that it gives way by ``droop`` rad/Nm."""
-        gain, bias = np.array(drive.gainprm), np.array(drive.biasprm)
-        given = 1 / gain[0] if self.options.on_top and gain[0] > 0 else 0.0  # as it came
-        droop += given
-        if gain[0] > 0 > bias[2]:  # a damping ratio, which is positive there, holds by itself
+    def _soften(self, actuator: Any, droop: float) -> None:
+        """Set the gain of a position actuator so that it droops by ``droop`` rad/Nm."""
+        gain, bias = np.array(actuator.gainprm), np.array(actuator.biasprm)
+        earlier = 1 / gain[0] if self.options.on_top and gain[0] > 0 else 0.0  # in the user's model
+        droop += earlier
+        if gain[0] > 0 > bias[2]:  # positive is a damping ratio, which needs no change
             bias[2] /= np.sqrt(droop * gain[0])
         gain[0], bias[1] = 1 / droop, -1 / droop
-        drive.gainprm, drive.biasprm = gain, bias
+        actuator.gainprm, actuator.biasprm = gain, bias
 
     def springs(self, name: str, joint: int) -> None:
-        """Put play and springs behind a joint: about its axis, then across it."""
+        """Add play and springs after a joint: about its axis, then across it."""
         axes = self.joint_in_world(joint)[:3, :3]
         self._play(name, joint, axes[:, 2])
         flexibility = self.changes.springs.joint[joint - 1]
@@ -179,34 +180,34 @@ class _Patch:
             stiffness: tuple[float, ...] = (1 / c,)
             if k == 2 and softening > 0:
                 stiffness = _stiffening(
-                    c, softening, HEAVY * typical_moment(self.changes.model.arm)
+                    c, softening, MOMENT_RANGE * typical_moment(self.changes.model.arm)
                 )
             inertia = self.scene.inertia_about(name, axes[:, k])
-            self._behind(name, label, axes[:, k], stiffness=stiffness, inertia=inertia)
+            self._add_hinge(name, label, axes[:, k], stiffness=stiffness, inertia=inertia)
             self.changed.append(f"joint {name}_{label}: stiffness {1 / c:.6g} Nm/rad")
 
     def _play(self, name: str, joint: int, axis: Array) -> None:
-        """Put a limited hinge behind a joint, and a friction that leaves the link behind."""
+        """Add a limited hinge after a joint, and the friction that keeps its play taken up."""
         half = self.changes.of_joint(Kind.PLAY, joint) / 2
         if not half:
             return
         largest = self.scene.largest_inertia(name)
-        friction = TAKEN_UP * largest
-        # MuJoCo scales limits and friction by the inertia at its zero pose, where that of an arm
-        # straight up is next to nothing about its first axis.
-        softer = min(self.scene.inertia_about(name, axis) / largest, 1.0)
-        self._behind(name, "backlash", axis, half_range=half, softer=softer)
-        self.scene.rub_behind(name, f"{name}_backlash", friction, softer)
+        friction = PLAY_DECELERATION * largest
+        # MuJoCo scales limits and friction by the inertia at its zero pose, which is close to zero
+        # about the first axis of an arm that points straight up.
+        softness = min(self.scene.inertia_about(name, axis) / largest, 1.0)
+        self._add_hinge(name, "backlash", axis, half_range=half, softness=softness)
+        self.scene.add_friction_tendon(name, f"{name}_backlash", friction, softness)
         self.changed.append(
             f"joint {name}_backlash: +-{half:.6g} rad; tendon {name}_backlash_friction, "
             f"{friction:.3g} Nm, takes it up against the motion where no load does"
         )
 
-    def _behind(self, name: str, label: str, axis: Array, **settings: Any) -> None:
+    def _add_hinge(self, name: str, label: str, axis: Array, **settings: Any) -> None:
         body = self.scene.body_of(name)
         hinge = Hinge(f"{name}_{label}", self.scene.anchor(name), self.scene.in_body(body, axis),
                       **settings)  # fmt: skip
-        self.scene.put_behind(name, hinge)
+        self.scene.add_hinge_after(name, hinge)
 
     def inertial(self, name: str, joint: int) -> None:
         """Scale mass and inertia of a joint's body, and move its centre of gravity."""
@@ -214,14 +215,16 @@ class _Patch:
         moment = self.changes.vector(Kind.LINK_MOMENT, joint)
         body = self.scene.body_of(name)
         if scale != 1:
-            own = self.scene.inertial(body)
-            own.mass *= scale
-            own.inertia = np.array(own.inertia) * scale
+            element = self.scene.inertial(body)
+            element.mass *= scale
+            element.inertia = np.array(element.inertia) * scale
             self.changed.append(f"body {body.name}: mass and inertia times {scale:.6g}")
         if moment.any():
-            own = self.scene.inertial(body)
+            element = self.scene.inertial(body)
             in_world = self.joint_in_world(joint)[:3, :3] @ moment
-            own.ipos = np.array(own.ipos) + self.scene.in_body(body, in_world) / own.mass
+            element.ipos = (
+                np.array(element.ipos) + self.scene.in_body(body, in_world) / element.mass
+            )
             self.changed.append(f"body {body.name}: centre of gravity")
 
     def base(self) -> None:
@@ -235,19 +238,19 @@ class _Patch:
                 axis = self.world[:3, k]
                 inertia = self.scene.inertia_about(self.names[0], axis, self.world[:3, 3])
                 name = f"base_compliance_{'xyz'[k]}"
-                turned = self.scene.in_body(first, axis)
-                hinges.append(Hinge(name, anchor, turned, (1 / c,), inertia))
+                axis_in_body = self.scene.in_body(first, axis)
+                hinges.append(Hinge(name, anchor, axis_in_body, (1 / c,), inertia))
                 self.changed.append(
                     f"joint {name}: stiffness {1 / c:.6g} Nm/rad, before the first joint"
                 )
         if hinges:
-            self.scene.put_before(first, "base_compliance", hinges)
+            self.scene.insert_body_before(first, "base_compliance", hinges)
 
     def links(self) -> None:
-        """Let links bend: two pairs of hinges across the link, each of 2 EI / L.
+        """Add link flexibility: two pairs of hinges across the link, each of stiffness 2 EI / L.
 
-        At the two Gauss points of its length, so that shift and slope of its end are those of the
-        cantilever, for a force and for a moment.
+        They are at the two Gauss points of its length, so that deflection and slope of its end are
+        the cantilever's, for a force and for a moment.
         """
         for i, flexibility in enumerate(self.changes.springs.link[:-1]):
             root, end = self.joint_in_world(i + 1)[:3, 3], self.joint_in_world(i + 2)[:3, 3]
@@ -266,7 +269,7 @@ class _Patch:
                         f"{name}_{len(hinges) + 1}", self.scene.point_in(body, point),
                         self.scene.in_body(body, axis), (stiffness,), inertia,
                     ))  # fmt: skip
-            self.scene.put_before(body, name, hinges)
+            self.scene.insert_body_before(body, name, hinges)
             self.changed.append(
                 f"joints {name}_1 to _4: stiffness {stiffness:.6g} Nm/rad across the link"
             )
@@ -319,7 +322,7 @@ class _Patch:
         self.scene.place("site", site, np.linalg.inv(parent) @ in_world)
 
     def load(self) -> None:
-        """Change the body that models the load; where none is named, hang a mass beside it."""
+        """Change the body that models the load; where none is named, add a mass."""
         extra = sum(s.value for s in self.changes.settings if s.kind is Kind.PAYLOAD)
         shift = self.changes.vector(Kind.PAYLOAD_COG)
         if not extra and not shift.any():
@@ -327,7 +330,7 @@ class _Patch:
         if self.options.load:
             self._change_load(extra, shift)
         elif extra > 0 and not shift.any():
-            self._hang(extra)
+            self._add_load(extra)
         else:
             bodies = ", ".join(b.name for b in self.scene.spec.bodies if b.name)
             self.missing.append(
@@ -338,21 +341,21 @@ class _Patch:
     def _change_load(self, extra: float, shift: Array) -> None:
         named = [b.name for b in self.scene.spec.bodies if b.name]
         body = self.scene.spec.body(named_one(self.scene.path, "--load", self.options.load, named))
-        own = self.scene.inertial(body)
-        if own.mass + extra <= 0:
+        element = self.scene.inertial(body)
+        if element.mass + extra <= 0:
             raise InputError(
-                f"{self.scene.path}: --load: found {own.mass:.6g} kg in {body.name}, expected more "
-                f"than the {-extra:.6g} kg that the load is lighter"
+                f"{self.scene.path}: --load: found {element.mass:.6g} kg in {body.name}, expected "
+                f"more than the {-extra:.6g} kg that the load is lighter"
             )
-        own.mass += extra
+        element.mass += extra
         in_world = self.joint_in_world(self.changes.n + 1)[:3, :3] @ shift
-        own.ipos = np.array(own.ipos) + self.scene.in_body(body, in_world)
+        element.ipos = np.array(element.ipos) + self.scene.in_body(body, in_world)
         if extra:
-            self.changed.append(f"body {body.name}: mass {own.mass:.6g} kg")
+            self.changed.append(f"body {body.name}: mass {element.mass:.6g} kg")
         if shift.any():
             self.changed.append(f"body {body.name}: centre of gravity")
 
-    def _hang(self, extra: float) -> None:
+    def _add_load(self, extra: float) -> None:
         last = self.scene.body_of(self.names[-1])
         flange = self.joint_in_world(self.changes.n + 1)
         centre = flange[:3, :3] @ self.changes.model.payload_cog + flange[:3, 3]
@@ -361,13 +364,13 @@ class _Patch:
         load.ipos = np.zeros(3)  # without it MuJoCo's writer leaves the inertial out
         self.changed.append(f"body payload_difference: {extra:.6g} kg")
 
-    def not_held(self) -> list[str]:
-        """Return what is not in the model, with what people do instead."""
+    def unsupported(self) -> list[str]:
+        """Return what is not in the model, with what to do instead."""
         lines = list(self.missing)
-        lifted = [b.name for b in self.scene.spec.bodies if b.gravcomp]
-        if lifted:
+        compensated = [b.name for b in self.scene.spec.bodies if b.gravcomp]
+        if compensated:
             lines.append(
-                f"gravcomp of {', '.join(lifted)} takes out what springs and servos give way"
+                f"gravcomp of {', '.join(compensated)} cancels the sag of springs and servos"
             )
-        lines += [f"{name}: {text}" for name, text in self.changes.not_held]
-        return [*lines, *self.changes.left_out]
+        lines += [f"{name}: {text}" for name, text in self.changes.unsupported]
+        return [*lines, *self.changes.skipped]

@@ -1,7 +1,7 @@
-"""A user's MJCF while it is changed: its MjSpec, what it compiled to as it came, and its text.
+"""A user's MJCF while it is changed: its MjSpec, the original compiled model, and its text.
 
-MjSpec can neither put a body between two others nor write more than six digits, so both are done
-in the text that it writes.
+MjSpec can neither insert a body between two others nor write more than six digits, so both are
+done in the text that it writes.
 """
 
 from __future__ import annotations
@@ -21,26 +21,26 @@ from gapbridge.core.arrays import Array
 from gapbridge.core.errors import InputError
 from gapbridge.core.rotation import transform
 
-ARMATURE = 1e-3  # kg m2 of a further joint, which MuJoCo needs to integrate stiff springs
-DAMPING = 0.3  # ratio of a further joint's damping to the critical one
+ARMATURE = 1e-3  # kg m2 of an added joint, which MuJoCo needs to integrate stiff springs
+DAMPING = 0.3  # damping ratio of an added joint
 FOLDERS = ("meshdir", "texturedir", "assetdir")  # of <compiler>, relative to the file
 PLACED = ("pos", "quat", "axisangle", "xyaxes", "zaxis", "euler")
-WRAPPER_MASS = 1e-6  # kg: MuJoCo asks for more than none of a body that moves
-SOLREF = (0.004, 1.0)  # of play and of what rubs over it
-POSES = 64  # in which a joint's inertia is looked at
+WRAPPER_MASS = 1e-6  # kg: MuJoCo requires more than zero of a moving body
+SOLREF = (0.004, 1.0)  # of play and of the friction across it
+POSES = 64  # in which a joint's inertia is computed
 
 
 @dataclass(frozen=True)
 class Hinge:
-    """A further joint; point and axis in the frame of the body that it carries."""
+    """An added joint; point and axis in the frame of the body that it carries."""
 
     name: str
     point: Array  # (3,) m
     axis: Array  # (3,) unit vector
     stiffness: tuple[float, ...] = ()  # Nm/rad, Nm/rad2, ...: a polynomial in the angle
-    inertia: float = 0.0  # kg m2 that swings on the spring, for its damping
+    inertia: float = 0.0  # kg m2 carried by the spring, for its damping
     half_range: float = 0.0  # rad to each side, 0 where it is not limited
-    softer: float = 1.0  # how much softer the limits are than MuJoCo's own
+    softness: float = 1.0  # how much softer the limits are than MuJoCo's own
 
     def element(self, timestep: float) -> ElementTree.Element:
         """Return the <joint>, every attribute written: a model's classes give others.
@@ -59,17 +59,17 @@ class Hinge:
         if half:
             joint.set("range", numbers([-half, half]))
             joint.set("solreflimit", numbers(SOLREF))
-            joint.set("solimplimit", numbers(impedance(self.softer)))
+            joint.set("solimplimit", numbers(impedance(self.softness)))
         return joint
 
 
-def impedance(softer: float) -> tuple[float, ...]:
+def impedance(softness: float) -> tuple[float, ...]:
     """Return MuJoCo's solimp, its own where ``softer`` is 1."""
-    return 1 - 0.1 * softer, 1 - 0.05 * softer, 1e-3, 0.5, 2.0
+    return 1 - 0.1 * softness, 1 - 0.05 * softness, 1e-3, 0.5, 2.0
 
 
 class Scene:
-    """A model: joints at angle zero, frames in world as the model came."""
+    """A model: joints at angle zero, frames in world of the original."""
 
     def __init__(self, path: Path) -> None:
         """Read and compile a file. Raises InputError where MuJoCo is missing or refuses it."""
@@ -91,16 +91,16 @@ class Scene:
             text = " ".join(str(error).split())
             raise InputError(f"{path}: found no MJCF that compiles ({text})") from None
         self.data: Any = mujoco.MjData(self.compiled)
-        for j in range(self.compiled.njnt):  # joints at their angle zero, ref is no angle
+        for j in range(self.compiled.njnt):  # angle zero, whatever the joint's ref
             self.data.qpos[self.compiled.jnt_qposadr[j]] = 0
         mujoco.mj_kinematics(self.compiled, self.data)
         mujoco.mj_comPos(self.compiled, self.data)
         self._qpos = [np.array(key.qpos) for key in self.spec.keys]
         self._placed: dict[tuple[str, str], Array] = {}  # tag and name -> frame in its parent's
-        self._behind: dict[str, list[Hinge]] = {}  # by joint
-        self._before: dict[str, tuple[str, list[Hinge]]] = {}  # by body: the body put before it
+        self._after: dict[str, list[Hinge]] = {}  # by joint
+        self._before: dict[str, tuple[str, list[Hinge]]] = {}  # by body: the body inserted before
         self._explicit: set[str] = set()
-        self._rubbing: list[tuple[str, str, float, float]] = []
+        self._tendons: list[tuple[str, str, float, float]] = []
 
     def hinges(self) -> list[str]:
         """Return the names of all hinges."""
@@ -164,53 +164,50 @@ class Scene:
     def largest_inertia(self, joint: str) -> float:
         """Return the largest inertia (kg m2) of all beyond a joint about its axis, in any pose."""
         j = self.compiled.joint(joint).id
-        moved = [self.compiled.joint(name).qposadr[0] for name in self.hinges()]
+        addresses = [self.compiled.joint(name).qposadr[0] for name in self.hinges()]
         data = self.mujoco.MjData(self.compiled)
-        found = []
-        for q in np.random.default_rng(1).uniform(-np.pi, np.pi, (POSES, len(moved))):
-            data.qpos[moved] = q
+        inertias = []
+        for q in np.random.default_rng(1).uniform(-np.pi, np.pi, (POSES, len(addresses))):
+            data.qpos[addresses] = q
             self.mujoco.mj_kinematics(self.compiled, data)
-            found.append(self._inertia(data, j, data.xaxis[j], data.xanchor[j]))
-        return max(found)
+            inertias.append(self._inertia(data, j, data.xaxis[j], data.xanchor[j]))
+        return max(inertias)
 
     def _inertia(self, data: Any, joint: int, axis: Array, anchor: Array) -> float:
         body = self.compiled.jnt_bodyid[joint]
         total = 0.0
         for k in range(body, self.compiled.nbody):
-            up = k
-            while up > body:
-                up = self.compiled.body_parentid[up]
-            if up == body:
-                away = np.cross(axis, data.xipos[k] - anchor)
-                total += self.compiled.body_mass[k] * float(away @ away)
+            ancestor = k
+            while ancestor > body:
+                ancestor = self.compiled.body_parentid[ancestor]
+            if ancestor == body:
+                lever = np.cross(axis, data.xipos[k] - anchor)
+                total += self.compiled.body_mass[k] * float(lever @ lever)
         return total + ARMATURE
 
-    def put_behind(self, joint: str, hinge: Hinge) -> None:
-        """Put a hinge behind a joint and those put there before, in the joint's body."""
-        self._behind.setdefault(joint, []).append(hinge)
+    def add_hinge_after(self, joint: str, hinge: Hinge) -> None:
+        """Add a hinge after a joint and the hinges added there before, in the joint's body."""
+        self._after.setdefault(joint, []).append(hinge)
 
-    def rub_behind(self, joint: str, further: str, friction: float, softer: float) -> None:
-        """Let what turns by a joint and a further one behind it rub against what carries both.
+    def add_friction_tendon(self, joint: str, added: str, friction: float, softness: float) -> None:
+        """Add a tendon over a joint and an added one, with ``friction`` (Nm) across both."""
+        self._tendons.append((joint, added, friction, softness))
 
-        A tendon over both with ``friction`` (Nm).
-        """
-        self._rubbing.append((joint, further, friction, softer))
-
-    def put_before(self, body: Any, name: str, hinges: Sequence[Hinge]) -> None:
-        """Put a body with hinges between a body and its parent."""
+    def insert_body_before(self, body: Any, name: str, hinges: Sequence[Hinge]) -> None:
+        """Insert a body with hinges between a body and its parent."""
         self._before[body.name] = (name, [*self._before.get(body.name, (name, []))[1], *hinges])
 
     @property
-    def further(self) -> int:
-        """Return how many joints were put in."""
-        return sum(map(len, self._behind.values())) + sum(len(h) for _, h in self._before.values())
+    def added_joints(self) -> int:
+        """Return the number of added joints."""
+        return sum(map(len, self._after.values())) + sum(len(h) for _, h in self._before.values())
 
     def _keyframes(self, root: ElementTree.Element) -> None:
-        """Write the keyframes' qpos anew, further joints at zero."""
+        """Rewrite the keyframes' qpos, added joints at zero."""
         size = {0: 7, 1: 4, 2: 1, 3: 1}  # of qpos: free, ball, slide, hinge
         for key, element in zip(self.spec.keys, root.iterfind("./keyframe/key"), strict=True):
-            given = self._qpos[key.id]
-            if not len(given):
+            qpos = self._qpos[key.id]
+            if not len(qpos):
                 continue
             parts: list[Array] = []
             for j in range(self.compiled.njnt):
@@ -219,31 +216,31 @@ class Scene:
                 if j == body.jntadr[0]:
                     parts.append(np.zeros(len(self._before.get(body.name, ("", []))[1])))
                 begin = joint.qposadr[0]
-                parts.append(given[begin : begin + size[int(joint.type[0])]])
-                parts.append(np.zeros(len(self._behind.get(joint.name, []))))
+                parts.append(qpos[begin : begin + size[int(joint.type[0])]])
+                parts.append(np.zeros(len(self._after.get(joint.name, []))))
             element.set("qpos", numbers(np.concatenate(parts)))
 
     def text(self, comment: Sequence[str], folder: Path | None) -> str:
-        """Return the changed model as XML, as it has to read in ``folder``."""
+        """Return the changed model as XML, its paths relative to ``folder``."""
         self.spec.comment = ""
         self.spec.compile()
         root = ElementTree.fromstring(self.spec.to_xml())
         timestep = float(self.spec.option.timestep)
         text = "\n".join(comment).replace("--", "- -")
         root.insert(0, ElementTree.Comment(f" {text} "))
-        for joint, hinges in self._behind.items():
-            body, own = _in_body(root, _named(root, "joint", joint))
-            place = list(body).index(own) + 1
+        for joint, hinges in self._after.items():
+            body, child = _in_body(root, _named(root, "joint", joint))
+            index = list(body).index(child) + 1
             for k, hinge in enumerate(hinges):
-                body.insert(place + k, hinge.element(timestep))
+                body.insert(index + k, hinge.element(timestep))
         for name, (wrapper, hinges) in self._before.items():
-            _put_before(root, name, wrapper, [hinge.element(timestep) for hinge in hinges])
+            _write_body_before(root, name, wrapper, [hinge.element(timestep) for hinge in hinges])
         for (tag, name), frame in self._placed.items():
             carrier = self._before[name][0] if tag == "body" and name in self._before else name
             _write_frame(root, tag, carrier, frame)
-        for joints in self._rubbing:
-            _rub(root, *joints)
-        if self.further:
+        for tendon in self._tendons:
+            _write_tendon(root, *tendon)
+        if self.added_joints:
             self._keyframes(root)
         if folder is not None and folder.resolve() != self.path.parent.resolve():
             _rebase(root, self.path.parent.resolve(), folder.resolve())
@@ -274,11 +271,10 @@ def _write_frame(root: ElementTree.Element, tag: str, name: str, in_body: Array)
     """Write the frame (4, 4) of a body or site in its parent body's: position and quaternion."""
     element = _named(root, tag, name)
     parents = {child: parent for parent in root.iter() for child in parent}
-    around, frame = parents[element], in_body
-    inverse = np.eye(4)
-    while around.tag == "frame":
-        inverse = inverse @ np.linalg.inv(_frame_of(around))
-        around = parents[around]
+    parent, inverse = parents[element], np.eye(4)
+    while parent.tag == "frame":
+        inverse = inverse @ np.linalg.inv(_frame_of(parent))
+        parent = parents[parent]
     frame = inverse @ in_body
     for key in PLACED:
         element.attrib.pop(key, None)
@@ -294,44 +290,44 @@ def _frame_of(element: ElementTree.Element) -> Array:
     return transform(Rotation.from_quat(quat[[1, 2, 3, 0]]).as_matrix(), pos)
 
 
-def _put_before(
+def _write_body_before(
     root: ElementTree.Element, name: str, wrapper: str, hinges: Sequence[ElementTree.Element]
 ) -> None:
     body = _named(root, "body", name)
     parent = next(e for e in root.iter() if body in list(e))
-    new = ElementTree.Element("body", name=wrapper)
+    inserted = ElementTree.Element("body", name=wrapper)
     for key in (*PLACED, "childclass"):
         if key in body.attrib:
-            new.set(key, body.attrib[key])
+            inserted.set(key, body.attrib[key])
             if key in PLACED:
                 del body.attrib[key]
     point = np.array(hinges[0].attrib["pos"].split(), dtype=float)
     inertial = {"pos": point, "mass": WRAPPER_MASS, "diaginertia": [WRAPPER_MASS] * 3}
-    ElementTree.SubElement(new, "inertial", {k: numbers(v) for k, v in inertial.items()})
-    new.extend(hinges)
-    place = list(parent).index(body)
+    ElementTree.SubElement(inserted, "inertial", {k: numbers(v) for k, v in inertial.items()})
+    inserted.extend(hinges)
+    index = list(parent).index(body)
     parent.remove(body)
-    new.append(body)
-    parent.insert(place, new)
+    inserted.append(body)
+    parent.insert(index, inserted)
 
 
-def _rub(
-    root: ElementTree.Element, joint: str, further: str, friction: float, softer: float
+def _write_tendon(
+    root: ElementTree.Element, joint: str, added: str, friction: float, softness: float
 ) -> None:
     tendons = root.find("tendon")
     if tendons is None:
         tendons = ElementTree.SubElement(root, "tendon")
     fixed = ElementTree.SubElement(
-        tendons, "fixed", name=f"{further}_friction", frictionloss=numbers(friction),
+        tendons, "fixed", name=f"{added}_friction", frictionloss=numbers(friction),
         limited="false", stiffness="0", damping="0", solreffriction=numbers(SOLREF),
-        solimpfriction=numbers(impedance(softer)),
+        solimpfriction=numbers(impedance(softness)),
     )  # fmt: skip
-    for name in (joint, further):
+    for name in (joint, added):
         ElementTree.SubElement(fixed, "joint", joint=name, coef="1")
 
 
 def _rebase(root: ElementTree.Element, old: Path, new: Path) -> None:
-    """Write the folders of meshes and textures so that they hold from another folder."""
+    """Write the folders of meshes and textures relative to another folder."""
     files = [e for e in root.iterfind("./asset/*") if e.get("file")]
     if not files:
         return
@@ -339,9 +335,9 @@ def _rebase(root: ElementTree.Element, old: Path, new: Path) -> None:
     if compiler is None:
         compiler = ElementTree.Element("compiler")
         root.insert(0, compiler)
-    given = {key: compiler.get(key) for key in FOLDERS}
-    kept = [key for key in FOLDERS if given[key] is not None] or ["assetdir"]
-    for key in kept:
-        folder = Path(given[key] or "")
+    folders = {key: compiler.get(key) for key in FOLDERS}
+    keys = [key for key in FOLDERS if folders[key] is not None] or ["assetdir"]
+    for key in keys:
+        folder = Path(folders[key] or "")
         if not folder.is_absolute():
             compiler.set(key, os.path.relpath(old / folder, new))

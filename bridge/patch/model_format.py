@@ -16,13 +16,13 @@ from gapbridge.core.log.sources.joint_order import order_joints
 
 @dataclass(frozen=True)
 class PatchOptions:
-    """What the user says of the model."""
+    """What the user states about the model."""
 
     joints: tuple[str, ...] = ()  # its joints, in the order of the arm's
     tcp: str = ""  # its TCP: a site, link or prim
     load: str = ""  # its body that models the declared payload
-    on_top: bool = False  # the cell was diagnosed against this simulator: servos give way further
-    folder: Path | None = None  # where the patched model will stand, if not beside the model
+    on_top: bool = False  # diagnosed against this simulator: add to the delays and droop it has
+    folder: Path | None = None  # of the patched model, if not the model's own
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class Patched:
 
     text: str
     changed: tuple[str, ...]  # one line a change
-    not_held: tuple[str, ...]  # one line a thing that the format cannot hold, and what to do
+    unsupported: tuple[str, ...]  # one line each: what the format cannot represent, what to do
 
 
 class ModelFormat(ABC):
@@ -42,20 +42,20 @@ class ModelFormat(ABC):
     @abstractmethod
     def patch(self, path: Path, changes: ModelChanges, options: PatchOptions,
               notes: Sequence[str]) -> Patched:  # fmt: skip
-        """Return the model at ``path`` with the changes in it; ``notes`` go in as comments.
+        """Return the model at ``path`` with the changes in it; ``notes`` are added as comments.
 
-        Raises InputError where the model cannot be read, is of another arm, or does not say which
-        joint is which.
+        Raises InputError where the model cannot be read, is of another arm, or its joints cannot
+        be assigned to the arm's.
         """
 
 
 def pick_joints(
-    path: Path, found: Sequence[str], changes: ModelChanges, options: PatchOptions
+    path: Path, names_in_model: Sequence[str], changes: ModelChanges, options: PatchOptions
 ) -> tuple[str, ...]:
     """Return the model's joint names in the order of the arm's. Raises InputError."""
     n = changes.n
     arm = changes.model.arm.joint_names or tuple(f"joint_{i + 1}" for i in range(n))
-    names = order_joints(path, found, arm, options.joints)
+    names = order_joints(path, names_in_model, arm, options.joints)
     if len(names) != n:
         raise InputError(
             f"{path}: joints: found {len(names)} ({', '.join(names)}), expected {n} as the "
@@ -64,10 +64,10 @@ def pick_joints(
     return names
 
 
-def named_one(path: Path, option: str, name: str, found: Sequence[str]) -> str:
+def named_one(path: Path, option: str, name: str, names: Sequence[str]) -> str:
     """Return a name that the model has; raises InputError with the nearest one."""
-    if name in found:
+    if name in names:
         return name
-    near = difflib.get_close_matches(name, found, n=1)
-    hint = f"; did you mean {near[0]}?" if near else f": {', '.join(found) or 'none'}"
+    matches = difflib.get_close_matches(name, names, n=1)
+    hint = f"; did you mean {matches[0]}?" if matches else f": {', '.join(names) or 'none'}"
     raise InputError(f"{path}: {option}: found {name}, expected one that the model has{hint}")

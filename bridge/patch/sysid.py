@@ -1,8 +1,8 @@
 """The cell's numbers as bounds for MuJoCo's own system identification (``mujoco.sysid``).
 
-What was accused is free within three standard deviations, all else the cell has is frozen. How a
-number enters the patched model is measured: it is patched with the bounds too, and what changes in
-the model is interpolated between (a parabola through both bounds and the value).
+Parameters of causes are free within three standard deviations, all others are frozen. How a number
+enters the patched model is determined numerically: the model is patched at both bounds too, and
+what changes in it is interpolated (a parabola through both bounds and the value).
 """
 
 from __future__ import annotations
@@ -54,17 +54,17 @@ class Bounds:
 
 @dataclass(frozen=True)
 class _Number:
-    """Where one number stands in a model: the terms of one effect at one site are one."""
+    """Where one number is in a model: the terms of one effect at one site are one."""
 
     bounds: Bounds
     terms: tuple[int, ...]  # indices into the model's terms; the last one is varied
-    place: int  # in the term's values
+    index: int  # in the term's values
 
     def varied(self, model: Model, value: float) -> Model:
         """Return the model with another value."""
         last = self.terms[-1]
         values = np.array(model.terms[last].values)
-        values[self.place] += value - self.bounds.value
+        values[self.index] += value - self.bounds.value
         terms = list(model.terms)
         terms[last] = terms[last].with_values(values)
         return replace(model, terms=tuple(terms))
@@ -89,11 +89,11 @@ def parameters_text(path: Path, cell: Cell, options: PatchOptions, suffix: str) 
     for number in numbers:
         bounds = number.bounds
         if bounds.free:
-            both = [
+            at_bounds = [
                 _attributes(path, number.varied(cell.model, value), plain)
                 for value in (bounds.lower, bounds.upper)
             ]
-            changes[bounds.name] = _between(at_value, *both)
+            changes[bounds.name] = _between(at_value, *at_bounds)
     return _module(path, cell, numbers, changes)
 
 
@@ -104,25 +104,25 @@ def _numbers(cell: Cell) -> Iterator[_Number]:
     for i, term in enumerate(model.terms):
         if not term.stand_in and CATALOGUE[term.effect].of_the_arm:
             sites.setdefault((term.effect, term.site), []).append(i)
-    for (effect, site), places in sites.items():
+    for (effect, site), indices in sites.items():
         for k, parameter in enumerate(CATALOGUE[effect].parameters(model.arm, site)):
             name = CATALOGUE[effect].label(site, parameter)
-            value = sum(model.terms[i].values[k] for i in places)
+            value = sum(model.terms[i].values[k] for i in indices)
             std = sigma.get(name)
-            reach = 0.0 if std is None else SIGMAS * std
-            lower = max(value - reach, parameter.lower)
-            upper = min(value + reach, parameter.upper)
-            free = reach > 0 and lower < upper
-            yield _Number(Bounds(name, value, lower, upper, free), tuple(places), k)
+            half_width = 0.0 if std is None else SIGMAS * std
+            lower = max(value - half_width, parameter.lower)
+            upper = min(value + half_width, parameter.upper)
+            free = half_width > 0 and lower < upper
+            yield _Number(Bounds(name, value, lower, upper, free), tuple(indices), k)
 
 
 def _sigmas(cell: Cell) -> dict[str, float]:
-    """Return the standard deviation of each accused or fitted number by name."""
+    """Return the standard deviation of each diagnosed or fitted number by name."""
     spread = cell.spread
-    found = dict(zip(spread.names, np.sqrt(np.maximum(np.diag(spread.covariance), 0)), strict=True))
-    for cause in cell.accused:
-        found |= {p.name: p.std for p in cause.parameters if p.std}
-    return {name: float(value) for name, value in found.items() if value > 0}
+    stds = dict(zip(spread.names, np.sqrt(np.maximum(np.diag(spread.covariance), 0)), strict=True))
+    for cause in cell.causes:
+        stds |= {p.name: p.std for p in cause.parameters if p.std}
+    return {name: float(value) for name, value in stds.items() if value > 0}
 
 
 def _attributes(path: Path, model: Model, options: PatchOptions) -> dict[tuple[str, ...], Array]:
@@ -134,15 +134,15 @@ def _attributes(path: Path, model: Model, options: PatchOptions) -> dict[tuple[s
     elements = {
         "body": spec.bodies, "joint": spec.joints, "site": spec.sites, "actuator": spec.actuators,
     }  # fmt: skip
-    found: dict[tuple[str, ...], Array] = {
+    attributes: dict[tuple[str, ...], Array] = {
         (kind, element.name, attribute): np.atleast_1d(getattr(element, attribute)).astype(float)
-        for kind, listed in elements.items()
-        for element in listed
+        for kind, group in elements.items()
+        for element in group
         for attribute in ATTRIBUTES[kind]
         if element.name
     }
-    found["option", "", "gravity"] = np.array(spec.option.gravity)
-    return found
+    attributes["option", "", "gravity"] = np.array(spec.option.gravity)
+    return attributes
 
 
 def _between(
@@ -150,13 +150,13 @@ def _between(
     upper: Mapping[tuple[str, ...], Array],
 ) -> list[list[Any]]:  # fmt: skip
     """Return what changes towards the bounds: kind, name, attribute, at the lower, at the upper."""
-    found = []
+    changes = []
     for key, value in middle.items():
         low, high = lower.get(key, value), upper.get(key, value)
         if not (np.array_equal(low, value, True) and np.array_equal(high, value, True)):
             steps = [np.nan_to_num(bound - value).tolist() for bound in (low, high)]
-            found.append([*key, *steps])
-    return found
+            changes.append([*key, *steps])
+    return changes
 
 
 def _module(
@@ -167,12 +167,12 @@ def _module(
         f"{n.bounds.free}),"
         for n in numbers
     )
-    moved = "\n".join(
-        f"    {name!r}: [\n" + "".join(f"        {tuple(one)!r},\n" for one in listed) + "    ],"
-        for name, listed in changes.items()
+    changes_text = "\n".join(
+        f"    {name!r}: [\n" + "".join(f"        {tuple(row)!r},\n" for row in rows) + "    ],"
+        for name, rows in changes.items()
     )
     model, origin = json.dumps(path.name), json.dumps(str(cell.path.name))
-    return TEMPLATE.format(model=model, cell=origin, bounds=bounds, changes=moved)
+    return TEMPLATE.format(model=model, cell=origin, bounds=bounds, changes=changes_text)
 
 
 TEMPLATE = '''"""Bounds for MuJoCo's sysid, of {model} patched with {cell}; by gapbridge.
@@ -202,19 +202,19 @@ def modifier(name):
     def modify(spec, parameter):
         x = float(np.ravel(parameter.value)[0]) - value
         for kind, element, attribute, low, high in CHANGES.get(name, ()):
-            own = getattr(spec, kind) if kind == "option" else getattr(spec, kind)(element)
+            target = getattr(spec, kind) if kind == "option" else getattr(spec, kind)(element)
             change = np.zeros(len(low))  # a parabola through 0 at x = 0, low at a, high at b
             if a:
                 change = change + np.array(low) * (x * (x - b) / (a * (a - b)) if b else x / a)
             if b:
                 change = change + np.array(high) * (x * (x - a) / (b * (b - a)) if a else x / b)
-            given = getattr(own, attribute)
+            nominal = getattr(target, attribute)
             if attribute == "nsample":
-                setattr(own, attribute, int(given + max(0, *low, *high)))
-            elif np.ndim(given) == 0:
-                setattr(own, attribute, float(given) + float(change[0]))
+                setattr(target, attribute, int(nominal + max(0, *low, *high)))
+            elif np.ndim(nominal) == 0:
+                setattr(target, attribute, float(nominal) + float(change[0]))
             else:
-                setattr(own, attribute, np.array(given) + change)
+                setattr(target, attribute, np.array(nominal) + change)
 
     return modify
 
@@ -223,9 +223,9 @@ def parameters():
     """Return the mujoco.sysid.ParameterDict."""
     from mujoco import sysid
 
-    found = sysid.ParameterDict()
+    bounds = sysid.ParameterDict()
     for name, (value, lower, upper, free) in BOUNDS.items():
-        found.add(sysid.Parameter(name, value, lower, upper, frozen=not free,
-                                  modifier=modifier(name) if free else None))
-    return found
+        bounds.add(sysid.Parameter(name, value, lower, upper, frozen=not free,
+                                   modifier=modifier(name) if free else None))
+    return bounds
 '''

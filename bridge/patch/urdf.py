@@ -50,7 +50,7 @@ class Urdf(ModelFormat):
         changed = []
         for i, name in enumerate(names):
             if not np.allclose(changes.shift[i], np.eye(4), rtol=0, atol=TINY):
-                document.move(name, changes.moved(i, world), frames)
+                document.move(name, changes.motion(i, world), frames)
                 changed.append(f"joint {name}: origin")
             changed += _dynamics(document, name, i + 1, changes)
         changed += _inertials(document, names, changes)
@@ -63,7 +63,7 @@ class Urdf(ModelFormat):
 
 
 class _Document:
-    """A URDF as text, of which single attributes are rewritten where they stand."""
+    """A URDF as text, in which single attributes are rewritten in place."""
 
     def __init__(self, path: Path) -> None:
         try:
@@ -82,13 +82,13 @@ class _Document:
         return [name for name, joint in self.joints.items() if joint.get("type") in TURNING]
 
     def end(self, joint: str, tag: str) -> str:
-        found = self.joints[joint].find(tag)
-        return "" if found is None else str(found.get("link"))
+        element = self.joints[joint].find(tag)
+        return "" if element is None else str(element.get("link"))
 
     def origin(self, joint: str) -> Array:
-        found = self.joints[joint].find("origin")
-        given = {} if found is None else found.attrib
-        xyz, rpy = (np.array(given.get(k, "0 0 0").split(), dtype=float) for k in ("xyz", "rpy"))
+        element = self.joints[joint].find("origin")
+        pose = {} if element is None else element.attrib
+        xyz, rpy = (np.array(pose.get(k, "0 0 0").split(), dtype=float) for k in ("xyz", "rpy"))
         return transform(rpy_matrix(rpy), xyz)
 
     def child_frames(self) -> dict[str, Array]:
@@ -111,8 +111,8 @@ class _Document:
     def axes(self, names: Sequence[str], frames: dict[str, Array]) -> Axes:
         point, direction = [], []
         for name in names:
-            frame, found = frames[self.end(name, "child")], self.joints[name].find("axis")
-            axis = np.array(("1 0 0" if found is None else found.get("xyz", "1 0 0")).split(),
+            frame, element = frames[self.end(name, "child")], self.joints[name].find("axis")
+            axis = np.array(("1 0 0" if element is None else element.get("xyz", "1 0 0")).split(),
                             dtype=float)  # fmt: skip
             point.append(frame[:3, 3])
             direction.append(frame[:3, :3] @ axis / np.linalg.norm(axis))
@@ -130,7 +130,7 @@ class _Document:
     ) -> None:
         """Rewrite attributes of <tag> in <kind name=...>; the element is made where missing.
 
-        ``inside``: the element of it that <tag> is in; '': it itself.
+        ``inside``: the child element that contains <tag>; '': <tag> is a direct child.
         """
         with_type = r"(?=[^>]*\btype\s*=)" if kind == "joint" else ""  # no transmission's joint
         block = re.search(
@@ -144,13 +144,13 @@ class _Document:
                              re.DOTALL)  # fmt: skip
             assert part is not None, f"{name}: {inside}"
             begin, end, kind = begin + part.start(), begin + part.end(), inside
-        given = self.text[begin:end]
+        text = self.text[begin:end]
         numbers = {key: " ".join(f"{v:.17g}" for v in np.atleast_1d(value))
                    for key, value in values.items()}  # fmt: skip
-        element = re.search(rf"<{tag}\b[^>]*?/?>", _without_comments(given))
+        element = re.search(rf"<{tag}\b[^>]*?/?>", _without_comments(text))
         if element is None:
             attributes = " ".join(f'{key}="{value}"' for key, value in numbers.items())
-            new = given.replace(f"</{kind}>", f"  <{tag} {attributes}/>\n  </{kind}>")
+            rewritten = text.replace(f"</{kind}>", f"  <{tag} {attributes}/>\n  </{kind}>")
         else:
             old = written = element[0]
             for key, value in numbers.items():
@@ -159,31 +159,31 @@ class _Document:
                     written = re.sub(pattern, rf"\g<1>\g<2>{value}\g<2>", written, count=1)
                 else:
                     written = re.sub(r"\s*(/?>)$", rf' {key}="{value}"\1', written)
-            place = element.start()
-            new = given[:place] + written + given[place + len(old) :]
-        self.text = self.text[:begin] + new + self.text[end:]
+            start = element.start()
+            rewritten = text[:start] + written + text[start + len(old) :]
+        self.text = self.text[:begin] + rewritten + self.text[end:]
 
     def comment(self, lines: Sequence[str]) -> None:
         """Put lines into a comment right inside of <robot>."""
         text = "\n       ".join(line.replace("--", "- -") for line in lines)
         self.text = re.sub(
-            r"(<robot\b[^>]*>)", lambda found: f"{found[1]}\n  <!-- {text} -->", self.text, count=1
+            r"(<robot\b[^>]*>)", lambda tag: f"{tag[1]}\n  <!-- {text} -->", self.text, count=1
         )
 
 
 def _without_comments(text: str) -> str:
-    """Return the text with comments blanked out, so that places stay."""
-    return re.sub(r"<!--.*?-->", lambda found: " " * len(found[0]), text, flags=re.DOTALL)
+    """Return the text with comments blanked out, so that offsets stay."""
+    return re.sub(r"<!--.*?-->", lambda comment: " " * len(comment[0]), text, flags=re.DOTALL)
 
 
 def _dynamics(document: _Document, name: str, joint: int, changes: ModelChanges) -> list[str]:
-    found = document.joints[name].find("dynamics")
-    given = {} if found is None else found.attrib
+    element = document.joints[name].find("dynamics")
+    attributes = {} if element is None else element.attrib
     values: dict[str, Array | float] = {}
     for kind, key in ((Kind.FRICTION, "friction"), (Kind.DAMPING, "damping")):
         added = changes.of_joint(kind, joint)
         if added:
-            values[key] = float(given.get(key, 0)) + added
+            values[key] = float(attributes.get(key, 0)) + added
     if values:
         document.write("joint", name, "dynamics", values)
     return [f"joint {name}: {key} {value:.6g}" for key, value in values.items()]
@@ -200,9 +200,9 @@ def _inertials(document: _Document, names: Sequence[str], changes: ModelChanges)
         for tag, keys in (("mass", ("value",)), ("inertia", ("ixx", "ixy", "ixz", "iyy", "iyz",
                                                              "izz"))):  # fmt: skip
             element = inertial.find(tag)
-            given = {} if element is None else element.attrib
+            attributes = {} if element is None else element.attrib
             values: dict[str, Array | float] = {
-                key: float(given[key]) * factor for key in keys if key in given
+                key: float(attributes[key]) * factor for key in keys if key in attributes
             }
             if values:
                 document.write("link", link, tag, values)
@@ -222,13 +222,13 @@ def _centres(
         mass = None if inertial is None else inertial.find("mass")
         if inertial is None or mass is None or not moment.any():
             continue
-        turned = frames[link][:3, :3].T @ (world @ changes.joint_in_base[i])[:3, :3] @ moment
-        found = inertial.find("origin")
-        given = "0 0 0" if found is None else found.get("xyz", "0 0 0")
+        in_link = frames[link][:3, :3].T @ (world @ changes.joint_in_base[i])[:3, :3] @ moment
+        element = inertial.find("origin")
+        xyz = "0 0 0" if element is None else element.get("xyz", "0 0 0")
         scale = 1 + changes.of_joint(Kind.LINK_SCALE, i + 1)
-        shift = turned / (float(mass.get("value", 1)) * scale)
-        place = np.array(given.split(), dtype=float) + shift
-        document.write("link", link, "origin", {"xyz": place}, inside="inertial")
+        shift = in_link / (float(mass.get("value", 1)) * scale)
+        centre = np.array(xyz.split(), dtype=float) + shift
+        document.write("link", link, "origin", {"xyz": centre}, inside="inertial")
         lines.append(f"link {link}: centre of gravity")
     return lines
 
@@ -237,7 +237,7 @@ def _tool(
     document: _Document, path: Path, changes: ModelChanges, options: PatchOptions, world: Array,
     frames: dict[str, Array], changed: list[str],
 ) -> list[str]:  # fmt: skip
-    """Move the TCP's link; returns what cannot be held."""
+    """Move the TCP's link; returns what the URDF cannot represent."""
     if np.allclose(changes.tcp_shift, np.eye(4), rtol=0, atol=TINY):
         return []
     if not options.tcp:
@@ -269,6 +269,6 @@ def _springs(changes: ModelChanges) -> list[str]:
 
 def _settings(changes: ModelChanges) -> list[str]:
     kinds = {setting.kind for setting in changes.settings}
-    own = [text for kind, text in INSTEAD.items() if kind in kinds]
-    own += [f"{name}: {instead}" for name, instead in changes.not_held]
-    return [*own, *changes.left_out]
+    lines = [text for kind, text in INSTEAD.items() if kind in kinds]
+    lines += [f"{name}: {instead}" for name, instead in changes.unsupported]
+    return [*lines, *changes.skipped]

@@ -1,8 +1,8 @@
-"""USD: a stronger layer of ``over`` prims above the user's own stage, which stays as it is.
+"""USD: a stronger layer of ``over`` prims above the user's own stage, which is not changed.
 
-Attributes are those of UsdPhysics; where it has none, PhysX's and Newton's stand side by side. A
-flexible joint or play is a further body of no weight and a further joint before the joint's own
-body. Angles of drives, limits and damping are in degrees there, armature and friction are not.
+Attributes are those of UsdPhysics; where it has none, both PhysX's and Newton's are written. A
+flexible joint or play is an added body of negligible mass and an added joint before the joint's
+own body. Angles of drives, limits and damping are in degrees there, armature and friction are not.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ from gapbridge.core.rotation import transform
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-PER_DEGREE = np.pi / 180  # of what a drive gives per rad
-AT_ZERO = 1e-5  # m and of rotations: by which a body may be off and still stand at zero angles
+PER_DEGREE = np.pi / 180  # rad: factor from a drive's gain per rad to one per degree
+AT_ZERO = 1e-5  # m, and of rotation matrices: tolerance for a body to be at zero angles
 SMALL = 1e-4  # kg, kg m2 of a body between two joints
 INSTEAD = {
     Kind.LAG: "lag of the servo: in the controller, or a drive whose damping / stiffness is that",
@@ -53,22 +53,22 @@ class Usd(ModelFormat):
         stage = _Stage(path, options.folder)
         names = pick_joints(path, list(stage.joints), changes, options)
         world = base_in_world(changes.axes(), stage.axes(names), str(path), names)
-        done = _Layer(stage, changes, options, world, names)
+        layer = _Layer(stage, changes, options, world, names)
         for joint, name in enumerate(names, start=1):
-            done.frame(name, joint)
-            done.friction(name, joint)
-            done.drive(name, joint)
-            done.inertial(name, joint)
-            done.springs(name, joint)
-        if done.changed and not stage.place_again():
-            done.missing.append("rest pose of the bodies: the stage has the arm elsewhere than at "
+            layer.frame(name, joint)
+            layer.friction(name, joint)
+            layer.drive(name, joint)
+            layer.inertial(name, joint)
+            layer.springs(name, joint)
+        if layer.changed and not stage.move_bodies():
+            layer.missing.append("rest pose of the bodies: the stage has the arm elsewhere than at "
                                 "zero angles; simulators move them to the joints")  # fmt: skip
-        done.tool()
-        done.gravity()
-        missing = done.not_held()
-        comment = ["Patched by gapbridge.", *done.changed, *notes,
+        layer.tool()
+        layer.gravity()
+        missing = layer.unsupported()
+        comment = ["Patched by gapbridge.", *layer.changed, *notes,
                    *(f"not in this file: {line}" for line in missing)]  # fmt: skip
-        return Patched(stage.text(comment), tuple(done.changed), tuple(missing))
+        return Patched(stage.text(comment), tuple(layer.changed), tuple(missing))
 
 
 class _Stage:
@@ -87,14 +87,14 @@ class _Stage:
         self.layer.subLayerPaths.append(str(path.resolve()))
         try:
             self.stage: Any = Usd.Stage.Open(self.layer)
-            below = Usd.Stage.Open(str(path))
+            source = Usd.Stage.Open(str(path))
         except Tf.ErrorException as error:
             text = " ".join(str(error).split())
             raise InputError(f"{path}: found no USD that opens ({text})") from None
-        self.default = below.GetDefaultPrim()
+        self.default = source.GetDefaultPrim()
         self.folder = folder or path.parent
-        self.unit = UsdGeom.GetStageMetersPerUnit(below)
-        self.kilogram = UsdPhysics.GetStageKilogramsPerUnit(below)
+        self.unit = UsdGeom.GetStageMetersPerUnit(source)
+        self.kilogram = UsdPhysics.GetStageKilogramsPerUnit(source)
         self.joints: dict[str, Any] = {}
         for prim in self.stage.Traverse():
             if prim.IsA(UsdPhysics.RevoluteJoint):
@@ -103,32 +103,32 @@ class _Stage:
         self.frames = self._at_zero()
 
     def _at_zero(self) -> dict[str, Array]:
-        """Return where bodies (4, 4) stand at zero angles: by the joints, from the first ones."""
+        """Return the poses (4, 4) of bodies at zero angles, joint by joint from the roots."""
         frames: dict[str, Array] = {}
-        left = list(self._every_joint())
-        carried = {self.body(joint, 1) for joint in left}
-        for joint in left:
+        remaining = list(self._every_joint())
+        carried = {self.body(joint, 1) for joint in remaining}
+        for joint in remaining:
             root = self.body(joint, 0)
             if root not in carried:
                 frames[root] = self.authored(root)
-        while ready := [joint for joint in left if self.body(joint, 0) in frames]:
+        while ready := [joint for joint in remaining if self.body(joint, 0) in frames]:
             for joint in ready:
                 parent = frames[self.body(joint, 0)]
                 local = self.local(joint, 0) @ np.linalg.inv(self.local(joint, 1))
                 frames.setdefault(self.body(joint, 1), parent @ local)
-            left = [joint for joint in left if joint not in ready]
-        return frames  # a closed chain is in none: its joints are none of an arm's
+            remaining = [joint for joint in remaining if joint not in ready]
+        return frames  # without closed chains, whose joints cannot be an arm's
 
-    def place_again(self) -> bool:
-        """Move the bodies to where the changed joints have them; False: they were elsewhere."""
-        before = {path: self.authored(path) for path in self.frames}
+    def move_bodies(self) -> bool:
+        """Move bodies as the changed joints require; False: they were not at zero angles."""
+        original = {path: self.authored(path) for path in self.frames}
         for path, frame in self.frames.items():
-            if not np.allclose(before[path], frame, rtol=0, atol=AT_ZERO):
+            if not np.allclose(original[path], frame, rtol=0, atol=AT_ZERO):
                 return False
         for path, frame in self._at_zero().items():  # parents come first
-            now = self.authored(path)
-            if path and not np.allclose(now, frame, rtol=0, atol=TINY):
-                self.move(path, frame @ np.linalg.inv(now))
+            current = self.authored(path)
+            if path and not np.allclose(current, frame, rtol=0, atol=TINY):
+                self.move(path, frame @ np.linalg.inv(current))
         return True
 
     def _every_joint(self) -> Iterator[Any]:
@@ -159,18 +159,18 @@ class _Stage:
         """Return a joint's frame (4, 4) in one of its bodies."""
         rotation = joint.GetLocalRot0Attr() if side == 0 else joint.GetLocalRot1Attr()
         position = joint.GetLocalPos0Attr() if side == 0 else joint.GetLocalPos1Attr()
-        quat, at = rotation.Get(), position.Get()
+        quat, point = rotation.Get(), position.Get()
         R = np.eye(3) if quat is None else _matrix(quat.GetReal(), quat.GetImaginary())
         scale = self._scale(self.body(joint, side))
-        p = np.zeros(3) if at is None else np.array(at, dtype=float) * scale * self.unit
+        p = np.zeros(3) if point is None else np.array(point, dtype=float) * scale * self.unit
         return transform(R, p)
 
     def last_body(self, joint: str) -> str:
-        """Return the body that a joint carried as the stage came."""
+        """Return the body that a joint carried in the original stage."""
         return self._carried[joint]
 
     def _scale(self, path: str) -> Array:
-        """Return the scale (3,) of a prim's axes in world, in which joints' places are given."""
+        """Return the scale (3,) of a prim's axes in world, which applies to joints' positions."""
         if not path:
             return np.ones(3)
         matrix = np.array(
@@ -206,33 +206,33 @@ class _Stage:
         w, x, y, z = _quat(frame[:3, :3])
         rotation = joint.CreateLocalRot0Attr() if side == 0 else joint.CreateLocalRot1Attr()
         position = joint.CreateLocalPos0Attr() if side == 0 else joint.CreateLocalPos1Attr()
-        at = frame[:3, 3] / self.unit / self._scale(self.body(joint, side))
+        point = frame[:3, 3] / self.unit / self._scale(self.body(joint, side))
         rotation.Set(self.Gf.Quatf(w, x, y, z))
-        position.Set(self.Gf.Vec3f(*(float(v) for v in at)))
+        position.Set(self.Gf.Vec3f(*(float(v) for v in point)))
 
     def move(self, path: str, motion: Array) -> None:
-        """Move a prim by a motion (4, 4) in world, by one matrix in place of its own steps."""
+        """Move a prim by a motion (4, 4) in world; one matrix replaces its transform steps."""
         prim = self.UsdGeom.Xformable(self.stage.GetPrimAtPath(path))
         cache = self.UsdGeom.XformCache()
-        own = np.array(cache.GetLocalToWorldTransform(prim.GetPrim())).T
+        current = np.array(cache.GetLocalToWorldTransform(prim.GetPrim())).T
         parent = np.array(cache.GetParentToWorldTransform(prim.GetPrim())).T
         step = motion.copy()
         step[:3, 3] /= self.unit
-        local = np.linalg.inv(parent) @ step @ own
+        local = np.linalg.inv(parent) @ step @ current
         prim.ClearXformOpOrder()
         prim.AddTransformOp(opSuffix="patched").Set(self.Gf.Matrix4d(local.T.tolist()))
 
     def set(self, prim: Any, name: str, kind: str, value: Any) -> None:
-        """Write an attribute, which is made where the prim has none."""
+        """Write an attribute, which is created where the prim has none."""
         attribute = prim.GetAttribute(name) or prim.CreateAttribute(
             name, getattr(self.Sdf.ValueTypeNames, kind)
         )
         attribute.Set(value)
 
     def text(self, comment: Sequence[str]) -> str:
-        """Return the layer's text, the model's path as it reads from where the layer will be."""
-        below = Path(os.path.relpath(self.path.resolve(), self.folder.resolve())).as_posix()
-        self.layer.subLayerPaths[0] = below if below.startswith(".") else f"./{below}"
+        """Return the layer's text, the model's path relative to the layer's folder."""
+        relative = Path(os.path.relpath(self.path.resolve(), self.folder.resolve())).as_posix()
+        self.layer.subLayerPaths[0] = relative if relative.startswith(".") else f"./{relative}"
         self.layer.comment = "\n".join(comment)
         if self.default:
             self.layer.defaultPrim = self.default.GetName()
@@ -251,18 +251,18 @@ class _Layer:
 
     def frame(self, name: str, joint: int) -> None:
         """Move a joint in its parent."""
-        own = self.stage.joints[name]
+        usd_joint = self.stage.joints[name]
         if not np.allclose(self.changes.shift[joint - 1], np.eye(4), rtol=0, atol=TINY):
-            motion = self.changes.moved(joint - 1, self.world)
-            parent = self.stage.frames[self.stage.body(own, 0)]
-            local = np.linalg.inv(parent) @ motion @ self.stage.in_world(own)
-            self.stage.set_local(own, 0, local)
+            motion = self.changes.motion(joint - 1, self.world)
+            parent = self.stage.frames[self.stage.body(usd_joint, 0)]
+            local = np.linalg.inv(parent) @ motion @ self.stage.in_world(usd_joint)
+            self.stage.set_local(usd_joint, 0, local)
             self.changed.append(f"joint {name}: physics:localPos0, localRot0")
 
     def friction(self, name: str, joint: int) -> None:
         """Add friction, damping and armature, as PhysX and as Newton name them."""
         prim = self.stage.joints[name].GetPrim()
-        for kind, ours in (
+        for kind, names in (
             (Kind.FRICTION, (("newton:friction", 1.0),
                              ("physxJointAxis:angular:dynamicFrictionEffort", 1.0),
                              ("physxJointAxis:angular:staticFrictionEffort", 1.0))),
@@ -274,14 +274,14 @@ class _Layer:
             added = self.changes.of_joint(kind, joint)
             if not added:
                 continue
-            for attribute, factor in ours:
-                value = self._had(prim, attribute) + added * factor / self._effort(kind)
+            for attribute, factor in names:
+                value = self._current(prim, attribute) + added * factor / self._effort(kind)
                 self.stage.set(prim, attribute, "Float", value)
                 self.changed.append(f"joint {name}: {attribute} {value:.6g}")
 
-    def _had(self, prim: Any, attribute: str) -> float:
-        found = prim.GetAttribute(attribute)
-        return float(found.Get() or 0.0) if found else 0.0
+    def _current(self, prim: Any, attribute: str) -> float:
+        value = prim.GetAttribute(attribute)
+        return float(value.Get() or 0.0) if value else 0.0
 
     def _effort(self, kind: Kind) -> float:
         """Return Nm (or kg m2) per the stage's own unit."""
@@ -298,10 +298,10 @@ class _Layer:
         if not droop:
             return
         drive = self.stage.UsdPhysics.DriveAPI(prim, "angular")
-        given = drive.GetStiffnessAttr().Get() if drive.GetStiffnessAttr() else None
-        per = PER_DEGREE / self._effort(Kind.DAMPING)
-        had = per / float(given) if given and self.options.on_top else 0.0
-        stiffness = per / (droop + had)
+        current = drive.GetStiffnessAttr().Get() if drive.GetStiffnessAttr() else None
+        scale = PER_DEGREE / self._effort(Kind.DAMPING)
+        compliance = scale / float(current) if current and self.options.on_top else 0.0
+        stiffness = scale / (droop + compliance)
         drive = self.stage.UsdPhysics.DriveAPI.Apply(prim, "angular")
         drive.CreateStiffnessAttr().Set(stiffness)
         self.changed.append(f"joint {name}: drive's stiffness {stiffness:.6g}")
@@ -326,52 +326,52 @@ class _Layer:
             self.changed.append(f"{path}: mass and inertia times {scale:.6g}")
         if moment.any():
             frame = self.stage.frames[path]
-            turned = (self.world @ self.changes.joint_in_base[joint - 1])[:3, :3] @ moment
-            shift = frame[:3, :3].T @ turned / (mass * scale * self.stage.kilogram)
-            given = body.GetCenterOfMassAttr().Get()
-            at = np.array(given or (0, 0, 0), dtype=float)
-            at = np.where(np.isfinite(at), at, 0.0) + shift / self.stage.unit
-            body.CreateCenterOfMassAttr().Set(self.stage.Gf.Vec3f(*(float(v) for v in at)))
+            moment_in_world = (self.world @ self.changes.joint_in_base[joint - 1])[:3, :3] @ moment
+            shift = frame[:3, :3].T @ moment_in_world / (mass * scale * self.stage.kilogram)
+            authored = body.GetCenterOfMassAttr().Get()
+            centre = np.array(authored or (0, 0, 0), dtype=float)
+            centre = np.where(np.isfinite(centre), centre, 0.0) + shift / self.stage.unit
+            body.CreateCenterOfMassAttr().Set(self.stage.Gf.Vec3f(*(float(v) for v in centre)))
             self.changed.append(f"{path}: physics:centerOfMass")
 
     def springs(self, name: str, joint: int) -> None:
-        """Put play and springs between a joint and its body: a small body and a joint each."""
+        """Add play and springs between a joint and its body: a small body and a joint each."""
         frame = (self.world @ self.changes.joint_in_base[joint - 1])[:3, :3]
         flexibility = self.changes.springs.joint[joint - 1]
         softening = self.changes.springs.softening[joint - 1]
         play = self.changes.of_joint(Kind.PLAY, joint)
         if play:
-            self._behind(name, "backlash", frame[:, 2], half=play / 2)
+            self._add_spring(name, "backlash", frame[:, 2], half=play / 2)
         for k, label in ((2, "axial_compliance"), (0, "radial_x"), (1, "radial_y")):
             if flexibility[k] > 0:
-                self._behind(name, label, frame[:, k], stiffness=1 / float(flexibility[k]))
+                self._add_spring(name, label, frame[:, k], stiffness=1 / float(flexibility[k]))
         if softening > 0:
             self.missing.append(f"stiffening of {name}: its spring is the linear one; a drive's "
                                 "stiffness by angle needs code")  # fmt: skip
 
-    def _behind(
+    def _add_spring(
         self, name: str, label: str, axis: Array, stiffness: float = 0.0, half: float = 0.0
     ) -> None:
-        stage, own = self.stage, self.stage.joints[name]
-        carried = stage.body(own, 1)
-        path = f"{own.GetPath().GetParentPath()}/{name}_{label}"
-        between = stage.UsdGeom.Xform.Define(stage.stage, f"{path}_body")
-        stage.UsdPhysics.RigidBodyAPI.Apply(between.GetPrim())
-        mass = stage.UsdPhysics.MassAPI.Apply(between.GetPrim())
+        stage, joint = self.stage, self.stage.joints[name]
+        child = stage.body(joint, 1)
+        path = f"{joint.GetPath().GetParentPath()}/{name}_{label}"
+        body = stage.UsdGeom.Xform.Define(stage.stage, f"{path}_body")
+        stage.UsdPhysics.RigidBodyAPI.Apply(body.GetPrim())
+        mass = stage.UsdPhysics.MassAPI.Apply(body.GetPrim())
         mass.CreateMassAttr().Set(SMALL / stage.kilogram)
         mass.CreateDiagonalInertiaAttr().Set(stage.Gf.Vec3f(SMALL / self._effort(Kind.DAMPING)))
-        spot = stage.frames[carried] @ stage.local(own, 1)
-        stage.frames[f"{path}_body"] = spot
-        self._place(between, spot)
+        frame = stage.frames[child] @ stage.local(joint, 1)
+        stage.frames[f"{path}_body"] = frame
+        self._place(body, frame)
         spring = stage.UsdPhysics.RevoluteJoint.Define(stage.stage, path)
         spring.CreateAxisAttr().Set("Z")
         spring.CreateBody0Rel().SetTargets([f"{path}_body"])
-        spring.CreateBody1Rel().SetTargets([carried])
-        turned = transform(_with_z(axis), spot[:3, 3])
-        stage.set_local(spring, 0, np.linalg.inv(spot) @ turned)
-        stage.set_local(spring, 1, np.linalg.inv(stage.frames[carried]) @ turned)
-        own.GetBody1Rel().SetTargets([f"{path}_body"])
-        stage.set_local(own, 1, np.eye(4))
+        spring.CreateBody1Rel().SetTargets([child])
+        spring_frame = transform(_with_z(axis), frame[:3, 3])
+        stage.set_local(spring, 0, np.linalg.inv(frame) @ spring_frame)
+        stage.set_local(spring, 1, np.linalg.inv(stage.frames[child]) @ spring_frame)
+        joint.GetBody1Rel().SetTargets([f"{path}_body"])
+        stage.set_local(joint, 1, np.eye(4))
         if half:
             spring.CreateLowerLimitAttr().Set(float(-np.degrees(half)))
             spring.CreateUpperLimitAttr().Set(float(np.degrees(half)))
@@ -404,15 +404,15 @@ class _Layer:
         stage = self.stage.stage
         paths = {p.GetName(): str(p.GetPath()) for p in stage.Traverse()
                  if p.IsA(self.stage.UsdGeom.Xformable)}  # fmt: skip
-        wanted = self.options.tcp
-        if wanted not in paths.values():
-            wanted = paths[named_one(self.stage.path, "--tcp", wanted, list(paths))]
+        tcp = self.options.tcp
+        if tcp not in paths.values():
+            tcp = paths[named_one(self.stage.path, "--tcp", tcp, list(paths))]
         frame = self.world @ self.changes.tcp_in_base
         motion = frame @ self.changes.tcp_shift @ np.linalg.inv(frame)
         last = self.stage.last_body(self.names[-1])
-        stands = self.stage.authored(last) @ np.linalg.inv(self.stage.frames[last])
-        self.stage.move(wanted, stands @ motion @ np.linalg.inv(stands))
-        self.changed.append(f"{wanted}: TCP")
+        placement = self.stage.authored(last) @ np.linalg.inv(self.stage.frames[last])
+        self.stage.move(tcp, placement @ motion @ np.linalg.inv(placement))
+        self.changed.append(f"{tcp}: TCP")
 
     def gravity(self) -> None:
         """Turn the scene's gravity."""
@@ -430,8 +430,8 @@ class _Layer:
         scene.CreateGravityMagnitudeAttr().Set(size / self.stage.unit)
         self.changed.append(f"{scenes[0].GetPath()}: gravity")
 
-    def not_held(self) -> list[str]:
-        """Return what is not in the layer, with what people do instead."""
+    def unsupported(self) -> list[str]:
+        """Return what is not in the layer, with what to do instead."""
         kinds = {setting.kind for setting in self.changes.settings}
         lines = self.missing + [text for kind, text in INSTEAD.items()
                                 if kind in kinds and kind is not Kind.LINK_MOMENT]  # fmt: skip
@@ -439,8 +439,8 @@ class _Layer:
             lines.append("flexible links: MJCF with springs across the links")
         if self.changes.springs.base.any():
             lines.append("flexible base: driven joints between the base and the world")
-        lines += [f"{name}: {text}" for name, text in self.changes.not_held]
-        return [*lines, *self.changes.left_out]
+        lines += [f"{name}: {text}" for name, text in self.changes.unsupported]
+        return [*lines, *self.changes.skipped]
 
 
 def _matrix(w: float, xyz: Any) -> Array:

@@ -8,7 +8,7 @@ from pathlib import Path
 import click
 
 from gapbridge.bridge.cell import Cell
-from gapbridge.bridge.cell.schema import Accused
+from gapbridge.bridge.cell.schema import CauseEntry
 from gapbridge.bridge.cli.options import FILE, cell_option, open_cell
 from gapbridge.bridge.document.output_file import require_writable, write_text
 from gapbridge.bridge.patch.model_format import PatchOptions
@@ -61,14 +61,14 @@ def patch(
     require_writable(out, model, cell)
     options = _options(given, out, joints, tcp, load)
     bounds = None if parameters is None else _bounds(model, given, options, parameters, (out, cell))
-    ties = tie_lines(given.accused, given.model.terms)
+    ties = tie_lines(given.causes, given.model.terms)
     patched = kind.patch(model, changes_of(given.model), options, [f"cell: {cell.name}", *ties])
     write_text(out, patched.text)
     for line in patched.changed:
         click.echo(line)
     if not patched.changed:
         click.echo("nothing changed: the cell has no effect that this format holds")
-    for line in patched.not_held:
+    for line in patched.unsupported:
         click.echo(f"not held: {line}")
     for line in ties:
         click.echo(line)
@@ -104,7 +104,7 @@ def _bounds(
     return parameters_text(model, cell, options, suffix)
 
 
-def tie_lines(accused: Sequence[Accused], terms: Sequence[Term]) -> tuple[str, ...]:
+def tie_lines(accused: Sequence[CauseEntry], terms: Sequence[Term]) -> tuple[str, ...]:
     """Return one line for each accused effect that has ties and is in the model: both candidates.
 
     The accused one is in the model with its value; of the other it is said how people put it in

@@ -11,7 +11,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from gapbridge.bridge.api.found_spread import fit_intervals
+from gapbridge.bridge.api.uncertainty import fit_intervals
 from gapbridge.bridge.cell import Cell, save_cell
 from gapbridge.bridge.cell.log_fit import pose_findings
 from gapbridge.bridge.cli.log.large_log import LargeLog, has_sessions, is_large

@@ -66,7 +66,7 @@ def test_a_tie_is_a_comment_with_both_candidates(folder: Path, model: str) -> No
 
 def test_what_was_not_accused_is_never_written(folder: Path) -> None:
     done = patch(folder, "arm.xml", "--out", "out.xml")
-    assert "not held: viscous_friction of joint 2: a stand-in, not accused" in done.out
+    assert "not held: viscous_friction of joint 2: a stand-in, not a confirmed cause" in done.out
     compiled = mujoco.MjModel.from_xml_path(str(folder / "out.xml"))
     assert np.ravel(compiled.dof_damping[compiled.joint(UR_JOINTS[1]).dofadr[0]])[0] == 0
 

@@ -43,7 +43,7 @@ SOME_Q = np.random.default_rng(5).uniform(-2, 2, (12, 6))
 def patched(path: Path, text: str, model: Model, tcp: str) -> tuple[str, list[str], list[str]]:
     path.write_text(text)
     found = format_of(path).patch(path, changes_of(model), PatchOptions(tcp=tcp), ["a note"])
-    return found.text, list(found.changed), list(found.not_held)
+    return found.text, list(found.changed), list(found.unsupported)
 
 
 def fitting(terms: tuple[Term, ...]) -> tuple[Term, ...]:

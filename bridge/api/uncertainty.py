@@ -1,4 +1,4 @@
-"""What a diagnosis found, as cells keep it: covariance, intervals, what was accused, with ties."""
+"""Uncertainty of a fit or diagnosis as cells keep it: covariance, intervals, causes with ties."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from gapbridge.core.effects import flexibility_names
 from gapbridge.core.estimation.identification import Identification
 
 
-def spread_of(found: Diagnosis) -> Spread:
+def spread_of(diagnosis: Diagnosis) -> Spread:
     """Return the covariance of the position channel's causes, each effect's numbers by itself."""
-    for channel in found.channels:
+    for channel in diagnosis.channels:
         if channel.channel == "position":
             selection = channel.selection
             pairs = zip(selection.terms, selection.covariance, strict=True)
-            causes = [(term, own) for term, own in pairs if term in found.terms]
-            terms, covariance = [t for t, _ in causes], [own for _, own in causes]
-            return Spread.of_terms(found.model, terms, covariance)
+            causes = [(term, block) for term, block in pairs if term in diagnosis.terms]
+            terms, covariance = [t for t, _ in causes], [block for _, block in causes]
+            return Spread.of_terms(diagnosis.model, terms, covariance)
     return Spread.none()
 
 
-def accused(found: Diagnosis, earlier: Sequence[Any] = ()) -> list[dict[str, Any]]:
+def cause_entries(diagnosis: Diagnosis, earlier: Sequence[Any] = ()) -> list[dict[str, Any]]:
     """Return the causes with values, standard deviations and ties, as the cell's provenance.
 
-    ``earlier``: entries of the cell that was diagnosed, which are kept where nothing new is said.
+    ``earlier``: the diagnosed cell's entries; those without a parameter of a new cause are kept.
     """
     entries: list[dict[str, Any]] = [
         {
@@ -41,11 +41,11 @@ def accused(found: Diagnosis, earlier: Sequence[Any] = ()) -> list[dict[str, Any
             ],
             "indistinguishable_from": list(cause.indistinguishable_from),
         }
-        for channel in found.channels
+        for channel in diagnosis.channels
         for cause in channel.causes
     ]  # fmt: skip
     new = {p["name"] for entry in entries for p in entry["parameters"]}
-    kept = [one.model_dump() for one in earlier if not new & {p.name for p in one.parameters}]
+    kept = [old.model_dump() for old in earlier if not new & {p.name for p in old.parameters}]
     return [*entries, *kept]
 
 
@@ -54,22 +54,20 @@ def _known(std: float | None) -> float | None:
 
 
 def intervals_applied(
-    found: Diagnosis, *, stand_ins: bool = False
+    diagnosis: Diagnosis, *, stand_ins: bool = False
 ) -> dict[str, tuple[float, float]]:
     """Return the 95 % interval of each number that ``--apply`` writes, by name."""
     applied = [
         cause
-        for channel in found.channels
+        for channel in diagnosis.channels
         for cause in (*channel.causes, *(channel.stand_ins if stand_ins else ()))
     ]
     return intervals_of((p.name, p.value, p.std) for cause in applied for p in cause.parameters)
 
 
-def fit_intervals(found: Identification) -> dict[str, tuple[float, float]]:
+def fit_intervals(fit: Identification) -> dict[str, tuple[float, float]]:
     """Return the 95 % interval of each flexibility that a fit determines, by name, rad/Nm."""
-    values = np.concatenate([found.axial, found.radial])
-    stds = np.concatenate([found.std_axial, found.std_radial])
-    numbers = zip(
-        flexibility_names(len(values) // 2), values, stds, found.identifiable, strict=True
-    )
-    return intervals_of((name, float(v), float(std)) for name, v, std, shown in numbers if shown)
+    values = np.concatenate([fit.axial, fit.radial])
+    stds = np.concatenate([fit.std_axial, fit.std_radial])
+    numbers = zip(flexibility_names(len(values) // 2), values, stds, fit.identifiable, strict=True)
+    return intervals_of((name, float(v), float(std)) for name, v, std, known in numbers if known)
