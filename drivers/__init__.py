@@ -33,10 +33,10 @@ def make_driver(settings: DriverSettings, model: Model, bounds: GateBounds | Non
     if name not in DRIVERS:
         raise LinkError(f"link.driver: found {name!r}, expected one of {', '.join(DRIVERS)}")
     try:
-        found = resolve_name(DRIVERS[name])
+        driver_class = resolve_name(DRIVERS[name])
     except ImportError as error:
         raise LinkError(f"link.driver {name}: its library cannot be imported: {error}") from None
-    driver = cast("Driver", found(settings, model))
+    driver = cast("Driver", driver_class(settings, model))
     if bounds is not None:
         driver.gate.hold_to(bounds)
     return driver

@@ -19,19 +19,19 @@ def address_of(link: DriverSettings) -> str:
     A host is what its name resolves to, once for the whole run. A port is left out where it is the
     protocol's own: RTDE and Modbus of one robot are one controller, ports of a gateway are not.
     """
-    given = link.model_dump(mode="json")
-    if "interface" in given:  # a bus, with a whole arm by each profile
-        host = given.get("host")
-        bus = {**given, "host": None if host is None else resolved(str(host))}
+    settings = link.model_dump(mode="json")
+    if "interface" in settings:  # a bus, with a whole arm by each profile
+        host = settings.get("host")
+        bus = {**settings, "host": None if host is None else resolved(str(host))}
         names = ("interface", "host", "port", "channel", "profile")
         return "bus " + " ".join(f"{bus.get(k)}" for k in names)
-    if given.get("transport") == "rtu":
-        return f"serial {_real(given['serial'])} unit {given.get('device_id')}"
-    if "host" not in given:
-        return f"host {given.get('file', link)}"
-    port = given.get("port")
-    at = f" port {port}" if port is not None and port not in OWN_PORTS else ""
-    return f"host {resolved(str(given['host']))}{at}"
+    if settings.get("transport") == "rtu":
+        return f"serial {_real(settings['serial'])} unit {settings.get('device_id')}"
+    if "host" not in settings:
+        return f"host {settings.get('file', link)}"
+    port = settings.get("port")
+    port_text = f" port {port}" if port is not None and port not in OWN_PORTS else ""
+    return f"host {resolved(str(settings['host']))}{port_text}"
 
 
 @functools.cache
@@ -43,10 +43,10 @@ def resolved(host: str) -> str:
     with contextlib.suppress(ValueError):
         return str(ipaddress.ip_address(host))
     try:
-        found = socket.getaddrinfo(host, None, socket.AF_INET, socket.SOCK_STREAM)
+        addresses = socket.getaddrinfo(host, None, socket.AF_INET, socket.SOCK_STREAM)
     except (OSError, UnicodeError):
         return host.lower().rstrip(".")
-    return min(str(address[0]) for *_, address in found)
+    return min(str(address[0]) for *_, address in addresses)
 
 
 def _real(path: str) -> str:

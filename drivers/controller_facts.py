@@ -62,20 +62,24 @@ def differences(
     """
     if facts.n != model.arm.n:
         return [Difference(("robot",), f"{model.arm.n} joints", f"{facts.n}, as the controller")]
-    found = [*_geometry(facts, model), *_tool(facts, model, tolerance), *_load(facts, model)]
+    result = [*_geometry(facts, model), *_tool(facts, model, tolerance), *_load(facts, model)]
     if rate is not None and facts.rate is not None and rate > 1.02 * facts.rate:
-        found.append(
+        result.append(
             Difference(("link", "rate"), f"{rate:g} Hz", f"at most {facts.rate:g} Hz", sure=False)
         )
-    return found
+    return result
 
 
 def _geometry(facts: ControllerFacts, model: Model) -> Iterator[Difference]:
     if facts.arm is not None:
         q = np.random.default_rng(0).uniform(-np.pi, np.pi, (POSES, facts.n))
-        theirs = flange_in_first(facts.arm, q)[:, :3, 3]
-        ours = flange_in_first(model.arm, q)[:, :3, 3]
-        off = np.linalg.norm(register_robustly(ours, theirs).in_base(ours) - theirs, axis=1)
+        controller_points = flange_in_first(facts.arm, q)[:, :3, 3]
+        model_points = flange_in_first(model.arm, q)[:, :3, 3]
+        off = np.linalg.norm(
+            register_robustly(model_points, controller_points).in_base(model_points)
+            - controller_points,
+            axis=1,
+        )
         apart, name = float(off.max()), facts.model or "the controller's arm"
         if apart > OTHER_ARM:
             yield Difference(
@@ -102,12 +106,12 @@ def _geometry(facts: ControllerFacts, model: Model) -> Iterator[Difference]:
 def _tool(facts: ControllerFacts, model: Model, tolerance: float) -> Iterator[Difference]:
     if facts.tcp is None:
         return
-    ours, theirs = model.tool_in_flange, facts.tcp
-    apart = float(np.linalg.norm(ours[:3, 3] - theirs[:3, 3]))
-    cosine = 0.5 * (float(np.trace(ours[:3, :3].T @ theirs[:3, :3])) - 1.0)
+    model_tcp, controller_tcp = model.tool_in_flange, facts.tcp
+    apart = float(np.linalg.norm(model_tcp[:3, 3] - controller_tcp[:3, 3]))
+    cosine = 0.5 * (float(np.trace(model_tcp[:3, :3].T @ controller_tcp[:3, :3])) - 1.0)
     turned = float(np.arccos(np.clip(cosine, -1.0, 1.0)))
     if apart > 1e-5 or turned > 1e-4:
-        given_text = ", ".join(f"{v:.5g}" for v in theirs[:3, 3])
+        given_text = ", ".join(f"{v:.5g}" for v in controller_tcp[:3, 3])
         # the flange of a URDF may have other axes than the controller's
         sure = (apart > tolerance or turned > TCP_TURNED) and not model.arm.joint_names
         yield Difference(
@@ -129,11 +133,11 @@ def _load(facts: ControllerFacts, model: Model) -> Iterator[Difference]:
             ("payload", "cog"), f"[{', '.join(f'{v:g}' for v in model.payload_cog)}]",
             f"[{given_text}], as the controller has it", sure=False,
         )  # fmt: skip
-    given = facts.gravity
-    if given is not None and np.linalg.norm(given) > 1.0:
-        apart = np.abs(given - model.gravity)
+    gravity = facts.gravity
+    if gravity is not None and np.linalg.norm(gravity) > 1.0:
+        apart = np.abs(gravity - model.gravity)
         if np.linalg.norm(apart) > TILTED:
-            given_text = ", ".join(f"{v + 0.0:.4g}" for v in given)
+            given_text = ", ".join(f"{v + 0.0:.4g}" for v in gravity)
             # the base of a URDF may have other horizontal axes than the controller's
             sure = not model.arm.joint_names or bool(apart[2] > TILTED)
             yield Difference(

@@ -114,13 +114,13 @@ class Driver(ABC):
         the controller's arm, TCP or gravity are not the cell's; returns what else differs.
         """
         self.gate.end()
-        found = self.differences(state)
-        for wrong in found:
+        differing = self.differences(state)
+        for wrong in differing:
             if wrong.sure:
                 raise WriteError(f"{wrong} (gapbridge check --live)")
         self._make_ready(state)
         self.gate.begin(state.target_q, state.actual_q)
-        return found
+        return differing
 
     def _make_ready(self, state: RobotState) -> None:
         """Do what ``arm`` promises; see there."""

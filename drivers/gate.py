@@ -164,11 +164,11 @@ def _judge(links, joints, offsets, numbers, budget, moves, first):  # type: igno
             return FAR_OFFSET, -1, length, 0.0
         if turn > OUTERMOST_TURN * SECOND_ORDER:
             return FAR_TURN, -1, turn, 0.0
-        reason, joint, found, travel = _judge_joints(links, joints, numbers, first)
+        reason, joint, value, travel = _judge_joints(links, joints, numbers, first)
     else:
-        reason, joint, found, travel = _judge_offsets(offsets, numbers, length, turn)
+        reason, joint, value, travel = _judge_offsets(offsets, numbers, length, turn)
     if reason != FINE:
-        return reason, joint, found, 0.0
+        return reason, joint, value, 0.0
     if travel > numbers[5] * (1.0 + GRAIN):
         return STEP, -1, travel, 0.0
     if travel > budget:
@@ -248,16 +248,16 @@ class Gate:
         if self._started is not None:
             self._check_start(joints[0])
         budget = min(self._budget + DRIFT * max(self._clock() - self._at, 0.0), self._most)
-        code, joint, found, self._travel = self._judged(budget)
+        code, joint, value, self._travel = self._judged(budget)
         if code != FINE:
-            raise GateError(self._reason(code, joint, found))
+            raise GateError(self._reason(code, joint, value))
 
     def _judged(self, budget: float) -> tuple[int, int, float, float]:
-        code, joint, found, travel = _judge(
+        code, joint, value, travel = _judge(
             self._links, self._joints, self._offsets, self._numbers, budget, self._moves_arm,
             self._started is not None,
         )  # fmt: skip
-        return int(code), int(joint), float(found), float(travel)
+        return int(code), int(joint), float(value), float(travel)
 
     def _check_start(self, q: Array) -> None:
         assert self._started is not None
@@ -276,20 +276,20 @@ class Gate:
         self._joints[2], self._offsets[1] = self._joints[0], self._offsets[0]
         self._started = None
 
-    def _reason(self, code: int, joint: int, found: float) -> str:
+    def _reason(self, code: int, joint: int, value: float) -> str:
         where = f"gate: joint {joint + 1}: " if joint >= 0 else "gate: "
         lower, upper = self._joints[3, joint], self._joints[4, joint]
-        bounds, takes = self.bounds, f"found a step that takes {1e3 * found:.1f} ms at the rates"
+        bounds, takes = self.bounds, f"found a step that takes {1e3 * value:.1f} ms at the rates"
         message = {
-            NOT_FINITE: f"found {found}, expected a finite number",
-            OUTSIDE: f"found {found:.4f} rad, expected {lower:.4f} to {upper:.4f}",
-            FAR_OFFSET: f"found an offset of {found:.6f} m, expected at most {bounds.offset:g}",
-            FAR_TURN: f"found an offset of {found:.6f} rad, expected at most "
+            NOT_FINITE: f"found {value}, expected a finite number",
+            OUTSIDE: f"found {value:.4f} rad, expected {lower:.4f} to {upper:.4f}",
+            FAR_OFFSET: f"found an offset of {value:.6f} m, expected at most {bounds.offset:g}",
+            FAR_TURN: f"found an offset of {value:.6f} rad, expected at most "
             f"{bounds.offset_rotation:g}",
-            JOINT_OFFSET: f"found {found:.4f} rad from its nominal setpoint, expected at most "
+            JOINT_OFFSET: f"found {value:.4f} rad from its nominal setpoint, expected at most "
             f"{bounds.joint_offset:g}",
             STEP: f"{takes}, expected at most {1e3 * self._longest:.1f} ms",
             RATE: f"{takes}, more than has passed",
-            AWAY: f"found a first setpoint {found:.4f} rad from the arm, expected at most {START}",
+            AWAY: f"found a first setpoint {value:.4f} rad from the arm, expected at most {START}",
         }
         return where + message[code]

@@ -53,13 +53,13 @@ class ProfileSettings(DriverSettings):
 
     def located(self, folder: Path) -> Self:
         """Return the settings with whole paths. Raises InputError for no such profile."""
-        found = super().located(folder)
+        settings = super().located(folder)
         if self.names_file:
-            return found.model_copy(update={"profile": str((folder / self.profile).resolve())})
+            return settings.model_copy(update={"profile": str((folder / self.profile).resolve())})
         if not self.profile_path.is_file():
             shipped = ", ".join(sorted(path.stem for path in self.shipped.glob("*.yaml")))
             raise InputError(
                 f"link.profile: found {self.profile!r}, expected one of {shipped}, or a path "
                 "ending in .yaml"
             )
-        return found
+        return settings

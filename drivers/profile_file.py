@@ -24,10 +24,10 @@ class ProfileDocument(Document):
         """Return the error that says ``message`` about a key path."""
         return ProfileError(f"{self.path}, line {self.line(keys)}: {name_of(keys)}: {message}")
 
-    def require_joints(self, found: int, expected: int | None) -> None:
+    def require_joints(self, count: int, expected: int | None) -> None:
         """Raise ProfileError where a profile has not as many joints as the arm; None: any."""
-        if expected is not None and found != expected:
-            raise self.error(("joints",), f"found {found}, expected {expected}: the arm has those")
+        if expected is not None and count != expected:
+            raise self.error(("joints",), f"found {count}, expected {expected}: the arm has those")
 
 
 def name_of(keys: Keys) -> str:
@@ -56,8 +56,8 @@ def read_profile_file(
     ``refusal`` makes an error of the first thing that pydantic objects to; a misspelt key comes
     before the one it lacks. Raises ProfileError, also where the file cannot be read or is broken.
     """
-    found = read_yaml(path, PROFILE)
-    document = ProfileDocument(found.path, found.text, found.root, found.data)
+    source = read_yaml(path, PROFILE)
+    document = ProfileDocument(source.path, source.text, source.root, source.data)
     try:
         return document, schema.model_validate(document.data)
     except ValidationError as error:

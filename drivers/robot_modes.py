@@ -1,4 +1,4 @@
-"""What a robot is in, in RTDE's numbers, whatever the controller: one table for all drivers.
+"""Robot and safety modes in RTDE's numbers, whatever the controller: one table for all drivers.
 
 Source: Universal Robots, RTDE guide (robot_mode, safety_mode, safety_status_bits): bits 0 normal, 2
 protective stop, 6 robot emergency stop, 7 emergency stop, 9 fault, 10 stopped due to safety.
@@ -7,7 +7,8 @@ protective stop, 6 robot emergency stop, 7 emergency stop, 9 fault, 10 stopped d
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Literal, NamedTuple
+from enum import StrEnum
+from typing import NamedTuple
 
 from gapbridge.core.state import RobotState
 
@@ -17,8 +18,14 @@ STOPPED = 1 << 10
 STOPS = 0b111_1111_1100  # safety_status_bits: all but normal and reduced mode
 PLAYING = 2  # runtime_state
 
-StopReason = Literal["not_ready", "protective_stop", "emergency_stop", "fault"]
-"""What keeps a robot from moving, as profiles name it."""
+
+class StopReason(StrEnum):
+    """What keeps a robot from moving, as profiles name it."""
+
+    NOT_READY = "not_ready"
+    PROTECTIVE_STOP = "protective_stop"
+    EMERGENCY_STOP = "emergency_stop"
+    FAULT = "fault"
 
 
 class Modes(NamedTuple):
@@ -29,18 +36,18 @@ class Modes(NamedTuple):
     safety_status_bits: int
 
 
-MODES: dict[str, Modes] = {
-    "": Modes(RUNNING, NORMAL, 1),
-    "not_ready": Modes(IDLE, NORMAL, 1),
-    "protective_stop": Modes(RUNNING, PROTECTIVE_STOP, 1 << 2 | STOPPED),
-    "emergency_stop": Modes(POWER_OFF, EMERGENCY_STOP, 1 << 6 | 1 << 7 | STOPPED),
-    "fault": Modes(RUNNING, FAULT, 1 << 9 | STOPPED),
+MODES: dict[StopReason | None, Modes] = {
+    None: Modes(RUNNING, NORMAL, 1),
+    StopReason.NOT_READY: Modes(IDLE, NORMAL, 1),
+    StopReason.PROTECTIVE_STOP: Modes(RUNNING, PROTECTIVE_STOP, 1 << 2 | STOPPED),
+    StopReason.EMERGENCY_STOP: Modes(POWER_OFF, EMERGENCY_STOP, 1 << 6 | 1 << 7 | STOPPED),
+    StopReason.FAULT: Modes(RUNNING, FAULT, 1 << 9 | STOPPED),
 }
-"""A reason to stop, as profiles name it -> what every driver reports."""
+"""A stop reason -> what every driver reports; None: the robot may move."""
 
 
 def why_not_ready(state: RobotState) -> str:
-    """Return in words what keeps the robot from moving; empty: nothing does."""
+    """Return why the robot cannot move, as text; empty where it can."""
     stops = state.safety_status_bits & STOPS
     if state.robot_mode == RUNNING and state.safety_mode in (NORMAL, REDUCED) and not stops:
         return ""
@@ -48,15 +55,15 @@ def why_not_ready(state: RobotState) -> str:
     return f"{detail}, safety_status_bits {state.safety_status_bits:#b}" if stops else detail
 
 
-def modes_of(stop_reasons: Iterable[str]) -> Modes:
+def modes_of(stop_reasons: Iterable[StopReason | None]) -> Modes:
     """Return the modes of all ``stop_reasons`` at once: the gravest of each, all stops' bits."""
-    found = MODES[""]
+    combined = MODES[None]
     for reason in stop_reasons:
         mode = MODES[reason]
-        bits = found.safety_status_bits | mode.safety_status_bits
-        found = Modes(
-            min(found.robot_mode, mode.robot_mode),
-            max(found.safety_mode, mode.safety_mode),
+        bits = combined.safety_status_bits | mode.safety_status_bits
+        combined = Modes(
+            min(combined.robot_mode, mode.robot_mode),
+            max(combined.safety_mode, mode.safety_mode),
             bits & ~1 if bits & STOPPED else bits,
         )
-    return found
+    return combined

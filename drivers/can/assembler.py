@@ -18,7 +18,8 @@ from typing import NamedTuple
 import numpy as np
 
 from gapbridge.core.arrays import Array
-from gapbridge.drivers.can.profile import CanProfile, Incoming, Key
+from gapbridge.drivers.can.profile import CanProfile, Incoming, Key, Status
+from gapbridge.drivers.robot_modes import StopReason
 
 QUANTITIES = ("position", "velocity", "torque", "temperature")
 UNSTEADY = (
@@ -52,22 +53,26 @@ class Assembler:
         self._zero = np.zeros_like(self._scale)
         self._zero[0] = joints.zero
         self._wire = np.full_like(self._scale, np.nan)  # (q, n): last values, the wire's units
-        self._held: dict[Key, dict[str, float]] = {}
+        self._frames: dict[Key, dict[str, float]] = {}
         self._first = 0.0  # s, bus clock
         self._began = 0.0  # s, monotonic
         self._count: float | None = None
         self._tied = profile.ordered or profile.counted or bool(profile.request)
-        self._own: dict[Key, float] = {}  # s, bus clock: last frame of each message of the sample
+        self._last_stamps: dict[
+            Key, float
+        ] = {}  # s, bus clock: last frame of each message of the sample
         self._steady = True  # all frames of the sample begun came a period after their own last one
         self._order: list[Key] = []  # of the sample last given
-        self._given = -math.inf  # s, bus clock: that sample's last frame
+        self._sample_stamp = -math.inf  # s, bus clock: that sample's last frame
         self.dropped: Counter[str] = Counter()  # reason -> frames or sets
-        self.status: dict[tuple[Key, str], tuple[float, str, bool]] = {}
+        self.status: dict[tuple[Key, str], Status] = {}
         self.enabled: dict[tuple[Key, str], bool] = {}
         self.received_at: dict[Key, float] = {}  # s, monotonic, of each message that we read
         self.stopping: set[tuple[Key, str]] = set()  # members of ``status`` that report a stop
-        self.cleared: dict[tuple[Key, str], tuple[float, str, bool]] = {}  # those that have ended
-        self._seen: dict[Key, bytes] = {}  # last bytes of messages beside the sample
+        self.cleared: dict[
+            tuple[Key, str], tuple[float, StopReason | None, bool]
+        ] = {}  # those that have ended
+        self._last_bytes: dict[Key, bytes] = {}  # last bytes of messages outside the sample
 
     @property
     def broken(self) -> int:
@@ -77,13 +82,15 @@ class Assembler:
     @property
     def missing(self) -> list[str]:
         """Return the messages that a sample still lacks which has been begun; none: not begun."""
-        if not self._held:
+        if not self._frames:
             return []
-        return [self._profile.incoming[k].name for k in self._profile.sample if k not in self._held]
+        return [
+            self._profile.incoming[k].name for k in self._profile.sample if k not in self._frames
+        ]
 
     def reset(self) -> None:
         """Forget a sample that has been begun."""
-        self._held.clear()
+        self._frames.clear()
 
     def take(self, key: Key, data: bytes, stamp: float, received: float) -> Sample | None:
         """Take one frame; returns the sample that it completes. Raises nothing.
@@ -93,7 +100,9 @@ class Assembler:
         incoming = self._profile.incoming.get(key)
         if incoming is None:
             return None
-        if self._seen.get(key) == data:  # the same bytes say the same: most of an arm's status
+        if (
+            self._last_bytes.get(key) == data
+        ):  # the same bytes say the same: most of an arm's status
             self.received_at[key] = received
             return None
         try:
@@ -106,7 +115,7 @@ class Assembler:
             self._note(incoming, values)
         if key in self._members:
             return self._collect(incoming, values, stamp, received)
-        self._seen[key] = data
+        self._last_bytes[key] = data
         self._read(incoming, values)
         return None
 
@@ -133,54 +142,54 @@ class Assembler:
         self, incoming: Incoming, values: dict[str, float], stamp: float, received: float
     ) -> Sample | None:
         profile, key = self._profile, incoming.key
-        if self._held and self._breaks(incoming, values, stamp):
+        if self._frames and self._breaks(incoming, values, stamp):
             self.dropped["torn"] += 1
-            self._held.clear()
-        if profile.ordered and profile.sample[len(self._held)] != key:
+            self._frames.clear()
+        if profile.ordered and profile.sample[len(self._frames)] != key:
             self.dropped["out of order"] += 1
-            self._held.clear()
+            self._frames.clear()
             return None
-        if not self._held:
+        if not self._frames:
             self._first, self._began, self._steady = stamp, received, True
-        self._held[key] = values
-        since, self._own[key] = stamp - self._own.get(key, -math.inf), stamp
+        self._frames[key] = values
+        since, self._last_stamps[key] = stamp - self._last_stamps.get(key, -math.inf), stamp
         self._steady &= abs(since * profile.rate - 1.0) <= UNSTEADY
-        if len(self._held) < len(self._members):
+        if len(self._frames) < len(self._members):
             return None
-        held, self._held = self._held, {}
+        frames, self._frames = self._frames, {}
         if incoming.counter is not None:
             if values[incoming.counter] == self._count:
                 self.dropped["repeated"] += 1
                 return None
             self._count = values[incoming.counter]
-        if not self._tied and self._doubtful(list(held), stamp):
+        if not self._tied and self._doubtful(list(frames), stamp):
             self.dropped["out of order"] += 1
             return None
-        for member, found in held.items():
-            self._read(profile.incoming[member], found)
+        for member, signals in frames.items():
+            self._read(profile.incoming[member], signals)
         return self._sample(stamp, received)
 
     def _breaks(self, incoming: Incoming, values: dict[str, float], stamp: float) -> bool:
         """Return whether a frame cannot belong to the sample that has been begun."""
-        if incoming.key in self._held or not 0.0 <= stamp - self._first <= self._profile.window:
+        if incoming.key in self._frames or not 0.0 <= stamp - self._first <= self._profile.window:
             return True
-        if self._profile.ordered and self._profile.sample[len(self._held)] != incoming.key:
+        if self._profile.ordered and self._profile.sample[len(self._frames)] != incoming.key:
             return True
         counter = incoming.counter
         if counter is None:
             return False
         count = values[counter]
-        return any(v[counter] != count for v in self._held.values())
+        return any(v[counter] != count for v in self._frames.values())
 
     def _doubtful(self, order: list[Key], stamp: float) -> bool:
         """Return whether a whole sample may be of two cycles: another order, off the cadence.
 
         An order is forgotten with ``status_timeout``: after it the arm may have started anew.
         """
-        remembered = 0.0 <= stamp - self._given <= self._profile.status_timeout
+        remembered = 0.0 <= stamp - self._sample_stamp <= self._profile.status_timeout
         if remembered and order != self._order and not self._steady:
             return True
-        self._order, self._given = order, stamp
+        self._order, self._sample_stamp = order, stamp
         return False
 
     def _sample(self, stamp: float, received: float) -> Sample:

@@ -62,19 +62,19 @@ def read_dbc(path: Path) -> Dbc:
     except Exception as error:  # cantools raises its own, textparser's and KeyError
         raise ProfileError(f"{path}, line {_line_in(str(error))}: {_plain(error)}") from None
     messages: dict[str, Any] = {}
-    seen: dict[tuple[int, bool], str] = {}
+    message_names: dict[tuple[int, bool], str] = {}
     dbc = Dbc(path, messages, lines)
     for message in database.messages:
         if message.name in messages:
             raise dbc.error(message.name, "", "found twice, expected once")
         messages[message.name] = message
         key = (message.frame_id, message.is_extended_frame)
-        if key in seen:
+        if key in message_names:
             raise dbc.error(
                 message.name, "",
-                f"found identifier {message.frame_id:#x}, which is that of {seen[key]}",
+                f"found identifier {message.frame_id:#x}, which is that of {message_names[key]}",
             )  # fmt: skip
-        seen[key] = message.name
+        message_names[key] = message.name
         _check_message(dbc, message)
     return dbc
 
@@ -106,10 +106,10 @@ def _check_message(dbc: Dbc, message: Any) -> None:
 def _check_types(path: Path, text: str) -> None:
     """Refuse types that no DBC knows; cantools would take them for integers."""
     for number, line in enumerate(text.splitlines(), 1):
-        found = _TYPE.match(line)
-        if found and found[3] not in "012":
+        match = _TYPE.match(line)
+        if match and match[3] not in "012":
             raise ProfileError(
-                f"{path}, line {number}: SIG_VALTYPE_ {found[2]}: found type {found[3]}, "
+                f"{path}, line {number}: SIG_VALTYPE_ {match[2]}: found type {match[3]}, "
                 "expected 0 (integer), 1 (32-bit float) or 2 (64-bit float)"
             )
 
@@ -118,17 +118,17 @@ def _lines_of(text: str) -> dict[tuple[str, str], int]:
     lines: dict[tuple[str, str], int] = {}
     message = ""
     for number, line in enumerate(text.splitlines(), 1):
-        if found := _MESSAGE.match(line):
-            message = found[1]
+        if match := _MESSAGE.match(line):
+            message = match[1]
             lines.setdefault((message, ""), number)
-        elif found := _SIGNAL.match(line):
-            lines.setdefault((message, found[1]), number)
+        elif match := _SIGNAL.match(line):
+            lines.setdefault((message, match[1]), number)
     return lines
 
 
 def _line_in(text: str) -> int:
-    found = re.search(r"line (\d+)", text)
-    return int(found[1]) if found else 1
+    match = re.search(r"line (\d+)", text)
+    return int(match[1]) if match else 1
 
 
 def _plain(error: BaseException) -> str:

@@ -51,13 +51,13 @@ class CanDriver(Driver):
         self.writer = FrameWriter(settings, profile, clock)
         self._builder = StateBuilder(profile.n)
         self._armed_at: float | None = None  # s, monotonic
-        self._given = -1.0  # s, received of the sample last returned
+        self._returned_at = -1.0  # s, received of the sample last returned
         self._slot = 0.0  # s, when an arm that must be asked is asked next
         self._changed = 0.0  # s, monotonic: when the joints last changed
         self._q: Array | None = None
         self._angles: list[float] = []  # the same, as they were reported in the last sample
         self._broken = 0  # samples dropped, as far as they were reported
-        self._kept: Sample | None = None  # came before a dropped one was reported
+        self._pending: Sample | None = None  # came before a dropped one was reported
         self._listening = 0.0  # s, monotonic: since when other commanders would be heard
 
     # -- reading ----------------------------------------------------------------------------------
@@ -68,18 +68,18 @@ class CanDriver(Driver):
         self.writer.use(self.reader.bus)
         self._listening = self._now()
         end = self._now() + min(FIRST_SAMPLE, self.settings.connect_timeout)
-        found = False
-        while not found or self.reader.silent_status():
+        received = False
+        while not received or self.reader.silent_status():
             if self._now() > end:
-                raise self._nothing_received(found)
+                raise self._nothing_received(received)
             self._ask()
-            found = self.reader.listen(max(1.0 / self.rate, SLICE)) is not None or found
+            received = self.reader.listen(max(1.0 / self.rate, SLICE)) is not None or received
         self._changed = self._now()
         self._begin_anew()
 
     def _begin_anew(self) -> None:
         """Let what came while nobody asked for states be: torn frames, stops that are over."""
-        self._broken, self._kept = self.reader.assembler.broken, None
+        self._broken, self._pending = self.reader.assembler.broken, None
         self._builder.forget()
         self.reader.forget_cleared()
 
@@ -101,8 +101,8 @@ class CanDriver(Driver):
 
     def _read_state(self) -> RobotState:
         """Return the newest complete sample that was not returned yet; see Driver.read_state."""
-        sample = self._asked() if self.profile.request else self._awaited()
-        self._given = sample.received
+        sample = self._requested() if self.profile.request else self._received()
+        self._returned_at = sample.received
         if silent := self.reader.silent_status():
             raise StaleStateError(
                 f"{self.settings.where()}: no {silent} for {self.profile.status_timeout:g} s"
@@ -120,17 +120,17 @@ class CanDriver(Driver):
         self._builder.remember()
         self.reader.forget_cleared()
 
-    def _awaited(self) -> Sample:
+    def _received(self) -> Sample:
         """Return the next sample of an arm that sends by itself; slower where we want fewer."""
         end = self._now() + self.settings.state_timeout
-        earliest = self._given + 1.0 / self.rate - 0.5 / self.profile.rate
-        sample, self._kept = self.reader.newest() or self._kept, None
+        earliest = self._returned_at + 1.0 / self.rate - 0.5 / self.profile.rate
+        sample, self._pending = self.reader.newest() or self._pending, None
         self._check_torn(sample)
         while sample is None or sample.received < earliest:
-            left = end - self._now()
-            if left <= 0.0:
+            remaining = end - self._now()
+            if remaining <= 0.0:
                 raise self._stale()
-            sample = self.reader.poll(min(left, SLICE)) or sample
+            sample = self.reader.poll(min(remaining, SLICE)) or sample
             self._check_torn(sample)
         return sample
 
@@ -138,13 +138,13 @@ class CanDriver(Driver):
         """Report, once, that frames have come which make no sample; a good one is kept."""
         broken, self._broken = self._broken, self.reader.assembler.broken
         if self._broken > broken:
-            self._kept = sample
+            self._pending = sample
             detail = ", ".join(f"{n} {why}" for why, n in self.reader.assembler.dropped.items())
             raise InvalidStateError(
                 f"{self.profile.name}: frames that make no sample were dropped (so far {detail})"
             )
 
-    def _asked(self) -> Sample:
+    def _requested(self) -> Sample:
         """Return the sample that an arm gives when it is asked, once per cycle."""
         now = self._now()
         self._slot = max(self._slot + 1.0 / self.rate, now - 1.0 / self.rate)
@@ -152,14 +152,14 @@ class CanDriver(Driver):
             self.reader.listen(self._slot - now)
         self.reader.newest()
         self.reader.assembler.reset()
-        asked = self._now()
+        requested_at = self._now()
         self._ask()
-        end = asked + self.settings.state_timeout
+        end = requested_at + self.settings.state_timeout
         patience = max(ANSWER, 2.0 / self.rate)
-        whole = asked + patience
-        while (left := end - self._now()) > 0.0:
-            sample = self.reader.poll(min(left, SLICE))
-            if sample is not None and sample.began >= asked:
+        whole = requested_at + patience
+        while (remaining := end - self._now()) > 0.0:
+            sample = self.reader.poll(min(remaining, SLICE))
+            if sample is not None and sample.began >= requested_at:
                 return sample
             if (now := self._now()) <= whole:
                 continue
@@ -170,7 +170,9 @@ class CanDriver(Driver):
         raise self._stale()
 
     def _stale(self) -> StaleStateError:
-        silent = f"for {self._now() - self._given:.3f} s" if self._given > 0.0 else "yet"
+        silent = (
+            f"for {self._now() - self._returned_at:.3f} s" if self._returned_at > 0.0 else "yet"
+        )
         errors = self.reader.error_frames
         detail = f" ({errors} error frames so far)" if errors else ""
         return StaleStateError(
@@ -212,7 +214,7 @@ class CanDriver(Driver):
         foreign = self.reader.foreign
         if foreign is not None and self._now() - foreign.seen < quiet:
             raise self._commanded_by_another()
-        self._kept = None
+        self._pending = None
         reason, message = self.reader.stop_reason(writing=False)
         if reason:
             raise WriteError(f"{self.profile.name}: {reason}: {message}")
@@ -239,9 +241,9 @@ class CanDriver(Driver):
     def _listen(self, seconds: float) -> None:
         """Read for a while, asking those that must be asked; keeps the present joints."""
         end = self._now() + seconds
-        while (left := end - self._now()) > 0.0 or seconds == 0.0:
+        while (remaining := end - self._now()) > 0.0 or seconds == 0.0:
             self._ask()
-            sample = self.reader.listen(min(max(left, 0.001), 1.0 / self.rate))
+            sample = self.reader.listen(min(max(remaining, 0.001), 1.0 / self.rate))
             if sample is not None and np.isfinite(sample.position).all():
                 self._q, self._angles = sample.position, sample.position.tolist()
             if seconds == 0.0:

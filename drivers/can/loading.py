@@ -154,21 +154,23 @@ class OutgoingLoading:
 
     def actions(self, steps: Sequence[Step], key: str) -> tuple[Action, ...]:
         """Return the steps of a sequence. Raises ProfileError."""
-        found = []
+        result = []
         for i, step in enumerate(steps):
             if step.until in ("enabled", "disabled") and self.file.enabled is None:
                 raise self.names.error((key, i, "until"), "found no key `enabled` to show it")
             if step.hold and self.file.setpoint is None:
                 raise self.names.error((key, i, "hold"), "found no key `setpoint` to hold with")
             frames = self.frames(step.send, (key, i, "send"))
-            found.append(Action(frames, step.hold, step.wait, step.until, step.within, step.every))
-        return tuple(found)
+            result.append(Action(frames, step.hold, step.wait, step.until, step.within, step.every))
+        return tuple(result)
 
     def control(self, sends: frozenset[Key]) -> frozenset[Key]:
         """Return what only a commander sends; asking for feedback is no commanding."""
-        further = frozenset(self.names.key(identifier) for identifier in self.file.control)
-        asked = {self.names.message(frame.message, ("request",))[1] for frame in self.file.request}
-        return (sends | further) - asked
+        declared = frozenset(self.names.key(identifier) for identifier in self.file.control)
+        requests = {
+            self.names.message(frame.message, ("request",))[1] for frame in self.file.request
+        }
+        return (sends | declared) - requests
 
     def check_sends(self, profile: CanProfile) -> None:
         """Refuse a frame that the allow-list does not have, and feedback that we would send."""
@@ -207,7 +209,7 @@ def read_profile(path: Path, installation: Mapping[str, list[float]] | None = No
 def _schema_error(document: ProfileDocument, worst: ErrorDetails) -> ProfileError:
     """Return one line out of what pydantic says."""
     keys = tuple(key for key in worst["loc"] if key != "list[constrained-float]")
-    found = worst["input"] if not isinstance(worst["input"], dict | list) else "something else"
+    value = worst["input"] if not isinstance(worst["input"], dict | list) else "something else"
     if worst["type"] == "missing":
         text = "found nothing, expected this key"
     elif worst["type"] == "extra_forbidden":
@@ -215,7 +217,7 @@ def _schema_error(document: ProfileDocument, worst: ErrorDetails) -> ProfileErro
     elif worst["type"] == "value_error":
         text = worst["msg"].removeprefix("Value error, ")
     else:
-        text = f"found {found!r}, {worst['msg'][0].lower()}{worst['msg'][1:]}"
+        text = f"found {value!r}, {worst['msg'][0].lower()}{worst['msg'][1:]}"
     return document.error(keys, text)
 
 
@@ -258,8 +260,8 @@ class _Loading:
     def _joints(self) -> JointMap:
         file, feedback = self.file, self.file.feedback
         sign = np.array(self._per_joint("direction", file.direction, 1.0))
-        given = file.gear if isinstance(file.gear, list) else [file.gear] * self.n
-        gear = np.array(self._per_joint("gear", given, 1.0))
+        gears = file.gear if isinstance(file.gear, list) else [file.gear] * self.n
+        gear = np.array(self._per_joint("gear", gears, 1.0))
         if (gear == 0.0).any():
             raise self.names.error(("gear",), "found 0, expected a ratio that is not zero")
         zero = np.array(self._per_joint("zero", file.zero, 0.0))
@@ -281,12 +283,12 @@ class _Loading:
             counts.append(0.0 if signal.conversion.is_float else float(signal.conversion.scale))
         return JointMap(scale, zero, out, np.abs(out * np.array(counts)))
 
-    def _per_joint(self, key: str, given: Sequence[float] | None, left_out: float) -> list[float]:
-        if given is None:
+    def _per_joint(self, key: str, values: Sequence[float] | None, left_out: float) -> list[float]:
+        if values is None:
             return [left_out] * self.n
-        if len(given) != self.n:
-            raise self.names.error((key,), f"found {len(given)} values, expected {self.n}")
-        return [float(v) for v in given]
+        if len(values) != self.n:
+            raise self.names.error((key,), f"found {len(values)} values, expected {self.n}")
+        return [float(v) for v in values]
 
     def _units(self, quantity: Quantity, name: str, keys: Keys) -> Array:
         """Return SI in one wire unit (n,); checks that every joint is there, once."""
@@ -299,10 +301,12 @@ class _Loading:
             )
         factors = []
         for i, full in enumerate(quantity.signals):
-            at: Keys = (*keys, "signals", i)
-            message, signal = self.names.signal(full, at)
+            signal_keys: Keys = (*keys, "signals", i)
+            message, signal = self.names.signal(full, signal_keys)
             if quantity.signals.index(full) != i:
-                raise self.names.error(at, f"found {full} twice, expected one signal per joint")
+                raise self.names.error(
+                    signal_keys, f"found {full} twice, expected one signal per joint"
+                )
             unit = quantity.unit or signal.unit
             if unit in UNITS[name]:
                 factors.append(UNITS[name][unit])
@@ -335,16 +339,16 @@ class _Loading:
         for i, full in enumerate(self.file.enabled.signals if self.file.enabled else ()):
             message, signal = self.names.signal(full, ("enabled", "signals", i))
             enabled.setdefault(message.name, []).append(signal.name)
-        found: dict[Key, Incoming] = {}
+        incoming: dict[Key, Incoming] = {}
         counted = [*self.file.sample.messages] if self.file.sample.counter else []
         for name in dict.fromkeys([*readings, *checks, *enabled, *counted]):
             message, key = self.names.message(name, self._place(name))
-            found[key] = Incoming(
+            incoming[key] = Incoming(
                 name, key, message.length, message, tuple(readings.get(name, ())),
                 tuple(checks.get(name, ())), tuple(enabled.get(name, ())),
                 self._counter(message),
             )  # fmt: skip
-        return found
+        return incoming
 
     def _place(self, name: str) -> Keys:
         """Return where the profile names a message of its sample."""

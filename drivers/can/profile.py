@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from gapbridge.core.arrays import Array
+from gapbridge.drivers.robot_modes import StopReason
 
 Key = tuple[int, bool]  # identifier, whether it has 29 bits
-
-NORMAL = ""
+Status = tuple[float, StopReason | None, bool]  # value, its meaning, counts only while writing
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,13 +28,13 @@ class Check:
 
     signal: str
     normal: frozenset[int]
-    values: dict[int, str]
-    otherwise: str
+    values: dict[int, StopReason]
+    otherwise: StopReason
     while_writing: bool = False  # counts only then
 
-    def stop_reason(self, value: int) -> str:
-        """Return what a value means; empty where the arm is well."""
-        return NORMAL if value in self.normal else self.values.get(value, self.otherwise)
+    def stop_reason(self, value: int) -> StopReason | None:
+        """Return what a value means; None where the arm is well."""
+        return None if value in self.normal else self.values.get(value, self.otherwise)
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,10 +55,10 @@ class Incoming:
         if len(data) != self.length:
             raise ValueError(f"{self.name}: found {len(data)} bytes, expected {self.length}")
         try:
-            found: dict[str, float] = self.message.decode(data, decode_choices=False)
+            signals: dict[str, float] = self.message.decode(data, decode_choices=False)
         except Exception as error:  # cantools, bitstruct and struct each raise their own
             raise ValueError(f"{self.name}: {error}") from None
-        return found
+        return signals
 
 
 @dataclass(frozen=True, slots=True)

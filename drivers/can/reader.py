@@ -10,10 +10,11 @@ import numpy as np
 from gapbridge.core.arrays import Array
 from gapbridge.core.errors import LinkError, first_line
 from gapbridge.drivers.can.assembler import Assembler, Sample
-from gapbridge.drivers.can.profile import CanProfile, Key
+from gapbridge.drivers.can.profile import CanProfile, Key, Status
 from gapbridge.drivers.can.settings import CanSettings
 from gapbridge.drivers.can_bus.bus import close_bus, open_bus
 from gapbridge.drivers.clock import SYSTEM, Clock
+from gapbridge.drivers.robot_modes import StopReason
 
 LONGEST_WAY, LEAST_WAY = 4.0, 0.03  # cycles, s: what has lain here for longer is not fresh
 BACKLOG_TIME = 0.05  # s that reading what has piled up may take
@@ -97,18 +98,18 @@ class FrameReader:
     def listen(self, seconds: float) -> Sample | None:
         """Take frames for a while; returns the newest complete sample of them."""
         newest, until = None, self._now() + seconds
-        while (left := until - self._now()) > 0.0:
-            newest = self.poll(min(left, 0.02)) or newest
+        while (remaining := until - self._now()) > 0.0:
+            newest = self.poll(min(remaining, 0.02)) or newest
         return newest
 
     def _receive(self, timeout: float) -> Any:
         if self.bus is None:
             raise LinkError(f"{self._settings.where()}: found no bus, expected connect() first")
         try:
-            asked = self._now()
+            polled_at = self._now()
             if (frame := self.bus.recv(0.0)) is not None:
                 return frame
-            self._empty = asked
+            self._empty = polled_at
             return self.bus.recv(timeout) if timeout > 0.0 else None
         except Exception as error:  # CanError, OSError, serial's, or a broken text on the wire
             raise LinkError(f"{self._settings.where()}: {first_line(error)}") from None
@@ -162,14 +163,14 @@ class FrameReader:
         motors = self.assembler.enabled
         return bool(motors) and not any(motors.values())
 
-    def stop_reason(self, writing: bool) -> tuple[str, str]:
-        """Return what is wrong with the arm and the words for it; empty where nothing is."""
+    def stop_reason(self, writing: bool) -> tuple[StopReason | None, str]:
+        """Return why the arm cannot move and the signal that says so; None where it can."""
         if not self.assembler.stopping:
-            return "", ""
+            return None, ""
         return self._first_stop_reason(self.assembler.status, writing)
 
-    def cleared_stop_reason(self, writing: bool) -> str:
-        """Return what was wrong since ``forget_cleared`` and is no longer; empty: nothing."""
+    def cleared_stop_reason(self, writing: bool) -> StopReason | None:
+        """Return what was wrong since ``forget_cleared`` and is no longer; None: nothing."""
         return self._first_stop_reason(self.assembler.cleared, writing)[0]
 
     def forget_cleared(self) -> None:
@@ -177,13 +178,13 @@ class FrameReader:
         self.assembler.cleared.clear()
 
     def _first_stop_reason(
-        self, status: dict[tuple[Key, str], tuple[float, str, bool]], writing: bool
-    ) -> tuple[str, str]:
+        self, status: dict[tuple[Key, str], Status], writing: bool
+    ) -> tuple[StopReason | None, str]:
         for (key, signal), (value, reason, only_writing) in status.items():
             if reason and (writing or not only_writing):
                 name = self._profile.incoming[key].name
                 return reason, f"{name}.{signal} is {value:g}"
-        return "", ""
+        return None, ""
 
     def silent_status(self) -> str:
         """Return the name of a status message that has not come for too long; empty: none."""

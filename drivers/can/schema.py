@@ -45,7 +45,9 @@ class StatusEntry(Section):
     signal: str
     normal: list[int] = Field(min_length=1, description="values of an arm that is well")
     values: dict[int, StopReason] = Field(default={}, description="what single other values mean")
-    otherwise: StopReason = Field(default="fault", description="what every other value means")
+    otherwise: StopReason = Field(
+        default=StopReason.FAULT, description="what every other value means"
+    )
     while_writing: bool = Field(default=False, description="counts only while we write")
 
 

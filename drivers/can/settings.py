@@ -37,8 +37,8 @@ class CanSettings(ProfileSettings, ArmBusSettings):
     @property
     def installation(self) -> dict[str, list[float]]:
         """Return what this arm's installation says instead of the profile."""
-        given = {name: getattr(self, name) for name in ("direction", "zero", "gear")}
-        return {name: list(value) for name, value in given.items() if value is not None}
+        values = {name: getattr(self, name) for name in ("direction", "zero", "gear")}
+        return {name: list(value) for name, value in values.items() if value is not None}
 
     def read_files(self) -> None:
         """Read profile and DBC; see DriverSettings."""

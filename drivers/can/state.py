@@ -7,7 +7,7 @@ import numpy as np
 from gapbridge.core.arrays import Array
 from gapbridge.core.state import RobotState
 from gapbridge.drivers.can.assembler import Sample
-from gapbridge.drivers.robot_modes import modes_of
+from gapbridge.drivers.robot_modes import StopReason, modes_of
 
 
 class StateBuilder:
@@ -26,7 +26,9 @@ class StateBuilder:
         """Take velocities from the state last made on: it can be believed."""
         self._before = self._last
 
-    def build(self, sample: Sample, target: Array | None, reason: str, ready: bool) -> RobotState:
+    def build(
+        self, sample: Sample, target: Array | None, reason: StopReason | None, ready: bool
+    ) -> RobotState:
         """Return the state of a sample.
 
         ``target`` (n,) is what the arm was last commanded, where anyone commanded it.
@@ -37,7 +39,7 @@ class StateBuilder:
         if qd is None:
             qd = self._differences(sample, self._before)
         self._last = sample
-        modes = modes_of((reason, "" if ready else "not_ready"))
+        modes = modes_of((reason, None if ready else StopReason.NOT_READY))
         return RobotState(
             timestamp=sample.received,
             received=sample.received,

@@ -49,8 +49,8 @@ class BusSettings(BaseModel):
 
     def where(self) -> str:
         """Return how messages call this bus."""
-        at = f"@{self.host}:{self.port}" if self.interface == "socketcand" else ""
-        return f"{self.interface} {self.channel}{at}"
+        server = f"@{self.host}:{self.port}" if self.interface == "socketcand" else ""
+        return f"{self.interface} {self.channel}{server}"
 
 
 class ArmBusSettings(BusSettings):

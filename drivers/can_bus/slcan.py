@@ -26,8 +26,8 @@ class BufferedPort:
     @property
     def write_timeout(self) -> float | None:
         """Return how long a write may take, s; None: without end."""
-        found: float | None = self._port.write_timeout
-        return found
+        timeout: float | None = self._port.write_timeout
+        return timeout
 
     @write_timeout.setter
     def write_timeout(self, seconds: float | None) -> None:
@@ -36,17 +36,17 @@ class BufferedPort:
     @property
     def in_waiting(self) -> int:
         """Return how many bytes can be read at once. Raises OSError where the port has gone."""
-        left = len(self._piece) - self._next
-        return left if left else int(self._port.in_waiting)
+        unread = len(self._piece) - self._next
+        return unread if unread else int(self._port.in_waiting)
 
     def read(self, size: int = 1) -> bytes:
         """Return up to ``size`` bytes, none where none come within the port's timeout."""
         if self._next >= len(self._piece):
             self._piece = self._port.read(min(max(self._port.in_waiting, size), PIECE))
             self._next = 0
-        found = self._piece[self._next : self._next + size]
-        self._next += len(found)
-        return found
+        data = self._piece[self._next : self._next + size]
+        self._next += len(data)
+        return data
 
     def reset_input_buffer(self) -> None:
         """Forget what has come and was not read."""

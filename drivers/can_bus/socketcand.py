@@ -35,10 +35,10 @@ class SocketcandBus(SocketCanDaemonBus):
         """Read one answer of the handshake and no more: frames may follow at once."""
         wanted, answer = msg.encode("ascii"), b""
         while len(answer) < len(wanted):
-            more = self._link.recv(len(wanted) - len(answer))
-            if not more:
+            data = self._link.recv(len(wanted) - len(answer))
+            if not data:
                 break
-            answer += more
+            answer += data
         if answer != wanted:
             raise can.CanInitializationError(f"expected {msg!r}, found {answer!r}")
 

@@ -37,8 +37,8 @@ class RpdoWriter:
             for layout in self._profile.rpdo:
                 for entry in layout.entries:
                     if entry.name not in (*OURS, self._profile.target):
-                        held = self._master.read(node, entry.address)
-                        self._image[joint][entry.name] = held
+                        counts = self._master.read(node, entry.address)
+                        self._image[joint][entry.name] = counts
 
     def forget(self) -> None:
         """Forget what was sent: the drives' own state holds."""

@@ -23,10 +23,11 @@ UNLIMITED = 0x7FFFFFFE  # counts
 
 def check_identity(master: Master, profile: CanopenProfile, node: int) -> None:
     """Refuse what is no CiA 402 drive, or lacks the profile's mode. Raises LinkError."""
-    found = master.read(node, DEVICE_TYPE) & 0xFFFF
-    if found != CIA402:
+    device_profile = master.read(node, DEVICE_TYPE) & 0xFFFF
+    if device_profile != CIA402:
         raise LinkError(
-            f"{master.where}: node {node}: found device profile {found}, expected 402 (a drive)"
+            f"{master.where}: node {node}: found device profile {device_profile}, "
+            "expected 402 (a drive)"
         )
     modes = master.read_where_present(node, SUPPORTED_MODES)
     if modes is not None and not modes >> (profile.mode_number - 1) & 1:
@@ -113,11 +114,11 @@ def _check_pdo(master: Master, node: int, layout: PdoLayout) -> None:
         return pdo
 
     pdo = master.sdo(node, f"the mapping of {layout.name}", act)
-    found = [(Address(v.index, v.subindex), v.length) for v in pdo.map]
+    mapped = [(Address(v.index, v.subindex), v.length) for v in pdo.map]
     wanted = [(entry.address, entry.bits) for entry in layout.entries]
     message = ""
-    if found != wanted:
-        message = f"maps {', '.join(str(a) for a, _ in found) or 'nothing'}"
+    if mapped != wanted:
+        message = f"maps {', '.join(str(a) for a, _ in mapped) or 'nothing'}"
     elif not pdo.enabled or pdo.cob_id != layout.cob_id(node):
         message = f"is {'at' if pdo.enabled else 'off at'} 0x{pdo.cob_id:X}"
     elif pdo.trans_type != SYNCHRONOUS:
@@ -140,6 +141,6 @@ def _silence_others(master: Master, profile: CanopenProfile, node: int) -> None:
             address = Address(base + number - 1, 1)
             if number in used:
                 continue
-            found = master.read_where_present(node, address)
-            if found is not None and not found & 1 << 31:
-                master.write(node, address, found | 1 << 31)
+            cob_id = master.read_where_present(node, address)
+            if cob_id is not None and not cob_id & 1 << 31:
+                master.write(node, address, cob_id | 1 << 31)

@@ -106,18 +106,18 @@ class CanopenDriver(Driver):
         heartbeats = self.master.heartbeats
         assert heartbeats is not None
         end = self._now() + min(STARTING, self.settings.connect_timeout)
-        while (found := self.sync_cycle.exchange()) is None or not heartbeats.all_operational:
+        while (sample := self.sync_cycle.exchange()) is None or not heartbeats.all_operational:
             if self._now() > end:
                 why = self.master.collector.why() + " after a SYNC"
-                if found is not None:
+                if sample is not None:
                     silent = [n for n in self.profile.nodes if heartbeats.nmt.get(n) != OPERATIONAL]
                     why = f"found no heartbeat in OPERATIONAL of nodes {silent}"
                 raise LinkError(f"{self.master.where}: {why}")
         try:
-            self._validate(self._builder.build(found, None, False))
+            self._validate(self._builder.build(sample, None, False))
         except InvalidStateError as error:
             raise LinkError(f"{self.settings.where()}: {error}") from None
-        self._fresh_at = found.received
+        self._fresh_at = sample.received
 
     # -- reading ----------------------------------------------------------------------------------
 
@@ -128,12 +128,12 @@ class CanopenDriver(Driver):
         """
         while True:
             stray = self.master.collector.stray
-            found = self.sync_cycle.exchange()
+            sample = self.sync_cycle.exchange()
             self._check_heartbeats()
-            if found is not None and not stray:
-                self._fresh_at = found.received
-                return self._state(found)
-            why = self.master.collector.why() if found is None else f"{stray} came without a SYNC"
+            if sample is not None and not stray:
+                self._fresh_at = sample.received
+                return self._state(sample)
+            why = self.master.collector.why() if sample is None else f"{stray} came without a SYNC"
             now = self._now()
             if now - self._fresh_at > self.settings.state_timeout:
                 raise StaleStateError(
@@ -169,10 +169,10 @@ class CanopenDriver(Driver):
         super()._validate(state)
         self._builder.remember(state)
 
-    def _state(self, found: SyncSet) -> RobotState:
+    def _state(self, sample: SyncSet) -> RobotState:
         armed = self._armed_at is not None
         before = self._builder.last_q
-        state = self._builder.build(found, self.writer.target if armed else None, armed)
+        state = self._builder.build(sample, self.writer.target if armed else None, armed)
         self._check_frozen(state, before)
         return state
 
@@ -207,15 +207,15 @@ class CanopenDriver(Driver):
         if self._armed_at is not None:
             return
         try:
-            found = self._quiet_sample()
-            for joint, reported in enumerate(states(found)):
+            sample = self._quiet_sample()
+            for joint, reported in enumerate(states(sample)):
                 if reported in FAULTS and not self.settings.clear_faults:
                     node = self.profile.nodes[joint]
                     raise WriteError(
                         f"{self.master.where}: node {node}: found {reported}"
                         f"{self.power.complaint(node)}, expected none; link.clear_faults resets it"
                     )
-            self._enable(found)
+            self._enable(sample)
         except WriteError:
             raise
         except LinkError as error:
@@ -229,18 +229,18 @@ class CanopenDriver(Driver):
             foreign, now = self.foreign, self._now()
             if foreign is not None and (foreign.seen > begun or now - foreign.seen < quiet):
                 raise WriteError(self._two_masters(foreign))
-            found = self.sync_cycle.exchange()
+            sample = self.sync_cycle.exchange()
             self._check_heartbeats()
-            if found is not None and now - self._connected_at >= quiet:
-                return found
-            if found is None and now - self._fresh_at > quiet + self.settings.state_timeout:
+            if sample is not None and now - self._connected_at >= quiet:
+                return sample
+            if sample is None and now - self._fresh_at > quiet + self.settings.state_timeout:
                 raise StaleStateError(f"{self.master.where}: {self.master.collector.why()}")
 
-    def _enable(self, found: SyncSet) -> None:
-        start = positions(self.profile, found)
+    def _enable(self, sample: SyncSet) -> None:
+        start = positions(self.profile, sample)
         try:
             self.power.prepare()
-            hold = self.power.enable(found, self.settings.arming_time, self.settings.clear_faults)
+            hold = self.power.enable(sample, self.settings.arming_time, self.settings.clear_faults)
             assert self.sync_cycle.sample is not None
             gave = float(np.abs(positions(self.profile, self.sync_cycle.sample) - start).max())
             if gave > self.settings.arming_distance:
@@ -320,11 +320,11 @@ class SyncCycle:
         self._writer.make_whole()
         collector = self._master.collector
         collector.clear_stray()
-        found = collector.wait(self._master.sync() + self._window)
-        self._torn = found is None
-        if found is not None:
-            self.sample = found
-        return found
+        sample = collector.wait(self._master.sync() + self._window)
+        self._torn = sample is None
+        if sample is not None:
+            self.sample = sample
+        return sample
 
     def _wait_for_slot(self) -> None:
         now = self._clock.monotonic()

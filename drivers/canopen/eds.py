@@ -41,11 +41,11 @@ class Eds:
         """Return what lies at an address, None where the EDS has no number there."""
         import canopen.objectdictionary as library
 
-        found = _entry(_cached(self.path), address)
-        if found is None or found.data_type not in library.INTEGER_TYPES:
+        entry = _entry(_cached(self.path), address)
+        if entry is None or entry.data_type not in library.INTEGER_TYPES:
             return None
-        signed = found.data_type in library.SIGNED_TYPES
-        return Variable(len(found), signed, found.readable, found.writable, found.pdo_mappable)
+        signed = entry.data_type in library.SIGNED_TYPES
+        return Variable(len(entry), signed, entry.readable, entry.writable, entry.pdo_mappable)
 
     def has(self, address: Address) -> bool:
         """Return whether the EDS has an object at an address."""
@@ -88,7 +88,7 @@ def _entry(dictionary: Any, address: Address) -> Any:
 
     if address.index not in dictionary:
         return None
-    found = dictionary[address.index]
-    if isinstance(found, library.ODVariable):
-        return found if address.subindex == 0 else None
-    return found.get(address.subindex)
+    entry = dictionary[address.index]
+    if isinstance(entry, library.ODVariable):
+        return entry if address.subindex == 0 else None
+    return entry.get(address.subindex)

@@ -82,13 +82,13 @@ class BusListener(MessageListener):
 
 def _commands(profile: CanopenProfile) -> dict[int, str]:
     """Return the identifiers that a master of our drives uses, and how messages call them."""
-    found = {SYNC: "SYNC", NMT: "NMT command"}
-    found[HEARTBEAT_BASE + profile.heartbeat.our_node] = "heartbeat with our node id"
+    names = {SYNC: "SYNC", NMT: "NMT command"}
+    names[HEARTBEAT_BASE + profile.heartbeat.our_node] = "heartbeat with our node id"
     for node in profile.nodes:
-        found[SDO_REQUEST_BASE + node] = f"SDO request to node {node}"
+        names[SDO_REQUEST_BASE + node] = f"SDO request to node {node}"
         for number in range(PDO_COUNT):
-            found[RPDO_BASE + PDO_STEP * number + node] = f"RPDO{number + 1} of node {node}"
-    return found
+            names[RPDO_BASE + PDO_STEP * number + node] = f"RPDO{number + 1} of node {node}"
+    return names
 
 
 class HeartbeatMonitor:
@@ -117,10 +117,10 @@ class HeartbeatMonitor:
 
     def _emergency_of(self, node: int, consumer: Any) -> Any:
         def note(error: Any) -> None:
-            found = Emergency(node, error.code, error.register, time.monotonic())
-            self.log.append(found)
+            emergency = Emergency(node, error.code, error.register, time.monotonic())
+            self.log.append(emergency)
             if error.code & 0xFF00:
-                self.active[node] = found
+                self.active[node] = emergency
             else:
                 self.active.pop(node, None)
             if len(consumer.log) > KEPT:  # the library's own log has no end

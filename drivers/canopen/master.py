@@ -136,8 +136,8 @@ class Master:
         if now < self._beat_at:
             return
         self._beat_at = now + 0.5 * self._profile.heartbeat.ours
-        ours = HEARTBEAT_BASE + self._profile.heartbeat.our_node
-        self.send(ours, bytes([OPERATIONAL_STATE]), "heartbeat")
+        cob_id = HEARTBEAT_BASE + self._profile.heartbeat.our_node
+        self.send(cob_id, bytes([OPERATIONAL_STATE]), "heartbeat")
 
     def command(self, node: int, state: str) -> None:
         """Send an NMT command to one node: OPERATIONAL, PRE-OPERATIONAL. Raises LinkError."""
@@ -191,8 +191,8 @@ class Master:
                     return None
                 raise
 
-        found: int | None = self.sdo(node, str(address), act)
-        return found
+        value: int | None = self.sdo(node, str(address), act)
+        return value
 
     def write_where_present(self, node: int, address: Address, value: int) -> bool:
         """Write an object that a drive may lack; returns whether it has it. Raises LinkError."""
@@ -203,8 +203,8 @@ class Master:
 
 
 def _variable(remote: Any, address: Address) -> Any:
-    found = remote.sdo[address.index]
-    return found[address.subindex] if hasattr(found, "__getitem__") else found
+    entry = remote.sdo[address.index]
+    return entry[address.subindex] if hasattr(entry, "__getitem__") else entry
 
 
 class AllowedFrames:

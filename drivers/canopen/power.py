@@ -82,27 +82,27 @@ class Power:
             self._master.write(node, MODES_OF_OPERATION, mode)
             del self._modes[node]
 
-    def enable(self, found: SyncSet, within: float, clear_faults: bool) -> Array:
+    def enable(self, sample: SyncSet, within: float, clear_faults: bool) -> Array:
         """Enable all drives where they stand; returns the joints (n,) that they hold, rad.
 
-        ``found`` is the newest sample. Raises WriteError where one does not get there.
+        ``sample`` is the newest sample. Raises WriteError where one does not get there.
         """
         hold: Array | None = None
         resetting = False
         end = time.monotonic() + within
         while True:
-            reported = states(found)
+            reported = states(sample)
             enabled = all(state == "OPERATION ENABLED" for state in reported)
             if hold is None and enabled:
-                hold = positions(self._profile, found)
-            if hold is not None and enabled and not_following(self._profile, found) is None:
+                hold = positions(self._profile, sample)
+            if hold is not None and enabled and not_following(self._profile, sample) is None:
                 return hold
             if time.monotonic() > end:
-                raise self._not_there(found)
+                raise self._not_there(sample)
             resetting = not resetting and clear_faults
             detail = [self._towards(state, enabled, resetting) for state in reported]
-            self._writer.send(detail, positions(self._profile, found) if hold is None else hold)
-            found = self._exchange() or found
+            self._writer.send(detail, positions(self._profile, sample) if hold is None else hold)
+            sample = self._exchange() or sample
 
     def _towards(self, state: State, all_enabled: bool, resetting: bool) -> int:
         """Return the next Controlword; a fault is reset by a rising edge."""
@@ -112,13 +112,13 @@ class Power:
             return self.following
         return TOWARDS_ENABLED.get(state, DISABLE_VOLTAGE)
 
-    def _not_there(self, found: SyncSet) -> WriteError:
-        joint = not_following(self._profile, found) or 0
-        counts, node = found.counts[joint], self._profile.nodes[joint]
+    def _not_there(self, sample: SyncSet) -> WriteError:
+        joint = not_following(self._profile, sample) or 0
+        counts, node = sample.counts[joint], self._profile.nodes[joint]
         mode = counts.get("Modes of operation display", self._profile.mode_number)
         return WriteError(
             f"{self._master.where}: node {node} does not follow setpoints: found "
-            f"{states(found)[joint]}, Statusword 0x{counts['Statusword']:04X}, mode {mode}, "
+            f"{states(sample)[joint]}, Statusword 0x{counts['Statusword']:04X}, mode {mode}, "
             f"expected OPERATION ENABLED in mode {self._profile.mode_number}{self.complaint(node)}"
         )
 
@@ -143,9 +143,9 @@ class Power:
                 moving = "OPERATION ENABLED"
                 detail = [QUICK_STOP if s == moving and not late else word for s in reported]
                 self._writer.send(detail, q)
-            found = self._exchange()
-            if found is not None:
-                reported, now = states(found), positions(profile, found)
+            sample = self._exchange()
+            if sample is not None:
+                reported, now = states(sample), positions(profile, sample)
                 still = still + 1 if q is not None and (now == q).all() else 0
                 q = now
                 if all(state in OFF for state in reported):

@@ -170,20 +170,20 @@ def read_profile(path: Path, joints: int | None = None) -> CanopenProfile:
 
 
 def _check_nodes(document: ProfileDocument, file: ProfileFile) -> None:
-    ours = file.heartbeat.our_node
-    seen: dict[int, int] = {}
+    our_node = file.heartbeat.our_node
+    joint_of_node: dict[int, int] = {}
     for i, joint in enumerate(file.joints):
         keys: Keys = ("joints", i, "node")
-        if joint.node in seen:
+        if joint.node in joint_of_node:
             raise document.error(
                 keys, f"found {joint.node} again, expected one node per joint: joint "
-                f"{seen[joint.node] + 1} has it",
+                f"{joint_of_node[joint.node] + 1} has it",
             )  # fmt: skip
-        if joint.node == ours:
+        if joint.node == our_node:
             raise document.error(
                 keys, f"found {joint.node}, expected another than heartbeat.our_node"
             )
-        seen[joint.node] = i
+        joint_of_node[joint.node] = i
 
 
 def _check_times(document: ProfileDocument, file: ProfileFile) -> None:
@@ -213,22 +213,22 @@ class _Pdos:
     eds: Eds
 
     def layouts(
-        self, key: str, given: Mapping[int, Sequence[str | int]], wanted: tuple[str, ...]
+        self, key: str, names_of_pdo: Mapping[int, Sequence[str | int]], wanted: tuple[str, ...]
     ) -> tuple[PdoLayout, ...]:
         """Return the layouts of a section; refuses what is missing, twice or too long."""
         layouts: list[PdoLayout] = []
-        seen: dict[str, Keys] = {}
-        for number, names in sorted(given.items()):
+        keys_of_name: dict[str, Keys] = {}
+        for number, names in sorted(names_of_pdo.items()):
             entries = []
             for i, name in enumerate(names):
                 keys: Keys = (key, str(number), i)
                 entry = self._entry(keys, name, key == "tpdo")
-                if entry.name in seen:
-                    line = self.document.line(seen[entry.name])
+                if entry.name in keys_of_name:
+                    line = self.document.line(keys_of_name[entry.name])
                     raise self.document.error(
                         keys, f"found {entry.name!r} again (line {line}), expected it once"
                     )
-                seen[entry.name] = keys
+                keys_of_name[entry.name] = keys
                 entries.append(entry)
             bits = sum(entry.bits for entry in entries)
             if not 0 < bits <= MOST_BITS:
@@ -237,24 +237,27 @@ class _Pdos:
                 )
             layouts.append(PdoLayout(number, tuple(entries), key == "tpdo"))
         for name in wanted:
-            if name not in seen:
+            if name not in keys_of_name:
                 raise self.document.error((key,), f"found no {name!r}, expected it in a PDO")
         return tuple(layouts)
 
     def _entry(self, keys: Keys, name: str | int, transmitted: bool) -> Entry:
         address = self._address(keys, name)
-        called = next((known for known, at in OBJECTS.items() if at == address), str(address))
-        found = self.eds.variable(address)
-        if found is None:
+        called = next(
+            (known for known, known_address in OBJECTS.items() if known_address == address),
+            str(address),
+        )
+        variable = self.eds.variable(address)
+        if variable is None:
             raise self.document.error(
                 keys, f"found {called!r}, expected an object of {self.eds.path.name} ({address})"
             )
-        if not found.mappable or not (found.readable if transmitted else found.writable):
+        if not variable.mappable or not (variable.readable if transmitted else variable.writable):
             kind = "TPDO" if transmitted else "RPDO"
             raise self.document.error(
                 keys, f"found {called!r}, which {self.eds.path.name} allows in no {kind}"
             )
-        return Entry(called, address, found.bits, found.signed)
+        return Entry(called, address, variable.bits, variable.signed)
 
     def _address(self, keys: Keys, name: str | int) -> Address:
         if isinstance(name, str):

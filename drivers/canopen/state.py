@@ -11,24 +11,24 @@ from gapbridge.core.state import RobotState
 from gapbridge.drivers.canopen.objects import MODE_ACTIVE, State, state_of
 from gapbridge.drivers.canopen.profile import CanopenProfile
 from gapbridge.drivers.canopen.sync_set import SyncSet
-from gapbridge.drivers.robot_modes import modes_of
+from gapbridge.drivers.robot_modes import StopReason, modes_of
 
 SPAN, OLDEST = 5, 0.1  # samples, s: what a velocity is reckoned from where drives report none
 
 
-def states(found: SyncSet) -> list[State]:
+def states(sample: SyncSet) -> list[State]:
     """Return the drives' states, per joint."""
-    return [state_of(counts["Statusword"]) for counts in found.counts]
+    return [state_of(counts["Statusword"]) for counts in sample.counts]
 
 
-def positions(profile: CanopenProfile, found: SyncSet) -> Array:
+def positions(profile: CanopenProfile, sample: SyncSet) -> Array:
     """Return the joint angles (n,), rad."""
-    return profile.angles(np.array([c["Position actual value"] for c in found.counts], float))
+    return profile.angles(np.array([c["Position actual value"] for c in sample.counts], float))
 
 
-def not_following(profile: CanopenProfile, found: SyncSet) -> int | None:
+def not_following(profile: CanopenProfile, sample: SyncSet) -> int | None:
     """Return a joint (from 0) whose drive does not act on setpoints; None: all do."""
-    for joint, (counts, state) in enumerate(zip(found.counts, states(found), strict=True)):
+    for joint, (counts, state) in enumerate(zip(sample.counts, states(sample), strict=True)):
         mode = counts.get("Modes of operation display", profile.mode_number)
         active = counts["Statusword"] & MODE_ACTIVE or not profile.file.confirms_mode
         if state != "OPERATION ENABLED" or mode != profile.mode_number or not active:
@@ -57,56 +57,57 @@ class StateBuilder:
         """Take note of a state that can be believed."""
         self._last.append((state.timestamp, state.actual_q))
 
-    def build(self, found: SyncSet, target: Array | None, armed: bool) -> RobotState:
+    def build(self, sample: SyncSet, target: Array | None, armed: bool) -> RobotState:
         """Return the state.
 
         ``target`` (n,) is what the drives were last commanded, rad. The time of the sample is that
         of its SYNC, at which all drives latched their positions.
         """
-        q = positions(self._profile, found)
-        modes = modes_of([self._stop_reason(found, armed)])
+        q = positions(self._profile, sample)
+        modes = modes_of([self._stop_reason(sample, armed)])
         return RobotState(
-            timestamp=found.synced,
-            received=found.received,
+            timestamp=sample.synced,
+            received=sample.received,
             actual_q=q,
-            actual_qd=self._velocity(found, q),
+            actual_qd=self._velocity(sample, q),
             target_q=q if target is None else target,
             actual_TCP_force=np.zeros(6),
-            actual_current_as_torque=self._torque(found),
+            actual_current_as_torque=self._torque(sample),
             robot_mode=modes.robot_mode,
             safety_mode=modes.safety_mode,
             safety_status_bits=modes.safety_status_bits,
         )
 
-    def _stop_reason(self, found: SyncSet, armed: bool) -> str:
-        reported = states(found)
+    def _stop_reason(self, sample: SyncSet, armed: bool) -> StopReason | None:
+        reported = states(sample)
         if "FAULT" in reported or "FAULT REACTION ACTIVE" in reported:
-            return "fault"
+            return StopReason.FAULT
         if not armed:
-            return ""
+            return None
         if "QUICK STOP ACTIVE" in reported:
-            return "protective_stop"
-        return "" if not_following(self._profile, found) is None else "not_ready"
+            return StopReason.PROTECTIVE_STOP
+        following = not_following(self._profile, sample) is None
+        return None if following else StopReason.NOT_READY
 
-    def _velocity(self, found: SyncSet, q: Array) -> Array:
+    def _velocity(self, sample: SyncSet, q: Array) -> Array:
         """Return (n,) rad/s: the drives' own where the profile knows its unit.
 
         Else out of the last samples: one step alone would show the SYNC's jitter.
         """
         scale = self._profile.file.velocity_scale
-        reported = [counts.get("Velocity actual value") for counts in found.counts]
+        reported = [counts.get("Velocity actual value") for counts in sample.counts]
         if scale is not None and None not in reported:
             return np.array(reported, float) * scale / self._profile.counts_per_radian
-        while self._last and found.synced - self._last[0][0] > OLDEST:
+        while self._last and sample.synced - self._last[0][0] > OLDEST:
             self._last.popleft()
         if not self._last:
             return np.zeros(self._profile.n)
         synced, before = self._last[0]
-        return np.asarray((q - before) / max(found.synced - synced, 1e-4))
+        return np.asarray((q - before) / max(sample.synced - synced, 1e-4))
 
-    def _torque(self, found: SyncSet) -> Array | None:
+    def _torque(self, sample: SyncSet) -> Array | None:
         """Return (n,) Nm: Torque actual value is in thousandths of the rated torque."""
         if self._rated is None:
             return None
-        reported = np.array([counts["Torque actual value"] for counts in found.counts], float)
+        reported = np.array([counts["Torque actual value"] for counts in sample.counts], float)
         return reported * 1e-3 * self._rated * self._profile.direction

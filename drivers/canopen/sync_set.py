@@ -1,14 +1,25 @@
-"""One SYNC's TPDOs: they count only when all have come, each once, none from the SYNC before."""
+"""One SYNC's TPDOs: they count only where all were received, once each, after that SYNC."""
 
 from __future__ import annotations
 
 import threading
 import time
 from collections import Counter
+from enum import StrEnum
 from typing import NamedTuple
 
 from gapbridge.drivers.canopen.pdo import PdoLayout
 from gapbridge.drivers.canopen.profile import CanopenProfile
+
+
+class DropReason(StrEnum):
+    """Why a frame or a set does not count."""
+
+    TWICE = "twice"
+    MALFORMED = "malformed"
+    LATE = "late"
+    NO_SYNC = "no SYNC"
+    TORN = "torn"
 
 
 class SyncSet(NamedTuple):
@@ -30,32 +41,32 @@ class SyncCollector:
         }
         self._nodes = profile.nodes
         self._changed = threading.Condition()
-        self._held: dict[int, dict[str, int]] = {}
+        self._frames: dict[int, dict[str, int]] = {}
         self._open = False
-        self._rejected = ""  # why this set cannot be believed
+        self._rejected: tuple[DropReason, str, str] | None = None  # why, which TPDO, detail
         self._synced = self._received = 0.0
-        self._missing: set[int] = set()  # COB-IDs that a torn set lacked, and that may still come
-        self.dropped: Counter[str] = Counter()  # reason -> frames or sets
-        self.stray = ""  # a TPDO that came to no SYNC since the last look; empty: none
+        self._missing: set[int] = set()  # COB-IDs that a torn set lacked and that may still arrive
+        self.dropped: Counter[DropReason] = Counter()  # reason -> frames or sets
+        self.stray = ""  # a TPDO without a SYNC since ``clear_stray``; empty: none
 
     def clear_stray(self) -> None:
-        """Take note that somebody has looked at ``stray``."""
+        """Reset ``stray``: it was evaluated."""
         self.stray = ""
 
     def begin(self, now: float) -> None:
-        """Forget what was collected: a SYNC leaves at ``now`` (s, monotonic)."""
+        """Start a new set: a SYNC leaves at ``now`` (s, monotonic)."""
         with self._changed:
-            self._held, self._rejected, self._open = {}, "", True
+            self._frames, self._rejected, self._open = {}, None, True
             self._missing.clear()
             self._synced = self._received = now
 
     def end(self) -> None:
-        """Take nothing until the next SYNC."""
+        """Accept nothing until the next SYNC."""
         with self._changed:
             self._open = False
 
     def take(self, cob_id: int, data: bytes, now: float) -> None:
-        """Take one frame. Raises nothing; what is no TPDO of the profile is passed over."""
+        """Add one frame. Raises nothing; what is no TPDO of the profile is ignored."""
         member = self._members.get(cob_id)
         if member is None:
             return
@@ -65,67 +76,72 @@ class SyncCollector:
             if not self._open:
                 self._take_late(cob_id, who)
                 return
-            if cob_id in self._held:
-                self._refuse("twice", f"{who} came twice after one SYNC")
+            if cob_id in self._frames:
+                self._reject(DropReason.TWICE, who)
                 return
             try:
-                self._held[cob_id] = layout.decode(data)
+                self._frames[cob_id] = layout.decode(data)
             except ValueError as error:
-                self._refuse("malformed", f"{who}: {error}")
+                self._reject(DropReason.MALFORMED, who, str(error))
                 return
             self._received = now
-            if len(self._held) == len(self._members):
+            if len(self._frames) == len(self._members):
                 self._open = False
                 self._changed.notify_all()
 
     def _take_late(self, cob_id: int, who: str) -> None:
         if cob_id in self._missing:
             self._missing.discard(cob_id)
-            self.dropped["late"] += 1
+            self.dropped[DropReason.LATE] += 1
         else:
-            self.dropped["no SYNC"] += 1
+            self.dropped[DropReason.NO_SYNC] += 1
             self.stray = who
 
     @property
     def awaits_late(self) -> bool:
-        """Return whether TPDOs of a torn set may still come: they must not meet the next SYNC's."""
+        """Return whether TPDOs of a torn set may still arrive, which would mix with the next."""
         return bool(self._missing)
 
-    def _refuse(self, reason: str, message: str) -> None:
+    def _reject(self, reason: DropReason, who: str, detail: str = "") -> None:
         self.dropped[reason] += 1
-        self._rejected = self._rejected or message
+        self._rejected = self._rejected or (reason, who, detail)
         self._changed.notify_all()
 
     def wait(self, until: float) -> SyncSet | None:
-        """Return the set, None where it is not whole or cannot be believed by ``until``."""
+        """Return the set, None where it is incomplete or rejected by ``until``."""
         with self._changed:
             self._changed.wait_for(self._over, max(until - time.monotonic(), 0.0))
             self._open = False
-            if self._rejected or len(self._held) < len(self._members):
-                self.dropped["torn"] += 1
-                self._missing = set(self._members) - set(self._held)
+            if self._rejected or len(self._frames) < len(self._members):
+                self.dropped[DropReason.TORN] += 1
+                self._missing = set(self._members) - set(self._frames)
                 return None
             counts: list[dict[str, int]] = [{} for _ in self._nodes]
-            for cob_id, found in self._held.items():
-                counts[self._members[cob_id][0]].update(found)
+            for cob_id, objects in self._frames.items():
+                counts[self._members[cob_id][0]].update(objects)
             return SyncSet(tuple(counts), self._synced, self._received)
 
     def _over(self) -> bool:
-        return bool(self._rejected) or len(self._held) == len(self._members)
+        return bool(self._rejected) or len(self._frames) == len(self._members)
 
     @property
     def empty(self) -> bool:
-        """Return whether nothing at all has come since the SYNC."""
-        return not self._held and not self._rejected
+        """Return whether nothing was received since the SYNC."""
+        return not self._frames and not self._rejected
 
     def why(self) -> str:
-        """Return what is wrong with the set at hand."""
+        """Return what is wrong with this set."""
         if self._rejected:
-            return self._rejected
+            reason, who, detail = self._rejected
+            return (
+                f"{who} came twice after one SYNC"
+                if reason == DropReason.TWICE
+                else f"{who}: {detail}"
+            )
         missing = [
             f"{layout.name} of node {self._nodes[joint]}"
             for cob_id, (joint, layout) in self._members.items()
-            if cob_id not in self._held
+            if cob_id not in self._frames
         ]
         few = ", ".join(missing[:3]) + (f" and {len(missing) - 3} more" if len(missing) > 3 else "")
-        return f"found {len(self._held)} of {len(self._members)} TPDOs, without {few}"
+        return f"found {len(self._frames)} of {len(self._members)} TPDOs, without {few}"

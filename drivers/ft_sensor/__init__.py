@@ -30,7 +30,7 @@ def make_sensor(settings: FtSensorSettings) -> ForceTorqueSensor:
             f"ft_sensor.driver: found {name!r}, expected one of {', '.join(FT_SENSORS)}"
         )
     try:
-        found = resolve_name(FT_SENSORS[name])
+        sensor_class = resolve_name(FT_SENSORS[name])
     except ImportError as error:
         raise LinkError(f"ft_sensor.driver {name}: cannot be imported: {error}") from None
-    return cast("ForceTorqueSensor", found(settings))
+    return cast("ForceTorqueSensor", sensor_class(settings))

@@ -63,13 +63,13 @@ class AnswerDecoder:
 
     def take(self, identifier: int, data: bytes, stamp: float) -> list[bytes] | None:
         """Take one frame with its time stamp (s); returns the answer where it is complete."""
-        found = self._found
+        frames = self._found
         if identifier == self._first_id:
-            self.dropped += len(found)
+            self.dropped += len(frames)
             self._found, self._begun = [data], stamp
-        elif found and identifier == self._first_id + len(found):
+        elif frames and identifier == self._first_id + len(frames):
             if 0.0 <= stamp - self._begun <= self._window:
-                found.append(data)
+                frames.append(data)
             else:
                 self._drop()
         else:
@@ -143,14 +143,14 @@ class AtiNetCanOem(CanSensor):
     ) -> list[bytes] | None:
         """Return the data of an answer's frames; None where it has not come in time."""
         decoder = AnswerDecoder(self._base | operation, frames, window)
-        while (left := until - time.monotonic()) > 0.0:
-            frame = self._receive(left)
+        while (remaining := until - time.monotonic()) > 0.0:
+            frame = self._receive(remaining)
             if frame is None:
                 break
-            found = decoder.take(frame.arbitration_id, bytes(frame.data), frame.timestamp)
-            if found is not None:
+            answer = decoder.take(frame.arbitration_id, bytes(frame.data), frame.timestamp)
+            if answer is not None:
                 self.dropped += decoder.dropped
-                return found
+                return answer
             if frame.arbitration_id == (self._base | operation) + frames - 1:
                 break  # the last one, and not all before it: asking again is quicker
         self.dropped += decoder.dropped
@@ -164,10 +164,10 @@ class AtiNetCanOem(CanSensor):
         if self._due > until:
             return None
         self._drain()
-        asked = time.monotonic()
-        self._due = max(self._due + 1.0 / self.settings.rate, asked)
+        requested_at = time.monotonic()
+        self._due = max(self._due + 1.0 / self.settings.rate, requested_at)
         self._send(self._base | GAUGES, b"")
-        answer = self._answer(GAUGES, 2, asked + SAMPLE, TOGETHER)
+        answer = self._answer(GAUGES, 2, requested_at + SAMPLE, TOGETHER)
         received = time.monotonic()
         if answer is None:
             return None
@@ -177,7 +177,9 @@ class AtiNetCanOem(CanSensor):
             return None
         status, gauges = decoded
         # it samples between question and answer, whose ways are taken for equally long
-        return Reading(0.5 * (asked + received), received, self._matrix @ np.array(gauges), status)
+        return Reading(
+            0.5 * (requested_at + received), received, self._matrix @ np.array(gauges), status
+        )
 
     def _drain(self) -> None:
         """Drop late answers to former questions."""

@@ -218,9 +218,9 @@ def _undoing(model: Model) -> tuple[Array, Array]:
 
 def _standing(model: Model) -> Motion:
     """Return seven rows of an arm at rest, for the probes."""
-    rest, rows = np.zeros((7, model.arm.n)), np.arange(7)
+    zeros, rows = np.zeros((7, model.arm.n)), np.arange(7)
     return Motion(
-        t=np.zeros(7), q=rest, qd=rest, qdd=rest, target_q=None, loads=Loads(), rows=rows,
+        t=np.zeros(7), q=zeros, qd=zeros, qdd=zeros, target_q=None, loads=Loads(), rows=rows,
         valid=np.ones(7, dtype=bool), stretch=np.zeros(7, dtype=np.int64), start=0.0,
         moving=False, still=np.zeros(model.arm.n),
     )  # fmt: skip

@@ -45,24 +45,24 @@ class StreamDecoder:
         """Take bytes as they come; returns the counts (6 each) of the samples completed."""
         from pymodbus.framer import FramerRTU
 
-        held, found = self._bytes, []
-        held += data
+        buffer, samples = self._bytes, []
+        buffer += data
         while True:
-            start = held.find(HEAD)
+            start = buffer.find(HEAD)
             if start < 0:
-                start = len(held) - (held[-1:] == HEAD[:1])
+                start = len(buffer) - (buffer[-1:] == HEAD[:1])
             self.dropped += start
-            del held[:start]
-            if len(held) < FRAME.size:
+            del buffer[:start]
+            if len(buffer) < FRAME.size:
                 break
-            whole = bytes(held[: FRAME.size])
+            whole = bytes(buffer[: FRAME.size])
             if FramerRTU.compute_CRC(whole[:-2]).to_bytes(2, "big") == whole[-2:]:
-                found.append(FRAME.unpack(whole))
-                del held[: FRAME.size]
+                samples.append(FRAME.unpack(whole))
+                del buffer[: FRAME.size]
             else:
                 self.dropped += 1
-                del held[:1]
-        return found
+                del buffer[:1]
+        return samples
 
 
 class RobotiqFt300(ForceTorqueSensor):
@@ -148,12 +148,12 @@ class RobotiqFt300(ForceTorqueSensor):
             return self._ask()
         until = time.monotonic() + timeout
         while not self._waiting:
-            left = until - time.monotonic()
-            if left <= 0.0:
+            remaining = until - time.monotonic()
+            if remaining <= 0.0:
                 if time.monotonic() - self._last_received > SILENCE:
                     self._start_stream()  # it may have been switched off meanwhile
                 return None
-            self._take_bytes(left)
+            self._take_bytes(remaining)
         return self._waiting.pop(0)
 
     def _take_bytes(self, timeout: float) -> None:
@@ -168,9 +168,9 @@ class RobotiqFt300(ForceTorqueSensor):
         received = time.monotonic()
         samples = self._decoder.take(data)
         self.dropped = self._decoder.dropped
-        way = FRAME.size * BITS / self.settings.baudrate
-        for behind, counts in enumerate(reversed(samples)):
-            stamp = received - way - behind / STREAM_RATE
+        transfer_time = FRAME.size * BITS / self.settings.baudrate
+        for age, counts in enumerate(reversed(samples)):
+            stamp = received - transfer_time - age / STREAM_RATE
             self._waiting.insert(0, self._reading(stamp, received, counts))
         if samples:
             self._last_received = received
@@ -180,7 +180,7 @@ class RobotiqFt300(ForceTorqueSensor):
         from pymodbus.exceptions import ConnectionException, ModbusException
 
         line = self._line()
-        asked = time.monotonic()
+        requested_at = time.monotonic()
         try:
             answer = self._client.read_holding_registers(
                 REGISTER, count=6, device_id=self.settings.device_id
@@ -197,7 +197,7 @@ class RobotiqFt300(ForceTorqueSensor):
             self.dropped += 1
             return None
         counts = struct.unpack(">6h", struct.pack(">6H", *answer.registers))
-        return self._reading(0.5 * (asked + received), received, counts)
+        return self._reading(0.5 * (requested_at + received), received, counts)
 
     def _reading(self, stamp: float, received: float, counts: tuple[int, ...]) -> Reading:
         return Reading(stamp, received, self.settings.sign * UNIT * np.array(counts))

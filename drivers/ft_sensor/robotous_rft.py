@@ -83,18 +83,18 @@ class RobotousRft(CanSensor):
     def read(self, timeout: float) -> Reading | None:
         """Return the next sample; see ForceTorqueSensor.read."""
         until = time.monotonic() + timeout
-        while (left := until - time.monotonic()) > 0.0:
-            frame = self._receive(left)
+        while (remaining := until - time.monotonic()) > 0.0:
+            frame = self._receive(remaining)
             if frame is None:
                 break
             received = time.monotonic()
             stamp = frame.timestamp or received
-            found = self._decoder.take(frame.arbitration_id, bytes(frame.data), stamp)
+            counts = self._decoder.take(frame.arbitration_id, bytes(frame.data), stamp)
             self.dropped = self._decoder.dropped
-            if found is not None:
+            if counts is not None:
                 self._last_received = received
-                wrench = np.array(found[:6]) * self._unit
-                return Reading(self._clock.take(stamp, received), received, wrench, found[6])
+                wrench = np.array(counts[:6]) * self._unit
+                return Reading(self._clock.take(stamp, received), received, wrench, counts[6])
         if time.monotonic() - self._last_received > SILENCE:
             self._command(START)  # it may have been switched off meanwhile
         return None

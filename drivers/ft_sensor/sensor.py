@@ -23,17 +23,17 @@ class ClockOffset:
         self._offset: float | None = None  # s, monotonic minus theirs
         self._last = 0.0  # s, theirs
 
-    def take(self, theirs: float, received: float) -> float:
-        """Take an arrival (s, monotonic) of a sample stamped ``theirs``; returns its stamp here.
+    def take(self, sensor_time: float, received: float) -> float:
+        """Return when the sample stamped ``sensor_time`` was taken, s monotonic (<= ``received``).
 
-        The result is never later than ``received``. A clock that jumps starts the estimate anew.
+        A sensor clock that jumps restarts the estimate.
         """
-        lead, gap = received - theirs, theirs - self._last
-        self._last = theirs
+        lead, gap = received - sensor_time, sensor_time - self._last
+        self._last = sensor_time
         if self._offset is None or gap < 0.0 or lead - self._offset > JUMP:
             self._offset = lead
         self._offset = min(lead, self._offset + DRIFT * gap)
-        return min(theirs + self._offset, received)
+        return min(sensor_time + self._offset, received)
 
 
 @dataclass(frozen=True, slots=True)

@@ -136,21 +136,21 @@ class Decoder:
 
     def _stop_reasons_of(self, registers: Registers) -> tuple[tuple[StopReason, str], ...]:
         """Return the conditions that are not met; looked at anew where a register has changed."""
-        found = [bytes_of(registers[block]) for block, bytes_of in self._looked]
-        if found != self._last_bytes:
+        condition_bytes = [bytes_of(registers[block]) for block, bytes_of in self._looked]
+        if condition_bytes != self._last_bytes:
             self._stop_reasons = tuple(
                 (condition.otherwise, _words(condition, count))
                 for spot, condition in self._conditions
                 if not condition.fine(count := int(_number(registers, spot)))
             )
-            self._last_bytes = found
+            self._last_bytes = condition_bytes
         return self._stop_reasons
 
     def _check_lengths(self, registers: Registers) -> None:
-        for (block, size), found in zip(self._sizes, registers, strict=True):
-            if len(found) != size:
+        for (block, size), data in zip(self._sizes, registers, strict=True):
+            if len(data) != size:
                 raise InvalidStateError(
-                    f"{block.table} {block.first}: found {len(found) // 2} registers, expected "
+                    f"{block.table} {block.first}: found {len(data) // 2} registers, expected "
                     f"{block.count}"
                 )
 

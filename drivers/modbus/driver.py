@@ -68,9 +68,9 @@ class ModbusDriver(Driver):
         """Open the link and check that it is the profile's controller. Writes nothing."""
         self.transport.open()
         try:
-            found = [self.transport.read(block) for block in self.map.identity]
+            identity = [self.transport.read(block) for block in self.map.identity]
             with self._named():
-                check_identity(self.profile, self.map, found)
+                check_identity(self.profile, self.map, identity)
             self._slow_at, self._quickest = 0.0, math.inf
             blocks = self._read_blocks()
             with self._named():
@@ -137,12 +137,12 @@ class ModbusDriver(Driver):
         """
         if not self.transport.is_open:
             self.transport.open()  # raises LinkError where nobody is there any more
-        asked = self._now()
+        requested_at = self._now()
         try:
             sample = self._decoder.decode(self._read_blocks())
         except StaleStateError:
             return None
-        self._answer = self._now() - asked
+        self._answer = self._now() - requested_at
         self._quickest = min(self._quickest, self._answer)
         return None if self._answer > self._longest_answer else sample
 
@@ -157,14 +157,14 @@ class ModbusDriver(Driver):
         if now - self._given > self._longest_answer:
             problem = None  # of a state that is old by now
         if problem is not None and first.table == "holding":
-            found = [self.transport.exchange(first, *problem)]
+            registers = [self.transport.exchange(first, *problem)]
         else:
             if problem is not None:
                 self.transport.write("holding", *problem)
-            found = [self.transport.read(first)]
+            registers = [self.transport.read(first)]
         for block in self._other_blocks:
-            found.append(self.transport.read(block))
-        return found + self._slow
+            registers.append(self.transport.read(block))
+        return registers + self._slow
 
     def _validate(self, state: RobotState) -> None:
         """See Driver._validate."""
@@ -172,26 +172,26 @@ class ModbusDriver(Driver):
         self._before, self._fresh_at = state, state.received
 
     def _state(self, sample: Sample, received: float) -> RobotState:
-        found, before = sample.vectors, self._before
-        q = found["position"]
+        vectors, before = sample.vectors, self._before
+        q = vectors["position"]
         timestamp = self._freshness.take(sample.clock, q, received)
-        velocity = found.get("velocity")
+        velocity = vectors.get("velocity")
         if velocity is None:
             velocity = 0.0 * q
             if before is not None and received > before.received:
                 velocity = (q - before.actual_q) / (received - before.received)
         sent = self._writer.target()
-        target = found.get("target", q if sent is None else sent)
+        target = vectors.get("target", q if sent is None else sent)
         force = np.zeros(6)
-        if "force" in found:
-            force[:3] = found["force"]
-        if "moment" in found:
-            force[3:] = found["moment"]
+        if "force" in vectors:
+            force[:3] = vectors["force"]
+        if "moment" in vectors:
+            force[3:] = vectors["moment"]
         modes = modes_of(reason for reason, _ in sample.stop_reasons)
         return RobotState(
             timestamp, received, q, velocity, target, force,
-            joint_temperatures=found.get("temperature"),
-            actual_current_as_torque=found.get("joint_torque"),
+            joint_temperatures=vectors.get("temperature"),
+            actual_current_as_torque=vectors.get("joint_torque"),
             robot_mode=modes.robot_mode, safety_mode=modes.safety_mode,
             safety_status_bits=modes.safety_status_bits,
         )  # fmt: skip

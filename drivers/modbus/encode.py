@@ -35,15 +35,15 @@ def offset_counts(units: Sequence[float], offset_in_base: Sequence[float]) -> li
 
     Raises ValueError for one that is not finite or does not fit 16 bits.
     """
-    found: list[int] = []
+    counts: list[int] = []
     for i, (value, unit) in enumerate(zip(offset_in_base, units, strict=True)):
         if not math.isfinite(value) or abs(count := round(value / unit)) > LARGEST:
             raise ValueError(
                 f"found an offset of {value:g} {'m' if i < 3 else 'rad'}, expected at most "
                 f"{LARGEST * unit:g}: what 16 bits hold"
             )
-        found.append(count)
-    return found
+        counts.append(count)
+    return counts
 
 
 def units_of(box: Mailbox) -> tuple[float, ...]:
@@ -56,14 +56,14 @@ def rate_counts(rates: Sequence[float]) -> list[int]:
 
     Raises ValueError for what rounds down to nothing.
     """
-    found: list[int] = []
+    counts: list[int] = []
     for name, rate, count in zip(
         ("offset_rate", "offset_rotation_rate"), rates, RATE_COUNTS, strict=True
     ):
-        found.append(min(int(rate / count * (1.0 + 1e-9)), 0xFFFF))
-        if found[-1] < 1:
+        counts.append(min(int(rate / count * (1.0 + 1e-9)), 0xFFFF))
+        if counts[-1] < 1:
             raise ValueError(f"{name}: found {rate:g}, expected {count:g} at least")
-    return found
+    return counts
 
 
 def mailbox_words(
@@ -86,30 +86,30 @@ def vector_registers(entry: Vector, values: Sequence[float]) -> dict[int, int]:
     Raises ValueError where one does not fit.
     """
     size = entry.scale * UNITS[entry.unit][1]
-    found: dict[int, int] = {}
+    registers: dict[int, int] = {}
     angles = list(values)
     if entry.turns is not None:
         turns = [math.floor(v / (2.0 * math.pi)) for v in values]
         angles = [v - 2.0 * math.pi * t for v, t in zip(values, turns, strict=True)]
-        _place(found, turns_of(entry, entry.turns), [float(t) for t in turns])
-    _place(found, entry, [v / size for v in angles])
-    return found
+        _place(registers, turns_of(entry, entry.turns), [float(t) for t in turns])
+    _place(registers, entry, [v / size for v in angles])
+    return registers
 
 
-def _place(found: dict[int, int], entry: Vector, counts: Sequence[float]) -> None:
+def _place(registers: dict[int, int], entry: Vector, counts: Sequence[float]) -> None:
     coding = entry.coding
     words, size = coding.encode(counts), coding.words
     for i, address in enumerate(addresses(entry, len(counts))):
         for k in range(size):
-            found[address + k] = words[i * size + k]
+            registers[address + k] = words[i * size + k]
 
 
 def runs(registers: dict[int, int]) -> list[tuple[int, list[int]]]:
     """Return registers as unbroken runs: first address and words."""
-    found: list[tuple[int, list[int]]] = []
+    result: list[tuple[int, list[int]]] = []
     for address in sorted(registers):
-        if found and address == found[-1][0] + len(found[-1][1]):
-            found[-1][1].append(registers[address])
+        if result and address == result[-1][0] + len(result[-1][1]):
+            result[-1][1].append(registers[address])
         else:
-            found.append((address, [registers[address]]))
-    return found
+            result.append((address, [registers[address]]))
+    return result

@@ -92,33 +92,33 @@ def _each_cycle(keys: Keys) -> bool:
 
 def _blocks(groups: Iterable[list[Span]], gaps: bool) -> list[Block]:
     """Return the fewest blocks that hold the groups, greedily and in their order."""
-    left = list(groups)
-    found: list[Block] = []
-    while left:
-        first, *rest = left
+    remaining = list(groups)
+    blocks: list[Block] = []
+    while remaining:
+        first, *others = remaining
         table = first[0].table
-        taken, left = list(first), []
-        for group in rest:
-            both = [*taken, *group]
+        group_spans, remaining = list(first), []
+        for group in others:
+            both = [*group_spans, *group]
             if group[0].table == table and _length(both) <= MOST_REGISTERS:
-                taken = both
+                group_spans = both
             else:
-                left.append(group)
-        found.extend(_cut(taken, gaps))
-    return found
+                remaining.append(group)
+        blocks.extend(_cut(group_spans, gaps))
+    return blocks
 
 
-def _cut(taken: list[Span], gaps: bool) -> list[Block]:
+def _cut(group: list[Span], gaps: bool) -> list[Block]:
     """Return one block, or, where gaps cannot be read across, one for each unbroken run."""
-    ordered = sorted(taken, key=lambda s: s.first)
+    ordered = sorted(group, key=lambda s: s.first)
     runs: list[tuple[int, int]] = []
     for span in ordered:
         if runs and (gaps or span.first <= runs[-1][1]) and _fits(runs[-1][0], span.end):
             runs[-1] = (runs[-1][0], max(runs[-1][1], span.end))
         else:
             runs.append((span.first, span.end))
-    main = min(s.first for s in taken if s.keys == taken[0].keys)
-    blocks = [Block(taken[0].table, first, end - first) for first, end in runs]
+    main = min(s.first for s in group if s.keys == group[0].keys)
+    blocks = [Block(group[0].table, first, end - first) for first, end in runs]
     return sorted(blocks, key=lambda b: not b.first <= main < b.first + b.count)
 
 
@@ -134,7 +134,7 @@ def _joined(
     fast: list[Block], conditions: list[list[Span]]
 ) -> tuple[list[Block], list[list[Span]]]:
     """Return blocks widened by the conditions that one request still reaches, and the others."""
-    left: list[list[Span]] = []
+    separate: list[list[Span]] = []
     for group in conditions:
         for i, block in enumerate(fast):
             first = min(block.first, *(s.first for s in group))
@@ -143,8 +143,8 @@ def _joined(
                 fast[i] = Block(block.table, first, end - first)
                 break
         else:
-            left.append(group)
-    return fast, left
+            separate.append(group)
+    return fast, separate
 
 
 def _inside(block: Block, group: list[Span]) -> bool:
@@ -157,8 +157,8 @@ def _writable(profile: ProfileFile) -> set[tuple[Table, int]]:
         return set()
     if write.mode == "mailbox":
         return {(write.table, write.address + i) for i in range(MAILBOX_WORDS)}
-    found: set[tuple[Table, int]] = set()
+    registers: set[tuple[Table, int]] = set()
     for span in spans(profile):
         if span.keys[0] == "write" and span.keys[1] not in ("busy", "result"):
-            found |= {(span.table, span.first + i) for i in range(span.count)}
-    return found
+            registers |= {(span.table, span.first + i) for i in range(span.count)}
+    return registers

@@ -68,9 +68,9 @@ def read_profile(path: Path, joints: int | None = None) -> ProfileFile:
 def vectors(profile: ProfileFile) -> Iterator[tuple[Keys, str, Vector, int]]:
     """Yield keys, kind, entry and count of numbers of every vector in the file."""
     for name in KINDS:
-        found = getattr(profile.state, name)
-        if found is not None:
-            yield ("state", name), KINDS[name], found, 3 if name in THREE else profile.joints
+        entry = getattr(profile.state, name)
+        if entry is not None:
+            yield ("state", name), KINDS[name], entry, 3 if name in THREE else profile.joints
     if profile.write.mode == "target_trigger":
         yield ("write", "target"), "angle", profile.write.target, profile.joints
 
@@ -163,29 +163,29 @@ def _check_write(document: ProfileDocument, keys: Keys, write: RegisterWrite) ->
 
 def spans(profile: ProfileFile) -> list[Span]:
     """Return the registers of every entry."""
-    found: list[Span] = []
+    result: list[Span] = []
     for keys, _, entry, count in vectors(profile):
         words = entry.coding.words
-        found.extend(Span(keys, entry.table, a, words) for a in addresses(entry, count))
+        result.extend(Span(keys, entry.table, a, words) for a in addresses(entry, count))
         if entry.turns is not None:
             turns = turns_of(entry, entry.turns)
-            found.extend(
+            result.extend(
                 Span((*keys, "turns"), entry.table, a, turns.coding.words)
                 for a in addresses(turns, count)
             )
-    found.extend(
+    result.extend(
         Span(keys, place.table, place.address, 1 if place.table in BIT_TABLES else words)
         for keys, place in single_places(profile)
         for words in (place.coding.words,)
     )
     if profile.clock is not None and profile.clock.again is not None:
         clock = profile.clock
-        found.append(Span(("clock", "again"), clock.table, clock.again or 0, clock.coding.words))
+        result.append(Span(("clock", "again"), clock.table, clock.again or 0, clock.coding.words))
     if profile.write.mode == "mailbox":
         box = profile.write
-        found.append(Span(("write", "address"), box.table, box.address, MAILBOX_WORDS))
-        found.append(Span(("write", "echo_address"), box.echo_table, box.echo_address, ECHO_WORDS))
-    return found
+        result.append(Span(("write", "address"), box.table, box.address, MAILBOX_WORDS))
+        result.append(Span(("write", "echo_address"), box.echo_table, box.echo_address, ECHO_WORDS))
+    return result
 
 
 def _check_overlap(document: ProfileDocument, profile: ProfileFile) -> None:
@@ -233,10 +233,8 @@ def _refusal(document: ProfileDocument, worst: ErrorDetails) -> ProfileError:
     if worst["type"] == "missing":
         return document.error(keys, f"found nothing, expected {_wanted(keys)}")
     if worst["type"] in ("union_tag_invalid", "union_tag_not_found"):
-        found = worst.get("ctx", {}).get("tag", "nothing")
-        return document.error(
-            (*keys, "mode"), f"found {found!r}, expected one of {', '.join(modes)}"
-        )
+        tag = worst.get("ctx", {}).get("tag", "nothing")
+        return document.error((*keys, "mode"), f"found {tag!r}, expected one of {', '.join(modes)}")
     return document.error(keys, found_and_expected(worst))
 
 

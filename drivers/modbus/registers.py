@@ -91,11 +91,11 @@ class Coding:
             return [v - 0x10000 if v & 0x8000 else v for v in registers]
         words, count = self.words, len(registers) // self.words
         data = struct.pack(f">{len(registers)}H", *self._ordered(registers))
-        found = struct.unpack(f">{count}{CODES[self.type]}", data)
+        values = struct.unpack(f">{count}{CODES[self.type]}", data)
         if self.type.startswith("sm"):
             top = 1 << (16 * words - 1)
-            return [-(v & ~top) if v & top else v for v in found]
-        return list(found)
+            return [-(v & ~top) if v & top else v for v in values]
+        return list(values)
 
     def encode(self, counts: Sequence[float]) -> list[int]:
         """Return the registers of numbers given as counts; integers are rounded.

@@ -76,7 +76,7 @@ class Condition(Place):
     name: str = Field(min_length=1, description="what messages call it")
     good: list[int] = Field(min_length=1, description="counts that are fine")
     mask: int | None = Field(default=None, ge=1, description="bits that count")
-    otherwise: StopReason = "not_ready"
+    otherwise: StopReason = StopReason.NOT_READY
 
     def fine(self, count: int) -> bool:
         """Return whether the register says what it must."""

@@ -78,11 +78,11 @@ class _CheckedSocket(ssl.SSLSocket):
             raise
         if context.pinned is None:
             return
-        found = hashlib.sha256(self.getpeercert(binary_form=True) or b"").digest()
-        if found != context.pinned:
+        fingerprint = hashlib.sha256(self.getpeercert(binary_form=True) or b"").digest()
+        if fingerprint != context.pinned:
             detail = (
-                f"found a certificate with SHA-256 {found.hex()}, expected {context.pinned.hex()} "
-                "(link.fingerprint)"
+                f"found a certificate with SHA-256 {fingerprint.hex()}, expected "
+                f"{context.pinned.hex()} (link.fingerprint)"
             )
             context.note_refusal(detail)
             raise ssl.SSLError(1, detail)
@@ -171,10 +171,10 @@ class Transport:
         table = block.table
         function = READ_FUNCTIONS[table]
         self._opened()
-        found = self._ask(
+        answer = self._ask(
             self._calls[table], block.first, count=block.count, device_id=self._device
         )
-        return check_answer(found, function, block.count, f"{self.name}: {table}")
+        return check_answer(answer, function, block.count, f"{self.name}: {table}")
 
     def exchange(self, block: Block, address: int, values: Sequence[int]) -> bytes:
         """Write holding registers, then read a block of them, in one request (function 23)."""
@@ -276,14 +276,14 @@ def check_answer(answer: Any, function: int, count: int, where: str) -> bytes:
     Raises InvalidStateError where it is not one.
     """
     _check_function(answer, function, where)
-    found = answer.bits[:count] if function in (1, 2) else answer.registers
-    if len(found) != count:
-        raise InvalidStateError(f"{where}: found {len(found)} registers, expected {count}")
+    values = answer.bits[:count] if function in (1, 2) else answer.registers
+    if len(values) != count:
+        raise InvalidStateError(f"{where}: found {len(values)} registers, expected {count}")
     if function in (1, 2):
-        return wire_of([int(v) for v in found])
-    if min(found) < 0 or max(found) > 0xFFFF:
+        return wire_of([int(v) for v in values])
+    if min(values) < 0 or max(values) > 0xFFFF:
         raise InvalidStateError(f"{where}: found a register beyond 16 bits")
-    return wire_of(found)
+    return wire_of(values)
 
 
 def check_written(answer: Any, function: int, address: int, count: int, where: str) -> None:

@@ -87,8 +87,8 @@ class UrRtdeDriver(Driver):
 
     def round_trip(self) -> float | None:
         """Return how long a question to the RTDE server takes, s; see Driver.round_trip."""
-        self._way = found = round_trip(self.settings.host)
-        return found
+        self._way = duration = round_trip(self.settings.host)
+        return duration
 
     def way(self) -> float:
         """Return the round trip when the arm was armed; see Driver.way."""
@@ -107,10 +107,10 @@ class UrRtdeDriver(Driver):
 
         Offset mode only: offsets act at the controller's TCP, joint setpoints do not.
         """
-        found = None if self.moves_arm else self.reader.joints_and_tcp()
-        if found is None:
+        q_and_tcp = None if self.moves_arm else self.reader.joints_and_tcp()
+        if q_and_tcp is None:
             return None
-        q, tcp = found
+        q, tcp = q_and_tcp
         wanted = wanted_pose(self._model, q[None])
         apart = float(np.linalg.norm(tcp[:3] - wanted.position[0]))
         cosine = 0.5 * (np.trace(one_rotation_matrix(tcp[3:]).T @ wanted.rotation[0]) - 1.0)
@@ -131,10 +131,10 @@ class UrRtdeDriver(Driver):
     def differences(self, state: RobotState) -> list[Difference]:
         """Return where the cell differs; see Driver.differences. Raises WriteError."""
         try:
-            found = self.facts(state)
+            facts = self.facts(state)
         except LinkError as error:
             raise WriteError(str(error)) from None
-        all_of = differences(found, self._model, self.rate, self.settings.tcp_tolerance)
+        all_of = differences(facts, self._model, self.rate, self.settings.tcp_tolerance)
         # offset mode: mismatch compares the TCP where it is, before arming and all along
         return all_of if self.moves_arm else [d for d in all_of if d.keys[0] != "tool"]
 

@@ -194,7 +194,7 @@ def read_primary(host: str) -> PrimaryFacts:
 
     Raises OSError, EOFError where it cannot be read, struct.error where it is another thing.
     """
-    until, found = time.monotonic() + TIMEOUT, PrimaryFacts()
+    until, facts = time.monotonic() + TIMEOUT, PrimaryFacts()
     with socket.create_connection((host, PRIMARY), TIMEOUT) as link, link.makefile("rb") as stream:
         while time.monotonic() < until:
             size, kind = struct.unpack(">ib", _exactly(stream, 5))
@@ -203,14 +203,14 @@ def read_primary(host: str) -> PrimaryFacts:
             body = _exactly(stream, size - 5)
             if kind != STATE:
                 continue
-            found = _with_state(found, body)
-            if found.calibrated is not None and found.nominal is not None:
-                return found
-    return found
+            facts = _with_state(facts, body)
+            if facts.calibrated is not None and facts.nominal is not None:
+                return facts
+    return facts
 
 
-def _with_state(found: PrimaryFacts, body: bytes) -> PrimaryFacts:
-    calibrated, nominal, limits = found.calibrated, found.nominal, found.limits
+def _with_state(facts: PrimaryFacts, body: bytes) -> PrimaryFacts:
+    calibrated, nominal, limits = facts.calibrated, facts.nominal, facts.limits
     for kind, part in _parts(body):
         if kind == KINEMATICS:
             # checksums, then theta, a, d, alpha

@@ -190,14 +190,14 @@ class StateReader:
                         f"{self._settings.host}: {name}: found {len(row)} numbers, expected {size}"
                     )
         values = np.array([*chain.from_iterable(rows)])
-        found: dict[str, Any] = {name: values[where] for name, where in self._fields}
-        current, constants = found.pop("actual_current", None), self._settings.torque_constants
+        fields: dict[str, Any] = {name: values[where] for name, where in self._fields}
+        current, constants = fields.pop("actual_current", None), self._settings.torque_constants
         if current is not None and constants is not None:
-            found["actual_current_as_torque"] = current * constants
+            fields["actual_current_as_torque"] = current * constants
         return RobotState(
             timestamp, received, payload=payload, robot_mode=modes[0], safety_mode=modes[1],
             runtime_state=modes[2], safety_status_bits=modes[3], speed_scaling=modes[4],
-            **found,
+            **fields,
         )  # fmt: skip
 
     def joints_and_tcp(self) -> tuple[Array, Array] | None:
@@ -209,9 +209,9 @@ class StateReader:
         receive = self._receive
         for _ in range(ATTEMPTS if self._has_pose else 0):
             before = receive.getTimestamp()
-            found = receive.getActualQ(), receive.getActualTCPPose()
+            q_and_tcp = receive.getActualQ(), receive.getActualTCPPose()
             if receive.getTimestamp() == before:
-                return np.array(found[0]), np.array(found[1])
+                return np.array(q_and_tcp[0]), np.array(q_and_tcp[1])
         return None
 
 

@@ -10,7 +10,7 @@ import pytest
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.errors import Implausible, InvalidStateError, WriteError
 from gapbridge.core.state import RobotState
-from gapbridge.drivers.robot_modes import MODES, modes_of, why_not_ready
+from gapbridge.drivers.robot_modes import MODES, StopReason, modes_of, why_not_ready
 from gapbridge.drivers.simulated.ur.modes import SAFETY_BITS
 from gapbridge.drivers.state_check import BEYOND, FASTEST, HASTE, JITTER, SampleCheck
 from gapbridge.drivers.ur_rtde.command import check_ready
@@ -18,18 +18,20 @@ from gapbridge.drivers.ur_rtde.command import check_ready
 ARM = builtin_arm("ur10e")
 
 
-@pytest.mark.parametrize("stop_reason", ["", "protective_stop", "emergency_stop"])
-def test_every_driver_reports_a_stop_as_a_ur_controller_does(stop_reason: str) -> None:
-    modes = modes_of([stop_reason])
-    assert modes == MODES[stop_reason]
+@pytest.mark.parametrize("reason", [None, StopReason.PROTECTIVE_STOP, StopReason.EMERGENCY_STOP])
+def test_every_driver_reports_a_stop_as_a_ur_controller_does(
+    reason: StopReason | None,
+) -> None:
+    modes = modes_of([reason])
+    assert modes == MODES[reason]
     assert modes.safety_status_bits == SAFETY_BITS[modes.safety_mode]
 
 
 def test_of_several_stops_the_gravest_counts_and_no_bit_is_lost() -> None:
-    both = modes_of(["not_ready", "protective_stop", "fault"])
+    both = modes_of([StopReason.NOT_READY, StopReason.PROTECTIVE_STOP, StopReason.FAULT])
     assert (both.robot_mode, both.safety_mode) == (5, 9)
     assert both.safety_status_bits == 1 << 2 | 1 << 9 | 1 << 10
-    assert modes_of([]) == MODES[""]
+    assert modes_of([]) == MODES[None]
 
 
 @pytest.mark.parametrize("bit", range(11))

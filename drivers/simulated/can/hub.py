@@ -55,10 +55,10 @@ class Hub:
 
     def add_terminal(self) -> str:
         """Return the path of a serial line behind which an slcan adapter hangs on this bus."""
-        ours, theirs = os.openpty()
-        path = os.ttyname(theirs)
-        self._terminals.append(theirs)  # kept open, so that a client may come and go
-        self._add(SerialPort(ours))
+        master, slave = os.openpty()
+        path = os.ttyname(slave)
+        self._terminals.append(slave)  # kept open, so that a client may come and go
+        self._add(SerialPort(master))
         self._poke()
         return path
 

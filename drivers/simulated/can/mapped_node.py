@@ -13,6 +13,7 @@ import numpy as np
 from gapbridge.drivers.can.loading import read_profile
 from gapbridge.drivers.can.profile import Incoming, Outgoing
 from gapbridge.drivers.can.settings import CanSettings
+from gapbridge.drivers.robot_modes import StopReason
 from gapbridge.drivers.simulated.can.nodes import CanNodes
 from gapbridge.drivers.simulated.server.arm_controller import ArmController
 
@@ -89,7 +90,7 @@ class MappedNodes(CanNodes):
             scale = profile.joints.scale[reading.quantity][reading.joint]
             values[reading.signal] = reported[reading.quantity][reading.joint] / scale
         for check in incoming.checks:
-            bad = [v for v, reason in check.values.items() if reason == "emergency_stop"]
+            bad = [v for v, reason in check.values.items() if reason == StopReason.EMERGENCY_STOP]
             values[check.signal] = (bad or [1])[0] if not controller.can_move else min(check.normal)
         for signal in incoming.enabled:
             yes = min(profile.enabled_values)

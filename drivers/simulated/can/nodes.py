@@ -120,14 +120,14 @@ class CanNodes(ProtocolServer):
             return self._inner.frames.popleft() if self._inner.frames else None
         while True:
             try:
-                found = self._bus.recv(0.0)
+                message = self._bus.recv(0.0)
             except (can.CanError, OSError) as error:
                 raise LinkError(f"simulated arm: {error}") from None
-            if found is None:
+            if message is None:
                 return None
-            if not found.is_remote_frame and not found.is_error_frame:
-                extended = bool(found.is_extended_id)
-                return Frame(int(found.arbitration_id), bytes(found.data), extended)
+            if not message.is_remote_frame and not message.is_error_frame:
+                extended = bool(message.is_extended_id)
+                return Frame(int(message.arbitration_id), bytes(message.data), extended)
 
     def tear(self, first: int, second: int) -> None:
         """Lose frame ``second`` of the next sample, ``first`` of the one after; the first is off.
@@ -158,7 +158,7 @@ class CanNodes(ProtocolServer):
     def commands(self, controller: ArmController) -> Mapping[str, Command]:
         """Return the bench commands of a bus: frames that get lost."""
         return {
-            "withhold": (1, lambda given: self.withheld.add(int(given[0])),
+            "withhold": (1, lambda arguments: self.withheld.add(int(arguments[0])),
                          "withhold ID: frames of this identifier get lost"),
             "resume": (0, lambda _: self.withheld.clear(), "resume: no frames get lost any more"),
         }  # fmt: skip

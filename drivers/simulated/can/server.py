@@ -26,5 +26,5 @@ def make_servers(link: CanSettings, host: str, controller: ArmController) -> lis
             f"link.profile: found 6 joints in piper, expected {controller.n}: the cell's arm has "
             "those"
         )
-    found: ProtocolServer = nodes(link, host, controller)
-    return [found]
+    server: ProtocolServer = nodes(link, host, controller)
+    return [server]

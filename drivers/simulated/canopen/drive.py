@@ -167,10 +167,10 @@ class Drive(canopen.LocalNode):
         for entry in range(1, value + 1):
             mapped = self.number(index, entry)
             try:
-                found = self._find_object(mapped >> 16, mapped >> 8 & 0xFF)  # type: ignore[no-untyped-call]
+                variable = self._find_object(mapped >> 16, mapped >> 8 & 0xFF)  # type: ignore[no-untyped-call]
             except canopen.SdoAbortedError:
                 raise canopen.SdoAbortedError(NOT_MAPPABLE) from None
-            if not found.pdo_mappable or len(found) != mapped & 0xFF:
+            if not variable.pdo_mappable or len(variable) != mapped & 0xFF:
                 raise canopen.SdoAbortedError(NOT_MAPPABLE)
             bits += mapped & 0xFF
         if bits > 64:
@@ -186,22 +186,22 @@ class Drive(canopen.LocalNode):
             entries = [self.number(index + 0x200, i) for i in range(1, count + 1)]
             objects = tuple((e >> 16, e >> 8 & 0xFF, e & 0xFF) for e in entries)
             synchronous = self.number(index, 2) <= 240
-            found = Mapping(cob_id & 0x7FF, synchronous, objects)
-            self._mappings[index] = None if cob_id & INVALID or not count else found
+            mapping = Mapping(cob_id & 0x7FF, synchronous, objects)
+            self._mappings[index] = None if cob_id & INVALID or not count else mapping
         return self._mappings[index]
 
     def receive(self, cob_id: int, data: bytes) -> None:
         """Take a frame that may be one of our RPDOs."""
         for index in range(0x1400, 0x1404):
-            found = self._mapping(index)
-            if found is None or found.cob_id != cob_id:
+            mapping = self._mapping(index)
+            if mapping is None or mapping.cob_id != cob_id:
                 continue
-            if len(data) < sum(bits for *_, bits in found.objects) // 8:
+            if len(data) < sum(bits for *_, bits in mapping.objects) // 8:
                 self.emcy.send(0x8210, COMMUNICATION)  # PDO not processed due to length error
-            elif found.synchronous:
+            elif mapping.synchronous:
                 self._received[index] = data
             else:
-                self._act(found, data)
+                self._act(mapping, data)
 
     def _act(self, mapping: Mapping, data: bytes) -> None:
         whole = int.from_bytes(data, "little")
@@ -230,18 +230,18 @@ class Drive(canopen.LocalNode):
     def samples_off_by(self, angle: float) -> list[tuple[int, bytes]]:
         """Return the frames that a joint ``angle`` (rad) further on would have."""
         here, self.q = self.q, self.q + angle
-        found = self.samples()
+        frames = self.samples()
         self.q = here
-        return found
+        return frames
 
     def samples(self) -> list[tuple[int, bytes]]:
         """Return the frames of all synchronous TPDOs, of this moment."""
         frames = []
         for index in range(0x1800, 0x1804):
-            found = self._mapping(index)
-            if found is not None and found.synchronous:
-                parts = [self.get_data(i, s) for i, s, _ in found.objects]
-                frames.append((found.cob_id, b"".join(parts)))
+            mapping = self._mapping(index)
+            if mapping is not None and mapping.synchronous:
+                parts = [self.get_data(i, s) for i, s, _ in mapping.objects]
+                frames.append((mapping.cob_id, b"".join(parts)))
         return frames
 
     def fail(self, code: int, register: int = 1) -> None:

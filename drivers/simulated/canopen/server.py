@@ -209,11 +209,11 @@ class CanopenServer(ProtocolServer):
         ]
 
     def _send_held(self, now: float) -> None:
-        due = [held for held in self._held if held.due <= now]
-        self._held = [held for held in self._held if held.due > now]
-        for held in due:
-            data = held.data if held.sync == self._syncs else held.off
-            self._network.send_message(held.cob_id, data)
+        due = [pdo for pdo in self._held if pdo.due <= now]
+        self._held = [pdo for pdo in self._held if pdo.due > now]
+        for pdo in due:
+            data = pdo.data if pdo.sync == self._syncs else pdo.off
+            self._network.send_message(pdo.cob_id, data)
 
     def hold_back(self, node: float, delay: float, count: int = 1) -> None:
         """Have a node's TPDOs come ``delay`` s late, at the next ``count`` SYNCs."""
@@ -327,13 +327,14 @@ class CanopenServer(ProtocolServer):
     def commands(self, controller: ArmController) -> Mapping[str, Command]:
         """Return the bench commands of drives."""
         return {
-            "silence": (1, lambda given: self.silence(given[0]),
+            "silence": (1, lambda arguments: self.silence(arguments[0]),
                         "NODE: this drive sends nothing any more"),
             "speak": (0, lambda _: self.speak(), "all drives send again"),
-            "restart": (1, lambda given: self.restart(given[0]), "NODE: this drive starts anew"),
-            "fail": (2, lambda given: self.fail(given[0], int(given[1]) & 0xFFFF),
+            "restart": (1, lambda arguments: self.restart(arguments[0]),
+                        "NODE: this drive restarts"),
+            "fail": (2, lambda arguments: self.fail(arguments[0], int(arguments[1]) & 0xFFFF),
                      "NODE CODE: this drive goes to FAULT with an error code"),
-            "late": (2, lambda given: self.hold_back(given[0], max(given[1], 0.0)),
+            "late": (2, lambda arguments: self.hold_back(arguments[0], max(arguments[1], 0.0)),
                      "NODE SECONDS: its next TPDOs come so late"),
         }  # fmt: skip
 

@@ -50,8 +50,8 @@ class AtiNode(SimulatedSensor):
 
     def gauges(self) -> list[int]:
         """Return the gauges (6,), held at the ends of their range."""
-        found = np.rint(self._inverse @ np.array(self.reaction()))
-        return [int(v) for v in np.clip(found, -32768, 32767)]
+        counts = np.rint(self._inverse @ np.array(self.reaction()))
+        return [int(v) for v in np.clip(counts, -32768, 32767)]
 
     def answer(self, operation: int, data: bytes) -> list[bytes]:
         """Return the frames that answer a question; their ids count up from the operation."""

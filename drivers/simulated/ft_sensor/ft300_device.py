@@ -130,9 +130,9 @@ class Ft300Device(SimulatedSensor):
                 self._quiet = self._quiet + 1 if byte == 0xFF else 0
                 if self._quiet >= QUIET:
                     self.streaming, begin = False, end
-            kept = data[begin:] if data[begin:].strip(b"\xff") else b""
-            if kept and not self.streaming and not self.silent:
-                os.write(self._inside, kept)
+            payload = data[begin:] if data[begin:].strip(b"\xff") else b""
+            if payload and not self.streaming and not self.silent:
+                os.write(self._inside, payload)
         if self._inside in ready:
             data = _read(self._inside)
             if not self.silent:

@@ -63,8 +63,8 @@ class SimulatedSensor(ABC):
     def counts(self, per_newton: float, per_newton_metre: float) -> list[int]:
         """Return the wrench as int16 counts (6,), held at the end of the range."""
         scale = 3 * (per_newton,) + 3 * (per_newton_metre,)
-        found = [round(v * k) for v, k in zip(self.reaction(), scale, strict=True)]
-        return [int(v) for v in np.clip(found, -32768, 32767)]
+        scaled = [round(v * k) for v, k in zip(self.reaction(), scale, strict=True)]
+        return [int(v) for v in np.clip(scaled, -32768, 32767)]
 
     def __enter__(self) -> Self:
         self.start()
@@ -91,8 +91,8 @@ def reaction_at(
         a, b, c, d, e, f = in_flange()
         force = (a, b, c)
         torque = subtract((d, e, f), cross(xyz, force))
-        found = (*unrotate(rotation, force), *unrotate(rotation, torque))
-        u, v, w, x, y, z = (sign * value for value in found)
+        wrench = (*unrotate(rotation, force), *unrotate(rotation, torque))
+        u, v, w, x, y, z = (sign * value for value in wrench)
         return (u, v, w, x, y, z)
 
     return reaction

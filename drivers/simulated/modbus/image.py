@@ -17,13 +17,13 @@ TABLES: tuple[Table, ...] = ("coil", "discrete", "holding", "input")
 
 def blank(profile: ProfileFile) -> Image:
     """Return every register of a profile, zero, and those in between, which read as zero too."""
-    found: Image = {table: {} for table in TABLES}
+    image: Image = {table: {} for table in TABLES}
     for span in spans(profile):
-        found[span.table].update(dict.fromkeys(range(span.first, span.end), 0))
-    for table, registers in found.items():
+        image[span.table].update(dict.fromkeys(range(span.first, span.end), 0))
+    for table, registers in image.items():
         if registers and (profile.gaps or table in BIT_TABLES):
-            found[table] = dict.fromkeys(range(min(registers), max(registers) + 1), 0)
-    return found
+            image[table] = dict.fromkeys(range(min(registers), max(registers) + 1), 0)
+    return image
 
 
 def readings(controller: ArmController) -> dict[str, Sequence[float]]:
@@ -37,12 +37,12 @@ def readings(controller: ArmController) -> dict[str, Sequence[float]]:
 
 def state_registers(profile: ProfileFile, values: dict[str, Sequence[float]]) -> Image:
     """Return the registers of a state. Numbers that do not fit are cut off, as firmware does."""
-    found: Image = {table: {} for table in TABLES}
+    image: Image = {table: {} for table in TABLES}
     for name, numbers in values.items():
         entry: Vector | None = getattr(profile.state, name)
         if entry is not None:
-            found[entry.table].update(vector_registers(entry, _cut(entry, numbers)))
-    return found
+            image[entry.table].update(vector_registers(entry, _cut(entry, numbers)))
+    return image
 
 
 def _cut(entry: Vector, numbers: Sequence[float]) -> list[float]:
@@ -57,13 +57,13 @@ def condition_registers(
     conditions: Iterable[Condition], active: frozenset[StopReason]
 ) -> list[tuple[Table, int, int]]:
     """Return table, address and register of conditions: fine, unless their stop is active."""
-    found: dict[tuple[Table, int], int] = {}
+    registers: dict[tuple[Table, int], int] = {}
     for condition in conditions:
         spot = (condition.table, condition.address)
         value = bad(condition) if condition.otherwise in active else condition.good[0]
         mask = 0xFFFF if condition.mask is None else condition.mask
-        found[spot] = found.get(spot, 0) & ~mask | value & mask
-    return [(table, address, value) for (table, address), value in found.items()]
+        registers[spot] = registers.get(spot, 0) & ~mask | value & mask
+    return [(table, address, value) for (table, address), value in registers.items()]
 
 
 def bad(condition: Condition) -> int:
@@ -78,10 +78,10 @@ def clock_registers(profile: ProfileFile, seconds: float) -> list[tuple[Table, i
     if clock is None:
         return []
     count = clock_count(clock, seconds, profile.period)
-    found = place_registers(clock, count)
+    registers = place_registers(clock, count)
     if clock.again is not None:
-        found += place_registers(clock.model_copy(update={"address": clock.again}), count)
-    return found
+        registers += place_registers(clock.model_copy(update={"address": clock.again}), count)
+    return registers
 
 
 def clock_count(clock: Clock, seconds: float, period: float) -> float:

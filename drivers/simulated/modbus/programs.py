@@ -127,12 +127,12 @@ class MailboxProgram:
         self._solved = (controller.own_q, self.applied)
         wanted = offset_frame(tcp_in_base(arm, controller.own_q, tool), self.applied)
         near = tuple(a + b for a, b in zip(controller.own_q, controller.joint_offset, strict=True))
-        found = solve(arm, wanted, near, tool, steps=20)
-        if found is None:
+        joints = solve(arm, wanted, near, tool, steps=20)
+        if joints is None:
             log.warning("no joints for the offset pose")
             controller.protective_stop()
             return
-        controller.offset_by([a - b for a, b in zip(found, controller.own_q, strict=True)])
+        controller.offset_by([a - b for a, b in zip(joints, controller.own_q, strict=True)])
 
     def registers(self, controller: ArmController) -> list[tuple[Table, int, int]]:
         """Return the eight registers of the answer."""
@@ -194,15 +194,15 @@ class TargetProgram:
     def registers(self, controller: ArmController) -> list[tuple[Table, int, int]]:
         """Return whether a motion runs, and what the last one came to."""
         moving = not (isinstance(controller.motion, Hold) or controller.motion is HOLD)
-        found: list[tuple[Table, int, int]] = []
+        entries: list[tuple[Table, int, int]] = []
         busy, result = self._entry.busy, self._entry.result
         if busy is not None:
-            found.append((busy.table, busy.address, bad(busy) if moving else busy.good[0]))
+            entries.append((busy.table, busy.address, bad(busy) if moving else busy.good[0]))
         if result is not None:
             fine = result.good[-1] if self._done else result.good[0]
             value = bad(result) if self._refused else fine
-            found.append((result.table, result.address, value))
-        return found
+            entries.append((result.table, result.address, value))
+        return entries
 
 
 def make_program(profile: ProfileFile) -> MailboxProgram | TargetProgram | NoProgram:

@@ -118,13 +118,15 @@ class ModbusServer(ProtocolServer):
         """Return the library's blocks: every register of the map, the coils in whole words."""
         blocks: list[list[SimData]] = []
         for table in image.TABLES:
-            kept = sorted(self._image[table])
+            addresses = sorted(self._image[table])
             if table in BIT_TABLES:
-                first = min(kept, default=0) // 16 * 16
-                bits = [False] * (max(kept, default=15) // 16 * 16 + 16 - first)
+                first = min(addresses, default=0) // 16 * 16
+                bits = [False] * (max(addresses, default=15) // 16 * 16 + 16 - first)
                 blocks.append([SimData(first, values=bits, datatype=DataType.BITS)])
             else:
-                blocks.append([SimData(a, datatype=DataType.REGISTERS) for a in kept or [65535]])
+                blocks.append(
+                    [SimData(a, datatype=DataType.REGISTERS) for a in addresses or [65535]]
+                )
         coils, discretes, holdings, inputs = blocks
         return coils, discretes, holdings, inputs
 
@@ -203,12 +205,12 @@ class ModbusServer(ProtocolServer):
         values = image.readings(controller)
         for table, registers in image.state_registers(profile, values).items():
             new[table].update(registers)
-        found = image.condition_registers(
+        entries = image.condition_registers(
             [*profile.identity, *profile.status], _stop_reasons(controller)
         )
-        found += image.clock_registers(profile, controller.clock)
-        found += self.program.registers(controller)
-        for table, address, register in found:
+        entries += image.clock_registers(profile, controller.clock)
+        entries += self.program.registers(controller)
+        for table, address, register in entries:
             new[table][address] = register
         if self._torn > 0:
             self._torn -= 1
@@ -225,24 +227,24 @@ class ModbusServer(ProtocolServer):
     def commands(self, controller: ArmController) -> Mapping[str, Command]:
         """Return bench commands for faults of this protocol."""
 
-        def program(given: list[float]) -> None:
+        def program(arguments: list[float]) -> None:
             if isinstance(self.program, MailboxProgram):
-                self.program.run(bool(given[0]))
+                self.program.run(bool(arguments[0]))
 
         return {
-            "tear": (1, lambda given: self.tear(int(given[0])),
+            "tear": (1, lambda arguments: self.tear(int(arguments[0])),
                      "N: mix two moments in the next N samples"),
             "program": (1, program, "0 or 1: stop or start the robot's mailbox program"),
         }  # fmt: skip
 
 
 def _stop_reasons(controller: ArmController) -> frozenset[StopReason]:
-    found: set[StopReason] = set()
+    reasons: set[StopReason] = set()
     if controller.protective:
-        found |= {"protective_stop", "fault"}
+        reasons |= {StopReason.PROTECTIVE_STOP, StopReason.FAULT}
     if controller.emergency:
-        found |= {"emergency_stop", "not_ready"}
-    return frozenset(found)
+        reasons |= {StopReason.EMERGENCY_STOP, StopReason.NOT_READY}
+    return frozenset(reasons)
 
 
 def make_servers(

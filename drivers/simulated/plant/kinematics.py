@@ -81,8 +81,8 @@ def solve(
         if largest > 0.3:
             change *= 0.3 / largest
         q = [a + float(b) for a, b in zip(q, change, strict=True)]
-    found = gap(tcp_in_base(arm, q, tool), target)
-    return tuple(q) if max(map(abs, found)) < 1e-7 else None
+    error = gap(tcp_in_base(arm, q, tool), target)
+    return tuple(q) if max(map(abs, error)) < 1e-7 else None
 
 
 def between(start: Frame, end: Frame, share: float) -> Frame:
@@ -116,15 +116,15 @@ def holding_torque(
     weight = scale(gravity, mass)
     force = add(weight, wrench[:3])
     moment = add(add(cross(centre, weight), cross(tip, wrench[:3])), wrench[3:])
-    found: list[float] = []
+    torques: list[float] = []
     for i in reversed(range(len(arm.mass))):
         r, origin = frames[i].rotation, frames[i].origin
-        at = add(origin, rotate(r, arm.cog[i]))
+        lever = add(origin, rotate(r, arm.cog[i]))
         pull = scale(gravity, arm.mass[i])
-        force, moment = add(force, pull), add(moment, cross(at, pull))
+        force, moment = add(force, pull), add(moment, cross(lever, pull))
         here = subtract(moment, cross(origin, force))
-        found.append(-(here[0] * r[2] + here[1] * r[5] + here[2] * r[8]))
-    return tuple(reversed(found))
+        torques.append(-(here[0] * r[2] + here[1] * r[5] + here[2] * r[8]))
+    return tuple(reversed(torques))
 
 
 def within_limits(arm: PlantArm, q: Sequence[float]) -> bool:

@@ -40,12 +40,12 @@ def ramp_share(distance: float, speed: float, acceleration: float, t: float) -> 
     if t >= total:
         return 1.0, True
     if t < rise:
-        way = 0.5 * acceleration * t * t
+        travelled = 0.5 * acceleration * t * t
     elif t < rise + cruise:
-        way = top * (t - 0.5 * rise)
+        travelled = top * (t - 0.5 * rise)
     else:
-        way = distance - 0.5 * acceleration * (total - t) ** 2
-    return way / distance, False
+        travelled = distance - 0.5 * acceleration * (total - t) ** 2
+    return travelled / distance, False
 
 
 class Stateless:
@@ -124,11 +124,11 @@ class MoveLine:
         """Return the next joint target; the motion fails where the line leaves the workspace."""
         self._t += dt
         share, self.done = ramp_share(self._way, self._speed, self._acceleration, self._t)
-        found = solve(self._arm, between(self._start, self._goal, share), q, self._tool, steps=12)
-        if found is None:
+        joints = solve(self._arm, between(self._start, self._goal, share), q, self._tool, steps=12)
+        if joints is None:
             self.failed = self.done = True
             return q
-        return found
+        return joints
 
 
 class Stop(Stateless):
@@ -179,9 +179,9 @@ class MovePath:
             self._index += 1
             self._reached(self._index)
             self._motion = self._makers[self._index](q)
-        found = self._motion.step(q, qd, dt)
+        joints = self._motion.step(q, qd, dt)
         if self._motion.done:
             self.failed = self._motion.failed
             self._motion = None
             self.done = self.failed or self._index + 1 >= len(self._makers)
-        return found
+        return joints

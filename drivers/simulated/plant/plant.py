@@ -189,16 +189,16 @@ class Plant:
         force = add(weight, load.force)
         # Moment about the base origin: the sum over everything beyond, moved to each joint below.
         moment = add(add(cross(centre, weight), cross(tip, load.force)), load.torque)
-        found: list[Vector3] = []
+        moments: list[Vector3] = []
         for frame, mass, cog in zip(
             reversed(frames), reversed(self.arm.mass), reversed(self.arm.cog), strict=True
         ):
             pull = scale(gravity, mass)
-            at = add(frame.origin, rotate(frame.rotation, cog))
-            force, moment = add(force, pull), add(moment, cross(at, pull))
+            lever = add(frame.origin, rotate(frame.rotation, cog))
+            force, moment = add(force, pull), add(moment, cross(lever, pull))
             here = subtract(moment, cross(frame.origin, force))
-            found.append(unrotate(frame.rotation, here))
-        return tuple(reversed(found))
+            moments.append(unrotate(frame.rotation, here))
+        return tuple(reversed(moments))
 
     def true_tcp(self) -> Frame:
         """Return where the TCP really is, in base."""

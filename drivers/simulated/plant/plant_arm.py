@@ -67,15 +67,15 @@ class PlantArm:
 
     def frames(self, q: Sequence[float]) -> list[Frame]:
         """Return the n joint frames (after their own rotation) and the flange, rigid, in base."""
-        found: list[Frame] = []
+        result: list[Frame] = []
         rotation, origin = IDENTITY, (0.0, 0.0, 0.0)
         for i, link in enumerate(self.links):
             origin = add(origin, rotate(rotation, link.origin))
             rotation = compose(rotation, link.rotation)
             if i < len(q):
                 rotation = turn_z(rotation, q[i])
-            found.append(Frame(rotation, origin))
-        return found
+            result.append(Frame(rotation, origin))
+        return result
 
     def flange(self, q: Sequence[float]) -> Frame:
         """Return the flange of the rigid arm in base."""

@@ -33,18 +33,18 @@ class Servo(Stateless):
         """Return the next joint target."""
         share = dt / max(0.25 * self.lookahead, dt)
         most = SERVO_ACCELERATION * dt
-        found = []
+        joints = []
         for now, speed, goal, limit in zip(q, qd, self.goal, self._limits, strict=True):
-            left = goal - now
-            if abs(left) < 1e-9 and abs(speed) < 2.0 * most:
-                found.append(goal)
+            remaining = goal - now
+            if abs(remaining) < 1e-9 and abs(speed) < 2.0 * most:
+                joints.append(goal)
                 continue
             # Never faster than what can still be braked before the goal.
-            brake = math.sqrt(1.6 * SERVO_ACCELERATION * abs(left))
-            wanted = min(max(left * share / dt, -brake, -limit), brake, limit)
+            brake = math.sqrt(1.6 * SERVO_ACCELERATION * abs(remaining))
+            wanted = min(max(remaining * share / dt, -brake, -limit), brake, limit)
             wanted = min(max(wanted, speed - most), speed + most)
-            found.append(now + wanted * dt)
-        return tuple(found)
+            joints.append(now + wanted * dt)
+        return tuple(joints)
 
 
 class _Speed:

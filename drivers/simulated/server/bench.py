@@ -78,7 +78,7 @@ class BenchServer:
         controller: BenchSubject,
         drop_clients: Callable[[], None],
         move_own: Callable[[Joints], None],
-        further: Mapping[str, Command] | None = None,
+        more_commands: Mapping[str, Command] | None = None,
     ) -> None:
         self._controller = controller
         self._random = np.random.default_rng((controller.plant.settings.seed, 2))
@@ -99,12 +99,12 @@ class BenchServer:
             "freeze": (0, lambda _: controller.freeze(True),
                        "the controller's clock stands still, packets go on"),
             "thaw": (0, lambda _: controller.freeze(False), "the clock goes on"),
-            "stall": (1, lambda given: controller.stall(max(given[0], 0.0)),
+            "stall": (1, lambda arguments: controller.stall(max(arguments[0], 0.0)),
                       "SECONDS: the controller sends and answers nothing"),
             "drop": (0, lambda _: drop_clients(), "close every client's connection"),
             "truth": (0, self._truth, "the hidden plant as JSON, for scoring only"),
             "help": (0, self._help, "this list"),
-            **(further or {}),
+            **(more_commands or {}),
         }  # fmt: skip
 
     def handle(self, connection: Connection) -> None:
@@ -209,9 +209,9 @@ def _numbers(name: str, arguments: list[str], count: int) -> list[float]:
     if len(arguments) != count:
         raise BenchError(f"{name}: found {len(arguments)} numbers, expected {count}")
     try:
-        found = [float(word) for word in arguments]
+        numbers = [float(word) for word in arguments]
     except ValueError:
         raise BenchError(f"{name}: found {' '.join(arguments)!r}, expected numbers") from None
-    if not all(map(math.isfinite, found)):
+    if not all(map(math.isfinite, numbers)):
         raise BenchError(f"{name}: found {' '.join(arguments)!r}, expected finite numbers")
-    return found
+    return numbers

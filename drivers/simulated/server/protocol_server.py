@@ -76,10 +76,10 @@ class ServerLoop:
         self._port = bench_port
         self._listener: socket.socket | None = None
         self._clients: list[Connection] = []
-        further: dict[str, Command] = {}
+        commands: dict[str, Command] = {}
         for server in servers:
-            further.update(server.commands(controller))
-        self._bench = BenchServer(controller, self._drop, controller.move_own, further)
+            commands.update(server.commands(controller))
+        self._bench = BenchServer(controller, self._drop, controller.move_own, commands)
 
     @property
     def bench_port(self) -> int:
@@ -118,11 +118,11 @@ class ServerLoop:
 
     def _serve_until(self, deadline: float) -> None:
         while True:
-            left = deadline - time.monotonic()
+            remaining = deadline - time.monotonic()
             owners = {s.fileno(): (server, s) for server in self.servers for s in server.sockets()}
             clients = {c.fileno(): c for c in self._clients}
             listener = [self._listener.fileno()] if self._listener else []
-            ready, _, _ = select.select([*listener, *clients, *owners], [], [], max(left, 0.0))
+            ready, _, _ = select.select([*listener, *clients, *owners], [], [], max(remaining, 0.0))
             for number in ready:
                 if number in owners:
                     server, waited = owners[number]
@@ -133,7 +133,7 @@ class ServerLoop:
                 else:
                     self._accept()
             self._clients = [c for c in self._clients if c.open]
-            if left <= 0.0 or not ready:
+            if remaining <= 0.0 or not ready:
                 return
 
     def _accept(self) -> None:

@@ -142,9 +142,9 @@ class Controller:
         if self.program is None:
             self.watchdogs.clear()
             return
-        for name, (period, left) in list(self.watchdogs.items()):
-            self.watchdogs[name] = Watchdog(period, left - dt)
-            if left - dt < 0.0:
+        for name, (period, remaining) in list(self.watchdogs.items()):
+            self.watchdogs[name] = Watchdog(period, remaining - dt)
+            if remaining - dt < 0.0:
                 log.warning("watchdog on %s expired, the program stops", name)
                 self.end_program()
                 return
@@ -303,10 +303,10 @@ class Controller:
 
     def finite(self, values: Sequence[float], what: str) -> Joints:
         """Return `values` as joints or pose; raises ScriptError where one is not finite."""
-        found = tuple(float(v) for v in values)
-        if not all(map(math.isfinite, found)):
-            raise ScriptError(f"{what} is not finite: {found}")
-        return found
+        numbers = tuple(float(v) for v in values)
+        if not all(map(math.isfinite, numbers)):
+            raise ScriptError(f"{what} is not finite: {numbers}")
+        return numbers
 
 
 class ScriptError(Exception):

@@ -115,17 +115,17 @@ class Server:
     def _serve_until(self, deadline: float) -> None:
         """Answer clients until the next cycle is due."""
         while True:
-            left = deadline - time.monotonic()
+            remaining = deadline - time.monotonic()
             watched = [*self._listeners, *self._clients]
             try:
-                ready, _, _ = select.select(watched, [], [], max(left, 0.0))
+                ready, _, _ = select.select(watched, [], [], max(remaining, 0.0))
             except (OSError, ValueError):
                 self._forget_closed()
                 continue
             for sock in ready:
                 self._serve(sock)
             self._forget_closed()
-            if left <= 0.0 or not ready:
+            if remaining <= 0.0 or not ready:
                 return
 
     def _serve(self, sock: socket.socket) -> None:

@@ -82,7 +82,9 @@ def announced_rows(
             ((calibration or {}).get(f"delta_{key}") or [0.0] * UR_JOINTS)[i] for key in DELTAS
         ]
         values = (row.get("offset", 0.0), row["a"], row["d"], row["alpha"])
-        theta, a, d, alpha = (float(v) + float(more) for v, more in zip(values, added, strict=True))
+        theta, a, d, alpha = (
+            float(v) + float(correction) for v, correction in zip(values, added, strict=True)
+        )
         rows.append((theta, a, d, alpha))
     return tuple(rows)
 
@@ -97,15 +99,15 @@ def simulated_arm(
     """
     table = plant_arm(arm)
     n = len(table.mass)
-    given = [*START_Q, *[0.0] * n][:n] if start_q is None else [float(q) for q in start_q]
-    if len(given) != n:
-        raise ArmError(f"start_q: found {len(given)} values, expected {n}")
+    joints = [*START_Q, *[0.0] * n][:n] if start_q is None else [float(q) for q in start_q]
+    if len(joints) != n:
+        raise ArmError(f"start_q: found {len(joints)} values, expected {n}")
     if start_q is None:
-        limits = zip(given, table.lower, table.upper, strict=True)
-        given = [min(max(q, lo), hi) for q, lo, hi in limits]
-    if not within_limits(table, given):
-        raise ArmError(f"start_q: found {given}, expected joints within the arm's limits")
-    return table, replace(draw_plant_settings(table, seed), **plant), tuple(given)
+        limits = zip(joints, table.lower, table.upper, strict=True)
+        joints = [min(max(q, lo), hi) for q, lo, hi in limits]
+    if not within_limits(table, joints):
+        raise ArmError(f"start_q: found {joints}, expected joints within the arm's limits")
+    return table, replace(draw_plant_settings(table, seed), **plant), tuple(joints)
 
 
 def make_controller(settings: ServerSettings) -> Controller:

@@ -59,10 +59,10 @@ def _positive(value: float) -> float:
 
 
 def _joints_for(c: Controller, goal: Frame, near: Joints | None = None) -> Joints:
-    found = solve(c.plant.arm, goal, near or c.target_q, c.declared.tool)
-    if found is None:
+    joints = solve(c.plant.arm, goal, near or c.target_q, c.declared.tool)
+    if joints is None:
         raise ScriptError("get_inverse_kin: unable to find a solution")
-    return found
+    return joints
 
 
 def _move_joints_to_pose(r: Registers) -> Steps:
@@ -131,9 +131,9 @@ def _jog(r: Registers) -> None:
         turn = tcp_in_base(c.plant.arm, c.target_q, c.declared.tool)
     elif feature == 2:
         turn = frame_of(r.pose(8))
-    at = Frame(turn.rotation, (0.0, 0.0, 0.0))
-    shift = place(at, Frame(BASE.rotation, speed[:3])).origin
-    spin = place(at, Frame(BASE.rotation, speed[3:])).origin
+    rotation = Frame(turn.rotation, (0.0, 0.0, 0.0))
+    shift = place(rotation, Frame(BASE.rotation, speed[:3])).origin
+    spin = place(rotation, Frame(BASE.rotation, speed[3:])).origin
     acceleration = r.number(7) or JOG_ACCELERATION
     c.start_motion(SpeedTool(c.plant.arm, c.declared.tool, (*shift, *spin), acceleration))
 

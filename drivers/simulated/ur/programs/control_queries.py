@@ -40,16 +40,16 @@ def _solution(r: Registers, near: Joints) -> Joints | None:
     return solve(c.plant.arm, frame_of(r.pose()), near, c.declared.tool)
 
 
-def _answer_solution(r: Registers, found: Joints | None) -> None:
-    if found is None:
+def _answer_solution(r: Registers, joints: Joints | None) -> None:
+    if joints is None:
         raise ScriptError("get_inverse_kin: unable to find a solution")
-    r.answer_vector(found)
+    r.answer_vector(joints)
 
 
 def _pose_is_safe(r: Registers) -> None:
-    found = _solution(r, r.controller.target_q)
+    joints = _solution(r, r.controller.target_q)
     arm = r.controller.plant.arm
-    r.answer(int(found is not None and within_limits(arm, found)))
+    r.answer(int(joints is not None and within_limits(arm, joints)))
 
 
 def _forward(r: Registers) -> None:

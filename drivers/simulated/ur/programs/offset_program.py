@@ -94,10 +94,10 @@ class OffsetMotion:
         controller = self._controller
         arm, tool = controller.plant.arm, controller.declared.tool
         wanted = offset_frame(tcp_in_base(arm, new, tool), self.applied)
-        found = solve(arm, wanted, q, tool, steps=20)
-        if found is None:
+        joints = solve(arm, wanted, q, tool, steps=20)
+        if joints is None:
             raise ScriptError("get_inverse_kin: no joints for the offset pose")
-        return found
+        return joints
 
 
 class OffsetRegisters:

@@ -79,8 +79,8 @@ class DashboardServer:
         action = self._plain.get(line.lower())
         if action is not None:
             return action()
-        word, _, rest = line.partition(" ")
-        argument = rest.strip()
+        word, _, tail = line.partition(" ")
+        argument = tail.strip()
         if word.lower() == "load":
             return self._load(argument)
         if word.lower() == "popup":

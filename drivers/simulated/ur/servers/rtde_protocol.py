@@ -91,10 +91,10 @@ class OutputRecipe:
 def output_recipe(names: list[str], version: int, every: int) -> OutputRecipe:
     """Return the encoder of `names`, sent in every `every`-th cycle, in protocol `version`."""
     types = _types(names, OUTPUTS)
-    found = [(n, t) for n, t in zip(names, types, strict=True) if t != "NOT_FOUND"]
-    plan = tuple((n, FORMATS[t][1] == 1) for n, t in found)
+    available = [(n, t) for n, t in zip(names, types, strict=True) if t != "NOT_FOUND"]
+    plan = tuple((n, FORMATS[t][1] == 1) for n, t in available)
     start = ">HBB" if version == 2 else ">HB"
-    layout = struct.Struct(start + "".join(FORMATS[t][0] for _, t in found))
+    layout = struct.Struct(start + "".join(FORMATS[t][0] for _, t in available))
     head = (layout.size, DATA, 1) if version == 2 else (layout.size, DATA)
     return OutputRecipe(tuple(names), tuple(types), plan, layout, head, every)
 
@@ -127,10 +127,10 @@ class InputRecipe:
     @staticmethod
     def _named(flat: tuple[Any, ...], plan: tuple[tuple[str, int], ...]) -> dict[str, Any]:
         values: dict[str, Any] = {}
-        at = 0
+        index = 0
         for name, count in plan:
-            values[name] = flat[at] if count == 1 else flat[at : at + count]
-            at += count
+            values[name] = flat[index] if count == 1 else flat[index : index + count]
+            index += count
         return values
 
 

@@ -136,10 +136,10 @@ class RtdeServer:
             log.warning("RTDE request of unknown type %d", kind)
 
     def _negotiate(self, session: RtdeSession, payload: bytes) -> None:
-        asked = struct.unpack_from(">H", payload)[0] if len(payload) >= 2 else 0
-        accepted = asked in VERSIONS
+        version = struct.unpack_from(">H", payload)[0] if len(payload) >= 2 else 0
+        accepted = version in VERSIONS
         if accepted:
-            session.speak_version(asked)
+            session.speak_version(version)
         session.send(wire.frame(wire.REQUEST_VERSION, bytes([accepted])))
 
     def _set_up_outputs(self, session: RtdeSession, payload: bytes) -> None:
@@ -157,11 +157,11 @@ class RtdeServer:
 
     def _set_up_inputs(self, session: RtdeSession, payload: bytes) -> None:
         names = wire.split_names(payload)
-        taken = {n for other in self.sessions if other is not session for n in other.claims}
-        types = ["IN_USE" if name in taken else INPUTS.get(name, "NOT_FOUND") for name in names]
+        claimed = {n for other in self.sessions if other is not session for n in other.claims}
+        types = ["IN_USE" if name in claimed else INPUTS.get(name, "NOT_FOUND") for name in names]
         number = 0
         recipe = wire.input_recipe(names)
-        if recipe is not None and not taken.intersection(names):
+        if recipe is not None and not claimed.intersection(names):
             number = len(session.inputs) + 1
             session.inputs[number] = recipe
             session.claims.update(names)
