@@ -119,7 +119,7 @@ def test_each_compiled_function_of_ours_is_kept_so() -> None:
     from gapbridge.core import limits
     from gapbridge.core.kernels import interpolation, single
 
-    compiled = (single.correct, limits._limit, interpolation._follow, setpoint_stream._followed)
+    compiled = (single.correct, limits._limit, interpolation._follow, setpoint_stream._track)
     for function in compiled:
         stamp = function._cache._impl.locator.get_source_stamp()
         assert stamp[1] == machine_code.fingerprint(), function

@@ -172,7 +172,7 @@ def checked(builder: StateBuilder):
     check = SampleCheck(builtin_arm("ur10e"))
 
     def believed(sample):
-        state = builder.build(sample, None, "", ready=True)
+        state = builder.build(sample, None, None, ready=True)
         check.check(state)
         builder.remember()
         return state
