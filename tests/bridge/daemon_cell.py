@@ -200,9 +200,14 @@ def only_recording(folder: Path) -> Path:
 
 
 def offsets(cycles: dict[str, Any]) -> Array:
-    """Return the TCP offsets (N, 6) of cycles that were written; zero where nothing was."""
+    """Return the TCP offsets (N, 6) that the arm had; zero where nothing was to be written.
+
+    A cycle whose setpoint could not leave (its state was too old) keeps the offset before it.
+    """
     found = np.stack([cycles[f"offset_{i}"] for i in range(6)], axis=1)
-    return np.where(cycles["written"][:, None] > 0, found, 0.0)
+    wrote, meant = cycles["written"] > 0, cycles["attempted"] > 0
+    last = np.maximum.accumulate(np.where(wrote | ~meant, np.arange(len(found)), 0))
+    return np.where(wrote[last, None], found[last], 0.0)
 
 
 def gapbridge(*arguments: object, folder: Path) -> subprocess.Popen[str]:

@@ -57,9 +57,11 @@ def _no_socketcand(message: bytes) -> bytes:
 
 
 def _flood(rig: Rig) -> None:
+    """Fill the bus: 10,000 frames at the rate that 1 Mbit/s carries, 8 a millisecond."""
     frame = b"< frame 7DF 0.0 0102030405060708 >"
-    for _ in range(20):
-        rig.proxy.inject(DOWN, "can", frame * 500)
+    for _ in range(125):
+        rig.proxy.inject(DOWN, "can", frame * 80)
+        rig.pass_time(0.01)
 
 
 def _error_frames(rig: Rig) -> None:
@@ -81,7 +83,7 @@ ROWS = (
           MODBUS, within=LATER, end=("observing", "fault")) for name, ruin in _MODBUS[:4]),
     Row("broken text, once", "short or corrupt message", "one message is no frame",
         _ruin(_no_socketcand, 1), CAN, "none", SOON, GOES_ON),
-    Row("flood", "CAN flood, queue growth", "10,000 frames of a foreign identifier at once",
+    Row("flood", "CAN flood, queue growth", "10,000 frames of a foreign identifier, 8 each ms",
         _flood, CAN, "none", SOON, ("compensating", "observing")),
     Row("error frames", "CAN error frames", "20 error frames", _error_frames, CAN, "none",
         seconds(1.0), ("compensating", "observing")),

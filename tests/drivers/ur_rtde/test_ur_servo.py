@@ -215,7 +215,7 @@ def test_an_emergency_stop_ends_the_stream_and_arming_is_refused(
         """,
     )
     assert str(out["error"]).startswith("WriteError: ")
-    assert "_mode: found" in str(out["rearm"])
+    assert "expected robot_mode 7 (running)" in str(out["rearm"])
 
 
 def test_the_first_setpoint_does_not_wait_for_the_script(controller: SimulatedController) -> None:

@@ -117,6 +117,7 @@ def test_a_stalled_and_a_dropped_link_are_stale(controller: SimulatedController)
         bench.do("drop")
         out["dropped"], _ = until_error(2.0)
         """,
+        state_timeout=0.1,
     )
     assert out["stalled"].startswith("StaleStateError: ")
     assert out["asked"] <= 0.2 * 500 + 2
