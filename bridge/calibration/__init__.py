@@ -1,1 +1,1 @@
-"""Field calibration sessions: a technician is led from an unknown arm to a calibrated cell."""
+"""Field calibration: guided sessions that measure an arm and write a calibrated cell."""

@@ -1,4 +1,4 @@
-"""How poses, loads, lengths, times and a verification are worded for a technician."""
+"""Texts for the operator: joint angles, loads, lengths, durations, the result of a verification."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from gapbridge.core.calibration.verify import Suspect, Verification
 from gapbridge.core.effects import CATALOGUE
 
 
-def degrees(q: Array) -> str:
-    """Return joints as a pendant shows them."""
+def joints_text(q: Array) -> str:
+    """Return joint angles (n,), rad, in degrees."""
     return "  ".join(f"J{i + 1} {v:+.2f}°" for i, v in enumerate(np.degrees(q)))
 
 
 def millimetres(value: float) -> str:
-    """Return a length in mm, as many digits as count."""
+    """Return a length (m) in mm; decimals by size."""
     size = abs(value) * 1e3
     if not np.isfinite(size):
         return "not known"
     return f"{value * 1e3:.{3 if size < 10 else 2 if size < 100 else 0}f} mm"
 
 
-def point(value: Array) -> str:
-    """Return a reading (k,) in mm (and mrad)."""
+def reading_text(value: Array) -> str:
+    """Return a reading (k,), SI units, in mm (and mrad); k = 0: contact alone."""
     if not len(value):
         return "seated"
     lengths = " ".join(f"{v * 1e3:.3f}" for v in value[:3])
@@ -36,22 +36,22 @@ def point(value: Array) -> str:
     return f"{lengths} mm" + (f", {turns} mrad" if turns else "")
 
 
-def force(wrench: Array | None) -> str:
-    """Return a flange sensor's reading (6,): its force in N."""
+def force_text(wrench: Array | None) -> str:
+    """Return the force of a wrench (6,), N, Nm."""
     if wrench is None:
         return "nothing"
     return " ".join(f"{v:+.2f}" for v in wrench[:3]) + " N"
 
 
 def load_text(load: Payload) -> str:
-    """Return a load: name, mass, centre of gravity."""
+    """Return name, mass and centre of gravity of a load."""
     cog = ", ".join(f"{v * 1e3:g}" for v in load.cog)
     name = f"{load.name}: " if load.name else ""
     return f"{name}{load.mass:g} kg, centre of gravity ({cog}) mm from the flange"
 
 
 def duration(seconds: float) -> str:
-    """Return a time to go, as coarse as it is known."""
+    """Return an estimated duration (s), rounded."""
     minutes = seconds / 60.0
     if minutes < 1.0:
         return "less than a minute"
@@ -60,55 +60,55 @@ def duration(seconds: float) -> str:
     return f"about {int(minutes // 60)} h {round(minutes % 60 / 5) * 5:02d} min"
 
 
-def figure(value: float) -> str:
-    """Return a number with three or four digits that count."""
+def number_text(value: float) -> str:
+    """Return a number with three decimals, from 10 on with one."""
     if not np.isfinite(value):
         return "not known"
     return f"{value:.3f}" if abs(value) < 10.0 else f"{value:.1f}"
 
 
-def parameter(value: float, unit: str) -> str:
-    """Return a value as it is reported, m as mm, rad as mrad."""
+def quantity_text(value: float, unit: str) -> str:
+    """Return a value with its unit, m as mm, rad as mrad."""
     shown, factor = unit_of(unit)
-    return f"{figure(value * factor)} {shown}"
+    return f"{number_text(value * factor)} {shown}"
 
 
-def verdict_text(found: Verification) -> str:
-    """Return the verification in one sentence."""
-    errors = found.errors
+def verdict_text(verification: Verification) -> str:
+    """Return the result of a verification in one sentence."""
+    errors = verification.errors
     text = (
-        f"{len(errors.rows)} poses are {1e3 * errors.rms:.3f} mm rms off, {found.ratio:.2f} times "
-        "what the calibration predicted"
+        f"{len(errors.rows)} poses are {1e3 * errors.rms:.3f} mm rms off, "
+        f"{verification.ratio:.2f} times what the calibration predicted"
     )
-    if found.holds:
+    if verification.holds:
         return f"the calibration holds: {text}"
-    moved = (
-        "no single change of tool, load, instrument or one joint explains it: calibrate anew"
-        if found.moved is None
-        else moved_text(found.moved)
+    change = (
+        "no single change of tool, load, instrument or one joint explains it: recalibrate"
+        if verification.moved is None
+        else change_text(verification.moved)
     )
-    return f"the calibration no longer holds: {text} (chance {found.chance:.1g}); {moved}"
+    return f"the calibration no longer holds: {text} (chance {verification.chance:.1g}); {change}"
 
 
-def moved_text(moved: Suspect) -> str:
-    """Return what moved, and by how much."""
-    if moved.reading is not None:
-        return f"reading {moved.reading} alone does not fit: measure it again"
-    if moved.effect:
-        size = _size(moved.estimates)
-        return CATALOGUE[moved.effect].moved.format(joint=moved.joint, size=size)
-    return f"the instrument stands elsewhere, by {_size(moved.estimates)}: register it again"
+def change_text(change: Suspect) -> str:
+    """Return what has changed since the calibration, and by how much."""
+    if change.reading is not None:
+        return f"reading {change.reading} alone does not fit: measure it again"
+    if change.effect:
+        size = _size(change.estimates)
+        return CATALOGUE[change.effect].moved.format(joint=change.joint, size=size)
+    return f"the instrument has moved by {_size(change.estimates)}: register it again"
 
 
 def _size(estimates: Sequence[Estimate]) -> str:
-    """Return how far lengths, angles and masses moved."""
+    """Return the norm of the lengths, angles and masses that are significant."""
     sizes = []
     for unit in ("m", "rad", "kg"):
-        own, (name, factor) = [e for e in estimates if e.unit == unit], unit_of(unit)
-        if not own:
+        selected, (name, factor) = [e for e in estimates if e.unit == unit], unit_of(unit)
+        if not selected:
             continue
-        size = float(np.linalg.norm([e.value for e in own]))
-        sure = float(np.sqrt(np.mean([e.std**2 for e in own])))
-        if size > 2 * sure or len(estimates) == 1:
-            sizes.append(f"{factor * size:.3g} {name} (1 sigma {factor * sure:.2g})")
+        size = float(np.linalg.norm([e.value for e in selected]))
+        std = float(np.sqrt(np.mean([e.std**2 for e in selected])))
+        if size > 2 * std or len(estimates) == 1:
+            sizes.append(f"{factor * size:.3g} {name} (1 sigma {factor * std:.2g})")
     return " and ".join(sizes) or "little"

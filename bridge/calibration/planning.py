@@ -1,4 +1,4 @@
-"""From a cell to the plan of its session."""
+"""Plans a session from the settings of a cell."""
 
 from __future__ import annotations
 
@@ -27,22 +27,21 @@ from gapbridge.core.planning.capsules import Box
 from gapbridge.core.planning.design import SessionDesign, far_end, plan
 from gapbridge.core.planning.workspace import Place, Reflector, Workspace
 
-REPEATABILITY = 5e-5  # m, 1 sigma of one coordinate, where the cell does not report it
-NEEDS_PLACE = {"distance": "fixed end", "sphere": "sphere", "point": "point"}
-"""Kinds that are planned around something fixed in the cell, and what that is."""
-TOUCHED = ("sphere", "point")  # kinds without anything that looks at the tool
+REPEATABILITY = 5e-5  # m, 1 sigma of one coordinate, if the cell does not give it
+FIXTURES = {"distance": "fixed end", "sphere": "sphere", "point": "point"}
+"""Kinds of readings planned around a fixed object in the cell -> the object."""
+CONTACT_KINDS = ("sphere", "point")  # kinds by contact: no instrument looks at the tool
 
 
 def effects_of(cell: Cell) -> tuple[str, ...]:
-    """Return what is to be found."""
+    """Return the effects to fit."""
     return tuple(cell.calibration.effects or DEFAULT)
 
 
 def observable_of(cell: Cell, instrument: Base, places: int = 1) -> Observable:
-    """Return how the instrument's readings depend on arm and instrument.
+    """Return the measurement model of the instrument's readings.
 
-    An instrument that was moved on the way, so that it had several ``places``, is registered at
-    none of them.
+    An instrument that was moved, so that it had several ``places``, counts as not registered.
     """
     return make_observable(
         instrument.measures, registered=cell.metrology.registered and places == 1,
@@ -51,25 +50,25 @@ def observable_of(cell: Cell, instrument: Base, places: int = 1) -> Observable:
 
 
 def metrology_of(cell: Cell, instrument: Base, places: int = 1) -> Metrology:
-    """Return the instrument as the fit takes it."""
-    own = cell.metrology
-    sigma = instrument.sigma or own.sigma
-    return Metrology(own.registered and places == 1, sigma, own.repeatability)
+    """Return registration and noise of the instrument for the fit."""
+    declared = cell.metrology
+    sigma = instrument.sigma or declared.sigma
+    return Metrology(declared.registered and places == 1, sigma, declared.repeatability)
 
 
 def loads_of(cell: Cell) -> tuple[Payload, ...]:
-    """Return the loads that people hang on; the cell's own payload where it names none."""
+    """Return the loads of the session; default: the cell's payload alone."""
     entries = cell.calibration.loads
     if not entries:
-        own = cell.file.payload
-        return (Payload(own.mass, _three(own.cog), "as in the cell"),)
-    return tuple(Payload(e.mass, _three(e.cog), e.name) for e in entries)
+        payload = cell.file.payload
+        return (Payload(payload.mass, _vector3(payload.cog), "as in the cell"),)
+    return tuple(Payload(e.mass, _vector3(e.cog), e.name) for e in entries)
 
 
-def planned(cell: Cell, options: SessionOptions, emit: Callable[[str, float], None]) -> Plan:
-    """Return the plan of a whole session. Raises InputError where there can be none."""
-    given, instrument = cell.calibration, options.instrument
-    space = space_of(cell, instrument.measures)
+def make_plan(cell: Cell, options: SessionOptions, emit: Callable[[str, float], None]) -> Plan:
+    """Return the plan of a calibration; ``emit`` takes step and progress. Raises InputError."""
+    settings, instrument = cell.calibration, options.instrument
+    space = workspace_of(cell, instrument.measures)
     observable = observable_of(cell, instrument, max(len(space.places), 1))
     return plan(
         identifiable_parameters(cell.model, effects_of(cell), observable=observable),
@@ -77,9 +76,9 @@ def planned(cell: Cell, options: SessionOptions, emit: Callable[[str, float], No
         loads_of(cell),
         space,
         SessionDesign(
-            poses=options.poses or given.poses,
-            held_out=given.held_out,
-            repeats=given.repeats,
+            poses=options.poses or settings.poses,
+            held_out=settings.held_out,
+            repeats=settings.repeats,
             seed=options.seed,
             sigma=float(np.hypot(instrument.sigma or cell.metrology.sigma,
                                  cell.metrology.repeatability or REPEATABILITY)),
@@ -88,85 +87,85 @@ def planned(cell: Cell, options: SessionOptions, emit: Callable[[str, float], No
     )  # fmt: skip
 
 
-def space_of(cell: Cell, kind: str) -> Workspace:
-    """Return where the arm may be measured. Raises CellError."""
-    given, seen = cell.calibration, cell.calibration.reflector
+def workspace_of(cell: Cell, kind: str) -> Workspace:
+    """Return where the arm may be measured with a kind of reading. Raises CellError."""
+    settings, seen = cell.calibration, cell.calibration.reflector
     places = _places(cell, kind)
-    lower, upper = _range(cell, given.joint_range)
+    lower, upper = _range(cell, settings.joint_range)
     return Workspace.of(
-        cell.model, lower=lower, upper=upper, floor=given.floor, places=places,
-        keep_out=[Box(_three(b.lower), _three(b.upper)) for b in _boxes(cell, given)],
+        cell.model, lower=lower, upper=upper, floor=settings.floor, places=places,
+        keep_out=[Box(_vector3(b.lower), _vector3(b.upper)) for b in _boxes(cell, settings)],
         reflector=None if seen is None else Reflector(looks=seen.looks, acceptance=seen.acceptance),
     )  # fmt: skip
 
 
 def _places(cell: Cell, kind: str) -> list[Place]:
-    """Return where the instrument stands in turn, with its range. Raises CellError."""
-    given, where = cell.calibration, f"{cell.path}: calibration"
-    if given.instrument_at is None:
-        if kind in NEEDS_PLACE:
+    """Return the planned positions of the instrument, with its range. Raises CellError."""
+    settings, where = cell.calibration, f"{cell.path}: calibration"
+    if settings.instrument_at is None:
+        if kind in FIXTURES:
             raise CellError(
-                f"{where}.instrument_at: found nothing, expected where the {NEEDS_PLACE[kind]} is, "
+                f"{where}.instrument_at: found nothing, expected where the {FIXTURES[kind]} is, "
                 "m, in base, about"
             )
         for key in ("further_places", "instrument_range", "reflector"):
-            if getattr(given, key):
+            if getattr(settings, key):
                 raise CellError(
                     f"{where}.instrument_at: found nothing beside {key}, expected where the "
                     "instrument stands first, m, in base, about"
                 )
         return []
-    for key in ("instrument_range", "reflector") if kind in TOUCHED else ():
-        if getattr(given, key):
+    for key in ("instrument_range", "reflector") if kind in CONTACT_KINDS else ():
+        if getattr(settings, key):
             raise CellError(
-                f"{where}.{key}: found it with a {NEEDS_PLACE[kind]} that is touched, expected it "
+                f"{where}.{key}: found it with a {FIXTURES[kind]} that is touched, expected it "
                 "only where an instrument looks at the tool"
             )
-    if given.reflector is not None and not any(given.reflector.looks):
+    if settings.reflector is not None and not any(settings.reflector.looks):
         raise CellError(f"{where}.reflector.looks: found no length, expected a direction")
-    ends = given.instrument_range or RangeEntry()
-    farthest = np.inf if ends.farthest is None else ends.farthest
-    if ends.nearest >= farthest:
+    limits = settings.instrument_range or RangeEntry()
+    farthest = np.inf if limits.farthest is None else limits.farthest
+    if limits.nearest >= farthest:
         raise CellError(
-            f"{where}.instrument_range: found nearest {ends.nearest:g} and farthest {farthest:g}, "
-            "expected nearest below farthest"
+            f"{where}.instrument_range: found nearest {limits.nearest:g} and farthest "
+            f"{farthest:g}, expected nearest below farthest"
         )
     return [
-        Place(_three(at), ends.nearest, farthest)
-        for at in (given.instrument_at, *given.further_places)
+        Place(_vector3(position), limits.nearest, farthest)
+        for position in (settings.instrument_at, *settings.further_places)
     ]
 
 
 def with_loads(space: Workspace, loads: Sequence[Payload]) -> Workspace:
-    """Return the space of an arm on whose flange such loads hang, in turn."""
+    """Return the workspace with the extent of these loads in collision checks."""
     return replace(space, hung=(*space.hung, *(far_end(load) for load in loads)))
 
 
-def _boxes(cell: Cell, given: CalibrationSettings) -> list[BoxEntry]:
-    for i, box in enumerate(given.keep_out):
+def _boxes(cell: Cell, settings: CalibrationSettings) -> list[BoxEntry]:
+    for i, box in enumerate(settings.keep_out):
         if any(a >= b for a, b in zip(box.lower, box.upper, strict=True)):
             raise CellError(
                 f"{cell.path}: calibration.keep_out entry {i + 1}: found lower {box.lower} and "
                 f"upper {box.upper}, expected lower below upper"
             )
-    return list(given.keep_out)
+    return list(settings.keep_out)
 
 
 def _range(
-    cell: Cell, given: JointRange | None
+    cell: Cell, settings: JointRange | None
 ) -> tuple[list[float] | None, list[float] | None]:  # fmt: skip
-    if given is None:
+    if settings is None:
         return None, None
     n = cell.arm.n
-    for name, values in (("lower", given.lower), ("upper", given.upper)):
+    for name, values in (("lower", settings.lower), ("upper", settings.upper)):
         if len(values) != n:
             raise CellError(
                 f"{cell.path}: calibration.joint_range.{name}: found {len(values)} values, "
                 f"expected {n}"
             )
-    return given.lower, given.upper
+    return settings.lower, settings.upper
 
 
-def _three(values: list[float]) -> tuple[float, float, float]:
+def _vector3(values: list[float]) -> tuple[float, float, float]:
     x, y, z = values
     return x, y, z

@@ -1,4 +1,4 @@
-"""One call of `gapbridge calibrate`: begin or go on, measure, fit, hand over."""
+"""One call of `gapbridge calibrate`: start or resume a session, measure, evaluate."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ from gapbridge.bridge.calibration.format import load_text
 from gapbridge.bridge.calibration.instruments.instrument import (
     AnyInstrument,
     Ask,
+    InstrumentContext,
     ReadingError,
-    Surroundings,
 )
-from gapbridge.bridge.calibration.jobs.calibrate import WholeJob
+from gapbridge.bridge.calibration.jobs.calibrate import CalibrationJob
 from gapbridge.bridge.calibration.jobs.job import Job
 from gapbridge.bridge.calibration.jobs.short import PayloadJob, ToolJob
 from gapbridge.bridge.calibration.jobs.verify import VerifyJob
 from gapbridge.bridge.calibration.joints.joint_source import JointSource, PlannedJoints, TypedJoints
 from gapbridge.bridge.calibration.options import SessionOptions
 from gapbridge.bridge.calibration.planning import (
-    TOUCHED,
+    CONTACT_KINDS,
     loads_of,
     metrology_of,
-    space_of,
     with_loads,
+    workspace_of,
 )
-from gapbridge.bridge.calibration.session.folders import begun_entry, check_begun, session_folder
+from gapbridge.bridge.calibration.session.folders import check_start, session_folder, start_entry
 from gapbridge.bridge.calibration.session.journal import Journal
 from gapbridge.bridge.calibration.session.measuring import Measuring
 from gapbridge.bridge.calibration.session.plan_document import write_poses
@@ -43,29 +43,28 @@ from gapbridge.core.calibration.plan import PlannedPose
 from gapbridge.core.errors import CellError, LinkError
 
 JOBS: dict[str, tuple[str, type[Job]]] = {
-    "whole": ("Calibration of", WholeJob),
+    "whole": ("Calibration of", CalibrationJob),
     "verify": ("Verification of", VerifyJob),
     "payload": ("Load and force sensor of", PayloadJob),
     "tool": ("Tool of", ToolJob),
 }
-"""SessionOptions.kind -> title, and what is done."""
+"""SessionOptions.kind -> title and job."""
 
 
 def run_session(cell: Cell, options: SessionOptions) -> None:
-    """Do what a person has asked for. Raises InputError, RunError; click's Exit after Ctrl-C."""
+    """Start or resume a session. Raises InputError, RunError; click's Exit after Ctrl-C."""
     folder = session_folder(cell, options)
     journal = Journal(folder)
     with journal:
         session = Session.of(journal)
         prompt = Prompt(lambda text: session.add("note", text=text))
         try:
-            _lead(cell, options, prompt, session)
+            _run(cell, options, prompt, session)
         except SessionCommand as command:
-            if command.name == "undo" and session.taken:  # at the last question
-                session.add("undo", stop=session.taken[-1].stop)
-                prompt.say(
-                    f"discarded the last reading; stop {(session.next or 0) + 1} is to be measured"
-                )
+            if command.name == "undo" and session.accepted:  # at the last question
+                session.add("undo", stop=session.accepted[-1].stop)
+                stop = (session.next_stop or 0) + 1
+                prompt.say(f"discarded the last reading; stop {stop} is to be measured")
             prompt.say(_how_to_resume(cell, options, session))
         except InputEnded:
             prompt.say()
@@ -79,42 +78,42 @@ def run_session(cell: Cell, options: SessionOptions) -> None:
             raise
 
 
-def _lead(cell: Cell, options: SessionOptions, prompt: Prompt, session: Session) -> None:
+def _run(cell: Cell, options: SessionOptions, prompt: Prompt, session: Session) -> None:
     folder = session.journal.path.parent
     title, kind = JOBS[options.kind]
     prompt.say(f"{title} {cell.path}: {cell.arm.name}", "bold")
     job = kind(cell, options, prompt, session)
-    if session.begun:
-        check_begun(session.begun, cell, options, folder)
+    if session.start_entry:
+        check_start(session.start_entry, cell, options, folder)
         _report_resumed(prompt, session, folder)
     else:
-        session.add("begun", **begun_entry(cell, options))
+        session.add("begun", **start_entry(cell, options))
         prompt.say(f"new session in {folder}")
-    around = Surroundings(
+    context = InstrumentContext(
         ask=lambda question: prompt.ask(f"  {question}"),
         link_host=str(getattr(cell.link, "host", "") or ""),
-        since=float(session.begun["time"]),
+        since=float(session.start_entry["time"]),
     )
     with ExitStack() as stack:
-        joints = make_joints(cell, options, around.ask, folder)
+        joints = make_joint_source(cell, options, context.ask, folder)
         instrument = None
-        if not options.plan_only and (session.plan is None or session.next is not None):
-            instrument = job.instrument(around)  # before the plan: reports at once what is missing
+        if not options.plan_only and (session.plan is None or session.next_stop is not None):
+            instrument = job.instrument(context)  # before planning: reports what is missing
             with prompt.waiting("reaching the instrument"):
                 stack.enter_context(instrument)
-        if job.from_here and (session.plan is None or session.next is not None):
+        if job.starts_at_current_pose and (session.plan is None or session.next_stop is not None):
             _open(prompt, stack, joints)
         if session.plan is None:
             _make_plan(job, joints)
         else:
-            _report_old_plan(job)
+            _report_existing_plan(job)
         if options.plan_only:
             prompt.say(f"joints of every stop: {folder / 'poses.csv'}")
             prompt.say(f"to measure: {_command(cell, options, session)}")
             return
-        if session.next is not None:
+        if session.next_stop is not None:
             assert instrument is not None
-            if not job.from_here:
+            if not job.starts_at_current_pose:
                 _open(prompt, stack, joints)
             _measure(job, joints, instrument)
     job.finish()
@@ -125,37 +124,37 @@ def _open(prompt: Prompt, stack: ExitStack, joints: JointSource) -> None:
         stack.enter_context(joints)
 
 
-def _begin(job: Job, joints: JointSource) -> Array:
-    """Return where the arm stands before the plan is made (n,), rad."""
+def _start_joints(job: Job, joints: JointSource) -> Array:
+    """Return the present joint angles (n,), rad, from which the plan starts."""
     n = job.cell.arm.n
-    here = joints.now()
-    while here is None:
+    current = joints.current_q()
+    while current is None:
         try:
-            standing = joints.stand(PlannedPose(0, np.full(n, np.nan), 0, np.zeros(n))).q
+            q = joints.sample_at_rest(PlannedPose(0, np.full(n, np.nan), 0, np.zeros(n))).q
         except ReadingError as error:
             job.prompt.warn(str(error))
             continue
-        if np.isfinite(standing).all():
-            here = standing
+        if np.isfinite(q).all():
+            current = q
         else:
             job.prompt.warn(
-                "found nothing, expected where the arm stands now: the plan begins there"
+                "found nothing, expected where the arm stands now: the plan starts there"
             )
-    return here
+    return current
 
 
 def _make_plan(job: Job, joints: JointSource) -> None:
     prompt, session = job.prompt, job.session
-    begin = _begin(job, joints) if job.from_here else None
+    begin = _start_joints(job, joints) if job.starts_at_current_pose else None
     with prompt.waiting("planning") as emit:
         plan = job.plan(begin, lambda text, share: emit(f"planning: {text} ({share:.0%})"))
-    session.keep_plan(plan)
+    session.add_plan(plan)
     write_poses(plan, job.folder / "poses.csv")
     job.report_plan(plan)
 
 
-def _report_old_plan(job: Job) -> None:
-    """Report the plan of an earlier call where it is asked for, and that it stays."""
+def _report_existing_plan(job: Job) -> None:
+    """Print the plan of an earlier call with --plan-only, and warn that --poses is ignored."""
     if job.options.poses is not None:
         job.prompt.warn("this session already has a plan: --poses has no effect")
     if job.options.plan_only and job.session.plan is not None:
@@ -164,50 +163,52 @@ def _report_old_plan(job: Job) -> None:
 
 def _report_resumed(prompt: Prompt, session: Session, folder: Path) -> None:
     count = len(session.stops)
-    done = count - session.left
+    done = count - session.remaining
     prompt.say(f"resuming the session in {folder}: {done} of {count} stops are measured")
     if session.journal.torn:
         prompt.say("  the last line of its journal was incomplete and is ignored")
-    if session.taken:
-        prompt.say(f"  the last reading kept: stop {session.taken[-1].stop + 1}")
-    if session.mounted is not None and session.plan is not None and session.next is not None:
+    if session.accepted:
+        prompt.say(f"  the last reading kept: stop {session.accepted[-1].stop + 1}")
+    if session.mounted is not None and session.plan is not None and session.next_stop is not None:
         prompt.say(f"  on the flange: {load_text(session.plan.loads[session.mounted])}")
 
 
 def _measure(job: Job, joints: JointSource, instrument: AnyInstrument) -> None:
-    prompt, given, options = job.prompt, job.cell.calibration, job.options
-    if instrument.seats and options.move:
+    prompt, settings, options = job.prompt, job.cell.calibration, job.options
+    if instrument.contact and options.move:
         raise CellError(
             f"{job.cell.path}: calibration.instrument.kind: found {options.instrument.kind!r} with "
             "--move, expected another: the tool is brought onto something by hand"
         )
-    if instrument.seats and isinstance(joints, PlannedJoints):
+    if instrument.contact and isinstance(joints, PlannedJoints):
         raise CellError(
             f"{job.cell.path}: calibration.joints: found 'planned' with an instrument of kind "
             f"{options.instrument.kind!r}, expected 'link' or 'typed': the joints are the reading"
         )
     prompt.say(f"instrument: {instrument.name}; joints: {_joints_text(joints, options)}")
     prompt.say("at every question: Enter continues, `undo`, `back`, `skip`, `quit`, `?`")
-    positioning = Positioning(prompt, job.session, joints, instrument, _clear(job), given)
+    positioning = Positioning(
+        prompt, job.session, joints, instrument, _collision_check(job), settings
+    )
     sigma = metrology_of(job.cell, options.instrument).sigma
     Measuring(
-        prompt, job.session, positioning, instrument, job.reading_check(), sigma, given.samples
-    ).lead()
+        prompt, job.session, positioning, instrument, job.reading_check(), sigma, settings.samples
+    ).run()
 
 
-def _clear(job: Job) -> Callable[[Array], Array]:
-    space = with_loads(space_of(job.cell, "position"), loads_of(job.cell))
-    return lambda q: np.asarray(space.clear(q), dtype=float)
+def _collision_check(job: Job) -> Callable[[Array], Array]:
+    workspace = with_loads(workspace_of(job.cell, "position"), loads_of(job.cell))
+    return lambda q: np.asarray(workspace.clear(q), dtype=float)
 
 
 def _joints_text(joints: JointSource, options: SessionOptions) -> str:
-    if joints.watches:
+    if joints.detects_rest:
         return "from the controller" + (", which Gapbridge drives" if options.move else "")
     return "as planned" if isinstance(joints, PlannedJoints) else "typed in degrees"
 
 
 def _how_to_resume(cell: Cell, options: SessionOptions, session: Session) -> str:
-    done = len(session.stops) - session.left
+    done = len(session.stops) - session.remaining
     kept = f"{done} of {len(session.stops)} stops are measured and kept; " if session.stops else ""
     return f"{kept}to resume: {_command(cell, options, session)}"
 
@@ -227,17 +228,17 @@ def _command(cell: Cell, options: SessionOptions, session: Session) -> str:
     return shlex.join(parts)
 
 
-def make_joints(cell: Cell, options: SessionOptions, ask: Ask, folder: Path) -> JointSource:
-    """Return how joints are known, not yet open. Raises CellError where the cell does not fit."""
-    given = cell.calibration
-    source = given.joints or ("link" if cell.link is not None else "typed")
+def make_joint_source(cell: Cell, options: SessionOptions, ask: Ask, folder: Path) -> JointSource:
+    """Return the source of joint angles, not yet open. Raises CellError if it is unavailable."""
+    settings = cell.calibration
+    source = settings.joints or ("link" if cell.link is not None else "typed")
     if source != "link":
         if options.move:
             raise CellError(
                 f"{cell.path}: calibration.joints: found {source!r} with --move, expected 'link'"
             )
-        seated = options.kind == "tool" or options.instrument.measures in TOUCHED
-        return TypedJoints(ask, seated) if source == "typed" else PlannedJoints()
+        contact = options.kind == "tool" or options.instrument.measures in CONTACT_KINDS
+        return TypedJoints(ask, contact) if source == "typed" else PlannedJoints()
     if cell.link is None:
         raise CellError(f"{cell.path}: link: found nothing, expected the robot's address")
     if options.move and not cell.link.moves_arm:
@@ -247,4 +248,4 @@ def make_joints(cell: Cell, options: SessionOptions, ask: Ask, folder: Path) -> 
         )
     from gapbridge.bridge.calibration.joints.link import LinkedJoints
 
-    return LinkedJoints(cell, given.settle, given.speed, folder, options.move)
+    return LinkedJoints(cell, settings.settle, settings.speed, folder, options.move)

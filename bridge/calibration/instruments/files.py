@@ -1,4 +1,4 @@
-"""Readings in text files that the instrument's software writes: one that grows, or many."""
+"""Readings from text files of the instrument's software: one growing file, or one per reading."""
 
 from __future__ import annotations
 
@@ -15,62 +15,62 @@ import numpy as np
 from gapbridge.bridge.calibration.instruments.instrument import (
     Instrument,
     ReadingError,
+    ReadRequest,
     Samples,
-    Where,
 )
-from gapbridge.bridge.calibration.instruments.numbers import coordinates, numbers
+from gapbridge.bridge.calibration.instruments.numbers import parse_numbers, to_si
 from gapbridge.bridge.cell.settings.instruments import ExportSettings, FileSettings, FolderSettings
 from gapbridge.core.arrays import Array
 from gapbridge.core.errors import InputError
 
 E = TypeVar("E", bound=ExportSettings)
-LOOK = 0.1  # s between two looks
-WHOLE = 0.3  # s for which a file must not have grown
-STOP = "stop"  # name of the column that says which stop of the plan a row belongs to
+POLL_INTERVAL = 0.1  # s
+UNCHANGED_FOR = 0.3  # s without a change after which a file counts as complete
+STOP_COLUMN = "stop"  # optional: number of the stop (from 1) that a row belongs to
 
 
 @dataclass(frozen=True)
 class Row:
-    """One row: its line in the file, from 1, its cells, and its stop where it reports one."""
+    """One row of a file."""
 
-    line: int
+    line: int  # number in the file, from 1
     cells: tuple[str, ...]
-    stop: int | None
+    stop: int | None  # from 1; None: no column ``stop``
 
 
 @dataclass(frozen=True)
 class Table:
-    """The whole lines of a file so far."""
+    """The complete lines of a file so far."""
 
     path: Path
-    names: tuple[str, ...]  # empty: it has no line of names
+    names: tuple[str, ...]  # of the columns; empty: the file has no header
     rows: tuple[Row, ...]
 
-    def numbers(self, row: Row, columns: tuple[str, ...] | None, count: int) -> list[float]:
-        """Return the numbers of a row's columns, by default its last ones.
+    def values(self, row: Row, columns: tuple[str, ...] | None, count: int) -> list[float]:
+        """Return ``count`` numbers of a row: the named columns, by default the last ones.
 
-        Raises ReadingError, naming file and row.
+        Raises ReadingError naming file and row, InputError for an unknown column.
         """
-        cells = row.cells[-count:] if columns is None else self._named(row, columns)
+        cells = row.cells[-count:] if columns is None else self._select(row, columns)
         try:
-            return numbers(";".join(cells), count)
+            return parse_numbers(";".join(cells), count)
         except ReadingError as error:
             raise ReadingError(f"{self.path}: row {row.line}: {error}") from None
 
-    def _named(self, row: Row, columns: tuple[str, ...]) -> tuple[str, ...]:
+    def _select(self, row: Row, columns: tuple[str, ...]) -> tuple[str, ...]:
         missing = [name for name in columns if name not in self.names]
         if missing:
             raise InputError(
                 f"{self.path}: column {missing[0]}: found none, expected one of "
-                f"{', '.join(self.names) or 'a line of names'}"
+                f"{', '.join(self.names) or 'a header'}"
             )
         return tuple(row.cells[self.names.index(name)] for name in columns)
 
 
 def read_table(path: Path, growing: bool = True) -> Table:
-    """Return a file's whole lines; an unfinished last line of a ``growing`` one does not count yet.
+    """Return the complete lines of a file; of a ``growing`` one without an unterminated last line.
 
-    Raises InputError where it is no text.
+    Raises InputError if it cannot be read, is no UTF-8, or a stop is no whole number.
     """
     try:
         text = path.read_bytes().decode("utf-8-sig")
@@ -78,31 +78,31 @@ def read_table(path: Path, growing: bool = True) -> Table:
         raise InputError(f"{path}: found bytes that are no text, expected CSV (UTF-8)") from None
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from None
-    whole = text[: text.rfind("\n") + 1] if growing else text
-    first = whole.split("\n", 1)[0]
+    complete = text[: text.rfind("\n") + 1] if growing else text
+    first = complete.split("\n", 1)[0]
     separator = max(";\t,", key=first.count) if any(c in first for c in ";\t,") else " "
-    lines = list(csv.reader(io.StringIO(whole), delimiter=separator, skipinitialspace=True))
-    named = bool(lines) and any(not _is_number(c) for c in lines[0] if c.strip())
-    names = tuple(c.strip() for c in lines[0]) if named else ()
-    at = names.index(STOP) if STOP in names else None
+    lines = list(csv.reader(io.StringIO(complete), delimiter=separator, skipinitialspace=True))
+    has_header = bool(lines) and any(not _is_number(c) for c in lines[0] if c.strip())
+    names = tuple(c.strip() for c in lines[0]) if has_header else ()
+    stop_index = names.index(STOP_COLUMN) if STOP_COLUMN in names else None
     rows = []
     for i, cells in enumerate(lines[len(names) and 1 :], 1 + bool(names)):
         kept = tuple(c.strip() for c in cells if c.strip() or names)
         if not any(kept) or kept[0].startswith("#"):
             continue
-        rows.append(Row(i, kept, _stop(path, i, kept, at)))
+        rows.append(Row(i, kept, _stop(path, i, kept, stop_index)))
     return Table(path, names, tuple(rows))
 
 
-def _stop(path: Path, line: int, cells: tuple[str, ...], at: int | None) -> int | None:
-    if at is None:
+def _stop(path: Path, line: int, cells: tuple[str, ...], index: int | None) -> int | None:
+    if index is None:
         return None
     try:
-        return int(cells[at])
+        return int(cells[index])
     except (ValueError, IndexError):
-        found = cells[at] if at < len(cells) else "nothing"
+        found = cells[index] if index < len(cells) else "nothing"
         raise InputError(
-            f"{path}: row {line}, column {STOP}: found {found!r}, expected a whole number"
+            f"{path}: row {line}, column {STOP_COLUMN}: found {found!r}, expected a whole number"
         ) from None
 
 
@@ -114,109 +114,109 @@ def _is_number(cell: str) -> bool:
     return True
 
 
-class _Exported(Instrument[E]):
-    """Waits for a reading that has not been had."""
+class _ExportedReadings(Instrument[E]):
+    """Waits for a reading that the session has not used yet."""
 
-    waits = True
-
-    @abstractmethod
-    def _look(self, where: Where) -> Samples | None:
-        """Return the next reading, None where there is none yet. Raises ReadingError."""
+    self_triggered = True
 
     @abstractmethod
-    def _nothing(self, where: Where) -> str:
-        """Return what was not found in time, and what was expected."""
+    def _poll(self, request: ReadRequest) -> Samples | None:
+        """Return the next reading, None if there is none yet. Raises ReadingError."""
 
-    def read(self, where: Where) -> Samples:
-        """Return the next reading. Raises ReadingError where it is none or none comes in time."""
+    @abstractmethod
+    def _timeout_message(self, request: ReadRequest) -> str:
+        """Return the message for a reading that did not arrive within ``settings.timeout``."""
+
+    def read(self, request: ReadRequest) -> Samples:
+        """Return the next reading. Raises ReadingError if it is invalid or none arrives in time."""
         until = time.monotonic() + self.settings.timeout
-        while (found := self._look(where)) is None:
+        while (samples := self._poll(request)) is None:
             if time.monotonic() > until:
-                raise ReadingError(self._nothing(where))
-            time.sleep(LOOK)
-        return found
+                raise ReadingError(self._timeout_message(request))
+            time.sleep(POLL_INTERVAL)
+        return samples
 
     def _coordinates(self, table: Table, row: Row) -> Array:
-        return coordinates(
-            table.numbers(row, self.settings.columns, self.settings.width), self.settings
-        )
+        settings = self.settings
+        return to_si(table.values(row, settings.columns, settings.width), settings)
 
 
-class File(_Exported[FileSettings]):
-    """Takes the next row that has not been had, or, with a column ``stop``, the stop's last one."""
+class ReadingsFile(_ExportedReadings[FileSettings]):
+    """Reads the next unused row of a CSV file; with a column ``stop``, the last row of a stop."""
 
     @property
     def name(self) -> str:
-        """Return the file."""
+        """Return the file and its unit."""
         return f"readings from {self.settings.file} in {self.settings.unit}"
 
     def open(self) -> None:
-        """Check that the file, or at least its folder, is there. Raises InputError."""
+        """Check that the file, or at least its folder, exists. Raises InputError."""
         file = self.settings.file
         if file.is_dir() or not file.parent.is_dir():
             raise InputError(f"{file}: found no such file, expected the instrument's CSV")
         if file.exists():
             read_table(file)
 
-    def _nothing(self, where: Where) -> str:
-        given = self.settings
-        return f"{given.file}: found no new row for {given.timeout:g} s, expected stop {where.stop}"
+    def _timeout_message(self, request: ReadRequest) -> str:
+        file, timeout = self.settings.file, self.settings.timeout
+        return f"{file}: found no new row for {timeout:g} s, expected stop {request.stop}"
 
-    def _look(self, where: Where) -> Samples | None:
+    def _poll(self, request: ReadRequest) -> Samples | None:
         if not self.settings.file.exists():
             return None
         table = read_table(self.settings.file)
-        row = _next(table, where)
+        row = _next_row(table, request)
         if row is None:
             return None
         return Samples(self._coordinates(table, row)[np.newaxis], f"row {row.line}")
 
 
-def _next(table: Table, where: Where) -> Row | None:
-    rows = [r for r in table.rows if f"row {r.line}" not in where.used]
+def _next_row(table: Table, request: ReadRequest) -> Row | None:
+    rows = [r for r in table.rows if f"row {r.line}" not in request.used]
     if any(r.stop is not None for r in table.rows):
-        own = [r for r in table.rows if r.stop == where.stop]
-        return own[-1] if own else None
+        matching = [r for r in table.rows if r.stop == request.stop]
+        return matching[-1] if matching else None
     return rows[0] if rows else None
 
 
-class WatchedFolder(_Exported[FolderSettings]):
-    """Takes the oldest file that came since the session began and has not been had.
+class WatchedFolder(_ExportedReadings[FolderSettings]):
+    """Reads the oldest unused file of a folder that was written since the session began.
 
-    A file with several rows is several samples of one point.
+    The rows of one file are samples of one point.
     """
 
     @property
     def name(self) -> str:
-        """Return the folder."""
+        """Return the file pattern and its unit."""
         return f"files {self.settings.folder / self.settings.pattern} in {self.settings.unit}"
 
     def open(self) -> None:
-        """Check that the folder is there. Raises InputError."""
+        """Check that the folder exists. Raises InputError."""
         if not self.settings.folder.is_dir():
             raise InputError(
                 f"{self.settings.folder}: found no such folder, expected the one that the "
                 "tracker's software writes to"
             )
 
-    def _nothing(self, where: Where) -> str:
-        given, of = self.settings, self.settings.pattern
-        return f"{given.folder}: found no new file for {given.timeout:g} s, expected {of}"
+    def _timeout_message(self, request: ReadRequest) -> str:
+        folder, pattern = self.settings.folder, self.settings.pattern
+        return f"{folder}: found no new file for {self.settings.timeout:g} s, expected {pattern}"
 
-    def _look(self, where: Where) -> Samples | None:
-        """Return the samples of the oldest new file, once it is whole."""
-        came = []
+    def _poll(self, request: ReadRequest) -> Samples | None:
+        """Return the samples of the oldest new file once it is complete."""
+        new_files = []
         for path in self.settings.folder.glob(self.settings.pattern):
             try:
-                at = path.stat().st_mtime
+                modified = path.stat().st_mtime
             except OSError:
                 continue  # renamed or deleted meanwhile
-            if path.is_file() and path.name not in where.used and at >= self.around.since:
-                came.append((at, path.name, path))
-        if not came:
+            unused = path.is_file() and path.name not in request.used
+            if unused and modified >= self.context.since:
+                new_files.append((modified, path.name, path))
+        if not new_files:
             return None
-        at, _, path = min(came)
-        if time.time() - at <= WHOLE:
+        modified, _, path = min(new_files)
+        if time.time() - modified <= UNCHANGED_FOR:
             return None
         table = read_table(path, growing=False)
         if not table.rows:

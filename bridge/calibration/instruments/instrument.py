@@ -1,4 +1,4 @@
-"""What an instrument is: opened once, read at each pose, closed; SI inside, units declared."""
+"""Base of all instruments: opened once, read at each pose, closed; values are in SI units."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ S = TypeVar("S", bound=Base)
 
 
 class Ask(Protocol):
-    """Asks the person at the terminal for one line; commands of the session are raised."""
+    """Asks the operator for one line; a command of the session raises SessionCommand."""
 
     def __call__(self, question: str) -> str:
         """Return what was typed, stripped."""
@@ -22,75 +22,75 @@ class Ask(Protocol):
 
 
 @dataclass(frozen=True)
-class Surroundings:
-    """What an instrument may use of the session."""
+class InstrumentContext:
+    """What the session provides to an instrument."""
 
     ask: Ask
-    link_host: str = ""  # of the cell's controller; empty: none
-    since: float = 0.0  # s, time.time() when the session began: what is older is none of its
+    link_host: str = ""  # address of the cell's controller; empty: none
+    since: float = 0.0  # s, time.time() when the session began; older files are ignored
 
 
 @dataclass(frozen=True)
-class Where:
-    """What is to be measured now."""
+class ReadRequest:
+    """Which reading is requested."""
 
     stop: int = 1  # number of the stop in the plan, from 1
-    samples: int = 1  # how many to average, where it gives more than one
-    used: frozenset[str] = frozenset()  # sources of readings that have been had before
+    samples: int = 1  # number to average, for an instrument that gives several
+    used: frozenset[str] = frozenset()  # sources of readings that were used before
 
 
 @dataclass(frozen=True)
 class Samples:
-    """What one look through the instrument gave."""
+    """The samples of one reading."""
 
     values: Array  # (M, k) SI, M at least 1
-    source: str = ""  # row or file that it stood in, so that none counts twice
+    source: str = ""  # row or file it was read from, so that none is used twice
 
 
 class ReadingError(Exception):
-    """What came from the instrument is no reading; the message says why. It is asked again."""
+    """The instrument gave no valid reading; the message says why. The reading is repeated."""
 
 
 class Instrument(ABC, Generic[S]):
-    """One instrument, for one thread. The constructor opens nothing."""
+    """One instrument; not thread-safe. The constructor opens nothing."""
 
-    manual = False  # a person reads it: mistakes of typing happen
-    waits = False  # for the person, or for what is exported: nobody need say when to read
-    needs_wrench = False  # the controller must report the raw reading of a flange sensor
-    stands = "the instrument"  # what has a place in the cell, in words
-    seats = False  # the tool is brought onto something by hand: the joints are read afterwards
+    manual = False  # its readings are typed, so typing errors are possible
+    self_triggered = False  # ``read`` waits for the operator or a file: no prompt before it
+    needs_wrench = False  # the controller must report ft_raw_wrench
+    placed_part = "the instrument"  # name of the part that is placed in the cell, for messages
+    contact = False  # the tool is brought into contact by hand: joints are read after ``read``
 
-    def __init__(self, settings: S, around: Surroundings) -> None:
-        self.settings, self.around = settings, around
+    def __init__(self, settings: S, context: InstrumentContext) -> None:
+        self.settings, self.context = settings, context
 
     @property
     def kind(self) -> str:
-        """Return the kind of its readings, a key of the calibration's observables."""
+        """Return the kind of its readings, a key of core.calibration.observables.OBSERVABLES."""
         return self.settings.measures
 
     @property
     @abstractmethod
     def name(self) -> str:
-        """Return how people call it, with its unit."""
+        """Return its name for messages, with its unit."""
 
     def open(self) -> None:
-        """Get ready. Raises InputError or LinkError where it cannot be reached."""
+        """Connect to it or check its files. Raises InputError, LinkError."""
 
     @abstractmethod
-    def read(self, where: Where) -> Samples:
-        """Return samples of the target where it is now.
+    def read(self, request: ReadRequest) -> Samples:
+        """Return samples (M, k), SI units, of the target at its present position.
 
-        Raises ReadingError where what came is no reading, LinkError where it is gone.
+        Raises ReadingError if a reading is invalid, LinkError if the connection is lost.
         """
 
-    def hung(self, load: Payload) -> None:
-        """Take the load on the flange, which a simulated one hangs there.
+    def set_load(self, load: Payload) -> None:
+        """Note the load that was mounted; a simulated instrument mounts it in the simulation.
 
         Raises LinkError.
         """
 
     def close(self) -> None:
-        """Let go of it. Never raises; may be repeated."""
+        """Disconnect. Never raises; may be repeated."""
 
     def __enter__(self) -> Self:
         self.open()

@@ -1,4 +1,4 @@
-"""Numbers as people and tracker software write them, turned into SI."""
+"""Parses numbers as operators and tracker software write them, and converts them to SI units."""
 
 from __future__ import annotations
 
@@ -12,31 +12,29 @@ from gapbridge.bridge.cell.settings.instruments import METRES, RADIANS, Coordina
 from gapbridge.core.arrays import Array
 from gapbridge.core.rotation import rotation_vector, rpy_matrix
 
-FARTHEST = 100.0  # m: no instrument of this kind looks farther
-_NAME = re.compile(r"[A-Za-z_][A-Za-z_0-9]*\s*[:=]")  # "X = 12.3": what stands before a number
+MAX_RANGE = 100.0  # m, of an instrument
+_NAME = re.compile(r"[A-Za-z_][A-Za-z_0-9]*\s*[:=]")  # the label in "X = 12.3"
 _UNIT = re.compile(r"(?<=[\d.,\s])(mm|um|µm|m|in|deg|rad|°)(?=[\s,;]|$)")
 
 
-def numbers(text: str, count: int, unit: str = "") -> list[float]:
+def parse_numbers(text: str, count: int, unit: str = "") -> list[float]:
     """Return exactly ``count`` finite numbers of a line.
 
-    Between them stand commas, semicolons, tabs or spaces; a decimal comma is understood where
-    something else stands between them. A unit that is written out must be ``unit``. Raises
-    ReadingError.
+    Separators are commas, semicolons, tabs or spaces; decimal commas are accepted with any other
+    separator. A unit in the text must be ``unit``. Raises ReadingError.
     """
     plain = _NAME.sub(" ", text.strip())
     for written in _UNIT.findall(plain):
-        reported = {"µm": "um", "°": "deg"}.get(written, written)
-        if unit and reported != unit and reported not in RADIANS:
+        standard = {"µm": "um", "°": "deg"}.get(written, written)
+        if unit and standard != unit and standard not in RADIANS:
             raise ReadingError(f"found {written}, expected {unit}: the unit declared for it")
     plain = _UNIT.sub(" ", plain)
-    message = _tokens(plain, count)
     found = []
-    for word in message:
+    for token in _tokens(plain, count):
         try:
-            found.append(float(word))
+            found.append(float(token))
         except ValueError:
-            raise ReadingError(f"found {word!r}, expected a number") from None
+            raise ReadingError(f"found {token!r}, expected a number") from None
     if len(found) != count:
         plural = "s" if len(found) != 1 else ""
         raise ReadingError(f"found {len(found)} number{plural} in {text!r}, expected {count}")
@@ -54,35 +52,35 @@ def _tokens(text: str, count: int) -> list[str]:
     return [p for p in re.split(r"[\s,;]+", text.strip()) if p]
 
 
-def coordinates(values: list[float], settings: Coordinates) -> Array:
-    """Return a point (3,) in m, or a pose (6,) in m and rotation vector, in SI.
+def to_si(values: list[float], settings: Coordinates) -> Array:
+    """Return a position (3,) in m, or a pose (6,): position in m, rotation vector in rad.
 
-    Raises ReadingError where a length is beyond what such an instrument sees, or a quaternion has
-    no unit length.
+    Raises ReadingError if a coordinate exceeds MAX_RANGE, an angle one turn, or if a quaternion
+    has no unit length.
     """
     point = np.array(values[:3]) * METRES[settings.unit]
-    if np.abs(point).max() > FARTHEST:
-        at = int(np.abs(point).argmax())
+    if np.abs(point).max() > MAX_RANGE:
+        i = int(np.abs(point).argmax())
         raise ReadingError(
-            f"found {values[at]:g} {settings.unit}, {abs(point[at]):.0f} m away, expected at most "
-            f"{FARTHEST:g} m: is the unit right?"
+            f"found {values[i]:g} {settings.unit}, {abs(point[i]):.0f} m away, expected at most "
+            f"{MAX_RANGE:g} m: is the unit right?"
         )
     if not settings.pose:
         return point
-    return np.concatenate([point, _turn(np.array(values[3:]), settings)])
+    return np.concatenate([point, _rotation_vector(np.array(values[3:]), settings)])
 
 
-def _turn(values: Array, settings: Coordinates) -> Array:
+def _rotation_vector(values: Array, settings: Coordinates) -> Array:
     if settings.rotation == "quaternion":
         length = float(np.linalg.norm(values))
         if abs(length - 1.0) > 1e-2:
             raise ReadingError(f"found a quaternion of length {length:.3g}, expected 1 (x y z w)")
         x, y, z, w = values / length
-        half = np.array([x, y, z])
-        sine = float(np.linalg.norm(half))
+        vector = np.array([x, y, z])
+        sine = float(np.linalg.norm(vector))  # of half the angle
         if sine < 1e-12:
-            return 2.0 * half
-        return half / sine * 2.0 * math.atan2(sine, w)
+            return 2.0 * vector
+        return vector / sine * 2.0 * math.atan2(sine, w)
     angles = values * RADIANS[settings.angle_unit]
     if np.abs(angles).max() > 2.0 * math.pi + 1e-6:
         raise ReadingError(

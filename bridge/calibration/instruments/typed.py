@@ -1,4 +1,4 @@
-"""Instruments that a person reads: numbers typed, or pasted from the clipboard, at the terminal."""
+"""Instruments read by the operator: numbers are typed or pasted at the terminal."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ import numpy as np
 from gapbridge.bridge.calibration.instruments.instrument import (
     Instrument,
     ReadingError,
+    ReadRequest,
     S,
     Samples,
-    Where,
 )
-from gapbridge.bridge.calibration.instruments.numbers import FARTHEST, coordinates, numbers
+from gapbridge.bridge.calibration.instruments.numbers import MAX_RANGE, parse_numbers, to_si
 from gapbridge.bridge.cell.settings.instruments import (
     METRES,
     DialGaugeSettings,
@@ -19,70 +19,70 @@ from gapbridge.bridge.cell.settings.instruments import (
     TypedSettings,
 )
 
-NEAREST = 1e-3  # m between two balls
+MIN_BALL_DISTANCE = 1e-3  # m between the centres
 
 
-class _Typed(Instrument[S]):
+class _TypedReading(Instrument[S]):
     manual = True
-    waits = True
+    self_triggered = True
 
 
-class Typed(_Typed[TypedSettings]):
-    """A person reads a display and types; several lines pasted at once count one by one."""
+class TypedCoordinates(_TypedReading[TypedSettings]):
+    """Coordinates typed by the operator; of several pasted lines each is one reading."""
 
     @property
     def name(self) -> str:
-        """Return what is typed."""
+        """Return its name with the unit."""
         return f"readings typed in {self.settings.unit}"
 
-    def read(self, where: Where) -> Samples:
-        """Return one sample (1, 3) or (1, 6). Raises ReadingError."""
-        given = self.settings
-        what = "x y z" if not given.pose else f"x y z and {given.rotation}"
-        line = self.around.ask(f"{what}, {given.unit}")
-        return Samples(coordinates(numbers(line, given.width, given.unit), given)[None])
+    def read(self, request: ReadRequest) -> Samples:
+        """Return one sample: (1, 3) m, or (1, 6) m and rotation vector. Raises ReadingError."""
+        settings = self.settings
+        names = "x y z" if not settings.pose else f"x y z and {settings.rotation}"
+        line = self.context.ask(f"{names}, {settings.unit}")
+        return Samples(to_si(parse_numbers(line, settings.width, settings.unit), settings)[None])
 
 
-class DialGauge(_Typed[DialGaugeSettings]):
-    """A dial gauge, draw wire or ballbar: one distance a pose, to which ``zero`` is added."""
+class DialGauge(_TypedReading[DialGaugeSettings]):
+    """A dial gauge, draw wire or ballbar: one distance per pose, ``zero`` added."""
 
-    stands = "its fixed end"
+    placed_part = "its fixed end"
 
     @property
     def name(self) -> str:
-        """Return what is typed."""
+        """Return its name with the unit."""
         return f"distances typed in {self.settings.unit}"
 
-    def read(self, where: Where) -> Samples:
+    def read(self, request: ReadRequest) -> Samples:
         """Return one sample (1, 1), m. Raises ReadingError."""
-        given = self.settings
-        (dial,) = numbers(self.around.ask(f"dial, {given.unit}"), 1, given.unit)
-        distance = (dial + (given.zero or 0.0)) * METRES[given.unit]
-        low = 0.0 if given.zero is not None else -FARTHEST
-        if not low < distance < FARTHEST:
+        settings = self.settings
+        (dial,) = parse_numbers(self.context.ask(f"dial, {settings.unit}"), 1, settings.unit)
+        distance = (dial + (settings.zero or 0.0)) * METRES[settings.unit]
+        low = 0.0 if settings.zero is not None else -MAX_RANGE
+        if not low < distance < MAX_RANGE:
             raise ReadingError(
                 f"found a distance of {distance:g} m, expected more than {low:g} and less "
-                f"than {FARTHEST:g}: are unit and zero right?"
+                f"than {MAX_RANGE:g}: are unit and zero right?"
             )
         return Samples(np.array([[distance]]))
 
 
-class TwoBalls(_Typed[TwoBallsSettings]):
-    """Two balls on the tool, measured one after the other; the instrument may stand anywhere."""
+class TwoBalls(_TypedReading[TwoBallsSettings]):
+    """Two balls on the tool, measured one after the other, in any frame of fixed orientation."""
 
     @property
     def name(self) -> str:
-        """Return what is typed."""
+        """Return its name with the unit."""
         return f"two balls typed in {self.settings.unit}"
 
-    def read(self, where: Where) -> Samples:
+    def read(self, request: ReadRequest) -> Samples:
         """Return one sample (1, 3), m: second ball minus first. Raises ReadingError."""
         unit = self.settings.unit
         first, second = (
-            np.array(numbers(self.around.ask(f"{which} ball x y z, {unit}"), 3, unit))
+            np.array(parse_numbers(self.context.ask(f"{which} ball x y z, {unit}"), 3, unit))
             * METRES[unit]
             for which in ("first", "second")
         )
-        if np.linalg.norm(second - first) < NEAREST:
+        if np.linalg.norm(second - first) < MIN_BALL_DISTANCE:
             raise ReadingError("found both balls at the same place, expected two")
         return Samples((second - first)[None])

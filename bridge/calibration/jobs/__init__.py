@@ -1,1 +1,1 @@
-"""What a calibration session is made for: the whole arm, a check, a payload, a tool."""
+"""Jobs of a calibration session: calibration, verification, payload, tool."""

@@ -1,4 +1,4 @@
-"""A whole calibration: from an unknown arm to a cell that compensates."""
+"""The calibration of an arm: plan, fit, verification, report and the calibrated cell."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from rich.table import Table
 
 from gapbridge.bridge.calibration.format import (
     duration,
-    figure,
     load_text,
     millimetres,
-    parameter,
+    number_text,
+    quantity_text,
 )
 from gapbridge.bridge.calibration.jobs.job import Job, write_document, write_log
 from gapbridge.bridge.calibration.options import SessionOptions
-from gapbridge.bridge.calibration.planning import effects_of, metrology_of, observable_of, planned
+from gapbridge.bridge.calibration.planning import effects_of, make_plan, metrology_of, observable_of
 from gapbridge.bridge.calibration.session.prompt import Prompt
 from gapbridge.bridge.calibration.session.session import Session, seconds_left
 from gapbridge.bridge.cell import Cell
 from gapbridge.bridge.document.notes import calibration_text, note_text
-from gapbridge.bridge.document.provenance import fitted as fitted_on
+from gapbridge.bridge.document.provenance import fitted as fit_provenance
 from gapbridge.bridge.document.provenance import provenance
 from gapbridge.bridge.report.labels import unit_of
 from gapbridge.core.arrays import Array
@@ -39,39 +39,39 @@ from gapbridge.core.effects import names_part_of
 from gapbridge.core.fitted_range import range_of
 from gapbridge.core.log.log import read_log
 
-REFITS = 3  # times at most that the readings may ask for more
-LEAST_SEEN = 2e-6  # m: a repeatability below this is none that was seen
-DIAGNOSED = ("position", "pose")  # kinds whose remainder the diagnosis can judge
+MAX_REFITS = 3  # with effects that the first fit lacks
+MIN_REPEATABILITY = 2e-6  # m, below which it is reported as better than the instrument
+DIAGNOSABLE_KINDS = ("position", "pose")  # kinds of readings whose residual can be diagnosed
 
 
-def baseline_beside(cell: Path) -> Path:
-    """Return where a calibrated cell's accuracy baseline is kept."""
+def baseline_path(cell: Path) -> Path:
+    """Return the path of a calibrated cell's accuracy baseline."""
     return cell.with_name(f"{cell.stem}.promise.json")
 
 
-class WholeJob(Job):
-    """Plan, measure, fit, verify, report, and a new cell."""
+class CalibrationJob(Job):
+    """Calibrates an arm: plan, fit, verification, report, new cell."""
 
     def plan(self, begin: Array | None, emit: Callable[[str, float], None]) -> Plan:
-        """Return the most informative poses."""
-        return planned(self.cell, self.options, emit)
+        """Return the plan with the most informative poses."""
+        return make_plan(self.cell, self.options, emit)
 
     def report_plan(self, plan: Plan) -> None:
-        """Print the number of stops, and the accuracy to expect of n poses."""
+        """Print the number of stops, and the expected accuracy by number of poses."""
         prompt, minutes = self.prompt, self.cell.calibration.minutes_per_load
         fit = sum(not p.held_out and not p.repeat for p in plan.poses)
-        held = sum(p.held_out for p in plan.poses)
-        again = sum(p.repeat > 0 for p in plan.poses)
+        held_out = sum(p.held_out for p in plan.poses)
+        repeats = sum(p.repeat > 0 for p in plan.poses)
         prompt.say(
-            f"plan: {fit} poses to fit, {held} to verify, {again} once more for the repeatability: "
-            f"{len(plan.poses)} stops, "
+            f"plan: {fit} poses to fit, {held_out} to verify, {repeats} once more for the "
+            f"repeatability: {len(plan.poses)} stops, "
             f"{duration(seconds_left(self.session, minutes) + plan.travel)}"
         )
         self._report_places(plan)
         used = {p.load for p in plan.poses}
         for i, load in enumerate(plan.loads):
-            needless = "" if i in used else " (not needed: it would add nothing)"
-            prompt.say(f"  load {i + 1}: {load_text(load)}{needless}")
+            unused = "" if i in used else " (not needed: it would add nothing)"
+            prompt.say(f"  load {i + 1}: {load_text(load)}{unused}")
         prompt.say(
             f"expected: the predicted TCP known to {millimetres(plan.expected.tcp_std)} (1 sigma "
             f"over workspace and loads; {millimetres(plan.expected.tcp_std_worst)} at worst)"
@@ -85,18 +85,18 @@ class WholeJob(Job):
             prompt.say(f"  note: {note_text(note)}")
 
     def _report_places(self, plan: Plan) -> None:
-        """Say where the instrument stands in turn, where it is carried about."""
-        given = self.cell.calibration
-        for i, at in enumerate(
-            given.further_places and [given.instrument_at, *given.further_places]
+        """Print the planned positions of an instrument that is moved during the session."""
+        settings = self.cell.calibration
+        for i, position in enumerate(
+            settings.further_places and [settings.instrument_at, *settings.further_places]
         ):
             count = sum(p.station == i for p in plan.poses)
-            place = ", ".join(f"{v:g}" for v in at or ())
-            needless = "" if count else " (not needed: nothing more is seen from there)"
-            self.prompt.say(f"  place {i + 1}: ({place}) m in base, {count} stops{needless}")
+            place = ", ".join(f"{v:g}" for v in position or ())
+            unused = "" if count else " (not needed: nothing more is visible from there)"
+            self.prompt.say(f"  place {i + 1}: ({place}) m in base, {count} stops{unused}")
 
-    def _wanted(self, missing: tuple[MissingEffect, ...]) -> bool:
-        """Return whether effects that the fitted poses support are to be fitted as well."""
+    def _confirm_effects(self, missing: tuple[MissingEffect, ...]) -> bool:
+        """Ask whether to fit effects as well that reduce the cross-validated error."""
         shares = ", ".join(f"{effect.name} {100 * effect.share:.0f} %" for effect in missing)
         names = ", ".join(effect.name for effect in missing)
         self.prompt.say(
@@ -105,78 +105,80 @@ class WholeJob(Job):
         question = f"The fitted poses ask for {names} as well. Fit again with it?"
         return self.options.yes or self.prompt.confirm(question)
 
-    def _chosen(self, fit: SessionFit) -> tuple[SessionFit, tuple[str, ...]]:
-        """Return the fit with what the fitted poses support and a person wants; and what fell.
+    def _with_missing_effects(self, fit: SessionFit) -> tuple[SessionFit, tuple[str, ...]]:
+        """Return the fit extended by confirmed effects, and the names of rejected effects.
 
-        The held-out poses have no say in it. What is not borne out by its own value falls.
+        Held-out poses are not used. An effect is rejected if all its values are within three
+        standard deviations of zero.
         """
-        asked: tuple[str, ...] = ()
-        fallen: tuple[str, ...] = ()
-        for _ in range(REFITS):
-            new = tuple(effect for effect in fit.missing if effect.name not in (*asked, *fallen))
-            if not new or not self._wanted(new):
+        added: tuple[str, ...] = ()
+        rejected: tuple[str, ...] = ()
+        for _ in range(MAX_REFITS):
+            new = tuple(effect for effect in fit.missing if effect.name not in (*added, *rejected))
+            if not new or not self._confirm_effects(new):
                 break
-            names = (*asked, *(effect.name for effect in new))
-            further = fitted(self.cell, self.options, self.prompt, self.session, names)
+            names = (*added, *(effect.name for effect in new))
+            further = run_fit(self.cell, self.options, self.prompt, self.session, names)
             while unfit := unsupported(further.estimates(), names):
                 for name in unfit:
-                    self._report_declined(name, further)
-                fallen += unfit
-                names = tuple(name for name in names if name not in fallen)
-                if names == asked:
+                    self._report_rejected(name, further)
+                rejected += unfit
+                names = tuple(name for name in names if name not in rejected)
+                if names == added:
                     further = fit
                     break
-                further = fitted(self.cell, self.options, self.prompt, self.session, names)
-            if names == asked:
+                further = run_fit(self.cell, self.options, self.prompt, self.session, names)
+            if names == added:
                 break
-            fit, asked = further, names
-        return fit, fallen
+            fit, added = further, names
+        return fit, rejected
 
-    def _report_declined(self, name: str, fit: SessionFit) -> None:
-        own = [e for e in fit.estimates() if names_part_of(e.name, name)]
-        values = ", ".join(f"{e.name} = {parameter(e.value, e.unit)} ± {parameter(e.std, e.unit)}"
-                           for e in own)  # fmt: skip
+    def _report_rejected(self, name: str, fit: SessionFit) -> None:
+        estimates = [e for e in fit.estimates() if names_part_of(e.name, name)]
+        values = ", ".join(f"{e.name} = {quantity_text(e.value, e.unit)} ± "
+                           f"{quantity_text(e.std, e.unit)}" for e in estimates)  # fmt: skip
         self.prompt.warn(f"not fitted: {values} is less than three standard deviations from zero")
 
     def finish(self) -> None:
-        """Fit, show, report, and write the new cell once a person says yes."""
+        """Fit, evaluate and report; write the new cell if the operator confirms."""
         prompt, folder, options = self.prompt, self.folder, self.options
         prompt.say()
-        fit, fallen = self._chosen(fitted(self.cell, options, prompt, self.session))
-        found = calibration_of(self.cell, options, prompt, self.session, fit, fallen)
-        report_calibration(prompt, found)
-        metrology = metrology_of(self.cell, options.instrument, self.session.places)
-        write_log(found.readings, metrology.registered, folder / "readings.csv")
+        fit = run_fit(self.cell, options, prompt, self.session)
+        fit, rejected = self._with_missing_effects(fit)
+        result = evaluate_fit(self.cell, options, prompt, self.session, fit, rejected)
+        report_calibration(prompt, result)
+        metrology = metrology_of(self.cell, options.instrument, self.session.station_count)
+        write_log(result.readings, metrology.registered, folder / "readings.csv")
         origin = provenance({"log": [folder / "readings.csv"], "cell": [self.cell.path]})
-        baseline = document_of(found, sigma=metrology.sigma)
-        baseline |= {"verdict": calibration_text(found), "provenance": origin}
+        baseline = document_of(result, sigma=metrology.sigma)
+        baseline |= {"verdict": calibration_text(result), "provenance": origin}
         write_document(folder / "promise.json", baseline)
         from gapbridge.bridge.calibration.jobs.facts import (
-            session_facts,  # pictures take their time
+            session_facts,  # plotting is slow to import
         )
         from gapbridge.bridge.calibration.report import Material, write_report
 
         facts = session_facts(self.cell, options, self.session)
-        for file in write_report(Material(found, self.session.plan, facts), folder):
+        for file in write_report(Material(result, self.session.plan, facts), folder):
             prompt.say(f"{file}: written")
-        if not found.complete:
-            prompt.warn(f"not complete: {note_text(found.remaining)}")
-        if (why := worse_than_before(found.held_out_before, found.held_out_after)) is not None:
+        if not result.complete:
+            prompt.warn(f"not complete: {note_text(result.remaining)}")
+        if (why := worse_than_before(result.held_out_before, result.held_out_after)) is not None:
             self.session.add("ended", applied=None)
             prompt.warn(why)
             return
         log = read_log(folder / "readings.csv", self.cell.arm.n)
-        spread = Spread(tuple(e.name for e in found.estimates), found.whole_covariance)
-        intervals = self.cell.intervals | {e.name: e.interval for e in found.estimates if e.shown}
-        sections = {"provenance": fitted_on(origin, range_of(log), spread, intervals)}
-        target = self.hand_over(found.model, "the calibrated cell", sections)
+        spread = Spread(tuple(e.name for e in result.estimates), result.whole_covariance)
+        intervals = self.cell.intervals | {e.name: e.interval for e in result.estimates if e.shown}
+        sections = {"provenance": fit_provenance(origin, range_of(log), spread, intervals)}
+        target = self.write_new_cell(result.model, "the calibrated cell", sections)
         if target is not None:
-            write_document(baseline_beside(target), baseline)
+            write_document(baseline_path(target), baseline)
             prompt.say(f"  months later: gapbridge calibrate {target} --verify")
 
 
 def worse_than_before(before: Errors, after: Errors) -> str | None:
-    """Return why a fit is not written: it ran away on unseen poses; None: it did not."""
+    """Return why a fit is not applied: larger errors (m) on held-out poses; None: it is applied."""
     if not after.rms > before.rms:  # without held-out poses both are nan
         return None
     return (
@@ -186,28 +188,28 @@ def worse_than_before(before: Errors, after: Errors) -> str | None:
 
 
 def _poorly_determined(plan: Plan) -> list[str]:
-    """Return the parameters whose expected spread is no less than their usual size."""
+    """Return parameters whose expected standard deviation exceeds their prior's."""
     expected = plan.expected
     rows = zip(expected.names, expected.units, expected.std, expected.prior, strict=True)
     return [
-        f"{name} (±{parameter(std, unit)})"
+        f"{name} (±{quantity_text(std, unit)})"
         for name, unit, std, prior in rows
         if not np.isfinite(std) or std > prior
     ]
 
 
-def fitted(
+def run_fit(
     cell: Cell,
     options: SessionOptions,
     prompt: Prompt,
     session: Session,
     more: tuple[str, ...] = (),
 ) -> SessionFit:
-    """Return the fit of a session's readings, with ``more`` effects than the cell names.
+    """Return the fit of a session's readings, with effects ``more`` added to those of the cell.
 
-    Nothing of the held-out poses is looked at. Raises InputError where the readings are too few.
+    Held-out poses are not used. Raises InputError if the readings are too few.
     """
-    kind, places = options.instrument.measures, session.places
+    kind, places = options.instrument.measures, session.station_count
     observable = observable_of(cell, options.instrument, places)
     metrology = metrology_of(cell, options.instrument, places)
     with prompt.waiting("fitting") as emit:
@@ -220,7 +222,7 @@ def fitted(
         )  # fmt: skip
 
 
-def calibration_of(
+def evaluate_fit(
     cell: Cell,
     options: SessionOptions,
     prompt: Prompt,
@@ -228,43 +230,43 @@ def calibration_of(
     fit: SessionFit,
     declined: tuple[str, ...],
 ) -> Calibration:
-    """Return the fit judged on the held-out poses: the one look at them."""
+    """Return the fit evaluated on the held-out poses, which are used here only."""
     assert session.plan is not None
     with prompt.waiting("verifying") as emit:
         return judged(
             cell.model, fit, declined=declined, expected=session.plan.expected,
-            diagnose=options.instrument.measures in DIAGNOSED,
+            diagnose=options.instrument.measures in DIAGNOSABLE_KINDS,
             progress=lambda text: emit(f"verifying: {text}"),
         )  # fmt: skip
 
 
-def report_calibration(prompt: Prompt, found: Calibration) -> None:
-    """Say what a fit has found, how far it carries, and what stays unknown."""
-    prompt.say(calibration_text(found), "bold green" if found.complete else "bold yellow")
+def report_calibration(prompt: Prompt, result: Calibration) -> None:
+    """Print the result of a fit: errors, noise, parameters, what is not identifiable."""
+    prompt.say(calibration_text(result), "bold green" if result.complete else "bold yellow")
     pairs = (
-        ("fitted poses", found.before, found.after),
-        ("poses to verify", found.held_out_before, found.held_out_after),
+        ("fitted poses", result.before, result.after),
+        ("poses to verify", result.held_out_before, result.held_out_after),
     )
     for name, before, after in pairs:
         if len(after.vector):
             prompt.say(f"  {name}: {_errors(before)} before, {_errors(after)} after")
-    noise = f"  the fit leaves {millimetres(found.noise)} a coordinate"
-    if np.isfinite(found.noise_floor):
-        noise += f", instrument and arm alone {millimetres(found.noise_floor)}"
-    if np.isfinite(found.repeatability):
-        small = found.repeatability < LEAST_SEEN
+    noise = f"  the fit leaves {millimetres(result.noise)} a coordinate"
+    if np.isfinite(result.noise_floor):
+        noise += f", instrument and arm alone {millimetres(result.noise_floor)}"
+    if np.isfinite(result.repeatability):
+        small = result.repeatability < MIN_REPEATABILITY
         noise += ", the arm repeats " + (
             "better than the instrument reports" if small
-            else f"to {millimetres(found.repeatability)}"
+            else f"to {millimetres(result.repeatability)}"
         )  # fmt: skip
     prompt.say(noise)
-    prompt.console.print(_table(found))
-    for row in found.outliers:
+    prompt.console.print(_table(result))
+    for row in result.outliers:
         prompt.say(f"  outlier, down-weighted: reading {int(row) + 1}")
-    for note in found.notes:
+    for note in result.notes:
         prompt.say(f"  note: {note_text(note)}")
-    if found.combinations:
-        prompt.say(f"  {len(found.combinations)} parameters cannot be separated; the report "
+    if result.combinations:
+        prompt.say(f"  {len(result.combinations)} parameters cannot be separated; the report "
                  "names them")  # fmt: skip
 
 
@@ -272,7 +274,7 @@ def _errors(errors: Errors) -> str:
     return f"{millimetres(errors.mean)} mean, {millimetres(errors.max)} at most"
 
 
-def _table(found: Calibration) -> Table:
+def _table(result: Calibration) -> Table:
     table = Table(
         title="what the arm has beyond the cell's model (± 1 sigma)", title_justify="left",
         box=SIMPLE_HEAD, padding=(0, 1),
@@ -281,10 +283,10 @@ def _table(found: Calibration) -> Table:
     for name in ("value", "±", "planned ±"):
         table.add_column(name, justify="right", no_wrap=name != "±")
     table.add_column("")
-    for e in found.estimates:
+    for e in result.estimates:
         unit, factor = unit_of(e.unit)
-        planned = "" if e.expected_std is None else figure(e.expected_std * factor)
-        spread = figure(e.std * factor) if e.shown else "not identifiable"
+        planned = "" if e.expected_std is None else number_text(e.expected_std * factor)
+        spread = number_text(e.std * factor) if e.shown else "not identifiable"
         bound = " (bound)" if e.on_bound else ""
-        table.add_row(e.name, figure(e.value * factor), spread, planned, unit + bound)
+        table.add_row(e.name, number_text(e.value * factor), spread, planned, unit + bound)
     return table

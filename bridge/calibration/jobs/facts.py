@@ -1,4 +1,4 @@
-"""What the report says about a session beside its figures."""
+"""The facts of a session for its report: who, where, when, with which instrument."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from gapbridge.bridge.calibration.session.session import Session
 from gapbridge.bridge.cell import Cell
 from gapbridge.bridge.document.provenance import digest, installed_version
 
-NAMES = {
+INSTRUMENT_NAMES = {
     "typed": "readings typed at the terminal",
     "file": "readings from a file",
     "folder": "files exported by the instrument's software",
@@ -26,18 +26,18 @@ NAMES = {
 
 
 def session_facts(
-    cell: Cell, options: SessionOptions, session: Session, what: tuple[str, str] | None = None
+    cell: Cell, options: SessionOptions, session: Session, device: tuple[str, str] | None = None
 ) -> SessionFacts:
-    """Return who, where, when and with what.
+    """Return the facts of a session.
 
-    ``what`` is name and kind of what measured, where it is not the ordered instrument.
+    ``device``: name and kind of readings, if not those of the chosen instrument.
     """
     given, instrument = cell.calibration, options.instrument
-    name, kind = what or (NAMES[instrument.kind], instrument.measures)
-    times = [t.time for t in session.taken] or [float(session.begun["time"])]
-    wide = {"position": 3, "pose": 3, "distance": 1}.get(kind, 0)  # the others look from nowhere
-    distances = [np.linalg.norm(t.value[:wide]) for t in session.taken if wide]
-    started = datetime.fromtimestamp(float(session.begun["time"]))
+    name, kind = device or (INSTRUMENT_NAMES[instrument.kind], instrument.measures)
+    times = [t.time for t in session.accepted] or [float(session.start_entry["time"])]
+    lengths = {"position": 3, "pose": 3, "distance": 1}.get(kind, 0)  # 0: no distance is measured
+    distances = [np.linalg.norm(t.value[:lengths]) for t in session.accepted if lengths]
+    started = datetime.fromtimestamp(float(session.start_entry["time"]))
     return SessionFacts(
         cell=cell.path.stem,
         arm=cell.arm.name,
@@ -46,15 +46,15 @@ def session_facts(
         customer=given.customer,
         environment=given.environment,
         instrument=InstrumentFacts(
-            name=name, kind=kind, serial="" if what else instrument.serial,
-            certificate="" if what else instrument.certificate,
+            name=name, kind=kind, serial="" if device else instrument.serial,
+            certificate="" if device else instrument.certificate,
             sigma=instrument.sigma or cell.metrology.sigma,
             distance=float(np.median(distances)) if distances else 0.0,
         ),
         folder=session.journal.path.parent,
         started=started,
         ended=datetime.fromtimestamp(max(times)),
-        readings=len(session.taken),
+        readings=len(session.accepted),
         undone=session.undone,
         number=_number(started, session),
         version=installed_version(),
@@ -65,22 +65,22 @@ def session_facts(
 
 
 def _number(started: datetime, session: Session) -> str:
-    """Return the report's number: when the session began, and a digest of its journal so far."""
+    """Return the report's number: start of the session and a digest of its journal."""
     content = digest(session.journal.path) or ""
     return f"GB-{started:%Y%m%d-%H%M}-{content[:8]}"
 
 
 def _remarks(session: Session) -> list[str]:
-    """Return what happened on the way, in words."""
-    found = list(session.notes)
-    if session.places > 1:
-        found.append(f"the instrument stood at {session.places} places")
+    """Return notes and irregularities of the session as sentences."""
+    remarks = list(session.notes)
+    if session.station_count > 1:
+        remarks.append(f"the instrument stood at {session.station_count} places")
     if session.target:
-        found.append(f"the target had {session.target + 1} places on the tool")
+        remarks.append(f"the target had {session.target + 1} places on the tool")
     if session.skipped:
         stops = ", ".join(str(s + 1) for s in sorted(session.skipped))
-        found.append(f"left out: stop {stops}")
-    doubted = [t.stop + 1 for t in session.taken if t.doubted]
+        remarks.append(f"left out: stop {stops}")
+    doubted = [t.stop + 1 for t in session.accepted if t.doubted]
     if doubted:
-        found.append(f"kept though doubtful: stop {', '.join(map(str, doubted))}")
-    return found
+        remarks.append(f"kept though doubtful: stop {', '.join(map(str, doubted))}")
+    return remarks

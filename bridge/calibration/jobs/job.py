@@ -1,4 +1,4 @@
-"""What differs between a whole calibration, a verification and the short sessions."""
+"""Base class of the jobs: calibration, verification, payload, tool; and their outputs."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from gapbridge.bridge.calibration.instruments import INSTRUMENTS
-from gapbridge.bridge.calibration.instruments.instrument import AnyInstrument, Surroundings
+from gapbridge.bridge.calibration.instruments.instrument import AnyInstrument, InstrumentContext
 from gapbridge.bridge.calibration.options import SessionOptions
 from gapbridge.bridge.calibration.planning import effects_of, loads_of, metrology_of
 from gapbridge.bridge.calibration.session.prompt import Prompt
@@ -33,10 +33,10 @@ NO_EXPECTATION = Expectation((), (), np.zeros(0), np.zeros(0), float("nan"), flo
 
 
 class Job(ABC):
-    """One session's purpose: what is planned, what measures, and what becomes of it."""
+    """The purpose of one session: its plan, instrument, evaluation and output."""
 
-    from_here = False  # the plan begins where the arm stands now
-    suffix = "calibrated"  # of the new cell's name, where none is given
+    starts_at_current_pose = False  # the plan depends on the present joint angles
+    suffix = "calibrated"  # of the new cell's default name
 
     def __init__(
         self, cell: Cell, options: SessionOptions, prompt: Prompt, session: Session
@@ -50,18 +50,18 @@ class Job(ABC):
 
     @abstractmethod
     def plan(self, begin: Array | None, emit: Callable[[str, float], None]) -> Plan:
-        """Return the plan. Raises InputError where there can be none."""
+        """Return the plan; ``begin`` (n,) rad: present joint angles. Raises InputError."""
 
     @abstractmethod
     def report_plan(self, plan: Plan) -> None:
-        """Say what is planned, and what it will determine."""
+        """Print the plan and the accuracy to expect."""
 
-    def instrument(self, around: Surroundings) -> AnyInstrument:
-        """Return what measures, not yet open."""
-        return INSTRUMENTS[self.options.instrument.kind](self.options.instrument, around)
+    def instrument(self, context: InstrumentContext) -> AnyInstrument:
+        """Return the instrument, not yet open."""
+        return INSTRUMENTS[self.options.instrument.kind](self.options.instrument, context)
 
     def reading_check(self) -> ReadingCheck | None:
-        """Return who judges the readings; None: nobody can."""
+        """Return the check of each reading; None: readings are not checked one by one."""
         metrology = metrology_of(self.cell, self.options.instrument)
         return ReadingCheck(
             self.cell.model, metrology, self.options.instrument.measures, metrology.sigma,
@@ -70,15 +70,15 @@ class Job(ABC):
 
     @abstractmethod
     def finish(self) -> None:
-        """Work out what the readings determine, report it, and apply it where a person says so."""
+        """Fit the readings, write the report, and write a new cell if the operator confirms."""
 
     def report_short(
         self, found: PayloadCalibration | ToolCalibration, lines: Sequence[str],
         instrument: tuple[str, str],
     ) -> None:  # fmt: skip
-        """Say what a short session found, a line an estimate, and write its report.
+        """Print the result of a short session, one line per estimate, and write its report.
 
-        ``instrument``: name and kind of what was measured with.
+        ``instrument``: its name and kind of reading.
         """
         from gapbridge.bridge.calibration.jobs.facts import session_facts
         from gapbridge.bridge.calibration.report import ShortMaterial, write_report
@@ -92,14 +92,14 @@ class Job(ABC):
         for file in write_report(ShortMaterial(found, facts, self.cell.model), self.folder):
             prompt.say(f"{file}: written")
 
-    def hand_over(
+    def write_new_cell(
         self, model: Model, what: str, sections: dict[str, Any] | None = None
     ) -> Path | None:
-        """Ask, and write the new cell; the old one stays. Returns where it was written."""
+        """Ask, and write a new cell; the old one is kept. Returns its path, None if declined."""
         cell, prompt = self.cell, self.prompt
         stem = cell.path.with_name(f"{cell.path.stem}_{self.suffix}{cell.path.suffix}")
-        target = self.options.new_cell or _free(stem)
-        known = f", replacing the one there of {_since(target)}" if target.exists() else ""
+        target = self.options.new_cell or _unused_path(stem)
+        known = f", replacing the one there of {_modified_text(target)}" if target.exists() else ""
         prompt.say()
         question = f"Write {what} to {target}{known}? {cell.path} is not changed."
         if not self.options.yes and not prompt.confirm(question):
@@ -109,7 +109,7 @@ class Job(ABC):
         require_writable(target, cell.path)
         origin = provenance({"log": [self.session.journal.path], "cell": [cell.path]})
         kept = cell.file.provenance
-        if kept is not None:  # what was fitted of the arm stays as it was
+        if kept is not None:  # the provenance of fitted parameters is kept
             kept_keys = {"fitted", "parameters", "covariance"}
             origin |= kept.model_dump(mode="json", include=kept_keys)
         save_cell(cell, target, model, {"provenance": origin} | (sections or {}))
@@ -118,13 +118,13 @@ class Job(ABC):
         return target
 
 
-def bare_plan(
+def short_plan(
     loads: tuple[Payload, ...],
     poses: list[PlannedPose],
     bought: Sequence[tuple[int, float]] = (),
     expected: Expectation = NO_EXPECTATION,
 ) -> Plan:
-    """Return a plan of a short session, of which no parameters of the arm are expected."""
+    """Return the plan of a verification or short session, without expected parameters."""
     return Plan(loads, tuple(poses), expected, tuple(bought), 0.0)
 
 
@@ -133,20 +133,20 @@ def write_document(path: Path, document: dict[str, Any]) -> None:
     write_text(path, json.dumps(document, indent=1, allow_nan=False) + "\n")
 
 
-def _since(path: Path) -> str:
+def _modified_text(path: Path) -> str:
     return datetime.fromtimestamp(path.stat().st_mtime).strftime("%Y-%m-%d %H:%M")
 
 
-def _free(path: Path) -> Path:
-    """Return the path, or the first numbered one beside it that is free."""
+def _unused_path(path: Path) -> Path:
+    """Return the path, or the first numbered variant that does not exist."""
     names = [path, *(path.with_name(f"{path.stem}_{i}{path.suffix}") for i in range(2, 1000))]
     return next(p for p in names if not p.exists())
 
 
 def write_log(readings: Readings, registered: bool, path: Path) -> None:
-    """Write readings in a log's columns; those that an instrument did not give are left out.
+    """Write readings as a log (docs/logs.md), with the columns that were measured.
 
-    A log has one frame: of an instrument that was moved, rows of its first place alone are written.
+    A log has one frame: of an instrument that was moved, only the first station is written.
     """
     rows = readings if registered else readings[readings.station == 0]
     if rows.kind in ("position", "pose"):

@@ -1,7 +1,7 @@
-"""Short sessions that begin where the arm stands and turn the wrist: a new tool, a new payload.
+"""Short sessions that start at the present pose and turn the wrist: a new tool, a new payload.
 
-`--tool-only`: the tip of the tool, brought onto one fixed point from several orientations.
-`--payload-only`: what hangs on the flange, from the force sensor in a few orientations.
+`--tool-only`: the TCP, from the tool's tip at one fixed point in several orientations.
+`--payload-only`: the payload, from the flange's force-torque sensor in a few orientations.
 """
 
 from __future__ import annotations
@@ -10,10 +10,10 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from gapbridge.bridge.calibration.format import figure, millimetres
-from gapbridge.bridge.calibration.instruments.instrument import AnyInstrument, Surroundings
-from gapbridge.bridge.calibration.instruments.joints_alone import FlangeSensor, TipOnPoint
-from gapbridge.bridge.calibration.jobs.job import Job, bare_plan
+from gapbridge.bridge.calibration.format import millimetres, number_text
+from gapbridge.bridge.calibration.instruments.instrument import AnyInstrument, InstrumentContext
+from gapbridge.bridge.calibration.instruments.joint_only import FlangeSensor, PointContact
+from gapbridge.bridge.calibration.jobs.job import Job, short_plan
 from gapbridge.bridge.calibration.options import SessionOptions
 from gapbridge.bridge.calibration.planning import loads_of
 from gapbridge.bridge.calibration.session.prompt import Prompt
@@ -34,22 +34,22 @@ POSES = 6
 
 
 class _ShortJob(Job):
-    """A job of a few orientations, judged at the end alone."""
+    """A job of a few orientations; readings are checked by the final fit only."""
 
-    from_here = True
+    starts_at_current_pose = True
 
     def reading_check(self) -> ReadingCheck | None:
-        """Return nobody: there are as many unknowns as a few orientations determine."""
+        """Return None: a few orientations give no redundancy to check single readings."""
         return None
 
 
-def _planned(q: Sequence[Array]) -> list[PlannedPose]:
+def _planned_poses(q: Sequence[Array]) -> list[PlannedPose]:
     """Return orientations, each (n,) rad, as the poses of a plan, all under the first load."""
     return [PlannedPose(i, row, 0, np.zeros(len(row))) for i, row in enumerate(q)]
 
 
 class ToolJob(_ShortJob):
-    """The tool centre point from joint angles alone."""
+    """Identifies the tool centre point from joint angles alone."""
 
     suffix = "tool"
 
@@ -64,43 +64,43 @@ class ToolJob(_ShortJob):
         super().__init__(cell, options, prompt, session)
 
     def plan(self, begin: Array | None, emit: Callable[[str, float], None]) -> Plan:
-        """Return orientations about where the tip is now."""
+        """Return orientations about the present position of the tip."""
         assert begin is not None
-        found = plan_tool(
+        result = plan_tool(
             self.cell.model, begin, poses=self.options.poses or POSES, seed=self.options.seed
         )
-        return bare_plan(loads_of(self.cell)[:1], _planned(found.poses), found.bought)
+        return short_plan(loads_of(self.cell)[:1], _planned_poses(result.poses), result.bought)
 
     def report_plan(self, plan: Plan) -> None:
-        """Say how many touches there are, and how well they will determine the tip."""
+        """Print the number of contacts and the expected accuracy of the TCP."""
         expected = f"; expected ±{millimetres(plan.bought[-1][1])}" if plan.bought else ""
         self.prompt.say(f"plan: the tip onto one fixed point {len(plan.poses)} times{expected}")
 
-    def instrument(self, around: Surroundings) -> AnyInstrument:
-        """Return the fixed point."""
-        return TipOnPoint(PointSettings(kind="point"), around)
+    def instrument(self, context: InstrumentContext) -> AnyInstrument:
+        """Return the contact with the fixed point."""
+        return PointContact(PointSettings(kind="point"), context)
 
     def finish(self) -> None:
-        """Report where the tip is, and write it into a new cell after a yes."""
+        """Report the TCP and, if confirmed, write it into a new cell."""
         model = self.cell.model
         readings = self.session.readings("point")
-        found = calibrate_tool(model, readings.q, readings.loads)
+        result = calibrate_tool(model, readings.q, readings.loads)
         lines = [
             f"  {e.name:<11} {millimetres(e.value)}  "
             f"(95 %: {millimetres(e.interval[0])} to {millimetres(e.interval[1])})"
-            for e in found.estimates
+            for e in result.estimates
         ]
-        self.report_short(found, lines, ("tip on a fixed point", "touch"))
-        applied = found.applied(model)
+        self.report_short(result, lines, ("tip on a fixed point", "touch"))
+        applied = result.applied(model)
         tcp = {
             "xyz": [float(v) for v in applied.tool_in_flange[:3, 3]],
             "rpy": [float(v) for v in roll_pitch_yaw(applied.tool_in_flange[:3, :3])],
         }
-        self.hand_over(applied, "the cell with this tool", {"tool": {"tcp": tcp}})
+        self.write_new_cell(applied, "the cell with this tool", {"tool": {"tcp": tcp}})
 
 
 class PayloadJob(_ShortJob):
-    """Mass, centre of gravity and the sensor's bias; the wrist turns where the arm stands."""
+    """Identifies mass and centre of gravity of the payload, and the sensor's bias."""
 
     suffix = "loaded"
 
@@ -115,41 +115,42 @@ class PayloadJob(_ShortJob):
         super().__init__(cell, options, prompt, session)
 
     def plan(self, begin: Array | None, emit: Callable[[str, float], None]) -> Plan:
-        """Return orientations of the flange around where the arm stands."""
+        """Return orientations of the flange about the present pose."""
         assert begin is not None
-        own = self.cell.file.payload
-        load = Payload(own.mass, (own.cog[0], own.cog[1], own.cog[2]), "to be weighed; so far")
-        found = plan_payload(
+        nominal = self.cell.file.payload
+        x, y, z = nominal.cog
+        load = Payload(nominal.mass, (x, y, z), "to be identified; declared")
+        result = plan_payload(
             self.cell.model, begin, poses=self.options.poses, seed=self.options.seed
         )
         expected = Expectation(
-            found.names, found.units, found.std, np.full(len(found.std), np.nan), np.nan, np.nan
+            result.names, result.units, result.std, np.full(len(result.std), np.nan), np.nan, np.nan
         )
-        return bare_plan((load,), _planned(found.poses), expected=expected)
+        return short_plan((load,), _planned_poses(result.poses), expected=expected)
 
     def report_plan(self, plan: Plan) -> None:
-        """Say how many orientations there are, and how well they will determine the load."""
+        """Print the number of orientations and the expected accuracy of the payload."""
         rows = zip(plan.expected.names, plan.expected.units, plan.expected.std, strict=True)
-        spreads = ", ".join(f"{n} ±{figure(s)} {u}" for n, u, s in list(rows)[:4])
+        spreads = ", ".join(f"{n} ±{number_text(s)} {u}" for n, u, s in list(rows)[:4])
         self.prompt.say(f"plan: {len(plan.poses)} orientations; expected {spreads}")
 
-    def instrument(self, around: Surroundings) -> AnyInstrument:
-        """Return the flange's own sensor."""
-        return FlangeSensor(Base(), around)
+    def instrument(self, context: InstrumentContext) -> AnyInstrument:
+        """Return the flange's force-torque sensor."""
+        return FlangeSensor(Base(), context)
 
     def finish(self) -> None:
-        """Report mass, centre of gravity and bias, and write them into a new cell after a yes."""
-        taken = self.session.taken
-        q = np.array([t.q for t in taken])
-        wrench = np.array([t.raw_wrench for t in taken])
-        found = calibrate_payload(self.cell.model, q, wrench)
+        """Report payload and sensor bias; if confirmed, write the payload into a new cell."""
+        readings = self.session.accepted
+        q = np.array([r.q for r in readings])
+        wrench = np.array([r.raw_wrench for r in readings])
+        result = calibrate_payload(self.cell.model, q, wrench)
         lines = [
-            f"  {e.name:<14} {figure(e.value)} {e.unit}  "
-            f"(95 %: {figure(e.interval[0])} to {figure(e.interval[1])})"
-            for e in found.estimates
+            f"  {e.name:<14} {number_text(e.value)} {e.unit}  "
+            f"(95 %: {number_text(e.interval[0])} to {number_text(e.interval[1])})"
+            for e in result.estimates
         ]
-        self.report_short(found, lines, ("the force sensor of the flange", "wrench"))
-        payload = {"mass": found.mass, "cog": [float(v) for v in found.cog]}
-        self.hand_over(
-            found.applied(self.cell.model), "the cell with this load", {"payload": payload}
+        self.report_short(result, lines, ("the force sensor of the flange", "wrench"))
+        payload = {"mass": result.mass, "cog": [float(v) for v in result.cog]}
+        self.write_new_cell(
+            result.applied(self.cell.model), "the cell with this load", {"payload": payload}
         )

@@ -1,4 +1,4 @@
-"""Months later: a few poses measured again show whether the calibration still holds."""
+"""Verification: a few poses are measured to decide whether a calibration is still valid."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from typing import Any
 import numpy as np
 
 from gapbridge.bridge.calibration.format import (
+    change_text,
     duration,
     millimetres,
-    moved_text,
-    parameter,
+    quantity_text,
     verdict_text,
 )
-from gapbridge.bridge.calibration.jobs.calibrate import baseline_beside
-from gapbridge.bridge.calibration.jobs.job import Job, bare_plan, write_log
+from gapbridge.bridge.calibration.jobs.calibrate import baseline_path
+from gapbridge.bridge.calibration.jobs.job import Job, short_plan, write_log
 from gapbridge.bridge.calibration.planning import (
     loads_of,
     metrology_of,
     observable_of,
-    space_of,
     with_loads,
+    workspace_of,
 )
 from gapbridge.bridge.calibration.session.session import seconds_left
 from gapbridge.bridge.document.notes import note_texts
@@ -39,13 +39,13 @@ POSES = 10
 
 
 class VerifyJob(Job):
-    """Poses all over the workspace, under each load; nothing is fitted but the instrument."""
+    """Compares poses across the workspace, under each load, with the accuracy baseline."""
 
     def _baseline(self) -> dict[str, Any]:
-        """Return the calibration's accuracy baseline. Raises InputError where nobody knows."""
-        path = baseline_beside(self.cell.path)
+        """Return the accuracy baseline of the calibration. Raises InputError if there is none."""
+        path = baseline_path(self.cell.path)
         try:
-            found = json.loads(path.read_text(encoding="utf-8"))
+            document = json.loads(path.read_text(encoding="utf-8"))
         except (OSError, ValueError) as error:
             why = (
                 "no such file" if isinstance(error, FileNotFoundError) else "none that can be read"
@@ -54,82 +54,83 @@ class VerifyJob(Job):
                 f"{path}: found {why}, expected the accuracy baseline that "
                 "`gapbridge calibrate` writes beside a calibrated cell"
             ) from None
-        if not isinstance(found, dict):
+        if not isinstance(document, dict):
             raise InputError(f"{path}: found no mapping, expected an accuracy baseline")
-        return found
+        return document
 
     def plan(self, begin: Array | None, emit: Callable[[str, float], None]) -> Plan:
-        """Return poses far from each other."""
+        """Return poses far apart from each other, in the order of travel, load by load."""
         baseline = baseline_in(self._baseline())
         if baseline.kind != self.options.instrument.measures:
             raise InputError(
-                f"{baseline_beside(self.cell.path)}: found a calibration by {baseline.kind}, "
+                f"{baseline_path(self.cell.path)}: found a calibration by {baseline.kind}, "
                 f"expected one by {self.options.instrument.measures}: verify it as it was made"
             )
         loads = tuple(sorted(loads_of(self.cell), key=lambda load: load.mass))
-        space = with_loads(space_of(self.cell, baseline.kind), loads)
-        space = replace(space, places=space.places[:1])  # a few poses from one place
+        workspace = with_loads(workspace_of(self.cell, baseline.kind), loads)
+        workspace = replace(workspace, places=workspace.places[:1])  # a few poses from one place
         observable = observable_of(self.cell, self.options.instrument)
         emit("looking for poses", 0.2)
-        found = candidates_of(
-            baseline.parameters(self.cell.model), observable, loads, space, self.options.seed
+        candidates = candidates_of(
+            baseline.parameters(self.cell.model), observable, loads, workspace, self.options.seed
         )
-        count = min(self.options.poses or POSES, len(found.q))
-        chosen = far_apart(self.cell.model.rigid_pose(found.q).position, count)
+        count = min(self.options.poses or POSES, len(candidates.q))
+        chosen = far_apart(self.cell.model.rigid_pose(candidates.q).position, count)
         speed = joint_speed(self.cell.arm.limits.velocity)
         poses: list[PlannedPose] = []
         for load, part in enumerate(np.array_split(chosen, len(loads))):
-            q = found.q[part]
-            way = shortest_way(leg_times(q, q, speed), np.zeros(len(q)))
-            free = np.zeros(q.shape[1])
+            q = candidates.q[part]
+            order = shortest_way(leg_times(q, q, speed), np.zeros(len(q)))
+            approach = np.zeros(q.shape[1])  # any
             poses += [
-                PlannedPose(len(poses) + i, q[k], load, free, held_out=True)
-                for i, k in enumerate(way)
+                PlannedPose(len(poses) + i, q[k], load, approach, held_out=True)
+                for i, k in enumerate(order)
             ]
-        return bare_plan(loads, poses)
+        return short_plan(loads, poses)
 
     def report_plan(self, plan: Plan) -> None:
-        """Say how many stops there are."""
-        left = seconds_left(self.session, self.cell.calibration.minutes_per_load)
-        self.prompt.say(f"plan: {len(plan.poses)} poses, {duration(left)}")
+        """Print the number of stops and the estimated duration."""
+        time = seconds_left(self.session, self.cell.calibration.minutes_per_load)
+        self.prompt.say(f"plan: {len(plan.poses)} poses, {duration(time)}")
 
     def finish(self) -> None:
-        """Say whether the calibration holds, and report it."""
+        """Report whether the calibration is still valid, and what has changed if it is not."""
         prompt, options, folder = self.prompt, self.options, self.folder
-        places = self.session.places
+        places = self.session.station_count
         metrology = metrology_of(self.cell, options.instrument, places)
         readings = self.session.all_readings(options.instrument.measures)
         with prompt.waiting("comparing"):
-            found = verify(
+            verification = verify(
                 self.cell.model, readings, self._baseline(), metrology,
                 observable=observable_of(self.cell, options.instrument, places),
             )  # fmt: skip
         prompt.say()
-        self._report(found)
+        self._report(verification)
         write_log(readings, metrology.registered, folder / "readings.csv")
         from gapbridge.bridge.calibration.jobs.facts import session_facts
         from gapbridge.bridge.calibration.report import VerificationMaterial, write_report
 
         facts = session_facts(self.cell, options, self.session)
-        for file in write_report(VerificationMaterial(found, facts, readings), folder):
+        for file in write_report(VerificationMaterial(verification, facts, readings), folder):
             prompt.say(f"{file}: written")
-        moved = None if found.moved is None else found.moved.name
-        others = [other.name for other in found.suspects]
-        self.session.add("ended", holds=found.holds, moved=moved, or_else=others)
+        moved = None if verification.moved is None else verification.moved.name
+        others = [other.name for other in verification.suspects]
+        self.session.add("ended", holds=verification.holds, moved=moved, or_else=others)
 
-    def _report(self, found: Verification) -> None:
+    def _report(self, verification: Verification) -> None:
         prompt = self.prompt
-        prompt.say(verdict_text(found), "bold green" if found.holds else "bold red")
+        prompt.say(verdict_text(verification), "bold green" if verification.holds else "bold red")
         prompt.say(
-            f"  errors {millimetres(found.errors.mean)} mean, "
-            f"{millimetres(found.errors.max)} at most; {found.ratio:.2f} times what was predicted"
+            f"  errors {millimetres(verification.errors.mean)} mean, "
+            f"{millimetres(verification.errors.max)} at most; {verification.ratio:.2f} times what "
+            "was predicted"
         )
-        for estimate in () if found.moved is None else found.moved.estimates:
+        for estimate in () if verification.moved is None else verification.moved.estimates:
             prompt.say(
-                f"  {estimate.name} {parameter(estimate.value, estimate.unit)} "
-                f"± {parameter(estimate.std, estimate.unit)}"
+                f"  {estimate.name} {quantity_text(estimate.value, estimate.unit)} "
+                f"± {quantity_text(estimate.std, estimate.unit)}"
             )
-        for other in found.suspects:
-            prompt.say(f"  these readings cannot distinguish it from: {moved_text(other)}")
-        for note in note_texts(found.notes):
+        for other in verification.suspects:
+            prompt.say(f"  these readings cannot distinguish it from: {change_text(other)}")
+        for note in note_texts(verification.notes):
             prompt.say(f"  note: {note}")

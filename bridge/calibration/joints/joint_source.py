@@ -1,4 +1,4 @@
-"""Where the arm stands, and how a session learns it: one base, a member for each way."""
+"""Where the joint angles of a reading come from: base class, planned and typed joints."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Self
 import numpy as np
 
 from gapbridge.bridge.calibration.instruments.instrument import Ask, ReadingError
-from gapbridge.bridge.calibration.instruments.numbers import numbers
+from gapbridge.bridge.calibration.instruments.numbers import parse_numbers
 from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.plan import PlannedPose
 from gapbridge.core.errors import RunError
@@ -18,7 +18,7 @@ from gapbridge.core.errors import RunError
 
 @dataclass(frozen=True)
 class JointSample:
-    """The arm at rest; a field that nobody reports is None."""
+    """The state of the arm at rest; a field that is not reported is None."""
 
     q: Array  # (n,) rad
     temperature: Array | None = None  # (n,) °C
@@ -29,35 +29,35 @@ class JointSample:
 
 
 class JointSource(ABC):
-    """Reports where the arm stands. The constructor opens nothing."""
+    """Source of joint angles. The constructor opens nothing."""
 
-    drives = False  # whether ``drive`` works
-    watches = False  # whether ``arrived`` can decide by itself
+    can_drive = False  # whether ``move_to`` works
+    detects_rest = False  # whether ``arrived`` reads the arm itself
 
     def open(self) -> None:
-        """Get ready. Raises InputError or LinkError."""
+        """Connect. Raises InputError, LinkError."""
 
     def close(self) -> None:
-        """Let go. Never raises."""
+        """Disconnect. Never raises."""
 
     def arrived(self, pose: PlannedPose) -> JointSample | None:
-        """Return where the arm rests, once it does so near the pose; None before."""
+        """Return a sample once the arm is at rest near the pose; None before."""
         return None
 
-    def now(self) -> Array | None:
-        """Return the joints (n,) at this moment, None where nobody knows."""
+    def current_q(self) -> Array | None:
+        """Return the present joint angles (n,), rad; None if they are unknown."""
         return None
 
     @abstractmethod
-    def stand(self, pose: PlannedPose) -> JointSample:
-        """Return where the arm stands, at rest. Raises ReadingError where it does not."""
+    def sample_at_rest(self, pose: PlannedPose) -> JointSample:
+        """Return a sample of the arm at rest. Raises ReadingError if it does not come to rest."""
 
-    def still(self, stand: JointSample) -> bool:
-        """Return whether the arm has not moved since."""
+    def unmoved_since(self, sample: JointSample) -> bool:
+        """Return whether the arm has not moved since the sample."""
         return True
 
-    def drive(self, pose: PlannedPose, via: Sequence[Array] = ()) -> None:
-        """Move the arm to a pose, by joints ``via`` (n,) in turn. Raises RunError."""
+    def move_to(self, pose: PlannedPose, via: Sequence[Array] = ()) -> None:
+        """Move the arm to a pose through joint angles ``via``, each (n,) rad. Raises RunError."""
         raise RunError("this session does not move the arm")
 
     def __enter__(self) -> Self:
@@ -69,34 +69,34 @@ class JointSource(ABC):
 
 
 class PlannedJoints(JointSource):
-    """The arm's own program brings it exactly to the planned poses."""
+    """The arm's own program moves it exactly to the planned poses."""
 
-    def stand(self, pose: PlannedPose) -> JointSample:
-        """Return the planned joints."""
+    def sample_at_rest(self, pose: PlannedPose) -> JointSample:
+        """Return the planned joint angles."""
         return JointSample(pose.q)
 
 
 class TypedJoints(JointSource):
-    """A person reads the pendant, in degrees."""
+    """The operator types the joint angles of the pendant, in degrees."""
 
-    def __init__(self, ask: Ask, seated: bool = False) -> None:
-        self._ask, self._seated = ask, seated
+    def __init__(self, ask: Ask, contact: bool = False) -> None:
+        self._ask, self._contact = ask, contact
 
-    def stand(self, pose: PlannedPose) -> JointSample:
-        """Return what is typed; Enter alone: exactly as planned. Raises ReadingError.
+    def sample_at_rest(self, pose: PlannedPose) -> JointSample:
+        """Return the typed joint angles; Enter alone: as planned. Raises ReadingError.
 
-        Where the tool is ``seated`` by hand the joints are the reading, and Enter reports none.
+        With ``contact`` the joint angles are the reading, and Enter alone is not accepted.
         """
         n = len(pose.q)
-        exactly = "" if self._seated else " (Enter: exactly as planned)"
-        line = self._ask(f"joints J1..J{n}, deg{exactly}")
-        if not line and self._seated:
+        hint = "" if self._contact else " (Enter: exactly as planned)"
+        line = self._ask(f"joints J1..J{n}, deg{hint}")
+        if not line and self._contact:
             raise ReadingError("found nothing, expected where the arm stands now, in degrees")
         if not line:
             return JointSample(pose.q)
-        given = np.array(numbers(line, n, "deg"))
-        if np.abs(given).max() > 720.0:
-            raise ReadingError(f"found {np.abs(given).max():g} deg, expected at most two turns")
-        if np.abs(given).max() < 2.0 * np.pi and np.abs(given - pose.q).max() < 0.1:
+        angles = np.array(parse_numbers(line, n, "deg"))
+        if np.abs(angles).max() > 720.0:
+            raise ReadingError(f"found {np.abs(angles).max():g} deg, expected at most two turns")
+        if np.abs(angles).max() < 2.0 * np.pi and np.abs(angles - pose.q).max() < 0.1:
             raise ReadingError("found what look like radians, expected degrees")
-        return JointSample(np.radians(given))
+        return JointSample(np.radians(angles))

@@ -1,1 +1,1 @@
-"""A calibration session: its readings, its journal and what it asks of a person."""
+"""A calibration session: journal, prompts, positioning of the arm, readings and their checks."""

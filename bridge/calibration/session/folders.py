@@ -1,4 +1,4 @@
-"""Where sessions are kept, and which one a call of the command goes on with."""
+"""Folders of sessions: which session a call of the command resumes, or starts."""
 
 from __future__ import annotations
 
@@ -12,28 +12,28 @@ from gapbridge.bridge.cell import Cell
 from gapbridge.bridge.cell.settings.instruments import InstrumentSettings
 from gapbridge.core.errors import InputError
 
-SAME = (
+FIXED_KEYS = (
     "robot", "tool", "payload", "gravity", "reference_temperature", "compliance", "effects",
-)  # keys of a cell that may not change during a session  # fmt: skip
+)  # keys of the cell that must not change during a session  # fmt: skip
 
 
 def session_folder(cell: Cell, options: SessionOptions) -> Path:
-    """Return the folder of the session to go on with, or of a new one."""
+    """Return the folder of the cell's latest unfinished session, or of a new one."""
     if options.folder is not None:
         return options.folder
     base = cell.calibration.folder
     stem = f"{cell.path.stem}-{options.kind}" if options.kind != "whole" else cell.path.stem
     found = sorted(base.glob(f"*/{FILE}"), key=lambda p: p.stat().st_mtime, reverse=True)
     for journal in found:
-        if _goes_on(journal, cell, options.kind):
+        if _is_unfinished(journal, cell, options.kind):
             return journal.parent
     today = f"{stem}-{date.today().isoformat()}"
     names = [today, *(f"{today}-{i}" for i in range(2, 1000))]
     return next(base / name for name in names if not (base / name / FILE).exists())
 
 
-def _goes_on(journal: Path, cell: Cell, kind: str) -> bool:
-    """Return whether a journal is one of this cell's that has not ended."""
+def _is_unfinished(journal: Path, cell: Cell, kind: str) -> bool:
+    """Return whether a journal is an unfinished session of this cell and kind."""
     try:
         entries = read_entries(journal)
     except InputError:
@@ -44,8 +44,8 @@ def _goes_on(journal: Path, cell: Cell, kind: str) -> bool:
     return same and not any(e["kind"] == "ended" for e in entries)
 
 
-def begun_entry(cell: Cell, options: SessionOptions) -> dict[str, Any]:
-    """Return what a session's journal begins with."""
+def start_entry(cell: Cell, options: SessionOptions) -> dict[str, Any]:
+    """Return the fields of the first entry of a journal, of kind ``begun``."""
     return {
         "version": VERSION,
         "job": options.kind,
@@ -58,29 +58,29 @@ def begun_entry(cell: Cell, options: SessionOptions) -> dict[str, Any]:
 
 
 def _model_keys(cell: Cell) -> dict[str, Any]:
-    given = cell.file.model_dump(mode="json")
-    return {key: given[key] for key in SAME}
+    settings = cell.file.model_dump(mode="json")
+    return {key: settings[key] for key in FIXED_KEYS}
 
 
-def check_begun(begun: Entry, cell: Cell, options: SessionOptions, folder: Path) -> None:
-    """Raise InputError where a session was begun for something else than is asked for now."""
-    if begun.get("version") != VERSION:
+def check_start(entry: Entry, cell: Cell, options: SessionOptions, folder: Path) -> None:
+    """Raise InputError if a session was started with another model, kind or instrument."""
+    if entry.get("version") != VERSION:
         raise InputError(
-            f"{folder}: found a session of version {begun.get('version')}, expected {VERSION}"
+            f"{folder}: found a session of version {entry.get('version')}, expected {VERSION}"
         )
-    if begun.get("job") != options.kind:
+    if entry.get("job") != options.kind:
         raise InputError(
-            f"{folder}: found a session of kind {begun.get('job')!r}, expected {options.kind!r}: "
+            f"{folder}: found a session of kind {entry.get('job')!r}, expected {options.kind!r}: "
             "give another --session"
         )
-    before, now = begun.get("model", {}), _model_keys(cell)
-    changed = [key for key in SAME if before.get(key) != now[key]]
+    old, new = entry.get("model", {}), _model_keys(cell)
+    changed = [key for key in FIXED_KEYS if old.get(key) != new[key]]
     if changed:
         raise InputError(
             f"{cell.path}: {changed[0]}: found it changed since the session in {folder} began, "
             "expected the same; for the changed cell begin another with --session"
         )
-    measured = _measures(begun.get("instrument", {}))
+    measured = _measures(entry.get("instrument", {}))
     if measured != options.instrument.measures:
         raise InputError(
             f"{folder}: found readings of kind {measured}, expected {options.instrument.measures} "

@@ -1,6 +1,6 @@
-"""The session on disk: one append-only file of JSON lines, each of them there before the next step.
+"""The journal of a session: an append-only file of JSON lines, synced to disk line by line.
 
-A power cut may tear the last line, and no other: it is cut off when the session goes on.
+A power failure can tear the last line only; it is removed when the session is resumed.
 """
 
 from __future__ import annotations
@@ -26,18 +26,18 @@ Entry = dict[str, Any]
 
 
 class Journal:
-    """The one writer of a session's journal; ``entries`` are those that were there before."""
+    """The only writer of a session's journal; ``entries`` are those found when it was opened."""
 
     def __init__(self, folder: Path) -> None:
         self.path = folder / FILE
         self.entries: list[Entry] = []
-        self.torn = False  # the last line had been torn by a power cut or a kill
+        self.torn = False  # the last line was incomplete and has been removed
         self._fd = -1
 
     def open(self) -> None:
-        """Take the journal, and read what stands in it.
+        """Lock the journal and read its entries.
 
-        Raises InputError where another session has it or a line is damaged, RunError where it
+        Raises InputError if another process has locked it or a line is damaged, RunError if it
         cannot be written.
         """
         try:
@@ -65,9 +65,9 @@ class Journal:
         self.entries = read_entries(self.path)
 
     def add(self, kind: str, **fields: Any) -> Entry:
-        """Write an entry and have it on disk; returns it.
+        """Append an entry, sync it to disk and return it.
 
-        Raises RunError where that cannot be; the journal then is as it was.
+        Raises RunError if that fails; the journal is then unchanged.
         """
         entry = {"kind": kind, "time": time.time(), **fields}
         line = json.dumps(plain(entry), allow_nan=False, separators=(",", ":")) + "\n"
@@ -84,7 +84,7 @@ class Journal:
         return entry
 
     def close(self) -> None:
-        """Let go of the file. May be repeated."""
+        """Close and unlock the file. May be repeated."""
         if self._fd >= 0:
             os.close(self._fd)
             self._fd = -1
@@ -98,7 +98,7 @@ class Journal:
 
 
 def read_entries(path: Path) -> list[Entry]:
-    """Return the whole lines of a journal; raises InputError where one is damaged."""
+    """Return the entries of all complete lines; raises InputError if one is damaged."""
     try:
         lines = path.read_bytes().split(b"\n")[:-1]
     except OSError as error:
@@ -119,10 +119,7 @@ def read_entries(path: Path) -> list[Entry]:
 
 
 def plain(value: Any) -> Any:
-    """Return a value as JSON knows it; what is no finite number becomes its name, ``float`` reads.
-
-    Arrays become lists.
-    """
+    """Return a value for JSON: arrays as lists, nan and inf as strings that ``float`` accepts."""
     if isinstance(value, dict):
         return {str(k): plain(v) for k, v in value.items()}
     if isinstance(value, np.ndarray | list | tuple):

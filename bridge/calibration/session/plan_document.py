@@ -1,4 +1,4 @@
-"""A plan as the journal keeps it, and as a table for who programs the arm."""
+"""A plan as a journal entry, and as a CSV table for the robot program."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from gapbridge.core.notes import Note, Reason
 
 
 def plan_of(entry: dict[str, Any]) -> Plan:
-    """Return the plan of an entry of the journal."""
+    """Return the plan of a journal entry."""
     expected = entry["expected"]
     return Plan(
         loads=tuple(
@@ -31,13 +31,13 @@ def plan_of(entry: dict[str, Any]) -> Plan:
         notes=tuple(
             Note(Reason[note[0]], tuple(note[1]))
             for note in entry["notes"]
-            if not isinstance(note, str)  # older journals kept sentences
+            if not isinstance(note, str)  # older journals have sentences here
         ),
     )  # fmt: skip
 
 
 def entry_of(plan: Plan) -> dict[str, Any]:
-    """Return the entry of the journal for a plan."""
+    """Return the journal entry of a plan."""
     return {**asdict(plan), "notes": [(note.reason.name, note.values) for note in plan.notes]}
 
 
@@ -55,7 +55,7 @@ def _vector3(values: list[Any]) -> tuple[float, float, float]:
 
 
 def write_poses(plan: Plan, path: Path) -> None:
-    """Write the stops as CSV, in the order of travel: stop from 1, place, load, joints in rad."""
+    """Write the stops as CSV in the order of travel: stop (from 1), place, load, joints in rad."""
     n = len(plan.poses[0].q)
     rows = [
         (i + 1, p.number, p.station, p.load, plan.loads[p.load].mass, p.held_out, p.repeat, *p.q)

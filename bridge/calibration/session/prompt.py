@@ -1,4 +1,4 @@
-"""The terminal of a session: what is said, what is asked, and the words that work everywhere."""
+"""The terminal of a session: output, questions, and the commands accepted at every question."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.status import Status
 
 T = TypeVar("T")
-LOOK = 0.1  # s between two looks at what is waited for
+POLL_INTERVAL = 0.1  # s
 COMMANDS = {
     "undo": "discard the last reading and measure that pose again",
     "back": "measure an earlier pose again: has the instrument or the target moved?",
@@ -26,11 +26,11 @@ COMMANDS = {
 }
 ENTER = "continue: the load is mounted, the arm is in place, measure"
 HELP = "list these commands"
-_SHORT = {"u": "undo", "b": "back", "q": "quit", "exit": "quit", "h": "?", "help": "?"}
+_ALIASES = {"u": "undo", "b": "back", "q": "quit", "exit": "quit", "h": "?", "help": "?"}
 
 
-class SessionCommand(Exception):  # noqa: N818 - an answer, no failure
-    """A person typed one of WORDS instead of an answer."""
+class SessionCommand(Exception):  # noqa: N818 - not an error
+    """The operator typed one of COMMANDS instead of an answer."""
 
     def __init__(self, name: str, rest: str = "") -> None:
         super().__init__(name)
@@ -38,45 +38,45 @@ class SessionCommand(Exception):  # noqa: N818 - an answer, no failure
 
 
 class InputEnded(Exception):  # noqa: N818
-    """Nobody is there to answer: the input has come to its end."""
+    """The standard input has ended."""
 
 
 class Prompt:
-    """One terminal. ``note`` gets every note that a person writes."""
+    """The terminal of a session. ``note`` is called with every note that the operator types."""
 
     def __init__(self, note: Callable[[str], None] = lambda _: None) -> None:
         self.console = Console(highlight=False, soft_wrap=True)
         self.note = note
-        self._typed = _Lines()
+        self._typed = _InputLines()
 
     def say(self, text: str = "", style: str | None = None) -> None:
         """Print a line."""
         self.console.print(text, style=style, markup=False)
 
     def warn(self, text: str) -> None:
-        """Print a line that must be seen."""
+        """Print a highlighted warning."""
         self.say(f"! {text}", "bold yellow")
 
     def ask(self, question: str) -> str:
-        """Return what is typed; raises SessionCommand for a command, InputEnded at the end."""
+        """Return the typed line; raises SessionCommand for a command, InputEnded at the end."""
         return self.ask_unless(question, lambda: None) or ""
 
-    def ask_unless(self, question: str, look: Callable[[], T | None]) -> str | T:
-        """Return what is typed, or what ``look`` finds meanwhile, whichever comes first."""
+    def ask_unless(self, question: str, poll: Callable[[], T | None]) -> str | T:
+        """Return the typed line, or the first result of ``poll`` that is not None."""
         while True:
-            typed = self._read(question, look)
+            typed = self._read(question, poll)
             if not isinstance(typed, str):
                 return typed
             if not self._is_help(typed):
                 return self._answer(typed)
 
     def enter(self, question: str) -> None:
-        """Return on Enter alone; any other answer is asked again."""
+        """Return on Enter alone; after any other answer ask again."""
         while answer := self.ask(question):
             self.say(f"found {answer!r}, expected Enter, or a command of the session (`?`)")
 
     def confirm(self, question: str) -> bool:
-        """Return whether a person says yes; asks until it is yes or no."""
+        """Return whether the answer is yes; ask until it is yes or no."""
         while True:
             answer = self.ask(f"{question} [yes/no]").lower()
             if answer in ("y", "yes", "n", "no"):
@@ -84,48 +84,48 @@ class Prompt:
             self.say(f"found {answer!r}, expected yes or no")
 
     def choose(self, question: str, answers: dict[str, str]) -> str:
-        """Return the key of one of the answers; Enter is the first."""
+        """Return the key of the chosen answer (key -> description); Enter chooses the first."""
         first = next(iter(answers))
         shown = {"Enter" if key == first else key: text for key, text in answers.items()}
         for key, text in shown.items():
             self.say(f"    {key:<8} {text}")
         while True:
             answer = self.ask(question).lower()
-            found = [k for k in answers if answer and k.startswith(answer)]
-            if found or not answer:
-                return found[0] if found else first
+            matching = [k for k in answers if answer and k.startswith(answer)]
+            if matching or not answer:
+                return matching[0] if matching else first
             self.say(f"found {answer!r}, expected {_either(list(shown))}")
 
     @contextmanager
     def waiting(self, text: str) -> Iterator[Callable[[str], None]]:
-        """Show what is waited for while the block lasts; gives a function that changes it."""
+        """Show a status text while the block runs; yields a function that changes it."""
         if not self.console.is_terminal:
             yield lambda text: None
             return
         with Status(text, console=self.console, refresh_per_second=4) as shown:
             yield lambda text: shown.update(text)
 
-    def _read(self, question: str, look: Callable[[], T | None]) -> str | T:
+    def _read(self, question: str, poll: Callable[[], T | None]) -> str | T:
         if early := self._typed.flush():
             self.say(f"  discarded input typed before the question: {early}", "yellow")
         self.console.print(f"{question} > ", end="", markup=False, style="bold")
         self.console.file.flush()
         while True:
-            line = self._typed.line(LOOK)
+            line = self._typed.line(POLL_INTERVAL)
             if line is not None:
                 if not sys.stdin.isatty():
-                    self.say(line)  # nothing has shown it yet
+                    self.say(line)  # piped input is not echoed
                 return line.strip()
             if self._typed.ended:
                 raise InputEnded
-            found = look()
-            if found is not None:
+            result = poll()
+            if result is not None:
                 self.say()
-                return found
+                return result
 
     def _is_help(self, line: str) -> bool:
         word, _, rest = line.partition(" ")
-        word = _SHORT.get(word.lower(), word.lower())
+        word = _ALIASES.get(word.lower(), word.lower())
         if word == "?":
             self.say(f"  Enter    {ENTER}")
             for name, text in COMMANDS.items():
@@ -140,7 +140,7 @@ class Prompt:
 
     def _answer(self, line: str) -> str:
         word, _, rest = line.partition(" ")
-        name = _SHORT.get(word.lower(), word.lower())
+        name = _ALIASES.get(word.lower(), word.lower())
         if name in COMMANDS:
             raise SessionCommand(name, rest.strip())
         return line
@@ -150,43 +150,43 @@ def _either(choices: list[str]) -> str:
     return choices[0] if len(choices) == 1 else f"{', '.join(choices[:-1])} or {choices[-1]}"
 
 
-class _Lines:
-    """Lines of the standard input, without ever waiting longer than asked."""
+class _InputLines:
+    """Lines of the standard input, read with a timeout."""
 
     def __init__(self) -> None:
-        self._rest = b""
+        self._buffer = b""
         self.ended = False
 
-    def _took(self, wait: float) -> bool:
-        """Return whether anything came within ``wait`` s, and keep it."""
+    def _receive(self, wait: float) -> bool:
+        """Return whether input arrived within ``wait`` s; it is added to the buffer."""
         fd = sys.stdin.fileno()
         if self.ended or not select.select([fd], [], [], wait)[0]:
             return False
         data = os.read(fd, 4096)
         self.ended = not data
-        self._rest += data
+        self._buffer += data
         return True
 
     def flush(self) -> str:
-        """Drop what was typed at a terminal so far, and return it; a file or pipe keeps its lines.
+        """Discard and return input typed at a terminal so far; lines of a file or pipe are kept.
 
-        An answer typed before its question was meant for another one.
+        Input typed before a question was meant for another one.
         """
         fd = sys.stdin.fileno()
         if not os.isatty(fd):
             return ""
-        while self._took(0.0):
+        while self._receive(0.0):
             pass
-        termios.tcflush(fd, termios.TCIFLUSH)  # a line that has not ended yet
-        early, self._rest = self._rest, b""
+        termios.tcflush(fd, termios.TCIFLUSH)  # an unfinished line
+        early, self._buffer = self._buffer, b""
         return " ⏎ ".join(early.decode("utf-8", "replace").splitlines())
 
     def line(self, wait: float) -> str | None:
-        """Return the next line, None where none comes within ``wait`` s."""
-        if b"\n" not in self._rest:
-            self._took(wait)
-        line, end, rest = self._rest.partition(b"\n")
+        """Return the next line, None if none arrives within ``wait`` s."""
+        if b"\n" not in self._buffer:
+            self._receive(wait)
+        line, end, rest = self._buffer.partition(b"\n")
         if not end:
             return None
-        self._rest = rest
+        self._buffer = rest
         return line.decode("utf-8", "replace")

@@ -1,14 +1,14 @@
-"""What the next reading should be, from those so far, and what could be wrong with one that is off.
+"""Predicts the next reading from those so far, and explains one that is implausible.
 
-Model and instrument are fitted to the readings so far, every parameter held at the cell's model by
-its usual size. A reading that is farther off than that allows is doubted, and what could have gone
-wrong is tried: another unit, exchanged axes, one mistyped coordinate, another load, a joint.
+Model and instrument are fitted to the readings so far, with a prior of usual size on every
+parameter. If a reading is outside the predicted range, possible mistakes are tested: another unit,
+exchanged axes, one mistyped coordinate, another load, a mistyped joint.
 """
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -24,41 +24,41 @@ from gapbridge.core.errors import GapbridgeError
 from gapbridge.core.metrology import Metrology
 from gapbridge.core.model import Model, Poses
 
-NEAREST = 0.02  # m: nothing on a tool comes nearer to an instrument's origin, or to a second ball
-FARTHEST = 100.0  # m: no instrument of this kind looks farther
-WIDEST = 3.0  # m between two balls on one tool
-LOOSE, SHARE = 0.05, 0.1  # m, and share of a distance, by which an uncalibrated arm may be off
-BALLS, BALLS_SHARE = 1e-3, 0.01  # the same for two balls, which no arm moves against each other
-REPEATABILITY = 1e-4  # m, 1 sigma of one coordinate: of an arm of which nobody knows it
-UNMODELLED = 1e-4  # m, 1 sigma: what a session cannot fit and still is no mistake
-UNITS = {
+MIN_DISTANCE = 0.02  # m, of the target from the instrument's origin, or between two balls
+MAX_DISTANCE = 100.0  # m, of the target from the instrument's origin
+MAX_BALL_DISTANCE = 3.0  # m between two balls
+TOLERANCE, RELATIVE_TOLERANCE = 0.05, 0.1  # m, share of a distance: error of an uncalibrated arm
+BALL_TOLERANCE, RELATIVE_BALL_TOLERANCE = 1e-3, 0.01  # m, share: error of the distance of two balls
+REPEATABILITY = 1e-4  # m, 1 sigma of one coordinate, if the cell does not give it
+UNMODELLED = 1e-4  # m, 1 sigma of one coordinate: error of the model that no parameter covers
+UNIT_ERRORS = {
     1e-3: "a thousand times too large: millimetres taken for metres?",
     1e3: "a thousand times too small: metres taken for millimetres?",
     1 / 25.4: "25.4 times too large: millimetres taken for inches?",
     25.4: "25.4 times too small: inches taken for millimetres?",
 }
-SPARE = {"distance": 4, "relative": 9}
-"""Numbers beyond the unknowns, by kind: with fewer the instrument may be found in a wrong place."""
-EXCHANGED = ((1, 0, 2), (2, 1, 0), (0, 2, 1), (1, 2, 0), (2, 0, 1))
+REDUNDANCY = {"distance": 4, "relative": 9}
+"""Equations beyond the unknowns, by kind, that are needed to locate the instrument reliably."""
+AXIS_ORDERS = ((1, 0, 2), (2, 1, 0), (0, 2, 1), (1, 2, 0), (2, 0, 1))
 AXES = "xyz"
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What a reading looks like beside those before it."""
+    """The check of one reading against the readings before it."""
 
-    off: float  # m, distance from where it was expected; nan: nothing to compare with yet
-    allowed: float  # m, how far a good one would be off at most
-    doubted: bool
-    reasons: tuple[str, ...] = ()  # what could have gone wrong, likeliest first
-    instead: Array | None = None  # (k,) the reading, put right, where that is plain
+    deviation: float  # m, from the prediction; nan: no prediction yet
+    limit: float  # m, largest plausible deviation; 0: no such reading is possible
+    implausible: bool
+    explanations: tuple[str, ...] = ()  # possible mistakes, likeliest first
+    corrected: Array | None = None  # (k,) value in the corrected unit; None: no unit error
 
 
-NOTHING = Verdict(float("nan"), float("nan"), False)
+NOT_CHECKED = Verdict(float("nan"), float("nan"), False)
 
 
 class ReadingCheck:
-    """Judges readings of one session; cheap enough to be asked after each."""
+    """Checks each reading of one session as soon as it is taken."""
 
     def __init__(
         self, model: Model, metrology: Metrology, kind: str, sigma: float,
@@ -71,115 +71,115 @@ class ReadingCheck:
         self._parameters: dict[bool, Parameters] = {}
 
     @property
-    def compares(self) -> bool:
-        """Return whether two readings of one pose can be held against each other."""
+    def compares_readings(self) -> bool:
+        """Return whether two readings of one pose can be compared."""
         return not make_observable(self._kind, **self._options).closes
 
-    def judge(self, before: Readings, new: Readings, typed: bool, joints: bool) -> Verdict:
-        """Judge one new reading (a Readings of one row) by those before it.
+    def check(self, before: Readings, new: Readings, typed: bool, joints: bool) -> Verdict:
+        """Check one new reading (Readings of one row) against those before it.
 
-        ``typed``: a person has typed it; ``joints``: the joint angles were typed.
+        ``typed``: its value was typed by hand; ``joints``: its joint angles were.
         """
         same = before[(before.station == new.station[0]) & (before.target == new.target[0])]
-        fit = self._fitted(same, new)
-        if fit is None:  # too few readings yet to know where the instrument stands
-            return self._first(same, new)
-        off, allowed, doubted = fit.compare(new)
-        if not doubted:
-            return Verdict(off, allowed, False)
-        reasons, instead = self._reasons(fit, new, typed, joints)
-        return Verdict(off, allowed, True, tuple(reasons), instead)
+        fit = self._fit(same, new)
+        if fit is None:  # too few readings to locate the instrument
+            return self._check_first(same, new)
+        deviation, limit, implausible = fit.compare(new)
+        if not implausible:
+            return Verdict(deviation, limit, False)
+        explanations, corrected = self._explanations(fit, new, typed, joints)
+        return Verdict(deviation, limit, True, tuple(explanations), corrected)
 
-    def _first(self, before: Readings, new: Readings) -> Verdict:
-        """Return what reach, and the readings before it, say of one of the first readings."""
-        tip = np.concatenate([self.poses(before).position, self.poses(new).position])
-        failed = early_check(before, new, tip)
-        if failed is None:
-            return NOTHING
-        reasons = [failed[2]]
-        instead: Array | None = None
-        for factor, reason in UNITS.items():
+    def _check_first(self, before: Readings, new: Readings) -> Verdict:
+        """Check one of the first readings by range and by the distances to those before it."""
+        tcp = np.concatenate([self.poses(before).position, self.poses(new).position])
+        result = check_without_fit(before, new, tcp)
+        if result is None:
+            return NOT_CHECKED
+        explanations = [*result.explanations]
+        corrected: Array | None = None
+        for factor, explanation in UNIT_ERRORS.items():
             value = new.value.copy()
             value[:, :3] *= factor
-            if early_check(before, replace(new, value=value), tip) is None and len(before):
-                reasons.append(reason)
-                instead = value[0]
+            if check_without_fit(before, replace(new, value=value), tcp) is None and len(before):
+                explanations.append(explanation)
+                corrected = value[0]
         if not len(before):
-            reasons.append("is the unit right?")
-        return Verdict(failed[0], failed[1], True, tuple(reasons), instead)
+            explanations.append("is the unit right?")
+        return replace(result, explanations=tuple(explanations), corrected=corrected)
 
     def shift(self, old: Readings, new: Readings, before: Readings) -> Array:
-        """Return how far a pose's reading has gone (k,), m, base axes where they are known.
+        """Return the change (k,) of a pose's reading, m, in base axes once there is a fit.
 
-        The way that the arm itself has gone between the two is taken off.
+        ``before``: good readings for the fit, by which the arm's own motion is subtracted.
         """
         same = before[(before.station == old.station[0]) & (before.target == old.target[0])]
-        fit = self._fitted(same, old)
+        fit = self._fit(same, old)
         if fit is None:
             return np.asarray((new.value - old.value)[0, :3])
         return fit.gap(new)[:3] - fit.gap(old)[:3]
 
     def poses(self, readings: Readings) -> Poses:
-        """Return where the cell's model has the TCP at some readings."""
+        """Return the TCP poses of some readings by the cell's model, in base."""
         return self._model.predict(readings.q, readings.loads)
 
-    def _fitted(self, before: Readings, new: Readings) -> ReadingFit | None:
-        """Return the fit to the readings ``before``; None where they are too few, or fit no arm."""
+    def _fit(self, before: Readings, new: Readings) -> ReadingFit | None:
+        """Return the fit to the readings ``before``; None if they are too few or it fails."""
         registered = self._metrology.registered and int(new.station[0]) == 0
         before, new = at_one_place(before), at_one_place(new)
         observable = make_observable(self._kind, registered=registered, **self._options)
         layout = observable.layout(before if len(before) else new)
-        needed = layout.size + SPARE.get(self._kind, 0)
+        needed = layout.size + REDUNDANCY.get(self._kind, 0)
         few = len(before) * observable.equations <= needed
         if observable.closes or (few and layout.size):
             return None
         if registered not in self._parameters:
             self._parameters[registered] = Parameters.every(self._model, self._effects)
-        own = self._parameters[registered]
+        parameters = self._parameters[registered]
         with contextlib.suppress(GapbridgeError):
-            return fit_readings(before, new, own, observable, self._sigma)
+            return fit_readings(before, new, parameters, observable, self._sigma)
         return None
 
-    def _reasons(
+    def _explanations(
         self, fit: ReadingFit, new: Readings, typed: bool, joints: bool
     ) -> tuple[list[str], Array | None]:
-        reasons: list[str] = []
-        instead: Array | None = None
+        explanations: list[str] = []
+        corrected: Array | None = None
         value = new.value[0]
-        for factor, reason in UNITS.items():
+        for factor, explanation in UNIT_ERRORS.items():
             changed = value.copy()
             changed[:3] *= factor
             if fit.fits(replace(new, value=changed[None])):
-                reasons.append(reason)
-                instead = changed
-        for other, reason in self._others(value) if typed or len(value) >= 3 else ():
+                explanations.append(explanation)
+                corrected = changed
+        for other, explanation in self._axis_variants(value) if typed or len(value) >= 3 else ():
             if fit.fits(replace(new, value=other[None])):
-                reasons.append(reason)
-        if typed and not reasons:
-            reasons += [
-                _coordinate(new, i, expected) for i, expected in fit.single_coordinates(new)
+                explanations.append(explanation)
+        if typed and not explanations:
+            explanations += [
+                _coordinate_text(new, i, expected) for i, expected in fit.single_coordinates(new)
             ]
-        reasons += self._other_loads(fit, new)
-        if joints and not reasons:
-            reasons += [_joint(new, i, angle) for i, angle in fit.single_joints(new)]
-        return reasons, instead
+        explanations += self._load_explanations(fit, new)
+        if joints and not explanations:
+            explanations += [_joint_text(new, i, angle) for i, angle in fit.single_joints(new)]
+        return explanations, corrected
 
     @staticmethod
-    def _others(value: Array) -> Iterator[tuple[Array, str]]:
-        """Yield the reading with axes exchanged, or a sign turned round."""
+    def _axis_variants(value: Array) -> Iterator[tuple[Array, str]]:
+        """Yield the value with axes exchanged or one sign inverted, and the explanation."""
         if len(value) < 3:
             return
-        for order in EXCHANGED:
+        for order in AXIS_ORDERS:
             changed = value.copy()
             changed[:3] = value[list(order)]
             yield changed, f"it fits with its axes in the order {' '.join(AXES[i] for i in order)}"
         for i in range(3):
             changed = value.copy()
             changed[i] *= -1
-            yield changed, f"it fits with the sign of {AXES[i]} turned round"
+            yield changed, f"it fits with the sign of {AXES[i]} inverted"
 
-    def _other_loads(self, fit: ReadingFit, new: Readings) -> list[str]:
-        found = []
+    def _load_explanations(self, fit: ReadingFit, new: Readings) -> list[str]:
+        explanations = []
         for number, load in enumerate((*self._loads, Payload(0.0, name="nothing at all"))):
             if number == int(new.load[0]):
                 continue
@@ -188,89 +188,94 @@ class ReadingCheck:
             )
             if fit.fits(replace(new, loads=loads)):
                 name = load.name or f"{load.mass:g} kg"
-                found.append(f"it fits if {name} hangs on the flange")
-        return found
+                explanations.append(f"it fits if {name} hangs on the flange")
+        return explanations
 
 
-def _coordinate(new: Readings, i: int, expected: float) -> str:
+def _coordinate_text(new: Readings, i: int, expected: float) -> str:
     return (
         f"{AXES[i]} alone is off: {new.value[0, i] * 1e3:.3f} mm where about "
         f"{expected * 1e3:.1f} mm was expected; mistyped?"
     )
 
 
-def _joint(new: Readings, i: int, angle: float) -> str:
+def _joint_text(new: Readings, i: int, angle: float) -> str:
     return (
         f"it fits if joint {i + 1} stands at {np.degrees(angle):.2f}° instead of "
         f"{np.degrees(new.q[0, i]):.2f}°"
     )
 
 
-def early_check(before: Readings, new: Readings, tip: Array) -> tuple[float, float, str] | None:
-    """Return how far a reading is off (m), how far it may be, and why it is doubted; None: not.
+def check_without_fit(before: Readings, new: Readings, tcp: Array) -> Verdict | None:
+    """Check one new reading by range and by the readings ``before``; None: plausible.
 
-    ``new`` is one reading, ``tip`` (N + 1, 3) m where the cell's model has the TCP at those
-    ``before`` and then at the new one, base.
+    ``tcp`` (N + 1, 3) m, in base: of the cell's model, at the N readings before and the new one.
     """
     value = new.value[0, :3]
-    if not len(value):
-        return None
-    checks: dict[str, Callable[[], tuple[float, float, str] | None]] = {
-        "position": lambda: _points(before, value, tip),
-        "pose": lambda: _points(before, value, tip),
-        "distance": lambda: _distances(before, float(value[0]), tip),
-        "relative": lambda: _balls(before, value),
-    }
-    check = checks.get(new.kind)
-    return check() if check else None
+    match new.kind:
+        case "position" | "pose":
+            return _check_position(before, value, tcp)
+        case "distance":
+            return _check_distance(before, float(value[0]), tcp)
+        case "relative":
+            return _check_ball_distance(before, value)
+    return None
 
 
-def _points(before: Readings, value: Array, tip: Array) -> tuple[float, float, str] | None:
-    far = float(np.linalg.norm(value))
-    if not NEAREST <= far <= FARTHEST:
-        return _off(far, NEAREST if far < NEAREST else FARTHEST, "from the instrument's origin")
+def _check_position(before: Readings, value: Array, tcp: Array) -> Verdict | None:
+    distance = float(np.linalg.norm(value))
+    failed = _check_range(distance, MIN_DISTANCE, MAX_DISTANCE, "from the instrument's origin")
+    if failed is not None:
+        return failed
     for i, earlier in enumerate(before.value[:, :3]):
         apart = float(np.linalg.norm(value - earlier))
-        meant = float(np.linalg.norm(tip[-1] - tip[i]))
-        allowed = LOOSE + SHARE * meant
-        if abs(apart - meant) > allowed:
-            reason = (
+        expected = float(np.linalg.norm(tcp[-1] - tcp[i]))
+        limit = TOLERANCE + RELATIVE_TOLERANCE * expected
+        if abs(apart - expected) > limit:
+            explanation = (
                 f"it is {1e3 * apart:.1f} mm from an earlier reading here; the joints put the two "
-                f"{1e3 * meant:.0f} mm apart"
+                f"{1e3 * expected:.0f} mm apart"
             )
-            return abs(apart - meant), allowed, reason
+            return Verdict(abs(apart - expected), limit, True, (explanation,))
     return None
 
 
-def _distances(before: Readings, value: float, tip: Array) -> tuple[float, float, str] | None:
-    if abs(value) > FARTHEST:
-        return _off(abs(value), FARTHEST, "from the fixed end")
+def _check_distance(before: Readings, value: float, tcp: Array) -> Verdict | None:
+    failed = _check_range(abs(value), 0.0, MAX_DISTANCE, "from the fixed end")
+    if failed is not None:
+        return failed
     for i, earlier in enumerate(before.value[:, 0]):
-        meant = float(np.linalg.norm(tip[-1] - tip[i]))
-        change, allowed = abs(value - float(earlier)), meant + LOOSE + SHARE * meant
-        if change > allowed:
-            reason = (
+        expected = float(np.linalg.norm(tcp[-1] - tcp[i]))
+        change = abs(value - float(earlier))
+        limit = expected + TOLERANCE + RELATIVE_TOLERANCE * expected
+        if change > limit:
+            explanation = (
                 f"it differs by {1e3 * change:.1f} mm from an earlier reading; the joints put the "
-                f"two {1e3 * meant:.0f} mm apart"
+                f"two {1e3 * expected:.0f} mm apart"
             )
-            return change, allowed, reason
+            return Verdict(change, limit, True, (explanation,))
     return None
 
 
-def _balls(before: Readings, value: Array) -> tuple[float, float, str] | None:
-    far = float(np.linalg.norm(value))
-    if not NEAREST <= far <= WIDEST:
-        return _off(far, NEAREST if far < NEAREST else WIDEST, "between the balls")
+def _check_ball_distance(before: Readings, value: Array) -> Verdict | None:
+    distance = float(np.linalg.norm(value))
+    failed = _check_range(distance, MIN_DISTANCE, MAX_BALL_DISTANCE, "between the balls")
+    if failed is not None:
+        return failed
     for earlier in before.value:
         apart = float(np.linalg.norm(earlier))
-        allowed = BALLS + BALLS_SHARE * apart
-        if abs(far - apart) > allowed:
-            reason = f"the balls are {1e3 * far:.1f} mm apart, {1e3 * apart:.1f} mm before"
-            return abs(far - apart), allowed, reason
+        limit = BALL_TOLERANCE + RELATIVE_BALL_TOLERANCE * apart
+        if abs(distance - apart) > limit:
+            explanation = (
+                f"the balls are {1e3 * distance:.1f} mm apart, {1e3 * apart:.1f} mm before"
+            )
+            return Verdict(abs(distance - apart), limit, True, (explanation,))
     return None
 
 
-def _off(far: float, limit: float, where: str) -> tuple[float, float, str]:
-    side = "at least" if far < limit else "at most"
-    reason = f"{1e3 * far:.3f} mm {where}, expected {side} {1e3 * limit:.0f} mm"
-    return abs(far - limit), 0.0, reason
+def _check_range(value: float, low: float, high: float, what: str) -> Verdict | None:
+    if low <= value <= high:
+        return None
+    side, limit = ("at least", low) if value < low else ("at most", high)
+    explanation = f"{1e3 * value:.3f} mm {what}, expected {side} {1e3 * limit:.0f} mm"
+    return Verdict(abs(value - limit), 0.0, True, (explanation,))

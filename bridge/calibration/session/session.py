@@ -1,4 +1,4 @@
-"""Where a session stands: what its journal holds, entry by entry; how far it has come."""
+"""State of a session, replayed from its journal, and its progress."""
 
 from __future__ import annotations
 
@@ -17,39 +17,39 @@ from gapbridge.core.calibration.readings import Readings
 from gapbridge.core.loads import Loads
 
 _VECTORS = ("q", "value", "approach", "temperature", "wrench", "raw_wrench")
-FIRST = 60.0  # s a stop, before anyone knows
-PAUSE = 600.0  # s: a longer time between two readings was a pause
-WIDTH = 16  # characters of the whole bar
+DEFAULT_INTERVAL = 60.0  # s per stop, before the first two readings
+MAX_INTERVAL = 600.0  # s; a longer time between two readings is a pause
+BAR_WIDTH = 16  # characters of the progress bar
 
 
 @dataclass(frozen=True)
 class Reading:
-    """What was measured at one stop."""
+    """One averaged reading at a stop; field names are keys of the journal."""
 
-    stop: int  # number in the plan's poses, from 0
+    stop: int  # index in Plan.poses
     q: Array  # (n,) rad
     value: Array  # (k,) SI, mean of the samples
     scatter: float  # m, 1 sigma of one coordinate of the mean; nan: not known
-    samples: int  # averaged
-    load: int
-    station: int
-    target: int
+    samples: int  # number averaged
+    load: int  # index in Plan.loads
+    station: int  # position of the instrument, from 0: each has its own unknown frame
+    target: int  # position of the target on the tool, from 0
     approach: Array  # (n,) sign of each joint's last motion
     time: float = 0.0  # s, time.time()
-    source: str = ""  # row or file of the instrument
+    source: str = ""  # row or file that it was read from
     temperature: Array | None = None  # (n,) °C
     wrench: Array | None = None  # (6,) N, Nm: actual_TCP_force
     raw_wrench: Array | None = None  # (6,) N, Nm: ft_raw_wrench
-    again: bool = False  # an earlier stop, measured once more
-    doubted: bool = False  # kept by the person though it did not fit
+    again: bool = False  # an earlier stop, measured again
+    doubted: bool = False  # kept by the operator although implausible
 
     def entry(self) -> dict[str, Any]:
-        """Return it for the journal, which gives it its time."""
+        """Return the journal entry, without the time, which the journal adds."""
         return {k: v for k, v in asdict(self).items() if v is not None and k != "time"}
 
     @classmethod
     def of(cls, entry: dict[str, Any]) -> Reading:
-        """Return what an entry of the journal holds."""
+        """Return the reading of a journal entry."""
         known = {k: v for k, v in entry.items() if k in cls.__dataclass_fields__}
         for name in _VECTORS:
             if name in known:
@@ -60,73 +60,73 @@ class Reading:
 
 @dataclass
 class Session:
-    """A session in memory; everything that changes it goes through its journal first."""
+    """State of a session; every change is written to the journal first."""
 
     journal: Journal
-    begun: Entry = field(default_factory=dict)  # the first entry
+    start_entry: Entry = field(default_factory=dict)  # kind "begun"; empty: a new session
     plan: Plan | None = None
-    taken: list[Reading] = field(default_factory=list)
-    undone: int = 0
-    skipped: set[int] = field(default_factory=set)
-    mounted: int | None = None  # load that hangs on the flange
-    station: int = 0
-    place: int = 0  # of the plan's, at which the instrument stands
-    target: int = 0
+    accepted: list[Reading] = field(default_factory=list)
+    undone: int = 0  # number of readings discarded with `undo`
+    skipped: set[int] = field(default_factory=set)  # stops
+    mounted: int | None = None  # index in Plan.loads of the load on the flange
+    station: int = 0  # of the instrument, as in Reading: also counts unplanned moves
+    place: int = 0  # planned position of the instrument, as PlannedPose.station
+    target: int = 0  # added to PlannedPose.target: counts slips of the target
     notes: list[str] = field(default_factory=list)
-    used: set[str] = field(default_factory=set)
-    seconds: list[float] = field(default_factory=list)  # between a reading and the one before
+    used_sources: set[str] = field(default_factory=set)
+    intervals: list[float] = field(default_factory=list)  # s between consecutive readings
 
     @classmethod
     def of(cls, journal: Journal) -> Session:
-        """Return where the session of an open journal stands."""
+        """Return the session of an open journal."""
         session = cls(journal)
         for entry in journal.entries:
             session.apply(entry)
         return session
 
     def add(self, kind: str, **fields: Any) -> None:
-        """Write an entry, then act on it."""
+        """Write an entry to the journal, then apply it."""
         self.apply(self.journal.add(kind, **fields))
 
     def apply(self, entry: Entry) -> None:
-        """Act on an entry of the journal; one of a kind that is not known means nothing here."""
+        """Apply an entry of the journal; unknown kinds are ignored."""
         match entry["kind"]:
             case "begun":
-                self.begun = entry
+                self.start_entry = entry
             case "plan":
                 self.plan = plan_of(entry["plan"])
             case "reading":
-                self._take(Reading.of(entry))
+                self._accept(Reading.of(entry))
             case "rejected":
-                self.used.add(entry.get("source", ""))
+                self.used_sources.add(entry.get("source", ""))
             case "undo":
                 self.undone += 1
-                self.taken.pop()
+                self.accepted.pop()
             case "skip":
                 self.skipped.add(int(entry["stop"]))
             case "mounted":
                 self.mounted = int(entry["load"])
             case "moved":
-                self._move(entry)
+                self._move_instrument(entry)
             case "note":
                 self.notes.append(str(entry["text"]))
 
-    def _take(self, found: Reading) -> None:
-        if self.taken and found.time - self.taken[-1].time > 0.0:
-            self.seconds.append(found.time - self.taken[-1].time)
-        self.taken.append(found)
-        self.used.add(found.source)
+    def _accept(self, reading: Reading) -> None:
+        if self.accepted and reading.time - self.accepted[-1].time > 0.0:
+            self.intervals.append(reading.time - self.accepted[-1].time)
+        self.accepted.append(reading)
+        self.used_sources.add(reading.source)
 
-    def _move(self, entry: Entry) -> None:
+    def _move_instrument(self, entry: Entry) -> None:
         self.station = int(entry["station"])
         self.target = int(entry["target"])
         self.place = int(entry.get("place", self.place))
-        since = entry.get("since")  # readings from this one on were of the new place already
+        since = entry.get("since")  # index of the first reading taken after the move
         if since is not None:
-            for i in range(int(since), len(self.taken)):
-                self.taken[i] = replace(self.taken[i], station=self.station, target=self.target)
-
-    # -- what follows -----------------------------------------------------------------------------
+            for i in range(int(since), len(self.accepted)):
+                self.accepted[i] = replace(
+                    self.accepted[i], station=self.station, target=self.target
+                )
 
     @property
     def stops(self) -> tuple[PlannedPose, ...]:
@@ -134,31 +134,35 @@ class Session:
         return () if self.plan is None else self.plan.poses
 
     @property
-    def next(self) -> int | None:
-        """Return the number of the next stop, None after the last."""
-        done = {t.stop for t in self.taken} | self.skipped
-        return next((i for i in range(len(self.stops)) if i not in done), None)
+    def open_stops(self) -> list[int]:
+        """Return the stops that are neither measured nor skipped."""
+        done = {t.stop for t in self.accepted} | self.skipped
+        return [i for i in range(len(self.stops)) if i not in done]
 
     @property
-    def left(self) -> int:
-        """Return how many stops are left."""
-        done = {t.stop for t in self.taken} | self.skipped
-        return sum(i not in done for i in range(len(self.stops)))
+    def next_stop(self) -> int | None:
+        """Return the first open stop, None after the last."""
+        return next(iter(self.open_stops), None)
 
     @property
-    def places(self) -> int:
-        """Return how many places the instrument has had; 1 means that it was never moved."""
-        return max((t.station for t in self.taken), default=0) + 1
+    def remaining(self) -> int:
+        """Return the number of open stops."""
+        return len(self.open_stops)
+
+    @property
+    def station_count(self) -> int:
+        """Return the number of positions of the instrument; 1: it was never moved."""
+        return max((t.station for t in self.accepted), default=0) + 1
 
     def all_readings(self, kind: str) -> Readings:
-        """Return all readings, the instrument's places numbered without holes."""
-        found = self.readings(kind)
-        return replace(found, station=np.unique(found.station, return_inverse=True)[1])
+        """Return all accepted readings, stations numbered consecutively."""
+        readings = self.readings(kind)
+        return replace(readings, station=np.unique(readings.station, return_inverse=True)[1])
 
-    def readings(self, kind: str, taken: list[Reading] | None = None) -> Readings:
-        """Return readings (default: all that stand) as the calibration takes them."""
+    def readings(self, kind: str, selected: list[Reading] | None = None) -> Readings:
+        """Return readings (default: all accepted ones) as input of the fit."""
         assert self.plan is not None
-        rows = self.taken if taken is None else taken
+        rows = self.accepted if selected is None else selected
         loads, stops = self.plan.loads, self.stops
         n = len(stops[0].q) if stops else 0
         temperature = [t.temperature for t in rows]
@@ -183,32 +187,32 @@ class Session:
             pose=np.array([stops[t.stop].number for t in rows], dtype=np.int64),
         )  # fmt: skip
 
-    def keep_plan(self, plan: Plan) -> None:
-        """Write the plan that the session follows."""
+    def add_plan(self, plan: Plan) -> None:
+        """Write the plan to the journal."""
         self.add("plan", plan=entry_of(plan))
 
 
 def seconds_left(session: Session, minutes_per_load: float) -> float:
-    """Return s until the last stop, by the readings so far."""
-    paces = [s for s in session.seconds if s < PAUSE][-20:]
-    done = {t.stop for t in session.taken} | session.skipped
-    blocks = {(p.station, p.load) for i, p in enumerate(session.stops) if i not in done}
-    changes = len(blocks - {(session.place, session.mounted)})
-    return session.left * (median(paces) if paces else FIRST) + changes * 60.0 * minutes_per_load
+    """Return the estimated time to the last stop, s, from the intervals so far."""
+    recent = [s for s in session.intervals if s < MAX_INTERVAL][-20:]
+    per_stop = median(recent) if recent else DEFAULT_INTERVAL
+    setups = {(session.stops[i].station, session.stops[i].load) for i in session.open_stops}
+    changes = len(setups - {(session.place, session.mounted)})
+    return session.remaining * per_stop + changes * 60.0 * minutes_per_load
 
 
-def header(session: Session, stop: int, minutes_per_load: float) -> str:
-    """Return the line above a stop."""
-    count, done = len(session.stops), len(session.stops) - session.left
+def stop_header(session: Session, stop: int, minutes_per_load: float) -> str:
+    """Return the progress line shown before a stop."""
+    count, done = len(session.stops), len(session.stops) - session.remaining
     pose = session.stops[stop]
-    drawn = "█" * round(done / count * WIDTH)
-    more = [f"place {pose.station + 1}"] if any(p.station for p in session.stops) else []
+    bar = "█" * round(done / count * BAR_WIDTH)
+    details = [f"place {pose.station + 1}"] if any(p.station for p in session.stops) else []
     if pose.repeat:
         first = next(i for i, p in enumerate(session.stops) if p.number == pose.number)
-        more.append(f"stop {first + 1} once more")
+        details.append(f"stop {first + 1} once more")
     if pose.held_out:
-        more.append("to verify, not fitted")
+        details.append("to verify, not fitted")
     return " · ".join(
-        [f"{drawn:░<{WIDTH}} stop {stop + 1} of {count}", f"load {pose.load + 1}", *more,
+        [f"{bar:░<{BAR_WIDTH}} stop {stop + 1} of {count}", f"load {pose.load + 1}", *details,
          f"{duration(seconds_left(session, minutes_per_load))} left"]
     )  # fmt: skip

@@ -9,7 +9,7 @@ import pytest
 from played import FRAME, plan_in, play, positions, typed, write_cell
 
 from gapbridge.bridge.calibration.options import SessionOptions
-from gapbridge.bridge.calibration.planning import planned, space_of
+from gapbridge.bridge.calibration.planning import make_plan, workspace_of
 from gapbridge.bridge.calibration.session.journal import FILE, read_entries
 from gapbridge.bridge.cell import load_cell
 from gapbridge.core.calibration.plan import Plan
@@ -28,7 +28,7 @@ def cell_with(folder: Path, *lines: str, **changed: object) -> Path:
 def plan_with(folder: Path, *lines: str, **changed: object) -> tuple[Plan, Model]:
     cell = load_cell(cell_with(folder, *lines, **changed))
     options = SessionOptions("whole", None, cell.calibration.instrument)
-    return planned(cell, options, lambda text, share: None), cell.model
+    return make_plan(cell, options, lambda text, share: None), cell.model
 
 
 def test_poses_that_turn_the_reflector_away_are_not_planned(tmp_path: Path) -> None:
@@ -141,7 +141,7 @@ def test_loads_reach_as_far_on_the_way_as_in_the_plan(tmp_path: Path) -> None:
     from gapbridge.bridge.calibration.planning import loads_of, with_loads
 
     cell = load_cell(cell_with(tmp_path))
-    bare = space_of(cell, "position")
+    bare = workspace_of(cell, "position")
     loaded = with_loads(bare, loads_of(cell))
     q = bare.draw(2000, np.random.default_rng(0))
     assert (loaded.clear(q) & ~bare.clear(q)).sum() == 0

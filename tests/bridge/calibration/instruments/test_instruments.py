@@ -21,11 +21,11 @@ from technician import Hands
 from gapbridge.bridge.calibration.instruments import INSTRUMENTS
 from gapbridge.bridge.calibration.instruments.instrument import (
     AnyInstrument,
+    InstrumentContext,
     ReadingError,
-    Surroundings,
-    Where,
+    ReadRequest,
 )
-from gapbridge.bridge.calibration.instruments.numbers import numbers
+from gapbridge.bridge.calibration.instruments.numbers import parse_numbers
 from gapbridge.bridge.cell.settings.instruments import InstrumentSettings
 from gapbridge.bridge.demo.links.link import free_address
 from gapbridge.bridge.demo.links.ur_rtde import UrRtdeLink
@@ -39,9 +39,9 @@ SETTINGS: TypeAdapter[InstrumentSettings] = TypeAdapter(InstrumentSettings)
 def instrument(kind: str, *lines: str, since: float = 0.0, **keys: Any) -> AnyInstrument:
     """Return an instrument at a terminal where these lines are typed."""
     typed = iter(lines)
-    around = Surroundings(ask=lambda question: next(typed), since=since)
+    context = InstrumentContext(ask=lambda question: next(typed), since=since)
     settings = SETTINGS.validate_python({"kind": kind, **keys})
-    return INSTRUMENTS[settings.kind](settings, around)
+    return INSTRUMENTS[settings.kind](settings, context)
 
 
 def test_every_kind_that_a_cell_may_name_has_an_instrument() -> None:
@@ -58,8 +58,8 @@ def test_every_kind_that_a_cell_may_name_has_an_instrument() -> None:
     ],
 )  # fmt: skip
 def test_a_point_is_understood_however_it_is_written(line: str) -> None:
-    found = instrument("typed", line, unit="mm").read(Where()).values
-    np.testing.assert_allclose(found, [[1.2345, -0.06725, 0.890]], rtol=1e-12)
+    reader = instrument("typed", line, unit="mm").read(ReadRequest()).values
+    np.testing.assert_allclose(reader, [[1.2345, -0.06725, 0.890]], rtol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -76,7 +76,7 @@ def test_a_point_is_understood_however_it_is_written(line: str) -> None:
 )
 def test_what_is_no_point_is_reported_with_the_reason(line: str, phrase: str) -> None:
     with pytest.raises(ReadingError, match=phrase.replace("?", r"\?")):
-        instrument("typed", line, unit="mm").read(Where())
+        instrument("typed", line, unit="mm").read(ReadRequest())
 
 
 @settings(deadline=None)
@@ -84,7 +84,7 @@ def test_what_is_no_point_is_reported_with_the_reason(line: str, phrase: str) ->
 def test_numbers_read_back_exactly_whatever_stands_between_them(
     values: list[float], between: str
 ) -> None:
-    assert numbers(between.join(repr(v) for v in values), 3) == values
+    assert parse_numbers(between.join(repr(v) for v in values), 3) == values
 
 
 @pytest.mark.parametrize(
@@ -99,52 +99,54 @@ def test_numbers_read_back_exactly_whatever_stands_between_them(
 def test_a_pose_is_the_same_however_its_rotation_is_reported(
     keys: dict[str, str], line: str
 ) -> None:
-    found = instrument("typed", line, unit="m", pose=True, **keys).read(Where()).values[0]
-    np.testing.assert_allclose(found, [1, 2, 3, 0, 0, np.pi / 2], atol=1e-9)
+    reader = instrument("typed", line, unit="m", pose=True, **keys).read(ReadRequest()).values[0]
+    np.testing.assert_allclose(reader, [1, 2, 3, 0, 0, np.pi / 2], atol=1e-9)
 
 
 def test_degrees_in_radians_clothes_are_refused() -> None:
     with pytest.raises(ReadingError, match="is the unit right"):
-        instrument("typed", "1 2 3 0 0 90", unit="m", pose=True, angle_unit="rad").read(Where())
+        instrument("typed", "1 2 3 0 0 90", unit="m", pose=True, angle_unit="rad").read(
+            ReadRequest()
+        )
 
 
 def test_a_dial_gauge_counts_from_its_zero() -> None:
-    found = instrument("dial_gauge", "0,25 mm", unit="mm", zero=500.0).read(Where()).values
-    np.testing.assert_allclose(found, [[0.50025]])
+    reader = instrument("dial_gauge", "0,25 mm", unit="mm", zero=500.0).read(ReadRequest()).values
+    np.testing.assert_allclose(reader, [[0.50025]])
 
 
 def test_two_balls_give_their_difference_and_one_ball_twice_is_refused() -> None:
-    found = instrument("two_balls", "1 2 3", "101 2 3", unit="mm").read(Where()).values
-    np.testing.assert_allclose(found, [[0.1, 0.0, 0.0]], atol=1e-12)
+    reader = instrument("two_balls", "1 2 3", "101 2 3", unit="mm").read(ReadRequest()).values
+    np.testing.assert_allclose(reader, [[0.1, 0.0, 0.0]], atol=1e-12)
     with pytest.raises(ReadingError, match="same place"):
-        instrument("two_balls", "1 2 3", "1 2 3", unit="mm").read(Where())
+        instrument("two_balls", "1 2 3", "1 2 3", unit="mm").read(ReadRequest())
 
 
 def test_a_sphere_needs_no_number() -> None:
-    assert instrument("sphere", "").read(Where()).values.shape == (1, 0)
+    assert instrument("sphere", "").read(ReadRequest()).values.shape == (1, 0)
 
 
 def test_a_file_gives_row_after_row_and_waits_for_the_next(tmp_path: Path) -> None:
     file = tmp_path / "readings.csv"
     file.write_text("time;x;y;z\n1;100,5;2;3\n2;200;2;3\n3;300;2", encoding="utf-8")
-    found = instrument("file", unit="mm", file=str(file), timeout=5.0)
-    first = found.read(Where())
+    reader = instrument("file", unit="mm", file=str(file), timeout=5.0)
+    first = reader.read(ReadRequest())
     np.testing.assert_allclose(first.values, [[0.1005, 0.002, 0.003]])
-    second = found.read(Where(used=frozenset({first.source})))
+    second = reader.read(ReadRequest(used=frozenset({first.source})))
     assert second.values[0, 0] == pytest.approx(0.2)
     used = frozenset({first.source, second.source})
     threading.Timer(0.2, lambda: file.open("a").write(";3\n")).start()
-    assert found.read(Where(used=used)).values[0, 0] == pytest.approx(0.3)
+    assert reader.read(ReadRequest(used=used)).values[0, 0] == pytest.approx(0.3)
 
 
 def test_a_file_with_stops_gives_each_stop_its_last_row(tmp_path: Path) -> None:
     file = tmp_path / "readings.csv"
     file.write_text("stop,x,y,z\n1,1,0,0\n2,2,0,0\n1,3,0,0\n", encoding="utf-8")
-    found = instrument("file", unit="m", file=str(file), timeout=0.2)
-    assert found.read(Where(stop=1)).values[0, 0] == 3.0
-    assert found.read(Where(stop=2)).values[0, 0] == 2.0
+    reader = instrument("file", unit="m", file=str(file), timeout=0.2)
+    assert reader.read(ReadRequest(stop=1)).values[0, 0] == 3.0
+    assert reader.read(ReadRequest(stop=2)).values[0, 0] == 2.0
     with pytest.raises(ReadingError, match=r"no new row .* expected stop 3"):
-        found.read(Where(stop=3))
+        reader.read(ReadRequest(stop=3))
 
 
 @pytest.mark.parametrize(
@@ -155,17 +157,17 @@ def test_a_bad_row_is_named(tmp_path: Path, text: str, phrase: str) -> None:
     file = tmp_path / "readings.csv"
     file.write_text(text, encoding="utf-8")
     with pytest.raises(ReadingError, match=phrase):
-        instrument("file", unit="m", file=str(file)).read(Where())
+        instrument("file", unit="m", file=str(file)).read(ReadRequest())
 
 
 def test_columns_are_found_by_name_and_a_missing_one_is_reported(tmp_path: Path) -> None:
     file = tmp_path / "readings.csv"
     file.write_text("z,y,x,rms\n3,2,1,0.1\n", encoding="utf-8")
     keys = {"unit": "m", "file": str(file)}
-    found = instrument("file", columns=("x", "y", "z"), **keys).read(Where())
-    np.testing.assert_allclose(found.values, [[1, 2, 3]])
+    reader = instrument("file", columns=("x", "y", "z"), **keys).read(ReadRequest())
+    np.testing.assert_allclose(reader.values, [[1, 2, 3]])
     with pytest.raises(InputError, match="column w: found none"):
-        instrument("file", columns=("w", "y", "z"), **keys).read(Where())
+        instrument("file", columns=("w", "y", "z"), **keys).read(ReadRequest())
 
 
 def test_a_watched_folder_gives_whole_new_files_oldest_first(tmp_path: Path) -> None:
@@ -176,13 +178,13 @@ def test_a_watched_folder_gives_whole_new_files_oldest_first(tmp_path: Path) -> 
         path = tmp_path / f"{name}.csv"
         path.write_text(text, encoding="utf-8")
         os.utime(path, (now - age, now - age))
-    found = instrument("folder", unit="m", folder=str(tmp_path), timeout=0.4, since=now - 50)
-    first = found.read(Where())
+    reader = instrument("folder", unit="m", folder=str(tmp_path), timeout=0.4, since=now - 50)
+    first = reader.read(ReadRequest())
     np.testing.assert_allclose(first.values, [[1, 0, 0], [2, 0, 0]])
-    second = found.read(Where(used=frozenset({first.source})))
+    second = reader.read(ReadRequest(used=frozenset({first.source})))
     np.testing.assert_allclose(second.values, [[4.5, 0, 0]])
     with pytest.raises(ReadingError, match="no new file"):
-        found.read(Where(used=frozenset({first.source, second.source})))
+        reader.read(ReadRequest(used=frozenset({first.source, second.source})))
 
 
 def _serve(answers: list[bytes]) -> int:
@@ -202,11 +204,11 @@ def _serve(answers: list[bytes]) -> int:
 
 def test_a_line_feed_averages_lines_and_shows_when_it_hangs_up() -> None:
     port = _serve([b"", b"1 2 3\r\n\n3 2 3\n", b"1 2 3\n"])
-    found = instrument("line_feed", unit="m", port=port)
-    found.open()
-    np.testing.assert_allclose(found.read(Where(samples=2)).values, [[1, 2, 3], [3, 2, 3]])
+    reader = instrument("line_feed", unit="m", port=port)
+    reader.open()
+    np.testing.assert_allclose(reader.read(ReadRequest(samples=2)).values, [[1, 2, 3], [3, 2, 3]])
     with pytest.raises(LinkError, match="hung up"):
-        found.read(Where(samples=2))
+        reader.read(ReadRequest(samples=2))
 
 
 def test_an_instrument_that_is_not_there_is_reported(tmp_path: Path) -> None:
@@ -228,7 +230,7 @@ def test_the_simulated_tracker_hangs_what_was_said_to_be_mounted(tmp_path: Path)
     cell.write_text(f"robot: {{model: ur10e}}\nlink: {{host: {host}}}\n", encoding="utf-8")
     with ServedCell(cell, 3), instrument("simulated_tracker", host=host) as tracker:
         hands, state = Hands(host), RTDEReceiveInterface(host)
-        tracker.hung(Payload(9.5, (0.0, 0.01, 0.09), "plate"))
+        tracker.set_load(Payload(9.5, (0.0, 0.01, 0.09), "plate"))
         assert json.loads(hands.bench("truth"))["payload"] == {
             "mass": 9.5,
             "cog": [0.0, 0.01, 0.09],
@@ -238,5 +240,5 @@ def test_the_simulated_tracker_hangs_what_was_said_to_be_mounted(tmp_path: Path)
             time.sleep(0.05)
         assert state.getPayload() == 9.5
         np.testing.assert_allclose(state.getPayloadCog(), [0.0, 0.01, 0.09])
-        assert tracker.read(Where(samples=3)).values.shape == (3, 3)
+        assert tracker.read(ReadRequest(samples=3)).values.shape == (3, 3)
         state.disconnect()

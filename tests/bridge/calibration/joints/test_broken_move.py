@@ -46,8 +46,8 @@ class BrokenRun:
 def test_the_reason_of_a_broken_move_is_shown(monkeypatch: pytest.MonkeyPatch) -> None:
     joints = object.__new__(LinkedJoints)
     joints._run = BrokenRun()  # type: ignore[assignment]
-    monkeypatch.setattr(joints, "now", lambda: None)
+    monkeypatch.setattr(joints, "current_q", lambda: None)
     pose = PlannedPose(0, np.zeros(6), 0, np.zeros(6))
     with pytest.raises(RunError) as caught:
-        joints._follow(pose, 1.0)
+        joints._wait_for_arrival(pose, 1.0)
     assert str(caught.value) == f"the move broke off: {LINES[1]}; {LINES[2]}"

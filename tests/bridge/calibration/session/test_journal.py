@@ -58,11 +58,11 @@ def test_a_plan_reads_back_as_it_was_written(tmp_path: Path) -> None:
         assert (one.load, one.held_out, one.number) == (other.load, other.held_out, other.number)
 
 
-def test_a_book_stands_where_its_journal_left_it(tmp_path: Path) -> None:
+def test_a_resumed_session_has_the_state_of_its_journal(tmp_path: Path) -> None:
     with Journal(tmp_path) as journal:
         session = Session.of(journal)
         session.add("begun", version=1)
-        session.keep_plan(small_plan())
+        session.add_plan(small_plan())
         session.add("mounted", load=0)
         for stop in (0, 1, 2):
             session.add("reading", **taken(stop, source=f"row {stop}").entry())
@@ -72,12 +72,12 @@ def test_a_book_stands_where_its_journal_left_it(tmp_path: Path) -> None:
         session.add("note", text="door opened")
     with Journal(tmp_path) as journal:
         again = Session.of(journal)
-    assert [t.stop for t in again.taken] == [0, 1]
-    assert again.next == 2
-    assert (again.left, again.undone, again.mounted) == (1, 1, 0)
-    assert again.used == {"row 0", "row 1", "row 2", "row 9"}
+    assert [t.stop for t in again.accepted] == [0, 1]
+    assert again.next_stop == 2
+    assert (again.remaining, again.undone, again.mounted) == (1, 1, 0)
+    assert again.used_sources == {"row 0", "row 1", "row 2", "row 9"}
     assert again.notes == ["door opened"]
-    assert np.isnan(again.taken[0].scatter)
+    assert np.isnan(again.accepted[0].scatter)
     readings = again.readings("position")
     np.testing.assert_array_equal(readings.held_out, [False, True])
     assert readings.value.shape == (2, 3)
@@ -86,13 +86,13 @@ def test_a_book_stands_where_its_journal_left_it(tmp_path: Path) -> None:
 def test_readings_after_a_knock_belong_to_the_new_place(tmp_path: Path) -> None:
     with Journal(tmp_path) as journal:
         session = Session.of(journal)
-        session.keep_plan(small_plan())
+        session.add_plan(small_plan())
         for stop in (0, 1, 2):
             session.add("reading", **taken(stop).entry())
         session.add("moved", station=1, target=0, since=1)
     with Journal(tmp_path) as journal:
         again = Session.of(journal)
-    assert [t.station for t in again.taken] == [0, 1, 1]
+    assert [t.station for t in again.accepted] == [0, 1, 1]
 
 
 def test_an_entry_that_did_not_fit_on_the_disk_leaves_the_journal_as_it_was(

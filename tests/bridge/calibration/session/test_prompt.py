@@ -26,22 +26,22 @@ def keyboard(monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
 @pytest.fixture
 def types(keyboard: int, monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     """Return who types lines one by one, each when a question waits for it."""
-    flush, line = prompt._Lines.flush, prompt._Lines.line
+    flush, line = prompt._InputLines.flush, prompt._InputLines.line
     left: list[str] = []
     asked = [False]
 
-    def flushed(self: prompt._Lines) -> str:
+    def flushed(self: prompt._InputLines) -> str:
         asked[0] = True
         return flush(self)
 
-    def waits(self: prompt._Lines, seconds: float) -> str | None:
+    def waits(self: prompt._InputLines, seconds: float) -> str | None:
         if asked[0] and left:
             os.write(keyboard, f"{left.pop(0)}\n".encode())
         asked[0] = False
         return line(self, seconds)
 
-    monkeypatch.setattr(prompt._Lines, "flush", flushed)
-    monkeypatch.setattr(prompt._Lines, "line", waits)
+    monkeypatch.setattr(prompt._InputLines, "flush", flushed)
+    monkeypatch.setattr(prompt._InputLines, "line", waits)
     return lambda *lines: left.extend(lines)
 
 

@@ -7,7 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gapbridge.bridge.calibration.session.reading_check import ReadingCheck, Verdict, early_check
+from gapbridge.bridge.calibration.session.reading_check import (
+    ReadingCheck,
+    Verdict,
+    check_without_fit,
+)
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.calibration.parameters import DEFAULT
 from gapbridge.core.calibration.plan import Payload
@@ -58,7 +62,7 @@ def judged(
     """Judge the last of some readings by those before it."""
     found = ReadingCheck(NOMINAL, metrology, "position", metrology.sigma, DEFAULT, LOADS)
     last = np.arange(len(readings)) == len(readings) - 1
-    return found.judge(readings[~last], readings[last], typed, joints)
+    return found.check(readings[~last], readings[last], typed, joints)
 
 
 def with_last(readings: Readings, value: list[float] | np.ndarray) -> Readings:
@@ -76,9 +80,9 @@ def test_good_readings_are_not_rejected(registered: bool) -> None:
         readings = session(12, seed, registered)
         for k in range(12):
             rows = np.arange(12)
-            seen.append(found.judge(readings[rows < k], readings[rows == k], True, False))
-    assert not any(v.doubted for v in seen)
-    assert sum(np.isfinite(v.off) for v in seen) >= 3 * (12 if registered else 8)
+            seen.append(found.check(readings[rows < k], readings[rows == k], True, False))
+    assert not any(v.implausible for v in seen)
+    assert sum(np.isfinite(v.deviation) for v in seen) >= 3 * (12 if registered else 8)
 
 
 @pytest.mark.parametrize(
@@ -87,9 +91,9 @@ def test_good_readings_are_not_rejected(registered: bool) -> None:
 def test_a_wrong_unit_is_named_and_put_right(factor: float, phrase: str) -> None:
     readings = session(10, 1)
     found = judged(with_last(readings, readings.value[-1] * factor))
-    assert found.doubted
-    assert phrase in found.reasons[0]
-    np.testing.assert_allclose(found.instead, readings.value[-1])
+    assert found.implausible
+    assert phrase in found.explanations[0]
+    np.testing.assert_allclose(found.corrected, readings.value[-1])
 
 
 def test_a_mistyped_coordinate_is_named() -> None:
@@ -97,15 +101,15 @@ def test_a_mistyped_coordinate_is_named() -> None:
     wrong = readings.value[-1].copy()
     wrong[1] += 0.09
     found = judged(with_last(readings, wrong))
-    assert found.doubted
-    assert any(reason.startswith("y alone is off") for reason in found.reasons)
+    assert found.implausible
+    assert any(reason.startswith("y alone is off") for reason in found.explanations)
 
 
 def test_exchanged_axes_and_a_lost_sign_are_named() -> None:
     readings = session(12, 3)
     x, y, z = readings.value[-1]
-    assert any("z y x" in r for r in judged(with_last(readings, [z, y, x])).reasons)
-    assert any("sign of x" in r for r in judged(with_last(readings, [-x, y, z])).reasons)
+    assert any("z y x" in r for r in judged(with_last(readings, [z, y, x])).explanations)
+    assert any("sign of x" in r for r in judged(with_last(readings, [-x, y, z])).explanations)
 
 
 def test_a_load_that_was_not_changed_is_named() -> None:
@@ -116,16 +120,16 @@ def test_a_load_that_was_not_changed_is_named() -> None:
     load = readings.load.copy()
     load[-1] = 0
     found = judged(replace(readings, loads=swapped, load=load))
-    assert found.doubted
-    assert any("plate hangs on the flange" in reason for reason in found.reasons)
+    assert found.implausible
+    assert any("plate hangs on the flange" in reason for reason in found.explanations)
 
 
 def test_a_knocked_tracker_is_seen() -> None:
     readings = session(40, 5)
     found = judged(with_last(readings, readings.value[-1] + [0.0015, -0.001, 0.002]))
-    assert found.doubted
-    assert 1e-3 < found.off < 4e-3
-    assert found.allowed < 1e-3
+    assert found.implausible
+    assert 1e-3 < found.deviation < 4e-3
+    assert found.limit < 1e-3
 
 
 def test_a_mistyped_joint_is_named() -> None:
@@ -133,12 +137,12 @@ def test_a_mistyped_joint_is_named() -> None:
     q = readings.q.copy()
     q[-1, 2] += np.radians(10.0)
     found = judged(replace(readings, q=q), typed=False, joints=True)
-    assert found.doubted
-    assert any("joint 3" in reason for reason in found.reasons)
+    assert found.implausible
+    assert any("joint 3" in reason for reason in found.explanations)
 
 
 def test_the_first_readings_of_an_unregistered_instrument_show_nothing_yet() -> None:
-    assert not np.isfinite(judged(session(2, 0)).off)
+    assert not np.isfinite(judged(session(2, 0)).deviation)
 
 
 @pytest.mark.parametrize("count", [1, 2, 3])
@@ -146,17 +150,17 @@ def test_the_first_readings_of_an_unregistered_instrument_show_nothing_yet() -> 
 def test_the_first_three_readings_in_a_wrong_unit_are_doubted(count: int, factor: float) -> None:
     readings = session(count, 1)
     verdict = judged(with_last(readings, readings.value[-1] * factor))
-    assert verdict.doubted
+    assert verdict.implausible
     if count > 1:
-        assert "millimetres" in " ".join(verdict.reasons)
-        assert verdict.instead == pytest.approx(readings.value[-1])
+        assert "millimetres" in " ".join(verdict.explanations)
+        assert verdict.corrected == pytest.approx(readings.value[-1])
 
 
 def test_a_second_reading_of_another_stop_is_doubted_by_the_first() -> None:
     readings = session(2, 1)
     verdict = judged(with_last(readings, readings.value[0]))
-    assert verdict.doubted
-    assert "the joints put the two" in verdict.reasons[0]
+    assert verdict.implausible
+    assert "the joints put the two" in verdict.explanations[0]
 
 
 def test_two_balls_keep_their_distance_and_a_gauge_moves_no_farther_than_the_arm() -> None:
@@ -164,10 +168,10 @@ def test_two_balls_keep_their_distance_and_a_gauge_moves_no_farther_than_the_arm
     tip = NOMINAL.predict(readings.q, readings.loads).position
     balls = replace(readings, kind="relative", value=np.array([[0.2, 0, 0], [0, 0.21, 0]]))
     one, two = balls[np.array([0])], balls[np.array([1])]
-    assert early_check(one, two, tip) is not None
-    assert early_check(one, replace(two, value=np.array([[0, 0.2002, 0]])), tip) is None
+    assert check_without_fit(one, two, tip) is not None
+    assert check_without_fit(one, replace(two, value=np.array([[0, 0.2002, 0]])), tip) is None
     far = float(np.linalg.norm(tip[1] - tip[0]))
     gauge = replace(readings, kind="distance", value=np.array([[1.0], [1.0 + 2 * far + 0.1]]))
-    assert early_check(gauge[np.array([0])], gauge[np.array([1])], tip) is not None
+    assert check_without_fit(gauge[np.array([0])], gauge[np.array([1])], tip) is not None
     near = replace(gauge, value=np.array([[1.0], [1.0 + 0.5 * far]]))
-    assert early_check(near[np.array([0])], near[np.array([1])], tip) is None
+    assert check_without_fit(near[np.array([0])], near[np.array([1])], tip) is None
