@@ -214,13 +214,8 @@ def _how_to_resume(cell: Cell, options: SessionOptions, session: Session) -> str
 
 
 def _command(cell: Cell, options: SessionOptions, session: Session) -> str:
-    parts = [
-        "gapbridge",
-        "calibrate",
-        str(cell.path),
-        "--session",
-        str(session.journal.path.parent),
-    ]
+    folder = session.journal.path.parent
+    parts = ["gapbridge", "calibrate", str(cell.path), "--session", str(folder)]
     flags = {"verify": "--verify", "payload": "--payload-only", "tool": "--tool-only"}
     parts += [flags[options.kind]] if options.kind in flags else []
     parts += ["--move"] if options.move else []

@@ -156,10 +156,10 @@ class CalibrationJob(Job):
         from gapbridge.bridge.calibration.jobs.facts import (
             session_facts,  # plotting is slow to import
         )
-        from gapbridge.bridge.calibration.report import Material, write_report
+        from gapbridge.bridge.calibration.report import CalibrationData, write_report
 
         facts = session_facts(self.cell, options, self.session)
-        for file in write_report(Material(result, self.session.plan, facts), folder):
+        for file in write_report(CalibrationData(result, self.session.plan, facts), folder):
             prompt.say(f"{file}: written")
         if not result.complete:
             prompt.warn(f"not complete: {note_text(result.remaining)}")
@@ -199,12 +199,9 @@ def _poorly_determined(plan: Plan) -> list[str]:
 
 
 def run_fit(
-    cell: Cell,
-    options: SessionOptions,
-    prompt: Prompt,
-    session: Session,
+    cell: Cell, options: SessionOptions, prompt: Prompt, session: Session,
     more: tuple[str, ...] = (),
-) -> SessionFit:
+) -> SessionFit:  # fmt: skip
     """Return the fit of a session's readings, with effects ``more`` added to those of the cell.
 
     Held-out poses are not used. Raises InputError if the readings are too few.
@@ -223,18 +220,14 @@ def run_fit(
 
 
 def evaluate_fit(
-    cell: Cell,
-    options: SessionOptions,
-    prompt: Prompt,
-    session: Session,
-    fit: SessionFit,
-    declined: tuple[str, ...],
-) -> Calibration:
-    """Return the fit evaluated on the held-out poses, which are used here only."""
+    cell: Cell, options: SessionOptions, prompt: Prompt, session: Session, fit: SessionFit,
+    rejected: tuple[str, ...],
+) -> Calibration:  # fmt: skip
+    """Return the fit, ``rejected`` effects noted, evaluated on the held-out poses."""
     assert session.plan is not None
     with prompt.waiting("verifying") as emit:
         return judged(
-            cell.model, fit, declined=declined, expected=session.plan.expected,
+            cell.model, fit, declined=rejected, expected=session.plan.expected,
             diagnose=options.instrument.measures in DIAGNOSABLE_KINDS,
             progress=lambda text: emit(f"verifying: {text}"),
         )  # fmt: skip

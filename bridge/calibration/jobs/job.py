@@ -73,7 +73,7 @@ class Job(ABC):
         """Fit the readings, write the report, and write a new cell if the operator confirms."""
 
     def report_short(
-        self, found: PayloadCalibration | ToolCalibration, lines: Sequence[str],
+        self, result: PayloadCalibration | ToolCalibration, lines: Sequence[str],
         instrument: tuple[str, str],
     ) -> None:  # fmt: skip
         """Print the result of a short session, one line per estimate, and write its report.
@@ -81,15 +81,15 @@ class Job(ABC):
         ``instrument``: its name and kind of reading.
         """
         from gapbridge.bridge.calibration.jobs.facts import session_facts
-        from gapbridge.bridge.calibration.report import ShortMaterial, write_report
+        from gapbridge.bridge.calibration.report import ShortSessionData, write_report
 
         prompt = self.prompt
         prompt.say()
-        prompt.say(short_text(found), "bold")
-        for line in (*lines, *(f"  note: {note_text(note)}" for note in found.notes)):
+        prompt.say(short_text(result), "bold")
+        for line in (*lines, *(f"  note: {note_text(note)}" for note in result.notes)):
             prompt.say(line)
         facts = session_facts(self.cell, self.options, self.session, instrument)
-        for file in write_report(ShortMaterial(found, facts, self.cell.model), self.folder):
+        for file in write_report(ShortSessionData(result, facts, self.cell.model), self.folder):
             prompt.say(f"{file}: written")
 
     def write_new_cell(

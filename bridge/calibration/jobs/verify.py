@@ -108,10 +108,10 @@ class VerifyJob(Job):
         self._report(verification)
         write_log(readings, metrology.registered, folder / "readings.csv")
         from gapbridge.bridge.calibration.jobs.facts import session_facts
-        from gapbridge.bridge.calibration.report import VerificationMaterial, write_report
+        from gapbridge.bridge.calibration.report import VerificationData, write_report
 
         facts = session_facts(self.cell, options, self.session)
-        for file in write_report(VerificationMaterial(verification, facts, readings), folder):
+        for file in write_report(VerificationData(verification, facts, readings), folder):
             prompt.say(f"{file}: written")
         moved = None if verification.moved is None else verification.moved.name
         others = [other.name for other in verification.suspects]

@@ -1,16 +1,16 @@
-"""Reports of calibration sessions, for customers: one HTML file and a PDF."""
+"""Reports of calibration sessions for customers, as HTML and PDF."""
 
+from gapbridge.bridge.calibration.report.data import CalibrationData
 from gapbridge.bridge.calibration.report.facts import InstrumentFacts, SessionFacts
-from gapbridge.bridge.calibration.report.material import Material
 from gapbridge.bridge.calibration.report.report import write_report
-from gapbridge.bridge.calibration.report.sections.short_sections import ShortMaterial
-from gapbridge.bridge.calibration.report.sections.verification_sections import VerificationMaterial
+from gapbridge.bridge.calibration.report.sections.short_sections import ShortSessionData
+from gapbridge.bridge.calibration.report.sections.verification_sections import VerificationData
 
 __all__ = [
+    "CalibrationData",
     "InstrumentFacts",
-    "Material",
     "SessionFacts",
-    "ShortMaterial",
-    "VerificationMaterial",
+    "ShortSessionData",
+    "VerificationData",
     "write_report",
 ]

@@ -1,4 +1,4 @@
-"""Facts of a calibration session that stand in no reading: who, where, when, with what."""
+"""Facts of a session for its report that are not readings: who, where, when, with what."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 
 @dataclass(frozen=True)
 class InstrumentFacts:
-    """The instrument, as its data sheet, its certificate and the technician describe it."""
+    """The instrument by its data sheet, its certificate and the operator."""
 
     name: str
     kind: str = "position"  # key of core.calibration.observables.OBSERVABLES
@@ -21,7 +21,7 @@ class InstrumentFacts:
 
 @dataclass(frozen=True)
 class SessionFacts:
-    """One session; what is left empty is left out of the report."""
+    """One session; the report omits empty fields."""
 
     cell: str  # name of the cell
     arm: str
@@ -29,14 +29,14 @@ class SessionFacts:
     folder: Path  # of the session
     started: datetime
     ended: datetime
-    readings: int  # taken, those that were undone left out
-    undone: int = 0  # taken back by the technician
+    readings: int  # accepted ones
+    undone: int = 0  # discarded by the operator
     serial: str = ""  # of the arm
     operator: str = ""
     customer: str = ""
-    environment: str = ""  # anything else worth knowing, in words
+    environment: str = ""  # temperature, place, ...
     number: str = ""  # of the report
     version: str = ""  # of Gapbridge
     cell_sha256: str = ""  # of the cell file that was calibrated
-    accuracy: float | None = None  # m, asked for; None: nobody has
-    remarks: tuple[str, ...] = field(default=())  # what happened on the way, in words
+    accuracy: float | None = None  # m, required; None: no requirement
+    remarks: tuple[str, ...] = field(default=())  # notes and irregularities

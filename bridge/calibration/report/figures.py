@@ -1,4 +1,4 @@
-"""Figures as a certificate has them: lengths in mm, angles in mrad, no more digits than known."""
+"""Numbers for reports: lengths in mm, angles in mrad, digits by their uncertainty."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from gapbridge.core.calibration.result import Estimate
 
 
 def mm(length: float) -> str:
-    """Return a length (m) in mm, to the micrometre; finer below ten of them."""
+    """Return a length (m) in mm, to 1 µm; below 10 µm to 0.1 µm, from 10 mm on to 10 µm."""
     if not math.isfinite(length):
         return "unknown"
     size = abs(length) * 1e3
@@ -18,13 +18,13 @@ def mm(length: float) -> str:
     return f"{fixed(length * 1e3, decimals)} mm"
 
 
-def fine(length: float) -> str:
-    """Return a length (m) in mm to a tenth of a micrometre, for what is added up."""
+def mm_fine(length: float) -> str:
+    """Return a length (m) in mm to 0.1 µm, for terms of a sum."""
     return f"{fixed(length * 1e3, 4)} mm" if math.isfinite(length) else "unknown"
 
 
 def load_title(mass: float, name: str = "") -> str:
-    """Return "8 kg" or "1 kg (gripper)"; a name that only says the mass is left out."""
+    """Return "8 kg" or "1 kg (gripper)"; a name equal to the mass is omitted."""
     weight = f"{plain(mass)} kg"
     return f"{weight} ({name})" if name and name != weight else weight
 
@@ -35,7 +35,7 @@ def mrad(angle: float) -> str:
 
 
 def estimate_texts(e: Estimate) -> tuple[str, str, str, str]:
-    """Return value, interval, 1 sigma and unit of an estimate, all to the digits of its sigma."""
+    """Return value, 95 % interval, 1 sigma and unit of an estimate, rounded by its sigma."""
     unit, factor = unit_of(e.unit)
     digits = decimals_of(e.std * factor)
     low, high = (fixed(v * factor, digits) for v in e.interval)
@@ -43,5 +43,5 @@ def estimate_texts(e: Estimate) -> tuple[str, str, str, str]:
 
 
 def degrees(q: object) -> str:
-    """Return joint angles (rad) in degrees, with one decimal."""
+    """Return joint angles (n,), rad, in degrees with one decimal."""
     return ", ".join(fixed(math.degrees(float(v)), 1) for v in q)  # type: ignore[attr-defined]

@@ -1,1 +1,1 @@
-"""The sections of each kind of calibration report."""
+"""The sections of the calibration reports."""

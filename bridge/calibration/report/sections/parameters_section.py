@@ -1,9 +1,9 @@
-"""The parameters with intervals, what cannot be separated, and what is left: the residual."""
+"""Parameters with intervals, what is not identifiable, and the diagnosis of the residual."""
 
 from __future__ import annotations
 
+from gapbridge.bridge.calibration.report.data import CalibrationData
 from gapbridge.bridge.calibration.report.figures import degrees, estimate_texts
-from gapbridge.bridge.calibration.report.material import Material
 from gapbridge.bridge.document import blocks
 from gapbridge.bridge.document.axes import plain
 from gapbridge.bridge.document.findings import finding_text
@@ -24,26 +24,26 @@ from gapbridge.core.calibration.result import Estimate
 from gapbridge.core.diagnosis.channel_diagnosis import Verdict
 from gapbridge.core.diagnosis.diagnosis import Diagnosis
 
-SHOWN = 8  # measurements proposed
+MAX_MEASUREMENTS = 8  # of those proposed
 
 
-def parameters(material: Material) -> list[blocks.Block]:
-    """Return the table and what the readings do not determine."""
-    c = material.calibration
+def parameters(data: CalibrationData) -> list[blocks.Block]:
+    """Return the table of parameters, and those that the readings do not determine."""
+    c = data.calibration
     shown = [e for e in c.estimates if e.shown]
-    # the combinations speak of most of those that are not shown
+    # combinations name most of the parameters that are not shown
     named = {note.values[0] for note in c.combinations}
     hidden = [e.name for e in c.estimates if not e.shown and e.name not in named]
     planned = any(e.expected_std is not None for e in shown)
     content: list[blocks.Block] = [estimates_table(shown, planned=planned)]
     if any(e.on_bound for e in shown):
-        text = "* stands on the bound of what is physically possible."
+        text = "* is at its physical bound."
         content.append(blocks.Paragraph(text, "note"))
     if c.combinations or hidden:
         content.append(blocks.Heading("What these readings cannot determine"))
         items = [note_text(note, parameter_title) for note in c.combinations]
         items += [
-            f"{parameter_title(name)}: these readings do not show it; it stays near where it stood"
+            f"{parameter_title(name)}: not identifiable from these readings; kept near its prior"
             for name in hidden
         ]
         content.append(blocks.Bullets(tuple(items)))
@@ -51,7 +51,7 @@ def parameters(material: Material) -> list[blocks.Block]:
 
 
 def estimates_table(shown: list[Estimate], *, planned: bool) -> blocks.Table:
-    """Return values with intervals; ``planned``: beside what the plan expected."""
+    """Return values with intervals; ``planned``: with the sigma that the plan predicted."""
     heads: tuple[str, ...]
     if not planned:
         heads = ("parameter", "value", "95 % interval", "1 sigma", "unit")
@@ -73,20 +73,15 @@ def _planned(e: Estimate) -> str:
     return fixed(e.expected_std * factor, decimals_of(e.std * factor))
 
 
-def residual(material: Material) -> list[blocks.Block]:
-    """Return the verdict, what was found, and what would settle it."""
-    c = material.calibration
+def residual(data: CalibrationData) -> list[blocks.Block]:
+    """Return the diagnosis of the residual and, if incomplete, the next measurements."""
+    c = data.calibration
     if c.diagnosis is None:
-        text = "These readings do not allow to examine the residual."
+        text = "The residual of these readings cannot be diagnosed."
         return [blocks.Verdict(blocks.Badge("Not examined", blocks.QUIET), text)]
-    badge = (
-        blocks.Badge("Complete", blocks.GOOD)
-        if c.complete
-        else blocks.Badge("Not complete", blocks.DOUBTFUL)
-    )
     main = chosen_channel(c.diagnosis)
     content: list[blocks.Block] = [
-        blocks.Verdict(badge, sentence(note_text(c.remaining, parameter_title)))
+        blocks.Verdict(data.completeness, sentence(note_text(c.remaining, parameter_title)))
     ]
     if not c.missing_effects and (c.complete or c.diagnosis.verdict is not Verdict.NO_GAP):
         content.append(blocks.Paragraph(" ".join(sentences(main))))
@@ -101,18 +96,18 @@ def residual(material: Material) -> list[blocks.Block]:
                 )
             )
         )
-    return [*content, *([] if c.complete else _next(c.diagnosis))]
+    return [*content, *([] if c.complete else _next_measurements(c.diagnosis))]
 
 
-def _next(diagnosis: Diagnosis) -> list[blocks.Block]:
+def _next_measurements(diagnosis: Diagnosis) -> list[blocks.Block]:
     if not diagnosis.next_measurements:
         return []
     rows = [
         [str(i), degrees(m.q), f"{plain(m.payload)} kg",
          listed([effect_title(name) for name in m.separates], "or")]
-        for i, m in enumerate(diagnosis.next_measurements[:SHOWN], start=1)
+        for i, m in enumerate(diagnosis.next_measurements[:MAX_MEASUREMENTS], start=1)
     ]  # fmt: skip
-    heads = ("", "joint angles, degrees", "load", "would settle")
+    heads = ("", "joint angles, degrees", "load", "distinguishes")
     return [
         blocks.Heading("What to measure next"),
         blocks.Table(heads, rows, (0.3, 2.6, 0.7, 2.4), (2,)),

@@ -1,11 +1,11 @@
-"""The poses: planned, measured, what more of them would buy; and every reading."""
+"""The poses of the plan, the accuracy by number of poses, and all readings."""
 
 from __future__ import annotations
 
 import numpy as np
 
+from gapbridge.bridge.calibration.report.data import CalibrationData
 from gapbridge.bridge.calibration.report.figures import degrees, mm
-from gapbridge.bridge.calibration.report.material import Material
 from gapbridge.bridge.document.axes import Chart, scale
 from gapbridge.bridge.document.blocks import Block, Cell, Paragraph, Pictures, Table
 from gapbridge.bridge.document.drawing import AFTER, EDGE, INK, LIMIT, Circle, Drawing
@@ -18,20 +18,20 @@ VIEWS = (("The poses, from above", 0, 1), ("The poses, from the side", 0, 2))
 AXES = ("x, m", "y, m", "z, m")
 
 
-def poses(material: Material) -> list[Block]:
-    """Return the arm in its poses, and the plan's expectation beside what was reached."""
-    drawings = [_view(material, *view) for view in VIEWS]
-    caption = "The arm in the poses of the fit (grey) and those kept out of it (green)."
+def poses(data: CalibrationData) -> list[Block]:
+    """Return the arm in its poses, and the expected and the reached accuracy."""
+    drawings = [_view(data, *view) for view in VIEWS]
+    caption = "The arm in the fitted poses (grey) and the held-out ones (green)."
     blocks: list[Block] = [Pictures(tuple(drawings), caption)]
-    if material.plan is not None:
-        blocks += _planned(material, material.plan)
+    if data.plan is not None:
+        blocks += _planned(data, data.plan)
     return blocks
 
 
-def _view(material: Material, title: str, i: int, j: int) -> Drawing:
-    readings = material.calibration.readings
+def _view(data: CalibrationData, title: str, i: int, j: int) -> Drawing:
+    readings = data.calibration.readings
     _, first = np.unique(readings.pose, return_index=True)
-    rigid = material.calibration.model.without_terms()
+    rigid = data.calibration.model.without_terms()
     shapes = [skeleton(rigid, readings.q[k]) for k in first]
     points = np.concatenate(shapes)
     x, y = (scale(AXES[k], [*points[:, k]], tight=True) for k in (i, j))
@@ -45,48 +45,47 @@ def _view(material: Material, title: str, i: int, j: int) -> Drawing:
     return chart.drawing
 
 
-def _planned(material: Material, plan: Plan) -> list[Block]:
-    reached = material.predicted_std
+def _planned(data: CalibrationData, plan: Plan) -> list[Block]:
+    reached = data.predicted_std
     minutes = plan.travel / 60
     text = (
-        f"Before anyone moved, the plan expected the tool's place to be known to "
-        f"{mm(plan.expected.tcp_std)} (1 sigma, rms over the workspace; at worst "
-        f"{mm(plan.expected.tcp_std_worst)}); reached are {mm(reached)} at the poses that judge "
-        f"it. Travel between the poses takes about {minutes:.0f} min."
+        f"The plan predicted the position of the tool to {mm(plan.expected.tcp_std)} (1 sigma, rms "
+        f"over the workspace; at worst {mm(plan.expected.tcp_std_worst)}); the fit reached "
+        f"{mm(reached)} at the validation poses. Travel between the poses takes about "
+        f"{minutes:.0f} min."
     )
     blocks: list[Block] = [Paragraph(text)]
     if len(plan.bought) > 1:
-        blocks.append(Pictures((_bought(plan),), (
-            "What so many poses in the fit buy, as the plan expects it; the line is what was "
-            "planned."
+        blocks.append(Pictures((_accuracy_chart(plan),), (
+            "Expected accuracy by number of fitted poses; dashed: the plan."
         )))  # fmt: skip
     return blocks
 
 
-def _bought(plan: Plan) -> Drawing:
+def _accuracy_chart(plan: Plan) -> Drawing:
     count = [float(k) for k, _ in plan.bought]
     std = [v * 1e3 for _, v in plan.bought]
     planned = len({p.number for p in plan.poses if not p.held_out})
     known = [v for v in std if np.isfinite(v)]
-    most = min(max(known), 8 * min(known)) if known else 1.0
-    y = scale("1 sigma of the tool, mm", [most])
-    chart = Chart("What poses buy", scale("poses in the fit", [*count, planned]), y, width=420)
-    kept = [(a, b) for a, b in zip(count, std, strict=True) if b <= y.high]
-    chart.line([a for a, _ in kept], [b for _, b in kept], AFTER)
-    chart.points([a for a, _ in kept], [b for _, b in kept], AFTER, radius=3)
+    top = min(max(known), 8 * min(known)) if known else 1.0
+    y = scale("1 sigma of the tool, mm", [top])
+    chart = Chart(
+        "Accuracy by number of poses", scale("poses in the fit", [*count, planned]), y, width=420
+    )
+    shown = [(a, b) for a, b in zip(count, std, strict=True) if b <= y.high]
+    chart.line([a for a, _ in shown], [b for _, b in shown], AFTER)
+    chart.points([a for a, _ in shown], [b for _, b in shown], AFTER, radius=3)
     chart.line([planned, planned], [0.0, y.high], LIMIT, width=1.2, dashed=True)
     return chart.drawing
 
 
-def all_readings(material: Material) -> list[Block]:
-    """Return one long table."""
-    readings = material.calibration.readings
-    before, after = (_by_row(e.rows, e.norm, len(readings)) for e in material.both)
+def all_readings(data: CalibrationData) -> list[Block]:
+    """Return the table of all readings."""
+    readings = data.calibration.readings
+    before, after = (_by_row(e.rows, e.norm, len(readings)) for e in data.all_errors)
     rows: list[list[Cell]] = []
     for i in range(len(readings)):
-        used = (
-            "outlier" if i in material.outlier_rows else "check" if readings.held_out[i] else "fit"
-        )
+        used = "outlier" if i in data.outlier_rows else "check" if readings.held_out[i] else "fit"
         rows.append([
             str(i + 1), str(int(readings.pose[i]) + 1), str(int(readings.load[i]) + 1),
             degrees(readings.q[i]), used, _in_mm(before[i]), _in_mm(after[i]),
@@ -96,9 +95,9 @@ def all_readings(material: Material) -> list[Block]:
 
 
 def _by_row(rows: Index, norm: Array, count: int) -> Array:
-    found = np.full(count, np.nan)
-    found[rows] = norm * 1e3
-    return found
+    errors = np.full(count, np.nan)
+    errors[rows] = norm * 1e3
+    return errors
 
 
 def _in_mm(value: float) -> str:

@@ -1,4 +1,4 @@
-"""The short report of a verification: whether the calibration still holds."""
+"""The report of a verification: whether the calibration is still valid, and what changed."""
 
 from __future__ import annotations
 
@@ -25,31 +25,31 @@ from gapbridge.bridge.report.labels import (
 from gapbridge.core.calibration.readings import Readings
 from gapbridge.core.calibration.verify import Suspect, Verification
 
-HOLDS = (
-    "Nothing: use the cell as it is. Check it again after some months, and after every collision, "
+STEPS_VALID = (
+    "Nothing: use the cell as it is. Verify it again after some months, and after every collision, "
     "repair or change of the tool.",
 )
-BROKEN = (
+STEPS_INVALID = (
     "Do not rely on this cell's correction: gapbridge disarm CELL.",
-    "Look at what the report names: loose screws, the tool and its load, the instrument's target.",
-    "Then measure it anew: gapbridge calibrate CELL, or --tool-only or --payload-only where only "
+    "Inspect what the report names: loose screws, the tool and its load, the instrument's target.",
+    "Then recalibrate: gapbridge calibrate CELL, or with --tool-only or --payload-only if only "
     "those have changed.",
 )
-TWICE = 2.0  # predicted sigmas that an error hardly exceeds
+BAND_FACTOR = 2.0  # predicted sigmas that a valid calibration's error rarely exceeds
 
 
 @dataclass(frozen=True)
-class VerificationMaterial:
-    """A verification with the facts of its session; readings give the poses where given."""
+class VerificationData:
+    """A verification with the facts of its session; ``readings`` give the joint angles."""
 
     verification: Verification
     session: SessionFacts
     readings: Readings | None = None
 
 
-def holds(material: VerificationMaterial) -> list[blocks.Block]:
-    """Return the verdict, the large figures and how it was judged."""
-    v = material.verification
+def result(data: VerificationData) -> list[blocks.Block]:
+    """Return the verdict, the next steps, the main figures and the criterion."""
+    v = data.verification
     badge = (
         blocks.Badge("Still holds", blocks.GOOD)
         if v.holds
@@ -60,36 +60,34 @@ def holds(material: VerificationMaterial) -> list[blocks.Block]:
         blocks.Tile("error now, rms", mm(v.errors.rms), f"at most {mm(v.errors.max)}"),
         blocks.Tile("predicted, rms", mm(predicted), "uncertainty, arm and instrument"),
         blocks.Tile("error over prediction", f"{v.ratio:.2f}", "about 1 is as predicted"),
-        blocks.Tile("chance", likelihood(v.chance), "of so much, if it still holds"),
+        blocks.Tile("chance", likelihood(v.chance), "of this ratio, if still valid"),
     ))  # fmt: skip
     text = (
-        "A few poses were measured again and compared with what the calibration said they "
-        "would be. It counts as broken where so large an error would come by chance less than "
-        "once in a thousand."
+        "A few poses were measured and compared with the prediction of the calibration. It counts "
+        "as no longer valid if errors of this size would occur by chance in less than one of "
+        "1000 verifications."
     )
-    steps = HOLDS if v.holds else BROKEN
+    steps = STEPS_VALID if v.holds else STEPS_INVALID
     return [
         blocks.Verdict(badge, sentence(verdict_text(v))), blocks.Heading("What to do now"),
         blocks.Bullets(steps), tiles, blocks.Paragraph(text, "note"),
     ]  # fmt: skip
 
 
-def facts(material: VerificationMaterial) -> list[blocks.Block]:
-    """Return the facts."""
-    v = material.verification
+def facts(data: VerificationData) -> list[blocks.Block]:
+    """Return the facts of a verification session."""
+    v = data.verification
     counts = [("readings", str(len(v.errors.rows)))]
-    return facts_blocks(
-        material.session, counts, len(v.stations), note_texts(v.notes, parameter_title)
-    )
+    return facts_blocks(data.session, counts, len(v.stations), note_texts(v.notes, parameter_title))
 
 
-def poses(material: VerificationMaterial) -> list[blocks.Block]:
-    """Return a picture and a table."""
-    v, readings = material.verification, material.readings
+def poses(data: VerificationData) -> list[blocks.Block]:
+    """Return a chart and a table of the errors against twice their prediction."""
+    v, readings = data.verification, data.readings
     rows: list[list[blocks.Cell]] = []
     for i, row in enumerate(v.errors.rows):
         q = "–" if readings is None else degrees(readings.q[row])
-        within = v.errors.norm[i] <= TWICE * v.predicted[i]
+        within = v.errors.norm[i] <= BAND_FACTOR * v.predicted[i]
         rows.append([
             str(int(row) + 1), q, ",  ".join(fixed(x * 1e3, 3) for x in v.errors.vector[i]),
             mm(float(v.errors.norm[i])), mm(float(v.predicted[i])),
@@ -105,55 +103,53 @@ def _picture(v: Verification) -> Drawing:
     labels = [str(int(row) + 1) for row in v.errors.rows]
     step = max(1, len(labels) // 20)
     labels = [name if i % step == 0 else "" for i, name in enumerate(labels)]
-    values = [*v.errors.norm * 1e3, *TWICE * v.predicted * 1e3]
+    values = [*v.errors.norm * 1e3, *BAND_FACTOR * v.predicted * 1e3]
     chart = Chart("Error and prediction", named("reading", labels), scale("mm", values), width=560)
     for i, (error, predicted) in enumerate(zip(v.errors.norm, v.predicted, strict=True)):
         chart.column(i, float(error) * 1e3, AFTER, 0.55)
-        most = TWICE * float(predicted) * 1e3
+        most = BAND_FACTOR * float(predicted) * 1e3
         chart.line([i - 0.4, i + 0.4], [most, most], EDGE, width=2.2)
     chart.legend((("error", AFTER), ("twice the prediction", EDGE)))
     return chart.drawing
 
 
-def moved(material: VerificationMaterial) -> list[blocks.Block]:
-    """Return the suspects; nothing where the calibration holds."""
-    v = material.verification
+def changes(data: VerificationData) -> list[blocks.Block]:
+    """Return the possible changes since the calibration; nothing if it is still valid."""
+    v = data.verification
     if v.holds:
         return []
     if v.moved is None:
         return [blocks.Paragraph(
             "No single change (tool, load, one joint's zero, instrument, one bad reading) "
-            "explains the errors. Calibrate anew."
+            "explains the errors. Recalibrate."
         )]  # fmt: skip
-    shown: list[blocks.Block] = [
-        blocks.Paragraph(f"What explains it best: {suspect_title(v.moved)}.")
-    ]
+    shown: list[blocks.Block] = [blocks.Paragraph(f"Best explanation: {change_title(v.moved)}.")]
     if v.moved.estimates:
         shown.append(estimates_table(list(v.moved.estimates), planned=False))
     if v.suspects:
-        rows = [[suspect_title(s), likelihood(s.chance)] for s in v.suspects]
+        rows = [[change_title(s), likelihood(s.chance)] for s in v.suspects]
         shown += [
-            blocks.Heading("What explains it nearly as well"),
-            blocks.Table(("change", "chance of what is left"), rows, (3, 1), (1,)),
+            blocks.Heading("Explanations that fit nearly as well"),
+            blocks.Table(("change", "chance of the residual"), rows, (3, 1), (1,)),
         ]
     return shown
 
 
-def suspect_title(suspect: Suspect) -> str:
-    """Return what may have moved, for people."""
+def change_title(suspect: Suspect) -> str:
+    """Return the name of a possible change."""
     if suspect.reading is not None:
         return f"reading {suspect.reading} alone is wrong"
     if not suspect.effect:
-        return "the instrument stands elsewhere"
+        return "the instrument has moved"
     if suspect.joint is None:
         return effect_title(suspect.effect)
     return f"another {parameter_title(suspect.name)}"
 
 
-VERIFICATION: tuple[blocks.Section[VerificationMaterial], ...] = (
-    blocks.Section("result", "Result", holds),
+VERIFICATION: tuple[blocks.Section[VerificationData], ...] = (
+    blocks.Section("result", "Result", result),
     blocks.Section("session", "Session and instrument", facts),
     blocks.Section("poses", "Every reading", poses,
             "Error of each reading, and twice the calibration's prediction of it."),
-    blocks.Section("moved", "What may have moved", moved),
+    blocks.Section("moved", "What may have changed", changes),
 )  # fmt: skip

@@ -7,7 +7,7 @@ import pytest
 from calibration_report_cases import calibration, plan, session
 from other_kinds import calibration_of
 
-from gapbridge.bridge.calibration.report import InstrumentFacts, Material, write_report
+from gapbridge.bridge.calibration.report import CalibrationData, InstrumentFacts, write_report
 from gapbridge.bridge.calibration.report.figures import mm
 from gapbridge.bridge.calibration.report.report import CALIBRATION
 from gapbridge.core.calibration.observables import OBSERVABLES
@@ -16,7 +16,7 @@ from gapbridge.core.calibration.observables import OBSERVABLES
 @pytest.fixture(scope="module")
 def written(tmp_path_factory):
     return write_report(
-        Material(calibration(), plan(), session()), tmp_path_factory.mktemp("report")
+        CalibrationData(calibration(), plan(), session()), tmp_path_factory.mktemp("report")
     )
 
 
@@ -55,7 +55,7 @@ def test_names_are_written_as_they_are_and_nothing_of_them_is_markup(written):
 def test_names_in_other_scripts_are_not_lost(tmp_path):
     names = {"customer": "株式会社ロボット", "operator": "Елена Ψαρρά", "serial": "서울 2"}
     facts = session(cell="机器人 3", **names)
-    page, paper = write_report(Material(calibration(), None, facts), tmp_path)
+    page, paper = write_report(CalibrationData(calibration(), None, facts), tmp_path)
     html, phrase = page.read_text("utf-8"), text_of(paper)
     for name in (*names.values(), "机器人 3"):
         assert name in html
@@ -72,7 +72,7 @@ def test_nothing_is_loaded_from_outside(written):
 def test_every_kind_of_reading_has_its_report(kind, tmp_path):
     c = calibration_of(kind)
     facts = session(instrument=InstrumentFacts("an instrument", kind=kind))
-    page, paper = write_report(Material(c, None, facts), tmp_path)
+    page, paper = write_report(CalibrationData(c, None, facts), tmp_path)
     html, phrase = page.read_text("utf-8"), text_of(paper)
     assert mm(c.held_out_after.mean) in html
     assert "expanded uncertainty" in phrase

@@ -8,22 +8,24 @@ from on_a_phone import PATIENCE
 from short_session_cases import payload, tool, verification
 
 from gapbridge.bridge.calibration.report import (
-    Material,
-    ShortMaterial,
-    VerificationMaterial,
+    CalibrationData,
+    ShortSessionData,
+    VerificationData,
     write_report,
 )
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 WRITERS = {
-    "calibration": lambda out: write_report(Material(calibration(), plan(), session()), out),
+    "calibration": lambda out: write_report(CalibrationData(calibration(), plan(), session()), out),
     "verification": lambda out: write_report(
-        VerificationMaterial(verification(moved=True)[0], session(), verification(moved=True)[1]),
+        VerificationData(verification(moved=True)[0], session(), verification(moved=True)[1]),
         out,
     ),
-    "payload": lambda out: write_report(ShortMaterial(payload()[0], session(), payload()[1]), out),
-    "tool": lambda out: write_report(ShortMaterial(tool()[0], session(), tool()[1]), out),
+    "payload": lambda out: write_report(
+        ShortSessionData(payload()[0], session(), payload()[1]), out
+    ),
+    "tool": lambda out: write_report(ShortSessionData(tool()[0], session(), tool()[1]), out),
 }
 # texts of a drawing that reach beyond its edge
 CUT = """[...document.querySelectorAll('svg')].flatMap(svg => {

@@ -7,8 +7,8 @@ from short_session_cases import payload, tool, verification
 
 from gapbridge.bridge.calibration.report import (
     InstrumentFacts,
-    ShortMaterial,
-    VerificationMaterial,
+    ShortSessionData,
+    VerificationData,
     write_report,
 )
 from gapbridge.bridge.calibration.report.figures import estimate_texts, mm
@@ -23,18 +23,18 @@ def read(paths):
 
 def test_a_calibration_that_holds_says_so_and_accuses_nothing(tmp_path):
     found, readings = verification(moved=False)
-    html, phrase = read(write_report(VerificationMaterial(found, session(), readings), tmp_path))
+    html, phrase = read(write_report(VerificationData(found, session(), readings), tmp_path))
     for text in (html, phrase):
         assert "Still holds" in text
         assert "Nothing: use the cell as it is." in text
-        assert "What may have moved" not in text
+        assert "What may have changed" not in text
         assert mm(found.errors.rms) in text
     assert sorted(p.name for p in tmp_path.iterdir()) == ["verification.html", "verification.pdf"]
 
 
 def test_a_calibration_that_no_longer_holds_names_what_moved(tmp_path):
     found, readings = verification(moved=True)
-    html, phrase = read(write_report(VerificationMaterial(found, session(), readings), tmp_path))
+    html, phrase = read(write_report(VerificationData(found, session(), readings), tmp_path))
     for text in (html, phrase):
         assert "No longer holds" in text
         assert "Do not rely on this cell" in text
@@ -44,7 +44,7 @@ def test_a_calibration_that_no_longer_holds_names_what_moved(tmp_path):
 
 def test_a_verification_without_its_readings_leaves_only_the_angles_out(tmp_path):
     found, _ = verification(moved=True)
-    html, _ = read(write_report(VerificationMaterial(found, session()), tmp_path))
+    html, _ = read(write_report(VerificationData(found, session()), tmp_path))
     assert all(mm(float(e)) in html for e in found.errors.norm)
 
 
@@ -54,10 +54,10 @@ def test_a_short_session_shows_each_number_with_its_interval(kind, unit, tmp_pat
     facts = session(instrument=instrument)
     if kind == "payload":
         found, nominal = payload()
-        paths = write_report(ShortMaterial(found, facts, nominal), tmp_path)
+        paths = write_report(ShortSessionData(found, facts, nominal), tmp_path)
     else:
         found, nominal = tool()
-        paths = write_report(ShortMaterial(found, facts, nominal), tmp_path)
+        paths = write_report(ShortSessionData(found, facts, nominal), tmp_path)
     html, phrase = read(paths)
 
     for estimate in found.estimates:
@@ -76,7 +76,7 @@ def test_a_short_session_shows_each_number_with_its_interval(kind, unit, tmp_pat
 def test_a_outlier_reading_of_the_sensor_is_remarked(tmp_path):
     found, nominal = payload()
     assert list(found.outliers) == [5]
-    html, _ = read(write_report(ShortMaterial(found, session(), nominal), tmp_path))
+    html, _ = read(write_report(ShortSessionData(found, session(), nominal), tmp_path))
     assert "Found, see remarks" in html
     assert html.index("See the remarks under") < html.index("Set the same payload")
     assert "Down-weighted as outlier: reading 6." in html

@@ -10,7 +10,7 @@ import pypdfium2
 import pytest
 from calibration_report_cases import calibration, plan, session
 
-from gapbridge.bridge.calibration.report import Material, write_report
+from gapbridge.bridge.calibration.report import CalibrationData, write_report
 from gapbridge.core.calibration.result import Errors
 from gapbridge.core.notes import Note, Reason
 
@@ -20,7 +20,9 @@ FACTS = {"number": "GB-20261121-0912-1a2b3c4d", "version": "9.8.7", "cell_sha256
 def page(folder: Path, accuracy: float | None, **changed: object) -> str:
     found = replace(calibration(), **changed)
     facts = session(**FACTS, accuracy=accuracy)
-    return write_report(Material(found, plan(), facts), folder)[0].read_text(encoding="utf-8")
+    return write_report(CalibrationData(found, plan(), facts), folder)[0].read_text(
+        encoding="utf-8"
+    )
 
 
 def test_number_version_hash_certificate_and_room_to_sign_stand_in_it(tmp_path: Path) -> None:
@@ -28,16 +30,16 @@ def test_number_version_hash_certificate_and_room_to_sign_stand_in_it(tmp_path: 
     for found in (FACTS["number"], "Gapbridge 9.8.7", "abababab " * 7 + "abababab", "no. 88120"):
         assert found in text
     assert "released by" in text
-    assert "Asked for" not in text
+    assert "Required: " not in text
 
 
 @pytest.mark.parametrize(("accuracy", "word"), [(1e-3, "Pass"), (1e-5, "Fail")])
 def test_the_accuracy_asked_for_is_met_or_not(tmp_path: Path, accuracy: float, word: str) -> None:
     text = page(tmp_path, accuracy)
     assert f">{word}</span>" in text
-    assert f"farther off than {accuracy * 1e3:.3f} mm" in text
+    assert f"held-out pose above {accuracy * 1e3:.3f} mm" in text
     steps = text.split("What to do now")[1].split("</ul>")[0]
-    assert ("The accuracy asked for is not shown" in steps) == (word == "Fail")
+    assert ("The required accuracy is not met" in steps) == (word == "Fail")
     assert "gapbridge calibrate CELL --verify" in steps
 
 
@@ -80,7 +82,7 @@ def test_what_is_left_is_the_same_statement_in_every_section(tmp_path: Path) -> 
 
 
 def test_every_page_says_how_many_there_are(tmp_path: Path) -> None:
-    _, paper = write_report(Material(calibration(), plan(), session(**FACTS)), tmp_path)
+    _, paper = write_report(CalibrationData(calibration(), plan(), session(**FACTS)), tmp_path)
     pages = pypdfium2.PdfDocument(str(paper))
     ends = [p.get_textpage().get_text_bounded().strip().split("\n")[-1] for p in pages]
     assert ends == [f"page {i} of {len(pages)}" for i in range(1, len(pages) + 1)]

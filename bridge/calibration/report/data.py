@@ -1,4 +1,4 @@
-"""What the sections of a calibration's report are made of."""
+"""The data of a calibration's report, and the errors that its sections share."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from gapbridge.bridge.calibration.report.facts import SessionFacts
+from gapbridge.bridge.document.blocks import DOUBTFUL, GOOD, Badge
 from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.budget.budget import Budget, budget
 from gapbridge.core.calibration.budget.inputs import outlier_readings
@@ -15,17 +16,17 @@ from gapbridge.core.calibration.budget.pose_accuracy import KINDS, PoseAccuracy,
 from gapbridge.core.calibration.plan import Plan
 from gapbridge.core.calibration.result import Calibration, Errors
 
-ERRORS = {
-    "position": "the distance between where the tool was measured and where the model puts it",
-    "distance": "the difference between the distance that was measured and the model's",
-    "sphere": "how far from the sphere the model puts the tool while it touched it",
-    "point": "how far from the fixed point the model puts the tip while it was there",
-    "relative": "the difference between one ball's place seen from the other, and the model's",
+ERROR_DEFINITIONS = {
+    "position": "the distance between the measured and the predicted position of the tool",
+    "distance": "the difference between the measured and the predicted distance",
+    "sphere": "the predicted distance of the tool from the sphere that it touched",
+    "point": "the predicted distance of the tip from the fixed point that it touched",
+    "relative": "the difference between the measured and the predicted vector between the balls",
 }
 
 
 @dataclass(frozen=True)
-class Material:
+class CalibrationData:
     """A calibration with its plan and the facts of its session."""
 
     calibration: Calibration
@@ -33,26 +34,23 @@ class Material:
     session: SessionFacts
 
     @cached_property
-    def judged(self) -> tuple[Errors, Errors]:
-        """Return the errors before and after by which the calibration is judged.
-
-        Those of the held-out poses; of the fitted ones where none were held out.
-        """
+    def validation_errors(self) -> tuple[Errors, Errors]:
+        """Return the errors before and after of the held-out poses; without any, of the fitted."""
         c = self.calibration
         if len(c.held_out_before.vector):
             return c.held_out_before, c.held_out_after
         return c.before, c.after
 
     @cached_property
-    def both(self) -> tuple[Errors, Errors]:
+    def all_errors(self) -> tuple[Errors, Errors]:
         """Return the errors before and after of all readings, fitted and held out."""
         c = self.calibration
         return _joined(c.before, c.held_out_before), _joined(c.after, c.held_out_after)
 
     @cached_property
-    def inliers(self) -> tuple[Errors, Errors]:
-        """Return the errors before and after of all readings but the outliers."""
-        before, after = self.both
+    def inlier_errors(self) -> tuple[Errors, Errors]:
+        """Return the errors before and after of all readings except outliers."""
+        before, after = self.all_errors
         kept = np.array([int(r) not in self.outlier_rows for r in before.rows], dtype=bool)
         return (
             Errors(before.vector[kept], before.rows[kept]),
@@ -60,32 +58,38 @@ class Material:
         )
 
     @cached_property
-    def accuracies(self) -> tuple[PoseAccuracy, ...]:
-        """Return AP and RP of the poses that were visited more than once."""
+    def pose_accuracies(self) -> tuple[PoseAccuracy, ...]:
+        """Return AP and RP (ISO 9283) of the poses that were visited more than once."""
         return pose_accuracies(self.calibration)
 
     @cached_property
     def outlier_rows(self) -> frozenset[int]:
-        """Return the rows of readings that are blunders."""
+        """Return the rows of outlier readings."""
         return frozenset(int(r) for r in outlier_readings(self.calibration))
 
     @property
     def predicted_std(self) -> float:
-        """Return 1 sigma (3D, rms) of the predicted TCP at the poses that judge it, m."""
+        """Return 1 sigma (3D, rms) of the predicted TCP at the validation poses, m."""
         std = self.calibration.tcp_std
         return float(np.sqrt(np.mean(std**2))) if len(std) else float("nan")
 
     @property
-    def held_out(self) -> bool:
-        """Return whether poses were kept out of the fit."""
+    def has_held_out(self) -> bool:
+        """Return whether any poses were held out."""
         return bool(len(self.calibration.held_out_before.vector))
 
     @property
-    def judged_on(self) -> str:
-        """Return which poses the errors are judged on."""
-        if self.held_out:
-            return "poses that the fit never saw"
-        return "the poses of the fit themselves (none were kept out)"
+    def validation_poses(self) -> str:
+        """Return the name of the poses of ``validation_errors``."""
+        if self.has_held_out:
+            return "poses not used in the fit"
+        return "the fitted poses (none were held out)"
+
+    @property
+    def completeness(self) -> Badge:
+        """Return whether the residual is explained by arm and instrument alone."""
+        complete = self.calibration.complete
+        return Badge("Complete", GOOD) if complete else Badge("Not complete", DOUBTFUL)
 
     @cached_property
     def budget(self) -> Budget:
@@ -93,25 +97,25 @@ class Material:
         return budget(self.calibration)
 
     @cached_property
-    def tip(self) -> Array:
-        """Return where the calibrated model puts the TCP of every reading (N, 3), m, in base."""
+    def tcp(self) -> Array:
+        """Return the TCP of every reading by the calibrated model (N, 3), m, in base."""
         readings = self.calibration.readings
         return self.calibration.model.predict(readings.q, readings.loads).position
 
     @property
-    def shows_places(self) -> bool:
-        """Return whether the readings show where the tool is, all three coordinates."""
+    def measures_position(self) -> bool:
+        """Return whether the readings contain all three coordinates of the target."""
         return self.calibration.readings.kind in KINDS
 
     @property
-    def error_meaning(self) -> str:
-        """Return what an error is, for this kind of reading."""
-        return ERRORS.get(self.calibration.readings.kind, ERRORS["position"])
+    def error_definition(self) -> str:
+        """Return the definition of an error for this kind of reading."""
+        return ERROR_DEFINITIONS.get(self.calibration.readings.kind, ERROR_DEFINITIONS["position"])
 
     @property
     def axes(self) -> tuple[str, ...]:
-        """Return what the coordinates of an error are called."""
-        width = self.judged[0].vector.shape[1]
+        """Return the names of the coordinates of an error."""
+        width = self.validation_errors[0].vector.shape[1]
         return ("x", "y", "z") if width == 3 else ("distance",) if width == 1 else ()
 
 
