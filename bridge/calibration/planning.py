@@ -68,13 +68,13 @@ def loads_of(cell: Cell) -> tuple[Payload, ...]:
 def make_plan(cell: Cell, options: SessionOptions, emit: Callable[[str, float], None]) -> Plan:
     """Return the plan of a calibration; ``emit`` takes step and progress. Raises InputError."""
     settings, instrument = cell.calibration, options.instrument
-    space = workspace_of(cell, instrument.measures)
-    observable = observable_of(cell, instrument, max(len(space.places), 1))
+    workspace = workspace_of(cell, instrument.measures)
+    observable = observable_of(cell, instrument, max(len(workspace.places), 1))
     return plan(
         identifiable_parameters(cell.model, effects_of(cell), observable=observable),
         observable,
         loads_of(cell),
-        space,
+        workspace,
         SessionDesign(
             poses=options.poses or settings.poses,
             held_out=settings.held_out,
@@ -89,13 +89,15 @@ def make_plan(cell: Cell, options: SessionOptions, emit: Callable[[str, float], 
 
 def workspace_of(cell: Cell, kind: str) -> Workspace:
     """Return where the arm may be measured with a kind of reading. Raises CellError."""
-    settings, seen = cell.calibration, cell.calibration.reflector
+    settings, entry = cell.calibration, cell.calibration.reflector
     places = _places(cell, kind)
     lower, upper = _range(cell, settings.joint_range)
     return Workspace.of(
         cell.model, lower=lower, upper=upper, floor=settings.floor, places=places,
         keep_out=[Box(_vector3(b.lower), _vector3(b.upper)) for b in _boxes(cell, settings)],
-        reflector=None if seen is None else Reflector(looks=seen.looks, acceptance=seen.acceptance),
+        reflector=None if entry is None else Reflector(
+            looks=entry.looks, acceptance=entry.acceptance
+        ),
     )  # fmt: skip
 
 
@@ -136,9 +138,9 @@ def _places(cell: Cell, kind: str) -> list[Place]:
     ]
 
 
-def with_loads(space: Workspace, loads: Sequence[Payload]) -> Workspace:
+def with_loads(workspace: Workspace, loads: Sequence[Payload]) -> Workspace:
     """Return the workspace with the extent of these loads in collision checks."""
-    return replace(space, hung=(*space.hung, *(far_end(load) for load in loads)))
+    return replace(workspace, hung=(*workspace.hung, *(far_end(load) for load in loads)))
 
 
 def _boxes(cell: Cell, settings: CalibrationSettings) -> list[BoxEntry]:

@@ -100,9 +100,9 @@ def _stop(path: Path, line: int, cells: tuple[str, ...], index: int | None) -> i
     try:
         return int(cells[index])
     except (ValueError, IndexError):
-        found = cells[index] if index < len(cells) else "nothing"
+        text = cells[index] if index < len(cells) else "nothing"
         raise InputError(
-            f"{path}: row {line}, column {STOP_COLUMN}: found {found!r}, expected a whole number"
+            f"{path}: row {line}, column {STOP_COLUMN}: found {text!r}, expected a whole number"
         ) from None
 
 

@@ -54,14 +54,14 @@ class LineFeed(Instrument[LineFeedSettings]):
 
     def read(self, request: ReadRequest) -> Samples:
         """Return ``request.samples`` samples (M, 3) or (M, 6). Raises ReadingError, LinkError."""
-        settings, found, buffer = self.settings, [], b""
+        settings, values, buffer = self.settings, [], b""
         with self._connect() as link:
             for _ in range(request.samples):
                 if settings.trigger:
                     link.sendall(settings.trigger.encode() + b"\n")
                 line, buffer = self._line(link, buffer)
-                found.append(to_si(parse_numbers(line, settings.width, settings.unit), settings))
-        return Samples(np.array(found))
+                values.append(to_si(parse_numbers(line, settings.width, settings.unit), settings))
+        return Samples(np.array(values))
 
     def _line(self, link: socket.socket, buffer: bytes) -> tuple[str, bytes]:
         """Return the next line that is not empty, and the bytes received after it."""
@@ -116,8 +116,8 @@ class SimulatedTracker(Instrument[SimulatedTrackerSettings]):
     def read(self, request: ReadRequest) -> Samples:
         """Return samples (M, 3) m, or (M, 6) m and rotation vector. Raises LinkError."""
         samples = [self._measure() for _ in range(request.samples)]
-        found = np.array(samples)[:, 1:]
-        return Samples(found if self.settings.pose else found[:, :3])
+        values = np.array(samples)[:, 1:]
+        return Samples(values if self.settings.pose else values[:, :3])
 
     def set_load(self, load: Payload) -> None:
         """Mount the load on the simulated flange, and set it in a UR controller.

@@ -29,18 +29,18 @@ def parse_numbers(text: str, count: int, unit: str = "") -> list[float]:
         if unit and standard != unit and standard not in RADIANS:
             raise ReadingError(f"found {written}, expected {unit}: the unit declared for it")
     plain = _UNIT.sub(" ", plain)
-    found = []
+    values = []
     for token in _tokens(plain, count):
         try:
-            found.append(float(token))
+            values.append(float(token))
         except ValueError:
             raise ReadingError(f"found {token!r}, expected a number") from None
-    if len(found) != count:
-        plural = "s" if len(found) != 1 else ""
-        raise ReadingError(f"found {len(found)} number{plural} in {text!r}, expected {count}")
-    if not all(map(math.isfinite, found)):
+    if len(values) != count:
+        plural = "s" if len(values) != 1 else ""
+        raise ReadingError(f"found {len(values)} number{plural} in {text!r}, expected {count}")
+    if not all(map(math.isfinite, values)):
         raise ReadingError(f"found {text!r}, expected finite numbers")
-    return found
+    return values
 
 
 def _tokens(text: str, count: int) -> list[str]:

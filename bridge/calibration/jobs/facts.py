@@ -32,19 +32,19 @@ def session_facts(
 
     ``device``: name and kind of readings, if not those of the chosen instrument.
     """
-    given, instrument = cell.calibration, options.instrument
+    settings, instrument = cell.calibration, options.instrument
     name, kind = device or (INSTRUMENT_NAMES[instrument.kind], instrument.measures)
-    times = [t.time for t in session.accepted] or [float(session.start_entry["time"])]
+    times = [r.time for r in session.accepted] or [float(session.start_entry["time"])]
     lengths = {"position": 3, "pose": 3, "distance": 1}.get(kind, 0)  # 0: no distance is measured
-    distances = [np.linalg.norm(t.value[:lengths]) for t in session.accepted if lengths]
+    distances = [np.linalg.norm(r.value[:lengths]) for r in session.accepted if lengths]
     started = datetime.fromtimestamp(float(session.start_entry["time"]))
     return SessionFacts(
         cell=cell.path.stem,
         arm=cell.arm.name,
-        serial=given.serial,
-        operator=given.operator,
-        customer=given.customer,
-        environment=given.environment,
+        serial=settings.serial,
+        operator=settings.operator,
+        customer=settings.customer,
+        environment=settings.environment,
         instrument=InstrumentFacts(
             name=name, kind=kind, serial="" if device else instrument.serial,
             certificate="" if device else instrument.certificate,
@@ -59,7 +59,7 @@ def session_facts(
         number=_number(started, session),
         version=installed_version(),
         cell_sha256=digest(cell.path) or "",
-        accuracy=given.accuracy,
+        accuracy=settings.accuracy,
         remarks=tuple(_remarks(session)),
     )  # fmt: skip
 
@@ -80,7 +80,7 @@ def _remarks(session: Session) -> list[str]:
     if session.skipped:
         stops = ", ".join(str(s + 1) for s in sorted(session.skipped))
         remarks.append(f"left out: stop {stops}")
-    doubted = [t.stop + 1 for t in session.accepted if t.doubted]
+    doubted = [r.stop + 1 for r in session.accepted if r.doubted]
     if doubted:
         remarks.append(f"kept though doubtful: stop {', '.join(map(str, doubted))}")
     return remarks

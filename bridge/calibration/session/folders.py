@@ -23,8 +23,8 @@ def session_folder(cell: Cell, options: SessionOptions) -> Path:
         return options.folder
     base = cell.calibration.folder
     stem = f"{cell.path.stem}-{options.kind}" if options.kind != "whole" else cell.path.stem
-    found = sorted(base.glob(f"*/{FILE}"), key=lambda p: p.stat().st_mtime, reverse=True)
-    for journal in found:
+    journals = sorted(base.glob(f"*/{FILE}"), key=lambda p: p.stat().st_mtime, reverse=True)
+    for journal in journals:
         if _is_unfinished(journal, cell, options.kind):
             return journal.parent
     today = f"{stem}-{date.today().isoformat()}"

@@ -51,7 +51,7 @@ def capture(
 ) -> CapturedReading:  # fmt: skip
     """Read the instrument. Raises ReadingError if it fails or the arm moves, LinkError.
 
-    ``stand`` None: the joints are sampled after the instrument was read.
+    ``joint_sample`` None: the joints are sampled after the instrument was read.
     """
     samples = instrument.read(request)
     if joint_sample is None:
@@ -125,8 +125,8 @@ class Measuring:
         session = self.session
         present = (session.station, session.target)
         return any(
-            (t.station, t.target - session.stops[t.stop].target) == present
-            for t in session.accepted
+            (r.station, r.target - session.stops[r.stop].target) == present
+            for r in session.accepted
         )
 
     def _measure_stop(self, stop: int) -> None:
@@ -161,28 +161,29 @@ class Measuring:
         while True:
             try:
                 if self.instrument.manual or self.instrument.contact:
-                    found = self._captured(stop, joint_sample)
+                    captured = self._capture(stop, joint_sample)
                 else:
                     with self.prompt.waiting(f"reading {self.instrument.name}"):
-                        found = self._captured(stop, joint_sample)
+                        captured = self._capture(stop, joint_sample)
                 break
             except ReadingError as error:
                 self.prompt.warn(str(error))
                 if not self.instrument.manual:
                     self.prompt.enter("  Enter to try again")
                     joint_sample = self.positioning.reach(pose)
-        arm = found.joint_sample
+        arm = captured.joint_sample
         before = self.session.accepted[-1].q if self.session.accepted else arm.q
         approach = np.sign(np.where(np.abs(arm.q - before) > 1e-4, arm.q - before, 0.0))
         planned = np.where(pose.approach != 0.0, pose.approach, approach)
         return Reading(
-            stop=stop, q=arm.q, value=found.value, scatter=found.scatter, samples=found.samples,
-            load=pose.load, station=self.session.station, target=pose.target + self.session.target,
-            approach=planned if arm.approach is None else arm.approach, source=found.source,
+            stop=stop, q=arm.q, value=captured.value, scatter=captured.scatter,
+            samples=captured.samples, source=captured.source, load=pose.load,
+            station=self.session.station, target=pose.target + self.session.target,
+            approach=planned if arm.approach is None else arm.approach,
             temperature=arm.temperature, wrench=arm.wrench, raw_wrench=arm.raw_wrench, again=again,
-        ), found  # fmt: skip
+        ), captured  # fmt: skip
 
-    def _captured(self, stop: int, joint_sample: JointSample | None) -> CapturedReading:
+    def _capture(self, stop: int, joint_sample: JointSample | None) -> CapturedReading:
         request = ReadRequest(stop + 1, self._samples, frozenset(self.session.used_sources))
         pose, joints = self.session.stops[stop], self.positioning.joints
         return capture(self.instrument, joints, pose, joint_sample, request)
@@ -191,7 +192,7 @@ class Measuring:
         """Check a reading against the readings so far, and the scatter of its samples."""
         if self.reading_check is None:
             return NOT_CHECKED
-        good = [t for t in self.session.accepted if not t.doubted]
+        good = [r for r in self.session.accepted if not r.doubted]
         kind = self.instrument.kind
         verdict = self.reading_check.check(
             self.session.readings(kind, good), self.session.readings(kind, [reading]),
@@ -338,7 +339,7 @@ class Measuring:
         assert self.reading_check is not None
         shift = self.reading_check.shift(
             session.readings(kind, [before]), session.readings(kind, [now]),
-            session.readings(kind, [t for t in session.accepted[:-1] if not t.doubted]),
+            session.readings(kind, [r for r in session.accepted[:-1] if not r.doubted]),
         )  # fmt: skip
         return Revisit(before, now, shift)
 

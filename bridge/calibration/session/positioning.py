@@ -166,7 +166,7 @@ class Positioning:
         begin = self.joints.current_q()
         if begin is None:
             return None
-        known = [t.q for t in self.session.accepted] + [p.q for p in self.session.stops]
+        known = [r.q for r in self.session.accepted] + [p.q for p in self.session.stops]
         via = route(self._is_free, begin, pose.q, known)
         if via is None:
             self.prompt.warn(

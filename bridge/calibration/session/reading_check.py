@@ -111,7 +111,7 @@ class ReadingCheck:
     def shift(self, old: Readings, new: Readings, before: Readings) -> Array:
         """Return the change (k,) of a pose's reading, m, in base axes once there is a fit.
 
-        ``before``: good readings for the fit, by which the arm's own motion is subtracted.
+        ``before``: good readings for the fit, by which the motion of the arm is subtracted.
         """
         same = before[(before.station == old.station[0]) & (before.target == old.target[0])]
         fit = self._fit(same, old)

@@ -32,7 +32,7 @@ class Reading:
     scatter: float  # m, 1 sigma of one coordinate of the mean; nan: not known
     samples: int  # number averaged
     load: int  # index in Plan.loads
-    station: int  # position of the instrument, from 0: each has its own unknown frame
+    station: int  # position of the instrument, from 0: each has a frame of its own
     target: int  # position of the target on the tool, from 0
     approach: Array  # (n,) sign of each joint's last motion
     time: float = 0.0  # s, time.time()
@@ -136,7 +136,7 @@ class Session:
     @property
     def open_stops(self) -> list[int]:
         """Return the stops that are neither measured nor skipped."""
-        done = {t.stop for t in self.accepted} | self.skipped
+        done = {r.stop for r in self.accepted} | self.skipped
         return [i for i in range(len(self.stops)) if i not in done]
 
     @property
@@ -152,7 +152,7 @@ class Session:
     @property
     def station_count(self) -> int:
         """Return the number of positions of the instrument; 1: it was never moved."""
-        return max((t.station for t in self.accepted), default=0) + 1
+        return max((r.station for r in self.accepted), default=0) + 1
 
     def all_readings(self, kind: str) -> Readings:
         """Return all accepted readings, stations numbered consecutively."""
@@ -165,26 +165,26 @@ class Session:
         rows = self.accepted if selected is None else selected
         loads, stops = self.plan.loads, self.stops
         n = len(stops[0].q) if stops else 0
-        temperature = [t.temperature for t in rows]
+        temperature = [r.temperature for r in rows]
         return Readings(
             kind=kind,
-            q=np.array([t.q for t in rows]).reshape(-1, n),
-            value=np.array([t.value for t in rows]).reshape(len(rows), -1 if rows else 3),
-            scatter=np.array([t.scatter for t in rows]),
+            q=np.array([r.q for r in rows]).reshape(-1, n),
+            value=np.array([r.value for r in rows]).reshape(len(rows), -1 if rows else 3),
+            scatter=np.array([r.scatter for r in rows]),
             loads=Loads(
-                payload_mass=np.array([loads[t.load].mass for t in rows]),
-                payload_cog=np.array([loads[t.load].cog for t in rows]).reshape(-1, 3),
+                payload_mass=np.array([loads[r.load].mass for r in rows]),
+                payload_cog=np.array([loads[r.load].cog for r in rows]).reshape(-1, 3),
                 temperature=(
                     None if any(v is None for v in temperature) or not rows
                     else np.array(temperature, dtype=float)
                 ),
-                approach=np.array([t.approach for t in rows]).reshape(-1, n),
+                approach=np.array([r.approach for r in rows]).reshape(-1, n),
             ),
-            load=np.array([t.load for t in rows], dtype=np.int64),
-            station=np.array([t.station for t in rows], dtype=np.int64),
-            target=np.array([t.target for t in rows], dtype=np.int64),
-            held_out=np.array([stops[t.stop].held_out for t in rows], dtype=bool),
-            pose=np.array([stops[t.stop].number for t in rows], dtype=np.int64),
+            load=np.array([r.load for r in rows], dtype=np.int64),
+            station=np.array([r.station for r in rows], dtype=np.int64),
+            target=np.array([r.target for r in rows], dtype=np.int64),
+            held_out=np.array([stops[r.stop].held_out for r in rows], dtype=bool),
+            pose=np.array([stops[r.stop].number for r in rows], dtype=np.int64),
         )  # fmt: skip
 
     def add_plan(self, plan: Plan) -> None:

@@ -1,4 +1,4 @@
-"""What a cell says of the instrument has its effect on the plan, and on what is asked."""
+"""Settings of the instrument in the cell affect the plan and the prompts."""
 
 from __future__ import annotations
 
@@ -6,7 +6,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from played import FRAME, plan_in, play, positions, typed, write_cell
+from scripted_session import (
+    FRAME,
+    plan_in,
+    reading_line,
+    run_calibrate,
+    tracker_readings,
+    write_cell,
+)
 
 from gapbridge.bridge.calibration.options import SessionOptions
 from gapbridge.bridge.calibration.planning import make_plan, workspace_of
@@ -15,7 +22,7 @@ from gapbridge.bridge.cell import load_cell
 from gapbridge.core.calibration.plan import Plan
 from gapbridge.core.model import Model
 
-AT = (2.5, -0.8, 0.6)
+INSTRUMENT_AT = (2.5, -0.8, 0.6)
 
 
 def cell_with(folder: Path, *lines: str, **changed: object) -> Path:
@@ -33,9 +40,11 @@ def plan_with(folder: Path, *lines: str, **changed: object) -> tuple[Plan, Model
 
 def test_poses_that_turn_the_reflector_away_are_not_planned(tmp_path: Path) -> None:
     plan, model = plan_with(
-        tmp_path, f"instrument_at: {list(AT)}", "reflector: {looks: [0, 0, 2], acceptance: 0.5}"
+        tmp_path,
+        f"instrument_at: {list(INSTRUMENT_AT)}",
+        "reflector: {looks: [0, 0, 2], acceptance: 0.5}",
     )
-    free, _ = plan_with(tmp_path, f"instrument_at: {list(AT)}")
+    free, _ = plan_with(tmp_path, f"instrument_at: {list(INSTRUMENT_AT)}")
     turned = [_angle(p, model) for p in (plan, free)]
     assert turned[0].max() < 0.5
     assert turned[1].max() > 0.5
@@ -43,7 +52,7 @@ def test_poses_that_turn_the_reflector_away_are_not_planned(tmp_path: Path) -> N
 
 def _angle(plan: Plan, model: Model) -> np.ndarray:
     poses = model.rigid_pose(np.array([p.q for p in plan.poses]))
-    way = np.array(AT) - poses.position
+    way = np.array(INSTRUMENT_AT) - poses.position
     cosine = np.einsum("ni,ni->n", way, poses.rotation[:, :, 2]) / np.linalg.norm(way, axis=1)
     return np.asarray(np.arccos(cosine))
 
@@ -56,42 +65,42 @@ def test_poses_out_of_the_instruments_range_are_not_planned(
     tmp_path: Path, kind: str, near: float, far: float
 ) -> None:
     plan, model = plan_with(
-        tmp_path, f"instrument_at: {list(AT)}",
+        tmp_path, f"instrument_at: {list(INSTRUMENT_AT)}",
         f"instrument_range: {{nearest: {near}, farthest: {far}}}", instrument=kind, poses=24,
     )  # fmt: skip
     position = model.rigid_pose(np.array([p.q for p in plan.poses])).position
-    apart = np.linalg.norm(position - np.array(AT), axis=1)
+    apart = np.linalg.norm(position - np.array(INSTRUMENT_AT), axis=1)
     assert near <= apart.min() + 1e-9
     assert apart.max() - 1e-9 <= far
 
 
-def test_an_instrument_that_is_carried_about_is_led_from_place_to_place(tmp_path: Path) -> None:
+def test_an_instrument_is_moved_through_its_planned_places(tmp_path: Path) -> None:
     cell = cell_with(
-        tmp_path, f"instrument_at: {list(AT)}", "further_places: [[-2.0, 1.0, 0.5]]",
+        tmp_path, f"instrument_at: {list(INSTRUMENT_AT)}", "further_places: [[-2.0, 1.0, 0.5]]",
         "reflector: {looks: [0, 0, 1], acceptance: 0.7}", registered="true", poses=20,
     )  # fmt: skip
     session = tmp_path / "s"
-    played = play(cell, "--plan-only", "--session", session)
-    assert played.code == 0, played.err
-    assert "place 2: (-2, 1, 0.5) m in base" in played.out
+    result = run_calibrate(cell, "--plan-only", "--session", session)
+    assert result.code == 0, result.err
+    assert "place 2: (-2, 1, 0.5) m in base" in result.out
     plan = plan_in(session)
     stations = [p.station for p in plan.poses]
     assert set(stations) == {0, 1}
     assert stations == sorted(stations)
     table = np.genfromtxt(session / "poses.csv", delimiter=",", names=True)
     np.testing.assert_array_equal(table["place"], stations)
-    one, other = positions(plan, frame=None), positions(plan, frame=FRAME)
+    one, other = tracker_readings(plan, frame=None), tracker_readings(plan, frame=FRAME)
     lines: list[str] = []
     for i, pose in enumerate(plan.poses):
         if i and pose.station != plan.poses[i - 1].station:
-            lines.append("")  # it stands there
+            lines.append("")  # the instrument is placed
         if not i or pose.load != plan.poses[i - 1].load:
-            lines.append("")  # it hangs there
-        lines.append(typed((other if pose.station else one)[i]))
-    played = play(cell, "--session", session, lines=[*lines, "yes"])
-    assert played.code == 0, played.err + played.out[-1500:]
+            lines.append("")  # the load is mounted
+        lines.append(reading_line((other if pose.station else one)[i]))
+    result = run_calibrate(cell, "--session", session, lines=[*lines, "yes"])
+    assert result.code == 0, result.err + result.out[-1500:]
     carried = "place 2 · the instrument at about (-2, 1, 0.5) m in base"
-    assert carried in played.out, played.out[-1500:]
+    assert carried in result.out, result.out[-1500:]
     readings = [e for e in read_entries(session / FILE) if e["kind"] == "reading"]
     assert [e["station"] for e in readings] == stations
 
@@ -126,18 +135,18 @@ def test_a_tip_on_one_point_is_planned_and_needs_its_place(tmp_path: Path) -> No
         (["instrument_at: [2, 0, 1]", "reflector: {looks: [0, 0, 1]}"], {}, "acceptance"),
     ],
 )  # fmt: skip
-def test_what_cannot_be_meant_is_refused_in_one_line(
+def test_contradicting_settings_are_refused_in_one_line(
     tmp_path: Path, lines: list[str], changed: dict[str, object], phrase: str
 ) -> None:
-    played = play(
+    result = run_calibrate(
         cell_with(tmp_path, *lines, **changed), "--plan-only", "--session", tmp_path / "s"
     )
-    assert played.code == 2
-    assert phrase in played.err
-    assert played.err.count("\n") == 1
+    assert result.code == 2
+    assert phrase in result.err
+    assert result.err.count("\n") == 1
 
 
-def test_loads_reach_as_far_on_the_way_as_in_the_plan(tmp_path: Path) -> None:
+def test_loads_count_in_collision_checks(tmp_path: Path) -> None:
     from gapbridge.bridge.calibration.planning import loads_of, with_loads
 
     cell = load_cell(cell_with(tmp_path))

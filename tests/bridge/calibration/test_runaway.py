@@ -1,4 +1,4 @@
-"""A fit that ran away is never written, whatever is answered."""
+"""A fit with larger errors on held-out poses is never written."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whole sessions through the command: mistakes, breaks and their mending, refusals."""
+"""Sessions run by the command: mistakes and their correction, interruptions, refusals."""
 
 from __future__ import annotations
 
@@ -7,17 +7,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from played import (
+from scripted_session import (
     AXIAL,
     FRAME,
     KNOCKED,
-    Played,
+    CommandResult,
     plan_in,
-    play,
-    positions,
-    script,
+    reading_line,
+    run_calibrate,
+    session_lines,
+    tracker_readings,
     truth,
-    typed,
     write_cell,
 )
 
@@ -26,20 +26,20 @@ from gapbridge.bridge.cell import load_cell
 
 
 @pytest.fixture(scope="module")
-def clean(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Played]:
-    """Return the folder of a session without mistakes, and how it went."""
+def clean(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, CommandResult]:
+    """Return the folder and the result of a session without mistakes."""
     folder = tmp_path_factory.mktemp("clean")
     cell = write_cell(folder)
-    assert play(cell, "--plan-only", "--session", folder / "s").code == 0
+    assert run_calibrate(cell, "--plan-only", "--session", folder / "s").code == 0
     plan = plan_in(folder / "s")
-    lines = script(plan, [typed(v) for v in positions(plan)])
-    return folder, play(
+    lines = session_lines(plan, [reading_line(v) for v in tracker_readings(plan)])
+    return folder, run_calibrate(
         cell, "--session", folder / "s", "--apply", folder / "new.yaml", lines=[*lines, "yes"]
     )
 
 
 def remaining(cell: Path, plan_folder: Path) -> np.ndarray:
-    """Return how far a cell's prediction is off at the session's poses (N,), m, rigidly fitted."""
+    """Return the error of a cell at the poses of a session (N,), m, after registration."""
     from gapbridge.core.estimation.registration import register
 
     plan = plan_in(plan_folder)
@@ -54,9 +54,9 @@ def remaining(cell: Path, plan_folder: Path) -> np.ndarray:
     return np.linalg.norm(register(there, predicted).in_base(there) - predicted, axis=1)
 
 
-def test_a_session_ends_with_a_cell_that_knows_the_arm(clean: tuple[Path, Played]) -> None:
-    folder, played = clean
-    assert played.code == 0, played.err
+def test_a_session_ends_with_an_accurate_cell(clean: tuple[Path, CommandResult]) -> None:
+    folder, result = clean
+    assert result.code == 0, result.err
     assert remaining(folder / "cell.yaml", folder / "s").max() > 5e-4
     assert remaining(folder / "new.yaml", folder / "s").max() < 1.2e-4
     axial = load_cell(folder / "new.yaml").model.compliance()[0]
@@ -68,79 +68,97 @@ def test_a_session_ends_with_a_cell_that_knows_the_arm(clean: tuple[Path, Played
     assert "\ncompliance:" not in (folder / "cell.yaml").read_text()
 
 
-def test_nothing_is_applied_without_a_yes(clean: tuple[Path, Played], tmp_path: Path) -> None:
+def test_nothing_is_applied_without_a_yes(
+    clean: tuple[Path, CommandResult], tmp_path: Path
+) -> None:
     folder, _ = clean
-    played = play(
+    result = run_calibrate(
         folder / "cell.yaml", "--session", folder / "s", "--apply", tmp_path / "no.yaml",
         lines=["perhaps", "no"],
     )  # fmt: skip
-    assert played.code == 0
-    assert "nothing is applied" in played.out
+    assert result.code == 0
+    assert "nothing is applied" in result.out
     assert not (tmp_path / "no.yaml").exists()
 
 
-def test_mistakes_on_the_way_leave_the_same_calibration(
-    clean: tuple[Path, Played], tmp_path: Path
+def test_corrected_mistakes_leave_the_same_calibration(
+    clean: tuple[Path, CommandResult], tmp_path: Path
 ) -> None:
-    """A reading in mm, a typo, a wrong key, an undo, a knocked tracker, breaks in between."""
+    """A reading in mm, a typo, a wrong key, an undo, a knocked tracker, interruptions."""
     cell = write_cell(tmp_path)
-    play(cell, "--plan-only", "--session", tmp_path / "s")
+    run_calibrate(cell, "--plan-only", "--session", tmp_path / "s")
     plan = plan_in(tmp_path / "s")
-    good, after = positions(plan), positions(plan, 1, KNOCKED)
+    good, after = tracker_readings(plan), tracker_readings(plan, 1, KNOCKED)
     load = [p.load for p in plan.poses]
     wrong = good[6] + np.array([0.0, 0.09, 0.0])
-    first = [*script_from(load, good, 0, 5), *hung(load, 5), "1 2", typed(good[5], 1e3)]
+    first = [
+        *session_lines_from(load, good, 0, 5),
+        *mounting_lines(load, 5),
+        "1 2",
+        reading_line(good[5], 1e3),
+    ]
     first += [
-        typed(good[5], 1e-3),
+        reading_line(good[5], 1e-3),
         "take",
-        *hung(load, 6),
-        typed(wrong),
+        *mounting_lines(load, 6),
+        reading_line(wrong),
         "",
-        typed(good[6]),
+        reading_line(good[6]),
         "undo",
-        typed(good[6]),
+        reading_line(good[6]),
     ]
     first += ["note the door stood open"]
-    played = play(cell, "--session", tmp_path / "s", lines=first)
-    assert played.code == 0
-    assert "is the unit right?" in played.out
-    assert "metres taken for millimetres" in played.out
-    assert "y alone is off" in played.out
-    assert "found 2 numbers" in played.out
-    assert "to resume: gapbridge calibrate" in played.out
+    result = run_calibrate(cell, "--session", tmp_path / "s", lines=first)
+    assert result.code == 0
+    assert "is the unit right?" in result.out
+    assert "metres taken for millimetres" in result.out
+    assert "y alone is off" in result.out
+    assert "found 2 numbers" in result.out
+    assert "to resume: gapbridge calibrate" in result.out
     assert len(_kept(tmp_path)) == 7
     last = next(k for k in range(9, len(load)) if len(set(load[k - 3 : k + 1])) == 1)
-    second = [*script_from(load, good, 7, last), *hung(load, last), typed(after[last]), "back"]
-    second += [typed(after[k]) for k in (last - 1, last - 2, last - 3)]
-    second += ["", *script_from(load, after, last, len(load)), "yes"]
-    played = play(cell, "--session", tmp_path / "s", "--apply", tmp_path / "new.yaml", lines=second)
-    assert played.code == 0, played.err + played.out[-2000:]
-    assert "the instrument has moved" in played.out
-    assert "resuming the session" in played.out
+    second = [
+        *session_lines_from(load, good, 7, last),
+        *mounting_lines(load, last),
+        reading_line(after[last]),
+        "back",
+    ]
+    second += [reading_line(after[k]) for k in (last - 1, last - 2, last - 3)]
+    second += ["", *session_lines_from(load, after, last, len(load)), "yes"]
+    result = run_calibrate(
+        cell, "--session", tmp_path / "s", "--apply", tmp_path / "new.yaml", lines=second
+    )
+    assert result.code == 0, result.err + result.out[-2000:]
+    assert "the instrument has moved" in result.out
+    assert "resuming the session" in result.out
     assert remaining(tmp_path / "new.yaml", tmp_path / "s").max() < 1.2e-4
     _same_within_intervals(clean[0] / "s", tmp_path / "s")
 
 
-def test_the_first_reading_in_another_unit_is_held_to_no_expected_place(tmp_path: Path) -> None:
+def test_a_first_reading_out_of_range_has_no_expected_position(tmp_path: Path) -> None:
     cell = write_cell(tmp_path)
-    play(cell, "--plan-only", "--session", tmp_path / "s")
+    run_calibrate(cell, "--plan-only", "--session", tmp_path / "s")
     plan = plan_in(tmp_path / "s")
-    lines = ["", typed(positions(plan)[0], 1e-3), "", "quit"]
-    played = play(cell, "--session", tmp_path / "s", lines=lines)
-    assert "this instrument cannot give such a reading" in played.out
-    assert "is the unit right?" in played.out
-    assert "from where it was expected" not in played.out
+    lines = ["", reading_line(tracker_readings(plan)[0], 1e-3), "", "quit"]
+    result = run_calibrate(cell, "--session", tmp_path / "s", lines=lines)
+    assert "this instrument cannot give such a reading" in result.out
+    assert "is the unit right?" in result.out
+    assert "from where it was expected" not in result.out
     assert not _kept(tmp_path)
 
 
-def hung(load: list[int], stop: int) -> list[str]:
-    """Return Enter where another load is hung before a stop."""
+def mounting_lines(load: list[int], stop: int) -> list[str]:
+    """Return Enter if another load is mounted before a stop."""
     return [""] if stop == 0 or load[stop] != load[stop - 1] else []
 
 
-def script_from(load: list[int], values: np.ndarray, first: int, end: int) -> list[str]:
-    """Return the lines of some stops, loads hung on the way."""
-    return [line for k in range(first, end) for line in (*hung(load, k), typed(values[k]))]
+def session_lines_from(load: list[int], values: np.ndarray, first: int, end: int) -> list[str]:
+    """Return the input of some stops, Enter for each load included."""
+    return [
+        line
+        for k in range(first, end)
+        for line in (*mounting_lines(load, k), reading_line(values[k]))
+    ]
 
 
 def _kept(folder: Path) -> list[dict[str, object]]:
@@ -159,17 +177,17 @@ def _same_within_intervals(one: Path, other: Path) -> None:
     assert (np.abs(a.values - b.values) < 3.5 * spread).all()
 
 
-def test_an_ended_input_and_quit_end_in_order_and_show_how_to_go_on(tmp_path: Path) -> None:
+def test_end_of_input_and_quit_show_how_to_resume(tmp_path: Path) -> None:
     cell = write_cell(tmp_path)
-    play(cell, "--plan-only", "--session", tmp_path / "s")
-    value = typed(positions(plan_in(tmp_path / "s"))[0])
-    played = play(cell, "--session", tmp_path / "s", lines=["", "?", value, "quit"])
-    assert played.code == 0
-    assert "discard the last reading" in played.out
-    assert "1 of 24 stops are measured and kept; to resume: gapbridge calibrate" in played.out
-    played = play(cell, "--session", tmp_path / "s", lines=["skip"])
-    assert "stop 2 is skipped" in played.out
-    assert "the input ended" in played.out
+    run_calibrate(cell, "--plan-only", "--session", tmp_path / "s")
+    value = reading_line(tracker_readings(plan_in(tmp_path / "s"))[0])
+    result = run_calibrate(cell, "--session", tmp_path / "s", lines=["", "?", value, "quit"])
+    assert result.code == 0
+    assert "discard the last reading" in result.out
+    assert "1 of 24 stops are measured and kept; to resume: gapbridge calibrate" in result.out
+    result = run_calibrate(cell, "--session", tmp_path / "s", lines=["skip"])
+    assert "stop 2 is skipped" in result.out
+    assert "the input ended" in result.out
 
 
 @pytest.mark.parametrize(
@@ -192,53 +210,53 @@ def test_unusable_input_is_refused_in_one_line(
     tmp_path: Path, arguments: list[str], changed: dict[str, object], phrase: str
 ) -> None:
     cell = write_cell(tmp_path, **{"poses": 12, **changed})
-    played = play(cell, "--session", tmp_path / "s", *arguments)
-    assert played.code == 2, played
-    assert phrase in played.err
-    assert played.err.count("\n") == 1
-    assert "Traceback" not in played.err
+    result = run_calibrate(cell, "--session", tmp_path / "s", *arguments)
+    assert result.code == 2, result
+    assert phrase in result.err
+    assert result.err.count("\n") == 1
+    assert "Traceback" not in result.err
 
 
-def test_a_session_goes_on_only_with_the_cell_it_was_begun_for(
-    clean: tuple[Path, Played], tmp_path: Path
+def test_a_session_resumes_only_with_its_own_cell(
+    clean: tuple[Path, CommandResult], tmp_path: Path
 ) -> None:
     session = clean[0] / "s"
     cell = write_cell(tmp_path)
     text = cell.read_text()
     cell.write_text(text + "payload: {mass: 3.0}\n")
-    played = play(cell, "--session", session)
-    assert played.code == 2
-    assert "payload: found it changed since the session" in played.err
+    result = run_calibrate(cell, "--session", session)
+    assert result.code == 2
+    assert "payload: found it changed since the session" in result.err
     cell.write_text(text)
-    played = play(cell, "--session", session, "--instrument", "dial_gauge,unit=mm")
-    assert played.code == 2
-    assert "found readings of kind position, expected distance" in played.err
+    result = run_calibrate(cell, "--session", session, "--instrument", "dial_gauge,unit=mm")
+    assert result.code == 2
+    assert "found readings of kind position, expected distance" in result.err
 
 
-def test_months_later_the_calibration_holds_and_a_deflected_tool_is_seen(
-    clean: tuple[Path, Played], tmp_path: Path
+def test_a_verification_accepts_the_arm_and_detects_a_bent_tool(
+    clean: tuple[Path, CommandResult], tmp_path: Path
 ) -> None:
     cell = clean[0] / "new.yaml"
     for bend, phrase in ((0.0, "holds"), (0.004, "tool")):
         session = tmp_path / f"v{bend:g}"
-        assert play(cell, "--verify", "--plan-only", "--session", session).code == 0
+        assert run_calibrate(cell, "--verify", "--plan-only", "--session", session).code == 0
         plan = plan_in(session)
         value = _verified(plan, bend)
-        lines = script(plan, [typed(v) for v in value])
+        lines = session_lines(plan, [reading_line(v) for v in value])
         lines = [part for line in lines for part in ([line, "keep"] if bend and line else [line])]
-        played = play(cell, "--verify", "--session", session, lines=lines)
-        assert played.code == 0, played.err + played.out[-1500:]
+        result = run_calibrate(cell, "--verify", "--session", session, lines=lines)
+        assert result.code == 0, result.err + result.out[-1500:]
         assert (session / "verification.html").exists()
-        assert phrase in played.out.lower()
+        assert phrase in result.out.lower()
         holds = next(e for e in read_entries(session / FILE) if e["kind"] == "ended")["holds"]
         assert holds is (bend == 0.0)
 
 
 def _verified(plan: object, bend: float) -> np.ndarray:
-    """Return readings of the hidden arm whose tool was bent sideways by ``bend`` m."""
+    """Return readings of the true arm whose tool was displaced by ``bend`` (m) along x."""
     from dataclasses import replace
 
-    import played as source
+    import scripted_session as source
 
     from gapbridge.core.calibration.plan import Plan
     from gapbridge.core.loads import Loads

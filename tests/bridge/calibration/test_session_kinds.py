@@ -1,4 +1,4 @@
-"""Sessions of every kind of instrument, whole through the command, ending with a new cell."""
+"""Complete sessions with every kind of instrument, run by the command."""
 
 from __future__ import annotations
 
@@ -12,7 +12,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from played import AXIAL, FRAME, Played, plan_in, play, truth, typed, write_cell
+from scripted_session import (
+    AXIAL,
+    FRAME,
+    CommandResult,
+    plan_in,
+    reading_line,
+    run_calibrate,
+    truth,
+    write_cell,
+)
 
 from gapbridge.bridge.calibration.planning import observable_of
 from gapbridge.bridge.calibration.session.journal import FILE, read_entries
@@ -25,15 +34,15 @@ from gapbridge.core.calibration.plan import Plan
 from gapbridge.core.calibration.readings import Readings
 from gapbridge.core.loads import Loads
 
-AT = np.array([0.7, 0.25, 0.5])  # where people say that it is
-TRUE_AT = np.array([0.704, 0.247, 0.505])  # where it is
-SEAT = 1e-5  # rad, 1 sigma: a seated joint is read no better
+APPROXIMATE_POINT = np.array([0.7, 0.25, 0.5])  # m, as declared in the cell
+TRUE_POINT = np.array([0.704, 0.247, 0.505])  # m
+CONTACT_NOISE = 1e-5  # rad, 1 sigma of the joint angles in contact
 OFFSETS = {"joint_offset_2": 8e-4, "joint_offset_3": -6e-4, "joint_offset_5": 5e-4}
 
 
 @dataclass
 class Session:
-    """A planned session, and what its instrument reads at each stop."""
+    """A planned session, and the readings of its instrument at each stop."""
 
     folder: Path
     cell: Path
@@ -41,34 +50,34 @@ class Session:
     readings: Readings
 
     def lines(self, *each: Callable[[int], str]) -> list[str]:
-        """Return what is typed: at each stop a line from each of ``each``; loads hung before."""
-        lines, hung = [], None
+        """Return the input: one line from each of ``each`` per stop, Enter for each load."""
+        lines, mounted = [], None
         for i, pose in enumerate(self.plan.poses):
-            if pose.load != hung:
+            if pose.load != mounted:
                 lines.append("")
-                hung = pose.load
+                mounted = pose.load
             lines += [line(i) for line in each]
         return [*lines, "yes"]
 
-    def play(self, lines: list[str]) -> Played:
-        played = play(
+    def run(self, lines: list[str]) -> CommandResult:
+        result = run_calibrate(
             self.cell, "--session", self.folder / "s", "--apply", self.folder / "new.yaml",
             lines=lines,
         )  # fmt: skip
-        assert played.code == 0, played.err + played.out[-1500:]
-        assert (self.folder / "new.yaml").exists(), played.out[-4000:]
-        return played
+        assert result.code == 0, result.err + result.out[-1500:]
+        assert (self.folder / "new.yaml").exists(), result.out[-4000:]
+        return result
 
 
-def begun(
+def planned_session(
     folder: Path, instrument: str, poses: int, nuisance: Nuisance, joints: str = "planned",
     tool: tuple[float, float, float] | None = None,
 ) -> Session:  # fmt: skip
-    """Return a session that is planned, and its readings with noise."""
+    """Plan a session and simulate its readings with noise."""
     cell = write_cell(folder, instrument=instrument, joints=joints, poses=poses)
     with cell.open("a", encoding="utf-8") as file:
-        file.write(f"  instrument_at: {AT.tolist()}\n  floor: -0.2\n")
-    assert play(cell, "--plan-only", "--session", folder / "s").code == 0
+        file.write(f"  instrument_at: {APPROXIMATE_POINT.tolist()}\n  floor: -0.2\n")
+    assert run_calibrate(cell, "--plan-only", "--session", folder / "s").code == 0
     plan, loaded = plan_in(folder / "s"), load_cell(cell)
     load = np.array([p.load for p in plan.poses])
     count = len(load)
@@ -83,87 +92,91 @@ def begun(
         np.zeros(count, dtype=bool), np.arange(count),
     )  # fmt: skip
     observable = observable_of(loaded, loaded.calibration.instrument)
-    found = predicted_readings(observable, truth(), blank, nuisance)
-    assert len(found) == count
+    readings = predicted_readings(observable, truth(), blank, nuisance)
+    assert len(readings) == count
     random = np.random.default_rng(5)
-    found.value[:] += random.normal(0, 2e-5, found.value.shape)
-    found.q[:] += random.normal(0, SEAT, found.q.shape) if observable.closes else 0.0
-    return Session(folder, cell, plan, found)
+    readings.value[:] += random.normal(0, 2e-5, readings.value.shape)
+    readings.q[:] += random.normal(0, CONTACT_NOISE, readings.q.shape) if observable.closes else 0.0
+    return Session(folder, cell, plan, readings)
 
 
-def finds_the_arm(session: Session, played: Played, of: str = "") -> None:
-    """Check that the new cell has what is hidden in the arm, as well as it says."""
+def check_identified(session: Session, result: CommandResult, of: str = "") -> None:
+    """Check that the true parameters are within five sigmas of the identified ones."""
     assert load_cell(session.folder / "new.yaml").model.terms
     assert (session.folder / "s" / "calibration.html").exists()
-    assert "kept" in played.out
+    assert "kept" in result.out
     reported = json.loads((session.folder / "s" / "promise.json").read_text())
     baseline = baseline_in(reported)
     true = {**OFFSETS, **{f"axial_compliance_{i + 1}": c for i, c in enumerate(AXIAL)}}
-    apart = baseline.values - [true.get(name, 0.0) for name in baseline.names]
-    own = np.array([name.startswith(of) for name in baseline.names])
-    assert (np.abs(apart) < 5.0 * np.sqrt(np.diag(baseline.covariance)))[own].all(), baseline.names
+    error = baseline.values - [true.get(name, 0.0) for name in baseline.names]
+    selected = np.array([name.startswith(of) for name in baseline.names])
+    assert (np.abs(error) < 5.0 * np.sqrt(np.diag(baseline.covariance)))[selected].all(), (
+        baseline.names
+    )
     assert {"axial_compliance_2", "axial_compliance_3"} <= set(baseline.names)
 
 
-def at_the_point(length: float = 0.0, balls: int = 1) -> Nuisance:
-    return Nuisance((fixed_at(TRUE_AT),), np.zeros((balls, 3)), np.array([length]))
+def fixed_point_frame(length: float = 0.0, balls: int = 1) -> Nuisance:
+    return Nuisance((fixed_at(TRUE_POINT),), np.zeros((balls, 3)), np.array([length]))
 
 
 def in_degrees(q: np.ndarray) -> str:
     return " ".join(f"{v:.6f}" for v in np.degrees(q))
 
 
-def test_a_dial_gauge_whose_zero_nobody_knows(tmp_path: Path) -> None:
-    session = begun(tmp_path, "{kind: dial_gauge, unit: mm}", 26, at_the_point(0.2))
+def test_a_dial_gauge_of_unknown_zero(tmp_path: Path) -> None:
+    session = planned_session(tmp_path, "{kind: dial_gauge, unit: mm}", 26, fixed_point_frame(0.2))
     dial = [f"{1e3 * v:.3f}" for v in session.readings.value[:, 0]]
-    finds_the_arm(session, session.play(session.lines(lambda i: dial[i])))
+    check_identified(session, session.run(session.lines(lambda i: dial[i])))
 
 
-def test_two_balls_measured_from_anywhere(tmp_path: Path) -> None:
+def test_two_balls_measured_in_an_unknown_frame(tmp_path: Path) -> None:
     balls = Nuisance((FRAME,), np.array([[0.0, 0.0, 0.0], [0.21, 0.02, 0.0]]), np.zeros(1))
-    session = begun(tmp_path, "{kind: two_balls, unit: in}", 16, balls)
+    session = planned_session(tmp_path, "{kind: two_balls, unit: in}", 16, balls)
     first = np.random.default_rng(1).uniform(-2, 2, session.readings.value.shape)
     second = first + session.readings.value
-    played = session.play(session.lines(
-        lambda i: typed(first[i], 1 / 0.0254), lambda i: typed(second[i], 1 / 0.0254)
+    result = session.run(session.lines(
+        lambda i: reading_line(first[i], 1 / 0.0254), lambda i: reading_line(second[i], 1 / 0.0254)
     ))  # fmt: skip
-    # of parallel joints' zeros the sum alone is shown
-    finds_the_arm(session, played, of="axial_compliance")
+    # of the zeros of parallel joints only the sum is identifiable
+    check_identified(session, result, of="axial_compliance")
 
 
 @pytest.mark.parametrize(
     ("instrument", "poses", "radius"),
     [("{kind: sphere, radius: 0.03}", 28, 0.03), ("{kind: point}", 16, 0.0)],
 )
-def test_joint_angles_alone_where_the_probe_sits(
+def test_contact_with_joint_angles_alone(
     tmp_path: Path, instrument: str, poses: int, radius: float
 ) -> None:
-    session = begun(tmp_path, instrument, poses, at_the_point(radius), joints="typed")
+    session = planned_session(
+        tmp_path, instrument, poses, fixed_point_frame(radius), joints="typed"
+    )
     q = session.readings.q
-    finds_the_arm(session, session.play(session.lines(lambda i: "", lambda i: in_degrees(q[i]))))
+    check_identified(session, session.run(session.lines(lambda i: "", lambda i: in_degrees(q[i]))))
 
 
 def test_files_that_the_trackers_software_exports(tmp_path: Path) -> None:
     out = tmp_path / "out"
     out.mkdir()
-    session = begun(
+    session = planned_session(
         tmp_path, "{kind: folder, unit: mm, folder: out, pattern: 'M*.txt'}", 14,
         Nuisance((FRAME,), np.zeros((1, 3)), np.zeros(1)),
     )  # fmt: skip
     since = read_entries(tmp_path / "s" / FILE)[0]["time"]
     for i, value in enumerate(session.readings.value):
-        # the names are not in their order, other files lie beside
+        # names are not in the order of the files, and other files are in the folder
         path = out / f"M{(7 * i) % 97}.txt"
         point = ";".join(f"{1e3 * v:.4f}".replace(".", ",") for v in value)
         path.write_text(f"X;Y;Z\n{point}\n", encoding="utf-8")
         os.utime(path, (since + 1e-3 * i, since + 1e-3 * i))
     (out / "log.csv").write_text("nothing", encoding="utf-8")
-    finds_the_arm(session, session.play(session.lines()))
+    check_identified(session, session.run(session.lines()))
 
 
 @pytest.fixture
 def feed() -> Iterator[tuple[int, list[np.ndarray]]]:
-    """Serve lines: a connection that asks gets the next of the readings, as often as it asks."""
+    """Serve lines: each connection gets one reading, repeated for each request."""
     values: list[np.ndarray] = []
     with socket.create_server(("127.0.0.1", 0)) as server:
         thread = threading.Thread(target=_serve, args=(server, values), daemon=True)
@@ -193,22 +206,22 @@ def test_lines_that_the_trackers_software_sends_on_demand(
     tmp_path: Path, feed: tuple[int, list[np.ndarray]]
 ) -> None:
     port, values = feed
-    session = begun(
+    session = planned_session(
         tmp_path, f"{{kind: line_feed, unit: mm, port: {port}, trigger: MEASURE}}", 14,
         Nuisance((FRAME,), np.zeros((1, 3)), np.zeros(1)),
     )  # fmt: skip
     values.extend(session.readings.value)
-    played = session.play(session.lines(lambda i: ""))
-    assert "mean of 10" in played.out
-    finds_the_arm(session, played)
+    result = session.run(session.lines(lambda i: ""))
+    assert "mean of 10" in result.out
+    check_identified(session, result)
 
 
-def test_what_touches_is_reported_by_joints_that_somebody_read(tmp_path: Path) -> None:
-    session = begun(tmp_path, "{kind: point}", 12, at_the_point(), joints="typed")
-    lines = ["", "", "", in_degrees(session.readings.q[0])]  # hung, seated, Enter for the joints
-    played = play(session.cell, "--session", tmp_path / "s", lines=lines)
-    assert "found nothing, expected where the arm stands now" in played.out
+def test_contact_readings_need_joint_angles(tmp_path: Path) -> None:
+    session = planned_session(tmp_path, "{kind: point}", 12, fixed_point_frame(), joints="typed")
+    lines = ["", "", "", in_degrees(session.readings.q[0])]  # load, contact, Enter for the joints
+    result = run_calibrate(session.cell, "--session", tmp_path / "s", lines=lines)
+    assert "found nothing, expected where the arm stands now" in result.out
     session.cell.write_text(session.cell.read_text().replace("joints: typed", "joints: planned"))
-    played = play(session.cell, "--session", tmp_path / "s", lines=lines)
-    assert played.code == 2
-    assert "the joints are the reading" in played.err
+    result = run_calibrate(session.cell, "--session", tmp_path / "s", lines=lines)
+    assert result.code == 2
+    assert "the joints are the reading" in result.err

@@ -1,4 +1,4 @@
-"""The short sessions, and probes that are seated by hand, on a simulated arm in a terminal."""
+"""The short sessions on a simulated arm, run in a terminal."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bench_hand import BenchHand, lead
-from technician import Hands, Terminal, last_pose
+from cell_operator import CellOperator, Terminal, last_pose
+from jogging_operator import JoggingOperator, answer_questions
 
 from gapbridge.bridge.cell import load_cell
 from gapbridge.bridge.demo.processes import ServedCell
@@ -37,24 +37,24 @@ def write_cell(folder: Path, name: str, host: str, tcp: tuple[float, ...]) -> Pa
 
 
 @pytest.fixture(scope="module")
-def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[BenchHand]:
-    """Serve an arm; a hand that jogs it and looks at its tool."""
+def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[JoggingOperator]:
+    """Serve an arm; return an operator that jogs it."""
     folder, pid = tmp_path_factory.mktemp("served"), os.getpid()
     host = f"127.{1 + (pid >> 8) % 250}.{pid % 256}.{next(_hosts) + 200}"
     cell = write_cell(folder, "served.yaml", host, TRUE_TCP)
     with ServedCell(cell, 3):
-        yield BenchHand(Hands(host), load_cell(cell).model)
+        yield JoggingOperator(CellOperator(host), load_cell(cell).model)
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)
-def test_payload_only_weighs_what_hangs_there(served: BenchHand, tmp_path: Path) -> None:
-    cell = write_cell(tmp_path, "cell.yaml", served.hands.host, TRUE_TCP)
+def test_payload_only_identifies_the_payload(served: JoggingOperator, tmp_path: Path) -> None:
+    cell = write_cell(tmp_path, "cell.yaml", served.operator.host, TRUE_TCP)
     new = tmp_path / "new.yaml"
     served.jog(BEGIN)
-    served.hands.hang(*LOAD, emit=False)  # the controller believes in nothing of the kind
+    served.operator.mount(*LOAD, emit=False)  # the controller is not informed
     with Terminal(cell, "--payload-only", "--session", tmp_path / "s", "--apply", new) as terminal:
-        shown = lead(terminal, {
+        shown = answer_questions(terminal, {
             "it is mounted": "",
             "rests there": lambda t: served.jog(last_pose(t.shown)),
             "[yes/no]": "yes",
@@ -69,8 +69,10 @@ def test_payload_only_weighs_what_hangs_there(served: BenchHand, tmp_path: Path)
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)
-def test_tool_only_finds_the_tip_by_touching_one_point(served: BenchHand, tmp_path: Path) -> None:
-    cell = write_cell(tmp_path, "cell.yaml", served.hands.host, (0.004, -0.003, 0.172))
+def test_tool_only_finds_the_tip_by_touching_one_point(
+    served: JoggingOperator, tmp_path: Path
+) -> None:
+    cell = write_cell(tmp_path, "cell.yaml", served.operator.host, (0.004, -0.003, 0.172))
     new = tmp_path / "new.yaml"
     served.jog(BEGIN)
     point = served.pose()[0]
@@ -80,10 +82,10 @@ def test_tool_only_finds_the_tip_by_touching_one_point(served: BenchHand, tmp_pa
         return ""
 
     with Terminal(cell, "--tool-only", "--session", tmp_path / "s", "--apply", new) as terminal:
-        shown = lead(terminal, {
+        shown = answer_questions(terminal, {
             "it is mounted": "", "tip on the point": seated, "[yes/no]": "yes",
         })  # fmt: skip
         assert terminal.code == 0, shown[-2000:]
     found = load_cell(new).model.tool_in_flange[:3, 3]
-    np.testing.assert_allclose(found, TRUE_TCP, atol=2e-3)  # the arm bends, which no reading shows
+    np.testing.assert_allclose(found, TRUE_TCP, atol=2e-3)  # compliance is not in the readings
     assert list((tmp_path / "s").glob("*.html"))

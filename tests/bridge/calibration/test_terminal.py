@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from technician import FRAME, Hands, Terminal, last_pose
+from cell_operator import FRAME, CellOperator, Terminal, last_pose
 
 from benchmarks.calibration.kills import run as run_kills
 from gapbridge.bridge.calibration.session.journal import FILE, read_entries
@@ -54,20 +54,20 @@ def write_cell(folder: Path, instrument: str, poses: int) -> tuple[Path, str]:
 
 @dataclass
 class Person:
-    """Answers the questions; makes the mistakes of ``mistakes`` (number of the reading: which)."""
+    """Answers the questions, with ``mistakes`` (number of the reading -> mistake)."""
 
-    hands: Hands
+    operator: CellOperator
     mistakes: dict[int, str] = field(default_factory=dict)
     read: int = 0
 
     def answer(self, terminal: Terminal, question: str) -> str | None:
-        """Return what is typed; None: nothing, the arm is jogged instead."""
+        """Return the input line; None: the arm is jogged instead."""
         if "it is mounted" in question:
             second = terminal.shown.rfind("9.5 kg, centre") > terminal.shown.rfind("1.5 kg, centre")
-            self.hands.hang(*LOADS[second])
+            self.operator.mount(*LOADS[second])
             return ""
         if "rests there" in question:
-            self.hands.jog(last_pose(terminal.shown))
+            self.operator.jog(last_pose(terminal.shown))
             return None
         if question.startswith("x y z"):
             return self._reading()
@@ -90,14 +90,16 @@ class Person:
             return None
         if mistake == "knock":
             turn = rotation_matrix(np.array([0.1, -0.2, 0.702]))
-            self.hands.frame = Registration(turn, FRAME.position + np.array([2e-3, 1e-3, -1.5e-3]))
-        value = self.hands.look() * (1e3 if mistake == "mm" else 1.0)
+            self.operator.frame = Registration(
+                turn, FRAME.position + np.array([2e-3, 1e-3, -1.5e-3])
+            )
+        value = self.operator.measure() * (1e3 if mistake == "mm" else 1.0)
         if mistake == "typo":
             value[1] += 0.09
         return " ".join(f"{v:.6f}" for v in value)
 
-    def lead(self, terminal: Terminal) -> bool:
-        """Answer until the command ends; returns False where the power was cut before."""
+    def answer_questions(self, terminal: Terminal) -> bool:
+        """Answer until the command ends; return False after a simulated power cut."""
         for _ in range(200):
             question = terminal.question()
             if question is None:
@@ -114,18 +116,18 @@ class Person:
 
 @pytest.mark.slow
 @pytest.mark.timeout(1200)
-def test_a_person_with_mistakes_and_a_power_cut_ends_with_a_valid_cell(tmp_path: Path) -> None:
+def test_mistakes_and_a_power_cut_end_with_a_valid_cell(tmp_path: Path) -> None:
     cell, host = write_cell(tmp_path, "{kind: typed, unit: m}", 12)
     new, session = tmp_path / "new.yaml", tmp_path / "s"
-    person = Person(Hands(host), {4: "mm", 6: "typo", 9: "knock", 15: "power cut"})
+    person = Person(CellOperator(host), {4: "mm", 6: "typo", 9: "knock", 15: "power cut"})
     with ServedCell(cell, 3):
         with Terminal(cell, "--session", session) as terminal:
-            assert not person.lead(terminal), terminal.shown[-2000:]
+            assert not person.answer_questions(terminal), terminal.shown[-2000:]
             first = terminal.shown
         kept = sum(e["kind"] == "reading" for e in read_entries(session / FILE))
         assert kept == first.count("  kept  ") + 3  # the poses that `back` measured again
         with Terminal(cell, "--session", session, "--apply", new) as terminal:
-            assert person.lead(terminal), terminal.shown[-2000:]
+            assert person.answer_questions(terminal), terminal.shown[-2000:]
             assert terminal.code == 0, terminal.shown[-2000:]
     assert "is the unit right?" in first
     assert "alone is off" in first
@@ -142,26 +144,26 @@ def test_a_person_with_mistakes_and_a_power_cut_ends_with_a_valid_cell(tmp_path:
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)
-def test_the_arm_is_driven_after_a_yes_and_ctrl_c_shows_how_to_go_on(tmp_path: Path) -> None:
+def test_the_arm_moves_after_confirmation_and_ctrl_c_shows_how_to_resume(tmp_path: Path) -> None:
     cell, host = write_cell(tmp_path, "{kind: simulated_tracker}", 8)
     # where the arm begins it hangs low: above a near floor no straight way would be free
     cell.write_text(cell.read_text().replace("floor: 0.1", "floor: -1.0"), encoding="utf-8")
-    hands = Hands(host)
+    operator = CellOperator(host)
     with ServedCell(cell, 3), Terminal(cell, "--session", tmp_path / "s", "--move") as terminal:
         assert "it is mounted" in str(terminal.question())
-        before = json.loads(hands.bench("truth"))["rigid_tcp"]
+        before = json.loads(operator.bench("truth"))["rigid_tcp"]
         terminal.type("")
         assert "Move it?" in str(terminal.question())
-        assert json.loads(hands.bench("truth"))["rigid_tcp"] == pytest.approx(before, abs=1e-4)
+        assert json.loads(operator.bench("truth"))["rigid_tcp"] == pytest.approx(before, abs=1e-4)
         terminal.type("yes")
         broken = 0
         while terminal.shown.count("  kept  ") < 1:
-            terminal.watch()
+            terminal.read_output()
             if terminal.shown.count("Continue from here") > broken:  # the machine missed deadlines
                 broken += 1
                 terminal.type("yes")
         terminal.signal(signal.SIGINT)
-        shown = terminal.rest()
+        shown = terminal.wait_for_end()
         assert terminal.code == 1
     assert "the controller's payload is" not in shown  # the simulated tracker hangs each load
     assert "interrupted" in shown
@@ -173,7 +175,7 @@ def test_the_arm_is_driven_after_a_yes_and_ctrl_c_shows_how_to_go_on(tmp_path: P
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)
-def test_no_reading_is_lost_by_kill_9_and_the_session_always_goes_on() -> None:
+def test_no_reading_is_lost_by_kill_9_and_the_session_always_resumes() -> None:
     tally = run_kills(kills=5, seed=1, say=False)
     assert tally.acknowledged > 0
     assert (tally.lost, tally.refused) == (0, 0)

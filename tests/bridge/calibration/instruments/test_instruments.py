@@ -1,4 +1,4 @@
-"""Instruments: numbers as people and tracker software write them, in SI afterwards."""
+"""Instruments: parsing of numbers and units, files, folders, sockets."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from cell_operator import CellOperator
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import TypeAdapter
 from rtde_receive import RTDEReceiveInterface
-from technician import Hands
 
 from gapbridge.bridge.calibration.instruments import INSTRUMENTS
 from gapbridge.bridge.calibration.instruments.instrument import (
@@ -74,7 +74,7 @@ def test_a_point_is_understood_however_it_is_written(line: str) -> None:
         ("1e9 2 3", "is the unit right?"),
     ],
 )
-def test_what_is_no_point_is_reported_with_the_reason(line: str, phrase: str) -> None:
+def test_an_invalid_point_is_reported_with_the_reason(line: str, phrase: str) -> None:
     with pytest.raises(ReadingError, match=phrase.replace("?", r"\?")):
         instrument("typed", line, unit="mm").read(ReadRequest())
 
@@ -103,7 +103,7 @@ def test_a_pose_is_the_same_however_its_rotation_is_reported(
     np.testing.assert_allclose(reader, [1, 2, 3, 0, 0, np.pi / 2], atol=1e-9)
 
 
-def test_degrees_in_radians_clothes_are_refused() -> None:
+def test_degrees_declared_as_radians_are_refused() -> None:
     with pytest.raises(ReadingError, match="is the unit right"):
         instrument("typed", "1 2 3 0 0 90", unit="m", pose=True, angle_unit="rad").read(
             ReadRequest()
@@ -202,7 +202,7 @@ def _serve(answers: list[bytes]) -> int:
     return int(listener.getsockname()[1])
 
 
-def test_a_line_feed_averages_lines_and_shows_when_it_hangs_up() -> None:
+def test_a_line_feed_averages_lines_and_reports_a_closed_connection() -> None:
     port = _serve([b"", b"1 2 3\r\n\n3 2 3\n", b"1 2 3\n"])
     reader = instrument("line_feed", unit="m", port=port)
     reader.open()
@@ -211,7 +211,7 @@ def test_a_line_feed_averages_lines_and_shows_when_it_hangs_up() -> None:
         reader.read(ReadRequest(samples=2))
 
 
-def test_an_instrument_that_is_not_there_is_reported(tmp_path: Path) -> None:
+def test_an_instrument_that_cannot_be_reached_is_reported(tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
     with pytest.raises(LinkError, match="expected the tracker's software"):
@@ -224,14 +224,14 @@ def test_an_instrument_that_is_not_there_is_reported(tmp_path: Path) -> None:
         instrument("file", unit="m", file=str(tmp_path / "none" / "x.csv")).open()
 
 
-def test_the_simulated_tracker_hangs_what_was_said_to_be_mounted(tmp_path: Path) -> None:
+def test_the_simulated_tracker_mounts_the_confirmed_load(tmp_path: Path) -> None:
     host = free_address(UrRtdeLink.ports)
     cell = tmp_path / "cell.yaml"
     cell.write_text(f"robot: {{model: ur10e}}\nlink: {{host: {host}}}\n", encoding="utf-8")
     with ServedCell(cell, 3), instrument("simulated_tracker", host=host) as tracker:
-        hands, state = Hands(host), RTDEReceiveInterface(host)
+        operator, state = CellOperator(host), RTDEReceiveInterface(host)
         tracker.set_load(Payload(9.5, (0.0, 0.01, 0.09), "plate"))
-        assert json.loads(hands.bench("truth"))["payload"] == {
+        assert json.loads(operator.bench("truth"))["payload"] == {
             "mass": 9.5,
             "cog": [0.0, 0.01, 0.09],
         }

@@ -1,4 +1,4 @@
-"""The table of what a calibration found, on a terminal of the usual width."""
+"""The table of fitted parameters at a width of 80 columns."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The short session of a new tool, from joint angles that a person types."""
+"""The short session of a new tool with typed joint angles."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from played import plan_in, play, write_cell
+from scripted_session import plan_in, run_calibrate, write_cell
 
 from gapbridge.bridge.cell import load_cell
 from gapbridge.core.arm import builtin_arm
@@ -27,8 +27,10 @@ def reported(q: np.ndarray) -> str:
 
 def test_the_tip_of_a_new_tool_is_found_and_written_after_a_yes(tmp_path: Path) -> None:
     cell, session = write_cell(tmp_path, joints="typed"), tmp_path / "s"
-    played = play(cell, "--tool-only", "--plan-only", "--session", session, lines=[reported(BEGIN)])
-    assert played.code == 0, played.err
+    result = run_calibrate(
+        cell, "--tool-only", "--plan-only", "--session", session, lines=[reported(BEGIN)]
+    )
+    assert result.code == 0, result.err
     plan = plan_in(session)
     tool = np.eye(4)
     tool[:3, 3] = 0.012, -0.008, 0.15
@@ -44,11 +46,11 @@ def test_the_tip_of_a_new_tool_is_found_and_written_after_a_yes(tmp_path: Path) 
     for pose in touching:
         lines += ["", reported(pose)]
     new = tmp_path / "new.yaml"
-    played = play(
+    result = run_calibrate(
         cell, "--tool-only", "--session", session, "--apply", new,
         lines=[*lines, "yes"],
     )  # fmt: skip
-    assert played.code == 0, played.err + played.out[-1500:]
+    assert result.code == 0, result.err + result.out[-1500:]
     found = load_cell(new).model.tool_in_flange
     np.testing.assert_allclose(found[:3, 3], tool[:3, 3], atol=5e-5)
     assert (session / "tool.html").exists()
@@ -57,21 +59,21 @@ def test_the_tip_of_a_new_tool_is_found_and_written_after_a_yes(tmp_path: Path) 
 def test_joints_in_radians_are_taken_for_a_mistake(tmp_path: Path) -> None:
     cell = write_cell(tmp_path, joints="typed")
     radians = " ".join(f"{v:.4f}" for v in BEGIN)
-    played = play(
+    result = run_calibrate(
         cell, "--tool-only", "--session", tmp_path / "s", lines=["1 2 3", "", reported(BEGIN), "",
                                                                   "", radians, "quit"],
     )  # fmt: skip
-    assert played.code == 0
-    assert "found 3 numbers" in played.out
-    assert "expected where the arm stands now" in played.out
-    assert "look like radians" in played.out
+    assert result.code == 0
+    assert "found 3 numbers" in result.out
+    assert "expected where the arm stands now" in result.out
+    assert "look like radians" in result.out
 
 
 @pytest.mark.parametrize("arguments", [["--tool-only"], ["--payload-only"]])
 def test_short_sessions_need_to_know_where_the_arm_stands(
     tmp_path: Path, arguments: list[str]
 ) -> None:
-    played = play(write_cell(tmp_path), *arguments, "--session", tmp_path / "s")
-    assert played.code == 2
-    assert "calibration.joints" in played.err
-    assert played.err.count("\n") == 1
+    result = run_calibrate(write_cell(tmp_path), *arguments, "--session", tmp_path / "s")
+    assert result.code == 2
+    assert "calibration.joints" in result.err
+    assert result.err.count("\n") == 1

@@ -1,4 +1,4 @@
-"""What a verification says on the terminal of what has moved."""
+"""The output of a verification about what has changed."""
 
 from __future__ import annotations
 
@@ -41,5 +41,5 @@ def test_other_joints_that_explain_as_much_are_named_with_their_size() -> None:
     assert "the zero of joint 3 moved by 20 mrad" in line
 
 
-def test_where_the_readings_decide_nothing_else_is_named() -> None:
+def test_no_alternative_is_named_if_the_readings_decide() -> None:
     assert not any("cannot distinguish" in line for line in said())

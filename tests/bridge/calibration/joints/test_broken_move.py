@@ -1,4 +1,4 @@
-"""A move that breaks off says why, not only where the daemon ended."""
+"""A failed move reports its reason."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class BrokenRun:
         return self._said[since:]
 
 
-def test_the_reason_of_a_broken_move_is_shown(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_reason_of_a_failed_move_is_shown(monkeypatch: pytest.MonkeyPatch) -> None:
     joints = object.__new__(LinkedJoints)
     joints._run = BrokenRun()  # type: ignore[assignment]
     monkeypatch.setattr(joints, "current_q", lambda: None)

@@ -64,7 +64,7 @@ def test_a_value_has_the_digits_of_its_deviation():
     assert decimals_of(0.0) == decimals_of(math.inf) == 3
 
 
-def test_nothing_is_never_minus_nothing():
+def test_zero_has_no_minus_sign():
     assert fixed(-1e-9, 3) == "0.000"
     assert fixed(-0.0126, 2) == "−0.01"
 

@@ -73,7 +73,7 @@ def test_a_short_session_shows_each_number_with_its_interval(kind, unit, tmp_pat
     assert "noise, declared" not in html
 
 
-def test_a_outlier_reading_of_the_sensor_is_remarked(tmp_path):
+def test_an_outlier_reading_of_the_sensor_is_reported(tmp_path):
     found, nominal = payload()
     assert list(found.outliers) == [5]
     html, _ = read(write_report(ShortSessionData(found, session(), nominal), tmp_path))

@@ -1,4 +1,4 @@
-"""The journal survives a power cut: no entry that was written is lost, none is believed half."""
+"""The journal survives a power cut: no written entry is lost, no torn entry is used."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def small_plan(stops: int = 4) -> Plan:
     return Plan(loads, poses, expected, ((6, 1e-4),), 12.0, (NOTE,))
 
 
-def taken(stop: int, **changed: object) -> Reading:
+def reading_at(stop: int, **changed: object) -> Reading:
     given: dict[str, object] = {
         "stop": stop, "q": np.full(6, 0.1 * stop), "value": np.array([1.0, 2.0, 3.0 + stop]),
         "scatter": float("nan"), "samples": 1, "load": stop // 2, "station": 0, "target": 0,
@@ -46,14 +46,14 @@ def taken(stop: int, **changed: object) -> Reading:
 
 def test_a_plan_reads_back_as_it_was_written(tmp_path: Path) -> None:
     plan = small_plan()
-    found = plan_of(json.loads(json.dumps(plain(entry_of(plan)), allow_nan=False)))
-    assert found.loads == plan.loads
-    assert found.bought == plan.bought
-    assert note_texts(found.notes) == note_texts(plan.notes)
+    restored = plan_of(json.loads(json.dumps(plain(entry_of(plan)), allow_nan=False)))
+    assert restored.loads == plan.loads
+    assert restored.bought == plan.bought
+    assert note_texts(restored.notes) == note_texts(plan.notes)
     older = plan_of(json.loads(json.dumps(plain(entry_of(plan)))) | {"notes": ["a sentence"]})
     assert older.notes == ()
-    assert np.isinf(found.expected.std[0])
-    for one, other in zip(found.poses, plan.poses, strict=True):
+    assert np.isinf(restored.expected.std[0])
+    for one, other in zip(restored.poses, plan.poses, strict=True):
         np.testing.assert_array_equal(one.q, other.q)
         assert (one.load, one.held_out, one.number) == (other.load, other.held_out, other.number)
 
@@ -65,20 +65,20 @@ def test_a_resumed_session_has_the_state_of_its_journal(tmp_path: Path) -> None:
         session.add_plan(small_plan())
         session.add("mounted", load=0)
         for stop in (0, 1, 2):
-            session.add("reading", **taken(stop, source=f"row {stop}").entry())
+            session.add("reading", **reading_at(stop, source=f"row {stop}").entry())
         session.add("undo", stop=2)
         session.add("skip", stop=3)
         session.add("rejected", stop=2, source="row 9")
         session.add("note", text="door opened")
     with Journal(tmp_path) as journal:
-        again = Session.of(journal)
-    assert [t.stop for t in again.accepted] == [0, 1]
-    assert again.next_stop == 2
-    assert (again.remaining, again.undone, again.mounted) == (1, 1, 0)
-    assert again.used_sources == {"row 0", "row 1", "row 2", "row 9"}
-    assert again.notes == ["door opened"]
-    assert np.isnan(again.accepted[0].scatter)
-    readings = again.readings("position")
+        resumed = Session.of(journal)
+    assert [t.stop for t in resumed.accepted] == [0, 1]
+    assert resumed.next_stop == 2
+    assert (resumed.remaining, resumed.undone, resumed.mounted) == (1, 1, 0)
+    assert resumed.used_sources == {"row 0", "row 1", "row 2", "row 9"}
+    assert resumed.notes == ["door opened"]
+    assert np.isnan(resumed.accepted[0].scatter)
+    readings = resumed.readings("position")
     np.testing.assert_array_equal(readings.held_out, [False, True])
     assert readings.value.shape == (2, 3)
 
@@ -88,11 +88,11 @@ def test_readings_after_a_knock_belong_to_the_new_place(tmp_path: Path) -> None:
         session = Session.of(journal)
         session.add_plan(small_plan())
         for stop in (0, 1, 2):
-            session.add("reading", **taken(stop).entry())
+            session.add("reading", **reading_at(stop).entry())
         session.add("moved", station=1, target=0, since=1)
     with Journal(tmp_path) as journal:
-        again = Session.of(journal)
-    assert [t.station for t in again.accepted] == [0, 1, 1]
+        resumed = Session.of(journal)
+    assert [t.station for t in resumed.accepted] == [0, 1, 1]
 
 
 def test_an_entry_that_did_not_fit_on_the_disk_leaves_the_journal_as_it_was(
@@ -159,7 +159,7 @@ def _write_forever(folder: str, reported: int) -> None:
             os.write(reported, b".")  # the next step: only now may anybody rely on it
 
 
-def test_what_was_acknowledged_before_a_kill_is_there_afterwards(tmp_path: Path) -> None:
+def test_acknowledged_entries_survive_a_kill(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     for _ in range(5):
         read, write = os.pipe()

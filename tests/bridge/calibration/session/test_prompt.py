@@ -1,4 +1,4 @@
-"""Questions at a terminal: what was typed before them answers none, and Enter means Enter."""
+"""Questions at a terminal: early input is discarded, and Enter alone continues."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def types(keyboard: int, monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]
     return lambda *lines: left.extend(lines)
 
 
-def test_what_was_typed_before_a_question_does_not_answer_it(
+def test_input_typed_before_a_question_does_not_answer_it(
     keyboard: int, types: Callable[..., None], capsys: pytest.CaptureFixture[str]
 ) -> None:
     os.write(keyboard, b"yes\n1.0 2.0 3.0\nhalf a li")
@@ -54,7 +54,7 @@ def test_what_was_typed_before_a_question_does_not_answer_it(
     assert "discarded input typed before the question: yes ⏎ 1.0 2.0 3.0" in capsys.readouterr().out
 
 
-def test_enter_is_enter_and_nothing_else(
+def test_enter_accepts_no_other_answer(
     types: Callable[..., None], capsys: pytest.CaptureFixture[str]
 ) -> None:
     types("no", "wait", "")
@@ -64,7 +64,7 @@ def test_enter_is_enter_and_nothing_else(
     assert "found 'wait', expected Enter" in said
 
 
-def test_words_of_the_session_work_where_enter_is_asked(types: Callable[..., None]) -> None:
+def test_session_commands_work_where_enter_is_expected(types: Callable[..., None]) -> None:
     types("undo")
     with pytest.raises(SessionCommand, match="undo"):
         Prompt().enter("Enter when it is mounted")

@@ -1,4 +1,4 @@
-"""Mistakes of people are seen while they can be put right, and good readings are not doubted."""
+"""Mistakes are detected with the right explanation; good readings are not flagged."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def truth(seed: int) -> Model:
 
 
 def session(count: int, seed: int, registered: bool = False) -> Readings:
-    """Return readings of a hidden arm, taken from somewhere in the hall."""
+    """Return readings of a true arm, in an unknown frame unless ``registered``."""
     rng = np.random.default_rng((seed, 3))
     q = np.array([0, -1.5, 1.5, -1.8, -1.5, 0]) + rng.uniform(-0.9, 0.9, (count, 6))
     load = np.arange(count) % 2
@@ -56,13 +56,13 @@ def session(count: int, seed: int, registered: bool = False) -> Readings:
     )  # fmt: skip
 
 
-def judged(
+def check_last(
     readings: Readings, metrology: Metrology = METROLOGY, typed: bool = True, joints: bool = False
 ) -> Verdict:
-    """Judge the last of some readings by those before it."""
-    found = ReadingCheck(NOMINAL, metrology, "position", metrology.sigma, DEFAULT, LOADS)
+    """Check the last of some readings against those before it."""
+    check = ReadingCheck(NOMINAL, metrology, "position", metrology.sigma, DEFAULT, LOADS)
     last = np.arange(len(readings)) == len(readings) - 1
-    return found.check(readings[~last], readings[last], typed, joints)
+    return check.check(readings[~last], readings[last], typed, joints)
 
 
 def with_last(readings: Readings, value: list[float] | np.ndarray) -> Readings:
@@ -74,15 +74,15 @@ def with_last(readings: Readings, value: list[float] | np.ndarray) -> Readings:
 @pytest.mark.parametrize("registered", [True, False])
 def test_good_readings_are_not_rejected(registered: bool) -> None:
     metrology = replace(METROLOGY, registered=registered)
-    found = ReadingCheck(NOMINAL, metrology, "position", 2e-5, DEFAULT, LOADS)
-    seen = []
+    check = ReadingCheck(NOMINAL, metrology, "position", 2e-5, DEFAULT, LOADS)
+    verdicts = []
     for seed in range(3):
         readings = session(12, seed, registered)
         for k in range(12):
             rows = np.arange(12)
-            seen.append(found.check(readings[rows < k], readings[rows == k], True, False))
-    assert not any(v.implausible for v in seen)
-    assert sum(np.isfinite(v.deviation) for v in seen) >= 3 * (12 if registered else 8)
+            verdicts.append(check.check(readings[rows < k], readings[rows == k], True, False))
+    assert not any(v.implausible for v in verdicts)
+    assert sum(np.isfinite(v.deviation) for v in verdicts) >= 3 * (12 if registered else 8)
 
 
 @pytest.mark.parametrize(
@@ -90,26 +90,26 @@ def test_good_readings_are_not_rejected(registered: bool) -> None:
 )
 def test_a_wrong_unit_is_named_and_put_right(factor: float, phrase: str) -> None:
     readings = session(10, 1)
-    found = judged(with_last(readings, readings.value[-1] * factor))
-    assert found.implausible
-    assert phrase in found.explanations[0]
-    np.testing.assert_allclose(found.corrected, readings.value[-1])
+    verdict = check_last(with_last(readings, readings.value[-1] * factor))
+    assert verdict.implausible
+    assert phrase in verdict.explanations[0]
+    np.testing.assert_allclose(verdict.corrected, readings.value[-1])
 
 
 def test_a_mistyped_coordinate_is_named() -> None:
     readings = session(12, 2)
     wrong = readings.value[-1].copy()
     wrong[1] += 0.09
-    found = judged(with_last(readings, wrong))
-    assert found.implausible
-    assert any(reason.startswith("y alone is off") for reason in found.explanations)
+    verdict = check_last(with_last(readings, wrong))
+    assert verdict.implausible
+    assert any(reason.startswith("y alone is off") for reason in verdict.explanations)
 
 
 def test_exchanged_axes_and_a_lost_sign_are_named() -> None:
     readings = session(12, 3)
     x, y, z = readings.value[-1]
-    assert any("z y x" in r for r in judged(with_last(readings, [z, y, x])).explanations)
-    assert any("sign of x" in r for r in judged(with_last(readings, [-x, y, z])).explanations)
+    assert any("z y x" in r for r in check_last(with_last(readings, [z, y, x])).explanations)
+    assert any("sign of x" in r for r in check_last(with_last(readings, [-x, y, z])).explanations)
 
 
 def test_a_load_that_was_not_changed_is_named() -> None:
@@ -119,37 +119,37 @@ def test_a_load_that_was_not_changed_is_named() -> None:
     swapped.payload_mass[-1] = LOADS[0].mass  # declared: reflector; it was the plate
     load = readings.load.copy()
     load[-1] = 0
-    found = judged(replace(readings, loads=swapped, load=load))
-    assert found.implausible
-    assert any("plate hangs on the flange" in reason for reason in found.explanations)
+    verdict = check_last(replace(readings, loads=swapped, load=load))
+    assert verdict.implausible
+    assert any("plate hangs on the flange" in reason for reason in verdict.explanations)
 
 
 def test_a_knocked_tracker_is_seen() -> None:
     readings = session(40, 5)
-    found = judged(with_last(readings, readings.value[-1] + [0.0015, -0.001, 0.002]))
-    assert found.implausible
-    assert 1e-3 < found.deviation < 4e-3
-    assert found.limit < 1e-3
+    verdict = check_last(with_last(readings, readings.value[-1] + [0.0015, -0.001, 0.002]))
+    assert verdict.implausible
+    assert 1e-3 < verdict.deviation < 4e-3
+    assert verdict.limit < 1e-3
 
 
 def test_a_mistyped_joint_is_named() -> None:
     readings = session(20, 6)
     q = readings.q.copy()
     q[-1, 2] += np.radians(10.0)
-    found = judged(replace(readings, q=q), typed=False, joints=True)
-    assert found.implausible
-    assert any("joint 3" in reason for reason in found.explanations)
+    verdict = check_last(replace(readings, q=q), typed=False, joints=True)
+    assert verdict.implausible
+    assert any("joint 3" in reason for reason in verdict.explanations)
 
 
 def test_the_first_readings_of_an_unregistered_instrument_show_nothing_yet() -> None:
-    assert not np.isfinite(judged(session(2, 0)).deviation)
+    assert not np.isfinite(check_last(session(2, 0)).deviation)
 
 
 @pytest.mark.parametrize("count", [1, 2, 3])
 @pytest.mark.parametrize("factor", [1e-3, 1e3])
 def test_the_first_three_readings_in_a_wrong_unit_are_doubted(count: int, factor: float) -> None:
     readings = session(count, 1)
-    verdict = judged(with_last(readings, readings.value[-1] * factor))
+    verdict = check_last(with_last(readings, readings.value[-1] * factor))
     assert verdict.implausible
     if count > 1:
         assert "millimetres" in " ".join(verdict.explanations)
@@ -158,7 +158,7 @@ def test_the_first_three_readings_in_a_wrong_unit_are_doubted(count: int, factor
 
 def test_a_second_reading_of_another_stop_is_doubted_by_the_first() -> None:
     readings = session(2, 1)
-    verdict = judged(with_last(readings, readings.value[0]))
+    verdict = check_last(with_last(readings, readings.value[0]))
     assert verdict.implausible
     assert "the joints put the two" in verdict.explanations[0]
 

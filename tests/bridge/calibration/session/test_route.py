@@ -1,4 +1,4 @@
-"""The way of a driven arm: round what the cell names, by poses that are free, at rest in each."""
+"""Paths of a moved arm: collision-free, through known poses, at rest in each."""
 
 from __future__ import annotations
 
@@ -19,35 +19,35 @@ BEGIN, END = np.array([-1.0, 0.0]), np.array([1.0, 0.0])
 ABOVE, LEFT, RIGHT = np.array([0.0, 2.0]), np.array([-1.0, 1.5]), np.array([1.0, 1.5])
 
 
-def wall(q: np.ndarray) -> np.ndarray:
-    """Report what is not in a wall between BEGIN and END, one unit high."""
+def outside_wall(q: np.ndarray) -> np.ndarray:
+    """Return which points are outside a wall between BEGIN and END, one unit high."""
     return np.asarray((np.abs(q[:, 0]) > 0.3) | (q[:, 1] > 1.0), dtype=float)
 
 
-def test_a_free_way_goes_straight() -> None:
-    assert route(wall, LEFT, RIGHT, [ABOVE]) == []
+def test_a_free_path_is_straight() -> None:
+    assert route(outside_wall, LEFT, RIGHT, [ABOVE]) == []
 
 
-def test_the_shortest_way_by_one_pose_is_taken() -> None:
+def test_the_shortest_path_through_one_pose_is_taken() -> None:
     far = np.array([0.0, 9.0])
-    (by,) = route(wall, BEGIN, END, [far, np.array([0.1, 3.0])]) or []
-    np.testing.assert_array_equal(by, [0.1, 3.0])
+    (via,) = route(outside_wall, BEGIN, END, [far, np.array([0.1, 3.0])]) or []
+    np.testing.assert_array_equal(via, [0.1, 3.0])
 
 
-def test_two_poses_are_gone_by_where_one_is_not_enough() -> None:
-    by = route(wall, BEGIN, END, [RIGHT, LEFT])
-    assert by is not None
-    np.testing.assert_array_equal(by, [LEFT, RIGHT])
+def test_two_via_poses_are_used_if_one_is_not_enough() -> None:
+    via = route(outside_wall, BEGIN, END, [RIGHT, LEFT])
+    assert via is not None
+    np.testing.assert_array_equal(via, [LEFT, RIGHT])
 
 
-def test_where_no_pose_leads_round_no_way_is_reported() -> None:
-    assert route(wall, BEGIN, END, [LEFT]) is None
-    assert route(wall, BEGIN, END, []) is None
+def test_no_path_is_returned_if_no_via_pose_helps() -> None:
+    assert route(outside_wall, BEGIN, END, [LEFT]) is None
+    assert route(outside_wall, BEGIN, END, []) is None
 
 
 @settings(max_examples=8, deadline=None)
 @given(st.integers(0, 50))
-def test_an_arm_goes_round_a_pillar_without_coming_into_it(seed: int) -> None:
+def test_a_path_round_a_pillar_is_collision_free(seed: int) -> None:
     pillar = Box((-1.5, -0.15, -1.0), (-0.5, 0.15, 1.0))  # where the arm points
     space = Workspace.of(Model(builtin_arm("ur10e")), keep_out=(pillar,), floor=0.0)
 
@@ -58,14 +58,14 @@ def test_an_arm_goes_round_a_pillar_without_coming_into_it(seed: int) -> None:
     begin = np.array([-0.6, -1.0, 1.2, -1.8, -1.5, 0.0])
     end = begin * [-1, 1, 1, 1, 1, 1]
     drawn = space.draw(60, random)
-    by = route(clear, begin, end, list(drawn[space.clear(drawn)]))
-    assert by != []
-    if by is not None:
-        way = np.vstack([begin, *by, end])
+    via = route(clear, begin, end, list(drawn[space.clear(drawn)]))
+    assert via != []
+    if via is not None:
+        way = np.vstack([begin, *via, end])
         assert all_free(clear, way[:-1], way[1:]).all()
 
 
-def test_the_arm_rests_at_every_pose_that_it_goes_by(tmp_path: Path) -> None:
+def test_the_arm_stops_at_every_via_pose(tmp_path: Path) -> None:
     stops = [np.zeros(6), np.full(6, 0.5), np.array([0.5, -1, 0, 0, 0, 0])]
     length = write_move(tmp_path / "move.csv", stops, 0.4)
     table = np.loadtxt(tmp_path / "move.csv", delimiter=",", skiprows=1)

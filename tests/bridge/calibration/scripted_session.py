@@ -1,4 +1,4 @@
-"""Sessions played from a script: every line that a person would type, written down before."""
+"""Calibration sessions run in this process with scripted input lines."""
 
 from __future__ import annotations
 
@@ -47,8 +47,8 @@ KNOCKED = Registration(
 
 
 @dataclass(frozen=True)
-class Played:
-    """How a call of the command went."""
+class CommandResult:
+    """Exit code and output of a call of the command."""
 
     code: int
     out: str
@@ -65,12 +65,12 @@ def write_cell(folder: Path, **changed: object) -> Path:
     return path
 
 
-def play(cell: Path, *arguments: object, lines: Sequence[str] = ()) -> Played:
-    """Run the command in this process, with ``lines`` as what is typed, then the input's end."""
+def run_calibrate(cell: Path, *arguments: object, lines: Sequence[str] = ()) -> CommandResult:
+    """Run the command in this process with ``lines`` as input, then its end."""
     out, err = io.StringIO(), io.StringIO()
     read, write = os.pipe()
-    with os.fdopen(write, "w") as typed:
-        typed.write("".join(f"{line}\n" for line in lines))
+    with os.fdopen(write, "w") as reading_line:
+        reading_line.write("".join(f"{line}\n" for line in lines))
     before, sys.stdin = sys.stdin, os.fdopen(read)
     try:
         with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
@@ -81,7 +81,7 @@ def play(cell: Path, *arguments: object, lines: Sequence[str] = ()) -> Played:
         sys.stdin.close()
         sys.stdin = before
     assert isinstance(code, int)
-    return Played(code, out.getvalue(), err.getvalue())
+    return CommandResult(code, out.getvalue(), err.getvalue())
 
 
 def plan_in(session: Path) -> Plan:
@@ -90,13 +90,13 @@ def plan_in(session: Path) -> Plan:
 
 
 def truth() -> Model:
-    """Return the hidden arm."""
+    """Return the true arm."""
     terms = [Term("joint_offset", Site(j), (v,)) for j, v in ((2, 8e-4), (3, -6e-4), (5, 5e-4))]
     return Model(builtin_arm("ur10e")).with_terms(terms).with_compliance(AXIAL, (0.0,) * 6)
 
 
-def positions(plan: Plan, seed: int = 0, frame: Registration | None = FRAME) -> Array:
-    """Return what a tracker would read at each stop (N, 3), m."""
+def tracker_readings(plan: Plan, seed: int = 0, frame: Registration | None = FRAME) -> Array:
+    """Return the readings of a tracker at each stop (N, 3), m."""
     q = np.array([p.q for p in plan.poses])
     loads = Loads(
         payload_mass=np.array([plan.loads[p.load].mass for p in plan.poses]),
@@ -107,16 +107,16 @@ def positions(plan: Plan, seed: int = 0, frame: Registration | None = FRAME) -> 
     return found if frame is None else found @ frame.rotation.T + frame.position
 
 
-def typed(value: Array, factor: float = 1.0) -> str:
+def reading_line(value: Array, factor: float = 1.0) -> str:
     return " ".join(f"{v * factor:.9f}" for v in value)
 
 
-def script(plan: Plan, readings: Sequence[str]) -> list[str]:
-    """Return the lines of a session without mistakes: loads hung, stops read."""
-    lines, hung = [], None
+def session_lines(plan: Plan, readings: Sequence[str]) -> list[str]:
+    """Return the input of a session without mistakes: Enter for each load, a reading per stop."""
+    lines, mounted = [], None
     for pose, reading in zip(plan.poses, readings, strict=True):
-        if pose.load != hung:
+        if pose.load != mounted:
             lines.append("")
-            hung = pose.load
+            mounted = pose.load
         lines.append(reading)
     return lines

@@ -1,4 +1,4 @@
-"""A technician at the terminal, the pendant and the tracker of a simulated cell."""
+"""An operator at the terminal, the pendant and the tracker of a simulated cell."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ Array = NDArray[np.float64]
 JOINT = re.compile(r"J\d ([+-][\d.]+)°")
 COLOURS = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
 FRAME = Registration(rotation_matrix(np.array([0.1, -0.2, 0.7])), np.array([2.5, -0.8, 0.3]))
-PATIENCE = 240.0  # s, on a busy machine
+TIMEOUT = 240.0  # s, on a busy machine
 
 
 @dataclass
-class Hands:
-    """What a person does beside the terminal of a simulated UR cell."""
+class CellOperator:
+    """Controls of a simulated UR cell: bench, pendant and tracker."""
 
     host: str
-    frame: Registration = FRAME  # where the tracker stands
+    frame: Registration = FRAME  # of the tracker
 
     def bench(self, line: str) -> str:
         with socket.create_connection((self.host, BENCH_PORT), timeout=10) as link:
@@ -46,7 +46,7 @@ class Hands:
             link.sendall(program.encode())
             time.sleep(0.1)
 
-    def hang(self, mass: float, cog: tuple[float, float, float], emit: bool = True) -> None:
+    def mount(self, mass: float, cog: tuple[float, float, float], emit: bool = True) -> None:
         numbers = " ".join(f"{v:.6g}" for v in (mass, *cog))
         self.bench(f"payload {numbers}")
         if emit:
@@ -57,14 +57,14 @@ class Hands:
         numbers = ",".join(f"{v:.9g}" for v in q)
         self.pendant(f"def go():\n  movej([{numbers}], a=8.0, v=2.5)\nend\n")
 
-    def look(self) -> Array:
-        """Return what the tracker shows (3,), m, in its own frame."""
-        seen = [[float(v) for v in self.bench("measure").split(",")[1:4]] for _ in range(10)]
-        return np.mean(seen, axis=0) @ self.frame.rotation.T + self.frame.position
+    def measure(self) -> Array:
+        """Return the averaged reading of the tracker (3,), m, in its own frame."""
+        samples = [[float(v) for v in self.bench("measure").split(",")[1:4]] for _ in range(10)]
+        return np.mean(samples, axis=0) @ self.frame.rotation.T + self.frame.position
 
 
 def _heed_interrupts() -> None:
-    """Have Ctrl-C arrive, even where a shell runs the tests in its background, which ignores it."""
+    """Restore the handling of Ctrl-C, which shells disable for background jobs."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
@@ -80,7 +80,7 @@ class Terminal:
     def __enter__(self) -> Self:
         path = os.pathsep.join(p for p in sys.path if p)
         self._child = pexpect.spawn(
-            self.command[0], self.command[1:], encoding="utf-8", timeout=PATIENCE,
+            self.command[0], self.command[1:], encoding="utf-8", timeout=TIMEOUT,
             env={**os.environ, "PYTHONPATH": path, "TERM": "xterm"}, dimensions=(50, 160),
             preexec_fn=_heed_interrupts,
         )  # fmt: skip
@@ -106,16 +106,16 @@ class Terminal:
             if found == 1:
                 child.wait()
                 return None
-            assert found == 0, f"nothing for {PATIENCE:g} s after: {self.shown[-1500:]}"
+            assert found == 0, f"nothing for {TIMEOUT:g} s after: {self.shown[-1500:]}"
             line = re.split(r"[\r\n]+", waited)[-1]
             if line.endswith(" > "):
                 return line[:-3].strip()
 
-    def watch(self) -> None:
-        """Take what is shown meanwhile."""
+    def read_output(self) -> None:
+        """Read the output that is available, or wait for some."""
         assert self._child is not None
         try:
-            self.shown += COLOURS.sub("", self._child.read_nonblocking(4096, timeout=PATIENCE))
+            self.shown += COLOURS.sub("", self._child.read_nonblocking(4096, timeout=TIMEOUT))
         except pexpect.EOF:
             raise AssertionError(f"it ended: {self.shown[-1500:]}") from None
 
@@ -127,7 +127,7 @@ class Terminal:
         assert self._child is not None
         os.kill(self._child.pid, number)
 
-    def rest(self) -> str:
+    def wait_for_end(self) -> str:
         """Wait for the end; returns all that was shown."""
         assert self.question() is None, self.shown[-800:]
         return self.shown
@@ -139,6 +139,6 @@ class Terminal:
 
 
 def last_pose(shown: str) -> Array:
-    """Return the joints (n,), rad, that were commanded last."""
+    """Return the last displayed pose (n,), rad."""
     line = next(part for part in reversed(shown.splitlines()) if "J1 " in part)
     return np.radians([float(v) for v in JOINT.findall(line)])
