@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -34,7 +33,7 @@ from gapbridge.bridge.calibration.session.folders import check_start, session_fo
 from gapbridge.bridge.calibration.session.journal import Journal
 from gapbridge.bridge.calibration.session.measuring import Measuring
 from gapbridge.bridge.calibration.session.plan_document import write_poses
-from gapbridge.bridge.calibration.session.positioning import Positioning
+from gapbridge.bridge.calibration.session.positioning import CollisionCheck, Positioning
 from gapbridge.bridge.calibration.session.prompt import InputEnded, Prompt, SessionCommand
 from gapbridge.bridge.calibration.session.session import Session
 from gapbridge.bridge.cell import Cell
@@ -196,7 +195,7 @@ def _measure(job: Job, joints: JointSource, instrument: AnyInstrument) -> None:
     ).run()
 
 
-def _collision_check(job: Job) -> Callable[[Array], Array]:
+def _collision_check(job: Job) -> CollisionCheck:
     workspace = with_loads(workspace_of(job.cell, "position"), loads_of(job.cell))
     return lambda q: np.asarray(workspace.clear(q), dtype=float)
 

@@ -13,6 +13,7 @@ from gapbridge.bridge.calibration.instruments.instrument import (
     ReadRequest,
 )
 from gapbridge.bridge.calibration.joints.joint_source import JointSample, JointSource, TypedJoints
+from gapbridge.bridge.calibration.planning import REPEATABILITY
 from gapbridge.bridge.calibration.session.positioning import Positioning
 from gapbridge.bridge.calibration.session.prompt import Prompt, SessionCommand
 from gapbridge.bridge.calibration.session.reading_check import NOT_CHECKED, ReadingCheck, Verdict
@@ -28,7 +29,6 @@ MIN_SCATTER = 1e-4  # m: less scatter is accepted
 REVISITS = 3  # earlier poses that `back` measures again if the first of them has changed
 SHIFT_FACTOR = 6.0  # times the noise of instrument and arm: a larger change of a reading is a move
 MIN_SHIFT = 1.5e-4  # m, smallest change that counts as a move
-REPEATABILITY = 5e-5  # m, 1 sigma of one coordinate of the arm
 DECISIVE_RATIO = 3.0  # of the rms residuals: instrument moved against target slipped
 SAME_READING = 2e-4  # m: two readings nearer to each other are the same
 

@@ -75,7 +75,7 @@ class Positioning:
 
     def __init__(
         self, prompt: Prompt, session: Session, joints: JointSource, instrument: AnyInstrument,
-        is_free: Callable[[Array], Array], settings: CalibrationSettings,
+        is_free: CollisionCheck, settings: CalibrationSettings,
     ) -> None:  # fmt: skip
         self.prompt, self.session, self.joints = prompt, session, joints
         self.minutes_per_load = settings.minutes_per_load

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from gapbridge.bridge.calibration.instruments.numbers import MAX_RANGE
 from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.observables import make_observable
 from gapbridge.core.calibration.parameters import Parameters
@@ -25,7 +26,6 @@ from gapbridge.core.metrology import Metrology
 from gapbridge.core.model import Model, Poses
 
 MIN_DISTANCE = 0.02  # m, of the target from the instrument's origin, or between two balls
-MAX_DISTANCE = 100.0  # m, of the target from the instrument's origin
 MAX_BALL_DISTANCE = 3.0  # m between two balls
 TOLERANCE, RELATIVE_TOLERANCE = 0.05, 0.1  # m, share of a distance: error of an uncalibrated arm
 BALL_TOLERANCE, RELATIVE_BALL_TOLERANCE = 1e-3, 0.01  # m, share: error of the distance of two balls
@@ -224,7 +224,7 @@ def check_without_fit(before: Readings, new: Readings, tcp: Array) -> Verdict | 
 
 def _check_position(before: Readings, value: Array, tcp: Array) -> Verdict | None:
     distance = float(np.linalg.norm(value))
-    failed = _check_range(distance, MIN_DISTANCE, MAX_DISTANCE, "from the instrument's origin")
+    failed = _check_range(distance, MIN_DISTANCE, MAX_RANGE, "from the instrument's origin")
     if failed is not None:
         return failed
     for i, earlier in enumerate(before.value[:, :3]):
@@ -241,7 +241,7 @@ def _check_position(before: Readings, value: Array, tcp: Array) -> Verdict | Non
 
 
 def _check_distance(before: Readings, value: float, tcp: Array) -> Verdict | None:
-    failed = _check_range(abs(value), 0.0, MAX_DISTANCE, "from the fixed end")
+    failed = _check_range(abs(value), 0.0, MAX_RANGE, "from the fixed end")
     if failed is not None:
         return failed
     for i, earlier in enumerate(before.value[:, 0]):

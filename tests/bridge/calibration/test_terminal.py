@@ -73,10 +73,6 @@ class Person:
             return self._reading()
         if question.startswith("what now"):
             reported = terminal.shown[terminal.shown.rfind("a good reading is within") :]
-            if "instrument and target stand where they stood" in terminal.shown[-1500:]:
-                return "keep"  # the arm has effects that this session does not fit
-            if "it is no slip" in reported:
-                return "back"
             return "" if "alone is off" in reported else "back"
         if question.startswith("which"):
             return ""

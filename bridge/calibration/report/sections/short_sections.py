@@ -188,7 +188,7 @@ def _contact_chart(result: ToolCalibration) -> Drawing:
 PAYLOAD: tuple[blocks.Section[ShortSessionData[PayloadCalibration]], ...] = (
     blocks.Section("result", "Result", payload_result),
     blocks.Section("session", "Session and instrument", short_facts),
-    blocks.Section("parameters", "What was found", payload_parameters,
+    blocks.Section("parameters", "Identified parameters", payload_parameters,
             "Flange axes; intervals of 95 %."),
     blocks.Section("residual", "The residual", payload_residual,
             "Reading minus load and sensor zero, orientation by orientation."),
@@ -197,6 +197,6 @@ TOOL: tuple[blocks.Section[ShortSessionData[ToolCalibration]], ...] = (
     blocks.Section("result", "Result", tool_result),
     blocks.Section("session", "Session and instrument", short_facts),
     blocks.Section(
-        "parameters", "What was found", tool_parameters, "Flange axes; intervals of 95 %."
+        "parameters", "Identified parameters", tool_parameters, "Flange axes; intervals of 95 %."
     ),
 )
