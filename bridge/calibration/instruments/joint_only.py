@@ -33,11 +33,8 @@ class _Contact(Instrument[S]):
 class SphereContact(_Contact[SphereSettings]):
     """The tool's probe in contact with a fixed sphere."""
 
-    placed_part, name, question = (
-        "the sphere",
-        "probe on a fixed sphere",
-        "probe seated on the sphere",
-    )
+    name, placed_part = "probe on a fixed sphere", "the sphere"
+    question = "probe seated on the sphere"
 
 
 class PointContact(_Contact[PointSettings]):

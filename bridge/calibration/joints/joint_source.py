@@ -31,7 +31,7 @@ class JointSample:
 class JointSource(ABC):
     """Source of joint angles. The constructor opens nothing."""
 
-    can_drive = False  # whether ``move_to`` works
+    can_move = False  # whether ``move_to`` works
     detects_rest = False  # whether ``arrived`` reads the arm itself
 
     def open(self) -> None:

@@ -58,7 +58,7 @@ class LinkedJoints(JointSource):
 
     def __init__(self, cell: Cell, settle: float, speed: float, folder: Path, move: bool) -> None:
         self._settle, self._speed, self._folder = settle, speed, folder
-        self.can_drive = move
+        self.can_move = move
         self._settings = settings_of(cell).model_copy(
             update={
                 "recording": RecordingSettings(folder=None), "web": None, "metrics": None,
@@ -109,7 +109,7 @@ class LinkedJoints(JointSource):
 
     def move_to(self, pose: PlannedPose, via: Sequence[Array] = ()) -> None:
         """Move the arm to a pose at ``speed`` and wait until it rests there. Raises RunError."""
-        if not self.can_drive:
+        if not self.can_move:
             return super().move_to(pose, via)
         begin = self.current_q()
         if begin is None:

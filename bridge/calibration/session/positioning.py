@@ -101,7 +101,7 @@ class Positioning:
         """Ask for a load (index) to be mounted, and whether the arm may be moved with it."""
         if load != self.session.mounted:
             self._ask_to_mount(load)
-        if self.joints.can_drive and self._confirmed_load != load:
+        if self.joints.can_move and self._confirmed_load != load:
             count = sum(p.load == load for p in self.session.stops)
             self.prompt.say()
             self._may_move = self.prompt.confirm(

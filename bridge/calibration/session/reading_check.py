@@ -75,10 +75,10 @@ class ReadingCheck:
         """Return whether two readings of one pose can be compared."""
         return not make_observable(self._kind, **self._options).closes
 
-    def check(self, before: Readings, new: Readings, typed: bool, joints: bool) -> Verdict:
+    def check(self, before: Readings, new: Readings, typed: bool, typed_joints: bool) -> Verdict:
         """Check one new reading (Readings of one row) against those before it.
 
-        ``typed``: its value was typed by hand; ``joints``: its joint angles were.
+        ``typed``: its value was typed by hand; ``typed_joints``: its joint angles were.
         """
         same = before[(before.station == new.station[0]) & (before.target == new.target[0])]
         fit = self._fit(same, new)
@@ -87,7 +87,7 @@ class ReadingCheck:
         deviation, limit, implausible = fit.compare(new)
         if not implausible:
             return Verdict(deviation, limit, False)
-        explanations, corrected = self._explanations(fit, new, typed, joints)
+        explanations, corrected = self._explanations(fit, new, typed, typed_joints)
         return Verdict(deviation, limit, True, tuple(explanations), corrected)
 
     def _check_first(self, before: Readings, new: Readings) -> Verdict:
@@ -141,7 +141,7 @@ class ReadingCheck:
         return None
 
     def _explanations(
-        self, fit: ReadingFit, new: Readings, typed: bool, joints: bool
+        self, fit: ReadingFit, new: Readings, typed: bool, typed_joints: bool
     ) -> tuple[list[str], Array | None]:
         explanations: list[str] = []
         corrected: Array | None = None
@@ -160,7 +160,7 @@ class ReadingCheck:
                 _coordinate_text(new, i, expected) for i, expected in fit.single_coordinates(new)
             ]
         explanations += self._load_explanations(fit, new)
-        if joints and not explanations:
+        if typed_joints and not explanations:
             explanations += [_joint_text(new, i, angle) for i, angle in fit.single_joints(new)]
         return explanations, corrected
 
