@@ -84,7 +84,7 @@ class LineFeed(Instrument[LineFeedSettings]):
             except OSError as error:
                 raise LinkError(f"{self.name}: {error}") from None
             if not data:
-                raise LinkError(f"{self.name}: it has hung up")
+                raise LinkError(f"{self.name}: the connection was closed")
             buffer += data
             if len(buffer) > LONGEST_LINE and b"\n" not in buffer:
                 raise ReadingError(f"found {len(buffer)} bytes without the end of a line")
@@ -146,7 +146,7 @@ class SimulatedTracker(Instrument[SimulatedTrackerSettings]):
             while b"\n" not in self._buffer:
                 data = self._socket.recv(4096)
                 if not data:
-                    raise ConnectionError("it has hung up")
+                    raise ConnectionError("the connection was closed")
                 self._buffer += data
         except OSError as error:
             raise LinkError(f"{self.name}: {error}") from None

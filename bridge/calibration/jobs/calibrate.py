@@ -40,7 +40,7 @@ from gapbridge.core.fitted_range import range_of
 from gapbridge.core.log.log import read_log
 
 MAX_REFITS = 3  # with effects that the first fit lacks
-MIN_REPEATABILITY = 2e-6  # m, below which it is reported as better than the instrument
+MIN_REPEATABILITY = 2e-6  # m, below which it is not given
 DIAGNOSABLE_KINDS = ("position", "pose")  # kinds of readings whose residual can be diagnosed
 
 
@@ -102,7 +102,7 @@ class CalibrationJob(Job):
         self.prompt.say(
             f"on poses left out of the fit in turn, this reduces the remaining error: {shares}"
         )
-        question = f"The fitted poses ask for {names} as well. Fit again with it?"
+        question = f"The fitted poses indicate {names} as well. Fit again with it?"
         return self.options.yes or self.prompt.confirm(question)
 
     def _with_missing_effects(self, fit: SessionFit) -> tuple[SessionFit, tuple[str, ...]]:
@@ -243,15 +243,13 @@ def report_calibration(prompt: Prompt, result: Calibration) -> None:
     for name, before, after in pairs:
         if len(after.vector):
             prompt.say(f"  {name}: {_errors(before)} before, {_errors(after)} after")
-    noise = f"  the fit leaves {millimetres(result.noise)} a coordinate"
+    noise = f"  residual {millimetres(result.noise)} per coordinate (1 sigma)"
     if np.isfinite(result.noise_floor):
-        noise += f", instrument and arm alone {millimetres(result.noise_floor)}"
+        noise += f", noise of instrument and arm {millimetres(result.noise_floor)}"
     if np.isfinite(result.repeatability):
         small = result.repeatability < MIN_REPEATABILITY
-        noise += ", the arm repeats " + (
-            "better than the instrument reports" if small
-            else f"to {millimetres(result.repeatability)}"
-        )  # fmt: skip
+        text = "too small to be measured" if small else millimetres(result.repeatability)
+        noise += f", repeatability of the arm {text}"
     prompt.say(noise)
     prompt.console.print(_table(result))
     for row in result.outliers:
@@ -269,7 +267,7 @@ def _errors(errors: Errors) -> str:
 
 def _table(result: Calibration) -> Table:
     table = Table(
-        title="what the arm has beyond the cell's model (± 1 sigma)", title_justify="left",
+        title="corrections to the cell's model (± 1 sigma)", title_justify="left",
         box=SIMPLE_HEAD, padding=(0, 1),
     )  # fmt: skip
     table.add_column("parameter", no_wrap=True)

@@ -134,7 +134,7 @@ class LinkedJoints(JointSource):
                 writing, message_count = True, len(run.messages())
             if writing and not state.writes:
                 why = "; ".join(run.messages(message_count)) or state.name.lower()
-                raise RunError(f"the move broke off: {why}")
+                raise RunError(f"the move failed: {why}")
             q = self.current_q()
             at_pose = q is not None and np.abs(q - pose.q).max() < ARRIVAL_TOLERANCE / 10
             if writing and at_pose and run.daemon.memory.ended and self._at_rest():

@@ -51,7 +51,7 @@ class Journal:
         except OSError:
             self.close()
             raise InputError(
-                f"{self.path}: found a session that is going on in another terminal, expected none"
+                f"{self.path}: found a session that is open in another terminal, expected none"
             ) from None
         self._read()
 

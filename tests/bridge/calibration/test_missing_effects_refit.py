@@ -66,7 +66,7 @@ def test_a_missing_effect_is_offered_and_fitted_after_confirmation(
 ) -> None:
     folder, result = refitted
     assert result.code == 0, result.err
-    assert "poses ask for transmission_error_2 as well. Fit again with it?" in result.out
+    assert "poses indicate transmission_error_2 as well. Fit again with it?" in result.out
     offered, judged = result.out.index("Fit again"), result.out.index("poses to verify:")
     assert offered < judged  # held-out poses are used once, by the final fit
     assert result.out.count("poses to verify:") == 1

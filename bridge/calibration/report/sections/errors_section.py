@@ -44,9 +44,9 @@ def _caption(data: CalibrationData) -> str:
         text += " The table includes outliers."
     if len(data.axes) > 1:
         c = data.calibration
-        text += f" The fit leaves {mm(c.noise)} along an axis (1 sigma)"
+        text += f" Residual along an axis: {mm(c.noise)} (1 sigma)"
         known = np.isfinite(c.noise_floor)
-        text += f", arm and instrument alone {mm(c.noise_floor)}." if known else "."
+        text += f", noise of arm and instrument {mm(c.noise_floor)}." if known else "."
     return text
 
 

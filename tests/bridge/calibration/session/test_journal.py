@@ -148,7 +148,7 @@ def test_a_line_that_is_no_entry_is_refused_with_its_number(tmp_path: Path, line
 
 
 def test_two_terminals_do_not_share_a_session(tmp_path: Path) -> None:
-    with Journal(tmp_path), pytest.raises(InputError, match="going on in another terminal"):
+    with Journal(tmp_path), pytest.raises(InputError, match="open in another terminal"):
         Journal(tmp_path).open()
 
 

@@ -50,4 +50,4 @@ def test_the_reason_of_a_failed_move_is_shown(monkeypatch: pytest.MonkeyPatch) -
     pose = PlannedPose(0, np.zeros(6), 0, np.zeros(6))
     with pytest.raises(RunError) as caught:
         joints._wait_for_arrival(pose, 1.0)
-    assert str(caught.value) == f"the move broke off: {LINES[1]}; {LINES[2]}"
+    assert str(caught.value) == f"the move failed: {LINES[1]}; {LINES[2]}"
