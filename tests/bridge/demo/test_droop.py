@@ -54,7 +54,7 @@ def rests(arm: Plant, setpoints: np.ndarray) -> np.ndarray:
 def test_droop_is_found_and_setpoints_bring_the_joints_where_they_were_wanted() -> None:
     nominal = Model(ARM, payload_mass=LOAD, payload_cog=np.array(COG))
     before = rests(plant(), POSES)
-    log = Log("rests.csv", {"target_q": POSES, "actual_q": before}, 6)
+    log = Log("measurements.csv", {"target_q": POSES, "actual_q": before}, 6)
     (channel,) = [c for c in diagnose(nominal, log).channels if c.channel == "tracking"]
     (cause,) = channel.causes
     assert (cause.effect, cause.joints) == ("servo_droop", (2, 3, 4, 5))
