@@ -14,12 +14,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from gapbridge.bridge.patch.changes import TINY, Axes, ModelChanges, base_in_world
+from gapbridge.bridge.patch.changes import TOLERANCE, Axes, ModelChanges, base_in_world
 from gapbridge.bridge.patch.model_format import (
     ModelFormat,
     Patched,
     PatchOptions,
-    named_one,
+    known_name,
     pick_joints,
 )
 from gapbridge.core.arrays import Array
@@ -127,7 +127,7 @@ class _Stage:
                 return False
         for path, frame in self._at_zero().items():  # parents come first
             current = self.authored(path)
-            if path and not np.allclose(current, frame, rtol=0, atol=TINY):
+            if path and not np.allclose(current, frame, rtol=0, atol=TOLERANCE):
                 self.move(path, frame @ np.linalg.inv(current))
         return True
 
@@ -252,7 +252,7 @@ class _Layer:
     def frame(self, name: str, joint: int) -> None:
         """Move a joint in its parent."""
         usd_joint = self.stage.joints[name]
-        if not np.allclose(self.changes.shift[joint - 1], np.eye(4), rtol=0, atol=TINY):
+        if not np.allclose(self.changes.shift[joint - 1], np.eye(4), rtol=0, atol=TOLERANCE):
             motion = self.changes.motion(joint - 1, self.world)
             parent = self.stage.frames[self.stage.body(usd_joint, 0)]
             local = np.linalg.inv(parent) @ motion @ self.stage.in_world(usd_joint)
@@ -396,7 +396,7 @@ class _Layer:
 
     def tool(self) -> None:
         """Move the TCP's Xform, which is given by its path or name."""
-        if np.allclose(self.changes.tcp_shift, np.eye(4), rtol=0, atol=TINY):
+        if np.allclose(self.changes.tcp_shift, np.eye(4), rtol=0, atol=TOLERANCE):
             return
         if not self.options.tcp:
             self.missing.append("tool: name the Xform of the TCP with --tcp")
@@ -406,7 +406,7 @@ class _Layer:
                  if p.IsA(self.stage.UsdGeom.Xformable)}  # fmt: skip
         tcp = self.options.tcp
         if tcp not in paths.values():
-            tcp = paths[named_one(self.stage.path, "--tcp", tcp, list(paths))]
+            tcp = paths[known_name(self.stage.path, "--tcp", tcp, list(paths))]
         frame = self.world @ self.changes.tcp_in_base
         motion = frame @ self.changes.tcp_shift @ np.linalg.inv(frame)
         last = self.stage.last_body(self.names[-1])
@@ -431,7 +431,7 @@ class _Layer:
         self.changed.append(f"{scenes[0].GetPath()}: gravity")
 
     def unsupported(self) -> list[str]:
-        """Return what is not in the layer, with what to do instead."""
+        """Return the changes that are not in the layer, with what to do instead."""
         kinds = {setting.kind for setting in self.changes.settings}
         lines = self.missing + [text for kind, text in INSTEAD.items()
                                 if kind in kinds and kind is not Kind.LINK_MOMENT]  # fmt: skip
@@ -450,7 +450,7 @@ def _matrix(w: float, xyz: Any) -> Array:
 
 
 def _quat(R: Array) -> tuple[float, float, float, float]:
-    """Return w, x, y, z."""
+    """Return a rotation (3, 3) as quaternion w, x, y, z."""
     from scipy.spatial.transform import Rotation
 
     x, y, z, w = Rotation.from_matrix(R).as_quat()
