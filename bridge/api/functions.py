@@ -63,7 +63,7 @@ def predict(cell: Cell, log: Log, *, channels: bool = False) -> Predicted:
 
 
 def compensate(cell: Cell, log: Log) -> Corrected:
-    """Return for every row the setpoint whose predicted pose is the rigid arm's at the row's own.
+    """Return each row's corrected setpoint: its predicted pose is the rigid arm's at the row's q.
 
     Raises InputError where a row has no equilibrium.
     """

@@ -105,7 +105,7 @@ class Fitted:
     provenance: dict[str, Any]
 
     def save(self, path: Path | str) -> None:
-        """Write the cell with the flexibilities found, as ``gapbridge fit`` does."""
+        """Write the cell with the fitted flexibilities, as ``gapbridge fit`` does."""
         _save(self.cell, path, self.model, self.provenance)
 
     def to_json(self) -> dict[str, Any]:

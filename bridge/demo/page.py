@@ -36,7 +36,7 @@ FIT_SCOPE = (
     "effects are identified by the diagnosis."
 )
 CELL_NOTES = (Reason.TOOL_WRITTEN, Reason.TOOL_OFF_WRITTEN)  # what `gapbridge fit` would write
-NARROW = 380.0  # px of a chart: a phone shows it at nearly its own size
+NARROW = 380.0  # px of a chart that fits on a phone
 NEXT_STEPS = (
     "Write a cell for your own robot: gapbridge init HOST --out CELL.",
     "Check it: gapbridge check CELL --live, then watch it: gapbridge run CELL --observe.",
@@ -118,11 +118,11 @@ def _errors(result: Result) -> Drawing:
 
 
 def _flexibilities(result: Result) -> list[Block]:
-    found = result.identification
-    n = len(found.axial)
+    fit = result.identification
+    n = len(fit.axial)
     kinds = (
-        ("axial", found.axial, found.std_axial, found.identifiable[:n], BEFORE, -0.2),
-        ("radial", found.radial, found.std_radial, found.identifiable[n:], AFTER, 0.2),
+        ("axial", fit.axial, fit.std_axial, fit.identifiable[:n], BEFORE, -0.2),
+        ("radial", fit.radial, fit.std_radial, fit.identifiable[n:], AFTER, 0.2),
     )
     tops = [v * 1e6 for _, value, std, shown, _, _ in kinds for v in (value + 2 * std)[shown]]
     labels = [f"joint {i + 1}" for i in range(n)]
@@ -140,7 +140,7 @@ def _flexibilities(result: Result) -> list[Block]:
             chart.column(i + shift, v, colour, 0.36)
             chart.line([i + shift] * 2, [max(v - 2 * s, 0.0), v + 2 * s], INK)
     chart.legend([(name, colour) for name, _, _, _, colour, _ in kinds])
-    shown_notes = (n for n in (*found.notes, *found.combinations) if n.reason not in CELL_NOTES)
+    shown_notes = (n for n in (*fit.notes, *fit.combinations) if n.reason not in CELL_NOTES)
     notes = note_texts(tuple(shown_notes))
     heads = ("joint", "axial, µrad/Nm", "radial, µrad/Nm")
     return [

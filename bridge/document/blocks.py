@@ -23,7 +23,7 @@ class Strong:
 
 @dataclass(frozen=True)
 class Badge:
-    """A short word on a coloured ground; ``kind`` is GOOD, DOUBTFUL, BAD or QUIET."""
+    """A short word on a coloured background; ``kind`` is GOOD, DOUBTFUL, BAD or QUIET."""
 
     text: str
     kind: str

@@ -119,35 +119,35 @@ def _titled(value: Any, title: Callable[[str], str]) -> Any:
     return value
 
 
-def calibration_text(found: Calibration, title: Callable[[str], str] = str) -> str:
+def calibration_text(result: Calibration, title: Callable[[str], str] = str) -> str:
     """Return a calibration in one sentence; ``title`` as in ``note_text``."""
-    held_out = len(found.held_out_before.rows) > 0
-    before, after = (
-        (found.held_out_before, found.held_out_after) if held_out else (found.before, found.after)
-    )
+    held_out = len(result.held_out_before.rows) > 0
+    before, after = result.before, result.after
+    if held_out:
+        before, after = result.held_out_before, result.held_out_after
     where = "on held-out poses" if held_out else "on the fitted poses (none held out)"
     change = "rises" if after.rms > before.rms else "falls"
     text = (
         f"the error {change} from {1e3 * before.rms:.3f} to {1e3 * after.rms:.3f} mm rms {where}; "
-        f"the fit leaves {1e3 * found.noise:.3f} mm per coordinate"
+        f"the fit leaves {1e3 * result.noise:.3f} mm per coordinate"
     )
-    if np.isfinite(found.noise_floor):
-        text += f" (instrument and arm alone: {1e3 * found.noise_floor:.3f} mm)"
+    if np.isfinite(result.noise_floor):
+        text += f" (instrument and arm alone: {1e3 * result.noise_floor:.3f} mm)"
     return (
-        f"{text}; {'' if found.complete else 'not complete: '}{note_text(found.remaining, title)}"
+        f"{text}; {'' if result.complete else 'not complete: '}{note_text(result.remaining, title)}"
     )
 
 
-def short_text(found: PayloadCalibration | ToolCalibration) -> str:
+def short_text(result: PayloadCalibration | ToolCalibration) -> str:
     """Return the result of a short session in one sentence."""
-    return _payload(found) if isinstance(found, PayloadCalibration) else _tool(found)
+    return _payload(result) if isinstance(result, PayloadCalibration) else _tool(result)
 
 
-def _payload(found: PayloadCalibration) -> str:
-    for note in found.notes:
+def _payload(result: PayloadCalibration) -> str:
+    for note in result.notes:
         if note.reason in (Reason.NOTHING_WEIGHS, Reason.NEGATIVE_MASS):
             return note_text(note)
-    mass, *centre = found.estimates[:4]
+    mass, *centre = result.estimates[:4]
     low, high = mass.interval
     return (
         f"the load weighs {mass.value:.3f} kg ({low:.3f} to {high:.3f}); standard deviation of its "
@@ -155,11 +155,11 @@ def _payload(found: PayloadCalibration) -> str:
     )
 
 
-def _tool(found: ToolCalibration) -> str:
-    std = float(np.linalg.norm([e.std for e in found.estimates]))
-    if found.moved < MIN_MOVE_SIGMAS * std:
+def _tool(result: ToolCalibration) -> str:
+    std = float(np.linalg.norm([e.std for e in result.estimates]))
+    if result.moved < MIN_MOVE_SIGMAS * std:
         return f"the tool's tip agrees with the cell; standard deviation {1e3 * std:.2f} mm"
     return (
-        f"the tool's tip is {1e3 * found.moved:.2f} mm from the cell's (standard deviation "
+        f"the tool's tip is {1e3 * result.moved:.2f} mm from the cell's (standard deviation "
         f"{1e3 * std:.2f} mm)"
     )

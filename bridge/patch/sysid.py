@@ -181,7 +181,7 @@ TEMPLATE = '''"""Bounds for MuJoCo's sysid, of {model} patched with {cell}; by g
     bounds = parameters()
     sysid.apply_param_modifiers(bounds, mujoco.MjSpec.from_file(<the patched model>))
 
-Free: what a diagnosis or calibration has found, within three standard deviations. SI units.
+Free: parameters of a diagnosis or calibration, within three standard deviations. SI units.
 """
 
 import numpy as np

@@ -6,6 +6,7 @@ import numpy as np
 
 from gapbridge.bridge.document import blocks
 from gapbridge.bridge.document.findings import clock
+from gapbridge.bridge.document.provenance import HALF_WIDTH
 from gapbridge.bridge.report.labels import (
     decimals_of,
     effect_title,
@@ -20,7 +21,6 @@ from gapbridge.core.diagnosis.causes import Cause
 from gapbridge.core.diagnosis.separation import Measurement
 from gapbridge.core.effects import Reported
 
-HALF_WIDTH = 1.96  # of a 95 % interval, in standard deviations
 SHOWN = 12
 
 

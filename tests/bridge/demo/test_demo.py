@@ -1,4 +1,4 @@
-"""The demo as a newcomer runs it: real command, real protocol, real processes."""
+"""The demo as a user runs it: the command, the real protocol, its processes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the demo hides in its arm is named: its fit and its diagnosis, on what its plant shows."""
+"""The diagnosis names the demo's hidden effects, on data of the simulated plant."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def plant_of(link: DemoLink) -> Plant:
 
 
 def measured(link: DemoLink, plant: Plant) -> Measurements:
-    """Return the rests that the demo measures for its fit."""
+    """Return the measurements that the demo fits."""
     rng = np.random.default_rng((link.seed, 5))
     scene, parts = link.scene, []
     planned = plan(link.cell.model, link.home, link.seed, scene)
@@ -95,7 +95,7 @@ def test_what_is_hidden_is_named_on_every_link(tmp_path: Path, name: str, seed: 
 def test_a_zero_against_which_flexibilities_were_fitted_is_named(
     tmp_path: Path, seed: int, value: float
 ) -> None:
-    """It lifts the arm by what the arm bends: the fit finds none, and all are named beside it."""
+    """The zero offset cancels the sag, so that the fit of flexibilities is biased."""
     link = LINKS["ur_rtde"](tmp_path, seed)
     zero, truth = (0.0, 0.0, value, 0.0, 0.0, 0.0), {"joint_offset_3": value}
     link.hidden = HiddenEffects(
@@ -105,7 +105,7 @@ def test_a_zero_against_which_flexibilities_were_fitted_is_named(
 
 
 def is_named(link: DemoLink, tmp_path: Path, least: float = 1e-3) -> None:
-    """Check that what a link hides is named, and that the gap of ``least`` m closes with it."""
+    """Check that the hidden effects are named and close a gap of at least ``least`` m."""
     plant, path = plant_of(link), tmp_path / "calibration.csv"
     write_log(path, measured(link, plant), link.reports_joints)
     log = read_log(path, link.cell.arm.n)

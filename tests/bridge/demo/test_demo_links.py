@@ -1,4 +1,4 @@
-"""The demo on CAN and over Modbus: the same job and summary, over the real wires."""
+"""The demo on CAN and over Modbus: the same steps and summary, over the real protocols."""
 
 from __future__ import annotations
 
@@ -140,7 +140,7 @@ class Shown(NamedTuple):
 
 @pytest.fixture(scope="module")
 def shown(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Shown]:
-    """The demos of the other links, side by side: each mostly waits for its arm."""
+    """The demos of the other links, run in parallel: each mostly waits for its arm."""
     folder = tmp_path_factory.mktemp("demos")
     running = []
     for name in OTHERS:

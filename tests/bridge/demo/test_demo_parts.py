@@ -1,4 +1,4 @@
-"""The demo's parts, each on numbers whose answer is known."""
+"""The demo's parts, each on data with a known result."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ SOFT = MODEL.with_compliance(
 def measured(
     q: np.ndarray, nominal: np.ndarray, load: int, scatter: float, seed: int
 ) -> Measurements:
-    """What a tracker would see of a bending arm at encoder angles q."""
+    """Return simulated tracker measurements of a deflected arm at encoder angles q (N, n)."""
     random = np.random.default_rng(seed)
     loads = TEST_LOADS[load].rows(len(q))
     poses = SOFT.predict(q, loads)
@@ -67,7 +67,7 @@ def measured(
 
 @pytest.fixture(scope="module")
 def result(tmp_path_factory: pytest.TempPathFactory) -> Result:
-    """A whole demo on paper: the arm's answers come from the model, with scatter."""
+    """A demo result whose measurements come from the model, with scatter."""
     given = plan(MODEL, HOME, 4)
     scatter = 1e-5
     runs = [
@@ -228,7 +228,7 @@ MISSED = "compensating -> holding (deadlines missed): 28 of 500 cycles missed"
 
 
 class FastClock(Clock):
-    """Time that passes at once."""
+    """A clock whose sleeps return at once."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -241,7 +241,7 @@ class FastClock(Clock):
 
 
 class SlowMachine(Session):
-    """A machine that keeps a quarter of the rate only."""
+    """A machine that can keep only a quarter of the rate."""
 
     def __init__(self, kept: float, emit) -> None:
         super().__init__(None, Path(), emit, FastClock())
@@ -259,7 +259,7 @@ class SlowMachine(Session):
 
 
 class Scripted(Session):
-    """A machine whose runs end as scripted: visits done, why it broke off, a stall seen."""
+    """A session whose runs end as scripted: visits done, error, stall."""
 
     def __init__(self, *script: tuple[int, str, bool]) -> None:
         self.reported: list[str] = []
@@ -269,21 +269,21 @@ class Scripted(Session):
 
     def _run(self, cell, load, poses, longest):
         self.requested.append(len(poses))
-        done, broke, stalled = self.script.pop(0)
+        done, error, stalled = self.script.pop(0)
         zero = np.zeros((done, 6))
         found = Measurements(
             zero[:, 0], poses[:done], zero, zero[:, 0], zero[:, :3], zero, zero, zero
         )
-        return RunOutcome(found if done else None, broke, stalled)
+        return RunOutcome(found if done else None, error, stalled)
 
 
 class FakeLink:
-    """The link as far as a visit asks for it."""
+    """The parts of a DemoLink that Session.visit uses."""
 
     home = HOME
 
     def __init__(self) -> None:
-        self.gone: list[np.ndarray] = []
+        self.moves: list[np.ndarray] = []
 
     def declared(self, cell, load):
         return cell
@@ -297,7 +297,7 @@ class FakeLink:
     def attach(self, load): ...
 
     def move_to(self, q):
-        self.gone.append(q)
+        self.moves.append(q)
 
     def close(self): ...
 
@@ -344,10 +344,10 @@ def test_a_run_that_a_stall_ended_goes_on_with_the_visits_that_are_left():
 def test_a_run_that_a_stall_ended_on_its_way_home_leaves_the_arm_there():
     session = Scripted((5, "state stale", False))
     assert len(five_visits(session)) == 5
-    assert session._link.gone == [HOME]
+    assert session._link.moves == [HOME]
     session = Scripted((5, "", False))
     assert len(five_visits(session)) == 5
-    assert session._link.gone == []
+    assert session._link.moves == []
 
 
 def test_runs_that_come_no_farther_on_a_machine_that_keeps_time_are_a_failure():

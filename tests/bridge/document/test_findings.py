@@ -1,4 +1,4 @@
-"""Words for findings: every check has its sentence, and each fact is worded with its numbers."""
+"""Texts of findings: every check has its own, and each text contains the numbers of its fact."""
 
 from __future__ import annotations
 

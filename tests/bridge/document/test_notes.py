@@ -1,4 +1,4 @@
-"""Every note has its words, and the words take every number that it carries."""
+"""Texts of notes: every reason has its own, which uses all values of the note."""
 
 from __future__ import annotations
 
