@@ -68,9 +68,9 @@ def run_demo(seed: int, out: Path, link: str = "ur_rtde", console: Console | Non
 def _job(
     link: DemoLink, seed: int, out: Path, console: Console, begun: float
 ) -> tuple[Result, str]:
-    cell, scene = link.cell, link.scene
+    cell, experiment = link.cell, link.experiment
     session = Session(link, out, console.print)
-    planned = plan(cell.model, link.home, seed, scene)
+    planned = plan(cell.model, link.home, seed, experiment)
     log = _calibrate(link, session, planned, out, console)
     fit = identify_compliance(cell.model, read_log(log, cell.arm.n), cell.metrology)
     # only the flexibilities are kept: the diagnosis has to find the hidden effects
@@ -88,7 +88,7 @@ def _job(
     explained: list[Measurements] = []
     explained_cell, folder = out / "explained.yaml", out / "diagnosis"
     with DiagnosisProcess(log, calibrated.path, folder, explained_cell) as diagnosis_process:
-        for load, visits in zip(scene.test_loads, planned.test, strict=True):
+        for load, visits in zip(experiment.test_loads, planned.test, strict=True):
             _check(cell, calibrated, session, load, visits, visited, console)
         console.print("diagnosing the remaining error of the calibration log")
         diagnosis = diagnosis_process.output()
@@ -97,7 +97,7 @@ def _job(
     names = dict.fromkeys(cause.effect for cause in causes)
     console.print(f"causes named by the diagnosis and applied: {', '.join(names) or 'nothing'}")
     corrected = _refit(log, load_cell(explained_cell), out)
-    for load, visits in zip(scene.test_loads, planned.test, strict=True):
+    for load, visits in zip(experiment.test_loads, planned.test, strict=True):
         console.print(f"checking {len(visits)} visits with {load.name}, with fit and diagnosis")
         explained.append(session.visit(corrected, load, visits))
     result = Result(
@@ -106,7 +106,7 @@ def _job(
         compensated=joined(visited.compensated),
         loads=tuple(visited.loads), setpoints_written=session.written, loop=session.figures(),
         duration=time.monotonic() - begun, resolution=link.resolution(),
-        test_loads=scene.test_loads, explained=joined(explained),
+        test_loads=experiment.test_loads, explained=joined(explained),
         hidden=link.hidden, causes=causes, corrected=corrected.model,
     )  # fmt: skip
     return result, diagnosis
@@ -125,7 +125,7 @@ def _calibrate(
 ) -> Path:
     """Measure poses under each calibration load; returns the path of the log."""
     parts = []
-    for load, poses in zip(link.scene.calibration_loads, planned.calibration, strict=True):
+    for load, poses in zip(link.experiment.calibration_loads, planned.calibration, strict=True):
         console.print(f"measuring {len(poses)} poses with {load.name}")
         parts.append(session.visit(link.cell, load, poses))
     write_log(out / "calibration.csv", joined(parts), link.reports_joints)

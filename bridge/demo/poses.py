@@ -57,19 +57,19 @@ TEST_LOADS = (
 
 
 @dataclass(frozen=True)
-class Scene:
+class Experiment:
     """Workspace, loads and numbers of poses of the demo on one arm."""
 
     workspace: Workspace
     calibration_loads: tuple[Load, ...]
     test_loads: tuple[Load, ...]
-    calibrate: int = 10  # poses per calibration load
-    test: int = 3  # poses per test load
+    calibration_poses: int = 10  # per calibration load
+    test_poses: int = 3  # per test load
     # per pose, for each test load; the scatter between visits is the arm's repeatability
     visits: tuple[int, ...] = (2, 1)
 
 
-UR10E = Scene(
+UR10E = Experiment(
     # around elbow-up poses with the tool pointing down
     Workspace(
         lower=(-0.5, -2.1, 0.8, -2.6, -2.1, -0.7), upper=(0.5, -0.9, 2.1, -0.9, -1.0, 0.7),
@@ -130,23 +130,23 @@ class Plan:
     test: tuple[Array, ...]  # visits per test load (M, 6), none at a calibration pose
 
 
-def plan(model: Model, home: Array, seed: int, scene: Scene = UR10E) -> Plan:
+def plan(model: Model, home: Array, seed: int, experiment: Experiment = UR10E) -> Plan:
     """Return informative poses per calibration load and random ones per test load."""
-    free = candidates(model, seed, scene.workspace)
+    free = candidates(model, seed, experiment.workspace)
     n = model.arm.n
     information = np.eye(2 * n) * 1e-2
     used: set[int] = set()
     calibration = []
-    for load in scene.calibration_loads:
-        chosen = informative(model, free, load, scene.calibrate, information)
+    for load in experiment.calibration_loads:
+        chosen = informative(model, free, load, experiment.calibration_poses, information)
         used |= set(chosen.tolist())
         calibration.append(free[chosen][visit_order(free[chosen], home)])
     position = model.rigid_pose(free).position
-    far = np.flatnonzero(np.hypot(position[:, 0], position[:, 1]) > scene.workspace.far)
+    far = np.flatnonzero(np.hypot(position[:, 0], position[:, 1]) > experiment.workspace.far)
     unused = free[[i for i in far if i not in used]]
     tests = []
-    for k in range(len(scene.test_loads)):
-        chosen_poses = unused[k * scene.test : (k + 1) * scene.test]
+    for k in range(len(experiment.test_loads)):
+        chosen_poses = unused[k * experiment.test_poses : (k + 1) * experiment.test_poses]
         chosen_poses = chosen_poses[visit_order(chosen_poses, home)]
-        tests.append(np.tile(chosen_poses, (scene.visits[k], 1)))
+        tests.append(np.tile(chosen_poses, (experiment.visits[k], 1)))
     return Plan(tuple(calibration), tuple(tests))

@@ -8,7 +8,7 @@ import numpy as np
 
 from gapbridge.bridge.demo.hidden import yielding_servos
 from gapbridge.bridge.demo.links.link import DemoLink
-from gapbridge.bridge.demo.poses import Load, Scene, Workspace
+from gapbridge.bridge.demo.poses import Experiment, Load, Workspace
 from gapbridge.bridge.demo.result import Resolution
 from gapbridge.bridge.demo.trajectory import PERIOD, visit_trajectory
 from gapbridge.bridge.setpoint_source.quintic import write_trajectory
@@ -38,7 +38,7 @@ class CanLink(DemoLink):
     template = "can.yaml"
     files = ("piper.urdf",)
     ports = (SOCKETCAND_PORT, BENCH_PORT)
-    scene = Scene(
+    experiment = Experiment(
         workspace=Workspace(
             lower=(-0.6, 1.0, -2.0, -1.0, 0.0, -1.6), upper=(0.6, 2.3, -0.6, 1.0, 1.1, 1.6),
             lowest=0.05, nearest=0.22, far=0.35, regular=0.02,
@@ -52,7 +52,7 @@ class CanLink(DemoLink):
             Load("1.4 kg", 1.4, (0.01, 0.0, 0.09)),
             Load("1.2 kg at the side", 1.2, (-0.04, 0.03, 0.07)),
         ),
-        calibrate=13, test=2,
+        calibration_poses=13, test_poses=2,
     )  # fmt: skip
 
     def __init__(self, out: Path, seed: int) -> None:

@@ -20,7 +20,7 @@ from gapbridge.bridge.daemon.daemon import Daemon
 from gapbridge.bridge.demo.bench import Bench
 from gapbridge.bridge.demo.hidden import HiddenEffects
 from gapbridge.bridge.demo.measurements import SETTLING_TIME
-from gapbridge.bridge.demo.poses import Load, Scene
+from gapbridge.bridge.demo.poses import Experiment, Load
 from gapbridge.bridge.demo.processes import ServedCell
 from gapbridge.bridge.demo.result import Resolution
 from gapbridge.bridge.document.output_file import write_text
@@ -39,7 +39,7 @@ class DemoLink(ABC):
     template: ClassVar[str]  # the cell file, in bridge/demo
     files: ClassVar[tuple[str, ...]] = ()  # files that the cell refers to, also there
     ports: ClassVar[tuple[int, ...]]  # of the simulated controller
-    scene: ClassVar[Scene]
+    experiment: ClassVar[Experiment]
     settling: ClassVar[float] = SETTLING_TIME  # s at rest before readings count
     effect_choices: ClassVar[tuple[str, ...]] = ("bent_tool",)  # one is drawn from the seed
     reports_joints: ClassVar[bool] = True  # measured joints are fine enough for the fit

@@ -49,7 +49,7 @@ class ModbusLink(DemoLink):
     ports = (PORT, BENCH_PORT)
     settling = 0.3
     reports_joints = False
-    scene = replace(
+    experiment = replace(
         UR10E,
         # close poses, since the robot's program moves at 0.5 rad/s; the wrist turns widely, which
         # identifies a bent tool
@@ -65,7 +65,7 @@ class ModbusLink(DemoLink):
             Load("12 kg and off", 12.0, (0.01, 0.0, 0.08)),
             Load("8 kg", 8.0, (0.0, 0.02, 0.07)),
         ),
-        calibrate=11,
+        calibration_poses=11,
     )  # fmt: skip
 
     def resolution(self) -> Resolution:

@@ -27,7 +27,7 @@ class UrRtdeLink(DemoLink):
     name = "ur_rtde"
     template = "cell.yaml"
     ports = (RTDE_PORT, DASHBOARD_PORT, SCRIPT_PORT, PRIMARY_PORT, BENCH_PORT)
-    scene = UR10E
+    experiment = UR10E
     effect_choices = ("bent_tool", "shifted_zero")
 
     def bench(self) -> Bench:

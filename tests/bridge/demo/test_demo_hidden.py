@@ -45,9 +45,9 @@ def plant_of(link: DemoLink) -> Plant:
 def measured(link: DemoLink, plant: Plant) -> Measurements:
     """Return the measurements that the demo fits."""
     rng = np.random.default_rng((link.seed, 5))
-    scene, parts = link.scene, []
-    planned = plan(link.cell.model, link.home, link.seed, scene)
-    for load, poses in zip(scene.calibration_loads, planned.calibration, strict=True):
+    experiment, parts = link.experiment, []
+    planned = plan(link.cell.model, link.home, link.seed, experiment)
+    for load, poses in zip(experiment.calibration_loads, planned.calibration, strict=True):
         plant.load = Load(load.mass, load.cog, load.wrench[:3], load.wrench[3:])
         frames, read = [], []
         for q in poses:
@@ -70,10 +70,10 @@ def measured(link: DemoLink, plant: Plant) -> Measurements:
 
 def errors(link: DemoLink, plant: Plant, cell: Cell) -> np.ndarray:
     """Return the model's distance (m) from the plant over the demo's test poses."""
-    scene, found = link.scene, []
-    planned = plan(link.cell.model, link.home, link.seed, scene)
+    experiment, found = link.experiment, []
+    planned = plan(link.cell.model, link.home, link.seed, experiment)
     plant.scatter = (0.0,) * len(plant.q)
-    for load, poses in zip(scene.test_loads, planned.test, strict=True):
+    for load, poses in zip(experiment.test_loads, planned.test, strict=True):
         plant.load = Load(load.mass, load.cog, load.wrench[:3], load.wrench[3:])
         expected = cell.model.predict(poses, load.rows(len(poses))).position
         for q, position in zip(poses, expected, strict=True):

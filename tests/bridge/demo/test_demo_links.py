@@ -50,26 +50,28 @@ def test_the_demos_piper_is_the_one_that_users_copy() -> None:
 
 @pytest.mark.parametrize("seed", [1, 2, 8])
 def test_poses_are_within_the_arms_limits_and_there_are_enough(link: DemoLink, seed: int) -> None:
-    scene, model = link.scene, link.cell.model
-    given = plan(model, link.home, seed, scene)
+    wanted, model = link.experiment, link.cell.model
+    given = plan(model, link.home, seed, wanted)
     arm = plant_arm(link.cell.arm)
-    assert [len(q) for q in given.calibration] == [scene.calibrate] * len(given.calibration)
-    assert [len(q) for q in given.test] == [scene.test * times for times in scene.visits]
+    assert [len(q) for q in given.calibration] == [wanted.calibration_poses] * len(
+        given.calibration
+    )
+    assert [len(q) for q in given.test] == [wanted.test_poses * times for times in wanted.visits]
     for poses in (given.calibration, given.test):
         assert all(within_limits(arm, q.tolist()) for q in np.vstack(poses))
     far = model.rigid_pose(np.vstack(given.test)).position
-    assert np.hypot(far[:, 0], far[:, 1]).min() > scene.workspace.far
-    assert len(candidates(model, seed, scene.workspace)) > 100
+    assert np.hypot(far[:, 0], far[:, 1]).min() > wanted.workspace.far
+    assert len(candidates(model, seed, wanted.workspace)) > 100
 
 
 def test_what_is_hidden_stands_in_no_cell_that_the_run_reads(link: DemoLink) -> None:
-    declared = link.declared(link.cell, link.scene.test_loads[0])
+    declared = link.declared(link.cell, link.experiment.test_loads[0])
     for cell in (link.cell, declared):
         assert cell.simulation.compliance is None
         assert cell.simulation.tool_shift is None
         assert cell.model.terms == ()
-    assert declared.model.payload_mass == link.scene.test_loads[0].mass
-    assert declared.model.payload_cog.tolist() == list(link.scene.test_loads[0].cog)
+    assert declared.model.payload_mass == link.experiment.test_loads[0].mass
+    assert declared.model.payload_cog.tolist() == list(link.experiment.test_loads[0].cog)
 
 
 def test_another_seed_hides_another_piper_and_the_same_seed_the_same(tmp_path: Path) -> None:
@@ -99,7 +101,7 @@ def test_the_bench_moves_the_arm_and_stamps_with_this_machines_clock(tmp_path: P
     goal = link.home + np.array([0.1, 0.05, -0.05, 0.0, 0.0, 0.1])
     with link.served():
         bench = link.bench()
-        load = link.scene.test_loads[1]
+        load = link.experiment.test_loads[1]
         bench.attach(load)
         bench.move_to(goal, travel_time(link.home, goal))
         before = time.monotonic()
@@ -114,7 +116,7 @@ def test_the_bench_moves_the_arm_and_stamps_with_this_machines_clock(tmp_path: P
 
 
 def test_a_load_that_no_controller_reports_goes_into_the_log(tmp_path: Path) -> None:
-    load = LINKS["can"].scene.calibration_loads[2]
+    load = LINKS["can"].experiment.calibration_loads[2]
     t, q = np.arange(0, 2, 0.01), np.full((200, 6), 0.4)
     recording = {"timestamp": t, "actual_q": q, "actual_qd": 0 * q}
     readings = np.column_stack([t, np.tile([0.1, 0.2, 0.3, 0.0, 0.0, 1.0], (200, 1))])

@@ -105,7 +105,7 @@ def test_planned_poses_are_free_and_none_is_tested_that_was_fitted(seed: int) ->
         assert np.abs(fitted - pose).max(axis=1).min() > 0.02
     for rows, times in zip(given.test, UR10E.visits, strict=True):
         assert len(np.unique(rows, axis=0)) * times == len(rows)
-    assert len(np.unique(tested, axis=0)) == UR10E.test * len(given.test)
+    assert len(np.unique(tested, axis=0)) == UR10E.test_poses * len(given.test)
 
 
 def test_another_seed_draws_other_poses() -> None:
