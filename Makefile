@@ -1,5 +1,5 @@
-# Everything runs in .venv, which is made here: Python 3.11 or newer and make are all it takes.
-# `make PYTHON=python3.12 test` takes another interpreter.
+# Everything runs in .venv, which is created here; it needs only Python 3.11 or newer and make.
+# `make PYTHON=python3.12 test` uses another interpreter.
 
 PYTHON ?= python3
 BIN := .venv/bin
@@ -8,21 +8,21 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check
 .PHONY: help demo test everything check coverage bench faults simulate mutants clean
 
 help:
-	@echo "make demo      the whole job on a simulated cell; results in out/demo"
-	@echo "make test      the tests, in minutes"
-	@echo "make everything  these and the slow ones: long runs of daemons, demos, kills, fuzzing"
+	@echo "make demo      calibrate, compensate and diagnose a simulated cell; results in out/demo"
+	@echo "make test      the tests without the slow ones"
+	@echo "make everything  all tests: also long runs of daemons, demos, kills, fuzzing"
 	@echo "make check     format, lint, types, import contracts, the tests"
-	@echo "make coverage  all tests, and which lines of core and drivers they reach"
-	@echo "make bench     speed beside peers, in one run; figures in out/speed.json, out/fleet.json"
-	@echo "make faults    every fault on the real wire, and random ones; fills docs/reliability.md"
-	@echo "make mutants   small mistakes put into the product one at a time, and which go unnoticed"
+	@echo "make coverage  all tests, with the line coverage of core and drivers"
+	@echo "make bench     speed compared with other libraries; figures in out/speed.json, out/fleet.json"
+	@echo "make faults    every fault over the real protocols, and random ones; fills docs/reliability.md"
+	@echo "make mutants   put small faults into the product one at a time, and list those not detected"
 	@echo "make simulate  whole runs with faults in simulated time, on all cores; SEEDS=100000, FIRST=0"
-	@echo "make clean     remove .venv and everything that was made"
+	@echo "make clean     remove .venv and all generated files"
 
 demo: .venv/.main
 	$(BIN)/gapbridge demo
 
-# Two processes for what goes over wires, which mostly waits; two that compute in the meantime.
+# Two processes for tests of protocols, which mostly wait; two for all others.
 SIDE_BY_SIDE := -n 4
 
 test: warm
@@ -38,7 +38,7 @@ check: warm
 	$(BIN)/lint-imports
 	$(BIN)/python -m pytest $(SIDE_BY_SIDE) -m "not slow"
 
-# Compiled kernels run unseen: the tests that check them run once more, as plain Python.
+# Coverage cannot see compiled kernels: their tests also run as plain Python.
 KERNEL_TESTS := $(addprefix tests/core/test_,kinematics.py statics.py equilibrium.py \
 	compensation.py limits.py effects_position.py effects_moving.py)
 
@@ -50,7 +50,7 @@ bench: warm
 	$(BIN)/python -m benchmarks.speed --out out/speed.json
 	$(BIN)/python -m benchmarks.fleet growth --no-dask --json out/fleet.json
 
-# REPEAT: times that each fault is made. SEQUENCES: random ones. MINUTES: no fault is begun after.
+# REPEAT: runs of each fault. SEQUENCES: random sequences. MINUTES: no fault is started later.
 REPEAT ?= 5
 SEQUENCES ?= 1000
 MINUTES ?= 120
@@ -62,8 +62,8 @@ faults: warm
 mutants: warm
 	$(BIN)/python -m benchmarks.mutants --out out/mutants.jsonl
 
-# SEEDS: how many runs; the same command again goes on where it was left (out/simulation.jsonl).
-# One of them again: .venv/bin/python -m benchmarks.simulation --seed N
+# SEEDS: number of runs; the same command resumes an interrupted one (out/simulation.jsonl).
+# A single run: .venv/bin/python -m benchmarks.simulation --seed N
 SEEDS ?= 2000
 FIRST ?= 0
 
@@ -75,8 +75,8 @@ simulate: warm
 		|| { echo "$(PYTHON) is older than 3.11; try make PYTHON=python3.12"; exit 1; }
 	$(PYTHON) -m venv .venv
 
-# one stamp per set of dependencies: a later make finds nothing to do
-# What compiles the inner loops goes first: they are compiled while the rest is fetched and unpacked.
+# One stamp per set of dependencies. The libraries that compile the inner loops are installed first:
+# the loops are compiled while the other libraries are downloaded.
 .venv/.main: pyproject.toml | .venv/bin/python
 	$(PIP) install --quiet --no-compile numba pydantic pyyaml
 	$(BIN)/python -m gapbridge.bridge.loop.warm_up & compiling=$$!; \
@@ -87,8 +87,7 @@ simulate: warm
 	$(PIP) install --quiet --editable '.[test]'
 	@touch $@ .venv/.main
 
-# After an installation, and after every change of a compiled function:
-# nothing is compiled in the middle of a test.
+# After an installation and after every change of a compiled function: no test has to compile.
 .PHONY: warm
 warm: .venv/.test
 	@$(BIN)/python -m gapbridge.bridge.loop.warm_up

@@ -1,1 +1,1 @@
-"""The command line, the cell, the daemon: everything that stands around core and drivers."""
+"""The application around core and drivers: command line, cell files, daemon, reports."""

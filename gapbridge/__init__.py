@@ -1,7 +1,7 @@
-"""Gapbridge: how an arm bends under load, setpoints that correct it, why model and arm disagree.
+"""Gapbridge: stiffness model of a robot arm, setpoint compensation, sim-to-real diagnosis.
 
-The names below are what other programs build on. They are imported when they are asked for, so that
-``import gapbridge`` costs nothing. Everything else may move.
+The names below are the public interface. They are imported on first use, so that
+``import gapbridge`` is quick. Everything else may change.
 
 Example::
 
@@ -60,7 +60,7 @@ PUBLIC: dict[str, str] = dict.fromkeys(API, "bridge.api") | {
 
 
 def __getattr__(name: str) -> Any:
-    """Return a public name, imported now."""
+    """Import and return a public name."""
     if name not in PUBLIC:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(importlib.import_module(f"{__name__}.{PUBLIC[name]}"), name)

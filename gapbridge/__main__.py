@@ -1,17 +1,17 @@
-"""``gapbridge``, and ``python -m gapbridge`` where its script is not on the path."""
+"""Entry point of ``gapbridge`` and of ``python -m gapbridge``."""
 
 import os
 import signal
 
 
 def run() -> None:
-    """Run the command. An interrupt while it is imported is one line, too: nothing is open yet."""
-    ours = signal.getsignal(signal.SIGINT) is signal.default_int_handler
-    if ours:
+    """Run the command. An interrupt during the imports ends with one line: nothing is open yet."""
+    default = signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    if default:
         signal.signal(signal.SIGINT, _leave)
     from gapbridge.bridge.cli import main
 
-    if ours:
+    if default:
         signal.signal(signal.SIGINT, signal.default_int_handler)
     main()
 

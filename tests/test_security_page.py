@@ -23,7 +23,7 @@ def test_a_test_that_the_page_names_is_there(name: str) -> None:
 
 def test_each_point_on_what_listens_and_what_leaves_names_its_test() -> None:
     page = (ROOT / "SECURITY.md").read_text(encoding="utf-8")
-    for title in ("What the daemon listens on", "What leaves for the robot"):
+    for title in ("What the daemon listens on", "What is sent to the robot"):
         section = page.split(f"\n## {title}\n")[1].split("\n## ")[0]
         points = re.split(r"^- ", section, flags=re.MULTILINE)[1:]
         assert len(points) > 5

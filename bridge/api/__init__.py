@@ -1,6 +1,6 @@
-"""Gapbridge from Python: what the commands do, as functions that return small records.
+"""The Python interface: the commands as functions that return small records.
 
-``import gapbridge`` gives the same names.
+``import gapbridge`` provides the same names.
 """
 
 from gapbridge.bridge.api.functions import compensate, diagnose, fit, load_cell, predict, read_log

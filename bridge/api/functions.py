@@ -1,6 +1,6 @@
-"""The commands as functions: same checks, same results, nothing printed but a source's notes.
+"""The commands as Python functions, with the same checks and results.
 
-All raise InputError, one clear line, for what cannot be used.
+All raise InputError, with a message of one line, for unusable input.
 """
 
 from __future__ import annotations
@@ -63,9 +63,9 @@ def predict(cell: Cell, log: Log, *, channels: bool = False) -> Predicted:
 
 
 def compensate(cell: Cell, log: Log) -> Corrected:
-    """Return the setpoint of every row whose predicted real pose is the rigid arm's at it.
+    """Return each row's corrected setpoint: its predicted pose is the rigid arm's at the row's q.
 
-    Raises InputError where the arm finds no equilibrium in a row.
+    Raises InputError where a row has no equilibrium.
     """
     loads = log.loads(by_approach(cell.model.terms))
     corrected = correct(cell.model, log.require("target_q", "actual_q"), loads)
@@ -110,10 +110,10 @@ def diagnose(
     cell: Cell, log: Log, *, withhold: Sequence[str] = (), remounted: bool = False,
     simulated: Log | None = None,
 ) -> Diagnosed:  # fmt: skip
-    """Return what explains the gap between a log and the cell's model; ``gapbridge diagnose``.
+    """Return the causes of the gap between a log and the cell's model; ``gapbridge diagnose``.
 
-    ``withhold`` names effects to take out of the catalogue; ``simulated`` is the log of another
-    simulator, row by row, whose values are the prediction.
+    ``withhold``: effects to leave out of the catalogue. ``simulated``: log of another simulator,
+    row by row, used as the prediction.
     """
     from gapbridge.bridge.document.diagnosis_json import document
     from gapbridge.core.diagnosis.diagnosis import channels_of
@@ -136,7 +136,7 @@ def diagnose(
 
 
 def _sources(cell: Cell, log: Log, simulated: Log | None = None) -> dict[str, list[Path]]:
-    """Return the files by role: a log made in Python has none."""
+    """Return the input files by role; a log made in Python has none."""
     logs = {"log": log} if simulated is None else {"log": log, "sim": simulated}
     read = {role: [Path(p) for p in one.files or (one.path,)] for role, one in logs.items()}
     return {**{role: [p for p in paths if p.exists()] for role, paths in read.items()},

@@ -31,14 +31,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Predicted:
-    """Predicted TCP poses of N rows, in base."""
+    """Predicted TCP poses of N rows, in the base frame."""
 
     position: Array  # (N, 3) m
     rotation_vector: Array  # (N, 3) rad
     position_std: Array | None = None  # (N, 3) m, 1 sigma in base axes; None: nothing was fitted
     outside: Mask | None = None  # (N,) outside what was fitted; None: nothing was
     channels: dict[str, Array] = field(default_factory=dict)  # (N, k) by name, where asked for
-    needs: dict[str, str] = field(default_factory=dict)  # what a channel needs that is not there
+    needs: dict[str, str] = field(default_factory=dict)  # missing columns or settings of a channel
     sources: dict[str, list[Path]] = field(default_factory=dict)  # log and cell, by role
 
     @property
@@ -71,7 +71,7 @@ class Corrected:
     """Offset-corrected setpoints of N rows."""
 
     q: Array  # (N, n) rad
-    residual: Array  # (N,) m: distance of the predicted from the wanted pose
+    residual: Array  # (N,) m: distance of the predicted from the intended pose
     sources: dict[str, list[Path]] = field(default_factory=dict)  # log and cell, by role
 
     def save(self, path: Path | str) -> None:
@@ -90,22 +90,22 @@ class Corrected:
 class Fitted:
     """Joint flexibilities identified from a log; (n,) each, rad/Nm."""
 
-    cell: Cell  # that was fitted
+    cell: Cell  # the input
     model: Model  # the cell's, with the flexibilities
     axial: Array
     radial: Array
     std_axial: Array  # 1 sigma
     std_radial: Array
-    shown: Mask  # (2n,), axial then radial: identifiable from the data; the rest is the cell's
+    shown: Mask  # (2n,), axial then radial: identifiable from the data; others are the cell's
     samples: int
     gap_rms: float  # m, one coordinate, before
     remaining_rms: float  # m, after
-    remaining_rms_held_out: float | None  # m, on poses that the fit did not see
+    remaining_rms_held_out: float | None  # m, on held-out poses
     notes: tuple[str, ...]
     provenance: dict[str, Any]
 
     def save(self, path: Path | str) -> None:
-        """Write the cell with the flexibilities found, as ``gapbridge fit`` does."""
+        """Write the cell with the fitted flexibilities, as ``gapbridge fit`` does."""
         _save(self.cell, path, self.model, self.provenance)
 
     def to_json(self) -> dict[str, Any]:
@@ -124,7 +124,7 @@ class Fitted:
 class Diagnosed:
     """The diagnosis of a log: the document that ``gapbridge diagnose --json`` writes."""
 
-    cell: Cell  # that was diagnosed
+    cell: Cell  # the input
     log: Log
     diagnosis: Diagnosis = field(repr=False)  # as the core has it
     document: dict[str, Any] = field(repr=False)  # schema gapbridge.diagnosis/1, with provenance
@@ -146,7 +146,7 @@ class Diagnosed:
 
     @property
     def stand_ins(self) -> tuple[str, ...]:
-        """Return the effects that are not proved, but shrink the gap in regions not fitted."""
+        """Return effects that are not confirmed but reduce the gap in held-out regions."""
         return self._effects("stand_ins")
 
     def save(self, path: Path | str, *, stand_ins: bool = False) -> None:
@@ -164,7 +164,7 @@ class Diagnosed:
 
     def write_report(self, folder: Path | str) -> list[Path]:
         """Write diagnosis.json and report.html, as ``--out`` does; returns their paths."""
-        from gapbridge.bridge.report import write_report  # only here
+        from gapbridge.bridge.report import write_report  # loaded only here
 
         folder = Path(folder)
         require_folder(folder, "the report", above=False)

@@ -16,7 +16,7 @@ from gapbridge.core.estimation.identification import Identification
 
 
 def spread_of(diagnosis: Diagnosis) -> Spread:
-    """Return the covariance of the position channel's causes, each effect's numbers by itself."""
+    """Return the covariance of the position channel's causes, block by block per effect."""
     for channel in diagnosis.channels:
         if channel.channel == "position":
             selection = channel.selection
@@ -36,7 +36,7 @@ def cause_entries(diagnosis: Diagnosis, earlier: Sequence[Any] = ()) -> list[dic
         {
             "effect": cause.effect, "joints": list(cause.joints), "channel": channel.channel,
             "parameters": [
-                {"name": p.name, "value": float(p.value), "std": _known(p.std), "unit": p.unit}
+                {"name": p.name, "value": float(p.value), "std": _finite(p.std), "unit": p.unit}
                 for p in cause.parameters
             ],
             "indistinguishable_from": list(cause.indistinguishable_from),
@@ -49,7 +49,7 @@ def cause_entries(diagnosis: Diagnosis, earlier: Sequence[Any] = ()) -> list[dic
     return [*entries, *kept]
 
 
-def _known(std: float | None) -> float | None:
+def _finite(std: float | None) -> float | None:
     return None if std is None or not math.isfinite(std) else float(std)
 
 

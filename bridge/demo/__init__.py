@@ -1,4 +1,4 @@
-"""The demo: ``run_demo`` does the whole job on a simulated cell."""
+"""The demo: ``run_demo`` calibrates, compensates and diagnoses a simulated cell."""
 
 from gapbridge.bridge.demo.job import run_demo
 

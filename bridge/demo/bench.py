@@ -1,4 +1,4 @@
-"""The people and the laser tracker around the simulated cell: its bench port, and the pendant."""
+"""The test bench of the simulated cell: attach loads, move the arm, read the laser tracker."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from gapbridge.core.errors import LinkError
 from gapbridge.drivers.simulated.ur.settings import BENCH_PORT, SCRIPT_PORT
 
 READINGS_PERIOD = 0.01  # s between two readings of the tracker
-LONGEST_MOVE = 20.0  # s
-LOOK = 0.25  # s between two looks at whether the arm stands
-STANDING = 1.5e-4  # m between two looks
+MAX_MOVE_TIME = 20.0  # s
+POLL_PERIOD = 0.25  # s between two checks whether the arm is at rest
+MAX_STILL_MOTION = 1.5e-4  # m of the TCP between two checks of an arm at rest
 
 
 class Bench:
-    """One connection to the bench port, for one thread."""
+    """One connection to the bench port of the simulated controller, for one thread."""
 
     def __init__(self, host: str, port: int) -> None:
         self._host = host
         self._socket = socket.create_connection((host, port), timeout=10)
         self._lines = self._socket.makefile("r")
 
-    def ask(self, line: str) -> str:
-        """Return the bench's answer; raises LinkError where it refuses."""
+    def request(self, line: str) -> str:
+        """Send a command and return the answer. Raises LinkError where the bench refuses it."""
         try:
             self._socket.sendall(line.encode() + b"\n")
             answer = self._lines.readline().strip()
@@ -42,7 +42,8 @@ class Bench:
     def measure(self) -> Array:
         """Return one reading (7,): time (s), position (m), rotation vector (rad).
 
-        The time is that of the run's states: this machine's, where a controller sends none.
+        The time is on the clock of the recorded states: this computer's monotonic clock where the
+        controller sends no time.
         """
         reading = self._reading()
         reading[0] = time.monotonic()
@@ -50,63 +51,63 @@ class Bench:
 
     def _reading(self) -> Array:
         """Return one reading (7,) with the controller's own time."""
-        return np.array([float(v) for v in self.ask("measure").split(",")])
+        return np.array([float(v) for v in self.request("measure").split(",")])
 
-    def hang(self, load: Load) -> None:
-        """Hang a load on the flange, and let go of the tool or pull at it."""
+    def attach(self, load: Load) -> None:
+        """Attach a payload to the flange and apply the load's external wrench at the TCP."""
         numbers = " ".join(f"{v:.9g}" for v in (load.mass, *load.cog))
-        self.ask(f"payload {numbers}")
-        self.ask("wrench " + " ".join(f"{v:.9g}" for v in load.wrench))
+        self.request(f"payload {numbers}")
+        self.request("wrench " + " ".join(f"{v:.9g}" for v in load.wrench))
 
-    def go(self, q: Array, travel: float = 0.0) -> None:
-        """Move the arm to ``q`` (n,) by its own program, and wait until it stands there.
+    def move_to(self, q: Array, travel: float = 0.0) -> None:
+        """Move the arm to ``q`` (n,), rad, by the robot's program, and wait until it is at rest.
 
-        It is looked at from ``travel`` s on, which it takes at least. Raises LinkError where it
-        does not come to rest in time.
+        Checks begin after ``travel`` s, the least that the move takes. Raises LinkError where the
+        arm is not at rest within MAX_MOVE_TIME.
         """
         self._start(q)
         time.sleep(travel)
-        latest, before = time.monotonic() + LONGEST_MOVE, self.measure()
+        latest, before = time.monotonic() + MAX_MOVE_TIME, self.measure()
         while time.monotonic() < latest:
-            time.sleep(LOOK)
+            time.sleep(POLL_PERIOD)
             now = self.measure()
-            if np.linalg.norm(now[1:4] - before[1:4]) < STANDING:
+            if np.linalg.norm(now[1:4] - before[1:4]) < MAX_STILL_MOTION:
                 return
             before = now
-        raise LinkError(f"the arm did not come to rest within {LONGEST_MOVE:g} s")
+        raise LinkError(f"the arm did not come to rest within {MAX_MOVE_TIME:g} s")
 
     def _start(self, q: Array) -> None:
-        """Have the robot's own program move to ``q`` (n,)."""
-        self.ask("move " + " ".join(f"{v:.9g}" for v in q))
+        """Start a move of the robot's program to ``q`` (n,), rad."""
+        self.request("move " + " ".join(f"{v:.9g}" for v in q))
 
     def close(self) -> None:
-        """Leave the bench."""
+        """Close the connection."""
         self._lines.close()
         self._socket.close()
 
 
 class UrBench(Bench):
-    """The bench of a UR controller: people use its pendant, and its clock is everyone's."""
+    """The bench of a UR controller: moves and payloads are sent as URScript."""
 
     def __init__(self, host: str) -> None:
         super().__init__(host, BENCH_PORT)
 
     def measure(self) -> Array:
-        """Return one reading (7,), its time the controller's; see Bench.measure."""
+        """Return one reading (7,) with the controller's time; see Bench.measure."""
         return self._reading()
 
-    def hang(self, load: Load) -> None:
-        """Hang a load as on any bench, and enter it in the controller."""
-        super().hang(load)
+    def attach(self, load: Load) -> None:
+        """Attach a load, and enter its mass and centre of gravity in the controller."""
+        super().attach(load)
         cog = ",".join(f"{v:.9g}" for v in load.cog)
-        self._pendant(f"def hang():\n  set_payload({load.mass:.9g}, [{cog}])\nend\n")
+        self._run_script(f"def attach():\n  set_payload({load.mass:.9g}, [{cog}])\nend\n")
 
     def _start(self, q: Array) -> None:
         numbers = ",".join(f"{v:.9g}" for v in q)
-        self._pendant(f"def go():\n  movej([{numbers}], a=1.0, v=0.7)\nend\n")
+        self._run_script(f"def go():\n  movej([{numbers}], a=1.0, v=0.7)\nend\n")
 
-    def _pendant(self, program: str) -> None:
-        """Run a short program, as a person at the pendant would."""
+    def _run_script(self, program: str) -> None:
+        """Run a short URScript program on the controller."""
         address = (self._host, SCRIPT_PORT)
         with socket.create_connection(address, timeout=10) as script:
             script.sendall(program.encode())
@@ -114,19 +115,19 @@ class UrBench(Bench):
 
 
 class Tracker(threading.Thread):
-    """Reads the tracker a hundred times a second while the ``with`` block lasts."""
+    """Reads the tracker at 100 Hz while the ``with`` block lasts."""
 
     def __init__(self, bench: Bench) -> None:
         super().__init__(name="tracker", daemon=True)
         self._bench = bench
-        self._ending = threading.Event()
+        self._over = threading.Event()
         self._readings: list[Array] = []
         self._error: LinkError | None = None
 
     def run(self) -> None:
-        """Collect readings until the block ends."""
+        """Collect readings until the ``with`` block ends."""
         try:
-            while not self._ending.wait(READINGS_PERIOD):
+            while not self._over.wait(READINGS_PERIOD):
                 self._readings.append(self._bench.measure())
         except LinkError as error:
             self._error = error
@@ -142,6 +143,6 @@ class Tracker(threading.Thread):
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._ending.set()
+        self._over.set()
         self.join(5)
         self._bench.close()

@@ -1,4 +1,4 @@
-"""What is hidden in the demo's arm beside its flexibilities: effects that no fit knows."""
+"""Effects hidden in the demo's simulated arm that the fit of the flexibilities does not model."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ from typing import Any
 
 import numpy as np
 
-GIVES = 5.0e-3  # rad: what servos that give way come to at most
-SHIFTS = (1.0e-3, 2.5e-3)  # m, of a tool that hit something
-ZEROS, ZERO_JOINTS = (2.5e-3, 4.0e-3), (2, 4, 5)  # rad, of a joint whose encoder was replaced
-TRUE_ANYWAY = ("axial_compliance", "radial_compliance")  # the arm bends, and a fit is not exact
-SIGMAS = 4.0  # of its own, within which a found value holds the truth
-FLOOR = 2e-5  # SI: what flexibilities fitted beside the effect, not with it, leave in its value
+MAX_DROOP = 5.0e-3  # rad, largest deflection of a servo under the holding torque
+TOOL_SHIFTS = (1.0e-3, 2.5e-3)  # m, range of the shift of a bent tool
+JOINT_ZEROS, ZERO_JOINTS = (2.5e-3, 4.0e-3), (2, 4, 5)  # rad, offset; positive lowers the arm
+ALWAYS_TRUE = ("axial_compliance", "radial_compliance")  # the arm bends; a fit is not exact
+MAX_SIGMAS = 4.0  # largest accepted error of an estimate, in its standard deviations
+TOLERANCE = 2e-5  # SI: bias of an estimate whose flexibilities were fitted without the effect
 
 
 @dataclass(frozen=True)
-class Accused:
-    """A cause that the diagnosis named, with its numbers: name, value, 1 sigma, unit."""
+class NamedCause:
+    """A cause named by the diagnosis; parameters as name, value, standard deviation, unit."""
 
     effect: str
     joints: tuple[int, ...]
@@ -26,93 +26,92 @@ class Accused:
 
 
 @dataclass(frozen=True)
-class Hidden:
-    """Effects of the arm that the demo's cell does not know.
+class HiddenEffects:
+    """Effects of the simulated arm that the demo's cell does not model.
 
-    effects: as the diagnosis names them; about: what happened, for people.
-    truth: its true numbers by the names of the diagnosis, SI.
-    simulation: the same as keys of a cell's section ``simulation``, fields of PlantSettings.
+    effects: identifiers in the catalogue. description: what happened, for reports.
+    truth: true values (SI) by parameter name.
+    simulation: the same as keys of a cell's section ``simulation`` (fields of PlantSettings).
     """
 
     effects: tuple[str, ...]
-    about: str
+    description: str
     truth: Mapping[str, float]
     simulation: Mapping[str, tuple[float, ...]]
 
     @classmethod
-    def drawn(cls, seed: int, among: tuple[str, ...]) -> Hidden:
-        """Return one of the effects ``among``, which and how large drawn from the seed."""
-        which = np.random.default_rng((seed, 37)).integers(len(among))
-        return DRAWS[among[int(which)]](np.random.default_rng((seed, 29)))
+    def drawn(cls, seed: int, choices: tuple[str, ...]) -> HiddenEffects:
+        """Return one of ``choices`` (keys of DRAW_FUNCTIONS); seed draws choice and size."""
+        index = np.random.default_rng((seed, 37)).integers(len(choices))
+        return DRAW_FUNCTIONS[choices[int(index)]](np.random.default_rng((seed, 29)))
 
-    def beside(self, other: Hidden) -> Hidden:
-        """Return what is hidden where both are."""
-        return Hidden(
-            self.effects + other.effects, f"{self.about}, and {other.about}",
+    def combined(self, other: HiddenEffects) -> HiddenEffects:
+        """Return the effects of both."""
+        return HiddenEffects(
+            self.effects + other.effects, f"{self.description}, and {other.description}",
             {**self.truth, **other.truth}, {**self.simulation, **other.simulation},
         )  # fmt: skip
 
-    def denials(self, accused: Iterable[Accused]) -> list[str]:
-        """Return a line for each accusation that the truth does not hold, and for what is missing.
+    def mismatches(self, causes: Iterable[NamedCause]) -> list[str]:
+        """Return a line for each false cause, each missed effect and each wrong value.
 
-        A number is held by the truth within SIGMAS of its own standard deviation and FLOOR.
+        A value is right within MAX_SIGMAS of its standard deviations plus TOLERANCE.
         """
-        accused = list(accused)
+        causes = list(causes)
         lines = [
-            f"{cause.effect} is accused, and this arm has none"
-            for cause in accused
-            if cause.effect not in (*self.effects, *TRUE_ANYWAY)
+            f"{cause.effect} is named as a cause, but this arm does not have it"
+            for cause in causes
+            if cause.effect not in (*self.effects, *ALWAYS_TRUE)
         ]
-        named = {cause.effect for cause in accused}
-        lines += [f"{e} is in the arm, and not named" for e in self.effects if e not in named]
-        own = [p for cause in accused if cause.effect in self.effects for p in cause.parameters]
-        for name, value, std, _ in own:
+        named = {cause.effect for cause in causes}
+        lines += [f"{e} is in the arm but was not named" for e in self.effects if e not in named]
+        estimates = [p for c in causes if c.effect in self.effects for p in c.parameters]
+        for name, value, std, _ in estimates:
             true = self.truth.get(name, 0.0)
-            if abs(value - true) > SIGMAS * std + FLOOR:
-                lines.append(
-                    f"{name} is {value:.6f}, found with 1 sigma {std:.6f}: truly {true:.6f}"
-                )
+            if abs(value - true) > MAX_SIGMAS * std + TOLERANCE:
+                lines.append(f"{name} was estimated as {value:.6f} ± {std:.6f}, true {true:.6f}")
         return lines
 
 
-def _bent_tool(rng: np.random.Generator) -> Hidden:
-    way = rng.normal(size=3)
-    shift = tuple(float(v) for v in way / np.linalg.norm(way) * rng.uniform(*SHIFTS))
+def _bent_tool(rng: np.random.Generator) -> HiddenEffects:
+    direction = rng.normal(size=3)
+    direction /= np.linalg.norm(direction)
+    shift = tuple(float(v) for v in direction * rng.uniform(*TOOL_SHIFTS))
     truth = {f"tool_frame_{axis}": v for axis, v in zip("xyz", shift, strict=True)}
-    return Hidden(("tool_frame",), "the tool was bent, too", truth, {"tool_shift": shift})
+    return HiddenEffects(("tool_frame",), "the tool is also bent", truth, {"tool_shift": shift})
 
 
-def _lost_zero(rng: np.random.Generator) -> Hidden:
-    joint, value = int(rng.choice(ZERO_JOINTS)), float(rng.uniform(*ZEROS))  # lower, as it bends
+def _shifted_zero(rng: np.random.Generator) -> HiddenEffects:
+    joint, value = int(rng.choice(ZERO_JOINTS)), float(rng.uniform(*JOINT_ZEROS))
     zero = tuple(value if i + 1 == joint else 0.0 for i in range(6))
     truth = {f"joint_offset_{joint}": value}
-    return Hidden(("joint_offset",), "the zero of a joint was off, too", truth, {"zero": zero})
+    return HiddenEffects(("joint_offset",), "a joint's zero is also off", truth, {"zero": zero})
 
 
-def soft_servos(seed: int, held: Sequence[float]) -> Hidden:
-    """Return servos that give way by some 5 mrad, and less, where they hold ``held`` (n,), Nm.
+def yielding_servos(seed: int, torque: Sequence[float]) -> HiddenEffects:
+    """Return servos that yield by 3.5 to 5 mrad under holding torques ``torque`` (n,), Nm.
 
-    A joint with less than a newton metre has a servo that stands.
+    A servo that holds 1 Nm or less does not yield.
     """
     rng = np.random.default_rng((seed, 31))
-    share = rng.uniform(0.7, 1.0, len(held))
+    share = rng.uniform(0.7, 1.0, len(torque))
     droop = tuple(
-        float(GIVES * s / h) if h > 1.0 else 0.0 for s, h in zip(share, held, strict=True)
+        float(MAX_DROOP * s / t) if t > 1.0 else 0.0 for s, t in zip(share, torque, strict=True)
     )
     truth = {f"servo_droop_{i + 1}": v for i, v in enumerate(droop) if v}
-    return Hidden(("servo_droop",), "its servos give way", truth, {"droop": droop})
+    return HiddenEffects(("servo_droop",), "its servos yield under load", truth, {"droop": droop})
 
 
-DRAWS: dict[str, Callable[[np.random.Generator], Hidden]] = {
-    "bent_tool": _bent_tool, "lost_zero": _lost_zero,
+DRAW_FUNCTIONS: dict[str, Callable[[np.random.Generator], HiddenEffects]] = {
+    "bent_tool": _bent_tool, "shifted_zero": _shifted_zero,
 }  # fmt: skip
-"""What may be hidden: what the diagnosis names rightly whatever the seed."""
+"""Effects that may be hidden; the diagnosis identifies each of them at any seed."""
 
 
-def accused_in(document: Mapping[str, Any]) -> tuple[Accused, ...]:
-    """Return what a diagnosis accuses, from its JSON."""
+def named_causes(document: Mapping[str, Any]) -> tuple[NamedCause, ...]:
+    """Return the causes that a diagnosis names, from its JSON."""
     return tuple(
-        Accused(
+        NamedCause(
             cause["effect"], tuple(cause["joints"]),
             tuple((p["name"], p["value"], p["std"], p["unit"]) for p in cause["parameters"]),
         )

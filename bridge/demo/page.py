@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from gapbridge.bridge.demo.picture import arm_drawing, bars_drawing, coloured
+from gapbridge.bridge.demo.picture import arm_drawing, bars_drawing, coloured_rounds
 from gapbridge.bridge.demo.result import Result
 from gapbridge.bridge.demo.terminal import truth_rows
 from gapbridge.bridge.document.axes import Chart, logarithmic, named, scale
@@ -31,12 +31,12 @@ from gapbridge.bridge.document.notes import note_texts
 from gapbridge.bridge.document.provenance import origin_blocks, origin_line
 from gapbridge.core.notes import Reason
 
-KEPT = (
-    "Only the flexibilities are kept of this fit, also where it found the tool point off: whatever "
-    "else is wrong is left to the diagnosis."
+FIT_SCOPE = (
+    "Only the flexibilities of this fit are kept, even where it estimated a tool point: other "
+    "effects are identified by the diagnosis."
 )
-OF_THE_CELL = (Reason.TOOL_WRITTEN, Reason.TOOL_OFF_WRITTEN)  # what `gapbridge fit` would write
-NARROW = 380.0  # px of a chart: a phone shows it at nearly its own size
+CELL_NOTES = (Reason.TOOL_WRITTEN, Reason.TOOL_OFF_WRITTEN)  # what `gapbridge fit` would write
+NARROW = 380.0  # px of a chart that fits on a phone
 NEXT_STEPS = (
     "Write a cell for your own robot: gapbridge init HOST --out CELL.",
     "Check it: gapbridge check CELL --live, then watch it: gapbridge run CELL --observe.",
@@ -45,7 +45,7 @@ NEXT_STEPS = (
 
 
 def page(result: Result, diagnosis: str, origin: Mapping[str, Any] | None = None) -> str:
-    """Return the page; ``diagnosis`` is in plain sentences, ``origin`` the run's provenance."""
+    """Return the HTML; ``diagnosis`` is the printed text, ``origin`` the run's provenance."""
     return html(document(result, diagnosis, origin or {}))
 
 
@@ -54,15 +54,15 @@ def document(result: Result, diagnosis: str, origin: Mapping[str, Any]) -> Docum
     truth = _truth(result)
     parts: list[tuple[str, str, list[Block]]] = [
         ("result", "The result", _result(result)),
-        *([("truth", "The hidden truth, and what was found", truth)] if truth else []),
+        *([("truth", "Hidden effects and their estimates", truth)] if truth else []),
         ("visits", "Every visit", [Pictures((_errors(result),))]),
-        ("flexibilities", "What was found of the arm", _flexibilities(result)),
-        ("diagnosis", "What the diagnosis says of what the fit leaves", _diagnosis(diagnosis)),
-        ("figures", "How it was done", [_figures(result), *origin_blocks(origin)]),
+        ("flexibilities", "Identified flexibilities", _flexibilities(result)),
+        ("diagnosis", "Diagnosis of the remaining error", _diagnosis(diagnosis)),
+        ("figures", "Run and link", [_figures(result), *origin_blocks(origin)]),
     ]
     software = origin_line(origin)
     return Document(
-        f"The whole job on a simulated {result.model.arm.name}",
+        f"Demo on a simulated {result.model.arm.name}",
         f"Link {result.link}, seed {result.seed} · {software}",
         tuple(Part(key, title, "", blocks) for key, title, blocks in parts if blocks),
         f"Demo of {software}, seed {result.seed}",
@@ -73,11 +73,11 @@ def _result(result: Result) -> list[Block]:
     errors = result.summary()["tcp_error_mm"]
     ratio = errors["without"]["rms"] / errors["with"]["rms"]
     lead = (
-        f"Without compensation the tool misses its place by {errors['without']['rms']:.3f} mm "
-        f"rms (at most {errors['without']['max']:.3f}); with it, by {errors['with']['rms']:.3f} mm "
-        f"({errors['with']['max']:.3f}): {ratio:.0f} times less. The arm comes back to a place "
-        f"within {result.repeatability * 1e3:.3f} mm. The arm's flexibilities are drawn from seed "
-        f"{result.seed}; nothing that corrects the arm knows them."
+        f"Without compensation the TCP error is {errors['without']['rms']:.3f} mm "
+        f"rms (at most {errors['without']['max']:.3f}); with it, {errors['with']['rms']:.3f} mm "
+        f"({errors['with']['max']:.3f}): {ratio:.0f} times smaller. The arm's repeatability is "
+        f"{result.repeatability * 1e3:.3f} mm. Its true flexibilities are drawn from seed "
+        f"{result.seed} and are not known to the program that corrects it."
     )
     return [
         Paragraph(lead, "lead"), Heading("What to do now"), Bullets(NEXT_STEPS),
@@ -86,22 +86,22 @@ def _result(result: Result) -> list[Block]:
 
 
 def _truth(result: Result) -> list[Block]:
-    """Return what was hidden beside what was found; nothing where nothing was hidden."""
+    """Return the hidden parameters with their estimates; empty where nothing was hidden."""
     if result.hidden is None:
         return []
     fitted = result.summary()["tcp_error_mm"]["fitted"]["rms"]
     rows: list[list[Cell]] = [
-        [Named("", code=name), truly, found or "not found"]
-        for name, truly, found in truth_rows(result)
+        [Named("", code=name), true, estimate or "not found"]
+        for name, true, estimate in truth_rows(result)
     ]
     return [
-        Paragraph(f"The fitted flexibilities alone left {fitted:.3f} mm: {result.hidden.about}."),
-        Table(("parameter", "truly", "found"), rows),
+        Paragraph(f"Fitted flexibilities alone left {fitted:.3f} mm: {result.hidden.description}."),
+        Table(("parameter", "true", "estimated"), rows),
     ]  # fmt: skip
 
 
 def _errors(result: Result) -> Drawing:
-    rounds = coloured(result)
+    rounds = coloured_rounds(result)
     visit = [float(i) for i in range(1, len(result.loads) + 1)]
     every = [v * 1e3 for _, error, _ in rounds for v in error]
     errors = logarithmic("mm", [*every, result.repeatability * 1e3])
@@ -109,7 +109,7 @@ def _errors(result: Result) -> Drawing:
     for _, error, colour in rounds:
         hints = [
             f"{load}: {e * 1e3:.3f} mm, q = {np.round(q, 3).tolist()}"
-            for load, e, q in zip(result.loads, error, result.without.nominal_q, strict=True)
+            for load, e, q in zip(result.loads, error, result.uncompensated.nominal_q, strict=True)
         ]
         chart.points(visit, [*error * 1e3], colour, radius=3.4, hints=hints)
     chart.level(result.repeatability * 1e3, "repeatability", EDGE)
@@ -118,11 +118,11 @@ def _errors(result: Result) -> Drawing:
 
 
 def _flexibilities(result: Result) -> list[Block]:
-    found = result.identification
-    n = len(found.axial)
+    fit = result.identification
+    n = len(fit.axial)
     kinds = (
-        ("axial", found.axial, found.std_axial, found.identifiable[:n], BEFORE, -0.2),
-        ("radial", found.radial, found.std_radial, found.identifiable[n:], AFTER, 0.2),
+        ("axial", fit.axial, fit.std_axial, fit.identifiable[:n], BEFORE, -0.2),
+        ("radial", fit.radial, fit.std_radial, fit.identifiable[n:], AFTER, 0.2),
     )
     tops = [v * 1e6 for _, value, std, shown, _, _ in kinds for v in (value + 2 * std)[shown]]
     labels = [f"joint {i + 1}" for i in range(n)]
@@ -140,11 +140,11 @@ def _flexibilities(result: Result) -> list[Block]:
             chart.column(i + shift, v, colour, 0.36)
             chart.line([i + shift] * 2, [max(v - 2 * s, 0.0), v + 2 * s], INK)
     chart.legend([(name, colour) for name, _, _, _, colour, _ in kinds])
-    said = (n for n in (*found.notes, *found.combinations) if n.reason not in OF_THE_CELL)
-    notes = note_texts(tuple(said))
+    shown_notes = (n for n in (*fit.notes, *fit.combinations) if n.reason not in CELL_NOTES)
+    notes = note_texts(tuple(shown_notes))
     heads = ("joint", "axial, µrad/Nm", "radial, µrad/Nm")
     return [
-        Pictures((chart.drawing,)), Table(heads, cells, (0.5, 1, 1)), Paragraph(KEPT),
+        Pictures((chart.drawing,)), Table(heads, cells, (0.5, 1, 1)), Paragraph(FIT_SCOPE),
         *([Bullets(notes)] if notes else []),
     ]  # fmt: skip
 
@@ -153,11 +153,11 @@ def _diagnosis(text: str) -> list[Block]:
     lines = [line.strip() for line in text.splitlines()]
     return [
         *(Paragraph(line) for line in lines if line),
-        Paragraph("In pictures: diagnosis/report.html.", "note"),
+        Paragraph("With charts: diagnosis/report.html.", "note"),
     ]
 
 
-def _count(length: float) -> str:
+def _resolution(length: float) -> str:
     return f"{length * 1e3:.3g} mm" if length else "64-bit floats"
 
 
@@ -170,9 +170,9 @@ def _figures(result: Result) -> Columns:
         ("rate of the loop", f"{loop.rate:.1f} Hz"),
         ("cycles missed", f"{loop.missed} of {loop.cycles}"),
         ("age of the state behind a setpoint, p99", f"{loop.p99:.0f} µs"),
-        ("one count of what is written, at the TCP", _count(result.resolution.written)),
-        ("one count of the joints as read, at the TCP", _count(result.resolution.read)),
-        ("what that means", result.resolution.note or "nothing is lost on the wire"),
+        ("resolution of the written values, at the TCP", _resolution(result.resolution.written)),
+        ("resolution of the joint readings, at the TCP", _resolution(result.resolution.read)),
+        ("meaning", result.resolution.note or "the link loses no resolution"),
         ("whole demo", f"{result.duration:.0f} s"),
     )
     return Columns((Pairs(pairs),))

@@ -1,4 +1,4 @@
-"""Which poses the demo measures: the most informative about the joints, others to check."""
+"""The poses that the demo measures: the most informative for the fit, others for the check."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ CANDIDATES = 400
 
 @dataclass(frozen=True)
 class Workspace:
-    """Where an arm may go."""
+    """Limits of the poses that are drawn."""
 
     lower: tuple[float, ...]  # rad
     upper: tuple[float, ...]  # rad
-    lowest: float  # m: the tool comes no closer to the table
-    nearest: float  # m: the tool stays at least this far from the base's axis
-    far: float  # m: test poses reach out as far as this, where arms bend
+    lowest: float  # m, least height of the TCP above the base
+    nearest: float  # m, least distance of the TCP from the axis of the base
+    far: float  # m, least such distance of a test pose, where arms deflect most
     regular: float  # smallest singular value of the Jacobian (rotations times the lever)
 
 
 @dataclass(frozen=True)
 class Load:
-    """What a person hangs on the flange, and what pulls at the tool."""
+    """A payload on the flange and an external wrench at the TCP."""
 
     name: str
     mass: float  # kg
@@ -57,19 +57,19 @@ TEST_LOADS = (
 
 
 @dataclass(frozen=True)
-class Scene:
-    """What is shown on one arm."""
+class Experiment:
+    """Workspace, loads and numbers of poses of the demo on one arm."""
 
     workspace: Workspace
     calibration_loads: tuple[Load, ...]
     test_loads: tuple[Load, ...]
-    calibrate: int = 10  # poses per calibration load
-    test: int = 3  # poses per test load
-    # of each pose of each test load: what differs between them is the arm's repeatability
+    calibration_poses: int = 10  # per calibration load
+    test_poses: int = 3  # per test load
+    # per pose, for each test load; the scatter between visits is the arm's repeatability
     visits: tuple[int, ...] = (2, 1)
 
 
-UR10E = Scene(
+UR10E = Experiment(
     # around elbow-up poses with the tool pointing down
     Workspace(
         lower=(-0.5, -2.1, 0.8, -2.6, -2.1, -0.7), upper=(0.5, -0.9, 2.1, -0.9, -1.0, 0.7),
@@ -81,72 +81,72 @@ UR10E = Scene(
 
 
 def candidates(model: Model, seed: int, workspace: Workspace = UR10E.workspace) -> Array:
-    """Return free, regular poses (N, 6) drawn from the seed."""
+    """Return poses (N, n) in the workspace and away from singularities, drawn from the seed."""
     bounds = np.array(workspace.lower), np.array(workspace.upper)
     q = np.random.default_rng((seed, 11)).uniform(*bounds, (CANDIDATES, model.arm.n))
     position = model.rigid_pose(q).position
     jacobian = model.without_terms().linear_form(q).jacobian.copy()
     jacobian[:, 3:] *= LEVER
     smallest = np.linalg.svd(jacobian, compute_uv=False)[:, -1]
-    away = np.hypot(position[:, 0], position[:, 1])
-    free = (position[:, 2] > workspace.lowest) & (away > workspace.nearest)
+    radius = np.hypot(position[:, 0], position[:, 1])
+    free = (position[:, 2] > workspace.lowest) & (radius > workspace.nearest)
     return q[free & (smallest > workspace.regular)]
 
 
-def informative(model: Model, q: Array, load: Load, count: int, known: Array) -> Array:
-    """Return the indices of ``count`` poses that add most to what is known (D-optimal, greedy).
+def informative(model: Model, q: Array, load: Load, count: int, information: Array) -> Array:
+    """Return the indices of ``count`` poses chosen by greedy D-optimal design.
 
-    ``known`` (2n, 2n) is the information so far, in units of one measured position; it is updated
-    in place.
+    ``information`` (2n, 2n), in units of one measured position, is updated in place.
     """
     rigid = model.without_terms()
     form = rigid.linear_form(q, load.rows(len(q))).regressor[:, :3] * 1e-5 / 2e-5
     parts = np.einsum("rki,rkj->rij", form, form)
     chosen: list[int] = []
     for _ in range(count):
-        gain = np.linalg.slogdet(known + parts)[1]
+        gain = np.linalg.slogdet(information + parts)[1]
         gain[chosen] = -np.inf
         best = int(np.argmax(gain))
         chosen.append(best)
-        known += parts[best]
+        information += parts[best]
     return np.array(chosen)
 
 
-def tour(q: Array, start: Array) -> Array:
-    """Return a short way from the start through the poses (N, 6): their order."""
-    return np.array(shortest_way(_apart(q, q), _apart(start[None], q)[0]), dtype=int)
+def visit_order(q: Array, start: Array) -> Array:
+    """Return the order of the poses (N, n) on a short path from ``start`` (n,)."""
+    between, first = _joint_distance(q, q), _joint_distance(start[None], q)[0]
+    return np.array(shortest_way(between, first), dtype=int)
 
 
-def _apart(q: Array, to: Array) -> Array:
-    """Return how far the joint that moves most goes from ``q`` (A, n) to ``to`` (B, n): (A, B)."""
+def _joint_distance(q: Array, to: Array) -> Array:
+    """Return the largest joint motion (A, B), rad, from ``q`` (A, n) to ``to`` (B, n)."""
     return np.asarray(np.abs(q[:, None] - to[None]).max(axis=2))
 
 
 @dataclass(frozen=True)
 class Plan:
-    """Poses of the whole demo, each list in the order of its visits."""
+    """Poses of the whole demo, in the order of the visits."""
 
     calibration: tuple[Array, ...]  # per calibration load (N, 6)
-    test: tuple[Array, ...]  # visits per test load (M, 6), at no pose of the calibration
+    test: tuple[Array, ...]  # visits per test load (M, 6), none at a calibration pose
 
 
-def plan(model: Model, home: Array, seed: int, scene: Scene = UR10E) -> Plan:
+def plan(model: Model, home: Array, seed: int, experiment: Experiment = UR10E) -> Plan:
     """Return informative poses per calibration load and random ones per test load."""
-    free = candidates(model, seed, scene.workspace)
+    free = candidates(model, seed, experiment.workspace)
     n = model.arm.n
-    known = np.eye(2 * n) * 1e-2
+    information = np.eye(2 * n) * 1e-2
     used: set[int] = set()
     calibration = []
-    for load in scene.calibration_loads:
-        chosen = informative(model, free, load, scene.calibrate, known)
+    for load in experiment.calibration_loads:
+        chosen = informative(model, free, load, experiment.calibration_poses, information)
         used |= set(chosen.tolist())
-        calibration.append(free[chosen][tour(free[chosen], home)])
+        calibration.append(free[chosen][visit_order(free[chosen], home)])
     position = model.rigid_pose(free).position
-    far = np.flatnonzero(np.hypot(position[:, 0], position[:, 1]) > scene.workspace.far)
-    rest = free[[i for i in far if i not in used]]
+    far = np.flatnonzero(np.hypot(position[:, 0], position[:, 1]) > experiment.workspace.far)
+    unused = free[[i for i in far if i not in used]]
     tests = []
-    for k in range(len(scene.test_loads)):
-        chosen_poses = rest[k * scene.test : (k + 1) * scene.test]
-        chosen_poses = chosen_poses[tour(chosen_poses, home)]
-        tests.append(np.tile(chosen_poses, (scene.visits[k], 1)))
+    for k in range(len(experiment.test_loads)):
+        chosen_poses = unused[k * experiment.test_poses : (k + 1) * experiment.test_poses]
+        chosen_poses = chosen_poses[visit_order(chosen_poses, home)]
+        tests.append(np.tile(chosen_poses, (experiment.visits[k], 1)))
     return Plan(tuple(calibration), tuple(tests))

@@ -1,4 +1,4 @@
-"""Commands that run beside the demo: ``gapbridge simulate`` of its cell, and the diagnosis."""
+"""Child processes of the demo: ``gapbridge simulate`` and ``gapbridge diagnose``."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from gapbridge.core.errors import LinkError, RunError
 PR_SET_PDEATHSIG = 1  # prctl's
 START_LIMIT = 40.0  # s
 STOP_LIMIT = 5.0  # s
-LONGEST = 900.0  # s, on a machine that stalls
-POLITE = 10  # niceness: the loop comes first
+MAX_DURATION = 900.0  # s, also on a machine that stalls
+NICENESS = 10  # below the control loop
 
 
 class ServedCell:
-    """The simulated controller of a cell while the ``with`` block lasts."""
+    """The simulated controller of a cell, running while the ``with`` block lasts."""
 
     def __init__(self, cell: Path, seed: int) -> None:
         self._command = [
@@ -34,7 +34,7 @@ class ServedCell:
         self._lines: list[str] = []
 
     def __enter__(self) -> Self:
-        """Start it and wait until it serves. Raises LinkError, with its last words."""
+        """Start it and wait until it serves. Raises LinkError with its last line of output."""
         self._process = subprocess.Popen(
             self._command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT, text=True, env=environment(), start_new_session=True,
@@ -56,7 +56,7 @@ class ServedCell:
                 raise LinkError(f"the simulated controller did not start: {last}")
 
     def _read(self, lines: queue.Queue[str]) -> None:
-        """Take what it says, to its end: a full pipe would stop it."""
+        """Read its output to the end: a full pipe would block it."""
         assert self._process is not None
         assert self._process.stdout is not None
         for line in self._process.stdout:
@@ -80,13 +80,13 @@ class ServedCell:
 
 
 def _end_with_parent() -> None:
-    """Have the kernel end the controller with the demo, however that ends: ports stay free."""
+    """Have the kernel end the controller with the demo, however that ends, to free its ports."""
     if sys.platform.startswith("linux"):
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0)
 
 
-class Diagnosing:
-    """``gapbridge diagnose`` as a process of its own while the ``with`` block lasts."""
+class DiagnosisProcess:
+    """``gapbridge diagnose``, running in the background while the ``with`` block lasts."""
 
     def __init__(self, log: Path, cell: Path, out: Path, new_cell: Path) -> None:
         self._command = [
@@ -98,17 +98,17 @@ class Diagnosing:
     def __enter__(self) -> Self:
         self._process = subprocess.Popen(
             self._command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
-            stdin=subprocess.DEVNULL, env=environment(), preexec_fn=lambda: os.nice(POLITE),
+            stdin=subprocess.DEVNULL, env=environment(), preexec_fn=lambda: os.nice(NICENESS),
         )  # fmt: skip
         return self
 
-    def answer(self) -> str:
-        """Wait for the answer in plain sentences. Raises RunError where there is none."""
+    def output(self) -> str:
+        """Wait for the end and return what was printed. Raises RunError where it failed."""
         assert self._process is not None
         try:
-            output, _ = self._process.communicate(timeout=LONGEST)
+            output, _ = self._process.communicate(timeout=MAX_DURATION)
         except subprocess.TimeoutExpired:
-            raise RunError(f"the diagnosis did not end within {LONGEST:g} s") from None
+            raise RunError(f"the diagnosis did not end within {MAX_DURATION:g} s") from None
         if self._process.returncode:
             raise RunError(f"the diagnosis failed: {output.strip()[-300:]}")
         return output.strip()

@@ -1,4 +1,4 @@
-"""What the demo has shown, as numbers."""
+"""The figures of a demo run."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from gapbridge.bridge.demo.hidden import Accused, Hidden
+from gapbridge.bridge.demo.hidden import HiddenEffects, NamedCause
+from gapbridge.bridge.demo.measurements import Measurements
 from gapbridge.bridge.demo.poses import TEST_LOADS, Load
-from gapbridge.bridge.demo.rests import Rests
 from gapbridge.core.arrays import Array
 from gapbridge.core.compensation import correct
 from gapbridge.core.effects import settling
@@ -20,17 +20,17 @@ from gapbridge.core.model import Model
 
 @dataclass(frozen=True)
 class LoopFigures:
-    """How the daemon's loop kept time."""
+    """Timing of the daemon's loop."""
 
     rate: float  # Hz
-    missed: int  # cycles of the controller that were not seen
+    missed: int  # cycles of the controller that were missed
     cycles: int
     p99: float  # us, age of the state behind a setpoint, in the worst run
 
 
 @dataclass(frozen=True)
 class Resolution:
-    """What one count on the wire comes to at the TCP, m: the finest that a link can say."""
+    """Resolution of a link at the TCP, m: what one count of its protocol comes to."""
 
     written: float  # of an offset, or of a joint setpoint times the reach
     read: float  # of the joints as read, times the reach
@@ -39,29 +39,29 @@ class Resolution:
 
 @dataclass(frozen=True)
 class Result:
-    """The whole demo."""
+    """The result of the whole demo."""
 
     link: str
     seed: int
     identification: Identification
     model: Model  # calibrated
-    without: Rests  # test visits, effect-free setpoints
-    compensated: Rests  # the same visits, corrected setpoints
+    uncompensated: Measurements  # test visits, setpoints of the rigid arm
+    compensated: Measurements  # the same visits, corrected setpoints
     loads: tuple[str, ...]  # name of the load of each visit
     setpoints_written: int
     loop: LoopFigures
     duration: float  # s
     resolution: Resolution = Resolution(0.0, 0.0)
     test_loads: tuple[Load, ...] = TEST_LOADS
-    explained: Rests | None = None  # the same visits, corrected by what the diagnosis named too
-    hidden: Hidden | None = None  # the truth beside the flexibilities
-    corrected: Model | None = None  # with what the diagnosis named
-    accused: tuple[Accused, ...] = ()  # by the diagnosis, with the fitted flexibilities
+    explained: Measurements | None = None  # the same visits, the named causes corrected too
+    hidden: HiddenEffects | None = None  # true effects besides the flexibilities
+    corrected: Model | None = None  # with the causes that the diagnosis named
+    causes: tuple[NamedCause, ...] = ()  # named by the diagnosis after the fit
 
     @property
     def error_without(self) -> Array:
-        """Return the distance (M,) (m) of the TCP from where it was wanted, uncompensated."""
-        return tcp_error(self.model, self.without)
+        """Return the distance (M,), m, of the TCP from its intended position, uncompensated."""
+        return tcp_error(self.model, self.uncompensated)
 
     @property
     def error_fitted(self) -> Array:
@@ -70,28 +70,28 @@ class Result:
 
     @property
     def error_with(self) -> Array:
-        """Return the same, corrected by all that was found."""
+        """Return the same, corrected by fit and diagnosis."""
         return tcp_error(self.model, self.explained or self.compensated)
 
     @property
     def joint_errors(self) -> tuple[Array, Array] | None:
-        """Return how far joints rest from where they are wanted (M, n), rad: before and after.
+        """Return the joint errors at rest (M, n), rad, without and with compensation.
 
-        None where no servo gives way. Wanted is what corrects the arm behind the servos.
+        None where no servo yields. Their reference corrects the arm's effects, not the servos'.
         """
         servos = () if self.corrected is None else settling(self.corrected.terms)
         if self.corrected is None or self.explained is None or not servos:
             return None
-        kept = tuple(t for t in self.corrected.terms if t not in servos)
-        rests = self.explained
-        loads = Loads(rests.payload, rests.payload_cog, rests.force)
-        wanted = correct(replace(self.corrected, terms=kept), rests.nominal_q, loads).q
-        before = self.without.actual_q - self.without.nominal_q
-        return before, rests.actual_q - wanted
+        others = tuple(t for t in self.corrected.terms if t not in servos)
+        run = self.explained
+        loads = Loads(run.payload, run.payload_cog, run.force)
+        intended = correct(replace(self.corrected, terms=others), run.nominal_q, loads).q
+        before = self.uncompensated.actual_q - self.uncompensated.nominal_q
+        return before, run.actual_q - intended
 
     @property
-    def series(self) -> tuple[tuple[str, Array], ...]:
-        """Return the errors (M,) of each round of visits, by what corrected them."""
+    def rounds(self) -> tuple[tuple[str, Array], ...]:
+        """Return name and errors (M,), m, of each round of visits."""
         if self.explained is None:
             return (("without", self.error_without), ("with compensation", self.error_with))
         return (
@@ -101,8 +101,8 @@ class Result:
 
     @property
     def repeatability(self) -> float:
-        """Return how far (m, rms) the arm comes back from where it was: measured on revisits."""
-        return repeatability([self.without, self.compensated], self.loads)
+        """Return the rms distance (m) between visits of one pose and their mean."""
+        return repeatability([self.uncompensated, self.compensated], self.loads)
 
     def summary(self) -> dict[str, Any]:
         """Return what summary.json holds."""
@@ -118,7 +118,7 @@ class Result:
             "hidden": None if self.hidden is None else dict(self.hidden.truth),
             "accused": {
                 name: {"value": value, "std": std, "unit": unit}
-                for cause in self.accused
+                for cause in self.causes
                 for name, value, std, unit in cause.parameters
             },
             "joint_error_mrad": self._joint_figures(),
@@ -142,27 +142,22 @@ class Result:
         return {k: millimetres(np.abs(e)) for k, e in zip(("without", "with"), errors, strict=True)}
 
 
-def reach(model: Model) -> float:
-    """Return the length of the stretched arm with its tool, m."""
-    return model.length
+def tcp_error(model: Model, measurements: Measurements) -> Array:
+    """Return the distance (M,), m, of the measured TCP from the rigid arm's at the nominal pose."""
+    intended = model.rigid_pose(measurements.nominal_q).position
+    return np.asarray(np.linalg.norm(measurements.position - intended, axis=1))
 
 
-def tcp_error(model: Model, rests: Rests) -> Array:
-    """Return the distance (M,) (m) of the measured TCP from the rigid arm's at the meant pose."""
-    wanted = model.rigid_pose(rests.nominal_q).position
-    return np.asarray(np.linalg.norm(rests.position - wanted, axis=1))
-
-
-def repeatability(runs: list[Rests], labels: tuple[str, ...]) -> float:
+def repeatability(runs: list[Measurements], labels: tuple[str, ...]) -> float:
     """Return the rms distance (m) of visits from the mean of all visits to the same pose.
 
-    Within each run, pose and load; corrected for the degree of freedom that each mean takes.
+    Per run, pose and load; each mean takes one degree of freedom. NaN without repeated visits.
     """
     square, freedom = 0.0, 0
-    for rests in runs:
-        keys = [(label, *q) for label, q in zip(labels, rests.nominal_q.tolist(), strict=True)]
+    for run in runs:
+        keys = [(label, *q) for label, q in zip(labels, run.nominal_q.tolist(), strict=True)]
         for key in set(keys):
-            rows = rests.position[[i for i, k in enumerate(keys) if k == key]]
+            rows = run.position[[i for i, k in enumerate(keys) if k == key]]
             square += float(np.sum((rows - rows.mean(axis=0)) ** 2))
             freedom += len(rows) - 1
     return float(np.sqrt(square / freedom)) if freedom else float("nan")
@@ -174,10 +169,10 @@ def millimetres(error: Array) -> dict[str, float]:
 
 
 def visits_of_poses(result: Result) -> list[list[int]]:
-    """Return the rows of each pose and load, in the order of their first visit."""
-    found: dict[tuple[object, ...], list[int]] = {}
+    """Return the row numbers of each pose and load, in the order of the first visit."""
+    rows: dict[tuple[object, ...], list[int]] = {}
     for i, (load, q) in enumerate(
-        zip(result.loads, np.round(result.without.nominal_q, 9).tolist(), strict=True)
+        zip(result.loads, np.round(result.uncompensated.nominal_q, 9).tolist(), strict=True)
     ):
-        found.setdefault((load, *q), []).append(i)
-    return list(found.values())
+        rows.setdefault((load, *q), []).append(i)
+    return list(rows.values())

@@ -1,4 +1,4 @@
-"""The cell during the demo: loads are hung, the daemon runs, the tracker looks on."""
+"""Measurement runs of the demo: attach a load, run the daemon, record the tracker."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from gapbridge.bridge.daemon.daemon import Daemon, settings_of
 from gapbridge.bridge.daemon.summary import RunSummary
 from gapbridge.bridge.demo.bench import Tracker
 from gapbridge.bridge.demo.links.link import DemoLink
+from gapbridge.bridge.demo.measurements import FEW_READINGS, Measurements, joined, measurements_at
 from gapbridge.bridge.demo.poses import Load
-from gapbridge.bridge.demo.rests import FEW_READINGS, Rests, joined, rests_so_far
 from gapbridge.bridge.demo.result import LoopFigures
 from gapbridge.bridge.loop.supervisor import Cause, State
 from gapbridge.core.arrays import Array
@@ -23,38 +23,38 @@ from gapbridge.core.errors import LinkError, RunError
 from gapbridge.core.log.mcap_reading import read_columns
 from gapbridge.drivers.clock import SYSTEM, Clock
 
-SLOWEST = 4  # a machine that cannot keep the cell's rate runs at half of it, or at a fourth
-MARGIN = 60.0  # s to connect, arm and end, on top of the trajectory
-PATIENCE = 1200.0  # s that a machine which stalls may take longer over one load
-PAUSE = 5.0  # s after a run in which a stalled machine came no farther
-STALL = 0.05  # s that a timer of this process comes late: the machine stood still
-STALLED = (
+MAX_SLOWDOWN = 4  # where deadlines are missed the rate is halved, down to this fraction
+MARGIN = 60.0  # s to connect, arm and end, in addition to the trajectory
+MAX_STALL_TIME = 1200.0  # s for all runs with one load, retries after stalls included
+RETRY_PAUSE = 5.0  # s after a run without a completed visit
+MAX_TIMER_DELAY = 0.05  # s; a timer later than this means that the machine stalled
+STALL_CAUSES = (
     Cause.OVERRUN, Cause.STALE, Cause.RESYNC, Cause.SILENCE, Cause.LINK_LOST, Cause.INEFFECTIVE,
     Cause.WRITE_FAILED, Cause.SOURCE_DRY, "limits.following",
     FEW_READINGS,
 )  # fmt: skip
-"""Why a run ends on a machine that stands still: deadlines, and an arm that was left behind."""
-FRUITLESS = 4  # runs in a row without a visit, and no timer late: that is no machine standing still
+"""Errors of a run that a stalled machine causes: missed deadlines, following errors."""
+MAX_RUNS_WITHOUT_VISIT = 4  # in a row and without a late timer: no stall, a failure
 
 
-class Ended(NamedTuple):
-    """How far a run came: the rests up to there, and why it broke off; empty: it did not."""
+class RunOutcome(NamedTuple):
+    """Result of one run: its measurements, and the error that ended it (empty: completed)."""
 
-    found: Rests | None
-    broke: str
-    stalled: bool  # the machine stood still meanwhile
+    measurements: Measurements | None
+    error: str
+    stalled: bool  # a timer came late during the run
 
 
-class Lateness(threading.Thread):
-    """Sees whether this machine stands still while the ``with`` block lasts."""
+class TimerDelay(threading.Thread):
+    """Measures how late timers come on this machine while the ``with`` block lasts."""
 
     def __init__(self) -> None:
-        super().__init__(name="lateness", daemon=True)
+        super().__init__(name="timer delay", daemon=True)
         self._over = threading.Event()
-        self.worst = 0.0  # s
+        self.worst = 0.0  # s, largest delay so far
 
     def run(self) -> None:
-        """Wait for short times, and see how much longer it takes."""
+        """Wait 5 ms repeatedly and keep the largest delay."""
         before = time.monotonic()
         while not self._over.wait(0.005):
             now = time.monotonic()
@@ -70,7 +70,7 @@ class Lateness(threading.Thread):
 
 
 class Session:
-    """Runs of the daemon on one simulated cell, one after the other."""
+    """Successive runs of the daemon on one simulated cell."""
 
     def __init__(
         self, link: DemoLink, folder: Path, emit: Callable[[str], None], clock: Clock = SYSTEM
@@ -82,87 +82,88 @@ class Session:
         self._runs: list[RunSummary] = []
         self._slower = 1
 
-    def visit(self, cell: Cell, load: Load, poses: Array) -> Rests:
-        """Visit poses (M, n) with a load on the arm; returns what was measured at each.
+    def visit(self, cell: Cell, load: Load, poses: Array) -> Measurements:
+        """Visit poses (M, n) under a load and return the measurements at each.
 
-        The daemon writes setpoints corrected by the cell's model: a cell without compliance is
-        one without compensation. There is one try: a run that breaks off because this machine
-        stood still goes on from home with the visits that are left, at half the rate where
-        deadlines were missed. Raises RunError where a run breaks off for any other reason, or the
-        machine stalls for longer than PATIENCE.
+        The daemon writes setpoints corrected by the cell's model; without compliance in the cell
+        nothing is corrected. A run that ends because this machine stalled is continued from home
+        with the remaining visits, at half the rate where deadlines were missed. Raises RunError
+        where a run ends for any other reason, or stalls last longer than MAX_STALL_TIME.
         """
         cell = self._link.declared(cell, load)
-        latest = self._clock.monotonic() + PATIENCE
-        parts: list[Rests] = []
-        left, fruitless = poses, 0
-        longest = self._link.prepare(self._folder, left)
+        latest = self._clock.monotonic() + MAX_STALL_TIME
+        parts: list[Measurements] = []
+        remaining, runs_without_visit = poses, 0
+        longest = self._link.prepare(self._folder, remaining)
         bench = self._link.bench()
         try:
-            bench.hang(load)
+            bench.attach(load)
             while True:
-                ended = self._run(cell, load, left, longest)
-                if ended.found is not None:
-                    parts.append(ended.found)
-                    left = left[len(ended.found) :]
-                fruitless = 0 if ended.found is not None or ended.stalled else fruitless + 1
-                if ended.broke or len(left):
-                    self._require_stall(ended, fruitless, latest)
+                outcome = self._run(cell, load, remaining, longest)
+                if progress := outcome.measurements is not None:
+                    parts.append(outcome.measurements)
+                    remaining = remaining[len(outcome.measurements) :]
+                runs_without_visit = 0 if progress or outcome.stalled else runs_without_visit + 1
+                if outcome.error or len(remaining):
+                    self._check_outcome(outcome, runs_without_visit, latest)
                     self._emit(
-                        f"  this machine stood still ({ended.broke}); {len(poses) - len(left)} of "
-                        f"{len(poses)} visits are done, going on{self._slow(ended.broke)}"
+                        f"  this machine stalled ({outcome.error}); "
+                        f"{len(poses) - len(remaining)} of {len(poses)} visits done, "
+                        f"continuing{self._slow_down(outcome.error)}"
                     )
-                    self._clock.sleep(0.0 if ended.found is not None else PAUSE)
-                    bench.go(self._link.home)  # the next run begins there
-                if not len(left):
+                    self._clock.sleep(0.0 if progress else RETRY_PAUSE)
+                    bench.move_to(self._link.home)  # the next run begins there
+                if not len(remaining):
                     return parts[0] if len(parts) == 1 else joined(parts)
-                longest = self._link.prepare(self._folder, left)
+                longest = self._link.prepare(self._folder, remaining)
         finally:
             bench.close()
 
-    def _require_stall(self, ended: Ended, fruitless: int, latest: float) -> None:
-        """Raise RunError where a run has not broken off for a stalled machine, or too late."""
-        known = fruitless < FRUITLESS and any(cause in ended.broke for cause in STALLED)
-        if not (ended.stalled or known):
-            raise RunError(ended.broke or "the run ended before its last visit")
+    def _check_outcome(self, outcome: RunOutcome, runs_without_visit: int, latest: float) -> None:
+        """Raise RunError where no stall ended the run, or stalls last too long."""
+        retry = any(cause in outcome.error for cause in STALL_CAUSES)
+        retry = retry and runs_without_visit < MAX_RUNS_WITHOUT_VISIT
+        if not (outcome.stalled or retry):
+            raise RunError(outcome.error or "the run ended before its last visit")
         if self._clock.monotonic() > latest:
-            raise RunError(f"this machine stalled for {PATIENCE:g} s and more: {ended.broke}")
+            raise RunError(f"stalled for more than {MAX_STALL_TIME:g} s: {outcome.error}")
 
-    def _slow(self, broke: str) -> str:
-        """Halve the rate from here on where deadlines were missed; return that in words."""
-        if Cause.OVERRUN not in broke or self._slower >= SLOWEST:
+    def _slow_down(self, error: str) -> str:
+        """Halve the rate of later runs where deadlines were missed; return the message for it."""
+        if Cause.OVERRUN not in error or self._slower >= MAX_SLOWDOWN:
             return ""
         self._slower *= 2
-        return f" at {1 / self._slower:g} of the rate, which this machine may keep"
+        return f" at {1 / self._slower:g} of the rate"
 
     def _settings(self, cell: Cell) -> DaemonSettings:
-        given = settings_of(cell)
-        link = given.link.model_copy(update={"rate": given.link.rate / self._slower})
-        return given.model_copy(update={"link": link, "uncorrected": True})
+        settings = settings_of(cell)
+        link = settings.link.model_copy(update={"rate": settings.link.rate / self._slower})
+        return settings.model_copy(update={"link": link, "uncorrected": True})
 
-    def _run(self, cell: Cell, load: Load, poses: Array, longest: float) -> Ended:
-        """Run the daemon through the poses, or as far as it comes."""
+    def _run(self, cell: Cell, load: Load, poses: Array, longest: float) -> RunOutcome:
+        """Run the daemon through the poses until the end or the first error."""
         daemon = Daemon(self._settings(cell), may_write=True)
         over = threading.Event()
         watch = threading.Thread(target=_watch, args=(daemon, over, longest + MARGIN), daemon=True)
         watch.start()
-        summary, broke = None, ""
-        with Lateness() as late:
+        summary, error = None, ""
+        with TimerDelay() as timer:
             try:
                 with Tracker(self._link.bench()) as tracker, self._link.motion(daemon, poses):
                     summary = daemon.run(arm=True)
                 readings = tracker.readings()
-            except LinkError as error:
-                broke = str(error)
+            except LinkError as link_error:
+                error = str(link_error)
             finally:
                 over.set()
-        stalled = late.worst > STALL
+        stalled = timer.worst > MAX_TIMER_DELAY
         if summary is not None:
             self._runs.append(summary)
-        if summary is None or broke or summary.recording is None:
-            return Ended(None, broke or "nothing was recorded", stalled)
+        if summary is None or error or summary.recording is None:
+            return RunOutcome(None, error or "nothing was recorded", stalled)
         recording = read_columns(summary.recording, reported_only=True)
-        found, missing = rests_so_far(recording, readings, poses, load, self._link.settling)
-        return Ended(found, summary.faults[0] if summary.faults else missing, stalled)
+        measured, missing = measurements_at(recording, readings, poses, load, self._link.settling)
+        return RunOutcome(measured, summary.faults[0] if summary.faults else missing, stalled)
 
     @property
     def written(self) -> int:
@@ -182,7 +183,7 @@ class Session:
 
 
 def _watch(daemon: Daemon, over: threading.Event, longest: float) -> None:
-    """Stop a run that no longer writes: the daemon goes on observing after a fault."""
+    """Stop a run that no longer writes: after a fault the daemon would keep observing."""
     began, latest = False, time.monotonic() + longest
     while not over.wait(0.1):
         state = daemon.state

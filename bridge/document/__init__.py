@@ -1,1 +1,1 @@
-"""Documents for people: blocks, pictures and tables, written as HTML and as PDF."""
+"""Documents of blocks, drawings and tables, written as HTML and PDF; texts of findings."""

@@ -1,4 +1,4 @@
-"""Axes of a chart: scales, ticks, and the way from values to places."""
+"""Charts: axes with scales and ticks, and the marks drawn in them."""
 
 from __future__ import annotations
 
@@ -26,34 +26,34 @@ from gapbridge.core.arrays import Array
 
 WIDTH, HEIGHT = 340.0, 230.0
 LEFT, RIGHT, TOP, BOTTOM = 44.0, 10.0, 30.0, 38.0
-TITLE = 20.0  # px: of the y axis' title and what stands between
-FIGURE, MINUS = 6.4, 8.4  # px of a figure and of a minus sign of 10 px, in the widest usual font
+TITLE = 20.0  # px of the y axis' title and its margin
+DIGIT, MINUS = 6.4, 8.4  # px, width of a digit and a minus sign of 10 px in the widest usual font
 
 
 def plain(value: float) -> str:
-    """Return a number without trailing zeros, nor zeros before an exponent: ticks have no room."""
+    """Return a number without trailing zeros and without leading zeros in its exponent."""
     digits, e, exponent = f"{value:.4g}".partition("e")
     return f"{digits}{e}{int(exponent) if e else ''}".replace("-", "−")
 
 
 def _width(text: str) -> float:
-    """Return the px that a number of 10 px needs at most."""
-    return FIGURE * len(text) + (MINUS - FIGURE) * text.count("−")
+    """Return the largest width, px, of a number in 10 px type."""
+    return DIGIT * len(text) + (MINUS - DIGIT) * text.count("−")
 
 
 @dataclass(frozen=True)
 class Scale:
-    """One axis: what it shows, from where to where."""
+    """One axis: title, range and ticks."""
 
     title: str
     low: float
     high: float
     ticks: tuple[float, ...] = ()  # none: no grid
-    labels: tuple[str, ...] = ()  # instead of the ticks' numbers
+    labels: tuple[str, ...] = ()  # of the ticks, instead of their numbers
     log: bool = False
 
     def share(self, value: float) -> float:
-        """Return how far along the axis a value lies, 0 to 1."""
+        """Return the position of a value on the axis, 0 to 1."""
         if self.log:
             low, high = math.log10(self.low), math.log10(self.high)
             value = math.log10(max(value, self.low))
@@ -64,9 +64,9 @@ class Scale:
 def scale(
     title: str, values: Sequence[float], *, tight: bool = False, ticks: int = 4, zero: bool = True
 ) -> Scale:
-    """Return a scale that holds all values, and 0 where ``zero``, with round ticks.
+    """Return a scale with round ticks that covers all values, and 0 where ``zero``.
 
-    It begins and ends at a tick, or, ``tight``, a little beyond the values.
+    It begins and ends at a tick; where ``tight``, 4 % beyond the values.
     """
     finite = [float(v) for v in values if math.isfinite(v)] or [0.0]
     low, high = min(finite), max(finite)
@@ -84,7 +84,7 @@ def scale(
 
 
 def logarithmic(title: str, values: Sequence[float]) -> Scale:
-    """Return a scale in powers of ten that holds all values above 0."""
+    """Return a logarithmic scale that covers all values above 0."""
     positive = [float(v) for v in values if math.isfinite(v) and v > 0] or [1.0]
     steps = (1.0, 2.0, 5.0)
     first = math.floor(math.log10(min(positive)))
@@ -92,20 +92,20 @@ def logarithmic(title: str, values: Sequence[float]) -> Scale:
     every = [k * 10.0**e for e in range(first, last + 1) for k in steps]
     low = max(v for v in every if v <= min(positive) * (1 + 1e-9))
     high = min((v for v in every if v >= max(positive) and v > low), default=2 * low)
-    kept = tuple(v for v in every if low <= v <= high)
-    if len(kept) > 7:
-        kept = tuple(v for v in kept if abs(math.log10(v) % 1) < 1e-9)
-    return Scale(title, low, high, kept, log=True)
+    ticks = tuple(v for v in every if low <= v <= high)
+    if len(ticks) > 7:
+        ticks = tuple(v for v in ticks if abs(math.log10(v) % 1) < 1e-9)
+    return Scale(title, low, high, ticks, log=True)
 
 
 def visible(values: Sequence[float]) -> list[float]:
-    """Return values for a scale in powers of ten, the least ones not to stretch it."""
+    """Return values for a logarithmic scale, at least a twentieth of their lower quartile."""
     least = sorted(values)[len(values) // 4] / 20 if values else 0.0
     return [max(v, least) for v in values]
 
 
 def named(title: str, labels: Sequence[str]) -> Scale:
-    """Return a scale of named places 0, 1, 2, ..."""
+    """Return a scale of categories at 0, 1, 2, ..."""
     count = len(labels)
     return Scale(title, -0.5, count - 0.5, tuple(float(i) for i in range(count)), tuple(labels))
 
@@ -133,7 +133,7 @@ class Chart:
         self._axes()
 
     def at(self, x: float, y: float) -> Point:
-        """Return the place of a value."""
+        """Return the place of a value in the drawing, px."""
         return (
             self.left + self.x.share(x) * (self.right - self.left),
             self.bottom - self.y.share(y) * (self.bottom - self.top),
@@ -165,12 +165,12 @@ class Chart:
         self.drawing.add(Rectangle(left, top, right - left, max(bottom - top, 0.5), colour, hint))
 
     def label(self, x: float, y: float, text: str) -> None:
-        """Write a figure just above a value."""
+        """Write a text just above a value."""
         a, b = self.at(x, y)
         self.drawing.add(Text(a, b - 4, text, 9.5, SOFT, "middle"))
 
     def square(self, x: float, y: float, colour: str, side: float = 9.0) -> None:
-        """Draw a square of so many pixels around a value."""
+        """Draw a square of ``side`` px centred on a value."""
         a, b = self.at(x, y)
         self.drawing.add(Rectangle(a - side / 2, b - side / 2, side, side, colour))
 
@@ -181,19 +181,19 @@ class Chart:
         self.drawing.add(Rectangle(left, top, max(right - left, 0.5), bottom - top, colour, hint))
 
     def upright(self, x: float, text: str, colour: str) -> None:
-        """Draw a dashed line upwards, with what it means at its top."""
+        """Draw a dashed vertical line with a text at its top."""
         self.line([x, x], [self.y.low, self.y.high], colour, width=1.2, dashed=True)
         place = self.at(x, self.y.high)
         self.drawing.add(Text(place[0] + 3, place[1] + 8, text, 10, colour))
 
     def level(self, y: float, text: str, colour: str) -> None:
-        """Draw a dashed line across, with what it means at its right end."""
+        """Draw a dashed horizontal line with a text at its right end."""
         self.line([self.x.low, self.x.high], [y, y], colour, width=1.2, dashed=True)
         place = self.at(self.x.high, y)
         self.drawing.add(Text(place[0], place[1] - 4, text, 10, colour, "end"))
 
     def legend(self, entries: Sequence[tuple[str, str]]) -> None:
-        """Say what the colours mean, at the upper right."""
+        """Draw a legend of (text, colour) at the upper right."""
         x = self.right
         for text, colour in reversed(entries):
             x -= 5.6 * len(text)
@@ -202,7 +202,7 @@ class Chart:
             x -= 22
 
     def legend_below(self, entries: Sequence[tuple[str, str]]) -> None:
-        """Say what the colours mean in lines below the axes, for long texts."""
+        """Draw a legend of (text, colour) below the axes, a line per entry, for long texts."""
         for text, colour in entries:
             y = self.drawing.height + 8
             self.drawing.add(Circle(self.left + 4, y - 3.5, 3.6, colour))
@@ -210,7 +210,7 @@ class Chart:
             self.drawing.extend(15)
 
     def _make_equal(self) -> None:
-        """Give both axes the same number of units to the pixel."""
+        """Give both axes the same number of units per pixel."""
         wide, high = self.right - self.left, self.bottom - self.top
         unit = max((self.x.high - self.x.low) / wide, (self.y.high - self.y.low) / high)
         self.x, self.y = _widened(self.x, unit * wide), _widened(self.y, unit * high)
@@ -238,15 +238,15 @@ class Chart:
         self.drawing.add(upright)
 
 
-def _widened(given: Scale, span: float) -> Scale:
-    middle = (given.low + given.high) / 2
-    return Scale(given.title, middle - span / 2, middle + span / 2, given.ticks, given.labels)
+def _widened(axis: Scale, span: float) -> Scale:
+    middle = (axis.low + axis.high) / 2
+    return Scale(axis.title, middle - span / 2, middle + span / 2, axis.ticks, axis.labels)
 
 
 def distribution(title: str, quantity: str, series: Sequence[tuple[str, Array, str]]) -> Chart:
-    """Return the share of values that are at most so large, per series of (name, values, colour).
+    """Return the cumulative distribution of each series of (name, values, colour).
 
-    ``quantity`` names the values, which stand in powers of ten.
+    ``quantity`` is the title of the values' axis, which is logarithmic.
     """
     every = [float(v) for _, values, _ in series for v in values]
     chart = Chart(title, logarithmic(quantity, visible(every)), scale("share, %", [0, 100]))

@@ -1,4 +1,4 @@
-"""Blocks of a report, described once and written twice: as HTML and as PDF."""
+"""Blocks of a report; html.py and pdf.py write them."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Strong:
 
 @dataclass(frozen=True)
 class Badge:
-    """A short word on a coloured ground; ``kind`` is GOOD, DOUBTFUL, BAD or QUIET."""
+    """A short word on a coloured background; ``kind`` is GOOD, DOUBTFUL, BAD or QUIET."""
 
     text: str
     kind: str
@@ -31,7 +31,7 @@ class Badge:
 
 @dataclass(frozen=True)
 class Bar:
-    """A small bar for a share of 0 to 1, with its figure beside it."""
+    """A small bar for a share of 0 to 1, followed by its figure."""
 
     share: float | None
     text: str
@@ -40,13 +40,13 @@ class Bar:
     @property
     def filled(self) -> float:
         """Return the share that can be drawn, 0 to 1."""
-        given = self.share
-        return 0.0 if given is None or not math.isfinite(given) else min(max(given, 0.0), 1.0)
+        share = self.share
+        return 0.0 if share is None or not math.isfinite(share) else min(max(share, 0.0), 1.0)
 
 
 @dataclass(frozen=True)
 class Named:
-    """A name in bold, what belongs to it, and its identifier below."""
+    """A name in bold, further text, and an identifier below."""
 
     text: str
     more: str = ""
@@ -58,11 +58,11 @@ Cell = str | Strong | Badge | Bar | Named
 
 @dataclass(frozen=True)
 class Verdict:
-    """The answer in one word and one sentence."""
+    """A verdict: one word and one sentence."""
 
     badge: Badge
     text: str
-    more: tuple[Badge, ...] = ()  # beside the first
+    more: tuple[Badge, ...] = ()  # after the first
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ class Tile:
 
 @dataclass(frozen=True)
 class Tiles:
-    """Large figures side by side."""
+    """Large figures in a row."""
 
     tiles: tuple[Tile, ...]
 
@@ -105,7 +105,7 @@ class Bullets:
 
 @dataclass(frozen=True)
 class Pairs:
-    """Names and what belongs to them, as on the front of a certificate."""
+    """Names and values, as on the front of a certificate."""
 
     pairs: tuple[tuple[str, str], ...]
     title: str = ""
@@ -113,43 +113,43 @@ class Pairs:
 
 @dataclass(frozen=True)
 class Columns:
-    """Pairs side by side where there is room."""
+    """Pairs in columns where the page is wide enough."""
 
     columns: tuple[Pairs, ...]
 
 
 @dataclass(frozen=True)
 class Table:
-    """A table; ``widths`` are relative, ``numbers`` are the columns that stand to the right."""
+    """A table; ``widths`` are relative, ``numbers`` are the columns that are right-aligned."""
 
     heads: tuple[str, ...]
     rows: Sequence[Sequence[Cell]]
     widths: tuple[float, ...] = ()
     numbers: tuple[int, ...] = ()
-    sums: int = 0  # rows at the end that are set off from the others
+    sums: int = 0  # rows at the end that are sums, below a rule
 
 
 @dataclass(frozen=True)
 class Pictures:
-    """Drawings side by side where there is room, with one caption."""
+    """Drawings in a row where the page is wide enough, with one caption."""
 
     drawings: tuple[Drawing, ...]
     caption: str = ""
 
 
 @dataclass(frozen=True)
-class Beside:
-    """Small tables side by side where there is room."""
+class TableRow:
+    """Small tables in a row where the page is wide enough."""
 
     tables: tuple[Table, ...]
 
 
 @dataclass(frozen=True)
 class Gallery:
-    """One drawing of several, which the page's menus choose from; paper shows the first.
+    """Several drawings, of which menus of the HTML page choose one; the PDF shows the first.
 
-    ``menus`` are titles with their entries; the drawings stand in the order of the menus' entries,
-    those of the last menu next to each other.
+    ``menus`` are titles with their entries; the drawings are in the order of the menus' entries,
+    the last menu varying fastest.
     """
 
     menus: tuple[tuple[str, tuple[str, ...]], ...]
@@ -159,7 +159,7 @@ class Gallery:
 
 @dataclass(frozen=True)
 class View:
-    """Lines in space, which the page lets one turn; paper shows them from one side."""
+    """A 3-D scene that can be turned on the HTML page; the PDF shows one view."""
 
     scene: Scene
     caption: str = ""
@@ -173,7 +173,7 @@ Block = (
     | Bullets
     | Columns
     | Table
-    | Beside
+    | TableRow
     | Pictures
     | Gallery
     | View
@@ -188,7 +188,7 @@ class Part:
     title: str
     about: str
     blocks: Sequence[Block]
-    folded: bool = False  # True: the page shows it only when asked to
+    folded: bool = False  # True: collapsed on the HTML page
 
 
 @dataclass(frozen=True)
@@ -198,21 +198,21 @@ class Document:
     title: str
     subtitle: str
     parts: tuple[Part, ...]
-    footer: str = field(default="")  # stands on every page of the PDF
+    footer: str = field(default="")  # on every page of the PDF
 
 
 @dataclass(frozen=True)
 class Section(Generic[M]):
-    """One section; ``blocks`` makes its blocks of M: none where there is nothing to show."""
+    """One section; ``blocks`` returns its blocks for an M, or none to omit it."""
 
     key: str
     title: str
     blocks: Callable[[M], list[Block]]
     about: str = ""
-    folded: bool = False  # True: the page shows it only when asked to
+    folded: bool = False  # True: collapsed on the HTML page
 
 
 def parts(sections: Sequence[Section[M]], material: M) -> tuple[Part, ...]:
-    """Return the sections that have something to show as parts of a document."""
-    made = [(s, s.blocks(material)) for s in sections]
-    return tuple(Part(s.key, s.title, s.about, b, s.folded) for s, b in made if b)
+    """Return the parts of a document: the sections that are not empty."""
+    content = [(s, s.blocks(material)) for s in sections]
+    return tuple(Part(s.key, s.title, s.about, b, s.folded) for s, b in content if b)

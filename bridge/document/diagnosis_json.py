@@ -15,7 +15,7 @@ SCHEMA = "gapbridge.diagnosis/1"
 
 
 def document(diagnosis: Diagnosis) -> dict[str, Any]:
-    """Return the diagnosis as JSON-ready values; a figure that cannot be had is None."""
+    """Return the diagnosis as JSON-ready values; a figure that is not available is None."""
     values: dict[str, Any] = {
         "schema": SCHEMA,
         "verdict": diagnosis.verdict.value,
@@ -112,25 +112,25 @@ def _cause(cause: Cause, channel: ChannelDiagnosis, diagnosis: Diagnosis) -> dic
 def _parameters(
     cause: Cause, channel: ChannelDiagnosis, diagnosis: Diagnosis
 ) -> list[dict[str, Any]]:
-    """Return a cause's parameters; a moment on clocks that overlap as the first session after it.
+    """Return a cause's parameters; where clocks overlap, a time as the first session after it.
 
-    That time is no time of any of the sessions' clocks.
+    A time of the joined clock would not be one of any session's clock.
     """
-    found: list[dict[str, Any]] = []
+    entries: list[dict[str, Any]] = []
     for p in cause.parameters:
         entry = {"name": p.name, "value": p.value, "std": p.std, "unit": p.unit}
         if p.is_time and not diagnosis.one_clock:
             first = diagnosis.sessions[_first_session(channel, p.value)]
-            found.append({**entry, "value": None, "std": None})
+            entries.append({**entry, "value": None, "std": None})
             name = p.name.removesuffix("_time") + "_session"
-            found.append({"name": name, "value": first, "std": None, "unit": ""})
+            entries.append({"name": name, "value": first, "std": None, "unit": ""})
         else:
-            found.append(entry)
-    return found
+            entries.append(entry)
+    return entries
 
 
 def _first_session(channel: ChannelDiagnosis, moment: float) -> int:
-    """Return the first session with rows after a moment of the joined clock."""
+    """Return the first session with rows after ``moment``, s of the joined clock."""
     observation = channel.selection.observation
     assert observation.times is not None
     assert observation.session is not None
@@ -156,7 +156,7 @@ def _across(carried: Carried, sessions: tuple[str, ...]) -> dict[str, Any]:
 
 
 def _finite(value: Any) -> Any:
-    """Return the value with what is no JSON number turned into None, bools and ints plain."""
+    """Return the value with numbers that JSON does not have (NaN, infinity) as None."""
     if isinstance(value, dict):
         return {k: _finite(v) for k, v in value.items()}
     if isinstance(value, list):

@@ -1,6 +1,6 @@
-"""Drawings: a few shapes in a plane, described once; HTML writes them as SVG, PDF as its lines.
+"""Drawings of plane shapes; svg.py and pdf.py write them.
 
-Colours are names of PALETTE, so that a page can show them dark.
+Colours are names of PALETTE, so that a page can show them in dark mode.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ DARK = {
     AFTER: "#6ea8ff", ON_BAR: "#0e151b", LIMIT: "#4fd093",
     BAD_DOT: "#ff7b72", PALE: "#36557a", VIOLET: "#b98be0",
 }  # fmt: skip
-"""The same on a dark screen."""
+"""The same for dark mode."""
 
 Point = tuple[float, float]
 
 
 @dataclass(frozen=True)
 class Stroke:
-    """How a line is drawn."""
+    """Colour, width and dashes of a line."""
 
     colour: str = INK
     width: float = 1.0
@@ -39,37 +39,37 @@ class Stroke:
 
 
 @dataclass(frozen=True)
-class _Along:
+class _AtPoints:
     """A shape at several points."""
 
     points: tuple[Point, ...]
 
     def moved(self, x: float, y: float) -> Self:
-        """Return the shape elsewhere."""
+        """Return the shape shifted by (x, y)."""
         return replace(self, points=tuple((a + x, b + y) for a, b in self.points))
 
 
 @dataclass(frozen=True)
-class Line(_Along):
+class Line(_AtPoints):
     """A line through points."""
 
     stroke: Stroke
 
 
 @dataclass(frozen=True)
-class _At:
-    """A shape at one place."""
+class _AtPoint:
+    """A shape at one point."""
 
     x: float
     y: float
 
     def moved(self, x: float, y: float) -> Self:
-        """Return the shape elsewhere."""
+        """Return the shape shifted by (x, y)."""
         return replace(self, x=self.x + x, y=self.y + y)
 
 
 @dataclass(frozen=True)
-class Rectangle(_At):
+class Rectangle(_AtPoint):
     """A filled rectangle; (x, y) is its upper left corner."""
 
     width: float
@@ -79,7 +79,7 @@ class Rectangle(_At):
 
 
 @dataclass(frozen=True)
-class Circle(_At):
+class Circle(_AtPoint):
     """A circle, filled or not."""
 
     radius: float
@@ -90,7 +90,7 @@ class Circle(_At):
 
 
 @dataclass(frozen=True)
-class Dots(_Along):
+class Dots(_AtPoints):
     """Many filled circles of one size."""
 
     radius: float
@@ -99,7 +99,7 @@ class Dots(_Along):
 
 
 @dataclass(frozen=True)
-class Text(_At):
+class Text(_AtPoint):
     """A line of text; ``anchor`` is start, middle or end; ``turned`` reads upwards."""
 
     text: str
@@ -119,7 +119,7 @@ class Drawing:
 
     width: float
     height: float
-    title: str  # said to who cannot see it
+    title: str  # for screen readers
     shapes: list[Shape] = field(default_factory=list)
 
     def line(self, points: Sequence[Point], stroke: Stroke) -> None:
@@ -127,7 +127,7 @@ class Drawing:
         self.shapes.append(Line(tuple(points), stroke))
 
     def extend(self, height: float) -> None:
-        """Make room at the bottom."""
+        """Add ``height`` px at the bottom."""
         self.height += height
 
     def add(self, shape: Shape) -> None:

@@ -1,4 +1,4 @@
-"""The words for what a diagnosis reports beside its figures, and for why an effect is no cause."""
+"""Texts of a diagnosis' findings, and of the reasons why an effect is not named as a cause."""
 
 from __future__ import annotations
 
@@ -29,25 +29,25 @@ DAY = 86400.0  # s
 SHOWN = 8  # rows of outliers
 WITHDRAWN = {
     Check.CURVED: "its curve cannot be distinguished from a straight line",
-    Check.INSIDE_BOUNDS: "its value stands on its bound",
-    Check.SIGNIFICANT: "its value may as well be none",
+    Check.INSIDE_BOUNDS: "its value is at its bound",
+    Check.SIGNIFICANT: "its value is not significantly different from zero",
     Check.USUAL_SIZE: "its value is too small to matter",
-    Check.NOT_LOCALISED: "one localised shape does as well",
-    Check.STABLE_VALUE: "it does not keep its value beside the unknown that is left",
-    Check.CONSTANT: "its value is no constant: it goes by {quantity}",
-    Check.COMPANION: "no load is declared, and none is accused",
-    Check.SEPARATED: "the flange hardly turns against gravity here, so that it may as well be "
-    "{quantity}",
-    Check.NOT_A_LEVEL: "it steps as {quantity} changes, so that it may as well go by that",
-    Check.HELD_OUT_GAIN: "it does not shrink the gap on samples that its fit did not see",
-    Check.ALL_ROWS_GAIN: "over all rows the gap does not shrink by it",
+    Check.NOT_LOCALISED: "a localised shape fits as well",
+    Check.STABLE_VALUE: "its value changes when the residual structure is modelled",
+    Check.CONSTANT: "its value is not constant: it depends on {quantity}",
+    Check.COMPANION: "no load is declared or identified",
+    Check.SEPARATED: "the flange hardly turns relative to gravity, so it cannot be separated "
+    "from {quantity}",
+    Check.NOT_A_LEVEL: "it steps where {quantity} changes, so it may depend on that",
+    Check.HELD_OUT_GAIN: "it does not reduce the gap on held-out samples",
+    Check.ALL_ROWS_GAIN: "it does not reduce the gap over all rows",
 }
 
 
 def finding_text(finding: Finding, *, rows: bool = True, title: Callable[[str], str] = str) -> str:
     """Return a finding as a sentence; without ``rows`` it names no lines of a file.
 
-    ``title``: how a parameter or an effect is named in it.
+    ``title``: function from the name of a parameter or an effect to its title.
     """
     if isinstance(finding, LogFinding):
         return log_finding_text(finding)
@@ -60,11 +60,11 @@ def withdrawal_text(reason: Withdrawal) -> str:
 
 
 def considered_text(considered: Considered) -> str:
-    """Return why an effect is not accused."""
+    """Return why an effect is not named as a cause."""
     if considered.outcome is Outcome.NOT_EXCITED:
         return f"not excited; needs {considered.needs}"
     if considered.withdrawal is None:
-        return "does not pay for its parameters beside what is found"
+        return "does not improve the fit enough for its parameters"
     return withdrawal_text(considered.withdrawal)
 
 
@@ -74,13 +74,13 @@ def _fact(fact: Fact, rows: bool, title: Callable[[str], str]) -> str:
             return f"{fact.rows} usable row(s) are too few for a diagnosis"
         case Thinned():
             return (
-                f"causes were searched on {fact.searched} of {fact.rows} rows, evenly taken; "
+                f"causes were searched on {fact.searched} of {fact.rows} rows, evenly spaced; "
                 "fitted and judged on all of them"
             )
         case Outliers():
             return _outliers(fact, rows)
         case NotAccused():
-            return _not_accused(fact, title(fact.term.effect))
+            return _not_named(fact, title(fact.term.effect))
         case Slip():
             return f"{title(fact.term.effect)}: {_slip(fact)}"
         case ParameterNote():
@@ -96,31 +96,31 @@ def _outliers(outliers: Outliers, rows: bool) -> str:
     return f"{text} (row {shown}{', ...' if len(outliers.lines) > SHOWN else ''} of the file)"
 
 
-def _not_accused(found: NotAccused, effect: str) -> str:
-    term = found.term
+def _not_named(fact: NotAccused, effect: str) -> str:
+    term = fact.term
     joint = f" of joint {term.site.joint}" if term.site.joint else ""
-    rest = "; poses not fitted gain by it: a stand-in" if found.stand_in else ""
-    return f"{effect}{joint} is not accused: {withdrawal_text(found.reason)}{rest}"
+    more = "; it improves held-out poses: a stand-in" if fact.stand_in else ""
+    return f"{effect}{joint} is not named as a cause: {withdrawal_text(fact.reason)}{more}"
 
 
 def _slip(slip: Slip) -> str:
     """Return what moved, how far, and between which rows."""
     term, joint = slip.term, slip.term.site.joint
-    what = "the target on the tool" if joint is None else f"the zero of joint {joint}"
+    moved = "the target on the tool" if joint is None else f"the zero of joint {joint}"
     if joint is None:
-        far = f"{1e3 * float(np.linalg.norm(term.values[:-1])):.3g} mm"
+        distance = f"{1e3 * float(np.linalg.norm(term.values[:-1])):.3g} mm"
     else:
-        far = f"{1e3 * term.values[0]:.3g} mrad ({np.degrees(term.values[0]):.3g} deg)"
+        distance = f"{1e3 * term.values[0]:.3g} mrad ({np.degrees(term.values[0]):.3g} deg)"
     when = f"rows {slip.before:g} and {slip.after:g} of the log"
     if slip.timed:
         dated = slip.before // DAY != slip.after // DAY
         when = f"{clock(slip.before, dated)} and {clock(slip.after, dated)}"
-    rest = "; before and after it nothing else changed" if slip.alone else ""
-    return f"{what} moved by {far} between {when}{rest}"
+    more = "; before and after it nothing else changed" if slip.alone else ""
+    return f"{moved} moved by {distance} between {when}{more}"
 
 
 def clock(time: float, dated: bool = False) -> str:
-    """Return a time of day (UTC), if asked for with its date, of seconds since 1970; else s."""
+    """Return seconds since 1970 as time of day (UTC), ``dated`` with its date; else seconds."""
     if time < SINCE_1970:
         return f"{time:.7g} s"
     return datetime.fromtimestamp(time, tz=UTC).strftime(
@@ -130,10 +130,10 @@ def clock(time: float, dated: bool = False) -> str:
 
 def _parameter(note: ParameterNote) -> str:
     if note.state is ParameterState.ON_BOUND:
-        return f"stands on its bound ({note.value:g} {note.unit})"
+        return f"is at its bound ({note.value:g} {note.unit})"
     if note.state is ParameterState.HELD:
         return (
-            "is held nominal: it came out several times as large as its like, and not "
-            "surely; something that is not named may stand behind it"
+            "is held nominal: its estimate is several times as large as those of similar "
+            "parameters and not significant; an unnamed effect may be its cause"
         )
-    return "is not identifiable from these data: others can stand in for it"
+    return "is not identifiable from these data: others can replace it"

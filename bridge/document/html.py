@@ -1,4 +1,4 @@
-"""A document as one HTML file that needs nothing else."""
+"""Write a document as one self-contained HTML file."""
 
 from __future__ import annotations
 
@@ -12,14 +12,18 @@ from gapbridge.bridge.document.svg import colours, svg
 
 
 def html(document: blocks.Document) -> str:
-    """Return the whole page."""
+    """Return the page."""
     links = "".join(f'<a href="#{p.key}">{escape(p.title)}</a>' for p in document.parts)
     body = "".join(_part(part) for part in document.parts)
     title = escape(document.title)
-    moving = any(
+    interactive = any(
         isinstance(b, blocks.Gallery | blocks.View) for p in document.parts for b in p.blocks
     )
-    script = f'<script type="module">{_own("view.js")}{_own("page.js")}</script>' if moving else ""
+    script = (
+        f'<script type="module">{_file("view.js")}{_file("page.js")}</script>'
+        if interactive
+        else ""
+    )
     return (
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
@@ -27,14 +31,14 @@ def html(document: blocks.Document) -> str:
         f"<title>{title}</title>"
         # an empty icon keeps browsers from asking for one
         '<link rel="icon" href="data:,">'
-        f"<style>{colours()}{_own('style.css')}</style></head><body>"
+        f"<style>{colours()}{_file('style.css')}</style></head><body>"
         f"<header><h1>{title}</h1><p>{escape(document.subtitle)}</p><nav>{links}</nav></header>"
         f"<main>{body}</main><footer><p>{escape(document.footer)}</p></footer>"
         f"{script}</body></html>\n"
     )
 
 
-def _own(name: str) -> str:
+def _file(name: str) -> str:
     return files("gapbridge.bridge.document").joinpath(name).read_text(encoding="utf-8")
 
 
@@ -74,7 +78,7 @@ def _columns(block: blocks.Columns) -> str:
     return f'<div class="columns">{"".join(_pairs(p) for p in block.columns)}</div>'
 
 
-def _beside(block: blocks.Beside) -> str:
+def _table_row(block: blocks.TableRow) -> str:
     return f'<div class="grid">{"".join(f"<div>{_table(t)}</div>" for t in block.tables)}</div>'
 
 
@@ -138,7 +142,7 @@ def _table(block: blocks.Table) -> str:
     body = "".join(
         ("<tr>" if number < first_sum else '<tr class="sum">')
         + "".join(
-            # the label stands beside the cell where a phone shows each row as a card
+            # on a phone each row is a card that shows the label of every cell
             f'<td{r} data-label="{escape(h)}"><div>{_cell(c)}</div></td>'
             if c != ""
             else "<td></td>"
@@ -174,6 +178,6 @@ def _cell(cell: blocks.Cell) -> str:
 _WRITERS: dict[type, Callable[..., str]] = {
     blocks.Verdict: _verdict, blocks.Tiles: _tiles, blocks.Heading: _heading,
     blocks.Paragraph: _paragraph, blocks.Bullets: _bullets, blocks.Columns: _columns,
-    blocks.Table: _table, blocks.Beside: _beside, blocks.Pictures: _pictures,
+    blocks.Table: _table, blocks.TableRow: _table_row, blocks.Pictures: _pictures,
     blocks.Gallery: _gallery, blocks.View: _view,
 }  # fmt: skip

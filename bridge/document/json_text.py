@@ -1,4 +1,4 @@
-"""JSON that every reader takes: numbers that it does not know are null."""
+"""Strict JSON: NaN and infinite numbers are written as null."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 
 def json_text(document: Mapping[str, Any], separators: tuple[str, str] | None = None) -> str:
-    """Return a document as JSON; what is no JSON value stands as text."""
+    """Return a document as JSON; values of other types are written as text."""
     try:
         return json.dumps(document, default=str, allow_nan=False, separators=separators)
     except ValueError:

@@ -1,4 +1,4 @@
-"""The words for what is odd about a log, or suspected of it."""
+"""Texts of the findings of log checks."""
 
 from __future__ import annotations
 
@@ -10,51 +10,51 @@ from gapbridge.core.log.log_finding import LogCheck, LogFinding
 
 POSITIONS_OFF = "the measured positions do not follow the arm: {0:.0f mm} off in any frame; "
 ROTATIONS_OFF = "the measured rotations do not follow the arm: "
-PULL = "actual_TCP_force looks {}; expected what the surroundings do to the tool, in base axes"
+PULL = "actual_TCP_force seems {}; expected what the surroundings do to the tool, in base axes"
 TEXTS = {
     LogCheck.MISSPELT: "a column was left out; found {0}; did you mean {1}?",
-    LogCheck.CLOCKS_OVERLAP: "the sessions' timestamps overlap: each has a clock of its own, so "
-    "nothing is said of the time between them",
+    LogCheck.CLOCKS_OVERLAP: "the sessions' timestamps overlap: each has its own clock, so the "
+    "time between them is unknown",
     LogCheck.COPIED_ROWS: "{0} of {1} rows repeat the timestamp before (the first is row {2}); the "
     "moving channels leave them out",
     LogCheck.ROUNDED_TIME: "timestamps are rounded to {0:.3g} s and repeat in {1} rows (the first "
     "is row {2}); the rows were taken as evenly spaced",
     LogCheck.AMBIGUOUS_TIME: "row {0}, column timestamp: found {1:g} again (as in {2} of {3} "
-    "rows), expected a time of its own per row",
+    "rows), expected a different time in each row",
     LogCheck.REPEATED_TIME: "{0} timestamp(s) are repeated",
     LogCheck.BACKWARD_TIME: "{0} timestamp(s) run backwards: rows should be in time order",
     LogCheck.NO_READING: "{0} row(s) have no {1:reading} and were left out",
-    LogCheck.POSITIONS_AT_REST: "the measured positions hardly move: is it the right column?",
+    LogCheck.POSITIONS_AT_REST: "the measured positions hardly change: is it the right column?",
     LogCheck.FAHRENHEIT: "the joint temperatures look like Fahrenheit, expected °C",
-    LogCheck.FEW_POSES: "{0} different pose(s) are few: what is found may be one of several "
-    "explanations; 30 or more that use the joints' whole range separate causes",
-    LogCheck.BEYOND_LIMITS: "joint(s) {0} stand beyond the limits of the cell's arm: is it the "
+    LogCheck.FEW_POSES: "{0} different pose(s) are few: the result may be one of several "
+    "explanations; 30 or more over the joints' whole range separate causes",
+    LogCheck.BEYOND_LIMITS: "joint(s) {0} are beyond the limits of the cell's arm: is it the "
     "right arm?",
-    LogCheck.BEYOND_SESSIONS: "session {0} goes beyond the other sessions in {1:columns}: its "
-    "figure as a new session holds for rows unlike those fitted",
+    LogCheck.BEYOND_SESSIONS: "session {0} is beyond the range of the other sessions in "
+    "{1:columns}: its figure as a new session is an extrapolation",
     LogCheck.BEYOND_FITTED: "{0:columns}: {1} of {2} rows lie outside what was fitted, {3:.4g} to "
     "{4:.4g} {5} (row {6}: {7:.4g})",
-    LogCheck.NOT_IN_BASE: "the measured positions lie {0:.0f mm} from where the arm is, and fit it "
-    "in a frame of their own: they are not in base; set metrology.registered to false",
+    LogCheck.NOT_IN_BASE: "the measured positions lie {0:.0f mm} from the arm's TCP, and fit it in "
+    "another frame: they are not in base; set metrology.registered to false",
     LogCheck.POSITIONS_OFF: POSITIONS_OFF + "is it the right arm, tool and order of joints and "
     "rows?",
     LogCheck.POSITIONS_OFF_BY: POSITIONS_OFF + "{1:finding}: then {2:.1f mm}",
     LogCheck.ROTATIONS_OFF: ROTATIONS_OFF + "{0:.1f} rad off; expected rotation vectors of the TCP",
     LogCheck.ROLL_PITCH_YAW: ROTATIONS_OFF + "they look like roll, pitch and yaw, expected "
     "rotation vectors",
-    LogCheck.TARGET_AXES: "the measured rotations are turned by {0:.2f} rad against the cell's "
-    "tool, the same in every pose: the target's axes are not those of tool.tcp",
+    LogCheck.TARGET_AXES: "the measured rotations differ by a constant {0:.2f} rad from the "
+    "cell's tool: the target's axes are not those of tool.tcp",
     LogCheck.MIRRORED: "they look mirrored (a left-handed frame, or two axes swapped)",
     LogCheck.INVERTED: "they look inverted: the base seen from the tool",
-    LogCheck.JOINT_SIGN: "joint {0} looks turned round in sign",
+    LogCheck.JOINT_SIGN: "joint {0} seems to have the wrong sign",
     LogCheck.ROW_LATE: "they look one row too late",
     LogCheck.ROW_EARLY: "they look one row too early",
     LogCheck.LENGTH_UNIT: "they look like {0}, expected m",
     LogCheck.OTHER_ARM: "they look like those of a {0}",
     LogCheck.FLANGE_NOT_TCP: "they look like the flange's, not the TCP's (tool.tcp)",
-    LogCheck.TCP_SIGN: "tool.tcp looks turned round in sign",
+    LogCheck.TCP_SIGN: "tool.tcp seems to have the wrong sign",
     LogCheck.MODIFIED_DH: "robot.dh looks like modified DH rows (Craig), expected standard ones",
-    LogCheck.DH_SIGN: "{0} of the DH rows looks turned round in sign",
+    LogCheck.DH_SIGN: "{0} of the DH rows seems to have the wrong sign",
     LogCheck.DH_UNIT: "lengths of the DH rows look like {0}, expected m",
     LogCheck.NO_TCP: "the measured point lies at {0:point} in the flange's frame, the cell "
     "declares no tool (tool.tcp)",
@@ -63,21 +63,20 @@ TEXTS = {
     LogCheck.JOINTS_SWAPPED: "joints {0} and {1} look swapped",
     LogCheck.UR_JOINTS_SWAPPED: "joints {0} and {1} look swapped (a UR's elbow and shoulder pan, "
     "as sorted by name)",
-    LogCheck.JOINTS_REVERSED: "the joints look turned round in order",
+    LogCheck.JOINTS_REVERSED: "the joints seem to be in reverse order",
     LogCheck.JOINT_ORDER: "the joints look out of order: {0:order}",
-    LogCheck.PULL_SIGN: PULL.format("turned round in sign"),
-    LogCheck.PULL_IN_TOOL: PULL.format("given in tool axes"),
-    LogCheck.PULL_SIGN_IN_TOOL: PULL.format("turned round in sign and given in tool axes"),
-    LogCheck.WRENCH_SIGN: "ft_raw_wrench looks turned round in sign; expected what the load does "
+    LogCheck.PULL_SIGN: PULL.format("to have the wrong sign"),
+    LogCheck.PULL_IN_TOOL: PULL.format("to be in tool axes"),
+    LogCheck.PULL_SIGN_IN_TOOL: PULL.format("to have the wrong sign and to be in tool axes"),
+    LogCheck.WRENCH_SIGN: "ft_raw_wrench seems to have the wrong sign; expected what the load does "
     "to the sensor (a mass at rest reads its weight, pointing down)",
-    LogCheck.TORQUE_SIGN: "actual_current_as_torque looks turned round in sign; expected what the "
-    "motors deliver",
-    LogCheck.MISSING_FLEXIBILITY: "position: the cell names no joint flexibility, and so many "
-    "causes are hard to prove one by one; asked for alone (`gapbridge fit`), {0} flexibilities "
-    "take the gap from {1:.3g mm} to {2:.3g mm} on poses that their fit did not see: fit "
-    "first, then diagnose what is left",
+    LogCheck.TORQUE_SIGN: "actual_current_as_torque seems to have the wrong sign; expected what "
+    "the motors deliver",
+    LogCheck.MISSING_FLEXIBILITY: "position: the cell has no joint flexibility, which hides other "
+    "causes; a fit of {0} flexibilities alone (`gapbridge fit`) reduces the gap from {1:.3g mm} "
+    "to {2:.3g mm} on held-out poses: fit first, then diagnose what remains",
 }
-WAYS = 8  # between stops, that are named
+MAX_LISTED = 8  # moves between stops that are listed
 READINGS = {
     "measured_position": "measured position",
     "measured_rotation": "measured rotation",
@@ -93,7 +92,7 @@ def log_finding_text(finding: LogFinding) -> str:
 
 
 class _Formatter(Formatter):
-    """What the texts ask for beside Python's own formats: ``mm``, ``column`` and the like."""
+    """Python's formats, and those of the texts: ``mm``, ``columns`` and others."""
 
     def format_field(self, value: Any, format_spec: str) -> str:
         match format_spec:
@@ -109,7 +108,7 @@ class _Formatter(Formatter):
 
                 return value if isinstance(value, str) else str(Hindered(*value))
             case "place":
-                return " and ".join((*value, "where instrument or target stand"))
+                return " and ".join((*value, "the place of instrument or target"))
             case "kg":
                 return ", ".join(f"{mass:g} kg" for mass in value)
             case "members":
@@ -117,8 +116,8 @@ class _Formatter(Formatter):
             case "shares":
                 return ", ".join(f"{name} ({100 * share:.0f} %)" for name, share in value)
             case "ways":
-                more = f" and {len(value) - WAYS} more" if len(value) > WAYS else ""
-                return ", ".join(f"{a} to {b}" for a, b in value[:WAYS]) + more
+                more = f" and {len(value) - MAX_LISTED} more" if len(value) > MAX_LISTED else ""
+                return ", ".join(f"{a} to {b}" for a, b in value[:MAX_LISTED]) + more
             case "finding":
                 return log_finding_text(value)
             case "columns":

@@ -1,9 +1,8 @@
-"""Output files: written beside their place, then renamed, so that none is ever half-written.
+"""Output files: written to a temporary file in the same folder and then renamed, so never partial.
 
-What was written outlives a power cut: the file is synced before its name, and its folder after it.
+They survive a power cut: the file is synced before it is renamed, its folder afterwards.
 
-A new one is the owner's to write and the group's to read (0640), whatever the umask; one that takes
-the place of another keeps that one's permissions.
+A new file has mode 0640, whatever the umask; a file that replaces another keeps its permissions.
 """
 
 from __future__ import annotations
@@ -23,27 +22,26 @@ from gapbridge.core.errors import InputError, RunError
 from gapbridge.core.log.columns import PARQUET
 
 CSV = ".csv"
-LONG = 50_000  # numbers from which a library writes a table as text: ten times as fast
+LONG = 50_000  # numbers from which pyarrow writes a table as text: ten times as fast
 MODE = 0o640  # of a new file
 FOLDER_MODE = 0o750  # of a new folder of recordings, sessions and the like
 
 
 def require_writable(path: Path, *inputs: Path) -> Path:
-    """Return the path if a file can be written there; asked before the work is done.
+    """Return the path if a file can be written there; called before the work is done.
 
-    Raises InputError where its folder is missing, it is a folder or a device itself, or it is one
-    of the inputs.
+    Raises InputError where its folder is missing, it is a folder or a device, or it is an input.
     """
     if path.is_dir():
         raise InputError(f"{path}: found a folder, expected a file to write")
-    if path.exists() and not path.is_file():  # root would put a file in the place of /dev/null
+    if path.exists() and not path.is_file():  # root would replace /dev/null by a file
         raise InputError(f"{path}: found a device or pipe, expected a file to write")
     folder = path.parent
     if not folder.is_dir():
         raise InputError(f"{path}: found no folder {folder}, expected an existing one")
-    for given in inputs:
-        if path.exists() and given.exists() and path.samefile(given):
-            raise InputError(f"{path}: found the output to be the input {given}, expected another")
+    for file in inputs:
+        if path.exists() and file.exists() and path.samefile(file):
+            raise InputError(f"{path}: found the output to be the input {file}, expected another")
     if not os.access(folder, os.W_OK):
         raise InputError(f"{path}: found a folder {folder} that cannot be written to")
     return path
@@ -52,7 +50,7 @@ def require_writable(path: Path, *inputs: Path) -> Path:
 def require_table(path: Path, *inputs: Path) -> Path:
     """Return the path if a table can be written there; see ``require_writable``.
 
-    Raises InputError, too, where its suffix promises another format than CSV or Parquet.
+    Raises InputError also where its suffix is not that of CSV or Parquet.
     """
     require_writable(path, *inputs)
     if path.suffix.lower() not in (CSV, *PARQUET):
@@ -62,9 +60,9 @@ def require_table(path: Path, *inputs: Path) -> Path:
 
 
 def require_folder(path: Path, option: str, *, above: bool = True) -> None:
-    """Make the folder that ``option`` names, with those above it unless they must exist.
+    """Make the folder given by ``option``, and missing parents where ``above``.
 
-    Raises InputError where no file can be written into it.
+    Raises InputError where it cannot be made or written to, or where a parent is missing.
     """
     if path.exists() and not path.is_dir():
         raise InputError(f"{path}: found a file, expected a folder for {option}")
@@ -80,18 +78,21 @@ def require_folder(path: Path, option: str, *, above: bool = True) -> None:
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[IO[str]]:
-    """Give a text file that takes the place of ``path`` when the block ends without an error."""
+    """Open a text file that replaces ``path`` when the block ends without an error."""
     with replacing_bytes(path) as binary:
         file = io.TextIOWrapper(binary, "utf-8", newline="\n")
         try:
             yield file
         finally:
-            file.detach()  # flushes; the file below is closed by who has opened it
+            file.detach()  # flushes; replacing_bytes closes the file
 
 
 @contextlib.contextmanager
 def replacing_bytes(path: Path) -> Iterator[IO[bytes]]:
-    """Give a binary file that takes the place of ``path`` when the block ends without an error."""
+    """Open a binary file that replaces ``path`` when the block ends without an error.
+
+    Raises RunError where it cannot be written.
+    """
     place = Path(os.path.realpath(path))
     part = place.with_name(f".{place.name}.{os.getpid()}.part")
     try:
@@ -101,7 +102,7 @@ def replacing_bytes(path: Path) -> Iterator[IO[bytes]]:
             file.flush()
             os.fsync(file.fileno())
         os.replace(part, place)
-        sync_folder(place.parent)  # else a power cut takes the new file with its name
+        sync_folder(place.parent)  # else a power cut can lose the new file's name
     except OSError as error:
         raise RunError(f"{path}: cannot be written: {error.strerror or error}") from error
     finally:
@@ -110,8 +111,8 @@ def replacing_bytes(path: Path) -> Iterator[IO[bytes]]:
 
 
 def sync_folder(folder: Path) -> None:
-    """Have the names in a folder on disk: a file that was synced can still lose its name."""
-    with contextlib.suppress(OSError):  # not every file system knows it
+    """Sync a folder: the name of a file that was synced is lost otherwise."""
+    with contextlib.suppress(OSError):  # not every file system supports it
         fd = os.open(folder, os.O_RDONLY)
         try:
             os.fsync(fd)
@@ -120,7 +121,7 @@ def sync_folder(folder: Path) -> None:
 
 
 def make_folder(folder: Path) -> None:
-    """Make a folder with all above it, nobody else's (0750), and have them on disk."""
+    """Make a folder and missing parents (mode 0750), and sync them."""
     missing = [path for path in (folder, *folder.parents) if not path.exists()]
     folder.mkdir(FOLDER_MODE, parents=True, exist_ok=True)
     for path in missing:
@@ -128,12 +129,12 @@ def make_folder(folder: Path) -> None:
 
 
 def private(path: str | Path, flags: int) -> int:
-    """Open a file for ``open``: a new one is nobody else's (0640)."""
+    """Open a file, as ``opener`` of ``open``: a new one has mode 0640."""
     return os.open(path, flags | os.O_CLOEXEC, MODE)
 
 
 def _keep_mode(place: Path, fd: int) -> None:
-    """Give a file the permissions of the one whose place it takes."""
+    """Give a file the permissions of the one that it replaces."""
     with contextlib.suppress(OSError):
         os.fchmod(fd, stat.S_IMODE(place.stat().st_mode))
 
@@ -145,9 +146,9 @@ def write_text(path: Path, text: str) -> None:
 
 
 def write_table(path: Path, columns: Sequence[str], table: Array) -> None:
-    """Write rows (N, k) under k column names, as Parquet where the path's suffix says so, or CSV.
+    """Write rows (N, k) under k column names, as Parquet or CSV by the path's suffix.
 
-    Every number reads back exactly.
+    Numbers are written exactly.
     """
     with writing_table(path) as append:
         append(columns, table)
@@ -155,9 +156,9 @@ def write_table(path: Path, columns: Sequence[str], table: Array) -> None:
 
 @contextlib.contextmanager
 def writing_table(path: Path) -> Iterator[Callable[[Sequence[str], Array], None]]:
-    """Give a function that appends rows (N, k) to what ``write_table`` would write at once.
+    """Open a table as ``write_table`` does; returns a function that appends rows (N, k) to it.
 
-    It takes the same column names each time.
+    The function takes the same column names each time.
     """
     with replacing_bytes(path) as binary, contextlib.ExitStack() as opened:
         if path.suffix.lower() in PARQUET:
@@ -177,7 +178,7 @@ def _parquet_to(
     def append(columns: Sequence[str], table: Array) -> None:
         frame = pyarrow.table([table[:, k] for k in range(table.shape[1])], list(columns))
         if not writers:
-            # numbers that hardly repeat: a dictionary of them is work for nothing
+            # numbers hardly repeat: a dictionary would not compress them
             writer = ParquetWriter(binary, frame.schema, use_dictionary=False)
             writers.append(opened.enter_context(writer))
         writers[0].write_table(frame)

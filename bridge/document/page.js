@@ -1,5 +1,5 @@
 
-// What moves on a report: views that turn, and menus that choose a drawing.
+// Interactive parts of a report: 3-D views, and menus that choose a drawing.
 const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(`--${name}`);
 for (const canvas of document.querySelectorAll('canvas.view')) {
   new View(canvas, JSON.parse(canvas.nextElementSibling.textContent), colour);
@@ -12,6 +12,6 @@ for (const gallery of document.querySelectorAll('.gallery')) {
     drawings.forEach((drawing, i) => { drawing.hidden = i !== chosen; });
   };
   menus.forEach((menu) => menu.addEventListener('change', show));
-  show();  // a reload keeps what the menus stood at
+  show();  // the browser restores the menus on a reload
 }
 document.documentElement.dataset.drawn = 'yes';

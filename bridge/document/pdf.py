@@ -1,4 +1,4 @@
-"""A document as a PDF: A4, its own font, numbered pages."""
+"""Write a document as a PDF: A4, embedded font, numbered pages."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ from reportlab.platypus import Paragraph as Text
 
 from gapbridge.bridge.document import blocks
 from gapbridge.bridge.document import drawing as drawn
-from gapbridge.bridge.document.pdf_table import beside_table, columns_table, table, tiles_table
+from gapbridge.bridge.document.pdf_table import columns_table, table, table_row, tiles_table
 from gapbridge.bridge.document.pdf_text import BOLD, PLAIN, STYLES, badge_markup, load_fonts, markup
 
 SIDE, TOP, BOTTOM = 18 * mm, 16 * mm, 18 * mm
 WIDTH = A4[0] - 2 * SIDE
-ROOM = 120  # pt, for a heading and the first rows of a long table
-WHOLE = 14  # rows of a table up to which it is not divided between pages
+MIN_SPACE = 120  # pt, for a heading and the first rows of a long table
+MAX_UNSPLIT_ROWS = 14  # of a table that is kept on one page
 
 
 class DrawnRow(Flowable):
-    """Drawings side by side, made smaller together where they are wider than the page."""
+    """Drawings in a row, scaled down together where they are wider than the page."""
 
     def __init__(
         self, drawings: tuple[drawn.Drawing, ...], gap: float = 16.0, largest: float = 0.76
@@ -95,7 +95,7 @@ def _footer(text: str) -> Callable[[Canvas, BaseDocTemplate], None]:
 
 
 class _Numbered(Canvas):
-    """A canvas whose pages say how many there are, which is known once all are drawn."""
+    """A canvas that prints "page 1 of N": the pages are kept until N is known."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
@@ -119,17 +119,17 @@ class _Numbered(Canvas):
 
 
 def _part(part: blocks.Part) -> list[Flowable]:
-    """Return a section; its heading never stands alone at the foot of a page."""
+    """Return a section; its heading is never alone at the foot of a page."""
     head: list[Flowable] = [Text(markup(part.title), STYLES["h2"])]
     if part.about:
         head.append(Text(markup(part.about), STYLES["note"]))
     kept: list[list[Flowable]] = [head]
     for block in part.blocks:
         groups = _block(block)
-        if isinstance(block, blocks.Table) and len(block.rows) > WHOLE:
-            # its head begins where some of its rows have room, and the rest goes on
+        if isinstance(block, blocks.Table) and len(block.rows) > MAX_UNSPLIT_ROWS:
+            # a long table may be split; its heading needs space for some rows
             loose = kept.pop() if kept[-1] is head or _is_heading(kept[-1][-1]) else []
-            kept += [[CondPageBreak(ROOM)], *[[f] for f in loose], *groups]
+            kept += [[CondPageBreak(MIN_SPACE)], *[[f] for f in loose], *groups]
             continue
         if kept[-1] is head or (_is_heading(kept[-1][-1])):
             kept[-1] = [*kept[-1], *groups.pop(0)]
@@ -142,7 +142,7 @@ def _is_heading(flowable: Flowable) -> bool:
 
 
 def _block(block: blocks.Block) -> list[list[Flowable]]:
-    """Return what a block is made of, in groups that no page's end divides."""
+    """Return the flowables of a block, in groups that are not split between pages."""
     if isinstance(block, blocks.Paragraph):
         return [[Text(markup(block.text), STYLES[block.kind or "text"])]]
     if isinstance(block, blocks.Heading):
@@ -157,14 +157,14 @@ def _block(block: blocks.Block) -> list[list[Flowable]]:
         return [[tiles_table(block, WIDTH), Spacer(1, 8)]]
     if isinstance(block, blocks.Columns):
         return [[columns_table(block, WIDTH), Spacer(1, 6)]]
-    if isinstance(block, blocks.Beside):
-        return [[beside_table(block, WIDTH), Spacer(1, 8)]]
+    if isinstance(block, blocks.TableRow):
+        return [[table_row(block, WIDTH), Spacer(1, 8)]]
     if isinstance(block, blocks.Gallery):
         return _pictures(blocks.Pictures(block.drawings[:1], block.caption))
     if isinstance(block, blocks.View):
         return _pictures(blocks.Pictures((block.scene.drawing(),), block.caption))
     if isinstance(block, blocks.Table):
-        long = len(block.rows) > WHOLE
+        long = len(block.rows) > MAX_UNSPLIT_ROWS
         grid, space = table(block, WIDTH), Spacer(1, 8)
         return [[grid], [space]] if long else [[grid, space]]
     return _pictures(block)
@@ -181,7 +181,7 @@ def _pictures(block: blocks.Pictures) -> list[list[Flowable]]:
 
 
 def _shape(canvas: Canvas, shape: drawn.Shape) -> None:
-    """Draw one shape; a page counts y upwards."""
+    """Draw one shape; y of a PDF page points up."""
     if isinstance(shape, drawn.Line):
         _stroke(canvas, shape.stroke)
         path = canvas.beginPath()

@@ -18,7 +18,7 @@ BAR = 38.0  # pt, a full bar
 
 
 def table(block: blocks.Table, width: float) -> Flowable:
-    """Return a table whose head is repeated on every page that it reaches."""
+    """Return a table whose head is repeated on every page."""
     shares = block.widths or (1.0,) * len(block.heads)
     widths = [width * share / sum(shares) for share in shares]
     heads = [
@@ -67,8 +67,8 @@ def tiles_table(block: blocks.Tiles, width: float) -> Flowable:
     return Grid(cells, [width / columns] * columns, style=TableStyle(style))
 
 
-def beside_table(block: blocks.Beside, width: float) -> Flowable:
-    """Return small tables side by side."""
+def table_row(block: blocks.TableRow, width: float) -> Flowable:
+    """Return small tables in a row."""
     each = width / len(block.tables)
     style: list[Command] = [
         ("VALIGN", (0, 0), (-1, -1), "TOP"),
@@ -79,7 +79,7 @@ def beside_table(block: blocks.Beside, width: float) -> Flowable:
 
 
 def columns_table(block: blocks.Columns, width: float) -> Flowable:
-    """Return pairs side by side."""
+    """Return pairs in columns."""
     each = width / len(block.columns)
     cells = [
         [Paragraph(markup(p.title), STYLES["h3"]), _pairs(p, each - 14)] if p.title else
@@ -121,7 +121,7 @@ def _cell(cell: blocks.Cell, number: bool, strong: bool) -> Flowable:
 
 
 class _Bar(Flowable):
-    """A share as a bar with its figure beside it."""
+    """A share as a bar, followed by its figure."""
 
     def __init__(self, bar: blocks.Bar) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""Text of the PDF: what its own font has no letters for is set in a font of the reader's."""
+"""Text styles and fonts of the PDF; Chinese, Japanese and Korean use the reader's fonts."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ HAN, KANA, HANGUL = "STSong-Light", "HeiseiKakuGo-W5", "HYGothic-Medium"
 _HANGUL, _HAN = r"\u1100-\u11ff\uac00-\ud7af", r"\u2e80-\u9fff\uf900-\ufaff\uff00-\uffef"
 _RUNS = re.compile(f"[{_HANGUL}]+|[{_HAN}]+|[^{_HANGUL}{_HAN}]+")
 INK, SOFT = HexColor("#1c2730"), HexColor("#5b6770")
-GROUNDS = {"good": ("#e2f4e9", "#1d6b42"), "doubtful": ("#fdf0d9", "#8a5a0b"),
+BADGE_COLOURS = {"good": ("#e2f4e9", "#1d6b42"), "doubtful": ("#fdf0d9", "#8a5a0b"),
            "bad": ("#fbe3e3", "#982a2a"), "quiet": ("#eef1f4", "#4d5962")}  # fmt: skip
 
 _TEXT = ParagraphStyle("text", fontName=PLAIN, fontSize=9, leading=12.5, textColor=INK,
@@ -30,7 +30,7 @@ _TEXT = ParagraphStyle("text", fontName=PLAIN, fontSize=9, leading=12.5, textCol
 
 @cache
 def load_fonts() -> None:
-    """Make the PDF's fonts known to the library."""
+    """Register the PDF's fonts with reportlab."""
     folder = files("gapbridge.bridge.document").joinpath("fonts")
     for name, file in ((PLAIN, "DejaVuSansCondensed.ttf"), (BOLD, "DejaVuSansCondensed-Bold.ttf")):
         with as_file(folder.joinpath(file)) as path:
@@ -41,7 +41,7 @@ def load_fonts() -> None:
 
 
 def markup(text: str) -> str:
-    """Return a text as the library's markup; runs of Chinese, Japanese, Korean have their font."""
+    """Return a text as reportlab's markup, with fonts for Chinese, Japanese and Korean."""
     if text.isascii():
         return escape(text)
     japanese = re.search(r"[\u3040-\u30ff]", text) is not None
@@ -84,8 +84,8 @@ STYLES = {
 
 
 def badge_markup(badge: Badge) -> str:
-    """Return a badge as text on a coloured ground."""
-    ground, ink = GROUNDS[badge.kind]
+    """Return a badge as text on a coloured background."""
+    ground, ink = BADGE_COLOURS[badge.kind]
     return (
         f'<font name="{BOLD}" color="{ink}" backColor="{ground}">'
         f"&nbsp;{markup(badge.text)}&nbsp;</font>"

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from gapbridge.bridge.document.blocks import Block
 
 BLOCK = 1 << 20  # bytes read at a time
-SIDE = 1.96  # sigmas on each side of a 95 % interval
+HALF_WIDTH = 1.96  # of a 95 % interval, in standard deviations
 
 
 def provenance(
@@ -25,13 +25,13 @@ def provenance(
 ) -> dict[str, Any]:
     """Return the provenance of the running command's result, as JSON and cells hold it.
 
-    ``files`` are what it read, by their role (``log``, ``cell``); a folder counts as all of its
-    files. Arguments are those of the command that differ from their defaults. Called from Python,
-    it is ``command`` that was done, with these files and the ``options`` that were given.
+    ``files`` are its inputs by role (``log``, ``cell``); a folder stands for all of its files.
+    Arguments are those of the command that differ from their defaults; called from Python, the
+    command is ``command`` and its arguments are these files and ``options``.
     """
     context = click.get_current_context(silent=True)
-    given = {role: [str(path) for path in paths] for role, paths in files.items() if paths}
-    called = given | {name: value for name, value in options.items() if value}
+    paths_by_role = {role: [str(path) for path in paths] for role, paths in files.items() if paths}
+    called = paths_by_role | {name: value for name, value in options.items() if value}
     return {
         "version": installed_version(),
         "time": datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z"),
@@ -51,7 +51,7 @@ def origin_line(origin: Mapping[str, Any]) -> str:
 
 
 def origin_blocks(origin: Mapping[str, Any]) -> list[Block]:
-    """Return version, time, arguments and files with their SHA-256 as blocks; none for none."""
+    """Return version, time, arguments and files with SHA-256 as blocks; empty without origin."""
     from gapbridge.bridge.document.blocks import (  # only where there is a report
         Columns,
         Heading,
@@ -80,10 +80,11 @@ def fitted(
     origin: dict[str, Any], ranges: Mapping[str, tuple[float, float]], spread: Spread,
     intervals: Mapping[str, tuple[float, float]], causes: Sequence[Mapping[str, Any]] = (),
 ) -> dict[str, Any]:  # fmt: skip
-    """Return the provenance of a cell: with what its model was fitted on, and how surely.
+    """Return the provenance of a cell whose model was fitted.
 
-    ``intervals`` are the 95 % intervals of the numbers that were applied, by name, SI; ``causes``
-    what was accused, as the schema of cells has it.
+    ``ranges``: fitted range of each quantity. ``spread``: covariance of the parameters.
+    ``intervals``: 95 % intervals of the applied values by name, SI. ``causes``: named causes, as in
+    the schema of cells.
     """
     listed = {name: [low, high] for name, (low, high) in ranges.items()}
     result = {**origin, "fitted": listed}
@@ -97,12 +98,12 @@ def fitted(
 
 
 def intervals_of(
-    found: Iterable[tuple[str, float, float | None]],
+    estimates: Iterable[tuple[str, float, float | None]],
 ) -> dict[str, tuple[float, float]]:
-    """Return the 95 % interval of each (name, value, 1 sigma); one without a sigma has none."""
+    """Return the 95 % interval of each (name, value, standard deviation or None), by name."""
     return {
-        name: (float(value - SIDE * std), float(value + SIDE * std))
-        for name, value, std in found
+        name: (float(value - HALF_WIDTH * std), float(value + HALF_WIDTH * std))
+        for name, value, std in estimates
         if std is not None and math.isfinite(std)
     }
 
@@ -120,15 +121,15 @@ def installed_version() -> str:
 def digest(path: Path) -> str | None:
     """Return the SHA-256 of a file, or of all files of a folder by name; None: unreadable."""
     files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
-    found = hashlib.sha256()
+    result = hashlib.sha256()
     try:
         for file in files:
             with file.open("rb") as stream:
                 while block := stream.read(BLOCK):
-                    found.update(block)
+                    result.update(block)
     except OSError:
         return None
-    return found.hexdigest()
+    return result.hexdigest()
 
 
 def _arguments(context: click.Context) -> dict[str, Any]:

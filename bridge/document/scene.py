@@ -1,4 +1,4 @@
-"""A scene: lines and arrows in space, turned on a page and projected onto paper."""
+"""A 3-D scene of lines and arrows, shown interactively in HTML and projected in PDF."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from gapbridge.bridge.document.drawing import GRID, INK, SOFT, Drawing, Stroke, 
 from gapbridge.bridge.document.drawing import Circle as Ring
 from gapbridge.core.arrays import Array
 
-AZIMUTH, ELEVATION = -0.9, 0.42  # rad, from where it is seen at first
+AZIMUTH, ELEVATION = -0.9, 0.42  # rad, initial view
 WIDTH, HEIGHT = 640.0, 430.0
 MARGIN = 22.0
 
@@ -38,7 +38,7 @@ class Arrows:
 
 @dataclass(frozen=True)
 class Scene:
-    """What is seen, in metres in one frame with z up; the legend says what the colours mean."""
+    """Lines and arrows (m) in one frame with z up, and a legend of (text, colour)."""
 
     title: str
     paths: tuple[Path, ...]
@@ -46,7 +46,7 @@ class Scene:
     legend: tuple[tuple[str, str], ...] = ()
 
     def document(self) -> dict[str, Any]:
-        """Return it as JSON values, to a tenth of a millimetre."""
+        """Return the scene as JSON values, coordinates rounded to 0.1 mm."""
         return {
             "title": self.title,
             "view": [AZIMUTH, ELEVATION],
@@ -62,7 +62,7 @@ class Scene:
         }
 
     def drawing(self) -> Drawing:
-        """Return the scene from its first side."""
+        """Return the initial view as a drawing."""
         drawing = Drawing(WIDTH, HEIGHT, self.title)
         every = [p.points for p in self.paths] + [x for a in self.arrows for x in (a.start, a.end)]
         flat = _projected(np.vstack(every))
@@ -71,18 +71,18 @@ class Scene:
         scale = float(np.min(room / np.maximum(high - low, 1e-9)))
         middle = (low + high) / 2
 
-        def at(points: Array) -> list[tuple[float, float]]:
-            given = (_projected(points) - middle) * scale
-            return [(WIDTH / 2 + float(x), HEIGHT / 2 - float(y)) for x, y in given]
+        def to_drawing(points: Array) -> list[tuple[float, float]]:
+            flat = (_projected(points) - middle) * scale
+            return [(WIDTH / 2 + float(x), HEIGHT / 2 - float(y)) for x, y in flat]
 
         for path in self.paths:
-            places = at(path.points)
+            places = to_drawing(path.points)
             drawing.line(places, Stroke(path.colour, path.width))
             if path.dots:
                 for place in places:
                     drawing.add(Ring(*place, path.width / 2 + 0.6, path.colour))
         for arrows in self.arrows:
-            for start, end in zip(at(arrows.start), at(arrows.end), strict=True):
+            for start, end in zip(to_drawing(arrows.start), to_drawing(arrows.end), strict=True):
                 drawing.line([start, end], Stroke(arrows.colour, 1.1))
                 drawing.add(Ring(*end, 1.5, arrows.colour))
         x = 6.0
@@ -94,7 +94,7 @@ class Scene:
 
 
 def base(reach: float) -> tuple[Path, ...]:
-    """Return the floor around the base (z = 0) and the base's axes, for an arm of that reach, m."""
+    """Return a floor grid (z = 0) and a marker at the base, for an arm of this reach, m."""
     step = 0.1 if reach < 0.7 else 0.25
     count = max(int(np.ceil(0.5 * reach / step)), 2)
     side = np.arange(-count, count + 1) * step

@@ -1,4 +1,4 @@
-"""The arm as a line through its joints, bent by its load or not: pictures are made of it."""
+"""The arm as a line through its joints, rigid or deflected, for drawings."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from gapbridge.core.model import Model
 def skeleton(model: Model, q: Array, loads: Loads | None = None) -> Array:
     """Return base, joint origins, flange and TCP (n + 3, 3), m in base, at ``q`` (n,) rad.
 
-    ``loads`` are those of one row; None: the model's payload and nothing more.
+    ``loads``: of one row; None: the model's payload only.
     """
     shape = kernel.new_shape(model.arm.n)
     rows = model.rows(np.asarray(q, dtype=np.float64)[None], loads or Loads())
@@ -27,6 +27,6 @@ def reach(model: Model) -> float:
 
 
 def round_factor(wanted: float) -> float:
-    """Return the next lower round number (one digit), at least 1: for what is drawn larger."""
+    """Return the next lower number of one digit, at least 1: a magnification for drawings."""
     size = 10 ** np.floor(np.log10(max(wanted, 1.0)))
     return float(max(np.floor(wanted / size) * size, 1.0))

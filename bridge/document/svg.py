@@ -1,4 +1,4 @@
-"""A drawing as SVG that stands inside a page."""
+"""Write a drawing as SVG."""
 
 from __future__ import annotations
 
@@ -28,20 +28,19 @@ def colours() -> str:
 
 
 def svg_file(drawing: Drawing) -> str:
-    """Return the drawing as a file of its own."""
+    """Return the drawing as a standalone SVG file."""
     style = f"<style>{colours()}text{{font-family:system-ui,sans-serif}}</style>"
     return svg(drawing, style) + "\n"
 
 
 def svg(drawing: Drawing, style: str = "") -> str:
-    """Return the drawing as one SVG element, as wide as its place but not wider than drawn."""
+    """Return the drawing as an SVG element, scaled to its container up to 1.45 times its width."""
     width, height = _number(drawing.width), _number(drawing.height)
-    # as wide as its place allows, up to half as wide again as it was drawn
-    most = _number(1.45 * drawing.width)
+    widest = _number(1.45 * drawing.width)
     shapes = "".join(_shape(shape) for shape in drawing.shapes)
     return (
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" '
-        f'width="{width}" height="{height}" style="max-width:min(100%,{most}px)" role="img" '
+        f'width="{width}" height="{height}" style="max-width:min(100%,{widest}px)" role="img" '
         f'aria-label="{escape(drawing.title)}">{style}{shapes}</svg>'
     )
 

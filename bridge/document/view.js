@@ -1,4 +1,4 @@
-// A scene of lines in space on a canvas: dragging turns it; the wheel zooms once it was clicked.
+// A 3-D scene of lines on a canvas: drag to turn; click, then scroll to zoom.
 
 export class View {
   constructor(canvas, scene, colour) {
@@ -16,7 +16,7 @@ export class View {
     const rest = () => { this.drag = null; };
     canvas.addEventListener('pointerup', rest);
     canvas.addEventListener('pointercancel', rest);
-    // until it is clicked, wheel and vertical swipes belong to the page
+    // before the first click, wheel and vertical swipes scroll the page
     canvas.addEventListener('click', () => canvas.classList.add('active'));
     canvas.addEventListener('blur', () => canvas.classList.remove('active'));
     canvas.addEventListener('pointerleave', () => {
@@ -32,7 +32,7 @@ export class View {
     matchMedia('(prefers-color-scheme: dark)').addEventListener('change', () => this.draw());
   }
 
-  // another scene from the same side; it keeps its size unless what it shows outgrows it
+  // show another scene with the same view and size, unless it needs more space
   set(scene) {
     this.scene = scene;
     const every = scene.paths.flatMap((p) => p.points)

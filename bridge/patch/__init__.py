@@ -1,4 +1,4 @@
-"""Writing a cell's effects into the models of simulators, each format in a file of its own."""
+"""Write a cell's effects into simulator models: MJCF, URDF and USD."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""What has to change in a model of the nominal arm so that it behaves as the cell's model.
+"""The changes that make a simulator model of the nominal arm behave as the cell's model.
 
-Geometry, tool, gravity and springs are the difference of two chains, with the cell's effects and
-without; all else is what each effect sets in a simulator's model. No effect is named here.
+Geometry, tool, gravity and springs are the difference of the chains with and without the cell's
+effects; everything else is set by the effects themselves (``Effect.simulator``).
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from gapbridge.core.errors import InputError
 from gapbridge.core.model import Model
 from gapbridge.core.rotation import rotation_matrix, transform
 
-ANGLE, DISTANCE = 1e-3, 1e-3  # rad, m: by which an axis may be off and still be the same arm's
-TINY = 1e-12
+MAX_ANGLE, MAX_DISTANCE = 1e-3, 1e-3  # rad, m, between a joint axis of the model and the cell's
+TOLERANCE = 1e-12  # of a frame that counts as unchanged
 
 
 @dataclass(frozen=True)
@@ -43,18 +43,18 @@ class Axes:
 
 @dataclass(frozen=True)
 class ModelChanges:
-    """What the cell's effects do to its arm."""
+    """The changes of the nominal arm that the cell's effects make."""
 
     model: Model  # of the cell, effects included
     joint_in_base: Array  # (n+1, 4, 4) nominal frames at zero angles: joints, then the flange
-    shift: Array  # (n+1, 4, 4) what follows each nominal frame: joint_in_base @ shift
+    shift: Array  # (n+1, 4, 4) change of each nominal frame: joint_in_base @ shift
     tcp_in_base: Array  # (4, 4) nominal
-    tcp_shift: Array  # (4, 4) tool_in_flange's change, flange's included
+    tcp_shift: Array  # (4, 4) change of tool_in_flange, with that of the flange
     gravity: Array | None  # (3,) m/s2 in base, None where the cell does not tilt it
     springs: Springs
     settings: tuple[SimulatorChange, ...]
     unsupported: tuple[tuple[str, str], ...]  # effect that no format supports, what to do instead
-    skipped: tuple[str, ...] = ()  # stand-ins, which are not written, one line each
+    skipped: tuple[str, ...] = ()  # a line for each stand-in; stand-ins are not written
 
     @property
     def n(self) -> int:
@@ -79,14 +79,14 @@ class ModelChanges:
         return total
 
     def motion(self, joint: int, base_in_world: Array) -> Array:
-        """Return the motion (4, 4) in world of everything from joint (from 0; n: flange) on."""
+        """Return the motion (4, 4) in world of all bodies from a joint (from 0; n: flange) on."""
         frame = base_in_world @ self.joint_in_base[joint]
         return np.asarray(frame @ self.shift[joint] @ np.linalg.inv(frame))
 
 
 def changes_of(model: Model) -> ModelChanges:
-    """Return what the terms of a model change of its nominal arm; stand-ins are left out."""
-    stand_ins = tuple(dict.fromkeys(_named(t) for t in model.terms if t.stand_in))
+    """Return the changes of the nominal arm by a model's terms; stand-ins are left out."""
+    stand_ins = tuple(dict.fromkeys(_term_name(t) for t in model.terms if t.stand_in))
     causes = [t for t in model.terms if not t.stand_in]
     outside_arm = _unsupported([t for t in causes if not CATALOGUE[t.effect].of_the_arm], model)
     arm_terms = [t for t in causes if CATALOGUE[t.effect].of_the_arm]
@@ -121,7 +121,7 @@ def changes_of(model: Model) -> ModelChanges:
     )  # fmt: skip
 
 
-def _named(term: Term) -> str:
+def _term_name(term: Term) -> str:
     return term.effect + ("" if term.site.joint is None else f" of joint {term.site.joint}")
 
 
@@ -152,7 +152,7 @@ def base_in_world(cell_axes: Axes, model_axes: Axes, source: str, names: tuple[s
     rotated, distance = cell_axes.direction @ R.T, np.einsum("nij,nj->ni", across, offset - t)
     for name, a, b, d in zip(names, rotated, model_axes.direction, distance, strict=True):
         angle = float(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b))
-        if angle > ANGLE or np.linalg.norm(d) > DISTANCE:
+        if angle > MAX_ANGLE or np.linalg.norm(d) > MAX_DISTANCE:
             raise InputError(
                 f"{source}: joint {name}: found its axis {np.degrees(angle):.3g} deg and "
                 f"{1e3 * np.linalg.norm(d):.3g} mm off the cell's nominal arm at zero angles, "

@@ -1,8 +1,8 @@
-"""MJCF through MuJoCo's own MjSpec: what compiles there is what a user's simulation runs.
+"""MJCF, edited with MuJoCo's MjSpec.
 
-Flexibility and play are additional joints in the joint's own body, named after it; sensors and
-actuators stay on the joint itself, whose angle is the encoder's. What acts before a joint (a
-flexible base, bending of the link before it) is an inserted body with hinges.
+Flexibility and play are additional joints in the joint's body, named after it; sensors and
+actuators stay on the joint itself, whose angle is the encoder's. A flexible base or link is an
+inserted body with hinges before the joint.
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ from typing import Any
 
 import numpy as np
 
-from gapbridge.bridge.patch.changes import TINY, ModelChanges, base_in_world
+from gapbridge.bridge.patch.changes import TOLERANCE, ModelChanges, base_in_world
 from gapbridge.bridge.patch.mjcf_scene import Hinge, Scene
 from gapbridge.bridge.patch.model_format import (
     ModelFormat,
     Patched,
     PatchOptions,
-    named_one,
+    known_name,
     pick_joints,
 )
 from gapbridge.core.arrays import Array
@@ -31,8 +31,8 @@ from gapbridge.core.rotation import rotation_matrix, transform
 PLAY_DECELERATION = 0.2  # rad/s2: up to this deceleration friction holds the play taken up
 GAUSS = (0.5 - 3**0.5 / 6, 0.5 + 3**0.5 / 6)  # of a length: two points of quadrature
 MOMENT_RANGE = 1.5  # times a joint's typical moment: range over which a stiffening spring is fitted
-LINEAR = 1  # of an actuator's interp
-SMALL = 1e-6  # kg m2 of a point mass: MuJoCo requires more than zero
+LINEAR = 1  # an actuator's interp: linear interpolation
+POINT_INERTIA = 1e-6  # kg m2 of a point mass: MuJoCo requires more than zero
 
 
 class Mjcf(ModelFormat):
@@ -74,10 +74,10 @@ class Mjcf(ModelFormat):
 
 
 def _stiffening(c: float, softening: float, moment_limit: float) -> tuple[float, float, float]:
-    """Return a spring's polynomial for theta = c M / sqrt(1 + softening M^2), up to ``most`` Nm.
+    """Return a spring's polynomial for theta = c M / sqrt(1 + softening M^2).
 
-    The law's inverse is an infinite series of odd powers; MuJoCo's spring has two of them, linear
-    and cubic, whose factors minimise the squared error of the angle.
+    The law's inverse is an infinite series of odd powers; MuJoCo's spring has linear and cubic
+    terms, whose factors minimise the squared error of the angle up to ``moment_limit`` Nm.
     """
     moment = np.linspace(0.0, moment_limit, 200)[1:]
     root = np.sqrt(1 + softening * moment**2)
@@ -89,7 +89,7 @@ def _stiffening(c: float, softening: float, moment_limit: float) -> tuple[float,
 
 
 class _Patch:
-    """One model being patched: what was changed, and what could not be."""
+    """One model being patched, with a line per change and per change that is not possible."""
 
     def __init__(self, scene: Scene, names: Sequence[str], world: Array, changes: ModelChanges,
                  options: PatchOptions) -> None:  # fmt: skip
@@ -104,7 +104,7 @@ class _Patch:
 
     def frame(self, name: str, joint: int) -> None:
         """Move a joint's body."""
-        if not np.allclose(self.changes.shift[joint - 1], np.eye(4), rtol=0, atol=TINY):
+        if not np.allclose(self.changes.shift[joint - 1], np.eye(4), rtol=0, atol=TOLERANCE):
             self.scene.move(self.scene.body_of(name), self.changes.motion(joint - 1, self.world))
             self.changed.append(f"joint {name}: its body's frame")
 
@@ -228,7 +228,7 @@ class _Patch:
             self.changed.append(f"body {body.name}: centre of gravity")
 
     def base(self) -> None:
-        """Put the base on springs about its axes, before the first joint."""
+        """Insert springs about the base axes before the first joint."""
         springs = self.changes.springs.base
         first = self.scene.body_of(self.names[0])
         anchor = self.scene.point_in(first, self.world[:3, 3])
@@ -276,14 +276,14 @@ class _Patch:
 
     def tool(self) -> None:
         """Move the TCP's site."""
-        if np.allclose(self.changes.tcp_shift, np.eye(4), rtol=0, atol=TINY):
+        if np.allclose(self.changes.tcp_shift, np.eye(4), rtol=0, atol=TOLERANCE):
             return
         sites = [site.name for site in self.scene.spec.sites]
         if not self.options.tcp:
             listed = ", ".join(sites) or "none"
             self.missing.append(f"tool: name the site of the TCP with --tcp ({listed})")
             return
-        site = self.scene.spec.site(named_one(self.scene.path, "--tcp", self.options.tcp, sites))
+        site = self.scene.spec.site(known_name(self.scene.path, "--tcp", self.options.tcp, sites))
         frame = self.world @ self.changes.tcp_in_base
         motion = frame @ self.changes.tcp_shift @ np.linalg.inv(frame)
         self._place_site(site, motion @ self._site_in_world(site))
@@ -322,7 +322,7 @@ class _Patch:
         self.scene.place("site", site, np.linalg.inv(parent) @ in_world)
 
     def load(self) -> None:
-        """Change the body that models the load; where none is named, add a mass."""
+        """Change the body that models the load; where ``--load`` names none, add a mass."""
         extra = sum(s.value for s in self.changes.settings if s.kind is Kind.PAYLOAD)
         shift = self.changes.vector(Kind.PAYLOAD_COG)
         if not extra and not shift.any():
@@ -334,13 +334,13 @@ class _Patch:
         else:
             bodies = ", ".join(b.name for b in self.scene.spec.bodies if b.name)
             self.missing.append(
-                f"load: {extra:+.6g} kg, its centre {1e3 * np.linalg.norm(shift):.4g} mm off: name "
+                f"load: {extra:+.6g} kg, centre {1e3 * np.linalg.norm(shift):.4g} mm off: name "
                 f"the body that models it with --load ({bodies})"
             )
 
     def _change_load(self, extra: float, shift: Array) -> None:
         named = [b.name for b in self.scene.spec.bodies if b.name]
-        body = self.scene.spec.body(named_one(self.scene.path, "--load", self.options.load, named))
+        body = self.scene.spec.body(known_name(self.scene.path, "--load", self.options.load, named))
         element = self.scene.inertial(body)
         if element.mass + extra <= 0:
             raise InputError(
@@ -360,12 +360,12 @@ class _Patch:
         flange = self.joint_in_world(self.changes.n + 1)
         centre = flange[:3, :3] @ self.changes.model.payload_cog + flange[:3, 3]
         load = last.add_body(name="payload_difference", pos=self.scene.point_in(last, centre))
-        load.explicitinertial, load.mass, load.inertia = True, extra, [SMALL] * 3
+        load.explicitinertial, load.mass, load.inertia = True, extra, [POINT_INERTIA] * 3
         load.ipos = np.zeros(3)  # without it MuJoCo's writer leaves the inertial out
         self.changed.append(f"body payload_difference: {extra:.6g} kg")
 
     def unsupported(self) -> list[str]:
-        """Return what is not in the model, with what to do instead."""
+        """Return the changes that are not in the model, with what to do instead."""
         lines = list(self.missing)
         compensated = [b.name for b in self.scene.spec.bodies if b.gravcomp]
         if compensated:

@@ -1,4 +1,4 @@
-"""A user's MJCF while it is changed: its MjSpec, the original compiled model, and its text.
+"""A user's MJCF being edited: its MjSpec, the original compiled model, and its XML.
 
 MjSpec can neither insert a body between two others nor write more than six digits, so both are
 done in the text that it writes.
@@ -43,9 +43,9 @@ class Hinge:
     softness: float = 1.0  # how much softer the limits are than MuJoCo's own
 
     def element(self, timestep: float) -> ElementTree.Element:
-        """Return the <joint>, every attribute written: a model's classes give others.
+        """Return the <joint> with every attribute, which the model's defaults could override.
 
-        A spring too stiff for the time step is damped as much as its integration needs.
+        A spring that is too stiff for the time step gets the damping that its integration needs.
         """
         stiffness = self.stiffness or (0.0,)
         damping = max(2 * DAMPING * np.sqrt(self.inertia * stiffness[0]), timestep * stiffness[0])
@@ -64,12 +64,12 @@ class Hinge:
 
 
 def impedance(softness: float) -> tuple[float, ...]:
-    """Return MuJoCo's solimp, its own where ``softer`` is 1."""
+    """Return MuJoCo's solimp, its default where ``softness`` is 1."""
     return 1 - 0.1 * softness, 1 - 0.05 * softness, 1e-3, 0.5, 2.0
 
 
 class Scene:
-    """A model: joints at angle zero, frames in world of the original."""
+    """A model with joints at angle zero; frames in world are those of the original."""
 
     def __init__(self, path: Path) -> None:
         """Read and compile a file. Raises InputError where MuJoCo is missing or refuses it."""
@@ -134,7 +134,7 @@ class Scene:
         return transform(self.data.xmat[body.id].reshape(3, 3), self.data.xpos[body.id])
 
     def move(self, body: Any, motion: Array) -> None:
-        """Move a body and all beyond by a motion (4, 4) in world."""
+        """Move a body and all that follow by a motion (4, 4) in world."""
         parent = self.frame(body.parent)
         local = np.linalg.inv(parent) @ motion @ self.frame(body)
         self.place("body", body, local)
@@ -144,7 +144,7 @@ class Scene:
         self._placed[tag, element.name] = in_parent
 
     def inertial(self, body: Any) -> Any:
-        """Return a body whose mass, centre and inertia can be changed: its own, written out."""
+        """Return a body with explicit mass, centre of gravity and inertia, to be changed."""
         if body.name not in self._explicit:
             compiled = self.compiled.body(body.id)
             body.explicitinertial = True
@@ -156,13 +156,13 @@ class Scene:
         return body
 
     def inertia_about(self, joint: str, axis: Array, anchor: Array | None = None) -> float:
-        """Return the inertia (kg m2) of all beyond a joint about an axis (world) at its anchor."""
+        """Return the inertia (kg m2) of all bodies from a joint on, about an axis in world."""
         j = self.compiled.joint(joint).id
         anchor = self.data.xanchor[j] if anchor is None else anchor
         return self._inertia(self.data, j, axis, anchor)
 
     def largest_inertia(self, joint: str) -> float:
-        """Return the largest inertia (kg m2) of all beyond a joint about its axis, in any pose."""
+        """Return the largest inertia (kg m2) of all bodies from a joint on about its axis."""
         j = self.compiled.joint(joint).id
         addresses = [self.compiled.joint(name).qposadr[0] for name in self.hinges()]
         data = self.mujoco.MjData(self.compiled)
@@ -203,7 +203,7 @@ class Scene:
         return sum(map(len, self._after.values())) + sum(len(h) for _, h in self._before.values())
 
     def _keyframes(self, root: ElementTree.Element) -> None:
-        """Rewrite the keyframes' qpos, added joints at zero."""
+        """Rewrite the qpos of keyframes, added joints at zero."""
         size = {0: 7, 1: 4, 2: 1, 3: 1}  # of qpos: free, ball, slide, hinge
         for key, element in zip(self.spec.keys, root.iterfind("./keyframe/key"), strict=True):
             qpos = self._qpos[key.id]
@@ -249,7 +249,7 @@ class Scene:
 
 
 def numbers(values: Any) -> str:
-    """Return numbers as an attribute, all digits."""
+    """Return numbers as an attribute's text, with all digits."""
     return " ".join(f"{v:.17g}" for v in np.atleast_1d(values))
 
 

@@ -16,7 +16,7 @@ from gapbridge.core.log.sources.joint_order import order_joints
 
 @dataclass(frozen=True)
 class PatchOptions:
-    """What the user states about the model."""
+    """The user's options for a model."""
 
     joints: tuple[str, ...] = ()  # its joints, in the order of the arm's
     tcp: str = ""  # its TCP: a site, link or prim
@@ -30,7 +30,7 @@ class Patched:
     """A patched model and what was done to it."""
 
     text: str
-    changed: tuple[str, ...]  # one line a change
+    changed: tuple[str, ...]  # one line per change
     unsupported: tuple[str, ...]  # one line each: what the format cannot represent, what to do
 
 
@@ -64,8 +64,8 @@ def pick_joints(
     return names
 
 
-def named_one(path: Path, option: str, name: str, names: Sequence[str]) -> str:
-    """Return a name that the model has; raises InputError with the nearest one."""
+def known_name(path: Path, option: str, name: str, names: Sequence[str]) -> str:
+    """Return ``name`` if the model has it. Raises InputError with the nearest name."""
     if name in names:
         return name
     matches = difflib.get_close_matches(name, names, n=1)

@@ -1,8 +1,8 @@
-"""The cell's numbers as bounds for MuJoCo's own system identification (``mujoco.sysid``).
+"""The cell's parameters as bounds for MuJoCo's system identification (``mujoco.sysid``).
 
-Parameters of causes are free within three standard deviations, all others are frozen. How a number
-enters the patched model is determined numerically: the model is patched at both bounds too, and
-what changes in it is interpolated (a parabola through both bounds and the value).
+Parameters of causes are free within three standard deviations, all others are frozen. The effect of
+a parameter on the patched model is determined numerically: the model is also patched at both
+bounds, and each attribute is interpolated (a parabola through both bounds and the value).
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from gapbridge.core.model import Model
 SIGMAS = 3.0  # from the value to each bound
 MODELS = Mjcf.suffixes
 SUFFIXES = (".py", ".yaml", ".yml")
-ATTRIBUTES = {  # of a MjSpec's elements: what a patch can change
+ATTRIBUTES = {  # of a MjSpec's elements, that a patch can change
     "body": ("pos", "quat", "mass", "ipos", "inertia"),
     "joint": ("stiffness", "damping", "frictionloss", "armature", "range"),
     "site": ("pos", "quat"),
@@ -36,7 +36,7 @@ ATTRIBUTES = {  # of a MjSpec's elements: what a patch can change
 
 @dataclass(frozen=True)
 class Bounds:
-    """One number of the cell: SI units, sign of docs/conventions.md."""
+    """One parameter of the cell with its bounds, SI; sign as in docs/conventions.md."""
 
     name: str
     value: float
@@ -45,7 +45,7 @@ class Bounds:
     free: bool
 
     def state(self) -> dict[str, Any]:
-        """Return it as ``mujoco.sysid.Parameter`` keeps its state."""
+        """Return the state of a ``mujoco.sysid.Parameter``."""
         return {
             "name": self.name, "nominal": [self.value], "value": [self.value],
             "min_value": [self.lower], "max_value": [self.upper], "frozen": not self.free,
@@ -53,8 +53,8 @@ class Bounds:
 
 
 @dataclass(frozen=True)
-class _Number:
-    """Where one number is in a model: the terms of one effect at one site are one."""
+class _Parameter:
+    """One parameter and the terms (of one effect at one site) whose sum it is."""
 
     bounds: Bounds
     terms: tuple[int, ...]  # indices into the model's terms; the last one is varied
@@ -71,7 +71,7 @@ class _Number:
 
 
 def parameters_text(path: Path, cell: Cell, options: PatchOptions, suffix: str) -> str:
-    """Return the bounds of a cell's numbers for the model at ``path``.
+    """Return the bounds of a cell's parameters for the model at ``path``.
 
     ``suffix`` .yaml: as ``ParameterDict.load_from_disk`` reads them; .py: a module whose
     ``parameters()`` gives them with modifiers for the patched model. Raises InputError as the patch
@@ -97,8 +97,8 @@ def parameters_text(path: Path, cell: Cell, options: PatchOptions, suffix: str) 
     return _module(path, cell, numbers, changes)
 
 
-def _numbers(cell: Cell) -> Iterator[_Number]:
-    """Yield all numbers of the cell's effects that a simulator's model may hold."""
+def _numbers(cell: Cell) -> Iterator[_Parameter]:
+    """Yield all parameters of the cell's effects that act on the arm."""
     model, sigma = cell.model, _sigmas(cell)
     sites: dict[tuple[str, Any], list[int]] = {}
     for i, term in enumerate(model.terms):
@@ -113,11 +113,11 @@ def _numbers(cell: Cell) -> Iterator[_Number]:
             lower = max(value - half_width, parameter.lower)
             upper = min(value + half_width, parameter.upper)
             free = half_width > 0 and lower < upper
-            yield _Number(Bounds(name, value, lower, upper, free), tuple(indices), k)
+            yield _Parameter(Bounds(name, value, lower, upper, free), tuple(indices), k)
 
 
 def _sigmas(cell: Cell) -> dict[str, float]:
-    """Return the standard deviation of each diagnosed or fitted number by name."""
+    """Return the standard deviation of each diagnosed or fitted parameter by name."""
     spread = cell.spread
     stds = dict(zip(spread.names, np.sqrt(np.maximum(np.diag(spread.covariance), 0)), strict=True))
     for cause in cell.causes:
@@ -126,7 +126,7 @@ def _sigmas(cell: Cell) -> dict[str, float]:
 
 
 def _attributes(path: Path, model: Model, options: PatchOptions) -> dict[tuple[str, ...], Array]:
-    """Return all numbers of the patched model that a patch can change, by element."""
+    """Return all attributes of the patched model that a patch can change, by element."""
     import mujoco
 
     text = Mjcf().patch(path, changes_of(model), options, ()).text
@@ -149,7 +149,7 @@ def _between(
     middle: Mapping[tuple[str, ...], Array], lower: Mapping[tuple[str, ...], Array],
     upper: Mapping[tuple[str, ...], Array],
 ) -> list[list[Any]]:  # fmt: skip
-    """Return what changes towards the bounds: kind, name, attribute, at the lower, at the upper."""
+    """Return changes at the bounds: kind, name, attribute, change at lower, change at upper."""
     changes = []
     for key, value in middle.items():
         low, high = lower.get(key, value), upper.get(key, value)
@@ -160,7 +160,7 @@ def _between(
 
 
 def _module(
-    path: Path, cell: Cell, numbers: list[_Number], changes: Mapping[str, list[list[Any]]]
+    path: Path, cell: Cell, numbers: list[_Parameter], changes: Mapping[str, list[list[Any]]]
 ) -> str:
     bounds = "\n".join(
         f"    {n.bounds.name!r}: ({n.bounds.value!r}, {n.bounds.lower!r}, {n.bounds.upper!r}, "
@@ -181,7 +181,7 @@ TEMPLATE = '''"""Bounds for MuJoCo's sysid, of {model} patched with {cell}; by g
     bounds = parameters()
     sysid.apply_param_modifiers(bounds, mujoco.MjSpec.from_file(<the patched model>))
 
-Free: what a diagnosis or calibration has found, within three standard deviations. SI units.
+Free: parameters of a diagnosis or calibration, within three standard deviations. SI units.
 """
 
 import numpy as np

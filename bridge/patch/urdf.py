@@ -9,12 +9,12 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from gapbridge.bridge.patch.changes import TINY, Axes, ModelChanges, base_in_world
+from gapbridge.bridge.patch.changes import TOLERANCE, Axes, ModelChanges, base_in_world
 from gapbridge.bridge.patch.model_format import (
     ModelFormat,
     Patched,
     PatchOptions,
-    named_one,
+    known_name,
     pick_joints,
 )
 from gapbridge.core.arrays import Array
@@ -22,7 +22,7 @@ from gapbridge.core.effects.simulator import Kind
 from gapbridge.core.errors import InputError
 from gapbridge.core.rotation import roll_pitch_yaw, rpy_matrix, transform
 
-TURNING = ("revolute", "continuous")
+REVOLUTE = ("revolute", "continuous")
 INSTEAD = {
     Kind.ARMATURE: "rotor inertia: set the armature where the simulator has it",
     Kind.DELAY: "delay: in the controller, or the simulator's actuator",
@@ -42,14 +42,14 @@ class Urdf(ModelFormat):
 
     def patch(self, path: Path, changes: ModelChanges, options: PatchOptions,
               notes: Sequence[str]) -> Patched:  # fmt: skip
-        """Return the URDF with changed attributes; order and comments stay."""
+        """Return the URDF with changed attributes; order and comments are kept."""
         document = _Document(path)
-        names = pick_joints(path, document.turning(), changes, options)
+        names = pick_joints(path, document.revolute_joints(), changes, options)
         frames = document.child_frames()
         world = base_in_world(changes.axes(), document.axes(names, frames), str(path), names)
         changed = []
         for i, name in enumerate(names):
-            if not np.allclose(changes.shift[i], np.eye(4), rtol=0, atol=TINY):
+            if not np.allclose(changes.shift[i], np.eye(4), rtol=0, atol=TOLERANCE):
                 document.move(name, changes.motion(i, world), frames)
                 changed.append(f"joint {name}: origin")
             changed += _dynamics(document, name, i + 1, changes)
@@ -63,7 +63,7 @@ class Urdf(ModelFormat):
 
 
 class _Document:
-    """A URDF as text, in which single attributes are rewritten in place."""
+    """A URDF as text, whose attributes are rewritten in place."""
 
     def __init__(self, path: Path) -> None:
         try:
@@ -78,8 +78,8 @@ class _Document:
         self.joints = {str(j.get("name")): j for j in self.root.findall("joint")}
         self.links = {str(link.get("name")): link for link in self.root.findall("link")}
 
-    def turning(self) -> list[str]:
-        return [name for name, joint in self.joints.items() if joint.get("type") in TURNING]
+    def revolute_joints(self) -> list[str]:
+        return [name for name, joint in self.joints.items() if joint.get("type") in REVOLUTE]
 
     def end(self, joint: str, tag: str) -> str:
         element = self.joints[joint].find(tag)
@@ -92,7 +92,7 @@ class _Document:
         return transform(rpy_matrix(rpy), xyz)
 
     def child_frames(self) -> dict[str, Array]:
-        """Return the frames (4, 4) of all links in the root's, joints at zero."""
+        """Return the frames (4, 4) of all links in the root link's, joints at zero."""
         parent_of = {self.end(name, "child"): name for name in self.joints}
         frames: dict[str, Array] = {}
 
@@ -119,7 +119,7 @@ class _Document:
         return Axes(np.array(point), np.array(direction))
 
     def move(self, joint: str, motion: Array, frames: dict[str, Array]) -> None:
-        """Move a joint's child (and all beyond) by a motion (4, 4) in the root's frame."""
+        """Move a joint's child and all that follow by a motion (4, 4) in the root's frame."""
         parent = frames[self.end(joint, "parent")]
         origin = np.linalg.inv(parent) @ motion @ parent @ self.origin(joint)
         self.write("joint", joint, "origin",
@@ -128,7 +128,7 @@ class _Document:
     def write(
         self, kind: str, name: str, tag: str, values: dict[str, Array | float], inside: str = ""
     ) -> None:
-        """Rewrite attributes of <tag> in <kind name=...>; the element is made where missing.
+        """Rewrite attributes of <tag> in <kind name=...>; a missing element is added.
 
         ``inside``: the child element that contains <tag>; '': <tag> is a direct child.
         """
@@ -164,7 +164,7 @@ class _Document:
         self.text = self.text[:begin] + rewritten + self.text[end:]
 
     def comment(self, lines: Sequence[str]) -> None:
-        """Put lines into a comment right inside of <robot>."""
+        """Insert lines as a comment at the start of <robot>."""
         text = "\n       ".join(line.replace("--", "- -") for line in lines)
         self.text = re.sub(
             r"(<robot\b[^>]*>)", lambda tag: f"{tag[1]}\n  <!-- {text} -->", self.text, count=1
@@ -172,7 +172,7 @@ class _Document:
 
 
 def _without_comments(text: str) -> str:
-    """Return the text with comments blanked out, so that offsets stay."""
+    """Return the text with comments replaced by blanks, so that offsets are kept."""
     return re.sub(r"<!--.*?-->", lambda comment: " " * len(comment[0]), text, flags=re.DOTALL)
 
 
@@ -238,11 +238,11 @@ def _tool(
     frames: dict[str, Array], changed: list[str],
 ) -> list[str]:  # fmt: skip
     """Move the TCP's link; returns what the URDF cannot represent."""
-    if np.allclose(changes.tcp_shift, np.eye(4), rtol=0, atol=TINY):
+    if np.allclose(changes.tcp_shift, np.eye(4), rtol=0, atol=TOLERANCE):
         return []
     if not options.tcp:
         return ["tool: name the fixed link of the TCP with --tcp"]
-    link = named_one(path, "--tcp", options.tcp, list(document.links))
+    link = known_name(path, "--tcp", options.tcp, list(document.links))
     joint = next((j for j in document.joints if document.end(j, "child") == link), None)
     if joint is None or document.joints[joint].get("type") != "fixed":
         raise InputError(f"{path}: --tcp: found {link}, expected a link behind a fixed joint")

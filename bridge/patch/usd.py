@@ -1,8 +1,8 @@
-"""USD: a stronger layer of ``over`` prims above the user's own stage, which is not changed.
+"""USD: a stronger layer of ``over`` prims on the user's stage, which is not changed.
 
 Attributes are those of UsdPhysics; where it has none, both PhysX's and Newton's are written. A
-flexible joint or play is an added body of negligible mass and an added joint before the joint's
-own body. Angles of drives, limits and damping are in degrees there, armature and friction are not.
+flexible joint or play is an added body of negligible mass with a joint before the joint's body.
+Drives, limits and damping are per degree, armature and friction are not.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from gapbridge.bridge.patch.changes import TINY, Axes, ModelChanges, base_in_world
+from gapbridge.bridge.patch.changes import TOLERANCE, Axes, ModelChanges, base_in_world
 from gapbridge.bridge.patch.model_format import (
     ModelFormat,
     Patched,
     PatchOptions,
-    named_one,
+    known_name,
     pick_joints,
 )
 from gapbridge.core.arrays import Array
@@ -72,7 +72,7 @@ class Usd(ModelFormat):
 
 
 class _Stage:
-    """A user's stage under a new, stronger layer; lengths in m, whatever the stage's unit."""
+    """A user's stage under a new, stronger layer; lengths are converted to m."""
 
     def __init__(self, path: Path, folder: Path | None) -> None:
         try:
@@ -127,7 +127,7 @@ class _Stage:
                 return False
         for path, frame in self._at_zero().items():  # parents come first
             current = self.authored(path)
-            if path and not np.allclose(current, frame, rtol=0, atol=TINY):
+            if path and not np.allclose(current, frame, rtol=0, atol=TOLERANCE):
                 self.move(path, frame @ np.linalg.inv(current))
         return True
 
@@ -240,7 +240,7 @@ class _Stage:
 
 
 class _Layer:
-    """The changes as they are written into a stage's stronger layer."""
+    """Writes the changes into the stronger layer of a stage."""
 
     def __init__(self, stage: _Stage, changes: ModelChanges, options: PatchOptions, world: Array,
                  names: Sequence[str]) -> None:  # fmt: skip
@@ -252,7 +252,7 @@ class _Layer:
     def frame(self, name: str, joint: int) -> None:
         """Move a joint in its parent."""
         usd_joint = self.stage.joints[name]
-        if not np.allclose(self.changes.shift[joint - 1], np.eye(4), rtol=0, atol=TINY):
+        if not np.allclose(self.changes.shift[joint - 1], np.eye(4), rtol=0, atol=TOLERANCE):
             motion = self.changes.motion(joint - 1, self.world)
             parent = self.stage.frames[self.stage.body(usd_joint, 0)]
             local = np.linalg.inv(parent) @ motion @ self.stage.in_world(usd_joint)
@@ -275,7 +275,7 @@ class _Layer:
             if not added:
                 continue
             for attribute, factor in names:
-                value = self._current(prim, attribute) + added * factor / self._effort(kind)
+                value = self._current(prim, attribute) + added * factor / self._torque_unit()
                 self.stage.set(prim, attribute, "Float", value)
                 self.changed.append(f"joint {name}: {attribute} {value:.6g}")
 
@@ -283,8 +283,8 @@ class _Layer:
         value = prim.GetAttribute(attribute)
         return float(value.Get() or 0.0) if value else 0.0
 
-    def _effort(self, kind: Kind) -> float:
-        """Return Nm (or kg m2) per the stage's own unit."""
+    def _torque_unit(self) -> float:
+        """Return the stage's unit of torque in Nm, and of inertia in kg m2."""
         return float(self.stage.kilogram * self.stage.unit**2)
 
     def drive(self, name: str, joint: int) -> None:
@@ -293,13 +293,13 @@ class _Layer:
         delay = self.changes.of_joint(Kind.DELAY, joint)
         droop = self.changes.of_joint(Kind.SERVO_COMPLIANCE, joint)
         if delay:
-            self.missing.append(f"delay of {name}, {delay:.6g} s: give it to the actuator in its "
-                                "own steps (newton:delaySteps, DelayedPDActuatorCfg)")  # fmt: skip
+            self.missing.append(f"delay of {name}, {delay:.6g} s: set it at the actuator in steps "
+                                "(newton:delaySteps, DelayedPDActuatorCfg)")  # fmt: skip
         if not droop:
             return
         drive = self.stage.UsdPhysics.DriveAPI(prim, "angular")
         current = drive.GetStiffnessAttr().Get() if drive.GetStiffnessAttr() else None
-        scale = PER_DEGREE / self._effort(Kind.DAMPING)
+        scale = PER_DEGREE / self._torque_unit()
         compliance = scale / float(current) if current and self.options.on_top else 0.0
         stiffness = scale / (droop + compliance)
         drive = self.stage.UsdPhysics.DriveAPI.Apply(prim, "angular")
@@ -359,7 +359,7 @@ class _Layer:
         stage.UsdPhysics.RigidBodyAPI.Apply(body.GetPrim())
         mass = stage.UsdPhysics.MassAPI.Apply(body.GetPrim())
         mass.CreateMassAttr().Set(SMALL / stage.kilogram)
-        mass.CreateDiagonalInertiaAttr().Set(stage.Gf.Vec3f(SMALL / self._effort(Kind.DAMPING)))
+        mass.CreateDiagonalInertiaAttr().Set(stage.Gf.Vec3f(SMALL / self._torque_unit()))
         frame = stage.frames[child] @ stage.local(joint, 1)
         stage.frames[f"{path}_body"] = frame
         self._place(body, frame)
@@ -379,14 +379,14 @@ class _Layer:
             return
         drive = stage.UsdPhysics.DriveAPI.Apply(spring.GetPrim(), "angular")
         drive.CreateTypeAttr().Set("force")
-        value = stiffness * PER_DEGREE / self._effort(Kind.DAMPING)
+        value = stiffness * PER_DEGREE / self._torque_unit()
         drive.CreateStiffnessAttr().Set(value)
         drive.CreateDampingAttr().Set(0.01 * value)
         drive.CreateTargetPositionAttr().Set(0.0)
         self.changed.append(f"joint {name}_{label}: drive's stiffness {value:.6g} per degree")
 
     def _place(self, xform: Any, frame: Array) -> None:
-        """Place a prim that was defined here at a frame (4, 4) in world."""
+        """Place a new prim at a frame (4, 4) in world."""
         cache = self.stage.UsdGeom.XformCache()
         parent = np.array(cache.GetParentToWorldTransform(xform.GetPrim())).T
         scaled = frame.copy()
@@ -395,8 +395,8 @@ class _Layer:
         xform.AddTransformOp().Set(self.stage.Gf.Matrix4d(matrix.T.tolist()))
 
     def tool(self) -> None:
-        """Move the TCP's Xform, which is given by its path or name."""
-        if np.allclose(self.changes.tcp_shift, np.eye(4), rtol=0, atol=TINY):
+        """Move the Xform of the TCP, given by path or name."""
+        if np.allclose(self.changes.tcp_shift, np.eye(4), rtol=0, atol=TOLERANCE):
             return
         if not self.options.tcp:
             self.missing.append("tool: name the Xform of the TCP with --tcp")
@@ -406,7 +406,7 @@ class _Layer:
                  if p.IsA(self.stage.UsdGeom.Xformable)}  # fmt: skip
         tcp = self.options.tcp
         if tcp not in paths.values():
-            tcp = paths[named_one(self.stage.path, "--tcp", tcp, list(paths))]
+            tcp = paths[known_name(self.stage.path, "--tcp", tcp, list(paths))]
         frame = self.world @ self.changes.tcp_in_base
         motion = frame @ self.changes.tcp_shift @ np.linalg.inv(frame)
         last = self.stage.last_body(self.names[-1])
@@ -431,7 +431,7 @@ class _Layer:
         self.changed.append(f"{scenes[0].GetPath()}: gravity")
 
     def unsupported(self) -> list[str]:
-        """Return what is not in the layer, with what to do instead."""
+        """Return the changes that are not in the layer, with what to do instead."""
         kinds = {setting.kind for setting in self.changes.settings}
         lines = self.missing + [text for kind, text in INSTEAD.items()
                                 if kind in kinds and kind is not Kind.LINK_MOMENT]  # fmt: skip
@@ -450,7 +450,7 @@ def _matrix(w: float, xyz: Any) -> Array:
 
 
 def _quat(R: Array) -> tuple[float, float, float, float]:
-    """Return w, x, y, z."""
+    """Return a rotation (3, 3) as quaternion w, x, y, z."""
     from scipy.spatial.transform import Rotation
 
     x, y, z, w = Rotation.from_matrix(R).as_quat()

@@ -1,4 +1,4 @@
-"""The answer: three sentences and one picture."""
+"""Summary of a diagnosis: verdict, three sentences, next steps, and a chart of the gap."""
 
 from __future__ import annotations
 
@@ -39,16 +39,16 @@ KINDS = {
     Verdict.UNEXPLAINED: blocks.BAD,
 }
 CAPTION = (
-    "Gap per coordinate (rms) before and after the found causes are put into the model, on "
-    "measurements the fit did not see, beside the noise. Below, how the gap divides up; squares "
-    "are what add up, so the shares are of the squared gap."
+    "Gap per coordinate (rms) before and after the causes are added to the model, on held-out "
+    "measurements, and the measurement noise. Below, the shares of the squared gap (squares add "
+    "up)."
 )
-WIDTH, LABELS = 390.0, 152.0  # of the drawing, and beside the bars
+WIDTH, LABELS = 390.0, 152.0  # of the drawing, and of the labels left of the bars
 ROW, BAR = 24.0, 15.0
 
 
 def answer(material: Material) -> list[blocks.Block]:
-    """Return the blocks; further channels have a line each."""
+    """Return the summary of the main channel in full, and a line for each other channel."""
     diagnosis = material.diagnosis
     main = chosen_channel(diagnosis)
     verdict = blocks.Badge(VERDICTS[diagnosis.verdict], KINDS[diagnosis.verdict])
@@ -65,67 +65,67 @@ def answer(material: Material) -> list[blocks.Block]:
 
 
 def next_steps(diagnosis: Diagnosis) -> list[str]:
-    """Return what the user does next, most urgent first."""
+    """Return recommended next steps, most urgent first."""
     causes = [cause for c in diagnosis.channels for cause in c.causes]
     steps = []
     if diagnosis.findings:
         steps.append(
-            "Read the findings under Data quality first: where one of them is a mistake in log or "
+            "Read the findings under Data quality first: where one is a mistake in the log or the "
             "cell, correct it and diagnose again."
         )
     if causes:
         steps.append(
-            "Write the causes into a new cell with --apply NEW_CELL, then diagnose a log with "
-            "other poses against that cell: its gap should be that of “after”."
+            "Write the causes into a new cell with --apply NEW_CELL, then diagnose a log of other "
+            "poses with that cell: its gap should be about that shown as “after”."
         )
     elif diagnosis.verdict is Verdict.NO_GAP:
-        steps.append("Nothing: use the cell as it is. Diagnose again after a change to the arm.")
+        steps.append("None: use the cell as it is. Diagnose again after a change to the arm.")
     if any(c.structured or c.verdict is Verdict.UNEXPLAINED for c in diagnosis.channels):
         steps.append(
-            "Do not compensate what no effect explains. Look at what the remaining gap depends on "
-            "(“Where the gap lies”) and at the arm there: wear, a loose part, cables, the "
-            "instrument's mounting."
+            "Do not compensate what no effect explains. Check what the remaining gap depends on "
+            "(“Where the gap lies”), and the arm there: wear, a loose part, cables, the mounting "
+            "of the instrument."
         )
     if diagnosis.next_measurements:
-        open_ = any(cause.indistinguishable_from for cause in causes)
-        what = "To decide between the causes that these data cannot separate, measure" if open_ \
+        tied = any(cause.indistinguishable_from for cause in causes)
+        purpose = "To decide between the causes that these data cannot separate, measure" if tied \
             else "To answer the open questions, measure"  # fmt: skip
-        steps.append(f"{what} the poses under “What to measure next” and add them to the log.")
+        steps.append(f"{purpose} the poses under “What to measure next” and add them to the log.")
     return steps
 
 
 def sentences(channel: ChannelDiagnosis) -> list[str]:
-    """Return three sentences: how large the gap is, what causes it, what is left."""
-    return [_size(channel), _causes(channel), _left(channel)]
+    """Return three sentences: size of the gap, its causes, and what remains."""
+    return [_size(channel), _causes(channel), _remaining(channel)]
 
 
 def one_line(channel: ChannelDiagnosis) -> str:
     """Return one sentence on a channel that is not the main one."""
     if channel.verdict is Verdict.NO_GAP:
-        return f"no gap; {with_unit(channel.gap_rms, channel.unit)} is what noise makes."
-    return f"{_causes(channel)} {_left(channel)}"
+        return f"no gap; {with_unit(channel.gap_rms, channel.unit)} is within the noise."
+    return f"{_causes(channel)} {_remaining(channel)}"
 
 
 def cause_title(cause: Cause) -> str:
-    """Return a cause in plain words with its joints."""
+    """Return the title of a cause with its joints and the effects that it is tied with."""
     where = f" ({joint_list(cause.joints)})" if cause.joints else ""
     ties = [effect_title(name) for name in cause.indistinguishable_from]
-    tie = f" – or, these data cannot distinguish between, {listed(ties, 'or')}" if ties else ""
+    tie = f" (or {listed(ties, 'or')}; these data cannot distinguish them)" if ties else ""
     return f"{effect_title(cause.effect)}{where}{tie}"
 
 
 def _size(channel: ChannelDiagnosis) -> str:
     unit, what = channel.unit, {
-        "position": "The tool is off by", "wrench": "The measured force is off by",
-        "tracking": "The joints are off their command by", "torque": "The joint torques are off by",
+        "position": "The TCP error is", "wrench": "The measured force is off by",
+        "tracking": "The following error is", "torque": "The joint torques are off by",
     }[channel.channel]  # fmt: skip
     per = "joint" if channel.channel in ("tracking", "torque") else "axis"
     floor = channel.noise_floor_rms
-    noise = "" if floor is None else f"; measurement noise makes {with_unit(floor, unit)} of it"
+    noise = "" if floor is None else f"; measurement noise accounts for {with_unit(floor, unit)}"
     if floor is not None and floor >= channel.gap_rms:
         noise = f", no more than the measurement noise of {with_unit(floor, unit)}"
     elif channel.verdict is Verdict.NO_GAP:
-        noise = "" if floor is None else f", and noise alone makes {with_unit(floor, unit)}"
+        noise = "" if floor is None else f"; noise alone would give {with_unit(floor, unit)}"
     return (
         f"{what} {with_unit(channel.gap_rms, unit)} per {per} (rms over {channel.samples} samples, "
         f"{with_unit(channel.gap_max, unit)} at worst){noise}."
@@ -137,27 +137,27 @@ def _causes(channel: ChannelDiagnosis) -> str:
         if channel.verdict is Verdict.NO_GAP:
             return "Model and measurement agree: no effect is needed to explain the difference."
         return (
-            "No known effect explains it: something is going on that is not in the catalogue, "
-            "and no known effect is blamed for it."
+            "No effect of the catalogue explains it, so none is named as a cause: its cause is not "
+            "in the catalogue."
         )
     causes = listed([cause_title(c) for c in channel.causes])
-    fall = 1 - after(channel) / max(channel.gap_rms, 1e-300)
-    sure = likelihood(min(c.probability for c in channel.causes))
+    reduction = 1 - after(channel) / max(channel.gap_rms, 1e-300)
+    probability = likelihood(min(c.probability for c in channel.causes))
     many = len(channel.causes) > 1
-    left = with_unit(after(channel), channel.unit)
+    remaining = with_unit(after(channel), channel.unit)
     change = (
-        f"the gap falls by {percent(fall)} to {left}"
-        if fall > 0
-        else (f"the gap does not fall (it is {left})")
+        f"the gap falls by {percent(reduction)} to {remaining}"
+        if reduction > 0
+        else (f"the gap does not fall (it is {remaining})")
     )
     return (
         f"Cause{'s' if many else ''}: {causes}; with {'them' if many else 'it'} in the model "
-        f"{change} on measurements that the fit did not see ({sure} sure).{elsewhere(channel)}"
+        f"{change} on held-out measurements (probability {probability}).{elsewhere(channel)}"
     )
 
 
 def elsewhere(channel: ChannelDiagnosis) -> str:
-    """Return what to expect where nothing was fitted: never only the flattering figure."""
+    """Return the expected gap in a new region and in a new session, which exceed the fit's."""
     found, unit = channel.elsewhere, channel.unit
     parts = []
     if found.new_region is not None:
@@ -165,24 +165,24 @@ def elsewhere(channel: ChannelDiagnosis) -> str:
     if found.new_session is not None:
         parts.append(f"{with_unit(found.new_session, unit)} in a new session")
     session = "" if found.new_session is not None else (
-        " One session does not show what a new one brings."
+        " One session does not show how sessions differ."
     )  # fmt: skip
     return (f" Expect {listed(parts)}." if parts else "") + session
 
 
-def _left(channel: ChannelDiagnosis) -> str:
+def _remaining(channel: ChannelDiagnosis) -> str:
     if channel.structured:
         names = [quantity_title(name) for name, share in channel.depends_on[:3] if share > 0.01]
         on = f" It depends on {listed(names)}." if names else ""
         size = with_unit(unexplained(channel), channel.unit)
-        return f"{size} stays unexplained, more than noise.{on}"
+        return f"{size} remains unexplained, more than noise.{on}"
     if channel.verdict is Verdict.NO_GAP:
-        return "Nothing needs to be changed on account of this log."
-    return "What remains looks like measurement noise, with no structure left in it."
+        return "This log calls for no change."
+    return "What remains has no structure and is consistent with measurement noise."
 
 
 def picture(channel: ChannelDiagnosis) -> Drawing:
-    """Return the bars of one channel, and the shares below them."""
+    """Return a chart of one channel: bars of the gap, and its shares below."""
     bars = [("before" if channel.causes else "gap", channel.gap_rms, BEFORE)]
     if channel.causes:
         bars.append(("after", after(channel), AFTER))
@@ -209,9 +209,9 @@ def _shares(drawing: Drawing, channel: ChannelDiagnosis, y: float) -> None:
         ("noise", part.noise, EDGE),
         ("unexplained", part.unexplained, BAD_DOT),
     ):
-        wide = (WIDTH - LABELS) * share
+        width = (WIDTH - LABELS) * share
         text = f"{name} {percent(share)}"
-        drawing.add(Rectangle(x, y, wide, BAR, colour, text))
-        if wide > 6.2 * len(text):
-            drawing.add(Text(x + wide / 2, y + 11.3, text, 10.5, ON_BAR, "middle"))
-        x += wide
+        drawing.add(Rectangle(x, y, width, BAR, colour, text))
+        if width > 6.2 * len(text):
+            drawing.add(Text(x + width / 2, y + 11.3, text, 10.5, ON_BAR, "middle"))
+        x += width

@@ -1,4 +1,4 @@
-"""The catalogue as a page of the documentation, generated from the effects' own docstrings.
+"""Generate docs/catalogue.md from the docstrings of the effects.
 
 Example: python -m gapbridge.bridge.report.catalogue_page docs/catalogue.md
 """
@@ -26,7 +26,7 @@ model, in SI units.
 
 
 def catalogue_page() -> str:
-    """Return the page as Markdown: a table of all effects by channel, then one part each."""
+    """Return the page as Markdown: a table of effects per channel, then a section per effect."""
     parts = [HEAD]
     for channel, unit in CHANNELS.items():
         parts += [f"## {CHANNEL_TITLES[channel]} (`{channel}`, {unit})", "", _table(channel), ""]
@@ -65,7 +65,7 @@ def _effect(effect: Effect) -> str:
 
 
 def main(arguments: list[str]) -> int:
-    """Write the page to the file that is named, or to its place in the checkout."""
+    """Write the page to the file in ``arguments``, by default docs/catalogue.md."""
     path = Path(arguments[0]) if arguments else PAGE
     path.write_text(catalogue_page(), encoding="utf-8")
     return 0

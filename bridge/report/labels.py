@@ -1,4 +1,4 @@
-"""Words: effects, quantities and values as people say them."""
+"""Titles of effects, quantities and parameters, and numbers with their units, for reports."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ _VECTORS = {
     "ft_raw_wrench": "sensor reading",
 }
 _AXES = ("x", "y", "z", "about x", "about y", "about z")
-OF_SESSIONS = {  # what sessions find that is no effect
+SESSION_PARAMETERS = {  # of calibration sessions, beyond those of effects
     "tool_tcp": "tool centre {part}",
     "payload_mass": "mass of the load",
     "payload_cog": "centre of gravity {part}",
@@ -63,13 +63,13 @@ PARTS = {
 
 
 def effect_title(identifier: str) -> str:
-    """Return an effect in plain words; its identifier where there are none."""
+    """Return the title of an effect; without one its identifier with spaces."""
     effect = CATALOGUE.get(identifier)
     return (effect.title if effect else "") or identifier.replace("_", " ")
 
 
 def quantity_title(name: str) -> str:
-    """Return a log column in plain words, joints counted from 1."""
+    """Return the title of a log column, joints counted from 1."""
     if name == "timestamp":
         return "time"
     if name == "payload":
@@ -83,7 +83,7 @@ def quantity_title(name: str) -> str:
 
 
 def quantity_unit(name: str) -> tuple[str, float]:
-    """Return the unit in which a log column is shown, and its factor."""
+    """Return the display unit of a log column, and the factor from SI."""
     if name.startswith(("actual_q_", "target_q_")):
         return "deg", 180 / math.pi
     units = {
@@ -99,17 +99,17 @@ def quantity_unit(name: str) -> tuple[str, float]:
 
 
 def unit_of(unit: str) -> tuple[str, float]:
-    """Return the unit that people use for an SI unit, and the factor to it."""
+    """Return the display unit for an SI unit, and the factor from SI."""
     return UNITS.get(unit, (unit, 1.0))
 
 
 def parameter_unit(parameter: Reported) -> tuple[str, float]:
-    """Return the unit in which a parameter is shown, and its factor."""
+    """Return the display unit of a parameter, and the factor from SI."""
     return ("deg", 180 / math.pi) if parameter.part == "phase" else unit_of(parameter.unit)
 
 
 def fixed(value: float, decimals: int) -> str:
-    """Return a number with so many decimals, with a true minus sign, never minus nothing."""
+    """Return a number with ``decimals`` decimals and a typographic minus, without "-0"."""
     if not math.isfinite(value):
         return "unknown"
     text = f"{value:.{decimals}f}"
@@ -119,14 +119,14 @@ def fixed(value: float, decimals: int) -> str:
 
 
 def decimals_of(spread: float) -> int:
-    """Return the decimals that show two digits of a spread."""
+    """Return the number of decimals that shows two significant digits of a spread."""
     if not math.isfinite(spread) or spread <= 0:
         return 3
     return min(max(1 - math.floor(math.log10(spread)), 0), 9)
 
 
 def number(value: float, digits: int = 3) -> str:
-    """Return a number with so many significant digits, without an exponent where one can."""
+    """Return a number with ``digits`` significant digits, with an exponent only if extreme."""
     if not math.isfinite(value):
         return "unknown"
     if value == 0:
@@ -139,7 +139,7 @@ def number(value: float, digits: int = 3) -> str:
 
 
 def with_unit(value: float | None, unit: str) -> str:
-    """Return a value (SI) in the unit that people use; "unknown" for None."""
+    """Return a value (SI) in its display unit; "unknown" for None."""
     if value is None:
         return "unknown"
     name, factor = unit_of(unit)
@@ -147,14 +147,14 @@ def with_unit(value: float | None, unit: str) -> str:
 
 
 def percent(share: float | None) -> str:
-    """Return a share as percent."""
+    """Return a share (0 to 1) as percent."""
     if share is None or not math.isfinite(share):
         return "unknown"
     return f"{round(share * 100)} %".replace("-", "−")
 
 
 def likelihood(probability: float) -> str:
-    """Return a probability as percent, without claiming certainty."""
+    """Return a probability as percent, bounded at 0.1 and 99.9 %."""
     if not math.isfinite(probability):
         return "unknown"
     if probability > 0.999:
@@ -165,7 +165,7 @@ def likelihood(probability: float) -> str:
 
 
 def listed(items: list[str], last: str = "and") -> str:
-    """Return words joined as in a sentence."""
+    """Return items joined with commas, and ``last`` before the last one."""
     if len(items) < 2:
         return "".join(items)
     return f"{', '.join(items[:-1])} {last} {items[-1]}"
@@ -179,12 +179,12 @@ def joint_list(joints: tuple[int, ...]) -> str:
 
 
 def parameter_title(name: str) -> str:
-    """Return the public name of a parameter or an effect in words; any other text as it is."""
-    parts = split_name(name, OF_SESSIONS)
+    """Return the title of a parameter or an effect by its public name; other text unchanged."""
+    parts = split_name(name, SESSION_PARAMETERS)
     if parts is None:
         return name
     effect = CATALOGUE.get(parts.effect)
-    pattern = OF_SESSIONS.get(parts.effect) or (effect.label_template if effect else "")
+    pattern = SESSION_PARAMETERS.get(parts.effect) or (effect.label_template if effect else "")
     if effect and name == parts.effect and (not pattern or "{" in pattern):
         return effect_title(name)
     joint, part = "" if parts.joint is None else str(parts.joint), _part_title(parts)

@@ -1,4 +1,4 @@
-"""The material of a report: the diagnosis, the log and the model it is about."""
+"""Input of a report: the diagnosis, its log and model; and figures that sections share."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from gapbridge.core.diagnosis.held_out import HeldOut
 from gapbridge.core.log.log import Log
 from gapbridge.core.model import Model
 
-SHOWN = 1500  # points a figure draws at most; outliers and extremes are not thinned away
+SHOWN = 1500  # most points of a figure; the largest values are always drawn
 
 
 @dataclass(frozen=True)
 class Material:
-    """All that a section may speak about."""
+    """Input of every section."""
 
     diagnosis: Diagnosis
     cell_name: str
@@ -34,7 +34,7 @@ class Material:
 
 @dataclass(frozen=True)
 class Shares:
-    """Of a gap's energy: what is explained, noise, and unexplained; they add up to one."""
+    """Shares of the squared gap; they add up to one."""
 
     explained: float
     noise: float
@@ -42,49 +42,49 @@ class Shares:
 
 
 def shares(channel: ChannelDiagnosis) -> Shares:
-    """Return the shares of a channel's gap; held out where held-out figures can be had."""
+    """Return the shares of a channel's squared gap, from held-out figures where available."""
     total = max(channel.gap_rms**2, 1e-300)
-    left = after(channel) if channel.causes else channel.gap_rms
-    rest = min(left**2 / total, 1.0)
+    gap = after(channel) if channel.causes else channel.gap_rms
+    remaining = min(gap**2 / total, 1.0)
     if not channel.structured:
-        return Shares(1 - rest, rest, 0.0)
+        return Shares(1 - remaining, remaining, 0.0)
     floor = channel.noise_floor_rms or 0.0
-    noise = min(floor**2 / total, rest)
-    # what a quantity predicts of samples that it did not see is no noise, whatever the floor says
-    predictable = rest * max((share for _, share in channel.depends_on), default=0.0)
-    beyond = min(max(rest - noise, predictable), rest)
-    return Shares(1 - rest, rest - beyond, beyond)
+    noise = min(floor**2 / total, remaining)
+    # what a quantity predicts of held-out samples is not noise, whatever the noise floor
+    predictable = remaining * max((share for _, share in channel.depends_on), default=0.0)
+    structure = min(max(remaining - noise, predictable), remaining)
+    return Shares(1 - remaining, remaining - structure, structure)
 
 
 def unexplained(channel: ChannelDiagnosis) -> float:
-    """Return the rms of what is left and no noise, in the channel's unit."""
+    """Return the rms of the unexplained gap beyond noise, in the channel's unit."""
     return max(
         channel.unexplained_rms, channel.gap_rms * float(np.sqrt(shares(channel).unexplained))
     )
 
 
 def after(channel: ChannelDiagnosis) -> float:
-    """Return the gap with the causes in the model, held out where that can be had."""
-    held = channel.remaining_rms_held_out
-    return channel.remaining_rms if held is None else held
+    """Return the gap (rms) with the causes in the model, held out where available."""
+    held_out = channel.remaining_rms_held_out
+    return channel.remaining_rms if held_out is None else held_out
 
 
 def per_sample(gap: Array, count: int) -> Array:
-    """Return the length (N,) of the first ``count`` coordinates of a gap."""
+    """Return the norm (N,) of the first ``count`` coordinates of a gap (N, k)."""
     return np.asarray(np.linalg.norm(gap[:, :count], axis=1))
 
 
 def held_out_pair(channel: ChannelDiagnosis) -> tuple[Array, Array] | None:
-    """Return the rms per coordinate of each kept sample, held out: without and with the causes.
+    """Return each kept sample's held-out rms per coordinate (N,), without and with the causes.
 
-    None where samples cannot be held out.
+    None where there are too few poses to hold any out.
     """
     if channel.held_out is None:
         return None
-    held = HeldOut(channel.selection)
-    if not held.possible:
+    held_out = HeldOut(channel.selection)
+    if not held_out.possible:
         return None
-    return np.sqrt(held.squares(())), channel.held_out
+    return np.sqrt(held_out.squares(())), channel.held_out
 
 
 def thinned(score: Array, most: int = SHOWN) -> Index:
@@ -98,7 +98,7 @@ def thinned(score: Array, most: int = SHOWN) -> Index:
 
 
 def chosen_channel(diagnosis: Diagnosis) -> ChannelDiagnosis:
-    """Return the channel to speak of first: the one with the largest gap over its noise."""
+    """Return the main channel: the one with the largest ratio of gap to noise."""
 
     def excess(channel: ChannelDiagnosis) -> float:
         return channel.gap_rms / max(channel.noise_floor_rms or channel.gap_rms, 1e-300)
@@ -110,9 +110,9 @@ def chosen_channel(diagnosis: Diagnosis) -> ChannelDiagnosis:
 def before_and_after(
     channel: ChannelDiagnosis, before: Array, after: Array
 ) -> list[tuple[str, Array, str]]:
-    """Return name, values and colour of what is drawn: after only where there are causes."""
-    given = [("before", before, BEFORE)]
-    return [*given, ("after", after, AFTER)] if channel.causes else given
+    """Return name, values and colour of each series; “after” only where there are causes."""
+    series = [("before", before, BEFORE)]
+    return [*series, ("after", after, AFTER)] if channel.causes else series
 
 
 def channel_heading(diagnosis: Diagnosis, channel: ChannelDiagnosis) -> list[Block]:

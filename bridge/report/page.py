@@ -1,4 +1,4 @@
-"""The report of a diagnosis: one HTML file that needs nothing else."""
+"""The report of a diagnosis: one self-contained HTML file."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from gapbridge.bridge.document.html import html
 from gapbridge.bridge.document.output_file import write_text
 from gapbridge.bridge.document.provenance import origin_blocks, origin_line
 from gapbridge.bridge.report.answer import answer
-from gapbridge.bridge.report.how_far import how_far
+from gapbridge.bridge.report.gap_location import effect_tables, gap_location
+from gapbridge.bridge.report.gap_reduction import gap_reduction
 from gapbridge.bridge.report.labels import CHANNELS, with_unit
 from gapbridge.bridge.report.material import Material, per_sample
 from gapbridge.bridge.report.parameters import parameters
-from gapbridge.bridge.report.where import where, which
 from gapbridge.core.diagnosis.channel_diagnosis import ChannelDiagnosis
 from gapbridge.core.diagnosis.diagnosis import Diagnosis
 from gapbridge.core.diagnosis.noise_floor import own_coordinates
 from gapbridge.core.log.log import Log
 from gapbridge.core.model import Model
 
-LISTED = 20  # outliers listed a channel
+LISTED = 20  # most outliers listed per channel
 
 FILE = "report.html"
 
@@ -58,12 +58,12 @@ def document(material: Material) -> blocks.Document:
 
 
 def _cell_title(name: str) -> str:
-    """Return a cell's name; of a path to a cell file, the file's own."""
+    """Return a cell's name; for a path to a cell file, the name of the file."""
     return Path(name).stem if name.endswith((".yaml", ".yml")) else name
 
 
 def data_quality(material: Material) -> list[blocks.Block]:
-    """Return rows used, findings, outliers, channels that the log does not show, origin."""
+    """Return rows used, findings, outliers, channels that are not observable, provenance."""
     diagnosis = material.diagnosis
     rows = [
         [CHANNELS[c.channel], str(len(material.log)), str(c.samples),
@@ -76,18 +76,18 @@ def data_quality(material: Material) -> list[blocks.Block]:
     shown: list[blocks.Block] = [blocks.Table(heads, rows), blocks.Heading("Findings")]
     shown.append(
         blocks.Bullets(tuple(finding_text(f) for f in diagnosis.findings)) if diagnosis.findings
-        else blocks.Paragraph("No check of the log found anything odd.")
+        else blocks.Paragraph("The checks of the log found no anomaly.")
     )  # fmt: skip
     for channel in diagnosis.channels:
         shown += _outliers(channel, material.log)
     if diagnosis.not_observable:
-        hidden = [
-            [CHANNELS.get(h.channel, h.channel), ", ".join(h.needs)]
-            for h in diagnosis.not_observable
+        missing = [
+            [CHANNELS.get(c.channel, c.channel), ", ".join(c.needs)]
+            for c in diagnosis.not_observable
         ]
         shown += [
             blocks.Heading("What this log cannot show"),
-            blocks.Table(("channel", "columns it would need"), hidden),
+            blocks.Table(("channel", "columns it would need"), missing),
         ]
     return shown + origin_blocks(material.origin)
 
@@ -107,7 +107,7 @@ def _outliers(channel: ChannelDiagnosis, log: Log) -> list[blocks.Block]:
     return [
         blocks.Heading(f"Outliers: {CHANNELS[channel.channel]}"),
         blocks.Paragraph(
-            f"They fit nothing around them and were excluded before any effect was judged.{more}"
+            f"They disagree with their neighbours and were excluded from the fit of effects.{more}"
         ),
         blocks.Table(("line of the file", "distance from the model"), rows),
     ]
@@ -115,14 +115,14 @@ def _outliers(channel: ChannelDiagnosis, log: Log) -> list[blocks.Block]:
 
 SECTIONS: tuple[blocks.Section[Material], ...] = (
     blocks.Section("answer", "The answer", answer),
-    blocks.Section("where", "Where the gap lies", where,
-            "Which joints and axes it comes from, and what it follows."),
-    blocks.Section("which", "Which effect causes it", which,
+    blocks.Section("where", "Where the gap lies", gap_location,
+            "Which joints and axes it comes from, and what it depends on."),
+    blocks.Section("which", "Which effect causes it", effect_tables,
             "Every effect that was tried, with the evidence for and against."),
-    blocks.Section("how_far", "How far it shrinks", how_far,
-            "Judged only on measurements that the fit did not see."),
+    blocks.Section("how_far", "How far it shrinks", gap_reduction,
+            "All figures are of held-out measurements."),
     blocks.Section("parameters", "Parameters and next measurements", parameters,
-            "What goes into the model, how surely, and what would settle the open questions."),
+            "What is added to the model, with intervals, and which measurements would add most."),
     blocks.Section("data_quality", "Data quality", data_quality,
-            "What was used, what was excluded, what could not be seen."),
+            "What was used, what was excluded, what is not observable."),
 )  # fmt: skip

@@ -1,4 +1,4 @@
-"""Parameters with their intervals, ties, and what to measure next."""
+"""Section of parameters with their intervals, ties, and the next measurements."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import numpy as np
 
 from gapbridge.bridge.document import blocks
 from gapbridge.bridge.document.findings import clock
+from gapbridge.bridge.document.provenance import HALF_WIDTH
 from gapbridge.bridge.report.labels import (
     decimals_of,
     effect_title,
@@ -20,7 +21,6 @@ from gapbridge.core.diagnosis.causes import Cause
 from gapbridge.core.diagnosis.separation import Measurement
 from gapbridge.core.effects import Reported
 
-SIDE = 1.96  # standard deviations of a 95 % interval
 SHOWN = 12
 
 
@@ -36,9 +36,7 @@ def parameters(material: Material) -> list[blocks.Block]:
 def _parameters(causes: list[Cause]) -> list[blocks.Block]:
     if not causes:
         return [
-            blocks.Paragraph(
-                "No effect was accused, so there are no parameters to add to the model."
-            )
+            blocks.Paragraph("No cause was named, so there are no parameters to add to the model.")
         ]
     rows: list[list[blocks.Cell]] = []
     for cause in causes:
@@ -48,8 +46,8 @@ def _parameters(causes: list[Cause]) -> list[blocks.Block]:
             rows.append([first, blocks.Named("", code=p.name), *_value(p)])
             first = ""
     note = (
-        "Each is what the real arm has more than the model; the interval holds it in 19 of 20 "
-        "cases."
+        "Each value is what the real arm has more than the model; the interval contains the true "
+        "value in 19 of 20 cases."
     )
     heads = ("cause", "parameter", "value", "95 % interval", "unit")
     return [blocks.Table(heads, rows, (2.2, 2.2, 1, 1.6, 0.8)), blocks.Paragraph(note, "note")]
@@ -62,9 +60,9 @@ def _value(p: Reported) -> tuple[str, str, str]:
     value = p.value * factor
     if p.std is None or not np.isfinite(p.std):
         return number(value), "unknown", name
-    side = SIDE * p.std * factor
-    digits = decimals_of(side)
-    low, high = (fixed(v, digits) for v in (value - side, value + side))
+    half = HALF_WIDTH * p.std * factor
+    digits = decimals_of(half)
+    low, high = (fixed(v, digits) for v in (value - half, value + half))
     return fixed(value, digits), f"{low} to {high}", name
 
 
@@ -72,7 +70,7 @@ def _ties(causes: list[Cause]) -> list[blocks.Block]:
     ties = tuple(
         f"{effect_title(c.effect).capitalize()} ({c.effect}) explains these data no better than "
         f"{listed([f'{effect_title(n)} ({n})' for n in c.indistinguishable_from], 'or')}. "
-        "The simpler or likelier one is named; a measurement below would decide."
+        "The simpler or likelier one is named; a measurement below would decide between them."
         for c in causes if c.indistinguishable_from
     )  # fmt: skip
     return [blocks.Heading("What these data cannot separate"), blocks.Bullets(ties)] if ties else []
@@ -80,25 +78,25 @@ def _ties(causes: list[Cause]) -> list[blocks.Block]:
 
 def _next(measurements: tuple[Measurement, ...]) -> list[blocks.Block]:
     if not measurements:
-        text = "No question is open that another pose under another load would settle."
+        text = "No further pose or load would decide between the effects."
         return [blocks.Paragraph(text)]
     moving = any(m.velocity for m in measurements)
     text = (
         "Move to these poses with these loads and add the rows to the log"
         f"{'; record a motion through those with a speed' if moving else ''}. Check each for free "
-        "space first: the poses keep the joint limits, but nothing here knows your cell."
+        "space first: the poses respect the joint limits, but obstacles are not known here."
     )
     content: list[blocks.Block] = [blocks.Paragraph(text), measurements_table(measurements, SHOWN)]
     more = len(measurements) - SHOWN
     return (
-        [*content, blocks.Paragraph(f"{more} more stand in the JSON.", "note")]
+        [*content, blocks.Paragraph(f"{more} more are in the JSON.", "note")]
         if more > 0
         else content
     )
 
 
 def measurements_table(measurements: tuple[Measurement, ...], most: int) -> blocks.Table:
-    """Return what to measure next as a table; speeds and approaches only where there are any."""
+    """Return a table of next measurements; speeds and approaches only where there are any."""
     shown = measurements[:most]
     columns: list[tuple[str, float, list[blocks.Cell]]] = [
         ("", 0.3, [str(i) for i in range(1, len(shown) + 1)]),

@@ -1,4 +1,4 @@
-"""The links that the demo can show: name -> what differs on it."""
+"""The links that the demo supports, by name."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ LINKS: dict[str, type[DemoLink]] = {link.name: link for link in (UrRtdeLink, Can
 
 
 def demo_link(name: str) -> type[DemoLink]:
-    """Return what the demo does on a link. Raises InputError for one that it does not know."""
+    """Return the demo's class for a link. Raises InputError for an unknown name."""
     if name not in LINKS:
         raise InputError(f"--link: found {name!r}, expected one of {', '.join(LINKS)}")
     return LINKS[name]

@@ -1,4 +1,4 @@
-"""What may differ from link to link in the demo; everything else is one job for all."""
+"""What differs from link to link in the demo; everything else is in job.py."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ import numpy as np
 from gapbridge.bridge.cell import Cell, load_cell
 from gapbridge.bridge.daemon.daemon import Daemon
 from gapbridge.bridge.demo.bench import Bench
-from gapbridge.bridge.demo.hidden import Hidden
-from gapbridge.bridge.demo.poses import Load, Scene
+from gapbridge.bridge.demo.hidden import HiddenEffects
+from gapbridge.bridge.demo.measurements import SETTLING_TIME
+from gapbridge.bridge.demo.poses import Experiment, Load
 from gapbridge.bridge.demo.processes import ServedCell
-from gapbridge.bridge.demo.rests import SETTLING
 from gapbridge.bridge.demo.result import Resolution
 from gapbridge.bridge.document.output_file import write_text
 from gapbridge.core.arrays import Array
@@ -29,29 +29,29 @@ from gapbridge.core.errors import CellError, RunError
 from gapbridge.drivers.simulated.ur.settings import BENCH_PORT
 
 PAYLOAD = re.compile(r"^payload:.*$", re.MULTILINE)
-LAST_HOST = 60  # 127.0.0.2 to this are tried
+LAST_HOST = 60  # addresses 127.0.0.2 to 127.0.0.60 are tried
 
 
 class DemoLink(ABC):
-    """The demo on one link: which arm, how it is served, who moves it, what it can report."""
+    """The demo on one link: arm, simulated controller, motion, and what the link reports."""
 
     name: ClassVar[str]
-    template: ClassVar[str]  # the cell, a file of this package's parent
-    files: ClassVar[tuple[str, ...]] = ()  # what the cell names, from there too
+    template: ClassVar[str]  # the cell file, in bridge/demo
+    files: ClassVar[tuple[str, ...]] = ()  # files that the cell refers to, also there
     ports: ClassVar[tuple[int, ...]]  # of the simulated controller
-    scene: ClassVar[Scene]
-    settling: ClassVar[float] = SETTLING  # s from standing still until readings count
-    hides: ClassVar[tuple[str, ...]] = ("bent_tool",)  # one of these, drawn from the seed
-    reports_joints: ClassVar[bool] = True  # joints as read are good enough to fit on
+    experiment: ClassVar[Experiment]
+    settling: ClassVar[float] = SETTLING_TIME  # s at rest before readings count
+    effect_choices: ClassVar[tuple[str, ...]] = ("bent_tool",)  # one is drawn from the seed
+    reports_joints: ClassVar[bool] = True  # measured joints are fine enough for the fit
 
     def __init__(self, out: Path, seed: int) -> None:
         self.seed = seed
-        self.hidden = Hidden.drawn(seed, self.hides)  # beside the arm's flexibilities
+        self.hidden = HiddenEffects.drawn(seed, self.effect_choices)  # besides the flexibilities
         self.host = free_address(self.ports)
         self.cell = self._write_cell(out)
 
     def _write_cell(self, out: Path) -> Cell:
-        """Write the demo's cell, and what it names, into ``out``."""
+        """Write the demo's cell and the files that it refers to into ``out``."""
         package = resources.files("gapbridge.bridge.demo")
         for name in (self.template, *self.files):
             text = package.joinpath(name).read_text(encoding="utf-8")
@@ -61,40 +61,40 @@ class DemoLink(ABC):
 
     @property
     def home(self) -> Array:
-        """Return where the arm stands at the start (n,), rad."""
+        """Return the arm's start pose (n,), rad."""
         return np.array(self.cell.simulation.start_q)
 
     @contextmanager
     def served(self) -> Iterator[None]:
-        """Serve the simulated controller in a process of its own. Raises LinkError.
+        """Serve the simulated controller in a child process. Raises LinkError.
 
-        It gets a copy of the cell that lies elsewhere: what is hidden in it stays hidden.
+        Its cell is a copy in another folder that also has the hidden effects.
         """
         with tempfile.TemporaryDirectory(prefix="simulated-") as folder:
-            hidden = Path(folder) / "cell.yaml"
-            text = self.cell.path.read_text(encoding="utf-8") + self._hidden()
+            simulated = Path(folder) / "cell.yaml"
+            text = self.cell.path.read_text(encoding="utf-8") + self._simulation_lines()
             for key, values in self.hidden.simulation.items():
                 text += f"  {key}: [{', '.join(f'{v:.9e}' for v in values)}]\n"
-            write_text(hidden, text)
+            write_text(simulated, text)
             for name in self.files:
                 write_text(Path(folder) / name, (self.cell.path.parent / name).read_text("utf-8"))
-            with ServedCell(hidden, self.seed):
+            with ServedCell(simulated, self.seed):
                 yield
 
-    def _hidden(self) -> str:
-        """Return lines of section ``simulation`` that only the simulated arm may know."""
+    def _simulation_lines(self) -> str:
+        """Return further lines of the section ``simulation`` of the simulated controller's cell."""
         return ""
 
     def bench(self) -> Bench:
-        """Return a connection to the people and the tracker around the arm."""
+        """Return a connection to the bench port."""
         return Bench(self.host, BENCH_PORT)
 
     @abstractmethod
     def resolution(self) -> Resolution:
-        """Return what one count of what is written and read comes to at the TCP."""
+        """Return the resolution of written and read values at the TCP."""
 
     def declared(self, cell: Cell, load: Load) -> Cell:
-        """Return the cell of a run with this load as its payload, as its user would write it."""
+        """Return the cell of a run with this load declared as its payload; writes its file."""
         cog = ", ".join(f"{v:g}" for v in load.cog)
         text = cell.path.read_text(encoding="utf-8")
         declared, count = PAYLOAD.subn(f"payload: {{mass: {load.mass:g}, cog: [{cog}]}}", text)
@@ -106,17 +106,17 @@ class DemoLink(ABC):
 
     @abstractmethod
     def prepare(self, folder: Path, poses: Array) -> float:
-        """Prepare a motion from home through ``poses`` (M, n) and home; returns its length, s."""
+        """Prepare a motion from home through ``poses`` (M, n) and home; returns its duration, s."""
 
     def motion(self, daemon: Daemon, poses: Array) -> AbstractContextManager[object]:
-        """Move the arm during a run, where setpoints do not. Raises LinkError at its end."""
+        """Move the arm during a run where setpoints do not. Raises LinkError when it ends."""
         return nullcontext()
 
 
 def free_address(ports: tuple[int, ...]) -> str:
-    """Return a loopback address on which none of ``ports`` is taken. Raises RunError."""
+    """Return a loopback address on which all ``ports`` are free. Raises RunError."""
     count = LAST_HOST - 1
-    for k in range(count):  # from elsewhere for each process: two may look in the same moment
+    for k in range(count):  # a different start per process: two may search at once
         host = f"127.0.0.{2 + (os.getpid() + k) % count}"
         if all(_is_free(host, port) for port in ports):
             return host

@@ -1,4 +1,4 @@
-"""UR over RTDE: setpoints move the arm; the controller reports payload and force."""
+"""The demo over RTDE: a UR10e moved by setpoints; the controller reports payload and force."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from gapbridge.bridge.demo.bench import Bench, UrBench
 from gapbridge.bridge.demo.links.link import DemoLink
 from gapbridge.bridge.demo.poses import UR10E, Load
 from gapbridge.bridge.demo.result import Resolution
-from gapbridge.bridge.demo.trajectory import PERIOD, visits
+from gapbridge.bridge.demo.trajectory import PERIOD, visit_trajectory
 from gapbridge.bridge.setpoint_source.quintic import write_trajectory
 from gapbridge.core.arrays import Array
 from gapbridge.drivers.simulated.ur.settings import (
@@ -27,22 +27,22 @@ class UrRtdeLink(DemoLink):
     name = "ur_rtde"
     template = "cell.yaml"
     ports = (RTDE_PORT, DASHBOARD_PORT, SCRIPT_PORT, PRIMARY_PORT, BENCH_PORT)
-    scene = UR10E
-    hides = ("bent_tool", "lost_zero")
+    experiment = UR10E
+    effect_choices = ("bent_tool", "shifted_zero")
 
     def bench(self) -> Bench:
-        """Return a connection to the bench, with the pendant."""
+        """Return a connection to the bench that also sends URScript."""
         return UrBench(self.host)
 
     def declared(self, cell: Cell, load: Load) -> Cell:
-        """Return the cell as it is: the controller is informed of the load."""
+        """Return the cell unchanged: the controller itself reports the load."""
         return cell
 
     def resolution(self) -> Resolution:
-        """Return nothing: joints go both ways as 64-bit floats."""
+        """Return zeros: joints are 64-bit floats in both directions."""
         return Resolution(0.0, 0.0)
 
     def prepare(self, folder: Path, poses: Array) -> float:
         """Write the trajectory that the daemon follows; see DemoLink.prepare."""
-        q = visits(self.home, poses, self.cell.arm.limits.velocity)
+        q = visit_trajectory(self.home, poses, self.cell.arm.limits.velocity)
         return write_trajectory(folder / "trajectory.csv", q, PERIOD)

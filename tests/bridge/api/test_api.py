@@ -1,4 +1,4 @@
-"""The commands as functions, and the page of examples, run as it stands."""
+"""The commands as functions, and the examples of docs/python.md."""
 
 from __future__ import annotations
 

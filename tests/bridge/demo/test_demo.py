@@ -1,4 +1,4 @@
-"""The demo as a newcomer runs it: real command, real protocol, real processes."""
+"""The demo as a user runs it: the command, the real protocol, its processes."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def test_the_demo_shows_what_it_states(tmp_path: Path) -> None:
     for name, true in summary["hidden"].items():
         assert summary["accused"][name]["value"] == pytest.approx(true, abs=6e-5)
     assert 0.01 < repeatability < 0.1
-    slower = 2 ** " ".join(ran.stdout.split()).count("which this machine may keep")
+    slower = 2 ** " ".join(ran.stdout.split()).count(" of the rate")
     assert 0.9 * 500 / slower < summary["loop"]["rate_hz"] < 1.01 * 500
     assert "<script src" not in (out / "report.html").read_text()
     rigid, calibrated = load_cell(out / "cell.yaml"), load_cell(out / "calibrated.yaml")

@@ -1,4 +1,4 @@
-"""What the demo hides in its arm is named: its fit and its diagnosis, on what its plant shows."""
+"""The diagnosis names the demo's hidden effects, on data of the simulated plant."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ import pytest
 
 from gapbridge.bridge.cell import Cell, load_cell, save_cell
 from gapbridge.bridge.cell.simulation import _plant
-from gapbridge.bridge.demo.hidden import Accused, Hidden
-from gapbridge.bridge.demo.job import _fit_again
+from gapbridge.bridge.demo.hidden import HiddenEffects, NamedCause
+from gapbridge.bridge.demo.job import _refit
 from gapbridge.bridge.demo.links import LINKS, DemoLink
 from gapbridge.bridge.demo.links.can import SOFTNESS
+from gapbridge.bridge.demo.measurements import Measurements, joined, write_log
 from gapbridge.bridge.demo.poses import plan
-from gapbridge.bridge.demo.rests import Rests, joined, write_log
 from gapbridge.core.diagnosis.diagnosis import diagnose
 from gapbridge.core.errors import CellError
 from gapbridge.core.estimation.identification import identify_compliance
@@ -42,12 +42,12 @@ def plant_of(link: DemoLink) -> Plant:
     return Plant(arm, replace(settings, **hidden), link.home)
 
 
-def measured(link: DemoLink, plant: Plant) -> Rests:
-    """Return the rests that the demo measures for its fit."""
+def measured(link: DemoLink, plant: Plant) -> Measurements:
+    """Return the measurements that the demo fits."""
     rng = np.random.default_rng((link.seed, 5))
-    scene, parts = link.scene, []
-    planned = plan(link.cell.model, link.home, link.seed, scene)
-    for load, poses in zip(scene.calibration_loads, planned.calibration, strict=True):
+    experiment, parts = link.experiment, []
+    planned = plan(link.cell.model, link.home, link.seed, experiment)
+    for load, poses in zip(experiment.calibration_loads, planned.calibration, strict=True):
         plant.load = Load(load.mass, load.cog, load.wrench[:3], load.wrench[3:])
         frames, read = [], []
         for q in poses:
@@ -58,7 +58,7 @@ def measured(link: DemoLink, plant: Plant) -> Rests:
             count = np.radians(0.001) if link.name == "can" else 1e-9  # rad, of what is read
             read.append(np.round(np.array(plant.q) / count) * count)
         rows = load.rows(len(poses))
-        parts.append(Rests(
+        parts.append(Measurements(
             np.zeros(len(poses)), poses, np.array(read), rows.payload_mass, rows.payload_cog,
             rows.wrench,
             np.array([f.origin for f in frames]) + rng.normal(0, TRACKER, (len(poses), 3)),
@@ -70,10 +70,10 @@ def measured(link: DemoLink, plant: Plant) -> Rests:
 
 def errors(link: DemoLink, plant: Plant, cell: Cell) -> np.ndarray:
     """Return the model's distance (m) from the plant over the demo's test poses."""
-    scene, found = link.scene, []
-    planned = plan(link.cell.model, link.home, link.seed, scene)
+    experiment, found = link.experiment, []
+    planned = plan(link.cell.model, link.home, link.seed, experiment)
     plant.scatter = (0.0,) * len(plant.q)
-    for load, poses in zip(scene.test_loads, planned.test, strict=True):
+    for load, poses in zip(experiment.test_loads, planned.test, strict=True):
         plant.load = Load(load.mass, load.cog, load.wrench[:3], load.wrench[3:])
         expected = cell.model.predict(poses, load.rows(len(poses))).position
         for q, position in zip(poses, expected, strict=True):
@@ -95,15 +95,17 @@ def test_what_is_hidden_is_named_on_every_link(tmp_path: Path, name: str, seed: 
 def test_a_zero_against_which_flexibilities_were_fitted_is_named(
     tmp_path: Path, seed: int, value: float
 ) -> None:
-    """It lifts the arm by what the arm bends: the fit finds none, and all are named beside it."""
+    """The zero offset cancels the sag, so that the fit of flexibilities is biased."""
     link = LINKS["ur_rtde"](tmp_path, seed)
     zero, truth = (0.0, 0.0, value, 0.0, 0.0, 0.0), {"joint_offset_3": value}
-    link.hidden = Hidden(("joint_offset",), "the zero of a joint is off", truth, {"zero": zero})
+    link.hidden = HiddenEffects(
+        ("joint_offset",), "the zero of a joint is off", truth, {"zero": zero}
+    )
     is_named(link, tmp_path, least=5e-4)
 
 
 def is_named(link: DemoLink, tmp_path: Path, least: float = 1e-3) -> None:
-    """Check that what a link hides is named, and that the gap of ``least`` m closes with it."""
+    """Check that the hidden effects are named and close a gap of at least ``least`` m."""
     plant, path = plant_of(link), tmp_path / "calibration.csv"
     write_log(path, measured(link, plant), link.reports_joints)
     log = read_log(path, link.cell.arm.n)
@@ -114,22 +116,22 @@ def is_named(link: DemoLink, tmp_path: Path, least: float = 1e-3) -> None:
     causes = [c for ch in diagnose(calibrated.model, log, calibrated.metrology).channels
               for c in ch.causes]  # fmt: skip
     accused = [
-        Accused(
+        NamedCause(
             c.effect, c.joints, tuple((p.name, p.value, p.std or 0.0, p.unit) for p in c.parameters)
         )
         for c in causes
     ]
-    assert link.hidden.denials(accused) == []
+    assert link.hidden.mismatches(accused) == []
     terms = [term for c in causes for term in c.terms]
     save_cell(calibrated, tmp_path / "explained.yaml", calibrated.model.with_terms(terms))
-    corrected = _fit_again(path, load_cell(tmp_path / "explained.yaml"), tmp_path)
+    corrected = _refit(path, load_cell(tmp_path / "explained.yaml"), tmp_path)
     alone, both = (errors(link, plant, cell) for cell in (calibrated, corrected))
     assert np.sqrt(np.mean(alone**2)) > least
     assert np.sqrt(np.mean(both**2)) < 5e-5
 
 
 def test_seeds_hide_different_effects_over_rtde() -> None:
-    drawn = [Hidden.drawn(seed, LINKS["ur_rtde"].hides) for seed in range(1, 9)]
+    drawn = [HiddenEffects.drawn(seed, LINKS["ur_rtde"].effect_choices) for seed in range(1, 9)]
     assert {hidden.effects for hidden in drawn} == {("tool_frame",), ("joint_offset",)}
     assert drawn[0].truth["tool_frame_z"] == pytest.approx(1.413e-3, rel=1e-3)  # as README shows
 

@@ -1,4 +1,4 @@
-"""The demo on CAN and over Modbus: the same job and summary, over the real wires."""
+"""The demo on CAN and over Modbus: the same steps and summary, over the real protocols."""
 
 from __future__ import annotations
 
@@ -17,9 +17,8 @@ import pytest
 from gapbridge.bridge.cell import load_cell
 from gapbridge.bridge.demo.links import LINKS, DemoLink
 from gapbridge.bridge.demo.links.modbus import travel_time
+from gapbridge.bridge.demo.measurements import measurements_at, write_log
 from gapbridge.bridge.demo.poses import candidates, plan
-from gapbridge.bridge.demo.rests import rests_so_far, write_log
-from gapbridge.bridge.demo.result import reach
 from gapbridge.core.errors import LinkError
 from gapbridge.core.log.log import read_log
 from gapbridge.drivers.simulated.plant.kinematics import within_limits
@@ -51,39 +50,41 @@ def test_the_demos_piper_is_the_one_that_users_copy() -> None:
 
 @pytest.mark.parametrize("seed", [1, 2, 8])
 def test_poses_are_within_the_arms_limits_and_there_are_enough(link: DemoLink, seed: int) -> None:
-    scene, model = link.scene, link.cell.model
-    given = plan(model, link.home, seed, scene)
+    wanted, model = link.experiment, link.cell.model
+    given = plan(model, link.home, seed, wanted)
     arm = plant_arm(link.cell.arm)
-    assert [len(q) for q in given.calibration] == [scene.calibrate] * len(given.calibration)
-    assert [len(q) for q in given.test] == [scene.test * times for times in scene.visits]
+    assert [len(q) for q in given.calibration] == [wanted.calibration_poses] * len(
+        given.calibration
+    )
+    assert [len(q) for q in given.test] == [wanted.test_poses * times for times in wanted.visits]
     for poses in (given.calibration, given.test):
         assert all(within_limits(arm, q.tolist()) for q in np.vstack(poses))
     far = model.rigid_pose(np.vstack(given.test)).position
-    assert np.hypot(far[:, 0], far[:, 1]).min() > scene.workspace.far
-    assert len(candidates(model, seed, scene.workspace)) > 100
+    assert np.hypot(far[:, 0], far[:, 1]).min() > wanted.workspace.far
+    assert len(candidates(model, seed, wanted.workspace)) > 100
 
 
 def test_what_is_hidden_stands_in_no_cell_that_the_run_reads(link: DemoLink) -> None:
-    declared = link.declared(link.cell, link.scene.test_loads[0])
+    declared = link.declared(link.cell, link.experiment.test_loads[0])
     for cell in (link.cell, declared):
         assert cell.simulation.compliance is None
         assert cell.simulation.tool_shift is None
         assert cell.model.terms == ()
-    assert declared.model.payload_mass == link.scene.test_loads[0].mass
-    assert declared.model.payload_cog.tolist() == list(link.scene.test_loads[0].cog)
+    assert declared.model.payload_mass == link.experiment.test_loads[0].mass
+    assert declared.model.payload_cog.tolist() == list(link.experiment.test_loads[0].cog)
 
 
 def test_another_seed_hides_another_piper_and_the_same_seed_the_same(tmp_path: Path) -> None:
-    first, again, other = (LINKS["can"](tmp_path, s)._hidden() for s in (1, 1, 2))  # type: ignore[attr-defined]
+    first, again, other = (LINKS["can"](tmp_path, s)._simulation_lines() for s in (1, 1, 2))  # type: ignore[attr-defined]
     assert first == again != other
 
 
 def test_what_one_count_comes_to_is_reported(tmp_path: Path) -> None:
     can, modbus = (LINKS[name](tmp_path, 1) for name in OTHERS)
     wire = np.radians(0.001)
-    assert can.resolution().written == pytest.approx(wire * reach(can.cell.model))
+    assert can.resolution().written == pytest.approx(wire * can.cell.model.length)
     assert modbus.resolution().written == 1e-6
-    assert modbus.resolution().read == pytest.approx(1e-3 * reach(modbus.cell.model))
+    assert modbus.resolution().read == pytest.approx(1e-3 * modbus.cell.model.length)
 
 
 @pytest.mark.parametrize("way", [0.003, 0.2, 0.25, 1.3])
@@ -100,9 +101,9 @@ def test_the_bench_moves_the_arm_and_stamps_with_this_machines_clock(tmp_path: P
     goal = link.home + np.array([0.1, 0.05, -0.05, 0.0, 0.0, 0.1])
     with link.served():
         bench = link.bench()
-        load = link.scene.test_loads[1]
-        bench.hang(load)
-        bench.go(goal, travel_time(link.home, goal))
+        load = link.experiment.test_loads[1]
+        bench.attach(load)
+        bench.move_to(goal, travel_time(link.home, goal))
         before = time.monotonic()
         reading = bench.measure()
         assert before <= reading[0] <= time.monotonic()
@@ -110,16 +111,16 @@ def test_the_bench_moves_the_arm_and_stamps_with_this_machines_clock(tmp_path: P
         deflected = np.linalg.norm(reading[1:4] - wanted)
         assert 2e-4 < deflected < 4e-3
         with pytest.raises(LinkError, match="move: outside the joint limits"):
-            bench.go(goal + 20.0)
+            bench.move_to(goal + 20.0)
         bench.close()
 
 
 def test_a_load_that_no_controller_reports_goes_into_the_log(tmp_path: Path) -> None:
-    load = LINKS["can"].scene.calibration_loads[2]
+    load = LINKS["can"].experiment.calibration_loads[2]
     t, q = np.arange(0, 2, 0.01), np.full((200, 6), 0.4)
     recording = {"timestamp": t, "actual_q": q, "actual_qd": 0 * q}
     readings = np.column_stack([t, np.tile([0.1, 0.2, 0.3, 0.0, 0.0, 1.0], (200, 1))])
-    found, missing = rests_so_far(recording, readings, q[:1] + 0.001, load)
+    found, missing = measurements_at(recording, readings, q[:1] + 0.001, load)
     assert found is not None, missing
     write_log(tmp_path / "both.csv", found)
     write_log(tmp_path / "sent.csv", found, joints=False)
@@ -141,7 +142,7 @@ class Shown(NamedTuple):
 
 @pytest.fixture(scope="module")
 def shown(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Shown]:
-    """The demos of the other links, side by side: each mostly waits for its arm."""
+    """The demos of the other links, run in parallel: each mostly waits for its arm."""
     folder = tmp_path_factory.mktemp("demos")
     running = []
     for name in OTHERS:
@@ -177,8 +178,8 @@ def test_the_demo_shows_on_every_link_what_it_states(name: str, shown: dict[str,
     assert error["with"]["rms"] < 2.0 * floor
     assert 0.01 < repeats < 0.1
     assert 0.0 < summary["resolution_mm"] < 0.02
-    assert "one count written is" in " ".join(reported.split())
-    slower = 2 ** " ".join(reported.split()).count("which this machine may keep")
+    assert "resolution at the TCP" in " ".join(reported.split())
+    slower = 2 ** " ".join(reported.split()).count(" of the rate")
     assert summary["setpoints_written"] > 4_000 / slower
     assert summary["loop"]["rate_hz"] > 40 / slower
     assert load_cell(out / "cell.yaml").model.terms == ()
@@ -193,7 +194,7 @@ def test_the_demo_shows_on_every_link_what_it_states(name: str, shown: dict[str,
     if name == "can":  # servos that give way
         assert 3.5 < joints["without"]["max"] < 6.0
         assert joints["without"]["rms"] > 20 * joints["with"]["rms"]
-        assert "joints rest" in reported
+        assert "joint error at rest" in " ".join(reported.split())
     else:
         assert joints is None
     assert len(read_log(out / "calibration.csv", 6)) == summary["samples"]

@@ -1,4 +1,4 @@
-"""The demo's parts, each on numbers whose answer is known."""
+"""The demo's parts, each on data with a known result."""
 
 from __future__ import annotations
 
@@ -12,15 +12,21 @@ from on_a_phone import CHROMIUM, faults_on_a_phone
 from rich.console import Console
 
 from gapbridge.bridge.cell import load_cell
-from gapbridge.bridge.demo.hidden import Accused, Hidden
+from gapbridge.bridge.demo.hidden import HiddenEffects, NamedCause
+from gapbridge.bridge.demo.measurements import Measurements, joined, measurements_at, write_log
 from gapbridge.bridge.demo.page import page
 from gapbridge.bridge.demo.picture import picture
 from gapbridge.bridge.demo.poses import CALIBRATION_LOADS, TEST_LOADS, UR10E, candidates, plan
-from gapbridge.bridge.demo.rests import Rests, joined, rests_so_far, write_log
 from gapbridge.bridge.demo.result import LoopFigures, Result, repeatability
-from gapbridge.bridge.demo.session import Ended, Session
+from gapbridge.bridge.demo.session import RunOutcome, Session
 from gapbridge.bridge.demo.terminal import bar, show
-from gapbridge.bridge.demo.trajectory import ACCELERATION, FASTEST, PERIOD, SHARE, visits
+from gapbridge.bridge.demo.trajectory import (
+    ACCELERATION,
+    MAX_SPEED,
+    PERIOD,
+    SPEED_SHARE,
+    visit_trajectory,
+)
 from gapbridge.bridge.document.svg import svg_file
 from gapbridge.bridge.setpoint_source.quintic import write_trajectory
 from gapbridge.core.arm import builtin_arm
@@ -42,8 +48,10 @@ SOFT = MODEL.with_compliance(
 )
 
 
-def measured(q: np.ndarray, nominal: np.ndarray, load: int, scatter: float, seed: int) -> Rests:
-    """What a tracker would see of a bending arm at encoder angles q."""
+def measured(
+    q: np.ndarray, nominal: np.ndarray, load: int, scatter: float, seed: int
+) -> Measurements:
+    """Return simulated tracker measurements of a deflected arm at encoder angles q (N, n)."""
     random = np.random.default_rng(seed)
     loads = TEST_LOADS[load].rows(len(q))
     poses = SOFT.predict(q, loads)
@@ -51,7 +59,7 @@ def measured(q: np.ndarray, nominal: np.ndarray, load: int, scatter: float, seed
     assert loads.payload_mass is not None
     assert loads.payload_cog is not None
     assert loads.wrench is not None
-    return Rests(
+    return Measurements(
         np.arange(len(q)) * 1.0, nominal, q, loads.payload_mass, loads.payload_cog, loads.wrench,
         position, rotation_vector(poses.rotation),
     )  # fmt: skip
@@ -59,7 +67,7 @@ def measured(q: np.ndarray, nominal: np.ndarray, load: int, scatter: float, seed
 
 @pytest.fixture(scope="module")
 def result(tmp_path_factory: pytest.TempPathFactory) -> Result:
-    """A whole demo on paper: the arm's answers come from the model, with scatter."""
+    """A demo result whose measurements come from the model, with scatter."""
     given = plan(MODEL, HOME, 4)
     scatter = 1e-5
     runs = [
@@ -74,7 +82,9 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> Result:
     ]
     return Result(
         link="ur_rtde", seed=4, identification=found, model=found.model,
-        without=joined([measured(q, q, k, scatter, 20 + k) for k, q in enumerate(given.test)]),
+        uncompensated=joined(
+            [measured(q, q, k, scatter, 20 + k) for k, q in enumerate(given.test)]
+        ),
         compensated=joined(
             [measured(c, q, k, scatter, 30 + k)
              for k, (c, q) in enumerate(zip(corrected, given.test, strict=True))]
@@ -95,7 +105,7 @@ def test_planned_poses_are_free_and_none_is_tested_that_was_fitted(seed: int) ->
         assert np.abs(fitted - pose).max(axis=1).min() > 0.02
     for rows, times in zip(given.test, UR10E.visits, strict=True):
         assert len(np.unique(rows, axis=0)) * times == len(rows)
-    assert len(np.unique(tested, axis=0)) == UR10E.test * len(given.test)
+    assert len(np.unique(tested, axis=0)) == UR10E.test_poses * len(given.test)
 
 
 def test_another_seed_draws_other_poses() -> None:
@@ -104,9 +114,9 @@ def test_another_seed_draws_other_poses() -> None:
 
 def test_a_trajectory_rests_at_every_pose_and_keeps_its_limits(tmp_path: Path) -> None:
     poses = plan(MODEL, HOME, 1).calibration[0]
-    q = visits(HOME, poses, TOP_SPEED)
+    q = visit_trajectory(HOME, poses, TOP_SPEED)
     speed = np.diff(q, axis=0) / PERIOD
-    share = (np.abs(speed) / np.minimum(SHARE * TOP_SPEED, FASTEST)).max()
+    share = (np.abs(speed) / np.minimum(SPEED_SHARE * TOP_SPEED, MAX_SPEED)).max()
     assert 0.7 < share < 1.05
     assert np.abs(np.diff(speed, axis=0)).max() / PERIOD < 1.2 * ACCELERATION
     np.testing.assert_array_equal(q[[0, -1]], [HOME, HOME])
@@ -129,16 +139,16 @@ def recording(q: np.ndarray, start: float = 100.0) -> dict[str, np.ndarray]:
     }
 
 
-def test_rests_take_what_was_measured_after_settling_and_nothing_else() -> None:
+def test_measurements_hold_only_readings_taken_after_settling() -> None:
     poses = HOME + np.array([[0.3, 0, 0, 0, 0, 0], [0, 0.4, 0, 0, 0, 0], [0.3, 0, 0, 0, 0, 0]])
-    given = recording(visits(HOME, poses, TOP_SPEED))
+    given = recording(visit_trajectory(HOME, poses, TOP_SPEED))
     t = given["timestamp"][::5]
     readings = np.zeros((len(t), 7))
     readings[:, 0] = t
     readings[:, 1:4] = given["actual_q"][::5, :3]
     flips = np.where(np.arange(len(t)) % 2, 1, -1)[:, None]  # one rotation, written two ways
     readings[:, 4:] = flips * [np.pi - 1e-9, 0, 0]
-    found, missing = rests_so_far(given, readings, poses)
+    found, missing = measurements_at(given, readings, poses)
     assert found is not None
     assert not missing
     np.testing.assert_allclose(found.actual_q, poses, atol=1e-7)
@@ -147,13 +157,13 @@ def test_rests_take_what_was_measured_after_settling_and_nothing_else() -> None:
 
 
 def test_a_visit_that_never_happened_is_reported() -> None:
-    given = recording(visits(HOME, HOME + np.array([[0.3, 0, 0, 0, 0, 0]]), TOP_SPEED))
+    given = recording(visit_trajectory(HOME, HOME + np.array([[0.3, 0, 0, 0, 0, 0]]), TOP_SPEED))
     readings = np.zeros((10, 7))
     elsewhere, unseen = (
-        rests_so_far(given, readings, HOME + np.array([shift]))
+        measurements_at(given, readings, HOME + np.array([shift]))
         for shift in ([0, 0.5, 0, 0, 0, 0], [0.3, 0, 0, 0, 0, 0])
     )
-    assert elsewhere == (None, "visit 1 of 1: the arm never rested there")
+    assert elsewhere == (None, "visit 1 of 1: the arm was never at rest there")
     assert unseen == (None, "visit 1: found 0 readings of the tracker, expected 8")
 
 
@@ -163,7 +173,7 @@ def test_repeatability_is_that_of_the_scatter() -> None:
     position = np.repeat(random.uniform(-1, 1, (200, 3)), 2, axis=0)
     position = position + random.normal(0, 2e-5, position.shape)
     empty = np.zeros((len(q), 6))
-    run = Rests(empty[:, 0], q, q, empty[:, 0], empty[:, :3], empty, position, empty[:, :3])
+    run = Measurements(empty[:, 0], q, q, empty[:, 0], empty[:, :3], empty, position, empty[:, :3])
     found = repeatability([run], ("a",) * len(q))
     assert found == pytest.approx(2e-5 * np.sqrt(3), rel=0.15)
 
@@ -173,8 +183,8 @@ def test_the_summary_holds_what_was_measured(result: Result) -> None:
     assert set(summary) >= {
         "link", "samples", "tcp_error_mm", "repeatability_mm", "setpoints_written", "loop"
     }  # fmt: skip
-    wanted = MODEL.rigid_pose(result.without.nominal_q).position
-    distance = np.linalg.norm(result.without.position - wanted, axis=1) * 1e3
+    wanted = MODEL.rigid_pose(result.uncompensated.nominal_q).position
+    distance = np.linalg.norm(result.uncompensated.position - wanted, axis=1) * 1e3
     assert summary["tcp_error_mm"]["without"]["max"] == pytest.approx(distance.max())
     assert summary["tcp_error_mm"]["without"]["rms"] == pytest.approx(np.sqrt(np.mean(distance**2)))
     assert summary["tcp_error_mm"]["without"]["rms"] > 20 * summary["tcp_error_mm"]["with"]["rms"]
@@ -184,7 +194,7 @@ def test_the_summary_holds_what_was_measured(result: Result) -> None:
 def test_the_picture_is_sound_xml_and_shows_every_pose(result: Result) -> None:
     root = ElementTree.fromstring(svg_file(picture(result)))
     texts = [e.text for e in root.iter("{http://www.w3.org/2000/svg}text")]
-    poses = len(np.unique(result.without.nominal_q, axis=0))
+    poses = len(np.unique(result.uncompensated.nominal_q, axis=0))
     assert sum(str(t).startswith("pose ") for t in texts) == poses
     bars = [
         e for e in root.iter("{http://www.w3.org/2000/svg}rect") if float(e.get("height", 0)) > 4
@@ -204,7 +214,7 @@ def test_the_page_does_not_claim_a_tool_point_that_the_demo_leaves_out(result: R
     text = page(replace(result, identification=replace(result.identification, notes=notes)), "")
     assert "3 outlier(s)" in text
     assert "written to the cell" not in text
-    assert "Only the flexibilities are kept" in text
+    assert "Only the flexibilities of this fit are kept" in text
 
 
 def test_bars_grow_with_their_share() -> None:
@@ -218,7 +228,7 @@ MISSED = "compensating -> holding (deadlines missed): 28 of 500 cycles missed"
 
 
 class FastClock(Clock):
-    """Time that passes at once."""
+    """A clock whose sleeps return at once."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -230,8 +240,8 @@ class FastClock(Clock):
         self.now += seconds
 
 
-class Slow(Session):
-    """A machine that keeps a quarter of the rate only."""
+class SlowMachine(Session):
+    """A machine that can keep only a quarter of the rate."""
 
     def __init__(self, kept: float, emit) -> None:
         super().__init__(None, Path(), emit, FastClock())
@@ -241,33 +251,39 @@ class Slow(Session):
     def _run(self, cell, load, poses, longest):
         link = self._settings(cell).link
         self.rates.append(link.rate)
-        return Ended(None, MISSED, False) if link.rate > self.kept else Ended(poses, "", False)
+        return (
+            RunOutcome(None, MISSED, False)
+            if link.rate > self.kept
+            else RunOutcome(poses, "", False)
+        )
 
 
 class Scripted(Session):
-    """A machine whose runs end as scripted: visits done, why it broke off, a stall seen."""
+    """A session whose runs end as scripted: visits done, error, stall."""
 
     def __init__(self, *script: tuple[int, str, bool]) -> None:
         self.reported: list[str] = []
         super().__init__(None, Path(), self.reported.append, FastClock())
         self.script = list(script)
-        self.asked: list[int] = []
+        self.requested: list[int] = []
 
     def _run(self, cell, load, poses, longest):
-        self.asked.append(len(poses))
-        done, broke, stalled = self.script.pop(0)
+        self.requested.append(len(poses))
+        done, error, stalled = self.script.pop(0)
         zero = np.zeros((done, 6))
-        found = Rests(zero[:, 0], poses[:done], zero, zero[:, 0], zero[:, :3], zero, zero, zero)
-        return Ended(found if done else None, broke, stalled)
+        found = Measurements(
+            zero[:, 0], poses[:done], zero, zero[:, 0], zero[:, :3], zero, zero, zero
+        )
+        return RunOutcome(found if done else None, error, stalled)
 
 
-class Hall:
-    """The link as far as a visit asks for it."""
+class FakeLink:
+    """The parts of a DemoLink that Session.visit uses."""
 
     home = HOME
 
     def __init__(self) -> None:
-        self.gone: list[np.ndarray] = []
+        self.moves: list[np.ndarray] = []
 
     def declared(self, cell, load):
         return cell
@@ -278,10 +294,10 @@ class Hall:
     def bench(self):
         return self
 
-    def hang(self, load): ...
+    def attach(self, load): ...
 
-    def go(self, q):
-        self.gone.append(q)
+    def move_to(self, q):
+        self.moves.append(q)
 
     def close(self): ...
 
@@ -290,8 +306,8 @@ class Hall:
 def test_a_machine_that_misses_deadlines_goes_on_at_a_lower_rate(kept, rates):
     cell = load_cell(Path(__file__).parents[3] / "config" / "ur10e_simulated.yaml")
     reported: list[str] = []
-    session = Slow(kept, reported.append)
-    session._link = Hall()
+    session = SlowMachine(kept, reported.append)
+    session._link = FakeLink()
     for expected in (rates, rates[-1:]):  # the second visit begins where the first ended
         session.rates.clear()
         assert len(session.visit(cell, TEST_LOADS[0], HOME[None])) == 1
@@ -301,14 +317,14 @@ def test_a_machine_that_misses_deadlines_goes_on_at_a_lower_rate(kept, rates):
 
 def test_a_machine_that_cannot_keep_a_fourth_of_the_rate_is_reported():
     cell = load_cell(Path(__file__).parents[3] / "config" / "ur10e_simulated.yaml")
-    session = Slow(50, lambda text: None)
-    session._link = Hall()
+    session = SlowMachine(50, lambda text: None)
+    session._link = FakeLink()
     with pytest.raises(RunError, match="deadlines missed"):
         session.visit(cell, TEST_LOADS[0], HOME[None])
 
 
-def five_visits(session: Scripted) -> Rests:
-    session._link = Hall()
+def five_visits(session: Scripted) -> Measurements:
+    session._link = FakeLink()
     cell = load_cell(Path(__file__).parents[3] / "config" / "ur10e_simulated.yaml")
     return session.visit(cell, TEST_LOADS[0], HOME + np.arange(5)[:, None] * 0.1)
 
@@ -318,20 +334,20 @@ def test_a_run_that_a_stall_ended_goes_on_with_the_visits_that_are_left():
         (2, "state stale", False), (1, "?", True), (0, "silence", False), (2, "", False)
     )
     found = five_visits(session)
-    assert session.asked == [5, 3, 2, 2]
+    assert session.requested == [5, 3, 2, 2]
     np.testing.assert_array_equal(found.nominal_q[:, 0], HOME[0] + np.arange(5) * 0.1)
     assert [line.split(";")[1][:21] for line in session.reported] == [
-        " 2 of 5 visits are do", " 3 of 5 visits are do", " 3 of 5 visits are do",
+        " 2 of 5 visits done, ", " 3 of 5 visits done, ", " 3 of 5 visits done, ",
     ]  # fmt: skip
 
 
 def test_a_run_that_a_stall_ended_on_its_way_home_leaves_the_arm_there():
     session = Scripted((5, "state stale", False))
     assert len(five_visits(session)) == 5
-    assert session._link.gone == [HOME]
+    assert session._link.moves == [HOME]
     session = Scripted((5, "", False))
     assert len(five_visits(session)) == 5
-    assert session._link.gone == []
+    assert session._link.moves == []
 
 
 def test_runs_that_come_no_farther_on_a_machine_that_keeps_time_are_a_failure():
@@ -339,7 +355,7 @@ def test_runs_that_come_no_farther_on_a_machine_that_keeps_time_are_a_failure():
     session = Scripted((1, behind, False), *[(0, behind, False)] * 9)
     with pytest.raises(RunError, match="behind"):
         five_visits(session)
-    assert session.asked == [5, 4, 4, 4, 4]
+    assert session.requested == [5, 4, 4, 4, 4]
     session = Scripted((1, behind, False), *[(0, behind, True)] * 9, (4, "", False))
     assert len(five_visits(session)) == 5
 
@@ -349,50 +365,50 @@ def test_a_run_that_no_stall_ended_is_a_failure_at_once(broke):
     session = Scripted((5 if broke else 3, broke, False))
     with pytest.raises(RunError, match=broke or "before its last visit"):
         five_visits(session)
-    assert session.asked == [5]
+    assert session.requested == [5]
 
 
-def accused(*parameters: tuple[str, float, float], effect: str = "tool_frame") -> Accused:
-    return Accused(effect, (), tuple((name, value, std, "m") for name, value, std in parameters))
+def named_cause(*parameters: tuple[str, float, float], effect: str = "tool_frame") -> NamedCause:
+    return NamedCause(effect, (), tuple((name, value, std, "m") for name, value, std in parameters))
 
 
-def bent(**shift: float) -> Hidden:
+def bent(**shift: float) -> HiddenEffects:
     truth = {f"tool_frame_{axis}": value for axis, value in shift.items()}
-    return Hidden(("tool_frame",), "bent", truth, {"tool_shift": tuple(shift.values())})
+    return HiddenEffects(("tool_frame",), "bent", truth, {"tool_shift": tuple(shift.values())})
 
 
 def test_a_bent_tool_is_drawn_from_the_seed() -> None:
-    drawn = [Hidden.drawn(seed, ("bent_tool",)) for seed in range(20)]
-    assert drawn[3] == Hidden.drawn(3, ("bent_tool",)) != drawn[4]
+    drawn = [HiddenEffects.drawn(seed, ("bent_tool",)) for seed in range(20)]
+    assert drawn[3] == HiddenEffects.drawn(3, ("bent_tool",)) != drawn[4]
     sizes = [np.linalg.norm(hidden.simulation["tool_shift"]) for hidden in drawn]
     assert 1e-3 <= min(sizes) <= max(sizes) <= 2.5e-3
 
 
-def test_every_accusation_is_held_to_the_truth() -> None:
+def test_named_causes_are_compared_with_the_hidden_truth() -> None:
     hidden = bent(x=1e-3, y=0.0, z=-5e-4)
-    right = accused(("tool_frame_x", 1.001e-3, 3e-6), ("tool_frame_z", -5.01e-4, 3e-6))
-    bends = accused(effect="axial_compliance")
-    assert hidden.denials([right, bends]) == []
+    right = named_cause(("tool_frame_x", 1.001e-3, 3e-6), ("tool_frame_z", -5.01e-4, 3e-6))
+    bends = named_cause(effect="axial_compliance")
+    assert hidden.mismatches([right, bends]) == []
     assert (
-        "link_flexibility is accused"
-        in hidden.denials([right, accused(effect="link_flexibility")])[0]
+        "link_flexibility is named"
+        in hidden.mismatches([right, named_cause(effect="link_flexibility")])[0]
     )
-    assert "not named" in hidden.denials([bends])[0]
-    wrong = accused(("tool_frame_x", 1.2e-3, 3e-6))
-    assert "tool_frame_x" in hidden.denials([wrong])[0]
+    assert "was not named" in hidden.mismatches([bends])[0]
+    wrong = named_cause(("tool_frame_x", 1.2e-3, 3e-6))
+    assert "tool_frame_x" in hidden.mismatches([wrong])[0]
 
 
 def test_three_rounds_of_visits_and_the_truth_are_shown(
     result: Result, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    known = accused(("tool_frame_x", 1.001e-3, 3e-6))
+    cause = named_cause(("tool_frame_x", 1.001e-3, 3e-6))
     whole = replace(
-        result, explained=result.compensated, hidden=bent(x=1e-3, y=0.0, z=0.0), accused=(known,)
+        result, explained=result.compensated, hidden=bent(x=1e-3, y=0.0, z=0.0), causes=(cause,)
     )
     show(whole, Console(width=140))
     said = capsys.readouterr().out
     assert "fit and diagnosis" in said
-    assert "tool_frame_x: truly +1 mm, found +1 ± 0.003 mm" in said
+    assert "tool_frame_x: true +1 mm, estimated +1 ± 0.003 mm" in said
     drawn = svg_file(picture(whole))
     assert all(f'fill="var(--{c})"' in drawn for c in ("bad-dot", "before", "limit"))
     html = page(whole, "")
@@ -406,7 +422,7 @@ def test_nothing_of_the_report_is_cut_off_on_a_phone(result: Result, tmp_path: P
     playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
     whole = replace(
         result, explained=result.compensated, hidden=bent(x=1e-3, y=0.0, z=0.0),
-        accused=(accused(("tool_frame_x", 1.001e-3, 3e-6)),),
+        causes=(named_cause(("tool_frame_x", 1.001e-3, 3e-6)),),
     )  # fmt: skip
     path = tmp_path / "report.html"
     path.write_text(page(whole, "verdict: explained\n" + "x" * 100), encoding="utf-8")
@@ -414,6 +430,6 @@ def test_nothing_of_the_report_is_cut_off_on_a_phone(result: Result, tmp_path: P
 
 
 def test_a_recording_without_states_is_a_run_to_be_repeated():
-    found, missing = rests_so_far({}, np.zeros((0, 7)), HOME[None])
+    found, missing = measurements_at({}, np.zeros((0, 7)), HOME[None])
     assert found is None
     assert "holds no state of the arm" in missing

@@ -1,4 +1,4 @@
-"""An arm of servos that give way: found in a log of its rests, made up for in its setpoints."""
+"""An arm with yielding servos: diagnosed from static measurements, compensated in its setpoints."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from gapbridge.drivers.simulated.plant.plant_settings import draw_plant_settings
 ARM = builtin_arm("ur3e")
 DROOP = (0.0, 1.6e-4, 3e-4, 1.5e-3, 1e-3, 0.0)  # rad/Nm: some 5 mrad where the arm is stretched out
 PERIOD = 0.005  # s, of the CAN demo's link
-REST = 250  # cycles in which the arm has come to rest
+SETTLING_CYCLES = 250  # after which the arm is at rest
 LOAD, COG = 2.0, (0.02, 0.01, 0.06)
 
 
@@ -40,21 +40,21 @@ def poses(count: int, seed: int) -> np.ndarray:
 POSES = poses(40, 1)
 
 
-def rests(arm: Plant, setpoints: np.ndarray) -> np.ndarray:
-    """Return where the encoders come to rest (N, n) for setpoints (N, n), encoders rounded."""
+def settled_joints(arm: Plant, setpoints: np.ndarray) -> np.ndarray:
+    """Return the joints at rest (N, n), rad, for setpoints (N, n), rounded to encoder counts."""
     found = []
     for q in setpoints:
-        for _ in range(REST):
+        for _ in range(SETTLING_CYCLES):
             arm.step(tuple(q), PERIOD)
         found.append(arm.q)
     return np.round(np.array(found) / 1.7e-5) * 1.7e-5
 
 
 @pytest.mark.slow
-def test_droop_is_found_and_setpoints_bring_the_joints_where_they_were_wanted() -> None:
+def test_droop_is_identified_and_its_compensation_removes_the_joint_error() -> None:
     nominal = Model(ARM, payload_mass=LOAD, payload_cog=np.array(COG))
-    before = rests(plant(), POSES)
-    log = Log("rests.csv", {"target_q": POSES, "actual_q": before}, 6)
+    before = settled_joints(plant(), POSES)
+    log = Log("measurements.csv", {"target_q": POSES, "actual_q": before}, 6)
     (channel,) = [c for c in diagnose(nominal, log).channels if c.channel == "tracking"]
     (cause,) = channel.causes
     assert (cause.effect, cause.joints) == ("servo_droop", (2, 3, 4, 5))
@@ -64,8 +64,9 @@ def test_droop_is_found_and_setpoints_bring_the_joints_where_they_were_wanted() 
         assert abs(reported.value - true) < max(4 * reported.std, 0.01 * true)
     live = Compensator(nominal.with_terms(cause.terms))
     wanted = poses(15, 2)
-    plain = np.abs(rests(plant(), wanted) - wanted)
-    corrected = np.abs(rests(plant(), np.array([live.correct(q).q for q in wanted])) - wanted)
+    plain = np.abs(settled_joints(plant(), wanted) - wanted)
+    setpoints = np.array([live.correct(q).q for q in wanted])
+    corrected = np.abs(settled_joints(plant(), setpoints) - wanted)
     assert plain.max() > 4e-3
     ratio = np.sqrt(np.mean(plain**2)) / np.sqrt(np.mean(corrected**2))
     assert ratio > 20, ratio

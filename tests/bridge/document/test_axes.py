@@ -1,4 +1,4 @@
-"""Axes of charts: their numbers stay short, and inside the drawing."""
+"""Axes of charts: tick labels are short and inside the drawing."""
 
 from __future__ import annotations
 

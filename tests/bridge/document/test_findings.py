@@ -1,4 +1,4 @@
-"""Words for findings: every check has its sentence, and each fact is worded with its numbers."""
+"""Texts of findings: every check has its own, and each text contains the numbers of its fact."""
 
 from __future__ import annotations
 
@@ -34,26 +34,26 @@ def test_every_check_has_a_sentence_of_its_own() -> None:
     assert len(set(WITHDRAWN.values())) == len(Check)
 
 
-def test_a_value_that_is_no_constant_names_what_it_goes_by() -> None:
+def test_a_value_that_is_not_constant_names_the_quantity() -> None:
     text = withdrawal_text(Withdrawal(Check.CONSTANT, "actual_q_2"))
-    assert text == "its value is no constant: it goes by actual_q_2"
+    assert text == "its value is not constant: it depends on actual_q_2"
 
 
 @pytest.mark.parametrize(
     ("fact", "text"),
     [
         (TooFewRows(3), "3 usable row(s) are too few for a diagnosis"),
-        (Thinned(60, 200), "causes were searched on 60 of 200 rows, evenly taken; fitted and "
+        (Thinned(60, 200), "causes were searched on 60 of 200 rows, evenly spaced; fitted and "
                            "judged on all of them"),
         (Outliers(((13, ""), (42, ""))), "2 outlier(s) excluded (row 13, 42 of the file)"),
         (Outliers(tuple((row, "b.csv") for row in range(2, 11))),
          "9 outlier(s) excluded (row 2 of b.csv, 3 of b.csv, 4 of b.csv, 5 of b.csv, 6 of b.csv, "
          "7 of b.csv, 8 of b.csv, 9 of b.csv, ... of the file)"),
         (NotAccused(PLAY, BOUND, stand_in=False),
-         "backlash of joint 2 is not accused: its value stands on its bound"),
+         "backlash of joint 2 is not named as a cause: its value is at its bound"),
         (NotAccused(Term("tool_frame", Site(), (1e-3,)), BOUND, stand_in=True),
-         "tool_frame is not accused: its value stands on its bound; poses not fitted gain by it: "
-         "a stand-in"),
+         "tool_frame is not named as a cause: its value is at its bound; it improves held-out "
+         "poses: a stand-in"),
         (Slip(Term("joint_slip", Site(3), (2e-3, 1.7e9)), 1.7e9, 1.7e9 + 40, True, True),
          "joint_slip: the zero of joint 3 moved by 2 mrad (0.115 deg) between 22:13:20 and "
          "22:14:00; before and after it nothing else changed"),
@@ -66,12 +66,12 @@ def test_a_value_that_is_no_constant_names_what_it_goes_by() -> None:
         (Slip(Term("target_slip", Site(), (3e-4, 4e-4, 0.0, 7.5)), 7, 8, True, False),
          "target_slip: the target on the tool moved by 0.5 mm between 7 s and 8 s"),
         (ParameterNote(ParameterState.ON_BOUND, "backlash_2", 0.0, "rad"),
-         "backlash_2 stands on its bound (0 rad)"),
+         "backlash_2 is at its bound (0 rad)"),
         (ParameterNote(ParameterState.HELD, "link_geometry_5_alpha", 0.0, "rad"),
-         "link_geometry_5_alpha is held nominal: it came out several times as large as its like, "
-         "and not surely; something that is not named may stand behind it"),
+         "link_geometry_5_alpha is held nominal: its estimate is several times as large as those "
+         "of similar parameters and not significant; an unnamed effect may be its cause"),
         (ParameterNote(ParameterState.NOT_IDENTIFIABLE, "backlash_2", 1e-4, "rad"),
-         "backlash_2 is not identifiable from these data: others can stand in for it"),
+         "backlash_2 is not identifiable from these data: others can replace it"),
     ],
 )  # fmt: skip
 def test_a_fact_is_worded_with_its_numbers(fact, text) -> None:
@@ -89,9 +89,9 @@ def test_without_rows_no_line_of_a_file_is_named() -> None:
         (Considered("payload", None, 0.0, Outcome.NOT_EXCITED, "a payload"),
          "not excited; needs a payload"),
         (Considered("payload", 0.1, 0.2, Outcome.NOT_NEEDED),
-         "does not pay for its parameters beside what is found"),
+         "does not improve the fit enough for its parameters"),
         (Considered("backlash", 0.1, 0.2, Outcome.WITHDRAWN, withdrawal=BOUND),
-         "its value stands on its bound"),
+         "its value is at its bound"),
     ],
 )  # fmt: skip
 def test_why_an_effect_is_no_cause(considered, text) -> None:

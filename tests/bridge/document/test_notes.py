@@ -1,4 +1,4 @@
-"""Every note has its words, and the words take every number that it carries."""
+"""Texts of notes: every reason has its own, which uses all values of the note."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ SAMPLES = {
     Note(Reason.SUM_KNOWN, ("a_1", "b_2", 0.991)):
         "a_1 and b_2: mostly their sum is known (correlation +0.991)",
     Note(Reason.ACTS_LIKE, ("a_1", ((1.0, "b_2"), (-0.5, "c_3")))):
-        "a_1: not identifiable alone from these data, it acts like +1.00 b_2 -0.50 c_3; what they "
-        "make together is written there, this one stays at the model's value",
+        "a_1: not identifiable alone from these data, it acts like +1.00 b_2 -0.50 c_3; their "
+        "sum is written there, this one stays at the model's value",
     Note(Reason.REDUNDANT, ("a_1", ("b_2", "c_3"))):
-        "a_1: the same as b_2 and c_3; what it adds is found there",
+        "a_1: the same as b_2 and c_3; its effect is included there",
     Note(Reason.REDUNDANT_WITH_PLACE, ("a_1", ())):
-        "a_1: the same as where instrument or target stand; what it adds is found there",
+        "a_1: the same as the place of instrument or target; its effect is included there",
     Note(Reason.EFFECTS_MISSING, ((("backlash_3", 0.42),),)):
-        "to be added, with the share that each takes off what is left on poses left out of its "
-        "fit: backlash_3 (42 %)",
+        "effects to add, with the share of the remaining error that each removes on held-out "
+        "poses: backlash_3 (42 %)",
     Note(Reason.IDLE_LOADS, ((0.01, 2.0),)):
-        "loads that add nothing and need not be hung: 0.01 kg, 2 kg",
+        "loads that add no information and need not be attached: 0.01 kg, 2 kg",
     Note(Reason.DETOURS, (tuple((i, i + 1) for i in range(1, 11)),)):
-        "no straight way in joint space, go round: stops 1 to 2, 2 to 3, 3 to 4, 4 to 5, 5 to 6, "
-        "6 to 7, 7 to 8, 8 to 9 and 2 more",
+        "no straight path in joint space, make a detour: stops 1 to 2, 2 to 3, 3 to 4, 4 to 5, "
+        "5 to 6, 6 to 7, 7 to 8, 8 to 9 and 2 more",
 }  # fmt: skip
 
 

@@ -174,7 +174,7 @@ def test_moving_effects_become_the_joints_and_actuators_own(tmp_path: Path) -> N
 
 @pytest.mark.parametrize("on_top", [False, True])
 def test_a_servo_gives_way_as_much_as_the_cell_says(tmp_path: Path, on_top: bool) -> None:
-    """Found against the simulator, the droop comes beside the simulator's own."""
+    """A droop diagnosed against the simulator is added to the simulator's own."""
     kp, droop = 1e4, 3e-5
     (tmp_path / "a.xml").write_text(given := mjcf(ARM, UR_JOINTS, kp=kp))
     model = NOMINAL.with_terms([Term("servo_droop", Site(3), (droop,))])
@@ -203,7 +203,7 @@ def test_a_delayed_actuator_moves_later(tmp_path: Path) -> None:
 
 
 def test_a_links_centre_moves_by_its_moment_over_its_mass(tmp_path: Path) -> None:
-    """The weight's torque at the joints says where the centre is, in both formats."""
+    """The gravity torques at the joints show the centre of gravity, in both formats."""
     model = NOMINAL.with_terms([Term("link_cog", Site(2), (0.4, -0.2, 0.1))])
     given = {"a.xml": mjcf(ARM, UR_JOINTS), "a.urdf": urdf(ARM, UR_JOINTS)}
     texts = {name: patched(tmp_path / name, text, model, "tcp" if name == "a.xml" else "")[0]

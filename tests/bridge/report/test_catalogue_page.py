@@ -1,4 +1,4 @@
-"""The documentation's catalogue is what the effects say of themselves."""
+"""docs/catalogue.md agrees with the docstrings of the effects."""
 
 import inspect
 

@@ -1,4 +1,4 @@
-"""The report: one file for every verdict, plain words, nothing in it that could run."""
+"""The report of every verdict: one file, its figures, no markup from user input."""
 
 import re
 from dataclasses import replace
@@ -91,7 +91,7 @@ def test_shares_add_up_to_one(case):
         assert min(part.explained, part.noise, part.unexplained) >= 0
 
 
-def test_what_a_quantity_foretells_is_not_called_noise():
+def test_what_a_quantity_predicts_is_not_called_noise():
     channel = diagnosed("partly explained").diagnosis.channels[0]
     blind = replace(channel, noise_floor_rms=channel.gap_rms, unexplained_rms=0.0)
     assert shares(blind).unexplained > 0

@@ -1,4 +1,4 @@
-"""The report in a real browser: figures draw, nothing is complained about, nothing is fetched."""
+"""The report in a browser: figures are drawn, without errors and without requests."""
 
 import re
 import shutil

@@ -75,9 +75,9 @@ def test_the_residual_is_described_alike_in_every_section(tmp_path: Path) -> Non
     }  # fmt: skip
     text = page(tmp_path, None, **changed)
     section = text[text.index('id="residual"') : text.index('id="poses"')]
-    assert "To be added, with the share" in section
+    assert "Effects to add, with the share" in section
     assert "90 %" in section
-    assert "no known effect" not in section.lower()
+    assert "no effect of the catalogue explains" not in section.lower()
     assert "no gap" not in section.lower()
 
 

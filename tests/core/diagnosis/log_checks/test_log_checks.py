@@ -149,7 +149,7 @@ def test_rows_without_a_reading_are_counted(name, phrase):
 
 
 def test_positions_that_stand_still_and_few_poses_are_reported():
-    assert "hardly move" in reported(with_columns(measured_position=np.ones_like(READ)))
+    assert "hardly change" in reported(with_columns(measured_position=np.ones_like(READ)))
     few = LOG.select(np.arange(5))
     assert "5 different pose(s) are few" in reported(few)
     assert "are few" not in reported(LOG.select(np.arange(40)))
@@ -158,7 +158,7 @@ def test_positions_that_stand_still_and_few_poses_are_reported():
 def test_joints_beyond_the_limits_are_reported():
     q = SESSION.q.copy()
     q[0, 1] = 3.0
-    assert "joint(s) 2 stand beyond" in reported(with_columns(actual_q=q))
+    assert "joint(s) 2 are beyond" in reported(with_columns(actual_q=q))
 
 
 def flipped(joint: int):
@@ -169,8 +169,8 @@ def flipped(joint: int):
 
 FRAMES = {
     "mirrored": ({"measured_position": READ * [1, -1, 1]}, "mirrored"),
-    "sign of a joint": ({"actual_q": flipped(2)}, "joint 2 looks turned round in sign"),
-    "order of the joints": ({"actual_q": SESSION.q[:, ::-1]}, "turned round in order"),
+    "sign of a joint": ({"actual_q": flipped(2)}, "joint 2 seems to have the wrong sign"),
+    "order of the joints": ({"actual_q": SESSION.q[:, ::-1]}, "in reverse order"),
     "rows late": ({"measured_position": np.roll(READ, 1, axis=0)}, "one row too late"),
     "rows early": ({"measured_position": np.roll(READ, -1, axis=0)}, "one row too early"),
     "inches": ({"measured_position": READ / 0.0254}, "look like inches"),
@@ -198,7 +198,7 @@ def test_angles_in_place_of_rotation_vectors_are_reported():
     shuffled = rotations().as_rotvec()[::-1]
     assert "rotations do not follow" in reported(with_columns(measured_rotation=shuffled))
     aside = (rotations() * Rotation.from_euler("x", 90, degrees=True)).as_rotvec()
-    assert "turned by 1.57 rad" in reported(with_columns(measured_rotation=aside))
+    assert "differ by a constant 1.57 rad" in reported(with_columns(measured_rotation=aside))
 
 
 def in_tool(pull):
@@ -207,9 +207,9 @@ def in_tool(pull):
 
 
 PULLS = {
-    "turned round in sign": -SESSION.tcp_wrench,
-    "given in tool axes": in_tool(SESSION.tcp_wrench),
-    "turned round in sign and given in tool axes": -in_tool(SESSION.tcp_wrench),
+    "to have the wrong sign": -SESSION.tcp_wrench,
+    "to be in tool axes": in_tool(SESSION.tcp_wrench),
+    "to have the wrong sign and to be in tool axes": -in_tool(SESSION.tcp_wrench),
 }
 
 
@@ -218,7 +218,7 @@ PULLS = {
 def test_a_pull_that_the_arm_gives_way_against_is_suspected(mistake, nominal):
     log = with_columns(actual_TCP_force=PULLS[mistake])
     (line,) = findings(log, small.model_of(nominal), FREE)
-    assert line.startswith(f"actual_TCP_force looks {mistake};")
+    assert line.startswith(f"actual_TCP_force seems {mistake};")
 
 
 def test_a_rigid_arm_shows_no_sign_of_a_pull():
@@ -258,4 +258,4 @@ def test_a_sensor_or_a_pull_of_the_wrong_sign_is_suspected(moving, turned):
         assert findings(truth.log_of(7, **kept), model, FREE) == []
         kept[turned] = -kept[turned]
         (line,) = findings(truth.log_of(7, **kept), model, FREE)
-        assert line.startswith(f"{turned} looks turned round in sign;")
+        assert line.startswith(f"{turned} seems to have the wrong sign;")

@@ -1,4 +1,4 @@
-"""Where the gap is: joints, axes, the quantities it follows; which effects explain it."""
+"""Sections “Where the gap lies” (joints, axes, quantities) and “Which effect causes it”."""
 
 from __future__ import annotations
 
@@ -34,25 +34,25 @@ from gapbridge.core.diagnosis.noise_floor import own_coordinates
 from gapbridge.core.planning.travel import far_apart
 
 MOST_QUANTITIES = 14
-STATED = 0.02  # share below which a dependence is not worth a line
-POINTS = 600  # of a drawing among many
-ARROWS = 250
-DRAWN = 4  # poses in which the arm is drawn
-LENGTH = 0.18  # of the arm's reach: how long a large error's arrow is drawn
-HEADS = ("effect", "verdict", "shrinks alone", "probability", "why")
+MIN_SHARE = 0.02  # smallest dependence that is listed
+POINTS = 600  # most points of a scatter plot
+ARROWS = 250  # most error arrows
+DRAWN_POSES = 4  # in which the arm is drawn
+ARROW_LENGTH = 0.18  # of a large error, as a share of the arm's reach
+HEADS = ("effect", "verdict", "reduction alone", "probability", "reason")
 NOTE = (
-    "“Alone” says how far the gap would fall, on measurements the fit did not see, if this effect "
-    "were the only one in the model. An effect can score well alone and still lose: when another "
-    "explains the same better, or with fewer numbers."
+    "“Alone” is the reduction of the gap on held-out measurements if this effect were the only "
+    "one in the model. An effect can score well alone and still be rejected, where another "
+    "explains the same better or with fewer parameters."
 )
 
 
-def where(material: Material) -> list[blocks.Block]:
-    """Return shares by joint and axis, the gap against quantities, and the arm in space."""
+def gap_location(material: Material) -> list[blocks.Block]:
+    """Return shares by joint and axis, scatter plots of the gap, and a view of the arm."""
     shown: list[blocks.Block] = []
     for channel in material.diagnosis.channels:
         shown += channel_heading(material.diagnosis, channel)
-        shown += [blocks.Beside((_joints(channel), _axes(channel), _depends(channel)))]
+        shown += [blocks.TableRow((_joints(channel), _axes(channel), _depends(channel)))]
         shown.append(_against(channel))
         if channel.channel == "position":
             shown.append(arm_view(channel, material))
@@ -63,7 +63,7 @@ def _joints(channel: ChannelDiagnosis) -> blocks.Table:
     rows: list[list[blocks.Cell]] = [
         [f"joint {j}", blocks.Bar(s, percent(s))] for j, s in channel.where.joints if s >= 0.005
     ]
-    title = "share of the gap" if channel.causes else "gap this joint alone could make"
+    title = "share of the gap" if channel.causes else "gap this joint alone could cause"
     return blocks.Table(("joint", title), rows or [["none", "no single joint stands out"]])
 
 
@@ -82,31 +82,31 @@ def _depends(channel: ChannelDiagnosis) -> blocks.Table:
     rows: list[list[blocks.Cell]] = [
         [quantity_title(n), blocks.Bar(s, percent(s))]
         for n, s in channel.where.depends_on
-        if s > STATED
+        if s > MIN_SHARE
     ]
-    heads = ("the gap depends on", "which predicts")
+    heads = ("the gap depends on", "share it predicts")
     return blocks.Table(heads, rows or [["none", "no single quantity of the log"]])
 
 
 def _quantities(channel: ChannelDiagnosis) -> list[str]:
-    """Return the quantities worth a look, most informative first."""
-    have = channel.selection.observation.quantities
+    """Return the quantities to plot the gap against, most informative first."""
+    available = channel.selection.observation.quantities
     first = [n for n, _ in (*channel.depends_on, *channel.where.depends_on)]
-    plain = [n for n in ("payload", "timestamp") if n in have]
+    general = [n for n in ("payload", "timestamp") if n in available]
     joints = [f"approach_{j - 1}" for c in channel.causes for j in c.joints]
-    rest = [n for n in have if n.startswith(("actual_q_", "target_q_"))]
-    names = dict.fromkeys([*first[:4], *plain, *joints, *first[4:], *rest])
-    return [n for n in names if n in have][:MOST_QUANTITIES]
+    angles = [n for n in available if n.startswith(("actual_q_", "target_q_"))]
+    names = dict.fromkeys([*first[:4], *general, *joints, *first[4:], *angles])
+    return [n for n in names if n in available][:MOST_QUANTITIES]
 
 
 def _against(channel: ChannelDiagnosis) -> blocks.Gallery:
-    """Return the gap of every sample against what it may depend on, one drawing a choice."""
+    """Return scatter plots of the gap against each quantity; menus choose the plot."""
     kept = channel.selection.kept
     gap, after = channel.gap[kept], channel.remaining[kept]
     count = own_coordinates(channel.selection.observation)
     keep = thinned(per_sample(gap, count), POINTS)
-    given = before_and_after(channel, gap[keep], after[keep])
-    across, upwards = _abscissas(channel, keep), _ordinates(channel, given, count)
+    series = before_and_after(channel, gap[keep], after[keep])
+    across, upwards = _abscissas(channel, keep), _ordinates(channel, series, count)
     drawings = [
         _scatter((x_title, x), (y_title, series))
         for _, y_title, series in upwards
@@ -118,7 +118,7 @@ def _against(channel: ChannelDiagnosis) -> blocks.Gallery:
     )
     return blocks.Gallery(
         menus, tuple(drawings), "The gap of the samples against what it may depend on; choose "
-        "above. What the causes explain is gone from “after”."
+        "above. “After” is the gap with the causes in the model."
         + (f" {len(keep)} of {len(gap)} samples are drawn." if len(keep) < len(gap) else ""),
     )  # fmt: skip
 
@@ -139,15 +139,15 @@ def _scatter(across: tuple[str, Array], upwards: tuple[str, Series]) -> Drawing:
 
 
 def _abscissas(channel: ChannelDiagnosis, keep: Index) -> list[tuple[str, str, Array]]:
-    """Return label, axis title and values of what the gap can be drawn against."""
+    """Return label, axis title and values of each quantity to plot against."""
     observation, kept = channel.selection.observation, channel.selection.kept
-    spread = np.random.default_rng(0).uniform(-0.08, 0.08, len(keep))
+    jitter = np.random.default_rng(0).uniform(-0.08, 0.08, len(keep))
     choices = []
     for name in _quantities(channel):
         unit, factor = quantity_unit(name)
         values: Array = observation.quantities[name][kept][keep] * factor
         if name.startswith("approach_"):
-            values = values + spread  # so that points at -1 and +1 do not hide each other
+            values = values + jitter  # points at -1 and +1 would overlap
         title = quantity_title(name)
         choices.append((title, f"{title} ({unit})" if unit else title, values))
     if not choices:
@@ -157,41 +157,41 @@ def _abscissas(channel: ChannelDiagnosis, keep: Index) -> list[tuple[str, str, A
 
 
 def _ordinates(
-    channel: ChannelDiagnosis, given: Series, count: int
+    channel: ChannelDiagnosis, gaps: Series, count: int
 ) -> list[tuple[str, str, Series]]:
-    """Return label, axis title and series: the largest coordinate, the size, the others."""
+    """Return label, axis title and series: the largest coordinate, the norm, the others."""
     unit, factor = unit_of(channel.unit)
     names = channel.selection.observation.axes
     size = ("size of the gap", f"gap ({unit})",
-            [(n, per_sample(g, count) * factor, c) for n, g, c in given])  # fmt: skip
+            [(n, per_sample(g, count) * factor, c) for n, g, c in gaps])  # fmt: skip
     order = np.argsort(-np.asarray(channel.where.axes)[:count])
     single = [
         (f"along {names[i]}" if count == 3 else names[i], f"gap, {names[i]} ({unit})",
-         [(n, g[:, i] * factor, c) for n, g, c in given])
+         [(n, g[:, i] * factor, c) for n, g, c in gaps])
         for i in order
     ]  # fmt: skip
     return [*single[:1], size, *single[1:]]
 
 
 def arm_view(channel: ChannelDiagnosis, material: Material) -> blocks.View:
-    """Return the arm at a few poses, with the TCP's error before and after at many."""
+    """Return a 3-D view of the arm at a few poses and the TCP errors before and after."""
     selection = channel.selection
     gap, after = channel.gap[selection.kept][:, :3], channel.remaining[selection.kept][:, :3]
     rows = selection.observation.rows[selection.kept]
     q = material.log.require("actual_q", "target_q")[rows]
-    tip = selection.observation.measured[selection.kept][:, :3] - gap  # where the model puts it
+    tip = selection.observation.measured[selection.kept][:, :3] - gap  # predicted by the model
     keep = thinned(per_sample(gap, 3), ARROWS)
     rigid = material.model.without_terms()
     large = float(np.quantile(per_sample(gap, 3), 0.95))
-    factor = round_factor(LENGTH * reach(rigid) / max(large, 1e-9))
-    chosen = far_apart(tip, DRAWN)
+    factor = round_factor(ARROW_LENGTH * reach(rigid) / max(large, 1e-9))
+    chosen = far_apart(tip, DRAWN_POSES)
     arms = [
         Path(skeleton(rigid, q[i]), EDGE if k else SOFT, 3.0 if k else 7.0, dots=True)
         for k, i in enumerate(chosen)
     ]  # fmt: skip
     errors = before_and_after(channel, gap, after)
     scene = Scene(
-        "The arm with the tool's errors as arrows",
+        "The arm with the TCP errors as arrows",
         (*base(reach(rigid)), *reversed(arms)),
         tuple(Arrows(tip[keep], tip[keep] + e[keep] * factor, colour) for _, e, colour in errors),
         (("arm", SOFT), *((f"error {name}", colour) for name, _, colour in errors)),
@@ -199,14 +199,14 @@ def arm_view(channel: ChannelDiagnosis, material: Material) -> blocks.View:
     drawn = f" {len(keep)} of {len(gap)} samples are drawn." if len(keep) < len(gap) else ""
     return blocks.View(
         scene,
-        f"The arm at {len(chosen)} of its poses; arrows show where the tool really was, drawn "
-        f"{factor:,.0f} times larger than they are. Drag to turn; click, then scroll to zoom. "
-        f"Base frame, squares of the floor 0.1 or 0.25 m.{drawn}",
+        f"The arm at {len(chosen)} of its poses; arrows point to the measured TCP, drawn "
+        f"{factor:,.0f} times longer. Drag to turn; click, then scroll to zoom. "
+        f"Base frame, grid of 0.1 or 0.25 m.{drawn}",
     )
 
 
-def which(material: Material) -> list[blocks.Block]:
-    """Return one table per channel."""
+def effect_tables(material: Material) -> list[blocks.Block]:
+    """Return a table of the effects that were tried, per channel."""
     shown: list[blocks.Block] = [blocks.Paragraph(NOTE, "note")]
     for channel in material.diagnosis.channels:
         shown += [*channel_heading(material.diagnosis, channel), _table(channel)]
@@ -214,10 +214,10 @@ def which(material: Material) -> list[blocks.Block]:
 
 
 def _table(channel: ChannelDiagnosis) -> blocks.Table:
-    rows = [_accused(c) for c in channel.causes]
-    losers = sorted(channel.considered, key=lambda k: (not k.excited, -(k.shrink_alone or 0.0)))
+    rows = [_cause_row(c) for c in channel.causes]
+    others = sorted(channel.considered, key=lambda k: (not k.excited, -(k.shrink_alone or 0.0)))
     tied = {name for c in channel.causes for name in c.indistinguishable_from}
-    rows += [_considered(k, k.effect in tied, bool(channel.causes)) for k in losers]
+    rows += [_considered_row(k, k.effect in tied, bool(channel.causes)) for k in others]
     return blocks.Table(HEADS, rows, (2.2, 1.1, 1.1, 0.9, 3))
 
 
@@ -225,8 +225,8 @@ def _name(effect: str, joints: tuple[int, ...] = ()) -> blocks.Named:
     return blocks.Named(effect_title(effect), f", {joint_list(joints)}" if joints else "", effect)
 
 
-def _accused(cause: Cause) -> list[blocks.Cell]:
-    why = "needed: without it the gap stays larger"
+def _cause_row(cause: Cause) -> list[blocks.Cell]:
+    why = "needed: without it the gap is larger"
     if cause.shrink is not None:
         low, high = cause.shrink.interval
         why = (
@@ -244,8 +244,8 @@ def _accused(cause: Cause) -> list[blocks.Cell]:
     return [_name(cause.effect, cause.joints), verdict, alone, likelihood(cause.probability), why]
 
 
-def _considered(considered: Considered, tied: bool, beside: bool) -> list[blocks.Cell]:
-    """Return the row of an effect that is not accused; ``beside``: others are."""
+def _considered_row(considered: Considered, tied: bool, explained: bool) -> list[blocks.Cell]:
+    """Return the row of an effect that is no cause; ``explained``: the channel has causes."""
     if considered.outcome is Outcome.NOT_EXCITED:
         why = f"this log does not show it; it needs {considered.needs}"
         return [_name(considered.effect), blocks.Badge("not excited", blocks.QUIET), "–", "–", why]
@@ -254,11 +254,11 @@ def _considered(considered: Considered, tied: bool, beside: bool) -> list[blocks
         why = "would explain these data as well as the cause named above"
     elif considered.outcome is Outcome.WITHDRAWN:
         verdict = blocks.Badge("withdrawn", blocks.DOUBTFUL)
-        why = f"looked like a cause, but is not accused: {considered_text(considered)}"
+        why = f"fitted well, but is not named as a cause: {considered_text(considered)}"
     else:
         verdict = blocks.Badge("no", blocks.QUIET)
-        others = ", beside the causes found," if beside else ""
-        why = f"explains too little{' more' if beside else ''}{others} for the numbers it adds"
+        more = " beyond the causes above" if explained else ""
+        why = f"explains too little{more} for the parameters it adds"
     alone: blocks.Cell = "–"
     if considered.shrink_alone is not None:
         alone = blocks.Bar(considered.shrink_alone, percent(considered.shrink_alone), EDGE)

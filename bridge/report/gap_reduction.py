@@ -1,4 +1,4 @@
-"""How far: the gap before and after, on measurements that the fit did not see."""
+"""Section “How far it shrinks”: the gap before and after, on held-out measurements."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from gapbridge.core.arrays import Array, Index
 from gapbridge.core.diagnosis.channel_diagnosis import ChannelDiagnosis
 
 
-def how_far(material: Material) -> list[Block]:
-    """Return the shares, and before and after for every channel."""
+def gap_reduction(material: Material) -> list[Block]:
+    """Return the shares of the gap, and for every channel the gap before and after."""
     diagnosis = material.diagnosis
     blocks: list[Block] = [_shares(diagnosis.channels)]
     for channel in diagnosis.channels:
@@ -52,24 +52,24 @@ def _channel(channel: ChannelDiagnosis) -> list[Block]:
     pair = held_out_pair(channel)
     blocks: list[Block] = [_causes(channel)] if any(c.shrink for c in channel.causes) else []
     if pair is None:
-        return [*blocks, Paragraph("There are too few different poses to hold any out.")]
+        return [*blocks, Paragraph("There are too few different poses for held-out figures.")]
     before, after = pair
     if not channel.causes:
-        text = "No cause was put into the model, so before and after are the same."
+        text = "No cause was added to the model, so before and after are the same."
         blocks.append(Paragraph(text, "note"))
     blocks.append(_pictures(channel, before, after))
     if channel.causes:
         better = float(np.mean(after < before))
-        blocks.append(Paragraph(f"{percent(better)} of the held-out samples came closer."))
+        blocks.append(Paragraph(f"{percent(better)} of the held-out samples have a smaller gap."))
     return blocks
 
 
 def _sessions(channel: ChannelDiagnosis, sessions: tuple[str, ...]) -> list[Block]:
-    """Return how each session does under a fit of the others, and what changed between them."""
-    found = channel.elsewhere.by_session
-    if not found:
+    """Return each session's gap under a fit of the others, and what changed between sessions."""
+    by_session = channel.elsewhere.by_session
+    if not by_session:
         return []
-    rows: list[list[Cell]] = [[sessions[s], with_unit(rms, channel.unit)] for s, rms in found]
+    rows: list[list[Cell]] = [[sessions[s], with_unit(rms, channel.unit)] for s, rms in by_session]
     blocks: list[Block] = [Table(("session", "residual under a fit of the others"), rows)]
     for across in channel.carried:
         title = effect_title(across.effect)
@@ -98,7 +98,7 @@ def _causes(channel: ChannelDiagnosis) -> Table:
             with_unit(s.gap_with, channel.unit),
             Bar(s.shrink, f"{percent(s.shrink)} ({percent(low)} to {percent(high)})", LIMIT),
         ])  # fmt: skip
-    heads = ("cause, all others kept in", "gap without it", "gap with it", "shrinks by (95 %)")
+    heads = ("cause, all others in the model", "gap without it", "gap with it", "reduction (95 %)")
     return Table(heads, rows, (2.4, 1, 1, 2))
 
 
@@ -114,13 +114,13 @@ def _pictures(channel: ChannelDiagnosis, before: Array, after: Array) -> Picture
     if level is not None and share.x.low <= level <= share.x.high:
         share.upright(level, "noise", EDGE)
     keep = thinned(before)
-    thin = f" {len(keep)} of {len(before)} samples are drawn." if len(keep) < len(before) else ""
+    note = f" {len(keep)} of {len(before)} samples are drawn." if len(keep) < len(before) else ""
     rows = channel.selection.observation.rows[channel.selection.kept][keep] + 1
     by_sample = _by_sample(rows, [(n, v[keep], c) for n, v, c in series], name, level)
     return Pictures(
         (share.drawing, by_sample),
-        "Held out. Left: the share of the samples whose gap is at most so large, gaps in powers "
-        f"of ten. Right: every sample. Dashed: the noise.{thin}",
+        "Held-out samples. Left: cumulative distribution of the gap, logarithmic. Right: every "
+        f"sample. Dashed: the noise.{note}",
     )
 
 
