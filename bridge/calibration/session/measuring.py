@@ -224,7 +224,10 @@ class Measuring:
         self.prompt.say(" · ".join(parts), "green" if not reading.doubted else "yellow")
 
     def _ask_operator(self, verdict: Verdict, same: bool) -> str:
-        """Report an implausible reading; return ``""`` (measure again), ``take`` or ``keep``."""
+        """Report an implausible reading; return ``""`` (measure again), ``take`` or ``keep``.
+
+        Raises SessionCommand where the operator chooses ``back``.
+        """
         if verdict.deviation > verdict.limit == 0.0:  # out of the instrument's range
             self.prompt.warn("this instrument cannot give such a reading")
         elif verdict.deviation > verdict.limit:
@@ -249,7 +252,10 @@ class Measuring:
             answers["take"] = f"take it as {reading_text(verdict.corrected)}"
         answers["keep"] = "keep it as it is, marked as doubtful"
         answers["back"] = "measure an earlier pose again: has the instrument or the target moved?"
-        return self.prompt.choose("  what now", answers)
+        answer = self.prompt.choose("  what now", answers)
+        if answer == "back":  # typed in part: `back` itself is a command already
+            raise SessionCommand(answer)
+        return answer
 
     def _run_command(self, command: SessionCommand, stop: int) -> None:
         """Execute a command of the session at a stop."""

@@ -121,7 +121,7 @@ def test_corrected_mistakes_leave_the_same_calibration(
         *session_lines_from(load, good, 7, last),
         *mounting_lines(load, last),
         reading_line(after[last]),
-        "back",
+        "bac",
     ]
     second += [reading_line(after[k]) for k in (last - 1, last - 2, last - 3)]
     second += ["", *session_lines_from(load, after, last, len(load)), "yes"]
