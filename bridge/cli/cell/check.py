@@ -7,9 +7,9 @@ from pathlib import Path
 import click
 
 from gapbridge.bridge.cell import Cell, load_cell
-from gapbridge.bridge.cell.cell import complaints, placed
+from gapbridge.bridge.cell.cell import cell_errors, located_message
 from gapbridge.bridge.cell.live import live_findings
-from gapbridge.bridge.cell.log_fit import log_findings
+from gapbridge.bridge.cell.log_consistency import log_findings
 from gapbridge.bridge.cell.run_settings import read_configuration
 from gapbridge.bridge.cli.options import FILE, cell_argument
 from gapbridge.bridge.setpoint_source import make_source
@@ -41,7 +41,7 @@ def check(cell: Path, live: bool, logs: tuple[Path, ...]) -> None:
 
     Example: gapbridge check cell.yaml --live
     """
-    errors = complaints(cell)
+    errors = cell_errors(cell)
     warnings: list[str] = []
     if not errors:
         given = load_cell(cell)
@@ -75,7 +75,7 @@ def _of_a_run(cell: Cell) -> list[str]:
         if isinstance(settings.link, ProfileSettings):
             make_driver(settings.link, cell.model)  # holds the profile to the arm; opens nothing
     except InputError as error:
-        return [placed(cell.document, str(error))]
+        return [located_message(cell.document, str(error))]
     try:
         make_source(settings.setpoints, cell.arm.n, True, cell.path.parent, settings.link.rate)
     except InputError as error:

@@ -15,9 +15,9 @@ from pydantic import ValidationError
 from gapbridge import drivers
 from gapbridge.bridge.cell import load_cell
 from gapbridge.bridge.cell.document import parse
-from gapbridge.bridge.cell.first_cell import Asked, first_cell
-from gapbridge.bridge.cell.live import whole_state
-from gapbridge.bridge.cell.message import refusals
+from gapbridge.bridge.cell.first_cell import InitOptions, first_cell_text
+from gapbridge.bridge.cell.live import read_valid_state
+from gapbridge.bridge.cell.message import validation_errors
 from gapbridge.bridge.cell.schema import CellFile
 from gapbridge.bridge.cell.sections import LinkSettings
 from gapbridge.bridge.cli.options import FILE
@@ -33,7 +33,7 @@ from gapbridge.drivers.ur_rtde.enquiry import enquire
 CAN_INTERFACE = re.compile(r"[a-z]*can[0-9]+")  # of the kernel: can0, vcan0, slcan1
 
 
-class GivenArm(NamedTuple):
+class ArmOptions(NamedTuple):
     """The arm, where its controller does not report which it is."""
 
     model: str | None
@@ -81,22 +81,22 @@ def init(
     require_writable(out)
     if out.exists():
         raise InputError(f"{out}: found a file that is already there, expected a new one")
-    given = GivenArm(**arm)
+    given = ArmOptions(**arm)
     if given.model is not None and given.urdf is not None:
         raise InputError("--model: found beside --urdf, expected one of them")
     if given.tip is not None and given.urdf is None:
         raise InputError("--tip: found without --urdf, expected the URDF whose link it is")
-    link = _link(host, driver, profile, port) | _further(keys)
+    link = _link(host, driver, profile, port) | _link_keys(keys)
     settings = _settings(link)
-    facts = enquire(host) if driver == "ur_rtde" else _read(settings, given)
+    facts = enquire(host) if driver == "ur_rtde" else _read_facts(settings, given)
     if str(link.get("profile")).endswith(".yaml"):
-        link["profile"] = _beside(Path(link["profile"]), out)
-    urdf = None if given.urdf is None else _beside(given.urdf, out)
-    asked = Asked(link, given.model, urdf, given.tip)
-    text = first_cell(facts, asked)
-    _check(text, out)
+        link["profile"] = _path_from_cell(Path(link["profile"]), out)
+    urdf = None if given.urdf is None else _path_from_cell(given.urdf, out)
+    options = InitOptions(link, given.model, urdf, given.tip)
+    text = first_cell_text(facts, options)
+    _require_loadable(text, out)
     write_text(out, text)
-    click.echo(f"{out}: written, {_known_text(facts)}")
+    click.echo(f"{out}: written, {_facts_text(facts)}")
     click.echo(f"next: gapbridge check {out} --live; gapbridge run {out} --observe")
 
 
@@ -125,7 +125,7 @@ def _link(host: str, driver: str, profile: str | None, port: int | None) -> dict
     return link if port is None else {**link, "port": port}
 
 
-def _further(keys: Sequence[str]) -> dict[str, Any]:
+def _link_keys(keys: Sequence[str]) -> dict[str, Any]:
     """Return the keys given with --link; values are YAML. Raises InputError."""
     for key in keys:
         if not re.match(r"\w+=.", key):
@@ -140,12 +140,12 @@ def _settings(link: dict[str, Any]) -> LinkSettings:
     try:
         found = CellFile.model_validate({"robot": {"model": "ur10e"}, "link": link}).link
     except ValidationError as error:
-        raise InputError(refusals(CellFile, error)[0][1]) from None
+        raise InputError(validation_errors(CellFile, error)[0][1]) from None
     assert found is not None
     return found.located(Path.cwd())
 
 
-def _read(link: LinkSettings, given: GivenArm) -> ControllerFacts:
+def _read_facts(link: LinkSettings, given: ArmOptions) -> ControllerFacts:
     """Return what a profile reads of an arm; needs the arm's joints to know which there are."""
     model, urdf, tip = given
     if urdf is None and model is None:
@@ -156,20 +156,22 @@ def _read(link: LinkSettings, given: GivenArm) -> ControllerFacts:
     arm = arm_from_urdf(urdf, tip) if urdf is not None else builtin_arm(str(model))
     with make_driver(link, Model(arm=arm)) as driver:
         try:
-            return driver.facts(whole_state(driver))
+            return driver.facts(read_valid_state(driver))
         except InvalidStateError as error:
             if error.reason is not Implausible.VALUE:
                 raise
-            raise InputError(f"{urdf or f'--model {model}'}: {error}{_cure(link)}") from None
+            raise InputError(
+                f"{urdf or f'--model {model}'}: {error}{_link_keys_hint(link)}"
+            ) from None
 
 
-def _cure(link: LinkSettings) -> str:
+def _link_keys_hint(link: LinkSettings) -> str:
     """Return what may be said of a link whose joints are read outside the arm's limits."""
     keys = [key for key in ("gear", "zero", "direction") if hasattr(link, key)]
     return f" (--link sets {', '.join(keys)})" if keys else " (the profile's unit and zero)"
 
 
-def _beside(path: Path, out: Path) -> str:
+def _path_from_cell(path: Path, out: Path) -> str:
     """Return a path relative to the cell's folder, or absolute where it is outside."""
     try:
         return str(path.resolve().relative_to(out.parent.resolve()))
@@ -177,7 +179,7 @@ def _beside(path: Path, out: Path) -> str:
         return str(path.resolve())
 
 
-def _check(text: str, out: Path) -> None:
+def _require_loadable(text: str, out: Path) -> None:
     """Raise where the cell cannot be loaded: nothing that no command reads is written."""
     with tempfile.NamedTemporaryFile(
         "w", suffix=".yaml", dir=out.parent, encoding="utf-8"
@@ -190,7 +192,7 @@ def _check(text: str, out: Path) -> None:
             raise type(error)(str(error).replace(trial.name, str(out))) from None
 
 
-def _known_text(facts: ControllerFacts) -> str:
+def _facts_text(facts: ControllerFacts) -> str:
     """Return in words what the controller has reported."""
     names = {
         "model": facts.model, "factory calibration": facts.calibration or None, "TCP": facts.tcp,

@@ -13,7 +13,7 @@ from rich.table import Table
 
 from gapbridge.bridge.api.uncertainty import fit_intervals
 from gapbridge.bridge.cell import Cell, save_cell
-from gapbridge.bridge.cell.log_fit import pose_findings
+from gapbridge.bridge.cell.log_consistency import pose_findings
 from gapbridge.bridge.cli.log.large_log import LargeLog, has_sessions, is_large
 from gapbridge.bridge.cli.options import (
     FILE,

@@ -23,15 +23,15 @@ class Bus:
 
 
 def test_a_torn_and_a_late_sample_are_read_again() -> None:
-    assert live.whole_state(Bus(InvalidStateError("torn"), StaleStateError("late"))) == "state"
+    assert live.read_valid_state(Bus(InvalidStateError("torn"), StaleStateError("late"))) == "state"
 
 
 def test_a_broken_link_is_not_waited_for() -> None:
     with pytest.raises(LinkError, match="cut"):
-        live.whole_state(Bus(LinkError("cut")))
+        live.read_valid_state(Bus(LinkError("cut")))
 
 
 def test_a_bus_that_is_never_whole_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(live, "LONGEST", 0.0)
+    monkeypatch.setattr(live, "READ_TIMEOUT", 0.0)
     with pytest.raises(InvalidStateError):
-        live.whole_state(Bus(*[InvalidStateError("torn")] * 100_000))
+        live.read_valid_state(Bus(*[InvalidStateError("torn")] * 100_000))

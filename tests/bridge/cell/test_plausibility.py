@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from gapbridge.bridge.cell import load_cell
-from gapbridge.bridge.cell.cell import complaints
+from gapbridge.bridge.cell.cell import cell_errors
 from gapbridge.core.arm import builtin_rows
 from gapbridge.core.errors import CellError
 
@@ -145,5 +145,5 @@ def test_lengths_of_a_calibration_that_cancel_are_right_as_they_stand(tmp_path: 
 
 def test_everything_that_is_wrong_is_listed(tmp_path: Path) -> None:
     text = ARM + "tool: {tcp: {xyz: [0, 0, 180]}}\ngravity: [0, 0, -1]\n"
-    lines = complaints(written(tmp_path, text))
+    lines = cell_errors(written(tmp_path, text))
     assert [line.split(": ")[1] for line in lines] == ["tool.tcp.xyz", "gravity"]

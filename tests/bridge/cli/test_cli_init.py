@@ -106,10 +106,10 @@ def test_gears_that_only_the_builder_knows(tmp_path: Path) -> None:
 
 
 def test_a_profile_beside_the_cell_is_found_from_its_folder(tmp_path: Path) -> None:
-    from gapbridge.bridge.cli.cell.init import _beside
+    from gapbridge.bridge.cli.cell.init import _path_from_cell
 
-    assert _beside(tmp_path / "arm.yaml", tmp_path / "cell.yaml") == "arm.yaml"
-    assert _beside(tmp_path / "arm.yaml", tmp_path / "cells" / "c.yaml") == str(
+    assert _path_from_cell(tmp_path / "arm.yaml", tmp_path / "cell.yaml") == "arm.yaml"
+    assert _path_from_cell(tmp_path / "arm.yaml", tmp_path / "cells" / "c.yaml") == str(
         tmp_path / "arm.yaml"
     )
 
