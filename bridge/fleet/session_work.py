@@ -1,4 +1,4 @@
-"""The work on one session: its diagnosis as rows, or what it says about the arm's compliance."""
+"""The jobs on one session: its diagnosis as table rows, or its equations of the compliance."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from gapbridge.core.estimation.compliance_fit import flexibilities, usual_flexib
 from gapbridge.core.estimation.hierarchical_evidence import evidence
 from gapbridge.core.log.log import Log
 
-EPOCH = 1.0e9  # s: timestamps beyond count from 1970, those below from some start
+EPOCH = 1.0e9  # s: larger timestamps are Unix times, smaller ones relative
 
 
 def diagnose_session(cell: Cell, log: Log, options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the diagnosis as facts of the session, its channels, and a row per parameter."""
+    """Return the diagnosis as plain JSON: facts of the session, channels, a row per parameter."""
     found = document(
         diagnose(
             cell.model,
@@ -40,14 +40,14 @@ def diagnose_session(cell: Cell, log: Log, options: Mapping[str, Any]) -> dict[s
 
 
 def facts(cell: Cell, log: Log) -> dict[str, Any]:
-    """Return what is to be known of a session, whatever is done with it."""
+    """Return arm type, number of joints and poses, and start (Unix time, s) of a session."""
     time = log.get("timestamp")
     begin = float(time[0]) if time is not None and time[0] > EPOCH else None
     return {"type": arm_type(cell), "joints": cell.arm.n, "poses": len(log), "time": begin}
 
 
 def arm_type(cell: Cell) -> str:
-    """Return the name of the arm's type; of DH rows, which have none, one made from them."""
+    """Return the name of the arm's type; for DH rows a hash of them."""
     arm = cell.arm
     if arm.name != "dh":
         return arm.name
@@ -89,7 +89,7 @@ def _rows(channel: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 
 def fit_session(cell: Cell, log: Log, options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the session's equations for the flexibilities, and what the cell says of them."""
+    """Return the session's equations of the flexibilities, and those of the cell, rad/Nm."""
     found = evidence(cell.model, log, cell.metrology)
     arrays = {"matrix": found.matrix.tolist(), "right": found.right.tolist()}
     return {

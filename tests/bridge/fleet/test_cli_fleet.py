@@ -62,7 +62,7 @@ def test_a_bad_log_is_reported_in_one_line_and_the_others_are_fitted(fitted: Any
     assert "s9.csv" in line
     assert "found 'heavy', expected a number" in line
     assert (
-        "13 sessions of 4 arms (the folder says the arm): 12 done, 1 cannot be used" in answer.out
+        "13 sessions of 4 arms (arm: name of the folder): 12 done, 1 cannot be used" in answer.out
     )
     sessions = rows_of(folder / "out" / "sessions.parquet")
     assert len(sessions) == 13
