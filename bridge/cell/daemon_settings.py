@@ -36,9 +36,7 @@ class DaemonSettings(Section):
     hang_timeout: float = Field(
         1.0, gt=0.0, description="s without a heartbeat after which the loop process is killed"
     )
-    backoff: tuple[float, float] = Field(
-        (0.2, 5.0), description="s before a restart: first, longest"
-    )
+    backoff: tuple[float, float] = Field((0.2, 5.0), description="s before a restart: first, max")
     model_source: str = "gapbridge.bridge.cell:load_cell"
     uncorrected: bool = Field(
         False, description="arm although the model corrects nothing: calibration of a rigid cell"

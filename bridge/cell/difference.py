@@ -70,10 +70,7 @@ class TcpShift:
 
     def to_json(self) -> dict[str, Any]:
         """Return it as JSON-able data, SI units."""
-        return {
-            "poses": self.poses, "rms": self.rms, "largest": self.largest, "turned": self.turned,
-            "where": self.where.tolist(), "mean": self.mean.tolist(),
-        }  # fmt: skip
+        return vars(self) | {"where": self.where.tolist(), "mean": self.mean.tolist()}
 
 
 def key_changes(before: Cell, after: Cell) -> list[KeyChange]:

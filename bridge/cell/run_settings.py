@@ -41,24 +41,20 @@ class Configuration:
 
 def configuration_for(settings: DaemonSettings) -> Configuration:
     """Return the configuration of given settings; reads their cell file. Raises InputError."""
-    with recorded() as files:
-        cell = load_cell(settings.cell)
-        _read_referenced_files(settings)
-    return _configuration(settings, cell, files)
+    return _read(settings.cell, settings)
 
 
 def read_configuration(path: Path) -> Configuration:
     """Return the checked configuration of a cell file. Raises InputError."""
+    return _read(path, None)
+
+
+def _read(path: Path, settings: DaemonSettings | None) -> Configuration:
+    """Read a cell file and all files that its settings, or the given ones, refer to."""
     with recorded() as files:
         cell = load_cell(path)
-        settings = settings_of(cell)
+        settings = settings or settings_of(cell)
         _read_referenced_files(settings)
-    return _configuration(settings, cell, files)
-
-
-def _configuration(
-    settings: DaemonSettings, cell: Cell, files: Mapping[str, bytes]
-) -> Configuration:
     text, fitted = cell.document.text, cell.fitted_range
     return Configuration(settings, cell.arm.n, text, files, fitted, cell.model)
 

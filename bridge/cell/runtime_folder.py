@@ -18,10 +18,7 @@ def candidates() -> list[Path]:
         found.append(Path(given.split(":")[0]))
     if given := os.environ.get("XDG_RUNTIME_DIR"):
         found.append(Path(given) / "gapbridge")
-    found += [
-        Path("/run/gapbridge"),
-        Path(tempfile.gettempdir()) / f"gapbridge-{os.getuid()}",
-    ]
+    found += [Path("/run/gapbridge"), Path(tempfile.gettempdir()) / f"gapbridge-{os.getuid()}"]
     return found
 
 

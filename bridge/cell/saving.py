@@ -43,10 +43,7 @@ _Dumper.add_representer(
 
 
 def save_cell(
-    cell: Cell,
-    path: Path | str,
-    model: Model | None = None,
-    sections: dict[str, Any] | None = None,
+    cell: Cell, path: Path | str, model: Model | None = None, sections: dict[str, Any] | None = None
 ) -> None:
     """Write the cell, with effects and TCP of ``model``, to ``path``, atomically.
 

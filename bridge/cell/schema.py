@@ -91,9 +91,7 @@ class EffectEntry(Section):
     joint: int | None = Field(default=None, strict=True, description="from 1")
     order: Number | None = Field(default=None, description="cycles per turn of the joint")
     parameters: dict[str, Number] = Field(default={}, description="name: value")
-    stand_in: bool = Field(
-        default=False, strict=True, description="improves the prediction, but is not proved"
-    )
+    stand_in: bool = Field(default=False, strict=True, description="effective, not proved")
 
 
 class MetrologyEntry(Section):

@@ -8,13 +8,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import (
-    Discriminator,
-    Field,
-    Tag,
-    field_validator,
-    model_validator,
-)
+from pydantic import Discriminator, Field, Tag, field_validator, model_validator
 
 from gapbridge.bridge.cell.settings.recording import RecordingSettings as RecordingSettings
 from gapbridge.drivers.addresses import is_loopback

@@ -91,10 +91,7 @@ def served_controller(
     """
     simulation, address = cell.file.simulation, _address(cell, host)
     arm, plant, start = simulated_arm(
-        cell.arm,
-        simulation.seed if seed is None else seed,
-        simulation.start_q,
-        **_plant(cell),
+        cell.arm, simulation.seed if seed is None else seed, simulation.start_q, **_plant(cell)
     )
     controller = make_controller(arm, plant, start, PERIOD)
     make_servers = resolve_name(SIMULATORS[str(getattr(link, "driver", ""))])

@@ -19,11 +19,7 @@ from gapbridge.bridge.report.labels import counted
 from gapbridge.core.errors import InputError
 
 JOURNAL_VERSION = 2  # format of the results, part of every key
-STATES = {
-    BAD: "cannot be used",
-    CRASHED: "failed",
-    DIED: "killed their workers",
-}
+STATES = {BAD: "cannot be used", CRASHED: "failed", DIED: "killed their workers"}
 
 
 @dataclass(frozen=True)

@@ -119,7 +119,6 @@ def by_arm(outcomes: Sequence[Outcome]) -> dict[str, list[Outcome]]:
     for arm, sessions in found.items():
         dated = all(o.result["time"] is not None for o in sessions)
         found[arm] = sorted(
-            sessions,
-            key=lambda o: (o.result["time"] if dated else 0.0, natural_key(o.session)),
+            sessions, key=lambda o: (o.result["time"] if dated else 0.0, natural_key(o.session))
         )
     return {arm: found[arm] for arm in sorted(found, key=natural_key)}

@@ -73,11 +73,7 @@ class CalibrationSettings(Section):
         description="poses to verify, never fitted",
     )
     repeats: int = Field(
-        default=4,
-        ge=0,
-        le=50,
-        strict=True,
-        description="repeated poses, for the repeatability of the arm",
+        default=4, ge=0, le=50, strict=True, description="poses repeated, for the repeatability"
     )
     effects: list[str] | None = Field(
         default=None, description="effects of the catalogue to identify"

@@ -30,11 +30,11 @@ from gapbridge.drivers import make_driver
 from gapbridge.drivers.controller_facts import ControllerFacts
 from gapbridge.drivers.ur_rtde.enquiry import enquire
 
-CAN_INTERFACE = re.compile(r"[a-z]*can[0-9]+")  # of the kernel: can0, vcan0, slcan1
+CAN_INTERFACE = re.compile(r"[a-z]*can[0-9]+")  # Linux names: can0, vcan0, slcan1
 
 
 class ArmOptions(NamedTuple):
-    """The arm, where its controller does not report which it is."""
+    """The arm, if its controller does not report which it is."""
 
     model: str | None
     urdf: Path | None
@@ -81,18 +81,18 @@ def init(
     require_writable(out)
     if out.exists():
         raise InputError(f"{out}: found a file that is already there, expected a new one")
-    given = ArmOptions(**arm)
-    if given.model is not None and given.urdf is not None:
+    arm_options = ArmOptions(**arm)
+    if arm_options.model is not None and arm_options.urdf is not None:
         raise InputError("--model: found beside --urdf, expected one of them")
-    if given.tip is not None and given.urdf is None:
+    if arm_options.tip is not None and arm_options.urdf is None:
         raise InputError("--tip: found without --urdf, expected the URDF whose link it is")
     link = _link(host, driver, profile, port) | _link_keys(keys)
     settings = _settings(link)
-    facts = enquire(host) if driver == "ur_rtde" else _read_facts(settings, given)
+    facts = enquire(host) if driver == "ur_rtde" else _read_facts(settings, arm_options)
     if str(link.get("profile")).endswith(".yaml"):
         link["profile"] = _path_from_cell(Path(link["profile"]), out)
-    urdf = None if given.urdf is None else _path_from_cell(given.urdf, out)
-    options = InitOptions(link, given.model, urdf, given.tip)
+    urdf = None if arm_options.urdf is None else _path_from_cell(arm_options.urdf, out)
+    options = InitOptions(link, arm_options.model, urdf, arm_options.tip)
     text = first_cell_text(facts, options)
     _require_loadable(text, out)
     write_text(out, text)
@@ -126,7 +126,7 @@ def _link(host: str, driver: str, profile: str | None, port: int | None) -> dict
 
 
 def _link_keys(keys: Sequence[str]) -> dict[str, Any]:
-    """Return the keys given with --link; values are YAML. Raises InputError."""
+    """Return the keys of --link; values are YAML. Raises InputError."""
     for key in keys:
         if not re.match(r"\w+=.", key):
             raise InputError(f"--link: found {key!r}, expected KEY=VALUE")
@@ -136,7 +136,7 @@ def _link_keys(keys: Sequence[str]) -> dict[str, Any]:
 
 
 def _settings(link: dict[str, Any]) -> LinkSettings:
-    """Return the settings of a link, with paths from here. Raises InputError."""
+    """Return the settings of a link, paths from the working folder. Raises InputError."""
     try:
         found = CellFile.model_validate({"robot": {"model": "ur10e"}, "link": link}).link
     except ValidationError as error:
@@ -145,9 +145,9 @@ def _settings(link: dict[str, Any]) -> LinkSettings:
     return found.located(Path.cwd())
 
 
-def _read_facts(link: LinkSettings, given: ArmOptions) -> ControllerFacts:
-    """Return what a profile reads of an arm; needs the arm's joints to know which there are."""
-    model, urdf, tip = given
+def _read_facts(link: LinkSettings, arm_options: ArmOptions) -> ControllerFacts:
+    """Return what the controller reports by its profile; the arm's joints must be known."""
+    model, urdf, tip = arm_options
     if urdf is None and model is None:
         raise InputError(
             f"--model: found nothing with --driver {link.driver}, expected --model or --urdf "
@@ -166,13 +166,13 @@ def _read_facts(link: LinkSettings, given: ArmOptions) -> ControllerFacts:
 
 
 def _link_keys_hint(link: LinkSettings) -> str:
-    """Return what may be said of a link whose joints are read outside the arm's limits."""
+    """Return a hint on the settings that are wrong if joint angles exceed the arm's limits."""
     keys = [key for key in ("gear", "zero", "direction") if hasattr(link, key)]
     return f" (--link sets {', '.join(keys)})" if keys else " (the profile's unit and zero)"
 
 
 def _path_from_cell(path: Path, out: Path) -> str:
-    """Return a path relative to the cell's folder, or absolute where it is outside."""
+    """Return a path relative to the cell's folder, or absolute if it is outside."""
     try:
         return str(path.resolve().relative_to(out.parent.resolve()))
     except ValueError:
@@ -180,29 +180,27 @@ def _path_from_cell(path: Path, out: Path) -> str:
 
 
 def _require_loadable(text: str, out: Path) -> None:
-    """Raise where the cell cannot be loaded: nothing that no command reads is written."""
-    with tempfile.NamedTemporaryFile(
-        "w", suffix=".yaml", dir=out.parent, encoding="utf-8"
-    ) as trial:
-        trial.write(text)
-        trial.flush()
+    """Raise GapbridgeError if the text is no valid cell: an invalid one is never written."""
+    with tempfile.NamedTemporaryFile("w", suffix=".yaml", dir=out.parent, encoding="utf-8") as file:
+        file.write(text)
+        file.flush()
         try:
-            load_cell(trial.name)
+            load_cell(file.name)
         except GapbridgeError as error:
-            raise type(error)(str(error).replace(trial.name, str(out))) from None
+            raise type(error)(str(error).replace(file.name, str(out))) from None
 
 
 def _facts_text(facts: ControllerFacts) -> str:
-    """Return in words what the controller has reported."""
+    """Return text that lists what the controller has reported, and what not."""
     names = {
         "model": facts.model, "factory calibration": facts.calibration or None, "TCP": facts.tcp,
         "payload": facts.payload, "gravity": facts.gravity, "joint limits": facts.lower,
         "rate": facts.rate,
     }  # fmt: skip
-    known = [name for name, value in names.items() if value is not None]
+    reported = [name for name, value in names.items() if value is not None]
     missing = [name for name, value in names.items() if value is None]
     joints = f"{facts.n} joints" if facts.q is None else f"{facts.n} joints at {_degrees(facts.q)}"
-    return f"{joints}; reported: {', '.join(known) or 'nothing else'}" + (
+    return f"{joints}; reported: {', '.join(reported) or 'nothing else'}" + (
         f"; not reported: {', '.join(missing)}" if missing else ""
     )
 

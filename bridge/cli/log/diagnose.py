@@ -11,7 +11,7 @@ import click
 from gapbridge.bridge.api.records import Diagnosed
 from gapbridge.bridge.cell import Cell
 from gapbridge.bridge.cell.opened_log import open_simulated
-from gapbridge.bridge.cli.log.answer import answer, other_arm
+from gapbridge.bridge.cli.log.diagnosis_text import diagnosis_text, wrong_arm_findings
 from gapbridge.bridge.cli.options import (
     FILE,
     cell_option,
@@ -107,9 +107,9 @@ def diagnose(
     with status("diagnosing") as emit:
         metrology = replace(opened.metrology, remounted=remounted)
         found = _diagnose(opened, rows, metrology, withhold, simulated, emit)
-    for finding in other_arm(found):
+    for finding in wrong_arm_findings(found):
         click.echo(f"warning: {rows.path}: {log_finding_text(finding)}", err=True)
-    click.echo(answer(found))
+    click.echo(diagnosis_text(found))
     origin = provenance({"log": logs, "cell": [cell], "sim": [sim] if sim else []})
     whole = Diagnosed(opened, rows, found, document(found) | {"provenance": origin})
     for file in output.write(whole):
@@ -118,7 +118,7 @@ def diagnose(
 
 @dataclass(frozen=True)
 class _Output:
-    """What is written, and where."""
+    """The output files of the command; None: not written."""
 
     out: Path | None
     json_file: Path | None
@@ -126,7 +126,7 @@ class _Output:
     stand_ins: bool
 
     def require_writable(self, *inputs: Path) -> None:
-        """Make the folder; raise InputError where a file cannot be written, or is an input."""
+        """Create the folder; raise InputError if a file is not writable, or is an input."""
         for file in (self.json_file, self.new_cell):
             if file is not None:
                 require_writable(file, *inputs)
@@ -136,7 +136,7 @@ class _Output:
             require_folder(self.out, "--out", above=False)
 
     def write(self, found: Diagnosed) -> list[Path]:
-        """Write what was asked for and return its files."""
+        """Write the requested files and return their paths."""
         if self.json_file is not None:
             found.write_json(self.json_file)
         if self.new_cell is not None:

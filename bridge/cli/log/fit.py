@@ -61,18 +61,18 @@ def fit(logs: tuple[Path, ...], cell: Path, remounted: bool, out: Path) -> None:
 
     Example: gapbridge fit log.csv --cell cell.yaml --out calibrated.yaml
     """
-    given = open_cell(cell)
+    opened = open_cell(cell)
     require_writable(out, *logs, cell)
-    metrology = replace(given.metrology, remounted=remounted)
+    metrology = replace(opened.metrology, remounted=remounted)
     try:
-        found, wrong, ranges = _identified(logs, given, metrology)
+        found, warnings, ranges = _identified(logs, opened, metrology)
     except ExcitationError as error:
         raise ExcitationError(f"{', '.join(map(str, logs))}: {error}") from None
-    spread = Spread.of_fit(found.identifiable, found.covariance).beside(given.spread)
-    intervals = given.intervals | fit_intervals(found)
+    spread = Spread.of_fit(found.identifiable, found.covariance).beside(opened.spread)
+    intervals = opened.intervals | fit_intervals(found)
     origin = fitted(provenance({"log": logs, "cell": [cell]}), ranges, spread, intervals)
-    save_cell(given, out, found.written, {"provenance": origin})
-    for line in wrong:
+    save_cell(opened, out, found.written, {"provenance": origin})
+    for line in warnings:
         click.echo(f"warning: {', '.join(map(str, logs))}: {line}", err=True)
     print_identification(found)
     click.echo(f"{out}: written")
@@ -81,9 +81,9 @@ def fit(logs: tuple[Path, ...], cell: Path, remounted: bool, out: Path) -> None:
 def _identified(
     paths: Sequence[Path], cell: Cell, metrology: Metrology
 ) -> tuple[Identification, list[str], dict[str, tuple[float, float]]]:
-    """Return what the logs show, what is odd in them, and the ranges fitted on.
+    """Return the estimate, warnings about the logs, and the range of each fitted column.
 
-    One of many rows passes in pieces.
+    A large log is read in pieces.
     """
     if (
         len(paths) == 1
@@ -91,18 +91,18 @@ def _identified(
         and not (has_sessions(paths[0]) or metrology.remounted)
     ):
         ranges: list[dict[str, tuple[float, float]]] = []
-        wrong: list[str] = []
+        warnings: list[str] = []
 
         def read_once() -> Iterator[Log]:
             for piece in LargeLog(paths[0], cell, by_approach(cell.model.terms)):
                 if not ranges:
-                    wrong.extend(pose_findings(cell, piece))
+                    warnings.extend(pose_findings(cell, piece))
                 ranges.append(range_of(piece))
                 yield piece
 
         with status("fitting") as emit:
             found = identify_streamed(cell.model, read_once(), metrology, progress=emit)
-        return found, wrong, merged(ranges)
+        return found, warnings, merged(ranges)
     rows = open_logs(paths, cell)
     with progress("fitting"):
         found = identify_compliance(cell.model, rows, metrology)
@@ -110,7 +110,7 @@ def _identified(
 
 
 def print_identification(found: Identification) -> None:
-    """Print flexibilities with their spread, how far they carry, and what stays unknown."""
+    """Print flexibilities with 1 sigma, gaps before and after, expected gaps, and notes."""
     table = Table(title="joint flexibility, 1e-6 rad/Nm", title_justify="left")
     for column in ("joint", "axial", "±", "radial", "±"):
         table.add_column(column, justify="right")
@@ -130,12 +130,12 @@ def print_identification(found: Identification) -> None:
     if np.isfinite(found.remaining_rms_held_out):
         change = _change(found.gap_rms_held_out, found.remaining_rms_held_out)
         click.echo(f"on poses left out of the fit: {change}")
-    for where, left in (
+    for where, rms in (
         ("a new region of joint space", found.remaining_rms_new_region),
         ("a new session", found.remaining_rms_new_session),
     ):
-        if np.isfinite(left):
-            click.echo(f"to expect in {where}, mm rms per coordinate (in space): {_mm(left)}")
+        if np.isfinite(rms):
+            click.echo(f"to expect in {where}, mm rms per coordinate (in space): {_mm(rms)}")
     for line in note_texts((*found.notes, *found.combinations)):
         click.echo(f"note: {line}")
 
@@ -145,7 +145,7 @@ def _change(before: float, after: float) -> str:
 
 
 def _mm(rms: float) -> str:
-    """Return an rms per coordinate (m) in mm, beside it that of the distance in space."""
+    """Return an rms per coordinate (m) in mm, and in parentheses that of the distance."""
     return f"{rms * 1e3:.4f} ({3**0.5 * rms * 1e3:.4f})"
 
 

@@ -39,9 +39,9 @@ def run(cell: Path, observe: bool, arm: bool, duration: float | None, log: str) 
     """
     if observe and arm:
         raise InputError("--observe: found beside --arm, expected one of them")
-    given = open_cell(cell)
-    from gapbridge.bridge.daemon.run import run_cell  # takes the numerical libraries along
+    opened = open_cell(cell)
+    from gapbridge.bridge.daemon.run import run_cell  # imports the numerical libraries
 
     json = JsonLines(sys.stderr).emit if log == "json" else None
-    if code := run_cell(given, observe=observe, arm=arm, duration=duration, log=json):
+    if code := run_cell(opened, observe=observe, arm=arm, duration=duration, log=json):
         raise click.exceptions.Exit(code)

@@ -36,12 +36,7 @@ def answer(summary: FleetDiagnosis, done: FleetRun) -> list[blocks.Block]:
         blocks.Badge(f"{VERDICTS[verdict]}: {count}", KINDS[verdict])
         for verdict, count in summary.verdicts
     )
-    sentences = [
-        _recurs(summary),
-        _drifting(summary),
-        _outliers(summary),
-        _skipped(done, usable),
-    ]
+    sentences = [_recurs(summary), _drifting(summary), _outliers(summary), _skipped(done, usable)]
     text = " ".join(s for s in sentences if s)
     return [
         blocks.Verdict(first, text, tuple(rest)), blocks.Heading("What to do now"),

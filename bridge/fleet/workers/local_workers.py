@@ -1,7 +1,7 @@
 """Local workers: spawned processes that run one session at a time.
 
-Every process has its own pipe, so that the task of a dead one is known; a ProcessPoolExecutor would
-fail as a whole.
+Every process has its own pipe, so that the task of a dead one is known; a ProcessPoolExecutor
+would fail as a whole.
 """
 
 from __future__ import annotations
@@ -20,12 +20,7 @@ from gapbridge.bridge.fleet.workers.workers import Workers
 from gapbridge.core.errors import RunError
 
 # one thread per process: threads do not speed up matrices of this size
-THREAD_VARIABLES = (
-    "OMP_NUM_THREADS",
-    "OPENBLAS_NUM_THREADS",
-    "MKL_NUM_THREADS",
-    "NUMBA_NUM_THREADS",
-)
+THREAD_VARS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 MAX_FAILED_STARTS = 3  # in a row, after which the run fails
 READY = "ready"
 QUEUED = 2  # tasks sent to a process, so that it never waits
@@ -129,8 +124,8 @@ class LocalWorkers(Workers):
 def _spawn() -> _Worker:
     context = multiprocessing.get_context("spawn")
     pipe, worker_pipe = context.Pipe()
-    before = {name: os.environ.get(name) for name in THREAD_VARIABLES}
-    os.environ.update(dict.fromkeys(THREAD_VARIABLES, "1"))
+    before = {name: os.environ.get(name) for name in THREAD_VARS}
+    os.environ.update(dict.fromkeys(THREAD_VARS, "1"))
     try:
         process = context.Process(target=_serve, args=(worker_pipe,), daemon=True)
         process.start()
