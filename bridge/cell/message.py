@@ -40,7 +40,7 @@ _EXPECTED_TEXTS = {
 
 
 def key_path(keys: Keys) -> str:
-    """Return a key path as people read it: ``robot.dh row 2.a``, list entries from 1."""
+    """Return a key path for messages: ``robot.dh entry 2.a``, list entries from 1."""
     text = ""
     for key in keys:
         if isinstance(key, int):

@@ -68,7 +68,7 @@ def calibration_of(
 def read_calibration(path: Path) -> dict[str, list[float]]:
     """Return the deltas of a UR controller's ``calibration.conf`` (an INI file).
 
-    Raises ArmError where the file is missing, is no INI file or holds no deltas.
+    Raises ArmError if the file is missing, is no INI file or contains no deltas.
     """
     parser = configparser.ConfigParser(interpolation=None)
     try:

@@ -13,13 +13,13 @@ from gapbridge.core.errors import InputError
 
 def candidates() -> list[Path]:
     """Return the possible runtime folders of a daemon of this user, preferred first."""
-    found = []
-    if given := os.environ.get("RUNTIME_DIRECTORY"):  # systemd's, colon-separated
-        found.append(Path(given.split(":")[0]))
-    if given := os.environ.get("XDG_RUNTIME_DIR"):
-        found.append(Path(given) / "gapbridge")
-    found += [Path("/run/gapbridge"), Path(tempfile.gettempdir()) / f"gapbridge-{os.getuid()}"]
-    return found
+    folders = []
+    if folder := os.environ.get("RUNTIME_DIRECTORY"):  # systemd's, colon-separated
+        folders.append(Path(folder.split(":")[0]))
+    if folder := os.environ.get("XDG_RUNTIME_DIR"):
+        folders.append(Path(folder) / "gapbridge")
+    folders += [Path("/run/gapbridge"), Path(tempfile.gettempdir()) / f"gapbridge-{os.getuid()}"]
+    return folders
 
 
 def runtime_folder() -> Path:
@@ -28,14 +28,14 @@ def runtime_folder() -> Path:
     for path in candidates():
         try:
             path.mkdir(mode=0o700, exist_ok=True)
-            found = path.lstat()
+            status = path.lstat()
         except OSError as error:
             problem = f"{path}: {error.strerror}"
             continue
-        if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.geteuid():
+        if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.geteuid():
             problem = f"{path}: found no folder of this user"
             continue
-        if stat.S_IMODE(found.st_mode) != 0o700:
+        if stat.S_IMODE(status.st_mode) != 0o700:
             path.chmod(0o700)
         return path
     raise InputError(f"{problem}, expected a folder for the daemon's socket (XDG_RUNTIME_DIR)")
@@ -43,5 +43,5 @@ def runtime_folder() -> Path:
 
 def cell_key(cell: Path) -> str:
     """Return a short name for a cell file: its stem and a hash of its absolute path."""
-    whole = str(cell.resolve())
-    return f"{cell.stem[:40]}-{hashlib.sha256(whole.encode()).hexdigest()[:10]}"
+    absolute = str(cell.resolve())
+    return f"{cell.stem[:40]}-{hashlib.sha256(absolute.encode()).hexdigest()[:10]}"

@@ -94,9 +94,9 @@ def _rebase(data: dict[str, Any], keys: tuple[str, ...], old: Path, new: Path) -
     for key in parents:
         section = section.get(key) if isinstance(section, dict) else None
     if isinstance(section, dict) and isinstance(section.get(last), str):
-        given = Path(section[last])
-        if not given.is_absolute():
-            section[last] = os.path.relpath(old.resolve() / given, new.resolve())
+        path = Path(section[last])
+        if not path.is_absolute():
+            section[last] = os.path.relpath(old.resolve() / path, new.resolve())
 
 
 def _edited(document: Document, expected: dict[str, Any], changes: dict[str, Any]) -> str | None:

@@ -35,8 +35,8 @@ def status(label: str) -> Iterator[Callable[[str], None]]:
     from rich.console import Console
     from rich.text import Text  # plain: ":wrench:" would become an emoji
 
-    with Console(stderr=True).status(label) as shown:
-        yield lambda text: shown.update(Text(f"{label}: {text}"))
+    with Console(stderr=True).status(label) as spinner:
+        yield lambda text: spinner.update(Text(f"{label}: {text}"))
 
 
 class CompileProgress:

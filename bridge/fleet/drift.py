@@ -23,7 +23,7 @@ class Figure(Enum):
     """A figure of a session that is not a parameter; the value is its name in reports."""
 
     GAP = "gap"
-    UNEXPLAINED = "gap that stays unexplained"
+    UNEXPLAINED = "unexplained gap"
     MISFIT = "misfit of the session"
 
 
@@ -119,8 +119,8 @@ def significant(drifts: Sequence[Drift]) -> list[Drift]:
 def _line(series: Series) -> tuple[float, float, float, int]:
     """Return slope, its 1 sigma, the weighted sum of squared residuals, degrees of freedom."""
     weight = 1 / np.maximum(series.std, 1e-300) ** 2
-    middle = float(weight @ series.times / weight.sum())
-    t = series.times - middle
+    mean_time = float(weight @ series.times / weight.sum())
+    t = series.times - mean_time
     information = float(weight @ t**2)
     slope = float(weight @ (t * series.value)) / information
     level = float(weight @ series.value / weight.sum())
@@ -147,10 +147,10 @@ def median_outliers(values: Sequence[float], *, ratios: bool) -> list[tuple[int,
     ``ratios``: values are positive and compared by their logarithm. Deviations are in units of the
     scaled median absolute deviation; if that is zero, there are no outliers.
     """
-    given = np.array(values, dtype=float)
-    if len(given) < MIN_VALUES:
+    data = np.array(values, dtype=float)
+    if len(data) < MIN_VALUES:
         return []
-    scaled = np.log(np.maximum(given, 1e-300)) if ratios else given
+    scaled = np.log(np.maximum(data, 1e-300)) if ratios else data
     middle = float(np.median(scaled))
     spread = 1.4826 * float(np.median(np.abs(scaled - middle)))
     if spread <= 0:

@@ -80,36 +80,36 @@ def fit_fleet(outcomes: Sequence[Outcome]) -> FleetFit:
 
 
 def _type(name: str, arms: dict[str, list[Outcome]]) -> FittedType:
-    given = [o for sessions in arms.values() for o in sessions]
+    outcomes = [o for sessions in arms.values() for o in sessions]
     number = [i for i, sessions in enumerate(arms.values()) for _ in sessions]
-    evidence = [_evidence(o) for o in given]
-    nominal = np.median([o.result["nominal"] for o in given], axis=0)
-    fit = fit_type(evidence, number, nominal, float(given[0].result["usual"]))
+    evidence = [_evidence(o) for o in outcomes]
+    nominal = np.median([o.result["nominal"] for o in outcomes], axis=0)
+    fit = fit_type(evidence, number, nominal, float(outcomes[0].result["usual"]))
     sessions = [
         _session(o, e, fit, s, i)
-        for s, (o, e, i) in enumerate(zip(given, evidence, number, strict=True))
+        for s, (o, e, i) in enumerate(zip(outcomes, evidence, number, strict=True))
     ]
-    found, begin = [], 0
+    fitted_arms, begin = [], 0
     for i, (arm, own) in enumerate(arms.items()):
-        found.append(FittedArm(arm, fit.arms[i], tuple(sessions[begin : begin + len(own)])))
+        fitted_arms.append(FittedArm(arm, fit.arms[i], tuple(sessions[begin : begin + len(own)])))
         begin += len(own)
     names = flexibility_names(len(nominal) // 2)
-    return FittedType(name, tuple(names), fit.scatter, tuple(found))
+    return FittedType(name, tuple(names), fit.scatter, tuple(fitted_arms))
 
 
 def _evidence(outcome: Outcome) -> Evidence:
-    given = dict(outcome.result["evidence"])
-    arrays = {k: np.array(given[k]) for k in ("matrix", "right")}
-    return Evidence(**(given | arrays))
+    fields = dict(outcome.result["evidence"])
+    arrays = {k: np.array(fields[k]) for k in ("matrix", "right")}
+    return Evidence(**(fields | arrays))
 
 
 def _session(
     outcome: Outcome, evidence: Evidence, fit: TypeFit, session: int, arm: int
 ) -> FittedSession:
     def rms(flexibility: Array) -> float:
-        left = evidence.matrix @ flexibility - evidence.right
+        residual = evidence.matrix @ flexibility - evidence.right
         rows = evidence.freedom + np.linalg.matrix_rank(evidence.matrix)
-        return math.sqrt((float(left @ left) + evidence.squares) / max(rows, 1))
+        return math.sqrt((float(residual @ residual) + evidence.squares) / max(rows, 1))
 
     one = fit.sessions[session]
     return FittedSession(

@@ -44,7 +44,7 @@ ROLES = tuple(TYPES)
     "--units", type=click.Choice(("degrees", "rad")), help="What a LeRobot dataset's angles are in."
 )
 @click.option("--episode", type=click.IntRange(0), help="One episode of a LeRobot dataset.")
-def convert(source: Path, out: Path, cell: Path | None, **given: Any) -> None:
+def convert(source: Path, out: Path, cell: Path | None, **options: Any) -> None:
     """Convert a recording of another program to a log.
 
     SOURCE is a ROS 1 or ROS 2 bag (JointState, JointTrajectoryControllerState, WrenchStamped,
@@ -66,9 +66,9 @@ def convert(source: Path, out: Path, cell: Path | None, **given: Any) -> None:
             f"{source}: found no known kind of recording, expected one of: {known}{also}"
         )
     require_table(out, *([source] if source.is_file() else []), *([cell] if cell else []))
-    options = _options(**given)
+    source_options = _options(**options)
     opened = open_cell(cell) if cell else None
-    converted = kind.read(source, joint_names(opened) if opened else (), options)
+    converted = kind.read(source, joint_names(opened) if opened else (), source_options)
     if opened is not None:
         converted.log(source, opened.arm.n)  # checks the number of joints
     names, table = converted.table()

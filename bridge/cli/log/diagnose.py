@@ -78,7 +78,7 @@ def diagnose(
     remounted: bool,
     withhold: tuple[str, ...],
     sim: Path | None,
-    **given: Any,
+    **options: Any,
 ) -> None:
     """Diagnose the sim-to-real gap of a log, or of several sessions of one arm.
 
@@ -95,7 +95,7 @@ def diagnose(
 
     Example: gapbridge diagnose log.csv --cell cell.yaml --out out/diagnosis --apply better.yaml
     """
-    output = _Output(**given)
+    output = _Output(**options)
     if output.stand_ins and output.new_cell is None:
         raise InputError("--stand-ins: found no --apply, expected the cell to write")
     opened = open_cell(cell)

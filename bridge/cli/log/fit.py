@@ -50,9 +50,9 @@ def fit(logs: tuple[Path, ...], cell: Path, remounted: bool, out: Path) -> None:
     with the identified flexibilities; those that the log does not determine keep the value of the
     cell, and are reported. If the instrument is not registered, its frame and the tool point are
     estimated too; the tool point is written where the log determines it (not with --remounted).
-    Where the poses are likelier with them, so are links and joints' zeros (or a registered cell's
-    tool point alone, which is written): no flexibility makes up for them, and diagnose names them.
-    Links are not written; where the cell would then predict unseen poses worse, they are held
+    If the poses support them, so are link geometry and joint offsets (of a registered cell the tool
+    point alone, which is written), so that they do not bias the flexibilities; diagnose names them.
+    Link geometry is not written; if the cell would then predict unseen poses worse, it is kept
     nominal.
     Declines, with the reason, if nothing in the log excites the compliance. A log of more than
     20,000 rows, or a recording of the daemon (.mcap), is read in pieces, so that memory does not

@@ -86,7 +86,7 @@ class FleetOptions:
 @click.option(
     "--withhold", multiple=True, metavar="EFFECT", help="Remove an effect from the catalogue."
 )
-def diagnose(withhold: tuple[str, ...], **given: Any) -> None:
+def diagnose(withhold: tuple[str, ...], **values: Any) -> None:
     """Diagnose every log: which effects recur, which arms drift, which are unusual.
 
     Writes results.parquet (a row per session and parameter), sessions.parquet and report.html. A
@@ -97,7 +97,7 @@ def diagnose(withhold: tuple[str, ...], **given: Any) -> None:
     """
     for name in withhold:
         effect_named(name)
-    options = FleetOptions(**given)
+    options = FleetOptions(**values)
     done, found = _run("diagnose", diagnose_session, {"withhold": list(withhold)}, options)
     from gapbridge.bridge.fleet.output import write_diagnosis
 
@@ -110,7 +110,7 @@ def diagnose(withhold: tuple[str, ...], **given: Any) -> None:
     "--apply", "cells", type=FILE, metavar="DIR",
     help="Write a new cell per arm there, and cells.csv, a table of them."
 )  # fmt: skip
-def fit(cells: Path | None, **given: Any) -> None:
+def fit(cells: Path | None, **values: Any) -> None:
     """Fit the compliance of all arms together: type, arm, session.
 
     An arm with few poses benefits from the others of its type where its own data are weak.
@@ -120,7 +120,7 @@ def fit(cells: Path | None, **given: Any) -> None:
     """
     if cells is not None:
         require_folder(cells, "--apply")
-    options = FleetOptions(**given)
+    options = FleetOptions(**values)
     done, found = _run("fit", fit_session, {}, options)
     from gapbridge.bridge.fleet.output import write_fit
 

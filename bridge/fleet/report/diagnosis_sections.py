@@ -126,16 +126,16 @@ def _row(one: Recurrence) -> list[blocks.Cell]:
 
 
 def _picture(found: Sequence[Recurrence]) -> Drawing:
-    shown = list(reversed(found))
+    rows = list(reversed(found))
     # one row per channel
     labels = [
         effect_title(r.effect) + ("" if r.channel == "position" else f" ({r.channel})")
-        for r in shown
+        for r in rows
     ]
     left = 16 + 5.4 * max(len(label) for label in labels)
     chart = Chart("", scale("share with the effect, %", [0, 100]), named("", labels),
-                  width=left + 300, height=80 + 30.0 * len(shown), left=left)  # fmt: skip
-    for i, r in enumerate(shown):
+                  width=left + 300, height=80 + 30.0 * len(rows), left=left)  # fmt: skip
+    for i, r in enumerate(rows):
         chart.bar(i + 0.18, 100 * r.sessions / r.observable, AFTER, 0.32, f"{r.sessions} sessions")
         chart.bar(i - 0.18, 100 * r.arms / r.arms_observable, PALE, 0.32, f"{r.arms} arms")
     chart.legend((("of sessions", AFTER), ("of arms", PALE)))

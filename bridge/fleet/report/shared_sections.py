@@ -44,7 +44,7 @@ def drifts(found: Sequence[Drift]) -> list[blocks.Block]:
         ]
         for d in found[:MAX_ROWS]
     ]  # fmt: skip
-    heads = ("arm", "what", "changes by", "1 sigma", "in all", "by chance")
+    heads = ("arm", "what", "slope", "1 sigma", "total", "by chance")
     picture = blocks.Pictures((_drift_chart(found[:MAX_DRAWN]),), "The most significant drifts.")
     return [blocks.Table(heads, rows), *_more_note(len(found)), picture]
 
@@ -91,7 +91,7 @@ def outliers(found: Sequence[Outlier]) -> list[blocks.Block]:
         ]
         for o in found[:MAX_ROWS]
     ]  # fmt: skip
-    heads = ("arm", "session", "what", "found", "usual", "deviations away")
+    heads = ("arm", "session", "what", "value", "usual", "deviations")
     return [blocks.Table(heads, rows, numbers=(3, 4, 5)), *_more_note(len(found))]
 
 
@@ -101,16 +101,16 @@ def sessions(
     """Return the sessions that were skipped, with the reason, and a table of the others."""
     bad = [o for o in done.outcomes if o.state != DONE]
     good = [o for o in done.outcomes if o.state == DONE]
-    shown: list[blocks.Block] = []
+    content: list[blocks.Block] = []
     if bad:
         rows = [
             [*_names(o), blocks.Badge(STATES[o.state], blocks.BAD), o.error] for o in bad[:MAX_ROWS]
         ]
         skipped = blocks.Table(("arm", "session", "state", "why"), rows, (1, 1, 1, 4))
-        shown += [blocks.Heading(f"Skipped ({len(bad)})"), skipped, *_more_note(len(bad))]
-        shown.append(blocks.Heading(f"Used ({len(good)})"))
+        content += [blocks.Heading(f"Skipped ({len(bad)})"), skipped, *_more_note(len(bad))]
+        content.append(blocks.Heading(f"Used ({len(good)})"))
     used = [[*_names(o), *cells(o)] for o in good[:MAX_ROWS]]
-    return [*shown, blocks.Table(("arm", "session", *heads), used), *_more_note(len(good))]
+    return [*content, blocks.Table(("arm", "session", *heads), used), *_more_note(len(good))]
 
 
 def _names(outcome: Outcome) -> tuple[blocks.Cell, blocks.Cell]:

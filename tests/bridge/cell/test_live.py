@@ -1,4 +1,4 @@
-"""What ``check --live`` and ``init`` read of a controller whose samples are not all whole."""
+"""Reading a controller with invalid samples, as ``check --live`` and ``init`` do."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from gapbridge.core.errors import InvalidStateError, LinkError, StaleStateError
 
 
 class Bus:
-    """Raises what it is given, then answers."""
+    """Raises the given errors, then returns a state."""
 
     def __init__(self, *errors: Exception) -> None:
         self.errors = list(errors)

@@ -1,4 +1,4 @@
-"""Logs that are too long for one piece, through the command."""
+"""``gapbridge fit`` and others with logs that are read in pieces."""
 
 from __future__ import annotations
 

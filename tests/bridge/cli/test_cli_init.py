@@ -26,7 +26,7 @@ GEARS = ("--link", "gear=[50, 50, 50, 20, 20, 20]", "--link", "direction=[1, 1, 
 
 @contextlib.contextmanager
 def simulated(folder: Path, config: str, **link: object) -> Iterator[str]:
-    """Serve the arm of a cell in config/ as its user would; yield its host."""
+    """Serve the arm of a cell in config/; yield its host."""
     host = own_host()
     cell = yaml.safe_load((CONFIG / config).read_text())
     cell["link"] |= {"host": host, **link}

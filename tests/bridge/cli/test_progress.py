@@ -1,4 +1,4 @@
-"""What a person sees while they wait."""
+"""Progress on stderr."""
 
 from __future__ import annotations
 

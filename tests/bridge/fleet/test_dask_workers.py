@@ -1,4 +1,4 @@
-"""A real Dask cluster over loopback TCP, its workers killed for real."""
+"""A real Dask cluster over loopback TCP, with workers that are killed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Drifts and outliers: found where they are, and not made up where there is scatter alone."""
+"""Drifts and outliers are found, and scatter alone is not reported as one."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SESSIONS = 6
 def series(
     rng: np.random.Generator, slope: float = 0.0, arm: str = "a", more: float = 3.0
 ) -> Series:
-    """Return values with an error of 1 that pretend to one of 1 / more."""
+    """Return values with 1 sigma of 1 whose stated std is 1 / ``more``."""
     at = np.arange(SESSIONS, dtype=float)
     value = 10 + slope * at + rng.normal(0, 1, SESSIONS)
     std = np.full(SESSIONS, 1 / more)
@@ -46,7 +46,7 @@ def test_two_sessions_show_no_drift() -> None:
     assert significant_drifts([two]) == []
 
 
-def test_sessions_stand_at_their_days_where_all_have_a_date() -> None:
+def test_session_times_are_days_if_all_have_a_date() -> None:
     times, per = session_times([1.7e9, 1.7e9 + DAY, 1.7e9 + 3 * DAY])
     assert per == "day"
     assert times.tolist() == [0.0, 1.0, 3.0]

@@ -1,4 +1,4 @@
-"""The journal: what was done stays done, whatever happened to the run."""
+"""The journal keeps finished outcomes when a run is interrupted."""
 
 from __future__ import annotations
 
@@ -59,8 +59,8 @@ def test_fresh_forgets(tmp_path: Path) -> None:
         assert journal.known("a") is None
 
 
-class Here(Workers):
-    """This process does the tasks, and notes them."""
+class InProcess(Workers):
+    """Runs the tasks in this process and records their sessions."""
 
     def __init__(self) -> None:
         self.given: list[str] = []
@@ -79,8 +79,8 @@ class Here(Workers):
 
 
 def resumed(tasks: list[Task], path: Path) -> list[str]:
-    """Run, and return the sessions that were really done."""
-    workers = Here()
+    """Run the tasks and return the sessions that were not resumed."""
+    workers = InProcess()
     with Journal(path) as journal:
         run(tasks, [], workers, journal, lambda outcome: None)
     return workers.given

@@ -1,4 +1,4 @@
-"""Which logs there are, whose they are, and which cell they belong to."""
+"""Sessions of a fleet: their logs, arms and cells."""
 
 from __future__ import annotations
 
