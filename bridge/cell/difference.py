@@ -80,24 +80,24 @@ def key_changes(before: Cell, after: Cell) -> list[KeyChange]:
         one.pop(name, None)
         other.pop(name, None)
     effects = [_effects_by_name(data.pop("effects", [])) for data in (one, other)]
-    found = list(_key_differences((), one, other))
+    changes = list(_key_differences((), one, other))
     for name in sorted(effects[0].keys() | effects[1].keys()):
         old, new = (listed.get(name) for listed in effects)
         if old != new:
-            found.append(KeyChange(f"effect {name}", old, new, in_model=True))
-    return found
+            changes.append(KeyChange(f"effect {name}", old, new, in_model=True))
+    return changes
 
 
 def _effects_by_name(effects: list[dict[str, Any]]) -> dict[str, Any]:
-    found: dict[str, Any] = {}
+    parameters: dict[str, Any] = {}
     for entry in effects:
         name = str(entry["effect"])
         if entry.get("joint") is not None:
             name += f" of joint {entry['joint']}"
         if entry.get("order") is not None:
             name += f", order {entry['order']:g}"
-        found[name] = entry["parameters"]
-    return found
+        parameters[name] = entry["parameters"]
+    return parameters
 
 
 def _key_differences(keys: tuple[str | int, ...], one: Any, other: Any) -> Iterator[KeyChange]:
@@ -133,7 +133,7 @@ def part_changes(before: Cell, after: Cell, q: Array | None = None, loads: Loads
         return []
     old, new = before.model, after.model
     q = _random_poses(before, seed) if q is None else q
-    found = [
+    parts = [
         PartChange(
             name, _model_shift(old, replace(old, **{k: getattr(new, k) for k in keys}), q, loads)
         )
@@ -147,8 +147,8 @@ def part_changes(before: Cell, after: Cell, q: Array | None = None, loads: Loads
             kept = [term for term in old.terms if (term.effect, term.site) != key]
             added = [other[key]] if key in other else []
             shift = _model_shift(old, replace(old, terms=(*kept, *added)), q, loads)
-            found.append(PartChange(key[0], shift, key[1], one.get(key), other.get(key)))
-    return sorted(found, key=lambda part: -(part.shift.rms if part.shift else 0.0))
+            parts.append(PartChange(key[0], shift, key[1], one.get(key), other.get(key)))
+    return sorted(parts, key=lambda part: -(part.shift.rms if part.shift else 0.0))
 
 
 def _random_poses(cell: Cell, seed: int) -> Array:

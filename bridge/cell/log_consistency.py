@@ -35,8 +35,8 @@ def log_findings(cell: Cell, path: Path) -> Findings:
     errors = pose_findings(cell, log)
     anomalies: dict[str, None] = {}  # in order, without duplicates
     for part in sessions_in(log):
-        found = findings(part, cell.model, cell.metrology)
-        anomalies |= dict.fromkeys(log_finding_text(finding) for finding in found)
+        unit_findings = findings(part, cell.model, cell.metrology)
+        anomalies |= dict.fromkeys(log_finding_text(finding) for finding in unit_findings)
     return Findings(
         [f"{cell.path} with {path}: {text}" for text in errors],
         [f"{path}: {text}" for text in anomalies if text not in errors],
@@ -47,6 +47,6 @@ def pose_findings(cell: Cell, log: Log) -> list[str]:
     """Return how measured poses contradict the cell's arm, without duplicates."""
     texts: dict[str, None] = {}
     for part in sessions_in(log):
-        found = frame_findings(cell.model, part, cell.metrology)
-        texts |= dict.fromkeys(log_finding_text(finding) for finding in found)
+        part_findings = frame_findings(cell.model, part, cell.metrology)
+        texts |= dict.fromkeys(log_finding_text(finding) for finding in part_findings)
     return list(texts)

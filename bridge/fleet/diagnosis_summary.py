@@ -79,11 +79,11 @@ def summarise(outcomes: Sequence[Outcome]) -> FleetDiagnosis:
 
 def _causes(outcome: Outcome) -> dict[tuple[str, str], list[Mapping[str, Any]]]:
     """Return the rows of each cause of a session, by (channel, effect)."""
-    found: dict[tuple[str, str], list[Mapping[str, Any]]] = defaultdict(list)
+    causes: dict[tuple[str, str], list[Mapping[str, Any]]] = defaultdict(list)
     for row in outcome.result["rows"]:
         if row["accused"]:
-            found[row["channel"], row["effect"]].append(row)
-    return found
+            causes[row["channel"], row["effect"]].append(row)
+    return causes
 
 
 def _observable(outcome: Outcome) -> set[tuple[str, str]]:
@@ -98,8 +98,8 @@ def _recurrences(done: Sequence[Outcome]) -> list[Recurrence]:
             causes[key].append((outcome.arm, rows))
         for key in _observable(outcome):
             observable[key].append(outcome.arm)
-    found = [_recurrence(key, causes[key], observable[key]) for key in causes]
-    return sorted(found, key=lambda r: (-r.sessions, r.channel, r.effect))
+    recurrences = [_recurrence(key, causes[key], observable[key]) for key in causes]
+    return sorted(recurrences, key=lambda r: (-r.sessions, r.channel, r.effect))
 
 
 def _recurrence(
@@ -155,7 +155,7 @@ def _onsets(arms: Mapping[str, Sequence[Outcome]]) -> Iterator[Onset]:
 
 
 def _outliers(done: Sequence[Outcome]) -> list[Outlier]:
-    found: list[Outlier] = []
+    outliers: list[Outlier] = []
     figures = ((GAP, Figure.GAP), ("remaining_rms", Figure.UNEXPLAINED))
     kinds = {(o.result["type"], c["channel"]) for o in done for c in o.result["channels"]}
     for kind, name in sorted(kinds):
@@ -166,12 +166,12 @@ def _outliers(done: Sequence[Outcome]) -> list[Outlier]:
         for key, figure in figures:
             for i, median, deviations in median_outliers([c[key] for _, c in same], ratios=True):
                 outcome, channel = same[i]
-                found.append(Outlier(
+                outliers.append(Outlier(
                     outcome.arm, outcome.session, ChannelFigure(name, figure), channel[key], median,
                     channel["unit"], deviations,
                 ))  # fmt: skip
-    found += _parameter_outliers(done)
-    return sorted(found, key=lambda o: -abs(o.deviations))
+    outliers += _parameter_outliers(done)
+    return sorted(outliers, key=lambda o: -abs(o.deviations))
 
 
 def _parameter_outliers(done: Sequence[Outcome]) -> Iterator[Outlier]:

@@ -64,7 +64,7 @@ class Journal:
 
     def _read(self) -> dict[str, Outcome]:
         """Return the outcomes of earlier runs by key; an incomplete last line is removed."""
-        found: dict[str, Outcome] = {}
+        outcomes: dict[str, Outcome] = {}
         self._file.seek(0)
         complete = 0  # bytes
         for line in self._file:
@@ -73,9 +73,9 @@ class Journal:
             complete += len(line)
             entry = _outcome(line)
             if entry is not None:
-                found[entry.key] = entry
+                outcomes[entry.key] = entry
         self._file.truncate(complete)
-        return found
+        return outcomes
 
 
 def _outcome(line: bytes) -> Outcome | None:

@@ -71,10 +71,10 @@ def run(
     resumed = len(tasks) - len(pending)
     if pending:
         with workers:
-            for found in workers.run(pending):
-                journal.add(found)
-                outcomes[found.session] = found
-                emit(found)
+            for outcome in workers.run(pending):
+                journal.add(outcome)
+                outcomes[outcome.session] = outcome
+                emit(outcome)
     ordered = sorted(outcomes.values(), key=lambda o: natural_key(o.session))
     return FleetRun(tuple(ordered), resumed, time.perf_counter() - begin, workers.description())
 

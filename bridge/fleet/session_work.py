@@ -21,7 +21,7 @@ EPOCH = 1.0e9  # s: larger timestamps are Unix times, smaller ones relative
 
 def diagnose_session(cell: Cell, log: Log, options: Mapping[str, Any]) -> dict[str, Any]:
     """Return the diagnosis as plain JSON: facts of the session, channels, a row per parameter."""
-    found = document(
+    diagnosis = document(
         diagnose(
             cell.model,
             log,
@@ -30,11 +30,11 @@ def diagnose_session(cell: Cell, log: Log, options: Mapping[str, Any]) -> dict[s
             observers=channels_of(cell.uncertain),
         )
     )
-    rows = [row for channel in found["channels"] for row in _rows(channel)]
+    rows = [row for channel in diagnosis["channels"] for row in _rows(channel)]
     return {
         **facts(cell, log),
-        "verdict": found["verdict"],
-        "channels": [_channel(c) for c in found["channels"]],
+        "verdict": diagnosis["verdict"],
+        "channels": [_channel(c) for c in diagnosis["channels"]],
         "rows": rows,
     }
 
@@ -90,11 +90,11 @@ def _rows(channel: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 def fit_session(cell: Cell, log: Log, options: Mapping[str, Any]) -> dict[str, Any]:
     """Return the session's equations of the flexibilities, and those of the cell, rad/Nm."""
-    found = evidence(cell.model, log, cell.metrology)
-    arrays = {"matrix": found.matrix.tolist(), "right": found.right.tolist()}
+    equations = evidence(cell.model, log, cell.metrology)
+    arrays = {"matrix": equations.matrix.tolist(), "right": equations.right.tolist()}
     return {
         **facts(cell, log),
         "nominal": flexibilities(cell.model).tolist(),
         "usual": usual_flexibility(cell.model),
-        "evidence": asdict(found) | arrays,
+        "evidence": asdict(equations) | arrays,
     }

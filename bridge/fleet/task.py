@@ -113,12 +113,12 @@ def usable(outcomes: Sequence[Outcome]) -> list[Outcome]:
 
 def by_arm(outcomes: Sequence[Outcome]) -> dict[str, list[Outcome]]:
     """Return the usable sessions of each arm, sorted by date if all have one, else by name."""
-    found: dict[str, list[Outcome]] = {}
+    sessions_by_arm: dict[str, list[Outcome]] = {}
     for outcome in usable(outcomes):
-        found.setdefault(outcome.arm, []).append(outcome)
-    for arm, sessions in found.items():
+        sessions_by_arm.setdefault(outcome.arm, []).append(outcome)
+    for arm, sessions in sessions_by_arm.items():
         dated = all(o.result["time"] is not None for o in sessions)
-        found[arm] = sorted(
+        sessions_by_arm[arm] = sorted(
             sessions, key=lambda o: (o.result["time"] if dated else 0.0, natural_key(o.session))
         )
-    return {arm: found[arm] for arm in sorted(found, key=natural_key)}
+    return {arm: sessions_by_arm[arm] for arm in sorted(sessions_by_arm, key=natural_key)}

@@ -49,13 +49,13 @@ def check(cell: Path, live: bool, logs: tuple[Path, ...]) -> None:
         if opened.file.link is not None:
             errors += _run_errors(opened)
         if live and not errors:
-            found = live_findings(opened)
-            errors += found.errors
-            warnings += found.warnings
+            findings = live_findings(opened)
+            errors += findings.errors
+            warnings += findings.warnings
         for log in logs if not errors else ():
-            found = log_findings(opened, log)
-            errors += found.errors
-            warnings += found.warnings
+            findings = log_findings(opened, log)
+            errors += findings.errors
+            warnings += findings.warnings
     for line in warnings:
         click.echo(f"warning: {line}", err=True)
     for line in errors:

@@ -138,11 +138,11 @@ def _link_keys(keys: Sequence[str]) -> dict[str, Any]:
 def _settings(link: dict[str, Any]) -> LinkSettings:
     """Return the settings of a link, paths from the working folder. Raises InputError."""
     try:
-        found = CellFile.model_validate({"robot": {"model": "ur10e"}, "link": link}).link
+        settings = CellFile.model_validate({"robot": {"model": "ur10e"}, "link": link}).link
     except ValidationError as error:
         raise InputError(validation_errors(CellFile, error)[0][1]) from None
-    assert found is not None
-    return found.located(Path.cwd())
+    assert settings is not None
+    return settings.located(Path.cwd())
 
 
 def _read_facts(link: LinkSettings, arm_options: ArmOptions) -> ControllerFacts:

@@ -87,12 +87,12 @@ def _options(
 
 
 def _by_role(topics: tuple[str, ...]) -> dict[str, str]:
-    found = {}
+    roles = {}
     for option in topics:
         role, equals, topic = option.partition("=")
         if not equals or role not in ROLES or not topic:
             raise InputError(
                 f"--topic: found {option!r}, expected ROLE=TOPIC, ROLE one of {', '.join(ROLES)}"
             )
-        found[role] = topic
-    return found
+        roles[role] = topic
+    return roles

@@ -106,12 +106,12 @@ def diagnose(
     output.require_writable(*logs, cell, *([sim] if sim else []))
     with status("diagnosing") as emit:
         metrology = replace(opened.metrology, remounted=remounted)
-        found = _diagnose(opened, rows, metrology, withhold, simulated, emit)
-    for finding in wrong_arm_findings(found):
+        diagnosis = _diagnose(opened, rows, metrology, withhold, simulated, emit)
+    for finding in wrong_arm_findings(diagnosis):
         click.echo(f"warning: {rows.path}: {log_finding_text(finding)}", err=True)
-    click.echo(diagnosis_text(found))
+    click.echo(diagnosis_text(diagnosis))
     origin = provenance({"log": logs, "cell": [cell], "sim": [sim] if sim else []})
-    whole = Diagnosed(opened, rows, found, document(found) | {"provenance": origin})
+    whole = Diagnosed(opened, rows, diagnosis, document(diagnosis) | {"provenance": origin})
     for file in output.write(whole):
         click.echo(f"{file}: written")
 
@@ -135,13 +135,13 @@ class _Output:
         if self.out is not None:
             require_folder(self.out, "--out", above=False)
 
-    def write(self, found: Diagnosed) -> list[Path]:
+    def write(self, diagnosed: Diagnosed) -> list[Path]:
         """Write the requested files and return their paths."""
         if self.json_file is not None:
-            found.write_json(self.json_file)
+            diagnosed.write_json(self.json_file)
         if self.new_cell is not None:
-            found.save(self.new_cell, stand_ins=self.stand_ins)
-        folder = [] if self.out is None else found.write_report(self.out)
+            diagnosed.save(self.new_cell, stand_ins=self.stand_ins)
+        folder = [] if self.out is None else diagnosed.write_report(self.out)
         return [*folder, *(f for f in (self.json_file, self.new_cell) if f is not None)]
 
 

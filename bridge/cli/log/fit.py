@@ -65,16 +65,16 @@ def fit(logs: tuple[Path, ...], cell: Path, remounted: bool, out: Path) -> None:
     require_writable(out, *logs, cell)
     metrology = replace(opened.metrology, remounted=remounted)
     try:
-        found, warnings, ranges = _identified(logs, opened, metrology)
+        estimate, warnings, ranges = _identified(logs, opened, metrology)
     except ExcitationError as error:
         raise ExcitationError(f"{', '.join(map(str, logs))}: {error}") from None
-    spread = Spread.of_fit(found.identifiable, found.covariance).beside(opened.spread)
-    intervals = opened.intervals | fit_intervals(found)
+    spread = Spread.of_fit(estimate.identifiable, estimate.covariance).beside(opened.spread)
+    intervals = opened.intervals | fit_intervals(estimate)
     origin = fitted(provenance({"log": logs, "cell": [cell]}), ranges, spread, intervals)
-    save_cell(opened, out, found.written, {"provenance": origin})
+    save_cell(opened, out, estimate.written, {"provenance": origin})
     for line in warnings:
         click.echo(f"warning: {', '.join(map(str, logs))}: {line}", err=True)
-    print_identification(found)
+    print_identification(estimate)
     click.echo(f"{out}: written")
 
 
@@ -101,42 +101,42 @@ def _identified(
                 yield piece
 
         with status("fitting") as emit:
-            found = identify_streamed(cell.model, read_once(), metrology, progress=emit)
-        return found, warnings, merged(ranges)
+            estimate = identify_streamed(cell.model, read_once(), metrology, progress=emit)
+        return estimate, warnings, merged(ranges)
     rows = open_logs(paths, cell)
     with progress("fitting"):
-        found = identify_compliance(cell.model, rows, metrology)
-    return found, pose_findings(cell, rows), range_of(rows)
+        estimate = identify_compliance(cell.model, rows, metrology)
+    return estimate, pose_findings(cell, rows), range_of(rows)
 
 
-def print_identification(found: Identification) -> None:
+def print_identification(estimate: Identification) -> None:
     """Print flexibilities with 1 sigma, gaps before and after, expected gaps, and notes."""
     table = Table(title="joint flexibility, 1e-6 rad/Nm", title_justify="left")
     for column in ("joint", "axial", "±", "radial", "±"):
         table.add_column(column, justify="right")
-    n = len(found.axial)
+    n = len(estimate.axial)
     for i in range(n):
         table.add_row(
             str(i + 1),
-            *_cells(found.axial[i], found.std_axial[i], bool(found.identifiable[i])),
-            *_cells(found.radial[i], found.std_radial[i], bool(found.identifiable[n + i])),
+            *_cells(estimate.axial[i], estimate.std_axial[i], bool(estimate.identifiable[i])),
+            *_cells(estimate.radial[i], estimate.std_radial[i], bool(estimate.identifiable[n + i])),
         )
     console = Console()
     console.print(table)
     click.echo(
-        f"gap over {found.samples} poses, mm rms per coordinate (in space): "
-        f"{_change(found.gap_rms, found.remaining_rms)}"
+        f"gap over {estimate.samples} poses, mm rms per coordinate (in space): "
+        f"{_change(estimate.gap_rms, estimate.remaining_rms)}"
     )
-    if np.isfinite(found.remaining_rms_held_out):
-        change = _change(found.gap_rms_held_out, found.remaining_rms_held_out)
+    if np.isfinite(estimate.remaining_rms_held_out):
+        change = _change(estimate.gap_rms_held_out, estimate.remaining_rms_held_out)
         click.echo(f"on poses left out of the fit: {change}")
     for where, rms in (
-        ("a new region of joint space", found.remaining_rms_new_region),
-        ("a new session", found.remaining_rms_new_session),
+        ("a new region of joint space", estimate.remaining_rms_new_region),
+        ("a new session", estimate.remaining_rms_new_session),
     ):
         if np.isfinite(rms):
             click.echo(f"to expect in {where}, mm rms per coordinate (in space): {_mm(rms)}")
-    for line in note_texts((*found.notes, *found.combinations)):
+    for line in note_texts((*estimate.notes, *estimate.combinations)):
         click.echo(f"note: {line}")
 
 

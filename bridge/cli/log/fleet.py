@@ -98,10 +98,10 @@ def diagnose(withhold: tuple[str, ...], **values: Any) -> None:
     for name in withhold:
         effect_named(name)
     options = FleetOptions(**values)
-    done, found = _run("diagnose", diagnose_session, {"withhold": list(withhold)}, options)
+    done, sessions = _run("diagnose", diagnose_session, {"withhold": list(withhold)}, options)
     from gapbridge.bridge.fleet.output import write_diagnosis
 
-    _print_results(done, found, *write_diagnosis(done, found, options.out))
+    _print_results(done, sessions, *write_diagnosis(done, sessions, options.out))
 
 
 @fleet.command()
@@ -121,10 +121,10 @@ def fit(cells: Path | None, **values: Any) -> None:
     if cells is not None:
         require_folder(cells, "--apply")
     options = FleetOptions(**values)
-    done, found = _run("fit", fit_session, {}, options)
+    done, sessions = _run("fit", fit_session, {}, options)
     from gapbridge.bridge.fleet.output import write_fit
 
-    _print_results(done, found, *write_fit(done, found, options.out, cells))
+    _print_results(done, sessions, *write_fit(done, sessions, options.out, cells))
 
 
 def _run(
@@ -134,12 +134,12 @@ def _run(
     workers, scheduler = options.workers, options.scheduler
     if workers is not None and scheduler is not None:
         raise InputError("--workers: found beside --scheduler, expected one of them")
-    found = find_sessions(options.logs, options.pattern, without=options.out)
-    cells = cell_source(options.cell, found.folder)
+    sessions = find_sessions(options.logs, options.pattern, without=options.out)
+    cells = cell_source(options.cell, sessions.folder)
     for warning in cells.warnings():
         click.echo(f"warning: {warning}", err=True)
     require_folder(options.out, "--out")
-    tasks, bad = make_tasks(found.sessions, cells, job, job_options)
+    tasks, bad = make_tasks(sessions.sessions, cells, job, job_options)
     count = min(workers or os.cpu_count() or 1, max(len(tasks), 1))
     pool: Workers = DaskWorkers(scheduler) if scheduler else LocalWorkers(count)
     for outcome in bad:
@@ -155,7 +155,7 @@ def _run(
 
         done = run(tasks, bad, pool, journal, emit)
     _require_usable(done)
-    return done, found
+    return done, sessions
 
 
 def _print_skipped(outcome: Outcome) -> None:
@@ -173,8 +173,8 @@ def _require_usable(done: FleetRun) -> None:
     raise RunError(f"{text}; the first: {first}")
 
 
-def _print_results(done: FleetRun, found: Fleet, lines: list[str], files: list[Path]) -> None:
-    for line in (*summary_lines(done, found), *lines):
+def _print_results(done: FleetRun, sessions: Fleet, lines: list[str], files: list[Path]) -> None:
+    for line in (*summary_lines(done, sessions), *lines):
         click.echo(line)
     for file in files:
         click.echo(f"{file}: written")

@@ -57,9 +57,9 @@ def predict(log: Path, cell: Path, out: Path, channels: bool) -> None:
     require_table(out, log, cell)
     summary = _Summary()
     with writing_table(out) as append, progress("predicting") as advance:
-        for piece, found in _predicted_pieces(opened, log, channels):
-            append(*as_table(found.columns))
-            summary.add(piece, found)
+        for piece, predicted in _predicted_pieces(opened, log, channels):
+            append(*as_table(predicted.columns))
+            summary.add(piece, predicted)
             advance(len(piece))
     click.echo(f"{out}: {summary.rows} predicted poses")
     for text in summary.lines(opened):
@@ -90,18 +90,18 @@ class _Summary:
         self._count = 0
         self._needs: dict[str, str] = {}
 
-    def add(self, log: Log, found: Predicted) -> None:
+    def add(self, log: Log, predicted: Predicted) -> None:
         self.rows += len(log)
-        if found.position_std is not None:
-            std = 1e3 * np.linalg.norm(found.position_std, axis=1)
+        if predicted.position_std is not None:
+            std = 1e3 * np.linalg.norm(predicted.position_std, axis=1)
             self._std.append(std)
             worst = int(std.argmax())
             self._worst = max(self._worst, (float(std[worst]), log.line(worst)), key=itemgetter(0))
-        if found.outside is not None:
-            rows = np.flatnonzero(found.outside)
+        if predicted.outside is not None:
+            rows = np.flatnonzero(predicted.outside)
             self._count += len(rows)
             self._outside += [log.line(i) for i in rows[: MAX_SHOWN - len(self._outside)]]
-        self._needs |= found.needs
+        self._needs |= predicted.needs
 
     def lines(self, cell: Cell) -> Iterator[str]:
         """Yield the lines of the summary."""

@@ -125,8 +125,8 @@ def _row(one: Recurrence) -> list[blocks.Cell]:
     ]
 
 
-def _picture(found: Sequence[Recurrence]) -> Drawing:
-    rows = list(reversed(found))
+def _picture(recurrences: Sequence[Recurrence]) -> Drawing:
+    rows = list(reversed(recurrences))
     # one row per channel
     labels = [
         effect_title(r.effect) + ("" if r.channel == "position" else f" ({r.channel})")
