@@ -56,9 +56,9 @@ class Cell:
 
     @property
     def link(self) -> LinkSettings | None:
-        """Return section ``link``, its paths made absolute; None where the cell has none.
+        """Return section ``link``, its paths made absolute; None if the cell has none.
 
-        Raises InputError where a file that it names cannot be used.
+        Raises InputError if a file that it names cannot be used.
         """
         section = self.file.link
         try:
@@ -68,7 +68,7 @@ class Cell:
 
     @property
     def ft_sensor(self) -> FtSensorSettings | None:
-        """Return section ``ft_sensor``; None where the cell has none."""
+        """Return section ``ft_sensor``; None if the cell has none."""
         return self.file.ft_sensor
 
     @property
@@ -88,13 +88,13 @@ class Cell:
 
     @property
     def web(self) -> WebSettings | None:
-        """Return section ``web``, its paths made absolute; None where the cell has none."""
+        """Return section ``web``, its paths made absolute; None if the cell has none."""
         section = self.file.web
         return None if section is None else section.located(self.path.parent)
 
     @property
     def metrics(self) -> MetricsSettings | None:
-        """Return section ``metrics``, its paths made absolute; None where the cell has none."""
+        """Return section ``metrics``, its paths made absolute; None if the cell has none."""
         section = self.file.metrics
         return None if section is None else section.located(self.path.parent)
 
@@ -111,7 +111,7 @@ class Cell:
 
     @property
     def spread(self) -> Spread:
-        """Return the covariance of the fitted parameters; an empty one where the cell has none."""
+        """Return the covariance of the fitted parameters; an empty one if the cell has none."""
         origin = self.file.provenance
         if origin is None or not origin.parameters:
             return Spread.none()
@@ -119,7 +119,7 @@ class Cell:
 
     @property
     def uncertain(self) -> Uncertain | None:
-        """Return the model uncertainty as the diagnosis uses it; None where it is unknown."""
+        """Return the model uncertainty as the diagnosis uses it; None if it is unknown."""
         return partial(self.spread.sigma_columns, self.model) if self.spread.names else None
 
     @property
@@ -180,7 +180,7 @@ def cell_errors(path: Path) -> list[str]:
 
 
 def build_cell(file: CellFile, document: Document) -> Cell:
-    """Return the cell of a file's keys; raises CellError where they contradict each other."""
+    """Return the cell of a file's keys; raises CellError if they contradict each other."""
     path = document.path
     try:
         arm = build_arm(file.robot, path.parent)

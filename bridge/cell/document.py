@@ -17,7 +17,7 @@ def parse(text: str, path: Path) -> Document:
 
 
 def read_document(path: Path) -> Document:
-    """Return the document of a cell file; raises CellError where it cannot be read."""
+    """Return the document of a cell file; raises CellError if it cannot be read."""
     return read_yaml(path, CELL_KIND)
 
 

@@ -21,7 +21,7 @@ MIN_RATE_SHARE = 0.8  # measured state rate / configured rate
 def live_findings(cell: Cell) -> Findings:
     """Return the differences of a cell from its controller; reads only, never moves the arm.
 
-    Raises CellError for a cell without a link, LinkError where the controller cannot be read.
+    Raises CellError for a cell without a link, LinkError if the controller cannot be read.
     """
     link = cell.link
     if link is None:

@@ -21,7 +21,7 @@ MEASURED = "measured_position"
 def log_findings(cell: Cell, path: Path) -> Findings:
     """Return how measured poses contradict the cell's arm (errors), and anomalies (warnings).
 
-    Raises InputError where the log cannot be used.
+    Raises InputError if the log cannot be used.
     """
     log = open_log(path, cell)
     if not log.has(MEASURED):

@@ -21,7 +21,7 @@ from gapbridge.core.log.sources import SourceOptions, source_of
 def open_log(path: Path, cell: Cell) -> Log:
     """Return a log for a cell's arm: a CSV or Parquet file, or another source (core.log.sources).
 
-    Raises LogError where a payload is out of range, angles look like degrees or positions like
+    Raises LogError if a payload is out of range, angles look like degrees or positions like
     millimetres.
     """
     source = source_of(path)

@@ -107,7 +107,7 @@ class Simulation(Section):
 
     seed: int = Field(default=0, ge=0, strict=True, description="of the plant and all noise")
     host: str | None = Field(default=None, description="loopback address; default: link.host")
-    start_q: list[Number] | None = Field(default=None, description="rad, where the arm starts")
+    start_q: list[Number] | None = Field(default=None, description="rad, initial joint angles")
     payload: Payload | None = Field(
         default=None, description="true load on the flange; default: payload"
     )

@@ -29,7 +29,7 @@ csv_option = click.option(
     "--out",
     required=True,
     type=FILE,
-    help="The file to write: CSV, or Parquet where it ends in .parquet.",
+    help="The file to write: CSV, or Parquet if it ends in .parquet.",
 )
 
 

@@ -20,7 +20,7 @@ class CellSource(ABC):
 
     @abstractmethod
     def cell_of(self, session: Session) -> Path:
-        """Return the session's cell file; raises InputError where it has none."""
+        """Return the session's cell file; raises InputError if it has none."""
 
     def warnings(self) -> tuple[str, ...]:
         """Return warnings to report before the run."""

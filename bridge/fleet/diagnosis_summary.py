@@ -107,10 +107,10 @@ def _recurrence(
 ) -> Recurrence:
     joints = Counter(j for _, rows in causes for j in {j for row in rows for j in row["joints"]})
     shrinks = [rows[0]["shrink"] for _, rows in causes if rows[0]["shrink"] is not None]
-    named, able = Counter(arm for arm, _ in causes), Counter(observable)
+    named, total = Counter(arm for arm, _ in causes), Counter(observable)
     return Recurrence(
-        *key, len(causes), len(observable), len(named), len(able),
-        sum(named[arm] == able[arm] for arm in named), tuple(joints.most_common()),
+        *key, len(causes), len(observable), len(named), len(total),
+        sum(named[arm] == total[arm] for arm in named), tuple(joints.most_common()),
         float(np.median(shrinks)) if shrinks else float("nan"),
         sum(bool(rows[0]["indistinguishable_from"]) for _, rows in causes),
     )  # fmt: skip

@@ -95,7 +95,7 @@ class CalibrationSettings(Section):
     joint_range: JointRange | None = Field(default=None, description="narrower joint limits")
     joints: Literal["link", "typed", "planned"] | None = Field(
         default=None,
-        description="where joint angles come from; default: link where there is one, else typed",
+        description="where joint angles come from; default: link if there is one, else typed",
     )
     speed: Annotated[Number, Field(gt=0, le=2.0)] = Field(
         default=0.4, description="rad/s of the fastest joint, with --move"

@@ -56,9 +56,9 @@ class ArmOptions(NamedTuple):
     "--profile", help="modbus, can, canopen: the profile of the controller (docs/porting.md)."
 )
 @click.option("--port", type=click.IntRange(1, 65535), help="modbus, socketcand: its port.")
-@click.option("--model", help="A built-in arm, where the controller does not say which it moves.")
+@click.option("--model", help="A built-in arm, if the controller does not report which it moves.")
 @click.option("--urdf", type=FILE, help="The arm's URDF, instead of --model.")
-@click.option("--tip", help="The URDF's link that is the flange, where it has several ends.")
+@click.option("--tip", help="The URDF's link that is the flange, if it has several ends.")
 @click.option(
     "--link",
     "keys",

@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     "--out",
     type=FILE,
     metavar="DIR",
-    help="Folder for diagnosis.json and report.html; made where it is missing.",
+    help="Folder for diagnosis.json and report.html; created if missing.",
 )
 @click.option("--json", "json_file", type=FILE, metavar="FILE", help="Write the diagnosis as JSON.")
 @click.option(

@@ -49,7 +49,7 @@ def fit(logs: tuple[Path, ...], cell: Path, remounted: bool, out: Path) -> None:
     under different payloads or forces. Effects of the cell are kept. Writes NEW_CELL: the same cell
     with the identified flexibilities; those that the log does not determine keep the value of the
     cell, and are reported. If the instrument is not registered, its frame and the tool point are
-    estimated too; the tool point is written where the log determines it (not with --remounted).
+    estimated too; the tool point is written if the log determines it (not with --remounted).
     If the poses support them, so are link geometry and joint offsets (of a registered cell the tool
     point alone, which is written), so that they do not bias the flexibilities; diagnose names them.
     Link geometry is not written; if the cell would then predict unseen poses worse, it is kept

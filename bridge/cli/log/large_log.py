@@ -54,7 +54,7 @@ def pieces_of(path: Path, cell: Cell) -> Iterable[Log]:
 
 
 def is_large(path: Path) -> bool:
-    """Return whether a log is to be read in pieces. Raises LogError where it cannot be read."""
+    """Return whether a log is to be read in pieces. Raises LogError if it cannot be read."""
     source = source_of(path)
     if source is not None:
         return source.identifier == Recording.identifier

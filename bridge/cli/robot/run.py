@@ -32,7 +32,7 @@ from gapbridge.core.errors import InputError
 def run(cell: Path, observe: bool, arm: bool, duration: float | None, log: str) -> None:
     """Run the on-cell daemon: read the arm's state, predict how it bends, correct its setpoints.
 
-    Setpoints are written where the cell has `setpoints.arm: true`, with --arm, or after
+    Setpoints are written if the cell has `setpoints.arm: true`, with --arm, or after
     `gapbridge arm CELL`. SIGHUP reads the cell file again; SIGTERM ramps out and ends.
 
     Example: gapbridge run cell.yaml --observe --duration 60
