@@ -21,10 +21,10 @@ from threadpoolctl import threadpool_limits
 from benchmarks.fleet.simulating import write_fleet
 from gapbridge.bridge.fleet.cell_source import OneCell
 from gapbridge.bridge.fleet.journal import Journal
-from gapbridge.bridge.fleet.runner import run, tasks_of
+from gapbridge.bridge.fleet.runner import make_tasks, run
 from gapbridge.bridge.fleet.session import find_sessions
 from gapbridge.bridge.fleet.session_work import fit_session
-from gapbridge.bridge.fleet.task import DONE, Outcome, Task, perform
+from gapbridge.bridge.fleet.task import DONE, Outcome, Task, run_task
 from gapbridge.bridge.fleet.workers.dask_workers import DaskWorkers
 from gapbridge.bridge.fleet.workers.local_workers import LocalWorkers
 from gapbridge.bridge.fleet.workers.workers import Workers
@@ -60,7 +60,7 @@ def measure(folder: Path, sessions: int, chunk: int, seed: int, *, dask: bool) -
     """Return times and ratios for so many sessions."""
     cell, _ = write_fleet(folder, [[POSES]] * sessions, seed)
     found = find_sessions([str(folder / "logs")])
-    tasks, _ = tasks_of(found.sessions, OneCell(cell), fit_session, {})
+    tasks, _ = make_tasks(found.sessions, OneCell(cell), fit_session, {})
     chunks = [tasks[i : i + chunk] for i in range(0, len(tasks), chunk)]
     with ExitStack() as stack:
         ways, started, below = _ways(folder, stack, dask=dask)
@@ -133,7 +133,7 @@ def _loop(tasks: Sequence[Task]) -> None:
     """Do the tasks one after the other, here: the bare work, nothing kept."""
     with threadpool_limits(1, "blas"):
         for task in tasks:
-            assert perform(task).state == DONE
+            assert run_task(task).state == DONE
 
 
 def _pool(workers: Workers, journal: Path) -> Way:
@@ -163,7 +163,7 @@ def whole(folder: Path, sessions: int, seed: int) -> float:
     cell, _ = write_fleet(folder, [[POSES]] * sessions, seed)
     begin = time.perf_counter()
     found = find_sessions([str(folder / "logs")])
-    tasks, _ = tasks_of(found.sessions, OneCell(cell), fit_session, {})
+    tasks, _ = make_tasks(found.sessions, OneCell(cell), fit_session, {})
     with Journal(folder / "journal", fresh=True) as book:
         run(tasks, [], LocalWorkers(WORKERS), book, lambda outcome: None)
     return time.perf_counter() - begin

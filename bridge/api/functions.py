@@ -82,7 +82,7 @@ def fit(cell: Cell, log: Log, *, remounted: bool = False) -> Fitted:
     in the log excites the compliance.
     """
     from gapbridge.bridge.api.uncertainty import fit_intervals
-    from gapbridge.bridge.cell.log_fit import pose_findings
+    from gapbridge.bridge.cell.log_consistency import pose_findings
     from gapbridge.bridge.document.notes import note_texts
     from gapbridge.core.estimation.identification import (
         identify_compliance,  # predict need not wait for it

@@ -1,4 +1,4 @@
-"""The cell: one file that says which arm stands there, what it carries and how it is reached."""
+"""The cell file: the arm, its tool and payload, and how its controller is reached."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ import numpy as np
 from pydantic import ValidationError
 
 from gapbridge.bridge.cell.document import read_document
-from gapbridge.bridge.cell.effects import compliance_terms, term_of
-from gapbridge.bridge.cell.message import key_path, message, messages
-from gapbridge.bridge.cell.plausibility import findings
+from gapbridge.bridge.cell.effects import compliance_terms, term_from_entry
+from gapbridge.bridge.cell.message import error_lines, key_path
+from gapbridge.bridge.cell.plausibility import check_plausibility
 from gapbridge.bridge.cell.robot import build_arm
 from gapbridge.bridge.cell.schema import CauseEntry, CellFile, Simulation
 from gapbridge.bridge.cell.sections import (
@@ -35,7 +35,7 @@ from gapbridge.core.model import Model, Uncertain
 from gapbridge.core.rotation import rpy_matrix, transform
 from gapbridge.drivers.ft_sensor.settings import FtSensorSettings
 
-FINEST = 1.0e-9  # m: what a sigma of zero counts as
+MIN_SIGMA = 1.0e-9  # m: replaces a sigma of zero
 
 
 @dataclass(frozen=True)
@@ -56,19 +56,19 @@ class Cell:
 
     @property
     def link(self) -> LinkSettings | None:
-        """Return section ``link``, its paths made absolute; None where the cell has none.
+        """Return section ``link``, its paths made absolute; None if the cell has none.
 
-        Raises InputError where a file that it names cannot be used.
+        Raises InputError if a file that it names cannot be used.
         """
-        given = self.file.link
+        section = self.file.link
         try:
-            return None if given is None else given.located(self.path.parent)
+            return None if section is None else section.located(self.path.parent)
         except InputError as error:
             raise type(error)(f"{self.path}: {error}") from None
 
     @property
     def ft_sensor(self) -> FtSensorSettings | None:
-        """Return section ``ft_sensor``; None where the cell has none."""
+        """Return section ``ft_sensor``; None if the cell has none."""
         return self.file.ft_sensor
 
     @property
@@ -88,15 +88,15 @@ class Cell:
 
     @property
     def web(self) -> WebSettings | None:
-        """Return section ``web``, its paths made absolute; None where the cell has none."""
-        given = self.file.web
-        return None if given is None else given.located(self.path.parent)
+        """Return section ``web``, its paths made absolute; None if the cell has none."""
+        section = self.file.web
+        return None if section is None else section.located(self.path.parent)
 
     @property
     def metrics(self) -> MetricsSettings | None:
-        """Return section ``metrics``, its paths made absolute; None where the cell has none."""
-        given = self.file.metrics
-        return None if given is None else given.located(self.path.parent)
+        """Return section ``metrics``, its paths made absolute; None if the cell has none."""
+        section = self.file.metrics
+        return None if section is None else section.located(self.path.parent)
 
     @property
     def calibration(self) -> CalibrationSettings:
@@ -105,13 +105,13 @@ class Cell:
 
     @property
     def fitted_range(self) -> dict[str, tuple[float, float]]:
-        """Return the least and largest value of each log column that the model was fitted on."""
+        """Return the minimum and maximum of each log column in the data of the fit, in its unit."""
         origin = self.file.provenance
         return {} if origin is None else dict(origin.fitted)
 
     @property
     def spread(self) -> Spread:
-        """Return the covariance of what was fitted; of nothing where the cell has none."""
+        """Return the covariance of the fitted parameters; an empty one if the cell has none."""
         origin = self.file.provenance
         if origin is None or not origin.parameters:
             return Spread.none()
@@ -119,18 +119,18 @@ class Cell:
 
     @property
     def uncertain(self) -> Uncertain | None:
-        """Return what the diagnosis asks of how unsure the model's numbers are; None: not known."""
+        """Return the model uncertainty as the diagnosis uses it; None if it is unknown."""
         return partial(self.spread.sigma_columns, self.model) if self.spread.names else None
 
     @property
     def causes(self) -> tuple[CauseEntry, ...]:
-        """Return what a diagnosis accused, as the cell's provenance has it."""
+        """Return the causes that a diagnosis named, from the cell's provenance."""
         origin = self.file.provenance
         return () if origin is None else tuple(origin.causes)
 
     @property
     def intervals(self) -> dict[str, tuple[float, float]]:
-        """Return the 95 % interval of each number that was applied, by name, SI."""
+        """Return the 95 % interval of each fitted or applied parameter, by name, in SI units."""
         origin = self.file.provenance
         return {} if origin is None else dict(origin.intervals)
 
@@ -143,55 +143,58 @@ class Cell:
 def load_cell(path: Path | str) -> Cell:
     """Return the cell of a YAML file.
 
-    Raises CellError (or ArmError) with one line that names file, line, key, what was found and
-    what was expected.
+    Raises CellError (or ArmError) with one line that names the file, the line, the key, the value
+    found and the value expected.
     """
     path = Path(path)
     document = read_document(path)
     try:
-        # a key with nothing behind it counts as left out
-        given = {key: value for key, value in document.data.items() if value is not None}
-        file = CellFile.model_validate(given)
+        file = _validated(document)
     except ValidationError as error:
-        raise CellError(message(document, CellFile, error)) from None
-    return cell_of(file, document)
+        raise CellError(error_lines(document, CellFile, error)[0]) from None
+    return build_cell(file, document)
 
 
-def complaints(path: Path) -> list[str]:
-    """Return a line for everything that is wrong with a cell file; none where it can be loaded.
+def _validated(document: Document) -> CellFile:
+    """Return the keys of a file; a key without a value counts as left out."""
+    return CellFile.model_validate({k: v for k, v in document.data.items() if v is not None})
 
-    Where keys do not fit, their values are not looked at.
+
+def cell_errors(path: Path) -> list[str]:
+    """Return a line for each error of a cell file; an empty list if it can be loaded.
+
+    Values are checked only if all keys are valid. Raises CellError if it is no YAML mapping.
     """
     document = read_document(path)
     try:
-        file = CellFile.model_validate({k: v for k, v in document.data.items() if v is not None})
+        file = _validated(document)
     except ValidationError as error:
-        return messages(document, CellFile, error)
+        return error_lines(document, CellFile, error)
     try:
-        found = findings(file, document, build_arm(file.robot, path.parent)).errors
-        if not found:
-            cell_of(file, document)
+        errors = check_plausibility(file, document, build_arm(file.robot, path.parent)).errors
+        if not errors:
+            build_cell(file, document)
     except (ArmError, CellError) as error:
-        found = [placed(document, str(error))]
-    return found
+        errors = [located_message(document, str(error))]
+    return errors
 
 
-def cell_of(file: CellFile, document: Document) -> Cell:
-    """Return the cell of a file's keys; raises CellError where they do not fit each other."""
+def build_cell(file: CellFile, document: Document) -> Cell:
+    """Return the cell of a file's keys; raises CellError if they contradict each other."""
     path = document.path
     try:
         arm = build_arm(file.robot, path.parent)
-        found = findings(file, document, arm)
-        if found.errors:
-            raise CellError(found.errors[0])
+        findings = check_plausibility(file, document, arm)
+        if findings.errors:
+            raise CellError(findings.errors[0])
         warnings = _check_payload(file, arm)
         if file.robot.tip is not None and file.robot.urdf is None:
-            warnings.append("robot.tip: means nothing without robot.urdf")
+            warnings.append("robot.tip: has no effect without robot.urdf")
         terms = compliance_terms(file.compliance, arm) + tuple(
-            term_of(entry, arm, f"effects entry {i + 1}") for i, entry in enumerate(file.effects)
+            term_from_entry(e, arm, f"effects entry {i}") for i, e in enumerate(file.effects, 1)
         )
     except (ArmError, CellError) as error:
-        raise type(error)(placed(document, str(error))) from None
+        raise type(error)(located_message(document, str(error))) from None
     tcp = file.tool.tcp
     model = Model(
         arm=arm,
@@ -203,24 +206,24 @@ def cell_of(file: CellFile, document: Document) -> Cell:
         terms=terms,
     )
     entry = file.metrology
-    metrology = Metrology(entry.registered, max(entry.sigma, FINEST), entry.repeatability)
+    metrology = Metrology(entry.registered, max(entry.sigma, MIN_SIGMA), entry.repeatability)
     return Cell(
         path,
         file,
         document,
         model,
         metrology,
-        (*found.warnings, *(placed(document, w) for w in warnings)),
+        (*findings.warnings, *(located_message(document, w) for w in warnings)),
     )
 
 
-def placed(document: Document, text: str) -> str:
-    """Return a message with its file, and the line of the key that it begins with."""
+def located_message(document: Document, text: str) -> str:
+    """Return a message prefixed with its file and the line of the key that it begins with."""
     path = str(document.path)
     if text.startswith(path):
         return text
     name = text.partition(":")[0]
-    # the key itself, or the nearest that holds it
+    # the key itself, or the nearest of its parents
     named = [k for k in _paths((), document.data) if f"{name}.".startswith(f"{key_path(k)}.")]
     line = document.line(max(named, key=len)) if named else None
     return f"{path}: {text}" if line is None else f"{path}, line {line}: {text}"
@@ -233,9 +236,9 @@ def _paths(keys: tuple[str | int, ...], value: object) -> Iterator[tuple[str | i
         entries = value.items()
     elif isinstance(value, list):
         entries = enumerate(value)
-    for key, own in entries:
+    for key, entry in entries:
         yield (*keys, key)
-        yield from _paths((*keys, key), own)
+        yield from _paths((*keys, key), entry)
 
 
 def _check_payload(file: CellFile, arm: Arm) -> list[str]:

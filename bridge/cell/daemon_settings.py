@@ -1,4 +1,4 @@
-"""What one run of the daemon is made of."""
+"""The settings of one run of the daemon."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from gapbridge.drivers.ur_rtde.settings import UrRtdeSettings
 
 
 class DaemonSettings(Section):
-    """One run: a cell's sections, and the path by which the loop's process reads the model.
+    """The sections of a cell that the daemon uses, and how its loop process reads the model.
 
-    ``model_source`` names the function that reads it, ``module:function`` from a path to an object
-    with a ``model``; tests replace it.
+    ``model_source`` is a ``module:function`` that takes the cell's path and returns an object with
+    a ``model``; tests replace it.
     """
 
-    cell: Path = Field(description="the cell file; the loop's process takes its model from there")
+    cell: Path = Field(description="the cell file, from which the loop process reads the model")
     link: LinkSettings = Field(default_factory=UrRtdeSettings)
     ft_sensor: AnyFtSensor | None = None
     limits: LimitSettings = Field(default_factory=LimitSettings)
@@ -34,17 +34,17 @@ class DaemonSettings(Section):
     web: WebSettings | None = None
     metrics: MetricsSettings | None = None
     hang_timeout: float = Field(
-        1.0, gt=0.0, description="s without a heartbeat after which the loop's process is ended"
+        1.0, gt=0.0, description="s without a heartbeat after which the loop process is killed"
     )
-    backoff: tuple[float, float] = Field((0.2, 5.0), description="s before a restart: first, most")
+    backoff: tuple[float, float] = Field((0.2, 5.0), description="s before a restart: first, max")
     model_source: str = "gapbridge.bridge.cell:load_cell"
     uncorrected: bool = Field(
-        False, description="arm though the model corrects nothing: a calibration moves a rigid cell"
+        False, description="arm although the model corrects nothing: calibration of a rigid cell"
     )
 
     @model_validator(mode="after")
     def _source_fits_link(self) -> DaemonSettings:
-        """Refuse a source of motion where the motion is the robot's own."""
+        """Refuse a setpoint source where the robot's own program moves the arm."""
         if not self.link.moves_arm and self.setpoints.source != "target":
             raise ValueError(
                 f"setpoints.source: found {self.setpoints.source!r} with a link that sends "

@@ -1,4 +1,4 @@
-"""What changed from one cell to another: its keys, and the pose of the TCP over the workspace."""
+"""The differences of two cells: their keys, and how far the predicted TCP moves."""
 
 from __future__ import annotations
 
@@ -17,155 +17,161 @@ from gapbridge.core.model import Model
 from gapbridge.core.rotation import rotation_vector
 
 POSES = 200
-FIELDS = {  # part of a cell -> fields of its model
+MODEL_FIELDS = {  # key of a cell -> fields of its model
     "tool": ("tool_in_flange",),
     "payload": ("payload_mass", "payload_cog"),
     "gravity": ("gravity",),
     "reference_temperature": ("reference_temperature",),
 }
-LEFT_OUT = ("provenance",)  # where a value comes from is no value
-WIDEST = np.pi  # rad: joints without limits are drawn within
+MODEL_KEYS = (*MODEL_FIELDS, "compliance")
+IGNORED_KEYS = ("provenance",)
+MAX_ANGLE = np.pi  # rad: bound of random poses, for joints without limits
 
 
 @dataclass(frozen=True)
-class Change:
-    """One key that differs; None: it is not there."""
+class KeyChange:
+    """One key that differs; None: the cell does not have it."""
 
     key: str
     before: Any
     after: Any
+    in_model: bool  # a part of the model, which ``part_changes`` reports too
+
+    def to_json(self) -> dict[str, Any]:
+        """Return it as JSON-able data."""
+        return {"key": self.key, "before": self.before, "after": self.after}
 
 
 @dataclass(frozen=True)
-class Part:
+class PartChange:
     """One part of the model that differs, and how far it alone moves the predicted TCP.
 
-    ``name`` is tool, payload, gravity, reference_temperature, or an effect, then with its terms
-    ``before`` and ``after`` and where they sit.
+    ``name`` is tool, payload, gravity, reference_temperature or an effect; an effect has a site
+    and its terms ``before`` and ``after`` (None: the cell does not have it).
     """
 
     name: str
-    moved: Moved | None
+    shift: TcpShift | None
     site: Site | None = None
     before: Term | None = None
     after: Term | None = None
 
 
 @dataclass(frozen=True)
-class Moved:
-    """How far predicted TCP poses lie apart, over ``poses`` poses."""
+class TcpShift:
+    """Distance of the TCP poses that two models predict, over ``poses`` poses."""
 
     poses: int
     rms: float  # m
     largest: float  # m
-    turned: float  # rad, largest
-    where: Array  # (n,) rad: joints of the largest
+    turned: float  # rad, largest rotation
+    where: Array  # (n,) rad: joint angles of the largest distance
     mean: Array  # (3,) m, base axes, after minus before
 
     def to_json(self) -> dict[str, Any]:
         """Return it as JSON-able data, SI units."""
-        return {
-            "poses": self.poses, "rms": self.rms, "largest": self.largest, "turned": self.turned,
-            "where": self.where.tolist(), "mean": self.mean.tolist(),
-        }  # fmt: skip
+        return vars(self) | {"where": self.where.tolist(), "mean": self.mean.tolist()}
 
 
-def changes(before: Cell, after: Cell) -> list[Change]:
+def key_changes(before: Cell, after: Cell) -> list[KeyChange]:
     """Return the keys whose values differ, defaults filled in."""
     one, other = (cell.file.model_dump(mode="json") for cell in (before, after))
-    for name in LEFT_OUT:
+    for name in IGNORED_KEYS:
         one.pop(name, None)
         other.pop(name, None)
-    effects = [_by_name(data.pop("effects", [])) for data in (one, other)]
-    found = list(_walk((), one, other))
+    effects = [_effects_by_name(data.pop("effects", [])) for data in (one, other)]
+    changes = list(_key_differences((), one, other))
     for name in sorted(effects[0].keys() | effects[1].keys()):
-        pair = [listed.get(name) for listed in effects]
-        if pair[0] != pair[1]:
-            found.append(Change(f"effect {name}", *pair))
-    return found
+        old, new = (listed.get(name) for listed in effects)
+        if old != new:
+            changes.append(KeyChange(f"effect {name}", old, new, in_model=True))
+    return changes
 
 
-def _by_name(effects: list[dict[str, Any]]) -> dict[str, Any]:
-    found: dict[str, Any] = {}
+def _effects_by_name(effects: list[dict[str, Any]]) -> dict[str, Any]:
+    parameters: dict[str, Any] = {}
     for entry in effects:
         name = str(entry["effect"])
         if entry.get("joint") is not None:
             name += f" of joint {entry['joint']}"
         if entry.get("order") is not None:
             name += f", order {entry['order']:g}"
-        found[name] = entry["parameters"]
-    return found
+        parameters[name] = entry["parameters"]
+    return parameters
 
 
-def _walk(keys: tuple[str | int, ...], one: Any, other: Any) -> Iterator[Change]:
+def _key_differences(keys: tuple[str | int, ...], one: Any, other: Any) -> Iterator[KeyChange]:
     if isinstance(one, dict) and isinstance(other, dict):
         for key in [*one, *(k for k in other if k not in one)]:
-            yield from _walk((*keys, key), one.get(key), other.get(key))
+            yield from _key_differences((*keys, key), one.get(key), other.get(key))
     elif one != other:
-        yield Change(key_path(keys), one, other)
+        yield KeyChange(key_path(keys), one, other, in_model=keys[0] in MODEL_KEYS)
 
 
-def moved(before: Cell, after: Cell, q: Array | None = None, loads: Loads | None = None,
-          seed: int = 0) -> Moved | None:  # fmt: skip
-    """Return how far the predicted TCP moves from one cell to the other; None: other joints.
+def tcp_shift(before: Cell, after: Cell, q: Array | None = None, loads: Loads | None = None,
+              seed: int = 0) -> TcpShift | None:  # fmt: skip
+    """Return how far the predicted TCP moves from one cell to the other.
 
     ``q`` (N, n) in rad; left out: random poses within the joint limits, under each cell's payload.
-    Poses in which an arm finds no equilibrium are left out.
+    Poses without equilibrium are left out. None if the arms have different numbers of joints, or
+    no pose has an equilibrium.
     """
     if before.arm.n != after.arm.n:
         return None
-    return _moved(before.model, after.model, _drawn(before, seed) if q is None else q, loads)
+    q = _random_poses(before, seed) if q is None else q
+    return _model_shift(before.model, after.model, q, loads)
 
 
-def parts(before: Cell, after: Cell, q: Array | None = None, loads: Loads | None = None,
-          seed: int = 0) -> list[Part]:  # fmt: skip
-    """Return the parts in which the models differ, the one that moves the TCP farthest first.
+def part_changes(before: Cell, after: Cell, q: Array | None = None, loads: Loads | None = None,
+                 seed: int = 0) -> list[PartChange]:  # fmt: skip
+    """Return the parts in which the models differ, sorted by the shift of the TCP, largest first.
 
-    Each is put by itself into the model of ``before``, over the poses of ``moved``. Empty where the
-    arms have other joints.
+    Each part alone is replaced in the model of ``before``, over the poses of ``tcp_shift``. Empty
+    if the arms have different numbers of joints.
     """
     if before.arm.n != after.arm.n:
         return []
     old, new = before.model, after.model
-    q = _drawn(before, seed) if q is None else q
-    found = [
-        Part(name, _moved(old, replace(old, **{key: getattr(new, key) for key in keys}), q, loads))
-        for name, keys in FIELDS.items()
-        if any(not np.array_equal(getattr(old, key), getattr(new, key)) for key in keys)
+    q = _random_poses(before, seed) if q is None else q
+    parts = [
+        PartChange(
+            name, _model_shift(old, replace(old, **{k: getattr(new, k) for k in keys}), q, loads)
+        )
+        for name, keys in MODEL_FIELDS.items()
+        if any(not np.array_equal(getattr(old, k), getattr(new, k)) for k in keys)
     ]
     one, other = ({(t.effect, t.site): t for t in model.terms if any(t.values)}
                   for model in (old, new))  # fmt: skip
-    for at in dict.fromkeys([*one, *other]):
-        if one.get(at) != other.get(at):
-            kept = [term for term in old.terms if (term.effect, term.site) != at]
-            put = [other[at]] if at in other else []
-            trial = replace(old, terms=(*kept, *put))
-            found.append(Part(at[0], _moved(old, trial, q, loads), at[1], one.get(at),
-                              other.get(at)))  # fmt: skip
-    return sorted(found, key=lambda part: -(part.moved.rms if part.moved else 0.0))
+    for key in dict.fromkeys([*one, *other]):
+        if one.get(key) != other.get(key):
+            kept = [term for term in old.terms if (term.effect, term.site) != key]
+            added = [other[key]] if key in other else []
+            shift = _model_shift(old, replace(old, terms=(*kept, *added)), q, loads)
+            parts.append(PartChange(key[0], shift, key[1], one.get(key), other.get(key)))
+    return sorted(parts, key=lambda part: -(part.shift.rms if part.shift else 0.0))
 
 
-def _drawn(cell: Cell, seed: int) -> Array:
+def _random_poses(cell: Cell, seed: int) -> Array:
     """Return random poses (POSES, n) within the joint limits, rad."""
     limits = cell.arm.limits
-    low, high = np.maximum(limits.lower, -WIDEST), np.minimum(limits.upper, WIDEST)
+    low, high = np.maximum(limits.lower, -MAX_ANGLE), np.minimum(limits.upper, MAX_ANGLE)
     return np.random.default_rng(seed).uniform(low, high, (POSES, cell.arm.n))
 
 
-def _moved(before: Model, after: Model, q: Array, loads: Loads | None) -> Moved | None:
-    """Return how far predicted TCP poses lie apart; None: no pose with an equilibrium."""
+def _model_shift(before: Model, after: Model, q: Array, loads: Loads | None) -> TcpShift | None:
+    """Return how far the predicted TCP moves; None: no pose has an equilibrium."""
     one, other = (model.predict(q, loads) for model in (before, after))
-    apart = other.position - one.position
-    fine = np.isfinite(apart).all(axis=1)
-    if not fine.any():
+    shift = other.position - one.position
+    valid = np.isfinite(shift).all(axis=1)
+    if not valid.any():
         return None
-    far = np.linalg.norm(apart[fine], axis=1)
-    turn = np.swapaxes(one.rotation[fine], 1, 2) @ other.rotation[fine]
-    return Moved(
-        poses=int(fine.sum()),
-        rms=float(np.sqrt(np.mean(far**2))),
-        largest=float(far.max()),
+    distance = np.linalg.norm(shift[valid], axis=1)
+    turn = np.swapaxes(one.rotation[valid], 1, 2) @ other.rotation[valid]
+    return TcpShift(
+        poses=int(valid.sum()),
+        rms=float(np.sqrt(np.mean(distance**2))),
+        largest=float(distance.max()),
         turned=float(np.linalg.norm(rotation_vector(turn), axis=1).max()),
-        where=q[fine][int(np.argmax(far))],
-        mean=apart[fine].mean(axis=0),
+        where=q[valid][int(np.argmax(distance))],
+        mean=shift[valid].mean(axis=0),
     )

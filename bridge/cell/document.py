@@ -1,4 +1,4 @@
-"""A cell file's YAML, and numbers as every YAML reader takes them."""
+"""Reading the YAML of a cell file, and numbers that every YAML version reads as numbers."""
 
 from __future__ import annotations
 
@@ -8,23 +8,23 @@ from pathlib import Path
 from gapbridge.core.errors import CellError
 from gapbridge.core.files import Document, Kind, loaders, parse_yaml, read_yaml
 
-CELL = Kind("cell", "a cell file", "robot: ...", CellError, loaders())
+CELL_KIND = Kind("cell", "a cell file", "robot: ...", CellError, loaders())
 
 
 def parse(text: str, path: Path) -> Document:
     """Return the document of a cell's text; raises CellError as parse_yaml does."""
-    return parse_yaml(text, path, CELL)
+    return parse_yaml(text, path, CELL_KIND)
 
 
 def read_document(path: Path) -> Document:
-    """Return the document of a cell file; raises CellError where it cannot be read."""
-    return read_yaml(path, CELL)
+    """Return the document of a cell file; raises CellError if it cannot be read."""
+    return read_yaml(path, CELL_KIND)
 
 
 def number_text(value: float) -> str:
-    """Return a float as every YAML reader takes it for a number; reading it gives it back exactly.
+    """Return a float as text that every YAML reader takes for the same number, exactly.
 
-    ``repr`` gives ``1e-05``, which YAML 1.1 readers take for a text.
+    ``repr`` gives ``1e-05``, which YAML 1.1 readers take for a string.
     """
     text = repr(float(value))
     if "e" in text and "." not in text:

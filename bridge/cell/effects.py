@@ -1,4 +1,4 @@
-"""Effects in a cell file and as terms of a model."""
+"""Conversion of effects between the cell file and the terms of a model."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from gapbridge.bridge.cell.message import nearest
+from gapbridge.bridge.cell.message import suggestion
 from gapbridge.bridge.cell.schema import Compliance, EffectEntry
 from gapbridge.core.arm import Arm
 from gapbridge.core.effects import (
@@ -20,11 +20,11 @@ from gapbridge.core.effects import (
 )
 from gapbridge.core.errors import CellError, InputError
 
-VALUE = "value"  # the name in the file of a parameter that has none of its own
+VALUE = "value"  # key in the file of a parameter without a name
 
 
-def term_of(entry: EffectEntry, arm: Arm, where: str) -> Term:
-    """Return the term of one entry of ``effects``; raises CellError beginning with ``where``."""
+def term_from_entry(entry: EffectEntry, arm: Arm, where: str) -> Term:
+    """Return the term of one entry of ``effects``; raises CellError that begins with ``where``."""
     try:
         effect = effect_named(entry.effect)
     except InputError as error:
@@ -33,8 +33,8 @@ def term_of(entry: EffectEntry, arm: Arm, where: str) -> Term:
     joints = [site.joint for site in sites]
     if entry.joint not in joints:
         allowed = "no joint" if joints == [None] else f"a joint of {joints[0]} to {joints[-1]}"
-        found = "none" if entry.joint is None else entry.joint
-        raise CellError(f"{where}.joint: found {found}, expected {allowed} for {entry.effect}")
+        joint = "none" if entry.joint is None else entry.joint
+        raise CellError(f"{where}.joint: found {joint}, expected {allowed} for {entry.effect}")
     if (entry.order is not None) != effect.periodic:
         raise CellError(
             f"{where}.order: found {'none' if entry.order is None else entry.order}, expected "
@@ -42,18 +42,18 @@ def term_of(entry: EffectEntry, arm: Arm, where: str) -> Term:
         )
     site = Site(entry.joint, entry.order)
     parameters = effect.parameters(arm, site)
-    names = [name_of(parameter) for parameter in parameters]
+    names = [file_key(parameter) for parameter in parameters]
     for name in entry.parameters:
         if name not in names:
             raise CellError(
                 f"{where}.parameters.{name}: found an unknown parameter of {entry.effect}; "
-                f"{nearest(name, names)}"
+                f"{suggestion(name, names)}"
             )
-    values = [_value(entry, name, p, where) for name, p in zip(names, parameters, strict=True)]
+    values = [_checked_value(entry, k, p, where) for k, p in zip(names, parameters, strict=True)]
     return Term(entry.effect, site, tuple(values), entry.stand_in)
 
 
-def _value(entry: EffectEntry, name: str, parameter: Parameter, where: str) -> float:
+def _checked_value(entry: EffectEntry, name: str, parameter: Parameter, where: str) -> float:
     if name not in entry.parameters:
         raise CellError(f"{where}.parameters.{name}: found nothing, expected {parameter.unit}")
     value = entry.parameters[name]
@@ -65,7 +65,7 @@ def _value(entry: EffectEntry, name: str, parameter: Parameter, where: str) -> f
     return value
 
 
-def name_of(parameter: Parameter) -> str:
+def file_key(parameter: Parameter) -> str:
     """Return a parameter's name in the cell file."""
     return parameter.name or VALUE
 
@@ -91,39 +91,39 @@ def compliance_entry(terms: Sequence[Term], n: int) -> dict[str, list[float]]:
     entry = {key: np.zeros(n) for key in flexibility_effects()}
     for term in terms:
         key = CATALOGUE[term.effect].flexibility
-        if _in_section(term) and term.site.joint is not None:
+        if _is_compliance_entry(term) and term.site.joint is not None:
             entry[key][term.site.joint - 1] += term.values[0]
-    # what is below zero is no flexibility: it stands among the effects
+    # a negative sum is no flexibility: effect_entries lists it
     return {key: np.maximum(values, 0.0).tolist() for key, values in entry.items()}
 
 
-def _in_section(term: Term) -> bool:
-    """Return whether a term belongs to the section; a stand-in keeps its mark among effects."""
+def _is_compliance_entry(term: Term) -> bool:
+    """Return whether a term is written in the compliance section; stand-ins are effects."""
     return bool(CATALOGUE[term.effect].flexibility) and not term.stand_in
 
 
 def _negative_terms(terms: Sequence[Term]) -> list[Term]:
-    """Return what a joint's flexibilities of one kind add up to, where that is below zero."""
+    """Return the sums of each joint's flexibilities of one kind, where negative."""
     totals: dict[tuple[str, Site], float] = {}
     for term in terms:
-        if _in_section(term):
+        if _is_compliance_entry(term):
             key = (term.effect, term.site)
             totals[key] = totals.get(key, 0.0) + term.values[0]
     return [Term(effect, site, (v,)) for (effect, site), v in totals.items() if v < 0]
 
 
 def effect_entries(terms: Sequence[Term], arm: Arm) -> list[dict[str, Any]]:
-    """Return the ``effects`` list of a model's terms; flexibilities stand in their own section."""
+    """Return the ``effects`` list of a model's terms; flexibilities have their own section."""
     entries = []
-    further = [term for term in terms if not _in_section(term)]
-    for term in (*_negative_terms(terms), *further):
+    others = [term for term in terms if not _is_compliance_entry(term)]
+    for term in (*_negative_terms(terms), *others):
         entry: dict[str, Any] = {"effect": term.effect}
         if term.site.joint is not None:
             entry["joint"] = term.site.joint
         if term.site.order is not None:
             entry["order"] = float(term.site.order)
         parameters = effect_named(term.effect).parameters(arm, term.site)
-        names = [name_of(parameter) for parameter in parameters]
+        names = [file_key(parameter) for parameter in parameters]
         entry["parameters"] = dict(zip(names, map(float, term.values), strict=True))
         if term.stand_in:
             entry["stand_in"] = True

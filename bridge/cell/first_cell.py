@@ -1,4 +1,4 @@
-"""The first cell of an arm: what its controller reports, as a file with comments."""
+"""The first cell of an arm: a commented file with the values that its controller reports."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from gapbridge.drivers.controller_facts import ControllerFacts
 
 
 @dataclass(frozen=True)
-class Asked:
-    """What the user gives: the link's keys, and the arm where the controller does not report it."""
+class InitOptions:
+    """The link's keys, and the arm if the controller does not report which it is."""
 
     link: Mapping[str, Any]
     model: str | None = None
@@ -26,18 +26,18 @@ class Asked:
     tip: str | None = None  # the URDF's link that is the flange
 
 
-def first_cell(facts: ControllerFacts, asked: Asked) -> str:
-    """Return the text of a cell. Raises InputError where nobody reports which arm it is."""
+def first_cell_text(facts: ControllerFacts, options: InitOptions) -> str:
+    """Return the text of a cell. Raises InputError if the arm is unknown or contradictory."""
     return "\n".join(
         line
-        for part in (_head(facts, asked), _robot(facts, asked), _tool(facts), _payload(facts),
-                     _rest(facts, asked))
+        for part in (_header(facts, options), _robot(facts, options), _tool(facts), _payload(facts),
+                     _other_sections(facts, options))
         for line in part
     )  # fmt: skip
 
 
-def _head(facts: ControllerFacts, asked: Asked) -> Iterator[str]:
-    link = asked.link
+def _header(facts: ControllerFacts, options: InitOptions) -> Iterator[str]:
+    link = options.link
     where = link.get("host") or link.get("channel") or link.get("serial")
     software = f", software {facts.version}" if facts.version else ""
     yield f"# Written by `gapbridge init` from what the controller at {where} reports{software}."
@@ -45,14 +45,14 @@ def _head(facts: ControllerFacts, asked: Asked) -> Iterator[str]:
     yield ""
 
 
-def _robot(facts: ControllerFacts, asked: Asked) -> Iterator[str]:
+def _robot(facts: ControllerFacts, options: InitOptions) -> Iterator[str]:
     yield "robot:"
-    if asked.urdf is not None:
-        yield f"  urdf: {asked.urdf}"
-        if asked.tip is not None:
-            yield f"  tip: {asked.tip}"
+    if options.urdf is not None:
+        yield f"  urdf: {options.urdf}"
+        if options.tip is not None:
+            yield f"  tip: {options.tip}"
     else:
-        model = asked.model or facts.model
+        model = options.model or facts.model
         if model is None:
             raise InputError(
                 "--model: found nothing, and the controller does not report which arm it moves; "
@@ -72,11 +72,11 @@ def _robot(facts: ControllerFacts, asked: Asked) -> Iterator[str]:
         elif not facts.calibration:
             yield "  # the controller does not report its factory calibration; where you have it:"
             yield "  # calibration: calibration.conf"
-        yield from _limits(facts, model)
+        yield from _limit_comments(facts, model)
     yield ""
 
 
-def _limits(facts: ControllerFacts, model: str) -> Iterator[str]:
+def _limit_comments(facts: ControllerFacts, model: str) -> Iterator[str]:
     known = builtin_arm(model).limits
     if facts.lower is None or facts.upper is None:
         return
@@ -110,7 +110,7 @@ def _payload(facts: ControllerFacts) -> Iterator[str]:
     yield ""
 
 
-def _rest(facts: ControllerFacts, asked: Asked) -> Iterator[str]:
+def _other_sections(facts: ControllerFacts, options: InitOptions) -> Iterator[str]:
     gravity = facts.gravity
     if gravity is not None and np.linalg.norm(gravity) > 1.0:
         yield f"gravity: {_list(gravity)}  # m/s2 in base, as the arm is mounted in the controller"
@@ -118,9 +118,9 @@ def _rest(facts: ControllerFacts, asked: Asked) -> Iterator[str]:
         yield "gravity: [0.0, 0.0, -9.80665]  # m/s2 in base; turn it for a wall or a ceiling"
     yield from ("", "metrology:", "  registered: false  # an instrument's frame is estimated along")
     yield from ("  sigma: 2.0e-05  # m, 1 sigma of one coordinate of your instrument", "", "link:")
-    for key, value in asked.link.items():
+    for key, value in options.link.items():
         yield f"  {key}: {value}"
-    if facts.rate is not None and "rate" not in asked.link:
+    if facts.rate is not None and "rate" not in options.link:
         yield f"  rate: {number_text(facts.rate)}  # Hz"
     known = None if facts.model is None else builtin_arm(facts.model).limits.velocity
     if facts.velocity is not None and known is not None and (facts.velocity < 0.99 * known).any():

@@ -1,4 +1,4 @@
-"""A cell beside its controller: what the controller says of its arm, and where the cell differs."""
+"""Comparison of a cell with its controller: arm, tool, payload, gravity and state rate."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from gapbridge.drivers.driver import Driver
 from gapbridge.drivers.ur_rtde.enquiry import require_listening
 from gapbridge.drivers.ur_rtde.settings import UrRtdeSettings
 
-SAMPLES, LONGEST = 50, 2.0  # states, s
-RATE = ("link", "rate")
-SLOW = 0.8  # share of the rate asked for that must come
+RATE_SAMPLES, READ_TIMEOUT = 50, 2.0  # number of states, s
+RATE_KEY = ("link", "rate")
+MIN_RATE_SHARE = 0.8  # measured state rate / configured rate
 
 
 def live_findings(cell: Cell) -> Findings:
-    """Return where a cell differs from its controller; observes, and moves nothing.
+    """Return the differences of a cell from its controller; reads only, never moves the arm.
 
-    Raises CellError for a cell without a link, LinkError where the controller cannot be read.
+    Raises CellError for a cell without a link, LinkError if the controller cannot be read.
     """
     link = cell.link
     if link is None:
@@ -32,42 +32,42 @@ def live_findings(cell: Cell) -> Findings:
     errors: list[str] = []
     warnings: list[str] = []
     with driver:
-        state = whole_state(driver)
+        state = read_valid_state(driver)
         differences = list(driver.differences(state))
-        for found in differences:
-            text = f"{cell.path}, line {cell.document.line(found.keys)}: {found}"
-            (errors if found.sure else warnings).append(text)
+        for difference in differences:
+            text = f"{cell.path}, line {cell.document.line(difference.keys)}: {difference}"
+            (errors if difference.sure else warnings).append(text)
         if driver.mismatch() is not None and not errors:
             errors.append(f"{cell.path}: {driver.mismatch()}")
-        rate = _rate(driver)
-    if rate < SLOW * link.rate and not any(found.keys == RATE for found in differences):
-        line = cell.document.line(RATE)
+        rate = _measured_rate(driver)
+    if rate < MIN_RATE_SHARE * link.rate and not any(d.keys == RATE_KEY for d in differences):
+        line = cell.document.line(RATE_KEY)
         warnings.append(
             f"{cell.path}, line {line}: link.rate: found {link.rate:g} Hz, expected about "
-            f"{rate:.0f} Hz, as states come"
+            f"{rate:.0f} Hz, the measured rate"
         )
     return Findings(errors, warnings)
 
 
-def whole_state(driver: Driver) -> RobotState:
-    """Return a state; a torn or missing sample is read again, for two seconds.
+def read_valid_state(driver: Driver) -> RobotState:
+    """Return a valid state; retries an invalid or stale one for READ_TIMEOUT.
 
     Raises LinkError.
     """
-    begun = time.monotonic()
+    start = time.monotonic()
     while True:
         try:
             return driver.read_state()
         except (InvalidStateError, StaleStateError):
-            if time.monotonic() - begun > LONGEST:
+            if time.monotonic() - start > READ_TIMEOUT:
                 raise
 
 
-def _rate(driver: Driver) -> float:
-    """Return how often states come, Hz."""
-    begun = time.monotonic()
+def _measured_rate(driver: Driver) -> float:
+    """Return the measured rate of states, Hz."""
+    start = time.monotonic()
     count = 0
-    while count < SAMPLES and time.monotonic() - begun < LONGEST:
-        whole_state(driver)
+    while count < RATE_SAMPLES and time.monotonic() - start < READ_TIMEOUT:
+        read_valid_state(driver)
         count += 1
-    return count / max(time.monotonic() - begun, 1e-6)
+    return count / max(time.monotonic() - start, 1e-6)

@@ -1,4 +1,4 @@
-"""One clear line out of what pydantic says about a cell file."""
+"""Pydantic's validation errors of a cell file as one-line messages."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pydantic_core import ErrorDetails
 
 from gapbridge.core.files import Document, Keys, quoted
 
-_EXPECTED = {
+_EXPECTED_TEXTS = {
     "float_type": "a number",
     "float_parsing": "a number",
     "int_type": "a whole number",
@@ -40,7 +40,7 @@ _EXPECTED = {
 
 
 def key_path(keys: Keys) -> str:
-    """Return a key path as people read it: ``robot.dh row 2.a``, list entries from 1."""
+    """Return a key path for messages: ``robot.dh entry 2.a``, list entries from 1."""
     text = ""
     for key in keys:
         if isinstance(key, int):
@@ -50,50 +50,47 @@ def key_path(keys: Keys) -> str:
     return text
 
 
-def message(document: Document, schema: type[BaseModel], error: ValidationError) -> str:
-    """Return one line: file, line, key path, what was found, what was expected.
+def error_lines(document: Document, schema: type[BaseModel], error: ValidationError) -> list[str]:
+    """Return a line per error: file, line, key path, what was found, what was expected.
 
     Unknown keys come first: a misspelt key is also a missing one.
     """
-    return messages(document, schema, error)[0]
-
-
-def messages(document: Document, schema: type[BaseModel], error: ValidationError) -> list[str]:
-    """Return a line for everything that is wrong, unknown keys first; see message."""
     return [
         f"{document.path}{'' if keys is None else f', line {document.line(keys)}'}: {text}"
-        for keys, text in refusals(schema, error)
+        for keys, text in validation_errors(schema, error)
     ]
 
 
-def refusals(schema: type[BaseModel], error: ValidationError) -> list[tuple[Keys | None, str]]:
-    """Return the keys (None: of a key that can be none), and what is wrong with them."""
+def validation_errors(
+    schema: type[BaseModel], error: ValidationError
+) -> list[tuple[Keys | None, str]]:
+    """Return the keys of each error (None: the key itself is invalid) and its text."""
     details = sorted(error.errors(), key=lambda d: d["type"] != "extra_forbidden")
-    return [_refusal(schema, detail) for detail in details]
+    return [_validation_error(schema, detail) for detail in details]
 
 
-def _refusal(schema: type[BaseModel], worst: ErrorDetails) -> tuple[Keys | None, str]:
-    if worst["type"] == "invalid_key":
-        return None, f"found a key {worst['input']!r}, expected a word"
-    keys, model = _own_keys(schema, worst["loc"])
-    if worst["type"] == "union_tag_invalid":
-        keys.append(_chooser(str(worst["ctx"].get("discriminator", ""))))
-        found, expected = repr(worst["ctx"]["tag"]), f"one of {worst['ctx']['expected_tags']}"
-    elif worst["type"] == "extra_forbidden":
+def _validation_error(schema: type[BaseModel], detail: ErrorDetails) -> tuple[Keys | None, str]:
+    if detail["type"] == "invalid_key":
+        return None, f"found a key {detail['input']!r}, expected a word"
+    keys, model = _file_keys(schema, detail["loc"])
+    if detail["type"] == "union_tag_invalid":
+        keys.append(_discriminator_key(str(detail["ctx"].get("discriminator", ""))))
+        found, expected = repr(detail["ctx"]["tag"]), f"one of {detail['ctx']['expected_tags']}"
+    elif detail["type"] == "extra_forbidden":
         found, expected = _unknown_key(keys, model)
     else:
-        found, expected = _found(worst), _expected(worst, _description(schema, keys))
+        found, expected = _found_text(detail), _expected_text(detail, _description(schema, keys))
     return keys, f"{key_path(keys)}: found {found}, expected {expected}"
 
 
-def _chooser(reported: str) -> str:
-    """Return the key that chooses between sections; pydantic quotes it, or names a function."""
+def _discriminator_key(reported: str) -> str:
+    """Return the key that selects a union member; pydantic quotes it, or names a function."""
     key = reported.strip("'")
     return key if key.isidentifier() else "driver"
 
 
-def nearest(name: str, known: Iterable[str]) -> str:
-    """Return a hint that names the nearest known word, or all of them."""
+def suggestion(name: str, known: Iterable[str]) -> str:
+    """Return a hint that names the most similar known name, or all of them."""
     names = list(known)
     near = difflib.get_close_matches(name.lower(), names, n=1, cutoff=0.5)
     return f"did you mean {near[0]!r}?" if near else f"known here: {', '.join(names)}"
@@ -105,7 +102,7 @@ def _unknown_key(keys: Keys, model: type[BaseModel] | None) -> tuple[str, str]:
     *parents, key = keys
     inside = f" in {key_path(parents)}" if parents else ""
     return (
-        f"an unknown key {str(key)!r}{inside}", f"one that is known; {nearest(str(key), known)}"
+        f"an unknown key {str(key)!r}{inside}", f"one that is known; {suggestion(str(key), known)}"
     )  # fmt: skip
 
 
@@ -116,10 +113,10 @@ def _models(annotation: Any) -> list[type[BaseModel]]:
     return [m for part in typing.get_args(annotation) for m in _models(part)]
 
 
-def _own_keys(
+def _file_keys(
     schema: type[BaseModel], loc: tuple[str | int, ...]
 ) -> tuple[list[str | int], type[BaseModel] | None]:
-    """Return the keys of the file in pydantic's location, and the model that holds the last one.
+    """Return the keys of the file in pydantic's location, and the model of the last one.
 
     Pydantic puts the names of union members and validators between the keys.
     """
@@ -134,7 +131,7 @@ def _own_keys(
             holder = owner
             keys.append(part)
             models = _models(owner.model_fields[part].annotation)
-        elif chosen := [m for m in models if _tag(m) == part]:
+        elif chosen := [m for m in models if _driver_tag(m) == part]:
             models = chosen
         elif part == loc[-1] and models and not _is_union_label(part, models):
             chosen = [m for m in models if m.__name__ in loc] or models
@@ -142,8 +139,8 @@ def _own_keys(
     return keys, holder
 
 
-def _tag(model: type[BaseModel]) -> str | None:
-    """Return the driver that settings belong to, None where they belong to none."""
+def _driver_tag(model: type[BaseModel]) -> str | None:
+    """Return the driver whose settings a model describes; None: no driver."""
     field = model.model_fields.get("driver")
     return None if field is None else str(field.default)
 
@@ -165,7 +162,7 @@ def _description(schema: type[BaseModel], keys: Keys) -> str:
     return text
 
 
-def _found(error: ErrorDetails) -> str:
+def _found_text(error: ErrorDetails) -> str:
     if error["type"] == "missing":
         return "nothing"
     value = error["input"]
@@ -176,12 +173,12 @@ def _found(error: ErrorDetails) -> str:
     return quoted(value)
 
 
-def _expected(error: ErrorDetails, description: str) -> str:
+def _expected_text(error: ErrorDetails, description: str) -> str:
     if error["type"] == "missing":
         return description or "it here"
     if error["type"] in ("value_error", "assertion_error"):
         return str(error.get("ctx", {}).get("error", error["msg"])).removeprefix("expected ")
-    template = _EXPECTED.get(error["type"])
+    template = _EXPECTED_TEXTS.get(error["type"])
     if template is None:
         return str(error["msg"]).removeprefix("Input should be ")
     text = template.format(**error.get("ctx", {}))

@@ -1,4 +1,4 @@
-"""A log as it is opened for a cell: of its arm, in its units, within its ratings."""
+"""Opening a log for a cell: number of joints, units and payloads are checked."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from gapbridge.core.log.sources import SourceOptions, source_of
 def open_log(path: Path, cell: Cell) -> Log:
     """Return a log for a cell's arm: a CSV or Parquet file, or another source (core.log.sources).
 
-    Raises LogError where a payload is out of range, angles look like degrees or positions like
+    Raises LogError if a payload is out of range, angles look like degrees or positions like
     millimetres.
     """
     source = source_of(path)
@@ -42,9 +42,9 @@ def open_log(path: Path, cell: Cell) -> Log:
 
 
 def open_simulated(path: Path, cell: Cell, log: Log) -> Log:
-    """Return a simulator's log at the rows of ``log``, its TCP where the log's joints are.
+    """Return a simulator's log at the rows of ``log``, with its TCP at the joint angles of ``log``.
 
-    Raises LogError where its rows are not those of the log.
+    Raises LogError if its rows do not match those of ``log``.
     """
     return at_joints_of(log, aligned(open_log(path, cell), log), cell)
 
@@ -52,16 +52,16 @@ def open_simulated(path: Path, cell: Cell, log: Log) -> Log:
 def at_joints_of(log: Log, simulated: Log, cell: Cell) -> Log:
     """Return a simulator's log with its TCP moved to the joint angles of ``log``, row by row.
 
-    A simulated servo rests elsewhere than the real one: that is the tracking channel's gap, and
-    none of the way from the joints to the TCP. The move is the difference of the cell's own model
-    at both angles. Logs without ``actual_q`` in both stay as they are.
+    A simulated servo stops at other joint angles than the real one. That is a gap of the tracking
+    channel, not of the position; it is removed by the difference that the cell's model predicts
+    between both angles. If either log has no ``actual_q``, ``simulated`` is returned unchanged.
     """
-    found, wanted = simulated.get("actual_q"), log.get("actual_q")
+    simulated_q, measured_q = simulated.get("actual_q"), log.get("actual_q")
     position = simulated.get("measured_position")
-    if found is None or wanted is None or position is None:
+    if simulated_q is None or measured_q is None or position is None:
         return simulated
-    moved = cell.model.predict(wanted).position - cell.model.predict(found).position
-    return replace(simulated, columns={**simulated.columns, "measured_position": position + moved})
+    shift = cell.model.predict(measured_q).position - cell.model.predict(simulated_q).position
+    return replace(simulated, columns={**simulated.columns, "measured_position": position + shift})
 
 
 def joint_names(cell: Cell) -> tuple[str, ...]:
@@ -70,7 +70,7 @@ def joint_names(cell: Cell) -> tuple[str, ...]:
 
 
 def check_log(log: Log, cell: Cell) -> None:
-    """Raise LogError where a log's numbers cannot be meant for a cell's arm."""
+    """Raise LogError if joint angles, units or payloads of a log are impossible for the arm."""
     for name in ("actual_q", "target_q"):
         if np.isinf(log.columns.get(name, np.zeros(0))).any():
             log.require(name)  # names the cell

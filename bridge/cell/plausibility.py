@@ -1,7 +1,7 @@
-"""Whether the values of a cell can be meant: units by their size, before anything is computed.
+"""Plausibility of the values of a cell: wrong units are recognised by magnitude.
 
-A TCP in millimetres puts the tool a hundred metres off and every later number with it. What is
-surely wrong is an error in every command; what is only odd is a warning.
+Impossible values are errors in every command (a TCP in mm, for instance); unusual ones are
+warnings. Where a constant is a pair, it is the bound of an error and that of a warning.
 """
 
 from __future__ import annotations
@@ -30,16 +30,16 @@ from gapbridge.core.plausibility import (
 )
 from gapbridge.drivers.ur_rtde.settings import UrRtdeSettings
 
-STANDARD = 9.80665  # m/s2
-SENSIBLE_GRAVITY, EARTH = 1.5, 0.1  # m/s2 beside the standard: no place, no place on the ground
-COARSEST, COARSE, FINE = 0.01, 1e-3, 1e-7  # m: 1 sigma of no instrument, of few instruments
-COLD, HOT = (-60.0, -20.0), (150.0, 60.0)  # °C: never, hardly
-SOFTEST, SOFT = 1.0, 0.01  # rad/Nm: no joint, few joints
-CALIBRATED, MUCH = 0.1, 0.02  # m at the flange: no factory calibration, few
-FARTHEST = 50.0  # m: no floor, box or instrument is so far from a base
-HEAVIEST_LOAD, HEAVY_LOAD = 3000.0, 300.0  # kg, where the arm's rating is not known
+STANDARD_GRAVITY = 9.80665  # m/s2
+GRAVITY_ERROR, GRAVITY_WARNING = 1.5, 0.1  # m/s2 from the standard
+SIGMA_ERROR, SIGMA_WARNING, MIN_SIGMA = 0.01, 1e-3, 1e-7  # m, 1 sigma of an instrument
+MIN_TEMPERATURE, MAX_TEMPERATURE = (-60.0, -20.0), (150.0, 60.0)  # °C: error, warning
+COMPLIANCE_ERROR, COMPLIANCE_WARNING = 1.0, 0.01  # rad/Nm, of one joint
+CALIBRATION_ERROR, CALIBRATION_WARNING = 0.1, 0.02  # m at the flange
+MAX_DISTANCE = 50.0  # m from the base: floor, boxes, instruments
+PAYLOAD_ERROR, PAYLOAD_WARNING = 3000.0, 300.0  # kg, without a rated payload
 UR_JOINTS = 6
-DISPLACED = 2.0  # times the reach, and a metre: no tool is that long
+LENGTH_ERROR_FACTOR = 2.0  # times the reach, plus 1 m
 
 
 class Findings(NamedTuple):
@@ -49,8 +49,8 @@ class Findings(NamedTuple):
     warnings: list[str]
 
 
-def findings(file: CellFile, document: Document, arm: Arm) -> Findings:
-    """Return what cannot be meant in a cell's values (errors), and what is odd (warnings)."""
+def check_plausibility(file: CellFile, document: Document, arm: Arm) -> Findings:
+    """Return the impossible values of a cell (errors) and the unusual ones (warnings)."""
     errors: list[str] = []
     warnings: list[str] = []
     for value in implausible_values(file, document, arm):
@@ -62,21 +62,22 @@ def findings(file: CellFile, document: Document, arm: Arm) -> Findings:
 
 
 def implausible_values(file: CellFile, document: Document, arm: Arm) -> Iterator[Implausible]:
-    """Yield every value of a cell that cannot be meant, or hardly; the arm's own come first."""
+    """Yield every impossible or unusual value of a cell; those of the arm come first."""
     yield from _robot(file, document, arm)
-    far = reach(arm)
+    arm_reach = reach(arm)
     tcp = file.tool.tcp
-    yield from _length(("tool", "tcp", "xyz"), tcp.xyz, far, "of the TCP")
+    yield from _lengths(("tool", "tcp", "xyz"), tcp.xyz, arm_reach, "of the TCP")
     yield from _angles(("tool", "tcp", "rpy"), tcp.rpy)
-    yield from _payload(("payload",), file.payload, arm, far)
-    yield from _surroundings(file)
+    yield from _payload(("payload",), file.payload, arm, arm_reach)
+    yield from _gravity_and_temperature(file)
     yield from _metrology(file)
     for key in ("axial", "radial"):
         for i, value in enumerate(getattr(file.compliance, key) or []):
-            if value > SOFT:
+            if value > COMPLIANCE_WARNING:
                 yield Implausible(
                     ("compliance", key, i), f"{value:g}", "rad/Nm (a stiffness, in Nm/rad?)"
-                    if value > SOFTEST else "at most 0.01 rad/Nm", sure=value > SOFTEST,
+                    if value > COMPLIANCE_ERROR else "at most 0.01 rad/Nm",
+                    sure=value > COMPLIANCE_ERROR,
                 )  # fmt: skip
     if isinstance(file.link, UrRtdeSettings) and arm.n != UR_JOINTS:
         yield Implausible(
@@ -84,15 +85,15 @@ def implausible_values(file: CellFile, document: Document, arm: Arm) -> Iterator
         )
     if file.ft_sensor is not None:
         mounted = file.ft_sensor.sensor_in_flange
-        yield from _length(("ft_sensor", "sensor_in_flange", "xyz"), mounted.xyz, far, "")
+        yield from _lengths(("ft_sensor", "sensor_in_flange", "xyz"), mounted.xyz, arm_reach, "")
         yield from _angles(("ft_sensor", "sensor_in_flange", "rpy"), mounted.rpy)
-    yield from _session(file.calibration, arm, far)
-    if (quick := file.limits.joint_velocity or 0.0) > QUICK:
+    yield from _session(file.calibration, arm, arm_reach)
+    if (velocity := file.limits.joint_velocity or 0.0) > QUICK:
         yield Implausible(
-            ("limits", "joint_velocity"), f"{quick:g}", "rad/s (it looks like degrees)"
+            ("limits", "joint_velocity"), f"{velocity:g}", "rad/s (it looks like degrees)"
         )
     if file.simulation.payload is not None:
-        yield from _payload(("simulation", "payload"), file.simulation.payload, arm, far)
+        yield from _payload(("simulation", "payload"), file.simulation.payload, arm, arm_reach)
     for i, angle in enumerate(file.simulation.start_q or []):
         if abs(angle) > TURNS:
             yield Implausible(
@@ -100,34 +101,35 @@ def implausible_values(file: CellFile, document: Document, arm: Arm) -> Iterator
             )
 
 
-def _session(given: CalibrationSettings, arm: Arm, far: float) -> Iterator[Implausible]:
-    """Yield what cannot be meant in the section of calibration sessions."""
+def _session(section: CalibrationSettings, arm: Arm, arm_reach: float) -> Iterator[Implausible]:
+    """Yield the implausible values of section ``calibration``."""
     top = "calibration"
     rated = LoadBounds.of(Model(arm=arm)).mass
-    for i, load in enumerate(given.loads):
+    for i, load in enumerate(section.loads):
         keys = (top, "loads", i)
         if load.mass > rated:
             yield Implausible(
                 (*keys, "mass"), f"{load.mass:g} kg", f"at most {rated:.3g} kg (grams?)",
                 sure=bool(np.isfinite(arm.payload)),
             )  # fmt: skip
-        yield from _payload(keys, load, arm, far)
-    if given.accuracy is not None and given.accuracy >= COARSEST:
-        yield Implausible((top, "accuracy"), f"{given.accuracy:g}", "m (it looks like mm)")
+        yield from _payload(keys, load, arm, arm_reach)
+    if section.accuracy is not None and section.accuracy >= SIGMA_ERROR:
+        yield Implausible((top, "accuracy"), f"{section.accuracy:g}", "m (it looks like mm)")
     places: list[tuple[tuple[str | int, ...], Sequence[float]]] = [
-        ((top, "floor"), [given.floor or 0.0]), ((top, "instrument_at"), given.instrument_at or []),
-        *(((top, "further_places", i), place) for i, place in enumerate(given.further_places)),
+        ((top, "floor"), [section.floor or 0.0]),
+        ((top, "instrument_at"), section.instrument_at or []),
+        *(((top, "further_places", i), place) for i, place in enumerate(section.further_places)),
     ]  # fmt: skip
-    for i, box in enumerate(given.keep_out):
+    for i, box in enumerate(section.keep_out):
         keys = (top, "keep_out", i)
         places += [((*keys, "lower"), box.lower), ((*keys, "upper"), box.upper)]
         if np.any(np.array(box.lower) > box.upper):
             yield Implausible((*keys, "lower"), f"{box.lower}", f"no more than upper, {box.upper}")
     for where, xyz in places:
-        if (size := max(map(abs, xyz), default=0.0)) > FARTHEST:
+        if (size := max(map(abs, xyz), default=0.0)) > MAX_DISTANCE:
             yield Implausible(where, f"{size:g}", "m (it looks like mm)")
-    for end in ("lower", "upper") if given.joint_range is not None else ():
-        if (angle := max(map(abs, getattr(given.joint_range, end)))) > TURNS:
+    for end in ("lower", "upper") if section.joint_range is not None else ():
+        if (angle := max(map(abs, getattr(section.joint_range, end)))) > TURNS:
             yield Implausible(
                 (top, "joint_range", end), f"{angle:g}", "rad (it looks like degrees)"
             )
@@ -142,13 +144,13 @@ def _robot(file: CellFile, document: Document, arm: Arm) -> Iterator[Implausible
         yield from implausible_in_urdf(document.path.parent / robot.urdf, arm)
         yield from implausible_in_arm(arm, ("robot", "urdf"))
     if robot.model is not None and robot.calibration is not None:
-        yield from _calibration(robot.model, arm)
+        yield from _factory_calibration(robot.model, arm)
 
 
 def _dh(file: CellFile, arm: Arm) -> Iterator[Implausible]:
     """Yield lengths in mm and angles in degrees of DH rows.
 
-    Lengths count only where the arm comes out too long: of a calibration they may cancel.
+    Lengths are checked only if the arm is too long: those of a factory calibration may cancel.
     """
     rows = file.robot.dh or []
     longest = max(range(len(rows)), key=lambda i: max(abs(rows[i].a), abs(rows[i].d)))
@@ -166,28 +168,28 @@ def _dh(file: CellFile, arm: Arm) -> Iterator[Implausible]:
                 )
 
 
-def _calibration(model: str, arm: Arm) -> Iterator[Implausible]:
+def _factory_calibration(model: str, arm: Arm) -> Iterator[Implausible]:
     q = np.random.default_rng(0).uniform(-np.pi, np.pi, (16, arm.n))
     nominal = builtin_arm(model)
-    apart = (nominal.link_in_link[0] @ flange_in_first(nominal, q))[:, :3, 3]
-    apart = apart - (arm.link_in_link[0] @ flange_in_first(arm, q))[:, :3, 3]
-    shift = float(np.linalg.norm(apart, axis=1).max())
-    if shift > MUCH:
+    shift = (nominal.link_in_link[0] @ flange_in_first(nominal, q))[:, :3, 3]
+    shift = shift - (arm.link_in_link[0] @ flange_in_first(arm, q))[:, :3, 3]
+    largest = float(np.linalg.norm(shift, axis=1).max())
+    if largest > CALIBRATION_WARNING:
         yield Implausible(
-            ("robot", "calibration"), f"deltas that move the flange by {1e3 * shift:.3g} mm",
-            f"a factory calibration of a {model}: a few mm", sure=shift > CALIBRATED,
+            ("robot", "calibration"), f"deltas that move the flange by {1e3 * largest:.3g} mm",
+            f"a factory calibration of a {model}: a few mm", sure=largest > CALIBRATION_ERROR,
         )  # fmt: skip
 
 
-def _length(
-    keys: tuple[str | int, ...], xyz: list[float] | tuple[float, ...], far: float, what: str
+def _lengths(
+    keys: tuple[str | int, ...], xyz: list[float] | tuple[float, ...], arm_reach: float, what: str
 ) -> Iterator[Implausible]:
     size = float(np.linalg.norm(xyz))
     found = f"{size:.4g} m {what} from the flange".replace("  ", " ")
-    if size > DISPLACED * far + 1.0:
-        yield Implausible(keys, found, f"m (it looks like mm: the arm reaches {far:.2f} m)")
-    elif size > far:
-        yield Implausible(keys, found, f"less than the arm's reach, {far:.2f} m", sure=False)
+    if size > LENGTH_ERROR_FACTOR * arm_reach + 1.0:
+        yield Implausible(keys, found, f"m (it looks like mm: the arm reaches {arm_reach:.2f} m)")
+    elif size > arm_reach:
+        yield Implausible(keys, found, f"less than the arm's reach, {arm_reach:.2f} m", sure=False)
 
 
 def _angles(
@@ -201,9 +203,9 @@ def _angles(
 
 
 def _payload(
-    keys: tuple[str | int, ...], payload: Payload | LoadEntry, arm: Arm, far: float
+    keys: tuple[str | int, ...], payload: Payload | LoadEntry, arm: Arm, arm_reach: float
 ) -> Iterator[Implausible]:
-    yield from _length((*keys, "cog"), payload.cog, far, "of the centre of gravity")
+    yield from _lengths((*keys, "cog"), payload.cog, arm_reach, "of the centre of gravity")
     if np.isfinite(arm.payload):
         bounds = LoadBounds.of(Model(arm=arm))
         moment = payload.mass * float(np.linalg.norm(payload.cog))
@@ -213,26 +215,26 @@ def _payload(
                 f"at most {LEVER * bounds.mass:.3g} kg m ({arm.name})", sure=False,
             )  # fmt: skip
         return
-    own = float(arm.mass.sum())
-    for most, sure in ((HEAVIEST_LOAD, True), (own or HEAVY_LOAD, False)):
-        if payload.mass > most:
-            expected = "kg (grams?)" if sure else f"at most {most:.3g} kg"
+    links = float(arm.mass.sum())
+    for limit, sure in ((PAYLOAD_ERROR, True), (links or PAYLOAD_WARNING, False)):
+        if payload.mass > limit:
+            expected = "kg (grams?)" if sure else f"at most {limit:.3g} kg"
             yield Implausible((*keys, "mass"), f"{payload.mass:g} kg", expected, sure=sure)
             return
 
 
-def _surroundings(file: CellFile) -> Iterator[Implausible]:
+def _gravity_and_temperature(file: CellFile) -> Iterator[Implausible]:
     size = float(np.linalg.norm(file.gravity))
     if size == 0.0:
         yield Implausible(("gravity",), "0", "9.80665 m/s2: without it no weight bends", sure=False)
-    elif abs(size - STANDARD) > SENSIBLE_GRAVITY:
+    elif abs(size - STANDARD_GRAVITY) > GRAVITY_ERROR:
         yield Implausible(("gravity",), f"a length of {size:g}", "9.80665 m/s2, along base axes")
-    elif abs(size - STANDARD) > EARTH:
+    elif abs(size - STANDARD_GRAVITY) > GRAVITY_WARNING:
         yield Implausible(("gravity",), f"a length of {size:g}", "9.7 to 9.9 m/s2", sure=False)
     value = file.reference_temperature
-    if not COLD[0] <= value <= HOT[0]:
+    if not MIN_TEMPERATURE[0] <= value <= MAX_TEMPERATURE[0]:
         yield Implausible(("reference_temperature",), f"{value:g}", "°C (it looks like kelvin)")
-    elif not COLD[1] <= value <= HOT[1]:
+    elif not MIN_TEMPERATURE[1] <= value <= MAX_TEMPERATURE[1]:
         yield Implausible(("reference_temperature",), f"{value:g}", "°C (Fahrenheit?)", sure=False)
 
 
@@ -242,9 +244,9 @@ def _metrology(file: CellFile) -> Iterator[Implausible]:
         if value is None:
             continue
         keys = ("metrology", key)
-        if value >= COARSEST:
+        if value >= SIGMA_ERROR:
             yield Implausible(keys, f"{value:g}", "m, 1 sigma of one coordinate (it looks like mm)")
-        elif value > COARSE:
+        elif value > SIGMA_WARNING:
             yield Implausible(keys, f"{value:g} m", "less than 0.001 m", sure=False)
-        elif 0.0 < value < FINE:
+        elif 0.0 < value < MIN_SIGMA:
             yield Implausible(keys, f"{value:g} m", "more than 1e-7 m", sure=False)

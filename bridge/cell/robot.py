@@ -1,4 +1,4 @@
-"""The arm of a cell: a built-in table, a URDF beside the cell, or DH rows."""
+"""The arm of a cell: a built-in model, a URDF or DH rows."""
 
 from __future__ import annotations
 
@@ -20,23 +20,23 @@ DELTAS = ("delta_theta", "delta_a", "delta_d", "delta_alpha")
 def build_arm(robot: Robot, folder: Path) -> Arm:
     """Return the arm that the robot section names; paths are relative to ``folder``.
 
-    Raises CellError (or ArmError, naming the URDF) where the section or a file of it cannot be
+    Raises CellError (or ArmError, naming the URDF) if the section or one of its files cannot be
     used; messages begin with the key.
     """
-    given = [kind for kind in ("model", "urdf", "dh") if getattr(robot, kind) is not None]
-    if len(given) > 1 and not robot.dh:
-        given = [kind for kind in given if kind != "dh"]  # an empty list left standing
-    if len(given) != 1:
-        found = " and ".join(given) or "none of them"
+    kinds = [kind for kind in ("model", "urdf", "dh") if getattr(robot, kind) is not None]
+    if len(kinds) > 1 and not robot.dh:
+        kinds = [kind for kind in kinds if kind != "dh"]  # an empty list counts as left out
+    if len(kinds) != 1:
+        found = " and ".join(kinds) or "none of them"
         raise CellError(f"robot: found {found}, expected one of model, urdf, dh")
     if robot.calibration is not None and robot.model is None:
         raise CellError(
-            f"robot.calibration: found beside robot.{given[0]}, expected only beside robot.model"
+            f"robot.calibration: found beside robot.{kinds[0]}, expected only beside robot.model"
         )
     if robot.rated_payload is not None and robot.model is not None:
         raise CellError(
             "robot.rated_payload: found beside robot.model, expected only beside robot.urdf or "
-            "robot.dh: of a built-in arm it is known"
+            "robot.dh: that of a built-in arm is known"
         )
     if robot.model is not None:
         return builtin_arm(robot.model, calibration_of(robot.calibration, folder))
@@ -52,23 +52,23 @@ def build_arm(robot: Robot, folder: Path) -> Arm:
 
 
 def calibration_of(
-    given: Calibration | str | None, folder: Path
+    calibration: Calibration | str | None, folder: Path
 ) -> Mapping[str, Sequence[float]] | None:
-    """Return the deltas that ``robot.calibration`` gives or names; None where it is left out.
+    """Return the DH deltas (rad, m, per joint) of ``robot.calibration`` or of the file it names.
 
-    Raises ArmError.
+    None if it is left out. Raises ArmError if the file cannot be used.
     """
-    if given is None:
+    if calibration is None:
         return None
-    if isinstance(given, Calibration):
-        return {key: value for key in DELTAS if (value := getattr(given, key)) is not None}
-    return read_calibration(folder / given)
+    if isinstance(calibration, Calibration):
+        return {key: value for key in DELTAS if (value := getattr(calibration, key)) is not None}
+    return read_calibration(folder / calibration)
 
 
 def read_calibration(path: Path) -> dict[str, list[float]]:
     """Return the deltas of a UR controller's ``calibration.conf`` (an INI file).
 
-    Raises ArmError where the file is missing, is no INI file or holds no deltas.
+    Raises ArmError if the file is missing, is no INI file or contains no deltas.
     """
     parser = configparser.ConfigParser(interpolation=None)
     try:
@@ -84,13 +84,13 @@ def read_calibration(path: Path) -> dict[str, list[float]]:
     for section in parser.sections():
         for key in DELTAS:
             if parser.has_option(section, key):
-                deltas[key] = _list(path, key, parser.get(section, key))
+                deltas[key] = _numbers(path, key, parser.get(section, key))
     if not deltas:
         raise ArmError(f"robot.calibration: {path}: found none of {', '.join(DELTAS)}")
     return deltas
 
 
-def _list(path: Path, key: str, text: str) -> list[float]:
+def _numbers(path: Path, key: str, text: str) -> list[float]:
     try:
         return [float(value) for value in json.loads(text)]
     except (ValueError, TypeError):

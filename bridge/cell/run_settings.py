@@ -1,4 +1,4 @@
-"""From a cell to what a run of the daemon is made of."""
+"""The configuration of a daemon run, read and checked from a cell file."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from gapbridge.bridge.cell import Cell, load_cell
-from gapbridge.bridge.cell.cell import placed
+from gapbridge.bridge.cell.cell import located_message
 from gapbridge.bridge.cell.daemon_settings import DaemonSettings
 from gapbridge.bridge.cell.runtime_folder import cell_key, runtime_folder
 from gapbridge.bridge.cell.sections import SetpointSettings
@@ -24,14 +24,14 @@ from gapbridge.core.model import Model
 
 @dataclass(frozen=True)
 class Configuration:
-    """A cell file as it was read: what runs, and how to know it again."""
+    """A cell file as it was read: the settings of the run, its text and all its files."""
 
     settings: DaemonSettings
     n: int  # joints
     text: str
-    files: Mapping[str, bytes]  # all that was read for it, by absolute path
-    fitted: Range = field(default_factory=dict)  # what the model was fitted on, by log column
-    model: Model | None = None  # for what the daemon itself compares; the loop reads its own
+    files: Mapping[str, bytes]  # contents of every file read for it, by absolute path
+    fitted: Range = field(default_factory=dict)  # data range of the fit, by log column
+    model: Model | None = None  # for checks of the daemon; the loop process reads its own
 
     @property
     def hash(self) -> str:
@@ -40,42 +40,38 @@ class Configuration:
 
 
 def configuration_for(settings: DaemonSettings) -> Configuration:
-    """Return the configuration of settings, whose cell file is read for it. Raises InputError."""
-    with recorded() as files:
-        cell = load_cell(settings.cell)
-        _read_named(settings)
-    return _configuration(settings, cell, files)
+    """Return the configuration of given settings; reads their cell file. Raises InputError."""
+    return _read(settings.cell, settings)
 
 
 def read_configuration(path: Path) -> Configuration:
-    """Return the configuration of a cell file, all of it checked. Raises InputError."""
+    """Return the checked configuration of a cell file. Raises InputError."""
+    return _read(path, None)
+
+
+def _read(path: Path, settings: DaemonSettings | None) -> Configuration:
+    """Read a cell file and all files that its settings, or the given ones, refer to."""
     with recorded() as files:
         cell = load_cell(path)
-        settings = settings_of(cell)
-        _read_named(settings)
-    return _configuration(settings, cell, files)
-
-
-def _configuration(
-    settings: DaemonSettings, cell: Cell, files: Mapping[str, bytes]
-) -> Configuration:
+        settings = settings or settings_of(cell)
+        _read_referenced_files(settings)
     text, fitted = cell.document.text, cell.fitted_range
     return Configuration(settings, cell.arm.n, text, files, fitted, cell.model)
 
 
-def _read_named(settings: DaemonSettings) -> None:
-    """Read the files that the sections of a run name. Raises InputError."""
+def _read_referenced_files(settings: DaemonSettings) -> None:
+    """Read the files that the settings refer to. Raises InputError."""
     settings.link.read_files()
     setpoints = settings.setpoints
     if setpoints.source == "trajectory" and setpoints.file is not None:
-        with contextlib.suppress(OSError):  # the loop's process names what is wrong with it
+        with contextlib.suppress(OSError):  # the loop process reports the error
             read_bytes(setpoints.file)
     if setpoints.source == "tcp" and setpoints.token_file is not None:
         read_token(setpoints.token_file, "setpoints.token_file")
 
 
 def settings_of(cell: Cell) -> DaemonSettings:
-    """Return what a run of this cell is made of. Raises InputError where sections do not fit."""
+    """Return the daemon settings of a cell. Raises InputError if sections contradict each other."""
     if cell.link is None:
         raise CellError(f"{cell.path}: link: found nothing, expected the robot's address for a run")
     for section, served in (("web", cell.web), ("metrics", cell.metrics)):
@@ -84,7 +80,7 @@ def settings_of(cell: Cell) -> DaemonSettings:
                 check_credentials(served, section)
             except InputError as error:
                 raise CellError(f"{cell.path}: {error}") from None
-    setpoints = _setpoints_of(cell)
+    setpoints = _setpoint_settings(cell)
     try:
         return DaemonSettings(
             cell=cell.path.resolve(), link=cell.link, limits=cell.limits, setpoints=setpoints,
@@ -93,22 +89,22 @@ def settings_of(cell: Cell) -> DaemonSettings:
         )  # fmt: skip
     except ValidationError as error:
         message = str(error.errors()[0]["msg"]).removeprefix("Value error, ")
-        raise CellError(placed(cell.document, message)) from None
+        raise CellError(located_message(cell.document, message)) from None
 
 
-def _setpoints_of(cell: Cell) -> SetpointSettings:
-    """Return section ``setpoints`` with whole paths, its token checked. Raises CellError."""
-    given = cell.setpoints
+def _setpoint_settings(cell: Cell) -> SetpointSettings:
+    """Return section ``setpoints`` with absolute paths, its token checked. Raises CellError."""
+    section = cell.setpoints
     update = {
         name: path.resolve()
         for name in ("file", "socket", "token_file")
-        if (path := getattr(given, name)) is not None
+        if (path := getattr(section, name)) is not None
     }
-    if given.source == "planner" and given.socket is None:
+    if section.source == "planner" and section.socket is None:
         update["socket"] = runtime_folder() / f"{cell_key(cell.path)}.planner.sock"
-    if given.source == "tcp" and given.token_file is not None:
+    if section.source == "tcp" and section.token_file is not None:
         try:
-            read_token(given.token_file, "setpoints.token_file")
+            read_token(section.token_file, "setpoints.token_file")
         except InputError as error:
             raise CellError(f"{cell.path}: {error}") from None
-    return given.model_copy(update=update)
+    return section.model_copy(update=update)

@@ -1,4 +1,4 @@
-"""The folder for sockets and locks: only its owner can look into it, and it need not be tidied."""
+"""The folder of the daemon's sockets and locks: temporary, accessible to its owner only."""
 
 from __future__ import annotations
 
@@ -12,39 +12,36 @@ from gapbridge.core.errors import InputError
 
 
 def candidates() -> list[Path]:
-    """Return where a daemon of this user may have its folder, best first."""
-    found = []
-    if given := os.environ.get("RUNTIME_DIRECTORY"):  # systemd's, colon-separated
-        found.append(Path(given.split(":")[0]))
-    if given := os.environ.get("XDG_RUNTIME_DIR"):
-        found.append(Path(given) / "gapbridge")
-    found += [
-        Path("/run/gapbridge"),
-        Path(tempfile.gettempdir()) / f"gapbridge-{os.getuid()}",
-    ]
-    return found
+    """Return the possible runtime folders of a daemon of this user, preferred first."""
+    folders = []
+    if folder := os.environ.get("RUNTIME_DIRECTORY"):  # systemd's, colon-separated
+        folders.append(Path(folder.split(":")[0]))
+    if folder := os.environ.get("XDG_RUNTIME_DIR"):
+        folders.append(Path(folder) / "gapbridge")
+    folders += [Path("/run/gapbridge"), Path(tempfile.gettempdir()) / f"gapbridge-{os.getuid()}"]
+    return folders
 
 
 def runtime_folder() -> Path:
-    """Return the folder, made where there is none. Raises InputError where none can be had."""
-    refused = ""
+    """Return the folder, created if missing. Raises InputError if none is usable."""
+    problem = ""
     for path in candidates():
         try:
             path.mkdir(mode=0o700, exist_ok=True)
-            found = path.lstat()
+            status = path.lstat()
         except OSError as error:
-            refused = f"{path}: {error.strerror}"
+            problem = f"{path}: {error.strerror}"
             continue
-        if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.geteuid():
-            refused = f"{path}: found a folder of somebody else, or no folder"
+        if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.geteuid():
+            problem = f"{path}: found no folder of this user"
             continue
-        if stat.S_IMODE(found.st_mode) != 0o700:
+        if stat.S_IMODE(status.st_mode) != 0o700:
             path.chmod(0o700)
         return path
-    raise InputError(f"{refused}, expected a folder for the daemon's socket (XDG_RUNTIME_DIR)")
+    raise InputError(f"{problem}, expected a folder for the daemon's socket (XDG_RUNTIME_DIR)")
 
 
 def cell_key(cell: Path) -> str:
-    """Return a short name for a cell file: its stem and a hash of its whole path."""
-    whole = str(cell.resolve())
-    return f"{cell.stem[:40]}-{hashlib.sha256(whole.encode()).hexdigest()[:10]}"
+    """Return a short name for a cell file: its stem and a hash of its absolute path."""
+    absolute = str(cell.resolve())
+    return f"{cell.stem[:40]}-{hashlib.sha256(absolute.encode()).hexdigest()[:10]}"

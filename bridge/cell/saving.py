@@ -1,4 +1,4 @@
-"""Writing a cell with another model in it: the user's own text, with the model's keys replaced."""
+"""Saving a cell with a new model: only the keys of the model change in the user's text."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ PATHS: tuple[tuple[str, ...], ...] = (
 
 
 class _Dumper(yaml.SafeDumper):
-    """Block style outside, numbers that read back exactly."""
+    """YAML whose numbers read back exactly."""
 
     def ignore_aliases(self, data: Any) -> bool:
-        """Write every value where it stands."""
+        """Write no aliases."""
         return True
 
 
@@ -43,26 +43,23 @@ _Dumper.add_representer(
 
 
 def save_cell(
-    cell: Cell,
-    path: Path | str,
-    model: Model | None = None,
-    sections: dict[str, Any] | None = None,
+    cell: Cell, path: Path | str, model: Model | None = None, sections: dict[str, Any] | None = None
 ) -> None:
-    """Write the cell, with effects and tool point of ``model``, to ``path`` in one step.
+    """Write the cell, with effects and TCP of ``model``, to ``path``, atomically.
 
-    ``sections`` are whole top-level keys that take the place of the cell's own (``payload``).
+    ``sections`` are whole top-level keys that replace those of the cell (``payload``).
 
-    Keys, order and comments of the user's file stay; relative paths are written so that they hold
-    from the new file's folder. Reading the new file gives the same model, number for number.
+    Keys, order and comments of the user's file are kept; relative paths are rewritten for the new
+    file's folder. Reading the new file gives exactly the same model.
     """
     path = Path(path)
     model = model or cell.model
-    text = cell_text(cell.document, path, model, _tool(cell, model) | (sections or {}))
+    text = cell_text(cell.document, path, model, _changed_tool(cell, model) | (sections or {}))
     write_text(path, text)
 
 
-def _tool(cell: Cell, model: Model) -> dict[str, Any]:
-    """Return the key ``tool`` with the tool point of ``model``; nothing where it is the cell's."""
+def _changed_tool(cell: Cell, model: Model) -> dict[str, Any]:
+    """Return the key ``tool`` with the TCP of ``model``; empty if it is that of the cell."""
     shift = model.tool_in_flange[:3, 3]
     if np.array_equal(shift, cell.model.tool_in_flange[:3, 3]):
         return {}
@@ -80,14 +77,14 @@ def cell_text(
     entries = effect_entries(model.terms, model.arm)
     if entries or "effects" in document.data:
         changes["effects"] = entries
-    wanted = copy.deepcopy(document.data)
+    expected = copy.deepcopy(document.data)
     for keys in PATHS:
-        _rebase(wanted, keys, document.path.parent, path.parent)
-    edited = _edited(document, wanted, changes)
-    wanted.update(changes)
-    if edited is not None and _reads_as(edited, path, wanted):
+        _rebase(expected, keys, document.path.parent, path.parent)
+    edited = _edited(document, expected, changes)
+    expected.update(changes)
+    if edited is not None and _reads_as(edited, path, expected):
         return edited
-    return yaml.dump(wanted, Dumper=_Dumper, sort_keys=False, allow_unicode=True,
+    return yaml.dump(expected, Dumper=_Dumper, sort_keys=False, allow_unicode=True,
                      default_flow_style=None, width=100)  # fmt: skip
 
 
@@ -97,18 +94,18 @@ def _rebase(data: dict[str, Any], keys: tuple[str, ...], old: Path, new: Path) -
     for key in parents:
         section = section.get(key) if isinstance(section, dict) else None
     if isinstance(section, dict) and isinstance(section.get(last), str):
-        given = Path(section[last])
-        if not given.is_absolute():
-            section[last] = os.path.relpath(old.resolve() / given, new.resolve())
+        path = Path(section[last])
+        if not path.is_absolute():
+            section[last] = os.path.relpath(old.resolve() / path, new.resolve())
 
 
-def _edited(document: Document, wanted: dict[str, Any], changes: dict[str, Any]) -> str | None:
-    """Return the user's text with values replaced, or None where its style forbids it."""
+def _edited(document: Document, expected: dict[str, Any], changes: dict[str, Any]) -> str | None:
+    """Return the user's text with values replaced, or None for a top level in flow style."""
     if document.root.flow_style:
         return None
     edits: list[tuple[int, int, str]] = []
     for keys in PATHS:
-        node, value = document.node(keys), _value(wanted, keys)
+        node, value = document.node(keys), _value(expected, keys)
         if isinstance(node, yaml.ScalarNode) and isinstance(value, str) and value != node.value:
             scalar = yaml.safe_dump(value, width=10**6).split("\n")[0]
             edits.append((node.start_mark.index, node.end_mark.index, scalar))
@@ -134,7 +131,7 @@ def _value(data: dict[str, Any], keys: tuple[str, ...]) -> Any:
 
 
 def _end(node: yaml.Node) -> int:
-    """Return where a value ends; a block's own mark lies after the comments that follow it."""
+    """Return the index after a value; the end mark of a block includes comments after it."""
     if isinstance(node, yaml.CollectionNode) and not node.flow_style and node.value:
         last = node.value[-1]
         return _end(last[1] if isinstance(last, tuple) else last)
@@ -165,8 +162,8 @@ def _flow(value: Any) -> str:
     return number_text(value) if isinstance(value, float) else str(value)
 
 
-def _reads_as(text: str, path: Path, wanted: dict[str, Any]) -> bool:
+def _reads_as(text: str, path: Path, expected: dict[str, Any]) -> bool:
     try:
-        return parse(text, path).data == wanted
+        return parse(text, path).data == expected
     except CellError:
         return False

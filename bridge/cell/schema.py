@@ -1,4 +1,4 @@
-"""The cell file's keys, and what may stand there."""
+"""The keys of the cell file, with their types, units and bounds."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class DhRow(Section):
 
 
 class Calibration(Section):
-    """A UR arm's factory calibration: what is added to its DH rows."""
+    """A UR arm's factory calibration: deltas added to its DH rows."""
 
     delta_theta: list[Number] | None = Field(default=None, description="rad per joint")
     delta_a: list[Number] | None = Field(default=None, description="m per joint")
@@ -50,7 +50,7 @@ class Robot(Section):
     dh: list[DhRow] | None = Field(default=None, description="standard DH rows")
     tip: str | None = Field(default=None, description="the URDF link that is the flange")
     rated_payload: Annotated[Number, Field(gt=0)] | None = Field(
-        default=None, description="kg, of urdf and dh; of model it is known"
+        default=None, description="kg, for urdf and dh; known for model"
     )
     calibration: Calibration | str | None = Field(
         default=None, description="UR's delta_* values, or its calibration.conf"
@@ -58,7 +58,7 @@ class Robot(Section):
 
 
 class Frame(Section):
-    """A frame in another one."""
+    """The pose of a frame in its parent frame."""
 
     xyz: Vector3 = Field(default=[0.0, 0.0, 0.0], description="m")
     rpy: Vector3 = Field(default=[0.0, 0.0, 0.0], description="rad, roll pitch yaw as in URDF")
@@ -71,7 +71,7 @@ class Tool(Section):
 
 
 class Payload(Section):
-    """What the tool carries, the tool's own weight included."""
+    """The load on the flange, the mass of the tool included."""
 
     mass: NotNegative = Field(default=0.0, description="kg")
     cog: Vector3 = Field(default=[0.0, 0.0, 0.0], description="m, in the flange frame")
@@ -91,7 +91,7 @@ class EffectEntry(Section):
     joint: int | None = Field(default=None, strict=True, description="from 1")
     order: Number | None = Field(default=None, description="cycles per turn of the joint")
     parameters: dict[str, Number] = Field(default={}, description="name: value")
-    stand_in: bool = Field(default=False, strict=True, description="useful, but not proved")
+    stand_in: bool = Field(default=False, strict=True, description="effective, not proved")
 
 
 class MetrologyEntry(Section):
@@ -103,25 +103,25 @@ class MetrologyEntry(Section):
 
 
 class Simulation(Section):
-    """What ``simulate`` and the bench put behind the protocol: a plant drawn from the seed."""
+    """The plant of ``simulate`` and the bench, drawn from the seed."""
 
     seed: int = Field(default=0, ge=0, strict=True, description="of the plant and all noise")
     host: str | None = Field(default=None, description="loopback address; default: link.host")
-    start_q: list[Number] | None = Field(default=None, description="rad, where the arm starts")
+    start_q: list[Number] | None = Field(default=None, description="rad, initial joint angles")
     payload: Payload | None = Field(
-        default=None, description="what really hangs on the flange; default: payload"
+        default=None, description="true load on the flange; default: payload"
     )
     compliance: Compliance | None = Field(
         default=None, description="true flexibilities, rad/Nm; default: drawn from the seed"
     )
     droop: list[NotNegative] | None = Field(
-        default=None, description="rad/Nm per joint by which servos give way; default: none"
+        default=None, description="rad/Nm per joint, compliance of the servos; default: none"
     )
     zero: list[Number] | None = Field(
-        default=None, description="rad per joint beyond what its encoder says; default: none"
+        default=None, description="rad per joint, true angle - encoder; default: none"
     )
     tool_shift: Vector3 | None = Field(
-        default=None, description="m, flange axes: where the TCP is beyond tool.tcp; default: 0"
+        default=None, description="m, flange axes: true TCP - tool.tcp; default: 0"
     )
     tracker_noise: NotNegative | None = Field(default=None, description="m, 1 sigma")
     rtde_port: int | None = Field(default=None, gt=0, lt=65536, strict=True)
@@ -132,7 +132,7 @@ class Simulation(Section):
 
 
 class SourceFile(Section):
-    """A file that a result was made from."""
+    """An input file of a result."""
 
     role: str = Field(description="log, cell or sim")
     name: str = Field(description="without its folder")
@@ -140,7 +140,7 @@ class SourceFile(Section):
 
 
 class CauseParameter(Section):
-    """A number of a cause, as the diagnosis gave it."""
+    """A parameter of a cause, as the diagnosis estimated it."""
 
     name: str
     value: Number
@@ -149,7 +149,7 @@ class CauseParameter(Section):
 
 
 class CauseEntry(Section):
-    """A cause that the diagnosis named, and what it could not distinguish from it."""
+    """A cause that the diagnosis named, and the effects indistinguishable from it."""
 
     effect: str
     joints: list[int] = Field(default=[])
@@ -159,7 +159,7 @@ class CauseEntry(Section):
 
 
 class Provenance(Section):
-    """Where the model in this cell comes from, as fit, calibrate and --apply write it."""
+    """Origin of the model in this cell, as fit, calibrate and --apply write it."""
 
     version: str = Field(default="", description="of Gapbridge")
     time: str = Field(default="", description="when it was written, UTC")
@@ -167,19 +167,19 @@ class Provenance(Section):
     arguments: dict[str, Any] = Field(default={}, description="of the command")
     files: list[SourceFile] = Field(default=[])
     fitted: dict[str, tuple[Number, Number]] = Field(
-        default={}, description="least and largest value of each column that was fitted on"
+        default={}, description="minimum and maximum of each log column in the data of the fit"
     )
     intervals: dict[str, tuple[Number, Number]] = Field(
-        default={}, description="95 % interval of each number that was applied, SI"
+        default={}, description="95 % interval of each fitted or applied parameter, SI"
     )
-    parameters: list[str] = Field(default=[], description="that were fitted, by name")
+    parameters: list[str] = Field(default=[], description="names of the fitted parameters")
     covariance: list[list[Number]] = Field(
-        default=[], description="of those parameters, SI: one row and column each"
+        default=[], description="of those parameters, SI: a row and a column each"
     )
     causes: list[CauseEntry] = Field(default=[], description="named by a diagnosis, with its ties")
 
     @model_validator(mode="after")
-    def _square(self) -> Provenance:
+    def _covariance_is_square(self) -> Provenance:
         size = len(self.parameters)
         if [len(row) for row in self.covariance] != [size] * size:
             raise ValueError(f"expected {size} rows of {size} numbers, one for each of parameters")
@@ -199,7 +199,7 @@ class CellFile(Section):
     metrology: MetrologyEntry = MetrologyEntry()
     link: LinkSettings | None = Field(default=None, description="driver, host, ...")
     ft_sensor: AnyFtSensor | None = Field(
-        default=None, description="driver, sensor_in_flange, ...: a sensor with a link of its own"
+        default=None, description="driver, sensor_in_flange, ...: a separately connected sensor"
     )
     limits: LimitSettings = LimitSettings()
     setpoints: SetpointSettings = SetpointSettings()
@@ -211,5 +211,5 @@ class CellFile(Section):
     )
     simulation: Simulation = Simulation()
     provenance: Provenance | None = Field(
-        default=None, description="where the model comes from; written by the commands"
+        default=None, description="origin of the model; written by the commands"
     )

@@ -1,6 +1,6 @@
-"""Sections of the cell file that the daemon runs by: link, limits, setpoints, recording.
+"""Sections of the cell file that the daemon uses: link, limits, setpoints, recording.
 
-Small pydantic models without a robot library behind them, so that a cell is read without one.
+These pydantic models import no robot library: a cell can be read without one.
 """
 
 from __future__ import annotations
@@ -8,13 +8,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import (
-    Discriminator,
-    Field,
-    Tag,
-    field_validator,
-    model_validator,
-)
+from pydantic import Discriminator, Field, Tag, field_validator, model_validator
 
 from gapbridge.bridge.cell.settings.recording import RecordingSettings as RecordingSettings
 from gapbridge.drivers.addresses import is_loopback
@@ -47,7 +41,7 @@ LinkSettings = Annotated[
 
 
 class LimitSettings(Section):
-    """Section ``limits``: what no setpoint passes, whatever computed it."""
+    """Section ``limits``: bounds of every setpoint, whatever computed it."""
 
     offset: float = Field(0.010, gt=0.0, le=0.1, description="longest TCP offset, m")
     offset_rotation: float = Field(0.02, gt=0.0, le=0.5, description="largest TCP rotation, rad")
@@ -66,16 +60,16 @@ class LimitSettings(Section):
         0.0, ge=0.0, description="distance kept from the arm's joint limits, rad"
     )
     following: float = Field(
-        0.1, gt=0.0, le=0.5, description="farthest a command may be from the actual joint, rad"
+        0.1, gt=0.0, le=0.5, description="largest distance of a command from the actual joint, rad"
     )
     zero_slip: float = Field(
         0.003,
         ge=0.0,
         le=0.1,
-        description="smallest slip of a joint's zero that `run` holds for, rad; 0: not watched",
+        description="slip of a joint's zero at which `run` holds, rad; 0: not watched",
     )
     ramp_time: float = Field(
-        0.5, gt=0.0, le=10.0, description="s in which offsets ramp in and out at least"
+        0.5, gt=0.0, le=10.0, description="shortest time in which offsets ramp in and out, s"
     )
 
 
@@ -100,7 +94,7 @@ class SetpointSettings(Section):
         description="planner, tcp, modbus: s without a setpoint after which the source is dry",
     )
     start_tolerance: float = Field(
-        0.02, gt=0.0, le=0.2, description="farthest the first setpoint may be from the arm, rad"
+        0.02, gt=0.0, le=0.2, description="largest distance of the first setpoint from the arm, rad"
     )
     use_force: bool = Field(True, description="whether the measured TCP force bends the model")
     force_filter: float = Field(
@@ -110,14 +104,14 @@ class SetpointSettings(Section):
     @field_validator("host")
     @classmethod
     def _loopback(cls, value: str) -> str:
-        """Refuse to listen where others could reach it: anyone who can write here moves the arm."""
+        """Refuse addresses that other hosts can reach: whoever writes there moves the arm."""
         if not is_loopback(value):
             raise ValueError("expected a loopback address (127.x.x.x, ::1)")
         return value
 
     @model_validator(mode="after")
     def _tcp_is_guarded(self) -> Self:
-        """Refuse a TCP port that anything on this machine, web pages too, could write to."""
+        """Refuse a TCP port without a token: any local program or web page could write to it."""
         if self.source == "tcp" and self.token_file is None:
             raise ValueError(
                 "setpoints.token_file: found nothing with source: tcp, expected a file of mode "

@@ -1,6 +1,6 @@
-"""The simulated controller of a cell: same arm and tool, hidden flexibilities of its own.
+"""The simulated controller of a cell: same arm and tool, other (hidden) flexibilities.
 
-A UR controller has a server of its own; any other protocol: servers around an ArmController.
+UR controllers have one server; other protocols are served around an ArmController.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from gapbridge.drivers.simulated.ur.settings import (
 
 HOST = "127.0.0.2"
 PORTS = ("rtde_port", "dashboard_port", "script_port", "bench_port", "primary_port")
-PERIOD = 0.004  # s, of an ArmController's cycle
+PERIOD = 0.004  # s, cycle of an ArmController
 
 SIMULATORS: dict[str, str] = {
     "can": "gapbridge.drivers.simulated.can.server:make_servers",
@@ -43,7 +43,7 @@ SIMULATORS: dict[str, str] = {
 
 
 class ServedController(NamedTuple):
-    """A cell's controller, not yet served."""
+    """The controller of a cell with its servers, not started."""
 
     controller: ArmController
     servers: list[ProtocolServer]
@@ -56,23 +56,25 @@ def serve_cell(
     host: str | None,
     seed: int | None,
     stop: Callable[[], bool],
-    say: Callable[[str], None],
+    emit: Callable[[str], None],
 ) -> None:
     """Serve the simulated controller of a cell until ``stop()`` is true.
 
-    ``say`` is called with where it listens. Raises CellError where the cell cannot be simulated,
-    LinkError where a port is taken.
+    ``emit`` is called with the addresses it listens on. Raises CellError if the cell cannot be
+    simulated, LinkError if a port is in use.
     """
     link = cell.link
     if link is not None and link.driver in SIMULATORS:
-        found = served_controller(cell, link, host, seed)
-        names = ", ".join(server.name for server in found.servers)
-        say(f"{cell.arm.name} at {found.host}: {names}, bench {found.bench_port}")
-        with served_sensor(cell.ft_sensor, lambda: found.controller.raw_wrench, link):
-            serve_controller(found.controller, found.servers, found.host, found.bench_port, stop)
+        served = served_controller(cell, link, host, seed)
+        names = ", ".join(server.name for server in served.servers)
+        emit(f"{cell.arm.name} at {served.host}: {names}, bench {served.bench_port}")
+        with served_sensor(cell.ft_sensor, lambda: served.controller.raw_wrench, link):
+            serve_controller(
+                served.controller, served.servers, served.host, served.bench_port, stop
+            )
         return
     settings = server_settings(cell, host, seed)
-    say(
+    emit(
         f"{settings.arm.name} at {settings.host}: RTDE {settings.rtde_port}, dashboard "
         f"{settings.dashboard_port}, primary {settings.primary_port}, scripts "
         f"{settings.script_port}, bench {settings.bench_port}"
@@ -83,16 +85,13 @@ def serve_cell(
 def served_controller(
     cell: Cell, link: DriverSettings, host: str | None = None, seed: int | None = None
 ) -> ServedController:
-    """Return the controller and the servers of a cell whose link is no UR controller's.
+    """Return the controller and the servers of a cell whose driver is not ur_rtde.
 
-    Its plant is drawn as ``server_settings`` says. Raises CellError.
+    For its plant see ``server_settings``. Raises CellError.
     """
     simulation, address = cell.file.simulation, _address(cell, host)
     arm, plant, start = simulated_arm(
-        cell.arm,
-        simulation.seed if seed is None else seed,
-        simulation.start_q,
-        **_plant(cell),
+        cell.arm, simulation.seed if seed is None else seed, simulation.start_q, **_plant(cell)
     )
     controller = make_controller(arm, plant, start, PERIOD)
     make_servers = resolve_name(SIMULATORS[str(getattr(link, "driver", ""))])
@@ -116,11 +115,11 @@ def server_settings(cell: Cell, host: str | None = None, seed: int | None = None
     """Return the server of a cell's simulated controller.
 
     Its plant has the cell's arm, tool, payload and gravity; its flexibilities are drawn from the
-    seed unless ``simulation.compliance`` gives them. The cell's own compliance and effects are what
-    is believed of it, so they play no part. Raises CellError where the cell cannot be simulated.
+    seed unless ``simulation.compliance`` sets them. Compliance and effects of the cell's model are
+    estimates and not part of the plant. Raises CellError if the cell cannot be simulated.
     """
     simulation, address = cell.file.simulation, _address(cell, host)
-    chosen = {name: getattr(simulation, name) for name in PORTS}
+    ports = {name: getattr(simulation, name) for name in PORTS}
     settings = simulated_cell(
         cell.arm,
         address,
@@ -133,8 +132,8 @@ def server_settings(cell: Cell, host: str | None = None, seed: int | None = None
         deltas = calibration_of(robot.calibration, cell.path.parent)
         settings = replace(settings, calibrated=announced_rows(robot.model, deltas))
     else:
-        settings = replace(settings, nominal=(), calibrated=())  # what no controller announces
-    return replace(settings, **{name: port for name, port in chosen.items() if port is not None})
+        settings = replace(settings, nominal=(), calibrated=())  # a UR reports built-in arms only
+    return replace(settings, **{name: port for name, port in ports.items() if port is not None})
 
 
 def _plant(cell: Cell) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""A side process takes a changed cell file, once the daemon reports that it has taken it."""
+"""Settings of a side process, updated when the daemon has loaded a changed cell file."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from gapbridge.bridge.cell.daemon_settings import DaemonSettings
 from gapbridge.bridge.cell.run_settings import read_configuration
 from gapbridge.core.errors import GapbridgeError
 
-KEPT = ("web", "metrics", "recording", "model_source")  # belongs to this run's processes
+FIXED_KEYS = ("web", "metrics", "recording", "model_source")  # until the daemon restarts
 
 
 class UpdatedSettings:
-    """The settings that a run has by now, from those that it began with.
+    """The current settings of a run.
 
-    ``text`` is the cell file that those were read from. The daemon's status reports a later file to
-    a process that was started anew.
+    ``text`` is the cell file from which the initial settings were read. A restarted side process
+    learns of a later file from the daemon's status.
     """
 
     def __init__(self, settings: DaemonSettings, text: str | None) -> None:
@@ -24,7 +24,7 @@ class UpdatedSettings:
         self._hash = None if text is None else hashlib.sha256(text.encode()).hexdigest()
 
     def on_event(self, event: dict[str, Any]) -> bool:
-        """Take note of an event; returns whether the settings are others now."""
+        """Handle an event of the daemon; returns whether the settings changed."""
         if event.get("kind") == "configuration" and event.get("ok"):
             reported = event.get("hash")
         elif event.get("kind") == "status":
@@ -37,13 +37,13 @@ class UpdatedSettings:
         return not (first and event["kind"] == "status") and self._read(str(reported))
 
     def _read(self, reported: str) -> bool:
-        """Read the file; one that has changed again meanwhile does not count."""
+        """Read the file; returns False if it is invalid or has changed again."""
         try:
-            found = read_configuration(self.settings.cell)
+            configuration = read_configuration(self.settings.cell)
         except GapbridgeError:
             return False
-        if found.hash != reported:
+        if configuration.hash != reported:
             return False
-        kept = {name: getattr(self.settings, name) for name in KEPT}
-        self.settings = found.settings.model_copy(update=kept)
+        fixed = {name: getattr(self.settings, name) for name in FIXED_KEYS}
+        self.settings = configuration.settings.model_copy(update=fixed)
         return True

@@ -1,4 +1,4 @@
-"""The entry point: commands loaded on use, one line for every failure, three exit codes."""
+"""The entry point: lazily imported commands, one-line errors, three exit codes."""
 
 from __future__ import annotations
 
@@ -13,26 +13,26 @@ from typing import NoReturn
 
 import click
 
-from gapbridge.bridge.cli.progress import Compiling
+from gapbridge.bridge.cli.progress import CompileProgress
 from gapbridge.bridge.cli.table import COMMANDS
 from gapbridge.core.errors import GapbridgeError
 from gapbridge.core.kernels import compiling
 
-WAIT = 0.02  # s until it is looked at again
-SUCCESS, FAILURE, UNUSABLE = 0, 1, 2
+INTERRUPT_RETRY = 0.02  # s until an interrupt inside LLVM is tried again
+SUCCESS, FAILURE, UNUSABLE_INPUT = 0, 1, 2
 
 
 class CommandTable(click.Group):
-    """A group whose commands are imported when they are called, so that help is quick."""
+    """A group whose commands are imported on use, which keeps ``--help`` fast."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         """Return the names in the order of the table."""
         return list(COMMANDS)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        """Return a command, imported now.
+        """Import and return a command.
 
-        Nothing of an import is garbage: looking through it again and again costs 0.2 s.
+        Garbage collection is off meanwhile: it would take 0.2 s and free nothing.
         """
         if cmd_name not in COMMANDS:
             return None
@@ -50,7 +50,7 @@ class CommandTable(click.Group):
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        """Return the command that is meant; an unknown one is reported with the nearest known."""
+        """Return the named command; an unknown name is reported with the most similar one."""
         if args and args[0] not in COMMANDS and not args[0].startswith("-"):
             import difflib
 
@@ -60,23 +60,23 @@ class CommandTable(click.Group):
         return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Write the table, without importing any command."""
+        """Write the list of commands without importing them."""
         with formatter.section("Commands"):
             formatter.write_dl([(name, line) for name, (_, line) in COMMANDS.items()])
 
 
-def _print_version(ctx: click.Context, _: click.Parameter, wanted: bool) -> None:
-    """Print the version and leave."""
-    if not wanted or ctx.resilient_parsing:
+def _print_version(ctx: click.Context, _: click.Parameter, requested: bool) -> None:
+    """Print the version and exit."""
+    if not requested or ctx.resilient_parsing:
         return
-    # a fifth of what --help takes, and only needed here
+    # imported here: a fifth of the time of --help
     from importlib.metadata import PackageNotFoundError, version
 
     try:
-        found = version("gapbridge")
+        installed = version("gapbridge")
     except PackageNotFoundError:
-        found = "not installed"
-    click.echo(f"gapbridge, version {found}")
+        installed = "not installed"
+    click.echo(f"gapbridge, version {installed}")
     ctx.exit()
 
 
@@ -99,34 +99,34 @@ def gapbridge() -> None:
 
 
 def main(arguments: list[str] | None = None) -> NoReturn:
-    """Run the command line and leave with its exit code; never shows a traceback."""
-    heed_interrupts()
+    """Run the command line and exit with its code; never shows a traceback."""
+    install_interrupt_handler()
     code = _run(sys.argv[1:] if arguments is None else arguments)
-    gc.freeze()  # else Python's last collection, of all compiled code, costs 0.1 s
+    gc.freeze()  # saves the final garbage collection, 0.1 s
     sys.exit(code)
 
 
 def _run(arguments: list[str]) -> int:
-    compiling.listeners[:] = [Compiling()]
+    compiling.listeners[:] = [CompileProgress()]
     try:
         result = gapbridge.main(args=arguments, prog_name="gapbridge", standalone_mode=False)
         sys.stdout.flush()
-    except click.exceptions.Exit as leaving:
-        return leaving.exit_code
+    except click.exceptions.Exit as error:
+        return error.exit_code
     except click.exceptions.NoArgsIsHelpError as error:
         click.echo(error.format_message(), err=True)
-        return UNUSABLE
+        return UNUSABLE_INPUT
     except click.UsageError as error:
         command = error.ctx.command_path if error.ctx else "gapbridge"
-        return _fail(f"{error.format_message()} (see {command} --help)", UNUSABLE)
+        return _fail(f"{error.format_message()} (see {command} --help)", UNUSABLE_INPUT)
     except click.ClickException as error:
-        return _fail(error.format_message(), UNUSABLE)
+        return _fail(error.format_message(), UNUSABLE_INPUT)
     except (KeyboardInterrupt, click.Abort):
         return _fail("interrupted", FAILURE)
     except GapbridgeError as error:
         return _fail(str(error), error.exit_code)
     except BrokenPipeError:
-        # whoever read our output has left; a closed stdout must not complain at exit either
+        # the reader of stdout is gone; flushing stdout at exit must not fail either
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return FAILURE
     except Exception as error:
@@ -140,8 +140,8 @@ def _fail(text: str, code: int) -> int:
 
 
 def _crash(error: Exception) -> int:
-    """Report an unforeseen failure in one line; its traceback goes to a file."""
-    import tempfile  # a twentieth of what --help takes
+    """Report an unexpected error in one line; its traceback is written to a file."""
+    import tempfile  # a twentieth of the time of --help
     import traceback
 
     with tempfile.NamedTemporaryFile(
@@ -153,23 +153,23 @@ def _crash(error: Exception) -> int:
     return _fail(f"{type(error).__name__}: {what} (details: {file.name})", FAILURE)
 
 
-def heed_interrupts() -> None:
-    """Have Ctrl-C end the command, but never inside LLVM; where it is ignored it stays so.
+def install_interrupt_handler() -> None:
+    """Let Ctrl-C end the command, but never inside LLVM; an ignored SIGINT stays ignored.
 
-    LLVM calls Python back while it loads a function. An interrupt there is shown as a traceback and
-    lost, or what was half loaded crashes the process, which leaves half a file behind.
+    LLVM calls Python back while it loads a function. An exception there is printed and lost, or the
+    half-loaded code crashes the process, which leaves an incomplete file.
     """
-    ours = signal.getsignal(signal.SIGINT) is signal.default_int_handler
-    if ours and threading.current_thread() is threading.main_thread():
+    is_default = signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    if is_default and threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGINT, _interrupted)
 
 
 def _interrupted(number: int, frame: FrameType | None) -> None:
     if not _in_llvm(frame):
         raise KeyboardInterrupt
-    again = threading.Timer(WAIT, os.kill, (os.getpid(), number))
-    again.daemon = True
-    again.start()
+    retry = threading.Timer(INTERRUPT_RETRY, os.kill, (os.getpid(), number))
+    retry.daemon = True
+    retry.start()
 
 
 def _in_llvm(frame: FrameType | None) -> bool:

@@ -1,6 +1,6 @@
-"""What several commands share: arguments, and how a log is read for a cell.
+"""Arguments that several commands share, and opening of cells and logs.
 
-What reads cells and logs is imported when it is called: ``status`` and ``--help`` read none.
+Readers of cells and logs are imported on use: ``status`` and ``--help`` need none.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ csv_option = click.option(
     "--out",
     required=True,
     type=FILE,
-    help="The file to write: CSV, or Parquet where it ends in .parquet.",
+    help="The file to write: CSV, or Parquet if it ends in .parquet.",
 )
 
 
@@ -44,9 +44,9 @@ def open_cell(path: Path) -> Cell:
 
 
 def open_logs(paths: Sequence[Path], cell: Cell) -> Log:
-    """Return one log, or several as the sessions of one; so is one with a column ``session``.
+    """Return several logs as the sessions of one; a single log is returned as it is.
 
-    Raises LogError as ``open_log`` does, and where the sessions do not belong together.
+    Raises LogError as ``open_log`` does, and if the sessions are inconsistent.
     """
     from gapbridge.bridge.cell.opened_log import open_log
     from gapbridge.core.sessions import join_sessions
@@ -55,23 +55,23 @@ def open_logs(paths: Sequence[Path], cell: Cell) -> Log:
 
 
 def warn_outside(log: Log, cell: Cell) -> None:
-    """Print a warning where a log's poses, loads or temperatures lie outside what was fitted.
+    """Print a warning if poses, loads or temperatures of a log are outside the data of the fit.
 
-    What was fitted stands in the cell's ``provenance``; cells without one give no warning.
+    Their range is in the cell's ``provenance``; without it there is no warning.
     """
-    for _ in looked_over([log], cell):
+    for _ in with_range_warning([log], cell):
         pass
 
 
-def looked_over(pieces: Iterable[Log], cell: Cell) -> Iterator[Log]:
-    """Yield the pieces of a log, then print what ``warn_outside`` does of all of them."""
+def with_range_warning(pieces: Iterable[Log], cell: Cell) -> Iterator[Log]:
+    """Yield the pieces of a log, then print the warnings of ``warn_outside`` for all of them."""
     from gapbridge.bridge.document.log_findings import log_finding_text
     from gapbridge.core.fitted_range import Outside
 
-    found, path = Outside(cell.fitted_range), ""
+    outside, path = Outside(cell.fitted_range), ""
     for piece in pieces:
-        found.add(piece)
+        outside.add(piece)
         path = piece.path
         yield piece
-    for finding in found.findings():
+    for finding in outside.findings():
         click.echo(f"warning: {path}: {log_finding_text(finding)}", err=True)

@@ -1,4 +1,4 @@
-"""Progress on stderr, when a person looks on."""
+"""Progress on stderr, if it is a terminal."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from collections.abc import Callable, Iterator
 from gapbridge.core.kernels.compiling import ABOUT
 from gapbridge.drivers.clock import SYSTEM
 
-AGAIN = 10.0  # s between two words on compiling
+REPORT_PERIOD = 10.0  # s between two lines on compiling
 
 
 @contextlib.contextmanager
 def progress(label: str, total: int | None = None) -> Iterator[Callable[[int], None]]:
-    """Give a function that advances a bar; silent where stderr is no terminal."""
+    """Yield a function that advances a progress bar; it does nothing without a terminal."""
     if not sys.stderr.isatty():
         yield lambda count: None
         return
@@ -28,33 +28,33 @@ def progress(label: str, total: int | None = None) -> Iterator[Callable[[int], N
 
 @contextlib.contextmanager
 def status(label: str) -> Iterator[Callable[[str], None]]:
-    """Give a function that reports what is being done; silent where stderr is no terminal."""
+    """Yield a function that shows the current step; it does nothing without a terminal."""
     if not sys.stderr.isatty():
         yield lambda text: None
         return
     from rich.console import Console
-    from rich.text import Text  # as it stands: ":wrench:" is no picture here
+    from rich.text import Text  # plain: ":wrench:" would become an emoji
 
-    with Console(stderr=True).status(label) as shown:
-        yield lambda text: shown.update(Text(f"{label}: {text}"))
+    with Console(stderr=True).status(label) as spinner:
+        yield lambda text: spinner.update(Text(f"{label}: {text}"))
 
 
-class Compiling:
-    """Says on stderr that functions are compiled, at once and then now and again."""
+class CompileProgress:
+    """Reports on stderr that functions are compiled, at once and every REPORT_PERIOD."""
 
     def __init__(self, clock: Callable[[], float] = SYSTEM.monotonic) -> None:
         self._clock = clock
-        self._begun: float | None = None  # s
-        self._next = 0.0  # s: when it says so again
+        self._start: float | None = None  # s
+        self._next = 0.0  # s: time of the next line
 
     def __call__(self, functions: int) -> None:
-        """Take note that so many functions have begun."""
+        """Report the number of functions whose compilation has started."""
         now = self._clock()
-        if self._begun is None:
-            self._begun = now
+        if self._start is None:
+            self._start = now
             sys.stderr.write(f"{ABOUT}: it takes a minute or two\n")
         elif now >= self._next:
-            sys.stderr.write(f"  {functions} functions, {now - self._begun:.0f} s\n")
+            sys.stderr.write(f"  {functions} functions, {now - self._start:.0f} s\n")
         else:
             return
-        self._next = now + AGAIN
+        self._next = now + REPORT_PERIOD

@@ -1,4 +1,4 @@
-"""The table of commands: name, where it lives, its one line. A new command is one line here."""
+"""The table of commands: name, location and summary. A new command is one line here."""
 
 from __future__ import annotations
 

@@ -11,7 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
-from gapbridge.bridge.cell.cell import complaints
+from gapbridge.bridge.cell.cell import cell_errors
 from gapbridge.bridge.cell.run_settings import Configuration, read_configuration
 from gapbridge.bridge.daemon.service_manager import ServiceManager
 from gapbridge.bridge.ipc.events import EventKind, EventLog
@@ -117,6 +117,6 @@ def _compatible(new: Configuration, running: Configuration) -> Configuration:
 def _messages(cell: Path, error: GapbridgeError) -> list[str]:
     """Return everything that is wrong with a cell file, where it is more than one thing."""
     try:
-        return complaints(cell) or [str(error)]
+        return cell_errors(cell) or [str(error)]
     except GapbridgeError:
         return [str(error)]

@@ -1,1 +1,1 @@
-"""Many arms, many sessions: fleets."""
+"""Diagnosis and fit of fleets: many arms, many sessions."""

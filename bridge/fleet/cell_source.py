@@ -1,4 +1,4 @@
-"""Which cell a session belongs to: one for all, one beside each log, or a table."""
+"""The cell of each session: one for all, one near each log, or from a table."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from gapbridge.bridge.fleet.session import Session
 from gapbridge.core.errors import CellError, InputError
 
 BESIDE = "beside"
-NAMES = ("cell.yaml", "cell.yml")
+CELL_NAMES = ("cell.yaml", "cell.yml")
 
 
 class CellSource(ABC):
-    """Says which cell file a session belongs to."""
+    """Finds the cell file of a session."""
 
     @abstractmethod
     def cell_of(self, session: Session) -> Path:
-        """Return the session's cell file; raises InputError where it has none."""
+        """Return the session's cell file; raises InputError if it has none."""
 
     def warnings(self) -> tuple[str, ...]:
-        """Return what is to be reported before the work begins."""
+        """Return warnings to report before the run."""
         return ()
 
 
@@ -38,30 +38,30 @@ class OneCell(CellSource):
         return self.path
 
     def warnings(self) -> tuple[str, ...]:
-        """Return the cell's own warnings; raises CellError where it cannot be used."""
+        """Return the warnings of the cell; raises CellError if it cannot be used."""
         return load_cell(self.path).warnings
 
 
 @dataclass(frozen=True)
-class CellBeside(CellSource):
-    """A cell beside each log: named like it, or ``cell.yaml`` there or in a folder above."""
+class CellNearLog(CellSource):
+    """A cell near each log: named like it, or ``cell.yaml`` in its folder or one above."""
 
-    folder: Path  # of the fleet: no cell above it is looked at
+    folder: Path  # of the fleet, the topmost one searched
 
     def cell_of(self, session: Session) -> Path:
         """Return the nearest cell."""
-        own = [session.log.with_suffix(suffix) for suffix in (".yaml", ".yml")]
+        candidates = [session.log.with_suffix(suffix) for suffix in (".yaml", ".yml")]
         top = self.folder.absolute()
         for place in session.log.absolute().parents:
-            own += [place / name for name in NAMES]
+            candidates += [place / name for name in CELL_NAMES]
             if place == top:
                 break
-        for path in own:
+        for path in candidates:
             if path.is_file():
                 return path
         raise CellError(
-            f"{session.log}: found no cell beside it, expected {own[0].name} or cell.yaml there, "
-            f"or cell.yaml in a folder above up to {self.folder}"
+            f"{session.log}: found no cell beside it, expected {candidates[0].name} or cell.yaml "
+            f"there, or cell.yaml in a folder above up to {self.folder}"
         )
 
 
@@ -83,12 +83,12 @@ class CellTable(CellSource):
 
 
 def cell_source(text: str, folder: Path) -> CellSource:
-    """Return what ``--cell`` says: a cell file, a table (.csv), or the word ``beside``.
+    """Return the source that ``--cell`` names: a cell file, a table (.csv) or ``beside``.
 
-    Raises InputError where it is none of them, or the table cannot be used.
+    Raises InputError if the table cannot be used.
     """
     if text == BESIDE:
-        return CellBeside(folder)
+        return CellNearLog(folder)
     path = Path(text)
     return _table(path) if path.suffix.lower() == ".csv" else OneCell(path)
 

@@ -1,4 +1,4 @@
-"""What a fleet's sessions say together of compliance: the hierarchical fit of each type."""
+"""The hierarchical compliance fit of each arm type of a fleet."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import norm
 
-from gapbridge.bridge.fleet.drift import ChannelFigure, Drift, Figure, Outlier, believed
+from gapbridge.bridge.fleet.drift import ChannelFigure, Drift, Figure, Outlier, significant
 from gapbridge.bridge.fleet.task import Outcome, by_arm
 from gapbridge.core.arrays import Array
 from gapbridge.core.effects import flexibility_names
@@ -18,8 +18,8 @@ from gapbridge.core.estimation.hierarchical import ArmFit, Scatter, SessionFit, 
 from gapbridge.core.estimation.hierarchical_evidence import Evidence
 
 UNIT = "rad/Nm"
-UNLIKE = 3.5  # deviations of what arms of a type scatter, from which on an arm is reported
-SURPRISING = 3.0  # times the usual noise, in variance
+ARM_OUTLIER = 3.5  # scatters between arms of a type
+SESSION_OUTLIER = 3.0  # variance / variance of the noise
 
 
 @dataclass(frozen=True)
@@ -28,14 +28,14 @@ class FittedSession:
 
     outcome: Outcome
     fit: SessionFit
-    gap_before: float  # m, rms of one coordinate, with the cell's flexibilities
-    gap_after: float  # m, with the arm's
-    gap_held_out: float  # m, with the arm's as all other sessions predict it
+    gap_before: float  # m, rms per coordinate, with the flexibilities of the cell
+    gap_after: float  # m, with the fitted flexibilities of the arm
+    gap_held_out: float  # m, with those fitted to all other sessions
 
 
 @dataclass(frozen=True)
 class FittedArm:
-    """One arm in the fit; its sessions in their order."""
+    """One arm in the fit, its sessions sorted."""
 
     name: str
     fit: ArmFit
@@ -43,7 +43,7 @@ class FittedArm:
 
     @property
     def poses(self) -> int:
-        """Return how many poses of it were used."""
+        """Return the number of poses used."""
         return sum(int(s.outcome.result["evidence"]["poses"]) for s in self.sessions)
 
 
@@ -58,15 +58,15 @@ class FittedType:
 
 
 @dataclass(frozen=True)
-class Fitted:
-    """The fleet."""
+class FleetFit:
+    """The fit of a fleet."""
 
     types: tuple[FittedType, ...]
     drifts: tuple[Drift, ...]
     outliers: tuple[Outlier, ...]
 
 
-def fitted(outcomes: Sequence[Outcome]) -> Fitted:
+def fit_fleet(outcomes: Sequence[Outcome]) -> FleetFit:
     """Return the hierarchical fit of every type that has a usable session."""
     kinds: dict[tuple[str, int], dict[str, list[Outcome]]] = {}
     for arm, sessions in by_arm(outcomes).items():
@@ -74,42 +74,42 @@ def fitted(outcomes: Sequence[Outcome]) -> Fitted:
             kind = (outcome.result["type"], outcome.result["joints"])
             kinds.setdefault(kind, {}).setdefault(arm, []).append(outcome)
     types = tuple(_type(kind[0], kinds[kind]) for kind in sorted(kinds))
-    drifts = tuple(believed([d for t in types for d in _drifts(t)]))
+    drifts = tuple(significant([d for t in types for d in _drifts(t)]))
     outliers = sorted((o for t in types for o in _outliers(t)), key=lambda o: -abs(o.deviations))
-    return Fitted(types, drifts, tuple(outliers))
+    return FleetFit(types, drifts, tuple(outliers))
 
 
 def _type(name: str, arms: dict[str, list[Outcome]]) -> FittedType:
-    given = [o for sessions in arms.values() for o in sessions]
+    outcomes = [o for sessions in arms.values() for o in sessions]
     number = [i for i, sessions in enumerate(arms.values()) for _ in sessions]
-    evidence = [_evidence(o) for o in given]
-    nominal = np.median([o.result["nominal"] for o in given], axis=0)
-    fit = fit_type(evidence, number, nominal, float(given[0].result["usual"]))
+    evidence = [_evidence(o) for o in outcomes]
+    nominal = np.median([o.result["nominal"] for o in outcomes], axis=0)
+    fit = fit_type(evidence, number, nominal, float(outcomes[0].result["usual"]))
     sessions = [
         _session(o, e, fit, s, i)
-        for s, (o, e, i) in enumerate(zip(given, evidence, number, strict=True))
+        for s, (o, e, i) in enumerate(zip(outcomes, evidence, number, strict=True))
     ]
-    found, begin = [], 0
+    fitted_arms, begin = [], 0
     for i, (arm, own) in enumerate(arms.items()):
-        found.append(FittedArm(arm, fit.arms[i], tuple(sessions[begin : begin + len(own)])))
+        fitted_arms.append(FittedArm(arm, fit.arms[i], tuple(sessions[begin : begin + len(own)])))
         begin += len(own)
     names = flexibility_names(len(nominal) // 2)
-    return FittedType(name, tuple(names), fit.scatter, tuple(found))
+    return FittedType(name, tuple(names), fit.scatter, tuple(fitted_arms))
 
 
 def _evidence(outcome: Outcome) -> Evidence:
-    given = dict(outcome.result["evidence"])
-    arrays = {k: np.array(given[k]) for k in ("matrix", "right")}
-    return Evidence(**(given | arrays))
+    fields = dict(outcome.result["evidence"])
+    arrays = {k: np.array(fields[k]) for k in ("matrix", "right")}
+    return Evidence(**(fields | arrays))
 
 
 def _session(
     outcome: Outcome, evidence: Evidence, fit: TypeFit, session: int, arm: int
 ) -> FittedSession:
     def rms(flexibility: Array) -> float:
-        left = evidence.matrix @ flexibility - evidence.right
+        residual = evidence.matrix @ flexibility - evidence.right
         rows = evidence.freedom + np.linalg.matrix_rank(evidence.matrix)
-        return math.sqrt((float(left @ left) + evidence.squares) / max(rows, 1))
+        return math.sqrt((float(residual @ residual) + evidence.squares) / max(rows, 1))
 
     one = fit.sessions[session]
     return FittedSession(
@@ -135,22 +135,22 @@ def _drifts(kind: FittedType) -> Iterator[Drift]:
 
 def _outliers(kind: FittedType) -> Iterator[Outlier]:
     for arm in kind.arms:
-        for j in np.flatnonzero((np.abs(arm.fit.beside_type) > UNLIKE) & kind.scatter.shown):
+        for j in np.flatnonzero((np.abs(arm.fit.beside_type) > ARM_OUTLIER) & kind.scatter.shown):
             yield Outlier(
                 arm.name, "", kind.parameters[j], float(arm.fit.flexibility[j]),
                 float(kind.scatter.mean[j]), UNIT, float(arm.fit.beside_type[j]),
             )  # fmt: skip
         for session in arm.sessions:
-            if session.fit.surprise > SURPRISING:
+            if session.fit.surprise > SESSION_OUTLIER:
                 yield Outlier(
                     arm.name, session.outcome.session, ChannelFigure("position", Figure.MISFIT),
                     session.gap_after, kind.scatter.noise, "m", math.sqrt(session.fit.surprise),
                 )  # fmt: skip
 
 
-def rows(found: Fitted) -> Iterator[dict[str, Any]]:
-    """Give a row per flexibility of each type, arm and session."""
-    for kind in found.types:
+def flexibility_rows(fleet: FleetFit) -> Iterator[dict[str, Any]]:
+    """Yield a row per flexibility of each type, arm and session."""
+    for kind in fleet.types:
         type_std = np.sqrt(np.diag(kind.scatter.covariance))
         for j, parameter in enumerate(kind.parameters):
             shared = {
@@ -166,7 +166,7 @@ def rows(found: Fitted) -> Iterator[dict[str, Any]]:
                 yield shared | {
                     "level": "arm", "arm": arm.name, "own_share": float(arm.fit.own[j]),
                     "scatter": float(kind.scatter.between_sessions[j]),
-                    "drift": _known(arm.fit.drift[j]), "drift_std": _known(arm.fit.drift_std[j]),
+                    "drift": _finite(arm.fit.drift[j]), "drift_std": _finite(arm.fit.drift_std[j]),
                     "drift_per": "session",
                 } | _interval(arm.fit.flexibility[j], arm.fit.std[j])  # fmt: skip
                 for session in arm.sessions:
@@ -175,24 +175,24 @@ def rows(found: Fitted) -> Iterator[dict[str, Any]]:
                     } | _interval(session.fit.flexibility[j], session.fit.std[j])  # fmt: skip
 
 
-def session_figures(found: Fitted) -> dict[str, dict[str, Any]]:
-    """Return the figures of each session by its name."""
+def session_figures(fleet: FleetFit) -> dict[str, dict[str, Any]]:
+    """Return the figures of each session, by its name."""
     return {
         s.outcome.session: {
             "outliers": s.outcome.result["evidence"]["outliers"], "noise": s.fit.noise,
             "gap_before": s.gap_before, "gap_after": s.gap_after, "gap_held_out": s.gap_held_out,
             "surprise": s.fit.surprise,
         }
-        for kind in found.types for arm in kind.arms for s in arm.sessions
+        for kind in fleet.types for arm in kind.arms for s in arm.sessions
     }  # fmt: skip
 
 
 def _interval(value: float, std: float) -> dict[str, float]:
-    """Return a value with its 95 % interval; a flexibility is not below zero."""
+    """Return a value with its 95 % interval; a flexibility is not negative."""
     return {"value": float(value), "std": float(std),
             "low": max(float(value - 1.96 * std), 0.0),
             "high": float(value + 1.96 * std)}  # fmt: skip
 
 
-def _known(value: float) -> float | None:
+def _finite(value: float) -> float | None:
     return float(value) if math.isfinite(value) else None

@@ -1,4 +1,4 @@
-"""The journal: every outcome as it comes, so that an interrupted run is taken up again."""
+"""The journal of outcomes, from which an interrupted run is resumed."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from gapbridge.bridge.document.output_file import private, sync_folder
 from gapbridge.bridge.fleet.task import Outcome
 from gapbridge.core.errors import InputError, RunError
 
-SYNC = 1.0  # s: what a crash of the machine, not of the program, may cost
+SYNC_PERIOD = 1.0  # s of outcomes that a power failure may lose
 
 
 class Journal:
-    """An append-only file of JSON lines; one run at a time writes it."""
+    """An append-only file of JSON lines with one writer at a time."""
 
     def __init__(self, path: Path, *, fresh: bool = False) -> None:
         self.path = path
@@ -38,49 +38,49 @@ class Journal:
         self._known = self._read()
 
     def __enter__(self) -> Self:
-        """Use it."""
+        """Return the journal."""
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Close it; what was added is on the disk."""
+        """Sync it to disk and close it."""
         os.fsync(self._file.fileno())
         self._file.close()
 
     def known(self, key: str) -> Outcome | None:
-        """Return the outcome under a key, of an earlier run."""
+        """Return the outcome of a task in an earlier run; None: there is none."""
         return self._known.get(key)
 
     def add(self, outcome: Outcome) -> None:
-        """Write an outcome; it outlives the program at once, the machine after a second."""
-        line = to_json(outcome.document())  # a ninth of json's time
+        """Write an outcome: flushed at once, synced to disk every SYNC_PERIOD."""
+        line = to_json(outcome.document())  # nine times faster than json
         try:
             self._file.write(line + b"\n")
             self._file.flush()
-            if time.monotonic() - self._synced > SYNC:
+            if time.monotonic() - self._synced > SYNC_PERIOD:
                 os.fsync(self._file.fileno())
                 self._synced = time.monotonic()
         except OSError as error:
             raise RunError(f"{self.path}: cannot be written: {error.strerror}") from None
 
     def _read(self) -> dict[str, Outcome]:
-        """Return what earlier runs have left; a line that was cut off is taken away."""
-        found: dict[str, Outcome] = {}
+        """Return the outcomes of earlier runs by key; an incomplete last line is removed."""
+        outcomes: dict[str, Outcome] = {}
         self._file.seek(0)
-        good = 0
+        complete = 0  # bytes
         for line in self._file:
             if not line.endswith(b"\n"):
                 break
-            good += len(line)
+            complete += len(line)
             entry = _outcome(line)
             if entry is not None:
-                found[entry.key] = entry
-        self._file.truncate(good)
-        return found
+                outcomes[entry.key] = entry
+        self._file.truncate(complete)
+        return outcomes
 
 
 def _outcome(line: bytes) -> Outcome | None:
     try:
-        given: dict[str, Any] = from_json(line)
-        return Outcome(**given)
+        fields: dict[str, Any] = from_json(line)
+        return Outcome(**fields)
     except (ValueError, TypeError):
         return None

@@ -1,7 +1,4 @@
-"""Writes what a run has found: tables, report, cells; returns the lines for the terminal.
-
-Tables are Parquet.
-"""
+"""Writes the results of a run: Parquet tables, report, cells and lines for the terminal."""
 
 from __future__ import annotations
 
@@ -16,35 +13,35 @@ import numpy as np
 
 from gapbridge.bridge.cell import load_cell, save_cell
 from gapbridge.bridge.document.output_file import replacing_bytes, write_text
-from gapbridge.bridge.fleet.diagnosis_summary import Diagnosed, diagnosed
+from gapbridge.bridge.fleet.diagnosis_summary import FleetDiagnosis, summarise
 from gapbridge.bridge.fleet.fit_summary import (
-    Fitted,
     FittedArm,
     FittedType,
-    fitted,
-    rows,
+    FleetFit,
+    fit_fleet,
+    flexibility_rows,
     session_figures,
 )
-from gapbridge.bridge.fleet.report.page import write_diagnosed_report, write_fitted_report
+from gapbridge.bridge.fleet.report.page import write_diagnosis_report, write_fit_report
 from gapbridge.bridge.fleet.report.shared_sections import quantity_title, type_title
-from gapbridge.bridge.fleet.runner import Done
-from gapbridge.bridge.fleet.session import Found
+from gapbridge.bridge.fleet.runner import FleetRun
+from gapbridge.bridge.fleet.session import Fleet
 from gapbridge.bridge.fleet.task import Outcome
 from gapbridge.bridge.report.labels import counted, effect_title, joint_list, with_unit
 from gapbridge.core.estimation.compliance_fit import flexibilities
 
-SHOWN = 8  # lines of a kind on the terminal; all are in the tables
-TABLE = "cells.csv"
-RESULTS, SESSIONS = "results.parquet", "sessions.parquet"
+SHOWN = 8  # lines of each kind on the terminal
+CELL_TABLE = "cells.csv"
+RESULTS_FILE, SESSIONS_FILE = "results.parquet", "sessions.parquet"
 CHANNELS = ("position", "wrench", "tracking", "torque")
-FIGURES = {"gap_rms": "float64", "gap_max": "float64", "noise_floor_rms": "float64",
+FIGURE_COLUMNS = {"gap_rms": "float64", "gap_max": "float64", "noise_floor_rms": "float64",
            "remaining_rms": "float64", "remaining_rms_held_out": "float64"}  # fmt: skip
-SESSION = {
+SESSION_COLUMNS = {
     "arm": "string", "session": "string", "type": "string", "log": "string", "cell": "string",
     "state": "string", "error": "string", "seconds": "float64", "processor": "float64",
     "time": "float64", "poses": "int64", "joints": "int64",
 }  # fmt: skip
-EFFECT = {
+EFFECT_COLUMNS = {
     "arm": "string", "session": "string", "type": "string", "time": "float64",
     "channel": "string", "effect": "string", "accused": "bool", "joints": "list<int64>",
     "parameter": "string", "value": "float64", "std": "float64", "unit": "string",
@@ -52,69 +49,71 @@ EFFECT = {
     "shrink_high": "float64", "shrink_alone": "float64",
     "indistinguishable_from": "list<string>",
 }  # fmt: skip
-DIAGNOSED = {
-    **SESSION, "verdict": "string",
+DIAGNOSIS_COLUMNS = {
+    **SESSION_COLUMNS, "verdict": "string",
     **{f"{c}_{f}": kind for c in CHANNELS
-       for f, kind in {"verdict": "string", "samples": "int64", **FIGURES}.items()},
+       for f, kind in {"verdict": "string", "samples": "int64", **FIGURE_COLUMNS}.items()},
 }  # fmt: skip
-FLEXIBILITY = {
+FLEXIBILITY_COLUMNS = {
     "level": "string", "type": "string", "arm": "string", "session": "string",
     "parameter": "string", "joint": "int64", "value": "float64", "std": "float64",
     "low": "float64", "high": "float64", "unit": "string", "shown": "bool",
     "scatter": "float64", "own_share": "float64", "drift": "float64", "drift_std": "float64",
     "drift_per": "string",
 }  # fmt: skip
-FITTED = {
-    **SESSION, "outliers": "int64", "noise": "float64", "gap_before": "float64",
+FIT_COLUMNS = {
+    **SESSION_COLUMNS, "outliers": "int64", "noise": "float64", "gap_before": "float64",
     "gap_after": "float64", "gap_held_out": "float64", "surprise": "float64",
 }  # fmt: skip
 
 
-def write_diagnosed(done: Done, found: Found, folder: Path) -> tuple[list[str], list[Path]]:
+def write_diagnosis(done: FleetRun, fleet: Fleet, folder: Path) -> tuple[list[str], list[Path]]:
     """Write the results of ``fleet diagnose``; returns lines for the terminal, and the files."""
-    together = diagnosed(done.outcomes)
+    summary = summarise(done.outcomes)
     files = [
-        write_parquet(folder / RESULTS, EFFECT, list(effect_rows(done.outcomes))),
-        write_parquet(folder / SESSIONS, DIAGNOSED, list(diagnosed_rows(done.outcomes))),
-        write_diagnosed_report(together, done, found, folder),
+        write_parquet(folder / RESULTS_FILE, EFFECT_COLUMNS, list(effect_rows(done.outcomes))),
+        write_parquet(
+            folder / SESSIONS_FILE, DIAGNOSIS_COLUMNS, list(diagnosis_rows(done.outcomes))
+        ),
+        write_diagnosis_report(summary, done, fleet, folder),
     ]
-    return _diagnosed_lines(together), files
+    return _diagnosis_lines(summary), files
 
 
-def write_fitted(
-    done: Done, found: Found, folder: Path, cells: Path | None
+def write_fit(
+    done: FleetRun, fleet: Fleet, folder: Path, cells: Path | None
 ) -> tuple[list[str], list[Path]]:
-    """Write the results of ``fleet fit``, and the cells where they are wanted."""
-    together = fitted(done.outcomes)
-    figures = session_figures(together)
+    """Write the results of ``fleet fit``, and the cells if ``cells`` names a folder."""
+    summary = fit_fleet(done.outcomes)
+    figures = session_figures(summary)
     sessions = [row | figures.get(row["session"], {}) for row in session_rows(done.outcomes)]
     files = [
-        write_parquet(folder / RESULTS, FLEXIBILITY, list(rows(together))),
-        write_parquet(folder / SESSIONS, FITTED, sessions),
-        write_fitted_report(together, done, found, folder),
+        write_parquet(folder / RESULTS_FILE, FLEXIBILITY_COLUMNS, list(flexibility_rows(summary))),
+        write_parquet(folder / SESSIONS_FILE, FIT_COLUMNS, sessions),
+        write_fit_report(summary, done, fleet, folder),
     ]
     if cells is not None:
-        files.append(write_cells(together, cells)[-1])
-    return _fitted_lines(together), files
+        files.append(write_cells(summary, cells)[-1])
+    return _fit_lines(summary), files
 
 
-def _diagnosed_lines(together: Diagnosed) -> list[str]:
+def _diagnosis_lines(summary: FleetDiagnosis) -> list[str]:
     lines = []
-    for one in together.recurrences[:SHOWN]:
+    for one in summary.recurrences[:SHOWN]:
         joints = joint_list(tuple(sorted(j for j, _ in one.joints[:3])))
         lines.append(
             f"{effect_title(one.effect)} ({one.effect}{', ' + joints if joints else ''}): "
-            f"{one.sessions} of {counted(one.looked, 'session')}, "
-            f"{one.arms} of {counted(one.arms_looked, 'arm')}"
+            f"{one.sessions} of {counted(one.observable, 'session')}, "
+            f"{one.arms} of {counted(one.arms_observable, 'arm')}"
         )
-    if not together.recurrences:
-        lines.append("no effect is accused in any session")
-    return lines + _unlike(together)
+    if not summary.recurrences:
+        lines.append("no effect is named in any session")
+    return lines + _drift_and_outlier_lines(summary)
 
 
-def _fitted_lines(together: Fitted) -> list[str]:
+def _fit_lines(summary: FleetFit) -> list[str]:
     lines = []
-    for kind in together.types:
+    for kind in summary.types:
         shown = kind.scatter.shown
         spread = kind.scatter.between_arms[shown] / np.maximum(kind.scatter.mean[shown], 1e-12)
         before, after = (
@@ -127,72 +126,72 @@ def _fitted_lines(together: Fitted) -> list[str]:
             f"{_percent(spread)}; gap {with_unit(before, 'm')} with the cells, "
             f"{with_unit(after, 'm')} as predicted by the other sessions"
         )
-    return lines + _unlike(together)
+    return lines + _drift_and_outlier_lines(summary)
 
 
 def _percent(spread: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> str:
     return f"{100 * float(np.median(spread)):.0f} %" if len(spread) else "not identifiable"
 
 
-def _unlike(together: Diagnosed | Fitted) -> list[str]:
+def _drift_and_outlier_lines(summary: FleetDiagnosis | FleetFit) -> list[str]:
     lines = [
-        f"drifts: {d.arm}, {quantity_title(d.quantity)}: {with_unit(d.slope, d.unit)} a {d.per}"
-        for d in together.drifts[:SHOWN]
+        f"drift: {d.arm}, {quantity_title(d.quantity)}: {with_unit(d.slope, d.unit)} a {d.per}"
+        for d in summary.drifts[:SHOWN]
     ]
     lines += [
-        f"stands out: {o.session or o.arm}, {quantity_title(o.quantity)}: "
+        f"outlier: {o.session or o.arm}, {quantity_title(o.quantity)}: "
         f"{with_unit(o.value, o.unit)}, usual {with_unit(o.usual, o.unit)}"
-        for o in together.outliers[:SHOWN]
+        for o in summary.outliers[:SHOWN]
     ]
     return lines
 
 
-def write_cells(found: Fitted, folder: Path) -> list[Path]:
-    """Write a cell per arm and the table that names them; returns the paths, the table last.
+def write_cells(fit: FleetFit, folder: Path) -> list[Path]:
+    """Write a cell per arm and the table of them; returns the paths, the table last.
 
-    Each is the cell of the arm's last session; what the fleet does not show stays as it is there.
+    Each is the cell of the arm's last session; flexibilities not identified are kept.
     """
     written: list[tuple[str, Path]] = []
-    taken: set[str] = set()
-    for kind in found.types:
+    used: set[str] = set()
+    for kind in fit.types:
         for arm in kind.arms:
-            path = folder / f"{_file_name(arm.name, taken)}.yaml"
-            _write(kind, arm, path)
+            path = folder / f"{_file_name(arm.name, used)}.yaml"
+            _write_cell(kind, arm, path)
             written.append((arm.name, path))
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
     table.writerow(("arm", "cell"))
     table.writerows((arm, path.name) for arm, path in written)
-    write_text(folder / TABLE, text.getvalue())
-    return [*(path for _, path in written), folder / TABLE]
+    write_text(folder / CELL_TABLE, text.getvalue())
+    return [*(path for _, path in written), folder / CELL_TABLE]
 
 
-def _write(kind: FittedType, arm: FittedArm, path: Path) -> None:
+def _write_cell(kind: FittedType, arm: FittedArm, path: Path) -> None:
     cell = load_cell(Path(arm.sessions[-1].outcome.cell))
     values = np.where(kind.scatter.shown, arm.fit.flexibility, flexibilities(cell.model))
     n = cell.arm.n
     save_cell(cell, path, cell.model.with_compliance(values[:n], values[n:]))
 
 
-def _file_name(arm: str, taken: set[str]) -> str:
-    """Return a file name for an arm, none twice."""
+def _file_name(arm: str, used: set[str]) -> str:
+    """Return a unique file name for an arm."""
     plain = re.sub(r"[^\w.-]+", "_", arm).strip(".") or "arm"
     name, count = plain, 1
-    while name.lower() in taken:
+    while name.lower() in used:
         count += 1
         name = f"{plain}-{count}"
-    taken.add(name.lower())
+    used.add(name.lower())
     return name
 
 
 def write_parquet(
     path: Path, columns: Mapping[str, str], rows: Sequence[Mapping[str, Any]]
 ) -> Path:
-    """Write rows under typed columns in one step; what a row lacks is null."""
+    """Write rows with typed columns atomically; missing values are null."""
     import pyarrow
     from pyarrow import parquet
 
-    schema = pyarrow.schema([(name, _kind(pyarrow, kind)) for name, kind in columns.items()])
+    schema = pyarrow.schema([(name, _arrow_type(pyarrow, kind)) for name, kind in columns.items()])
     table = pyarrow.Table.from_pylist(list(rows), schema=schema)
     with replacing_bytes(path) as file:
         parquet.write_table(table, file, compression="zstd")
@@ -200,7 +199,7 @@ def write_parquet(
 
 
 def session_rows(outcomes: Sequence[Outcome]) -> Iterator[dict[str, Any]]:
-    """Give a row per session, usable or not."""
+    """Yield a row per session, usable or not."""
     for outcome in outcomes:
         row = {name: getattr(outcome, name) for name in
                ("arm", "session", "log", "cell", "state", "error", "seconds",
@@ -209,19 +208,19 @@ def session_rows(outcomes: Sequence[Outcome]) -> Iterator[dict[str, Any]]:
         yield row | {name: outcome.result.get(name) for name in names}
 
 
-def diagnosed_rows(outcomes: Sequence[Outcome]) -> Iterator[dict[str, Any]]:
-    """Give a row per session with its channels' figures."""
+def diagnosis_rows(outcomes: Sequence[Outcome]) -> Iterator[dict[str, Any]]:
+    """Yield a row per session with the figures of its channels."""
     for row, outcome in zip(session_rows(outcomes), outcomes, strict=True):
         figures = {
             f"{channel['channel']}_{name}": channel[name]
             for channel in outcome.result.get("channels", ())
-            for name in ("verdict", "samples", *FIGURES)
+            for name in ("verdict", "samples", *FIGURE_COLUMNS)
         }
         yield row | {"verdict": outcome.result.get("verdict")} | figures
 
 
 def effect_rows(outcomes: Sequence[Outcome]) -> Iterator[dict[str, Any]]:
-    """Give a row per session and parameter of an accused effect, and per effect looked at."""
+    """Yield a row per session and parameter of a named cause, and per other effect tried."""
     for outcome in outcomes:
         shared = {"arm": outcome.arm, "session": outcome.session,
                   "type": outcome.result.get("type"),
@@ -230,7 +229,7 @@ def effect_rows(outcomes: Sequence[Outcome]) -> Iterator[dict[str, Any]]:
             yield shared | dict(row)
 
 
-def _kind(pyarrow: Any, kind: str) -> Any:
+def _arrow_type(pyarrow: Any, kind: str) -> Any:
     if kind.startswith("list<"):
         return pyarrow.list_(pyarrow.type_for_alias(kind[5:-1]))
     return pyarrow.type_for_alias(kind)

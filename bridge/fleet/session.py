@@ -1,4 +1,4 @@
-"""Sessions: which logs there are, and whose they are."""
+"""Finding the sessions of a fleet: its logs, and the arm of each."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ class Session:
     """One log of one arm."""
 
     arm: str
-    name: str  # its path below the fleet's folder, without the suffix: unique
+    name: str  # unique: path below the folder of the fleet, without suffix
     log: Path
 
 
 @dataclass(frozen=True)
-class Found:
-    """All sessions, in the order of their names, and the rule that names the arms."""
+class Fleet:
+    """All sessions, sorted by name, and the rule by which arms were named."""
 
     folder: Path
     sessions: tuple[Session, ...]
@@ -35,26 +35,26 @@ class Found:
 
     @property
     def arms(self) -> int:
-        """Return how many arms there are."""
+        """Return the number of arms."""
         return len({s.arm for s in self.sessions})
 
 
 def find_sessions(
     where: Sequence[str], pattern: str | None = None, without: Path | None = None
-) -> Found:
+) -> Fleet:
     """Return the sessions of folders, glob patterns and files.
 
-    A log's arm is the first folder below the fleet's; of a log that lies in that folder itself it
-    is the file's name up to its first underscore. ``pattern`` is a regular expression that finds
-    the arm in the path below the fleet's folder instead (its first group, or the whole match).
-    Nothing below ``without``, the results' folder, counts as a log.
-    Raises InputError where there is no log, or the pattern does not fit one.
+    A log's arm is the first folder below the folder of the fleet; for a log in that folder itself,
+    the file's name up to its first underscore. ``pattern`` is a regular expression that matches
+    the arm in the path below the folder of the fleet instead (first group, or the whole match).
+    Files below ``without``, the output folder, are ignored.
+    Raises InputError if there is no log, or ``pattern`` does not match one.
     """
-    every = {log for text in where for log in _logs(text)}
-    own = None if without is None else without.absolute()
+    found = {log for text in where for log in _logs(text)}
+    output = None if without is None else without.absolute()
     logs = sorted(
-        (log for log in every if own is None or own not in log.absolute().parents),
-        key=lambda p: natural(str(p)),
+        (log for log in found if output is None or output not in log.absolute().parents),
+        key=lambda p: natural_key(str(p)),
     )
     if not logs:
         raise InputError(f"{' '.join(where)}: found no log beside those in {without}")
@@ -67,10 +67,10 @@ def find_sessions(
         sessions.append(Session(_arm(below, expression, pattern), name, log))
     _require_unique(sessions)
     rule = f"pattern {pattern!r}" if pattern else _rule(sessions)
-    return Found(folder, tuple(sessions), rule)
+    return Fleet(folder, tuple(sessions), rule)
 
 
-def natural(text: str) -> list[tuple[int, int, str]]:
+def natural_key(text: str) -> list[tuple[int, int, str]]:
     """Return a key that sorts ``s2`` before ``s10``."""
     return [
         (0, int(part), "") if part.isdigit() else (1, 0, part)
@@ -132,7 +132,7 @@ def _require_unique(sessions: Sequence[Session]) -> None:
 def _rule(sessions: Sequence[Session]) -> str:
     flat = sum("/" not in s.name for s in sessions)
     if flat == 0:
-        return "the folder says the arm"
+        return "arm: name of the folder"
     if flat == len(sessions):
-        return "the file's name up to its first underscore says the arm"
-    return "the folder, or the file's name up to its first underscore, says the arm"
+        return "arm: name of the file up to its first underscore"
+    return "arm: name of the folder, or of the file up to its first underscore"

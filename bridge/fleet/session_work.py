@@ -1,4 +1,4 @@
-"""The work on one session: its diagnosis as rows, or what it says about the arm's compliance."""
+"""The jobs on one session: its diagnosis as table rows, or its equations of the compliance."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from gapbridge.core.estimation.compliance_fit import flexibilities, usual_flexib
 from gapbridge.core.estimation.hierarchical_evidence import evidence
 from gapbridge.core.log.log import Log
 
-EPOCH = 1.0e9  # s: timestamps beyond count from 1970, those below from some start
+EPOCH = 1.0e9  # s: larger timestamps are Unix times, smaller ones relative
 
 
 def diagnose_session(cell: Cell, log: Log, options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the diagnosis as facts of the session, its channels, and a row per parameter."""
-    found = document(
+    """Return the diagnosis as plain JSON: facts of the session, channels, a row per parameter."""
+    diagnosis = document(
         diagnose(
             cell.model,
             log,
@@ -30,24 +30,24 @@ def diagnose_session(cell: Cell, log: Log, options: Mapping[str, Any]) -> dict[s
             observers=channels_of(cell.uncertain),
         )
     )
-    rows = [row for channel in found["channels"] for row in _rows(channel)]
+    rows = [row for channel in diagnosis["channels"] for row in _rows(channel)]
     return {
         **facts(cell, log),
-        "verdict": found["verdict"],
-        "channels": [_channel(c) for c in found["channels"]],
+        "verdict": diagnosis["verdict"],
+        "channels": [_channel(c) for c in diagnosis["channels"]],
         "rows": rows,
     }
 
 
 def facts(cell: Cell, log: Log) -> dict[str, Any]:
-    """Return what is to be known of a session, whatever is done with it."""
+    """Return arm type, number of joints and poses, and start (Unix time, s) of a session."""
     time = log.get("timestamp")
     begin = float(time[0]) if time is not None and time[0] > EPOCH else None
     return {"type": arm_type(cell), "joints": cell.arm.n, "poses": len(log), "time": begin}
 
 
 def arm_type(cell: Cell) -> str:
-    """Return the name of the arm's type; of DH rows, which have none, one made from them."""
+    """Return the name of the arm's type; for DH rows a hash of them."""
     arm = cell.arm
     if arm.name != "dh":
         return arm.name
@@ -89,12 +89,12 @@ def _rows(channel: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 
 def fit_session(cell: Cell, log: Log, options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the session's equations for the flexibilities, and what the cell says of them."""
-    found = evidence(cell.model, log, cell.metrology)
-    arrays = {"matrix": found.matrix.tolist(), "right": found.right.tolist()}
+    """Return the session's equations of the flexibilities, and those of the cell, rad/Nm."""
+    equations = evidence(cell.model, log, cell.metrology)
+    arrays = {"matrix": equations.matrix.tolist(), "right": equations.right.tolist()}
     return {
         **facts(cell, log),
         "nominal": flexibilities(cell.model).tolist(),
         "usual": usual_flexibility(cell.model),
-        "evidence": asdict(found) | arrays,
+        "evidence": asdict(equations) | arrays,
     }

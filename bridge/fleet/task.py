@@ -1,4 +1,4 @@
-"""A task: the work on one session, done in whatever process; and what comes of it."""
+"""A task: the job on one session, run in any process; and its outcome."""
 
 from __future__ import annotations
 
@@ -12,87 +12,80 @@ from typing import Any
 
 from gapbridge.bridge.cell import Cell, load_cell
 from gapbridge.bridge.cell.opened_log import open_log
-from gapbridge.bridge.fleet.session import natural
+from gapbridge.bridge.fleet.session import natural_key
 from gapbridge.core.errors import ArmError, CellError, GapbridgeError, LogError
 from gapbridge.core.log.log import Log
 
-Work = Callable[[Cell, Log, Mapping[str, Any]], dict[str, Any]]
+SessionJob = Callable[[Cell, Log, Mapping[str, Any]], dict[str, Any]]
 DONE, BAD, CRASHED, DIED = "done", "bad", "crashed", "died"
-DEATHS = 2  # a session that has taken so many workers along is not tried again
+MAX_DEATHS = 2  # workers that a session may kill in one run
 
 
 @dataclass(frozen=True)
 class Task:
-    """One session's work; it is sent to a worker as it stands."""
+    """The job on one session, as it is sent to a worker."""
 
-    key: str  # of log, cell, work and options: a result under this key is still good
+    key: str  # hash of log, cell, job and options: identifies reusable results
     arm: str
     session: str
     log: Path
     cell: Path
-    work: Work
+    job: SessionJob
     options: Mapping[str, Any] = field(default_factory=dict)
+
+    def outcome(self, state: str, seconds: float = 0.0, **rest: Any) -> Outcome:
+        """Return an outcome of this task; ``rest`` are further fields of it."""
+        log, cell = str(self.log), str(self.cell)
+        return Outcome(self.key, self.arm, self.session, log, cell, state, seconds, **rest)
+
+    def died_outcome(self) -> Outcome:
+        """Return the outcome of a task that has killed MAX_DEATHS workers."""
+        text = f"{MAX_DEATHS} workers died over this session; it is not tried again in this run"
+        return self.outcome(DIED, error=f"{self.log}: {text}")
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of a task; ``result`` holds plain JSON values."""
+    """The outcome of a task; ``result`` holds plain JSON values."""
 
     key: str
     arm: str
     session: str
     log: str
     cell: str
-    state: str  # done, bad (input), crashed (an error nobody foresaw), died (took workers along)
-    seconds: float  # by the worker's clock, reading the log included
-    processor: float = 0.0  # s of a processor: what it costs, however busy the machine is
+    state: str  # done, bad (input), crashed (unexpected error), died (killed its workers)
+    seconds: float  # s by the worker's clock, reading the log included
+    processor: float = 0.0  # s of CPU time
     error: str = ""  # one line
     details: str = ""  # the traceback of a crash
     result: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def final(self) -> bool:
-        """Return whether doing it again would come to the same."""
+        """Return whether a repetition would give the same outcome."""
         return self.state in (DONE, BAD)
 
     def document(self) -> dict[str, Any]:
-        """Return it as JSON values; ``result`` is the outcome's own, not a copy."""
+        """Return it as JSON values; ``result`` is not copied."""
         return {f.name: getattr(self, f.name) for f in fields(self)}
 
 
-def outcome(task: Task, state: str, seconds: float = 0.0, **rest: Any) -> Outcome:
-    """Return the outcome of a task."""
-    return Outcome(
-        task.key, task.arm, task.session, str(task.log), str(task.cell), state, seconds, **rest
-    )
-
-
-def died(task: Task) -> Outcome:
-    """Return the outcome of a task that nobody lived through."""
-    return outcome(
-        task,
-        DIED,
-        error=f"{task.log}: {DEATHS} workers died over this session; it is not tried again "
-        "in this run",
-    )
-
-
-def perform(task: Task) -> Outcome:
-    """Do a task; whatever happens but the death of the process becomes an outcome."""
+def run_task(task: Task) -> Outcome:
+    """Run a task; every failure except the death of the process becomes an outcome."""
     begin, spent = time.perf_counter(), time.process_time()
-    state, rest = _performed(task)
+    state, rest = _result(task)
     seconds, processor = time.perf_counter() - begin, time.process_time() - spent
-    return outcome(task, state, seconds, processor=processor, **rest)
+    return task.outcome(state, seconds, processor=processor, **rest)
 
 
-def _performed(task: Task) -> tuple[str, dict[str, Any]]:
-    """Return the state and what belongs to it."""
+def _result(task: Task) -> tuple[str, dict[str, Any]]:
+    """Return the state and the fields of the outcome that belong to it."""
     try:
         cell = _cell(task.cell, task.cell.stat().st_mtime_ns) if task.cell.is_file() else (
             load_cell(task.cell)
         )  # fmt: skip
-        return DONE, {"result": task.work(cell, open_log(task.log, cell), task.options)}
-    except (ArmError, CellError, LogError) as error:  # they name their file
+        return DONE, {"result": task.job(cell, open_log(task.log, cell), task.options)}
+    except (ArmError, CellError, LogError) as error:  # their messages name the file
         return BAD, {"error": _line(error)}
     except GapbridgeError as error:
         return BAD, {"error": f"{task.log}: {_line(error)}"}
@@ -109,7 +102,7 @@ def _line(error: Exception) -> str:
 
 @functools.lru_cache(maxsize=64)
 def _cell(path: Path, changed: int) -> Cell:
-    """Return a cell, read once by each process."""
+    """Return a cell, read once per process."""
     return load_cell(path)
 
 
@@ -119,14 +112,13 @@ def usable(outcomes: Sequence[Outcome]) -> list[Outcome]:
 
 
 def by_arm(outcomes: Sequence[Outcome]) -> dict[str, list[Outcome]]:
-    """Return the usable sessions of each arm: by date where all have one, else by name."""
-    found: dict[str, list[Outcome]] = {}
+    """Return the usable sessions of each arm, sorted by date if all have one, else by name."""
+    sessions_by_arm: dict[str, list[Outcome]] = {}
     for outcome in usable(outcomes):
-        found.setdefault(outcome.arm, []).append(outcome)
-    for arm, sessions in found.items():
+        sessions_by_arm.setdefault(outcome.arm, []).append(outcome)
+    for arm, sessions in sessions_by_arm.items():
         dated = all(o.result["time"] is not None for o in sessions)
-        found[arm] = sorted(
-            sessions,
-            key=lambda o: (o.result["time"] if dated else 0.0, natural(o.session)),
+        sessions_by_arm[arm] = sorted(
+            sessions, key=lambda o: (o.result["time"] if dated else 0.0, natural_key(o.session))
         )
-    return {arm: found[arm] for arm in sorted(found, key=natural)}
+    return {arm: sessions_by_arm[arm] for arm in sorted(sessions_by_arm, key=natural_key)}

@@ -1,1 +1,1 @@
-"""Sections of a cell file that other folders run by."""
+"""Sections of a cell file that other packages use."""

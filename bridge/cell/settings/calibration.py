@@ -1,4 +1,4 @@
-"""Section ``calibration`` of the cell file: what a session measures, with what, and where."""
+"""Section ``calibration`` of the cell file: instrument, loads, poses and workspace."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 NotNegative = Annotated[Number, Field(ge=0)]
 Positive = Annotated[Number, Field(gt=0)]
 Vector3 = Annotated[list[Number], Field(min_length=3, max_length=3)]
-FEWEST_HELD_OUT = 8  # poses kept out of the fit by which an accuracy can be decided
+FEWEST_HELD_OUT = 8  # held-out poses from which an accuracy can be judged
 
 
 class LoadEntry(Section):
-    """A load that people hang on the flange, the tool's own weight included."""
+    """A load mounted on the flange, the mass of the tool included."""
 
-    name: str = Field(default="", description="as people call it")
+    name: str = Field(default="", description="name shown to the operator")
     mass: NotNegative = Field(description="kg")
     cog: Vector3 = Field(default=[0.0, 0.0, 0.0], description="m, in the flange frame")
 
 
 class BoxEntry(Section):
-    """A box, edges along base axes, that the arm stays out of."""
+    """A keep-out box for the arm, edges along base axes."""
 
     lower: Vector3 = Field(description="m, in base")
     upper: Vector3 = Field(description="m, in base")
@@ -40,26 +40,26 @@ class JointRange(Section):
 
 
 class RangeEntry(Section):
-    """How far the instrument reaches."""
+    """The measuring range of the instrument."""
 
     nearest: NotNegative = Field(default=0.0, description="m")
-    farthest: Positive | None = Field(default=None, description="m; default: as far as it sees")
+    farthest: Positive | None = Field(default=None, description="m; default: no limit")
 
 
 class ReflectorEntry(Section):
-    """Which way the reflector on the tool looks, and from how far aside it is still seen."""
+    """The viewing direction of the reflector on the tool, and its acceptance angle."""
 
     looks: Vector3 = Field(description="direction in the tool's axes")
     acceptance: Annotated[Number, Field(gt=0, le=3.1416)] = Field(
-        description="rad, half the cone in which it is seen"
+        description="rad, half angle of the cone in which it is seen"
     )
 
 
 class CalibrationSettings(Section):
-    """The whole section. Everything has a default but what hangs on the flange."""
+    """Section ``calibration``."""
 
     instrument: InstrumentSettings = Field(
-        default=TypedSettings(unit="mm"), description="kind, unit, ...: what measures"
+        default=TypedSettings(unit="mm"), description="kind, unit, ... of the instrument"
     )
     loads: list[LoadEntry] = Field(
         default=[], description="lightest first; default: the cell's payload alone"
@@ -73,32 +73,32 @@ class CalibrationSettings(Section):
         description="poses to verify, never fitted",
     )
     repeats: int = Field(
-        default=4, ge=0, le=50, strict=True, description="further visits: the arm's repeatability"
+        default=4, ge=0, le=50, strict=True, description="poses repeated, for the repeatability"
     )
     effects: list[str] | None = Field(
-        default=None, description="what is to be found, effects of the catalogue"
+        default=None, description="effects of the catalogue to identify"
     )
     instrument_at: Vector3 | None = Field(
-        default=None, description="m, in base, about: poses that it cannot see are left out"
+        default=None, description="m, in base, approximate: poses out of its sight are left out"
     )
     further_places: list[Vector3] = Field(
-        default=[], description="m, in base, about: where it is carried to afterwards, in turn"
+        default=[], description="m, in base, approximate: further stations, in turn"
     )
     instrument_range: RangeEntry | None = Field(
-        default=None, description="m: poses out of it are left out"
+        default=None, description="m: poses outside are left out"
     )
     reflector: ReflectorEntry | None = Field(
         default=None, description="poses that turn it away from the instrument are left out"
     )
-    keep_out: list[BoxEntry] = Field(default=[], description="boxes that the arm stays out of")
-    floor: Number | None = Field(default=0.0, description="m, in base: nothing comes below")
+    keep_out: list[BoxEntry] = Field(default=[], description="boxes that the arm must not enter")
+    floor: Number | None = Field(default=0.0, description="m, in base: lowest z of arm and load")
     joint_range: JointRange | None = Field(default=None, description="narrower joint limits")
     joints: Literal["link", "typed", "planned"] | None = Field(
         default=None,
-        description="where joint angles come from; default: link where there is one, else typed",
+        description="where joint angles come from; default: link if there is one, else typed",
     )
     speed: Annotated[Number, Field(gt=0, le=2.0)] = Field(
-        default=0.4, description="rad/s, fastest joint, where --move drives the arm"
+        default=0.4, description="rad/s of the fastest joint, with --move"
     )
     settle: Annotated[Number, Field(ge=0, le=60.0)] = Field(
         default=0.5, description="s at rest before the instrument is read"
@@ -109,7 +109,7 @@ class CalibrationSettings(Section):
     minutes_per_load: NotNegative = Field(default=5.0, description="min to change the load")
     folder: Path = Field(default=Path("calibration"), description="of the sessions")
     accuracy: Positive | None = Field(
-        default=None, description="m, asked for: no pose kept out of the fit may be farther off"
+        default=None, description="m, required: bound of the error of every held-out pose"
     )
     customer: str = Field(default="", description="for whom, for the report")
     operator: str = Field(default="", description="who measures, for the report")

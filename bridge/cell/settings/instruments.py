@@ -1,6 +1,6 @@
-"""Section ``calibration.instrument``: what measures, in which unit, and how it is reached.
+"""Section ``calibration.instrument``: kind, unit and connection of the instrument.
 
-Small pydantic models without any instrument behind them, so that a cell is read without one.
+These pydantic models import no instrument library: a cell can be read without one.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ RADIANS: dict[str, float] = {"rad": 1.0, "deg": 0.017453292519943295}
 
 
 class Base(Section):
-    """What every instrument says."""
+    """The settings that all instruments share."""
 
-    reads: ClassVar[str] = "position"  # kind of its readings where it gives no pose
+    reads: ClassVar[str] = "position"  # kind of its readings if it measures no pose
     sigma: Positive | None = Field(
         default=None, description="m, 1 sigma of one coordinate; default: metrology.sigma"
     )
@@ -37,17 +37,17 @@ class Base(Section):
 
     @property
     def options(self) -> dict[str, Any]:
-        """Return what else the calibration must know of this kind of reading."""
+        """Return the further arguments of its observable."""
         return {}
 
 
 class Coordinates(Base):
-    """An instrument that gives a point, or a pose, as numbers in a text."""
+    """An instrument whose readings are points or poses, as numbers in text."""
 
     unit: LengthUnit = Field(description="of lengths: m, mm, um or in")
     pose: bool = Field(default=False, strict=True, description="true: rotation as well")
     rotation: Literal["rotation_vector", "rpy", "quaternion"] = Field(
-        default="rotation_vector", description="how a pose gives its rotation; quaternion: x y z w"
+        default="rotation_vector", description="representation of the rotation; quaternion: x y z w"
     )
     angle_unit: AngleUnit = Field(default="deg", description="of rotation angles: rad or deg")
 
@@ -58,7 +58,7 @@ class Coordinates(Base):
 
     @property
     def width(self) -> int:
-        """Return how many numbers one reading has."""
+        """Return the count of numbers in a reading."""
         if not self.pose:
             return 3
         return 7 if self.rotation == "quaternion" else 6
@@ -71,7 +71,7 @@ class TypedSettings(Coordinates):
 
 
 class ExportSettings(Coordinates):
-    """Text files that the instrument's software writes."""
+    """Text files written by the instrument's software."""
 
     columns: tuple[str, ...] | None = Field(
         default=None, description="names of the columns; default: the last ones of each row"
@@ -80,14 +80,14 @@ class ExportSettings(Coordinates):
 
 
 class FileSettings(ExportSettings):
-    """A CSV file in which the readings stand, row by row, in the order of the plan."""
+    """A CSV file with one reading per row, in the order of the plan."""
 
     kind: Literal["file"]
     file: Path = Field(description="the CSV, relative to the cell's folder")
 
 
 class FolderSettings(ExportSettings):
-    """A folder into which the tracker's software exports one file a reading."""
+    """A folder into which the tracker's software exports one file per reading."""
 
     kind: Literal["folder"]
     folder: Path = Field(description="relative to the cell's folder")
@@ -95,7 +95,7 @@ class FolderSettings(ExportSettings):
 
 
 class LineFeedSettings(Coordinates):
-    """A TCP port of the tracker's software that sends one reading a line."""
+    """A TCP port of the tracker's software that sends one reading per line."""
 
     kind: Literal["line_feed"]
     host: str = Field(default="127.0.0.1", description="address of the tracker's software")
@@ -111,7 +111,7 @@ class DialGaugeSettings(Base):
     kind: Literal["dial_gauge"]
     unit: LengthUnit = Field(description="of lengths: m, mm, um or in")
     zero: float | None = Field(
-        default=None, description="distance at which it reads 0, in its unit; default: found along"
+        default=None, description="distance at which it reads 0, in its unit; default: estimated"
     )
 
     @property
@@ -121,7 +121,7 @@ class DialGaugeSettings(Base):
 
 
 class TwoBallsSettings(Base):
-    """Two balls on the tool, both measured at each pose: only their difference counts."""
+    """Two balls on the tool, both measured at each pose: their difference is used."""
 
     reads = "relative"
     kind: Literal["two_balls"]
@@ -129,12 +129,12 @@ class TwoBallsSettings(Base):
 
 
 class SphereSettings(Base):
-    """A fixed sphere that the tool's probe touches: joint angles alone are the reading."""
+    """A fixed sphere that the tool's probe touches: only joint angles are read."""
 
     reads = "sphere"
     kind: Literal["sphere"]
     radius: Positive | None = Field(
-        default=None, description="m, of sphere and probe together; default: found along"
+        default=None, description="m, of sphere and probe together; default: estimated"
     )
 
     @property
@@ -144,14 +144,14 @@ class SphereSettings(Base):
 
 
 class PointSettings(Base):
-    """A fixed point that the tool's tip is brought onto: joint angles alone are the reading."""
+    """A fixed point that the tool's tip touches: only joint angles are read."""
 
     reads = "point"
     kind: Literal["point"]
 
 
 class SimulatedTrackerSettings(Base):
-    """The laser tracker beside `gapbridge simulate`."""
+    """The simulated laser tracker of `gapbridge simulate`."""
 
     kind: Literal["simulated_tracker"]
     host: str | None = Field(default=None, description="loopback address; default: link.host")

@@ -1,4 +1,4 @@
-"""Section ``web`` of a cell: the status page."""
+"""Sections ``web`` and ``metrics`` of a cell: the status page and Prometheus metrics."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class WebSettings(ServedSettings):
     """The status page; a cell without this section has none."""
 
     port: int = Field(WEB_PORT, ge=0, le=65535, description="TCP port; 0: any that is free")
-    clients: int = Field(16, ge=1, le=1000, description="pages that may be open at the same time")
-    history: float = Field(
-        600.0, gt=0.0, le=86400.0, description="s of offsets and wrenches that are kept to show"
+    clients: int = Field(
+        16, ge=1, le=1000, description="largest number of pages open at the same time"
     )
+    history: float = Field(600.0, gt=0.0, le=86400.0, description="s of offsets and wrenches shown")

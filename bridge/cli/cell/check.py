@@ -7,9 +7,9 @@ from pathlib import Path
 import click
 
 from gapbridge.bridge.cell import Cell, load_cell
-from gapbridge.bridge.cell.cell import complaints, placed
+from gapbridge.bridge.cell.cell import cell_errors, located_message
 from gapbridge.bridge.cell.live import live_findings
-from gapbridge.bridge.cell.log_fit import log_findings
+from gapbridge.bridge.cell.log_consistency import log_findings
 from gapbridge.bridge.cell.run_settings import read_configuration
 from gapbridge.bridge.cli.options import FILE, cell_argument
 from gapbridge.bridge.setpoint_source import make_source
@@ -27,7 +27,7 @@ from gapbridge.drivers.link_settings import ProfileSettings
     type=FILE,
     multiple=True,
     metavar="LOG",
-    help="Hold the arm against measured poses too: order and signs of joints, DH rows, frames.",
+    help="Compare with measured poses too: order and signs of joints, DH rows, frames.",
 )
 def check(cell: Path, live: bool, logs: tuple[Path, ...]) -> None:
     """Check a cell file for mistakes, and report each with its line.
@@ -41,41 +41,41 @@ def check(cell: Path, live: bool, logs: tuple[Path, ...]) -> None:
 
     Example: gapbridge check cell.yaml --live
     """
-    errors = complaints(cell)
+    errors = cell_errors(cell)
     warnings: list[str] = []
     if not errors:
-        given = load_cell(cell)
-        warnings += given.warnings
-        if given.file.link is not None:
-            errors += _of_a_run(given)
+        opened = load_cell(cell)
+        warnings += opened.warnings
+        if opened.file.link is not None:
+            errors += _run_errors(opened)
         if live and not errors:
-            found = live_findings(given)
-            errors += found.errors
-            warnings += found.warnings
+            findings = live_findings(opened)
+            errors += findings.errors
+            warnings += findings.warnings
         for log in logs if not errors else ():
-            found = log_findings(given, log)
-            errors += found.errors
-            warnings += found.warnings
+            findings = log_findings(opened, log)
+            errors += findings.errors
+            warnings += findings.warnings
     for line in warnings:
         click.echo(f"warning: {line}", err=True)
     for line in errors:
         click.echo(f"error: {line}", err=True)
     if errors:
         raise click.exceptions.Exit(2)
-    counted = f", {len(warnings)} warning{'s' * (len(warnings) != 1)}" if warnings else ""
-    beside = [*["its controller"] * live, *map(str, logs)]
-    text = f" with {' and '.join(beside)}" if beside else ""
-    click.echo(f"{cell}: fit to be used{text}{counted}")
+    count = f", {len(warnings)} warning{'s' * (len(warnings) != 1)}" if warnings else ""
+    compared = [*["its controller"] * live, *map(str, logs)]
+    text = f" with {' and '.join(compared)}" if compared else ""
+    click.echo(f"{cell}: fit to be used{text}{count}")
 
 
-def _of_a_run(cell: Cell) -> list[str]:
-    """Return what is wrong with the files that only a run reads: profiles, tokens, a trajectory."""
+def _run_errors(cell: Cell) -> list[str]:
+    """Return the errors of files that only a run reads: profiles, tokens, a trajectory."""
     try:
         settings = read_configuration(cell.path).settings
         if isinstance(settings.link, ProfileSettings):
-            make_driver(settings.link, cell.model)  # holds the profile to the arm; opens nothing
+            make_driver(settings.link, cell.model)  # checks the profile against the arm
     except InputError as error:
-        return [placed(cell.document, str(error))]
+        return [located_message(cell.document, str(error))]
     try:
         make_source(settings.setpoints, cell.arm.n, True, cell.path.parent, settings.link.rate)
     except InputError as error:

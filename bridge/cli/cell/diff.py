@@ -10,7 +10,14 @@ import click
 import numpy as np
 
 from gapbridge.bridge.cell import Cell
-from gapbridge.bridge.cell.difference import FIELDS, Change, Moved, Part, changes, moved, parts
+from gapbridge.bridge.cell.difference import (
+    KeyChange,
+    PartChange,
+    TcpShift,
+    key_changes,
+    part_changes,
+    tcp_shift,
+)
 from gapbridge.bridge.cell.opened_log import open_log
 from gapbridge.bridge.cli.options import FILE, open_cell
 from gapbridge.bridge.document.provenance import provenance
@@ -18,8 +25,6 @@ from gapbridge.bridge.report.labels import effect_title, unit_of
 from gapbridge.core.arm import Arm
 from gapbridge.core.effects import Reported, Term, effect_named
 from gapbridge.core.rotation import rotation_vector
-
-MODEL = (*FIELDS, "compliance", "effect")  # beginnings of keys that are parts of the model
 
 
 @click.command()
@@ -38,32 +43,33 @@ def diff(before: Path, after: Path, log: Path | None, seed: int, as_json: bool) 
     Example: gapbridge diff cell.yaml calibrated.yaml
     """
     one, other = open_cell(before), open_cell(after)
-    found = changes(one, other)
+    changes = key_changes(one, other)
     rows = None if log is None else open_log(log, one)
     q = None if rows is None else rows.require("actual_q", "target_q")
     loads = None if rows is None else rows.loads()
-    shift, several = moved(one, other, q, loads, seed), parts(one, other, q, loads, seed)
+    shift = tcp_shift(one, other, q, loads, seed)
+    parts = part_changes(one, other, q, loads, seed)
     if as_json:
         reported = {
-            "changes": [vars(change) for change in found],
-            "parts": [_part_json(part, one, other) for part in several],
+            "changes": [change.to_json() for change in changes],
+            "parts": [_part_json(part, one, other) for part in parts],
             "moved": None if shift is None else shift.to_json(),
             "provenance": provenance({"cell": [before, after], "log": [log] if log else []}),
         }
         click.echo(json.dumps(reported, indent=1))
         return
-    if not found:
+    if not changes:
         click.echo("no key differs")
-    for change in found:
-        if not (several and change.key.partition(".")[0].partition(" ")[0] in MODEL):
-            click.echo(_line(change))
-    for part in several:
-        click.echo(f"{_described(part, one, other)}{_by_itself(part.moved)}")
+    for change in changes:
+        if not (parts and change.in_model):
+            click.echo(_change_line(change))
+    for part in parts:
+        click.echo(f"{_part_text(part, one, other)}{_part_shift_text(part.shift)}")
     _print_origin(other)
-    click.echo(_in_space(shift, "the log" if log else "the workspace"))
+    click.echo(_total_shift_text(shift, "the log" if log else "the workspace"))
 
 
-def _line(change: Change) -> str:
+def _change_line(change: KeyChange) -> str:
     if change.before is None:
         return f"{change.key}: added, {_text(change.after)}"
     if change.after is None:
@@ -81,27 +87,27 @@ def _text(value: Any) -> str:
     return str(value)
 
 
-def _part_json(part: Part, one: Cell, other: Cell) -> dict[str, Any]:
-    """Return a part in words, and how far it alone moves the predicted TCP, SI."""
-    shift = None if part.moved is None else part.moved.to_json()
-    return {"part": part.name, "words": _described(part, one, other), "moved": shift}
+def _part_json(part: PartChange, one: Cell, other: Cell) -> dict[str, Any]:
+    """Return a part as text, and how far it alone moves the predicted TCP, SI units."""
+    shift = None if part.shift is None else part.shift.to_json()
+    return {"part": part.name, "words": _part_text(part, one, other), "moved": shift}
 
 
-def _by_itself(shift: Moved | None) -> str:
+def _part_shift_text(shift: TcpShift | None) -> str:
     if shift is None:
         return ""
     return f"; alone {1e3 * shift.rms:.3f} mm rms at the TCP, at most {1e3 * shift.largest:.3f} mm"
 
 
-def _described(part: Part, one: Cell, other: Cell) -> str:
-    """Return what differs in a part, in units that people read."""
+def _part_text(part: PartChange, one: Cell, other: Cell) -> str:
+    """Return what differs in a part: lengths in mm, angles in mrad, compliance in µrad/Nm."""
     old, new = one.model, other.model
     if part.name == "tool":
-        apart = np.asarray(np.linalg.solve(old.tool_in_flange, new.tool_in_flange), dtype=float)
-        turned = 1e3 * float(np.linalg.norm(rotation_vector(apart[:3, :3])))
+        offset = np.asarray(np.linalg.solve(old.tool_in_flange, new.tool_in_flange), dtype=float)
+        turned = 1e3 * float(np.linalg.norm(rotation_vector(offset[:3, :3])))
         return (
             f"TCP: {_mm(old.tool_in_flange[:3, 3])} -> {_mm(new.tool_in_flange[:3, 3])} in the "
-            f"flange frame, {1e3 * np.linalg.norm(apart[:3, 3]):.3f} mm apart"
+            f"flange frame, {1e3 * np.linalg.norm(offset[:3, 3]):.3f} mm apart"
             + (f", turned by {turned:.3f} mrad" if turned > 1e-6 else "")
         )
     if part.name == "payload":
@@ -125,8 +131,8 @@ def _mm(vector: np.ndarray[Any, Any]) -> str:
     return "(" + ", ".join(f"{1e3 * v + 0.0:.6g}" for v in vector) + ") mm"
 
 
-def _values(part: Part, one: Arm, other: Arm) -> str:
-    """Return the numbers of an effect, before and after; zeros that stay are left out."""
+def _values(part: PartChange, one: Arm, other: Arm) -> str:
+    """Return the parameters of an effect, before and after; zero in both is left out."""
     before, after = _reported(part.before, one), _reported(part.after, other)
     pairs = [(b, a) for b, a in zip(before or after, after or before, strict=True)]
     texts = []
@@ -157,7 +163,7 @@ def _print_origin(cell: Cell) -> None:
         )
 
 
-def _in_space(shift: Moved | None, over: str) -> str:
+def _total_shift_text(shift: TcpShift | None, over: str) -> str:
     if shift is None:
         return "the predicted TCP cannot be compared: the arms have other joints, or no equilibrium"
     if shift.largest < 1e-9 and shift.turned < 1e-9:

@@ -25,14 +25,14 @@ def explain(effect: str | None) -> None:
             first = _text(member).partition("\n")[0]
             click.echo(f"{name:<{width}}  {first}")
         return
-    # numpy's threads would take longer to begin than all the rest
+    # starting numpy's threads would take longer than all the rest
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    click.echo(explanation(effect_named(effect)))
+    click.echo(explanation_text(effect_named(effect)))
 
 
-def explanation(effect: Effect) -> str:
-    """Return what a person should know of an effect: its docstring, needs and parameters."""
-    from gapbridge.core.arm import builtin_arm  # the list has no need of it
+def explanation_text(effect: Effect) -> str:
+    """Return the description, needed data and parameters of an effect."""
+    from gapbridge.core.arm import builtin_arm  # slow to import, not needed by the list
 
     arm = builtin_arm("ur10e")
     sites = effect.sites(arm)
@@ -54,5 +54,5 @@ def explanation(effect: Effect) -> str:
 
 
 def _text(effect: Effect) -> str:
-    """Return an effect's docstring without the marks of its names."""
+    """Return an effect's docstring without its markup."""
     return (inspect.getdoc(effect) or "").replace("``", "")

@@ -15,9 +15,9 @@ from pydantic import ValidationError
 from gapbridge import drivers
 from gapbridge.bridge.cell import load_cell
 from gapbridge.bridge.cell.document import parse
-from gapbridge.bridge.cell.first_cell import Asked, first_cell
-from gapbridge.bridge.cell.live import whole_state
-from gapbridge.bridge.cell.message import refusals
+from gapbridge.bridge.cell.first_cell import InitOptions, first_cell_text
+from gapbridge.bridge.cell.live import read_valid_state
+from gapbridge.bridge.cell.message import validation_errors
 from gapbridge.bridge.cell.schema import CellFile
 from gapbridge.bridge.cell.sections import LinkSettings
 from gapbridge.bridge.cli.options import FILE
@@ -30,11 +30,11 @@ from gapbridge.drivers import make_driver
 from gapbridge.drivers.controller_facts import ControllerFacts
 from gapbridge.drivers.ur_rtde.enquiry import enquire
 
-CAN_INTERFACE = re.compile(r"[a-z]*can[0-9]+")  # of the kernel: can0, vcan0, slcan1
+CAN_INTERFACE = re.compile(r"[a-z]*can[0-9]+")  # Linux names: can0, vcan0, slcan1
 
 
-class GivenArm(NamedTuple):
-    """The arm, where its controller does not report which it is."""
+class ArmOptions(NamedTuple):
+    """The arm, if its controller does not report which it is."""
 
     model: str | None
     urdf: Path | None
@@ -56,9 +56,9 @@ class GivenArm(NamedTuple):
     "--profile", help="modbus, can, canopen: the profile of the controller (docs/porting.md)."
 )
 @click.option("--port", type=click.IntRange(1, 65535), help="modbus, socketcand: its port.")
-@click.option("--model", help="A built-in arm, where the controller does not say which it moves.")
+@click.option("--model", help="A built-in arm, if the controller does not report which it moves.")
 @click.option("--urdf", type=FILE, help="The arm's URDF, instead of --model.")
-@click.option("--tip", help="The URDF's link that is the flange, where it has several ends.")
+@click.option("--tip", help="The URDF's link that is the flange, if it has several ends.")
 @click.option(
     "--link",
     "keys",
@@ -81,22 +81,22 @@ def init(
     require_writable(out)
     if out.exists():
         raise InputError(f"{out}: found a file that is already there, expected a new one")
-    given = GivenArm(**arm)
-    if given.model is not None and given.urdf is not None:
+    arm_options = ArmOptions(**arm)
+    if arm_options.model is not None and arm_options.urdf is not None:
         raise InputError("--model: found beside --urdf, expected one of them")
-    if given.tip is not None and given.urdf is None:
+    if arm_options.tip is not None and arm_options.urdf is None:
         raise InputError("--tip: found without --urdf, expected the URDF whose link it is")
-    link = _link(host, driver, profile, port) | _further(keys)
+    link = _link(host, driver, profile, port) | _link_keys(keys)
     settings = _settings(link)
-    facts = enquire(host) if driver == "ur_rtde" else _read(settings, given)
+    facts = enquire(host) if driver == "ur_rtde" else _read_facts(settings, arm_options)
     if str(link.get("profile")).endswith(".yaml"):
-        link["profile"] = _beside(Path(link["profile"]), out)
-    urdf = None if given.urdf is None else _beside(given.urdf, out)
-    asked = Asked(link, given.model, urdf, given.tip)
-    text = first_cell(facts, asked)
-    _check(text, out)
+        link["profile"] = _path_from_cell(Path(link["profile"]), out)
+    urdf = None if arm_options.urdf is None else _path_from_cell(arm_options.urdf, out)
+    options = InitOptions(link, arm_options.model, urdf, arm_options.tip)
+    text = first_cell_text(facts, options)
+    _require_loadable(text, out)
     write_text(out, text)
-    click.echo(f"{out}: written, {_known_text(facts)}")
+    click.echo(f"{out}: written, {_facts_text(facts)}")
     click.echo(f"next: gapbridge check {out} --live; gapbridge run {out} --observe")
 
 
@@ -125,8 +125,8 @@ def _link(host: str, driver: str, profile: str | None, port: int | None) -> dict
     return link if port is None else {**link, "port": port}
 
 
-def _further(keys: Sequence[str]) -> dict[str, Any]:
-    """Return the keys given with --link; values are YAML. Raises InputError."""
+def _link_keys(keys: Sequence[str]) -> dict[str, Any]:
+    """Return the keys of --link; values are YAML. Raises InputError."""
     for key in keys:
         if not re.match(r"\w+=.", key):
             raise InputError(f"--link: found {key!r}, expected KEY=VALUE")
@@ -136,18 +136,18 @@ def _further(keys: Sequence[str]) -> dict[str, Any]:
 
 
 def _settings(link: dict[str, Any]) -> LinkSettings:
-    """Return the settings of a link, with paths from here. Raises InputError."""
+    """Return the settings of a link, paths from the working folder. Raises InputError."""
     try:
-        found = CellFile.model_validate({"robot": {"model": "ur10e"}, "link": link}).link
+        settings = CellFile.model_validate({"robot": {"model": "ur10e"}, "link": link}).link
     except ValidationError as error:
-        raise InputError(refusals(CellFile, error)[0][1]) from None
-    assert found is not None
-    return found.located(Path.cwd())
+        raise InputError(validation_errors(CellFile, error)[0][1]) from None
+    assert settings is not None
+    return settings.located(Path.cwd())
 
 
-def _read(link: LinkSettings, given: GivenArm) -> ControllerFacts:
-    """Return what a profile reads of an arm; needs the arm's joints to know which there are."""
-    model, urdf, tip = given
+def _read_facts(link: LinkSettings, arm_options: ArmOptions) -> ControllerFacts:
+    """Return what the controller reports by its profile; the arm's joints must be known."""
+    model, urdf, tip = arm_options
     if urdf is None and model is None:
         raise InputError(
             f"--model: found nothing with --driver {link.driver}, expected --model or --urdf "
@@ -156,51 +156,51 @@ def _read(link: LinkSettings, given: GivenArm) -> ControllerFacts:
     arm = arm_from_urdf(urdf, tip) if urdf is not None else builtin_arm(str(model))
     with make_driver(link, Model(arm=arm)) as driver:
         try:
-            return driver.facts(whole_state(driver))
+            return driver.facts(read_valid_state(driver))
         except InvalidStateError as error:
             if error.reason is not Implausible.VALUE:
                 raise
-            raise InputError(f"{urdf or f'--model {model}'}: {error}{_cure(link)}") from None
+            raise InputError(
+                f"{urdf or f'--model {model}'}: {error}{_link_keys_hint(link)}"
+            ) from None
 
 
-def _cure(link: LinkSettings) -> str:
-    """Return what may be said of a link whose joints are read outside the arm's limits."""
+def _link_keys_hint(link: LinkSettings) -> str:
+    """Return a hint on the settings that are wrong if joint angles exceed the arm's limits."""
     keys = [key for key in ("gear", "zero", "direction") if hasattr(link, key)]
     return f" (--link sets {', '.join(keys)})" if keys else " (the profile's unit and zero)"
 
 
-def _beside(path: Path, out: Path) -> str:
-    """Return a path relative to the cell's folder, or absolute where it is outside."""
+def _path_from_cell(path: Path, out: Path) -> str:
+    """Return a path relative to the cell's folder, or absolute if it is outside."""
     try:
         return str(path.resolve().relative_to(out.parent.resolve()))
     except ValueError:
         return str(path.resolve())
 
 
-def _check(text: str, out: Path) -> None:
-    """Raise where the cell cannot be loaded: nothing that no command reads is written."""
-    with tempfile.NamedTemporaryFile(
-        "w", suffix=".yaml", dir=out.parent, encoding="utf-8"
-    ) as trial:
-        trial.write(text)
-        trial.flush()
+def _require_loadable(text: str, out: Path) -> None:
+    """Raise GapbridgeError if the text is no valid cell: an invalid one is never written."""
+    with tempfile.NamedTemporaryFile("w", suffix=".yaml", dir=out.parent, encoding="utf-8") as file:
+        file.write(text)
+        file.flush()
         try:
-            load_cell(trial.name)
+            load_cell(file.name)
         except GapbridgeError as error:
-            raise type(error)(str(error).replace(trial.name, str(out))) from None
+            raise type(error)(str(error).replace(file.name, str(out))) from None
 
 
-def _known_text(facts: ControllerFacts) -> str:
-    """Return in words what the controller has reported."""
+def _facts_text(facts: ControllerFacts) -> str:
+    """Return text that lists what the controller has reported, and what not."""
     names = {
         "model": facts.model, "factory calibration": facts.calibration or None, "TCP": facts.tcp,
         "payload": facts.payload, "gravity": facts.gravity, "joint limits": facts.lower,
         "rate": facts.rate,
     }  # fmt: skip
-    known = [name for name, value in names.items() if value is not None]
+    reported = [name for name, value in names.items() if value is not None]
     missing = [name for name, value in names.items() if value is None]
     joints = f"{facts.n} joints" if facts.q is None else f"{facts.n} joints at {_degrees(facts.q)}"
-    return f"{joints}; reported: {', '.join(known) or 'nothing else'}" + (
+    return f"{joints}; reported: {', '.join(reported) or 'nothing else'}" + (
         f"; not reported: {', '.join(missing)}" if missing else ""
     )
 

@@ -51,18 +51,19 @@ def patch(
 
     Example: gapbridge patch ur10e.xml --cell better.yaml --out ur10e_real.xml --tcp attachment_site
     """
-    from gapbridge.bridge.cli.cell.patch import tie_lines
     from gapbridge.bridge.patch import changes_of, format_of
 
     kind = format_of(model)
     if not model.is_file():
         raise InputError(f"{model}: file not found, expected a model")
-    given = open_cell(cell)
+    opened = open_cell(cell)
     require_writable(out, model, cell)
-    options = _options(given, out, joints, tcp, load)
-    bounds = None if parameters is None else _bounds(model, given, options, parameters, (out, cell))
-    ties = tie_lines(given.causes, given.model.terms)
-    patched = kind.patch(model, changes_of(given.model), options, [f"cell: {cell.name}", *ties])
+    options = _options(opened, out, joints, tcp, load)
+    bounds = None
+    if parameters is not None:
+        bounds = _bounds(model, opened, options, parameters, (out, cell))
+    ties = tie_lines(opened.causes, opened.model.terms)
+    patched = kind.patch(model, changes_of(opened.model), options, [f"cell: {cell.name}", *ties])
     write_text(out, patched.text)
     for line in patched.changed:
         click.echo(line)
@@ -104,17 +105,18 @@ def _bounds(
     return parameters_text(model, cell, options, suffix)
 
 
-def tie_lines(accused: Sequence[CauseEntry], terms: Sequence[Term]) -> tuple[str, ...]:
-    """Return one line for each accused effect that has ties and is in the model: both candidates.
+def tie_lines(causes: Sequence[CauseEntry], terms: Sequence[Term]) -> tuple[str, ...]:
+    """Return one line for each cause in the model that has ties: all candidates.
 
-    The accused one is in the model with its value; of the other it is said how people put it in
-    and where its value comes from.
+    The named cause is in the model with its value; for the others the line says how they are
+    modelled and how to estimate their value.
     """
-    there = {(term.effect, term.site.joint) for term in terms if not term.stand_in}
+    in_model = {(term.effect, term.site.joint) for term in terms if not term.stand_in}
     lines = []
-    for cause in accused:
+    for cause in causes:
         joints: list[int | None] = [*cause.joints] or [None]
-        if not cause.indistinguishable_from or not any((cause.effect, j) in there for j in joints):
+        applied = any((cause.effect, joint) in in_model for joint in joints)
+        if not (cause.indistinguishable_from and applied):
             continue
         numbers = ", ".join(f"{p.name} = {p.value:.6g} {p.unit}".rstrip() for p in cause.parameters)
         others = " or ".join(

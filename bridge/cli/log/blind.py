@@ -40,7 +40,7 @@ def blind(context: click.Context, arguments: tuple[str, ...]) -> None:
 
 
 def benchmark() -> click.Command:
-    """Return the benchmark's command; raises RunError where there is no checkout around us."""
+    """Return the benchmark's command; raises RunError outside a checkout."""
     if (CHECKOUT / "benchmarks" / "blind").is_dir() and str(CHECKOUT) not in sys.path:
         sys.path.append(str(CHECKOUT))
     try:

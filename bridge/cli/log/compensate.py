@@ -7,19 +7,19 @@ from pathlib import Path
 import click
 import numpy as np
 
-from gapbridge.bridge.api.functions import compensate as corrected
+from gapbridge.bridge.api.functions import compensate as compensate_log
 from gapbridge.bridge.cli.log.large_log import pieces_of
 from gapbridge.bridge.cli.options import (
     cell_option,
     csv_option,
     log_argument,
-    looked_over,
     open_cell,
+    with_range_warning,
 )
 from gapbridge.bridge.cli.progress import progress
 from gapbridge.bridge.document.output_file import require_table, writing_table
 
-MISSED = 1e-6  # m: a corrected setpoint that leaves more than this is reported
+MAX_RESIDUAL = 1e-6  # m from the intended pose, above which a row is reported
 
 
 @click.command()
@@ -35,18 +35,18 @@ def compensate(log: Path, cell: Path, out: Path) -> None:
 
     Example: gapbridge compensate log.csv --cell cell.yaml --out corrected.csv
     """
-    given = open_cell(cell)
+    opened = open_cell(cell)
     require_table(out, log, cell)
-    names = [f"corrected_q_{i}" for i in range(given.arm.n)]
+    names = [f"corrected_q_{i}" for i in range(opened.arm.n)]
     rows, missed, worst, line = 0, 0, 0.0, 0
     with writing_table(out) as append, progress("correcting") as advance:
-        for piece in looked_over(pieces_of(log, given), given):
-            found = corrected(given, piece)
-            append(names, found.q)
-            missed += int(np.sum(found.residual > MISSED))
-            most = int(found.residual.argmax())
-            if found.residual[most] > worst:
-                worst, line = float(found.residual[most]), piece.line(most)
+        for piece in with_range_warning(pieces_of(log, opened), opened):
+            corrected = compensate_log(opened, piece)
+            append(names, corrected.q)
+            missed += int(np.sum(corrected.residual > MAX_RESIDUAL))
+            most = int(corrected.residual.argmax())
+            if corrected.residual[most] > worst:
+                worst, line = float(corrected.residual[most]), piece.line(most)
             rows += len(piece)
             advance(len(piece))
     if missed:

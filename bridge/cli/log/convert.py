@@ -44,7 +44,7 @@ ROLES = tuple(TYPES)
     "--units", type=click.Choice(("degrees", "rad")), help="What a LeRobot dataset's angles are in."
 )
 @click.option("--episode", type=click.IntRange(0), help="One episode of a LeRobot dataset.")
-def convert(source: Path, out: Path, cell: Path | None, **given: Any) -> None:
+def convert(source: Path, out: Path, cell: Path | None, **options: Any) -> None:
     """Convert a recording of another program to a log.
 
     SOURCE is a ROS 1 or ROS 2 bag (JointState, JointTrajectoryControllerState, WrenchStamped,
@@ -59,18 +59,18 @@ def convert(source: Path, out: Path, cell: Path | None, **given: Any) -> None:
     if kind is None:
         if not source.exists():
             raise LogError(f"{source}: not found, expected a file or folder")
-        listed = "; ".join(one.title for one in SOURCES)
+        known = "; ".join(one.title for one in SOURCES)
         plain = source.name.lower().endswith((".csv", ".csv.gz", *PARQUET))
         also = "; a file with columns such as actual_q_0 is a log as it stands" if plain else ""
         raise LogError(
-            f"{source}: found no known kind of recording, expected one of: {listed}{also}"
+            f"{source}: found no known kind of recording, expected one of: {known}{also}"
         )
     require_table(out, *([source] if source.is_file() else []), *([cell] if cell else []))
-    options = _options(**given)
-    for_cell = open_cell(cell) if cell else None
-    converted = kind.read(source, joint_names(for_cell) if for_cell else (), options)
-    if for_cell is not None:
-        converted.log(source, for_cell.arm.n)  # the arm's number of joints
+    source_options = _options(**options)
+    opened = open_cell(cell) if cell else None
+    converted = kind.read(source, joint_names(opened) if opened else (), source_options)
+    if opened is not None:
+        converted.log(source, opened.arm.n)  # checks the number of joints
     names, table = converted.table()
     write_table(out, names, table)
     order = ", ".join(f"{i + 1} {name}" for i, name in enumerate(converted.joints))
@@ -87,12 +87,12 @@ def _options(
 
 
 def _by_role(topics: tuple[str, ...]) -> dict[str, str]:
-    found = {}
-    for given in topics:
-        role, equals, topic = given.partition("=")
+    roles = {}
+    for option in topics:
+        role, equals, topic = option.partition("=")
         if not equals or role not in ROLES or not topic:
             raise InputError(
-                f"--topic: found {given!r}, expected ROLE=TOPIC with ROLE one of {', '.join(ROLES)}"
+                f"--topic: found {option!r}, expected ROLE=TOPIC, ROLE one of {', '.join(ROLES)}"
             )
-        found[role] = topic
-    return found
+        roles[role] = topic
+    return roles

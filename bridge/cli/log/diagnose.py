@@ -11,7 +11,7 @@ import click
 from gapbridge.bridge.api.records import Diagnosed
 from gapbridge.bridge.cell import Cell
 from gapbridge.bridge.cell.opened_log import open_simulated
-from gapbridge.bridge.cli.log.answer import answer, other_arm
+from gapbridge.bridge.cli.log.diagnosis_text import diagnosis_text, wrong_arm_findings
 from gapbridge.bridge.cli.options import (
     FILE,
     cell_option,
@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     "--out",
     type=FILE,
     metavar="DIR",
-    help="Folder for diagnosis.json and report.html; made where it is missing.",
+    help="Folder for diagnosis.json and report.html; created if missing.",
 )
 @click.option("--json", "json_file", type=FILE, metavar="FILE", help="Write the diagnosis as JSON.")
 @click.option(
@@ -78,7 +78,7 @@ def diagnose(
     remounted: bool,
     withhold: tuple[str, ...],
     sim: Path | None,
-    **given: Any,
+    **options: Any,
 ) -> None:
     """Diagnose the sim-to-real gap of a log, or of several sessions of one arm.
 
@@ -95,7 +95,7 @@ def diagnose(
 
     Example: gapbridge diagnose log.csv --cell cell.yaml --out out/diagnosis --apply better.yaml
     """
-    output = _Output(**given)
+    output = _Output(**options)
     if output.stand_ins and output.new_cell is None:
         raise InputError("--stand-ins: found no --apply, expected the cell to write")
     opened = open_cell(cell)
@@ -106,19 +106,19 @@ def diagnose(
     output.require_writable(*logs, cell, *([sim] if sim else []))
     with status("diagnosing") as emit:
         metrology = replace(opened.metrology, remounted=remounted)
-        found = _diagnose(opened, rows, metrology, withhold, simulated, emit)
-    for finding in other_arm(found):
+        diagnosis = _diagnose(opened, rows, metrology, withhold, simulated, emit)
+    for finding in wrong_arm_findings(diagnosis):
         click.echo(f"warning: {rows.path}: {log_finding_text(finding)}", err=True)
-    click.echo(answer(found))
+    click.echo(diagnosis_text(diagnosis))
     origin = provenance({"log": logs, "cell": [cell], "sim": [sim] if sim else []})
-    whole = Diagnosed(opened, rows, found, document(found) | {"provenance": origin})
+    whole = Diagnosed(opened, rows, diagnosis, document(diagnosis) | {"provenance": origin})
     for file in output.write(whole):
         click.echo(f"{file}: written")
 
 
 @dataclass(frozen=True)
 class _Output:
-    """What is written, and where."""
+    """The output files of the command; None: not written."""
 
     out: Path | None
     json_file: Path | None
@@ -126,7 +126,7 @@ class _Output:
     stand_ins: bool
 
     def require_writable(self, *inputs: Path) -> None:
-        """Make the folder; raise InputError where a file cannot be written, or is an input."""
+        """Create the folder; raise InputError if a file is not writable, or is an input."""
         for file in (self.json_file, self.new_cell):
             if file is not None:
                 require_writable(file, *inputs)
@@ -135,13 +135,13 @@ class _Output:
         if self.out is not None:
             require_folder(self.out, "--out", above=False)
 
-    def write(self, found: Diagnosed) -> list[Path]:
-        """Write what was asked for and return its files."""
+    def write(self, diagnosed: Diagnosed) -> list[Path]:
+        """Write the requested files and return their paths."""
         if self.json_file is not None:
-            found.write_json(self.json_file)
+            diagnosed.write_json(self.json_file)
         if self.new_cell is not None:
-            found.save(self.new_cell, stand_ins=self.stand_ins)
-        folder = [] if self.out is None else found.write_report(self.out)
+            diagnosed.save(self.new_cell, stand_ins=self.stand_ins)
+        folder = [] if self.out is None else diagnosed.write_report(self.out)
         return [*folder, *(f for f in (self.json_file, self.new_cell) if f is not None)]
 
 

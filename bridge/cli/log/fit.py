@@ -13,7 +13,7 @@ from rich.table import Table
 
 from gapbridge.bridge.api.uncertainty import fit_intervals
 from gapbridge.bridge.cell import Cell, save_cell
-from gapbridge.bridge.cell.log_fit import pose_findings
+from gapbridge.bridge.cell.log_consistency import pose_findings
 from gapbridge.bridge.cli.log.large_log import LargeLog, has_sessions, is_large
 from gapbridge.bridge.cli.options import (
     FILE,
@@ -49,10 +49,10 @@ def fit(logs: tuple[Path, ...], cell: Path, remounted: bool, out: Path) -> None:
     under different payloads or forces. Effects of the cell are kept. Writes NEW_CELL: the same cell
     with the identified flexibilities; those that the log does not determine keep the value of the
     cell, and are reported. If the instrument is not registered, its frame and the tool point are
-    estimated too; the tool point is written where the log determines it (not with --remounted).
-    Where the poses are likelier with them, so are links and joints' zeros (or a registered cell's
-    tool point alone, which is written): no flexibility makes up for them, and diagnose names them.
-    Links are not written; where the cell would then predict unseen poses worse, they are held
+    estimated too; the tool point is written if the log determines it (not with --remounted).
+    If the poses support them, so are link geometry and joint offsets (of a registered cell the tool
+    point alone, which is written), so that they do not bias the flexibilities; diagnose names them.
+    Link geometry is not written; if the cell would then predict unseen poses worse, it is kept
     nominal.
     Declines, with the reason, if nothing in the log excites the compliance. A log of more than
     20,000 rows, or a recording of the daemon (.mcap), is read in pieces, so that memory does not
@@ -61,29 +61,29 @@ def fit(logs: tuple[Path, ...], cell: Path, remounted: bool, out: Path) -> None:
 
     Example: gapbridge fit log.csv --cell cell.yaml --out calibrated.yaml
     """
-    given = open_cell(cell)
+    opened = open_cell(cell)
     require_writable(out, *logs, cell)
-    metrology = replace(given.metrology, remounted=remounted)
+    metrology = replace(opened.metrology, remounted=remounted)
     try:
-        found, wrong, ranges = _identified(logs, given, metrology)
+        estimate, warnings, ranges = _identified(logs, opened, metrology)
     except ExcitationError as error:
         raise ExcitationError(f"{', '.join(map(str, logs))}: {error}") from None
-    spread = Spread.of_fit(found.identifiable, found.covariance).beside(given.spread)
-    intervals = given.intervals | fit_intervals(found)
+    spread = Spread.of_fit(estimate.identifiable, estimate.covariance).beside(opened.spread)
+    intervals = opened.intervals | fit_intervals(estimate)
     origin = fitted(provenance({"log": logs, "cell": [cell]}), ranges, spread, intervals)
-    save_cell(given, out, found.written, {"provenance": origin})
-    for line in wrong:
+    save_cell(opened, out, estimate.written, {"provenance": origin})
+    for line in warnings:
         click.echo(f"warning: {', '.join(map(str, logs))}: {line}", err=True)
-    print_identification(found)
+    print_identification(estimate)
     click.echo(f"{out}: written")
 
 
 def _identified(
     paths: Sequence[Path], cell: Cell, metrology: Metrology
 ) -> tuple[Identification, list[str], dict[str, tuple[float, float]]]:
-    """Return what the logs show, what is odd in them, and the ranges fitted on.
+    """Return the estimate, warnings about the logs, and the range of each fitted column.
 
-    One of many rows passes in pieces.
+    A large log is read in pieces.
     """
     if (
         len(paths) == 1
@@ -91,52 +91,52 @@ def _identified(
         and not (has_sessions(paths[0]) or metrology.remounted)
     ):
         ranges: list[dict[str, tuple[float, float]]] = []
-        wrong: list[str] = []
+        warnings: list[str] = []
 
         def read_once() -> Iterator[Log]:
             for piece in LargeLog(paths[0], cell, by_approach(cell.model.terms)):
                 if not ranges:
-                    wrong.extend(pose_findings(cell, piece))
+                    warnings.extend(pose_findings(cell, piece))
                 ranges.append(range_of(piece))
                 yield piece
 
         with status("fitting") as emit:
-            found = identify_streamed(cell.model, read_once(), metrology, progress=emit)
-        return found, wrong, merged(ranges)
+            estimate = identify_streamed(cell.model, read_once(), metrology, progress=emit)
+        return estimate, warnings, merged(ranges)
     rows = open_logs(paths, cell)
     with progress("fitting"):
-        found = identify_compliance(cell.model, rows, metrology)
-    return found, pose_findings(cell, rows), range_of(rows)
+        estimate = identify_compliance(cell.model, rows, metrology)
+    return estimate, pose_findings(cell, rows), range_of(rows)
 
 
-def print_identification(found: Identification) -> None:
-    """Print flexibilities with their spread, how far they carry, and what stays unknown."""
+def print_identification(estimate: Identification) -> None:
+    """Print flexibilities with 1 sigma, gaps before and after, expected gaps, and notes."""
     table = Table(title="joint flexibility, 1e-6 rad/Nm", title_justify="left")
     for column in ("joint", "axial", "±", "radial", "±"):
         table.add_column(column, justify="right")
-    n = len(found.axial)
+    n = len(estimate.axial)
     for i in range(n):
         table.add_row(
             str(i + 1),
-            *_cells(found.axial[i], found.std_axial[i], bool(found.identifiable[i])),
-            *_cells(found.radial[i], found.std_radial[i], bool(found.identifiable[n + i])),
+            *_cells(estimate.axial[i], estimate.std_axial[i], bool(estimate.identifiable[i])),
+            *_cells(estimate.radial[i], estimate.std_radial[i], bool(estimate.identifiable[n + i])),
         )
     console = Console()
     console.print(table)
     click.echo(
-        f"gap over {found.samples} poses, mm rms per coordinate (in space): "
-        f"{_change(found.gap_rms, found.remaining_rms)}"
+        f"gap over {estimate.samples} poses, mm rms per coordinate (in space): "
+        f"{_change(estimate.gap_rms, estimate.remaining_rms)}"
     )
-    if np.isfinite(found.remaining_rms_held_out):
-        change = _change(found.gap_rms_held_out, found.remaining_rms_held_out)
+    if np.isfinite(estimate.remaining_rms_held_out):
+        change = _change(estimate.gap_rms_held_out, estimate.remaining_rms_held_out)
         click.echo(f"on poses left out of the fit: {change}")
-    for where, left in (
-        ("a new region of joint space", found.remaining_rms_new_region),
-        ("a new session", found.remaining_rms_new_session),
+    for where, rms in (
+        ("a new region of joint space", estimate.remaining_rms_new_region),
+        ("a new session", estimate.remaining_rms_new_session),
     ):
-        if np.isfinite(left):
-            click.echo(f"to expect in {where}, mm rms per coordinate (in space): {_mm(left)}")
-    for line in note_texts((*found.notes, *found.combinations)):
+        if np.isfinite(rms):
+            click.echo(f"to expect in {where}, mm rms per coordinate (in space): {_mm(rms)}")
+    for line in note_texts((*estimate.notes, *estimate.combinations)):
         click.echo(f"note: {line}")
 
 
@@ -145,7 +145,7 @@ def _change(before: float, after: float) -> str:
 
 
 def _mm(rms: float) -> str:
-    """Return an rms per coordinate (m) in mm, beside it that of the distance in space."""
+    """Return an rms per coordinate (m) in mm, and in parentheses that of the distance."""
     return f"{rms * 1e3:.4f} ({3**0.5 * rms * 1e3:.4f})"
 
 

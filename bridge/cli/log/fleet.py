@@ -15,10 +15,10 @@ from gapbridge.bridge.cli.progress import progress
 from gapbridge.bridge.document.output_file import require_folder
 from gapbridge.bridge.fleet.cell_source import cell_source
 from gapbridge.bridge.fleet.journal import Journal
-from gapbridge.bridge.fleet.runner import Done, ending, run, tasks_of
-from gapbridge.bridge.fleet.session import Found, find_sessions
+from gapbridge.bridge.fleet.runner import FleetRun, make_tasks, run, summary_lines
+from gapbridge.bridge.fleet.session import Fleet, find_sessions
 from gapbridge.bridge.fleet.session_work import diagnose_session, fit_session
-from gapbridge.bridge.fleet.task import BAD, DONE, Outcome, Work
+from gapbridge.bridge.fleet.task import BAD, DONE, Outcome, SessionJob
 from gapbridge.bridge.fleet.workers.dask_workers import DaskWorkers
 from gapbridge.bridge.fleet.workers.local_workers import LocalWorkers
 from gapbridge.bridge.fleet.workers.workers import Workers
@@ -36,8 +36,8 @@ def fleet() -> None:
     """
 
 
-def shared(command: Callable[..., None]) -> Callable[..., None]:
-    """Add what both commands take."""
+def shared_options(command: Callable[..., None]) -> Callable[..., None]:
+    """Add the options of both commands."""
     for option in reversed((
         click.argument("logs", nargs=-1, required=True, metavar="DIR_OR_GLOB..."),
         click.option(
@@ -70,7 +70,7 @@ def shared(command: Callable[..., None]) -> Callable[..., None]:
 
 @dataclass(frozen=True)
 class FleetOptions:
-    """The options that the commands of a fleet share."""
+    """The values of the options that both commands share."""
 
     logs: tuple[str, ...]
     cell: str
@@ -82,11 +82,11 @@ class FleetOptions:
 
 
 @fleet.command()
-@shared
+@shared_options
 @click.option(
     "--withhold", multiple=True, metavar="EFFECT", help="Remove an effect from the catalogue."
 )
-def diagnose(withhold: tuple[str, ...], **given: Any) -> None:
+def diagnose(withhold: tuple[str, ...], **values: Any) -> None:
     """Diagnose every log: which effects recur, which arms drift, which are unusual.
 
     Writes results.parquet (a row per session and parameter), sessions.parquet and report.html. A
@@ -97,20 +97,20 @@ def diagnose(withhold: tuple[str, ...], **given: Any) -> None:
     """
     for name in withhold:
         effect_named(name)
-    options = FleetOptions(**given)
-    done, found = _run("diagnose", diagnose_session, {"withhold": list(withhold)}, options)
-    from gapbridge.bridge.fleet.output import write_diagnosed
+    options = FleetOptions(**values)
+    done, sessions = _run("diagnose", diagnose_session, {"withhold": list(withhold)}, options)
+    from gapbridge.bridge.fleet.output import write_diagnosis
 
-    _reported(done, found, *write_diagnosed(done, found, options.out))
+    _print_results(done, sessions, *write_diagnosis(done, sessions, options.out))
 
 
 @fleet.command()
-@shared
+@shared_options
 @click.option(
     "--apply", "cells", type=FILE, metavar="DIR",
     help="Write a new cell per arm there, and cells.csv, a table of them."
 )  # fmt: skip
-def fit(cells: Path | None, **given: Any) -> None:
+def fit(cells: Path | None, **values: Any) -> None:
     """Fit the compliance of all arms together: type, arm, session.
 
     An arm with few poses benefits from the others of its type where its own data are weak.
@@ -120,50 +120,50 @@ def fit(cells: Path | None, **given: Any) -> None:
     """
     if cells is not None:
         require_folder(cells, "--apply")
-    options = FleetOptions(**given)
-    done, found = _run("fit", fit_session, {}, options)
-    from gapbridge.bridge.fleet.output import write_fitted
+    options = FleetOptions(**values)
+    done, sessions = _run("fit", fit_session, {}, options)
+    from gapbridge.bridge.fleet.output import write_fit
 
-    _reported(done, found, *write_fitted(done, found, options.out, cells))
+    _print_results(done, sessions, *write_fit(done, sessions, options.out, cells))
 
 
 def _run(
-    name: str, work: Work, extra: Mapping[str, Any], options: FleetOptions
-) -> tuple[Done, Found]:  # fmt: skip
-    """Do a work on all sessions; ``extra`` are options of the work itself."""
+    name: str, job: SessionJob, job_options: Mapping[str, Any], options: FleetOptions
+) -> tuple[FleetRun, Fleet]:  # fmt: skip
+    """Run a job on all sessions; raises InputError or RunError if none is usable."""
     workers, scheduler = options.workers, options.scheduler
     if workers is not None and scheduler is not None:
         raise InputError("--workers: found beside --scheduler, expected one of them")
-    found = find_sessions(options.logs, options.pattern, without=options.out)
-    cells = cell_source(options.cell, found.folder)
+    sessions = find_sessions(options.logs, options.pattern, without=options.out)
+    cells = cell_source(options.cell, sessions.folder)
     for warning in cells.warnings():
         click.echo(f"warning: {warning}", err=True)
     require_folder(options.out, "--out")
-    tasks, bad = tasks_of(found.sessions, cells, work, extra)
+    tasks, bad = make_tasks(sessions.sessions, cells, job, job_options)
     count = min(workers or os.cpu_count() or 1, max(len(tasks), 1))
-    chosen: Workers = DaskWorkers(scheduler) if scheduler else LocalWorkers(count)
+    pool: Workers = DaskWorkers(scheduler) if scheduler else LocalWorkers(count)
     for outcome in bad:
-        _skipped(outcome)
+        _print_skipped(outcome)
     with (
         Journal(options.out / f"{name}.jsonl", fresh=options.fresh) as journal,
         progress(f"{name}: sessions", len(tasks)) as advance,
     ):
 
         def emit(outcome: Outcome) -> None:
-            _skipped(outcome)
+            _print_skipped(outcome)
             advance(1)
 
-        done = run(tasks, bad, chosen, journal, emit)
+        done = run(tasks, bad, pool, journal, emit)
     _require_usable(done)
-    return done, found
+    return done, sessions
 
 
-def _skipped(outcome: Outcome) -> None:
+def _print_skipped(outcome: Outcome) -> None:
     if outcome.state != DONE:
         click.echo(f"skipped: {outcome.error}", err=True)
 
 
-def _require_usable(done: Done) -> None:
+def _require_usable(done: FleetRun) -> None:
     if any(o.state == DONE for o in done.outcomes):
         return
     text = f"found no usable session among {len(done.outcomes)}, expected at least one"
@@ -173,8 +173,8 @@ def _require_usable(done: Done) -> None:
     raise RunError(f"{text}; the first: {first}")
 
 
-def _reported(done: Done, found: Found, lines: list[str], files: list[Path]) -> None:
-    for line in (*ending(done, found), *lines):
+def _print_results(done: FleetRun, sessions: Fleet, lines: list[str], files: list[Path]) -> None:
+    for line in (*summary_lines(done, sessions), *lines):
         click.echo(line)
     for file in files:
         click.echo(f"{file}: written")

@@ -1,4 +1,4 @@
-"""Logs that a command takes in pieces: recordings, and files of more rows than LARGE."""
+"""Logs read in pieces: recordings, and files of more than LARGE_ROWS rows."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from gapbridge.core.log.pieces import ROWS, LogPieces
 from gapbridge.core.log.sources import source_of
 from gapbridge.core.log.sources.recording import Recording
 
-AT_ONCE = 65_536  # rows of a piece where nothing but the piece's own result is kept
-LARGE = 20_000  # rows from which a log is read in pieces
-BYTES = 8_000_000  # of a text file that holds about as many
+PIECE_ROWS = 65_536  # of a piece whose rows are processed independently
+LARGE_ROWS = 20_000
+LARGE_BYTES = 8_000_000  # of a text file with about LARGE_ROWS
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class LargeLog:
         """Yield the pieces. Raises LogError, as ``open_log`` does."""
         files = [self.path]
         if not self.path.is_file():
-            from gapbridge.core.log.mcap_reading import files_of  # brings protobuf
+            from gapbridge.core.log.mcap_reading import files_of  # imports protobuf
 
             files = files_of(self.path)
         for file in files:
@@ -44,28 +44,28 @@ class LargeLog:
 
 
 def pieces_of(path: Path, cell: Cell) -> Iterable[Log]:
-    """Return a log for a cell's arm in pieces; what another program wrote, or is small, as one.
+    """Return a log in pieces; a small log, or another program's recording, is one piece.
 
     Raises LogError, as ``open_log`` does.
     """
     if source_of(path) is None and is_large(path):
-        return LargeLog(path, cell, by_approach(cell.model.terms), AT_ONCE)
+        return LargeLog(path, cell, by_approach(cell.model.terms), PIECE_ROWS)
     return [open_log(path, cell)]
 
 
 def is_large(path: Path) -> bool:
-    """Return whether a log is to be read in pieces. Raises LogError where it cannot be read."""
+    """Return whether a log is to be read in pieces. Raises LogError if it cannot be read."""
     source = source_of(path)
     if source is not None:
         return source.identifier == Recording.identifier
     if not path.is_file():
         return False
     if path.suffix.lower() not in PARQUET:
-        return path.stat().st_size > BYTES
+        return path.stat().st_size > LARGE_BYTES
     import pyarrow
 
     try:
-        return LogPieces(path, 0).count() > LARGE
+        return LogPieces(path, 0).count() > LARGE_ROWS
     except (pyarrow.ArrowException, OSError) as error:
         raise LogError(f"{path}: found no readable Parquet file ({error})") from None
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import click
 import numpy as np
 
-from gapbridge.bridge.api.functions import predict as predicted
+from gapbridge.bridge.api.functions import predict as predict_log
 from gapbridge.bridge.api.records import Predicted, as_table
 from gapbridge.bridge.cell import Cell
 from gapbridge.bridge.cli.log.large_log import pieces_of
@@ -18,8 +18,8 @@ from gapbridge.bridge.cli.options import (
     cell_option,
     csv_option,
     log_argument,
-    looked_over,
     open_cell,
+    with_range_warning,
 )
 from gapbridge.bridge.cli.progress import progress
 from gapbridge.bridge.document.output_file import require_table, writing_table
@@ -27,7 +27,7 @@ from gapbridge.core.arrays import Array
 from gapbridge.core.log.log import Log
 from gapbridge.core.predicted_channels import in_context, predicted_channels
 
-SHOWN = 8  # rows named at most
+MAX_SHOWN = 8  # rows listed
 
 
 @click.command()
@@ -53,34 +53,34 @@ def predict(log: Path, cell: Path, out: Path, channels: bool) -> None:
 
     Example: gapbridge predict log.csv --cell cell.yaml --out predicted.csv
     """
-    given = open_cell(cell)
+    opened = open_cell(cell)
     require_table(out, log, cell)
     summary = _Summary()
     with writing_table(out) as append, progress("predicting") as advance:
-        for piece, found in _predicted(given, log, channels):
-            append(*as_table(found.columns))
-            summary.add(piece, found)
+        for piece, predicted in _predicted_pieces(opened, log, channels):
+            append(*as_table(predicted.columns))
+            summary.add(piece, predicted)
             advance(len(piece))
     click.echo(f"{out}: {summary.rows} predicted poses")
-    for text in summary.lines(given):
+    for text in summary.lines(opened):
         click.echo(text)
 
 
-def _predicted(cell: Cell, log: Path, channels: bool) -> Iterator[tuple[Log, Predicted]]:
-    """Yield the pieces of a log with what is predicted of them."""
-    pieces = looked_over(pieces_of(log, cell), cell)
+def _predicted_pieces(cell: Cell, log: Path, channels: bool) -> Iterator[tuple[Log, Predicted]]:
+    """Yield the pieces of a log with their predictions."""
+    pieces = with_range_warning(pieces_of(log, cell), cell)
     if not channels:
-        yield from ((piece, predicted(cell, piece)) for piece in pieces)
+        yield from ((piece, predict_log(cell, piece)) for piece in pieces)
         return
-    for around, own in in_context(pieces):
-        piece = around.select(own)
-        further, needs = predicted_channels(cell.model, around)
-        further = {name: values[own] for name, values in further.items()}
-        yield piece, replace(predicted(cell, piece), channels=further, needs=needs)
+    for context, rows in in_context(pieces):
+        piece = context.select(rows)
+        channels_of_context, needs = predicted_channels(cell.model, context)
+        further = {name: values[rows] for name, values in channels_of_context.items()}
+        yield piece, replace(predict_log(cell, piece), channels=further, needs=needs)
 
 
 class _Summary:
-    """What is to be known of the predictions of all pieces: their spread, and what is not there."""
+    """Standard deviation, rows outside the fit and missing channels over all pieces."""
 
     def __init__(self) -> None:
         self.rows = 0
@@ -90,32 +90,32 @@ class _Summary:
         self._count = 0
         self._needs: dict[str, str] = {}
 
-    def add(self, log: Log, found: Predicted) -> None:
+    def add(self, log: Log, predicted: Predicted) -> None:
         self.rows += len(log)
-        if found.position_std is not None:
-            std = 1e3 * np.linalg.norm(found.position_std, axis=1)
+        if predicted.position_std is not None:
+            std = 1e3 * np.linalg.norm(predicted.position_std, axis=1)
             self._std.append(std)
             worst = int(std.argmax())
             self._worst = max(self._worst, (float(std[worst]), log.line(worst)), key=itemgetter(0))
-        if found.outside is not None:
-            rows = np.flatnonzero(found.outside)
+        if predicted.outside is not None:
+            rows = np.flatnonzero(predicted.outside)
             self._count += len(rows)
-            self._outside += [log.line(i) for i in rows[: SHOWN - len(self._outside)]]
-        self._needs |= found.needs
+            self._outside += [log.line(i) for i in rows[: MAX_SHOWN - len(self._outside)]]
+        self._needs |= predicted.needs
 
     def lines(self, cell: Cell) -> Iterator[str]:
-        """Yield what a person should know."""
+        """Yield the lines of the summary."""
         if not self._std:
             yield f"no standard deviation: {cell.path} keeps no covariance of a fit"
         else:
             worst, line = self._worst
-            middle = np.median(np.concatenate(self._std))
+            median = np.median(np.concatenate(self._std))
             yield (
-                f"standard deviation of the position (3D, the fit's part): {middle:.4f} mm in "
+                f"standard deviation of the position (3D, the fit's part): {median:.4f} mm in "
                 f"the middle, at most {worst:.4f} mm (row {line})"
             )
         if self._count:
-            some = ", ".join(map(str, self._outside)) + (", ..." if self._count > SHOWN else "")
-            yield f"outside what was fitted: {self._count} of {self.rows} rows ({some})"
+            rows = ", ".join(map(str, self._outside)) + (", ..." if self._count > MAX_SHOWN else "")
+            yield f"outside what was fitted: {self._count} of {self.rows} rows ({rows})"
         for channel, needed in self._needs.items():
             yield f"no {channel} predicted: needs {needed}"

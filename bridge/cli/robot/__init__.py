@@ -1,1 +1,1 @@
-"""Commands that reach a robot: real, simulated, or led by a person."""
+"""Commands that need a robot, real or simulated."""

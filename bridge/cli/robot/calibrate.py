@@ -87,7 +87,7 @@ def calibrate(
 
     Example: gapbridge calibrate cell.yaml --instrument typed,unit=mm --poses 20
     """
-    given = open_cell(cell)
+    opened = open_cell(cell)
     if verify + payload_only + tool_only > 1:
         raise click.UsageError("found more than one of --verify, --payload-only and --tool-only")
     folder, new_cell = options["folder"], options["new_cell"]
@@ -95,9 +95,9 @@ def calibrate(
         raise click.UsageError(f"{folder}: found a file, expected a folder for --session")
     if new_cell is not None:
         require_writable(new_cell, cell)
-    chosen = instrument_settings(given, instrument)
+    chosen = instrument_settings(opened, instrument)
     from gapbridge.bridge.calibration.options import SessionOptions
-    from gapbridge.bridge.calibration.run import run_session  # takes the numerical libraries along
+    from gapbridge.bridge.calibration.run import run_session  # imports the numerical libraries
 
     kind = "verify" if verify else "payload" if payload_only else "tool" if tool_only else "whole"
-    run_session(given, SessionOptions(kind=kind, instrument=chosen, **options))
+    run_session(opened, SessionOptions(kind=kind, instrument=chosen, **options))

@@ -46,6 +46,6 @@ def demo(seed: int, out: Path, link: str) -> None:  # fmt: skip
     Example: gapbridge demo --link can --out out/demo_can
     """
     require_folder(out, "--out")
-    from gapbridge.bridge.demo import run_demo  # takes the simulated controllers along
+    from gapbridge.bridge.demo import run_demo  # imports the simulated controllers
 
     run_demo(seed=seed, out=out, link=link)

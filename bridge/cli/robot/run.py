@@ -32,16 +32,16 @@ from gapbridge.core.errors import InputError
 def run(cell: Path, observe: bool, arm: bool, duration: float | None, log: str) -> None:
     """Run the on-cell daemon: read the arm's state, predict how it bends, correct its setpoints.
 
-    Setpoints are written where the cell has `setpoints.arm: true`, with --arm, or after
+    Setpoints are written if the cell has `setpoints.arm: true`, with --arm, or after
     `gapbridge arm CELL`. SIGHUP reads the cell file again; SIGTERM ramps out and ends.
 
     Example: gapbridge run cell.yaml --observe --duration 60
     """
     if observe and arm:
         raise InputError("--observe: found beside --arm, expected one of them")
-    given = open_cell(cell)
-    from gapbridge.bridge.daemon.run import run_cell  # takes the numerical libraries along
+    opened = open_cell(cell)
+    from gapbridge.bridge.daemon.run import run_cell  # imports the numerical libraries
 
     json = JsonLines(sys.stderr).emit if log == "json" else None
-    if code := run_cell(given, observe=observe, arm=arm, duration=duration, log=json):
+    if code := run_cell(opened, observe=observe, arm=arm, duration=duration, log=json):
         raise click.exceptions.Exit(code)

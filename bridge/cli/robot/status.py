@@ -25,5 +25,5 @@ def status(cell: Path | None, as_json: bool) -> None:
         click.echo(json.dumps(found if cell is None else found[0], indent=1))
     elif not found:
         click.echo("no daemon is running")
-    for each in [] if as_json else found:
-        click.echo("\n".join(lines(each)))
+    for document in [] if as_json else found:
+        click.echo("\n".join(lines(document)))

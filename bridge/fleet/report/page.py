@@ -1,4 +1,4 @@
-"""The report of a fleet: one HTML file that needs nothing else."""
+"""The report of a fleet, one self-contained HTML file."""
 
 from __future__ import annotations
 
@@ -9,60 +9,61 @@ from gapbridge.bridge.document.blocks import Document, Part
 from gapbridge.bridge.document.html import html
 from gapbridge.bridge.document.output_file import write_text
 from gapbridge.bridge.document.provenance import origin_blocks, origin_line, provenance
-from gapbridge.bridge.fleet.diagnosis_summary import Diagnosed
-from gapbridge.bridge.fleet.fit_summary import Fitted
-from gapbridge.bridge.fleet.report import diagnosed_sections, fitted_sections, shared_sections
-from gapbridge.bridge.fleet.runner import Done
-from gapbridge.bridge.fleet.session import Found
+from gapbridge.bridge.fleet.diagnosis_summary import FleetDiagnosis
+from gapbridge.bridge.fleet.fit_summary import FleetFit
+from gapbridge.bridge.fleet.report import diagnosis_sections, fit_sections, shared_sections
+from gapbridge.bridge.fleet.runner import FleetRun
+from gapbridge.bridge.fleet.session import Fleet
 from gapbridge.bridge.report.labels import counted
 
 FILE = "report.html"
+DRIFTING = "Significant changes over the sessions of an arm."
 
 
-def write_diagnosed_report(together: Diagnosed, done: Done, found: Found, folder: Path) -> Path:
+def write_diagnosis_report(
+    summary: FleetDiagnosis, done: FleetRun, fleet: Fleet, folder: Path
+) -> Path:
     """Write the report of ``fleet diagnose`` and return its path."""
-    drifts = [*shared_sections.drifts(together.drifts), *diagnosed_sections.onsets(together.onsets)]
+    drifts = [*shared_sections.drifts(summary.drifts), *diagnosis_sections.onsets(summary.onsets)]
     parts = (
-        Part("answer", "The answer", "", diagnosed_sections.answer(together, done)),
+        Part("answer", "The answer", "", diagnosis_sections.answer(summary, done)),
         Part("recurring", "Which effects recur", "Over all sessions whose log could show them.",
-             diagnosed_sections.recurring(together)),
-        Part("drifting", "Which arms drift", "What changes over an arm's sessions by more than it "
-             "scatters.", drifts),
-        Part("outlying", "What stands out", "Sessions unlike the others of their kind.",
-             shared_sections.outliers(together.outliers)),
+             diagnosis_sections.recurring(summary)),
+        Part("drifting", "Which arms drift", DRIFTING, drifts),
+        Part("outlying", "Outliers", "Sessions unlike the others of their kind.",
+             shared_sections.outliers(summary.outliers)),
         Part("sessions", "Sessions", "What was used, and what was skipped.",
-             shared_sections.sessions(done, diagnosed_sections.SESSION_HEADS,
-                                      diagnosed_sections.session_cells)),
+             shared_sections.sessions(done, diagnosis_sections.SESSION_HEADS,
+                                      diagnosis_sections.session_cells)),
     )  # fmt: skip
-    return _write(folder, "Diagnosis of a fleet", parts, done, found)
+    return _write(folder, "Diagnosis of a fleet", parts, done, fleet)
 
 
-def write_fitted_report(together: Fitted, done: Done, found: Found, folder: Path) -> Path:
+def write_fit_report(summary: FleetFit, done: FleetRun, fleet: Fleet, folder: Path) -> Path:
     """Write the report of ``fleet fit`` and return its path."""
     parts = (
-        Part("answer", "The answer", "", fitted_sections.answer(together)),
+        Part("answer", "The answer", "", fit_sections.answer(summary)),
         Part("types", "What arms of a type have in common",
-             "Flexibilities of the type, how far arms scatter about them, how far sessions do.",
-             fitted_sections.types(together)),
-        Part("arms", "The arms", "Each arm's own flexibilities, with what they borrow.",
-             fitted_sections.arms(together)),
-        Part("drifting", "Which arms drift", "What changes over an arm's sessions by more than it "
-             "scatters.", shared_sections.drifts(together.drifts)),
-        Part("outlying", "What stands out", "Arms and sessions unlike the others of their type.",
-             shared_sections.outliers(together.outliers)),
+             "Flexibilities of the type, and their scatter between arms and between sessions.",
+             fit_sections.types(summary)),
+        Part("arms", "The arms", "Flexibilities of each arm, with the share from its own data.",
+             fit_sections.arms(summary)),
+        Part("drifting", "Which arms drift", DRIFTING, shared_sections.drifts(summary.drifts)),
+        Part("outlying", "Outliers", "Arms and sessions unlike the others of their type.",
+             shared_sections.outliers(summary.outliers)),
         Part("sessions", "Sessions", "What was used, and what was skipped.",
-             shared_sections.sessions(done, fitted_sections.SESSION_HEADS,
-                                      fitted_sections.session_cells(together))),
+             shared_sections.sessions(done, fit_sections.SESSION_HEADS,
+                                      fit_sections.session_cells(summary))),
     )  # fmt: skip
-    return _write(folder, "Compliance of a fleet", parts, done, found)
+    return _write(folder, "Compliance of a fleet", parts, done, fleet)
 
 
-def _write(folder: Path, title: str, parts: Sequence[Part], done: Done, found: Found) -> Path:
+def _write(folder: Path, title: str, parts: Sequence[Part], done: FleetRun, fleet: Fleet) -> Path:
     path = folder / FILE
     cells = sorted({Path(o.cell) for o in done.outcomes if Path(o.cell).is_file()})
-    # of the logs, whose number has no end, sessions.parquet holds the names
-    origin = provenance({"cell": cells[: shared_sections.MOST]})
-    about = f"{counted(len(done.outcomes), 'session')} of {counted(found.arms, 'arm')}"
+    # without the logs, which sessions.parquet lists
+    origin = provenance({"cell": cells[: shared_sections.MAX_ROWS]})
+    about = f"{counted(len(done.outcomes), 'session')} of {counted(fleet.arms, 'arm')}"
     document = Document(
         title, f"{about} · {origin_line(origin)}",
         (*parts, Part("origin", "Where this comes from", "", origin_blocks(origin)[1:])),

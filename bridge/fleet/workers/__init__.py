@@ -1,1 +1,1 @@
-"""Who does the tasks: processes of this machine, or a Dask cluster."""
+"""Workers: local processes, or a Dask cluster."""

@@ -1,7 +1,7 @@
-"""Local workers: spawned processes that do one session at a time.
+"""Local workers: spawned processes that run one session at a time.
 
-A pool of the standard library breaks as a whole when one of its processes dies and cannot say
-over which task; here every process has its own pipe, so that the task in it is known.
+Every process has its own pipe, so that the task of a dead one is known; a ProcessPoolExecutor
+would fail as a whole.
 """
 
 from __future__ import annotations
@@ -15,29 +15,29 @@ from dataclasses import dataclass, field
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 
-from gapbridge.bridge.fleet.task import DEATHS, Outcome, Task, died, perform
+from gapbridge.bridge.fleet.task import MAX_DEATHS, Outcome, Task, run_task
 from gapbridge.bridge.fleet.workers.workers import Workers
 from gapbridge.core.errors import RunError
 
-# matrices of this size gain nothing from threads, which only get in each other's way
-SINGLE = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
-STILLBORN = 3  # processes that die before they are ready, one after the other: give up
+# one thread per process: threads do not speed up matrices of this size
+THREAD_VARS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+MAX_FAILED_STARTS = 3  # in a row, after which the run fails
 READY = "ready"
-AHEAD = 2  # tasks that a process has, so that it never waits for the next
-PLENTY = 4  # tasks per process from which on it gets more than one: at the end all share
+QUEUED = 2  # tasks sent to a process, so that it never waits
+MIN_TASKS_PER_PROCESS = 4  # pending, for QUEUED tasks at once
 
 
 @dataclass
 class _Worker:
-    """One process and what it is at."""
+    """One process and its tasks."""
 
     process: BaseProcess
     pipe: Connection
     ready: bool = False
-    tasks: deque[Task] = field(default_factory=deque)  # the first is being done, others wait
+    tasks: deque[Task] = field(default_factory=deque)  # the first is running
 
-    def come_up(self) -> None:
-        """Take tasks from now on."""
+    def set_ready(self) -> None:
+        """Mark the process as ready for tasks."""
         self.ready = True
 
 
@@ -47,11 +47,11 @@ class LocalWorkers(Workers):
     def __init__(self, count: int) -> None:
         self.count = count
         self._workers: list[_Worker] = []
-        self._stillborn = 0
-        self._deaths: dict[str, int] = {}
+        self._failed_starts = 0
+        self._deaths_by_task: dict[str, int] = {}
 
     def description(self) -> str:
-        """Return how many there are."""
+        """Return the number of processes."""
         return f"{self.count} local process{'es' if self.count > 1 else ''}"
 
     def start(self) -> None:
@@ -68,23 +68,23 @@ class LocalWorkers(Workers):
         self._workers = []
 
     def run(self, tasks: Iterable[Task]) -> Iterator[Outcome]:
-        """Give the outcomes as they come; a dead process's task is done again by another."""
-        left = deque(tasks)
+        """Yield the outcomes as they finish; another process repeats the task of a dead one."""
+        pending = deque(tasks)
         while True:
             for worker in self._workers:
-                most = AHEAD if len(left) > PLENTY * self.count else 1
-                while worker.ready and left and len(worker.tasks) < most:
-                    _give(worker, left.popleft())
-            if not left and not any(w.tasks for w in self._workers):
+                most = QUEUED if len(pending) > MIN_TASKS_PER_PROCESS * self.count else 1
+                while worker.ready and pending and len(worker.tasks) < most:
+                    _send(worker, pending.popleft())
+            if not pending and not any(w.tasks for w in self._workers):
                 return
-            for found in self._received():
-                if isinstance(found, Outcome):
-                    yield found
+            for result in self._received():
+                if isinstance(result, Outcome):
+                    yield result
                 else:
-                    left.appendleft(found)
+                    pending.appendleft(result)
 
     def _received(self) -> Iterator[Outcome | Task]:
-        """Wait; give outcomes, and tasks whose process has died and that are to be done again."""
+        """Wait for messages; yield outcomes, and tasks of dead processes to repeat."""
         by_pipe = {worker.pipe: worker for worker in self._workers}
         for pipe in wait(list(by_pipe)):
             assert isinstance(pipe, Connection)
@@ -92,41 +92,42 @@ class LocalWorkers(Workers):
             try:
                 message = pipe.recv()
             except (EOFError, OSError):
-                yield from self._replaced(worker)
+                yield from self._replace(worker)
                 continue
             if message == READY:
-                worker.come_up()
-                self._stillborn = 0
+                worker.set_ready()
+                self._failed_starts = 0
                 continue
             worker.tasks.popleft()
             yield message
 
-    def _replaced(self, worker: _Worker) -> Iterator[Outcome | Task]:
+    def _replace(self, worker: _Worker) -> Iterator[Outcome | Task]:
+        """Replace a dead process; yield its tasks to repeat, or the outcome of a fatal one."""
         worker.pipe.close()
         worker.process.join()
         if not worker.ready:
-            self._stillborn += 1
-            if self._stillborn >= STILLBORN:
+            self._failed_starts += 1
+            if self._failed_starts >= MAX_FAILED_STARTS:
                 raise RunError(
-                    f"{STILLBORN} local processes died while starting (exit code "
-                    f"{worker.process.exitcode}), expected them to come up"
+                    f"{MAX_FAILED_STARTS} local processes died while starting (exit code "
+                    f"{worker.process.exitcode}), expected them to start"
                 )
         self._workers[self._workers.index(worker)] = _spawn()
         if not worker.tasks:
             return
         task, *waiting = worker.tasks
         yield from waiting
-        self._deaths[task.key] = self._deaths.get(task.key, 0) + 1
-        yield died(task) if self._deaths[task.key] >= DEATHS else task
+        self._deaths_by_task[task.key] = self._deaths_by_task.get(task.key, 0) + 1
+        yield task.died_outcome() if self._deaths_by_task[task.key] >= MAX_DEATHS else task
 
 
 def _spawn() -> _Worker:
     context = multiprocessing.get_context("spawn")
-    here, there = context.Pipe()
-    before = {name: os.environ.get(name) for name in SINGLE}
-    os.environ.update(dict.fromkeys(SINGLE, "1"))
+    pipe, worker_pipe = context.Pipe()
+    before = {name: os.environ.get(name) for name in THREAD_VARS}
+    os.environ.update(dict.fromkeys(THREAD_VARS, "1"))
     try:
-        process = context.Process(target=_serve, args=(there,), daemon=True)
+        process = context.Process(target=_serve, args=(worker_pipe,), daemon=True)
         process.start()
     finally:
         for name, value in before.items():
@@ -134,12 +135,12 @@ def _spawn() -> _Worker:
                 del os.environ[name]
             else:
                 os.environ[name] = value
-    there.close()
-    return _Worker(process, here)
+    worker_pipe.close()
+    return _Worker(process, pipe)
 
 
-def _give(worker: _Worker, task: Task) -> None:
-    """Send a task; a process that has just died is found out by whoever listens next."""
+def _send(worker: _Worker, task: Task) -> None:
+    """Send a task; the death of the process is noticed at the next receive."""
     worker.tasks.append(task)
     try:
         worker.pipe.send(task)
@@ -148,12 +149,12 @@ def _give(worker: _Worker, task: Task) -> None:
 
 
 def _serve(pipe: Connection) -> None:
-    """Do tasks until the other end is gone."""
-    # the terminal's Ctrl-C reaches every process: who has started this one decides
+    """Run tasks until the pipe is closed."""
+    # Ctrl-C reaches every process of the terminal; the parent handles it
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         pipe.send(READY)
         while True:
-            pipe.send(perform(pipe.recv()))
+            pipe.send(run_task(pipe.recv()))
     except (EOFError, OSError):
         return

@@ -1,4 +1,4 @@
-"""Workers: who does the tasks. One base, one file a member."""
+"""The interface of workers, which run the tasks."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from gapbridge.bridge.fleet.task import Outcome, Task
 
 
 class Workers(ABC):
-    """Processes that do tasks, here or elsewhere. Used in a ``with`` block."""
+    """Processes that run tasks, local or remote; used as a context manager."""
 
     def __enter__(self) -> Self:
         """Start them."""
@@ -23,16 +23,16 @@ class Workers(ABC):
 
     @abstractmethod
     def start(self) -> None:
-        """Start or reach them; raises GapbridgeError where that fails."""
+        """Start or connect to them; raises GapbridgeError on failure."""
 
     @abstractmethod
     def run(self, tasks: Iterable[Task]) -> Iterator[Outcome]:
-        """Give the outcomes as they come; every task has exactly one."""
+        """Yield the outcomes as they finish, exactly one per task."""
 
     @abstractmethod
     def stop(self) -> None:
-        """Stop what was started here, at once."""
+        """Stop the processes that were started here, at once."""
 
     @abstractmethod
     def description(self) -> str:
-        """Return who they are, for people."""
+        """Return a description for the user."""

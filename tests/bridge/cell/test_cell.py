@@ -1,4 +1,4 @@
-"""Reading cell files: what they mean, and one line for every mistake."""
+"""Reading cell files: their values, and a one-line message for every mistake."""
 
 from __future__ import annotations
 

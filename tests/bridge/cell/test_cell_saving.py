@@ -1,4 +1,4 @@
-"""Writing cells back: same text, new model, number for number."""
+"""Saving cells: the text is kept, the model is new, numbers read back exactly."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What ``check --live`` and ``init`` read of a controller whose samples are not all whole."""
+"""Reading a controller with invalid samples, as ``check --live`` and ``init`` do."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from gapbridge.core.errors import InvalidStateError, LinkError, StaleStateError
 
 
 class Bus:
-    """Raises what it is given, then answers."""
+    """Raises the given errors, then returns a state."""
 
     def __init__(self, *errors: Exception) -> None:
         self.errors = list(errors)
@@ -23,15 +23,15 @@ class Bus:
 
 
 def test_a_torn_and_a_late_sample_are_read_again() -> None:
-    assert live.whole_state(Bus(InvalidStateError("torn"), StaleStateError("late"))) == "state"
+    assert live.read_valid_state(Bus(InvalidStateError("torn"), StaleStateError("late"))) == "state"
 
 
 def test_a_broken_link_is_not_waited_for() -> None:
     with pytest.raises(LinkError, match="cut"):
-        live.whole_state(Bus(LinkError("cut")))
+        live.read_valid_state(Bus(LinkError("cut")))
 
 
 def test_a_bus_that_is_never_whole_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(live, "LONGEST", 0.0)
+    monkeypatch.setattr(live, "READ_TIMEOUT", 0.0)
     with pytest.raises(InvalidStateError):
-        live.whole_state(Bus(*[InvalidStateError("torn")] * 100_000))
+        live.read_valid_state(Bus(*[InvalidStateError("torn")] * 100_000))

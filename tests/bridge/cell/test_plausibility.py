@@ -1,4 +1,4 @@
-"""Values that no cell can mean, each with its line; and what is only odd."""
+"""Impossible values of a cell are errors with their line, unusual ones are warnings."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from gapbridge.bridge.cell import load_cell
-from gapbridge.bridge.cell.cell import complaints
+from gapbridge.bridge.cell.cell import cell_errors
 from gapbridge.core.arm import builtin_rows
 from gapbridge.core.errors import CellError
 
@@ -73,7 +73,7 @@ def dh(**changed: float) -> str:
         (dh(mass=1e3), 1, "robot.dh", "7369 kg", "grams"),
     ],
 )  # fmt: skip
-def test_what_cannot_be_meant_is_refused_with_its_line(
+def test_an_impossible_value_is_an_error_with_its_line(
     tmp_path: Path, text: str, line: int, key: str, found: str, expected: str
 ) -> None:
     path = written(tmp_path, text)
@@ -100,7 +100,7 @@ def test_what_cannot_be_meant_is_refused_with_its_line(
         (dh(mass=0.0), "without masses"),
     ],
 )
-def test_what_is_only_odd_is_a_warning(tmp_path: Path, text: str, phrase: str) -> None:
+def test_an_unusual_value_is_a_warning(tmp_path: Path, text: str, phrase: str) -> None:
     (warning,) = load_cell(written(tmp_path, text)).warnings
     assert "cell.yaml, line " in warning
     assert phrase in warning
@@ -143,7 +143,7 @@ def test_lengths_of_a_calibration_that_cancel_are_right_as_they_stand(tmp_path: 
     assert load_cell(path).warnings == ()
 
 
-def test_everything_that_is_wrong_is_listed(tmp_path: Path) -> None:
+def test_all_errors_are_listed(tmp_path: Path) -> None:
     text = ARM + "tool: {tcp: {xyz: [0, 0, 180]}}\ngravity: [0, 0, -1]\n"
-    lines = complaints(written(tmp_path, text))
+    lines = cell_errors(written(tmp_path, text))
     assert [line.split(": ")[1] for line in lines] == ["tool.tcp.xyz", "gravity"]

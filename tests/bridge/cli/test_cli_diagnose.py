@@ -1,4 +1,4 @@
-"""The command diagnose: what it writes, what it says, what it refuses."""
+"""``gapbridge diagnose``: its files, its text, its errors."""
 
 from __future__ import annotations
 

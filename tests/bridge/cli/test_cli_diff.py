@@ -1,4 +1,4 @@
-"""``gapbridge diff``: what changed, in keys and millimetres."""
+"""``gapbridge diff``: changed keys, and shifts of the TCP."""
 
 from __future__ import annotations
 

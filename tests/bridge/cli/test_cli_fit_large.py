@@ -1,4 +1,4 @@
-"""Logs that are too long for one piece, through the command."""
+"""``gapbridge fit`` and others with logs that are read in pieces."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def test_a_large_log_gives_what_it_gives_in_one_piece(tmp_path, monkeypatch):
     log, cell = parquet_in(tmp_path, session(900)), cell_in(tmp_path)
     whole = gapbridge("fit", log, "--cell", cell, "--out", tmp_path / "whole.yaml")
     assert whole.code == 0, whole.err
-    monkeypatch.setattr(large_log, "LARGE", 500)
+    monkeypatch.setattr(large_log, "LARGE_ROWS", 500)
     monkeypatch.setattr(
         large_log, "LogPieces", lambda path, n, rows=0, motions=True: LogPieces(path, n, 200)
     )
@@ -68,7 +68,7 @@ def test_a_log_in_pieces_is_predicted_and_compensated_as_one(
         result = gapbridge(command, log, "--cell", fitted, "--out", out)
         assert result.code == 0, result.err
         found.append((result.out.replace(name, ""), result.err, read_table(out)))
-        monkeypatch.setattr(large_log, "LARGE", 500)
+        monkeypatch.setattr(large_log, "LARGE_ROWS", 500)
         monkeypatch.setattr(
             large_log, "LogPieces", lambda path, n, rows=0, motions=True: LogPieces(path, n, 200)
         )
@@ -91,7 +91,7 @@ def test_a_row_without_equilibrium_is_named_by_its_line_in_any_piece(tmp_path, m
             text = refused(command, log, "--cell", fitted, "--out", tmp_path / "new.csv")
             assert "log.parquet: row 642: the arm finds no equilibrium" in text
             assert not (tmp_path / "new.csv").exists()
-        monkeypatch.setattr(large_log, "LARGE", 500)
+        monkeypatch.setattr(large_log, "LARGE_ROWS", 500)
         monkeypatch.setattr(
             large_log, "LogPieces", lambda path, n, rows=0, motions=True: LogPieces(path, n, 200)
         )
@@ -101,7 +101,7 @@ def test_a_fault_far_down_a_large_log_names_its_row(tmp_path, monkeypatch):
     columns = session(900)
     columns["payload"][777] = 500.0
     log, cell = parquet_in(tmp_path, columns), cell_in(tmp_path)
-    monkeypatch.setattr(large_log, "LARGE", 500)
+    monkeypatch.setattr(large_log, "LARGE_ROWS", 500)
     text = refused("fit", log, "--cell", cell, "--out", tmp_path / "new.yaml")
     assert "row 779, column payload: found 500 kg" in text
 

@@ -26,7 +26,7 @@ GEARS = ("--link", "gear=[50, 50, 50, 20, 20, 20]", "--link", "direction=[1, 1, 
 
 @contextlib.contextmanager
 def simulated(folder: Path, config: str, **link: object) -> Iterator[str]:
-    """Serve the arm of a cell in config/ as its user would; yield its host."""
+    """Serve the arm of a cell in config/; yield its host."""
     host = own_host()
     cell = yaml.safe_load((CONFIG / config).read_text())
     cell["link"] |= {"host": host, **link}
@@ -106,10 +106,10 @@ def test_gears_that_only_the_builder_knows(tmp_path: Path) -> None:
 
 
 def test_a_profile_beside_the_cell_is_found_from_its_folder(tmp_path: Path) -> None:
-    from gapbridge.bridge.cli.cell.init import _beside
+    from gapbridge.bridge.cli.cell.init import _path_from_cell
 
-    assert _beside(tmp_path / "arm.yaml", tmp_path / "cell.yaml") == "arm.yaml"
-    assert _beside(tmp_path / "arm.yaml", tmp_path / "cells" / "c.yaml") == str(
+    assert _path_from_cell(tmp_path / "arm.yaml", tmp_path / "cell.yaml") == "arm.yaml"
+    assert _path_from_cell(tmp_path / "arm.yaml", tmp_path / "cells" / "c.yaml") == str(
         tmp_path / "arm.yaml"
     )
 

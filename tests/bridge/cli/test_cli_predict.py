@@ -32,7 +32,7 @@ def run(*arguments: object) -> int:
 
 
 def write_log(folder: Path, name: str, count: int, seed: int, wide: float = 0.7) -> Array:
-    """Write a log of a hidden arm's poses; return where they truly are (N, 3), m."""
+    """Write a log of a hidden arm's poses; return their true TCP positions (N, 3), m."""
     model = load_cell(folder / "cell.yaml").model
     hidden = model.with_compliance((3e-6, 8e-6, 7e-6, 1e-5, 1.2e-5, 2e-5), (2e-6,) * 6)
     rng = np.random.default_rng(seed)

@@ -1,4 +1,4 @@
-"""The commands run, demo and blind: what they pass on."""
+"""``gapbridge run``, ``demo`` and ``blind``: the options that they pass on."""
 
 from __future__ import annotations
 

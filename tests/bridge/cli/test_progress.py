@@ -1,4 +1,4 @@
-"""What a person sees while they wait."""
+"""Progress on stderr."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import time
 import numpy as np
 import pytest
 
-from gapbridge.bridge.cli.progress import Compiling, status
+from gapbridge.bridge.cli.progress import CompileProgress, status
 from gapbridge.core.kernels import compiling
 from gapbridge.core.kernels.machine_code import keep_by_all_sources
 
@@ -17,7 +17,7 @@ def test_compiling_is_said_at_once_and_then_now_and_again(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     now = iter([0.0, 3.0, 12.5, 14.0])
-    said = Compiling(lambda: next(now))
+    said = CompileProgress(lambda: next(now))
     for functions in (1, 2, 9, 10):
         said(functions)
     assert capsys.readouterr().err.splitlines() == [

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from gapbridge.bridge.fleet.cell_source import OneCell
-from gapbridge.bridge.fleet.runner import tasks_of
+from gapbridge.bridge.fleet.runner import make_tasks
 from gapbridge.bridge.fleet.session import find_sessions
-from gapbridge.bridge.fleet.task import Task, Work
+from gapbridge.bridge.fleet.task import SessionJob, Task
 from tests.bridge.cli_runs import (
     bent_model,
     cell_in,
@@ -33,10 +33,10 @@ def logs_in(folder: Path, names: Sequence[str], rows: int = 12) -> Path:
 
 
 def tasks_in(
-    folder: Path, names: Sequence[str], work: Work, options: Mapping[str, Any] | None = None
+    folder: Path, names: Sequence[str], work: SessionJob, options: Mapping[str, Any] | None = None
 ) -> list[Task]:
     """Return the tasks of small logs under one cell."""
     found = find_sessions([str(logs_in(folder, names))])
-    tasks, bad = tasks_of(found.sessions, OneCell(cell_in(folder)), work, options or {})
+    tasks, bad = make_tasks(found.sessions, OneCell(cell_in(folder)), work, options or {})
     assert not bad
     return tasks

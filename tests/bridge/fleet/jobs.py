@@ -1,4 +1,4 @@
-"""Works that tests give to real worker processes; the log's name says what is to happen."""
+"""Jobs for real worker processes; the name of the log determines what they do."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from gapbridge.core.log.log import Log
 
 
 def count_rows(cell: Cell, log: Log, options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the rows of the log and who has read it, once ``others`` processes have come."""
+    """Return the rows of the log and the process, after ``others`` processes have started."""
     time.sleep(options.get("pause", 0.0))
     if "present" in options:
         present = Path(str(options["present"]))
@@ -26,8 +26,8 @@ def count_rows(cell: Cell, log: Log, options: Mapping[str, Any]) -> dict[str, An
 
 
 def kill_itself(cell: Cell, log: Log, options: Mapping[str, Any]) -> dict[str, Any]:
-    """Die over logs named ``killer``, once only over those named ``once``."""
-    _note(log, options)
+    """Kill the process for logs named ``killer``; for those named ``once`` at the first run."""
+    _record_run(log, options)
     name = Path(log.path).stem
     if "killer" in name or ("once" in name and _runs(log, options) == 1):
         os.kill(os.getpid(), signal.SIGKILL)
@@ -35,20 +35,20 @@ def kill_itself(cell: Cell, log: Log, options: Mapping[str, Any]) -> dict[str, A
 
 
 def fail(cell: Cell, log: Log, options: Mapping[str, Any]) -> dict[str, Any]:
-    """Fail as nobody foresaw over logs named ``odd``."""
+    """Raise an unexpected error for logs named ``odd``."""
     if "odd" in Path(log.path).stem:
         raise ZeroDivisionError("the odd one")
     return count_rows(cell, log, options)
 
 
-def _note(log: Log, options: Mapping[str, Any]) -> None:
-    with _book(options).open("a") as file:
+def _record_run(log: Log, options: Mapping[str, Any]) -> None:
+    with _run_record(options).open("a") as file:
         file.write(f"{Path(log.path).stem}\n")
 
 
 def _runs(log: Log, options: Mapping[str, Any]) -> int:
-    return _book(options).read_text().split().count(Path(log.path).stem)
+    return _run_record(options).read_text().split().count(Path(log.path).stem)
 
 
-def _book(options: Mapping[str, Any]) -> Path:
+def _run_record(options: Mapping[str, Any]) -> Path:
     return Path(str(options["book"]))

@@ -1,4 +1,4 @@
-"""The command from end to end: real processes, real files, killed for real."""
+"""``gapbridge fleet`` from end to end, with real processes that are killed."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def rows_of(path: Path) -> list[dict[str, Any]]:
 
 @pytest.fixture(scope="module")
 def fitted(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Any]:
-    """Return a folder with a fitted fleet, one of its logs bad, and what the command said."""
+    """Return a folder with a fitted fleet, one of its logs bad, and the output of the command."""
     folder = tmp_path_factory.mktemp("fleet")
     logs = logs_in(folder, NAMES)
     (logs / "arm1" / "s9.csv").write_text("payload\nheavy\n")
@@ -62,7 +62,7 @@ def test_a_bad_log_is_reported_in_one_line_and_the_others_are_fitted(fitted: Any
     assert "s9.csv" in line
     assert "found 'heavy', expected a number" in line
     assert (
-        "13 sessions of 4 arms (the folder says the arm): 12 done, 1 cannot be used" in answer.out
+        "13 sessions of 4 arms (arm: name of the folder): 12 done, 1 cannot be used" in answer.out
     )
     sessions = rows_of(folder / "out" / "sessions.parquet")
     assert len(sessions) == 13

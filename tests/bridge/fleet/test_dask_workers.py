@@ -1,4 +1,4 @@
-"""A real Dask cluster over loopback TCP, its workers killed for real."""
+"""A real Dask cluster over loopback TCP, with workers that are killed."""
 
 from __future__ import annotations
 
@@ -68,5 +68,5 @@ def test_a_bad_log_is_one_outcome_among_others(address: str, tmp_path: Path) -> 
 
 def test_an_address_without_a_scheduler_is_reported_in_one_line() -> None:
     with pytest.raises(RunError, match="found no Dask scheduler there") as error:
-        DaskWorkers("tcp://127.0.0.1:9", reach=1.0).start()
+        DaskWorkers("tcp://127.0.0.1:9", timeout=1.0).start()
     assert "\n" not in str(error.value)

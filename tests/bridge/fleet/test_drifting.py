@@ -1,10 +1,16 @@
-"""Drifts and outliers: found where they are, and not made up where there is scatter alone."""
+"""Drifts and outliers are found, and scatter alone is not reported as one."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from gapbridge.bridge.fleet.drift import DAY, Series, drifts, far_from_median, places
+from gapbridge.bridge.fleet.drift import (
+    DAY,
+    Series,
+    median_outliers,
+    session_times,
+    significant_drifts,
+)
 
 SESSIONS = 6
 
@@ -12,7 +18,7 @@ SESSIONS = 6
 def series(
     rng: np.random.Generator, slope: float = 0.0, arm: str = "a", more: float = 3.0
 ) -> Series:
-    """Return values with an error of 1 that pretend to one of 1 / more."""
+    """Return values with 1 sigma of 1 whose stated std is 1 / ``more``."""
     at = np.arange(SESSIONS, dtype=float)
     value = 10 + slope * at + rng.normal(0, 1, SESSIONS)
     std = np.full(SESSIONS, 1 / more)
@@ -21,14 +27,14 @@ def series(
 
 def test_scatter_alone_is_no_drift_though_its_sigma_is_understated() -> None:
     rng = np.random.default_rng(0)
-    fleets = [drifts([series(rng, arm=str(i)) for i in range(60)]) for _ in range(20)]
+    fleets = [significant_drifts([series(rng, arm=str(i)) for i in range(60)]) for _ in range(20)]
     assert sum(bool(f) for f in fleets) <= 4
 
 
 def test_a_drift_is_found_with_its_size_among_arms_that_only_scatter() -> None:
     rng = np.random.default_rng(1)
     fleet = [series(rng, arm=str(i)) for i in range(60)]
-    found = drifts([*fleet, series(rng, slope=2.0, arm="moving")])
+    found = significant_drifts([*fleet, series(rng, slope=2.0, arm="moving")])
     assert [d.arm for d in found] == ["moving"]
     assert abs(found[0].slope - 2.0) < 3 * found[0].std
     assert abs(found[0].change - 10.0) < 15 * found[0].std
@@ -37,26 +43,26 @@ def test_a_drift_is_found_with_its_size_among_arms_that_only_scatter() -> None:
 def test_two_sessions_show_no_drift() -> None:
     at = np.array([0.0, 1.0])
     two = Series("a", "x", "m", "g", at, "session", at * 100, np.ones(2), ("s", "t"))
-    assert drifts([two]) == []
+    assert significant_drifts([two]) == []
 
 
-def test_sessions_stand_at_their_days_where_all_have_a_date() -> None:
-    at, per = places([1.7e9, 1.7e9 + DAY, 1.7e9 + 3 * DAY])
+def test_session_times_are_days_if_all_have_a_date() -> None:
+    times, per = session_times([1.7e9, 1.7e9 + DAY, 1.7e9 + 3 * DAY])
     assert per == "day"
-    assert at.tolist() == [0.0, 1.0, 3.0]
-    at, per = places([1.7e9, None, 1.7e9 + DAY])
+    assert times.tolist() == [0.0, 1.0, 3.0]
+    times, per = session_times([1.7e9, None, 1.7e9 + DAY])
     assert per == "session"
-    assert at.tolist() == [0.0, 1.0, 2.0]
+    assert times.tolist() == [0.0, 1.0, 2.0]
 
 
 def test_a_value_far_from_the_median_is_reported_with_the_usual_one() -> None:
     values = [*np.random.default_rng(2).lognormal(0, 0.2, 40), 9.0]
-    [(index, usual, deviations)] = far_from_median(values, ratios=True)
+    [(index, usual, deviations)] = median_outliers(values, ratios=True)
     assert index == 40
     assert 0.8 < usual < 1.25
     assert deviations > 4
 
 
 def test_few_or_equal_values_have_no_outliers() -> None:
-    assert far_from_median([1.0, 1.0, 1.0, 50.0], ratios=False) == []
-    assert far_from_median([1.0] * 20 + [50.0], ratios=False) == []
+    assert median_outliers([1.0, 1.0, 1.0, 50.0], ratios=False) == []
+    assert median_outliers([1.0] * 20 + [50.0], ratios=False) == []

@@ -1,4 +1,4 @@
-"""The journal: what was done stays done, whatever happened to the run."""
+"""The journal keeps finished outcomes when a run is interrupted."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import pytest
 
 from gapbridge.bridge.fleet.cell_source import OneCell
 from gapbridge.bridge.fleet.journal import Journal
-from gapbridge.bridge.fleet.runner import run, tasks_of
+from gapbridge.bridge.fleet.runner import make_tasks, run
 from gapbridge.bridge.fleet.session import find_sessions
-from gapbridge.bridge.fleet.task import BAD, DIED, DONE, Outcome, Task, perform
+from gapbridge.bridge.fleet.task import BAD, DIED, DONE, Outcome, Task, run_task
 from gapbridge.bridge.fleet.workers.workers import Workers
 from gapbridge.core.errors import RunError
 from tests.bridge.fleet.fleet_in import tasks_in
@@ -59,8 +59,8 @@ def test_fresh_forgets(tmp_path: Path) -> None:
         assert journal.known("a") is None
 
 
-class Here(Workers):
-    """This process does the tasks, and notes them."""
+class InProcess(Workers):
+    """Runs the tasks in this process and records their sessions."""
 
     def __init__(self) -> None:
         self.given: list[str] = []
@@ -75,12 +75,12 @@ class Here(Workers):
     def run(self, tasks: Iterable[Task]) -> Iterator[Outcome]:
         for task in tasks:
             self.given.append(task.session)
-            yield perform(task)
+            yield run_task(task)
 
 
 def resumed(tasks: list[Task], path: Path) -> list[str]:
-    """Run, and return the sessions that were really done."""
-    workers = Here()
+    """Run the tasks and return the sessions that were not resumed."""
+    workers = InProcess()
     with Journal(path) as journal:
         run(tasks, [], workers, journal, lambda outcome: None)
     return workers.given
@@ -98,7 +98,9 @@ def test_a_run_goes_on_where_it_was_broken_off_and_redoes_what_has_changed(tmp_p
     log = tasks[0].log
     log.write_text(log.read_text() + log.read_text().splitlines()[-1] + "\n")
     sessions = find_sessions([str(tmp_path / "logs")]).sessions
-    again, _ = tasks_of(sessions, OneCell(tmp_path / "cell.yaml"), count_rows, {})
+    again, _ = make_tasks(sessions, OneCell(tmp_path / "cell.yaml"), count_rows, {})
     assert resumed(again, path) == ["a/s1"]
-    other, _ = tasks_of(sessions, OneCell(tmp_path / "cell.yaml"), count_rows, {"withhold": ["x"]})
+    other, _ = make_tasks(
+        sessions, OneCell(tmp_path / "cell.yaml"), count_rows, {"withhold": ["x"]}
+    )
     assert {t.key for t in other}.isdisjoint({t.key for t in again})

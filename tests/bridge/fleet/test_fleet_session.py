@@ -1,4 +1,4 @@
-"""Which logs there are, whose they are, and which cell they belong to."""
+"""Sessions of a fleet: their logs, arms and cells."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from gapbridge.bridge.fleet.cell_source import CellBeside, CellTable, OneCell, cell_source
-from gapbridge.bridge.fleet.session import Found, find_sessions
+from gapbridge.bridge.fleet.cell_source import CellNearLog, CellTable, OneCell, cell_source
+from gapbridge.bridge.fleet.session import Fleet, find_sessions
 from gapbridge.core.errors import InputError
 
 
@@ -20,7 +20,7 @@ def files_in(folder: Path, *names: str) -> Path:
     return folder
 
 
-def arms_of(found: Found) -> dict[str, str]:
+def arms_of(found: Fleet) -> dict[str, str]:
     return {s.name: s.arm for s in found.sessions}
 
 
@@ -82,7 +82,7 @@ def test_a_cell_beside_the_log_wins_over_those_above(tmp_path: Path) -> None:
     files_in(tmp_path, "cell.yaml")
     found = find_sessions([str(tmp_path / "logs")])
     cells = cell_source("beside", found.folder)
-    assert isinstance(cells, CellBeside)
+    assert isinstance(cells, CellNearLog)
     first, second, third = found.sessions
     assert cells.cell_of(first).name == "s1.yaml"
     assert cells.cell_of(second) == tmp_path / "logs" / "a" / "cell.yaml"

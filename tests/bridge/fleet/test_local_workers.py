@@ -1,4 +1,4 @@
-"""Local workers: real processes, killed for real."""
+"""Local workers: real processes that are killed."""
 
 from __future__ import annotations
 

@@ -9,59 +9,59 @@ import numpy as np
 from gapbridge.bridge.document import blocks
 from gapbridge.bridge.document.axes import Chart, named, scale
 from gapbridge.bridge.document.drawing import AFTER, BEFORE, EDGE, PALE, Drawing
-from gapbridge.bridge.fleet.fit_summary import Fitted, FittedArm, FittedSession, FittedType
-from gapbridge.bridge.fleet.report.shared_sections import MOST, type_title
+from gapbridge.bridge.fleet.fit_summary import FittedArm, FittedSession, FittedType, FleetFit
+from gapbridge.bridge.fleet.report.shared_sections import MAX_ROWS, type_title
 from gapbridge.bridge.fleet.task import Outcome
 from gapbridge.bridge.report.labels import counted, number, parameter_title, percent, with_unit
 
 SESSION_HEADS = ("poses", "gap with the cell", "with the fit", "predicted by the others")
 MICRO = 1e6
-DRAWN = 40  # arms in the picture
+MAX_DRAWN = 40  # arms in the picture
 NEXT_STEPS = (
-    "Write each arm's flexibilities into a cell of its own with --cells FOLDER, and check one of "
+    "Write each arm's flexibilities into a cell of its own with --apply FOLDER, and check one of "
     "them on a log that was not fitted: gapbridge diagnose LOG --cell CELL.",
-    "Look at the arms that drift or stand out before their cells are used.",
+    "Inspect arms that drift or are outliers before their cells are used.",
 )
 
 
-def answer(together: Fitted) -> list[blocks.Block]:
-    """Return what the fit does to the gap, how alike the arms are, and what to do."""
-    leads = [blocks.Paragraph(_lead(kind), "lead") for kind in together.types]
+def answer(summary: FleetFit) -> list[blocks.Block]:
+    """Return the gap before and after the fit, the scatter between arms, and next steps."""
+    leads = [blocks.Paragraph(_lead(kind), "lead") for kind in summary.types]
     return [*leads, blocks.Heading("What to do now"), blocks.Bullets(NEXT_STEPS)]
 
 
 def _lead(kind: FittedType) -> str:
     sessions = [s for arm in kind.arms for s in arm.sessions]
-    before, after, held = (
+    before, after, held_out = (
         with_unit(float(np.sqrt(np.mean([getattr(s, name) ** 2 for s in sessions]))), "m")
         for name in ("gap_before", "gap_after", "gap_held_out")
     )
     shown = kind.scatter.shown
     spread = kind.scatter.between_arms[shown] / np.maximum(kind.scatter.mean[shown], 1e-12)
-    alike = (
+    scatter = (
         f"Arms of the type scatter by {percent(float(np.median(spread)))}." if len(spread)
-        else "No session shows any flexibility."
+        else "No flexibility is identifiable."
     )  # fmt: skip
     return (
         f"{type_title(kind.name)}: {counted(len(kind.arms), 'arm')}, "
         f"{counted(len(sessions), 'session')}. With the flexibilities of the cells the gap is "
-        f"{before} a coordinate; with those found {after}; a session is predicted by the others, "
-        f"which did not see it, to {held}. The noise of one coordinate is "
-        f"{with_unit(kind.scatter.noise, 'm')}. {alike}"
+        f"{before} rms per coordinate; with the fit {after}; of a session predicted from the "
+        f"others {held_out}. The noise of one coordinate is "
+        f"{with_unit(kind.scatter.noise, 'm')}. {scatter}"
     )
 
 
-def _type_heading(together: Fitted, kind: FittedType) -> list[blocks.Block]:
-    return [blocks.Heading(type_title(kind.name))] if len(together.types) > 1 else []
+def _type_heading(summary: FleetFit, kind: FittedType) -> list[blocks.Block]:
+    return [blocks.Heading(type_title(kind.name))] if len(summary.types) > 1 else []
 
 
-def types(together: Fitted) -> list[blocks.Block]:
-    """Return a table of each type's flexibilities."""
+def types(summary: FleetFit) -> list[blocks.Block]:
+    """Return a table of flexibilities per type."""
     content: list[blocks.Block] = []
     heads = ("flexibility", "of the type", "arms scatter by", "sessions scatter by")
-    for kind in together.types:
+    for kind in summary.types:
         rows = [_parameter(kind, j) for j in range(len(kind.parameters))]
-        content += [*_type_heading(together, kind), blocks.Table(heads, rows)]
+        content += [*_type_heading(summary, kind), blocks.Table(heads, rows)]
     return content
 
 
@@ -80,18 +80,18 @@ def _parameter(kind: FittedType, j: int) -> list[blocks.Cell]:
     ]  # fmt: skip
 
 
-def arms(together: Fitted) -> list[blocks.Block]:
-    """Return a picture and a table of each type's arms."""
+def arms(summary: FleetFit) -> list[blocks.Block]:
+    """Return a picture and a table of arms per type."""
     content: list[blocks.Block] = [blocks.Paragraph(
-        "“Own” says how much of an arm's value comes from its own data; the rest is borrowed from "
-        "the other arms of its type.", "note",
+        "“Own” is the share of an arm's value that comes from its own data, the rest from the "
+        "other arms of its type.", "note",
     )]  # fmt: skip
     heads = ("arm", "sessions", "poses", "own", "farthest from the type")
-    for kind in together.types:
-        content += [*_type_heading(together, kind), _pictures(kind)]
-        content.append(blocks.Table(heads, [_arm(kind, arm) for arm in kind.arms[:MOST]]))
-        if len(kind.arms) > MOST:
-            more = f"{len(kind.arms) - MOST} more are in results.parquet."
+    for kind in summary.types:
+        content += [*_type_heading(summary, kind), _pictures(kind)]
+        content.append(blocks.Table(heads, [_arm(kind, arm) for arm in kind.arms[:MAX_ROWS]]))
+        if len(kind.arms) > MAX_ROWS:
+            more = f"{len(kind.arms) - MAX_ROWS} more are in results.parquet."
             content.append(blocks.Paragraph(more, "note"))
     return content
 
@@ -109,30 +109,30 @@ def _arm(kind: FittedType, arm: FittedArm) -> list[blocks.Cell]:
             blocks.Bar(own, percent(own)), far]  # fmt: skip
 
 
-def _drawn(kind: FittedType) -> Sequence[FittedArm]:
-    """Return the arms of the picture: of many those farthest from their type."""
-    if len(kind.arms) <= DRAWN:
+def _arms_drawn(kind: FittedType) -> Sequence[FittedArm]:
+    """Return the arms in the picture: if there are many, those farthest from their type."""
+    if len(kind.arms) <= MAX_DRAWN:
         return kind.arms
     shown = kind.scatter.shown
     far = [float(np.max(np.abs(a.fit.beside_type[shown]), initial=0.0)) for a in kind.arms]
-    return [kind.arms[i] for i in sorted(np.argsort(far)[-DRAWN:])]
+    return [kind.arms[i] for i in sorted(np.argsort(far)[-MAX_DRAWN:])]
 
 
-def _which(drawn: Sequence[FittedArm], kind: FittedType) -> str:
+def _arms_text(drawn: Sequence[FittedArm], kind: FittedType) -> str:
     if len(drawn) == len(kind.arms):
         return "Every arm's"
     return f"The {len(drawn)} arms farthest from their type, of {len(kind.arms)}: each one's"
 
 
 def _pictures(kind: FittedType) -> blocks.Gallery:
-    """Return each arm's flexibilities with their intervals; the menu says which."""
-    drawn = _drawn(kind)
+    """Return a picture per flexibility, selected by a menu: each arm's value and interval."""
+    drawn = _arms_drawn(kind)
     own = np.mean([arm.fit.own for arm in kind.arms], axis=0)
     order = sorted(range(len(kind.parameters)), key=lambda j: (not kind.scatter.shown[j], -own[j]))
     titles = tuple(parameter_title(kind.parameters[j]) for j in order)
     return blocks.Gallery(
         (("Show", titles),), tuple(_picture(kind, drawn, j) for j in order),
-        f"{_which(drawn, kind)} flexibility with its 95 % interval; the dashed line is the type.",
+        f"{_arms_text(drawn, kind)} flexibility with its 95 % interval; dashed line: the type.",
     )  # fmt: skip
 
 
@@ -154,10 +154,10 @@ def _picture(kind: FittedType, drawn: Sequence[FittedArm], j: int) -> Drawing:
     return chart.drawing
 
 
-def session_cells(together: Fitted) -> Callable[[Outcome], Sequence[blocks.Cell]]:
-    """Return the function that gives a session's cells in the table of sessions."""
+def session_cells(summary: FleetFit) -> Callable[[Outcome], Sequence[blocks.Cell]]:
+    """Return the function that returns the table cells of a session."""
     fits: dict[str, FittedSession] = {
-        s.outcome.session: s for kind in together.types for arm in kind.arms for s in arm.sessions
+        s.outcome.session: s for kind in summary.types for arm in kind.arms for s in arm.sessions
     }
 
     def cells(outcome: Outcome) -> Sequence[blocks.Cell]:

@@ -1,4 +1,4 @@
-"""A cell beside a log: whether the arm that was measured is the cell's."""
+"""Consistency of a cell with a log: whether the measured poses are those of the cell's arm."""
 
 from __future__ import annotations
 
@@ -19,34 +19,34 @@ MEASURED = "measured_position"
 
 
 def log_findings(cell: Cell, path: Path) -> Findings:
-    """Return where a log's measured poses are not those of the cell's arm, and what is odd in it.
+    """Return how measured poses contradict the cell's arm (errors), and anomalies (warnings).
 
-    Raises InputError where the log cannot be used.
+    Raises InputError if the log cannot be used.
     """
     log = open_log(path, cell)
     if not log.has(MEASURED):
         hint = did_you_mean(log.unknown, [MEASURED], log.n)
         raise LogError(
             f"{path}: columns {MEASURED}_0..2: not found, expected them: without measured "
-            f"positions nothing shows which arm it was{hint}"
+            f"positions the arm cannot be checked{hint}"
         )
     log.require("actual_q", "target_q")
     log.loads()
     errors = pose_findings(cell, log)
-    odd: dict[str, None] = {}  # in order, each once
+    anomalies: dict[str, None] = {}  # in order, without duplicates
     for part in sessions_in(log):
-        found = findings(part, cell.model, cell.metrology)
-        odd |= dict.fromkeys(log_finding_text(finding) for finding in found)
+        unit_findings = findings(part, cell.model, cell.metrology)
+        anomalies |= dict.fromkeys(log_finding_text(finding) for finding in unit_findings)
     return Findings(
         [f"{cell.path} with {path}: {text}" for text in errors],
-        [f"{path}: {text}" for text in odd if text not in errors],
+        [f"{path}: {text}" for text in anomalies if text not in errors],
     )
 
 
 def pose_findings(cell: Cell, log: Log) -> list[str]:
-    """Return where measured poses are not those of the cell's arm, each finding once."""
+    """Return how measured poses contradict the cell's arm, without duplicates."""
     texts: dict[str, None] = {}
     for part in sessions_in(log):
-        found = frame_findings(cell.model, part, cell.metrology)
-        texts |= dict.fromkeys(log_finding_text(finding) for finding in found)
+        part_findings = frame_findings(cell.model, part, cell.metrology)
+        texts |= dict.fromkeys(log_finding_text(finding) for finding in part_findings)
     return list(texts)
