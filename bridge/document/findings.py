@@ -131,7 +131,7 @@ def clock(time: float, dated: bool = False) -> str:
 def _parameter(note: ParameterNote) -> str:
     if note.state is ParameterState.ON_BOUND:
         return f"stands on its bound ({note.value:g} {note.unit})"
-    if note.state is ParameterState.HELD:
+    if note.state is ParameterState.NOMINAL:
         return (
             "is held nominal: it came out several times as large as its like, and not "
             "surely; something that is not named may stand behind it"

@@ -158,7 +158,7 @@ def _causes(channel: ChannelDiagnosis) -> str:
 
 def elsewhere(channel: ChannelDiagnosis) -> str:
     """Return what to expect where nothing was fitted: never only the flattering figure."""
-    found, unit = channel.elsewhere, channel.unit
+    found, unit = channel.generalisation, channel.unit
     parts = []
     if found.new_region is not None:
         parts.append(f"{with_unit(found.new_region, unit)} in a new region of joint space")

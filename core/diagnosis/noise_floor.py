@@ -13,7 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapbridge.core.arrays import Array
-from gapbridge.core.diagnosis.criteria import EXCESS, NOT_WHITE, REPEATS_MEASURE, RESIDUAL_MEASURES
+from gapbridge.core.diagnosis.criteria import (
+    MIN_CORRELATED_SHARE,
+    MIN_REPEATS_FOR_FLOOR,
+    MIN_SAMPLES_FOR_RESIDUAL_RMS,
+    NOT_WHITE_P,
+)
 from gapbridge.core.diagnosis.observation import Observation
 from gapbridge.core.diagnosis.selection.selection import Selection
 
@@ -46,7 +51,7 @@ def noise_floor(selection: Selection, structured: bool) -> Floor:
         return Floor(observation.sigma, "stated")
     in_unit = own_coordinates(observation)
     variance, freedom = repeat_variance(observation, selection.residual, selection.kept)
-    if freedom >= REPEATS_MEASURE:
+    if freedom >= MIN_REPEATS_FOR_FLOOR:
         return Floor(float(np.sqrt(max(variance, observation.sigma**2))), "repeats")
     instrument = observation.instrument and observation.instrument()
     if instrument is not None:
@@ -58,7 +63,7 @@ def noise_floor(selection: Selection, structured: bool) -> Floor:
         each = np.einsum("nij,nij->ni", covariance, covariance)[:, :in_unit]
         estimated = float(np.mean(each))
         residual = selection.residual[selection.kept][:, :in_unit]
-        if len(residual) >= RESIDUAL_MEASURES:  # the estimate rests on fewer rows
+        if len(residual) >= MIN_SAMPLES_FOR_RESIDUAL_RMS:  # the estimate rests on fewer rows
             freedom_left = max(residual.size - selection.used, 1)
             estimated = max(float(np.sum(residual**2)) / freedom_left, observation.sigma**2)
         return Floor(float(np.sqrt(estimated)), "residual")
@@ -135,4 +140,6 @@ def _portmanteau(mean: Array, floor: float) -> Whiteness:
     p_value = min(float(gammaincc(LAGS / 2, statistic.max() / 2)) * own, 1.0)
     # the covariance at the first lag is what white noise has not
     excess = float(np.sqrt(np.mean(np.maximum(lagged[0], 0.0))))
-    return Whiteness(p_value, excess, not (p_value < NOT_WHITE and excess > EXCESS * floor))
+    return Whiteness(
+        p_value, excess, not (p_value < NOT_WHITE_P and excess > MIN_CORRELATED_SHARE * floor)
+    )

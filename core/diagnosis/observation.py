@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from gapbridge.core.arrays import Array
 from gapbridge.core.effects import Term
 
-HELD = "held_torque"  # Nm that a joint holds at rest: a quantity beside the columns of the log
+HELD_TORQUE = "held_torque"  # Nm, static torque of a joint: a quantity that is no column of the log
 Rivals = tuple[tuple[str, Array], ...]
 Predict = Callable[[Sequence[Term]], Array]
 

@@ -25,7 +25,7 @@ def parts(observation: Observation, kept: NDArray[np.bool_]) -> NDArray[np.int64
     return random_folds(region, PARTS)
 
 
-def one_place(observation: Observation) -> bool:
+def single_pose(observation: Observation) -> bool:
     """Return whether a channel was seen at one pose under one load: nothing new was left out."""
     return not any(
         name.startswith(("payload", "actual_TCP_force", "session"))

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from gapbridge.core.arrays import Array
 from gapbridge.core.diagnosis.criteria import SAME_SHARE
-from gapbridge.core.diagnosis.observation import HELD
+from gapbridge.core.diagnosis.observation import HELD_TORQUE
 from gapbridge.core.diagnosis.selection.problem import SampleSpace
 from gapbridge.core.estimation.held_out import random_folds
 from gapbridge.core.estimation.least_squares import basis_of, projected_out
@@ -113,15 +113,16 @@ def _loads_before_time(ranked: list[tuple[str, float]]) -> list[tuple[str, float
 
     Whatever happens once in a log follows its clock.
     """
-    at = next((i for i, (name, _) in enumerate(ranked) if name == "timestamp"), None)
-    if at is None:
+    place = next((i for i, (name, _) in enumerate(ranked) if name == "timestamp"), None)
+    if place is None:
         return ranked
-    time = ranked[at]
-    as_good = [i for i, (name, share) in enumerate(ranked)
-               if name.startswith(HELD) and at < i and share > time[1] - SAME_SHARE]  # fmt: skip
-    if as_good:
-        ranked.insert(as_good[-1] + 1, time)
-        del ranked[at]
+    least = ranked[place][1] - SAME_SHARE
+    equal = [
+        i for i, (name, share) in enumerate(ranked)
+        if i > place and name.startswith(HELD_TORQUE) and share > least
+    ]  # fmt: skip
+    if equal:
+        ranked.insert(equal[-1], ranked.pop(place))
     return ranked
 
 

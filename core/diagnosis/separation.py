@@ -20,7 +20,7 @@ import numpy as np
 
 from gapbridge.core.arrays import Array
 from gapbridge.core.diagnosis.channel_diagnosis import ChannelDiagnosis
-from gapbridge.core.diagnosis.criteria import DECISIVE, TIE_SCORE
+from gapbridge.core.diagnosis.criteria import MIN_SEPARATION, TIE_SCORE
 from gapbridge.core.diagnosis.selection.local_search import rivals
 from gapbridge.core.diagnosis.selection.problem import CandidateFit, SampleSpace, fit
 from gapbridge.core.dynamics import (
@@ -39,14 +39,16 @@ from gapbridge.core.log.log import Log
 from gapbridge.core.model import Model
 from gapbridge.core.motion import Motion
 
-EACH = 2  # measurements proposed per open question
-APART = 0.5  # rad, of some joint, between poses that are proposed together
-POSED = 1e-6  # share of a difference that changes with the pose: less, and no pose decides
+PER_QUESTION = 2  # measurements proposed per open question
+MIN_POSE_DISTANCE = 0.5  # rad, of some joint, between poses that are proposed together
+MIN_POSE_DEPENDENCE = (
+    1e-6  # share of a difference that changes with the pose: less, and no pose decides
+)
 Predict = Callable[[Sequence[Term]], Array]
 POSES = 160
-FAST = 0.7  # share of a joint's greatest speed that a trial uses at most
-PICK_UP = 0.25  # s in which a trial gets to its speed, at the hardest
-UNLIMITED = 2.0  # rad/s for joints whose greatest speed nobody knows
+MAX_SPEED_SHARE = 0.7  # share of a joint's greatest speed that a trial uses at most
+ACCELERATION_TIME = 0.25  # s in which a trial gets to its speed, at the hardest
+DEFAULT_MAX_SPEED = 2.0  # rad/s for joints whose greatest speed nobody knows
 LEAD, STEP = 0.5, 0.004  # s: how a trial's motion is sampled before its pose
 STILL = 0.02  # share of the greatest speed at which the direction of motion is unsure
 
@@ -65,7 +67,7 @@ class Measurement:
 
 
 @dataclass(frozen=True)
-class _Question:
+class _OpenQuestion:
     """Two explanations, and the effects between which they decide."""
 
     separates: tuple[str, ...]
@@ -88,9 +90,9 @@ def next_measurements(
         if channel.channel == "tracking" and not moving:
             continue
         trials = drawn if moving else drawn.at_rest
-        predict = PREDICTED[channel.channel](model, trials)
+        predict = PREDICTORS[channel.channel](model, trials)
         sigma = channel.noise_floor_rms or channel.selection.observation.sigma or 1e-5
-        for question in _questions(model, channel, trials, predict):
+        for question in _open_questions(model, channel, trials, predict):
             difference = _difference(channel, trials, predict, question)
             if difference is None:
                 continue
@@ -99,9 +101,9 @@ def next_measurements(
     return tuple(chosen)
 
 
-def _questions(
+def _open_questions(
     model: Model, channel: ChannelDiagnosis, trials: Trials, predict: Predict
-) -> Iterator[_Question]:
+) -> Iterator[_OpenQuestion]:
     """Yield what is open: effects to be separated, and effects that the log cannot show."""
     selection = channel.selection
     space, best = selection.working, selection.best
@@ -117,14 +119,14 @@ def _questions(
             if candidate.named and candidate.family not in chosen:
                 chosen.add(candidate.family)
                 swapped = fit(space, (*rest, other))
-                yield _Question(
+                yield _OpenQuestion(
                     (family, candidate.family), _named(space, best), _named(space, swapped)
                 )
     accused = tuple(selection.terms[p] for p in channel.judgement.accused)
     for considered in channel.considered:
         if not considered.excited:
-            for usual in _usual(model, considered.effect):
-                question = _Question((considered.effect,), (*accused, usual), accused)
+            for usual in _terms_of_usual_size(model, considered.effect):
+                question = _OpenQuestion((considered.effect,), (*accused, usual), accused)
                 if _difference(channel, trials, predict, question) is not None:
                     yield question
                     break
@@ -138,7 +140,7 @@ def _named(space: SampleSpace, best: CandidateFit) -> tuple[Term, ...]:
     )
 
 
-def _usual(model: Model, effect: str) -> Iterator[Term]:
+def _terms_of_usual_size(model: Model, effect: str) -> Iterator[Term]:
     """Yield an effect of usual size at each of its sites."""
     member = CATALOGUE[effect]
     for site in member.sites(model.arm):
@@ -147,27 +149,27 @@ def _usual(model: Model, effect: str) -> Iterator[Term]:
 
 
 def _difference(
-    channel: ChannelDiagnosis, trials: Trials, predict: Predict, question: _Question
+    channel: ChannelDiagnosis, trials: Trials, predict: Predict, question: _OpenQuestion
 ) -> Array | None:
     """Return how the readings of two explanations differ (N, k); None where no pose decides."""
     observation = channel.selection.observation
     try:
         apart = predict(question.one) - predict(question.other)
         if observation.nuisance.shape[2] >= 6:
-            seen = observation.predict(question.one) - observation.predict(question.other)
-            apart = apart - _framed(observation.nuisance, seen, predict(question.other))
+            on_log = observation.predict(question.one) - observation.predict(question.other)
+            apart = apart - _frame_correction(observation.nuisance, on_log, predict(question.other))
     except InputError:  # the arm would buckle under one of them
         return None
     apart = apart * observation.weight[: apart.shape[1]]
     spread, size = float(np.ptp(apart, axis=0).max()), float(np.abs(apart).max())
-    return apart if spread > POSED * max(size, 1e-300) else None
+    return apart if spread > MIN_POSE_DEPENDENCE * max(size, 1e-300) else None
 
 
-def _framed(nuisance: Array, seen: Array, position: Array) -> Array:
+def _frame_correction(nuisance: Array, on_log: Array, position: Array) -> Array:
     """Return how the frame that takes up the log's difference moves the readings of trials."""
     A = nuisance[:, :3].reshape(-1, nuisance.shape[2])
     # of several sessions the trials go on with the first one's frame
-    x = solve(A, seen[:, :3].ravel())[:6]
+    x = solve(A, on_log[:, :3].ravel())[:6]
     return np.asarray(-frame_columns(position)[:, :3] @ x)
 
 
@@ -176,9 +178,9 @@ def _best(moving: bool, trials: Trials, names: tuple[str, ...], gain: Array) -> 
     q, loads = trials.q, trials.loads
     assert loads.payload_mass is not None and loads.approach is not None
     for r in np.argsort(-gain):
-        if gain[r] < DECISIVE or len(chosen) == EACH:
+        if gain[r] < MIN_SEPARATION or len(chosen) == PER_QUESTION:
             break
-        if all(np.abs(q[r] - np.array(m.q)).max() > APART for m in chosen):
+        if all(np.abs(q[r] - np.array(m.q)).max() > MIN_POSE_DISTANCE for m in chosen):
             sided = any(CATALOGUE[name].by_approach for name in names)
             approach = tuple(int(v) for v in loads.approach[r]) if sided else None
             chosen.append(Measurement(
@@ -228,20 +230,20 @@ def draw_trials(model: Model, log: Log, seed: int) -> Trials:
         approach=rng.choice([-1.0, 1.0], (POSES, model.arm.n)),
     )
     end, start = (0.0, 0.0) if time is None else (float(time[-1]), float(time[0]))
-    fastest = fastest_of(model)
-    qd = FAST * fastest * rng.uniform(-1.0, 1.0, q.shape)
+    fastest = max_speed(model)
+    qd = MAX_SPEED_SHARE * fastest * rng.uniform(-1.0, 1.0, q.shape)
     # braking or picking up: never so hard that the trial began beyond the joint's greatest speed
     qdd = np.clip(
-        rng.uniform(-1.0, 1.0, q.shape) * fastest / PICK_UP,
+        rng.uniform(-1.0, 1.0, q.shape) * fastest / ACCELERATION_TIME,
         (qd - fastest) / LEAD, (qd + fastest) / LEAD,
     )  # fmt: skip
     return Trials(q, loads, qd, qdd, end, start)
 
 
-def fastest_of(model: Model) -> Array:
+def max_speed(model: Model) -> Array:
     """Return the greatest speed of each joint (n,), rad/s."""
     limit = model.arm.limits.velocity
-    return np.where(np.isfinite(limit) & (limit > 0), limit, UNLIMITED)
+    return np.where(np.isfinite(limit) & (limit > 0), limit, DEFAULT_MAX_SPEED)
 
 
 def _range(model: Model) -> tuple[Array, Array]:
@@ -273,11 +275,11 @@ def _motion(model: Model, trials: Trials) -> Motion:
         loads=trials.loads, rows=np.arange(count), valid=np.ones(count, dtype=bool),
         stretch=np.zeros(count, dtype=np.int64), start=trials.start,
         moving=bool(trials.qd.any()),
-        still=STILL * fastest_of(model),
+        still=STILL * max_speed(model),
     )  # fmt: skip
 
 
-def _followings(model: Model, trials: Trials) -> Predict:
+def _encoder_angles(model: Model, trials: Trials) -> Predict:
     """Return where the encoders stand at the end of each trial's motion."""
     count, n = trials.q.shape
     before = np.arange(-round(LEAD / STEP), 1) * STEP
@@ -294,15 +296,15 @@ def _followings(model: Model, trials: Trials) -> Predict:
         loads=trials.loads[np.repeat(np.arange(count), k)],
         rows=np.arange(count * k), valid=np.ones(count * k, dtype=bool),
         stretch=np.repeat(np.arange(count), k), start=trials.start, moving=True,
-        still=STILL * fastest_of(model),
+        still=STILL * max_speed(model),
     )  # fmt: skip
     motion = with_held(model, motion)
     return lambda terms: predict_tracking(model, motion, terms)[k - 1 :: k]
 
 
-PREDICTED: dict[str, Callable[[Model, Trials], Predict]] = {
+PREDICTORS: dict[str, Callable[[Model, Trials], Predict]] = {
     "position": _positions,
     "wrench": partial(_loads_of_motion, predict_wrench),
-    "tracking": _followings,
+    "tracking": _encoder_angles,
     "torque": partial(_loads_of_motion, predict_torque),
 }

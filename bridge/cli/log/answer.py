@@ -103,7 +103,7 @@ def _channel(channel: ChannelDiagnosis, sessions: tuple[str, ...]) -> list[str]:
 
 def _elsewhere(channel: ChannelDiagnosis, sessions: tuple[str, ...]) -> list[str]:
     """Return what to expect where nothing was fitted; a figure that cannot be had is said to be."""
-    unit, found = channel.unit, channel.elsewhere
+    unit, found = channel.unit, channel.generalisation
     region = "unknown (too few samples)" if found.new_region is None else size(
         found.new_region, unit)  # fmt: skip
     session = "unknown (one session)" if found.new_session is None else size(
@@ -117,10 +117,10 @@ def _elsewhere(channel: ChannelDiagnosis, sessions: tuple[str, ...]) -> list[str
 
 def _changed(channel: ChannelDiagnosis, cause: Cause, sessions: tuple[str, ...]) -> list[str]:
     """Return whether a cause carries from session to session, with its values where not."""
-    across = next((c for c in channel.carried if c.effect == cause.effect), None)
+    across = next((c for c in channel.session_transfer if c.effect == cause.effect), None)
     if across is None:
         return []
-    if across.carries:
+    if across.transfers:
         return [f"carries: the same in {len(across.values)} sessions"]
     lines = [f"changed between sessions (p = {across.p_value:.2g} if it had not):"]
     most = _most_changed([parameters for _, parameters in across.values])

@@ -65,12 +65,12 @@ def observe(model: Model, log: Log, metrology: Metrology) -> Observation | NotOb
         return NotObservable("position", ("actual_q",))
     index, parts = session_of(log), []
     for s, part in enumerate(sessions_in(log)):
-        seen = _observe_session(model, part, metrology)
-        if seen is None:
+        observation = _observe_session(model, part, metrology)
+        if observation is None:
             continue
-        _check_enough(seen, part, log.session_names[s] if log.session_names else "")
-        own_rows = np.flatnonzero(index == s)[seen.rows]
-        parts.append(_numbered(seen, s, own_rows))
+        _check_enough(observation, part, log.session_names[s] if log.session_names else "")
+        own_rows = np.flatnonzero(index == s)[observation.rows]
+        parts.append(_numbered(observation, s, own_rows))
     if not parts:
         return NotObservable("position", ("measured_position",))
     if len(log.session_names) < 2:
@@ -82,23 +82,23 @@ def observe(model: Model, log: Log, metrology: Metrology) -> Observation | NotOb
     return stacked(parts, together)
 
 
-def _numbered(seen: Observation, session: int, rows: NDArray[np.int64]) -> Observation:
+def _numbered(observation: Observation, session: int, rows: NDArray[np.int64]) -> Observation:
     """Return a session's observation with its number and its rows in the joined log."""
-    rebase = seen.rebase
+    rebase = observation.rebase
 
     def moved(step: Array, terms: Sequence[Term]) -> Observation:
         assert rebase is not None
         return _numbered(rebase(step, terms), session, rows)
 
     return replace(
-        seen, rows=rows, session=np.full(len(rows), session),
+        observation, rows=rows, session=np.full(len(rows), session),
         rebase=None if rebase is None else moved,
     )  # fmt: skip
 
 
-def _check_enough(seen: Observation, log: Log, name: str) -> None:
+def _check_enough(observation: Observation, log: Log, name: str) -> None:
     """Raise LogError where a session of several has too few poses for its nuisances."""
-    N, k, p = seen.nuisance.shape
+    N, k, p = observation.nuisance.shape
     least = p + MIN_FREEDOM_OF_SESSION
     if name and N * k < least:
         raise LogError(

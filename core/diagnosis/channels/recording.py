@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from gapbridge.core.arrays import Array, Index
 from gapbridge.core.derivatives import signal_noise
 from gapbridge.core.diagnosis.criteria import MIN_TORQUE_CHANGE, STEPPED_SHARE
-from gapbridge.core.diagnosis.observation import HELD
+from gapbridge.core.diagnosis.observation import HELD_TORQUE
 from gapbridge.core.estimation.held_out import pose_groups
 from gapbridge.core.log.log import Log
 from gapbridge.core.motion import Motion
@@ -84,7 +84,7 @@ def held_torques(motion: Motion) -> dict[str, Array]:
         return {}
     largest = max(float(np.abs(motion.held).max(initial=0.0)), SMALLEST_TORQUE)
     return {
-        f"{HELD}_{i}": motion.held[:, i]
+        f"{HELD_TORQUE}_{i}": motion.held[:, i]
         for i in np.flatnonzero(np.ptp(motion.held, axis=0) > MIN_TORQUE_CHANGE * largest)
     }
 

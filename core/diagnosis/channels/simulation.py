@@ -54,12 +54,12 @@ def predicted_by(channel: str, observe: Observe) -> Observe:
         model: Model, log: Log, metrology: Metrology
     ) -> Observation | NotObservable:
         values = log.get(PREFIX + SHOWN_BY[channel])
-        seen = observe(model, _behind(log, channel, values), metrology)
-        if isinstance(seen, NotObservable):
-            return seen
+        observation = observe(model, _behind(log, channel, values), metrology)
+        if isinstance(observation, NotObservable):
+            return observation
         if values is None:
             return NotObservable(channel, (f"{SHOWN_BY[channel]} (in the simulator's log)",))
-        return _with_prediction(seen, values)
+        return _with_prediction(observation, values)
 
     return seen_by_simulator
 
@@ -77,11 +77,11 @@ def _behind(log: Log, channel: str, values: Array | None) -> Log:
     return with_motion(behind, replace(motion, target_q=values[motion.rows]))
 
 
-def _with_prediction(seen: Observation, values: Array) -> Observation:
-    channel_rows, rebase, fewer = seen.predict, seen.rebase, seen.fewer
+def _with_prediction(observation: Observation, values: Array) -> Observation:
+    channel_rows, rebase, fewer = observation.predict, observation.rebase, observation.fewer
     nominal = channel_rows(())
     base = nominal.copy()
-    part = values[seen.rows]
+    part = values[observation.rows]
     base[:, : part.shape[1]] = part  # rotations, where measured, stay the model's
 
     def predict(terms: Sequence[Term]) -> Array:
@@ -93,4 +93,4 @@ def _with_prediction(seen: Observation, values: Array) -> Observation:
         else lambda step, terms: _with_prediction(rebase(step, terms), values)
     )
     thinned = None if fewer is None else lambda take: _with_prediction(fewer(take), values)
-    return replace(seen, predict=predict, rebase=moved, fewer=thinned, uncertain=None)
+    return replace(observation, predict=predict, rebase=moved, fewer=thinned, uncertain=None)

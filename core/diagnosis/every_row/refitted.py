@@ -13,15 +13,15 @@ import numpy as np
 
 from gapbridge.core.arrays import Mask
 from gapbridge.core.diagnosis.constancy import not_constant
-from gapbridge.core.diagnosis.criteria import OWN_SIGMAS, SIGMAS, TIE_SCORE
+from gapbridge.core.diagnosis.criteria import MIN_SIGMAS, MIN_SIGMAS_WITH_UNNAMED, TIE_SCORE
 from gapbridge.core.diagnosis.finding import Check, Withdrawal
 from gapbridge.core.diagnosis.held_out import HeldOut
 from gapbridge.core.diagnosis.judgement import (
-    VAGUE,
+    NOT_SIGNIFICANT,
     Judgement,
     covering_effects,
-    gainless,
     ties_of,
+    without_gain,
 )
 from gapbridge.core.diagnosis.observation import Observation
 from gapbridge.core.diagnosis.regions import regions
@@ -42,19 +42,19 @@ from gapbridge.core.model import Model
 
 Alone = Callable[[Selection, Sequence[int]], Selection]
 MOST_RIVALS = 12  # of all causes together
-GAINLESS = Withdrawal(Check.ALL_ROWS_GAIN)
+NO_GAIN = Withdrawal(Check.ALL_ROWS_GAIN)
 
 
-def with_uncertain_terms(judgement: Judgement) -> Judgement:
+def with_undecided_terms(judgement: Judgement) -> Judgement:
     """Return the judgement with what was too vague on some rows accused: all rows decide on it."""
-    vague = tuple(p for p, why in judgement.withdrawn if why == VAGUE)
+    undecided = tuple(p for p, why in judgement.withdrawn if why == NOT_SIGNIFICANT)
     return replace(
-        judgement, accused=(*judgement.accused, *vague), vague=vague,
-        withdrawn=tuple((p, why) for p, why in judgement.withdrawn if p not in vague),
+        judgement, accused=(*judgement.accused, *undecided), undecided=undecided,
+        withdrawn=tuple((p, why) for p, why in judgement.withdrawn if p not in undecided),
     )  # fmt: skip
 
 
-def on_every_row(
+def fitted_on_all_rows(
     selection: Selection, judgement: Judgement, whole: Observation, model: Model
 ) -> Selection:
     """Return the selection with its accused terms refitted on ``whole``.
@@ -105,8 +105,8 @@ def _shaped_as(candidate: Candidate, term: Term) -> Candidate:
     return replace(candidate, fixed=(*candidate.fixed[:-1], term.values[-1]))
 
 
-def still_accused(
-    selection: Selection, judgement: Judgement, held: HeldOut, alone: Alone
+def accused_on_all_rows(
+    selection: Selection, judgement: Judgement, held_out: HeldOut, alone: Alone
 ) -> tuple[Selection, Judgement]:
     """Return what all rows leave accused: effects that shrink the gap where nothing was fitted.
 
@@ -121,8 +121,8 @@ def still_accused(
     }
     selection, judgement = _without(varying, selection, judgement, alone)
     # in the space of all rows a term's position is its candidate
-    fallen = gainless(selection, judgement.accused, held) if held.possible else []
-    selection, judgement = _without(dict.fromkeys(fallen, GAINLESS), selection, judgement, alone)
+    fallen = without_gain(selection, judgement.accused, held_out) if held_out.possible else []
+    selection, judgement = _without(dict.fromkeys(fallen, NO_GAIN), selection, judgement, alone)
     single = [p for p in judgement.accused if p not in selection.prior]
     ties = ties_of(selection.working, selection.best, single)
     return selection, replace(judgement, ties=ties)
@@ -153,9 +153,11 @@ def _sure(selection: Selection, judgement: Judgement, alone: Alone) -> tuple[Sel
     """
     accused, withdrawn = list(judgement.accused), list(judgement.withdrawn)
     beside_links = {p for p in accused if p in selection.prior}  # of known size: three sigmas do
-    least = dict.fromkeys(set(judgement.vague) - beside_links, (SIGMAS / OWN_SIGMAS) ** 2)
+    least = dict.fromkeys(
+        set(judgement.undecided) - beside_links, (MIN_SIGMAS_WITH_UNNAMED / MIN_SIGMAS) ** 2
+    )
     while True:
-        if far := selection.far_off(accused):
+        if far := selection.implausible_parameters(accused):
             selection = alone(selection.with_nominal(far), accused)
             continue
         sure = {p: worth(selection.terms[p], selection.covariance[p]) for p in accused}
@@ -167,7 +169,7 @@ def _sure(selection: Selection, judgement: Judgement, alone: Alone) -> tuple[Sel
         if not weakest:
             return selection, replace(judgement, accused=tuple(accused), withdrawn=tuple(withdrawn))
         accused = [p for p in accused if p not in weakest]
-        withdrawn += [(p, VAGUE) for p in weakest]
+        withdrawn += [(p, NOT_SIGNIFICANT) for p in weakest]
         selection = alone(selection, accused)
 
 

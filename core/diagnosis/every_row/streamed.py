@@ -15,7 +15,7 @@ import numpy as np
 from gapbridge.core.arm import Arm
 from gapbridge.core.arrays import Array, Index
 from gapbridge.core.diagnosis.channels.recording import STRETCHES
-from gapbridge.core.diagnosis.criteria import OUTLIER_SHARE
+from gapbridge.core.diagnosis.criteria import MAX_OUTLIER_SHARE
 from gapbridge.core.diagnosis.every_row.long_recording import Block, LongRecording
 from gapbridge.core.diagnosis.noise_floor import BLOCK, own_coordinates
 from gapbridge.core.diagnosis.observation import NotObservable, Observation
@@ -24,7 +24,7 @@ from gapbridge.core.diagnosis.selection.candidate import Candidate, jacobian, na
 from gapbridge.core.diagnosis.selection.delay_columns import chord_columns, chord_value
 from gapbridge.core.diagnosis.selection.noise import Noise
 from gapbridge.core.diagnosis.selection.problem import SampleSpace, fit, penalties
-from gapbridge.core.diagnosis.selection.refit import Reduced, freed_of, step_on
+from gapbridge.core.diagnosis.selection.refit import ReducedRows, single_step, with_free_shape
 from gapbridge.core.diagnosis.selection.selection import Selection
 from gapbridge.core.diagnosis.selection.state import UnprojectedRows, candidate_of, chords_only
 from gapbridge.core.effects import Term
@@ -56,7 +56,7 @@ class Columns:
         self.candidates = selection.space.candidates
         self.accused = tuple(accused)
         self.terms = tuple(selection.terms[p] for p in accused)
-        self.freed = [freed_of(arm, self.candidates[p]) for p in accused]
+        self.freed = [with_free_shape(arm, self.candidates[p]) for p in accused]
         self.x = [
             np.array(term.values)[: len(c.parameters)]
             for term, c in zip(self.terms, self.freed, strict=True)
@@ -76,28 +76,30 @@ class Columns:
         """Return how many columns there are."""
         return int(self.start[-1]) + 2 + len(self.jacobian)
 
-    def at_samples(self, seen: Observation, bare: Array, gap: Array) -> Array:
-        """Return the columns (N, k, width) of an observation; ``bare`` is its gap without terms."""
+    def at_samples(self, observation: Observation, nominal_gap: Array, gap: Array) -> Array:
+        """Return the columns (N, k, width) of an observation; ``nominal_gap`` has no terms."""
         columns = [
-            self._candidate(seen, c, chord)
+            self._candidate(observation, c, chord)
             for c, chord in zip(self.candidates, self._chords, strict=True)
         ]
-        target = bare
+        target = nominal_gap
         if not self._from_nothing:  # the terms' part is put back, in the linear form at hand
             target = gap
             for term in self.terms:
                 c, x = candidate_of(list(self.candidates), term)
                 target = target + columns[c] @ x
         blocks = [
-            jacobian(seen, c, x, self.terms[:i] + self.terms[i + 1 :])
+            jacobian(observation, c, x, self.terms[:i] + self.terms[i + 1 :])
             for i, (c, x) in enumerate(zip(self.freed, self.x, strict=True))
         ]
         return np.concatenate([*columns, target[..., None], *blocks, gap[..., None]], axis=2)
 
-    def _candidate(self, seen: Observation, c: Candidate, chord: float | None) -> Array:
+    def _candidate(self, observation: Observation, c: Candidate, chord: float | None) -> Array:
         if chord is not None:
-            return chord_columns(seen, c, self.terms, chord)
-        return named_columns(seen, c, () if seen.channel == "tracking" else self.terms)
+            return chord_columns(observation, c, self.terms, chord)
+        return named_columns(
+            observation, c, () if observation.channel == "tracking" else self.terms
+        )
 
 
 @dataclass(frozen=True)
@@ -176,8 +178,8 @@ class Streamed:
         rows = rows_of(mix.T @ sums[:, used][:, :, used] @ mix)
         flat = rows.reshape(-1, rows.shape[2])
         known = dict(zip(self.columns.accused, range(len(self.columns.accused)), strict=True))
-        return step_on(
-            Reduced(
+        return single_step(
+            ReducedRows(
                 flat[:, :-1], flat[:, -1],
                 np.repeat(names, rows.shape[1]) if self.by_region else None,
                 float(self.gap.kept * len(self.white)),
@@ -256,25 +258,27 @@ class RowSums:
 
     def add(self, recording: LongRecording, block: Block) -> None:
         """Add the rows of a block."""
-        seen = self._observe(block.log)
-        if isinstance(seen, NotObservable):
+        observation = self._observe(block.log)
+        if isinstance(observation, NotObservable):
             return
-        inside = seen.rows + block.first >= block.begin
-        rows = seen.rows[inside] + block.first
+        inside = observation.rows + block.first >= block.begin
+        rows = observation.rows[inside] + block.first
         if not len(rows):
             return
-        bare = seen.measured - seen.predict(())
+        nominal_gap = observation.measured - observation.predict(())
         terms = self._columns.terms
-        gap = seen.measured - seen.predict(terms) if terms else bare
-        whole = self._columns.at_samples(seen, bare, gap)[inside] * self._white[:, None]
+        gap = observation.measured - observation.predict(terms) if terms else nominal_gap
+        whole = (
+            self._columns.at_samples(observation, nominal_gap, gap)[inside] * self._white[:, None]
+        )
         kept = np.sqrt(np.mean(whole[:, :, -1] ** 2, axis=1)) <= self._limit
-        whole, bare = whole[kept], bare[inside][kept]
+        whole, nominal_gap = whole[kept], nominal_gap[inside][kept]
         self._samples += len(rows)
         self._outliers.append(rows[~kept])
-        if not len(bare):
+        if not len(nominal_gap):
             return
-        self._squares += np.einsum("ij,ij->j", bare, bare)
-        farthest = float(np.linalg.norm(bare[:, : self._own], axis=1).max())
+        self._squares += np.einsum("ij,ij->j", nominal_gap, nominal_gap)
+        farthest = float(np.linalg.norm(nominal_gap[:, : self._own], axis=1).max())
         self._largest = max(self._largest, farthest)
         time = recording.log.columns["timestamp"][rows[kept]]
         self._means.add(time, whole)
@@ -303,7 +307,7 @@ def _limit(selection: Selection, terms: Sequence[Term], white: Array) -> float:
     """Return the whitened distance from which a row is an outlier; few are, or none is."""
     observation = selection.observation
     left = (observation.measured - observation.predict(terms)) * white
-    far = float(np.quantile(distance_of(left, 1.0), 1 - OUTLIER_SHARE))
+    far = float(np.quantile(distance_of(left, 1.0), 1 - MAX_OUTLIER_SHARE))
     return max(OUTLIER * scale_of(left), far)
 
 

@@ -11,7 +11,11 @@ from collections.abc import Iterator
 import numpy as np
 
 from gapbridge.core.arrays import Array
-from gapbridge.core.diagnosis.criteria import CLEARLY_BETTER, MISTAKE_LEAVES, NOT_THE_ARM
+from gapbridge.core.diagnosis.criteria import (
+    MAX_ARM_ERROR,
+    MAX_RATIO_TO_BEST,
+    MAX_SHARE_AFTER_CORRECTION,
+)
 from gapbridge.core.diagnosis.log_checks.kinematics import (
     best_order,
     inverted,
@@ -46,18 +50,18 @@ def frame_findings(model: Model, log: Log, metrology: Metrology) -> list[LogFind
         predicted = model.rigid_pose(q[rows]).position
     except InputError:
         return []
-    seen = measured[rows]
-    distance = _off(seen, predicted)
+    positions = measured[rows]
+    distance = _off(positions, predicted)
     findings = []
-    if distance > NOT_THE_ARM:
+    if distance > MAX_ARM_ERROR:
         findings.append(_why(model, q, measured, rows, distance, log.get("measured_rotation")))
     elif metrology.registered:
-        here = float(np.median(np.linalg.norm(seen - predicted, axis=1)))
-        if here > NOT_THE_ARM and distance < MISTAKE_LEAVES * here:
+        here = float(np.median(np.linalg.norm(positions - predicted, axis=1)))
+        if here > MAX_ARM_ERROR and distance < MAX_SHARE_AFTER_CORRECTION * here:
             findings.append(LogFinding(LogCheck.NOT_IN_BASE, (here,)))
     turned = log.get("measured_rotation")
     if turned is not None and not findings:
-        findings += _rotations(model, q[rows], seen, turned[rows], metrology)
+        findings += _rotations(model, q[rows], positions, turned[rows], metrology)
     return findings
 
 
@@ -79,9 +83,9 @@ def _why(
             if len(trial) < FEWEST:
                 continue
             left = _off(trial, trial_model.rigid_pose(trial_q).position)
-            if left < CLEARLY_BETTER * best:
+            if left < MAX_RATIO_TO_BEST * best:
                 best, named = left, mistake
-        if named is not None and best < MISTAKE_LEAVES * distance:
+        if named is not None and best < MAX_SHARE_AFTER_CORRECTION * distance:
             return LogFinding(LogCheck.POSITIONS_OFF_BY, (distance, named, best))
     return LogFinding(LogCheck.POSITIONS_OFF, (distance,))
 
@@ -90,52 +94,52 @@ def _mistakes(
     model: Model, q: Array, measured: Array, rows: Array, turned: Array | None
 ) -> Iterator[tuple[LogFinding, Model, Array, Array]]:
     """Yield each mistake with the model, joint angles and positions that would put it right."""
-    seen = measured[rows]
-    mirrored = seen * [1.0, 1.0, -1.0]
+    positions = measured[rows]
+    mirrored = positions * [1.0, 1.0, -1.0]
     yield LogFinding(LogCheck.MIRRORED), model, q[rows], mirrored
     for joint in range(q.shape[1]):
         flipped = q[rows].copy()
         flipped[:, joint] *= -1
-        yield LogFinding(LogCheck.JOINT_SIGN, (joint + 1,)), model, flipped, seen
+        yield LogFinding(LogCheck.JOINT_SIGN, (joint + 1,)), model, flipped, positions
     for step, check in ((1, LogCheck.ROW_LATE), (-1, LogCheck.ROW_EARLY)):
         inside = rows[(rows + step >= 0) & (rows + step < len(q))]
         inside = inside[np.isfinite(measured[inside + step]).all(axis=1)]
         yield LogFinding(check), model, q[inside], measured[inside + step]
     predicted = model.rigid_pose(q[rows]).position
-    size = spread_of(seen) / max(spread_of(predicted), 1e-9)
+    size = spread_of(positions) / max(spread_of(predicted), 1e-9)
     for unit, factor in (("centimetres", 100.0), ("inches", 1 / 0.0254), ("feet", 1 / 0.3048)):
         if 0.82 < size / factor < 1.22:
-            yield LogFinding(LogCheck.LENGTH_UNIT, (unit,)), model, q[rows], seen / factor
+            yield LogFinding(LogCheck.LENGTH_UNIT, (unit,)), model, q[rows], positions / factor
     for mistake, other in other_models(model):
-        yield mistake, other, q[rows], seen
-    point = measured_point(model, q[rows], seen)
+        yield mistake, other, q[rows], positions
+    point = measured_point(model, q[rows], positions)
     if point is not None:
-        yield point[0], point[1], q[rows], seen
-    order = best_order(model, q[rows], seen)
+        yield point[0], point[1], q[rows], positions
+    order = best_order(model, q[rows], positions)
     if order is not None:
-        yield order[0], model, order[1], seen
+        yield order[0], model, order[1], positions
     rotation = None if turned is None else turned[rows]
     if rotation is None or not np.isfinite(rotation).all():
         rotation = rotation_vector(np.swapaxes(model.rigid_pose(q[rows]).rotation, 1, 2))
-    yield LogFinding(LogCheck.INVERTED), model, q[rows], inverted(seen, rotation)
+    yield LogFinding(LogCheck.INVERTED), model, q[rows], inverted(positions, rotation)
 
 
 def _rotations(
-    model: Model, q: Array, seen: Array, turned: Array, metrology: Metrology
+    model: Model, q: Array, positions: Array, turned: Array, metrology: Metrology
 ) -> list[LogFinding]:
     good = np.isfinite(turned).all(axis=1)
     if good.sum() < FEWEST:
         return []
-    q, seen, turned = q[good], seen[good], turned[good]
+    q, positions, turned = q[good], positions[good], turned[good]
     poses = model.rigid_pose(q)
-    frame = register_robustly(seen, poses.position)
+    frame = register_robustly(positions, poses.position)
     base = np.eye(3) if metrology.registered else frame.rotation
     left, constant = _turned_off(poses.rotation, base, rotation_matrix(turned))
-    if left > 10 * NOT_THE_ARM:
-        if _turned_off(poses.rotation, base, _roll_pitch_yaw(turned))[0] < NOT_THE_ARM:
+    if left > 10 * MAX_ARM_ERROR:
+        if _turned_off(poses.rotation, base, _roll_pitch_yaw(turned))[0] < MAX_ARM_ERROR:
             return [LogFinding(LogCheck.ROLL_PITCH_YAW)]
         return [LogFinding(LogCheck.ROTATIONS_OFF, (left,))]
-    return [LogFinding(LogCheck.TARGET_AXES, (constant,))] if constant > 10 * NOT_THE_ARM else []
+    return [LogFinding(LogCheck.TARGET_AXES, (constant,))] if constant > 10 * MAX_ARM_ERROR else []
 
 
 def _turned_off(predicted: Array, base: Array, measured: Array) -> tuple[float, float]:

@@ -31,10 +31,10 @@ FARTHEST = 2.0  # m from the flange: no tool is longer
 
 def other_models(model: Model) -> Iterator[tuple[LogFinding, Model]]:
     """Yield what the model may have been taken for, with the model that puts it right."""
-    bare = np.eye(4)
+    without_tool = np.eye(4)
     if np.linalg.norm(model.tool_in_flange[:3, 3]) > 0:
-        bare[:3, :3] = model.tool_in_flange[:3, :3]
-        yield LogFinding(LogCheck.FLANGE_NOT_TCP), replace(model, tool_in_flange=bare)
+        without_tool[:3, :3] = model.tool_in_flange[:3, :3]
+        yield LogFinding(LogCheck.FLANGE_NOT_TCP), replace(model, tool_in_flange=without_tool)
         turned = model.tool_in_flange.copy()
         turned[:3, 3] *= -1
         yield LogFinding(LogCheck.TCP_SIGN), replace(model, tool_in_flange=turned)
@@ -63,7 +63,7 @@ def other_arms(model: Model) -> Iterator[tuple[LogFinding, Model]]:
             yield LogFinding(LogCheck.OTHER_ARM, (name,)), replace(model, arm=arm)
 
 
-def measured_point(model: Model, q: Array, seen: Array) -> tuple[LogFinding, Model] | None:
+def measured_point(model: Model, q: Array, measured: Array) -> tuple[LogFinding, Model] | None:
     """Return where on the flange the measured positions (N, 3) lie, and that model.
 
     The point and the instrument's frame are found together (Gauss-Newton, twice: the second time
@@ -71,11 +71,13 @@ def measured_point(model: Model, q: Array, seen: Array) -> tuple[LogFinding, Mod
     """
     if len(q) < POINTED:
         return None
-    bare = replace(model, tool_in_flange=np.eye(4))
-    flange = bare.rigid_pose(q)
+    without_tool = replace(model, tool_in_flange=np.eye(4))
+    flange = without_tool.rigid_pose(q)
     kept, point = np.ones(len(q), bool), np.zeros(3)
     for _ in range(2):
-        point, distance = _point_on_flange(flange.position[kept], flange.rotation[kept], seen[kept])
+        point, distance = _point_on_flange(
+            flange.position[kept], flange.rotation[kept], measured[kept]
+        )
         if np.linalg.norm(point) > FARTHEST:
             return None
         kept[kept] = distance <= OUTLYING * np.median(distance)
@@ -90,12 +92,12 @@ def measured_point(model: Model, q: Array, seen: Array) -> tuple[LogFinding, Mod
     return finding, replace(model, tool_in_flange=tool)
 
 
-def _point_on_flange(position: Array, rotation: Array, seen: Array) -> tuple[Array, Array]:
+def _point_on_flange(position: Array, rotation: Array, measured: Array) -> tuple[Array, Array]:
     """Return the point (3,) in the flange, m, and each row's distance (N,) left over."""
     point = np.zeros(3)
     for _ in range(STEPS):
         there = position + rotation @ point
-        in_base = register(seen, there).in_base(seen)
+        in_base = register(measured, there).in_base(measured)
         apart = (in_base - there).ravel()
         turn = np.zeros((len(in_base), 3, 3))  # columns: a small turn of the instrument's frame
         for k, axis in enumerate(np.eye(3)):
@@ -104,11 +106,11 @@ def _point_on_flange(position: Array, rotation: Array, seen: Array) -> tuple[Arr
         columns = np.concatenate([rotation, -turn, -shift], axis=2).reshape(-1, 9)
         point = point + solve(columns, apart, rank=1e-6)[:3]
     there = position + rotation @ point
-    distance = np.linalg.norm(register(seen, there).in_base(seen) - there, axis=1)
+    distance = np.linalg.norm(register(measured, there).in_base(measured) - there, axis=1)
     return point, np.asarray(distance)
 
 
-def best_order(model: Model, q: Array, seen: Array) -> tuple[LogFinding, Array] | None:
+def best_order(model: Model, q: Array, measured: Array) -> tuple[LogFinding, Array] | None:
     """Return the order of joints that fits positions (N, 3) best, and q in it.
 
     All orders of up to six joints; of more, exchanges of two and cyclic shifts. None where the
@@ -116,7 +118,7 @@ def best_order(model: Model, q: Array, seen: Array) -> tuple[LogFinding, Array] 
     """
     n = q.shape[1]
     rows = np.unique(np.linspace(0, len(q) - 1, SCREENED).astype(int))
-    few, target = q[rows], seen[rows]
+    few, target = q[rows], measured[rows]
     orders = list(_orders(n))
     stacked = model.rigid_pose(np.concatenate([few[:, order] for order in orders])).position
     best, chosen = np.inf, orders[0]
@@ -163,9 +165,9 @@ def _order(order: tuple[int, ...]) -> LogFinding:
     return LogFinding(LogCheck.JOINT_ORDER, (tuple((i + 1, order[i]) for i in moved),))
 
 
-def inverted(seen: Array, turned: Array) -> Array:
+def inverted(measured: Array, turned: Array) -> Array:
     """Return positions (N, 3) of inverted poses: what was measured in the tool's frame."""
-    return np.asarray(-np.einsum("nji,nj->ni", rotation_matrix(turned), seen))
+    return np.asarray(-np.einsum("nji,nj->ni", rotation_matrix(turned), measured))
 
 
 def dh_rows(arm: Arm) -> Array | None:

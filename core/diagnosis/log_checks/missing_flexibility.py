@@ -6,7 +6,7 @@ a fit that asks for the softness alone does not.
 
 from __future__ import annotations
 
-from gapbridge.core.diagnosis.criteria import MAIN_SHARE
+from gapbridge.core.diagnosis.criteria import MAX_SHARE_AFTER_FLEXIBILITIES
 from gapbridge.core.errors import GapbridgeError
 from gapbridge.core.estimation.compliance_fit import flexibilities
 from gapbridge.core.estimation.identification import identify_compliance
@@ -29,7 +29,7 @@ def softness_findings(model: Model, log: Log, metrology: Metrology) -> list[LogF
     except GapbridgeError:
         return []
     before, after = fitted.gap_rms_held_out, fitted.remaining_rms_held_out
-    if not after < MAIN_SHARE * before:
+    if not after < MAX_SHARE_AFTER_FLEXIBILITIES * before:
         return []
     values = int(fitted.identifiable.sum()), before, after
     return [LogFinding(LogCheck.MISSING_FLEXIBILITY, values)]

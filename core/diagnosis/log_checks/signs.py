@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from gapbridge.core.arrays import Array, Index
-from gapbridge.core.diagnosis.criteria import SIGN_LEAVES
+from gapbridge.core.diagnosis.criteria import MAX_SHARE_WITH_OTHER_SIGN
 from gapbridge.core.dynamics import predict_torque, predict_wrench
 from gapbridge.core.errors import InputError
 from gapbridge.core.estimation.least_squares import bounded
@@ -87,7 +87,7 @@ def _variants(model: Model, q: Array, pull: Array) -> dict[LogCheck | None, Arra
 def _best(residual: dict[LogCheck | None, float]) -> LogCheck | None:
     """Return the variant that leaves far less than the column as it stands, or None."""
     least = min(residual, key=lambda key: residual[key])
-    return least if residual[least] < SIGN_LEAVES * residual[None] else None
+    return least if residual[least] < MAX_SHARE_WITH_OTHER_SIGN * residual[None] else None
 
 
 def _compliance_rivals(model: Model, log: Log, q: Array, pull: Array) -> LogCheck | None:
@@ -112,13 +112,13 @@ def _compliance_rivals(model: Model, log: Log, q: Array, pull: Array) -> LogChec
 def _compliance_residual(model: Model, q: Array, measured: Array, loads: Loads) -> Array:
     """Return what joints that give way, never less than nothing, leave of the positions (N, 3)."""
     predicted = model.predict(q, loads).position
-    seen = register_robustly(measured, predicted).in_base(measured)
+    in_base = register_robustly(measured, predicted).in_base(measured)
     form, n = model.linear_form(q, loads), model.arm.n
-    free = np.concatenate([form.jacobian[:, :3], frame_columns(seen)[:, :3]], axis=2)
+    free = np.concatenate([form.jacobian[:, :3], frame_columns(in_base)[:, :3]], axis=2)
     A = np.concatenate([form.regressor[:, :3], free], axis=2).reshape(3 * len(q), -1)
-    b = (seen - predicted).ravel()
+    b = (in_base - predicted).ravel()
     lower = np.concatenate([-np.concatenate(model.compliance()), np.full(n + 6, -np.inf)])
-    weight, off = np.ones(len(b)), seen - predicted
+    weight, off = np.ones(len(b)), in_base - predicted
     for _ in range(ROUNDS):
         root = np.sqrt(weight)
         x = bounded(A * root[:, None], b * root, lower, np.full(len(lower), np.inf))[0]
@@ -178,4 +178,4 @@ def _reads_turned_round(model: Model, log: Log, q: Array, name: str) -> bool:
         return False
     expected = _predicted(model, log, q, name, None if pull is None else pull[rows], rows)
     asked, other = (spread_of(sign * column[rows] - expected) for sign in (1.0, -1.0))
-    return spread_of(expected) >= LEAST and other <= SIGN_LEAVES * asked
+    return spread_of(expected) >= LEAST and other <= MAX_SHARE_WITH_OTHER_SIGN * asked

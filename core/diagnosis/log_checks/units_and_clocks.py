@@ -67,7 +67,7 @@ def check_units(model: Model, log: Log) -> None:
         # one slip of a digit is no unit: three quarters of what is not zero have to be too large
         high = size[np.isfinite(size) & (size != 0)]
         worst = float(np.quantile(high, 0.25)) if len(high) else 0.0
-        if worst > most or (name == "measured_rotation" and _share(high > most) > 0.1):
+        if worst > most or (name == "measured_rotation" and _step_share(high > most) > 0.1):
             label = name if column.ndim == 1 else f"{name}_*"
             raise LogError(f"{log.path}: column {label}: found about {worst:.4g}; {what}")
 
@@ -125,7 +125,7 @@ def _usual_load(model: Model) -> float:
     return max(rated, model.payload_mass)
 
 
-def _share(flags: NDArray[np.bool_]) -> float:
+def _step_share(flags: NDArray[np.bool_]) -> float:
     return float(np.mean(flags)) if len(flags) else 0.0
 
 

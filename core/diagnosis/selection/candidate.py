@@ -16,7 +16,7 @@ import numpy as np
 from gapbridge.core.arm import Arm
 from gapbridge.core.arrays import Array
 from gapbridge.core.diagnosis.criteria import MIN_CYCLES
-from gapbridge.core.diagnosis.observation import HELD, Observation
+from gapbridge.core.diagnosis.observation import HELD_TORQUE, Observation
 from gapbridge.core.effects import CATALOGUE, Effect, Parameter, Site, Term
 from gapbridge.core.errors import InputError
 
@@ -59,7 +59,7 @@ class Candidate:
         return CATALOGUE.get(self.family, UNNAMED)
 
     @cached_property
-    def turns_its_joint(self) -> bool:
+    def turns_joint_by_own_angle(self) -> bool:
         """Return whether this turns a joint by the joint's own angle alone."""
         own = Effect.angle_columns
         return type(self.effect).angle_columns is not own
@@ -70,7 +70,7 @@ class Candidate:
         return self.effect.periodic
 
     @cached_property
-    def of_no_quantity(self) -> bool:
+    def without_quantity(self) -> bool:
         """Return whether this is an unnamed cause that goes by no column of the log."""
         return not self.named and not self.quantity
 
@@ -97,7 +97,7 @@ def own_target(quantity: str) -> str:
 def carrying(quantity: str) -> str:
     """Return the joint that holds the torque of a quantity, as own_target ('' if none)."""
     stem, _, index = quantity.rpartition("_")
-    return joint_target(int(index) + 1) if stem == HELD else ""
+    return joint_target(int(index) + 1) if stem == HELD_TORQUE else ""
 
 
 def named_candidates(
@@ -186,15 +186,15 @@ def named_columns(observation: Observation, candidate: Candidate, base: Sequence
     return columns
 
 
-def shows_alone(observation: Observation, candidate: Candidate) -> bool:
+def changes_prediction_alone(observation: Observation, candidate: Candidate) -> bool:
     """Return whether an effect changes predictions where no other is in the model."""
     return bool(_from_nominal(observation, candidate, ()).any())
 
 
-def with_what_it_needs(observation: Observation, candidate: Candidate) -> Candidate:
+def with_requirement(observation: Observation, candidate: Candidate) -> Candidate:
     """Return the candidate with the family beside which alone it shows: no load, no centre."""
     needed = candidate.effect.shown_by
-    if needed is None or shows_alone(observation, candidate):
+    if needed is None or changes_prediction_alone(observation, candidate):
         return candidate
     return replace(candidate, beside=needed.effect)
 

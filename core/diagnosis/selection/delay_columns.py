@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from gapbridge.core.arrays import Array
-from gapbridge.core.diagnosis.criteria import ALIKE, MIN_DELAYS
+from gapbridge.core.diagnosis.criteria import MIN_DELAY_SCATTER, MIN_DELAYS
 from gapbridge.core.diagnosis.observation import Observation
 from gapbridge.core.diagnosis.selection.candidate import Candidate, named_columns
 from gapbridge.core.diagnosis.selection.problem import CandidateFit, SampleSpace, fit
@@ -29,7 +29,7 @@ def exact_columns(observation: Observation, candidate: Candidate, base: Sequence
     compete on what they really predict. So do a light link's first moment and a heavy load's.
     """
     if observation.channel == "torque":
-        return _beside_twin(observation, candidate, base)
+        return _twin_columns(observation, candidate, base)
     if observation.channel != "tracking":
         return named_columns(observation, candidate, base)
     if len(candidate.parameters) > 1:
@@ -37,7 +37,7 @@ def exact_columns(observation: Observation, candidate: Candidate, base: Sequence
     return chord_columns(observation, candidate, base, chord_value(observation, candidate, base))
 
 
-def _beside_twin(observation: Observation, candidate: Candidate, base: Sequence[Term]) -> Array:
+def _twin_columns(observation: Observation, candidate: Candidate, base: Sequence[Term]) -> Array:
     """Return columns (N, k, d) that are exact at what the candidate would have to be as a twin.
 
     Where the model holds one of its twins, these are those of the first order with Broyden's
@@ -107,7 +107,7 @@ def _alike(term: Term, candidate: Candidate) -> bool:
     return delays or term.effect == candidate.family
 
 
-def as_one_delay(values: Array, variances: Array) -> tuple[Array, Array]:
+def shrunk_to_common_delay(values: Array, variances: Array) -> tuple[Array, Array]:
     """Return delays (n,) of one log and their variances, each known by the others' as well.
 
     A controller answers late at every joint alike. Where something else moves a joint, and hides
@@ -119,7 +119,7 @@ def as_one_delay(values: Array, variances: Array) -> tuple[Array, Array]:
         return values, variances
     centre = float(np.median(values[known]))
     scatter = scale_of(values[known] - centre)
-    prior = max(scatter, ALIKE * abs(centre)) ** 2
+    prior = max(scatter, MIN_DELAY_SCATTER * abs(centre)) ** 2
     own = np.where(known, prior / (prior + np.where(known, variances, 0.0)), 0.0)
     return centre + own * (values - centre), np.where(known, own * variances, prior)
 

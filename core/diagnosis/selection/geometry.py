@@ -23,10 +23,10 @@ import numpy as np
 from gapbridge.core.arrays import Array, Mask
 from gapbridge.core.diagnosis.criteria import (
     ACCUSATION_PENALTY,
-    FEW_LINKS,
+    JOINT_ZERO_FACTORS,
     MIN_GEOMETRIC_CAUSES,
-    OWN_SIGMAS,
-    TIMES_SET,
+    MIN_JOINTS_FOR_BLOCK,
+    MIN_SIGMAS,
 )
 from gapbridge.core.diagnosis.selection.candidate import Candidate
 from gapbridge.core.diagnosis.selection.local_search import pruned
@@ -36,12 +36,12 @@ from gapbridge.core.estimation.geometry import ANGLE, LENGTH, TIMES_MACHINED
 from gapbridge.core.estimation.least_squares import solve
 
 Members = Callable[[SampleSpace], tuple[int, ...]]
-NEVER = 1e9  # a penalty that no fit is worth
+FORBIDDEN_PENALTY = 1e9  # a penalty that no fit is worth
 NOMINAL = 1e-9  # of a number's usual size: 1 sigma of one that is held
-NONE_HELD: Mapping[int, Mask] = {}
+NONE_NOMINAL: Mapping[int, Mask] = {}
 
 
-def soft_candidates(space: SampleSpace) -> tuple[int, ...]:
+def flexibility_candidates(space: SampleSpace) -> tuple[int, ...]:
     """Return the flexibilities of all joints."""
     return tuple(c for c, k in enumerate(space.candidates) if k.effect.flexibility)
 
@@ -62,11 +62,11 @@ def link_candidates(space: SampleSpace, joints: bool = True) -> tuple[int, ...]:
 
 def prior(
     space: SampleSpace, block: Sequence[int], rest: Sequence[int],
-    held: Mapping[int, Mask] = NONE_HELD,
+    nominal: Mapping[int, Mask] = NONE_NOMINAL,
 ) -> dict[int, Array]:  # fmt: skip
     """Return 1 sigma (d,) of each number of the links beside a set of other candidates.
 
-    ``held`` (d,) are numbers that stay nominal.
+    ``nominal`` (d,) are numbers that stay nominal.
 
     An engineer's size times the power of two under which the gap is most likely: arms differ in
     how well their links are known (empirical Bayes; MacKay, Neural Computation 4 (1992) 415). What
@@ -80,8 +80,8 @@ def prior(
         for c in block
     }
     size |= {
-        c: np.where(nominal, NOMINAL * size[c], size[c])
-        for c, nominal in held.items() if c in size
+        c: np.where(fixed, NOMINAL * size[c], size[c])
+        for c, fixed in nominal.items() if c in size
     }  # fmt: skip
 
     def sized(links: float, joints: float) -> dict[int, Array]:
@@ -92,9 +92,9 @@ def prior(
 
     def score(times: tuple[float, float]) -> float:
         links = links_of(few, {place[c]: own for c, own in sized(*times).items()})
-        return _beside_set(few, [place[c] for c in rest], links) + links.penalty
+        return _score_with_links(few, [place[c] for c in rest], links) + links.penalty
 
-    return sized(*min(itertools.product(TIMES_MACHINED, TIMES_SET), key=score))
+    return sized(*min(itertools.product(TIMES_MACHINED, JOINT_ZERO_FACTORS), key=score))
 
 
 def _reduced(space: SampleSpace, chosen: Sequence[int]) -> SampleSpace:
@@ -132,7 +132,7 @@ class Links:
     def beside(self, space: SampleSpace, block: Iterable[int]) -> SampleSpace:
         """Return the space beside them; ``block``, their candidates, can be in no set there."""
         penalty = space.penalty.copy()
-        penalty[list(block)] = NEVER
+        penalty[list(block)] = FORBIDDEN_PENALTY
         return replace(space, y=self.whitened(space.y), X=self.whitened(space.X), penalty=penalty)
 
 
@@ -153,7 +153,7 @@ def with_links(
     beside that set, or where it holds several geometric causes. Flexibilities are in the set, those
     that are sure.
     """
-    tried = [_Block.of(space, best, members) for members in _forms(space, best)]
+    tried = [_Block.of(space, best, members) for members in _block_choices(space, best)]
     if not tried:
         return space, best, {}
     block = min(tried, key=lambda b: b.score)
@@ -170,7 +170,7 @@ def with_links(
     # a search goes its own way, and of a long log seldom the best: what was found stands beside too
     other = min([other, pruned(near, fit(near, rest))], key=lambda f: f.score)
     if other.score + links.penalty + tries < best.score:
-        if block.members is soft_candidates:
+        if block.members is flexibility_candidates:
             return space, _sure(space, (*other.chosen, *sigma), set(sigma)), {}
         return near, other, sigma
     return space, best, {}
@@ -186,7 +186,7 @@ def _sure(space: SampleSpace, chosen: Sequence[int], block: set[int]) -> Candida
             if c in block
         }
         weakest = min(strength, key=lambda c: strength[c], default=None)
-        if weakest is None or strength[weakest] >= OWN_SIGMAS:
+        if weakest is None or strength[weakest] >= MIN_SIGMAS:
             return current
         current = fit(space, [c for c in current.chosen if c != weakest])
 
@@ -207,10 +207,12 @@ class _Block:
         rest = [c for c in best.chosen if c not in block]
         sigma = prior(space, block, rest)
         links = links_of(space, sigma)
-        return cls(members, rest, sigma, links, _beside_set(space, rest, links) + links.penalty)
+        return cls(
+            members, rest, sigma, links, _score_with_links(space, rest, links) + links.penalty
+        )
 
 
-def _forms(space: SampleSpace, best: CandidateFit) -> list[Members]:
+def _block_choices(space: SampleSpace, best: CandidateFit) -> list[Members]:
     """Return what may be a cause as a whole: the links, with what goes with them or without.
 
     Geometry goes with the joints' zeros. First moments can well be off singly: they are tried where
@@ -222,19 +224,24 @@ def _forms(space: SampleSpace, best: CandidateFit) -> list[Members]:
         forms = [link_candidates]
     else:
         forms = [members for members in forms if _few_joints(space, best, members(space))]
-    if _few_joints(space, best, soft_candidates(space)):
-        forms.append(soft_candidates)
+    if _few_joints(space, best, flexibility_candidates(space)):
+        forms.append(flexibility_candidates)
     return [members for members in forms if len(members(space)) > 1]
 
 
 def _few_joints(space: SampleSpace, best: CandidateFit, block: Sequence[int]) -> bool:
     """Return whether a set holds a few joints of a block."""
-    return len({space.candidates[c].site.joint for c in best.chosen if c in block}) >= FEW_LINKS
+    return (
+        len({space.candidates[c].site.joint for c in best.chosen if c in block})
+        >= MIN_JOINTS_FOR_BLOCK
+    )
 
 
 def _geometric(candidate: Candidate) -> bool:
     """Return whether this is a link's geometry or the zero of a joint."""
-    return candidate.effect.together or (candidate.turns_its_joint and not candidate.periodic)
+    return candidate.effect.together or (
+        candidate.turns_joint_by_own_angle and not candidate.periodic
+    )
 
 
 def _of_mass(candidate: Candidate) -> bool:
@@ -242,7 +249,7 @@ def _of_mass(candidate: Candidate) -> bool:
     return candidate.effect.carried
 
 
-def _beside_set(space: SampleSpace, rest: Sequence[int], links: Links) -> float:
+def _score_with_links(space: SampleSpace, rest: Sequence[int], links: Links) -> float:
     """Return the score of a set beside the links, the penalty of these left out."""
     A, y = links.whitened(space.columns(rest)), links.whitened(space.y)
     rss = float(np.sum((y - A @ solve(A, y)) ** 2))

@@ -91,7 +91,7 @@ def joined_sets(space: SampleSpace, current: CandidateFit) -> list[CandidateFit]
     Named causes that together imitate something unknown fall away where it is given its own term;
     where they stand in each other's way, the set grows from that term anew.
     """
-    unnamed = {c for c, k in enumerate(space.candidates) if k.of_no_quantity}
+    unnamed = {c for c, k in enumerate(space.candidates) if k.without_quantity}
     joiners = unnamed | {c for _, c in joining(space, current.chosen, 4)}
     new = sorted(joiners - set(current.chosen))
     sets = [pruned(space, fit(space, (*current.chosen, c))) for c in new]

@@ -50,7 +50,7 @@ def step_candidates(
     for effect in effects:
         sites = effect.sites(state.arm)
         for site in sites:
-            always = _always(state, effect, site, still)
+            always = _step_columns(state, effect, site, still)
             had = [t for t in base if t.effect == effect.identifier and t.site == site]
             rest = tuple(t for t in base if t not in had)
             kept = _best(_gains(state, always, target, basis), times)
@@ -74,7 +74,7 @@ def _candidate(arm: Arm, effect: Effect, site: Site, moment: float, tried: int) 
     return Candidate(effect.identifier, site, sizes, fixed, tried=tried)
 
 
-def _always(state: SelectionState, effect: Effect, site: Site, base: Sequence[Term]) -> Array:
+def _step_columns(state: SelectionState, effect: Effect, site: Site, base: Sequence[Term]) -> Array:
     """Return d prediction / d size (N, k, d) of a step that is there in all rows."""
     sizes = effect.parameters(state.arm, site)[:-1]
     columns = []

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from gapbridge.core.arrays import Array
 from gapbridge.core.diagnosis.criteria import (
     LOOSE_PRIOR,
-    MOST_OUTLIERS,
-    OUTLIER_SHARE,
-    UNPREDICTED_SHARE,
+    MAX_EXCLUDED_SHARE,
+    MAX_OUTLIER_SHARE,
+    MAX_UNPREDICTED_SHARE,
 )
 from gapbridge.core.diagnosis.selection.candidate import Candidate
 from gapbridge.core.diagnosis.selection.forward import joining
@@ -94,7 +94,7 @@ def _keep(state: SelectionState, residual: Array) -> NDArray[np.bool_]:
     distance = distance_of(white, scale_of(white))
     outliers = np.flatnonzero(distance >= OUTLIER)
     moving = state.observation.channel in ("torque", "tracking")
-    share = OUTLIER_SHARE if moving else MOST_OUTLIERS
+    share = MAX_OUTLIER_SHARE if moving else MAX_EXCLUDED_SHARE
     limit = int(np.ceil(share * len(residual)))
     kept = np.ones(len(residual), dtype=bool)
     kept[outliers[np.argsort(-distance[outliers])][:limit]] = False
@@ -146,7 +146,7 @@ def _predicted_without_it(
         x = solve(with_it, target[rest])
         plain = solve(without, target[rest])
         off = float(np.linalg.norm(target[out] - A[out] @ x))
-        if off > UNPREDICTED_SHARE * float(np.linalg.norm(target[out] - A[out, :-d] @ plain)):
+        if off > MAX_UNPREDICTED_SHARE * float(np.linalg.norm(target[out] - A[out, :-d] @ plain)):
             return False
     return True
 

@@ -117,7 +117,7 @@ def _kind(candidate: Candidate) -> str:
     """Return among how many of its like a candidate was tried: usual lines are few."""
     if candidate.periodic and (candidate.site.order or 0) in USUAL_ORDERS:
         return "usual lines"
-    if candidate.of_no_quantity:
+    if candidate.without_quantity:
         return "rivals"
     return candidate.family
 

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from gapbridge.core.arm import Arm
 from gapbridge.core.arrays import Array
-from gapbridge.core.diagnosis.criteria import OWN_SIGMAS, PRIOR_REACH
+from gapbridge.core.diagnosis.criteria import MIN_SIGMAS, PRIOR_REACH
 from gapbridge.core.diagnosis.selection.candidate import Candidate, jacobian
-from gapbridge.core.diagnosis.selection.delay_columns import as_one_delay
+from gapbridge.core.diagnosis.selection.delay_columns import shrunk_to_common_delay
 from gapbridge.core.diagnosis.selection.problem import CandidateFit, SampleSpace
 from gapbridge.core.diagnosis.selection.state import SelectionState, flat
 from gapbridge.core.effects import CATALOGUE, Term
@@ -65,7 +65,7 @@ def refit(
     these are wider than those of white noise: what is unknown is not the same everywhere.
     """
     index = (*(c for c in linear_fit.chosen if space.candidates[c].named), *links)
-    freed = [freed_of(state.arm, space.candidates[c]) for c in index]
+    freed = [with_free_shape(state.arm, space.candidates[c]) for c in index]
     usual = [links.get(c, PRIOR_REACH * k.scales) for c, k in zip(index, freed, strict=True)]
     near = [links.get(c, np.inf) for c in index]
     extra = space.columns([c for c in linear_fit.chosen if not space.candidates[c].named])
@@ -76,7 +76,7 @@ def refit(
         rows = _linearised(state, freed, x, extra, usual, remainder)
         step = _step(*rows.with_prior(), rows.unit(), freed, x)
         parts = np.split(step, np.cumsum([len(v) for v in x]))[: len(x)]
-        share = _share(state, freed, x, parts, near, rows.A)
+        share = _step_share(state, freed, x, parts, near, rows.A)
         x = [_within(c, v + share * part) for c, v, part in zip(freed, x, parts, strict=True)]
         state = _frame_moved(state, extra, _terms(freed, x))
         if _largest_step(freed, parts) < CONVERGED:
@@ -90,7 +90,7 @@ def refit(
     terms = _terms(freed, x)
     gap = state.observation.measured - state.observation.predict(terms)
     if state.observation.nuisance.shape[2]:
-        gap = gap - state.observation.nuisance @ _along(extra, gap, state)
+        gap = gap - state.observation.nuisance @ _nuisance_step(extra, gap, state)
     return state, terms, index, tuple(covariance), gap
 
 
@@ -165,7 +165,7 @@ def _linearised(
     ]
     nuisance = flat(observation.nuisance, state)
     A = np.hstack([*blocks, extra, nuisance])
-    pull, towards = _pull(usual, x, A.shape[1], remainder, nuisance.shape[1])
+    pull, towards = _prior_rows(usual, x, A.shape[1], remainder, nuisance.shape[1])
     return _Linearised(A, flat(gap[..., None], state)[:, 0], pull, towards)
 
 
@@ -175,7 +175,7 @@ def _frame_moved(state: SelectionState, extra: Array, terms: tuple[Term, ...]) -
     if observation.rebase is None:
         return state
     gap = observation.measured - observation.predict(terms)
-    return replace(state, observation=observation.rebased(_along(extra, gap, state), terms))
+    return replace(state, observation=observation.rebased(_nuisance_step(extra, gap, state), terms))
 
 
 def _largest_step(freed: list[Candidate], parts: list[Array]) -> float:
@@ -185,7 +185,7 @@ def _largest_step(freed: list[Candidate], parts: list[Array]) -> float:
 
 
 @dataclass(frozen=True)
-class Reduced:
+class ReducedRows:
     """Whitened rows of a regression, of as many as there were those that hold the same sums."""
 
     A: Array  # (m, p) Jacobian at the values at hand
@@ -194,11 +194,13 @@ class Reduced:
     count: float  # rows that there were
 
 
-def step_on(
-    rows: Reduced, freed: list[Candidate], x: list[Array], floor: float
+def single_step(
+    rows: ReducedRows, freed: list[Candidate], x: list[Array], floor: float
 ) -> tuple[list[Array], list[Array]]:
     """Return values (d,) and covariances (d, d) of terms after one step from ``x``, near there."""
-    pull, towards = _pull([PRIOR_REACH * c.scales for c in freed], x, rows.A.shape[1], None, 0)
+    pull, towards = _prior_rows(
+        [PRIOR_REACH * c.scales for c in freed], x, rows.A.shape[1], None, 0
+    )
     whole, right = np.vstack([rows.A, pull]), np.concatenate([rows.b, towards])
     unit = 1 / np.sqrt(np.einsum("ij,ij->j", whole, whole))
     step = _step(whole, right, unit, freed, x)
@@ -219,7 +221,7 @@ def _as_one_delay(
     """Return values (d,) and covariances (d, d) of terms, delays known by those of other joints."""
     late = [k for k, c in enumerate(freed) if c.effect.delays]
     variances = np.array([covariance[k][0, 0] for k in late])
-    values, variances = as_one_delay(np.array([x[k][0] for k in late]), variances)
+    values, variances = shrunk_to_common_delay(np.array([x[k][0] for k in late]), variances)
     x, covariance = list(x), list(covariance)
     for k, value, variance in zip(late, values, variances, strict=True):
         x[k], covariance[k] = np.array([value]), np.array([[variance]])
@@ -293,7 +295,7 @@ def worth(term: Term, spread: Array) -> float:
     else:
         judged = slice(0, 1) if effect.curved or effect.shapes else slice(None)
         single = float(np.max(value[judged] ** 2 / np.maximum(np.diag(spread)[judged], 1e-300)))
-    return min(whole, single) / OWN_SIGMAS**2
+    return min(whole, single) / MIN_SIGMAS**2
 
 
 def _step(A: Array, b: Array, unit: Array, freed: list[Candidate], x: list[Array]) -> Array:
@@ -317,13 +319,13 @@ def _step(A: Array, b: Array, unit: Array, freed: list[Candidate], x: list[Array
     return step
 
 
-def _along(extra: Array, gap: Array, state: SelectionState) -> Array:
+def _nuisance_step(extra: Array, gap: Array, state: SelectionState) -> Array:
     """Return what of the nuisance (p,) a gap (N, k) asks for, unnamed functions beside it."""
     b, nuisance = flat(gap[..., None], state)[:, 0], flat(state.observation.nuisance, state)
     return solve(np.hstack([extra, nuisance]), b)[extra.shape[1] :]
 
 
-def _pull(
+def _prior_rows(
     usual: list[Array], x: list[Array], width: int, remainder: Remainder | None, nuisance: int
 ) -> tuple[Array, Array]:
     """Return rows (k, width) and targets that pull parameters ``x`` towards nominal.
@@ -345,7 +347,7 @@ def _pull(
     return np.vstack([rows, more]), np.concatenate([towards, np.zeros(len(known))])
 
 
-def _share(
+def _step_share(
     state: SelectionState, freed: list[Candidate], x: list[Array], parts: list[Array],
     near: list[Array | float], A: Array,
 ) -> float:  # fmt: skip
@@ -375,7 +377,7 @@ def _share(
     return 0.0
 
 
-def freed_of(arm: Arm, candidate: Candidate) -> Candidate:
+def with_free_shape(arm: Arm, candidate: Candidate) -> Candidate:
     """Return the candidate with what its columns held fixed (a softening) fitted too."""
     if not (candidate.effect.curved or candidate.effect.shapes):
         return candidate

@@ -13,18 +13,18 @@ import numpy as np
 
 from gapbridge.core.arrays import Array, Mask
 from gapbridge.core.diagnosis.criteria import (
-    HEAVIEST,
-    HELD_WHOLLY,
+    CONTAINED_SHARE,
     LARGE_SAMPLE,
-    NO_WORTH,
-    UNDETERMINED,
+    MAX_PAYLOAD_FACTOR,
+    NEGLIGIBLE_WORTH,
+    UNDETERMINED_SPREAD,
 )
 from gapbridge.core.diagnosis.observation import Observation
 from gapbridge.core.diagnosis.selection.candidate import (
     Candidate,
     joint_quantity,
     named_candidates,
-    with_what_it_needs,
+    with_requirement,
 )
 from gapbridge.core.diagnosis.selection.delay_columns import exact_columns, one_delay
 from gapbridge.core.diagnosis.selection.geometry import (
@@ -41,7 +41,7 @@ from gapbridge.core.diagnosis.selection.outliers import (
 )
 from gapbridge.core.diagnosis.selection.problem import CandidateFit, SampleSpace, fit
 from gapbridge.core.diagnosis.selection.refit import refit, worth
-from gapbridge.core.diagnosis.selection.search import by_what_is_left, screened_search
+from gapbridge.core.diagnosis.selection.search import screened_search, weighted_by_residual
 from gapbridge.core.diagnosis.selection.selection import Selection
 from gapbridge.core.diagnosis.selection.smooth import Pair, smooth_candidates, unnamed
 from gapbridge.core.diagnosis.selection.state import (
@@ -80,12 +80,12 @@ def select(
         last = None  # its columns are as large as the new ones: not both at a time
         last = _round(state, model, base, withheld, none, offered, turn == 0)
         same = terms_alike(last.terms, base) and turn > 0
-        settled = same and bool((last.state.kept == last.counted).all())
+        settled = same and bool((last.state.kept == last.fitted_samples).all())
         state, base, space = last.state, last.terms, last.space
         # beside an unnamed function a value is not yet what it comes to without; but what shows
         # nothing by itself (the scale of a torque that is not there) keeps the place of what does
         named_only = all(space.candidates[c].named for c in last.best.chosen)
-        weakest = last.weakest(1.0 if settled and named_only else NO_WORTH)
+        weakest = last.weakest(1.0 if settled and named_only else NEGLIGIBLE_WORTH)
         if weakest is not None:
             none.add((base[weakest].effect, base[weakest].site))
             base = base[:weakest] + base[weakest + 1 :]
@@ -99,7 +99,7 @@ def select(
         last = _named_refit(last)
     return Selection(
         last.state.observation, space, last.best, last.terms, last.index, last.covariance,
-        last.counted, last.whitened_by, last.residual, base, last.unprojected, last.links,
+        last.fitted_samples, last.fit_noise, last.residual, base, last.unprojected, last.links,
     )  # fmt: skip
 
 
@@ -108,8 +108,8 @@ class _Round:
     """What one round of the search came to."""
 
     state: SelectionState  # its noise and outliers by what was found
-    counted: Mask  # (N,) samples that were fitted
-    whitened_by: Noise
+    fitted_samples: Mask  # (N,) samples that were fitted
+    fit_noise: Noise
     space: SampleSpace
     near: SampleSpace  # the same, beside the links where their geometry is a cause
     unprojected: UnprojectedRows
@@ -131,7 +131,7 @@ class _Round:
             if c not in self.links:
                 size = self.space.candidates[c].scales
                 sigma = np.sqrt(np.diag(self.covariance[p]))
-                unknown = float((sigma / size[: len(sigma)]).min()) / UNDETERMINED
+                unknown = float((sigma / size[: len(sigma)]).min()) / UNDETERMINED_SPREAD
                 share[p] = -unknown if unknown > 1 else worth(self.terms[p], self.covariance[p])
         weakest = min(share, key=lambda p: share[p], default=None)
         return None if weakest is None or share[weakest] >= least else weakest
@@ -149,7 +149,7 @@ def _round(
     if first:  # the rows after a late slip stand out unless it is among what may be there
         steps = step_candidates(state, columns, base, withheld)
         state = mark_outliers(state, [*zip(open_to, columns, strict=True), *steps])
-    smooth = _beyond_loads(offered, open_to, columns, base)
+    smooth = _without_known_loads(offered, open_to, columns, base)
     stepping = step_candidates(state, columns, base, withheld)
     state = replace(state, candidates=[*open_to, *(candidate for candidate, _ in stepping)])
     columns += [step_columns for _, step_columns in stepping]
@@ -161,8 +161,8 @@ def _round(
             state, columns, base, smooth, (space, unprojected, best)
         )
     near, best, links = with_links(space, best, inside)
-    counted, whitened_by = state.kept, state.noise
-    exact = _exactly(near, best, state)
+    fitted_samples, fit_noise = state.kept, state.noise
+    exact = _refit_set(near, best, state)
     state, terms, index, covariance, residual = refit(state, space, exact, links)
     straight = with_straight_stiffness(space, best.chosen, index, terms, covariance)
     if straight is not None:
@@ -172,14 +172,14 @@ def _round(
     noise_residual = _without_smooth_part(state, space, best, smooth, residual)
     state = revise_noise_and_outliers(state, noise_residual, 1 - used / space.freedom)
     return _Round(
-        state, counted, whitened_by, space, near, unprojected, links, best, terms, index,
+        state, fitted_samples, fit_noise, space, near, unprojected, links, best, terms, index,
         covariance, residual,
     )  # fmt: skip
 
 
 def _named_refit(last: _Round) -> _Round:
     """Return a round whose named terms are refitted alone, unnamed functions left in the set."""
-    state = replace(last.state, kept=last.counted, noise=last.whitened_by)
+    state = replace(last.state, kept=last.fitted_samples, noise=last.fit_noise)
     alone, best = _named_alone(last.near, last.best, last.state.observation)
     while True:
         state, terms, index, covariance, residual = refit(state, last.space, alone, last.links)
@@ -187,7 +187,7 @@ def _named_refit(last: _Round) -> _Round:
             last, state=state, best=best, terms=terms, index=index, covariance=covariance,
             residual=residual,
         )  # fmt: skip
-        weakest = last.weakest(NO_WORTH)
+        weakest = last.weakest(NEGLIGIBLE_WORTH)
         if weakest is None:
             return last
         alone, best = (
@@ -196,7 +196,7 @@ def _named_refit(last: _Round) -> _Round:
         )
 
 
-def _beyond_loads(
+def _without_known_loads(
     smooth: list[Pair], candidates: Sequence[Candidate], columns: Sequence[Array],
     base: Sequence[Term],
 ) -> list[Pair]:  # fmt: skip
@@ -215,10 +215,10 @@ def _beyond_loads(
         return smooth
     U, remaining = basis_of(np.hstack(loads)), []
     for c, own in smooth:
-        if c.of_no_quantity:
+        if c.without_quantity:
             X = basis_of(own.reshape(len(U), -1))
             _, share, V = np.linalg.svd(projected_out(U, X), full_matrices=False)
-            unknown = share**2 > 1 - HELD_WHOLLY
+            unknown = share**2 > 1 - CONTAINED_SHARE
             if not unknown.any():
                 continue
             if not unknown.all():
@@ -240,9 +240,9 @@ def _named_candidates(
     ]
     rotation = observation.measured.shape[1] > 3
     return [
-        with_what_it_needs(observation, _bounded(c, model, observation))
+        with_requirement(observation, _bounded(c, model, observation))
         for c in named_candidates(model.arm, observation.channel, withheld, rotation, base, turns)
-        if _has_what_it_needs(c, observation)
+        if _observable(c, observation)
     ]
 
 
@@ -258,13 +258,13 @@ def _named_alone(
     named = [c for c in best.chosen if space.candidates[c].named]
     near = space
     if observation.channel in ("tracking", "torque"):
-        near = by_what_is_left(space, named, observation.measured.shape[1])
+        near = weighted_by_residual(space, named, observation.measured.shape[1])
     alone = pruned(near, forward_selected(near, fit(near, named), named_only=True)).chosen
     rest = (c for c in best.chosen if c not in named)
     return fit(space, alone), fit(space, (*alone, *rest))
 
 
-def _exactly(space: SampleSpace, best: CandidateFit, state: SelectionState) -> CandidateFit:
+def _refit_set(space: SampleSpace, best: CandidateFit, state: SelectionState) -> CandidateFit:
     """Return what of a set is refitted: of delays and lags the named alone.
 
     Beside them an unnamed function takes up what their curves lack at a first guess, and they would
@@ -320,11 +320,11 @@ def _bounded(candidate: Candidate, model: Model, observation: Observation) -> Ca
 def _payload_bounds(model: Model, observation: Observation) -> tuple[float, float]:
     """Return how far a payload may be off: the true one is no less than nothing, and no giant."""
     declared = observation.quantities.get("payload", np.array([model.payload_mass]))
-    most = HEAVIEST * max(float(declared.max()), LoadBounds.of(model).rated)
+    most = MAX_PAYLOAD_FACTOR * max(float(declared.max()), LoadBounds.of(model).rated)
     return -float(declared.min()), most
 
 
-def _has_what_it_needs(candidate: Candidate, observation: Observation) -> bool:
+def _observable(candidate: Candidate, observation: Observation) -> bool:
     if candidate.periodic:  # of a joint that moves at all
         assert candidate.site.joint is not None
         return joint_quantity(observation, candidate.site.joint - 1) in observation.quantities

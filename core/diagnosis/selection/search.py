@@ -96,7 +96,7 @@ def _deep_search(space: SampleSpace, base: Sequence[int]) -> CandidateFit:
     return min([best, *joined_sets(space, best)], key=lambda f: f.score)
 
 
-def by_what_is_left(space: SampleSpace, chosen: Sequence[int], k: int) -> SampleSpace:
+def weighted_by_residual(space: SampleSpace, chosen: Sequence[int], k: int) -> SampleSpace:
     """Return the space with each of its k coordinates weighed by what a set leaves of it."""
     values = np.concatenate([*fit(space, chosen).values, np.zeros(0)])
     residual = (space.y - space.columns(chosen) @ values).reshape(-1, k)

@@ -13,8 +13,8 @@ from gapbridge.core.arm import Arm
 from gapbridge.core.arrays import Array, Mask
 from gapbridge.core.diagnosis.criteria import (
     LARGE_SAMPLE,
-    OWN_SIGMAS,
-    SIGMAS,
+    MIN_SIGMAS,
+    MIN_SIGMAS_WITH_UNNAMED,
 )
 from gapbridge.core.diagnosis.observation import Observation
 from gapbridge.core.diagnosis.selection.geometry import (
@@ -52,7 +52,7 @@ class Selection:
     unprojected: UnprojectedRows  # the space before the nuisance was projected out
     prior: dict[int, Array] = field(default_factory=dict)  # 1 sigma (d,) of the numbers of each
     # link's candidate, where the geometry of all links is a cause
-    held: dict[int, Mask] = field(default_factory=dict)  # numbers (d,) of these that stay nominal
+    nominal: dict[int, Mask] = field(default_factory=dict)  # numbers (d,) of these kept nominal
     rows_each: float = 1.0  # rows of the log that each sample stands for, squares added up
 
     def unwhitener(self) -> Array:
@@ -123,7 +123,7 @@ class Selection:
         x = solve(X, space.y, self.pull(chosen))
         return dict(zip(chosen, np.split(x, np.cumsum(size[list(chosen)])[:-1]), strict=True))
 
-    def sized_beside(self, chosen: Sequence[int]) -> Selection:
+    def with_prior_for(self, chosen: Sequence[int]) -> Selection:
         """Return the selection with the links of the size that is most likely beside a set.
 
         What falls leaves them more to account for, or nothing to be large for.
@@ -131,12 +131,12 @@ class Selection:
         if not self.prior:
             return self
         rest = [c for c in chosen if c not in self.block]
-        sigma = prior(self.space, self.block, rest, self.held)
+        sigma = prior(self.space, self.block, rest, self.nominal)
         if all(np.array_equal(sigma[c], own) for c, own in self.prior.items()):
             return self
         return replace(self, prior=sigma)
 
-    def far_off(self, positions: Sequence[int]) -> dict[int, Mask]:
+    def implausible_parameters(self, positions: Sequence[int]) -> dict[int, Mask]:
         """Return, by candidate, numbers of the links (d,) that neither prior nor data vouch for.
 
         Where all others are of one size, a number several times as large is no machining: it
@@ -147,16 +147,16 @@ class Selection:
             c = self.term_index[p]
             if c in self.prior and self.observation.channel == "position":
                 size = np.abs(self.terms[p].values)
-                unsure = size < SIGMAS * np.sqrt(np.diag(self.covariance[p]))
-                far = (size > OWN_SIGMAS * self.prior[c]) & unsure
+                unsure = size < MIN_SIGMAS_WITH_UNNAMED * np.sqrt(np.diag(self.covariance[p]))
+                far = (size > MIN_SIGMAS * self.prior[c]) & unsure
                 if far.any():
                     doubtful[c] = far
         return doubtful
 
     def with_nominal(self, numbers: Mapping[int, Mask]) -> Selection:
         """Return the selection with further numbers of the links (d,) held nominal."""
-        return replace(self, held=self.held | {
-            c: own | self.held.get(c, False) for c, own in numbers.items()
+        return replace(self, nominal=self.nominal | {
+            c: own | self.nominal.get(c, False) for c, own in numbers.items()
         })  # fmt: skip
 
     def without_links(self) -> Selection:
@@ -215,10 +215,10 @@ def refitted_alone(
     their prior holds back.
     """
     whole = len(accused) == len(selection.terms) and remainder is None
-    if not accused or (whole and not selection.held):
+    if not accused or (whole and not selection.nominal):
         return selection
     chosen = [selection.term_index[p] for p in accused]
-    selection = selection.sized_beside(chosen)
+    selection = selection.with_prior_for(chosen)
     links = {c: sigma for c, sigma in selection.prior.items() if c in chosen}
     if remainder is not None and (links or len(selection.space.y) >= LARGE_SAMPLE):
         remainder = remainder.scatter_alone()
@@ -229,9 +229,9 @@ def refitted_alone(
     terms, covariance = list(selection.terms), list(selection.covariance)
     for c, term, term_covariance in zip(index, fitted, spread, strict=True):
         position = selection.term_index.index(c)
-        if (nominal := selection.held.get(c)) is not None:
-            term = term.with_values(np.where(nominal, 0.0, term.values))
-            term_covariance = term_covariance * ~(nominal | nominal[:, None])
+        if (fixed := selection.nominal.get(c)) is not None:
+            term = term.with_values(np.where(fixed, 0.0, term.values))
+            term_covariance = term_covariance * ~(fixed | fixed[:, None])
         terms[position], covariance[position] = term, term_covariance
     return replace(
         selection, observation=state.observation, terms=tuple(terms),

@@ -67,7 +67,7 @@ def test_a_value_that_is_no_constant_names_what_it_goes_by() -> None:
          "target_slip: the target on the tool moved by 0.5 mm between 7 s and 8 s"),
         (ParameterNote(ParameterState.ON_BOUND, "backlash_2", 0.0, "rad"),
          "backlash_2 stands on its bound (0 rad)"),
-        (ParameterNote(ParameterState.HELD, "link_geometry_5_alpha", 0.0, "rad"),
+        (ParameterNote(ParameterState.NOMINAL, "link_geometry_5_alpha", 0.0, "rad"),
          "link_geometry_5_alpha is held nominal: it came out several times as large as its like, "
          "and not surely; something that is not named may stand behind it"),
         (ParameterNote(ParameterState.NOT_IDENTIFIABLE, "backlash_2", 1e-4, "rad"),

@@ -13,14 +13,14 @@ from benchmarks.blind.session import Plan
 from gapbridge.core.diagnosis import remainder
 from gapbridge.core.diagnosis.channels.position import observe as observe_position
 from gapbridge.core.diagnosis.channels.wrench import observe
-from gapbridge.core.diagnosis.criteria import NEGLIGIBLE
+from gapbridge.core.diagnosis.criteria import NEGLIGIBLE_SIZE
 from gapbridge.core.diagnosis.diagnosis import diagnose
 from gapbridge.core.diagnosis.finding import Check, Withdrawal
 from gapbridge.core.diagnosis.held_out import HeldOut
-from gapbridge.core.diagnosis.judgement import Judgement, judge, judge_geometry, still_sure
-from gapbridge.core.diagnosis.remainder import closes_everywhere, withstanding
+from gapbridge.core.diagnosis.judgement import Judgement, judge, judge_geometry, significant_alone
+from gapbridge.core.diagnosis.remainder import links_close_gap, stable_effects
 from gapbridge.core.diagnosis.selection import rounds
-from gapbridge.core.diagnosis.selection.candidate import named_candidates, with_what_it_needs
+from gapbridge.core.diagnosis.selection.candidate import named_candidates, with_requirement
 from gapbridge.core.diagnosis.selection.refit import Remainder, _cluster_covariance, worth
 from gapbridge.core.effects import CATALOGUE, Site, Term
 from gapbridge.core.metrology import Metrology
@@ -88,7 +88,7 @@ def test_gain_and_turn_and_centre_wait_for_a_load(plant):
         model = plant.model(mass)
         seen = observe(model, log, Metrology())
         (own,) = [c for c in named_candidates(model.arm, "wrench") if c.family == effect]
-        return with_what_it_needs(seen, own).beside
+        return with_requirement(seen, own).beside
 
     for effect in ("ft_gain", "ft_misalignment", "payload_cog"):
         assert (beside(0.0, effect), beside(2.0, effect)) == ("payload", "")
@@ -172,7 +172,7 @@ def test_all_links_are_accused_where_they_close_the_gap_everywhere(links):
 @pytest.mark.parametrize("effect", ["cross_coupling", "backlash"])
 def test_links_that_close_no_gap_are_not_accused(effect):
     whole, judgement = fallen(small.diagnosed(effect).channels[0].selection)
-    assert not closes_everywhere(whole, ())
+    assert not links_close_gap(whole, ())
     found, again = judge_geometry(replace(whole, prior={}), judgement, small.model_of().arm)
     assert again is judgement
     assert not found.block
@@ -194,22 +194,24 @@ def test_a_tool_point_goes_with_the_links_where_it_helps_elsewhere(monkeypatch):
         asked.append(set(accused))
         return np.array([0.0 if c in point else 0.5 + (len(accused) < 3) for c in accused])
 
-    monkeypatch.setattr(remainder._Beside, "strengths", strengths)
-    monkeypatch.setattr(remainder._Closing, "takes", lambda *_: False)  # by their strengths alone
+    monkeypatch.setattr(remainder._UnnamedFunctions, "strengths", strengths)
+    monkeypatch.setattr(
+        remainder._GapClosure, "takes", lambda *_: False
+    )  # by their strengths alone
     zero = [c for c, k in enumerate(own) if k.family == "backlash"][:1]
-    stays, *_ = withstanding(whole, [*point, *lines, *zero])
+    stays, *_ = stable_effects(whole, [*point, *lines, *zero])
     assert asked[1] > {*point}  # the others are judged with the point, not with its gap
     assert {*stays} >= {*point}
-    found, *_ = withstanding(replace(whole, prior={}), point)
+    found, *_ = stable_effects(replace(whole, prior={}), point)
     assert found == []  # no links are a cause
 
 
 def test_links_are_sized_anew_beside_what_stays(links):
     whole, _ = fallen(links)
     wrong = replace(whole, prior={c: 8 * own for c, own in whole.prior.items()})
-    sized = wrong.sized_beside(whole.best.chosen)
+    sized = wrong.with_prior_for(whole.best.chosen)
     assert all(np.array_equal(sized.prior[c], own) for c, own in whole.prior.items())
-    assert whole.sized_beside(whole.best.chosen) is whole
+    assert whole.with_prior_for(whole.best.chosen) is whole
 
 
 @pytest.mark.parametrize(
@@ -257,7 +259,10 @@ def test_a_value_far_below_its_usual_size_is_no_accusation():
     found = small.diagnosed("backlash").channels[0].selection
     (term,), (c,) = found.terms, found.term_index
     usual = found.space.candidates[c].parameters[0].scale
-    for size, stays in ((0.5 * NEGLIGIBLE * usual, False), (2 * NEGLIGIBLE * usual, True)):
+    for size, stays in (
+        (0.5 * NEGLIGIBLE_SIZE * usual, False),
+        (2 * NEGLIGIBLE_SIZE * usual, True),
+    ):
         small_one = replace(
             found, terms=(term.with_values(np.array([size])),),
             covariance=(np.array([[(size / 50) ** 2]]),),
@@ -271,12 +276,12 @@ def test_what_is_no_longer_sure_beside_the_unknown_is_taken_back():
     found = small.diagnosed("backlash").channels[0].selection
     judgement = judge(found, HeldOut(found))
     arm = small.model_of().arm
-    assert still_sure(found, judgement, arm)[1] is judgement
+    assert significant_alone(found, judgement, arm)[1] is judgement
     rows = len(found.space.y)
     # an unnamed function that does the very same as the accused
     twin = found.space.columns(found.term_index)
     unknown = Remainder(twin, np.full(twin.shape[1], np.inf), np.arange(rows) // 3 % 20)
-    _, judged = still_sure(found, replace(judgement, remainder=unknown), arm)
+    _, judged = significant_alone(found, replace(judgement, remainder=unknown), arm)
     assert judged.accused == ()
     assert judged.structured
     assert [p for p, _ in judged.withdrawn] == [0]

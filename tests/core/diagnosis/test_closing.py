@@ -30,7 +30,7 @@ def closing(monkeypatch):
         selection = SimpleNamespace(
             block=(), space=space, observation=SimpleNamespace(channel=channel), kept=None
         )
-        return remainder._Closing(selection)
+        return remainder._GapClosure(selection)
 
     return made
 
@@ -102,7 +102,7 @@ def two_searches(monkeypatch):
         }.items():  # fmt: skip
             monkeypatch.setattr(diagnosis, name, value)
         model = SimpleNamespace(arm=None)
-        found, judgement, fallen = diagnosis._found(
+        found, judgement, fallen = diagnosis._search(
             SimpleNamespace(channel=channel), model, (), None
         )
         return found.terms[0].effect, judgement.accused, [c.effect for c in fallen]

@@ -37,7 +37,7 @@ def paired(selection):
 
 def left_of(selection, chosen) -> np.ndarray:
     """Return the whitened held-out residual (N, 3) of each sample."""
-    return HeldOut(selection)._left(tuple(sorted(chosen))).reshape(-1, 3)
+    return HeldOut(selection)._residuals(tuple(sorted(chosen))).reshape(-1, 3)
 
 
 def test_a_sample_never_helps_to_predict_itself(selection):

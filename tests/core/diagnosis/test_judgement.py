@@ -27,7 +27,13 @@ from gapbridge.core.diagnosis.finding import (
     Withdrawal,
 )
 from gapbridge.core.diagnosis.held_out import HeldOut
-from gapbridge.core.diagnosis.judgement import Judgement, judge, pure_error, still_sure, ties_of
+from gapbridge.core.diagnosis.judgement import (
+    Judgement,
+    judge,
+    pure_error,
+    significant_alone,
+    ties_of,
+)
 from gapbridge.core.diagnosis.selection.problem import fit
 from gapbridge.core.diagnosis.selection.selection import Selection
 from gapbridge.core.effects import CATALOGUE, Site, Term, effect_named
@@ -245,11 +251,11 @@ def test_links_as_a_whole_stand_only_where_one_of_them_is_sure(monkeypatch, thir
         observation=SimpleNamespace(channel="position"),
     )  # fmt: skip
     found.judged_together = partial(Selection.judged_together, found)
-    found.far_off = partial(Selection.far_off, found)
+    found.implausible_parameters = partial(Selection.implausible_parameters, found)
     found.covariance[0] = found.covariance[0] * 1e-4
     monkeypatch.setattr(judging, "refitted_alone", lambda *_: found)
     given = Judgement((0, 1, 2), False, None, (), {}, ())
-    selection, judgement = still_sure(found, given, None)
+    selection, judgement = significant_alone(found, given, None)
     assert selection is found
     assert judgement.accused == stays
     assert {p for p, _ in judgement.withdrawn} == {0, 1, 2} - {*stays}
@@ -271,10 +277,10 @@ def test_of_joints_zeros_among_the_links_each_has_to_be_sure_by_itself(monkeypat
         observation=SimpleNamespace(channel="position"),
         space=SimpleNamespace(candidates=[SimpleNamespace(effect=e) for e in own]),
     )  # fmt: skip
-    for name in ("_in_geometry", "is_link", "judged_together", "far_off"):
+    for name in ("_in_geometry", "is_link", "judged_together", "implausible_parameters"):
         setattr(found, name, partial(getattr(Selection, name), found))
     monkeypatch.setattr(judging, "refitted_alone", lambda *_: found)
-    _, judgement = still_sure(found, Judgement((0, 1, 2), False, None, (), {}, ()), None)
+    _, judgement = significant_alone(found, Judgement((0, 1, 2), False, None, (), {}, ()), None)
     assert judgement.accused == stays
     assert not judgement.structured
 
@@ -286,7 +292,7 @@ def test_a_twist_far_from_all_others_has_to_be_sure_by_itself(monkeypatch, sprea
     sizes, prior = np.array([1e-3, 1e-3, 41e-3]), np.full(3, 8e-3)
     found = SimpleNamespace(
         terms=(Term("link_geometry", Site(5), tuple(sizes)),), term_index=(4,), block=(4,),
-        covariance=[np.diag([1e-4, 1e-4, spread]) ** 2], prior={4: prior}, held={},
+        covariance=[np.diag([1e-4, 1e-4, spread]) ** 2], prior={4: prior}, nominal={},
         is_link=lambda p: True, _in_geometry=lambda p: True,
         observation=SimpleNamespace(channel="position"),
     )  # fmt: skip
@@ -295,7 +301,7 @@ def test_a_twist_far_from_all_others_has_to_be_sure_by_itself(monkeypatch, sprea
     )
     for own in (found, again):
         own.judged_together = partial(Selection.judged_together, own)
-        own.far_off = partial(Selection.far_off, own)
+        own.implausible_parameters = partial(Selection.implausible_parameters, own)
     asked = []
 
     def with_nominal(numbers):
@@ -304,7 +310,7 @@ def test_a_twist_far_from_all_others_has_to_be_sure_by_itself(monkeypatch, sprea
 
     found.with_nominal = with_nominal
     monkeypatch.setattr(judging, "refitted_alone", lambda selection, *_: selection)
-    selection, judgement = still_sure(found, Judgement((0,), False, None, (), {}, ()), None)
+    selection, judgement = significant_alone(found, Judgement((0,), False, None, (), {}, ()), None)
     assert selection is (again if held else found)
     assert asked == ([{4: [False, False, True]}] if held else [])
     assert judgement.accused == (0,)

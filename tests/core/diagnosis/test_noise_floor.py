@@ -98,7 +98,7 @@ def test_white_noise_is_white_and_a_ripple_is_not() -> None:
 
 
 def test_every_row_is_fitted_and_judged(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(whole, "MOST", {**whole.MOST, "position": 60})
+    monkeypatch.setattr(whole, "MAX_SAMPLES", {**whole.MAX_SAMPLES, "position": 60})
     drawn = small.session_of(1, small.Plan(poses=400))
     metrology = Metrology(registered=True, sigma=small.SIGMA)
     log = small.log_of(drawn, small.readings(small.REAL["axial_compliance"], drawn, 1))
@@ -126,7 +126,7 @@ def test_a_cause_that_few_rows_suggest_falls_by_all_of_them(
     position[taken] = off[taken]
     position[np.setdiff1d(np.arange(200), taken)[:60]] -= (off - small.readings(
         small.NOMINAL, drawn, 1))[np.setdiff1d(np.arange(200), taken)[:60]]  # fmt: skip
-    monkeypatch.setattr(whole, "MOST", {**whole.MOST, "position": 60})
+    monkeypatch.setattr(whole, "MAX_SAMPLES", {**whole.MAX_SAMPLES, "position": 60})
     metrology = Metrology(registered=True, sigma=small.SIGMA)
     (channel,) = diagnose(small.model_of(), small.log_of(drawn, position), metrology).channels
     assert not channel.causes

@@ -85,7 +85,9 @@ def test_blocks_find_what_the_whole_shows(both):
         assert other.gap_rms == pytest.approx(one.gap_rms, rel=0.01)
         assert other.remaining_rms == pytest.approx(one.remaining_rms, rel=0.02)
         assert other.remaining_rms_held_out == pytest.approx(one.remaining_rms_held_out, rel=0.02)
-        assert other.elsewhere.new_region == pytest.approx(one.elsewhere.new_region, rel=0.02)
+        assert other.generalisation.new_region == pytest.approx(
+            one.generalisation.new_region, rel=0.02
+        )
         for own, its in zip(one.causes, other.causes, strict=True):
             for a, b in zip(own.parameters, its.parameters, strict=True):
                 assert b.value == pytest.approx(a.value, abs=3 * a.std)

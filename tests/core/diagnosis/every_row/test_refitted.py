@@ -12,13 +12,13 @@ import small_arm as small
 
 from gapbridge.core.diagnosis.every_row import refitted as every_row
 from gapbridge.core.diagnosis.every_row.refitted import (
-    on_every_row,
+    accused_on_all_rows,
+    fitted_on_all_rows,
     refitted,
-    still_accused,
-    with_uncertain_terms,
+    with_undecided_terms,
 )
 from gapbridge.core.diagnosis.held_out import HeldOut
-from gapbridge.core.diagnosis.judgement import VAGUE, Judgement, judge
+from gapbridge.core.diagnosis.judgement import NOT_SIGNIFICANT, Judgement, judge
 from gapbridge.core.diagnosis.selection.selection import Selection
 from gapbridge.core.effects import Site, Term, effect_named
 
@@ -43,22 +43,24 @@ def test_what_stays_beside_the_unknown_keeps_its_scatter_among_regions():
 
 def on_all(selection, judgement):
     """Return the selection on all rows, and its held-out figures."""
-    whole = on_every_row(selection, judgement, selection.observation, small.model_of())
+    whole = fitted_on_all_rows(selection, judgement, selection.observation, small.model_of())
     return whole, HeldOut(whole)
 
 
 def withdrawn_as_vague(judgement, position):
     rest = tuple(p for p in judgement.accused if p != position)
-    return replace(judgement, accused=rest, withdrawn=(*judgement.withdrawn, (position, VAGUE)))
+    return replace(
+        judgement, accused=rest, withdrawn=(*judgement.withdrawn, (position, NOT_SIGNIFICANT))
+    )
 
 
 def test_what_was_too_vague_on_some_rows_is_accused_where_all_rows_are_sure(searched):
     selection, judgement = searched
     position = judgement.accused[0]
-    asked = with_uncertain_terms(withdrawn_as_vague(judgement, position))
-    assert asked.vague == (position,)
+    asked = with_undecided_terms(withdrawn_as_vague(judgement, position))
+    assert asked.undecided == (position,)
     whole, held = on_all(selection, asked)
-    _, decided = still_accused(whole, asked, held, ALONE)
+    _, decided = accused_on_all_rows(whole, asked, held, ALONE)
     assert position in decided.accused
     assert position not in dict(decided.withdrawn)
 
@@ -66,16 +68,16 @@ def test_what_was_too_vague_on_some_rows_is_accused_where_all_rows_are_sure(sear
 def test_what_is_vague_on_all_rows_too_is_withdrawn(searched):
     selection, judgement = searched
     position = judgement.accused[0]
-    asked = with_uncertain_terms(withdrawn_as_vague(judgement, position))
+    asked = with_undecided_terms(withdrawn_as_vague(judgement, position))
     whole, held = on_all(selection, asked)
     covariance = list(whole.covariance)
     value = np.array(whole.terms[position].values[: len(covariance[position])])
     covariance[position] = np.diag((value / 4.0) ** 2)  # enough for a word, not for an accusation
     unsure = replace(whole, covariance=tuple(covariance))
-    _, decided = still_accused(unsure, asked, held, ALONE)
+    _, decided = accused_on_all_rows(unsure, asked, held, ALONE)
     assert position not in decided.accused
-    assert dict(decided.withdrawn)[position] == VAGUE
-    _, kept = still_accused(unsure, judgement, held, ALONE)
+    assert dict(decided.withdrawn)[position] == NOT_SIGNIFICANT
+    _, kept = accused_on_all_rows(unsure, judgement, held, ALONE)
     assert position in kept.accused  # what some rows were sure of is not asked again
 
 
@@ -93,7 +95,10 @@ class OnAllRows:
         self.space = SimpleNamespace(candidates=own)
 
     _in_geometry, is_link = Selection._in_geometry, Selection.is_link
-    judged_together, far_off = Selection.judged_together, Selection.far_off
+    judged_together, implausible_parameters = (
+        Selection.judged_together,
+        Selection.implausible_parameters,
+    )
 
     def with_nominal(self, numbers):
         (held,) = numbers.values()
@@ -122,7 +127,7 @@ def test_what_is_left_once_others_fell_is_asked_anew(monkeypatch):
         return selection if 1 in accused or selection is not found else without_line
 
     asked = Judgement((0, 1), True, 0.0, (), {}, ())
-    left, decided = still_accused(found, asked, SimpleNamespace(possible=False), alone)
+    left, decided = accused_on_all_rows(found, asked, SimpleNamespace(possible=False), alone)
     assert decided.accused == (0,)
     assert left.terms[0].values == (1e-3, 0.0, 1e-3)
 
@@ -131,6 +136,6 @@ def test_what_is_left_once_others_fell_is_asked_anew(monkeypatch):
 def test_a_zero_among_the_links_that_some_rows_left_open_needs_three_sigmas(zero, stays):
     """It has a prior: without it the links of a UR10 stood for 0.57 mrad +- 0.13 mrad."""
     found = OnAllRows((1e-3, 1e-3, 1e-3), (zero,))
-    asked = Judgement((0, 1), True, 0.0, (), {}, (), vague=(1,))
+    asked = Judgement((0, 1), True, 0.0, (), {}, (), undecided=(1,))
     _, decided = every_row._sure(found, asked, lambda selection, accused: selection)
     assert decided.accused == stays

@@ -12,11 +12,11 @@ from gapbridge.core.diagnosis.selection.forward import exclusive
 from gapbridge.core.diagnosis.selection.local_search import improve, pruned, rivals
 from gapbridge.core.diagnosis.selection.problem import fit
 from gapbridge.core.diagnosis.selection.search import (
-    by_what_is_left,
     part,
     screened,
     screened_search,
     search,
+    weighted_by_residual,
 )
 
 FAMILIES = [
@@ -142,5 +142,5 @@ def test_what_an_unknown_moves_one_joint_hides_no_cause_at_another():
 def test_without_the_unknown_each_joint_is_weighed_by_what_is_left_of_it():
     space = two_joints()
     assert pruned(space, fit(space, (4,))).chosen == ()
-    near = by_what_is_left(space, (4,), 2)
+    near = weighted_by_residual(space, (4,), 2)
     assert pruned(near, fit(near, (4,))).chosen == (4,)

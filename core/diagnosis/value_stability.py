@@ -15,26 +15,26 @@ from numpy.typing import NDArray
 
 from gapbridge.core.arrays import Array
 from gapbridge.core.diagnosis.criteria import (
-    CLOSED_IN_A_PART,
+    BATCH_REMOVAL_ROWS,
+    BATCH_REMOVAL_STRENGTH,
     CLOSED_SHARE,
+    CLOSED_SHARE_IN_WORST_PART,
+    CONTAINED_SHARE,
     DEGENERATE,
-    FURTHER,
-    HELD_WHOLLY,
-    HOPELESS,
-    MAX_DRIFT,
-    MAX_TAKEN,
+    DOMINANT_SHARE,
+    EXTRA_PARAMETER_WEIGHT,
+    MAX_SHARE_IN_UNNAMED,
     MAX_UNNAMED,
-    MOSTLY,
-    SEVERAL_AT_A_TIME,
-    SIBLING,
-    SIGMAS,
+    MAX_VALUE_RATIO,
+    MIN_SIGMAS_OF_FURTHER_JOINTS,
+    MIN_SIGMAS_WITH_UNNAMED,
     STAND_IN_GAIN,
 )
 from gapbridge.core.diagnosis.held_out import HeldOut
 from gapbridge.core.diagnosis.observation import Observation
 from gapbridge.core.diagnosis.regions import parts, regions
 from gapbridge.core.diagnosis.selection.candidate import Candidate, carrying, joint_target
-from gapbridge.core.diagnosis.selection.delay_columns import as_one_delay
+from gapbridge.core.diagnosis.selection.delay_columns import shrunk_to_common_delay
 from gapbridge.core.diagnosis.selection.problem import gains
 from gapbridge.core.diagnosis.selection.refit import Remainder
 from gapbridge.core.diagnosis.selection.selection import Selection
@@ -43,7 +43,7 @@ from gapbridge.core.estimation.held_out import jackknife
 from gapbridge.core.estimation.least_squares import basis_of, projected_out, sigmas_square, solve
 
 
-def withstanding(
+def stable_effects(
     selection: Selection, believed: Sequence[int]
 ) -> tuple[list[int], Remainder, set[int]]:
     """Return the candidates, of those believed, that withstand, and the unnamed beside them.
@@ -55,43 +55,43 @@ def withstanding(
     see. Until then it stays: without it nothing else would keep its value. So does what it takes to
     close the gap everywhere.
     """
-    remainder = _Beside(selection)
+    remainder = _UnnamedFunctions(selection)
     accused = list(believed)
     point = _tool_point(selection, accused)
-    closing = _Closing(selection)
+    closing = _GapClosure(selection)
     while accused:
         strength = remainder.strengths(accused)
         strength[[c in point or c in closing.needed for c in accused]] = np.inf
         if strength.min() >= 1:
             break
         out = {int(np.argmin(strength))}
-        if len(remainder.space.y) > SEVERAL_AT_A_TIME:
+        if len(remainder.space.y) > BATCH_REMOVAL_ROWS:
             worst = np.argsort(strength)[: max(1, len(accused) // 8)]
-            out |= {int(i) for i in worst if strength[i] < HOPELESS}
+            out |= {int(i) for i in worst if strength[i] < BATCH_REMOVAL_STRENGTH}
         if closing.takes(accused, [accused[i] for i in sorted(out)]):
             continue
         accused = [c for i, c in enumerate(accused) if i not in out]
-        sized = selection.sized_beside(accused)
+        sized = selection.with_prior_for(accused)
         if sized is not selection:
             selection = sized
-            remainder = _Beside(selection)
+            remainder = _UnnamedFunctions(selection)
     if point and not _gains(selection, [c for c in accused if c not in point], point):
         accused = [c for c in accused if c not in point]
-    return accused, remainder.beside_refit(accused), closing.needed & set(accused)
+    return accused, remainder.fitted_with(accused), closing.needed & set(accused)
 
 
-def links_withstand(selection: Selection) -> bool:
+def links_predict_new_regions(selection: Selection) -> bool:
     """Return whether the geometry of all links predicts regions that its fit did not see.
 
     None of its numbers is sure by itself, so what they do together is judged: it has to gain.
     """
     space = selection.space
     named = [c for c in selection.best.chosen if space.candidates[c].named]
-    held = HeldOut(selection, parts=parts(selection.observation, selection.kept))
-    if not held.possible:
+    held_out = HeldOut(selection, parts=parts(selection.observation, selection.kept))
+    if not held_out.possible:
         return False
     links = [*named, *selection.block]
-    return held.shrink(links, named).interval[0] > STAND_IN_GAIN
+    return held_out.shrink(links, named).interval[0] > STAND_IN_GAIN
 
 
 def _tool_point(selection: Selection, chosen: Sequence[int]) -> list[int]:
@@ -102,12 +102,12 @@ def _tool_point(selection: Selection, chosen: Sequence[int]) -> list[int]:
 
 def _gains(selection: Selection, stays: Sequence[int], point: Sequence[int]) -> bool:
     """Return whether the tool's point shrinks the gap of regions not fitted, beside the links."""
-    held = HeldOut(selection, parts=parts(selection.observation, selection.kept))
+    held_out = HeldOut(selection, parts=parts(selection.observation, selection.kept))
     rest = [*stays, *selection.block]
-    return held.possible and held.shrink([*rest, *point], rest).interval[0] > STAND_IN_GAIN
+    return held_out.possible and held_out.shrink([*rest, *point], rest).interval[0] > STAND_IN_GAIN
 
 
-class _Closing:
+class _GapClosure:
     """Whether accusations close the gap in every part of a log, and which of them that takes.
 
     Each part is predicted by a fit that did not see it. Causes that show only together (a tool and
@@ -120,9 +120,9 @@ class _Closing:
         self.needed: set[int] = set()
         self._block, self._candidates = selection.block, selection.space.candidates
         self._part = parts(selection.observation, selection.kept)
-        self._held = HeldOut(selection, parts=self._part)
+        self._held_out = HeldOut(selection, parts=self._part)
         # of poses: a weight's and a gain's trace in one attitude is the same in every part
-        self._possible = selection.observation.channel == "position" and self._held.possible
+        self._possible = selection.observation.channel == "position" and self._held_out.possible
 
     def takes(self, accused: Sequence[int], out: Iterable[int]) -> bool:
         """Return whether closing the gap takes one of ``out``, which is then among the needed."""
@@ -139,39 +139,39 @@ class _Closing:
         if not self._possible:
             return False
         left, gap = (
-            np.bincount(self._part, self._held.squares(chosen))
+            np.bincount(self._part, self._held_out.squares(chosen))
             for chosen in ([*accused, *self._block], self._block)
         )
         worst = float(np.max(left[gap > 0] / gap[gap > 0], initial=0.0))
-        return left.sum() <= CLOSED_SHARE**2 * gap.sum() and worst <= CLOSED_IN_A_PART**2
+        return left.sum() <= CLOSED_SHARE**2 * gap.sum() and worst <= CLOSED_SHARE_IN_WORST_PART**2
 
 
 def closes_gap(selection: Selection, accused: Sequence[int]) -> bool:
     """Return whether candidates close a gap of poses in every part of the log."""
-    return _Closing(selection).closed(accused)
+    return _GapClosure(selection).closed(accused)
 
 
-def closes_everywhere(selection: Selection, accused: Sequence[int]) -> bool:
+def links_close_gap(selection: Selection, accused: Sequence[int]) -> bool:
     """Return whether all links' geometry closes, in every part of the log, what the accused leave.
 
     Each part is predicted by a fit that did not see it. What is no geometry at all reaches that in
     some part by chance, never in all.
     """
     part = parts(selection.observation, selection.kept)
-    held = HeldOut(selection, parts=part)
-    if not held.possible:
+    held_out = HeldOut(selection, parts=part)
+    if not held_out.possible:
         return False
     count = np.bincount(part)
     candidates = selection.space.candidates
     point = [c for c in selection.best.chosen if candidates[c].effect.beside_links]  # of the tool
     left, gap = (
-        np.bincount(part, held.squares(c)) for c in ([*selection.block, *point], accused)
+        np.bincount(part, held_out.squares(c)) for c in ([*selection.block, *point], accused)
     )  # fmt: skip
     alive = count > 0
     return bool(np.all(left[alive] < CLOSED_SHARE**2 * gap[alive]))
 
 
-class _Beside:
+class _UnnamedFunctions:
     """The unnamed functions of a selection, asked for anew as accusations go."""
 
     def __init__(self, selection: Selection) -> None:
@@ -196,9 +196,9 @@ class _Beside:
     def strengths(self, accused: list[int]) -> Array:
         """Return of each accusation how far it is over what it takes to stay (1: just)."""
         # of a large log the functions asked for once stay, so that one more is asked for a round
-        large = len(self.space.y) > SEVERAL_AT_A_TIME and len(self._asked) >= MAX_UNNAMED
+        large = len(self.space.y) > BATCH_REMOVAL_ROWS and len(self._asked) >= MAX_UNNAMED
         asked = self.beside = self.asked_for(accused, 1 if large else MAX_UNNAMED)
-        if len(self.space.y) > SEVERAL_AT_A_TIME:
+        if len(self.space.y) > BATCH_REMOVAL_ROWS:
             self._asked = asked
         value, spread, shown = self._values(accused, *self._beyond(accused, asked))
         together = [self._unit(accused), self.space.columns(self._first), self._zero(accused)]
@@ -220,9 +220,9 @@ class _Beside:
             square = sigmas_square(b, spread[np.ix_(index, index)])
             numbers = float(len(index))
             if not self.space.candidates[c].periodic:  # a line has the phase that suits a shape
-                numbers = 1 + FURTHER * (numbers - 1)
+                numbers = 1 + EXTRA_PARAMETER_WEIGHT * (numbers - 1)
             sigmas.append(float(np.sqrt(max(square, 0.0) / numbers)))
-            steady.append(min(share * MAX_DRIFT, MAX_DRIFT / share))
+            steady.append(min(share * MAX_VALUE_RATIO, MAX_VALUE_RATIO / share))
         return self._with_siblings(accused, np.array(sigmas), np.array(steady))
 
     def asked_for(self, accused: Sequence[int], most: int = MAX_UNNAMED) -> list[int]:
@@ -261,7 +261,7 @@ class _Beside:
     def _targets(self, asked: Sequence[int]) -> list[str]:
         """Return what the functions of a quantity move: a joint that bends moves no angle."""
         functions = [self.space.candidates[c] for c in asked]
-        moved = dict.fromkeys(k.target for k in functions if not k.of_no_quantity)
+        moved = dict.fromkeys(k.target for k in functions if not k.without_quantity)
         return [t for t in moved if t in self._constant]
 
     def _sigma(self, accused: Sequence[int], asked: Sequence[int]) -> Array:
@@ -300,16 +300,16 @@ class _Beside:
         space, X, beside = self.space, self._unit(accused), self._beside(asked)
         constants = self._sigma(accused, asked)
         for c in asked:
-            if not (space.candidates[c].of_no_quantity or _of_own_speed(space.candidates[c])):
+            if not (space.candidates[c].without_quantity or _of_own_speed(space.candidates[c])):
                 continue
             U = basis_of(space.columns([c]))
-            inside = np.einsum("ij,ij->j", U.T @ X, U.T @ X) > HELD_WHOLLY
+            inside = np.einsum("ij,ij->j", U.T @ X, U.T @ X) > CONTAINED_SHARE
             if not inside.any():
                 continue
             others = self._beside([o for o in asked if o != c])
             rest = basis_of(np.hstack([X[:, ~inside], others]))
             own, whole = (basis_of(projected_out(rest, A)) for A in (X[:, inside], U))
-            if np.sum((own.T @ space.y) ** 2) < MOSTLY * np.sum((whole.T @ space.y) ** 2):
+            if np.sum((own.T @ space.y) ** 2) < DOMINANT_SHARE * np.sum((whole.T @ space.y) ** 2):
                 continue
             V = basis_of(X[:, inside])
             beside = np.hstack([projected_out(V, U), others])
@@ -351,7 +351,7 @@ class _Beside:
         freedom = max(self.space.freedom - X.shape[1] - beside.shape[1], 1.0)
         without = np.array([solved(part != p)[0] for p in np.unique(self._part)])
         spread = inverse * max(rss / freedom, self.space.floor) + jackknife(without)
-        shown = taken < MAX_TAKEN
+        shown = taken < MAX_SHARE_IN_UNNAMED
         candidates = [self.space.candidates[c] for c in accused]
         begin = np.cumsum([0, *(len(k.parameters) for k in candidates)])
         late = np.array(
@@ -360,12 +360,12 @@ class _Beside:
         length = np.linalg.norm(self.space.columns([c for c, k in zip(
             accused, candidates, strict=True) if k.effect.delays]), axis=0)  # fmt: skip
         known = np.where(shown[late], np.diag(spread)[late], np.inf)
-        x, variance = as_one_delay(value[late] / length, known / length**2)
+        x, variance = shrunk_to_common_delay(value[late] / length, known / length**2)
         value[late], shown[late] = x * length, np.isfinite(variance)
         spread[late, late] = np.where(shown[late], variance * length**2, spread[late, late])
         return value, spread, shown
 
-    def beside_refit(self, accused: Sequence[int]) -> Remainder:
+    def fitted_with(self, accused: Sequence[int]) -> Remainder:
         """Return what stands beside the accused in their last refit.
 
         A joint's constant that an accused effect holds is the effect's: a tool's turn about the
@@ -387,11 +387,13 @@ class _Beside:
     def _with_siblings(self, accused: list[int], sigmas: Array, steady: Array) -> Array:
         """Return strengths: less is asked at further joints of an effect; of lines as much."""
         families = [self.space.candidates[c].family for c in accused]
-        first = np.minimum(sigmas / SIGMAS, steady)
+        first = np.minimum(sigmas / MIN_SIGMAS_WITH_UNNAMED, steady)
         stays = {f for f, s in zip(families, first, strict=True) if s >= 1}
         stays -= {k.family for k in self.space.candidates if k.periodic}
         sibling = np.array([f in stays for f in families])
-        return np.asarray(np.where(sibling, np.minimum(sigmas / SIBLING, steady), first))
+        return np.asarray(
+            np.where(sibling, np.minimum(sigmas / MIN_SIGMAS_OF_FURTHER_JOINTS, steady), first)
+        )
 
 
 def _unnamed(candidate: Candidate, observation: Observation) -> bool:
