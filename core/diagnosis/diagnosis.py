@@ -47,18 +47,14 @@ from gapbridge.core.diagnosis.judgement import (
 )
 from gapbridge.core.diagnosis.log_checks.missing_flexibility import softness_findings
 from gapbridge.core.diagnosis.log_checks.units_and_clocks import check_units, findings
-from gapbridge.core.diagnosis.noise_floor import (
-    Floor,
-    noise_floor,
-    whiteness,
-)
+from gapbridge.core.diagnosis.noise_floor import Floor, noise_floor, whiteness
 from gapbridge.core.diagnosis.observation import NotObservable, Observation, thinned
-from gapbridge.core.diagnosis.remainder import closes_gap
 from gapbridge.core.diagnosis.residual_structure import dependence
 from gapbridge.core.diagnosis.selection.moments import slips
 from gapbridge.core.diagnosis.selection.rounds import select
 from gapbridge.core.diagnosis.selection.selection import Selection, refitted_alone
 from gapbridge.core.diagnosis.separation import Measurement, next_measurements
+from gapbridge.core.diagnosis.value_stability import closes_gap
 from gapbridge.core.effects import CATALOGUE, Term, correcting, flexibility_effects
 from gapbridge.core.errors import LogError
 from gapbridge.core.fitted_range import outside_findings
@@ -264,7 +260,7 @@ class _SearchResult:
 
     def row_sums(self, observe: Callable[[Log], Any], model: Model) -> RowSums:
         """Return the sums over all rows of a long recording, linearised at the accused terms."""
-        by_region = self.judgement.remainder is not None
+        by_region = self.judgement.unnamed_part is not None
         return RowSums(self.selection, self.judgement.accused, observe, model.arm, by_region)
 
 
@@ -409,7 +405,7 @@ def _channel_diagnosis(
     decided = shown if streamed is None else streamed.selection(judgement.accused)
     held_out = HeldOut(decided)
     if searched.more or streamed is not None:
-        unknown = judgement.remainder is not None
+        unknown = judgement.unnamed_part is not None
         alone = partial(refitted, model, unknown) if streamed is None else streamed.alone
         decided, judgement = accused_on_all_rows(decided, judgement, held_out, alone)
     if streamed is None:

@@ -35,23 +35,20 @@ from gapbridge.core.diagnosis.finding import Check, Withdrawal
 from gapbridge.core.diagnosis.held_out import HeldOut
 from gapbridge.core.diagnosis.periodicity import not_periodic
 from gapbridge.core.diagnosis.regions import parts, single_pose
-from gapbridge.core.diagnosis.remainder import (
-    links_close_gap,
-    links_predict_new_regions,
-    stable_effects,
-)
-from gapbridge.core.diagnosis.residual_structure import (
-    dependence,
-    structure_p_value,
-)
+from gapbridge.core.diagnosis.residual_structure import dependence, structure_p_value
 from gapbridge.core.diagnosis.selection.candidate import Candidate
 from gapbridge.core.diagnosis.selection.delay_columns import delayed_by
 from gapbridge.core.diagnosis.selection.local_search import forward_selected, rivals
 from gapbridge.core.diagnosis.selection.problem import CandidateFit, SampleSpace, fit
-from gapbridge.core.diagnosis.selection.refit import Remainder, worth
+from gapbridge.core.diagnosis.selection.refit import UnnamedPart, worth
 from gapbridge.core.diagnosis.selection.selection import Selection, refitted_alone
 from gapbridge.core.diagnosis.selection.smooth import KNOTS
 from gapbridge.core.diagnosis.selection.stiffness_curves import straight_curves
+from gapbridge.core.diagnosis.value_stability import (
+    links_close_gap,
+    links_predict_new_regions,
+    stable_effects,
+)
 from gapbridge.core.effects import CATALOGUE
 from gapbridge.core.errors import InputError
 from gapbridge.core.estimation.least_squares import basis_of, projected_out
@@ -72,7 +69,7 @@ class Judgement:
     ]  # quantity, held-out share of the residual that it predicts
     ties: dict[int, tuple[str, ...]]  # position -> effects that fit equally well
     withdrawn: tuple[tuple[int, Withdrawal], ...]  # position, reason
-    remainder: Remainder | None = None  # unnamed functions for the residual structure
+    unnamed_part: UnnamedPart | None = None  # unnamed functions for the residual structure
     undecided: tuple[int, ...] = ()  # positions to be decided on all rows
     stand_ins: tuple[int, ...] = ()  # positions not accused that reduce the gap in new regions
 
@@ -94,13 +91,13 @@ def judge(selection: Selection, held_out: HeldOut) -> Judgement:
     tested = [
         c for c in selection.term_index if c not in withdrawn and c not in selection.block
     ]  # fmt: skip
-    accused, remainder, closing = stable_effects(selection, tested)
-    varying = not_constant(selection, accused, remainder.columns)
+    accused, unnamed_part, closing = stable_effects(selection, tested)
+    varying = not_constant(selection, accused, unnamed_part.columns)
     while closing & varying.keys():  # a varying term closed the gap: try without it
         withdrawn |= {c: Withdrawal(Check.CONSTANT, by) for c, by in varying.items()}
         tested = [c for c in tested if c not in varying]
-        accused, remainder, closing = stable_effects(selection, tested)
-        varying = not_constant(selection, accused, remainder.columns)
+        accused, unnamed_part, closing = stable_effects(selection, tested)
+        varying = not_constant(selection, accused, unnamed_part.columns)
     withdrawn |= {c: NOT_STABLE for c in tested if c not in accused}
     for c, quantity in varying.items():
         withdrawn[c] = Withdrawal(Check.CONSTANT, quantity)
@@ -114,8 +111,8 @@ def judge(selection: Selection, held_out: HeldOut) -> Judgement:
         withdrawn[c] = Withdrawal(Check.HELD_OUT_GAIN)
         accused.remove(c)
     judgement = _verdict(whole, selection, accused, withdrawn, withdrawn_any)
-    unknown = judgement.structured or remainder.columns.shape[1] > 0
-    return replace(judgement, remainder=remainder if unknown else None)
+    unknown = judgement.structured or unnamed_part.columns.shape[1] > 0
+    return replace(judgement, unnamed_part=unnamed_part if unknown else None)
 
 
 def judge_geometry(
@@ -214,7 +211,7 @@ def significant_alone(
     least one of their terms must be significant, and no parameter implausible without being so.
     """
     while True:
-        refit = refitted_alone(selection, arm, judgement.accused, judgement.remainder)
+        refit = refitted_alone(selection, arm, judgement.accused, judgement.unnamed_part)
         if far := refit.implausible_parameters(judgement.accused):
             selection = selection.with_nominal(far)
             continue
@@ -249,7 +246,7 @@ def _linear_with_unnamed(refit: Selection, judgement: Judgement) -> set[int]:
     """
     return {
         p for p in judgement.accused
-        if judgement.remainder is not None and CATALOGUE[refit.terms[p].effect].curved
+        if judgement.unnamed_part is not None and CATALOGUE[refit.terms[p].effect].curved
         and refit.terms[p].values[1] ** 2 < CURVATURE_GAIN * refit.covariance[p][1, 1]
     }  # fmt: skip
 
@@ -258,7 +255,7 @@ def _missing_requirement(selection: Selection, accused: Sequence[int]) -> list[i
     """Return the candidates whose required effect is not accused."""
     candidates = selection.space.candidates
     families = {"", *(candidates[c].family for c in accused)}
-    return [c for c in accused if candidates[c].beside not in families]
+    return [c for c in accused if candidates[c].requires not in families]
 
 
 def _confounded_with_load(selection: Selection) -> dict[int, str]:

@@ -26,11 +26,7 @@ FOLDS = 7
 SEED = 0
 
 
-def structure_p_value(
-    space: SampleSpace,
-    nuisance: Array,
-    chosen: Sequence[int],
-) -> float:
+def structure_p_value(space: SampleSpace, nuisance: Array, chosen: Sequence[int]) -> float:
     """Return the probability that noise alone leaves as much structure as is left."""
     fitted = basis_of(np.hstack([nuisance, space.columns(chosen)]))
     residuals = np.empty((1 + DRAWS, len(space.y)))
@@ -80,10 +76,7 @@ def _families(space: SampleSpace, fitted: Array) -> Iterator[tuple[NDArray[np.in
 
 
 def dependence(
-    space: SampleSpace,
-    nuisance: Array,
-    chosen: Sequence[int],
-    groups: NDArray[np.int64],
+    space: SampleSpace, nuisance: Array, chosen: Sequence[int], groups: NDArray[np.int64]
 ) -> list[tuple[str, float]]:
     """Return quantities and the share of the residual that each predicts held out, best first.
 

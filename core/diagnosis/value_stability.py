@@ -1,9 +1,9 @@
-"""Which accusations keep their value beside an unnamed remainder.
+"""Which effects keep their value when the residual structure is modelled by unnamed functions.
 
-A real arm has known effects and something unknown beside them, and what the catalogue holds can
-imitate a cause that it does not hold. So every unnamed function that the residual asks for is put
-beside the accused effects; an accusation stays that keeps its value beside them, the same in every
-region of the log. The weakest goes first, and what it took is then left for the unnamed to take.
+A real arm may have an unknown effect besides known ones, and effects of the catalogue can imitate
+an unknown one. So all unnamed functions that the residual calls for are fitted together with the
+effects. An effect is stable if its value remains significant and nearly the same, in every region
+of the log. The weakest is removed first; the unnamed functions are then chosen again.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ from gapbridge.core.diagnosis.criteria import (
     STAND_IN_GAIN,
 )
 from gapbridge.core.diagnosis.held_out import HeldOut
-from gapbridge.core.diagnosis.observation import Observation
+from gapbridge.core.diagnosis.observation import HELD_TORQUE, Observation
 from gapbridge.core.diagnosis.regions import parts, regions
-from gapbridge.core.diagnosis.selection.candidate import Candidate, carrying, joint_target
+from gapbridge.core.diagnosis.selection.candidate import Candidate, target_of
 from gapbridge.core.diagnosis.selection.delay_columns import shrunk_to_common_delay
 from gapbridge.core.diagnosis.selection.problem import gains
-from gapbridge.core.diagnosis.selection.refit import Remainder
+from gapbridge.core.diagnosis.selection.refit import UnnamedPart
 from gapbridge.core.diagnosis.selection.selection import Selection
 from gapbridge.core.diagnosis.selection.smooth import targets
 from gapbridge.core.estimation.held_out import jackknife
@@ -44,46 +44,46 @@ from gapbridge.core.estimation.least_squares import basis_of, projected_out, sig
 
 
 def stable_effects(
-    selection: Selection, believed: Sequence[int]
-) -> tuple[list[int], Remainder, set[int]]:
-    """Return the candidates, of those believed, that withstand, and the unnamed beside them.
+    selection: Selection, tested: Sequence[int]
+) -> tuple[list[int], UnnamedPart, set[int]]:
+    """Return the stable ones of ``tested`` candidates, and the unnamed functions fitted with them.
 
-    Third: which of them stay because it takes them to close the gap.
+    Third: which of them are kept because the gap is not closed without them.
 
-    Where all links are a cause the tool's point is one more number of the same geometry: hardly
-    ever sure beside unnamed functions, it is judged by what it does in regions that its fit did not
-    see. Until then it stays: without it nothing else would keep its value. So does what it takes to
-    close the gap everywhere.
+    Where all links are a cause, the tool point is part of the same geometry and hardly ever
+    significant with unnamed functions; it is judged last, by its gain in new regions. The same
+    holds for effects without which the gap would not be closed in every part of the log.
     """
-    remainder = _UnnamedFunctions(selection)
-    accused = list(believed)
-    point = _tool_point(selection, accused)
-    closing = _GapClosure(selection)
+    functions = _UnnamedFunctions(selection)
+    accused = list(tested)
+    tool_point = _tool_point(selection, accused)
+    closure = _GapClosure(selection)
     while accused:
-        strength = remainder.strengths(accused)
-        strength[[c in point or c in closing.needed for c in accused]] = np.inf
+        strength = functions.strengths(accused)
+        strength[[c in tool_point or c in closure.needed for c in accused]] = np.inf
         if strength.min() >= 1:
             break
-        out = {int(np.argmin(strength))}
-        if len(remainder.space.y) > BATCH_REMOVAL_ROWS:
+        weakest = {int(np.argmin(strength))}
+        if len(functions.space.y) > BATCH_REMOVAL_ROWS:
             worst = np.argsort(strength)[: max(1, len(accused) // 8)]
-            out |= {int(i) for i in worst if strength[i] < BATCH_REMOVAL_STRENGTH}
-        if closing.takes(accused, [accused[i] for i in sorted(out)]):
+            weakest |= {int(i) for i in worst if strength[i] < BATCH_REMOVAL_STRENGTH}
+        if closure.needs_any(accused, [accused[i] for i in sorted(weakest)]):
             continue
-        accused = [c for i, c in enumerate(accused) if i not in out]
+        accused = [c for i, c in enumerate(accused) if i not in weakest]
         sized = selection.with_prior_for(accused)
         if sized is not selection:
             selection = sized
-            remainder = _UnnamedFunctions(selection)
-    if point and not _gains(selection, [c for c in accused if c not in point], point):
-        accused = [c for c in accused if c not in point]
-    return accused, remainder.fitted_with(accused), closing.needed & set(accused)
+            functions = _UnnamedFunctions(selection)
+    others = [c for c in accused if c not in tool_point]
+    if tool_point and not _tool_point_gains(selection, others, tool_point):
+        accused = others
+    return accused, functions.fitted_with(accused), closure.needed & set(accused)
 
 
 def links_predict_new_regions(selection: Selection) -> bool:
-    """Return whether the geometry of all links predicts regions that its fit did not see.
+    """Return whether the geometry of all links reduces the gap in held-out regions.
 
-    None of its numbers is sure by itself, so what they do together is judged: it has to gain.
+    No single parameter is significant, so they are judged together.
     """
     space = selection.space
     named = [c for c in selection.best.chosen if space.candidates[c].named]
@@ -95,25 +95,28 @@ def links_predict_new_regions(selection: Selection) -> bool:
 
 
 def _tool_point(selection: Selection, chosen: Sequence[int]) -> list[int]:
-    """Return the tool's point among candidates, where all links are a cause."""
+    """Return the tool point among candidates, where all links are a cause."""
     own = selection.space.candidates
     return [c for c in chosen if selection.block and own[c].effect.beside_links]
 
 
-def _gains(selection: Selection, stays: Sequence[int], point: Sequence[int]) -> bool:
-    """Return whether the tool's point shrinks the gap of regions not fitted, beside the links."""
+def _tool_point_gains(
+    selection: Selection, accused: Sequence[int], tool_point: Sequence[int]
+) -> bool:
+    """Return whether the tool point reduces the gap of held-out regions further than the links."""
     held_out = HeldOut(selection, parts=parts(selection.observation, selection.kept))
-    rest = [*stays, *selection.block]
-    return held_out.possible and held_out.shrink([*rest, *point], rest).interval[0] > STAND_IN_GAIN
+    others = [*accused, *selection.block]
+    if not held_out.possible:
+        return False
+    return held_out.shrink([*others, *tool_point], others).interval[0] > STAND_IN_GAIN
 
 
 class _GapClosure:
-    """Whether accusations close the gap in every part of a log, and which of them that takes.
+    """Whether effects close the gap in every held-out part of a log, and which are needed for it.
 
-    Each part is predicted by a fit that did not see it. Causes that show only together (a tool and
-    what bends under it) leave each other no value that is sure beside unnamed functions; what
-    imitates an unknown closes its gap in some parts, not in all. Periodic lines are not asked: a
-    line has the phase that suits a shape.
+    Causes that only together explain the gap (a tool and what bends under it) are not significant
+    one by one with unnamed functions. Effects that imitate an unknown one close the gap in some
+    parts only. Periodic lines are never needed, because their phase fits any shape.
     """
 
     def __init__(self, selection: Selection) -> None:
@@ -121,29 +124,30 @@ class _GapClosure:
         self._block, self._candidates = selection.block, selection.space.candidates
         self._part = parts(selection.observation, selection.kept)
         self._held_out = HeldOut(selection, parts=self._part)
-        # of poses: a weight's and a gain's trace in one attitude is the same in every part
+        # only of poses: a weight and a gain at one attitude look the same in every part
         self._possible = selection.observation.channel == "position" and self._held_out.possible
 
-    def takes(self, accused: Sequence[int], out: Iterable[int]) -> bool:
-        """Return whether closing the gap takes one of ``out``, which is then among the needed."""
+    def needs_any(self, accused: Sequence[int], weakest: Iterable[int]) -> bool:
+        """Return whether closing the gap needs one of ``weakest``, which is then in ``needed``."""
         self._possible = self.closed(accused)
-        for c in out if self._possible else ():
-            rest = [o for o in accused if o != c]
-            if not (self._candidates[c].periodic or self.closed(rest)):
+        for c in weakest if self._possible else ():
+            others = [o for o in accused if o != c]
+            if not (self._candidates[c].periodic or self.closed(others)):
                 self.needed.add(c)
                 return True
         return False
 
     def closed(self, accused: Sequence[int]) -> bool:
-        """Return whether accusations close the gap in every part of the log."""
+        """Return whether the effects close the gap in every part of the log."""
         if not self._possible:
             return False
-        left, gap = (
+        residual, before = (
             np.bincount(self._part, self._held_out.squares(chosen))
             for chosen in ([*accused, *self._block], self._block)
         )
-        worst = float(np.max(left[gap > 0] / gap[gap > 0], initial=0.0))
-        return left.sum() <= CLOSED_SHARE**2 * gap.sum() and worst <= CLOSED_SHARE_IN_WORST_PART**2
+        worst = float(np.max(residual[before > 0] / before[before > 0], initial=0.0))
+        closed = residual.sum() <= CLOSED_SHARE**2 * before.sum()
+        return bool(closed and worst <= CLOSED_SHARE_IN_WORST_PART**2)
 
 
 def closes_gap(selection: Selection, accused: Sequence[int]) -> bool:
@@ -152,10 +156,9 @@ def closes_gap(selection: Selection, accused: Sequence[int]) -> bool:
 
 
 def links_close_gap(selection: Selection, accused: Sequence[int]) -> bool:
-    """Return whether all links' geometry closes, in every part of the log, what the accused leave.
+    """Return whether all links' geometry closes the accused effects' gap in every held-out part.
 
-    Each part is predicted by a fit that did not see it. What is no geometry at all reaches that in
-    some part by chance, never in all.
+    If the cause is not geometry, this happens in some part by chance, but not in all.
     """
     part = parts(selection.observation, selection.kept)
     held_out = HeldOut(selection, parts=part)
@@ -163,125 +166,135 @@ def links_close_gap(selection: Selection, accused: Sequence[int]) -> bool:
         return False
     count = np.bincount(part)
     candidates = selection.space.candidates
-    point = [c for c in selection.best.chosen if candidates[c].effect.beside_links]  # of the tool
-    left, gap = (
-        np.bincount(part, held_out.squares(c)) for c in ([*selection.block, *point], accused)
+    tool_point = [c for c in selection.best.chosen if candidates[c].effect.beside_links]
+    residual, before = (
+        np.bincount(part, held_out.squares(c)) for c in ([*selection.block, *tool_point], accused)
     )  # fmt: skip
     alive = count > 0
-    return bool(np.all(left[alive] < CLOSED_SHARE**2 * gap[alive]))
+    return bool(np.all(residual[alive] < CLOSED_SHARE**2 * before[alive]))
 
 
 class _UnnamedFunctions:
-    """The unnamed functions of a selection, asked for anew as accusations go."""
+    """The unnamed functions of a selection, chosen again for each set of accused effects."""
 
     def __init__(self, selection: Selection) -> None:
         self._selection, self.space = selection, selection.working
         unnamed = [
-            c for c, k in enumerate(self.space.candidates) if _unnamed(k, selection.observation)
+            c
+            for c, k in enumerate(self.space.candidates)
+            if _models_unknown(k, selection.observation)
         ]
         self._index = np.array(unnamed, dtype=np.int64)
         size = np.diff(self.space.start)[self._index]
-        self._price = size * np.log(self.space.freedom) + 2 * np.log(max(len(unnamed), 2))
-        self._asked = [c for c in selection.best.chosen if c in set(unnamed)]
-        self._first = self._asked  # beside which the accused were found
-        self.beside = self._asked  # those of the last question
-        # a constant is part of any function that moves a joint; of a sensor's axis it is a bias,
-        # and no more of it is the function's than the function is large
+        self._penalty = size * np.log(self.space.freedom) + 2 * np.log(max(len(unnamed), 2))
+        self._kept = [c for c in selection.best.chosen if c in set(unnamed)]
+        self._first = self._kept  # in the fit of the search
+        self.current = self._kept  # in the last test
+        # a function that moves a joint includes a constant; of a sensor's axis the constant is a
+        # bias, whose prior is the size of the function
         self._moved = targets(selection.observation)
         self._constant = {name: selection.rows_of(d) for name, d in self._moved.items()}
-        self._sensed = selection.observation.joint_columns is None
+        self._is_sensor = selection.observation.joint_columns is None
         self._rows = selection.observation.measured.shape[1]  # of each sample
         self._part = np.repeat(parts(selection.observation, selection.kept), self._rows)
 
     def strengths(self, accused: list[int]) -> Array:
-        """Return of each accusation how far it is over what it takes to stay (1: just)."""
-        # of a large log the functions asked for once stay, so that one more is asked for a round
-        large = len(self.space.y) > BATCH_REMOVAL_ROWS and len(self._asked) >= MAX_UNNAMED
-        asked = self.beside = self.asked_for(accused, 1 if large else MAX_UNNAMED)
+        """Return the strength of each accused effect; from 1 on it is stable."""
+        # of a large log the functions chosen once are kept, and one is added per round
+        large = len(self.space.y) > BATCH_REMOVAL_ROWS and len(self._kept) >= MAX_UNNAMED
+        chosen = self.current = self.functions_for(accused, 1 if large else MAX_UNNAMED)
         if len(self.space.y) > BATCH_REMOVAL_ROWS:
-            self._asked = asked
-        value, spread, shown = self._values(accused, *self._beyond(accused, asked))
-        together = [self._unit(accused), self.space.columns(self._first), self._zero(accused)]
-        # what the rows leave open goes by these columns' own lengths: not to unit ones
-        alone = np.linalg.lstsq(np.hstack(together), self.space.y, rcond=1e-9)[0]
+            self._kept = chosen
+        value, spread, identifiable = self._stable_values(
+            accused, *self._beyond_accused(accused, chosen)
+        )
+        together = [
+            self._unit(accused),
+            self.space.columns(self._first),
+            self._free_constants(accused),
+        ]
+        # not unit columns: the minimum-norm solution depends on their lengths
+        without_unnamed = np.linalg.lstsq(np.hstack(together), self.space.y, rcond=1e-9)[0]
         begin = 0
         sigmas: list[float] = []
-        steady: list[float] = []
+        ratio: list[float] = []
         for c in accused:
             size = int(self.space.start[c + 1] - self.space.start[c])
-            index = np.arange(begin, begin + size)[shown[begin : begin + size]]
+            index = np.arange(begin, begin + size)[identifiable[begin : begin + size]]
             begin += size
-            a, b = alone[index], value[index]
+            a, b = without_unnamed[index], value[index]
             share = float(a @ b) / max(float(a @ a), 1e-300)
             if not len(index) or share <= 0:
                 sigmas.append(0.0)
-                steady.append(0.0)
+                ratio.append(0.0)
                 continue
             square = sigmas_square(b, spread[np.ix_(index, index)])
             numbers = float(len(index))
-            if not self.space.candidates[c].periodic:  # a line has the phase that suits a shape
+            if not self.space.candidates[c].periodic:  # a line's phase fits any shape
                 numbers = 1 + EXTRA_PARAMETER_WEIGHT * (numbers - 1)
             sigmas.append(float(np.sqrt(max(square, 0.0) / numbers)))
-            steady.append(min(share * MAX_VALUE_RATIO, MAX_VALUE_RATIO / share))
-        return self._with_siblings(accused, np.array(sigmas), np.array(steady))
+            ratio.append(min(share * MAX_VALUE_RATIO, MAX_VALUE_RATIO / share))
+        return self._strengths(accused, np.array(sigmas), np.array(ratio))
 
-    def asked_for(self, accused: Sequence[int], most: int = MAX_UNNAMED) -> list[int]:
-        """Return the unnamed functions that the residual asks for, penalised for chance alone."""
-        space, asked = self.space, list(self._asked)
+    def functions_for(self, accused: Sequence[int], most: int = MAX_UNNAMED) -> list[int]:
+        """Return the unnamed functions that the residual calls for, penalised for chance alone."""
+        space, chosen = self.space, list(self._kept)
         for _ in range(most if len(self._index) else 0):
-            zero = self._zero(accused)
-            basis = basis_of(np.hstack([space.columns(accused), self._beside(asked), zero]))
-            left = projected_out(basis, space.y)
+            zero = self._free_constants(accused)
+            basis = basis_of(np.hstack([space.columns(accused), self._columns(chosen), zero]))
+            residual = projected_out(basis, space.y)
             freedom = max(space.freedom - basis.shape[1], 1.0)
-            variance = max(float(left @ left) / freedom, space.floor)
-            gain = gains(space, left, basis.T @ space.X)[0][self._index] / variance - self._price
-            gain[np.isin(self._index, asked)] = -np.inf
+            variance = max(float(residual @ residual) / freedom, space.floor)
+            gain = (
+                gains(space, residual, basis.T @ space.X)[0][self._index] / variance - self._penalty
+            )
+            gain[np.isin(self._index, chosen)] = -np.inf
             if gain.max() <= 0:
                 break
-            asked.append(int(self._index[np.argmax(gain)]))
-        return asked
+            chosen.append(int(self._index[np.argmax(gain)]))
+        return chosen
 
-    def _zero(self, accused: Sequence[int]) -> Array:
-        """Return a sensor's constants (m, a) that no accused effect holds: its zero is not sure.
+    def _free_constants(self, accused: Sequence[int]) -> Array:
+        """Return a sensor's constants (m, a) that no accused effect contains: its zero is free.
 
-        A constant that is not accused, but there, would be asked for as functions.
+        A bias that is not accused would otherwise be modelled by functions.
         """
-        if not self._sensed:
+        if not self._is_sensor:
             return np.zeros((len(self.space.y), 0))
         C = np.hstack(list(self._constant.values()))
         V = basis_of(self._unit(accused))
-        left = np.linalg.norm(projected_out(V, C), axis=0) / np.linalg.norm(C, axis=0)
-        return np.asarray(C[:, left > 1e-6])
+        residual = np.linalg.norm(projected_out(V, C), axis=0) / np.linalg.norm(C, axis=0)
+        return np.asarray(C[:, residual > 1e-6])
 
-    def _beside(self, asked: Sequence[int]) -> Array:
-        """Return the unnamed columns, and last the constants of what they move."""
-        constants = [self._constant[t] for t in self._targets(asked)]
-        return np.hstack([self.space.columns(asked), *constants])
+    def _columns(self, chosen: Sequence[int]) -> Array:
+        """Return the columns of unnamed functions, and last the constants of their targets."""
+        constants = [self._constant[t] for t in self._targets(chosen)]
+        return np.hstack([self.space.columns(chosen), *constants])
 
-    def _targets(self, asked: Sequence[int]) -> list[str]:
-        """Return what the functions of a quantity move: a joint that bends moves no angle."""
-        functions = [self.space.candidates[c] for c in asked]
+    def _targets(self, chosen: Sequence[int]) -> list[str]:
+        """Return the targets of the functions of a quantity (mechanical ones have no constant)."""
+        functions = [self.space.candidates[c] for c in chosen]
         moved = dict.fromkeys(k.target for k in functions if not k.without_quantity)
         return [t for t in moved if t in self._constant]
 
-    def _sigma(self, accused: Sequence[int], asked: Sequence[int]) -> Array:
-        """Return the prior 1 sigma of each constant; inf where it is wholly the function's.
+    def _constant_sigma(self, accused: Sequence[int], chosen: Sequence[int]) -> Array:
+        """Return the prior 1 sigma of each constant; inf: free.
 
-        Of a sensor's axis it is as large as all unnamed functions of that axis together; in units
-        in which the rows scatter by one.
+        Of a sensor's axis it is the size of all unnamed functions of that axis together, relative
+        to the scatter of the rows.
         """
-        targets_, space = self._targets(asked), self.space
-        if not self._sensed:
+        targets_, space = self._targets(chosen), self.space
+        if not self._is_sensor:
             width = sum(self._constant[t].shape[1] for t in targets_)
             return np.full(width, np.inf)
-        beside = self._beside(asked)
-        A = np.hstack([self._unit(accused), beside])
+        columns = self._columns(chosen)
+        A = np.hstack([self._unit(accused), columns])
         solution = solve(A, space.y)
         rss = float(np.sum((space.y - A @ solution) ** 2))
         scatter = np.sqrt(max(rss / max(space.freedom - A.shape[1], 1.0), space.floor))
-        x = solution[A.shape[1] - beside.shape[1] :]
+        x = solution[A.shape[1] - columns.shape[1] :]
         begin, made = 0, {t: np.zeros(len(space.y)) for t in targets_}
-        for c in asked:
+        for c in chosen:
             own = slice(begin, begin + int(space.start[c + 1] - space.start[c]))
             begin = own.stop
             target = space.candidates[c].target
@@ -290,68 +303,66 @@ class _UnnamedFunctions:
         size = [scatter * np.linalg.norm(self._constant[t]) for t in targets_]
         return np.array([np.linalg.norm(made[t]) / n for t, n in zip(targets_, size, strict=True)])
 
-    def _beyond(self, accused: Sequence[int], asked: Sequence[int]) -> tuple[Array, Array]:
-        """Return the unnamed columns, of those that hold an accused effect what they do beyond it.
+    def _beyond_accused(self, accused: Sequence[int], chosen: Sequence[int]) -> tuple[Array, Array]:
+        """Return the unnamed columns and the prior 1 sigma of each.
 
-        With the prior 1 sigma of each. A pull in any direction holds every weight; one that points
-        nearly down is a weight. A function of a joint's own speed holds its delay; one that is
-        nearly straight is a delay.
+        Functions that contain an accused effect count only beyond it: a pull in any direction
+        contains every weight, and one that points nearly down is a weight. A function of a joint's
+        own speed contains its delay, and one that is nearly linear is a delay.
         """
-        space, X, beside = self.space, self._unit(accused), self._beside(asked)
-        constants = self._sigma(accused, asked)
-        for c in asked:
+        space, X, columns = self.space, self._unit(accused), self._columns(chosen)
+        constants = self._constant_sigma(accused, chosen)
+        for c in chosen:
             if not (space.candidates[c].without_quantity or _of_own_speed(space.candidates[c])):
                 continue
             U = basis_of(space.columns([c]))
             inside = np.einsum("ij,ij->j", U.T @ X, U.T @ X) > CONTAINED_SHARE
             if not inside.any():
                 continue
-            others = self._beside([o for o in asked if o != c])
-            rest = basis_of(np.hstack([X[:, ~inside], others]))
-            own, whole = (basis_of(projected_out(rest, A)) for A in (X[:, inside], U))
+            others = self._columns([o for o in chosen if o != c])
+            basis = basis_of(np.hstack([X[:, ~inside], others]))
+            own, whole = (basis_of(projected_out(basis, A)) for A in (X[:, inside], U))
             if np.sum((own.T @ space.y) ** 2) < DOMINANT_SHARE * np.sum((whole.T @ space.y) ** 2):
                 continue
             V = basis_of(X[:, inside])
-            beside = np.hstack([projected_out(V, U), others])
-        free = np.full(beside.shape[1] - len(constants), np.inf)
-        return beside, np.concatenate([free, constants])
+            columns = np.hstack([projected_out(V, U), others])
+        free = np.full(columns.shape[1] - len(constants), np.inf)
+        return columns, np.concatenate([free, constants])
 
     def _unit(self, accused: Sequence[int]) -> Array:
         X = self.space.columns(accused)
         return np.asarray(X / (np.sqrt(np.einsum("ij,ij->j", X, X)) + 1e-300))
 
-    def _values(
-        self, accused: list[int], beside: Array, sigma: Array
+    def _stable_values(
+        self, accused: list[int], columns: Array, sigma: Array
     ) -> tuple[Array, Array, NDArray[np.bool_]]:
-        """Return values of unit columns, their covariance with scatter, and which are shown.
+        """Return values of unit columns, their covariance, and which are identifiable.
 
-        The scatter is a jackknife over parts of the log: what only imitates differs among them.
-        Of delays each joint's stands beside the others'.
+        The covariance includes the scatter over parts of the log (jackknife): an imitation differs
+        among them. Delays are shrunk to the common delay of all joints.
         """
         known = np.isfinite(sigma)
-        prior = np.diag(1 / np.maximum(sigma, 1e-300))[known]  # rows that every part holds
+        prior = np.diag(1 / np.maximum(sigma, 1e-300))[known]  # rows added to every part
         X, y = self._unit(accused), self.space.y
-        X, y = (
-            np.vstack([X, np.zeros((len(prior), X.shape[1]))]),
-            np.append(y, np.zeros(len(prior))),
-        )
-        beside = np.vstack([beside, prior])
+        X = np.vstack([X, np.zeros((len(prior), X.shape[1]))])
+        y = np.append(y, np.zeros(len(prior)))
+        columns = np.vstack([columns, prior])
         part = np.append(self._part, np.full(len(prior), -1))
 
         def solved(rows: NDArray[np.bool_]) -> tuple[Array, Array, Array, float]:
-            A, b, U = X[rows], y[rows], basis_of(beside[rows])
+            A, b, U = X[rows], y[rows], basis_of(columns[rows])
             A, b = projected_out(U, A), projected_out(U, b)
             size, V = np.linalg.eigh(A.T @ A)
-            open_ = size > DEGENERATE
-            inverse = (V * np.where(open_, 1 / np.maximum(size, DEGENERATE), 0)) @ V.T
+            determined = size > DEGENERATE
+            inverse = (V * np.where(determined, 1 / np.maximum(size, DEGENERATE), 0)) @ V.T
             x = inverse @ (A.T @ b)
-            return x, inverse, (V**2) @ ~open_, float(np.sum((b - A @ x) ** 2))
+            return x, inverse, (V**2) @ ~determined, float(np.sum((b - A @ x) ** 2))
 
-        value, inverse, taken, rss = solved(np.ones(len(part), dtype=bool))
-        freedom = max(self.space.freedom - X.shape[1] - beside.shape[1], 1.0)
+        value, inverse, in_unnamed, rss = solved(np.ones(len(part), dtype=bool))
+        freedom = max(self.space.freedom - X.shape[1] - columns.shape[1], 1.0)
         without = np.array([solved(part != p)[0] for p in np.unique(self._part)])
         spread = inverse * max(rss / freedom, self.space.floor) + jackknife(without)
-        shown = taken < MAX_SHARE_IN_UNNAMED
+        identifiable = in_unnamed < MAX_SHARE_IN_UNNAMED
         candidates = [self.space.candidates[c] for c in accused]
         begin = np.cumsum([0, *(len(k.parameters) for k in candidates)])
         late = np.array(
@@ -359,21 +370,21 @@ class _UnnamedFunctions:
         )
         length = np.linalg.norm(self.space.columns([c for c, k in zip(
             accused, candidates, strict=True) if k.effect.delays]), axis=0)  # fmt: skip
-        known = np.where(shown[late], np.diag(spread)[late], np.inf)
+        known = np.where(identifiable[late], np.diag(spread)[late], np.inf)
         x, variance = shrunk_to_common_delay(value[late] / length, known / length**2)
-        value[late], shown[late] = x * length, np.isfinite(variance)
-        spread[late, late] = np.where(shown[late], variance * length**2, spread[late, late])
-        return value, spread, shown
+        value[late], identifiable[late] = x * length, np.isfinite(variance)
+        spread[late, late] = np.where(identifiable[late], variance * length**2, spread[late, late])
+        return value, spread, identifiable
 
-    def fitted_with(self, accused: Sequence[int]) -> Remainder:
-        """Return what stands beside the accused in their last refit.
+    def fitted_with(self, accused: Sequence[int]) -> UnnamedPart:
+        """Return the unnamed functions for the last refit of the accused effects.
 
-        A joint's constant that an accused effect holds is the effect's: a tool's turn about the
-        last axis would else be as unsure as its prior.
+        A joint's constant that an accused effect contains is left out: a tool's rotation about the
+        last axis would otherwise be as uncertain as its prior.
         """
-        asked, selection = self.beside, self._selection
-        functions, sigma = selection.space.columns(asked), self._sigma(accused, asked)
-        constants = [selection.plain_rows_of(self._moved[t]) for t in self._targets(asked)]
+        chosen, selection = self.current, self._selection
+        functions, sigma = selection.space.columns(chosen), self._constant_sigma(accused, chosen)
+        constants = [selection.plain_rows_of(self._moved[t]) for t in self._targets(chosen)]
         C = np.hstack([functions[:, :0], *constants])
         V = basis_of(selection.space.columns(accused))
         size = np.maximum(np.linalg.norm(C, axis=0), 1e-300)
@@ -382,39 +393,36 @@ class _UnnamedFunctions:
         columns = np.hstack([functions, C[:, free]])
         sigma = np.concatenate([np.full(functions.shape[1], np.inf), sigma[free]])
         region = np.repeat(regions(selection.observation, selection.kept), self._rows)
-        return Remainder(columns, sigma, region)
+        return UnnamedPart(columns, sigma, region)
 
-    def _with_siblings(self, accused: list[int], sigmas: Array, steady: Array) -> Array:
-        """Return strengths: less is asked at further joints of an effect; of lines as much."""
+    def _strengths(self, accused: list[int], sigmas: Array, ratio: Array) -> Array:
+        """Return strengths; further joints of a stable effect (not of lines) need fewer sigmas."""
         families = [self.space.candidates[c].family for c in accused]
-        first = np.minimum(sigmas / MIN_SIGMAS_WITH_UNNAMED, steady)
-        stays = {f for f, s in zip(families, first, strict=True) if s >= 1}
-        stays -= {k.family for k in self.space.candidates if k.periodic}
-        sibling = np.array([f in stays for f in families])
+        first = np.minimum(sigmas / MIN_SIGMAS_WITH_UNNAMED, ratio)
+        stable = {f for f, s in zip(families, first, strict=True) if s >= 1}
+        stable -= {k.family for k in self.space.candidates if k.periodic}
+        further = np.array([f in stable for f in families])
         return np.asarray(
-            np.where(sibling, np.minimum(sigmas / MIN_SIGMAS_OF_FURTHER_JOINTS, steady), first)
+            np.where(further, np.minimum(sigmas / MIN_SIGMAS_OF_FURTHER_JOINTS, ratio), first)
         )
 
 
-def _unnamed(candidate: Candidate, observation: Observation) -> bool:
-    """Return whether a candidate stands for an unknown, and not for a named effect's own form.
+def _models_unknown(candidate: Candidate, observation: Observation) -> bool:
+    """Return whether a candidate models an unknown effect, not the form of a named one.
 
-    A function of a joint's own last motion that moves it is play. Of joints that are measured one
-    by one, a function of a joint's own speed is friction, and of its own torque droop; what moves
-    it by its own speed may be more than a delay.
+    In position a function of a joint's own approach is backlash; in torque a function of its own
+    speed is friction; in tracking a function of its own torque is droop.
     """
     if candidate.named:
         return False
     if observation.channel == "tracking":
-        return candidate.target != carrying(candidate.quantity)
+        return candidate.target != target_of(candidate.quantity, HELD_TORQUE)
     if observation.channel == "torque":
         return not _of_own_speed(candidate)
-    stem, _, index = candidate.quantity.rpartition("_")
-    return stem != "approach" or candidate.target != joint_target(int(index) + 1)
+    return candidate.target != target_of(candidate.quantity, "approach")
 
 
 def _of_own_speed(candidate: Candidate) -> bool:
     """Return whether a candidate moves a joint by a function of its own speed."""
-    stem, _, index = candidate.quantity.rpartition("_")
-    own = index.isdigit() and candidate.target == joint_target(int(index) + 1)
-    return own and stem in ("actual_qd", "target_qd")
+    own = target_of(candidate.quantity, "actual_qd", "target_qd")
+    return bool(own) and candidate.target == own

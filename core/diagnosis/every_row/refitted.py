@@ -32,7 +32,7 @@ from gapbridge.core.diagnosis.selection.local_search import rivals
 from gapbridge.core.diagnosis.selection.noise import carried_to
 from gapbridge.core.diagnosis.selection.outliers import inliers
 from gapbridge.core.diagnosis.selection.problem import fit
-from gapbridge.core.diagnosis.selection.refit import Remainder, refit, worth
+from gapbridge.core.diagnosis.selection.refit import UnnamedPart, refit, worth
 from gapbridge.core.diagnosis.selection.selection import Selection, refitted_alone
 from gapbridge.core.diagnosis.selection.state import SelectionState, sample_space
 from gapbridge.core.effects import Term
@@ -79,10 +79,10 @@ def fitted_on_all_rows(
     space, unprojected = sample_space(state, columns, terms, [])
     links = {p: selection.prior[c] for p, c in enumerate(selection.term_index)
              if c in selection.prior and p in accused}  # fmt: skip
-    near = links_of(space, links).beside(space, links) if links else space
+    near = links_of(space, links).whitened_space(space, links) if links else space
     linear = fit(near, tuple(p for p in accused if p not in links))
-    remainder = None if judgement.remainder is None else _scatter(placed, state.kept)
-    state, fitted, index, spread, residual = refit(state, space, linear, links, remainder)
+    unnamed_part = None if judgement.unnamed_part is None else _scatter(placed, state.kept)
+    state, fitted, index, spread, residual = refit(state, space, linear, links, unnamed_part)
     values, covariance = list(selection.terms), list(selection.covariance)
     for c, term, term_covariance in zip(index, fitted, spread, strict=True):
         values[c], covariance[c] = term, term_covariance
@@ -92,10 +92,10 @@ def fitted_on_all_rows(
     )  # fmt: skip
 
 
-def _scatter(observation: Observation, kept: Mask) -> Remainder:
+def _scatter(observation: Observation, kept: Mask) -> UnnamedPart:
     """Return the regions that values scatter among, where something unknown is left."""
     region = np.repeat(regions(observation, kept), observation.measured.shape[1])
-    return Remainder(np.zeros((len(region), 0)), np.zeros(0), region)
+    return UnnamedPart(np.zeros((len(region), 0)), np.zeros(0), region)
 
 
 def _shaped_as(candidate: Candidate, term: Term) -> Candidate:
@@ -180,8 +180,8 @@ def refitted(
 
     Beside something ``unknown`` covariances stay those of its scatter among regions.
     """
-    remainder = _scatter(selection.observation, selection.kept) if unknown else None
-    whole = refitted_alone(selection, model.arm, accused, remainder)
+    unnamed_part = _scatter(selection.observation, selection.kept) if unknown else None
+    whole = refitted_alone(selection, model.arm, accused, unnamed_part)
     links = {p: own for p, own in whole.prior.items() if p in accused}
     whole = replace(whole, prior=links)
     single = tuple(p for p in accused if p not in links)

@@ -1,8 +1,8 @@
-"""Candidates: everything that may stand behind a gap, each with its columns.
+"""Candidates: the hypotheses that may explain a gap, each with its columns.
 
 A *named* candidate is an effect of the catalogue at one site; a *smooth* one is an unnamed function
-of one quantity (what wins there is ``unexplained``). Columns are derivatives of the
-channel's whole prediction, by central differences, at the model found so far.
+of one quantity (if it is selected, the gap is ``unexplained``). Columns are derivatives of the
+channel's full prediction, by central differences, at the current model.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ import numpy as np
 from gapbridge.core.arm import Arm
 from gapbridge.core.arrays import Array
 from gapbridge.core.diagnosis.criteria import MIN_CYCLES
-from gapbridge.core.diagnosis.observation import HELD_TORQUE, Observation
+from gapbridge.core.diagnosis.observation import Observation
 from gapbridge.core.effects import CATALOGUE, Effect, Parameter, Site, Term
 from gapbridge.core.errors import InputError
 
 STEP = 1e-2  # of a parameter's usual scale, for central differences
-WHOLE_ORDERS = 128  # cycles a turn that are looked through one by one
-HALF_ORDERS = 40  # up to here also the halves
-# (typical moment / M0)^2 that a nonlinear stiffness curve starts from
+WHOLE_ORDERS = 128  # cycles per turn: periodic lines up to this order are candidates
+HALF_ORDERS = 40  # up to here also at half orders
+# (typical moment / M0)^2, the softening values of the candidates of a stiffness curve
 SOFTENING = tuple(float(v) for v in np.geomspace(0.1, 3000, 13))
 
 UNNAMED = Effect()
@@ -36,12 +36,12 @@ class Candidate:
     family: str  # the effect's identifier, or 'smooth'
     site: Site
     parameters: tuple[Parameter, ...]
-    fixed: tuple[float | None, ...]  # per parameter of the effect: None = fitted
-    curve: float | None = None  # softening of a nonlinear stiffness: columns linear, and softening
-    tried: int = 1  # hypotheses that this one was picked from
-    quantity: str = ""  # what a smooth candidate depends on
-    target: str = ""  # and what it moves
-    beside: str = ""  # family without which it shows nothing
+    fixed: tuple[float | None, ...]  # per parameter of the effect; None: fitted
+    curve: float | None = None  # softening of a stiffness curve (columns: linear, softening part)
+    tried: int = 1  # hypotheses from which this one was selected
+    quantity: str = ""  # the quantity that a smooth candidate is a function of
+    target: str = ""  # the joint, axis or frame that it moves
+    requires: str = ""  # family without which it changes no prediction
 
     @cached_property
     def named(self) -> bool:
@@ -60,7 +60,7 @@ class Candidate:
 
     @cached_property
     def turns_joint_by_own_angle(self) -> bool:
-        """Return whether this turns a joint by the joint's own angle alone."""
+        """Return whether this is an angle error of a joint as a function of its own angle."""
         own = Effect.angle_columns
         return type(self.effect).angle_columns is not own
 
@@ -71,7 +71,7 @@ class Candidate:
 
     @cached_property
     def without_quantity(self) -> bool:
-        """Return whether this is an unnamed cause that goes by no column of the log."""
+        """Return whether this is an unnamed cause that is no function of a quantity."""
         return not self.named and not self.quantity
 
     def term(self, x: Array) -> Term:
@@ -88,16 +88,10 @@ def joint_target(joint: int) -> str:
     return f"joint_{joint}"
 
 
-def own_target(quantity: str) -> str:
-    """Return the joint whose angle the quantity is, as smooth targets are named ('' if none)."""
-    stem, _, index = quantity.rpartition("_")
-    return joint_target(int(index) + 1) if stem in ("actual_q", "target_q") else ""
-
-
-def carrying(quantity: str) -> str:
-    """Return the joint that holds the torque of a quantity, as own_target ('' if none)."""
-    stem, _, index = quantity.rpartition("_")
-    return joint_target(int(index) + 1) if stem == HELD_TORQUE else ""
+def target_of(quantity: str, *columns: str) -> str:
+    """Return the target of the joint that a quantity of one of these columns is of ('' if none)."""
+    column, _, index = quantity.rpartition("_")
+    return joint_target(int(index) + 1) if column in columns else ""
 
 
 def named_candidates(
@@ -110,8 +104,8 @@ def named_candidates(
 ) -> list[Candidate]:
     """Return the catalogue's members for a channel, at every site of the arm.
 
-    What ``base`` holds already comes with its own period or curve. ``turns`` (n,) says how many
-    turns each joint's poses span.
+    Effects in ``base`` (the current model) come with their period or curve. ``turns`` (n,) is how
+    many turns each joint's poses span.
     """
     candidates = []
     for identifier, effect in CATALOGUE.items():
@@ -165,14 +159,14 @@ def _orders(site: Site, inside: Sequence[Term], turns: Sequence[float]) -> list[
         *(n / 2 for n in range(2, 2 * HALF_ORDERS + 1)),
         *(float(t.site.order) for t in inside if t.site.order is not None),
     }
-    # one cycle a turn is a usual period; of others, more than one has to be seen
+    # one cycle per turn is a usual period; of others, the range has to show more than one
     seen = turns[site.joint - 1] if site.joint and turns else 1.0
     least = min(MIN_CYCLES / max(seen, 1e-6), 3.0)
     return [order for order in sorted(orders) if order >= least or order in (1.0, 2.0)]
 
 
 def named_columns(observation: Observation, candidate: Candidate, base: Sequence[Term]) -> Array:
-    """Return d prediction / d parameter (N, k, d), ``base`` terms already in the model."""
+    """Return d prediction / d parameter (N, k, d), with the ``base`` terms in the model."""
     if candidate.effect.periodic:
         by_angle = angle_columns(observation, candidate)
         if by_angle is not None:
@@ -187,24 +181,24 @@ def named_columns(observation: Observation, candidate: Candidate, base: Sequence
 
 
 def changes_prediction_alone(observation: Observation, candidate: Candidate) -> bool:
-    """Return whether an effect changes predictions where no other is in the model."""
+    """Return whether an effect changes predictions without any other in the model."""
     return bool(_from_nominal(observation, candidate, ()).any())
 
 
 def with_requirement(observation: Observation, candidate: Candidate) -> Candidate:
-    """Return the candidate with the family beside which alone it shows: no load, no centre."""
+    """Return the candidate with the family that it requires (a centre of gravity, a load)."""
     needed = candidate.effect.shown_by
     if needed is None or changes_prediction_alone(observation, candidate):
         return candidate
-    return replace(candidate, beside=needed.effect)
+    return replace(candidate, requires=needed.effect)
 
 
 def jacobian(
     observation: Observation, candidate: Candidate, x: Array, others: Sequence[Term]
 ) -> Array:
-    """Return d prediction / d parameter (N, k, d) at values ``x`` (d,), beside other terms.
+    """Return d prediction / d parameter (N, k, d) at values ``x`` (d,), ``others`` in the model.
 
-    Zeros where the arm would buckle: only a prior leads back from there.
+    Zeros where the arm has no equilibrium: there only the prior determines the step.
     """
     columns = []
     for k, parameter in enumerate(candidate.parameters):
@@ -225,7 +219,7 @@ def _from_nominal(observation: Observation, candidate: Candidate, base: Sequence
 
 
 def angle_columns(observation: Observation, candidate: Candidate) -> Array | None:
-    """Return exact columns (N, k, d) of what turns a joint by its own angle; None for the rest."""
+    """Return exact columns (N, k, d) of angle errors by the own angle; None for other effects."""
     J, joint = observation.joint_columns, candidate.site.joint
     if J is None or joint is None:
         return None
@@ -236,9 +230,9 @@ def angle_columns(observation: Observation, candidate: Candidate) -> Array | Non
 
 
 def _stiffness_curve_columns(observation: Observation, candidate: Candidate) -> Array:
-    """Return the linear and the softening part of a stiffness curve (N, k, 2).
+    """Return the columns (N, k, 2) of a stiffness curve: linear part and softening part.
 
-    Both: a joint that the model holds as compliant already only bends its own line.
+    Both, because the joint may already be compliant in the model.
     """
     i, moment = (candidate.site.joint or 1) - 1, observation.axial_moment
     assert moment is not None and candidate.curve is not None

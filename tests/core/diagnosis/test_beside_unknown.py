@@ -10,7 +10,7 @@ import pytest
 import small_arm as small
 
 from benchmarks.blind.session import Plan
-from gapbridge.core.diagnosis import remainder
+from gapbridge.core.diagnosis import value_stability
 from gapbridge.core.diagnosis.channels.position import observe as observe_position
 from gapbridge.core.diagnosis.channels.wrench import observe
 from gapbridge.core.diagnosis.criteria import NEGLIGIBLE_SIZE
@@ -18,10 +18,10 @@ from gapbridge.core.diagnosis.diagnosis import diagnose
 from gapbridge.core.diagnosis.finding import Check, Withdrawal
 from gapbridge.core.diagnosis.held_out import HeldOut
 from gapbridge.core.diagnosis.judgement import Judgement, judge, judge_geometry, significant_alone
-from gapbridge.core.diagnosis.remainder import links_close_gap, stable_effects
 from gapbridge.core.diagnosis.selection import rounds
 from gapbridge.core.diagnosis.selection.candidate import named_candidates, with_requirement
-from gapbridge.core.diagnosis.selection.refit import Remainder, _cluster_covariance, worth
+from gapbridge.core.diagnosis.selection.refit import UnnamedPart, _cluster_covariance, worth
+from gapbridge.core.diagnosis.value_stability import links_close_gap, stable_effects
 from gapbridge.core.effects import CATALOGUE, Site, Term
 from gapbridge.core.metrology import Metrology
 
@@ -88,7 +88,7 @@ def test_gain_and_turn_and_centre_wait_for_a_load(plant):
         model = plant.model(mass)
         seen = observe(model, log, Metrology())
         (own,) = [c for c in named_candidates(model.arm, "wrench") if c.family == effect]
-        return with_requirement(seen, own).beside
+        return with_requirement(seen, own).requires
 
     for effect in ("ft_gain", "ft_misalignment", "payload_cog"):
         assert (beside(0.0, effect), beside(2.0, effect)) == ("payload", "")
@@ -194,9 +194,9 @@ def test_a_tool_point_goes_with_the_links_where_it_helps_elsewhere(monkeypatch):
         asked.append(set(accused))
         return np.array([0.0 if c in point else 0.5 + (len(accused) < 3) for c in accused])
 
-    monkeypatch.setattr(remainder._UnnamedFunctions, "strengths", strengths)
+    monkeypatch.setattr(value_stability._UnnamedFunctions, "strengths", strengths)
     monkeypatch.setattr(
-        remainder._GapClosure, "takes", lambda *_: False
+        value_stability._GapClosure, "needs_any", lambda *_: False
     )  # by their strengths alone
     zero = [c for c, k in enumerate(own) if k.family == "backlash"][:1]
     stays, *_ = stable_effects(whole, [*point, *lines, *zero])
@@ -280,8 +280,8 @@ def test_what_is_no_longer_sure_beside_the_unknown_is_taken_back():
     rows = len(found.space.y)
     # an unnamed function that does the very same as the accused
     twin = found.space.columns(found.term_index)
-    unknown = Remainder(twin, np.full(twin.shape[1], np.inf), np.arange(rows) // 3 % 20)
-    _, judged = significant_alone(found, replace(judgement, remainder=unknown), arm)
+    unknown = UnnamedPart(twin, np.full(twin.shape[1], np.inf), np.arange(rows) // 3 % 20)
+    _, judged = significant_alone(found, replace(judgement, unnamed_part=unknown), arm)
     assert judged.accused == ()
     assert judged.structured
     assert [p for p, _ in judged.withdrawn] == [0]

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from gapbridge.core.diagnosis import diagnosis, remainder
+from gapbridge.core.diagnosis import diagnosis, value_stability
 from gapbridge.core.diagnosis.causes import Considered, Outcome
 from gapbridge.core.diagnosis.finding import Check, Withdrawal
 from gapbridge.core.diagnosis.judgement import Judgement
@@ -23,22 +23,22 @@ def closing(monkeypatch):
             return np.asarray(shares.get(frozenset(chosen), np.ones(4)))[PARTS] ** 2
 
         held = SimpleNamespace(possible=True, squares=squares)
-        monkeypatch.setattr(remainder, "HeldOut", lambda selection, parts: held)
-        monkeypatch.setattr(remainder, "parts", lambda observation, kept: PARTS)
+        monkeypatch.setattr(value_stability, "HeldOut", lambda selection, parts: held)
+        monkeypatch.setattr(value_stability, "parts", lambda observation, kept: PARTS)
         candidates = [SimpleNamespace(periodic=c in periodic) for c in range(4)]
         space = SimpleNamespace(candidates=candidates)
         selection = SimpleNamespace(
             block=(), space=space, observation=SimpleNamespace(channel=channel), kept=None
         )
-        return remainder._GapClosure(selection)
+        return value_stability._GapClosure(selection)
 
     return made
 
 
 def test_two_that_close_the_gap_only_together_are_needed(closing):
     pair = closing({frozenset({0, 1}): np.full(4, 0.25)})
-    assert pair.takes([0, 1], [0])
-    assert pair.takes([0, 1], [1])
+    assert pair.needs_any([0, 1], [0])
+    assert pair.needs_any([0, 1], [1])
     assert pair.needed == {0, 1}
 
 
@@ -47,25 +47,25 @@ def test_what_others_do_as_well_is_not_needed_until_they_are_gone(closing):
     either = closing(
         dict.fromkeys([frozenset({0, 1}), frozenset({0, 2}), frozenset({0, 1, 2})], small)
     )
-    assert not either.takes([0, 1, 2], [2])
-    assert either.takes([0, 1], [1])
+    assert not either.needs_any([0, 1, 2], [2])
+    assert either.needs_any([0, 1], [1])
     assert either.needed == {1}
 
 
 def test_an_imitation_leaves_too_much_in_one_part_or_in_all(closing):
-    assert not closing({frozenset({0}): [0.1, 0.1, 0.1, 0.6]}).takes([0], [0])
-    assert not closing({frozenset({0}): np.full(4, 0.4)}).takes([0], [0])
-    assert closing({frozenset({0}): [0.3, 0.3, 0.3, 0.4]}).takes([0], [0])
+    assert not closing({frozenset({0}): [0.1, 0.1, 0.1, 0.6]}).needs_any([0], [0])
+    assert not closing({frozenset({0}): np.full(4, 0.4)}).needs_any([0], [0])
+    assert closing({frozenset({0}): [0.3, 0.3, 0.3, 0.4]}).needs_any([0], [0])
 
 
 def test_a_periodic_line_is_not_needed(closing):
     line = closing({frozenset({0, 1}): np.full(4, 0.1)}, periodic=(1,))
-    assert not line.takes([0, 1], [1])
-    assert line.takes([0, 1], [0])
+    assert not line.needs_any([0, 1], [1])
+    assert line.needs_any([0, 1], [0])
 
 
 def test_of_other_channels_than_position_nothing_is_needed(closing):
-    assert not closing({frozenset({0}): np.full(4, 0.1)}, channel="wrench").takes([0], [0])
+    assert not closing({frozenset({0}): np.full(4, 0.1)}, channel="wrench").needs_any([0], [0])
 
 
 class Searched:

@@ -150,11 +150,11 @@ def test_a_number_that_moves_nothing_takes_nothing_from_the_others(selection):
     chosen = list(selection.best.chosen)
     dead = next(c for c in range(len(selection.space.candidates)) if c not in chosen)
     own = selection.space.column_indices([dead])
-    X, taken = selection.space.X.copy(), selection.unprojected.taken.copy()
-    X[:, own] = taken[:, own] = 0.0
+    X, coefficients = selection.space.X.copy(), selection.unprojected.coefficients.copy()
+    X[:, own] = coefficients[:, own] = 0.0
     blind = replace(
         selection, space=replace(selection.space, X=X),
-        unprojected=replace(selection.unprojected, taken=taken),
+        unprojected=replace(selection.unprojected, coefficients=coefficients),
         prior={dead: np.full(len(own), 1e-3)},
     )  # fmt: skip
     held = HeldOut(blind)

@@ -177,11 +177,11 @@ def test_a_parameter_that_one_session_does_not_show_is_not_compared() -> None:
     other = own - 1 if own else own + 1
     column = selection.space.start[other]
     X[:, column] = np.where(rows == 0, X[:, column] + 1e-3, 0.0)
-    taken = selection.unprojected.taken.copy()
-    taken[:, column] = 0.0
+    coefficients = selection.unprojected.coefficients.copy()
+    coefficients[:, column] = 0.0
     changed = replace(
         selection, space=replace(selection.space, X=X),
-        unprojected=replace(selection.unprojected, taken=taken),
+        unprojected=replace(selection.unprojected, coefficients=coefficients),
     )  # fmt: skip
     reported = session_transfer(changed, (own, other), MODEL.arm)
     assert all(np.isfinite(c.p_value) for c in reported)
