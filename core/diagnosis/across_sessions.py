@@ -83,9 +83,8 @@ def _transfer(
             (s, _reported(space.candidates, members, values[i], covariance[block, block], arm))
         )
     effect = space.candidates[members[0]].family
-    return SessionTransfer(
-        effect, not (p_value < SESSIONS_DIFFER_P and matters), p_value, tuple(reported)
-    )
+    differs = p_value < SESSIONS_DIFFER_P and matters
+    return SessionTransfer(effect, not differs, p_value, tuple(reported))
 
 
 def _fitted_by_session(

@@ -14,8 +14,8 @@ from gapbridge.core.diagnosis.criteria import MIN_EXCITATION, UNDETERMINED_SPREA
 from gapbridge.core.diagnosis.finding import ParameterNote, ParameterState, Withdrawal
 from gapbridge.core.diagnosis.held_out import HeldOut, Shrink
 from gapbridge.core.diagnosis.judgement import Judgement
-from gapbridge.core.diagnosis.selection.forward import joining
-from gapbridge.core.diagnosis.selection.problem import CandidateFit, fit
+from gapbridge.core.diagnosis.selection.forward_selection import joining
+from gapbridge.core.diagnosis.selection.sample_space import CandidateFit, fit
 from gapbridge.core.diagnosis.selection.selection import Selection
 from gapbridge.core.effects import CATALOGUE, Reported, Term
 
@@ -100,9 +100,8 @@ def _cause(
         relative.append(float(np.min(np.where(deviation > 0, deviation, np.inf)
                                      / np.maximum(size, 1e-300))))  # fmt: skip
         notes += _at_bounds(effect, term, arm)
-        notes += _not_identifiable(
-            effect, term, deviation, arm, selection.nominal.get(selection.term_index[p])
-        )
+        nominal = selection.nominal.get(selection.term_index[p])
+        notes += _not_identifiable(effect, term, deviation, arm, nominal)
     joints = sorted({t.site.joint for t in (selection.terms[p] for p in positions)
                      if t.site.joint is not None})  # fmt: skip
     ties = tuple(dict.fromkeys(n for p in positions for n in judgement.ties.get(p, ())))
@@ -178,11 +177,8 @@ def considered_of(
             needs = effect.motion or ", ".join(effect.needs)
             listed.append(Considered(identifier, None, 0.0, Outcome.NOT_EXCITED, needs))
             continue
-        alone = (
-            held_out.shrink(variants, ()).shrink
-            if held_out.possible and len(variants) < 40
-            else None
-        )
+        tested = held_out.possible and len(variants) < 40
+        alone = held_out.shrink(variants, ()).shrink if tested else None
         better = min(_score_with(selection, base, c) for c in variants)
         odds = float(np.exp(-0.5 * min(max(better - base.score, -700.0), 700.0)))
         withdrawal = reasons.get(identifier)

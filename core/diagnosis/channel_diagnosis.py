@@ -69,9 +69,7 @@ class ChannelDiagnosis:
     fitted_together: tuple[Term, ...] = ()  # causes and stand-ins
     generalisation: Generalisation = NO_GENERALISATION  # new region, new session
     noise_floor_source: str = "unknown"  # see Floor
-    session_transfer: tuple[
-        SessionTransfer, ...
-    ] = ()  # of causes, where several sessions show them
+    session_transfer: tuple[SessionTransfer, ...] = ()  # of causes, for several sessions
 
 
 def locate(selection: Selection, gap: Array, accused: Sequence[int]) -> Where:

@@ -45,7 +45,7 @@ CLOSED_SHARE_IN_WORST_PART = 1 / 2  # for several accused effects together: an i
 MIN_GEOMETRIC_CAUSES = 2  # from which all links are tried as one cause
 # Structure of the residual
 MAX_STRUCTURE_P = 0.002  # p-value below which a residual is structured: 1 of 500 clean logs
-MAX_STRUCTURE_P_WITH_HINT = 0.05  # the same after an unnamed function was chosen or an effect fell
+MAX_STRUCTURE_P_WITH_HINT = 0.05  # the same if an unnamed function was chosen or an effect failed
 OVER_STATED_NOISE = 1.5  # times the stated noise: a larger residual is not noise
 OVER_REPEAT_SCATTER = 1.6  # times the scatter of repeated poses
 MIN_REPEATS_TO_TEST = 30  # degrees of freedom of repeats from which that test is made
@@ -80,7 +80,9 @@ NO_REVERSAL_PENALTY = 3.0  # of backlash in a log without reversals: an offset r
 ANY_CONSTANT_PENALTY = 1e-3  # of a sensor's constant: breaks exact ties, else rounding would
 MAX_LINES = 4  # periodic lines of a joint: more are the Fourier series of something else
 MIN_ORDERS_APART = 0.75  # cycles per turn between two lines of a joint
-MIN_PERIODS = 0.75  # of a line over the joint's range, beside an unknown: less than two extremes of
+MIN_PERIODS = (
+    0.75  # of a line in the joint's range if there is an unknown: less than two extremes of
+)
 # a sine fit any curve. False lines had 0.26 to 0.54, true ones at least 0.89
 MIN_DELAYS = 3  # joints with a known delay: with fewer no joint can be called the outlier
 NEGLIGIBLE_WORTH = 1e-4  # of a term, below which it is removed at once: a thirtieth of its sigma

@@ -12,20 +12,20 @@ from threadpoolctl import threadpool_limits
 
 from gapbridge.core.arrays import Array
 from gapbridge.core.diagnosis.across_sessions import session_transfer
-from gapbridge.core.diagnosis.causes import Cause, Considered, causes_of, considered_of
-from gapbridge.core.diagnosis.channel_diagnosis import ChannelDiagnosis, Verdict, Where, locate
-from gapbridge.core.diagnosis.channels import position, torque, tracking, wrench
-from gapbridge.core.diagnosis.channels.simulation import joined, predicted_by
-from gapbridge.core.diagnosis.criteria import MIN_CONDITIONS, MIN_FREEDOM, UNRESOLVED
-from gapbridge.core.diagnosis.every_row.gap_sizes import gaps, sizes_of, streamed_sizes
-from gapbridge.core.diagnosis.every_row.long_recording import LongRecording, long_recording
-from gapbridge.core.diagnosis.every_row.refitted import (
+from gapbridge.core.diagnosis.all_rows.gap_sizes import gaps, sizes_of, streamed_sizes
+from gapbridge.core.diagnosis.all_rows.long_recording import LongRecording, long_recording
+from gapbridge.core.diagnosis.all_rows.refit_on_all_rows import (
     accused_on_all_rows,
     fitted_on_all_rows,
     refitted,
     with_undecided_terms,
 )
-from gapbridge.core.diagnosis.every_row.streamed import RowSums, Streamed
+from gapbridge.core.diagnosis.all_rows.row_sums import RowSums, Streamed
+from gapbridge.core.diagnosis.causes import Cause, Considered, causes_of, considered_of
+from gapbridge.core.diagnosis.channel_diagnosis import ChannelDiagnosis, Verdict, Where, locate
+from gapbridge.core.diagnosis.channels import position, torque, tracking, wrench
+from gapbridge.core.diagnosis.channels.simulation import joined, predicted_by
+from gapbridge.core.diagnosis.criteria import MIN_CONDITIONS, MIN_FREEDOM, UNRESOLVED
 from gapbridge.core.diagnosis.finding import (
     ChannelFinding,
     Fact,
@@ -50,9 +50,9 @@ from gapbridge.core.diagnosis.log_checks.units_and_clocks import check_units, fi
 from gapbridge.core.diagnosis.noise_floor import Floor, noise_floor, whiteness
 from gapbridge.core.diagnosis.observation import NotObservable, Observation, thinned
 from gapbridge.core.diagnosis.residual_structure import dependence
-from gapbridge.core.diagnosis.selection.moments import slips
 from gapbridge.core.diagnosis.selection.rounds import select
 from gapbridge.core.diagnosis.selection.selection import Selection, refitted_alone
+from gapbridge.core.diagnosis.selection.step_times import slips
 from gapbridge.core.diagnosis.separation import Measurement, next_measurements
 from gapbridge.core.diagnosis.value_stability import closes_gap
 from gapbridge.core.effects import CATALOGUE, Term, correcting, flexibility_effects
@@ -113,12 +113,8 @@ def channels_of(uncertain: Uncertain | None) -> Mapping[str, Observe]:
         observation = position.observe(model, log, metrology)
         if isinstance(observation, NotObservable):
             return observation
-        q, rows, k = (
-            log.require("actual_q", "target_q"),
-            observation.rows,
-            observation.measured.shape[1],
-        )
-        loads = log.loads()[rows]
+        rows, k = observation.rows, observation.measured.shape[1]
+        q, loads = log.require("actual_q", "target_q"), log.loads()[rows]
         return replace(observation, uncertain=lambda terms: uncertain(q[rows], loads, terms)[:, :k])
 
     return {**CHANNELS, "position": observe}
@@ -400,26 +396,26 @@ def _channel_diagnosis(
     searched: _SearchResult, model: Model, streamed: Streamed | None
 ) -> ChannelDiagnosis:
     """Return the diagnosis validated on all rows; ``streamed`` are those of a long recording."""
-    observation, shown = searched.observation, searched.selection
+    observation, final = searched.observation, searched.selection
     judgement = searched.judgement
-    decided = shown if streamed is None else streamed.selection(judgement.accused)
+    decided = final if streamed is None else streamed.selection(judgement.accused)
     held_out = HeldOut(decided)
     if searched.more or streamed is not None:
         unknown = judgement.unnamed_part is not None
         alone = partial(refitted, model, unknown) if streamed is None else streamed.alone
         decided, judgement = accused_on_all_rows(decided, judgement, held_out, alone)
     if streamed is None:
-        shown = decided
+        final = decided
     else:
-        shown = replace(shown, terms=decided.terms, covariance=decided.covariance)
+        final = replace(final, terms=decided.terms, covariance=decided.covariance)
     chosen = [decided.term_index[p] for p in judgement.accused]
-    gap, remaining = gaps(shown, chosen)
+    gap, remaining = gaps(final, chosen)
     if streamed is None:
-        sizes = sizes_of(shown, gap, remaining)
+        sizes = sizes_of(final, gap, remaining)
     else:
         sizes = streamed_sizes(streamed, decided, judgement.accused)
     causes = causes_of(decided, judgement, held_out, model.arm)
-    judgement, floor = _with_whiteness(judgement, shown, sizes.means, searched.depends)
+    judgement, floor = _with_whiteness(judgement, final, sizes.means, searched.depends)
     held_out_rms = held_out.rms(chosen) if held_out.possible else None
     if not causes:  # only the frame was fitted
         held_out_rms = sizes.gap_rms
@@ -429,7 +425,7 @@ def _channel_diagnosis(
     verdict = Verdict.EXPLAINED if causes else Verdict.NO_GAP
     if structured:
         verdict = Verdict.PARTLY_EXPLAINED if causes else Verdict.UNEXPLAINED
-    per_sample = held_out if streamed is None else HeldOut(shown)
+    per_sample = held_out if streamed is None else HeldOut(final)
     return ChannelDiagnosis(
         channel=observation.channel, unit=observation.unit, samples=sizes.samples,
         gap_rms=sizes.gap_rms, gap_max=sizes.gap_max, noise_floor_rms=floor.rms,
@@ -437,7 +433,7 @@ def _channel_diagnosis(
         where=searched.where, causes=causes, considered=searched.considered,
         unexplained_rms=_unexplained(sizes.remaining_rms, floor.rms, judgement),
         structured=structured, p_value=judgement.p_value, depends_on=judgement.depends_on,
-        verdict=verdict, selection=shown, judgement=judgement, gap=gap, remaining=remaining,
+        verdict=verdict, selection=final, judgement=judgement, gap=gap, remaining=remaining,
         held_out=np.sqrt(per_sample.squares(chosen)) if per_sample.possible else None,
         outliers=sizes.outliers, generalisation=generalisation(decided, chosen),
         session_transfer=session_transfer(decided, chosen, model.arm),

@@ -39,8 +39,8 @@ from gapbridge.core.diagnosis.residual_structure import dependence, structure_p_
 from gapbridge.core.diagnosis.selection.candidate import Candidate
 from gapbridge.core.diagnosis.selection.delay_columns import delayed_by
 from gapbridge.core.diagnosis.selection.local_search import forward_selected, rivals
-from gapbridge.core.diagnosis.selection.problem import CandidateFit, SampleSpace, fit
 from gapbridge.core.diagnosis.selection.refit import UnnamedPart, worth
+from gapbridge.core.diagnosis.selection.sample_space import CandidateFit, SampleSpace, fit
 from gapbridge.core.diagnosis.selection.selection import Selection, refitted_alone
 from gapbridge.core.diagnosis.selection.smooth import KNOTS
 from gapbridge.core.diagnosis.selection.stiffness_curves import straight_curves
@@ -64,9 +64,7 @@ class Judgement:
     accused: tuple[int, ...]  # positions in ``selection.terms``
     structured: bool
     p_value: float | None
-    depends_on: tuple[
-        tuple[str, float], ...
-    ]  # quantity, held-out share of the residual that it predicts
+    depends_on: tuple[tuple[str, float], ...]  # quantity, held-out share of the residual
     ties: dict[int, tuple[str, ...]]  # position -> effects that fit equally well
     withdrawn: tuple[tuple[int, Withdrawal], ...]  # position, reason
     unnamed_part: UnnamedPart | None = None  # unnamed functions for the residual structure
@@ -133,9 +131,9 @@ def judge_geometry(
         return selection, judgement
     if whole is None or not links_close_gap(whole, accused_before):
         return selection, judgement
-    again = judge(whole, HeldOut(whole))
-    accused = {whole.term_index[p] for p in again.accused}
-    return (whole, again) if accused & set(whole.block) else (selection, judgement)
+    second_judgement = judge(whole, HeldOut(whole))
+    accused = {whole.term_index[p] for p in second_judgement.accused}
+    return (whole, second_judgement) if accused & set(whole.block) else (selection, judgement)
 
 
 def _verdict(
@@ -143,7 +141,7 @@ def _verdict(
     withdrawn: Mapping[int, Withdrawal], withdrawn_any: bool,
 ) -> Judgement:  # fmt: skip
     """Return the judgement with the ``accused`` candidates, and whether structure is left."""
-    place = {c: p for p, c in enumerate(whole.term_index)}
+    position_of = {c: p for p, c in enumerate(whole.term_index)}
     space, nuisance = selection.working, selection.nuisance_basis
     single = [c for c in accused if c not in selection.block]
     p_value = structure_p_value(space, nuisance, single)
@@ -153,17 +151,16 @@ def _verdict(
     unnamed = any(not space.candidates[c].named for c in selection.best.chosen)
     if unnamed:
         p_value = min(p_value, _unnamed_unnecessary_p(space, selection.best))
-    structured = p_value < (
-        MAX_STRUCTURE_P_WITH_HINT if unnamed or withdrawn_any else MAX_STRUCTURE_P
-    )
+    hint = unnamed or withdrawn_any
+    structured = p_value < (MAX_STRUCTURE_P_WITH_HINT if hint else MAX_STRUCTURE_P)
     depends: tuple[tuple[str, float], ...] = ()
     if structured or not accused:
         depends = tuple(dependence(space, nuisance, single, selection.groups))
     ties = ties_of(space, selection.best, single)
     return Judgement(
-        tuple(place[c] for c in accused), structured, p_value, depends,
-        {place[c]: names for c, names in ties.items()},
-        tuple((place[c], why) for c, why in withdrawn.items()),
+        tuple(position_of[c] for c in accused), structured, p_value, depends,
+        {position_of[c]: names for c, names in ties.items()},
+        tuple((position_of[c], why) for c, why in withdrawn.items()),
     )  # fmt: skip
 
 
@@ -212,19 +209,19 @@ def significant_alone(
     """
     while True:
         refit = refitted_alone(selection, arm, judgement.accused, judgement.unnamed_part)
-        if far := refit.implausible_parameters(judgement.accused):
-            selection = selection.with_nominal(far)
+        if implausible := refit.implausible_parameters(judgement.accused):
+            selection = selection.with_nominal(implausible)
             continue
         straight = _linear_with_unnamed(refit, judgement)
-        share = {
+        significance = {
             p: 0.0 if p in straight else worth(refit.terms[p], refit.covariance[p])
             for p in judgement.accused
         }
         weakest = min(
             refit.judged_together(judgement.accused),
-            key=lambda kind: max(share[p] for p in kind), default=(),
+            key=lambda kind: max(significance[p] for p in kind), default=(),
         )  # fmt: skip
-        if not weakest or max(share[p] for p in weakest) >= 1:
+        if not weakest or max(significance[p] for p in weakest) >= 1:
             return refit, judgement
         inside = refit.term_index[weakest[0]] in refit.block
         # friction that belongs to the links may be significant on more rows

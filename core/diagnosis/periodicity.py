@@ -1,6 +1,6 @@
 """Periodic lines of a joint that are not periodic: one local bump in its angle fits equally well.
 
-Nor is a line accepted, beside an unknown, if the joint's range shows less than a period of it.
+With an unnamed function in the set, a line also needs most of a period in the joint's range.
 """
 
 from __future__ import annotations

@@ -35,8 +35,8 @@ from gapbridge.core.diagnosis.observation import HELD_TORQUE, Observation
 from gapbridge.core.diagnosis.regions import parts, regions
 from gapbridge.core.diagnosis.selection.candidate import Candidate, target_of
 from gapbridge.core.diagnosis.selection.delay_columns import shrunk_to_common_delay
-from gapbridge.core.diagnosis.selection.problem import gains
 from gapbridge.core.diagnosis.selection.refit import UnnamedPart
+from gapbridge.core.diagnosis.selection.sample_space import gains
 from gapbridge.core.diagnosis.selection.selection import Selection
 from gapbridge.core.diagnosis.selection.smooth import targets
 from gapbridge.core.estimation.held_out import jackknife

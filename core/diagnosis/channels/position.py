@@ -30,12 +30,12 @@ from gapbridge.core.model import Model, Poses
 from gapbridge.core.rotation import rotation_matrix, rotation_vector
 from gapbridge.core.sessions import session_of, sessions_in
 
-LEVER = 0.2  # m/rad: first weight of a rotation against a position
+LEVER = 0.2  # m/rad: initial weight of a rotation relative to a position
 
 
 @dataclass(frozen=True)
 class Placement:
-    """Where the instrument stands, and where the target sits on the flange, in one session."""
+    """Pose of the instrument's frame, and of the target on the flange, in one session."""
 
     frame: Registration
     tool_in_flange: Array  # (4, 4)
@@ -126,8 +126,8 @@ def _observed(
 ) -> Observation:  # fmt: skip
     """Return the position channel of one session at a placement, ``data`` those of its ``rows``.
 
-    The tool point's columns are those of the model with ``terms``: at the nominal arm they are off
-    by as much as its joints are, and a joint's turn that they should take up stands as a cause.
+    The tool point's columns are those of the model with ``terms``. Those of the nominal arm would
+    have the error of its joint angles, and a rotation of a joint could appear as a cause.
     """
     q, loads, k = data.q, data.loads, 3 if data.rotation is None else 6
     model = replace(model, tool_in_flange=placement.tool_in_flange)
@@ -168,9 +168,9 @@ def _observed(
 
 
 def rounded_groups(q: Array, tolerance: float = 1e-3) -> NDArray[np.int64]:
-    """Return a number per row (N,): rows alike when rounded to ``tolerance`` (rad) share one.
+    """Return a group number per row (N,), equal for rows equal within ``tolerance`` (rad).
 
-    Of many rows; a pair on either side of a rounding border counts as two poses.
+    Fast for many rows, but equal poses on either side of a rounding limit get two numbers.
     """
     rounded = np.round(q / tolerance)
     return np.asarray(np.unique(rounded, axis=0, return_inverse=True)[1].reshape(-1))
@@ -191,7 +191,7 @@ def session_model(model: Model, log: Log, metrology: Metrology) -> Model:
 
 
 def _placed(model: Model, data: Data, metrology: Metrology) -> Placement:
-    """Return a first estimate of what is free in a session, outliers down-weighted."""
+    """Return a robust first estimate of a session's frame and tool point."""
     frame, tool = IDENTITY, model.tool_in_flange
     if not metrology.registered:
         frame = register_robustly(data.position, model.predict(data.q, data.loads).position)
@@ -213,13 +213,13 @@ def _tool_columns(model: Model, poses: Poses, k: int) -> Array:
 
 
 def _prediction(model: Model, q: Array, loads: Loads, reference: Array | None) -> Predict:
-    """Return terms -> positions (N, 3), with rotations as vectors off ``reference`` (N, 6)."""
+    """Return terms -> positions (N, 3), with ``reference`` also rotation vectors to it (N, 6)."""
 
     def predict(terms: Sequence[Term]) -> Array:
         real = model.with_terms(terms).predict(q, loads)
         if reference is None:
             return real.position
-        # rotations as small vectors against the measured ones, so that gaps simply subtract
+        # rotation vectors relative to the measured ones, so that gaps are differences
         off = rotation_vector(real.rotation @ np.swapaxes(reference, 1, 2))
         return np.hstack([real.position, off])
 
@@ -229,11 +229,11 @@ def _prediction(model: Model, q: Array, loads: Loads, reference: Array | None) -
 def quantities(log: Log, rows: NDArray[np.int64]) -> dict[str, Array]:
     """Return every scalar column of the log that varies over ``rows``, by its name in the log."""
     q = "actual_q" if log.has("actual_q") else "target_q"
-    given = ((name, log.get(name)) for name in (
+    named_columns = ((name, log.get(name)) for name in (
         "timestamp", "session", q, "payload", "payload_cog", "joint_temperatures",
         "actual_TCP_force", "measured_position",
     ))  # fmt: skip
-    return varying({name: column[rows] for name, column in given if column is not None})
+    return varying({name: column[rows] for name, column in named_columns if column is not None})
 
 
 def approaches(approach: Array | None, rows: NDArray[np.int64] | None = None) -> dict[str, Array]:

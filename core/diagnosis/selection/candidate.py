@@ -112,38 +112,38 @@ def named_candidates(
         if channel not in effect.channels or identifier in set(withheld) or effect.at_moment:
             continue
         for site in effect.sites(arm):
-            inside = [t for t in base if t.effect == identifier and t.site.joint == site.joint]
+            in_model = [t for t in base if t.effect == identifier and t.site.joint == site.joint]
             parameters = effect.parameters(arm, site)
-            candidates += _variants(effect, parameters, site, with_rotation, inside, turns)
+            candidates += _variants(effect, parameters, site, with_rotation, in_model, turns)
     return candidates
 
 
 def _variants(
     effect: Effect, parameters: tuple[Parameter, ...], site: Site, with_rotation: bool,
-    inside: Sequence[Term], turns: Sequence[float],
+    in_model: Sequence[Term], turns: Sequence[float],
 ) -> list[Candidate]:  # fmt: skip
     """Return an effect's candidates at one site, one for each order, curve or shape it may have.
 
-    ``inside`` are the terms of the effect that the model already has at this joint.
+    ``in_model`` are the terms of the effect that the model already has at this joint.
     """
     identifier = effect.identifier
     free: tuple[float | None, ...] = (None,) * len(parameters)
     if effect.periodic:
         return [
             Candidate(identifier, Site(site.joint, order), parameters, free)
-            for order in _orders(site, inside, turns)
+            for order in _orders(site, in_model, turns)
         ]
-    if effect.curved and not inside:
+    if effect.curved and not in_model:
         linear = (replace(parameters[0], lower=-np.inf),) * 2
         return [
             Candidate(identifier, site, linear, free, curve=s * parameters[1].scale)
             for s in SOFTENING
         ]
     if effect.shapes:
-        had = {t.values[-1] for t in inside}
+        present = {t.values[-1] for t in in_model}
         return [
             Candidate(identifier, site, parameters[:-1], (*free[:-1], shape))
-            for shape in (*effect.shapes, *(had - {*effect.shapes}))
+            for shape in (*effect.shapes, *(present - {*effect.shapes}))
         ]
     if any(p.of_rotation for p in parameters) and not with_rotation:
         shown = tuple(p for p in parameters if not p.of_rotation)
@@ -152,17 +152,17 @@ def _variants(
     return [Candidate(identifier, site, parameters, free)]
 
 
-def _orders(site: Site, inside: Sequence[Term], turns: Sequence[float]) -> list[float]:
+def _orders(site: Site, in_model: Sequence[Term], turns: Sequence[float]) -> list[float]:
     """Return the orders, in cycles a turn, of the lines that a joint may have."""
     orders = {
         *map(float, range(1, WHOLE_ORDERS + 1)),
         *(n / 2 for n in range(2, 2 * HALF_ORDERS + 1)),
-        *(float(t.site.order) for t in inside if t.site.order is not None),
+        *(float(t.site.order) for t in in_model if t.site.order is not None),
     }
     # one cycle per turn is a usual period; of others, the range has to show more than one
-    seen = turns[site.joint - 1] if site.joint and turns else 1.0
-    least = min(MIN_CYCLES / max(seen, 1e-6), 3.0)
-    return [order for order in sorted(orders) if order >= least or order in (1.0, 2.0)]
+    shown = turns[site.joint - 1] if site.joint and turns else 1.0
+    min_order = min(MIN_CYCLES / max(shown, 1e-6), 3.0)
+    return [order for order in sorted(orders) if order >= min_order or order in (1.0, 2.0)]
 
 
 def named_columns(observation: Observation, candidate: Candidate, base: Sequence[Term]) -> Array:
@@ -224,8 +224,8 @@ def angle_columns(observation: Observation, candidate: Candidate) -> Array | Non
     if J is None or joint is None:
         return None
     angle = observation.quantities.get(joint_quantity(observation, joint - 1))
-    still = np.zeros(len(J))  # a joint that never moves has one angle
-    shape = candidate.effect.angle_columns(candidate.site, still if angle is None else angle)
+    constant = np.zeros(len(J))  # a joint that never moves has one angle
+    shape = candidate.effect.angle_columns(candidate.site, constant if angle is None else angle)
     return None if shape is None else J[:, :, joint - 1, None] * shape[:, None, :]
 
 
@@ -236,9 +236,9 @@ def _stiffness_curve_columns(observation: Observation, candidate: Candidate) -> 
     """
     i, moment = (candidate.site.joint or 1) - 1, observation.axial_moment
     assert moment is not None and candidate.curve is not None
-    straight = observation.axial_columns()[:, :, i]
-    bent = 1 / np.sqrt(1 + candidate.curve * moment[:, i] ** 2)
-    return np.stack([straight, straight * bent[:, None]], axis=-1)
+    linear_part = observation.axial_columns()[:, :, i]
+    softened = 1 / np.sqrt(1 + candidate.curve * moment[:, i] ** 2)
+    return np.stack([linear_part, linear_part * softened[:, None]], axis=-1)
 
 
 def joint_quantity(observation: Observation, i: int) -> str:

@@ -14,7 +14,7 @@ from gapbridge.core.arrays import Array
 from gapbridge.core.diagnosis.criteria import MIN_DELAY_SCATTER, MIN_DELAYS
 from gapbridge.core.diagnosis.observation import Observation
 from gapbridge.core.diagnosis.selection.candidate import Candidate, named_columns
-from gapbridge.core.diagnosis.selection.problem import CandidateFit, SampleSpace, fit
+from gapbridge.core.diagnosis.selection.sample_space import CandidateFit, SampleSpace, fit
 from gapbridge.core.effects import CATALOGUE, Term
 from gapbridge.core.estimation.robust import scale_of
 

@@ -30,7 +30,7 @@ from gapbridge.core.diagnosis.criteria import (
 )
 from gapbridge.core.diagnosis.selection.candidate import Candidate
 from gapbridge.core.diagnosis.selection.local_search import pruned
-from gapbridge.core.diagnosis.selection.problem import CandidateFit, SampleSpace, fit
+from gapbridge.core.diagnosis.selection.sample_space import CandidateFit, SampleSpace, fit
 from gapbridge.core.diagnosis.selection.search import part, screened_search
 from gapbridge.core.estimation.geometry import ANGLE, LENGTH, TIMES_MACHINED
 from gapbridge.core.estimation.least_squares import solve
@@ -124,10 +124,10 @@ class Links:
 
     def whitened(self, columns: Array) -> Array:
         """Return columns (m, ...) whitened by the links' covariance."""
-        less = 1 - 1 / np.sqrt(1 + self.spread**2)
+        shrinkage = 1 - 1 / np.sqrt(1 + self.spread**2)
         along = self.directions.T @ columns
-        taken = self.directions @ (less * along.T).T
-        return np.subtract(columns, taken, out=taken)  # one copy of many columns, not two
+        part = self.directions @ (shrinkage * along.T).T
+        return np.subtract(columns, part, out=part)  # one copy of many columns, not two
 
     def whitened_space(self, space: SampleSpace, block: Iterable[int]) -> SampleSpace:
         """Return the space whitened by the links; their candidates ``block`` are excluded there."""
@@ -159,23 +159,21 @@ def with_links(
     sigma, links, others, score = block.sigma, block.links, block.others, block.score
     families = {c.family for c in space.candidates if c.named}
     tries = 2 * float(np.log(len(families))) + ACCUSATION_PENALTY
-    kin = [c for c in best.chosen if _geometric(space.candidates[c])]
-    if len(kin) < MIN_GEOMETRIC_CAUSES and score + tries >= best.score:
+    geometric = [c for c in best.chosen if _geometric(space.candidates[c])]
+    if len(geometric) < MIN_GEOMETRIC_CAUSES and score + tries >= best.score:
         return space, best, {}
     start = sorted({*base, *best.chosen} - set(sigma))
     start = [c for c in start if space.candidates[c].named]
     with_block = screened_search(
         space, base=start, transform=lambda p: links.whitened_space(p, block.members(p))
     )
-    search_space = links.whitened_space(space, sigma)
+    whitened = links.whitened_space(space, sigma)
     # the search may miss the optimum: the set found without the links is tried with them too
-    with_block = min(
-        [with_block, pruned(search_space, fit(search_space, others))], key=lambda f: f.score
-    )
+    with_block = min([with_block, pruned(whitened, fit(whitened, others))], key=lambda f: f.score)
     if with_block.score + links.penalty + tries < best.score:
         if block.members is flexibility_candidates:
             return space, _significant(space, (*with_block.chosen, *sigma), set(sigma)), {}
-        return search_space, with_block, sigma
+        return whitened, with_block, sigma
     return space, best, {}
 
 
@@ -210,9 +208,8 @@ class _Block:
         others = [c for c in best.chosen if c not in block]
         sigma = prior(space, block, others)
         links = links_of(space, sigma)
-        return cls(
-            members, others, sigma, links, _score_with_links(space, others, links) + links.penalty
-        )
+        score = _score_with_links(space, others, links) + links.penalty
+        return cls(members, others, sigma, links, score)
 
 
 def _block_choices(space: SampleSpace, best: CandidateFit) -> list[Members]:
@@ -234,10 +231,8 @@ def _block_choices(space: SampleSpace, best: CandidateFit) -> list[Members]:
 
 def _few_joints(space: SampleSpace, best: CandidateFit, block: Sequence[int]) -> bool:
     """Return whether a set has candidates of a block at several joints."""
-    return (
-        len({space.candidates[c].site.joint for c in best.chosen if c in block})
-        >= MIN_JOINTS_FOR_BLOCK
-    )
+    joints = {space.candidates[c].site.joint for c in best.chosen if c in block}
+    return len(joints) >= MIN_JOINTS_FOR_BLOCK
 
 
 def _geometric(candidate: Candidate) -> bool:

@@ -5,8 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from gapbridge.core.diagnosis.criteria import FAMILY_PENALTY
-from gapbridge.core.diagnosis.selection.forward import additions, forward_step, joining, projected
-from gapbridge.core.diagnosis.selection.problem import CandidateFit, SampleSpace, fit
+from gapbridge.core.diagnosis.selection.forward_selection import (
+    additions,
+    forward_step,
+    joining,
+    projected,
+)
+from gapbridge.core.diagnosis.selection.sample_space import CandidateFit, SampleSpace, fit
 from gapbridge.core.estimation.least_squares import inverse, sigmas_square
 
 MAX_MERGED = 9  # terms up to which every pair may be replaced by one

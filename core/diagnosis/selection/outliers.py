@@ -15,9 +15,9 @@ from gapbridge.core.diagnosis.criteria import (
     MAX_UNPREDICTED_SHARE,
 )
 from gapbridge.core.diagnosis.selection.candidate import Candidate
-from gapbridge.core.diagnosis.selection.forward import joining
+from gapbridge.core.diagnosis.selection.forward_selection import joining
 from gapbridge.core.diagnosis.selection.noise import estimate_noise
-from gapbridge.core.diagnosis.selection.problem import CandidateFit, SampleSpace, fit
+from gapbridge.core.diagnosis.selection.sample_space import CandidateFit, SampleSpace, fit
 from gapbridge.core.diagnosis.selection.state import SelectionState, UnprojectedRows, sample_space
 from gapbridge.core.effects import Term
 from gapbridge.core.estimation.least_squares import solve

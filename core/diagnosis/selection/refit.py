@@ -14,7 +14,7 @@ from gapbridge.core.arrays import Array
 from gapbridge.core.diagnosis.criteria import MIN_SIGMAS, PRIOR_REACH
 from gapbridge.core.diagnosis.selection.candidate import Candidate, jacobian
 from gapbridge.core.diagnosis.selection.delay_columns import shrunk_to_common_delay
-from gapbridge.core.diagnosis.selection.problem import CandidateFit, SampleSpace
+from gapbridge.core.diagnosis.selection.sample_space import CandidateFit, SampleSpace
 from gapbridge.core.diagnosis.selection.state import SelectionState, flat
 from gapbridge.core.effects import CATALOGUE, Term
 from gapbridge.core.errors import EquilibriumError, InputError
@@ -65,42 +65,42 @@ def refit(
     wider than those of white noise, because an unknown effect differs among regions.
     """
     index = (*(c for c in linear_fit.chosen if space.candidates[c].named), *links)
-    freed = [with_free_shape(state.arm, space.candidates[c]) for c in index]
-    usual = [links.get(c, PRIOR_REACH * k.scales) for c, k in zip(index, freed, strict=True)]
+    fitted = [with_free_shape(state.arm, space.candidates[c]) for c in index]
+    prior_sigma = [links.get(c, PRIOR_REACH * k.scales) for c, k in zip(index, fitted, strict=True)]
     sigma = [links.get(c, np.inf) for c in index]
     extra = space.columns([c for c in linear_fit.chosen if not space.candidates[c].named])
     if unnamed_part is not None:
         extra = np.hstack([extra, unnamed_part.columns])
-    x = _start_values(state, freed, _linear_values(space, linear_fit, freed))
+    x = _start_values(state, fitted, _linear_values(space, linear_fit, fitted))
     for _ in range(REFITS):
-        rows = _linearised(state, freed, x, extra, usual, unnamed_part)
-        step = _step(*rows.with_prior(), rows.unit(), freed, x)
+        rows = _linearised(state, fitted, x, extra, prior_sigma, unnamed_part)
+        step = _step(*rows.with_prior(), rows.unit(), fitted, x)
         parts = np.split(step, np.cumsum([len(v) for v in x]))[: len(x)]
-        share = _step_share(state, freed, x, parts, sigma, rows.A)
-        x = [_within(c, v + share * part) for c, v, part in zip(freed, x, parts, strict=True)]
-        state = _frame_moved(state, extra, _terms(freed, x))
-        if _largest_step(freed, parts) < CONVERGED:
+        share = _step_share(state, fitted, x, parts, sigma, rows.A)
+        x = [_within(c, v + share * part) for c, v, part in zip(fitted, x, parts, strict=True)]
+        state = _frame_moved(state, extra, _terms(fitted, x))
+        if _largest_step(fitted, parts) < CONVERGED:
             break
     covariance = _covariances(
         *rows.with_prior(), rows.variance(step, space.floor), [len(v) for v in x],
         None if unnamed_part is None or not len(index) else unnamed_part.region,
-        _uncertain(state, _terms(freed, x), len(rows.b) + len(rows.prior_target)),
+        _uncertain(state, _terms(fitted, x), len(rows.b) + len(rows.prior_target)),
     )  # fmt: skip
-    x, covariance = _as_one_delay(freed, x, covariance)
-    terms = _terms(freed, x)
+    x, covariance = _as_one_delay(fitted, x, covariance)
+    terms = _terms(fitted, x)
     gap = state.observation.measured - state.observation.predict(terms)
     if state.observation.nuisance.shape[2]:
         gap = gap - state.observation.nuisance @ _nuisance_step(extra, gap, state)
     return state, terms, index, tuple(covariance), gap
 
 
-def _terms(freed: list[Candidate], x: list[Array]) -> tuple[Term, ...]:
+def _terms(fitted: list[Candidate], x: list[Array]) -> tuple[Term, ...]:
     """Return the terms of candidates at the values ``x`` (d,) of each."""
-    return tuple(c.term(v) for c, v in zip(freed, x, strict=True))
+    return tuple(c.term(v) for c, v in zip(fitted, x, strict=True))
 
 
 def _linear_values(
-    space: SampleSpace, linear_fit: CandidateFit, freed: list[Candidate]
+    space: SampleSpace, linear_fit: CandidateFit, fitted: list[Candidate]
 ) -> list[Array]:
     """Return the values (d,) of a linear fit's named terms, and nominal values of the links."""
     x = [
@@ -108,19 +108,19 @@ def _linear_values(
         for c, v in zip(linear_fit.chosen, linear_fit.values, strict=True)
         if space.candidates[c].named
     ]
-    x += [np.zeros(len(c.parameters)) for c in freed[len(x) :]]
-    return [v[: len(c.parameters)] for c, v in zip(freed, x, strict=True)]
+    x += [np.zeros(len(c.parameters)) for c in fitted[len(x) :]]
+    return [v[: len(c.parameters)] for c, v in zip(fitted, x, strict=True)]
 
 
-def _start_values(state: SelectionState, freed: list[Candidate], x: list[Array]) -> list[Array]:
+def _start_values(state: SelectionState, fitted: list[Candidate], x: list[Array]) -> list[Array]:
     """Return start values (d,) of each term: nominal ones if the linear ones have no equilibrium.
 
     With the linear values of flexibilities the arm might buckle under its load.
     """
     try:
-        state.observation.predict(_terms(freed, x))
+        state.observation.predict(_terms(fitted, x))
     except EquilibriumError:
-        return [_within(c, np.zeros(len(v))) for c, v in zip(freed, x, strict=True)]
+        return [_within(c, np.zeros(len(v))) for c, v in zip(fitted, x, strict=True)]
     return x
 
 
@@ -150,19 +150,19 @@ class _Linearised:
 
 
 def _linearised(
-    state: SelectionState, freed: list[Candidate], x: list[Array], extra: Array,
-    usual: list[Array], unnamed_part: UnnamedPart | None,
+    state: SelectionState, fitted: list[Candidate], x: list[Array], extra: Array,
+    prior_sigma: list[Array], unnamed_part: UnnamedPart | None,
 ) -> _Linearised:  # fmt: skip
     """Return the regression at the values ``x``, with unnamed columns ``extra`` (m, e)."""
-    observation, terms = state.observation, _terms(freed, x)
+    observation, terms = state.observation, _terms(fitted, x)
     gap = observation.measured - observation.predict(terms)
     blocks = [
         flat(jacobian(observation, c, x[k], terms[:k] + terms[k + 1 :]), state)
-        for k, c in enumerate(freed)
+        for k, c in enumerate(fitted)
     ]
     nuisance = flat(observation.nuisance, state)
     A = np.hstack([*blocks, extra, nuisance])
-    prior, prior_target = _prior_rows(usual, x, A.shape[1], unnamed_part, nuisance.shape[1])
+    prior, prior_target = _prior_rows(prior_sigma, x, A.shape[1], unnamed_part, nuisance.shape[1])
     return _Linearised(A, flat(gap[..., None], state)[:, 0], prior, prior_target)
 
 
@@ -175,9 +175,9 @@ def _frame_moved(state: SelectionState, extra: Array, terms: tuple[Term, ...]) -
     return replace(state, observation=observation.rebased(_nuisance_step(extra, gap, state), terms))
 
 
-def _largest_step(freed: list[Candidate], parts: list[Array]) -> float:
+def _largest_step(fitted: list[Candidate], parts: list[Array]) -> float:
     """Return the largest component of a step, in usual sizes of the parameters."""
-    each = (float(np.abs(part / c.scales).max()) for c, part in zip(freed, parts, strict=True))
+    each = (float(np.abs(part / c.scales).max()) for c, part in zip(fitted, parts, strict=True))
     return max(each, default=0.0)
 
 
@@ -192,31 +192,30 @@ class ReducedRows:
 
 
 def single_step(
-    rows: ReducedRows, freed: list[Candidate], x: list[Array], floor: float
+    rows: ReducedRows, fitted: list[Candidate], x: list[Array], floor: float
 ) -> tuple[list[Array], list[Array]]:
     """Return values (d,) and covariances (d, d) of terms after one Gauss-Newton step from ``x``."""
-    prior, prior_target = _prior_rows(
-        [PRIOR_REACH * c.scales for c in freed], x, rows.A.shape[1], None, 0
-    )
-    whole, right = np.vstack([rows.A, prior]), np.concatenate([rows.b, prior_target])
+    prior_sigma = [PRIOR_REACH * c.scales for c in fitted]
+    prior, prior_target = _prior_rows(prior_sigma, x, rows.A.shape[1], None, 0)
+    whole, target = np.vstack([rows.A, prior]), np.concatenate([rows.b, prior_target])
     unit = 1 / np.sqrt(np.einsum("ij,ij->j", whole, whole))
-    step = _step(whole, right, unit, freed, x)
+    step = _step(whole, target, unit, fitted, x)
     sizes = [len(v) for v in x]
     values = [
         _within(c, v + part)
-        for c, v, part in zip(freed, x, np.split(step, np.cumsum(sizes)[:-1]), strict=True)
+        for c, v, part in zip(fitted, x, np.split(step, np.cumsum(sizes)[:-1]), strict=True)
     ]
     residual_ss = float(np.sum((rows.b - rows.A @ step) ** 2))
     variance = max(residual_ss / max(rows.count - rows.A.shape[1], 1), floor)
-    spread = _covariances(whole, right, variance, sizes, rows.region)
-    return _as_one_delay(freed, values, spread)
+    spread = _covariances(whole, target, variance, sizes, rows.region)
+    return _as_one_delay(fitted, values, spread)
 
 
 def _as_one_delay(
-    freed: list[Candidate], x: list[Array], covariance: list[Array]
+    fitted: list[Candidate], x: list[Array], covariance: list[Array]
 ) -> tuple[list[Array], list[Array]]:
     """Return values (d,) and covariances (d, d), delays shrunk to the common delay."""
-    late = [k for k, c in enumerate(freed) if c.effect.delays]
+    late = [k for k, c in enumerate(fitted) if c.effect.delays]
     variances = np.array([covariance[k][0, 0] for k in late])
     values, variances = shrunk_to_common_delay(np.array([x[k][0] for k in late]), variances)
     x, covariance = list(x), list(covariance)
@@ -226,20 +225,20 @@ def _as_one_delay(
 
 
 def _covariances(
-    rows: Array, right: Array, variance: float, sizes: list[int],
-    region: NDArray[np.int64] | None, unsure: Array | None = None,
+    rows: Array, target: Array, variance: float, sizes: list[int],
+    region: NDArray[np.int64] | None, model_sigmas: Array | None = None,
 ) -> list[Array]:  # fmt: skip
     """Return the covariance (d, d) of each term from the rows (m, p) of the regression.
 
-    ``unsure`` (m, r) are 1-sigma changes of the rows by the model's own fitted parameters.
+    ``model_sigmas`` (m, r) are 1-sigma changes of the rows by the model's own fitted parameters.
     """
     white_noise = inverse(rows.T @ rows)
     spread = white_noise * variance
     if region is not None:
-        spread = _cluster_covariance(spread, rows, right, region)
-    if unsure is not None:
-        moved = white_noise @ (rows.T @ unsure)
-        spread = spread + moved @ moved.T
+        spread = _cluster_covariance(spread, rows, target, region)
+    if model_sigmas is not None:
+        change = white_noise @ (rows.T @ model_sigmas)
+        spread = spread + change @ change.T
     begin = np.concatenate([[0], np.cumsum(sizes)]).astype(int)
     return [spread[i:j, i:j] for i, j in itertools.pairwise(begin)]
 
@@ -262,8 +261,8 @@ def _cluster_covariance(white_noise: Array, A: Array, b: Array, region: NDArray[
     from scipy.special import ndtri, stdtrit  # slow to import
 
     # few regions: normal distribution with the 95 % interval of Student's t
-    few = float(stdtrit(max(len(without) - 1, 1), 0.975) / ndtri(0.975))
-    return _no_narrower(few**2 * jackknife(without), white_noise)
+    factor = float(stdtrit(max(len(without) - 1, 1), 0.975) / ndtri(0.975))
+    return _no_narrower(factor**2 * jackknife(without), white_noise)
 
 
 def _no_narrower(scatter: Array, white_noise: Array) -> Array:
@@ -275,8 +274,8 @@ def _no_narrower(scatter: Array, white_noise: Array) -> Array:
     root = np.where(root > 0, root, 1.0)
     inside = (V / root).T @ (scatter * np.outer(unit, unit)) @ (V / root)
     share, U = np.linalg.eigh(inside)
-    half = size[:, None] * ((V * root) @ U)
-    return np.asarray((half * np.maximum(share, 1.0)) @ half.T)
+    factor_matrix = size[:, None] * ((V * root) @ U)
+    return np.asarray((factor_matrix * np.maximum(share, 1.0)) @ factor_matrix.T)
 
 
 def worth(term: Term, spread: Array) -> float:
@@ -295,12 +294,12 @@ def worth(term: Term, spread: Array) -> float:
     return min(whole, single) / MIN_SIGMAS**2
 
 
-def _step(A: Array, b: Array, unit: Array, freed: list[Candidate], x: list[Array]) -> Array:
+def _step(A: Array, b: Array, unit: Array, fitted: list[Candidate], x: list[Array]) -> Array:
     """Return the Gauss-Newton step (k,) with parameters on a bound fixed that would leave it.
 
     A step that is clipped afterwards might not reduce the residual, and the fit would stop.
     """
-    parameters = [p for c in freed for p in c.parameters]
+    parameters = [p for c in fitted for p in c.parameters]
     now = np.concatenate([*x, np.zeros(0)])
     lower, upper = (np.array([getattr(p, end) for p in parameters]) for end in ("lower", "upper"))
     free = np.ones(len(unit), dtype=bool)
@@ -323,15 +322,19 @@ def _nuisance_step(extra: Array, gap: Array, state: SelectionState) -> Array:
 
 
 def _prior_rows(
-    usual: list[Array], x: list[Array], width: int, unnamed_part: UnnamedPart | None, nuisance: int
+    prior_sigma: list[Array],
+    x: list[Array],
+    width: int,
+    unnamed_part: UnnamedPart | None,
+    nuisance: int,
 ) -> tuple[Array, Array]:
     """Return the rows (k, width) and targets of the priors of parameters ``x``.
 
-    ``usual`` is 1 sigma of each from nominal. If wide, it only acts on combinations that the data
-    do not determine, as lengths along parallel axes. The prior of
-    ``unnamed_part``, whose columns are before the last ``nuisance`` ones, is appended.
+    ``prior_sigma`` is 1 sigma of each from nominal. If wide, it only acts on combinations that the
+    data do not determine, as lengths along parallel axes. The prior of ``unnamed_part``, whose
+    columns are before the last ``nuisance`` ones, is appended.
     """
-    size = np.concatenate([*usual, np.zeros(0)])
+    size = np.concatenate([*prior_sigma, np.zeros(0)])
     rows = np.zeros((len(size), width))
     rows[np.arange(len(size)), np.arange(len(size))] = 1 / size
     prior_target = -np.concatenate([*x, np.zeros(0)]) / size
@@ -345,22 +348,22 @@ def _prior_rows(
 
 
 def _step_share(
-    state: SelectionState, freed: list[Candidate], x: list[Array], parts: list[Array],
+    state: SelectionState, fitted: list[Candidate], x: list[Array], parts: list[Array],
     sigma: list[Array | float], A: Array,
 ) -> float:  # fmt: skip
     """Return the share of a Gauss-Newton step that does not increase the objective.
 
     ``sigma`` is the prior 1 sigma of each term's parameters; inf: none.
     """
-    if not freed:
+    if not fitted:
         return 1.0
     linear = A[:, sum(len(v) for v in x) :]  # smooth terms and nuisance, refitted for each trial
     Q = basis_of(linear)
 
     def objective(share: float) -> float:
-        trial = [_within(c, v + share * part) for c, v, part in zip(freed, x, parts, strict=True)]
+        trial = [_within(c, v + share * part) for c, v, part in zip(fitted, x, parts, strict=True)]
         try:
-            gap = state.observation.measured - state.observation.predict(_terms(freed, trial))
+            gap = state.observation.measured - state.observation.predict(_terms(fitted, trial))
         except InputError:
             return float("inf")
         r = projected_out(Q, flat(gap[..., None], state)[:, 0])

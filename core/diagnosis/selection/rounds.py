@@ -29,15 +29,14 @@ from gapbridge.core.diagnosis.selection.candidate import (
 from gapbridge.core.diagnosis.selection.delay_columns import exact_columns, one_delay
 from gapbridge.core.diagnosis.selection.geometry import links_of, with_links
 from gapbridge.core.diagnosis.selection.local_search import forward_selected, pruned
-from gapbridge.core.diagnosis.selection.moments import step_candidates
 from gapbridge.core.diagnosis.selection.noise import Noise, estimate_noise
 from gapbridge.core.diagnosis.selection.outliers import (
     mark_outliers,
     readmit_explained_outliers,
     revise_noise_and_outliers,
 )
-from gapbridge.core.diagnosis.selection.problem import CandidateFit, SampleSpace, fit
 from gapbridge.core.diagnosis.selection.refit import refit, worth
+from gapbridge.core.diagnosis.selection.sample_space import CandidateFit, SampleSpace, fit
 from gapbridge.core.diagnosis.selection.search import screened_search, weighted_by_residual
 from gapbridge.core.diagnosis.selection.selection import Selection
 from gapbridge.core.diagnosis.selection.smooth import Pair, smooth_candidates, unnamed
@@ -48,6 +47,7 @@ from gapbridge.core.diagnosis.selection.state import (
     flat,
     sample_space,
 )
+from gapbridge.core.diagnosis.selection.step_times import step_candidates
 from gapbridge.core.diagnosis.selection.stiffness_curves import with_straight_stiffness
 from gapbridge.core.effects import Site, Term
 from gapbridge.core.estimation.least_squares import basis_of, projected_out, solve
@@ -176,12 +176,11 @@ def _round(
 
 def _named_refit(result: _Round) -> _Round:
     """Return a round with its named terms refitted alone; the set keeps its unnamed functions."""
+    links, space = result.links, result.space
     state = replace(result.state, kept=result.fitted_samples, noise=result.fit_noise)
-    named_fit, best = _without_unnamed(result.search_space, result.best, result.state.observation)
+    named_fit, best = _without_unnamed(result.search_space, result.best, state.observation)
     while True:
-        state, terms, index, covariance, residual = refit(
-            state, result.space, named_fit, result.links
-        )
+        state, terms, index, covariance, residual = refit(state, space, named_fit, links)
         result = replace(
             result, state=state, best=best, terms=terms, index=index, covariance=covariance,
             residual=residual,
@@ -258,9 +257,8 @@ def _without_unnamed(
     search_space = space
     if observation.channel in ("tracking", "torque"):
         search_space = weighted_by_residual(space, named, observation.measured.shape[1])
-    named_fit = pruned(
-        search_space, forward_selected(search_space, fit(search_space, named), named_only=True)
-    ).chosen
+    grown = forward_selected(search_space, fit(search_space, named), named_only=True)
+    named_fit = pruned(search_space, grown).chosen
     others = (c for c in best.chosen if c not in named)
     return fit(space, named_fit), fit(space, (*named_fit, *others))
 

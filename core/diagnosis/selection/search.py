@@ -16,7 +16,12 @@ from numpy.typing import NDArray
 
 from gapbridge.core.diagnosis.criteria import LARGE_SAMPLE
 from gapbridge.core.diagnosis.selection.candidate import Candidate
-from gapbridge.core.diagnosis.selection.forward import DEPTH, beam_search, joining, projected
+from gapbridge.core.diagnosis.selection.forward_selection import (
+    DEPTH,
+    beam_search,
+    joining,
+    projected,
+)
 from gapbridge.core.diagnosis.selection.local_search import (
     forward_selected,
     improve,
@@ -24,7 +29,7 @@ from gapbridge.core.diagnosis.selection.local_search import (
     pruned,
     with_fewest_families,
 )
-from gapbridge.core.diagnosis.selection.problem import (
+from gapbridge.core.diagnosis.selection.sample_space import (
     USUAL_ORDERS,
     CandidateFit,
     SampleSpace,
@@ -43,7 +48,7 @@ def screened_search(
 ) -> CandidateFit:  # fmt: skip
     """Return the best set among the candidates worth a search, in the indices of ``space``.
 
-    ``requires`` changes the part of the space that is searched (links that are noise in it).
+    ``transform`` is applied to the space of these candidates (whitening by links).
     """
     keep = screened(space, base)
     place = {int(c): i for i, c in enumerate(keep)}

@@ -16,8 +16,8 @@ from gapbridge.core.diagnosis.observation import Observation
 from gapbridge.core.diagnosis.selection.geometry import Links, link_candidates, links_of, prior
 from gapbridge.core.diagnosis.selection.local_search import pruned
 from gapbridge.core.diagnosis.selection.noise import Noise
-from gapbridge.core.diagnosis.selection.problem import CandidateFit, SampleSpace, fit
 from gapbridge.core.diagnosis.selection.refit import UnnamedPart, refit
+from gapbridge.core.diagnosis.selection.sample_space import CandidateFit, SampleSpace, fit
 from gapbridge.core.diagnosis.selection.state import SelectionState, UnprojectedRows
 from gapbridge.core.effects import Term
 from gapbridge.core.estimation.least_squares import projected_out, solve
@@ -84,9 +84,8 @@ class Selection:
     @cached_property
     def working(self) -> SampleSpace:
         """Return the space in which ``best`` was found: whitened by links that are a cause."""
-        return (
-            self.space if self.links is None else self.links.whitened_space(self.space, self.block)
-        )
+        links = self.links
+        return self.space if links is None else links.whitened_space(self.space, self.block)
 
     def rows_of(self, columns: Array) -> Array:
         """Return columns (N, k, d) as rows (m, d) of the working space."""
@@ -128,7 +127,7 @@ class Selection:
         A value several times the machining tolerance of all others has to be as significant as a
         single cause.
         """
-        doubtful = {}
+        implausible = {}
         for p in positions:
             c = self.term_index[p]
             if c in self.prior and self.observation.channel == "position":
@@ -136,8 +135,8 @@ class Selection:
                 unsure = size < MIN_SIGMAS_WITH_UNNAMED * np.sqrt(np.diag(self.covariance[p]))
                 far = (size > MIN_SIGMAS * self.prior[c]) & unsure
                 if far.any():
-                    doubtful[c] = far
-        return doubtful
+                    implausible[c] = far
+        return implausible
 
     def with_nominal(self, numbers: Mapping[int, Mask]) -> Selection:
         """Return the selection with further link parameters (d,) kept nominal."""
@@ -178,10 +177,8 @@ class Selection:
     def used(self) -> float:
         """Return the number of fitted parameters, nuisance included, effective ones of links."""
         links = 0.0 if self.links is None else self.links.used
-        return (
-            float(self.unprojected.nuisance.shape[1] + sum(len(v) for v in self.best.values))
-            + links
-        )
+        linear = self.unprojected.nuisance.shape[1] + sum(len(v) for v in self.best.values)
+        return float(linear) + links
 
     @property
     def groups(self) -> NDArray[np.int64]:

@@ -14,7 +14,7 @@ from gapbridge.core.diagnosis.criteria import ANY_CONSTANT_PENALTY, KNOWN_SHARE,
 from gapbridge.core.diagnosis.observation import Observation
 from gapbridge.core.diagnosis.selection.candidate import Candidate
 from gapbridge.core.diagnosis.selection.noise import Noise
-from gapbridge.core.diagnosis.selection.problem import AT_ONCE, SampleSpace, penalties
+from gapbridge.core.diagnosis.selection.sample_space import AT_ONCE, SampleSpace, penalties
 from gapbridge.core.effects import CATALOGUE, Term
 
 MIN_REMAINING = 1e-7  # share of a column outside the nuisance; below it is rounding

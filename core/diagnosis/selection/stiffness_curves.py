@@ -8,7 +8,7 @@ import numpy as np
 
 from gapbridge.core.arrays import Array
 from gapbridge.core.diagnosis.criteria import CURVATURE_GAIN
-from gapbridge.core.diagnosis.selection.problem import SampleSpace
+from gapbridge.core.diagnosis.selection.sample_space import SampleSpace
 from gapbridge.core.effects import CATALOGUE, Term
 from gapbridge.core.estimation.least_squares import basis_of, projected_out
 

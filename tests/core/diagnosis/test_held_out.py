@@ -84,7 +84,7 @@ def test_held_out_figures_are_those_of_a_cross_validation_by_hand(selection):
     assert held.rms(chosen) == pytest.approx(small.FLOOR, rel=0.2)
 
 
-def test_a_needless_cause_does_not_shrink_the_held_out_gap(selection):
+def test_an_unnecessary_cause_does_not_reduce_the_held_out_gap(selection):
     space, chosen = selection.space, selection.best.chosen
     needless = next(c for c, k in enumerate(space.candidates) if k.family == "link_geometry")
     held = HeldOut(selection)
@@ -110,7 +110,7 @@ def test_a_shrink_is_one_less_the_ratio_of_its_gaps_and_repeats(selection):
 
 
 @pytest.mark.parametrize("twins", [False, True])
-def test_the_interval_of_a_shrink_is_that_of_poses_drawn_anew(selection, twins):
+def test_the_interval_of_a_shrink_is_a_bootstrap_over_poses(selection, twins):
     """95 % over draws of whole conditions, done here the slow way."""
     held = HeldOut(paired(selection) if twins else selection)
     chosen = selection.best.chosen
@@ -145,7 +145,7 @@ def test_two_conditions_are_needed(selection):
     assert not HeldOut(one).possible
 
 
-def test_a_number_that_moves_nothing_takes_nothing_from_the_others(selection):
+def test_a_parameter_without_effect_does_not_change_the_others(selection):
     """Of a link kept near nominal that the samples do not show only its prior is there."""
     chosen = list(selection.best.chosen)
     dead = next(c for c in range(len(selection.space.candidates)) if c not in chosen)

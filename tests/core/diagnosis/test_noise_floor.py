@@ -35,7 +35,7 @@ def repeated(effect: str, times: int = 3):
     return small.log_of(session, small.readings(small.REAL[effect], session, 3))
 
 
-def test_repeats_measure_the_floor_beside_an_unknown_that_is_thirty_times_as_large() -> None:
+def test_repeats_measure_the_floor_under_an_unknown_thirty_times_as_large() -> None:
     metrology = Metrology(registered=True, sigma=small.SIGMA)
     (channel,) = diagnose(small.model_of(), repeated("cross_coupling"), metrology).channels
     assert channel.noise_floor_source == "repeats"
@@ -43,7 +43,7 @@ def test_repeats_measure_the_floor_beside_an_unknown_that_is_thirty_times_as_lar
     assert channel.gap_rms > 4 * small.FLOOR
 
 
-def test_without_repeats_what_is_left_is_no_measure_of_noise() -> None:
+def test_without_repeats_a_structured_residual_is_no_measure_of_noise() -> None:
     (channel,) = small.diagnosed("cross_coupling").channels
     assert channel.structured
     assert (channel.noise_floor_rms, channel.noise_floor_source) == (small.SIGMA, "stated")

@@ -56,20 +56,18 @@ def step_candidates(
             if others != constant:  # with a larger step still in the gap its times would win
                 second = _gains(state, whole_step, _gap(state, others), basis)
                 rows = list(dict.fromkeys([*rows, *_best(second, times)]))
-            times_ = dict.fromkeys(
-                [*(_time_before(times, k) for k in rows), *(t.values[-1] for t in present)]
-            )
-            tried = max(round(len(times) / max(len(times_), 1)), 1)
-            for time_ in times_:
-                candidate = _candidate(state.arm, effect, site, time_, tried)
-                after = (times > time_).astype(float)
+            steps = [*(_time_before(times, k) for k in rows), *(t.values[-1] for t in present)]
+            tried = max(round(len(times) / max(len({*steps}), 1)), 1)
+            for step in dict.fromkeys(steps):
+                candidate = _candidate(state.arm, effect, site, step, tried)
+                after = (times > step).astype(float)
                 pairs.append((candidate, whole_step * after[:, None, None]))
     return pairs
 
 
-def _candidate(arm: Arm, effect: Effect, site: Site, time_: float, tried: int) -> Candidate:
+def _candidate(arm: Arm, effect: Effect, site: Site, step: float, tried: int) -> Candidate:
     sizes = effect.parameters(arm, site)[:-1]
-    fixed = (None,) * len(sizes) + (time_,)
+    fixed = (None,) * len(sizes) + (step,)
     return Candidate(effect.identifier, site, sizes, fixed, tried=tried)
 
 

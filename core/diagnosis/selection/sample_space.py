@@ -133,10 +133,10 @@ def gains(space: SampleSpace, r: Array, along: Array | None = None) -> tuple[Arr
     gain, sign = np.zeros(len(space.candidates)), np.ones(len(space.candidates))
     for blocks in space.blocks:
         products = (g[blocks.columns] * blocks.unit).T
-        taken = within[:, blocks.columns] * blocks.unit
+        inside = within[:, blocks.columns] * blocks.unit
         d, n = products.shape
         whole = np.zeros((d + 1, d + 1, n))  # products of the columns and, last, of r
-        np.subtract(blocks.gram, np.einsum("pci,pcj->ijc", taken, taken), out=whole[:d, :d])
+        np.subtract(blocks.gram, np.einsum("pci,pcj->ijc", inside, inside), out=whole[:d, :d])
         whole[d, :d] = whole[:d, d] = products
         gain[blocks.index] = -_eliminated(whole, RANK if d == 1 else DEPENDENT)
         if d == 1:
@@ -191,9 +191,9 @@ def _plausible(candidate: Candidate, x: Array, s: Array) -> bool:
         lower = -np.inf if candidate.curve is not None else parameter.lower
         if value < lower - OUT_OF_BOUNDS_SIGMAS * deviation or value > parameter.upper:
             return False
-        most = (
+        limit = (
             MAX_SOFTENING if parameter.name == "softening" else MAX_TIMES_USUAL
         ) * parameter.scale
-        if parameter.unit not in SENSOR_UNITS and abs(value) - TOO_LARGE_SIGMAS * deviation > most:
+        if parameter.unit not in SENSOR_UNITS and abs(value) - TOO_LARGE_SIGMAS * deviation > limit:
             return False
     return True

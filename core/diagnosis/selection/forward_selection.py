@@ -9,7 +9,7 @@ import numpy as np
 
 from gapbridge.core.arrays import Array
 from gapbridge.core.diagnosis.criteria import MAX_LINES, MAX_SMOOTH_TERMS, MIN_ORDERS_APART
-from gapbridge.core.diagnosis.selection.problem import CandidateFit, SampleSpace, fit, gains
+from gapbridge.core.diagnosis.selection.sample_space import CandidateFit, SampleSpace, fit, gains
 from gapbridge.core.estimation.least_squares import basis_of, projected_out
 
 BEAM = 6

@@ -64,14 +64,14 @@ def accused_of(plant, error):
     return {c.effect for c in channel.causes}, channel
 
 
-def test_the_mean_of_an_unknown_wrench_is_no_bias_of_the_sensor(plant):
+def test_the_mean_of_an_unknown_wrench_is_not_a_bias(plant):
     accused, channel = accused_of(plant, hose)
     assert accused == set()
     assert channel.structured
     assert "actual_q_4" in [name for name, _ in channel.depends_on[:3]]
 
 
-def test_a_bias_that_the_unknown_cannot_be_is_accused_beside_it(plant):
+def test_a_bias_outside_the_span_of_the_unknown_is_accused(plant):
     accused, channel = accused_of(plant, lambda q: hose(q) + 12 * WAY)
     assert accused == {"ft_bias"}
     (cause,) = channel.causes
@@ -86,9 +86,9 @@ def test_gain_and_turn_and_centre_wait_for_a_load(plant):
     def beside(mass, effect):
         log = wrench_log(plant, hose, declared=mass > 0)
         model = plant.model(mass)
-        seen = observe(model, log, Metrology())
+        observation = observe(model, log, Metrology())
         (own,) = [c for c in named_candidates(model.arm, "wrench") if c.family == effect]
-        return with_requirement(seen, own).requires
+        return with_requirement(observation, own).requires
 
     for effect in ("ft_gain", "ft_misalignment", "payload_cog"):
         assert (beside(0.0, effect), beside(2.0, effect)) == ("payload", "")
@@ -111,8 +111,8 @@ def linear(seed, shift):
     region = np.repeat(np.arange(24), 10)
     A = np.column_stack([np.ones(240), rng.normal(size=240)])
     b = A @ [1.0, 2.0] + rng.normal(size=240) + shift * rng.normal(size=24)[region]
-    left = b - A @ np.linalg.lstsq(A, b, rcond=None)[0]
-    white = np.linalg.inv(A.T @ A) * float(left @ left) / 238
+    residual = b - A @ np.linalg.lstsq(A, b, rcond=None)[0]
+    white = np.linalg.inv(A.T @ A) * float(residual @ residual) / 238
     return white, A, b, region
 
 
@@ -133,7 +133,7 @@ def test_intervals_hold_where_regions_differ():
     assert np.mean(np.abs(naive) < 1.96) < 0.8
 
 
-def test_rows_after_the_regions_are_a_prior_that_always_stays():
+def test_rows_of_the_prior_are_never_left_out():
     white, A, b, region = linear(0, 0.0)
     held = np.vstack([A, [1e6, 0.0]])
     spread = _cluster_covariance(white * 0, held, np.append(b, 1e6), region)
@@ -178,20 +178,20 @@ def test_links_that_close_no_gap_are_not_accused(effect):
     assert not found.block
 
 
-def test_a_tool_point_goes_with_the_links_where_it_helps_elsewhere(monkeypatch):
+def test_a_tool_point_is_accused_with_the_links_if_it_helps_in_new_regions(monkeypatch):
     session = small.session_of(0)
     off = np.array([2e-3, -1e-3, 3e-3])
     real = replace(small.NOMINAL, rows=STRETCHED, tool_position=small.TOOL + off)
     log = small.log_of(session, small.readings(real, session))
-    seen = diagnose(small.model_of(), log, Metrology(registered=True, sigma=small.SIGMA))
-    whole, _ = fallen(seen.channels[0].selection)
+    result = diagnose(small.model_of(), log, Metrology(registered=True, sigma=small.SIGMA))
+    whole, _ = fallen(result.channels[0].selection)
     own = whole.space.candidates
     point = [c for c, k in enumerate(own) if k.family == "tool_frame"]
     lines = [c for c, k in enumerate(own) if k.periodic][:1]
-    asked = []
+    requested = []
 
     def strengths(_, accused):  # beside an unknown that moves the tool its point is the least sure
-        asked.append(set(accused))
+        requested.append(set(accused))
         return np.array([0.0 if c in point else 0.5 + (len(accused) < 3) for c in accused])
 
     monkeypatch.setattr(value_stability._UnnamedFunctions, "strengths", strengths)
@@ -199,14 +199,14 @@ def test_a_tool_point_goes_with_the_links_where_it_helps_elsewhere(monkeypatch):
         value_stability._GapClosure, "needs_any", lambda *_: False
     )  # by their strengths alone
     zero = [c for c, k in enumerate(own) if k.family == "backlash"][:1]
-    stays, *_ = stable_effects(whole, [*point, *lines, *zero])
-    assert asked[1] > {*point}  # the others are judged with the point, not with its gap
-    assert {*stays} >= {*point}
+    kept, *_ = stable_effects(whole, [*point, *lines, *zero])
+    assert requested[1] > {*point}  # the others are judged with the point, not with its gap
+    assert {*kept} >= {*point}
     found, *_ = stable_effects(replace(whole, prior={}), point)
     assert found == []  # no links are a cause
 
 
-def test_links_are_sized_anew_beside_what_stays(links):
+def test_the_links_prior_is_estimated_again_for_the_remaining_terms(links):
     whole, _ = fallen(links)
     wrong = replace(whole, prior={c: 8 * own for c, own in whole.prior.items()})
     sized = wrong.with_prior_for(whole.best.chosen)
@@ -226,7 +226,7 @@ def test_links_are_sized_anew_beside_what_stays(links):
         ("transmission_error", 17.0, (2.0, 2.0), np.array([[1.0, 0.9], [0.9, 1.0]]), False),
     ],
 )
-def test_a_finding_has_a_number_that_is_sure(effect, order, values, spread, sure):
+def test_a_significant_term_has_a_significant_parameter(effect, order, values, spread, sure):
     assert (worth(Term(effect, Site(2, order), values), spread) >= 1) is sure
 
 
@@ -243,13 +243,13 @@ def beside_a_single_link():
     return replace(whole, prior={}), Judgement((one,), True, 0.0, (), {}, ())
 
 
-def test_all_links_and_zeros_stand_for_the_one_that_leaves_much(beside_a_single_link):
+def test_all_links_replace_a_single_one_that_leaves_a_large_residual(beside_a_single_link):
     alone, judgement = beside_a_single_link
     found, again = judge_geometry(alone, judgement, small.model_of().arm)
     assert {found.terms[p].effect for p in again.accused} == {"link_geometry", "joint_offset"}
 
 
-def test_a_link_beside_which_nothing_is_left_stays_the_only_one(beside_a_single_link):
+def test_a_single_link_that_closes_the_gap_is_kept(beside_a_single_link):
     alone, judgement = beside_a_single_link
     enough = replace(judgement, structured=False)
     assert judge_geometry(alone, enough, small.model_of().arm) == (alone, enough)
@@ -259,7 +259,7 @@ def test_a_value_far_below_its_usual_size_is_no_accusation():
     found = small.diagnosed("backlash").channels[0].selection
     (term,), (c,) = found.terms, found.term_index
     usual = found.space.candidates[c].parameters[0].scale
-    for size, stays in (
+    for size, kept in (
         (0.5 * NEGLIGIBLE_SIZE * usual, False),
         (2 * NEGLIGIBLE_SIZE * usual, True),
     ):
@@ -268,11 +268,11 @@ def test_a_value_far_below_its_usual_size_is_no_accusation():
             covariance=(np.array([[(size / 50) ** 2]]),),
         )  # fmt: skip
         judged = judge(small_one, HeldOut(found))
-        assert (len(judged.accused) == 1) is stays
-        assert stays or judged.withdrawn == ((0, Withdrawal(Check.USUAL_SIZE)),)
+        assert (len(judged.accused) == 1) is kept
+        assert kept or judged.withdrawn == ((0, Withdrawal(Check.USUAL_SIZE)),)
 
 
-def test_what_is_no_longer_sure_beside_the_unknown_is_taken_back():
+def test_a_term_not_significant_with_unnamed_functions_is_withdrawn():
     found = small.diagnosed("backlash").channels[0].selection
     judgement = judge(found, HeldOut(found))
     arm = small.model_of().arm
@@ -294,18 +294,20 @@ def test_every_member_that_waits_for_another_names_one_of_its_channel():
             assert set(effect.channels) & set(other.channels)
 
 
-def test_what_the_exact_refit_takes_back_gives_its_place_to_another(monkeypatch):
+def test_a_term_removed_by_the_refit_is_replaced_by_another(monkeypatch):
     """Without reversals play is an offset: where the one has no value, the other is found."""
     one_sided = small.session_of(3, Plan(poses=60, both_sides=False))
     real = small.turned(2, lambda s, q: np.full(len(q), -4.5e-4))
     log = small.log_of(one_sided, small.readings(real, one_sided, 3))
-    seen = observe_position(small.model_of(), log, Metrology(registered=True, sigma=small.SIGMA))
-    (first,) = rounds.select(seen, small.model_of()).terms
+    observation = observe_position(
+        small.model_of(), log, Metrology(registered=True, sigma=small.SIGMA)
+    )
+    (first,) = rounds.select(observation, small.model_of()).terms
 
     def worthless(term, spread):
         return 0.0 if term.effect == first.effect else worth(term, spread)
 
     monkeypatch.setattr(rounds, "worth", worthless)
-    (instead,) = rounds.select(seen, small.model_of()).terms
+    (instead,) = rounds.select(observation, small.model_of()).terms
     assert {first.effect, instead.effect} == {"joint_offset", "backlash"}
     assert instead.site.joint == 2

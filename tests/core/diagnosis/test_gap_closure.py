@@ -42,7 +42,7 @@ def test_two_that_close_the_gap_only_together_are_needed(closing):
     assert pair.needed == {0, 1}
 
 
-def test_what_others_do_as_well_is_not_needed_until_they_are_gone(closing):
+def test_an_effect_is_not_needed_while_others_close_the_gap(closing):
     small = np.full(4, 0.25)
     either = closing(
         dict.fromkeys([frozenset({0, 1}), frozenset({0, 2}), frozenset({0, 1, 2})], small)
@@ -79,14 +79,14 @@ class Searched:
 @pytest.fixture
 def two_searches(monkeypatch):
     """Return a maker of a first search whose line falls and a second one; and what they saw."""
-    asked = []
+    requested = []
 
     def made(closes, channel="position"):
         stays = Judgement((0,), True, 0.0, (), {}, ())
         falls = Judgement((), True, 0.0, (), {}, ((0, Withdrawal(Check.STABLE_VALUE)),))
 
         def select(observation, model, without, progress):
-            asked.append(without)
+            requested.append(without)
             return Searched("axial_compliance" if without else "transmission_error")
 
         def judge(found, held):
@@ -102,19 +102,19 @@ def two_searches(monkeypatch):
         }.items():  # fmt: skip
             monkeypatch.setattr(diagnosis, name, value)
         model = SimpleNamespace(arm=None)
-        found, judgement, fallen = diagnosis._search(
+        found, judgement, withdrawn = diagnosis._search(
             SimpleNamespace(channel=channel), model, (), None
         )
-        return found.terms[0].effect, judgement.accused, [c.effect for c in fallen]
+        return found.terms[0].effect, judgement.accused, [c.effect for c in withdrawn]
 
-    return made, asked
+    return made, requested
 
 
-def test_where_nothing_stays_a_second_search_goes_without_what_fell(two_searches):
+def test_without_a_cause_the_search_is_repeated_without_the_withdrawn_effects(two_searches):
     """Of an iiwa under three loads 0.92 mm were left in one draw of the poses in two, not 0.2."""
-    made, asked = two_searches
+    made, requested = two_searches
     assert made(closes=True) == ("axial_compliance", (0,), ["transmission_error"])
-    assert asked == [(), ("transmission_error",)]
+    assert requested == [(), ("transmission_error",)]
 
 
 def test_a_second_search_that_does_not_close_the_gap_counts_for_nothing(two_searches):
@@ -123,6 +123,6 @@ def test_a_second_search_that_does_not_close_the_gap_counts_for_nothing(two_sear
 
 
 def test_only_poses_are_searched_a_second_time(two_searches):
-    made, asked = two_searches
+    made, requested = two_searches
     assert made(closes=True, channel="torque") == ("transmission_error", (), [])
-    assert asked == [()]
+    assert requested == [()]

@@ -9,9 +9,9 @@ import pytest
 
 from gapbridge.bridge.document.findings import finding_text
 from gapbridge.core.arm import builtin_arm
+from gapbridge.core.diagnosis.all_rows import long_recording as blocks
+from gapbridge.core.diagnosis.all_rows.row_sums import rows_of
 from gapbridge.core.diagnosis.diagnosis import diagnose
-from gapbridge.core.diagnosis.every_row import long_recording as blocks
-from gapbridge.core.diagnosis.every_row.streamed import rows_of
 from gapbridge.core.dynamics import predict_torque, with_pieces
 from gapbridge.core.log.log import Log
 from gapbridge.core.model import Model
