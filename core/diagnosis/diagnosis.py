@@ -45,7 +45,7 @@ from gapbridge.core.diagnosis.judgement import (
     significant_alone,
     with_stand_ins,
 )
-from gapbridge.core.diagnosis.log_checks.missing_flexibility import softness_findings
+from gapbridge.core.diagnosis.log_checks.missing_flexibility import flexibility_findings
 from gapbridge.core.diagnosis.log_checks.units_and_clocks import check_units, findings
 from gapbridge.core.diagnosis.noise_floor import Floor, noise_floor, whiteness
 from gapbridge.core.diagnosis.observation import NotObservable, Observation, thinned
@@ -193,7 +193,7 @@ def _diagnose(
     for channel in channels:
         reported += [ChannelFinding(channel.channel, fact) for fact in _facts(channel, log)]
         if simulated is None and len(flexibilities) == 2 and _gap_unexplained(channel):
-            reported += softness_findings(model, log, metrology)
+            reported += flexibility_findings(model, log, metrology)
     terms = _model_terms(channels)
     if not log.one_clock:
         terms = [_slip_applied(term, log) for term in terms]

@@ -63,7 +63,7 @@ def noise_floor(selection: Selection, structured: bool) -> Floor:
         each = np.einsum("nij,nij->ni", covariance, covariance)[:, :in_unit]
         estimated = float(np.mean(each))
         residual = selection.residual[selection.kept][:, :in_unit]
-        if len(residual) >= MIN_SAMPLES_FOR_RESIDUAL_RMS:  # the estimate rests on fewer rows
+        if len(residual) >= MIN_SAMPLES_FOR_RESIDUAL_RMS:  # noise was estimated from fewer rows
             freedom_left = max(residual.size - selection.used, 1)
             estimated = max(float(np.sum(residual**2)) / freedom_left, observation.sigma**2)
         return Floor(float(np.sqrt(estimated)), "residual")

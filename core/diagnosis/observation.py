@@ -12,7 +12,7 @@ from gapbridge.core.arrays import Array
 from gapbridge.core.effects import Term
 
 HELD_TORQUE = "held_torque"  # Nm, static torque of a joint: a quantity that is no column of the log
-Rivals = tuple[tuple[str, Array], ...]
+UnnamedColumns = tuple[tuple[str, Array], ...]
 Predict = Callable[[Sequence[Term]], Array]
 
 
@@ -46,7 +46,7 @@ class Observation:
     rows: NDArray[np.int64]  # (N,) row of each sample in the log
     axes: tuple[str, ...]  # name of each coordinate
     joint_columns: Array | None = None  # (N, k, n) d prediction / d joint angle
-    unnamed: Callable[[], Rivals] = tuple  # target, columns (N, k, d) of further rivals
+    unnamed: Callable[[], UnnamedColumns] = tuple  # target, columns (N, k, d) of unnamed causes
     friction: Array | None = None  # (N, k) sign of each joint's motion, in torque
     tool_axes: Array | None = None  # (N, 3, 3) axes of the TCP in base, as columns
     axial_moment: Array | None = None  # (N, n) Nm about each joint's axis
@@ -56,7 +56,9 @@ class Observation:
     rebase: Callable[[Array, Sequence[Term]], Observation] | None = None
     # 1 sigma (k,) from neighbouring samples of a recording
     instrument: Callable[[], Array | None] | None = None
-    fewer: Callable[[NDArray[np.int64]], Observation] | None = None  # of some samples only
+    subset: Callable[[NDArray[np.int64]], Observation] | None = (
+        None  # indices -> the observation of these samples
+    )
     # terms -> (N, k, r) 1-sigma changes of the prediction by the cell's fitted parameters
     uncertain: Callable[[Sequence[Term]], Array] | None = None
     session: NDArray[np.int64] | None = None  # (N,) session of each sample; None: there is one
@@ -82,8 +84,8 @@ def thinned(observation: Observation, most: int) -> Observation:
     if count <= most:
         return observation
     take = np.unique(np.linspace(0, count - 1, most).astype(int))
-    if observation.fewer is not None:
-        return observation.fewer(take)
+    if observation.subset is not None:
+        return observation.subset(take)
     whole, unnamed = observation.predict, observation.unnamed
 
     def some(columns: Array | None) -> Array | None:
@@ -126,7 +128,7 @@ def stacked(parts: Sequence[Observation], quantities: Mapping[str, Array]) -> Ob
     def predict(terms: Sequence[Term]) -> Array:
         return np.concatenate([part.predict(terms) for part in parts])
 
-    def unnamed() -> Rivals:
+    def unnamed() -> UnnamedColumns:
         each = [dict(part.unnamed()) for part in parts]
         return tuple(
             (target, np.concatenate([rivals[target] for rivals in each]))

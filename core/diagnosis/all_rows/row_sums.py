@@ -222,7 +222,7 @@ class Streamed:
             groups=np.repeat(np.minimum(stretch, STRETCHES - 1), each),
             rows=np.repeat(self.row, each),
             session=None if whole.session is None else np.repeat(self.session, each),
-            joint_columns=None, friction=None, times=None, fewer=None, unnamed=tuple,
+            joint_columns=None, friction=None, times=None, subset=None, unnamed=tuple,
         )  # fmt: skip
         whitener = np.broadcast_to(np.diag(self.inverse_sigma), (samples, k, k))
         return observation, replace(self.excerpt.noise, whitener=whitener)
@@ -254,7 +254,7 @@ class RowSums:
         self._own = own_coordinates(selection.observation)
         self._blocks: list[tuple[Array, float, int, int]] = []
         self._outliers: list[Index] = []
-        self._means = _Means(self._columns)
+        self._means = _BlockMeans(self._columns)
         self._samples, self._squares, self._largest = 0, np.zeros(len(self._inverse_sigma)), 0.0
 
     def add(self, recording: LongRecording, block: Block) -> None:
@@ -311,7 +311,7 @@ def _limit(selection: Selection, terms: Sequence[Term], inverse_sigma: Array) ->
     return max(OUTLIER * scale_of(residual), high)
 
 
-class _Means:
+class _BlockMeans:
     """Means of the Jacobian and the gap over every BLOCK seconds."""
 
     def __init__(self, columns: Columns) -> None:

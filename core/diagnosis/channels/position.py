@@ -12,7 +12,7 @@ from gapbridge.core.arrays import Array
 from gapbridge.core.diagnosis.channels.recording import varying
 from gapbridge.core.diagnosis.criteria import MIN_APPROACHES, MIN_FREEDOM_OF_SESSION
 from gapbridge.core.diagnosis.observation import NotObservable, Observation, Predict, stacked
-from gapbridge.core.diagnosis.selection.unnamed import unnamed_rivals
+from gapbridge.core.diagnosis.selection.unnamed import unnamed_causes
 from gapbridge.core.effects import Term
 from gapbridge.core.errors import LogError
 from gapbridge.core.estimation.compliance_fit import Data, fit_nuisances
@@ -160,7 +160,7 @@ def _observed(
         axes=("x", "y", "z", "rx", "ry", "rz")[:k],
         joint_columns=form.jacobian[:, :k],
         axial_moment=np.einsum("nij,nji->ni", form.moment, form.jacobian[:, 3:]),
-        unnamed=lambda: unnamed_rivals(model, q, loads, k),
+        unnamed=lambda: unnamed_causes(model, q, loads, k),
         tool_axes=poses.rotation,
         times=loads.time,
         rebase=rebase if nuisance.shape[2] else None,

@@ -79,7 +79,7 @@ def _behind(log: Log, channel: str, values: Array | None) -> Log:
 
 
 def _with_prediction(observation: Observation, values: Array) -> Observation:
-    channel_rows, rebase, fewer = observation.predict, observation.rebase, observation.fewer
+    channel_rows, rebase, subset = observation.predict, observation.rebase, observation.subset
     nominal = channel_rows(())
     base = nominal.copy()
     part = values[observation.rows]
@@ -93,5 +93,5 @@ def _with_prediction(observation: Observation, values: Array) -> Observation:
         if rebase is None
         else lambda step, terms: _with_prediction(rebase(step, terms), values)
     )
-    thinned = None if fewer is None else lambda take: _with_prediction(fewer(take), values)
-    return replace(observation, predict=predict, rebase=moved, fewer=thinned, uncertain=None)
+    thinned = None if subset is None else lambda take: _with_prediction(subset(take), values)
+    return replace(observation, predict=predict, rebase=moved, subset=thinned, uncertain=None)

@@ -17,7 +17,7 @@ from gapbridge.core.diagnosis.channels.recording import (
     subsampled,
 )
 from gapbridge.core.diagnosis.observation import NotObservable, Observation
-from gapbridge.core.diagnosis.selection.unnamed import unnamed_pulls
+from gapbridge.core.diagnosis.selection.unnamed import unnamed_loads
 from gapbridge.core.dynamics import predict_torque, with_pieces
 from gapbridge.core.effects import Term
 from gapbridge.core.log.log import Log
@@ -80,9 +80,9 @@ def _observed(
         joint_columns=own_joints(len(motion), n),
         order_in_time=motion.moving,
         friction=motion.direction if motion.moving else None,
-        unnamed=lambda: unnamed_pulls(model, motion, "torque"),
+        unnamed=lambda: unnamed_loads(model, motion, "torque"),
         instrument=lambda: instrument_noise(measured[whole.rows], whole),
-        fewer=lambda take: _observed(model, log, measured, whole, rows[take]),
+        subset=lambda take: _observed(model, log, measured, whole, rows[take]),
         session=session_of(log)[motion.rows] if log.session_names else None,
     )
 

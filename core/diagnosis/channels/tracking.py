@@ -68,7 +68,7 @@ def _observed(model: Model, log: Log, motion: Motion, rows: Index) -> Observatio
         joint_columns=own_joints(len(part), n),
         order_in_time=motion.moving,
         instrument=lambda: instrument_noise(motion.q - target, motion),
-        fewer=lambda take: _observed(model, log, motion, rows[take]),
+        subset=lambda take: _observed(model, log, motion, rows[take]),
         session=session_of(log)[part.rows] if log.session_names else None,
     )
 

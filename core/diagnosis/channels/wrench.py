@@ -17,7 +17,7 @@ from gapbridge.core.diagnosis.channels.recording import (
     subsampled,
 )
 from gapbridge.core.diagnosis.observation import NotObservable, Observation
-from gapbridge.core.diagnosis.selection.unnamed import unnamed_pulls
+from gapbridge.core.diagnosis.selection.unnamed import unnamed_loads
 from gapbridge.core.dynamics import predict_wrench, with_pieces
 from gapbridge.core.effects import Term
 from gapbridge.core.estimation.robust import scale_of
@@ -78,9 +78,9 @@ def _observed(
         rows=motion.rows,
         axes=AXES,
         order_in_time=motion.moving,
-        unnamed=lambda: unnamed_pulls(model, motion, "wrench"),
+        unnamed=lambda: unnamed_loads(model, motion, "wrench"),
         instrument=lambda: instrument_noise(measured[whole.rows], whole),
-        fewer=lambda take: _observed(model, log, measured, whole, rows[take]),
+        subset=lambda take: _observed(model, log, measured, whole, rows[take]),
         session=session_of(log)[motion.rows] if log.session_names else None,
     )
 

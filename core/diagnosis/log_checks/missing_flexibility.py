@@ -16,7 +16,7 @@ from gapbridge.core.metrology import Metrology
 from gapbridge.core.model import Model
 
 
-def softness_findings(model: Model, log: Log, metrology: Metrology) -> list[LogFinding]:
+def flexibility_findings(model: Model, log: Log, metrology: Metrology) -> list[LogFinding]:
     """Return a finding if the cell has no joint flexibilities and a fit of them halves the gap.
 
     The gap is that of held-out poses. Frame and tool point are fitted too, as in ``gapbridge fit``.

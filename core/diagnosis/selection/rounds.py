@@ -39,7 +39,7 @@ from gapbridge.core.diagnosis.selection.refit import refit, worth
 from gapbridge.core.diagnosis.selection.sample_space import CandidateFit, SampleSpace, fit
 from gapbridge.core.diagnosis.selection.search import screened_search, weighted_by_residual
 from gapbridge.core.diagnosis.selection.selection import Selection
-from gapbridge.core.diagnosis.selection.smooth import Pair, smooth_candidates, unnamed
+from gapbridge.core.diagnosis.selection.smooth import CandidateColumns, smooth_candidates, unnamed
 from gapbridge.core.diagnosis.selection.state import (
     SelectionState,
     UnprojectedRows,
@@ -136,7 +136,7 @@ class _Round:
 
 def _round(
     state: SelectionState, model: Model, base: tuple[Term, ...], withheld: Iterable[str],
-    excluded: set[tuple[str, Site]], smooth_pairs: list[Pair], first: bool,
+    excluded: set[tuple[str, Site]], smooth_pairs: list[CandidateColumns], first: bool,
 ) -> _Round:  # fmt: skip
     """Return a round: search at the model with ``base``, nonlinear refit, noise and outliers."""
     named = _named_candidates(state.observation, model, withheld, base)
@@ -195,9 +195,9 @@ def _named_refit(result: _Round) -> _Round:
 
 
 def _without_known_loads(
-    smooth: list[Pair], candidates: Sequence[Candidate], columns: Sequence[Array],
+    smooth: list[CandidateColumns], candidates: Sequence[Candidate], columns: Sequence[Array],
     base: Sequence[Term],
-) -> list[Pair]:  # fmt: skip
+) -> list[CandidateColumns]:  # fmt: skip
     """Return the smooth candidates, unnamed loads without the columns of loads in the model.
 
     A mass anywhere at the tool is a payload with a centre of gravity, a pull downwards a weight. In

@@ -13,7 +13,7 @@ from gapbridge.core.diagnosis.observation import HELD_TORQUE, Observation
 from gapbridge.core.diagnosis.selection.candidate import Candidate, joint_target, target_of
 from gapbridge.core.effects import Parameter, Site
 
-Pair = tuple[Candidate, Array]
+CandidateColumns = tuple[Candidate, Array]
 KNOTS = 5
 BUMPS = 24  # centres of local bumps over a joint's range
 CHANGES_FRICTION = ("timestamp", "payload")
@@ -21,9 +21,9 @@ SLOW = (0.03, 0.1, 0.3)  # shares of the largest speed over which friction may d
 STEPS = 23  # times of a possible jump
 
 
-def smooth_candidates(observation: Observation) -> list[Pair]:
+def smooth_candidates(observation: Observation) -> list[CandidateColumns]:
     """Return the smooth candidates of an observation with their columns (N, k, d)."""
-    pairs: list[Pair] = []
+    pairs: list[CandidateColumns] = []
     moved = targets(observation)
     for name, z in observation.quantities.items():
         shapes = [linear_basis(z)]
@@ -46,7 +46,7 @@ def smooth_candidates(observation: Observation) -> list[Pair]:
     return pairs
 
 
-def _springs(observation: Observation) -> list[Pair]:
+def _springs(observation: Observation) -> list[CandidateColumns]:
     """Return joint deflections as a function of the joint's own moment."""
     J, moment = observation.joint_columns, observation.axial_moment
     if J is None or moment is None:
@@ -58,7 +58,7 @@ def _springs(observation: Observation) -> list[Pair]:
     ]
 
 
-def _frictions(name: str, z: Array, observation: Observation) -> list[Pair]:
+def _frictions(name: str, z: Array, observation: Observation) -> list[CandidateColumns]:
     """Return friction that depends on time, load, or the joint's own temperature or speed."""
     if observation.friction is None:
         return []
@@ -99,12 +99,12 @@ def targets(observation: Observation) -> dict[str, Array]:
     return directions
 
 
-def _spread(quantity: str, target: str, directions: Array, shape: Array) -> Pair:
+def _spread(quantity: str, target: str, directions: Array, shape: Array) -> CandidateColumns:
     columns = directions[:, :, :, None] * shape[:, None, None, :]
     return unnamed(quantity, target, columns.reshape(*columns.shape[:2], -1))
 
 
-def unnamed(quantity: str, target: str, columns: Array) -> Pair:
+def unnamed(quantity: str, target: str, columns: Array) -> CandidateColumns:
     """Return a smooth candidate with its columns (N, k, d)."""
     size = columns.shape[-1]
     scale = (Parameter("", "", 1e-3),) * size
@@ -112,7 +112,7 @@ def unnamed(quantity: str, target: str, columns: Array) -> Pair:
     return smooth, columns
 
 
-def _bumps(name: str, target: str, z: Array, directions: Array) -> list[Pair]:
+def _bumps(name: str, target: str, z: Array, directions: Array) -> list[CandidateColumns]:
     pairs = []
     low, high = float(z.min()), float(z.max())
     for width in ((high - low) / BUMPS, (high - low) / (2.5 * BUMPS), 2.4 * (high - low) / BUMPS):
@@ -123,7 +123,7 @@ def _bumps(name: str, target: str, z: Array, directions: Array) -> list[Pair]:
     return pairs
 
 
-def _steps(name: str, z: Array, targets: dict[str, Array]) -> list[Pair]:
+def _steps(name: str, z: Array, targets: dict[str, Array]) -> list[CandidateColumns]:
     pairs = []
     for quantile in np.linspace(0.06, 0.94, STEPS):
         after = (z > np.quantile(z, quantile)).astype(float)[:, None]

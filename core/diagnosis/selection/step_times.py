@@ -19,7 +19,7 @@ from gapbridge.core.diagnosis.selection.candidate import Candidate
 from gapbridge.core.diagnosis.selection.state import SelectionState, flat
 from gapbridge.core.effects import CATALOGUE, Effect, Site, Term
 
-Pair = tuple[Candidate, Array]
+CandidateColumns = tuple[Candidate, Array]
 FREE = 1e6  # prior 1 sigma of a nuisance, in its size in the noise
 STEPS_PER_SITE = 3  # times of a step at one site that become candidates
 
@@ -29,7 +29,7 @@ def step_candidates(
     columns: Sequence[Array],
     base: Sequence[Term],
     withheld: Iterable[str] = (),
-) -> list[Pair]:
+) -> list[CandidateColumns]:
     """Return candidates at the best times of each effect that steps, with columns (N, k, d).
 
     ``columns`` are those of ``state.candidates`` at the model with ``base``; a step in ``base``
@@ -45,7 +45,7 @@ def step_candidates(
         return []
     constant = tuple(t for t in base if not CATALOGUE[t.effect].at_moment)
     target, basis = _integrated(state, columns, constant)
-    pairs: list[Pair] = []
+    pairs: list[CandidateColumns] = []
     for effect in effects:
         sites = effect.sites(state.arm)
         for site in sites:

@@ -24,7 +24,7 @@ LOAD_OFFSET = 0.1  # m, of a load from the TCP
 FORCE_STEP = 1.0  # N, of the central differences
 
 
-def unnamed_rivals(model: Model, q: Array, loads: Loads, k: int) -> tuple[tuple[str, Array], ...]:
+def unnamed_causes(model: Model, q: Array, loads: Loads, k: int) -> tuple[tuple[str, Array], ...]:
     """Return target and columns (N, k, d) of every unnamed cause; ``q`` (N, n) rad, k is 3 or 6.
 
     Compliance of each joint across its axis in two directions, bending of each link with any
@@ -32,13 +32,13 @@ def unnamed_rivals(model: Model, q: Array, loads: Loads, k: int) -> tuple[tuple[
     any base direction, in any tool direction.
     """
     return (
-        *_compliance_rivals(model, q, loads, k),
-        *_links(model, q, loads, k),
-        *_pulls(model, q, loads, k),
+        *_joint_compliances(model, q, loads, k),
+        *_link_bending(model, q, loads, k),
+        *_forces(model, q, loads, k),
     )
 
 
-def _compliance_rivals(model: Model, q: Array, loads: Loads, k: int) -> list[tuple[str, Array]]:
+def _joint_compliances(model: Model, q: Array, loads: Loads, k: int) -> list[tuple[str, Array]]:
     chain, rows = model.chain(), model.rows(q, loads)
     step = 1e-2 * 1e-3 / typical_moment(model.arm)
     rivals = []
@@ -59,7 +59,7 @@ def _compliance_rivals(model: Model, q: Array, loads: Loads, k: int) -> list[tup
     return rivals
 
 
-def _links(model: Model, q: Array, loads: Loads, k: int) -> list[tuple[str, Array]]:
+def _link_bending(model: Model, q: Array, loads: Loads, k: int) -> list[tuple[str, Array]]:
     """Return three compliant hinges along each link, at its ends and its middle."""
     still = np.zeros_like(q)
     frames = frames_of(model.chain(), q, still, still)
@@ -85,7 +85,7 @@ def _links(model: Model, q: Array, loads: Loads, k: int) -> list[tuple[str, Arra
     return rivals
 
 
-def _pulls(model: Model, q: Array, loads: Loads, k: int) -> list[tuple[str, Array]]:
+def _forces(model: Model, q: Array, loads: Loads, k: int) -> list[tuple[str, Array]]:
     if not model.chain().compliance.any():
         return []  # a force does not move a rigid arm
     chain = model.chain()
@@ -107,7 +107,7 @@ def _pulls(model: Model, q: Array, loads: Loads, k: int) -> list[tuple[str, Arra
     ]
 
 
-def unnamed_pulls(model: Model, motion: Motion, channel: str) -> tuple[tuple[str, Array], ...]:
+def unnamed_loads(model: Model, motion: Motion, channel: str) -> tuple[tuple[str, Array], ...]:
     """Return the columns of undeclared loads on torques (N, n, d) or wrenches (N, 6, d).
 
     A mass anywhere at the tool, a force in any base direction and, for torques, in any tool
@@ -121,13 +121,13 @@ def unnamed_pulls(model: Model, motion: Motion, channel: str) -> tuple[tuple[str
         pieces = pieces_of(model, pulled)
         columns.append(pieces.external_torque if channel == "torque" else pieces.external_wrench)
     in_base = np.stack(columns, axis=2)
-    rivals = [("load", _loads_anywhere(model, motion, channel)), ("pull", in_base)]
+    rivals = [("load", _mass_anywhere(model, motion, channel)), ("pull", in_base)]
     if channel == "torque":
         rivals.append(("tool pull", in_base @ model.rigid_pose(motion.q).rotation))
     return tuple(rivals)
 
 
-def _loads_anywhere(model: Model, motion: Motion, channel: str) -> Array:
+def _mass_anywhere(model: Model, motion: Motion, channel: str) -> Array:
     """Return columns (N, k, 4) of a mass at the TCP and of its offset along each axis."""
     at_tool = model.tool_in_flange[:3, 3]
     columns = []

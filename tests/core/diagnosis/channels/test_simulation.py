@@ -134,9 +134,9 @@ def test_a_search_over_fewer_rows_keeps_the_simulators_prediction(channel: str):
         small.model_of(), joined(log, simulator), METROLOGY
     )
     take = np.arange(0, len(observation.rows), 3)
-    assert observation.fewer is not None
-    fewer = observation.fewer(take)
-    assert np.allclose(fewer.predict(()), simulator.require(name)[observation.rows[take]])
+    assert observation.subset is not None
+    subset = observation.subset(take)
+    assert np.allclose(subset.predict(()), simulator.require(name)[observation.rows[take]])
 
 
 def test_a_delay_is_in_series_with_the_simulated_servo():
