@@ -6,7 +6,7 @@ import math
 from typing import Any
 
 from gapbridge.bridge.document.findings import considered_text, finding_text
-from gapbridge.core.diagnosis.across_sessions import Carried
+from gapbridge.core.diagnosis.across_sessions import SessionTransfer
 from gapbridge.core.diagnosis.causes import Cause
 from gapbridge.core.diagnosis.channel_diagnosis import ChannelDiagnosis
 from gapbridge.core.diagnosis.diagnosis import Diagnosis
@@ -55,11 +55,11 @@ def _channel(c: ChannelDiagnosis, diagnosis: Diagnosis) -> dict[str, Any]:
         "noise_floor_source": c.noise_floor_source,
         "remaining_rms": c.remaining_rms,
         "remaining_rms_held_out": c.remaining_rms_held_out,
-        "remaining_rms_new_region": c.elsewhere.new_region,
-        "remaining_rms_new_session": c.elsewhere.new_session,
+        "remaining_rms_new_region": c.generalisation.new_region,
+        "remaining_rms_new_session": c.generalisation.new_session,
         "sessions": [
             {"session": diagnosis.sessions[s], "remaining_rms_left_out": rms}
-            for s, rms in c.elsewhere.by_session
+            for s, rms in c.generalisation.by_session
         ],
         "where": {
             "joints": [{"joint": j, "share": s} for j, s in c.where.joints],
@@ -93,7 +93,7 @@ def _quantities(pairs: tuple[tuple[str, float], ...]) -> list[dict[str, Any]]:
 
 def _cause(cause: Cause, channel: ChannelDiagnosis, diagnosis: Diagnosis) -> dict[str, Any]:
     shrink = cause.shrink
-    across = next((c for c in channel.carried if c.effect == cause.effect), None)
+    across = next((c for c in channel.session_transfer if c.effect == cause.effect), None)
     return {
         "effect": cause.effect,
         "joints": list(cause.joints),
@@ -138,10 +138,10 @@ def _first_session(channel: ChannelDiagnosis, moment: float) -> int:
     return int(observation.session[after].min() if after.any() else observation.session.max())
 
 
-def _across(carried: Carried, sessions: tuple[str, ...]) -> dict[str, Any]:
+def _across(transfer: SessionTransfer, sessions: tuple[str, ...]) -> dict[str, Any]:
     return {
-        "carries": carried.carries,
-        "p_value": carried.p_value,
+        "carries": transfer.transfers,
+        "p_value": transfer.p_value,
         "values": [
             {
                 "session": sessions[s],
@@ -150,7 +150,7 @@ def _across(carried: Carried, sessions: tuple[str, ...]) -> dict[str, Any]:
                     for p in parameters
                 ],
             }
-            for s, parameters in carried.values
+            for s, parameters in transfer.values
         ],
     }
 

@@ -131,7 +131,7 @@ def clock(time: float, dated: bool = False) -> str:
 def _parameter(note: ParameterNote) -> str:
     if note.state is ParameterState.ON_BOUND:
         return f"is at its bound ({note.value:g} {note.unit})"
-    if note.state is ParameterState.HELD:
+    if note.state is ParameterState.NOMINAL:
         return (
             "is held nominal: its estimate is several times as large as those of similar "
             "parameters and not significant; an unnamed effect may be its cause"

@@ -158,7 +158,7 @@ def _causes(channel: ChannelDiagnosis) -> str:
 
 def elsewhere(channel: ChannelDiagnosis) -> str:
     """Return the expected gap in a new region and in a new session, which exceed the fit's."""
-    found, unit = channel.elsewhere, channel.unit
+    found, unit = channel.generalisation, channel.unit
     parts = []
     if found.new_region is not None:
         parts.append(f"{with_unit(found.new_region, unit)} in a new region of joint space")

@@ -37,7 +37,8 @@ def _shares(channels: tuple[ChannelDiagnosis, ...]) -> Table:
         rows.append([
             CHANNELS[c.channel], with_unit(c.gap_rms, c.unit),
             with_unit(c.remaining_rms_held_out, c.unit) if c.causes else "–",
-            with_unit(c.elsewhere.new_region, c.unit), with_unit(c.elsewhere.new_session, c.unit),
+            with_unit(c.generalisation.new_region, c.unit),
+            with_unit(c.generalisation.new_session, c.unit),
             with_unit(c.noise_floor_rms, c.unit),
             Bar(part.explained, percent(part.explained), LIMIT),
             Bar(part.noise, percent(part.noise), EDGE),
@@ -66,14 +67,14 @@ def _channel(channel: ChannelDiagnosis) -> list[Block]:
 
 def _sessions(channel: ChannelDiagnosis, sessions: tuple[str, ...]) -> list[Block]:
     """Return each session's gap under a fit of the others, and what changed between sessions."""
-    by_session = channel.elsewhere.by_session
+    by_session = channel.generalisation.by_session
     if not by_session:
         return []
     rows: list[list[Cell]] = [[sessions[s], with_unit(rms, channel.unit)] for s, rms in by_session]
     blocks: list[Block] = [Table(("session", "residual under a fit of the others"), rows)]
-    for across in channel.carried:
+    for across in channel.session_transfer:
         title = effect_title(across.effect)
-        if across.carries:
+        if across.transfers:
             blocks.append(Paragraph(f"{title}: the same in all sessions that show it."))
             continue
         heads = ("changed between sessions", *(sessions[s] for s, _ in across.values))

@@ -1,8 +1,7 @@
-"""What carries from session to session: each cause's value, session by session.
+"""Transfer between sessions: whether each cause has the same value in every session.
 
-A cause is fitted with a value of its own in each session, all other causes shared. It carries where
-the values agree; where they differ by more than chance and by more than a model cares for, it has
-changed, and is named as changed.
+A cause is fitted with one value per session, all other causes with shared values. It transfers if
+the values agree, or if their difference is not significant or does not matter to a model.
 """
 
 from __future__ import annotations
@@ -15,116 +14,119 @@ from numpy.typing import NDArray
 
 from gapbridge.core.arm import Arm
 from gapbridge.core.arrays import Array
-from gapbridge.core.diagnosis.criteria import CHANCE, EXCITED, MATERIAL_SHARE
+from gapbridge.core.diagnosis.criteria import MATERIAL_SHARE, MIN_EXCITATION, SESSIONS_DIFFER_P
 from gapbridge.core.diagnosis.selection.candidate import Candidate
 from gapbridge.core.diagnosis.selection.selection import Selection
 from gapbridge.core.effects import Reported
 from gapbridge.core.estimation.least_squares import inverse, sigmas_square, solve
 
-DEAD = 1e-7  # share of a parameter's column that a session has: below, it shows nothing of it
+MIN_COLUMN_SHARE = 1e-7  # of a parameter's column in a session, for the session to show it
 
 
 @dataclass(frozen=True)
-class Carried:
-    """One effect's values in the sessions that show it."""
+class SessionTransfer:
+    """One effect's values in the sessions in which it is excited."""
 
     effect: str
-    carries: bool
-    p_value: float  # that sessions with one value differ as much
+    transfers: bool
+    p_value: float  # of such differences if all sessions had one value
     values: tuple[tuple[int, tuple[Reported, ...]], ...]  # session, its parameters
 
 
-def carried(selection: Selection, chosen: Sequence[int], arm: Arm) -> tuple[Carried, ...]:
-    """Return how the effects of the ``chosen`` candidates carry; () where there is one session."""
+def session_transfer(
+    selection: Selection, chosen: Sequence[int], arm: Arm
+) -> tuple[SessionTransfer, ...]:
+    """Return the transfer of the effects of ``chosen`` candidates; () for a single session."""
     session = selection.observation.session
     if session is None:
         return ()
     of_row = np.repeat(session[selection.kept], selection.observation.measured.shape[1])
     space = selection.space
     effects = dict.fromkeys(space.candidates[c].family for c in chosen)
-    effects_carried = []
+    transfers = []
     for effect in effects:
         members = [c for c in chosen if space.candidates[c].family == effect]
-        rest = [c for c in chosen if c not in members]
-        compared = _compared(selection, members, rest, of_row, arm)
+        others = [c for c in chosen if c not in members]
+        compared = _transfer(selection, members, others, of_row, arm)
         if compared is not None:
-            effects_carried.append(compared)
-    return tuple(effects_carried)
+            transfers.append(compared)
+    return tuple(transfers)
 
 
-def _compared(
-    selection: Selection, members: list[int], rest: list[int], of_row: NDArray[np.int64], arm: Arm
-) -> Carried | None:
-    """Return how one effect carries; None where fewer than two sessions show it."""
+def _transfer(
+    selection: Selection, members: list[int], others: list[int], of_row: NDArray[np.int64], arm: Arm
+) -> SessionTransfer | None:
+    """Return the transfer of one effect; None if fewer than two sessions excite it."""
     space, unprojected = selection.space, selection.unprojected
     columns = unprojected.columns(space, members)
     usual = np.concatenate([space.candidates[c].scales for c in members])
-    shown = [
+    excited = [
         int(s) for s in np.unique(of_row)
-        if np.sqrt(np.sum((columns[of_row == s] * usual) ** 2, axis=0)).max() > EXCITED
+        if np.sqrt(np.sum((columns[of_row == s] * usual) ** 2, axis=0)).max() > MIN_EXCITATION
     ]  # fmt: skip
-    if len(shown) < 2:
+    if len(excited) < 2:
         return None
-    beside = np.hstack([unprojected.columns(space, rest), unprojected.nuisance])
-    values, covariance, alive = _fitted_by_session(selection, columns, beside, of_row, shown)
+    shared = np.hstack([unprojected.columns(space, others), unprojected.nuisance])
+    values, covariance, alive = _fitted_by_session(selection, columns, shared, of_row, excited)
     everywhere = alive.all(axis=0)
     if not everywhere.any():
         return None
-    compared = np.flatnonzero(np.tile(everywhere, len(shown)))
+    compared = np.flatnonzero(np.tile(everywhere, len(excited)))
     p_value, matters = _differing(
         values[:, everywhere], covariance[np.ix_(compared, compared)],
-        columns[:, everywhere], of_row, shown,
+        columns[:, everywhere], of_row, excited,
     )  # fmt: skip
     reported, width = [], columns.shape[1]
-    for i, s in enumerate(shown):
+    for i, s in enumerate(excited):
         block = slice(i * width, (i + 1) * width)
         reported.append(
             (s, _reported(space.candidates, members, values[i], covariance[block, block], arm))
         )
     effect = space.candidates[members[0]].family
-    return Carried(effect, not (p_value < CHANCE and matters), p_value, tuple(reported))
+    differs = p_value < SESSIONS_DIFFER_P and matters
+    return SessionTransfer(effect, not differs, p_value, tuple(reported))
 
 
 def _fitted_by_session(
-    selection: Selection, columns: Array, beside: Array, of_row: NDArray[np.int64],
-    shown: list[int],
+    selection: Selection, columns: Array, shared: Array, of_row: NDArray[np.int64],
+    excited: list[int],
 ) -> tuple[Array, Array, Array]:  # fmt: skip
-    """Return the values (S, d) of an effect in each session, what is ``beside`` shared by all.
+    """Return an effect's values (S, d) per session, fitted with the columns ``shared`` by all.
 
     With them their covariance (S d, S d), and which of them (S, d) the session shows at all.
     """
-    target, count = selection.unprojected.target, len(shown) * columns.shape[1]
-    A = np.hstack([*(columns * (of_row == s)[:, None] for s in shown), beside])
+    target, count = selection.unprojected.target, len(excited) * columns.shape[1]
+    A = np.hstack([*(columns * (of_row == s)[:, None] for s in excited), shared])
     size = np.sqrt(np.einsum("ij,ij->j", A, A))
     whole = np.sqrt(np.einsum("ij,ij->j", columns, columns))
-    alive = size > DEAD * np.concatenate([np.tile(whole, len(shown)), size[count:]])
+    alive = size > MIN_COLUMN_SHARE * np.concatenate([np.tile(whole, len(excited)), size[count:]])
     A = A * alive
     solution = solve(A, target)
     residual = target - A @ solution
     freedom = max(len(residual) * selection.rows_each - A.shape[1], 1)
     variance = max(float(residual @ residual) / freedom, selection.space.floor)
     covariance = inverse(A.T @ A)[:count, :count] * variance
-    shape = (len(shown), columns.shape[1])
+    shape = (len(excited), columns.shape[1])
     return solution[:count].reshape(shape), covariance, alive[:count].reshape(shape)
 
 
 def _differing(
-    values: Array, covariance: Array, columns: Array, of_row: NDArray[np.int64], shown: list[int]
+    values: Array, covariance: Array, columns: Array, of_row: NDArray[np.int64], excited: list[int]
 ) -> tuple[float, bool]:
-    """Return the probability of such differences (S, d) by chance, and whether they matter."""
+    """Return the p-value of the differences of ``values`` (S, d), and whether they matter."""
     from scipy.special import gammaincc
 
     count, width = values.shape
     C = np.kron(np.eye(count)[1:] - np.eye(count)[0], np.eye(width))  # each against the first
-    apart = C @ values.ravel()
+    differences = C @ values.ravel()
     spread = C @ covariance @ C.T
-    square = sigmas_square(apart, spread)
-    p_value = float(gammaincc(len(apart) / 2, square / 2))
+    square = sigmas_square(differences, spread)
+    p_value = float(gammaincc(len(differences) / 2, square / 2))
     mean = values.mean(axis=0)
     change = np.concatenate(
-        [columns[of_row == s] @ (values[i] - mean) for i, s in enumerate(shown)]
+        [columns[of_row == s] @ (values[i] - mean) for i, s in enumerate(excited)]
     )
-    whole = np.concatenate([columns[of_row == s] @ mean for s in shown])
+    whole = np.concatenate([columns[of_row == s] @ mean for s in excited])
     return p_value, bool(change @ change > MATERIAL_SHARE**2 * (whole @ whole))
 
 

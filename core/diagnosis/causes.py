@@ -1,4 +1,4 @@
-"""Causes: what is accused, how surely, and what was considered beside it."""
+"""Causes: accused effects with values and intervals, and the effects that are not accused."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ import numpy as np
 
 from gapbridge.core.arm import Arm
 from gapbridge.core.arrays import Array, Mask
-from gapbridge.core.diagnosis.criteria import EXCITED, UNDETERMINED
+from gapbridge.core.diagnosis.criteria import MIN_EXCITATION, UNDETERMINED_SPREAD
 from gapbridge.core.diagnosis.finding import ParameterNote, ParameterState, Withdrawal
 from gapbridge.core.diagnosis.held_out import HeldOut, Shrink
 from gapbridge.core.diagnosis.judgement import Judgement
-from gapbridge.core.diagnosis.selection.forward import joining
-from gapbridge.core.diagnosis.selection.problem import CandidateFit, fit
+from gapbridge.core.diagnosis.selection.forward_selection import joining
+from gapbridge.core.diagnosis.selection.sample_space import CandidateFit, fit
 from gapbridge.core.diagnosis.selection.selection import Selection
 from gapbridge.core.effects import CATALOGUE, Reported, Term
 
@@ -32,7 +32,7 @@ class Cause:
     probability: float
     indistinguishable_from: tuple[str, ...]
     terms: tuple[Term, ...]
-    relative_deviation: tuple[float, ...]  # per term: least sigma over value
+    relative_deviation: tuple[float, ...]  # per term: least standard deviation over value
     notes: tuple[ParameterNote, ...] = ()
 
 
@@ -40,8 +40,8 @@ class Outcome(Enum):
     """Why an effect is not accused."""
 
     NOT_EXCITED = auto()  # the log cannot show it
-    NOT_NEEDED = auto()  # explains too little beside the accused ones
-    WITHDRAWN = auto()  # selected first, and refused by a check
+    NOT_NEEDED = auto()  # explains too little in addition to the accused ones
+    WITHDRAWN = auto()  # selected, but failed a check
 
 
 @dataclass(frozen=True)
@@ -62,33 +62,33 @@ class Considered:
 
 
 def causes_of(
-    selection: Selection, judgement: Judgement, held: HeldOut, arm: Arm,
+    selection: Selection, judgement: Judgement, held_out: HeldOut, arm: Arm,
     shown: Sequence[int] | None = None,
 ) -> tuple[Cause, ...]:  # fmt: skip
     """Return the accused effects, the one with the largest share of the gap first.
 
-    ``shown`` are positions: of all accused only these are returned, the others kept in.
+    ``shown`` are positions: only these are returned, evaluated together with all accused.
     """
     members: dict[str, list[int]] = {}
     for position in judgement.accused if shown is None else shown:
         members.setdefault(selection.terms[position].effect, []).append(position)
-    everything = [selection.term_index[p] for p in judgement.accused]
+    all_accused = [selection.term_index[p] for p in judgement.accused]
     causes = [
         _cause(effect, sorted(positions, key=lambda p: selection.terms[p].site.joint or 0),
-               everything, selection, judgement, held, arm)
+               all_accused, selection, judgement, held_out, arm)
         for effect, positions in members.items()
     ]  # fmt: skip
     return tuple(sorted(causes, key=lambda c: -(c.shrink.gap_without if c.shrink else 0.0)))
 
 
 def _cause(
-    effect: str, positions: list[int], everything: list[int], selection: Selection,
-    judgement: Judgement, held: HeldOut, arm: Arm,
+    effect: str, positions: list[int], all_accused: list[int], selection: Selection,
+    judgement: Judgement, held_out: HeldOut, arm: Arm,
 ) -> Cause:  # fmt: skip
     members = {selection.term_index[p] for p in positions}
-    rest = [c for c in everything if c not in members]
-    shrink = held.shrink(everything, rest) if held.possible else None
-    alone = held.shrink(sorted(members), ()).shrink if held.possible else None
+    others = [c for c in all_accused if c not in members]
+    shrink = held_out.shrink(all_accused, others) if held_out.possible else None
+    alone = held_out.shrink(sorted(members), ()).shrink if held_out.possible else None
     listed: list[Reported] = []
     notes: list[ParameterNote] = []
     relative = []
@@ -99,9 +99,9 @@ def _cause(
         size = np.abs(value[: len(deviation)])
         relative.append(float(np.min(np.where(deviation > 0, deviation, np.inf)
                                      / np.maximum(size, 1e-300))))  # fmt: skip
-        held_nominal = selection.held.get(selection.term_index[p])
         notes += _at_bounds(effect, term, arm)
-        notes += _not_identifiable(effect, term, deviation, arm, held_nominal)
+        nominal = selection.nominal.get(selection.term_index[p])
+        notes += _not_identifiable(effect, term, deviation, arm, nominal)
     joints = sorted({t.site.joint for t in (selection.terms[p] for p in positions)
                      if t.site.joint is not None})  # fmt: skip
     ties = tuple(dict.fromkeys(n for p in positions for n in judgement.ties.get(p, ())))
@@ -124,31 +124,31 @@ def _at_bounds(effect: str, term: Term, arm: Arm) -> list[ParameterNote]:
 
 
 def _not_identifiable(
-    effect: str, term: Term, deviation: Array, arm: Arm, held: Mask | None
+    effect: str, term: Term, deviation: Array, arm: Arm, fixed: Mask | None
 ) -> list[ParameterNote]:
-    """Return a note on each parameter that these data leave open; nothing is hidden."""
+    """Return a note on each parameter that is not identifiable from these data."""
     notes = []
-    nominal = np.zeros(len(deviation), dtype=bool) if held is None else held
-    for parameter, value, spread, is_held in zip(
+    nominal = np.zeros(len(deviation), dtype=bool) if fixed is None else fixed
+    for parameter, value, spread, is_nominal in zip(
         CATALOGUE[effect].parameters(arm, term.site), term.values, deviation, nominal,
         strict=False,
     ):  # fmt: skip
-        if spread == 0 or spread > UNDETERMINED * parameter.scale:
+        if spread == 0 or spread > UNDETERMINED_SPREAD * parameter.scale:
             name = CATALOGUE[effect].label(term.site, parameter)
-            state = ParameterState.HELD if is_held else ParameterState.NOT_IDENTIFIABLE
+            state = ParameterState.NOMINAL if is_nominal else ParameterState.NOT_IDENTIFIABLE
             notes.append(ParameterNote(state, name, value, parameter.unit))
     return notes
 
 
 def probability(selection: Selection, members: set[int]) -> float:
-    """Return the probability that the effect is needed: against the best set without it."""
+    """Return the probability that an effect is needed, against the best set without it."""
     best, space = selection.best, selection.working
-    if members & set(selection.block):  # these won over the best set without them
+    if members & set(selection.block):  # the search has compared these already
         return 1.0
-    rest = fit(space, tuple(c for c in best.chosen if c not in members))
-    without = rest.score
+    others = fit(space, tuple(c for c in best.chosen if c not in members))
+    without = others.score
     families = {space.candidates[c].family for c in members}
-    for score, c in joining(space, rest.chosen, 12):
+    for score, c in joining(space, others.chosen, 12):
         if space.candidates[c].family not in families:
             without = min(without, score)
     odds = np.exp(-0.5 * min(max(without - best.score, 0.0), 700.0))
@@ -156,9 +156,9 @@ def probability(selection: Selection, members: set[int]) -> float:
 
 
 def considered_of(
-    selection: Selection, judgement: Judgement, held: HeldOut, withhold: Iterable[str] = ()
+    selection: Selection, judgement: Judgement, held_out: HeldOut, withhold: Iterable[str] = ()
 ) -> tuple[Considered, ...]:
-    """Return every other effect of the channel's catalogue, and why it is not accused."""
+    """Return every effect of the channel that is not accused, with the reason."""
     space, channel = selection.working, selection.observation.channel
     accused = {selection.terms[p].effect for p in judgement.accused}
     kept = tuple(
@@ -172,12 +172,13 @@ def considered_of(
             continue
         variants = [c for c, k in enumerate(space.candidates) if k.family == identifier]
         variants = _first_variants(selection, variants)
-        excited = any(_shown(selection, c) for c in variants)
+        excited = any(_excited(selection, c) for c in variants)
         if not variants or not excited:
             needs = effect.motion or ", ".join(effect.needs)
             listed.append(Considered(identifier, None, 0.0, Outcome.NOT_EXCITED, needs))
             continue
-        alone = held.shrink(variants, ()).shrink if held.possible and len(variants) < 40 else None
+        tested = held_out.possible and len(variants) < 40
+        alone = held_out.shrink(variants, ()).shrink if tested else None
         better = min(_score_with(selection, base, c) for c in variants)
         odds = float(np.exp(-0.5 * min(max(better - base.score, -700.0), 700.0)))
         withdrawal = reasons.get(identifier)
@@ -189,7 +190,7 @@ def considered_of(
 
 
 def _first_variants(selection: Selection, variants: list[int]) -> list[int]:
-    """Return one candidate per site: periods and curves come in many variants."""
+    """Return one candidate per joint: periodic lines and curves have many variants."""
     seen: set[int | None] = set()
     first = []
     for c in variants:
@@ -200,10 +201,10 @@ def _first_variants(selection: Selection, variants: list[int]) -> list[int]:
     return first
 
 
-def _shown(selection: Selection, c: int) -> bool:
+def _excited(selection: Selection, c: int) -> bool:
     space = selection.space
     columns = space.columns([c]) * space.candidates[c].scales
-    return bool(np.sqrt(np.sum(columns**2, axis=0)).max() > EXCITED)
+    return bool(np.sqrt(np.sum(columns**2, axis=0)).max() > MIN_EXCITATION)
 
 
 def _score_with(selection: Selection, base: CandidateFit, c: int) -> float:

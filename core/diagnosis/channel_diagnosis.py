@@ -1,4 +1,4 @@
-"""What was found in one channel of a log."""
+"""The diagnosis of one channel of a log."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapbridge.core.arrays import Array
-from gapbridge.core.diagnosis.across_sessions import Carried
+from gapbridge.core.diagnosis.across_sessions import SessionTransfer
 from gapbridge.core.diagnosis.causes import Cause, Considered
-from gapbridge.core.diagnosis.generalisation import NOWHERE, Generalisation
+from gapbridge.core.diagnosis.generalisation import NO_GENERALISATION, Generalisation
 from gapbridge.core.diagnosis.judgement import Judgement
 from gapbridge.core.diagnosis.residual_structure import dependence
 from gapbridge.core.diagnosis.selection.candidate import joint_target
@@ -22,7 +22,7 @@ from gapbridge.core.estimation.least_squares import basis_of
 
 
 class Verdict(StrEnum):
-    """What a diagnosis comes to, in one channel or in all; the value is the JSON's word."""
+    """The verdict on one channel or on all; the values are those of the JSON."""
 
     NO_GAP = "no_gap"
     EXPLAINED = "explained"
@@ -32,7 +32,7 @@ class Verdict(StrEnum):
 
 @dataclass(frozen=True)
 class Where:
-    """Shares of a gap."""
+    """Where a gap lies, as shares of its sum of squares."""
 
     joints: tuple[tuple[int, float], ...]  # joint from 1, share of the gap's energy; largest first
     axes: tuple[float, ...]
@@ -41,7 +41,7 @@ class Where:
 
 @dataclass(frozen=True)
 class ChannelDiagnosis:
-    """What was found in one channel; figures per coordinate, in the channel's unit."""
+    """The diagnosis of one channel; figures per coordinate, in the channel's unit."""
 
     channel: str
     unit: str
@@ -59,24 +59,24 @@ class ChannelDiagnosis:
     p_value: float | None
     depends_on: tuple[tuple[str, float], ...]
     verdict: Verdict
-    selection: Selection = field(repr=False)  # of a long recording that of its excerpt
+    selection: Selection = field(repr=False)  # of a long recording: on its excerpt
     judgement: Judgement = field(repr=False)
     gap: Array = field(repr=False)  # (N, k) measured - predicted, frame fitted
     remaining: Array = field(repr=False)  # (N, k) with the causes in the model
     held_out: Array | None = field(repr=False)  # (kept,) rms of each held-out sample
     outliers: NDArray[np.int64] = field(repr=False)  # rows of the log that were excluded
-    stand_ins: tuple[Cause, ...] = ()  # not proved, but useful where nothing was fitted
+    stand_ins: tuple[Cause, ...] = ()  # not accused, but reduce the gap in regions not fitted
     fitted_together: tuple[Term, ...] = ()  # causes and stand-ins
-    elsewhere: Generalisation = NOWHERE  # new region, new session
-    noise_floor_source: str = "unknown"  # what measured it
-    carried: tuple[Carried, ...] = ()  # of causes, where several sessions show them
+    generalisation: Generalisation = NO_GENERALISATION  # new region, new session
+    noise_floor_source: str = "unknown"  # see Floor
+    session_transfer: tuple[SessionTransfer, ...] = ()  # of causes, for several sessions
 
 
 def locate(selection: Selection, gap: Array, accused: Sequence[int]) -> Where:
     """Return where the gap (N, k) of the kept samples lies.
 
     ``accused`` are candidate indices: their joints share the part that they explain. Without any,
-    each joint is asked how much of the gap a turn of it alone could make.
+    each joint's share is what an unnamed function of its own angle error could explain.
     """
     space = selection.space
     own = gap[:, : min(gap.shape[1], 3)] if selection.observation.channel in (
@@ -91,7 +91,7 @@ def locate(selection: Selection, gap: Array, accused: Sequence[int]) -> Where:
             joint = space.candidates[c].site.joint
             if joint is not None:
                 part = space.X[:, space.start[c] : space.start[c + 1]] @ values[c]
-                # what of the gap points along this part: parts of one gap then add up
+                # projection of the gap on this part: the parts then add up
                 shares[joint] = shares.get(joint, 0.0) + float(part @ space.y) / total
     else:
         columns = selection.observation.joint_columns

@@ -1,10 +1,10 @@
-"""Whether an accused number is a constant, or the mean of something that goes by a quantity.
+"""Whether an accused parameter is constant, or the mean of a function of some quantity.
 
-Play that opens with the load looks like play, and a joint that is softer on one side like a soft
-joint: the catalogue's effect is the first order of what is there. So each accused number is let go
-by every quantity of the log in turn, by an unnamed function beside its constant. Where the residual
-asks for that and the function is no small part of the constant, the form is not the effect's.
-A periodic line is let go by the quarters of its joint's range: gears repeat in each.
+Backlash that grows with the load looks like backlash, and a joint that is more compliant on one
+side like a compliant joint: the effect is only the first order of the real one. So each accused
+parameter may vary with every quantity of the log in turn, by an unnamed function. If this improves
+the fit significantly and the variation is no small share of the mean, the effect is withdrawn.
+A periodic line may vary between the quarters of its joint's range, because gears repeat in each.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from gapbridge.core.arrays import Array
-from gapbridge.core.diagnosis.criteria import VARIES
+from gapbridge.core.diagnosis.criteria import MAX_VARIATION
 from gapbridge.core.diagnosis.selection.candidate import Candidate, joint_quantity
 from gapbridge.core.diagnosis.selection.delay_columns import exact_columns
 from gapbridge.core.diagnosis.selection.selection import Selection
@@ -24,34 +24,33 @@ from gapbridge.core.estimation.least_squares import basis_of, projected_out, sol
 
 
 def not_constant(
-    selection: Selection, accused: Sequence[int], beside: Array | None = None
+    selection: Selection, accused: Sequence[int], unnamed: Array | None = None
 ) -> dict[int, str]:
-    """Return the candidates, of those accused, whose number is none, and the quantity it goes by.
+    """Return the accused candidates whose parameter varies, with the quantity it depends on.
 
-    ``beside`` (m, d) are the unnamed functions that stand beside the accused, as rows of the sample
-    space; None: they are not known (on all rows), and lines alone are judged, which are compared
-    with themselves. Poses alone are judged: in motion friction and delay go by a joint's speed in
-    their own right.
+    ``unnamed`` (m, d) are the columns of the unnamed functions fitted together with the accused, in
+    the sample space. None: not known (on all rows); then only periodic lines are tested. Only poses
+    are tested: in motion, friction and delay depend on a joint's speed anyway.
     """
     if selection.observation.channel != "position":
         return {}
-    unnamed = selection.working.X[:, :0] if beside is None else beside
+    further = selection.working.X[:, :0] if unnamed is None else unnamed
     if selection.links is not None:
-        unnamed = selection.links.whitened(unnamed)
-    single, goes_by = [c for c in accused if c not in selection.block], {}
+        further = selection.links.whitened(further)
+    single, depends_on = [c for c in accused if c not in selection.block], {}
     for c in single:
         candidate = selection.working.candidates[c]
-        if candidate.periodic or (beside is not None and _is_a_number(candidate)):
-            quantity, share = _variation(selection, c, single, unnamed)
-            if share > VARIES:
-                goes_by[c] = quantity
-    return goes_by
+        if candidate.periodic or (unnamed is not None and _scales_a_quantity(candidate)):
+            quantity, share = _variation(selection, c, single, further)
+            if share > MAX_VARIATION:
+                depends_on[c] = quantity
+    return depends_on
 
 
-def _is_a_number(candidate: Candidate) -> bool:
+def _scales_a_quantity(candidate: Candidate) -> bool:
     """Return whether an effect is one number times a physical quantity.
 
-    Not so offsets, whose mean is theirs whatever else is there, lines, curves and moments.
+    Not so offsets (their mean is an offset whatever else is there), lines, curves and steps.
     """
     effect = candidate.effect
     form = effect.beside_links or effect.together or effect.curved or effect.at_moment
@@ -59,34 +58,34 @@ def _is_a_number(candidate: Candidate) -> bool:
 
 
 def _variation(
-    selection: Selection, c: int, accused: Sequence[int], beside: Array
+    selection: Selection, c: int, accused: Sequence[int], unnamed: Array
 ) -> tuple[str, float]:
-    """Return by which quantity a number goes, and how much: rms of what varies over the constant.
+    """Return the quantity that a parameter depends on, and its variation (rms over the mean).
 
-    ("", 0) where the residual asks for no variation at the price of chance.
+    ("", 0) where no variation improves the fit by more than its penalty for chance.
     """
     space, observation = selection.working, selection.observation
     jacobian = exact_columns(observation, space.candidates[c], _others(selection, c))
     constant = selection.rows_of(_by_session(jacobian, observation.quantities.get("session")))
-    rest = np.hstack([space.columns([o for o in accused if o != c]), beside])
-    basis = basis_of(_unit(np.hstack([constant, rest])))
+    others = np.hstack([space.columns([o for o in accused if o != c]), unnamed])
+    basis = basis_of(_unit(np.hstack([constant, others])))
     residual = projected_out(basis, space.y)
     freedom = max(space.freedom - basis.shape[1], 1.0)
     variance = max(float(residual @ residual) / freedom, space.floor)
     shapes = _shapes(selection, space.candidates[c])
-    most, name, varying = 0.0, "", constant[:, :0]
+    best, name, varying = 0.0, "", constant[:, :0]
     for quantity, shape in shapes.items():
         columns = jacobian[:, :, :, None] * shape[:, None, None, :]
         rows = _unit(selection.rows_of(columns.reshape(*jacobian.shape[:2], -1)))
         further = basis_of(projected_out(basis, rows))
         gain = float(np.sum((further.T @ residual) ** 2)) / variance
         gain -= further.shape[1] * np.log(space.freedom) + 2 * np.log(len(shapes))
-        if gain > most:
-            most, name, varying = gain, quantity, rows
+        if gain > best:
+            best, name, varying = gain, quantity, rows
     if not name:
         return "", 0.0
     both = np.hstack([constant, varying])
-    A = np.hstack([both, rest])
+    A = np.hstack([both, others])
     x = solve(A, space.y)
     whole = both @ x[: both.shape[1]]
     mean = constant @ solve(constant, whole)
@@ -95,7 +94,7 @@ def _variation(
 
 
 def _by_session(columns: Array, session: Array | None) -> Array:
-    """Return the columns (N, k, d) with a number for each session: what changed is no variation."""
+    """Return columns (N, k, d) with one parameter per session: a change is no variation."""
     if session is None:
         return columns
     each = (session[:, None] == np.unique(session)).astype(float)
@@ -108,7 +107,7 @@ def _others(selection: Selection, c: int) -> list[Term]:
 
 
 def _shapes(selection: Selection, candidate: Candidate) -> dict[str, Array]:
-    """Return the functions (N, d) by which a number may go, by the quantity that they go by."""
+    """Return, by quantity, the functions (N, d) of it by which a parameter may vary."""
     quantities = _quantities(selection, candidate)
     if not candidate.periodic:
         return {name: spline_basis(z) for name, z in quantities.items()}
@@ -118,16 +117,16 @@ def _shapes(selection: Selection, candidate: Candidate) -> dict[str, Array]:
 
 
 def _quarters(z: Array) -> Array:
-    """Return which quarter of a quantity's samples each belongs to (N, 3), centred."""
+    """Return centred indicators (N, 3) of the quarter of a quantity's range of each sample."""
     quarter = np.searchsorted(np.quantile(z, (0.25, 0.5, 0.75)), z)
     indicators = (quarter[:, None] == np.arange(1, 4)).astype(float)
     return np.asarray(indicators - indicators.mean(axis=0))
 
 
 def _quantities(selection: Selection, candidate: Candidate) -> dict[str, Array]:
-    """Return what a number may go by: the columns of the log, and the load that its joint holds.
+    """Return what a parameter may depend on: columns of the log, and its joint's static load.
 
-    Not by session, nor by time where there are several: what changed between them is reported so.
+    Not the session, nor the time where there are several: session_transfer reports such changes.
     """
     observation, joint = selection.observation, candidate.site.joint
     quantities = dict(observation.quantities)

@@ -1,4 +1,4 @@
-"""The diagnosis of a log: where each channel's gap lies, what causes it, how far it shrinks."""
+"""The diagnosis of a log: where each channel's gap lies, its causes, how much they reduce it."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from gapbridge.core.arrays import Array
-from gapbridge.core.diagnosis.across_sessions import carried
+from gapbridge.core.diagnosis.across_sessions import session_transfer
+from gapbridge.core.diagnosis.all_rows.gap_sizes import gaps, sizes_of, streamed_sizes
+from gapbridge.core.diagnosis.all_rows.long_recording import LongRecording, long_recording
+from gapbridge.core.diagnosis.all_rows.refit_on_all_rows import (
+    accused_on_all_rows,
+    fitted_on_all_rows,
+    refitted,
+    with_undecided_terms,
+)
+from gapbridge.core.diagnosis.all_rows.row_sums import RowSums, Streamed
 from gapbridge.core.diagnosis.causes import Cause, Considered, causes_of, considered_of
 from gapbridge.core.diagnosis.channel_diagnosis import ChannelDiagnosis, Verdict, Where, locate
 from gapbridge.core.diagnosis.channels import position, torque, tracking, wrench
 from gapbridge.core.diagnosis.channels.simulation import joined, predicted_by
 from gapbridge.core.diagnosis.criteria import MIN_CONDITIONS, MIN_FREEDOM, UNRESOLVED
-from gapbridge.core.diagnosis.every_row.gap_sizes import gaps, sizes_of, streamed_sizes
-from gapbridge.core.diagnosis.every_row.long_recording import LongRecording, long_recording
-from gapbridge.core.diagnosis.every_row.refitted import (
-    on_every_row,
-    refitted,
-    still_accused,
-    with_uncertain_terms,
-)
-from gapbridge.core.diagnosis.every_row.streamed import RowSums, Streamed
 from gapbridge.core.diagnosis.finding import (
     ChannelFinding,
     Fact,
@@ -42,23 +42,19 @@ from gapbridge.core.diagnosis.judgement import (
     Judgement,
     judge,
     judge_geometry,
-    still_sure,
+    significant_alone,
     with_stand_ins,
 )
-from gapbridge.core.diagnosis.log_checks.missing_flexibility import softness_findings
+from gapbridge.core.diagnosis.log_checks.missing_flexibility import flexibility_findings
 from gapbridge.core.diagnosis.log_checks.units_and_clocks import check_units, findings
-from gapbridge.core.diagnosis.noise_floor import (
-    Floor,
-    noise_floor,
-    whiteness,
-)
+from gapbridge.core.diagnosis.noise_floor import Floor, noise_floor, whiteness
 from gapbridge.core.diagnosis.observation import NotObservable, Observation, thinned
-from gapbridge.core.diagnosis.remainder import closes_gap
 from gapbridge.core.diagnosis.residual_structure import dependence
-from gapbridge.core.diagnosis.selection.moments import slips
 from gapbridge.core.diagnosis.selection.rounds import select
 from gapbridge.core.diagnosis.selection.selection import Selection, refitted_alone
+from gapbridge.core.diagnosis.selection.step_times import slips
 from gapbridge.core.diagnosis.separation import Measurement, next_measurements
+from gapbridge.core.diagnosis.value_stability import closes_gap
 from gapbridge.core.effects import CATALOGUE, Term, correcting, flexibility_effects
 from gapbridge.core.errors import LogError
 from gapbridge.core.fitted_range import outside_findings
@@ -80,13 +76,13 @@ CHANNELS: Mapping[str, Observe] = {
 }
 
 
-# samples that a diagnosis looks at: more cost time and add hardly anything
-MOST = {"position": 1200, "wrench": 300, "tracking": 300, "torque": 300}
+# samples that are searched: more cost time and hardly change the result
+MAX_SAMPLES = {"position": 1200, "wrench": 300, "tracking": 300, "torque": 300}
 
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What was found in a log."""
+    """The diagnosis of a log, in all channels."""
 
     verdict: Verdict
     channels: tuple[ChannelDiagnosis, ...]
@@ -94,7 +90,7 @@ class Diagnosis:
     next_measurements: tuple[Measurement, ...]
     findings: tuple[Finding, ...]
     model: Model = field(repr=False)  # with the causes in it
-    with_stand_ins: Model = field(repr=False)  # with the stand-ins too, fitted along
+    with_stand_ins: Model = field(repr=False)  # with causes and stand-ins, fitted together
     sessions: tuple[str, ...] = ()  # names, where there are several
     one_clock: bool = True  # False: the sessions' timestamps overlap
 
@@ -105,20 +101,21 @@ class Diagnosis:
 
 
 def channels_of(uncertain: Uncertain | None) -> Mapping[str, Observe]:
-    """Return the channels' observers, where ``uncertain`` says how unsure the model's poses are.
+    """Return the channels' observers, with the model's own pose uncertainty where it has one.
 
-    By what its own fitted numbers leave open, those of further terms known: causes are as unsure.
+    ``uncertain`` gives the 1-sigma changes of a pose by the cell's fitted parameters; they widen
+    the covariances of the causes.
     """
     if uncertain is None:
         return CHANNELS
 
     def observe(model: Model, log: Log, metrology: Metrology) -> Observation | NotObservable:
-        seen = position.observe(model, log, metrology)
-        if isinstance(seen, NotObservable):
-            return seen
-        q, rows, k = log.require("actual_q", "target_q"), seen.rows, seen.measured.shape[1]
-        loads = log.loads()[rows]
-        return replace(seen, uncertain=lambda terms: uncertain(q[rows], loads, terms)[:, :k])
+        observation = position.observe(model, log, metrology)
+        if isinstance(observation, NotObservable):
+            return observation
+        rows, k = observation.rows, observation.measured.shape[1]
+        q, loads = log.require("actual_q", "target_q"), log.loads()[rows]
+        return replace(observation, uncertain=lambda terms: uncertain(q[rows], loads, terms)[:, :k])
 
     return {**CHANNELS, "position": observe}
 
@@ -137,13 +134,13 @@ def diagnose(
 
     ``withhold`` names effects to take out of the catalogue; ``simulated`` is the log of another
     simulator, row by row, whose values are the prediction instead of the model's. Raises LogError
-    where the log cannot be used at all (units, numbers, no channel to look at).
+    if the log cannot be used at all (units, numbers, no channel to diagnose).
     """
-    # matrices of this size gain nothing from threads, which wait for each other on a busy machine
+    # matrices of this size gain nothing from threads
     with threadpool_limits(1, "blas"):
         metrology = metrology or Metrology()
         log = with_sessions(log, model)
-        if metrology.remounted:  # what each session has of its own is no effect that they share
+        if metrology.remounted:  # each session has a tool point of its own
             withhold = (*withhold, *correcting("tool"))
         return _diagnose(model, log, metrology, tuple(withhold), progress, observers, simulated)
 
@@ -154,27 +151,27 @@ def _diagnose(
     simulated: Log | None,
 ) -> Diagnosis:  # fmt: skip
     check_units(model, log)
-    notes: list[Finding] = [*_log_findings(model, log, metrology)]
+    reported: list[Finding] = [*_log_findings(model, log, metrology)]
     if simulated is not None:
         log = joined(log, simulated)
         observers = {name: predicted_by(name, o) for name, o in observers.items()}
     long = long_recording(log)
     channels: list[ChannelDiagnosis] = []
-    streaming: list[tuple[_Searched, RowSums]] = []
-    hidden: list[NotObservable] = []
+    streaming: list[tuple[_SearchResult, RowSums]] = []
+    not_observable: list[NotObservable] = []
     for name, observe in observers.items():
         sampled = None if name == "position" else long
         samples = _samples(observe, model, log, metrology, sampled)
         if isinstance(samples, NotObservable):
-            hidden.append(samples)
-        elif _too_few(samples[0]):
-            notes.append(ChannelFinding(name, TooFewRows(len(samples[0].rows))))
-            hidden.append(NotObservable(name, ("more rows",)))
+            not_observable.append(samples)
+        elif _too_few_samples(samples[0]):
+            reported.append(ChannelFinding(name, TooFewRows(len(samples[0].rows))))
+            not_observable.append(NotObservable(name, ("more rows",)))
         elif sampled is None:
-            searched = _searched(*samples, model, withhold, progress)
-            channels.append(_decided(searched, model, None))
+            searched = _search_and_refit(*samples, model, withhold, progress)
+            channels.append(_channel_diagnosis(searched, model, None))
         else:
-            searched = _searched(*samples, model, withhold, progress).without_columns()
+            searched = _search_and_refit(*samples, model, withhold, progress).without_columns()
             streamed = partial(_observed_in, observe, model, metrology)
             streaming.append((searched, searched.row_sums(streamed, model)))
     if long is not None and streaming:
@@ -183,25 +180,27 @@ def _diagnose(
         for block in long:
             for _, sums in streaming:
                 sums.add(long, block)
-        channels += [_decided(searched, model, sums.streamed()) for searched, sums in streaming]
+        channels += [
+            _channel_diagnosis(searched, model, sums.streamed()) for searched, sums in streaming
+        ]
     if not channels:
-        raise _no_channel(log, hidden)
-    notes += [
-        ChannelFinding(c.channel, Thinned(MOST[c.channel], c.samples))
-        for c in channels if c.samples > MOST[c.channel]
+        raise _no_channel(log, not_observable)
+    reported += [
+        ChannelFinding(c.channel, Thinned(MAX_SAMPLES[c.channel], c.samples))
+        for c in channels if c.samples > MAX_SAMPLES[c.channel]
     ]  # fmt: skip
-    soft = {*flexibility_effects().values()} - {*withhold}
+    flexibilities = {*flexibility_effects().values()} - {*withhold}
     for channel in channels:
-        notes += [ChannelFinding(channel.channel, fact) for fact in _facts(channel, log)]
-        if simulated is None and len(soft) == 2 and _lacks_much(channel):
-            notes += softness_findings(model, log, metrology)
-    terms = _for_the_model(channels)
+        reported += [ChannelFinding(channel.channel, fact) for fact in _facts(channel, log)]
+        if simulated is None and len(flexibilities) == 2 and _gap_unexplained(channel):
+            reported += flexibility_findings(model, log, metrology)
+    terms = _model_terms(channels)
     if not log.one_clock:
-        terms = [_slipped(term, log) for term in terms]
+        terms = [_slip_applied(term, log) for term in terms]
     return Diagnosis(
-        _overall(channels), tuple(channels), tuple(hidden),
-        next_measurements(model, log, channels), tuple(notes), model.with_terms(terms),
-        model.with_terms(_and_stand_ins(channels, terms)),
+        _overall(channels), tuple(channels), tuple(not_observable),
+        next_measurements(model, log, channels), tuple(reported), model.with_terms(terms),
+        model.with_terms(_terms_with_stand_ins(channels, terms)),
         log.session_names, log.one_clock,
     )  # fmt: skip
 
@@ -209,22 +208,22 @@ def _diagnose(
 def _samples(
     observe: Observe, model: Model, log: Log, metrology: Metrology, long: LongRecording | None
 ) -> tuple[Observation, Observation] | NotObservable:
-    """Return the samples of a channel to search in, and all of them, by their rows in the log."""
+    """Return a channel's samples to search in, and all of them, with their rows in the log."""
     excerpt = log if long is None else long.excerpt
     whole = observe(model, excerpt, metrology)
     if isinstance(whole, NotObservable):
         return whole
     fewer = whole
-    if len(whole.rows) > MOST[whole.channel]:
+    if len(whole.rows) > MAX_SAMPLES[whole.channel]:
         fewer = _thinned(whole, model, excerpt, metrology, observe)
     if long is None:
         return fewer, whole
     return replace(fewer, rows=long.rows[fewer.rows]), replace(whole, rows=long.rows[whole.rows])
 
 
-def _no_channel(log: Log, hidden: Sequence[NotObservable]) -> LogError:
-    needs = "; ".join(f"{h.channel}: {', '.join(h.needs)}" for h in hidden)
-    missing = [need for h in hidden for need in h.needs if need in COLUMNS]
+def _no_channel(log: Log, not_observable: Sequence[NotObservable]) -> LogError:
+    needs = "; ".join(f"{h.channel}: {', '.join(h.needs)}" for h in not_observable)
+    missing = [need for h in not_observable for need in h.needs if need in COLUMNS]
     hint = did_you_mean(log.unknown, missing, log.n)
     return LogError(f"{log.path}: found no channel to diagnose, expected one of: {needs}{hint}")
 
@@ -236,33 +235,33 @@ def _observed_in(
 
 
 @dataclass(frozen=True)
-class _Searched:
-    """What a search in a channel's samples found, before more rows judge."""
+class _SearchResult:
+    """The result of a search in a channel's samples, before it is validated on all rows."""
 
     observation: Observation
     selection: Selection  # on all samples of the channel
-    more: bool  # these are more than were searched
+    more: bool  # the selection has more samples than were searched
     judgement: Judgement
-    # on what the rest depends in the samples that were searched, beside some of the terms
+    # accused positions -> what the residual depends on in the samples that were searched
     depends: Callable[[Sequence[int]], Depends]
     where: Where
     considered: tuple[Considered, ...]
     stand_ins: tuple[Cause, ...]
     fitted_together: tuple[Term, ...]  # causes and stand-ins
 
-    def without_columns(self) -> _Searched:
-        """Return the same without the columns of all candidates: 50 MB that no row asks for."""
+    def without_columns(self) -> _SearchResult:
+        """Return the same without the columns of all candidates (50 MB)."""
         known = self.judgement.depends_on or self.depends(self.judgement.accused)
         return replace(self, depends=lambda _: known)
 
     def row_sums(self, observe: Callable[[Log], Any], model: Model) -> RowSums:
-        """Return the sums over all rows of a long recording, at what was found."""
-        by_region = self.judgement.remainder is not None
+        """Return the sums over all rows of a long recording, linearised at the accused terms."""
+        by_region = self.judgement.unnamed_part is not None
         return RowSums(self.selection, self.judgement.accused, observe, model.arm, by_region)
 
 
 def _log_findings(model: Model, log: Log, metrology: Metrology) -> list[LogFinding]:
-    """Return what is suspicious about the log; of several sessions each by itself."""
+    """Return the findings of the log checks, made for each session by itself."""
     if len(log.session_names) < 2:
         return findings(log, model, metrology)
     sessions: dict[LogFinding, list[str]] = {}
@@ -279,11 +278,11 @@ def _log_findings(model: Model, log: Log, metrology: Metrology) -> list[LogFindi
 def _thinned(
     observation: Observation, model: Model, log: Log, metrology: Metrology, observe: Observe
 ) -> Observation:
-    """Return the channel with fewer samples; poses are looked at anew, so that frames stay free."""
+    """Return the channel with fewer samples; poses are observed again, with free frames."""
     if observation.channel != "position":
-        return thinned(observation, MOST[observation.channel])
-    take = np.unique(np.linspace(0, len(observation.rows) - 1, MOST["position"]).astype(int))
-    # last motions come from neighbouring rows: they are reported before rows are left out
+        return thinned(observation, MAX_SAMPLES[observation.channel])
+    take = np.unique(np.linspace(0, len(observation.rows) - 1, MAX_SAMPLES["position"]).astype(int))
+    # approach directions come from neighbouring rows: derived before rows are left out
     approach = log.approach()
     columns = dict(log.columns) | ({} if approach is None else {"approach": approach})
     part = observe(model, replace(log, columns=columns).select(observation.rows[take]), metrology)
@@ -291,8 +290,8 @@ def _thinned(
     return replace(part, rows=observation.rows[take])
 
 
-def _for_the_model(channels: Sequence[ChannelDiagnosis]) -> list[Term]:
-    """Return each cause once: what several channels show (a payload) by the most certain one."""
+def _model_terms(channels: Sequence[ChannelDiagnosis]) -> list[Term]:
+    """Return the causes' terms; of several channels (a payload) the most certain value."""
     best: dict[tuple[str, object], tuple[float, Term]] = {}
     for channel in channels:
         for cause in channel.causes:
@@ -303,44 +302,46 @@ def _for_the_model(channels: Sequence[ChannelDiagnosis]) -> list[Term]:
     return [term for _, term in best.values()]
 
 
-def _and_stand_ins(channels: Sequence[ChannelDiagnosis], proved: Sequence[Term]) -> list[Term]:
-    """Return the proved terms and the stand-ins, with the values that they have together."""
-    terms = {(t.effect, t.site): t for t in proved}
+def _terms_with_stand_ins(
+    channels: Sequence[ChannelDiagnosis], accused: Sequence[Term]
+) -> list[Term]:
+    """Return the accused terms and the stand-ins, with the values of their common fit."""
+    terms = {(t.effect, t.site): t for t in accused}
     for channel in channels:
         terms |= {(t.effect, t.site): t for t in channel.fitted_together}
     return list(terms.values())
 
 
-def _slipped(term: Term, log: Log) -> Term:
-    """Return a term that steps once as it stands today: clocks that overlap hold no moment."""
+def _slip_applied(term: Term, log: Log) -> Term:
+    """Return a step as applied to all rows: overlapping clocks have no common time of it."""
     if not CATALOGUE[term.effect].at_moment:
         return term
     return replace(term, values=(*term.values[:-1], float(log.times()[0]) - 1.0))
 
 
-def _lacks_much(channel: ChannelDiagnosis) -> bool:
-    """Return whether poses leave a gap that no cause accounts for."""
+def _gap_unexplained(channel: ChannelDiagnosis) -> bool:
+    """Return whether a gap of poses is not fully explained."""
     return channel.channel == "position" and channel.verdict in (
         Verdict.UNEXPLAINED,
         Verdict.PARTLY_EXPLAINED,
     )
 
 
-def _too_few(observation: Observation) -> bool:
+def _too_few_samples(observation: Observation) -> bool:
     """Return whether there are too few samples for a diagnosis."""
     N, k, p = observation.nuisance.shape
     return N * k < p + MIN_FREEDOM or len(np.unique(observation.groups)) < MIN_CONDITIONS
 
 
-def _found(
+def _search(
     observation: Observation, model: Model, withhold: tuple[str, ...],
     progress: Callable[[str], None] | None,
 ) -> tuple[Selection, Judgement, tuple[Considered, ...]]:  # fmt: skip
-    """Return what a search found, what of it stays, and what fell before.
+    """Return a search's selection and judgement, and effects withdrawn in a previous search.
 
-    Where nothing stays, what fell may have stood in the place of the causes. A second search goes
-    without it, and counts where it closes the gap in every part of the log: of an iiwa under three
-    loads one draw of the poses in two came to nothing else.
+    If no cause remains, the withdrawn effects may have masked the causes. The search is repeated
+    without them, and counts if its causes close the gap in every part of the log (an iiwa under
+    three loads needed that for one of two sets of poses).
     """
 
     def judged(without: tuple[str, ...]) -> tuple[Selection, Judgement]:
@@ -348,92 +349,94 @@ def _found(
         return judge_geometry(found, judge(found, HeldOut(found)), model.arm)
 
     first, judgement = judged(withhold)
-    fallen = {first.terms[p].effect for p, _ in judgement.withdrawn}
+    withdrawn_effects = {first.terms[p].effect for p, _ in judgement.withdrawn}
     unexplained = judgement.structured and not judgement.accused
-    if not (unexplained and fallen and observation.channel == "position"):
+    if not (unexplained and withdrawn_effects and observation.channel == "position"):
         return first, judgement, ()
-    second, other = judged((*withhold, *fallen))
+    second, other = judged((*withhold, *withdrawn_effects))
     if not closes_gap(second, [second.term_index[p] for p in other.accused]):
         return first, judgement, ()
     considered = considered_of(first, judgement, HeldOut(first), withhold)
-    return second, other, tuple(c for c in considered if c.effect in fallen)
+    return second, other, tuple(c for c in considered if c.effect in withdrawn_effects)
 
 
-def _searched(
+def _search_and_refit(
     observation: Observation, whole: Observation, model: Model, withhold: tuple[str, ...],
     progress: Callable[[str], None] | None,
-) -> _Searched:  # fmt: skip
-    """Return what a search in ``observation`` found, refitted on all samples of ``whole``."""
-    searched, judgement, fallen = _found(observation, model, withhold, progress)
-    held = HeldOut(searched)
+) -> _SearchResult:  # fmt: skip
+    """Return the result of a search in ``observation``, refitted on all samples of ``whole``."""
+    searched, judgement, withdrawn = _search(observation, model, withhold, progress)
+    held_out = HeldOut(searched)
     judgement = with_stand_ins(searched, judgement)
-    stand_ins = _stand_ins(searched, judgement, held, model)
-    searched, judgement = still_sure(searched, judgement, model.arm)
-    without = (*withhold, *(c.effect for c in fallen))
-    considered = (*considered_of(searched, judgement, held, without), *fallen)
+    stand_ins = _stand_ins(searched, judgement, held_out, model)
+    searched, judgement = significant_alone(searched, judgement, model.arm)
+    without = (*withhold, *(c.effect for c in withdrawn))
+    considered = (*considered_of(searched, judgement, held_out, without), *withdrawn)
     chosen = [searched.term_index[p] for p in judgement.accused]
     where = locate(searched, gaps(searched, chosen)[0][searched.kept], chosen)
     selection = searched
     if len(whole.rows) > len(observation.rows):
         if progress:
             progress(f"{observation.channel}: all {len(whole.rows)} rows")
-        judgement = with_uncertain_terms(judgement)
-        selection = on_every_row(searched, judgement, whole, model)
+        judgement = with_undecided_terms(judgement)
+        selection = fitted_on_all_rows(searched, judgement, whole, model)
 
-    def follows(accused: Sequence[int]) -> Depends:
+    def depends(accused: Sequence[int]) -> Depends:
         fitted = [searched.term_index[p] for p in accused]
         basis = searched.nuisance_basis
         return tuple(dependence(searched.space, basis, fitted, searched.groups))
 
     more = selection is not searched
-    return _Searched(
-        observation, selection, more, judgement, follows, where, considered, *stand_ins
+    return _SearchResult(
+        observation, selection, more, judgement, depends, where, considered, *stand_ins
     )
 
 
-def _decided(searched: _Searched, model: Model, streamed: Streamed | None) -> ChannelDiagnosis:
-    """Return what all rows leave of what was found; ``streamed`` are those of a long recording."""
-    observation, shown = searched.observation, searched.selection
+def _channel_diagnosis(
+    searched: _SearchResult, model: Model, streamed: Streamed | None
+) -> ChannelDiagnosis:
+    """Return the diagnosis validated on all rows; ``streamed`` are those of a long recording."""
+    observation, final = searched.observation, searched.selection
     judgement = searched.judgement
-    decided = shown if streamed is None else streamed.selection(judgement.accused)
-    held = HeldOut(decided)
+    decided = final if streamed is None else streamed.selection(judgement.accused)
+    held_out = HeldOut(decided)
     if searched.more or streamed is not None:
-        unknown = judgement.remainder is not None
+        unknown = judgement.unnamed_part is not None
         alone = partial(refitted, model, unknown) if streamed is None else streamed.alone
-        decided, judgement = still_accused(decided, judgement, held, alone)
+        decided, judgement = accused_on_all_rows(decided, judgement, held_out, alone)
     if streamed is None:
-        shown = decided
+        final = decided
     else:
-        shown = replace(shown, terms=decided.terms, covariance=decided.covariance)
+        final = replace(final, terms=decided.terms, covariance=decided.covariance)
     chosen = [decided.term_index[p] for p in judgement.accused]
-    gap, remaining = gaps(shown, chosen)
+    gap, remaining = gaps(final, chosen)
     if streamed is None:
-        sizes = sizes_of(shown, gap, remaining)
+        sizes = sizes_of(final, gap, remaining)
     else:
         sizes = streamed_sizes(streamed, decided, judgement.accused)
-    causes = causes_of(decided, judgement, held, model.arm)
-    judgement, floor = _with_whiteness(judgement, shown, sizes.means, searched.depends)
-    held_rms = held.rms(chosen) if held.possible else None
-    if not causes:  # nothing was fitted but the frame, before as well as after
-        held_rms = sizes.gap_rms
+    causes = causes_of(decided, judgement, held_out, model.arm)
+    judgement, floor = _with_whiteness(judgement, final, sizes.means, searched.depends)
+    held_out_rms = held_out.rms(chosen) if held_out.possible else None
+    if not causes:  # only the frame was fitted
+        held_out_rms = sizes.gap_rms
     if sizes.remaining_rms < UNRESOLVED:
         judgement = replace(judgement, structured=False, depends_on=())
     structured = judgement.structured
     verdict = Verdict.EXPLAINED if causes else Verdict.NO_GAP
     if structured:
         verdict = Verdict.PARTLY_EXPLAINED if causes else Verdict.UNEXPLAINED
-    per_sample = held if streamed is None else HeldOut(shown)
+    per_sample = held_out if streamed is None else HeldOut(final)
     return ChannelDiagnosis(
         channel=observation.channel, unit=observation.unit, samples=sizes.samples,
         gap_rms=sizes.gap_rms, gap_max=sizes.gap_max, noise_floor_rms=floor.rms,
-        remaining_rms=sizes.remaining_rms, remaining_rms_held_out=held_rms,
+        remaining_rms=sizes.remaining_rms, remaining_rms_held_out=held_out_rms,
         where=searched.where, causes=causes, considered=searched.considered,
         unexplained_rms=_unexplained(sizes.remaining_rms, floor.rms, judgement),
         structured=structured, p_value=judgement.p_value, depends_on=judgement.depends_on,
-        verdict=verdict, selection=shown, judgement=judgement, gap=gap, remaining=remaining,
+        verdict=verdict, selection=final, judgement=judgement, gap=gap, remaining=remaining,
         held_out=np.sqrt(per_sample.squares(chosen)) if per_sample.possible else None,
-        outliers=sizes.outliers, elsewhere=generalisation(decided, chosen),
-        carried=carried(decided, chosen, model.arm),
+        outliers=sizes.outliers, generalisation=generalisation(decided, chosen),
+        session_transfer=session_transfer(decided, chosen, model.arm),
         noise_floor_source=floor.source, stand_ins=searched.stand_ins,
         fitted_together=searched.fitted_together,
     )  # fmt: skip
@@ -443,7 +446,7 @@ def _with_whiteness(
     judgement: Judgement, selection: Selection, means: Array | None,
     depends: Callable[[Sequence[int]], Depends],
 ) -> tuple[Judgement, Floor]:  # fmt: skip
-    """Return the judgement with what all rows of a recording say of its residual, and the floor."""
+    """Return the judgement with the whiteness test of a recording's residual, and the floor."""
     floor = noise_floor(selection, judgement.structured)
     test = whiteness(means, floor.rms)
     if test is None or test.white:
@@ -459,23 +462,23 @@ def _with_whiteness(
 
 
 def _stand_ins(
-    selection: Selection, judgement: Judgement, held: HeldOut, model: Model
+    selection: Selection, judgement: Judgement, held_out: HeldOut, model: Model
 ) -> tuple[tuple[Cause, ...], tuple[Term, ...]]:
     """Return the stand-ins as causes, and the terms of causes and stand-ins fitted together."""
     if not judgement.stand_ins:
         return (), ()
     both = (*judgement.accused, *judgement.stand_ins)
     together = refitted_alone(selection, model.arm, both)
-    notes = replace(judgement, accused=both, ties={})
+    combined = replace(judgement, accused=both, ties={})
     marked = [replace(together.terms[p], stand_in=p in judgement.stand_ins) for p in both]
-    return causes_of(together, notes, held, model.arm, judgement.stand_ins), tuple(marked)
+    return causes_of(together, combined, held_out, model.arm, judgement.stand_ins), tuple(marked)
 
 
 def _unexplained(remaining: float, floor: float | None, judgement: Judgement) -> float:
-    """Return the rms of what is left beyond the noise; of a residual without structure 0.
+    """Return the rms of the residual beyond the noise; 0 for a residual without structure.
 
-    Where no floor is known, or one no lower than what is left, what the residual depends on says
-    its share; where nothing does either, no part of it is known to be noise.
+    If the floor is unknown or not lower than the residual, the largest share that a quantity
+    predicts is taken; without one, the whole residual.
     """
     if not judgement.structured:
         return 0.0
@@ -498,13 +501,13 @@ def _overall(channels: Sequence[ChannelDiagnosis]) -> Verdict:
 
 
 def _line_of(log: Log, row: int) -> tuple[int, str]:
-    """Return the line of a row in its file; of several sessions with the session's name."""
+    """Return the line of a row in its file, and the session's name if there are several."""
     name = log.session_names[int(session_of(log)[row])] if log.session_names else ""
     return log.line(row), name
 
 
 def _facts(channel: ChannelDiagnosis, log: Log) -> list[Fact]:
-    """Return what a channel's diagnosis has to report beside its figures."""
+    """Return the facts to report about a channel in addition to its figures."""
     facts: list[Fact] = []
     if len(channel.outliers):
         facts.append(Outliers(tuple(_line_of(log, int(row)) for row in channel.outliers)))
@@ -513,8 +516,8 @@ def _facts(channel: ChannelDiagnosis, log: Log) -> list[Fact]:
         stand_in = position_ in judgement.stand_ins
         facts.append(NotAccused(selection.terms[position_], reason, stand_in))
     terms = [term for cause in channel.causes for term in cause.terms]
-    seen, alone = selection.observation, channel.verdict is Verdict.EXPLAINED
-    timed = "timestamp" in seen.quantities
-    for term, before, after in slips(terms, seen.times):
+    observation, alone = selection.observation, channel.verdict is Verdict.EXPLAINED
+    timed = "timestamp" in observation.quantities
+    for term, before, after in slips(terms, observation.times):
         facts.append(Slip(term, before, after, timed, alone))
     return facts + [note for cause in channel.causes for note in cause.notes]

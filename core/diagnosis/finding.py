@@ -1,4 +1,4 @@
-"""What a diagnosis reports beside its figures: enums and numbers; ``bridge`` words them."""
+"""Findings of a diagnosis as enums and numbers; ``bridge`` makes the text."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ class Check(Enum):
 
     CURVED = auto()  # its stiffness curve cannot be distinguished from a straight line
     INSIDE_BOUNDS = auto()
-    SIGNIFICANT = auto()  # its value is enough of its own sigmas
-    USUAL_SIZE = auto()  # its value is not far below what arms have
-    NOT_LOCALISED = auto()  # one bump in the joint's angle does not do as well
-    STABLE_VALUE = auto()  # it keeps its value beside unnamed functions for what is left
-    CONSTANT = auto()  # its value does not go by a quantity of the log
-    COMPANION = auto()  # what shows it is declared, or accused beside it
-    SEPARATED = auto()  # the log does not show that it is no load: the flange turns
-    NOT_A_LEVEL = auto()  # it does not step where a quantity of the log leaves all its levels
-    HELD_OUT_GAIN = auto()  # it shrinks the gap on samples that its fit did not see
+    SIGNIFICANT = auto()  # its value is enough standard deviations from zero
+    USUAL_SIZE = auto()  # its value is not far below the usual size
+    NOT_LOCALISED = auto()  # a line is not replaced by one bump in the joint's angle
+    STABLE_VALUE = auto()  # its value is stable when the residual structure is modelled
+    CONSTANT = auto()  # its value does not depend on a quantity of the log
+    COMPANION = auto()  # the effect that it requires is accused or declared
+    SEPARATED = auto()  # the flange turns, so that a sensor's constant is not a load
+    NOT_A_LEVEL = auto()  # it does not step exactly when a quantity of the log changes level
+    HELD_OUT_GAIN = auto()  # it reduces the gap on held-out samples
     ALL_ROWS_GAIN = auto()  # the same over all rows of the log
 
 
@@ -31,15 +31,15 @@ class Withdrawal:
     """Why a selected term is not accused."""
 
     failed: Check
-    quantity: str = ""  # CONSTANT: what the value goes by; SEPARATED, NOT_A_LEVEL: instead of what
+    quantity: str = ""  # CONSTANT: the value depends on it; SEPARATED, NOT_A_LEVEL: confounded
 
 
 class ParameterState(Enum):
-    """What keeps the value of an accused parameter from being an estimate."""
+    """Why the value of an accused parameter is no estimate."""
 
     ON_BOUND = auto()
-    NOT_IDENTIFIABLE = auto()  # from these data: others can stand in for it
-    HELD = auto()  # nominal: far from the size of its like, and not sure by itself
+    NOT_IDENTIFIABLE = auto()  # from these data: others have the same effect
+    NOMINAL = auto()  # kept nominal: far larger than its like, and not significant by itself
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class TooFewRows:
 
 @dataclass(frozen=True)
 class Thinned:
-    """A channel whose causes were searched on some of its rows and judged on all."""
+    """A channel whose causes were searched on some of its rows and validated on all."""
 
     searched: int
     rows: int
@@ -69,14 +69,14 @@ class Thinned:
 
 @dataclass(frozen=True)
 class Outliers:
-    """Rows excluded as outliers: each one's line in its file, and its session where several are."""
+    """Rows excluded as outliers: line in the file, and session name if there are several."""
 
     lines: tuple[tuple[int, str], ...]
 
 
 @dataclass(frozen=True)
 class NotAccused:
-    """A term that was selected and withdrawn; ``stand_in``: poses not fitted gain by it."""
+    """A term that was selected and withdrawn; ``stand_in``: it reduces the gap in new regions."""
 
     term: Term
     reason: Withdrawal
@@ -91,7 +91,7 @@ class Slip:
     before: float  # s, or the row where the log has no time
     after: float
     timed: bool
-    alone: bool  # nothing else remains: the model holds on both sides
+    alone: bool  # no structure remains: the model holds before and after
 
 
 Fact = TooFewRows | Thinned | Outliers | NotAccused | Slip | ParameterNote

@@ -1,9 +1,9 @@
-"""What to expect where nothing was fitted: in another region of joint space, in another session.
+"""Residuals to expect in another region of joint space and in another session.
 
-Poses that stand among the fitted ones flatter a model. For a *new region* the folds are regions of
-joint space (of a recording: stretches of time, with a gap to what is fitted); the frame comes from
-the fit's poses. For a *new session* the folds are sessions: the judged session gets a frame (and a
-tool point, if remounted) fitted on itself, and nothing else.
+Held-out poses close to fitted ones give optimistic figures. For a *new region* the folds are
+regions of joint space (of a recording: stretches of time with a margin on either side); the frame
+comes from the fitted poses. For a *new session* the folds are sessions: only the frame (and the
+tool point, if remounted) of the held-out session is fitted on it.
 """
 
 from __future__ import annotations
@@ -22,25 +22,25 @@ from gapbridge.core.estimation.held_out import joint_regions
 from gapbridge.core.estimation.least_squares import solve
 
 REGIONS = 5  # of joint space, or stretches of time: each is left out whole
-FEWEST = 3  # samples of a region that the figure needs
-GAP = 0.02  # share of a recording on either side of a judged stretch that is not fitted either
+MIN_SAMPLES = 3  # of a region, for it to count
+MARGIN = 0.02  # share of a recording, on either side of a held-out stretch, that is not fitted
 
 
 @dataclass(frozen=True)
 class Generalisation:
-    """Figures of one coordinate, rms, in the channel's unit; None: cannot be had."""
+    """Residual rms of one coordinate, in the channel's unit; None: not available."""
 
     new_region: float | None
     new_session: float | None
-    by_session: tuple[tuple[int, float], ...] = ()  # session, its remainder when left out
+    by_session: tuple[tuple[int, float], ...] = ()  # session, its rms when held out
 
 
-NOWHERE = Generalisation(None, None)
+NO_GENERALISATION = Generalisation(None, None)
 
 
 def generalisation(selection: Selection, chosen: Sequence[int]) -> Generalisation:
-    """Return what ``chosen`` candidates leave where their fit saw nothing."""
-    problem = _Problem(selection, tuple(chosen))
+    """Return the residuals of the ``chosen`` candidates in held-out regions and sessions."""
+    problem = _HeldOutRegression(selection, tuple(chosen))
     new_region = problem.new_region()
     each = problem.by_session()
     pooled = np.concatenate([r for _, r in each]) if each else None
@@ -49,8 +49,8 @@ def generalisation(selection: Selection, chosen: Sequence[int]) -> Generalisatio
     )
 
 
-class _Problem:
-    """The whitened rows of a selection's kept samples: columns of the causes, nuisances, gap."""
+class _HeldOutRegression:
+    """The regression in whitened rows of the kept samples: causes, nuisances, gap."""
 
     def __init__(self, selection: Selection, chosen: tuple[int, ...]) -> None:
         observation, kept = selection.observation, selection.kept
@@ -62,7 +62,7 @@ class _Problem:
         self._causes = unprojected.columns(selection.space, chosen)
         usual = [p.scale for c in chosen for p in selection.space.candidates[c].parameters]
         weak = 1 / (PRIOR_REACH * np.array(usual)) if usual else np.zeros(0)
-        self._hold = np.maximum(selection.pull(chosen), weak)
+        self._prior = np.maximum(selection.pull(chosen), weak)
         self._nuisance, self._gap = unprojected.nuisance, unprojected.target
         self._owner = np.array(observation.nuisance_session or (0,) * unprojected.nuisance.shape[1])
         whole = observation.session
@@ -70,20 +70,20 @@ class _Problem:
         self._fold, self._near = held_out_regions(observation, kept)
 
     def new_region(self) -> float | None:
-        """Return the rms over regions left out in turn, frames from the fitted poses."""
+        """Return the rms over held-out regions, frames from the fitted poses."""
         residuals = []
         for fold in range(int(self._fold.max()) + 1):
             out = self._fold == fold
             fitted = ~out & ~self._near[fold]
-            # a session without fitted poses has no frame there
-            framed = [s for s in np.unique(self._session) if self._enough(s, fitted)]
+            # a session needs fitted poses for its frame
+            framed = [s for s in np.unique(self._session) if self._has_frame(s, fitted)]
             judged = out & np.isin(self._session, framed)
             columns = np.isin(self._owner, framed)
             A = np.hstack([self._causes, self._nuisance[:, columns]])
             fitted &= np.isin(self._session, framed)
-            if judged.sum() < FEWEST or self._k * fitted.sum() <= A.shape[1]:
+            if judged.sum() < MIN_SAMPLES or self._k * fitted.sum() <= A.shape[1]:
                 continue
-            x = solve(A[self._rows(fitted)], self._gap[self._rows(fitted)], self._hold)
+            x = solve(A[self._rows(fitted)], self._gap[self._rows(fitted)], self._prior)
             rows = self._rows(judged)
             residuals.append(self._in_unit(self._gap[rows] - A[rows] @ x, judged))
         if len(residuals) < 2:
@@ -91,7 +91,7 @@ class _Problem:
         return _rms(np.concatenate(residuals))
 
     def by_session(self) -> list[tuple[int, Array]]:
-        """Return each session's remainder (n, own) under a fit of the others, itself placed."""
+        """Return each session's residual (n, own) under a fit of the others, its frame fitted."""
         sessions = np.unique(self._session)
         residuals = []
         for s in sessions if len(sessions) > 1 else ():
@@ -101,7 +101,7 @@ class _Problem:
             rows = self._rows(~out)
             if len(self._gap[rows]) <= A.shape[1]:
                 continue
-            x = solve(A[rows], self._gap[rows], self._hold)[: self._causes.shape[1]]
+            x = solve(A[rows], self._gap[rows], self._prior)[: self._causes.shape[1]]
             rows = self._rows(out)
             N = self._nuisance[rows][:, own_frame]
             residual = self._gap[rows] - self._causes[rows] @ x
@@ -109,7 +109,7 @@ class _Problem:
             residuals.append((int(s), self._in_unit(residual, out)))
         return residuals
 
-    def _enough(self, session: int, fitted: NDArray[np.bool_]) -> bool:
+    def _has_frame(self, session: int, fitted: NDArray[np.bool_]) -> bool:
         unknowns = int((self._owner == session).sum())
         samples = int((fitted & (self._session == session)).sum())
         return bool(self._k * samples >= unknowns + MIN_FREEDOM_OF_SESSION)
@@ -128,15 +128,15 @@ class _Problem:
 def held_out_regions(
     observation: Observation, kept: NDArray[np.bool_], seed: int = 0
 ) -> tuple[Index, NDArray[np.bool_]]:
-    """Return the region (n,) of each kept sample, and what else lies too near each (folds, n)."""
+    """Return the region (n,) of each kept sample, and samples too close to each (folds, n)."""
     n = int(kept.sum())
     if observation.order_in_time:
         place = np.arange(n) / n
         fold = np.minimum((place * REGIONS).astype(np.int64), REGIONS - 1)
         near = np.array([
             (fold != f)
-            & (place > f / REGIONS - GAP)
-            & (place < (f + 1) / REGIONS + GAP)
+            & (place > f / REGIONS - MARGIN)
+            & (place < (f + 1) / REGIONS + MARGIN)
             for f in range(REGIONS)
         ])  # fmt: skip
         return fold, near

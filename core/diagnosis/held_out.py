@@ -1,8 +1,8 @@
-"""Held-out gaps: what a set of terms is worth on samples that its fit did not see.
+"""Cross-validation: the gap that a set of terms leaves on held-out samples.
 
-Where every joint is a coordinate with a noise of its own (torques, following errors), a cause is
-judged with each joint weighed by its floor, as a wrench's torques are: what a wrist of 0.1 Nm shows
-twenty times over would else be lost in the noise of a shoulder of 10 Nm.
+Where every joint is a coordinate with a noise of its own (torques, following errors), each joint is
+weighted by its noise floor: a cause at a wrist with a noise of 0.1 Nm would otherwise be lost in
+the noise of a shoulder of 10 Nm.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ RESAMPLES = 400
 
 @dataclass(frozen=True)
 class Shrink:
-    """How far a gap shrinks once terms are in the model, on held-out samples."""
+    """The relative reduction of a held-out gap by adding terms to the model."""
 
-    gap_without: float  # rms per coordinate, others kept in, each joint weighed by its floor
+    gap_without: float  # rms per coordinate, other terms in the model, joints weighted by floor
     gap_with: float
     shrink: float
     interval: tuple[float, float]  # 95 %, over conditions
@@ -34,7 +34,7 @@ class Shrink:
 class HeldOut:
     """Cross-validation of sets of candidates in a selection's sample space.
 
-    Folds are conditions drawn at random, or ``parts`` (n,): numbers from 0 of each kept sample.
+    Folds are random groups of conditions, or ``parts`` (n,), the fold of each kept sample from 0.
     """
 
     def __init__(
@@ -45,10 +45,10 @@ class HeldOut:
         self._nuisance = selection.unprojected.nuisance
         k = selection.observation.measured.shape[1]
         own = {"position": 3}.get(selection.observation.channel, k)
-        # torques of a wrench count in N, as their noise compares: a cause may show in them alone
+        # torques of a wrench count in N by the ratio of noise: a cause may act on them alone
         self._weight = selection.observation.weight[: min(own, k)]
         self._unwhiten = selection.unwhitener()
-        self._level = _level(selection)[: min(own, k)]
+        self._joint_weight = _joint_weights(selection)[: min(own, k)]
         self._k, self._own = k, min(own, k)
         names, group = np.unique(selection.observation.groups[selection.kept], return_inverse=True)
         self._group, self._groups = group, len(names)
@@ -56,7 +56,7 @@ class HeldOut:
             parts = random_folds(group, FOLDS, seed)
         self.possible = int(parts.max()) > 0 and len(self._target) > self._nuisance.shape[1] + 3
         self._fold = np.repeat(parts, k)
-        self._pull = selection.pull
+        self._prior = selection.pull
         self._seed = seed
         self._known: dict[tuple[int, ...], Array] = {}
 
@@ -64,33 +64,33 @@ class HeldOut:
         """Return the mean square of each held-out sample's own coordinates (n,), channel unit."""
         return np.asarray(np.mean(self._gap(chosen) ** 2, axis=1))
 
-    def _levelled(self, chosen: Sequence[int]) -> Array:
-        """Return the same (n,) with each joint weighed by its floor."""
-        return np.asarray(np.mean((self._gap(chosen) * self._level) ** 2, axis=1))
+    def _weighted_squares(self, chosen: Sequence[int]) -> Array:
+        """Return the same (n,) with each joint weighted by its noise floor."""
+        return np.asarray(np.mean((self._gap(chosen) * self._joint_weight) ** 2, axis=1))
 
     def _gap(self, chosen: Sequence[int]) -> Array:
         """Return each held-out sample's own coordinates (n, own), channel unit."""
         key = tuple(sorted(chosen))
         if key not in self._known:
-            left = self._left(key).reshape(-1, self._k, 1)
-            self._known[key] = (self._unwhiten @ left)[:, : self._own, 0] * self._weight
+            residual = self._residuals(key).reshape(-1, self._k, 1)
+            self._known[key] = (self._unwhiten @ residual)[:, : self._own, 0] * self._weight
         return self._known[key]
 
     def rms(self, chosen: Sequence[int]) -> float:
         """Return the held-out rms of one coordinate, in the channel's unit."""
         return float(np.sqrt(np.mean(self.squares(chosen))))
 
-    def _left(self, chosen: tuple[int, ...]) -> Array:
+    def _residuals(self, chosen: tuple[int, ...]) -> Array:
         A = np.hstack([self._unprojected.columns(self._space, chosen), self._nuisance])
         if not A.shape[1]:
             return self._target
-        # with the pull: of a number that moves nothing only the pull is there
-        pull = np.concatenate([self._pull(chosen), np.zeros(self._nuisance.shape[1])])
-        return missed(A, self._target, self._fold, pull)
+        # the prior keeps parameters without any effect on the data determined
+        prior = np.concatenate([self._prior(chosen), np.zeros(self._nuisance.shape[1])])
+        return missed(A, self._target, self._fold, prior)
 
     def shrink(self, with_set: Sequence[int], without_set: Sequence[int]) -> Shrink:
-        """Return how far the gap shrinks from one set to another, with its interval."""
-        after, before = self._levelled(with_set), self._levelled(without_set)
+        """Return the reduction of the gap from one set to another, with a bootstrap interval."""
+        after, before = self._weighted_squares(with_set), self._weighted_squares(without_set)
         totals = np.zeros((2, self._groups))
         np.add.at(totals[0], self._group, after)
         np.add.at(totals[1], self._group, before)
@@ -106,10 +106,10 @@ class HeldOut:
         )  # fmt: skip
 
 
-def _level(selection: Selection) -> Array:
-    """Return the weight (k,) of each coordinate: joints by their floors, so that noise stays as is.
+def _joint_weights(selection: Selection) -> Array:
+    """Return the weight (k,) of each coordinate by its joint's noise; the mean noise is kept.
 
-    One for coordinates that share one noise, and of a wrench, which has its own weights.
+    1 for coordinates that share one noise, and for a wrench, which has its own weights.
     """
     k = selection.observation.measured.shape[1]
     sigma = selection.noise.block_sigma

@@ -1,8 +1,8 @@
-"""The judgement: what is accused, what is withdrawn, and what is said to be unexplained.
+"""The judgement: which selected terms are accused or withdrawn, and whether structure is left.
 
-An accusation stands or falls by itself: it has a value, off its bounds; it withstands the unnamed
-functions that the residual asks for (``remainder``); and it shrinks the gap on samples that its fit
-did not see. That something else is left takes nothing back; it is said.
+Each accused effect is validated by itself: its value is significant and off its bounds; it is
+stable when the unnamed functions that the residual calls for are added (``value_stability``); and
+it reduces the gap on held-out samples. Remaining structure is reported, but withdraws nothing.
 """
 
 from __future__ import annotations
@@ -15,49 +15,46 @@ from numpy.typing import NDArray
 
 from gapbridge.core.arm import Arm
 from gapbridge.core.arrays import Array
-from gapbridge.core.diagnosis.bump import bumps
 from gapbridge.core.diagnosis.constancy import not_constant
 from gapbridge.core.diagnosis.criteria import (
     CURVATURE_GAIN,
-    HINT_P,
-    NEGLIGIBLE,
-    OUTLIER_SHARE,
+    MAX_OUTLIER_SHARE,
+    MAX_STRUCTURE_P,
+    MAX_STRUCTURE_P_WITH_HINT,
+    MIN_REPEATS_TO_TEST,
+    NEGLIGIBLE_SIZE,
     OVER_INSTRUMENT_SIGMA,
     OVER_REPEAT_SCATTER,
     OVER_STATED_NOISE,
-    REPEATS_REFUTE,
     SAME_SPAN,
     STAND_IN_GAIN,
-    SURE_P,
     TIE_SCORE,
     USUAL_REPEATABILITY,
 )
 from gapbridge.core.diagnosis.finding import Check, Withdrawal
 from gapbridge.core.diagnosis.held_out import HeldOut
-from gapbridge.core.diagnosis.regions import one_place, parts
-from gapbridge.core.diagnosis.remainder import (
-    closes_everywhere,
-    links_withstand,
-    withstanding,
-)
-from gapbridge.core.diagnosis.residual_structure import (
-    dependence,
-    structure_p_value,
-)
+from gapbridge.core.diagnosis.periodicity import not_periodic
+from gapbridge.core.diagnosis.regions import parts, single_pose
+from gapbridge.core.diagnosis.residual_structure import dependence, structure_p_value
 from gapbridge.core.diagnosis.selection.candidate import Candidate
 from gapbridge.core.diagnosis.selection.delay_columns import delayed_by
 from gapbridge.core.diagnosis.selection.local_search import forward_selected, rivals
-from gapbridge.core.diagnosis.selection.problem import CandidateFit, SampleSpace, fit
-from gapbridge.core.diagnosis.selection.refit import Remainder, worth
+from gapbridge.core.diagnosis.selection.refit import UnnamedPart, worth
+from gapbridge.core.diagnosis.selection.sample_space import CandidateFit, SampleSpace, fit
 from gapbridge.core.diagnosis.selection.selection import Selection, refitted_alone
 from gapbridge.core.diagnosis.selection.smooth import KNOTS
 from gapbridge.core.diagnosis.selection.stiffness_curves import straight_curves
+from gapbridge.core.diagnosis.value_stability import (
+    links_close_gap,
+    links_predict_new_regions,
+    stable_effects,
+)
 from gapbridge.core.effects import CATALOGUE
 from gapbridge.core.errors import InputError
 from gapbridge.core.estimation.least_squares import basis_of, projected_out
 
-VAGUE = Withdrawal(Check.SIGNIFICANT)
-BESIDE = Withdrawal(Check.STABLE_VALUE)
+NOT_SIGNIFICANT = Withdrawal(Check.SIGNIFICANT)
+NOT_STABLE = Withdrawal(Check.STABLE_VALUE)
 
 
 @dataclass(frozen=True)
@@ -67,66 +64,61 @@ class Judgement:
     accused: tuple[int, ...]  # positions in ``selection.terms``
     structured: bool
     p_value: float | None
-    depends_on: tuple[
-        tuple[str, float], ...
-    ]  # quantity, held-out share of what is not accounted for
-    ties: dict[int, tuple[str, ...]]  # position -> effects that would do as well
+    depends_on: tuple[tuple[str, float], ...]  # quantity, held-out share of the residual
+    ties: dict[int, tuple[str, ...]]  # position -> effects that fit equally well
     withdrawn: tuple[tuple[int, Withdrawal], ...]  # position, reason
-    remainder: Remainder | None = None  # unnamed functions that account for what is left
-    vague: tuple[int, ...] = ()  # positions that some rows leave vague: all rows decide
-    stand_ins: tuple[
-        int, ...
-    ] = ()  # positions not accused that shrink the gap in regions not fitted
+    unnamed_part: UnnamedPart | None = None  # unnamed functions for the residual structure
+    undecided: tuple[int, ...] = ()  # positions to be decided on all rows
+    stand_ins: tuple[int, ...] = ()  # positions not accused that reduce the gap in new regions
 
 
-def judge(selection: Selection, held: HeldOut) -> Judgement:
+def judge(selection: Selection, held_out: HeldOut) -> Judgement:
     """Return the judgement of a selection."""
     withdrawn: dict[int, Withdrawal] = {}  # by candidate
     whole = selection
-    if selection.block and not links_withstand(selection):
-        withdrawn |= dict.fromkeys(selection.block, BESIDE)
+    if selection.block and not links_predict_new_regions(selection):
+        withdrawn |= dict.fromkeys(selection.block, NOT_STABLE)
         selection = selection.without_links()
-    for position, reason in _no_value(selection).items():
+    for position, reason in _insignificant(selection).items():
         withdrawn[selection.term_index[position]] = reason
-    withdrawn |= dict.fromkeys(bumps(selection), Withdrawal(Check.NOT_LOCALISED))
-    for c, loads in _like_a_load(selection).items():
+    withdrawn |= dict.fromkeys(not_periodic(selection), Withdrawal(Check.NOT_LOCALISED))
+    for c, loads in _confounded_with_load(selection).items():
         withdrawn.setdefault(c, Withdrawal(Check.SEPARATED, loads))
-    for c, quantity in _like_a_level(selection).items():
+    for c, quantity in _confounded_with_level(selection).items():
         withdrawn.setdefault(c, Withdrawal(Check.NOT_A_LEVEL, quantity))
-    believed = [
+    tested = [
         c for c in selection.term_index if c not in withdrawn and c not in selection.block
     ]  # fmt: skip
-    stays, remainder, closing = withstanding(selection, believed)
-    varying = not_constant(selection, stays, remainder.columns)
-    while closing & varying.keys():  # what closed the gap varies: another may do it in its place
+    accused, unnamed_part, closing = stable_effects(selection, tested)
+    varying = not_constant(selection, accused, unnamed_part.columns)
+    while closing & varying.keys():  # a varying term closed the gap: try without it
         withdrawn |= {c: Withdrawal(Check.CONSTANT, by) for c, by in varying.items()}
-        believed = [c for c in believed if c not in varying]
-        stays, remainder, closing = withstanding(selection, believed)
-        varying = not_constant(selection, stays, remainder.columns)
-    withdrawn |= {c: BESIDE for c in believed if c not in stays}
+        tested = [c for c in tested if c not in varying]
+        accused, unnamed_part, closing = stable_effects(selection, tested)
+        varying = not_constant(selection, accused, unnamed_part.columns)
+    withdrawn |= {c: NOT_STABLE for c in tested if c not in accused}
     for c, quantity in varying.items():
         withdrawn[c] = Withdrawal(Check.CONSTANT, quantity)
-        stays.remove(c)
-    for c in _without_companion(selection, stays):
+        accused.remove(c)
+    for c in _missing_requirement(selection, accused):
         withdrawn[c] = Withdrawal(Check.COMPANION)
-        stays.remove(c)
-    fallen = bool(withdrawn)
-    stays = [*stays, *selection.block]
-    for c in gainless(selection, stays, held):
+        accused.remove(c)
+    withdrawn_any = bool(withdrawn)
+    accused = [*accused, *selection.block]
+    for c in without_gain(selection, accused, held_out):
         withdrawn[c] = Withdrawal(Check.HELD_OUT_GAIN)
-        stays.remove(c)
-    judgement = _verdict(whole, selection, stays, withdrawn, fallen)
-    unknown = judgement.structured or remainder.columns.shape[1] > 0
-    return replace(judgement, remainder=remainder if unknown else None)
+        accused.remove(c)
+    judgement = _verdict(whole, selection, accused, withdrawn, withdrawn_any)
+    unknown = judgement.structured or unnamed_part.columns.shape[1] > 0
+    return replace(judgement, unnamed_part=unnamed_part if unknown else None)
 
 
 def judge_geometry(
     selection: Selection, judgement: Judgement, arm: Arm
 ) -> tuple[Selection, Judgement]:
-    """Return selection and judgement with all links' geometry accused, where one link is not it.
+    """Return selection and judgement with all links' geometry accused instead of single links.
 
-    What the accusations leave it has to close in every part of the log, each predicted by a fit
-    that did not see it.
+    It has to close the remaining gap in every part of the log, each held out of its fit.
     """
     accused_before = [selection.term_index[p] for p in judgement.accused]
     suspected = [*accused_before, *(selection.term_index[p] for p, _ in judgement.withdrawn)]
@@ -135,51 +127,52 @@ def judge_geometry(
         return selection, judgement
     try:
         whole = selection.with_all_links(arm)
-    except InputError:  # no arm of such links stands
+    except InputError:  # such an arm has no equilibrium
         return selection, judgement
-    if whole is None or not closes_everywhere(whole, accused_before):
+    if whole is None or not links_close_gap(whole, accused_before):
         return selection, judgement
-    again = judge(whole, HeldOut(whole))
-    accused = {whole.term_index[p] for p in again.accused}
-    return (whole, again) if accused & set(whole.block) else (selection, judgement)
+    second_judgement = judge(whole, HeldOut(whole))
+    accused = {whole.term_index[p] for p in second_judgement.accused}
+    return (whole, second_judgement) if accused & set(whole.block) else (selection, judgement)
 
 
 def _verdict(
-    whole: Selection, selection: Selection, stays: list[int],
-    withdrawn: Mapping[int, Withdrawal], fallen: bool,
+    whole: Selection, selection: Selection, accused: list[int],
+    withdrawn: Mapping[int, Withdrawal], withdrawn_any: bool,
 ) -> Judgement:  # fmt: skip
-    """Return the judgement of what stays of a whole selection, and whether structure is left."""
-    place = {c: p for p, c in enumerate(whole.term_index)}
+    """Return the judgement with the ``accused`` candidates, and whether structure is left."""
+    position_of = {c: p for p, c in enumerate(whole.term_index)}
     space, nuisance = selection.working, selection.nuisance_basis
-    single = [c for c in stays if c not in selection.block]
+    single = [c for c in accused if c not in selection.block]
     p_value = structure_p_value(space, nuisance, single)
-    p_value = min(p_value, _too_much_left(whole))
-    if np.mean(~whole.kept) > OUTLIER_SHARE:  # no bad luck: something befalls the log
+    p_value = min(p_value, _excess_residual_p(whole))
+    if np.mean(~whole.kept) > MAX_OUTLIER_SHARE:
         p_value = 0.0
     unnamed = any(not space.candidates[c].named for c in selection.best.chosen)
     if unnamed:
-        p_value = min(p_value, _needless(space, selection.best))
-    structured = p_value < (HINT_P if unnamed or fallen else SURE_P)
+        p_value = min(p_value, _unnamed_unnecessary_p(space, selection.best))
+    hint = unnamed or withdrawn_any
+    structured = p_value < (MAX_STRUCTURE_P_WITH_HINT if hint else MAX_STRUCTURE_P)
     depends: tuple[tuple[str, float], ...] = ()
-    if structured or not stays:
+    if structured or not accused:
         depends = tuple(dependence(space, nuisance, single, selection.groups))
     ties = ties_of(space, selection.best, single)
     return Judgement(
-        tuple(place[c] for c in stays), structured, p_value, depends,
-        {place[c]: names for c, names in ties.items()},
-        tuple((place[c], why) for c, why in withdrawn.items()),
+        tuple(position_of[c] for c in accused), structured, p_value, depends,
+        {position_of[c]: names for c, names in ties.items()},
+        tuple((position_of[c], why) for c, why in withdrawn.items()),
     )  # fmt: skip
 
 
-def _needless(space: SampleSpace, best: CandidateFit) -> float:
-    """Return the probability that named causes alone would do, of a set with unnamed functions."""
+def _unnamed_unnecessary_p(space: SampleSpace, best: CandidateFit) -> float:
+    """Return the probability that a set does not need its unnamed functions."""
     named = fit(space, [c for c in best.chosen if space.candidates[c].named])
     alone = forward_selected(space, named, named_only=True)
     return float(1 / (1 + np.exp(0.5 * np.clip(alone.score - best.score, -700.0, 700.0))))
 
 
-def _no_value(selection: Selection) -> dict[int, Withdrawal]:
-    """Return positions of terms that only a bound holds, or whose value may as well be none."""
+def _insignificant(selection: Selection) -> dict[int, Withdrawal]:
+    """Return positions of terms that are on a bound, negligible or not significant."""
     withdrawn = {}
     straight = straight_curves(
         selection.space, selection.term_index, selection.terms, selection.covariance
@@ -196,8 +189,8 @@ def _no_value(selection: Selection) -> dict[int, Withdrawal]:
         ):
             withdrawn[position] = Withdrawal(Check.INSIDE_BOUNDS)
         if worth(term, spread) < 1:
-            withdrawn[position] = VAGUE
-        least = NEGLIGIBLE * candidate.scales
+            withdrawn[position] = NOT_SIGNIFICANT
+        least = NEGLIGIBLE_SIZE * candidate.scales
         if candidate.curve is None and all(
             abs(v) < size for v, size in zip(term.values, least, strict=False)
         ):
@@ -205,33 +198,35 @@ def _no_value(selection: Selection) -> dict[int, Withdrawal]:
     return withdrawn
 
 
-def still_sure(selection: Selection, judgement: Judgement, arm: Arm) -> tuple[Selection, Judgement]:
-    """Return what is accused refitted as all there is, and its judgement.
+def significant_alone(
+    selection: Selection, judgement: Judgement, arm: Arm
+) -> tuple[Selection, Judgement]:
+    """Return selection and judgement after the accused terms are refitted alone.
 
-    Beside the unknown, and over the regions of the log, a value may be less sure than it was, and a
-    stiffness curve straight. Of the links, accused as a whole, one term at least must be sure by
-    itself: else the data show none of their numbers; and none may be far off without being sure.
+    With unnamed functions, and with covariances over the regions of the log, a value may be less
+    significant than before, and a stiffness curve linear. If all links are accused as a whole, at
+    least one of their terms must be significant, and no parameter implausible without being so.
     """
     while True:
-        refit = refitted_alone(selection, arm, judgement.accused, judgement.remainder)
-        if far := refit.far_off(judgement.accused):
-            selection = selection.with_nominal(far)
+        refit = refitted_alone(selection, arm, judgement.accused, judgement.unnamed_part)
+        if implausible := refit.implausible_parameters(judgement.accused):
+            selection = selection.with_nominal(implausible)
             continue
-        straight = _straight_beside(refit, judgement)
-        share = {
+        straight = _linear_with_unnamed(refit, judgement)
+        significance = {
             p: 0.0 if p in straight else worth(refit.terms[p], refit.covariance[p])
             for p in judgement.accused
         }
         weakest = min(
             refit.judged_together(judgement.accused),
-            key=lambda kind: max(share[p] for p in kind), default=(),
+            key=lambda kind: max(significance[p] for p in kind), default=(),
         )  # fmt: skip
-        if not weakest or max(share[p] for p in weakest) >= 1:
+        if not weakest or max(significance[p] for p in weakest) >= 1:
             return refit, judgement
         inside = refit.term_index[weakest[0]] in refit.block
-        # of friction beside the links more rows may still be sure
-        reason = VAGUE if inside else BESIDE
-        # a joint's zero among the links that shows nothing leaves nothing behind
+        # friction that belongs to the links may be significant on more rows
+        reason = NOT_SIGNIFICANT if inside else NOT_STABLE
+        # a joint's zero that is not significant leaves no structure behind
         structured = not inside or refit.is_link(weakest[0])
         judgement = replace(
             judgement, accused=tuple(p for p in judgement.accused if p not in weakest),
@@ -241,52 +236,52 @@ def still_sure(selection: Selection, judgement: Judgement, arm: Arm) -> tuple[Se
         )  # fmt: skip
 
 
-def _straight_beside(refit: Selection, judgement: Judgement) -> set[int]:
-    """Return positions of accused stiffness curves that are straight beside the unknown.
+def _linear_with_unnamed(refit: Selection, judgement: Judgement) -> set[int]:
+    """Return positions of accused stiffness curves that are linear given the unnamed functions.
 
-    By their sigma over the regions of the log: what scatters among regions has no likelihood.
+    By their standard deviation over the regions of the log, for which there is no likelihood.
     """
     return {
         p for p in judgement.accused
-        if judgement.remainder is not None and CATALOGUE[refit.terms[p].effect].curved
+        if judgement.unnamed_part is not None and CATALOGUE[refit.terms[p].effect].curved
         and refit.terms[p].values[1] ** 2 < CURVATURE_GAIN * refit.covariance[p][1, 1]
     }  # fmt: skip
 
 
-def _without_companion(selection: Selection, stays: Sequence[int]) -> list[int]:
-    """Return the candidates that show nothing without an effect that is not accused beside them."""
+def _missing_requirement(selection: Selection, accused: Sequence[int]) -> list[int]:
+    """Return the candidates whose required effect is not accused."""
     candidates = selection.space.candidates
-    families = {"", *(candidates[c].family for c in stays)}
-    return [c for c in stays if candidates[c].beside not in families]
+    families = {"", *(candidates[c].family for c in accused)}
+    return [c for c in accused if candidates[c].requires not in families]
 
 
-def _like_a_load(selection: Selection) -> dict[int, str]:
-    """Return the constants of a sensor of which a load's weight is one, too, and which load's.
+def _confounded_with_load(selection: Selection) -> dict[int, str]:
+    """Return a sensor's constants that a load explains equally, with the names of the loads.
 
-    As long as the flange does not turn against gravity a weight is a constant reading.
+    While the flange does not turn against gravity, a weight is a constant reading.
     """
     space, loads_of = selection.working, {}
     for c in selection.term_index:
         if not space.candidates[c].effect.any_constant:
             continue
-        U = basis_of(space.columns([c]))
+        basis = basis_of(space.columns([c]))
         alike = []
         for other, candidate in enumerate(space.candidates):
             if not candidate.effect.carried:
                 continue
             x = space.columns([other])
             whole = float(np.sum(x**2))
-            if whole > 0 and float(np.sum(projected_out(U, x) ** 2)) < SAME_SPAN * whole:
+            if whole > 0 and float(np.sum(projected_out(basis, x) ** 2)) < SAME_SPAN * whole:
                 alike.append(candidate.family)
         if alike:
             loads_of[c] = " or ".join(dict.fromkeys(alike))
     return loads_of
 
 
-def _like_a_level(selection: Selection) -> dict[int, str]:
-    """Return what steps as a quantity leaves all its levels that something unnamed goes by, too.
+def _confounded_with_level(selection: Selection) -> dict[int, str]:
+    """Return steps at which a quantity changes level that an unnamed function depends on too.
 
-    A tool that seats differently under each load is no target that moves as one is changed.
+    A tool that seats differently under each load is no target slip at a change of load.
     """
     observation, quantity_of = selection.observation, {}
     goes_by = dict.fromkeys(
@@ -304,70 +299,70 @@ def _like_a_level(selection: Selection) -> dict[int, str]:
     return quantity_of
 
 
-def gainless(selection: Selection, stays: Sequence[int], held: HeldOut) -> list[int]:
-    """Return the candidates of effects that do not shrink the held-out gap, the weakest first."""
-    if not held.possible:
-        return list(stays)
-    staying, fallen = list(stays), []
-    while staying:
-        kinds = _by_effect(selection, staying)
+def without_gain(selection: Selection, accused: Sequence[int], held_out: HeldOut) -> list[int]:
+    """Return the candidates of effects that do not reduce the held-out gap, the weakest first."""
+    if not held_out.possible:
+        return list(accused)
+    remaining, failed = list(accused), []
+    while remaining:
+        by_effect = _by_effect(selection, remaining)
         low = {
-            kind: held.shrink(staying, [c for c in staying if c not in members]).interval[0]
-            for kind, members in kinds.items()
+            kind: held_out.shrink(remaining, [c for c in remaining if c not in members]).interval[0]
+            for kind, members in by_effect.items()
         }
         worst = min(low, key=lambda kind: low[kind])
         if low[worst] > 0:
             break
-        fallen += kinds[worst]
-        staying = [c for c in staying if c not in kinds[worst]]
-    return fallen
+        failed += by_effect[worst]
+        remaining = [c for c in remaining if c not in by_effect[worst]]
+    return failed
 
 
 def _by_effect(selection: Selection, chosen: Sequence[int]) -> dict[str, list[int]]:
-    kinds: dict[str, list[int]] = {}
+    by_effect: dict[str, list[int]] = {}
     for c in chosen:
         whole = c in selection.block
-        kinds.setdefault("" if whole else selection.space.candidates[c].family, []).append(c)
-    return kinds
+        by_effect.setdefault("" if whole else selection.space.candidates[c].family, []).append(c)
+    return by_effect
 
 
 def with_stand_ins(selection: Selection, judgement: Judgement) -> Judgement:
-    """Return the judgement with what is not accused, but shrinks the gap in regions not fitted.
+    """Return the judgement with the stand-ins: terms not accused that help in new regions.
 
-    Terms go one by one, the least useful first, until each of those left gains.
+    Terms are removed one by one, the least useful first, until each remaining one helps.
     """
-    index, none = selection.term_index, _no_value(selection)
+    index, none = selection.term_index, _insignificant(selection)
     useful = [
         p for p, why in judgement.withdrawn if p not in none and why.failed is not Check.SEPARATED
     ]
-    held = HeldOut(selection, parts=parts(selection.observation, selection.kept))
-    if not (useful and held.possible) or one_place(selection.observation):
+    held_out = HeldOut(selection, parts=parts(selection.observation, selection.kept))
+    if not (useful and held_out.possible) or single_pose(selection.observation):
         return judgement
     chosen = [*judgement.accused, *useful]
-    units = _units(selection, useful)
-    while units:
+    groups = _groups(selection, useful)
+    while groups:
         everything = [index[p] for p in chosen]
-        rest = [[index[p] for p in chosen if p not in unit] for unit in units]
-        worst = min(range(len(units)), key=lambda u: held.rms(rest[u]))
-        if held.shrink(everything, rest[worst]).interval[0] > STAND_IN_GAIN:
+        others = [[index[p] for p in chosen if p not in group] for group in groups]
+        worst = min(range(len(groups)), key=lambda u: held_out.rms(others[u]))
+        if held_out.shrink(everything, others[worst]).interval[0] > STAND_IN_GAIN:
             break
-        gone = units.pop(worst)
-        chosen = [p for p in chosen if p not in gone]
-    stand_ins = tuple(sorted(p for unit in units for p in unit))
+        removed = groups.pop(worst)
+        chosen = [p for p in chosen if p not in removed]
+    stand_ins = tuple(sorted(p for group in groups for p in group))
     return replace(judgement, stand_ins=stand_ins)
 
 
-def _units(selection: Selection, positions: Sequence[int]) -> list[tuple[int, ...]]:
-    """Return the positions each by itself, the links' geometry in one."""
+def _groups(selection: Selection, positions: Sequence[int]) -> list[tuple[int, ...]]:
+    """Return each position by itself, those of the links' geometry as one group."""
     links = tuple(p for p in positions if selection.term_index[p] in selection.block)
     single: list[tuple[int, ...]] = [(p,) for p in positions if p not in links]
     return [*single, links] if links else single
 
 
-def _too_much_left(selection: Selection) -> float:
-    """Return the probability that noise leaves as much as is left; 1 unless that is too much.
+def _excess_residual_p(selection: Selection) -> float:
+    """Return the p-value of the residual's size under noise alone; 1 if it is not too large.
 
-    Against the noise that is stated, or that repeats show, or that instruments usually have.
+    The noise is the stated one, that of repeats, or the usual one of instruments.
     """
     observation, k = selection.observation, selection.observation.measured.shape[1]
     if observation.sigma <= 0 or observation.channel != "position":
@@ -378,13 +373,13 @@ def _too_much_left(selection: Selection) -> float:
     pure, repeats = pure_error(residual, observation.groups[selection.kept])
     if observation.sigma_is_whole:
         least, times = observation.sigma**2, OVER_STATED_NOISE
-    elif repeats >= REPEATS_REFUTE:
+    elif repeats >= MIN_REPEATS_TO_TEST:
         least, times = max(pure, observation.sigma**2), OVER_REPEAT_SCATTER
     else:
         least, times = max(USUAL_REPEATABILITY, OVER_INSTRUMENT_SIGMA * observation.sigma) ** 2, 1.0
     if variance <= times**2 * least:
         return 1.0
-    from scipy.special import gammaincc  # a fifth of a second, only where too much is left
+    from scipy.special import gammaincc  # slow to import
 
     return float(gammaincc(freedom / 2, freedom * variance / least / 2))
 
@@ -406,9 +401,9 @@ def pure_error(residual: Array, groups: NDArray[np.int64]) -> tuple[float, int]:
 def ties_of(
     space: SampleSpace, best: CandidateFit, accused: Sequence[int]
 ) -> dict[int, tuple[str, ...]]:
-    """Return the effects that would do as well as each accused one, at its place.
+    """Return the effects that fit as well in the place of each accused one.
 
-    Another delay has to do so at all joints: they have one effect together.
+    Another kind of delay has to do so at all joints, because they have one effect together.
     """
     listed: dict[int, tuple[str, ...]] = {}
     delayed = delayed_by(space, best)
@@ -423,29 +418,29 @@ def ties_of(
                 continue
             if delayed and space.candidates[other].effect.delays and family not in as_well:
                 continue
-            if space.candidates[other].effect.contains != kind:  # a curve holds its line: no rival
+            if space.candidates[other].effect.contains != kind:  # a curve contains its line
                 names.append(family)
         listed[c] = tuple(names)
     return listed
 
 
 def covering_effects(space: SampleSpace, best: CandidateFit, c: int) -> list[int]:
-    """Return the named effects that do all that a candidate does, and more: nothing decides.
+    """Return the named effects whose columns contain those of a candidate.
 
-    The zero of the last joint is a shift of the tool, and a heavier link 1 of an upright arm one
-    whose centre of gravity is further out; each is the simpler guess, and no surer.
+    The zero of the last joint is also a shift of the tool, and a heavier link 1 of an upright arm
+    one whose centre of gravity is further out; the data cannot distinguish them.
     """
-    rest = basis_of(space.columns([o for o in best.chosen if o != c]))
+    others = basis_of(space.columns([o for o in best.chosen if o != c]))
     x = space.columns([c])
-    x = projected_out(rest, x)
+    x = projected_out(others, x)
     whole = float(np.sum(x**2))
     listed = []
     for other, k in enumerate(space.candidates):
         if other == c or other in best.chosen or not _geometric(k):
             continue
-        U = space.columns([other])
-        U = basis_of(projected_out(rest, U))
-        if whole > 0 and float(np.sum(projected_out(U, x) ** 2)) < SAME_SPAN * whole:
+        basis = space.columns([other])
+        basis = basis_of(projected_out(others, basis))
+        if whole > 0 and float(np.sum(projected_out(basis, x) ** 2)) < SAME_SPAN * whole:
             listed.append(other)
     return listed
 

@@ -1,8 +1,8 @@
-"""The noise floor: measured, never what happens to be left.
+"""The noise floor of a channel, measured independently of the residual where possible.
 
-In order of trust: a stated sigma that is the whole; repeats of a pose under the same load; the
-differences of neighbouring samples of a recording, and its resolution. Only where none of them can
-be had, and nothing structured is left, does the scatter of the residual stand for the noise.
+In order: a stated total sigma; repeats of a pose under the same load; differences of neighbouring
+samples of a recording, and its resolution. Only if none of them is available, and the residual has
+no structure, it is the residual's own scatter.
 """
 
 from __future__ import annotations
@@ -13,18 +13,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapbridge.core.arrays import Array
-from gapbridge.core.diagnosis.criteria import EXCESS, NOT_WHITE, REPEATS_MEASURE, RESIDUAL_MEASURES
+from gapbridge.core.diagnosis.criteria import (
+    MIN_CORRELATED_SHARE,
+    MIN_REPEATS_FOR_FLOOR,
+    MIN_SAMPLES_FOR_RESIDUAL_RMS,
+    NOT_WHITE_P,
+)
 from gapbridge.core.diagnosis.observation import Observation
 from gapbridge.core.diagnosis.selection.selection import Selection
 
-BLOCK = 0.1  # s: what is correlated for less is the sensor's filter, not the arm
+BLOCK = 0.1  # s: shorter correlation is attributed to the sensor's filter
 LAGS = 5  # of block means
-FEWEST_BLOCKS = 40
+MIN_BLOCKS = 40
 
 
 @dataclass(frozen=True)
 class Floor:
-    """1 sigma of one coordinate, and what measured it."""
+    """1 sigma of one coordinate in the channel's unit, and its source."""
 
     rms: float | None
     source: str  # stated, repeats, neighbouring samples, residual, unknown
@@ -34,7 +39,7 @@ class Floor:
 class Whiteness:
     """Whether a residual is correlated in time."""
 
-    p_value: float  # that white noise (or noise filtered for less than BLOCK) is as correlated
+    p_value: float  # of white noise, or noise filtered over less than BLOCK
     excess: float  # rms of the correlated part, in the channel's unit
     white: bool
 
@@ -46,7 +51,7 @@ def noise_floor(selection: Selection, structured: bool) -> Floor:
         return Floor(observation.sigma, "stated")
     in_unit = own_coordinates(observation)
     variance, freedom = repeat_variance(observation, selection.residual, selection.kept)
-    if freedom >= REPEATS_MEASURE:
+    if freedom >= MIN_REPEATS_FOR_FLOOR:
         return Floor(float(np.sqrt(max(variance, observation.sigma**2))), "repeats")
     instrument = observation.instrument and observation.instrument()
     if instrument is not None:
@@ -58,7 +63,7 @@ def noise_floor(selection: Selection, structured: bool) -> Floor:
         each = np.einsum("nij,nij->ni", covariance, covariance)[:, :in_unit]
         estimated = float(np.mean(each))
         residual = selection.residual[selection.kept][:, :in_unit]
-        if len(residual) >= RESIDUAL_MEASURES:  # the estimate rests on fewer rows
+        if len(residual) >= MIN_SAMPLES_FOR_RESIDUAL_RMS:  # noise was estimated from fewer rows
             freedom_left = max(residual.size - selection.used, 1)
             estimated = max(float(np.sum(residual**2)) / freedom_left, observation.sigma**2)
         return Floor(float(np.sqrt(estimated)), "residual")
@@ -78,7 +83,7 @@ def repeat_variance(
 ) -> tuple[float, int]:
     """Return the variance of one coordinate among repeats, and its degrees of freedom.
 
-    Repeats are the same pose in the same session under the same load, come to by the same motions.
+    Repeats have the same pose, session, load and approach directions.
     """
     if observation.order_in_time:
         return 0.0, 0
@@ -92,19 +97,18 @@ def repeat_variance(
     count = np.bincount(condition)
     residual = residual[kept][:, :in_unit]
     mean = np.stack([np.bincount(condition, column) / count for column in residual.T], axis=1)
-    away = residual - mean[condition]
+    deviation = residual - mean[condition]
     freedom = int((count - 1).sum()) * in_unit
-    return float(np.sum(away**2)) / max(freedom, 1), freedom
+    return float(np.sum(deviation**2)) / max(freedom, 1), freedom
 
 
 def whiteness(means: Array | None, floor: float | None) -> Whiteness | None:
-    """Return whether the residual of a recording is white; None for poses, and short recordings.
+    """Return whether the residual of a recording is white; None for poses and short recordings.
 
-    ``means`` (B, k) are those of ``block_means``. A portmanteau test (Ljung and Box 1978) on means
-    over BLOCK seconds, so that noise which a sensor filters passes; the correlated part has to
-    matter beside the floor, too.
+    A portmanteau test (Ljung and Box 1978) on ``means`` (B, k) of ``block_means``, so that noise
+    filtered in the sensor passes. The correlated part also has to exceed a share of the floor.
     """
-    if means is None or not floor or len(means) < FEWEST_BLOCKS:
+    if means is None or not floor or len(means) < MIN_BLOCKS:
         return None
     return _portmanteau(means - means.mean(axis=0), floor)
 
@@ -119,8 +123,8 @@ def block_means(selection: Selection) -> Array | None:
     block = np.floor((t[kept] - t[kept][0]) / BLOCK).astype(np.int64)
     number = np.unique(block, return_inverse=True)[1].reshape(-1)
     count = np.bincount(number)
-    left = selection.residual[kept][:, :own]
-    return np.stack([np.bincount(number, left[:, j]) / count for j in range(own)], axis=1)
+    coordinates = selection.residual[kept][:, :own]
+    return np.stack([np.bincount(number, coordinates[:, j]) / count for j in range(own)], axis=1)
 
 
 def _portmanteau(mean: Array, floor: float) -> Whiteness:
@@ -133,6 +137,7 @@ def _portmanteau(mean: Array, floor: float) -> Whiteness:
     weight = 1 / (B - np.arange(1, LAGS + 1))
     statistic = B * (B + 2) * np.sum(r**2 * weight[:, None], axis=0)
     p_value = min(float(gammaincc(LAGS / 2, statistic.max() / 2)) * own, 1.0)
-    # the covariance at the first lag is what white noise has not
+    # the covariance at the first lag is zero for white noise
     excess = float(np.sqrt(np.mean(np.maximum(lagged[0], 0.0))))
-    return Whiteness(p_value, excess, not (p_value < NOT_WHITE and excess > EXCESS * floor))
+    correlated = p_value < NOT_WHITE_P and excess > MIN_CORRELATED_SHARE * floor
+    return Whiteness(p_value, excess, not correlated)

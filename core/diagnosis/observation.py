@@ -1,4 +1,4 @@
-"""What one channel shows: measured values, how to predict them, and what they may depend on."""
+"""One channel of a log: measured values, their prediction, and quantities they may depend on."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 from gapbridge.core.arrays import Array
 from gapbridge.core.effects import Term
 
-HELD = "held_torque"  # Nm that a joint holds at rest: a quantity beside the columns of the log
-Rivals = tuple[tuple[str, Array], ...]
+HELD_TORQUE = "held_torque"  # Nm, static torque of a joint: a quantity that is no column of the log
+UnnamedColumns = tuple[tuple[str, Array], ...]
 Predict = Callable[[Sequence[Term]], Array]
 
 
 @dataclass(frozen=True)
 class NotObservable:
-    """A channel that the log does not show, and the columns it would need."""
+    """A channel that is not observable in the log, and the columns it needs."""
 
     channel: str
     needs: tuple[str, ...]
@@ -29,8 +29,8 @@ class Observation:
     """One channel of one log, ready to be diagnosed. N samples of k coordinates each.
 
     ``predict(terms)`` gives the channel's values with these terms added to the cell's own model;
-    the gap is ``measured - predict(())``. ``nuisance`` columns (frames, biases that are nobody's
-    fault) are estimated along with everything else.
+    the gap is ``measured - predict(())``. ``nuisance`` columns (frames) are estimated together with
+    all effects.
     """
 
     channel: str
@@ -39,31 +39,33 @@ class Observation:
     predict: Predict
     nuisance: Array  # (N, k, p) d measured / d nuisance
     weight: Array  # (k,) 1/unit: makes the coordinates comparable (1 for the channel's own unit)
-    sigma: float  # 1 sigma of one coordinate that is known beforehand; 0: nothing is
-    sigma_is_whole: bool  # True: nothing comes on top of sigma
-    quantities: Mapping[str, Array]  # column name -> (N,): what a residual may depend on
-    groups: NDArray[np.int64]  # (N,) condition of each sample: held out as a whole
+    sigma: float  # known 1 sigma of one coordinate; 0: unknown
+    sigma_is_whole: bool  # True: sigma is the total noise
+    quantities: Mapping[str, Array]  # column name -> (N,), on which a residual may depend
+    groups: NDArray[np.int64]  # (N,) condition of each sample, held out together
     rows: NDArray[np.int64]  # (N,) row of each sample in the log
     axes: tuple[str, ...]  # name of each coordinate
-    joint_columns: Array | None = None  # (N, k, n) d prediction / d joint angle, where it has one
-    unnamed: Callable[[], Rivals] = tuple  # target, columns (N, k, d) of further rivals
-    friction: Array | None = None  # (N, k) sign of each joint's motion, where friction shows
+    joint_columns: Array | None = None  # (N, k, n) d prediction / d joint angle
+    unnamed: Callable[[], UnnamedColumns] = tuple  # target, columns (N, k, d) of unnamed causes
+    friction: Array | None = None  # (N, k) sign of each joint's motion, in torque
     tool_axes: Array | None = None  # (N, 3, 3) axes of the TCP in base, as columns
-    axial_moment: Array | None = None  # (N, n) Nm about each joint's axis, where it is known
-    times: Array | None = None  # (N,) s or numbers of rows, where something may have stepped
-    order_in_time: bool = False  # True: neighbours in time are correlated (a moving log)
-    # the same with the nuisance moved (p,), its columns those of the model with these terms
+    axial_moment: Array | None = None  # (N, n) Nm about each joint's axis
+    times: Array | None = None  # (N,) s or row numbers, for steps
+    order_in_time: bool = False  # True: a recording of motion, correlated in time
+    # nuisance step (p,), terms -> the observation with moved frames and columns at these terms
     rebase: Callable[[Array, Sequence[Term]], Observation] | None = None
-    # 1 sigma (k,) measured by neighbouring samples, where a recording shows it
+    # 1 sigma (k,) from neighbouring samples of a recording
     instrument: Callable[[], Array | None] | None = None
-    fewer: Callable[[NDArray[np.int64]], Observation] | None = None  # of some samples only
-    # (N, k, r) 1 sigma of the prediction by what the cell's own numbers leave open beside terms
+    subset: Callable[[NDArray[np.int64]], Observation] | None = (
+        None  # indices -> the observation of these samples
+    )
+    # terms -> (N, k, r) 1-sigma changes of the prediction by the cell's fitted parameters
     uncertain: Callable[[Sequence[Term]], Array] | None = None
     session: NDArray[np.int64] | None = None  # (N,) session of each sample; None: there is one
     nuisance_session: tuple[int, ...] = ()  # (p,) session of each nuisance column, where several
 
     def rebased(self, step: Array, terms: Sequence[Term]) -> Observation:
-        """Return the same with the nuisance moved (p,), its columns those at these terms."""
+        """Return the observation after a nuisance step (p,), with columns at these terms."""
         assert self.rebase is not None
         return replace(self.rebase(step, terms), uncertain=self.uncertain)
 
@@ -74,16 +76,16 @@ class Observation:
 
 
 def thinned(observation: Observation, most: int) -> Observation:
-    """Return the observation with at most so many samples, evenly taken; predictions stay whole.
+    """Return the observation with at most ``most`` samples, evenly spaced.
 
-    Delays and derivatives are then still those of the full log.
+    Predictions are still made on the full log, for delays and derivatives.
     """
     count = len(observation.rows)
     if count <= most:
         return observation
     take = np.unique(np.linspace(0, count - 1, most).astype(int))
-    if observation.fewer is not None:
-        return observation.fewer(take)
+    if observation.subset is not None:
+        return observation.subset(take)
     whole, unnamed = observation.predict, observation.unnamed
 
     def some(columns: Array | None) -> Array | None:
@@ -109,9 +111,9 @@ def thinned(observation: Observation, most: int) -> Observation:
 
 
 def stacked(parts: Sequence[Observation], quantities: Mapping[str, Array]) -> Observation:
-    """Return the observations of several sessions as one; each keeps a nuisance of its own.
+    """Return the observations of several sessions as one, with a nuisance for each.
 
-    ``quantities`` are those of all samples together, ``rows`` of the parts the rows in one log.
+    ``quantities`` are those of all samples; ``rows`` of the parts are rows of the joined log.
     """
     size = [len(part.rows) for part in parts]
     width = [part.nuisance.shape[2] for part in parts]
@@ -126,7 +128,7 @@ def stacked(parts: Sequence[Observation], quantities: Mapping[str, Array]) -> Ob
     def predict(terms: Sequence[Term]) -> Array:
         return np.concatenate([part.predict(terms) for part in parts])
 
-    def unnamed() -> Rivals:
+    def unnamed() -> UnnamedColumns:
         each = [dict(part.unnamed()) for part in parts]
         return tuple(
             (target, np.concatenate([rivals[target] for rivals in each]))

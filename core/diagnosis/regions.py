@@ -1,4 +1,4 @@
-"""Parts of a log that lie apart: several regions of joint space, or stretches of time, each."""
+"""Parts of a log for cross-validation: regions of joint space, or stretches of time."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ from numpy.typing import NDArray
 from gapbridge.core.diagnosis.observation import Observation
 from gapbridge.core.estimation.held_out import k_means, random_folds
 
-SAME_PLACE = 0.01  # rad that no joint leaves: one pose, whatever the encoders report
+SAME_POSE = 0.01  # rad: range of every joint below which a log has a single pose
 REGIONS = 24  # of joint space, or stretches of time
-PARTS = 8  # left out in turn, each of several regions that lie scattered
+PARTS = 8  # held out in turn, each of several scattered regions
 
 
 def parts(observation: Observation, kept: NDArray[np.bool_]) -> NDArray[np.int64]:
     """Return the part (n,) of each kept sample.
 
-    One region left out makes the rest extrapolate; scattered ones do so less, and still no
-    neighbour of a judged pose is in its fit.
+    Holding out one large region would mean extrapolation. With scattered regions it does less, and
+    still no neighbour of a held-out pose is in its fit.
     """
     region = regions(observation, kept)
     if observation.order_in_time:
@@ -25,11 +25,11 @@ def parts(observation: Observation, kept: NDArray[np.bool_]) -> NDArray[np.int64
     return random_folds(region, PARTS)
 
 
-def one_place(observation: Observation) -> bool:
-    """Return whether a channel was seen at one pose under one load: nothing new was left out."""
+def single_pose(observation: Observation) -> bool:
+    """Return whether a channel has a single pose and load, so that no region is a new one."""
     return not any(
         name.startswith(("payload", "actual_TCP_force", "session"))
-        or (name.startswith(("actual_q_", "target_q_")) and np.ptp(values) > SAME_PLACE)
+        or (name.startswith(("actual_q_", "target_q_")) and np.ptp(values) > SAME_POSE)
         for name, values in observation.quantities.items()
     )
 

@@ -1,8 +1,8 @@
-"""The residual: whether it has structure that no accepted term accounts for, and what it follows.
+"""Structure of the residual: whether there is any, and the quantities that it depends on.
 
-The test is a variance-component score test (Goeman's global test): the residual against the sum of
-all columns that anything in the catalogue or any smooth function could make. Many small traces add
-up in it where each alone would drown in the number of hypotheses tried.
+The test is a variance-component score test (Goeman's global test) of the residual against all
+columns of the catalogue and of the smooth functions. It adds up many small contributions, none of
+which is significant alone given the number of hypotheses.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from gapbridge.core.arrays import Array
 from gapbridge.core.diagnosis.criteria import SAME_SHARE
-from gapbridge.core.diagnosis.observation import HELD
-from gapbridge.core.diagnosis.selection.problem import SampleSpace
+from gapbridge.core.diagnosis.observation import HELD_TORQUE
+from gapbridge.core.diagnosis.selection.sample_space import SampleSpace
 from gapbridge.core.estimation.held_out import random_folds
 from gapbridge.core.estimation.least_squares import basis_of, projected_out
 
@@ -26,19 +26,15 @@ FOLDS = 7
 SEED = 0
 
 
-def structure_p_value(
-    space: SampleSpace,
-    nuisance: Array,
-    chosen: Sequence[int],
-) -> float:
-    """Return the probability that noise alone leaves as much structure as is left."""
+def structure_p_value(space: SampleSpace, nuisance: Array, chosen: Sequence[int]) -> float:
+    """Return the p-value of the residual's structure under noise alone."""
     fitted = basis_of(np.hstack([nuisance, space.columns(chosen)]))
     residuals = np.empty((1 + DRAWS, len(space.y)))
     residuals[0] = space.y
     np.random.default_rng(SEED).standard_normal(out=residuals[1:])
     residuals -= (residuals @ fitted) @ fitted.T
     whole = np.einsum("ij,ij->i", residuals, residuals)
-    if not whole[0]:  # nothing is left that could have structure
+    if not whole[0]:
         return 1.0
     worst = []
     for columns, sizes in _families(space, fitted):
@@ -46,7 +42,7 @@ def structure_p_value(
         share = _squares_along(space.X, columns, sizes, residuals) / whole
         mean, deviation = float(share[1:].mean()), float(share[1:].std()) + 1e-300
         worst.append((share - mean) / deviation)
-    top = np.max(np.array(worst), axis=0)  # the most striking family, of data and of each draw
+    top = np.max(np.array(worst), axis=0)  # the most significant family, of data and of each draw
     return float((1 + np.sum(top[1:] >= top[0])) / (1 + DRAWS))
 
 
@@ -60,10 +56,9 @@ def _squares_along(X: Array, columns: NDArray[np.int64], sizes: Array, residuals
 
 
 def _families(space: SampleSpace, fitted: Array) -> Iterator[tuple[NDArray[np.int64], Array]]:
-    """Yield for every family its columns' places (K,) and their sizes without what is fitted (K,).
+    """Yield for every family its column indices (K,) and their norms outside ``fitted`` (K,).
 
-    What is left has nothing of ``fitted`` in it, so that along the columns it is what it is along
-    the columns without it.
+    The residual is orthogonal to ``fitted``, so its products with the columns need no projection.
     """
     groups: dict[str, list[int]] = {}
     for c, candidate in enumerate(space.candidates):
@@ -80,10 +75,7 @@ def _families(space: SampleSpace, fitted: Array) -> Iterator[tuple[NDArray[np.in
 
 
 def dependence(
-    space: SampleSpace,
-    nuisance: Array,
-    chosen: Sequence[int],
-    groups: NDArray[np.int64],
+    space: SampleSpace, nuisance: Array, chosen: Sequence[int], groups: NDArray[np.int64]
 ) -> list[tuple[str, float]]:
     """Return quantities and the share of the residual that each predicts held out, best first.
 
@@ -109,24 +101,25 @@ def dependence(
 
 
 def _loads_before_time(ranked: list[tuple[str, float]]) -> list[tuple[str, float]]:
-    """Return the ranking with time behind what joints hold where both say about the same.
+    """Return the ranking with time after static torques that predict about equally much.
 
-    Whatever happens once in a log follows its clock.
+    Anything that happens once in a log correlates with its time.
     """
-    at = next((i for i, (name, _) in enumerate(ranked) if name == "timestamp"), None)
-    if at is None:
+    place = next((i for i, (name, _) in enumerate(ranked) if name == "timestamp"), None)
+    if place is None:
         return ranked
-    time = ranked[at]
-    as_good = [i for i, (name, share) in enumerate(ranked)
-               if name.startswith(HELD) and at < i and share > time[1] - SAME_SHARE]  # fmt: skip
-    if as_good:
-        ranked.insert(as_good[-1] + 1, time)
-        del ranked[at]
+    least = ranked[place][1] - SAME_SHARE
+    equal = [
+        i for i, (name, share) in enumerate(ranked)
+        if i > place and name.startswith(HELD_TORQUE) and share > least
+    ]  # fmt: skip
+    if equal:
+        ranked.insert(equal[-1], ranked.pop(place))
     return ranked
 
 
 def _one_of_a_kind(ranked: list[tuple[str, float]]) -> list[tuple[str, float]]:
-    """Keep only the best joint temperature: they all rise together and crowd out the rest."""
+    """Return the ranking with the best joint temperature only: all are correlated."""
     kept: list[tuple[str, float]] = []
     for name, share in ranked:
         warm = name.startswith("joint_temperatures_")
@@ -140,15 +133,15 @@ def _held_out_shares(columns: Array, r: Array, fold: NDArray[np.int64]) -> Array
     """Return the share of r (m,) that each block of columns (B, m, d) predicts held out (B,)."""
     by_fold = np.argsort(fold, kind="stable")
     ends = np.searchsorted(fold[by_fold], np.arange(FOLDS + 1))
-    if not r.any():  # nothing is left to be explained
+    if not r.any():
         return np.zeros(len(columns))
     unit, r = columns[:, by_fold], r[by_fold]
     unit = unit / (np.sqrt(np.einsum("bij,bij->bj", unit, unit))[:, None] + 1e-300)
     flipped = unit.transpose(0, 2, 1)
     G, g = flipped @ unit + 1e-6 * np.eye(columns.shape[2]), flipped @ r
-    left = np.zeros(len(columns))
+    residual_squares = np.zeros(len(columns))
     for begin, end in pairwise(ends):
         U, V, u = unit[:, begin:end], flipped[:, :, begin:end], r[begin:end]
         x = np.linalg.solve(G - V @ U, (g - V @ u)[..., None])
-        left += np.sum((u - (U @ x)[..., 0]) ** 2, axis=1)
-    return np.asarray(1 - left / float(r @ r))
+        residual_squares += np.sum((u - (U @ x)[..., 0]) ** 2, axis=1)
+    return np.asarray(1 - residual_squares / float(r @ r))

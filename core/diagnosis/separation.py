@@ -1,13 +1,13 @@
-"""Separation: the measurements that would decide what these data leave open.
+"""Separation: measurements that would distinguish tied explanations.
 
-Poses, loads and motions are drawn within the arm's limits. Those are proposed where two
-explanations that fit the log alike, or the model with and without an effect that the log cannot
-show, predict readings furthest apart, in multiples of the noise. The frame of an unregistered
-instrument is the one that each explanation needs on the log: what a frame can take up decides
-nothing.
+Random poses, loads and motions within the arm's limits are compared. Those are proposed at which
+two explanations that fit the log equally well, or the model with and without an effect that the log
+does not excite, predict the most different readings, in multiples of the noise. The frame of an
+unregistered instrument is refitted on the log for each explanation, so that a difference that a
+frame absorbs does not count.
 
-Poses are at rest for the channels that show at rest; for the moving ones each trial is a short
-motion through its pose, at a speed and an acceleration that the arm can.
+Trials are poses at rest, or in recordings short motions through a pose, at a feasible speed and
+acceleration.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ import numpy as np
 
 from gapbridge.core.arrays import Array
 from gapbridge.core.diagnosis.channel_diagnosis import ChannelDiagnosis
-from gapbridge.core.diagnosis.criteria import DECISIVE, TIE_SCORE
+from gapbridge.core.diagnosis.criteria import MIN_SEPARATION, TIE_SCORE
 from gapbridge.core.diagnosis.selection.local_search import rivals
-from gapbridge.core.diagnosis.selection.problem import CandidateFit, SampleSpace, fit
+from gapbridge.core.diagnosis.selection.sample_space import CandidateFit, SampleSpace, fit
 from gapbridge.core.dynamics import (
     predict_torque,
     predict_tracking,
@@ -39,47 +39,46 @@ from gapbridge.core.log.log import Log
 from gapbridge.core.model import Model
 from gapbridge.core.motion import Motion
 
-EACH = 2  # measurements proposed per open question
-APART = 0.5  # rad, of some joint, between poses that are proposed together
-POSED = 1e-6  # share of a difference that changes with the pose: less, and no pose decides
+PER_QUESTION = 2  # measurements proposed per open question
+MIN_POSE_DISTANCE = 0.5  # rad, of some joint, between proposed poses
+MIN_POSE_DEPENDENCE = 1e-6  # share of a difference that has to depend on the pose
 Predict = Callable[[Sequence[Term]], Array]
 POSES = 160
-FAST = 0.7  # share of a joint's greatest speed that a trial uses at most
-PICK_UP = 0.25  # s in which a trial gets to its speed, at the hardest
-UNLIMITED = 2.0  # rad/s for joints whose greatest speed nobody knows
-LEAD, STEP = 0.5, 0.004  # s: how a trial's motion is sampled before its pose
-STILL = 0.02  # share of the greatest speed at which the direction of motion is unsure
+MAX_SPEED_SHARE = 0.7  # of a joint's speed limit, in a trial
+ACCELERATION_TIME = 0.25  # s from rest to the speed limit, at least
+DEFAULT_MAX_SPEED = 2.0  # rad/s for joints without a speed limit
+LEAD, STEP = 0.5, 0.004  # s: duration and sampling of a trial's motion before its pose
+STILL = 0.02  # share of the speed limit below which the direction of motion is uncertain
 
 
 @dataclass(frozen=True)
 class Measurement:
-    """One pose and load worth measuring."""
+    """A proposed measurement: pose and load, in motion also velocity and acceleration."""
 
     q: tuple[float, ...]  # rad
     payload: float  # kg
     separates: tuple[str, ...]
-    expected_gain: float  # distance of the rivals' predictions there, in standard deviations
-    approach: tuple[int, ...] | None = None  # last motion of each joint, where it matters
-    velocity: tuple[float, ...] | None = None  # rad/s through the pose, where it has to move
+    expected_gain: float  # difference of the two predictions, in standard deviations
+    approach: tuple[int, ...] | None = None  # last motion of each joint; None: any
+    velocity: tuple[float, ...] | None = None  # rad/s through the pose; None: at rest
     acceleration: tuple[float, ...] | None = None  # rad/s2 there
 
 
 @dataclass(frozen=True)
-class _Question:
-    """Two explanations, and the effects between which they decide."""
+class _OpenQuestion:
+    """Two explanations to be separated, and the effects in which they differ."""
 
     separates: tuple[str, ...]
-    one: tuple[Term, ...]
-    other: tuple[Term, ...]
+    first: tuple[Term, ...]
+    second: tuple[Term, ...]
 
 
 def next_measurements(
     model: Model, log: Log, channels: Sequence[ChannelDiagnosis], seed: int = 0
 ) -> tuple[Measurement, ...]:
-    """Return poses and loads, within the joint limits, that decide ties or excite the silent.
+    """Return poses and loads, within the joint limits, that resolve ties or excite other effects.
 
-    Motions through the poses where the log records motion; at rest else, where no pose shows how
-    encoders follow.
+    Motions through the poses if the log is a recording; else poses at rest, without tracking.
     """
     chosen: list[Measurement] = []
     drawn = draw_trials(model, log, seed)
@@ -88,9 +87,9 @@ def next_measurements(
         if channel.channel == "tracking" and not moving:
             continue
         trials = drawn if moving else drawn.at_rest
-        predict = PREDICTED[channel.channel](model, trials)
+        predict = PREDICTORS[channel.channel](model, trials)
         sigma = channel.noise_floor_rms or channel.selection.observation.sigma or 1e-5
-        for question in _questions(model, channel, trials, predict):
+        for question in _open_questions(model, channel, trials, predict):
             difference = _difference(channel, trials, predict, question)
             if difference is None:
                 continue
@@ -99,15 +98,15 @@ def next_measurements(
     return tuple(chosen)
 
 
-def _questions(
+def _open_questions(
     model: Model, channel: ChannelDiagnosis, trials: Trials, predict: Predict
-) -> Iterator[_Question]:
-    """Yield what is open: effects to be separated, and effects that the log cannot show."""
+) -> Iterator[_OpenQuestion]:
+    """Yield the ties of accused effects, and the effects that the log does not excite."""
     selection = channel.selection
     space, best = selection.working, selection.best
     for position in channel.judgement.accused:
         accused_candidate = selection.term_index[position]
-        if accused_candidate in selection.block:  # nothing stands for all links but they themselves
+        if accused_candidate in selection.block:  # no rivals
             continue
         family = selection.terms[position].effect
         chosen = {family}
@@ -117,14 +116,14 @@ def _questions(
             if candidate.named and candidate.family not in chosen:
                 chosen.add(candidate.family)
                 swapped = fit(space, (*rest, other))
-                yield _Question(
+                yield _OpenQuestion(
                     (family, candidate.family), _named(space, best), _named(space, swapped)
                 )
     accused = tuple(selection.terms[p] for p in channel.judgement.accused)
     for considered in channel.considered:
         if not considered.excited:
-            for usual in _usual(model, considered.effect):
-                question = _Question((considered.effect,), (*accused, usual), accused)
+            for usual in _terms_of_usual_size(model, considered.effect):
+                question = _OpenQuestion((considered.effect,), (*accused, usual), accused)
                 if _difference(channel, trials, predict, question) is not None:
                     yield question
                     break
@@ -138,7 +137,7 @@ def _named(space: SampleSpace, best: CandidateFit) -> tuple[Term, ...]:
     )
 
 
-def _usual(model: Model, effect: str) -> Iterator[Term]:
+def _terms_of_usual_size(model: Model, effect: str) -> Iterator[Term]:
     """Yield an effect of usual size at each of its sites."""
     member = CATALOGUE[effect]
     for site in member.sites(model.arm):
@@ -147,27 +146,28 @@ def _usual(model: Model, effect: str) -> Iterator[Term]:
 
 
 def _difference(
-    channel: ChannelDiagnosis, trials: Trials, predict: Predict, question: _Question
+    channel: ChannelDiagnosis, trials: Trials, predict: Predict, question: _OpenQuestion
 ) -> Array | None:
-    """Return how the readings of two explanations differ (N, k); None where no pose decides."""
+    """Return the difference (N, k) of two explanations; None if it does not depend on the pose."""
     observation = channel.selection.observation
     try:
-        apart = predict(question.one) - predict(question.other)
+        apart = predict(question.first) - predict(question.second)
         if observation.nuisance.shape[2] >= 6:
-            seen = observation.predict(question.one) - observation.predict(question.other)
-            apart = apart - _framed(observation.nuisance, seen, predict(question.other))
-    except InputError:  # the arm would buckle under one of them
+            on_log = observation.predict(question.first) - observation.predict(question.second)
+            position = predict(question.second)
+            apart = apart - _frame_correction(observation.nuisance, on_log, position)
+    except InputError:  # no equilibrium under one of them
         return None
     apart = apart * observation.weight[: apart.shape[1]]
     spread, size = float(np.ptp(apart, axis=0).max()), float(np.abs(apart).max())
-    return apart if spread > POSED * max(size, 1e-300) else None
+    return apart if spread > MIN_POSE_DEPENDENCE * max(size, 1e-300) else None
 
 
-def _framed(nuisance: Array, seen: Array, position: Array) -> Array:
-    """Return how the frame that takes up the log's difference moves the readings of trials."""
+def _frame_correction(nuisance: Array, on_log: Array, position: Array) -> Array:
+    """Return the change of the trials' readings by the frame fitted to the log's difference."""
     A = nuisance[:, :3].reshape(-1, nuisance.shape[2])
-    # of several sessions the trials go on with the first one's frame
-    x = solve(A, seen[:, :3].ravel())[:6]
+    # of several sessions the trials are in the first one's frame
+    x = solve(A, on_log[:, :3].ravel())[:6]
     return np.asarray(-frame_columns(position)[:, :3] @ x)
 
 
@@ -176,9 +176,9 @@ def _best(moving: bool, trials: Trials, names: tuple[str, ...], gain: Array) -> 
     q, loads = trials.q, trials.loads
     assert loads.payload_mass is not None and loads.approach is not None
     for r in np.argsort(-gain):
-        if gain[r] < DECISIVE or len(chosen) == EACH:
+        if gain[r] < MIN_SEPARATION or len(chosen) == PER_QUESTION:
             break
-        if all(np.abs(q[r] - np.array(m.q)).max() > APART for m in chosen):
+        if all(np.abs(q[r] - np.array(m.q)).max() > MIN_POSE_DISTANCE for m in chosen):
             sided = any(CATALOGUE[name].by_approach for name in names)
             approach = tuple(int(v) for v in loads.approach[r]) if sided else None
             chosen.append(Measurement(
@@ -195,11 +195,11 @@ def _floats(values: Array) -> tuple[float, ...]:
 
 @dataclass(frozen=True)
 class Trials:
-    """Poses, loads and motions that could be measured."""
+    """Random poses, loads and motions that could be measured."""
 
     q: Array  # (N, n)
     loads: Loads
-    qd: Array  # (N, n) rad/s through the pose, where the channel is one of motion
+    qd: Array  # (N, n) rad/s through the pose; 0 at rest
     qdd: Array  # (N, n) rad/s2 there
     time: float  # s, of the measurement
     start: float  # s, of the log
@@ -212,7 +212,7 @@ class Trials:
 
 
 def draw_trials(model: Model, log: Log, seed: int) -> Trials:
-    """Return trials within the joint limits and the rated load, drawn from ``seed``."""
+    """Return random trials within the joint limits and the rated load."""
     rng = np.random.default_rng(seed)
     low, high = _range(model)
     q = rng.uniform(low, high, (POSES, model.arm.n))
@@ -228,25 +228,25 @@ def draw_trials(model: Model, log: Log, seed: int) -> Trials:
         approach=rng.choice([-1.0, 1.0], (POSES, model.arm.n)),
     )
     end, start = (0.0, 0.0) if time is None else (float(time[-1]), float(time[0]))
-    fastest = fastest_of(model)
-    qd = FAST * fastest * rng.uniform(-1.0, 1.0, q.shape)
-    # braking or picking up: never so hard that the trial began beyond the joint's greatest speed
+    fastest = max_speed(model)
+    qd = MAX_SPEED_SHARE * fastest * rng.uniform(-1.0, 1.0, q.shape)
+    # limited so that the trial does not begin above the speed limit
     qdd = np.clip(
-        rng.uniform(-1.0, 1.0, q.shape) * fastest / PICK_UP,
+        rng.uniform(-1.0, 1.0, q.shape) * fastest / ACCELERATION_TIME,
         (qd - fastest) / LEAD, (qd + fastest) / LEAD,
     )  # fmt: skip
     return Trials(q, loads, qd, qdd, end, start)
 
 
-def fastest_of(model: Model) -> Array:
-    """Return the greatest speed of each joint (n,), rad/s."""
+def max_speed(model: Model) -> Array:
+    """Return the speed limit of each joint (n,), rad/s."""
     limit = model.arm.limits.velocity
-    return np.where(np.isfinite(limit) & (limit > 0), limit, UNLIMITED)
+    return np.where(np.isfinite(limit) & (limit > 0), limit, DEFAULT_MAX_SPEED)
 
 
 def _range(model: Model) -> tuple[Array, Array]:
-    """Return where each joint may stand (n,), (n,): one turn at most, about zero if it may."""
-    # numbers so large that nothing is lost stand for "no limit": their sum is still a number
+    """Return the range of each joint (n,), (n,), rad: one turn at most, about zero if allowed."""
+    # finite values for infinite limits
     low, high = (
         np.clip(side, -1e6, 1e6) for side in (model.arm.limits.lower, model.arm.limits.upper)
     )
@@ -273,12 +273,12 @@ def _motion(model: Model, trials: Trials) -> Motion:
         loads=trials.loads, rows=np.arange(count), valid=np.ones(count, dtype=bool),
         stretch=np.zeros(count, dtype=np.int64), start=trials.start,
         moving=bool(trials.qd.any()),
-        still=STILL * fastest_of(model),
+        still=STILL * max_speed(model),
     )  # fmt: skip
 
 
-def _followings(model: Model, trials: Trials) -> Predict:
-    """Return where the encoders stand at the end of each trial's motion."""
+def _encoder_angles(model: Model, trials: Trials) -> Predict:
+    """Return the predictor of the encoder angles at the end of each trial's motion."""
     count, n = trials.q.shape
     before = np.arange(-round(LEAD / STEP), 1) * STEP
     k = len(before)
@@ -287,22 +287,22 @@ def _followings(model: Model, trials: Trials) -> Predict:
         -1, n
     )
     speed = (trials.qd[:, None] + trials.qdd[:, None] * t).reshape(-1, n)
-    hours = np.arange(count)[:, None] * 10.0 * LEAD  # one after the other
+    offset = np.arange(count)[:, None] * 10.0 * LEAD  # trials in sequence
     motion = Motion(
-        t=(trials.time + hours + before[None]).ravel(), q=q, qd=speed,
+        t=(trials.time + offset + before[None]).ravel(), q=q, qd=speed,
         qdd=np.repeat(trials.qdd, k, axis=0), target_q=q,
         loads=trials.loads[np.repeat(np.arange(count), k)],
         rows=np.arange(count * k), valid=np.ones(count * k, dtype=bool),
         stretch=np.repeat(np.arange(count), k), start=trials.start, moving=True,
-        still=STILL * fastest_of(model),
+        still=STILL * max_speed(model),
     )  # fmt: skip
     motion = with_held(model, motion)
     return lambda terms: predict_tracking(model, motion, terms)[k - 1 :: k]
 
 
-PREDICTED: dict[str, Callable[[Model, Trials], Predict]] = {
+PREDICTORS: dict[str, Callable[[Model, Trials], Predict]] = {
     "position": _positions,
     "wrench": partial(_loads_of_motion, predict_wrench),
-    "tracking": _followings,
+    "tracking": _encoder_angles,
     "torque": partial(_loads_of_motion, predict_torque),
 }

@@ -104,7 +104,7 @@ def _channel_lines(channel: ChannelDiagnosis, sessions: tuple[str, ...]) -> list
 
 def _expected_elsewhere(channel: ChannelDiagnosis, sessions: tuple[str, ...]) -> list[str]:
     """Return the expected errors in new regions and sessions, or that they are unknown."""
-    unit, elsewhere = channel.unit, channel.elsewhere
+    unit, elsewhere = channel.unit, channel.generalisation
     region = "unknown (too few samples)" if elsewhere.new_region is None else gap_text(
         elsewhere.new_region, unit)  # fmt: skip
     session = "unknown (one session)" if elsewhere.new_session is None else gap_text(
@@ -120,10 +120,10 @@ def _session_changes(
     channel: ChannelDiagnosis, cause: Cause, sessions: tuple[str, ...]
 ) -> list[str]:
     """Return whether a cause is the same in all sessions; if not, its values per session."""
-    across = next((c for c in channel.carried if c.effect == cause.effect), None)
+    across = next((c for c in channel.session_transfer if c.effect == cause.effect), None)
     if across is None:
         return []
-    if across.carries:
+    if across.transfers:
         return [f"carries: the same in {len(across.values)} sessions"]
     lines = [f"changed between sessions (p = {across.p_value:.2g} if it had not):"]
     most = _most_changed([parameters for _, parameters in across.values])

@@ -12,7 +12,7 @@ from gapbridge.core.arrays import Array
 from gapbridge.core.diagnosis.channels.recording import varying
 from gapbridge.core.diagnosis.criteria import MIN_APPROACHES, MIN_FREEDOM_OF_SESSION
 from gapbridge.core.diagnosis.observation import NotObservable, Observation, Predict, stacked
-from gapbridge.core.diagnosis.selection.unnamed import unnamed_rivals
+from gapbridge.core.diagnosis.selection.unnamed import unnamed_causes
 from gapbridge.core.effects import Term
 from gapbridge.core.errors import LogError
 from gapbridge.core.estimation.compliance_fit import Data, fit_nuisances
@@ -30,12 +30,12 @@ from gapbridge.core.model import Model, Poses
 from gapbridge.core.rotation import rotation_matrix, rotation_vector
 from gapbridge.core.sessions import session_of, sessions_in
 
-LEVER = 0.2  # m/rad: first weight of a rotation against a position
+LEVER = 0.2  # m/rad: initial weight of a rotation relative to a position
 
 
 @dataclass(frozen=True)
 class Placement:
-    """Where the instrument stands, and where the target sits on the flange, in one session."""
+    """Pose of the instrument's frame, and of the target on the flange, in one session."""
 
     frame: Registration
     tool_in_flange: Array  # (4, 4)
@@ -65,12 +65,12 @@ def observe(model: Model, log: Log, metrology: Metrology) -> Observation | NotOb
         return NotObservable("position", ("actual_q",))
     index, parts = session_of(log), []
     for s, part in enumerate(sessions_in(log)):
-        seen = _observe_session(model, part, metrology)
-        if seen is None:
+        observation = _observe_session(model, part, metrology)
+        if observation is None:
             continue
-        _check_enough(seen, part, log.session_names[s] if log.session_names else "")
-        own_rows = np.flatnonzero(index == s)[seen.rows]
-        parts.append(_numbered(seen, s, own_rows))
+        _check_enough(observation, part, log.session_names[s] if log.session_names else "")
+        own_rows = np.flatnonzero(index == s)[observation.rows]
+        parts.append(_numbered(observation, s, own_rows))
     if not parts:
         return NotObservable("position", ("measured_position",))
     if len(log.session_names) < 2:
@@ -82,23 +82,23 @@ def observe(model: Model, log: Log, metrology: Metrology) -> Observation | NotOb
     return stacked(parts, together)
 
 
-def _numbered(seen: Observation, session: int, rows: NDArray[np.int64]) -> Observation:
+def _numbered(observation: Observation, session: int, rows: NDArray[np.int64]) -> Observation:
     """Return a session's observation with its number and its rows in the joined log."""
-    rebase = seen.rebase
+    rebase = observation.rebase
 
     def moved(step: Array, terms: Sequence[Term]) -> Observation:
         assert rebase is not None
         return _numbered(rebase(step, terms), session, rows)
 
     return replace(
-        seen, rows=rows, session=np.full(len(rows), session),
+        observation, rows=rows, session=np.full(len(rows), session),
         rebase=None if rebase is None else moved,
     )  # fmt: skip
 
 
-def _check_enough(seen: Observation, log: Log, name: str) -> None:
+def _check_enough(observation: Observation, log: Log, name: str) -> None:
     """Raise LogError where a session of several has too few poses for its nuisances."""
-    N, k, p = seen.nuisance.shape
+    N, k, p = observation.nuisance.shape
     least = p + MIN_FREEDOM_OF_SESSION
     if name and N * k < least:
         raise LogError(
@@ -126,8 +126,8 @@ def _observed(
 ) -> Observation:  # fmt: skip
     """Return the position channel of one session at a placement, ``data`` those of its ``rows``.
 
-    The tool point's columns are those of the model with ``terms``: at the nominal arm they are off
-    by as much as its joints are, and a joint's turn that they should take up stands as a cause.
+    The tool point's columns are those of the model with ``terms``. Those of the nominal arm would
+    have the error of its joint angles, and a rotation of a joint could appear as a cause.
     """
     q, loads, k = data.q, data.loads, 3 if data.rotation is None else 6
     model = replace(model, tool_in_flange=placement.tool_in_flange)
@@ -160,7 +160,7 @@ def _observed(
         axes=("x", "y", "z", "rx", "ry", "rz")[:k],
         joint_columns=form.jacobian[:, :k],
         axial_moment=np.einsum("nij,nji->ni", form.moment, form.jacobian[:, 3:]),
-        unnamed=lambda: unnamed_rivals(model, q, loads, k),
+        unnamed=lambda: unnamed_causes(model, q, loads, k),
         tool_axes=poses.rotation,
         times=loads.time,
         rebase=rebase if nuisance.shape[2] else None,
@@ -168,9 +168,9 @@ def _observed(
 
 
 def rounded_groups(q: Array, tolerance: float = 1e-3) -> NDArray[np.int64]:
-    """Return a number per row (N,): rows alike when rounded to ``tolerance`` (rad) share one.
+    """Return a group number per row (N,), equal for rows equal within ``tolerance`` (rad).
 
-    Of many rows; a pair on either side of a rounding border counts as two poses.
+    Fast for many rows, but equal poses on either side of a rounding limit get two numbers.
     """
     rounded = np.round(q / tolerance)
     return np.asarray(np.unique(rounded, axis=0, return_inverse=True)[1].reshape(-1))
@@ -191,7 +191,7 @@ def session_model(model: Model, log: Log, metrology: Metrology) -> Model:
 
 
 def _placed(model: Model, data: Data, metrology: Metrology) -> Placement:
-    """Return a first estimate of what is free in a session, outliers down-weighted."""
+    """Return a robust first estimate of a session's frame and tool point."""
     frame, tool = IDENTITY, model.tool_in_flange
     if not metrology.registered:
         frame = register_robustly(data.position, model.predict(data.q, data.loads).position)
@@ -213,13 +213,13 @@ def _tool_columns(model: Model, poses: Poses, k: int) -> Array:
 
 
 def _prediction(model: Model, q: Array, loads: Loads, reference: Array | None) -> Predict:
-    """Return terms -> positions (N, 3), with rotations as vectors off ``reference`` (N, 6)."""
+    """Return terms -> positions (N, 3), with ``reference`` also rotation vectors to it (N, 6)."""
 
     def predict(terms: Sequence[Term]) -> Array:
         real = model.with_terms(terms).predict(q, loads)
         if reference is None:
             return real.position
-        # rotations as small vectors against the measured ones, so that gaps simply subtract
+        # rotation vectors relative to the measured ones, so that gaps are differences
         off = rotation_vector(real.rotation @ np.swapaxes(reference, 1, 2))
         return np.hstack([real.position, off])
 
@@ -229,11 +229,11 @@ def _prediction(model: Model, q: Array, loads: Loads, reference: Array | None) -
 def quantities(log: Log, rows: NDArray[np.int64]) -> dict[str, Array]:
     """Return every scalar column of the log that varies over ``rows``, by its name in the log."""
     q = "actual_q" if log.has("actual_q") else "target_q"
-    given = ((name, log.get(name)) for name in (
+    named_columns = ((name, log.get(name)) for name in (
         "timestamp", "session", q, "payload", "payload_cog", "joint_temperatures",
         "actual_TCP_force", "measured_position",
     ))  # fmt: skip
-    return varying({name: column[rows] for name, column in given if column is not None})
+    return varying({name: column[rows] for name, column in named_columns if column is not None})
 
 
 def approaches(approach: Array | None, rows: NDArray[np.int64] | None = None) -> dict[str, Array]:

@@ -1,4 +1,4 @@
-"""What the channels of recordings share: which rows are samples, conditions, quantities."""
+"""Shared by the channels of recordings: samples, conditions, quantities, noise of a signal."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from numpy.typing import NDArray
 from gapbridge.core.arrays import Array, Index
 from gapbridge.core.derivatives import signal_noise
 from gapbridge.core.diagnosis.criteria import MIN_TORQUE_CHANGE, STEPPED_SHARE
-from gapbridge.core.diagnosis.observation import HELD
+from gapbridge.core.diagnosis.observation import HELD_TORQUE
 from gapbridge.core.estimation.held_out import pose_groups
 from gapbridge.core.log.log import Log
 from gapbridge.core.motion import Motion
 
-MOST_SAMPLES = 30_000  # poses at rest, evenly picked: what memory holds
+MAX_POSES = 30_000  # poses at rest, evenly spaced: limited by memory
 STRETCHES = 24  # conditions of a recording: even stretches of time
-FEWEST_CONDITIONS = 5
-SMALLEST_TORQUE = 1e-3  # Nm
+MIN_CONDITIONS = 5
+MIN_TORQUE = 1e-3  # Nm
 CONSTANT_SPREAD = 1e-9  # spread below which a quantity counts as constant
 
 
-def subsampled(usable: NDArray[np.bool_], most: int = MOST_SAMPLES) -> Index:
+def subsampled(usable: NDArray[np.bool_], most: int = MAX_POSES) -> Index:
     """Return at most ``most`` of the usable rows, evenly spread."""
     rows = np.flatnonzero(usable)
     if len(rows) <= most:
@@ -41,13 +41,13 @@ def conditions(motion: Motion) -> Index:
         return np.asarray(np.minimum(number.astype(np.int64), STRETCHES - 1))
     loads = motion.loads
     groups = pose_groups(motion.q)
-    if groups.max() + 1 >= FEWEST_CONDITIONS:
+    if groups.max() + 1 >= MIN_CONDITIONS:
         return groups
-    given = [loads.payload_mass, loads.payload_cog, loads.wrench]
-    columns = [np.asarray(c).reshape(len(motion), -1) for c in given if c is not None]
+    load_columns = [loads.payload_mass, loads.payload_cog, loads.wrench]
+    columns = [np.asarray(c).reshape(len(motion), -1) for c in load_columns if c is not None]
     table = np.column_stack([groups, *columns])
     condition = np.unique(np.round(table, 6), axis=0, return_inverse=True)[1].reshape(-1)
-    if condition.max() + 1 >= FEWEST_CONDITIONS:
+    if condition.max() + 1 >= MIN_CONDITIONS:
         return np.asarray(condition)
     return np.arange(len(motion))
 
@@ -79,21 +79,21 @@ def varying(columns: Mapping[str, Array | None]) -> dict[str, Array]:
 
 
 def held_torques(motion: Motion) -> dict[str, Array]:
-    """Return the torques that the joints hold, where they vary, as quantities."""
+    """Return the static torques of the joints that vary, as quantities, Nm."""
     if motion.held is None:
         return {}
-    largest = max(float(np.abs(motion.held).max(initial=0.0)), SMALLEST_TORQUE)
+    largest = max(float(np.abs(motion.held).max(initial=0.0)), MIN_TORQUE)
     return {
-        f"{HELD}_{i}": motion.held[:, i]
+        f"{HELD_TORQUE}_{i}": motion.held[:, i]
         for i in np.flatnonzero(np.ptp(motion.held, axis=0) > MIN_TORQUE_CHANGE * largest)
     }
 
 
 def instrument_noise(signal: Array, motion: Motion) -> Array | None:
-    """Return 1 sigma (k,) of a recorded signal (N, k) by differences of neighbouring samples.
+    """Return 1 sigma (k,) of a recorded signal (N, k) from differences of neighbouring samples.
 
-    Not less than its resolution makes (a step over the root of 12). None for poses at rest, whose
-    neighbours in the log have nothing in common.
+    At least the quantisation noise (step over the root of 12). None for poses at rest, because
+    neighbours in the log are different poses.
     """
     if not motion.moving:
         return None
@@ -103,7 +103,7 @@ def instrument_noise(signal: Array, motion: Motion) -> Array | None:
 
 
 def signal_step(signal: Array) -> Array:
-    """Return the step (k,) in which each signal (N, k) is reported; 0 where it has none."""
+    """Return the quantisation step (k,) of each signal (N, k); 0: continuous."""
     steps = np.zeros(signal.shape[1])
     for j, values in enumerate(signal.T):
         distinct = np.unique(values)

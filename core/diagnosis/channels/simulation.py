@@ -1,7 +1,7 @@
 """Another simulator's prediction, row by row, in place of the model's own.
 
-The user's simulator says where the arm should be; the model only says how an effect changes that.
-Its values travel with the log under names of their own, so that rows stay together.
+The user's simulator gives the nominal prediction; the model only gives its change by an effect.
+The simulator's values are added to the log as further columns.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from gapbridge.core.model import Model
 from gapbridge.core.motion import motion_of, with_motion
 
 Observe = Callable[[Model, Log, Metrology], Observation | NotObservable]
-SHOWN_BY = {
+COLUMN_OF_CHANNEL = {
     "position": "measured_position",
     "wrench": "ft_raw_wrench",
     "tracking": "actual_q",
@@ -32,43 +32,44 @@ PREFIX = "simulated "
 
 
 def joined(log: Log, simulated: Log) -> Log:
-    """Return the log with the simulator's values beside its own.
+    """Return the log with the simulator's values as further columns.
 
     Raises LogError where a row has no counterpart or one of another pose, or the simulator's has
     nothing to compare.
     """
     simulated = aligned(simulated, log)
     predictions = {
-        PREFIX + name: simulated.require(name) for name in SHOWN_BY.values() if simulated.has(name)
+        PREFIX + name: simulated.require(name)
+        for name in COLUMN_OF_CHANNEL.values()
+        if simulated.has(name)
     }
     if not predictions:
-        wanted = ", ".join(f"{name}_0.." for name in SHOWN_BY.values())
+        wanted = ", ".join(f"{name}_0.." for name in COLUMN_OF_CHANNEL.values())
         raise LogError(f"{simulated.path}: columns: found no prediction, expected one of {wanted}")
     return replace(log, columns={**log.columns, **predictions})
 
 
 def predicted_by(channel: str, observe: Observe) -> Observe:
-    """Return an observer whose prediction is the simulator's; a channel it lacks is not seen."""
+    """Return an observer with the simulator's prediction; a channel it lacks is not observable."""
 
-    def seen_by_simulator(
-        model: Model, log: Log, metrology: Metrology
-    ) -> Observation | NotObservable:
-        values = log.get(PREFIX + SHOWN_BY[channel])
-        seen = observe(model, _behind(log, channel, values), metrology)
-        if isinstance(seen, NotObservable):
-            return seen
+    def simulated(model: Model, log: Log, metrology: Metrology) -> Observation | NotObservable:
+        values = log.get(PREFIX + COLUMN_OF_CHANNEL[channel])
+        observation = observe(model, _behind(log, channel, values), metrology)
+        if isinstance(observation, NotObservable):
+            return observation
         if values is None:
-            return NotObservable(channel, (f"{SHOWN_BY[channel]} (in the simulator's log)",))
-        return _with_prediction(seen, values)
+            needs = f"{COLUMN_OF_CHANNEL[channel]} (in the simulator's log)"
+            return NotObservable(channel, (needs,))
+        return _with_prediction(observation, values)
 
-    return seen_by_simulator
+    return simulated
 
 
 def _behind(log: Log, channel: str, values: Array | None) -> Log:
     """Return the log of a tracking channel with the simulator's encoders as its command.
 
-    A delay or lag that is sought comes behind the simulated servo's own: filters in a row. The
-    motion stays that of the log: a block of a long one cannot derive it from its own rows.
+    A delay or lag to be found is then in series with the simulated servo's own. The motion remains
+    that of the log, because a block of a long log cannot derive it from its own rows.
     """
     if channel != "tracking" or values is None or not log.has("target_q"):
         return log
@@ -77,11 +78,11 @@ def _behind(log: Log, channel: str, values: Array | None) -> Log:
     return with_motion(behind, replace(motion, target_q=values[motion.rows]))
 
 
-def _with_prediction(seen: Observation, values: Array) -> Observation:
-    channel_rows, rebase, fewer = seen.predict, seen.rebase, seen.fewer
+def _with_prediction(observation: Observation, values: Array) -> Observation:
+    channel_rows, rebase, subset = observation.predict, observation.rebase, observation.subset
     nominal = channel_rows(())
     base = nominal.copy()
-    part = values[seen.rows]
+    part = values[observation.rows]
     base[:, : part.shape[1]] = part  # rotations, where measured, stay the model's
 
     def predict(terms: Sequence[Term]) -> Array:
@@ -92,5 +93,5 @@ def _with_prediction(seen: Observation, values: Array) -> Observation:
         if rebase is None
         else lambda step, terms: _with_prediction(rebase(step, terms), values)
     )
-    thinned = None if fewer is None else lambda take: _with_prediction(fewer(take), values)
-    return replace(seen, predict=predict, rebase=moved, fewer=thinned, uncertain=None)
+    thinned = None if subset is None else lambda take: _with_prediction(subset(take), values)
+    return replace(observation, predict=predict, rebase=moved, subset=thinned, uncertain=None)

@@ -17,7 +17,7 @@ from gapbridge.core.diagnosis.channels.recording import (
     subsampled,
 )
 from gapbridge.core.diagnosis.observation import NotObservable, Observation
-from gapbridge.core.diagnosis.selection.unnamed import unnamed_pulls
+from gapbridge.core.diagnosis.selection.unnamed import unnamed_loads
 from gapbridge.core.dynamics import predict_torque, with_pieces
 from gapbridge.core.effects import Term
 from gapbridge.core.log.log import Log
@@ -27,18 +27,17 @@ from gapbridge.core.motion import Motion, motion_of
 from gapbridge.core.predicted_channels import NO_MASSES
 from gapbridge.core.sessions import session_of
 
-ENOUGH = 0.4  # share of rows that must remain for rests to be left out too
-BRIEF = 0.15  # s: a joint that is slow for no longer is turning round, not resting
+MIN_MOVING_SHARE = 0.4  # of the rows in which all joints move, for rows at rest to be left out
+MAX_REVERSAL = 0.15  # s: a joint that is slow for longer is at rest, not reversing
 
 
 def observe(model: Model, log: Log, metrology: Metrology) -> Observation | NotObservable:
     """Return the torque channel of a log (Nm, one coordinate a joint), or what it lacks.
 
-    Rows without derivatives (edges, gaps), with a torque that is not finite, or in which a joint
-    turns round, so that nobody knows the sign of its friction, are left out; of more than
-    30,000 poses at rest so many are taken, evenly. An arm whose links have no mass has no
-    torques to compare with, nor are columns that never change any. Raises LogError where the log
-    holds something unusable.
+    Rows without derivatives (edges, gaps), with a torque that is not finite, or with a joint that
+    reverses (unknown sign of friction) are left out. Of more than 30,000 poses at rest 30,000 are
+    taken, evenly spaced. Not observable if the links have no mass or the torques are constant.
+    Raises LogError if the log holds something unusable.
     """
     measured = log.get("actual_current_as_torque")
     needs = _needed(model, log)
@@ -81,9 +80,9 @@ def _observed(
         joint_columns=own_joints(len(motion), n),
         order_in_time=motion.moving,
         friction=motion.direction if motion.moving else None,
-        unnamed=lambda: unnamed_pulls(model, motion, "torque"),
+        unnamed=lambda: unnamed_loads(model, motion, "torque"),
         instrument=lambda: instrument_noise(measured[whole.rows], whole),
-        fewer=lambda take: _observed(model, log, measured, whole, rows[take]),
+        subset=lambda take: _observed(model, log, measured, whole, rows[take]),
         session=session_of(log)[motion.rows] if log.session_names else None,
     )
 
@@ -98,20 +97,20 @@ def _needed(model: Model, log: Log) -> tuple[str, ...]:
 
 
 def _steady(motion: Motion) -> NDArray[np.bool_]:
-    """Return the rows (N,) in which every joint's friction has a known sign, as far as can be.
+    """Return the rows (N,) in which every joint's friction has a known sign, as far as possible.
 
-    Joints that never move count as known (no friction). Where joints move one at a time, so that
-    some joint rests in most rows, only the turning round is left out.
+    Joints that never move count as known (no friction). If joints move one at a time, so that some
+    joint is at rest in most rows, only the reversals are left out.
     """
     keep = np.ones(len(motion), dtype=bool)
     if not motion.moving:
         return keep
     slow = motion.turning
-    if np.mean(~slow.any(axis=1)) >= ENOUGH:
+    if np.mean(~slow.any(axis=1)) >= MIN_MOVING_SHARE:
         return np.asarray(~slow.any(axis=1))
     for j in range(slow.shape[1]):
         for first, last in _runs(slow[:, j]):
-            if motion.t[last] - motion.t[first] < BRIEF:
+            if motion.t[last] - motion.t[first] < MAX_REVERSAL:
                 keep[first : last + 1] = False
     return keep
 

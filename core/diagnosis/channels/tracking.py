@@ -1,4 +1,4 @@
-"""The tracking channel: where the encoders stand against where they were commanded to be."""
+"""The tracking channel: encoder angles against commanded angles."""
 
 from __future__ import annotations
 
@@ -27,18 +27,18 @@ from gapbridge.core.model import Model
 from gapbridge.core.motion import Motion, motion_of
 from gapbridge.core.sessions import session_of
 
-SHORTEST_LEAD = 0.1  # s left out at the start of each stretch, whose past is unknown
-TEXT = 2e-7  # rad: smaller differences come from how the log was written
-REMEMBERED = 64  # predictions of one joint
-LEADS = 4.0  # times the delay: what is left out where it is longer
+MIN_LEAD = 0.1  # s left out at the start of each stretch, where past commands are unknown
+DECIMALS = 2e-7  # rad: smaller differences are rounding of the log
+CACHED = 64  # predictions of one joint
+LEAD_IN_DELAYS = 4.0  # times the delay: the time left out if that is longer
 
 
 def observe(model: Model, log: Log, metrology: Metrology) -> Observation | NotObservable:
     """Return the tracking channel of a log (rad, one coordinate a joint), or what it lacks.
 
-    Delays are predicted on every row; of more than 30,000 poses at rest so many are compared. The
+    Delays are predicted on every row; of more than 30,000 poses at rest 30,000 are compared. The
     start of each stretch is left out, because the commands before it are unknown. ``sigma`` is the
-    encoder's step over the root of 12. Raises LogError where the log holds something unusable.
+    encoder's step over the root of 12. Raises LogError if the log holds something unusable.
     """
     needs = tuple(name for name in ("target_q", "actual_q") if not log.has(name))
     if needs:
@@ -68,19 +68,19 @@ def _observed(model: Model, log: Log, motion: Motion, rows: Index) -> Observatio
         joint_columns=own_joints(len(part), n),
         order_in_time=motion.moving,
         instrument=lambda: instrument_noise(motion.q - target, motion),
-        fewer=lambda take: _observed(model, log, motion, rows[take]),
+        subset=lambda take: _observed(model, log, motion, rows[take]),
         session=session_of(log)[part.rows] if log.session_names else None,
     )
 
 
 def _encoders_under(model: Model, motion: Motion, rows: Index) -> Predict:
-    """Return where the encoders of some rows stand under further terms.
+    """Return the predictor of the encoder angles of some rows under further terms.
 
-    A fit asks again and again with one joint changed: the others are remembered.
+    A fit changes one joint at a time: predictions of the others are cached.
     """
     plain: Array = predict_tracking(model, motion)[rows]
 
-    @lru_cache(maxsize=REMEMBERED)
+    @lru_cache(maxsize=CACHED)
     def joint_under(joint: int, own: tuple[Term, ...]) -> Array:
         return np.asarray(predict_tracking(model, motion, own)[rows, joint - 1])
 
@@ -97,11 +97,11 @@ def _encoders_under(model: Model, motion: Motion, rows: Index) -> Predict:
 
 
 def encoder_step(q: Array) -> float:
-    """Return the quantisation step (rad) of encoder angles (N, n); 0 where they have none."""
+    """Return the quantisation step (rad) of encoder angles (N, n); 0: continuous."""
     steps = []
     for angles in q.T:
         gaps = np.diff(np.unique(angles))
-        gaps = gaps[gaps > TEXT]
+        gaps = gaps[gaps > DECIMALS]
         if len(gaps) < 20:
             continue
         step = float(np.quantile(gaps, 0.05))
@@ -113,16 +113,16 @@ def encoder_step(q: Array) -> float:
 
 
 def _known_past(motion: Motion) -> NDArray[np.bool_]:
-    """Return the rows (N,) whose commands before them are in the log."""
+    """Return the rows (N,) for which the preceding commands are in the log."""
     keep = np.ones(len(motion), dtype=bool)
     if not motion.moving:
         return keep
     assert motion.target_q is not None
-    # the slope of the gap over the speed is the whole delay, joint by joint
+    # the slope of the gap over the speed is the total delay of each joint
     behind = ((motion.target_q - motion.q) * motion.qd).sum(axis=0)
     speed = (motion.qd**2).sum(axis=0)
     delay = np.where(speed > 1e-6 * len(motion), behind / np.maximum(speed, 1e-12), 0.0)
-    lead = max(SHORTEST_LEAD, LEADS * float(np.abs(delay).max()))
+    lead = max(MIN_LEAD, LEAD_IN_DELAYS * float(np.abs(delay).max()))
     begins = np.concatenate([[True], np.diff(motion.stretch) > 0])
     since = motion.t - np.maximum.accumulate(np.where(begins, motion.t, -np.inf))
     late = since >= min(lead, 0.25 * float(motion.t[-1] - motion.t[0]))

@@ -1,4 +1,4 @@
-"""The wrench channel: the flange sensor against what payload and pull do to it."""
+"""The wrench channel: the flange sensor against the wrench of payload and external force."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from gapbridge.core.diagnosis.channels.recording import (
     subsampled,
 )
 from gapbridge.core.diagnosis.observation import NotObservable, Observation
-from gapbridge.core.diagnosis.selection.unnamed import unnamed_pulls
+from gapbridge.core.diagnosis.selection.unnamed import unnamed_loads
 from gapbridge.core.dynamics import predict_wrench, with_pieces
 from gapbridge.core.effects import Term
 from gapbridge.core.estimation.robust import scale_of
@@ -28,17 +28,16 @@ from gapbridge.core.motion import Motion, motion_of
 from gapbridge.core.sessions import session_of
 
 AXES = ("fx", "fy", "fz", "mx", "my", "mz")
-USUAL_WEIGHT = 10.0  # N/Nm between force and torque where the log does not show it
-WEIGHTS = (1.0, 1000.0)  # N/Nm, the range that a sensor can have
+USUAL_WEIGHT = 10.0  # N/Nm of torques relative to forces, without a noise to measure it
+WEIGHTS = (1.0, 1000.0)  # N/Nm, plausible range
 
 
 def observe(model: Model, log: Log, metrology: Metrology) -> Observation | NotObservable:
     """Return the wrench channel of a log (N), or what it lacks.
 
-    Torques are weighed by the ratio of the noise of forces to that of torques. Rows without
-    derivatives and rows whose wrench is not finite are left out; of more than 30,000
-    poses at rest so many are taken, evenly. Raises LogError where the log holds something
-    unusable.
+    Torques are weighted by the ratio of the noise of forces to that of torques. Rows without
+    derivatives and rows whose wrench is not finite are left out. Of more than 30,000 poses at rest
+    30,000 are taken, evenly spaced. Raises LogError if the log holds something unusable.
     """
     measured = log.get("ft_raw_wrench")
     needs = [] if measured is not None else ["ft_raw_wrench"]
@@ -79,21 +78,21 @@ def _observed(
         rows=motion.rows,
         axes=AXES,
         order_in_time=motion.moving,
-        unnamed=lambda: unnamed_pulls(model, motion, "wrench"),
+        unnamed=lambda: unnamed_loads(model, motion, "wrench"),
         instrument=lambda: instrument_noise(measured[whole.rows], whole),
-        fewer=lambda take: _observed(model, log, measured, whole, rows[take]),
+        subset=lambda take: _observed(model, log, measured, whole, rows[take]),
         session=session_of(log)[motion.rows] if log.session_names else None,
     )
 
 
 def _readings(wrench: Array) -> dict[str, Array]:
-    """Return the expected readings (N, 6) as quantities: a bad sensor errs by what it carries."""
+    """Return the expected wrench (N, 6) as quantities: sensor errors depend on the load."""
     spread = np.ptp(wrench, axis=0)
     return {f"ft_raw_wrench_{i}": wrench[:, i] for i in np.flatnonzero(spread > CONSTANT_SPREAD)}
 
 
 def torque_weight(noise: Array, wrench: Array) -> float:
-    """Return N/Nm that makes torques comparable with forces: the ratio of their noise (6,)."""
+    """Return the weight (N/Nm) of torques relative to forces, by their ``noise`` (6,)."""
     force, torque = (float(np.sqrt(np.mean(noise[k] ** 2))) for k in (slice(3), slice(3, 6)))
     tiny = 1e-7 * max(float(np.abs(wrench).max()), 1e-3)
     if not (force > tiny and torque > 1e-2 * tiny):
@@ -102,7 +101,7 @@ def torque_weight(noise: Array, wrench: Array) -> float:
 
 
 def _noise(sensor: Array, whole: Motion, value: Array, predicted: Array, motion: Motion) -> Array:
-    """Return the noise of each axis (6,): white noise if moving, else what a loose fit leaves."""
+    """Return the noise of each axis (6,): white noise in motion, else that of a flexible fit."""
     if whole.moving:
         kept = sensor[np.isfinite(sensor).all(axis=1)]
         return signal_noise(kept)
@@ -110,11 +109,11 @@ def _noise(sensor: Array, whole: Motion, value: Array, predicted: Array, motion:
     time = (motion.t - motion.t[0]) / max(float(np.ptp(motion.t)), 1.0)
     design = [np.ones((len(motion), 1)), time[:, None], predicted, motion.pieces.payload_wrench]
     while design:
-        loose = np.column_stack(design)
-        spare = len(motion) - np.linalg.matrix_rank(loose)
-        if spare >= max(5, len(motion) // 4):
-            left = value - loose @ np.linalg.lstsq(loose, value, rcond=None)[0]
-            typical = np.array([scale_of(axis) for axis in left.T])
-            return np.asarray(typical * np.sqrt(len(motion) / spare))
+        design_matrix = np.column_stack(design)
+        degrees_of_freedom = len(motion) - np.linalg.matrix_rank(design_matrix)
+        if degrees_of_freedom >= max(5, len(motion) // 4):
+            remainder = value - design_matrix @ np.linalg.lstsq(design_matrix, value, rcond=None)[0]
+            typical = np.array([scale_of(axis) for axis in remainder.T])
+            return np.asarray(typical * np.sqrt(len(motion) / degrees_of_freedom))
         design.pop()
     return np.zeros(6)

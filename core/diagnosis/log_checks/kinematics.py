@@ -1,7 +1,6 @@
-"""Kinematics that are another arm's: joint orders, modified DH rows, signs and units of lengths.
+"""Mistakes of a kinematic model: joint order, modified DH rows, signs and units of lengths, TCP.
 
-Where no frame brings measured and predicted poses together, each mistake that people make with a
-model is tried, and the one that fits is named.
+If measured and predicted poses agree in no frame, the usual mistakes are tried one by one.
 """
 
 from __future__ import annotations
@@ -20,21 +19,21 @@ from gapbridge.core.log.log_finding import LogCheck, LogFinding
 from gapbridge.core.model import Model
 from gapbridge.core.rotation import rotation_matrix
 
-MANY = 6  # joints up to which all orders are tried: 720
-SCREENED = 24  # rows that an order is judged on before all are
-NEAR = 1e-6  # m, rad: frames that are standard DH rows
-POINTED = 12  # rows from which nine numbers, point and frame, are determined
+MAX_PERMUTED = 6  # joints up to which all orders are tried: 720
+ORDER_ROWS = 24  # rows on which orders are compared
+DH_TOLERANCE = 1e-6  # m, rad: of frames that are standard DH rows
+MIN_POINT_ROWS = 12  # for nine unknowns, point and frame
 STEPS = 10  # of Gauss-Newton
-OUTLYING = 5.0  # times the median distance: a row left out the second time
-FARTHEST = 2.0  # m from the flange: no tool is longer
+OUTLIER_DISTANCE = 5.0  # times the median distance, from which a row is an outlier
+MAX_TOOL_LENGTH = 2.0  # m from the flange
 
 
 def other_models(model: Model) -> Iterator[tuple[LogFinding, Model]]:
-    """Yield what the model may have been taken for, with the model that puts it right."""
-    bare = np.eye(4)
+    """Yield each possible mistake in the model, with the corrected model."""
+    without_tool = np.eye(4)
     if np.linalg.norm(model.tool_in_flange[:3, 3]) > 0:
-        bare[:3, :3] = model.tool_in_flange[:3, :3]
-        yield LogFinding(LogCheck.FLANGE_NOT_TCP), replace(model, tool_in_flange=bare)
+        without_tool[:3, :3] = model.tool_in_flange[:3, :3]
+        yield LogFinding(LogCheck.FLANGE_NOT_TCP), replace(model, tool_in_flange=without_tool)
         turned = model.tool_in_flange.copy()
         turned[:3, 3] *= -1
         yield LogFinding(LogCheck.TCP_SIGN), replace(model, tool_in_flange=turned)
@@ -56,30 +55,31 @@ def other_models(model: Model) -> Iterator[tuple[LogFinding, Model]]:
 
 
 def other_arms(model: Model) -> Iterator[tuple[LogFinding, Model]]:
-    """Yield the model with each other built-in arm of as many joints."""
+    """Yield the model with each other built-in arm of the same number of joints."""
     for name in builtin_names():
         arm = builtin_arm(name)
         if name != model.arm.name and arm.n == model.arm.n:
             yield LogFinding(LogCheck.OTHER_ARM, (name,)), replace(model, arm=arm)
 
 
-def measured_point(model: Model, q: Array, seen: Array) -> tuple[LogFinding, Model] | None:
-    """Return where on the flange the measured positions (N, 3) lie, and that model.
+def measured_point(model: Model, q: Array, measured: Array) -> tuple[LogFinding, Model] | None:
+    """Return the point on the flange of the measured positions (N, 3), and the model with it.
 
-    The point and the instrument's frame are found together (Gauss-Newton, twice: the second time
-    without outliers). None where there are too few rows to tell.
+    The point and the instrument's frame are fitted together (Gauss-Newton, twice: the second time
+    without outliers). None if there are too few rows.
     """
-    if len(q) < POINTED:
+    if len(q) < MIN_POINT_ROWS:
         return None
-    bare = replace(model, tool_in_flange=np.eye(4))
-    flange = bare.rigid_pose(q)
+    without_tool = replace(model, tool_in_flange=np.eye(4))
+    flange = without_tool.rigid_pose(q)
     kept, point = np.ones(len(q), bool), np.zeros(3)
     for _ in range(2):
-        point, distance = _point_on_flange(flange.position[kept], flange.rotation[kept], seen[kept])
-        if np.linalg.norm(point) > FARTHEST:
+        position, rotation = flange.position[kept], flange.rotation[kept]
+        point, distance = _point_on_flange(position, rotation, measured[kept])
+        if np.linalg.norm(point) > MAX_TOOL_LENGTH:
             return None
-        kept[kept] = distance <= OUTLYING * np.median(distance)
-        if kept.sum() < POINTED:
+        kept[kept] = distance <= OUTLIER_DISTANCE * np.median(distance)
+        if kept.sum() < MIN_POINT_ROWS:
             return None
     tool = model.tool_in_flange.copy()
     declared = tool[:3, 3].copy()
@@ -90,57 +90,59 @@ def measured_point(model: Model, q: Array, seen: Array) -> tuple[LogFinding, Mod
     return finding, replace(model, tool_in_flange=tool)
 
 
-def _point_on_flange(position: Array, rotation: Array, seen: Array) -> tuple[Array, Array]:
-    """Return the point (3,) in the flange, m, and each row's distance (N,) left over."""
+def _point_on_flange(position: Array, rotation: Array, measured: Array) -> tuple[Array, Array]:
+    """Return the point (3,) in the flange, m, and each row's residual distance (N,), m."""
     point = np.zeros(3)
     for _ in range(STEPS):
-        there = position + rotation @ point
-        in_base = register(seen, there).in_base(seen)
-        apart = (in_base - there).ravel()
+        predicted_point = position + rotation @ point
+        in_base = register(measured, predicted_point).in_base(measured)
+        deviation = (in_base - predicted_point).ravel()
         turn = np.zeros((len(in_base), 3, 3))  # columns: a small turn of the instrument's frame
         for k, axis in enumerate(np.eye(3)):
             turn[:, :, k] = np.cross(axis, in_base)
         shift = np.broadcast_to(np.eye(3), turn.shape)
         columns = np.concatenate([rotation, -turn, -shift], axis=2).reshape(-1, 9)
-        point = point + solve(columns, apart, rank=1e-6)[:3]
-    there = position + rotation @ point
-    distance = np.linalg.norm(register(seen, there).in_base(seen) - there, axis=1)
+        point = point + solve(columns, deviation, rank=1e-6)[:3]
+    predicted_point = position + rotation @ point
+    distance = np.linalg.norm(
+        register(measured, predicted_point).in_base(measured) - predicted_point, axis=1
+    )
     return point, np.asarray(distance)
 
 
-def best_order(model: Model, q: Array, seen: Array) -> tuple[LogFinding, Array] | None:
+def best_order(model: Model, q: Array, measured: Array) -> tuple[LogFinding, Array] | None:
     """Return the order of joints that fits positions (N, 3) best, and q in it.
 
-    All orders of up to six joints; of more, exchanges of two and cyclic shifts. None where the
-    order as it stands is the best.
+    All orders of up to six joints; of more, exchanges of two and cyclic shifts. None if the given
+    order is the best.
     """
     n = q.shape[1]
-    rows = np.unique(np.linspace(0, len(q) - 1, SCREENED).astype(int))
-    few, target = q[rows], seen[rows]
+    rows = np.unique(np.linspace(0, len(q) - 1, ORDER_ROWS).astype(int))
+    few, target = q[rows], measured[rows]
     orders = list(_orders(n))
     stacked = model.rigid_pose(np.concatenate([few[:, order] for order in orders])).position
     best, chosen = np.inf, orders[0]
     for order, predicted in zip(orders, np.split(stacked, len(orders)), strict=True):
-        apart = register(target, predicted).in_base(target) - predicted
-        left = float(np.median(np.linalg.norm(apart, axis=1)))
-        if left < best - 1e-12:
-            best, chosen = left, order
+        deviation = register(target, predicted).in_base(target) - predicted
+        error = float(np.median(np.linalg.norm(deviation, axis=1)))
+        if error < best - 1e-12:
+            best, chosen = error, order
     if chosen == tuple(range(n)):
         return None
     return _order(chosen), q[:, chosen]
 
 
 def _orders(n: int) -> Iterator[tuple[int, ...]]:
-    own = tuple(range(n))
-    yield own
-    if n <= MANY:
+    given_order = tuple(range(n))
+    yield given_order
+    if n <= MAX_PERMUTED:
         if n > 2:
-            yield _exchanged(own, 0, 2)  # ROS sorts a UR's joints by name: elbow first
-        yield from (order for order in itertools.permutations(own) if order != own)
+            yield _exchanged(given_order, 0, 2)  # ROS sorts a UR's joints by name: elbow first
+        yield from (order for order in itertools.permutations(given_order) if order != given_order)
         return
-    yield from (_exchanged(own, i, j) for i, j in itertools.combinations(own, 2))
-    yield from (own[k:] + own[:k] for k in range(1, n))
-    yield own[::-1]
+    yield from (_exchanged(given_order, i, j) for i, j in itertools.combinations(given_order, 2))
+    yield from (given_order[k:] + given_order[:k] for k in range(1, n))
+    yield given_order[::-1]
 
 
 def _exchanged(order: tuple[int, ...], i: int, j: int) -> tuple[int, ...]:
@@ -150,7 +152,7 @@ def _exchanged(order: tuple[int, ...], i: int, j: int) -> tuple[int, ...]:
 
 
 def _order(order: tuple[int, ...]) -> LogFinding:
-    """Return what is wrong with the order: ``order[i]`` is the column that is joint i + 1."""
+    """Return the finding on a joint order: ``order[i]`` is the column of joint i + 1."""
     n = len(order)
     moved = [i for i in range(n) if order[i] != i]
     if order == tuple(range(n))[::-1]:
@@ -163,16 +165,16 @@ def _order(order: tuple[int, ...]) -> LogFinding:
     return LogFinding(LogCheck.JOINT_ORDER, (tuple((i + 1, order[i]) for i in moved),))
 
 
-def inverted(seen: Array, turned: Array) -> Array:
-    """Return positions (N, 3) of inverted poses: what was measured in the tool's frame."""
-    return np.asarray(-np.einsum("nji,nj->ni", rotation_matrix(turned), seen))
+def inverted(measured: Array, turned: Array) -> Array:
+    """Return positions (N, 3) of the inverse poses, which were measured in the tool frame."""
+    return np.asarray(-np.einsum("nji,nj->ni", rotation_matrix(turned), measured))
 
 
 def dh_rows(arm: Arm) -> Array | None:
-    """Return standard DH rows (n, 4) a, alpha, d, offset of an arm; None where it has none."""
+    """Return standard DH rows (n, 4) a, alpha, d, offset of an arm; None if it has none."""
     rows = np.zeros((arm.n, 4))
     before = arm.link_in_link[0]
-    if np.abs(before[:3, 3]).max() > NEAR or abs(before[2, 2] - 1) > NEAR:
+    if np.abs(before[:3, 3]).max() > DH_TOLERANCE or abs(before[2, 2] - 1) > DH_TOLERANCE:
         return None
     rows[0, 3] = np.arctan2(before[1, 0], before[0, 0])
     for i in range(arm.n):
@@ -183,7 +185,7 @@ def dh_rows(arm: Arm) -> Array | None:
         rows[i, :3] = link[0, 3], alpha, link[2, 3]
         if i + 1 < arm.n:
             rows[i + 1, 3] = offset
-        if np.abs(link - _link(link[0, 3], alpha, link[2, 3], offset)).max() > NEAR:
+        if np.abs(link - _link(link[0, 3], alpha, link[2, 3], offset)).max() > DH_TOLERANCE:
             return None
     return rows
 

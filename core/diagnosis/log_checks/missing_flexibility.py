@@ -1,12 +1,12 @@
-"""A cell without flexibilities, a soft arm: more causes than a short log can determine one by one.
+"""Log check for a rigid cell of a compliant arm: more causes than a short log can identify singly.
 
-The catalogue holds every joint's softness, but a search among all effects wants proof for each;
-a fit that asks for the softness alone does not.
+A search requires each joint's flexibility to be significant; a fit of all flexibilities alone does
+not.
 """
 
 from __future__ import annotations
 
-from gapbridge.core.diagnosis.criteria import MAIN_SHARE
+from gapbridge.core.diagnosis.criteria import MAX_SHARE_AFTER_FLEXIBILITIES
 from gapbridge.core.errors import GapbridgeError
 from gapbridge.core.estimation.compliance_fit import flexibilities
 from gapbridge.core.estimation.identification import identify_compliance
@@ -16,11 +16,10 @@ from gapbridge.core.metrology import Metrology
 from gapbridge.core.model import Model
 
 
-def softness_findings(model: Model, log: Log, metrology: Metrology) -> list[LogFinding]:
-    """Return a finding on joint flexibilities where the cell names none and a fit of them pays.
+def flexibility_findings(model: Model, log: Log, metrology: Metrology) -> list[LogFinding]:
+    """Return a finding if the cell has no joint flexibilities and a fit of them halves the gap.
 
-    It pays where it halves the gap on poses that it did not see, at least. Frame and tool point
-    are fitted along as ``gapbridge fit`` does.
+    The gap is that of held-out poses. Frame and tool point are fitted too, as in ``gapbridge fit``.
     """
     if flexibilities(model).any():
         return []
@@ -29,7 +28,7 @@ def softness_findings(model: Model, log: Log, metrology: Metrology) -> list[LogF
     except GapbridgeError:
         return []
     before, after = fitted.gap_rms_held_out, fitted.remaining_rms_held_out
-    if not after < MAIN_SHARE * before:
+    if not after < MAX_SHARE_AFTER_FLEXIBILITIES * before:
         return []
     values = int(fitted.identifiable.sum()), before, after
     return [LogFinding(LogCheck.MISSING_FLEXIBILITY, values)]

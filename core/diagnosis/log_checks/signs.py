@@ -1,8 +1,7 @@
-"""Forces of the wrong sign or in the wrong axes, suspected by name.
+"""Log checks for forces of the wrong sign or in the wrong axes (docs/conventions.md).
 
-An arm gives way in the direction of a pull, and a sensor reads it: where the data agree much better
-with the pull turned round, or taken in tool axes, the column does not mean what a log's does
-(docs/conventions.md).
+An arm deflects in the direction of a force, and a sensor measures it. If the data agree much better
+with the force reversed, or in tool axes, the column has another convention.
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from gapbridge.core.arrays import Array, Index
-from gapbridge.core.diagnosis.criteria import SIGN_LEAVES
+from gapbridge.core.diagnosis.criteria import MAX_SHARE_WITH_OTHER_SIGN
 from gapbridge.core.dynamics import predict_torque, predict_wrench
 from gapbridge.core.errors import InputError
 from gapbridge.core.estimation.least_squares import bounded
@@ -25,33 +24,33 @@ from gapbridge.core.log.log_finding import LogCheck, LogFinding
 from gapbridge.core.model import Model
 from gapbridge.core.motion import Motion
 
-MOST = 200  # rows looked at
-FEWEST = 6  # pulled rows from which a sign is judged
-LEAST = 1.0  # N, Nm: less is no pull
+MAX_ROWS = 200  # that are checked, evenly spaced
+MIN_ROWS = 6  # with a force, for a sign to be checked
+MIN_FORCE = 1.0  # N, Nm
 ROUNDS = 4
-SHOWN_BY = {
+SENSORS = {
     "ft_raw_wrench": LogCheck.WRENCH_SIGN,
     "actual_current_as_torque": LogCheck.TORQUE_SIGN,
 }
 
 
 def sign_findings(model: Model, log: Log) -> list[LogFinding]:
-    """Return which forces look turned round or in other axes, or []."""
+    """Return findings on forces that look reversed or in other axes."""
     q = log.get("actual_q") if log.has("actual_q") else log.get("target_q")
     if q is None:
         return []
     findings = []
-    for name, check in SHOWN_BY.items():
-        judged = name == "ft_raw_wrench" or model.arm.mass.any()
-        if judged and _reads_turned_round(model, log, q, name):
+    for name, check in SENSORS.items():
+        checked = name == "ft_raw_wrench" or model.arm.mass.any()
+        if checked and _is_reversed(model, log, q, name):
             findings.append(LogFinding(check))
     pull = log.get("actual_TCP_force")
     if pull is None or findings:
         return findings
-    for judge in (_compliance_rivals, *(_sensed(name) for name in SHOWN_BY)):
-        pulled = judge(model, log, q, pull)
-        if pulled is not None:
-            return [LogFinding(pulled)]
+    for find in (_by_deflection, *(_by_sensor(name) for name in SENSORS)):
+        convention = find(model, log, q, pull)
+        if convention is not None:
+            return [LogFinding(convention)]
     return []
 
 
@@ -61,7 +60,8 @@ def _rows(q: Array, *columns: Array | None) -> Index:
         if column is not None:
             good &= np.isfinite(column.reshape(len(q), -1)).all(axis=1)
     rows = np.flatnonzero(good)
-    return rows[np.unique(np.linspace(0, len(rows) - 1, MOST).astype(int))] if len(rows) else rows
+    take = np.linspace(0, max(len(rows) - 1, 0), MAX_ROWS).astype(int)
+    return rows[np.unique(take)] if len(rows) else rows
 
 
 def _loads(log: Log, rows: Index, pull: Array | None) -> Loads:
@@ -73,31 +73,33 @@ def _loads(log: Log, rows: Index, pull: Array | None) -> Loads:
 
 
 def _variants(model: Model, q: Array, pull: Array) -> dict[LogCheck | None, Array]:
-    """Return what the pull may mean; None: what a log's column says."""
-    hand = model.rigid_pose(q).rotation
-    turned = np.hstack([(hand @ part[..., None])[..., 0] for part in (pull[:, :3], pull[:, 3:])])
+    """Return the possible conventions of the external force; None: that of a log."""
+    tool_axes = model.rigid_pose(q).rotation
+    in_tool = np.hstack(
+        [(tool_axes @ part[..., None])[..., 0] for part in (pull[:, :3], pull[:, 3:])]
+    )
     return {
         None: pull,
         LogCheck.PULL_SIGN: -pull,
-        LogCheck.PULL_IN_TOOL: turned,
-        LogCheck.PULL_SIGN_IN_TOOL: -turned,
+        LogCheck.PULL_IN_TOOL: in_tool,
+        LogCheck.PULL_SIGN_IN_TOOL: -in_tool,
     }
 
 
 def _best(residual: dict[LogCheck | None, float]) -> LogCheck | None:
-    """Return the variant that leaves far less than the column as it stands, or None."""
+    """Return the convention with a much smaller residual than that of a log, or None."""
     least = min(residual, key=lambda key: residual[key])
-    return least if residual[least] < SIGN_LEAVES * residual[None] else None
+    return least if residual[least] < MAX_SHARE_WITH_OTHER_SIGN * residual[None] else None
 
 
-def _compliance_rivals(model: Model, log: Log, q: Array, pull: Array) -> LogCheck | None:
-    """Return what the pull looks like by how the measured positions give way to it."""
+def _by_deflection(model: Model, log: Log, q: Array, pull: Array) -> LogCheck | None:
+    """Return the finding on the force by the deflection of the measured positions."""
     measured = log.get("measured_position")
     if measured is None:
         return None
     rows = _rows(q, measured, pull)
-    pulled = np.abs(pull[rows]).max(axis=1, initial=0.0) > LEAST
-    if pulled.sum() < FEWEST or 3 * len(rows) < 2 * (3 * model.arm.n + 6):
+    pulled = np.abs(pull[rows]).max(axis=1, initial=0.0) > MIN_FORCE
+    if pulled.sum() < MIN_ROWS or 3 * len(rows) < 2 * (3 * model.arm.n + 6):
         return None
     residual = {}
     try:
@@ -110,15 +112,15 @@ def _compliance_rivals(model: Model, log: Log, q: Array, pull: Array) -> LogChec
 
 
 def _compliance_residual(model: Model, q: Array, measured: Array, loads: Loads) -> Array:
-    """Return what joints that give way, never less than nothing, leave of the positions (N, 3)."""
+    """Return the residual positions (N, 3) of a robust fit of non-negative flexibilities."""
     predicted = model.predict(q, loads).position
-    seen = register_robustly(measured, predicted).in_base(measured)
+    in_base = register_robustly(measured, predicted).in_base(measured)
     form, n = model.linear_form(q, loads), model.arm.n
-    free = np.concatenate([form.jacobian[:, :3], frame_columns(seen)[:, :3]], axis=2)
+    free = np.concatenate([form.jacobian[:, :3], frame_columns(in_base)[:, :3]], axis=2)
     A = np.concatenate([form.regressor[:, :3], free], axis=2).reshape(3 * len(q), -1)
-    b = (seen - predicted).ravel()
+    b = (in_base - predicted).ravel()
     lower = np.concatenate([-np.concatenate(model.compliance()), np.full(n + 6, -np.inf)])
-    weight, off = np.ones(len(b)), seen - predicted
+    weight, off = np.ones(len(b)), in_base - predicted
     for _ in range(ROUNDS):
         root = np.sqrt(weight)
         x = bounded(A * root[:, None], b * root, lower, np.full(len(lower), np.inf))[0]
@@ -130,7 +132,7 @@ def _compliance_residual(model: Model, q: Array, measured: Array, loads: Loads) 
 def _predicted(
     model: Model, log: Log, q: Array, name: str, pull: Array | None, rows: Index
 ) -> Array:
-    """Return what a channel would read at rest: accelerations matter little to a sign."""
+    """Return the prediction of a channel at rest; accelerations matter little to a sign."""
     count, n = len(rows), model.arm.n
     nothing = np.zeros((count, n))
     motion = Motion(
@@ -138,44 +140,44 @@ def _predicted(
         loads=_loads(log, rows, pull), rows=rows, valid=np.ones(count, dtype=bool),
         stretch=np.zeros(count, dtype=np.int64), start=0.0, moving=False, still=np.ones(n),
     )  # fmt: skip
-    how = predict_wrench if name == "ft_raw_wrench" else predict_torque
-    return how(replace(model, terms=()), motion)
+    predictor = predict_wrench if name == "ft_raw_wrench" else predict_torque
+    return predictor(replace(model, terms=()), motion)
 
 
 def spread_of(values: Array) -> float:
-    """Return how far values (N, k) scatter about a constant."""
+    """Return the median distance of values (N, k) from their median."""
     return float(np.median(np.linalg.norm(values - np.median(values, axis=0), axis=1)))
 
 
-def _sensed(name: str) -> Callable[[Model, Log, Array, Array], LogCheck | None]:
-    """Return the judge of a pull by what a sensor reads of it."""
+def _by_sensor(name: str) -> Callable[[Model, Log, Array, Array], LogCheck | None]:
+    """Return the check of a force by the readings of a sensor."""
 
-    def judge(model: Model, log: Log, q: Array, pull: Array) -> LogCheck | None:
+    def find(model: Model, log: Log, q: Array, pull: Array) -> LogCheck | None:
         column = log.get(name)
         if column is None or (name != "ft_raw_wrench" and not model.arm.mass.any()):
             return None
         rows = _rows(q, column, pull)
-        pulled = rows[np.abs(pull[rows]).max(axis=1, initial=0.0) > LEAST]
-        if len(pulled) < FEWEST:
+        pulled = rows[np.abs(pull[rows]).max(axis=1, initial=0.0) > MIN_FORCE]
+        if len(pulled) < MIN_ROWS:
             return None
-        left = {}
+        spread = {}
         for check, variant in _variants(model, q[pulled], pull[pulled]).items():
             predicted = _predicted(model, log, q, name, variant, pulled)
-            left[check] = spread_of(column[pulled] - predicted)
-        return _best(left)
+            spread[check] = spread_of(column[pulled] - predicted)
+        return _best(spread)
 
-    return judge
+    return find
 
 
-def _reads_turned_round(model: Model, log: Log, q: Array, name: str) -> bool:
-    """Return whether a sensor itself looks turned round in sign."""
+def _is_reversed(model: Model, log: Log, q: Array, name: str) -> bool:
+    """Return whether a sensor itself has the opposite sign."""
     column = log.get(name)
     pull = log.get("actual_TCP_force")
     if column is None:
         return False
     rows = _rows(q, column, pull)
-    if len(rows) < FEWEST:
+    if len(rows) < MIN_ROWS:
         return False
     expected = _predicted(model, log, q, name, None if pull is None else pull[rows], rows)
-    asked, other = (spread_of(sign * column[rows] - expected) for sign in (1.0, -1.0))
-    return spread_of(expected) >= LEAST and other <= SIGN_LEAVES * asked
+    nominal, reversed_ = (spread_of(sign * column[rows] - expected) for sign in (1.0, -1.0))
+    return spread_of(expected) >= MIN_FORCE and reversed_ <= MAX_SHARE_WITH_OTHER_SIGN * nominal

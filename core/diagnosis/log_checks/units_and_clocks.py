@@ -1,6 +1,6 @@
-"""Log checks: mistakes of units, names and clocks, reported by name before anything is fitted.
+"""Log checks for mistakes of units, column names and clocks, made before anything is fitted.
 
-Those that need a prediction (frames, signs, other kinematics) stand in the files beside this one.
+Checks that need a prediction (frames, signs, other kinematics) are in the other modules.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ from gapbridge.core.metrology import Metrology
 from gapbridge.core.model import Model
 from gapbridge.core.motion import time_finding
 
-TURNS = 25.0  # rad: joints do not turn further; degrees do
-LEAST_TURN = 7.0  # rad: a little more than one turn, which any encoder may say
-BEYOND = 1.5  # times a joint's limit: no joint stands there
-REACHES = 50.0  # times the arm's reach from the middle: no arm gets there; millimetres do
-HANDS = 3.0  # times the arm's reach: no payload's centre is that far from the flange
+MAX_ANGLE = 25.0  # rad: larger joint angles are degrees
+MIN_LIMIT = 7.0  # rad: a little more than one turn, which any encoder may report
+OVER_LIMIT = 1.5  # times a joint's limit: larger angles are degrees
+MAX_REACHES = 50.0  # times the arm's reach from the middle: larger positions are millimetres
+MAX_COG_REACHES = 3.0  # times the arm's reach, for a payload's centre of gravity
 OVERLOAD = 10.0  # times the rated payload (or the arm's own weight): grams
-HOT = 200.0  # °C: no joint gets there; kelvin do
-WARM = 95.0  # °C: arms stop before; Fahrenheit do not
-FULL_TURN = 2 * np.pi + 0.3  # rad: rotation vectors end there
-FEW_POSES = 15
+MAX_TEMPERATURE = 200.0  # °C: larger values are kelvin
+FAHRENHEIT_FROM = 95.0  # °C: arms stop before
+MAX_ROTATION = 2 * np.pi + 0.3  # rad, of a rotation vector
+MIN_POSES = 15
 AT_ONCE = 1000  # rows
 READINGS = (
     "measured_position", "measured_rotation", "ft_raw_wrench", "actual_current_as_torque",
@@ -34,22 +34,21 @@ READINGS = (
 
 
 def check_units(model: Model, log: Log) -> None:
-    """Raise LogError where a column's values can only be of another unit than a log's.
+    """Raise LogError if a column's values can only be in another unit.
 
     Joints or rotations in degrees, positions or centres of gravity in millimetres, payloads in
-    grams, temperatures in kelvin. An endless angle is no degrees: it is reported as such, with its
-    row.
+    grams, temperatures in kelvin; also for an infinite joint angle, with its row.
     """
     for name in ("actual_q", "target_q"):
         _check_angles(model, log, name)
     _check_positions(model, log)
     reach = _reach(model)
-    heaviest = OVERLOAD * _usual_load(model)
+    heaviest, largest_cog = OVERLOAD * _usual_load(model), MAX_COG_REACHES * reach + 1
     for name, most, what in (
-        ("measured_rotation", FULL_TURN, "the rotation vectors look like degrees, expected rad"),
+        ("measured_rotation", MAX_ROTATION, "the rotation vectors look like degrees, expected rad"),
         ("payload", heaviest, "the payload looks like grams, expected kg"),
-        ("payload_cog", HANDS * reach + 1, "the centre of gravity looks like mm, expected m"),
-        ("joint_temperatures", HOT, "the temperatures look like kelvin, expected °C"),
+        ("payload_cog", largest_cog, "the centre of gravity looks like mm, expected m"),
+        ("joint_temperatures", MAX_TEMPERATURE, "the temperatures look like kelvin, expected °C"),
     ):
         column = log.get(name)
         if column is None:
@@ -62,12 +61,12 @@ def check_units(model: Model, log: Log) -> None:
             if name == "measured_rotation"
             else np.abs(rows).max(axis=1)
         )
-        if not (size > most).any():  # whatever the share
+        if not (size > most).any():
             continue
-        # one slip of a digit is no unit: three quarters of what is not zero have to be too large
+        # not single typing errors: three quarters of the nonzero values have to be too large
         high = size[np.isfinite(size) & (size != 0)]
         worst = float(np.quantile(high, 0.25)) if len(high) else 0.0
-        if worst > most or (name == "measured_rotation" and _share(high > most) > 0.1):
+        if worst > most or (name == "measured_rotation" and _step_share(high > most) > 0.1):
             label = name if column.ndim == 1 else f"{name}_*"
             raise LogError(f"{log.path}: column {label}: found about {worst:.4g}; {what}")
 
@@ -75,8 +74,8 @@ def check_units(model: Model, log: Log) -> None:
 def _check_angles(model: Model, log: Log, name: str) -> None:
     q = log.get(name)
     limits = model.arm.limits
-    widest = BEYOND * np.maximum(np.abs(limits.lower), np.abs(limits.upper))
-    most = np.clip(widest, LEAST_TURN, TURNS)
+    widest = OVER_LIMIT * np.maximum(np.abs(limits.lower), np.abs(limits.upper))
+    most = np.clip(widest, MIN_LIMIT, MAX_ANGLE)
     if q is None or _within(q, float(most.min())) or not np.isfinite(q).any():
         return
     if np.isinf(q).any():
@@ -92,17 +91,17 @@ def _check_angles(model: Model, log: Log, name: str) -> None:
 def _check_positions(model: Model, log: Log) -> None:
     measured = log.get("measured_position")
     reach = _reach(model)
-    if measured is None or _within(measured, REACHES * reach / np.sqrt(12)):
-        return  # no two are farther apart
+    if measured is None or _within(measured, MAX_REACHES * reach / np.sqrt(12)):
+        return  # bounds every distance
     measured = measured[np.isfinite(measured).all(axis=1)]
     if not len(measured):
         return
     widest = measured.max(axis=0) - measured.min(axis=0)
-    if np.linalg.norm(widest) <= REACHES * reach:  # no median can lie farther away
+    if np.linalg.norm(widest) <= MAX_REACHES * reach:  # bounds the median
         return
     spread = measured - np.median(measured, axis=0)
     size = float(np.median(np.linalg.norm(spread, axis=1)))
-    if size > REACHES * reach:
+    if size > MAX_REACHES * reach:
         raise LogError(
             f"{log.path}: columns measured_position_*: found positions {size:g} apart for an arm "
             f"of {reach:.2f} m reach; the positions look like millimetres, expected m"
@@ -110,7 +109,7 @@ def _check_positions(model: Model, log: Log) -> None:
 
 
 def _within(values: Array, most: float) -> bool:
-    """Return whether all values are numbers of at most this size: one look at a sound log."""
+    """Return whether all values are finite and of at most this size."""
     return bool(-most <= values.min(initial=0.0) and values.max(initial=0.0) <= most)
 
 
@@ -125,16 +124,16 @@ def _usual_load(model: Model) -> float:
     return max(rated, model.payload_mass)
 
 
-def _share(flags: NDArray[np.bool_]) -> float:
+def _step_share(flags: NDArray[np.bool_]) -> float:
     return float(np.mean(flags)) if len(flags) else 0.0
 
 
 def findings(
     log: Log, model: Model | None = None, metrology: Metrology | None = None
 ) -> list[LogFinding]:
-    """Return what is odd about a log but does not forbid work.
+    """Return findings on a log that can still be used.
 
-    With ``model`` also mistakes of frames and signs, by what the arm can do at all.
+    With ``model`` also on joint limits, number of poses, frames and signs.
     """
     listed = [*_names(log), *_times(log), *_gaps(log)]
     measured = log.get("measured_position")
@@ -145,11 +144,11 @@ def findings(
         if at_rest:
             listed.append(LogFinding(LogCheck.POSITIONS_AT_REST))
     warm = log.get("joint_temperatures")
-    if warm is not None and np.isfinite(warm).any() and float(np.nanmedian(warm)) > WARM:
+    if warm is not None and np.isfinite(warm).any() and float(np.nanmedian(warm)) > FAHRENHEIT_FROM:
         listed.append(LogFinding(LogCheck.FAHRENHEIT))
     if model is None:
         return listed
-    # prediction checks units alone, and need not wait for these
+    # imported here, because prediction only checks units
     from gapbridge.core.diagnosis.log_checks.frames import frame_findings
     from gapbridge.core.diagnosis.log_checks.signs import sign_findings
 
@@ -160,7 +159,7 @@ def findings(
 
 
 def _names(log: Log) -> list[LogFinding]:
-    """Return columns that nobody reads but whose name nearly is one of a log's."""
+    """Return unknown columns whose name is similar to a known one."""
     absent = [name for name in COLUMNS if not log.has(name)]
     pairs = [misspelt([unknown], absent, log.n) for unknown in log.unknown]
     return [LogFinding(LogCheck.MISSPELT, pair) for pair in pairs if pair][:3]
@@ -182,9 +181,9 @@ def _gaps(log: Log) -> list[LogFinding]:
     findings = []
     for name in READINGS:
         column = log.get(name)
-        gone = 0 if column is None else int(np.sum(~np.isfinite(column).all(axis=1)))
-        if gone:
-            findings.append(LogFinding(LogCheck.NO_READING, (gone, name)))
+        missing = 0 if column is None else int(np.sum(~np.isfinite(column).all(axis=1)))
+        if missing:
+            findings.append(LogFinding(LogCheck.NO_READING, (missing, name)))
     return findings
 
 
@@ -208,10 +207,10 @@ def _poses(log: Log) -> list[LogFinding]:
     if q is None or not np.isfinite(q).all():
         return []
     few, rows = q[:0], 0
-    while len(few) < FEW_POSES:  # of a long log as few rows as it takes
+    while len(few) < MIN_POSES:
         if rows >= len(q):
             break
         more = q[rows : rows + AT_ONCE]
         few, rows = np.unique(np.vstack([few, np.round(more, 4)]), axis=0), rows + AT_ONCE
     count = len(few)
-    return [LogFinding(LogCheck.FEW_POSES, (count,))] if count < FEW_POSES else []
+    return [LogFinding(LogCheck.FEW_POSES, (count,))] if count < MIN_POSES else []

@@ -1,8 +1,8 @@
-"""Candidates: everything that may stand behind a gap, each with its columns.
+"""Candidates: the hypotheses that may explain a gap, each with its columns.
 
 A *named* candidate is an effect of the catalogue at one site; a *smooth* one is an unnamed function
-of one quantity (what wins there is ``unexplained``). Columns are derivatives of the
-channel's whole prediction, by central differences, at the model found so far.
+of one quantity (if it is selected, the gap is ``unexplained``). Columns are derivatives of the
+channel's full prediction, by central differences, at the current model.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ import numpy as np
 from gapbridge.core.arm import Arm
 from gapbridge.core.arrays import Array
 from gapbridge.core.diagnosis.criteria import MIN_CYCLES
-from gapbridge.core.diagnosis.observation import HELD, Observation
+from gapbridge.core.diagnosis.observation import Observation
 from gapbridge.core.effects import CATALOGUE, Effect, Parameter, Site, Term
 from gapbridge.core.errors import InputError
 
 STEP = 1e-2  # of a parameter's usual scale, for central differences
-WHOLE_ORDERS = 128  # cycles a turn that are looked through one by one
-HALF_ORDERS = 40  # up to here also the halves
-# (typical moment / M0)^2 that a nonlinear stiffness curve starts from
+WHOLE_ORDERS = 128  # cycles per turn: periodic lines up to this order are candidates
+HALF_ORDERS = 40  # up to here also at half orders
+# (typical moment / M0)^2, the softening values of the candidates of a stiffness curve
 SOFTENING = tuple(float(v) for v in np.geomspace(0.1, 3000, 13))
 
 UNNAMED = Effect()
@@ -36,12 +36,12 @@ class Candidate:
     family: str  # the effect's identifier, or 'smooth'
     site: Site
     parameters: tuple[Parameter, ...]
-    fixed: tuple[float | None, ...]  # per parameter of the effect: None = fitted
-    curve: float | None = None  # softening of a nonlinear stiffness: columns linear, and softening
-    tried: int = 1  # hypotheses that this one was picked from
-    quantity: str = ""  # what a smooth candidate depends on
-    target: str = ""  # and what it moves
-    beside: str = ""  # family without which it shows nothing
+    fixed: tuple[float | None, ...]  # per parameter of the effect; None: fitted
+    curve: float | None = None  # softening of a stiffness curve (columns: linear, softening part)
+    tried: int = 1  # hypotheses from which this one was selected
+    quantity: str = ""  # the quantity that a smooth candidate is a function of
+    target: str = ""  # the joint, axis or frame that it moves
+    requires: str = ""  # family without which it changes no prediction
 
     @cached_property
     def named(self) -> bool:
@@ -59,8 +59,8 @@ class Candidate:
         return CATALOGUE.get(self.family, UNNAMED)
 
     @cached_property
-    def turns_its_joint(self) -> bool:
-        """Return whether this turns a joint by the joint's own angle alone."""
+    def turns_joint_by_own_angle(self) -> bool:
+        """Return whether this is an angle error of a joint as a function of its own angle."""
         own = Effect.angle_columns
         return type(self.effect).angle_columns is not own
 
@@ -70,8 +70,8 @@ class Candidate:
         return self.effect.periodic
 
     @cached_property
-    def of_no_quantity(self) -> bool:
-        """Return whether this is an unnamed cause that goes by no column of the log."""
+    def without_quantity(self) -> bool:
+        """Return whether this is an unnamed cause that is no function of a quantity."""
         return not self.named and not self.quantity
 
     def term(self, x: Array) -> Term:
@@ -88,16 +88,10 @@ def joint_target(joint: int) -> str:
     return f"joint_{joint}"
 
 
-def own_target(quantity: str) -> str:
-    """Return the joint whose angle the quantity is, as smooth targets are named ('' if none)."""
-    stem, _, index = quantity.rpartition("_")
-    return joint_target(int(index) + 1) if stem in ("actual_q", "target_q") else ""
-
-
-def carrying(quantity: str) -> str:
-    """Return the joint that holds the torque of a quantity, as own_target ('' if none)."""
-    stem, _, index = quantity.rpartition("_")
-    return joint_target(int(index) + 1) if stem == HELD else ""
+def target_of(quantity: str, *columns: str) -> str:
+    """Return the target of the joint that a quantity of one of these columns is of ('' if none)."""
+    column, _, index = quantity.rpartition("_")
+    return joint_target(int(index) + 1) if column in columns else ""
 
 
 def named_candidates(
@@ -110,46 +104,46 @@ def named_candidates(
 ) -> list[Candidate]:
     """Return the catalogue's members for a channel, at every site of the arm.
 
-    What ``base`` holds already comes with its own period or curve. ``turns`` (n,) says how many
-    turns each joint's poses span.
+    Effects in ``base`` (the current model) come with their period or curve. ``turns`` (n,) is how
+    many turns each joint's poses span.
     """
     candidates = []
     for identifier, effect in CATALOGUE.items():
         if channel not in effect.channels or identifier in set(withheld) or effect.at_moment:
             continue
         for site in effect.sites(arm):
-            inside = [t for t in base if t.effect == identifier and t.site.joint == site.joint]
+            in_model = [t for t in base if t.effect == identifier and t.site.joint == site.joint]
             parameters = effect.parameters(arm, site)
-            candidates += _variants(effect, parameters, site, with_rotation, inside, turns)
+            candidates += _variants(effect, parameters, site, with_rotation, in_model, turns)
     return candidates
 
 
 def _variants(
     effect: Effect, parameters: tuple[Parameter, ...], site: Site, with_rotation: bool,
-    inside: Sequence[Term], turns: Sequence[float],
+    in_model: Sequence[Term], turns: Sequence[float],
 ) -> list[Candidate]:  # fmt: skip
     """Return an effect's candidates at one site, one for each order, curve or shape it may have.
 
-    ``inside`` are the terms of the effect that the model already has at this joint.
+    ``in_model`` are the terms of the effect that the model already has at this joint.
     """
     identifier = effect.identifier
     free: tuple[float | None, ...] = (None,) * len(parameters)
     if effect.periodic:
         return [
             Candidate(identifier, Site(site.joint, order), parameters, free)
-            for order in _orders(site, inside, turns)
+            for order in _orders(site, in_model, turns)
         ]
-    if effect.curved and not inside:
+    if effect.curved and not in_model:
         linear = (replace(parameters[0], lower=-np.inf),) * 2
         return [
             Candidate(identifier, site, linear, free, curve=s * parameters[1].scale)
             for s in SOFTENING
         ]
     if effect.shapes:
-        had = {t.values[-1] for t in inside}
+        present = {t.values[-1] for t in in_model}
         return [
             Candidate(identifier, site, parameters[:-1], (*free[:-1], shape))
-            for shape in (*effect.shapes, *(had - {*effect.shapes}))
+            for shape in (*effect.shapes, *(present - {*effect.shapes}))
         ]
     if any(p.of_rotation for p in parameters) and not with_rotation:
         shown = tuple(p for p in parameters if not p.of_rotation)
@@ -158,21 +152,21 @@ def _variants(
     return [Candidate(identifier, site, parameters, free)]
 
 
-def _orders(site: Site, inside: Sequence[Term], turns: Sequence[float]) -> list[float]:
+def _orders(site: Site, in_model: Sequence[Term], turns: Sequence[float]) -> list[float]:
     """Return the orders, in cycles a turn, of the lines that a joint may have."""
     orders = {
         *map(float, range(1, WHOLE_ORDERS + 1)),
         *(n / 2 for n in range(2, 2 * HALF_ORDERS + 1)),
-        *(float(t.site.order) for t in inside if t.site.order is not None),
+        *(float(t.site.order) for t in in_model if t.site.order is not None),
     }
-    # one cycle a turn is a usual period; of others, more than one has to be seen
-    seen = turns[site.joint - 1] if site.joint and turns else 1.0
-    least = min(MIN_CYCLES / max(seen, 1e-6), 3.0)
-    return [order for order in sorted(orders) if order >= least or order in (1.0, 2.0)]
+    # one cycle per turn is a usual period; of others, the range has to show more than one
+    shown = turns[site.joint - 1] if site.joint and turns else 1.0
+    min_order = min(MIN_CYCLES / max(shown, 1e-6), 3.0)
+    return [order for order in sorted(orders) if order >= min_order or order in (1.0, 2.0)]
 
 
 def named_columns(observation: Observation, candidate: Candidate, base: Sequence[Term]) -> Array:
-    """Return d prediction / d parameter (N, k, d), ``base`` terms already in the model."""
+    """Return d prediction / d parameter (N, k, d), with the ``base`` terms in the model."""
     if candidate.effect.periodic:
         by_angle = angle_columns(observation, candidate)
         if by_angle is not None:
@@ -186,25 +180,25 @@ def named_columns(observation: Observation, candidate: Candidate, base: Sequence
     return columns
 
 
-def shows_alone(observation: Observation, candidate: Candidate) -> bool:
-    """Return whether an effect changes predictions where no other is in the model."""
+def changes_prediction_alone(observation: Observation, candidate: Candidate) -> bool:
+    """Return whether an effect changes predictions without any other in the model."""
     return bool(_from_nominal(observation, candidate, ()).any())
 
 
-def with_what_it_needs(observation: Observation, candidate: Candidate) -> Candidate:
-    """Return the candidate with the family beside which alone it shows: no load, no centre."""
+def with_requirement(observation: Observation, candidate: Candidate) -> Candidate:
+    """Return the candidate with the family that it requires (a centre of gravity, a load)."""
     needed = candidate.effect.shown_by
-    if needed is None or shows_alone(observation, candidate):
+    if needed is None or changes_prediction_alone(observation, candidate):
         return candidate
-    return replace(candidate, beside=needed.effect)
+    return replace(candidate, requires=needed.effect)
 
 
 def jacobian(
     observation: Observation, candidate: Candidate, x: Array, others: Sequence[Term]
 ) -> Array:
-    """Return d prediction / d parameter (N, k, d) at values ``x`` (d,), beside other terms.
+    """Return d prediction / d parameter (N, k, d) at values ``x`` (d,), ``others`` in the model.
 
-    Zeros where the arm would buckle: only a prior leads back from there.
+    Zeros where the arm has no equilibrium: there only the prior determines the step.
     """
     columns = []
     for k, parameter in enumerate(candidate.parameters):
@@ -225,26 +219,26 @@ def _from_nominal(observation: Observation, candidate: Candidate, base: Sequence
 
 
 def angle_columns(observation: Observation, candidate: Candidate) -> Array | None:
-    """Return exact columns (N, k, d) of what turns a joint by its own angle; None for the rest."""
+    """Return exact columns (N, k, d) of angle errors by the own angle; None for other effects."""
     J, joint = observation.joint_columns, candidate.site.joint
     if J is None or joint is None:
         return None
     angle = observation.quantities.get(joint_quantity(observation, joint - 1))
-    still = np.zeros(len(J))  # a joint that never moves has one angle
-    shape = candidate.effect.angle_columns(candidate.site, still if angle is None else angle)
+    constant = np.zeros(len(J))  # a joint that never moves has one angle
+    shape = candidate.effect.angle_columns(candidate.site, constant if angle is None else angle)
     return None if shape is None else J[:, :, joint - 1, None] * shape[:, None, :]
 
 
 def _stiffness_curve_columns(observation: Observation, candidate: Candidate) -> Array:
-    """Return the linear and the softening part of a stiffness curve (N, k, 2).
+    """Return the columns (N, k, 2) of a stiffness curve: linear part and softening part.
 
-    Both: a joint that the model holds as compliant already only bends its own line.
+    Both, because the joint may already be compliant in the model.
     """
     i, moment = (candidate.site.joint or 1) - 1, observation.axial_moment
     assert moment is not None and candidate.curve is not None
-    straight = observation.axial_columns()[:, :, i]
-    bent = 1 / np.sqrt(1 + candidate.curve * moment[:, i] ** 2)
-    return np.stack([straight, straight * bent[:, None]], axis=-1)
+    linear_part = observation.axial_columns()[:, :, i]
+    softened = 1 / np.sqrt(1 + candidate.curve * moment[:, i] ** 2)
+    return np.stack([linear_part, linear_part * softened[:, None]], axis=-1)
 
 
 def joint_quantity(observation: Observation, i: int) -> str:

@@ -1,7 +1,7 @@
-"""What makes encoders come late, or rest elsewhere, as it really acts, not only to first order.
+"""Exact columns of delay, lag and dead band, where the first order does not suffice.
 
-To first order delay and lag both are the speed times the time, so that a linear search takes the
-one for the other, and what is then left looks like a third cause. Play has no derivative at all.
+To first order delay and lag are both speed times time, so that a linear search confuses them, and
+the residual looks like a third cause. A dead band has no derivative at all.
 """
 
 from __future__ import annotations
@@ -11,25 +11,25 @@ from collections.abc import Sequence
 import numpy as np
 
 from gapbridge.core.arrays import Array
-from gapbridge.core.diagnosis.criteria import ALIKE, MIN_DELAYS
+from gapbridge.core.diagnosis.criteria import MIN_DELAY_SCATTER, MIN_DELAYS
 from gapbridge.core.diagnosis.observation import Observation
 from gapbridge.core.diagnosis.selection.candidate import Candidate, named_columns
-from gapbridge.core.diagnosis.selection.problem import CandidateFit, SampleSpace, fit
+from gapbridge.core.diagnosis.selection.sample_space import CandidateFit, SampleSpace, fit
 from gapbridge.core.effects import CATALOGUE, Term
 from gapbridge.core.estimation.robust import scale_of
 
-SHORTEST = 1e-3  # usual sizes of the value: a chord needs a length
+MIN_CHORD = 1e-3  # usual sizes of the value, from which a chord is used
 
 
 def exact_columns(observation: Observation, candidate: Candidate, base: Sequence[Term]) -> Array:
-    """Return a candidate's columns (N, k, d) at the model found so far.
+    """Return a candidate's columns (N, k, d) at the current model ``base``.
 
-    In tracking it is the chord from nothing to the value found so far; of a delay or a lag to the
-    whole time that the joint comes late: exact there for the one as for its twin, so that both
-    compete on what they really predict. So do a light link's first moment and a heavy load's.
+    In tracking these are chords from zero to the current value; of a delay or a lag to the joint's
+    total delay, so that both are exact there and compete on their full predictions. In torque so do
+    the first moments of a light link and of a heavy load.
     """
     if observation.channel == "torque":
-        return _beside_twin(observation, candidate, base)
+        return _twin_columns(observation, candidate, base)
     if observation.channel != "tracking":
         return named_columns(observation, candidate, base)
     if len(candidate.parameters) > 1:
@@ -37,12 +37,12 @@ def exact_columns(observation: Observation, candidate: Candidate, base: Sequence
     return chord_columns(observation, candidate, base, chord_value(observation, candidate, base))
 
 
-def _beside_twin(observation: Observation, candidate: Candidate, base: Sequence[Term]) -> Array:
-    """Return columns (N, k, d) that are exact at what the candidate would have to be as a twin.
+def _twin_columns(observation: Observation, candidate: Candidate, base: Sequence[Term]) -> Array:
+    """Return columns (N, k, d) that are exact at the value with which it replaces an alike term.
 
-    Where the model holds one of its twins, these are those of the first order with Broyden's
-    update: the moments of inertia go along with the square of a shift, 0.1 m of a link of 0.6 kg
-    as 0.01 m of a load of 6 kg.
+    If the model has an alike effect, these are first-order columns with Broyden's update: moments
+    of inertia change with the square of a shift, and 0.1 m of a link of 0.6 kg has the first moment
+    of 0.01 m of a load of 6 kg.
     """
     twins = [t for t in base if _twins(t, candidate)]
     inside = any(t.effect == candidate.family and _of_joint(t, candidate) for t in base)
@@ -67,7 +67,7 @@ def _twins(term: Term, candidate: Candidate) -> bool:
 
 
 def chord_value(observation: Observation, candidate: Candidate, base: Sequence[Term]) -> float:
-    """Return up to which value a candidate's chord goes: what its joint has, or asks for."""
+    """Return the end value of a candidate's chord: its joint's value in the model, or a fit."""
     inside = [t.values[0] for t in base if _of_joint(t, candidate) and _alike(t, candidate)]
     parameter = candidate.parameters[0]
     if inside:
@@ -83,9 +83,9 @@ def chord_value(observation: Observation, candidate: Candidate, base: Sequence[T
 def chord_columns(
     observation: Observation, candidate: Candidate, base: Sequence[Term], value: float
 ) -> Array:
-    """Return the columns (N, k, 1) of a chord from nothing to ``value``."""
+    """Return the columns (N, k, 1) of a chord from zero to ``value``."""
     others = _others(candidate, base)
-    if abs(value) < SHORTEST * candidate.parameters[0].scale:
+    if abs(value) < MIN_CHORD * candidate.parameters[0].scale:
         return named_columns(observation, candidate, others)
     nothing = observation.predict(others)
     moved = observation.predict([*others, candidate.term(np.array([value]))]) - nothing
@@ -93,7 +93,7 @@ def chord_columns(
 
 
 def _others(candidate: Candidate, base: Sequence[Term]) -> list[Term]:
-    """Return what else moves the joint: play of one that lags is not that of one that does not."""
+    """Return the other terms of the joint, which the columns of dead band depend on."""
     return [t for t in base if _of_joint(t, candidate) and not _alike(t, candidate)]
 
 
@@ -102,38 +102,38 @@ def _of_joint(term: Term, candidate: Candidate) -> bool:
 
 
 def _alike(term: Term, candidate: Candidate) -> bool:
-    """Return whether a term's value is one of the candidate: of delays their sum is."""
+    """Return whether a term's value counts as the candidate's: delays add up."""
     delays = CATALOGUE[term.effect].delays and candidate.effect.delays
     return delays or term.effect == candidate.family
 
 
-def as_one_delay(values: Array, variances: Array) -> tuple[Array, Array]:
-    """Return delays (n,) of one log and their variances, each known by the others' as well.
+def shrunk_to_common_delay(values: Array, variances: Array) -> tuple[Array, Array]:
+    """Return the joints' delays (n,) and variances, shrunk to the common delay of the controller.
 
-    A controller answers late at every joint alike. Where something else moves a joint, and hides
-    its own delay, it is the median of all, give or take what they scatter about it or a tenth of
-    it. Fewer than three known ones say nothing of each other.
+    The prior of each delay is the median of all, with their scatter about it (at least a tenth of
+    it) as 1 sigma. It determines the delay of a joint whose own is not identifiable (variance inf).
+    With fewer than three known delays nothing is changed.
     """
     known = np.isfinite(variances)
     if known.sum() < MIN_DELAYS:
         return values, variances
     centre = float(np.median(values[known]))
     scatter = scale_of(values[known] - centre)
-    prior = max(scatter, ALIKE * abs(centre)) ** 2
+    prior = max(scatter, MIN_DELAY_SCATTER * abs(centre)) ** 2
     own = np.where(known, prior / (prior + np.where(known, variances, 0.0)), 0.0)
     return centre + own * (values - centre), np.where(known, own * variances, prior)
 
 
 def one_delay(space: SampleSpace, best: CandidateFit) -> CandidateFit:
-    """Return the set with all joints that answer late as one effect of the controller.
+    """Return the set with one kind of delay, latency or lag, at all joints that have one.
 
-    Latency or lag, whichever fits all of these joints better: each joint by itself decides little.
+    The kind that fits all of these joints better; a single joint hardly distinguishes them.
     """
     return min(delayed_by(space, best).values(), key=lambda f: f.score, default=best)
 
 
 def delayed_by(space: SampleSpace, best: CandidateFit) -> dict[str, CandidateFit]:
-    """Return the set with each of the delays at all joints that answer late; none for one joint."""
+    """Return, by kind of delay, the set with it at all joints that have one; {} for one joint."""
     site = {(k.family, k.site.joint): c for c, k in enumerate(space.candidates) if k.effect.delays}
     late = [c for c in best.chosen if space.candidates[c].effect.delays]
     if len(late) < 2:

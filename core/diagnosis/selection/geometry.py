@@ -1,14 +1,14 @@
-"""All links as one cause: many small numbers, none of which stands out alone.
+"""All links as one cause: many small parameters, none of which is significant alone.
 
-The geometry of the links in positions; in torques their first moments, of which only combinations
-show (base parameters; Gautier, Khalil, IEEE Trans. Robotics and Automation 6 (1990) 368), with the
-friction and the zero that every joint of a real arm has. So are the flexibilities of all joints:
-in a short log no tilt pays for itself, and one link that bends stands for several. They win as a
-whole; those that are sure are then judged one by one.
+In positions the geometry of the links; in torques their first moments, of which only combinations
+are identifiable (base parameters; Gautier, Khalil, IEEE Trans. Robotics and Automation 6 (1990)
+368), with the friction and torque offset of every joint. The flexibilities of all joints are tried
+as a whole too, because in a short log one link can imitate several; the significant ones are then
+validated one by one.
 
-The numbers have a prior (a normal one of an engineer's size), so that what the data do not show
-stays nominal. To a search it is then one more source of correlated noise: the sample space is
-whitened by it, and log det of what it adds is the penalty (marginal likelihood).
+The parameters have a normal prior, so that those without information stay nominal. To a search
+they are then a source of correlated noise: the sample space is whitened by it, and the log
+determinant of what it adds is the penalty (marginal likelihood).
 """
 
 from __future__ import annotations
@@ -23,65 +23,65 @@ import numpy as np
 from gapbridge.core.arrays import Array, Mask
 from gapbridge.core.diagnosis.criteria import (
     ACCUSATION_PENALTY,
-    FEW_LINKS,
+    JOINT_ZERO_FACTORS,
     MIN_GEOMETRIC_CAUSES,
-    OWN_SIGMAS,
-    TIMES_SET,
+    MIN_JOINTS_FOR_BLOCK,
+    MIN_SIGMAS,
 )
 from gapbridge.core.diagnosis.selection.candidate import Candidate
 from gapbridge.core.diagnosis.selection.local_search import pruned
-from gapbridge.core.diagnosis.selection.problem import CandidateFit, SampleSpace, fit
+from gapbridge.core.diagnosis.selection.sample_space import CandidateFit, SampleSpace, fit
 from gapbridge.core.diagnosis.selection.search import part, screened_search
 from gapbridge.core.estimation.geometry import ANGLE, LENGTH, TIMES_MACHINED
 from gapbridge.core.estimation.least_squares import solve
 
 Members = Callable[[SampleSpace], tuple[int, ...]]
-NEVER = 1e9  # a penalty that no fit is worth
-NOMINAL = 1e-9  # of a number's usual size: 1 sigma of one that is held
-NONE_HELD: Mapping[int, Mask] = {}
+FORBIDDEN_PENALTY = 1e9  # excludes a candidate from every set
+NOMINAL = 1e-9  # 1 sigma of a parameter kept nominal, in its usual size
+NONE_NOMINAL: Mapping[int, Mask] = {}
 
 
-def soft_candidates(space: SampleSpace) -> tuple[int, ...]:
+def flexibility_candidates(space: SampleSpace) -> tuple[int, ...]:
     """Return the flexibilities of all joints."""
     return tuple(c for c, k in enumerate(space.candidates) if k.effect.flexibility)
 
 
 def link_candidates(space: SampleSpace, joints: bool = True) -> tuple[int, ...]:
-    """Return the candidates of all links, and with ``joints`` what of these goes with them.
+    """Return the candidates of all links, with ``joints`` also the joints' own parameters.
 
-    A joint's zero is the angle in a link's DH row; in an arm whose links are all off, so are they.
-    With the links' first moments go friction and the torques' zeros.
+    To the links' geometry belong the joints' zeros (the angle of a DH row); to the links' first
+    moments friction and torque offsets.
     """
     links = [c for c, k in enumerate(space.candidates) if k.effect.together]
-    beside = [
+    of_joints = [
         c for c, k in enumerate(space.candidates)
         if joints and k.effect.beside_links and k.site.joint
     ]  # fmt: skip
-    return (*links, *beside) if links else ()
+    return (*links, *of_joints) if links else ()
 
 
 def prior(
-    space: SampleSpace, block: Sequence[int], rest: Sequence[int],
-    held: Mapping[int, Mask] = NONE_HELD,
+    space: SampleSpace, block: Sequence[int], others: Sequence[int],
+    nominal: Mapping[int, Mask] = NONE_NOMINAL,
 ) -> dict[int, Array]:  # fmt: skip
-    """Return 1 sigma (d,) of each number of the links beside a set of other candidates.
+    """Return the prior 1 sigma (d,) of each link parameter, given the ``others`` in the set.
 
-    ``held`` (d,) are numbers that stay nominal.
+    ``nominal`` (d,) are parameters kept nominal.
 
-    An engineer's size times the power of two under which the gap is most likely: arms differ in
-    how well their links are known (empirical Bayes; MacKay, Neural Computation 4 (1992) 415). What
-    each joint has of its own has a power of its own: its zero is set, not machined.
+    It is the usual machining tolerance times the power of two with the largest likelihood, because
+    arms differ in precision (empirical Bayes; MacKay, Neural Computation 4 (1992) 415). The joints'
+    own parameters have a factor of their own: zeros are set, not machined.
     """
     usual = {"m": LENGTH, "rad": ANGLE}
-    few = _reduced(space, [*block, *rest])
-    place = {c: k for k, c in enumerate([*block, *rest])}
+    few = _reduced(space, [*block, *others])
+    place = {c: k for k, c in enumerate([*block, *others])}
     size = {
         c: np.array([usual.get(p.unit, p.scale) for p in space.candidates[c].parameters])
         for c in block
     }
     size |= {
-        c: np.where(nominal, NOMINAL * size[c], size[c])
-        for c, nominal in held.items() if c in size
+        c: np.where(fixed, NOMINAL * size[c], size[c])
+        for c, fixed in nominal.items() if c in size
     }  # fmt: skip
 
     def sized(links: float, joints: float) -> dict[int, Array]:
@@ -92,13 +92,13 @@ def prior(
 
     def score(times: tuple[float, float]) -> float:
         links = links_of(few, {place[c]: own for c, own in sized(*times).items()})
-        return _beside_set(few, [place[c] for c in rest], links) + links.penalty
+        return _score_with_links(few, [place[c] for c in others], links) + links.penalty
 
-    return sized(*min(itertools.product(TIMES_MACHINED, TIMES_SET), key=score))
+    return sized(*min(itertools.product(TIMES_MACHINED, JOINT_ZERO_FACTORS), key=score))
 
 
 def _reduced(space: SampleSpace, chosen: Sequence[int]) -> SampleSpace:
-    """Return the space of some candidates, in this order, in as few rows as hold the same sums."""
+    """Return the space of some candidates in few rows with the same sums of products."""
     X = np.hstack([space.columns(chosen), space.y[:, None]])
     R = np.asarray(np.linalg.qr(X, mode="r"))
     few = part(space, np.array(chosen, dtype=np.int64))
@@ -114,25 +114,25 @@ class Links:
 
     @property
     def penalty(self) -> float:
-        """Return what their numbers cost in -2 log likelihood: log det of what they add."""
+        """Return the log determinant of the covariance that they add, in -2 log likelihood."""
         return float(np.sum(np.log1p(self.spread**2)))
 
     @property
     def used(self) -> float:
-        """Return how many numbers the samples determine."""
+        """Return the effective number of parameters."""
         return float(np.sum(self.spread**2 / (1 + self.spread**2)))
 
     def whitened(self, columns: Array) -> Array:
-        """Return columns (m, ...) in which the links are noise like any other."""
-        less = 1 - 1 / np.sqrt(1 + self.spread**2)
+        """Return columns (m, ...) whitened by the links' covariance."""
+        shrinkage = 1 - 1 / np.sqrt(1 + self.spread**2)
         along = self.directions.T @ columns
-        taken = self.directions @ (less * along.T).T
-        return np.subtract(columns, taken, out=taken)  # one copy of many columns, not two
+        part = self.directions @ (shrinkage * along.T).T
+        return np.subtract(columns, part, out=part)  # one copy of many columns, not two
 
-    def beside(self, space: SampleSpace, block: Iterable[int]) -> SampleSpace:
-        """Return the space beside them; ``block``, their candidates, can be in no set there."""
+    def whitened_space(self, space: SampleSpace, block: Iterable[int]) -> SampleSpace:
+        """Return the space whitened by the links; their candidates ``block`` are excluded there."""
         penalty = space.penalty.copy()
-        penalty[list(block)] = NEVER
+        penalty[list(block)] = FORBIDDEN_PENALTY
         return replace(space, y=self.whitened(space.y), X=self.whitened(space.X), penalty=penalty)
 
 
@@ -146,38 +146,39 @@ def links_of(space: SampleSpace, sigma: Mapping[int, Array]) -> Links:
 def with_links(
     space: SampleSpace, best: CandidateFit, base: Sequence[int]
 ) -> tuple[SampleSpace, CandidateFit, dict[int, Array]]:
-    """Return the better explanation: as it is, or beside the links' geometry as a whole.
+    """Return the better explanation: the set as it is, or one with all links as a cause.
 
-    The space returned is the one in which the set was found; the links are in no set, and their
-    prior is returned (empty where they are no cause). A search beside them pays where they do so
-    beside that set, or where it holds several geometric causes. Flexibilities are in the set, those
-    that are sure.
+    The returned space is the one in which the set was found. The links are in no set; their prior
+    is returned (empty if they are no cause). They are searched for if they improve the score of the
+    set, or if it has several geometric causes. Significant flexibilities are in the set itself.
     """
-    tried = [_Block.of(space, best, members) for members in _forms(space, best)]
+    tried = [_Block.of(space, best, members) for members in _block_choices(space, best)]
     if not tried:
         return space, best, {}
     block = min(tried, key=lambda b: b.score)
-    sigma, links, rest, score = block.sigma, block.links, block.rest, block.score
+    sigma, links, others, score = block.sigma, block.links, block.others, block.score
     families = {c.family for c in space.candidates if c.named}
     tries = 2 * float(np.log(len(families))) + ACCUSATION_PENALTY
-    kin = [c for c in best.chosen if _geometric(space.candidates[c])]
-    if len(kin) < MIN_GEOMETRIC_CAUSES and score + tries >= best.score:
+    geometric = [c for c in best.chosen if _geometric(space.candidates[c])]
+    if len(geometric) < MIN_GEOMETRIC_CAUSES and score + tries >= best.score:
         return space, best, {}
     start = sorted({*base, *best.chosen} - set(sigma))
     start = [c for c in start if space.candidates[c].named]
-    other = screened_search(space, base=start, beside=lambda p: links.beside(p, block.members(p)))
-    near = links.beside(space, sigma)
-    # a search goes its own way, and of a long log seldom the best: what was found stands beside too
-    other = min([other, pruned(near, fit(near, rest))], key=lambda f: f.score)
-    if other.score + links.penalty + tries < best.score:
-        if block.members is soft_candidates:
-            return space, _sure(space, (*other.chosen, *sigma), set(sigma)), {}
-        return near, other, sigma
+    with_block = screened_search(
+        space, base=start, transform=lambda p: links.whitened_space(p, block.members(p))
+    )
+    whitened = links.whitened_space(space, sigma)
+    # the search may miss the optimum: the set found without the links is tried with them too
+    with_block = min([with_block, pruned(whitened, fit(whitened, others))], key=lambda f: f.score)
+    if with_block.score + links.penalty + tries < best.score:
+        if block.members is flexibility_candidates:
+            return space, _significant(space, (*with_block.chosen, *sigma), set(sigma)), {}
+        return whitened, with_block, sigma
     return space, best, {}
 
 
-def _sure(space: SampleSpace, chosen: Sequence[int], block: set[int]) -> CandidateFit:
-    """Return a set less those numbers of a block that are not sure, the weakest first."""
+def _significant(space: SampleSpace, chosen: Sequence[int], block: set[int]) -> CandidateFit:
+    """Return a set without the parameters of a block that are not significant, weakest first."""
     current = fit(space, chosen)
     while True:
         strength = {
@@ -186,17 +187,17 @@ def _sure(space: SampleSpace, chosen: Sequence[int], block: set[int]) -> Candida
             if c in block
         }
         weakest = min(strength, key=lambda c: strength[c], default=None)
-        if weakest is None or strength[weakest] >= OWN_SIGMAS:
+        if weakest is None or strength[weakest] >= MIN_SIGMAS:
             return current
         current = fit(space, [c for c in current.chosen if c != weakest])
 
 
 @dataclass(frozen=True)
 class _Block:
-    """The links as a whole beside what else a set holds, with or without their joints' own."""
+    """All links as one cause together with the other terms of a set."""
 
     members: Members
-    rest: list[int]  # of the set
+    others: list[int]  # of the set
     sigma: dict[int, Array]
     links: Links
     score: float
@@ -204,17 +205,18 @@ class _Block:
     @classmethod
     def of(cls, space: SampleSpace, best: CandidateFit, members: Members) -> _Block:
         block = members(space)
-        rest = [c for c in best.chosen if c not in block]
-        sigma = prior(space, block, rest)
+        others = [c for c in best.chosen if c not in block]
+        sigma = prior(space, block, others)
         links = links_of(space, sigma)
-        return cls(members, rest, sigma, links, _beside_set(space, rest, links) + links.penalty)
+        score = _score_with_links(space, others, links) + links.penalty
+        return cls(members, others, sigma, links, score)
 
 
-def _forms(space: SampleSpace, best: CandidateFit) -> list[Members]:
-    """Return what may be a cause as a whole: the links, with what goes with them or without.
+def _block_choices(space: SampleSpace, best: CandidateFit) -> list[Members]:
+    """Return the blocks that may be one cause: links with or without joints, flexibilities.
 
-    Geometry goes with the joints' zeros. First moments can well be off singly: they are tried where
-    several are, or where several joints rub; and all joints' flexibilities where several bend.
+    Geometry includes the joints' zeros. First moments and flexibilities are tried as a whole only
+    if the set has them (or friction) at several joints.
     """
     forms: list[Members] = [link_candidates, partial(link_candidates, joints=False)]
     links = link_candidates(space)
@@ -222,28 +224,31 @@ def _forms(space: SampleSpace, best: CandidateFit) -> list[Members]:
         forms = [link_candidates]
     else:
         forms = [members for members in forms if _few_joints(space, best, members(space))]
-    if _few_joints(space, best, soft_candidates(space)):
-        forms.append(soft_candidates)
+    if _few_joints(space, best, flexibility_candidates(space)):
+        forms.append(flexibility_candidates)
     return [members for members in forms if len(members(space)) > 1]
 
 
 def _few_joints(space: SampleSpace, best: CandidateFit, block: Sequence[int]) -> bool:
-    """Return whether a set holds a few joints of a block."""
-    return len({space.candidates[c].site.joint for c in best.chosen if c in block}) >= FEW_LINKS
+    """Return whether a set has candidates of a block at several joints."""
+    joints = {space.candidates[c].site.joint for c in best.chosen if c in block}
+    return len(joints) >= MIN_JOINTS_FOR_BLOCK
 
 
 def _geometric(candidate: Candidate) -> bool:
     """Return whether this is a link's geometry or the zero of a joint."""
-    return candidate.effect.together or (candidate.turns_its_joint and not candidate.periodic)
+    return candidate.effect.together or (
+        candidate.turns_joint_by_own_angle and not candidate.periodic
+    )
 
 
 def _of_mass(candidate: Candidate) -> bool:
-    """Return whether a link's numbers are first moments: one link can well be off alone."""
+    """Return whether a link's parameters are first moments."""
     return candidate.effect.carried
 
 
-def _beside_set(space: SampleSpace, rest: Sequence[int], links: Links) -> float:
-    """Return the score of a set beside the links, the penalty of these left out."""
-    A, y = links.whitened(space.columns(rest)), links.whitened(space.y)
+def _score_with_links(space: SampleSpace, others: Sequence[int], links: Links) -> float:
+    """Return the score of a set in the space whitened by the links, without their penalty."""
+    A, y = links.whitened(space.columns(others)), links.whitened(space.y)
     rss = float(np.sum((y - A @ solve(A, y)) ** 2))
-    return float(space.misfit(np.array(rss)) + space.penalty[list(rest)].sum())
+    return float(space.misfit(np.array(rss)) + space.penalty[list(others)].sum())

@@ -1,38 +1,38 @@
-"""Sets near a set: terms dropped, swapped, merged, or joined by an unknown."""
+"""Local search: terms of a set dropped, swapped, merged, or unnamed ones added."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from gapbridge.core.diagnosis.criteria import FAMILY_PENALTY
-from gapbridge.core.diagnosis.selection.forward import (
+from gapbridge.core.diagnosis.selection.forward_selection import (
     additions,
     forward_step,
     joining,
     projected,
 )
-from gapbridge.core.diagnosis.selection.problem import CandidateFit, SampleSpace, fit
+from gapbridge.core.diagnosis.selection.sample_space import CandidateFit, SampleSpace, fit
 from gapbridge.core.estimation.least_squares import inverse, sigmas_square
 
-MERGED = 9  # terms up to which every pair is tried against one
-GROWTH = 30  # terms added to a set at most
+MAX_MERGED = 9  # terms up to which every pair may be replaced by one
+MAX_ADDED = 30  # terms added to a set at most
 
 
 def improve(space: SampleSpace, current: CandidateFit, named_only: bool = False) -> CandidateFit:
-    """Return the set after dropping and swapping terms as long as that pays."""
+    """Return the set after dropping and swapping terms while the score improves."""
     for _ in range(4):
         better = current
         for c in current.chosen:
-            rest = tuple(o for o in current.chosen if o != c)
-            trial = fit(space, rest)
+            others = tuple(o for o in current.chosen if o != c)
+            trial = fit(space, others)
             if trial.score < better.score:
                 better = trial
-            for _, other in additions(space, projected(space, rest), 3, named_only):
+            for _, other in additions(space, projected(space, others), 3, named_only):
                 if other != c:
-                    trial = fit(space, (*rest, other))
+                    trial = fit(space, (*others, other))
                     if trial.score < better.score - 1e-6:
                         better = trial
-        if better is current and 2 < len(current.chosen) <= MERGED:
+        if better is current and 2 < len(current.chosen) <= MAX_MERGED:
             better = _merged(space, current, named_only)
         if better is current:
             return current
@@ -41,20 +41,20 @@ def improve(space: SampleSpace, current: CandidateFit, named_only: bool = False)
 
 
 def _merged(space: SampleSpace, current: CandidateFit, named_only: bool) -> CandidateFit:
-    """Return the set with two terms replaced by one, where that pays: two that imitate a third."""
+    """Return the set with two terms replaced by one, if that improves the score."""
     better = current
     for i, one in enumerate(current.chosen):
         for other in current.chosen[i + 1 :]:
-            rest = tuple(c for c in current.chosen if c not in (one, other))
-            for _, new in additions(space, projected(space, rest), 2, named_only):
-                trial = fit(space, (*rest, new))
+            others = tuple(c for c in current.chosen if c not in (one, other))
+            for _, new in additions(space, projected(space, others), 2, named_only):
+                trial = fit(space, (*others, new))
                 if trial.score < better.score - 1e-6:
                     better = trial
     return better
 
 
 def pruned(space: SampleSpace, current: CandidateFit) -> CandidateFit:
-    """Return the set without the terms that it is better off without, dropped one by one."""
+    """Return the set after dropping terms one by one while the score improves."""
     while current.chosen:
         better = None
         for score, c in _drops(space, current):
@@ -70,7 +70,7 @@ def pruned(space: SampleSpace, current: CandidateFit) -> CandidateFit:
 
 
 def _drops(space: SampleSpace, current: CandidateFit) -> list[tuple[float, int]]:
-    """Return the score of the set less each of its terms, best first, out of one inverse."""
+    """Return the score of the set without each of its terms, best first, from one inverse."""
     X = space.columns(current.chosen)
     spread = inverse(X.T @ X)
     x = spread @ (X.T @ space.y)
@@ -86,12 +86,12 @@ def _drops(space: SampleSpace, current: CandidateFit) -> list[tuple[float, int]]
 
 
 def joined_sets(space: SampleSpace, current: CandidateFit) -> list[CandidateFit]:
-    """Return the set with one more term, less what that makes needless: unnamed rivals above all.
+    """Return sets with one more term, an unnamed one above all, without redundant terms.
 
-    Named causes that together imitate something unknown fall away where it is given its own term;
-    where they stand in each other's way, the set grows from that term anew.
+    Named causes that together imitate an unknown one are dropped once it has its own term. Forward
+    selections starting from an unnamed term are returned too.
     """
-    unnamed = {c for c, k in enumerate(space.candidates) if k.of_no_quantity}
+    unnamed = {c for c, k in enumerate(space.candidates) if k.without_quantity}
     joiners = unnamed | {c for _, c in joining(space, current.chosen, 4)}
     new = sorted(joiners - set(current.chosen))
     sets = [pruned(space, fit(space, (*current.chosen, c))) for c in new]
@@ -103,9 +103,9 @@ def joined_sets(space: SampleSpace, current: CandidateFit) -> list[CandidateFit]
 def forward_selected(
     space: SampleSpace, current: CandidateFit, named_only: bool = False
 ) -> CandidateFit:
-    """Return the set with the best terms added one by one as long as that pays."""
+    """Return the set after adding the best terms one by one while the score improves."""
     state = projected(space, current.chosen)
-    for _ in range(GROWTH):
+    for _ in range(MAX_ADDED):
         nearest = additions(space, state, 1, named_only)
         if not nearest or nearest[0][0] >= current.score:
             break
@@ -119,25 +119,24 @@ def forward_selected(
 def rivals(
     space: SampleSpace, best: CandidateFit, c: int, within: float
 ) -> list[tuple[float, int]]:
-    """Return the candidates that could stand for ``c`` in a set: (score above the best, index)."""
-    rest = tuple(o for o in best.chosen if o != c)
+    """Return the candidates that could replace ``c`` in a set: (score above the best, index)."""
+    others = tuple(o for o in best.chosen if o != c)
     near = []
-    for score, other in additions(space, projected(space, rest), 40):
+    for score, other in additions(space, projected(space, others), 40):
         if score > best.score + within:
             break
         if other == c:
             continue
-        trial = fit(space, (*rest, other))
+        trial = fit(space, (*others, other))
         if trial.score <= best.score + within:
             near.append((trial.score - best.score, other))
     return sorted(near)
 
 
 def with_fewest_families(space: SampleSpace, best: CandidateFit) -> CandidateFit:
-    """Return the set with as few kinds of effects as fit the data about as well.
+    """Return the set with the fewest kinds of effects that fit about equally well.
 
-    Which kinds are at work is one guess, at which places another: a kind that is there anyway is
-    the simpler guess for a term that could as well be of it.
+    A term is replaced by an effect of a kind that the set already has, if that fits as well.
     """
     for c in best.chosen:
         family = space.candidates[c].family
@@ -146,6 +145,6 @@ def with_fewest_families(space: SampleSpace, best: CandidateFit) -> CandidateFit
             continue
         for _, other in rivals(space, best, c, FAMILY_PENALTY):
             if space.candidates[other].named and space.candidates[other].family in kinds:
-                rest = tuple(o for o in best.chosen if o != c)
-                return with_fewest_families(space, fit(space, (*rest, other)))
+                others = tuple(o for o in best.chosen if o != c)
+                return with_fewest_families(space, fit(space, (*others, other)))
     return best

@@ -1,8 +1,8 @@
-"""Noise: how the residuals of a fit scatter, and the whitening that makes them alike.
+"""The noise model of residuals, and the whitening by it.
 
-The instrument's own noise is the same in every coordinate; the arm's repeatability comes through
-its joints, so it grows with the lever and is shared between coordinates. Both sizes are estimated
-by maximum likelihood; the instrument's stated sigma is a lower bound.
+The instrument's noise is isotropic. The arm's repeatability acts through the joints, so it grows
+with the lever arm and is correlated between coordinates. Both are estimated by maximum likelihood;
+the instrument's stated sigma is a lower bound.
 """
 
 from __future__ import annotations
@@ -17,22 +17,22 @@ from gapbridge.core.diagnosis.observation import Observation
 from gapbridge.core.estimation.nelder_mead import nelder_mead
 from gapbridge.core.estimation.robust import scale_of
 
-ALIKE_SAMPLES = 150  # samples from which every coordinate is taken to scatter alike
-ENOUGH = 400  # samples from which the sizes are estimated
+MAX_JOINT_NOISE_SAMPLES = 150  # of a log from which on the noise is taken as isotropic
+MAX_SAMPLES = 400  # that the noise is estimated from
 
 
 @dataclass(frozen=True)
 class Noise:
-    """Sizes of the noise and what whitens it."""
+    """Standard deviations of the noise, and the whitening matrices."""
 
     whitener: Array  # (N, k, k): whitener @ gap has unit variance in every coordinate
     block_sigma: Array  # (blocks,) 1 sigma of one coordinate, in its own unit
-    joint_sigma: float  # rad, 1 sigma of one joint's repeatability; 0 where there is no lever
-    floor_share: float  # known variance over whole variance: the whitened variance's lower bound
+    joint_sigma: float  # rad, 1 sigma of one joint's repeatability; 0: not modelled
+    floor_share: float  # known over total variance: lower bound of the whitened variance
 
 
 def blocks(observation: Observation) -> NDArray[np.int64]:
-    """Return which coordinates share one noise size (k,)."""
+    """Return the noise block (k,) of each coordinate; a block has one standard deviation."""
     k = observation.measured.shape[1]
     if observation.channel in ("position", "wrench"):
         return np.minimum(np.arange(k) // 3, 1)
@@ -42,17 +42,17 @@ def blocks(observation: Observation) -> NDArray[np.int64]:
 def estimate_noise(
     observation: Observation, residual: Array, kept: NDArray[np.bool_], shrink: float = 1.0
 ) -> Noise:
-    """Return the noise under which ``residual`` (N, k) of the kept samples is most likely.
+    """Return the maximum likelihood noise of ``residual`` (N, k), kept samples.
 
-    ``shrink`` is the share of the degrees of freedom that the fit left.
+    ``shrink`` is the share of degrees of freedom that the fit has left.
     """
     block = blocks(observation)
     count = int(block.max()) + 1
-    # a large log is asked for many causes: joint noise would swallow those not yet found
-    J = observation.joint_columns if len(kept) < ALIKE_SAMPLES else None
+    # in a large log joint noise would absorb causes that are not found yet
+    J = observation.joint_columns if len(kept) < MAX_JOINT_NOISE_SAMPLES else None
     use = np.flatnonzero(kept)
-    if len(use) > ENOUGH:
-        use = use[:: len(use) // ENOUGH + 1]
+    if len(use) > MAX_SAMPLES:
+        use = use[:: len(use) // MAX_SAMPLES + 1]
     r = residual[use] / np.sqrt(max(shrink, 0.05))
     known = observation.sigma**2
     spread = np.array([scale_of(r[:, block == b]) for b in range(count)])
@@ -78,7 +78,7 @@ def estimate_noise(
 
 
 def carried_to(observation: Observation, noise: Noise) -> Noise:
-    """Return the same noise, as estimated on other samples, for the samples of an observation."""
+    """Return a noise estimated on other samples, for the samples of an observation."""
     return _noise(observation, blocks(observation), noise.block_sigma**2, noise.joint_sigma**2)
 
 

@@ -1,4 +1,4 @@
-"""Outliers: which samples are excluded, and when they are taken back in."""
+"""Outliers: which samples are excluded, and when they are readmitted."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 from gapbridge.core.arrays import Array
 from gapbridge.core.diagnosis.criteria import (
     LOOSE_PRIOR,
-    MOST_OUTLIERS,
-    OUTLIER_SHARE,
-    UNPREDICTED_SHARE,
+    MAX_EXCLUDED_SHARE,
+    MAX_OUTLIER_SHARE,
+    MAX_UNPREDICTED_SHARE,
 )
 from gapbridge.core.diagnosis.selection.candidate import Candidate
-from gapbridge.core.diagnosis.selection.forward import joining
+from gapbridge.core.diagnosis.selection.forward_selection import joining
 from gapbridge.core.diagnosis.selection.noise import estimate_noise
-from gapbridge.core.diagnosis.selection.problem import CandidateFit, SampleSpace, fit
+from gapbridge.core.diagnosis.selection.sample_space import CandidateFit, SampleSpace, fit
 from gapbridge.core.diagnosis.selection.state import SelectionState, UnprojectedRows, sample_space
 from gapbridge.core.effects import Term
 from gapbridge.core.estimation.least_squares import solve
@@ -29,13 +29,13 @@ from gapbridge.core.estimation.robust import (
     weights_of,
 )
 
-STARTING, STEPS = 4, 8  # of the fit that looks for outliers
+STARTING, STEPS = 4, 8  # steps of the robust fit: with start weights, and in all
 
 
 def mark_outliers(
     state: SelectionState, explained_by: list[tuple[Candidate, Array]]
 ) -> SelectionState:
-    """Mark outliers before anything is searched: by a fit that can explain nearly anything."""
+    """Return the state with outliers of a robust fit of all effects under a loose prior."""
     observation = state.observation
     gap = observation.measured - observation.predict(())
     N, k = gap.shape
@@ -69,7 +69,7 @@ def mark_outliers(
 
 
 def inliers(state: SelectionState, residual: Array) -> NDArray[np.bool_]:
-    """Return the samples (N,) that are no outliers of a residual (N, k), the nuisance refitted."""
+    """Return the inliers (N,) of a residual (N, k), with the nuisance refitted."""
     nuisance = state.observation.nuisance
     if nuisance.shape[2]:
         W = state.noise.whitener
@@ -86,15 +86,15 @@ def whitened(state: SelectionState, residual: Array) -> Array:
 
 
 def _keep(state: SelectionState, residual: Array) -> NDArray[np.bool_]:
-    """Return the samples to keep: all but the farthest off, of a recording only a few of them.
+    """Return the inliers (N,): without the farthest outliers, of which a share is the limit.
 
-    There what stands out is friction at rest or a delay rather than a bad reading.
+    In recordings few are excluded: there they are friction at rest or delay, not bad readings.
     """
     white = whitened(state, residual)
     distance = distance_of(white, scale_of(white))
     outliers = np.flatnonzero(distance >= OUTLIER)
     moving = state.observation.channel in ("torque", "tracking")
-    share = OUTLIER_SHARE if moving else MOST_OUTLIERS
+    share = MAX_OUTLIER_SHARE if moving else MAX_EXCLUDED_SHARE
     limit = int(np.ceil(share * len(residual)))
     kept = np.ones(len(residual), dtype=bool)
     kept[outliers[np.argsort(-distance[outliers])][:limit]] = False
@@ -108,9 +108,9 @@ def readmit_explained_outliers(
     smooth: list[tuple[Candidate, Array]],
     known: tuple[SampleSpace, UnprojectedRows, CandidateFit],
 ) -> tuple[SelectionState, SampleSpace, UnprojectedRows, CandidateFit]:
-    """Take outliers back in where one local or smooth function makes them ordinary.
+    """Readmit the outliers if one smooth or local function explains all of them.
 
-    A chipped tooth or a knocked instrument looks like a few outliers; bad luck has no place.
+    A chipped tooth or a knocked instrument looks like a few outliers; bad readings are scattered.
     """
     best, outliers = known[-1], np.flatnonzero(~state.kept)
     whole = replace(state, kept=np.ones_like(state.kept))
@@ -134,19 +134,19 @@ def readmit_explained_outliers(
 def _predicted_without_it(
     A: Array, target: Array, outliers: NDArray[np.int64], k: int, d: int
 ) -> bool:
-    """Return whether each outlier is mostly what the last ``d`` columns say without it.
+    """Return whether the last ``d`` columns predict each outlier when it is held out.
 
-    A flexible function can bend to any single reading; it is believed only where the others,
-    outliers and inliers, indicate it beforehand.
+    A flexible function can fit any single reading; it counts only if the other samples, outliers
+    and inliers, predict it.
     """
     for sample in outliers:
         out = np.arange(k * sample, k * sample + k)
-        rest = np.delete(np.arange(len(target)), out)
-        with_it, without = A[rest], A[rest, :-d]
-        x = solve(with_it, target[rest])
-        plain = solve(without, target[rest])
+        others = np.delete(np.arange(len(target)), out)
+        with_it, without = A[others], A[others, :-d]
+        x = solve(with_it, target[others])
+        plain = solve(without, target[others])
         off = float(np.linalg.norm(target[out] - A[out] @ x))
-        if off > UNPREDICTED_SHARE * float(np.linalg.norm(target[out] - A[out, :-d] @ plain)):
+        if off > MAX_UNPREDICTED_SHARE * float(np.linalg.norm(target[out] - A[out, :-d] @ plain)):
             return False
     return True
 
@@ -154,7 +154,7 @@ def _predicted_without_it(
 def revise_noise_and_outliers(
     state: SelectionState, residual: Array, free: float
 ) -> SelectionState:
-    """Return the state with noise and outliers judged by the best explanation."""
+    """Return the state with noise and outliers of the best explanation's residual."""
     kept = _keep(state, residual)
     noise = estimate_noise(state.observation, residual, kept, free)
     return replace(state, kept=kept, noise=noise)

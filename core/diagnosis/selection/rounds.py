@@ -1,7 +1,7 @@
-"""The search, in rounds: around the model with what was found, until it finds the same again.
+"""The search in rounds, each linearised at the model found so far, until it converges.
 
-Each round searches among linear columns, refits exactly what it found, and looks anew at noise
-and outliers.
+Each round searches among linear columns, refits the selected terms on the full prediction, and
+estimates noise and outliers again.
 """
 
 from __future__ import annotations
@@ -13,37 +13,33 @@ import numpy as np
 
 from gapbridge.core.arrays import Array, Mask
 from gapbridge.core.diagnosis.criteria import (
-    HEAVIEST,
-    HELD_WHOLLY,
+    CONTAINED_SHARE,
     LARGE_SAMPLE,
-    NO_WORTH,
-    UNDETERMINED,
+    MAX_PAYLOAD_FACTOR,
+    NEGLIGIBLE_WORTH,
+    UNDETERMINED_SPREAD,
 )
 from gapbridge.core.diagnosis.observation import Observation
 from gapbridge.core.diagnosis.selection.candidate import (
     Candidate,
     joint_quantity,
     named_candidates,
-    with_what_it_needs,
+    with_requirement,
 )
 from gapbridge.core.diagnosis.selection.delay_columns import exact_columns, one_delay
-from gapbridge.core.diagnosis.selection.geometry import (
-    links_of,
-    with_links,
-)
+from gapbridge.core.diagnosis.selection.geometry import links_of, with_links
 from gapbridge.core.diagnosis.selection.local_search import forward_selected, pruned
-from gapbridge.core.diagnosis.selection.moments import step_candidates
 from gapbridge.core.diagnosis.selection.noise import Noise, estimate_noise
 from gapbridge.core.diagnosis.selection.outliers import (
     mark_outliers,
     readmit_explained_outliers,
     revise_noise_and_outliers,
 )
-from gapbridge.core.diagnosis.selection.problem import CandidateFit, SampleSpace, fit
 from gapbridge.core.diagnosis.selection.refit import refit, worth
-from gapbridge.core.diagnosis.selection.search import by_what_is_left, screened_search
+from gapbridge.core.diagnosis.selection.sample_space import CandidateFit, SampleSpace, fit
+from gapbridge.core.diagnosis.selection.search import screened_search, weighted_by_residual
 from gapbridge.core.diagnosis.selection.selection import Selection
-from gapbridge.core.diagnosis.selection.smooth import Pair, smooth_candidates, unnamed
+from gapbridge.core.diagnosis.selection.smooth import CandidateColumns, smooth_candidates, unnamed
 from gapbridge.core.diagnosis.selection.state import (
     SelectionState,
     UnprojectedRows,
@@ -51,6 +47,7 @@ from gapbridge.core.diagnosis.selection.state import (
     flat,
     sample_space,
 )
+from gapbridge.core.diagnosis.selection.step_times import step_candidates
 from gapbridge.core.diagnosis.selection.stiffness_curves import with_straight_stiffness
 from gapbridge.core.effects import Site, Term
 from gapbridge.core.estimation.least_squares import basis_of, projected_out, solve
@@ -66,52 +63,53 @@ def select(
     withheld: Iterable[str] = (),
     progress: Callable[[str], None] | None = None,
 ) -> Selection:
-    """Return the best explanation of an observation by named effects and smooth functions."""
+    """Return the best explanation of an observation by named effects and unnamed functions."""
     kept = np.ones(len(observation.rows), dtype=bool)
     first = estimate_noise(observation, observation.measured - observation.predict(()), kept)
     state = SelectionState(observation, model.arm, [], first, kept)
     base: tuple[Term, ...] = ()
-    offered = smooth_candidates(observation)
-    none: set[tuple[str, Site]] = set()  # what the exact refit takes back: its place is free
-    last: _Round | None = None
-    for turn in range(ROUNDS):
+    smooth_pairs = smooth_candidates(observation)
+    excluded: set[tuple[str, Site]] = set()  # effects removed by the nonlinear refit
+    result: _Round | None = None
+    for iteration in range(ROUNDS):
         if progress:
-            progress(f"{observation.channel}: round {turn + 1}")
-        last = None  # its columns are as large as the new ones: not both at a time
-        last = _round(state, model, base, withheld, none, offered, turn == 0)
-        same = terms_alike(last.terms, base) and turn > 0
-        settled = same and bool((last.state.kept == last.counted).all())
-        state, base, space = last.state, last.terms, last.space
-        # beside an unnamed function a value is not yet what it comes to without; but what shows
-        # nothing by itself (the scale of a torque that is not there) keeps the place of what does
-        named_only = all(space.candidates[c].named for c in last.best.chosen)
-        weakest = last.weakest(1.0 if settled and named_only else NO_WORTH)
+            progress(f"{observation.channel}: round {iteration + 1}")
+        result = None  # frees the memory of its columns
+        result = _round(state, model, base, withheld, excluded, smooth_pairs, iteration == 0)
+        same_terms = terms_alike(result.terms, base) and iteration > 0
+        converged = same_terms and bool((result.state.kept == result.fitted_samples).all())
+        state, base, space = result.state, result.terms, result.space
+        # values fitted together with an unnamed function are not final, but a term of negligible
+        # worth (the scale of a torque that is zero) may block another
+        named_only = all(space.candidates[c].named for c in result.best.chosen)
+        weakest = result.weakest(1.0 if converged and named_only else NEGLIGIBLE_WORTH)
         if weakest is not None:
-            none.add((base[weakest].effect, base[weakest].site))
+            excluded.add((base[weakest].effect, base[weakest].site))
             base = base[:weakest] + base[weakest + 1 :]
-        elif settled:
+        elif converged:
             break
-    assert last is not None
-    space = last.space
+    assert result is not None
+    space = result.space
     if len(space.y) >= LARGE_SAMPLE and any(
-        not space.candidates[c].named for c in last.best.chosen
+        not space.candidates[c].named for c in result.best.chosen
     ):
-        last = _named_refit(last)
+        result = _named_refit(result)
     return Selection(
-        last.state.observation, space, last.best, last.terms, last.index, last.covariance,
-        last.counted, last.whitened_by, last.residual, base, last.unprojected, last.links,
+        result.state.observation, space, result.best, result.terms, result.index,
+        result.covariance, result.fitted_samples, result.fit_noise, result.residual, base,
+        result.unprojected, result.links,
     )  # fmt: skip
 
 
 @dataclass(frozen=True)
 class _Round:
-    """What one round of the search came to."""
+    """The result of one round of the search."""
 
-    state: SelectionState  # its noise and outliers by what was found
-    counted: Mask  # (N,) samples that were fitted
-    whitened_by: Noise
+    state: SelectionState  # with noise and outliers of the round's residual
+    fitted_samples: Mask  # (N,) samples that were fitted
+    fit_noise: Noise
     space: SampleSpace
-    near: SampleSpace  # the same, beside the links where their geometry is a cause
+    search_space: SampleSpace  # the same, whitened by the links where they are a cause
     unprojected: UnprojectedRows
     links: dict[int, Array]
     best: CandidateFit
@@ -121,109 +119,109 @@ class _Round:
     residual: Array
 
     def weakest(self, least: float) -> int | None:
-        """Return the position of the term that is worth least, none of the links, if under a least.
+        """Return the position of the least significant term if below ``least``; links excluded.
 
-        One of which the data show nothing at all is worth nothing: beside equal gains of all axes
-        no load is sure.
+        Terms of which no parameter is identifiable come first.
         """
         share = {}
         for p, c in enumerate(self.index):
             if c not in self.links:
                 size = self.space.candidates[c].scales
                 sigma = np.sqrt(np.diag(self.covariance[p]))
-                unknown = float((sigma / size[: len(sigma)]).min()) / UNDETERMINED
-                share[p] = -unknown if unknown > 1 else worth(self.terms[p], self.covariance[p])
+                spread = float((sigma / size[: len(sigma)]).min()) / UNDETERMINED_SPREAD
+                share[p] = -spread if spread > 1 else worth(self.terms[p], self.covariance[p])
         weakest = min(share, key=lambda p: share[p], default=None)
         return None if weakest is None or share[weakest] >= least else weakest
 
 
 def _round(
     state: SelectionState, model: Model, base: tuple[Term, ...], withheld: Iterable[str],
-    none: set[tuple[str, Site]], offered: list[Pair], first: bool,
+    excluded: set[tuple[str, Site]], smooth_pairs: list[CandidateColumns], first: bool,
 ) -> _Round:  # fmt: skip
-    """Search around the model with ``base``, refit what is found exactly, and look at the rest."""
+    """Return a round: search at the model with ``base``, nonlinear refit, noise and outliers."""
     named = _named_candidates(state.observation, model, withheld, base)
-    open_to = [c for c in named if (c.family, c.site) not in none]
-    state = replace(state, candidates=open_to)
-    columns = [exact_columns(state.observation, c, base) for c in open_to]
-    if first:  # the rows after a late slip stand out unless it is among what may be there
+    named_open = [c for c in named if (c.family, c.site) not in excluded]
+    state = replace(state, candidates=named_open)
+    columns = [exact_columns(state.observation, c, base) for c in named_open]
+    if first:  # rows after a late slip would be outliers of a model without it
         steps = step_candidates(state, columns, base, withheld)
-        state = mark_outliers(state, [*zip(open_to, columns, strict=True), *steps])
-    smooth = _beyond_loads(offered, open_to, columns, base)
+        state = mark_outliers(state, [*zip(named_open, columns, strict=True), *steps])
+    smooth = _without_known_loads(smooth_pairs, named_open, columns, base)
     stepping = step_candidates(state, columns, base, withheld)
-    state = replace(state, candidates=[*open_to, *(candidate for candidate, _ in stepping)])
+    state = replace(state, candidates=[*named_open, *(candidate for candidate, _ in stepping)])
     columns += [step_columns for _, step_columns in stepping]
     space, unprojected = sample_space(state, columns, base, smooth)
-    inside = [candidate_of(state.candidates, t)[0] for t in base]
-    best = one_delay(space, screened_search(space, base=inside))
+    in_model = [candidate_of(state.candidates, t)[0] for t in base]
+    best = one_delay(space, screened_search(space, base=in_model))
     if not first and not state.kept.all():
         state, space, unprojected, best = readmit_explained_outliers(
             state, columns, base, smooth, (space, unprojected, best)
         )
-    near, best, links = with_links(space, best, inside)
-    counted, whitened_by = state.kept, state.noise
-    exact = _exactly(near, best, state)
+    search_space, best, links = with_links(space, best, in_model)
+    fitted_samples, fit_noise = state.kept, state.noise
+    exact = _refit_set(search_space, best, state)
     state, terms, index, covariance, residual = refit(state, space, exact, links)
     straight = with_straight_stiffness(space, best.chosen, index, terms, covariance)
     if straight is not None:
-        best = pruned(near, fit(near, straight))
+        best = pruned(search_space, fit(search_space, straight))
         state, terms, index, covariance, residual = refit(state, space, best, links)
     used = sum(len(v) for v in best.values) + (links_of(space, links).used if links else 0)
     noise_residual = _without_smooth_part(state, space, best, smooth, residual)
     state = revise_noise_and_outliers(state, noise_residual, 1 - used / space.freedom)
     return _Round(
-        state, counted, whitened_by, space, near, unprojected, links, best, terms, index,
-        covariance, residual,
+        state, fitted_samples, fit_noise, space, search_space, unprojected, links, best, terms,
+        index, covariance, residual,
     )  # fmt: skip
 
 
-def _named_refit(last: _Round) -> _Round:
-    """Return a round whose named terms are refitted alone, unnamed functions left in the set."""
-    state = replace(last.state, kept=last.counted, noise=last.whitened_by)
-    alone, best = _named_alone(last.near, last.best, last.state.observation)
+def _named_refit(result: _Round) -> _Round:
+    """Return a round with its named terms refitted alone; the set keeps its unnamed functions."""
+    links, space = result.links, result.space
+    state = replace(result.state, kept=result.fitted_samples, noise=result.fit_noise)
+    named_fit, best = _without_unnamed(result.search_space, result.best, state.observation)
     while True:
-        state, terms, index, covariance, residual = refit(state, last.space, alone, last.links)
-        last = replace(
-            last, state=state, best=best, terms=terms, index=index, covariance=covariance,
+        state, terms, index, covariance, residual = refit(state, space, named_fit, links)
+        result = replace(
+            result, state=state, best=best, terms=terms, index=index, covariance=covariance,
             residual=residual,
         )  # fmt: skip
-        weakest = last.weakest(NO_WORTH)
+        weakest = result.weakest(NEGLIGIBLE_WORTH)
         if weakest is None:
-            return last
-        alone, best = (
-            fit(last.near, [c for c in fitted.chosen if c != index[weakest]])
-            for fitted in (alone, best)
+            return result
+        named_fit, best = (
+            fit(result.search_space, [c for c in fitted.chosen if c != index[weakest]])
+            for fitted in (named_fit, best)
         )
 
 
-def _beyond_loads(
-    smooth: list[Pair], candidates: Sequence[Candidate], columns: Sequence[Array],
+def _without_known_loads(
+    smooth: list[CandidateColumns], candidates: Sequence[Candidate], columns: Sequence[Array],
     base: Sequence[Term],
-) -> list[Pair]:  # fmt: skip
-    """Return the smooth candidates, unnamed loads without what a load found does.
+) -> list[CandidateColumns]:  # fmt: skip
+    """Return the smooth candidates, unnamed loads without the columns of loads in the model.
 
-    A mass anywhere at the tool is a payload and its centre, a pull downwards a weight. Beside these
-    it would show nothing of its own, but take their values away, and then stand where they do.
+    A mass anywhere at the tool is a payload with a centre of gravity, a pull downwards a weight. In
+    a set with these an unnamed load would only take over their values.
     """
-    there = {t.effect for t in base}
+    in_model_effects = {t.effect for t in base}
     loads = [
         own.reshape(-1, own.shape[-1])
         for c, own in zip(candidates, columns, strict=True)
-        if c.effect.carried and not c.site.joint and there & {c.family, c.beside}
+        if c.effect.carried and not c.site.joint and in_model_effects & {c.family, c.requires}
     ]
     if not loads:
         return smooth
     U, remaining = basis_of(np.hstack(loads)), []
     for c, own in smooth:
-        if c.of_no_quantity:
+        if c.without_quantity:
             X = basis_of(own.reshape(len(U), -1))
             _, share, V = np.linalg.svd(projected_out(U, X), full_matrices=False)
-            unknown = share**2 > 1 - HELD_WHOLLY
-            if not unknown.any():
+            new = share**2 > 1 - CONTAINED_SHARE
+            if not new.any():
                 continue
-            if not unknown.all():
-                rest = (X @ V[unknown].T).reshape(*own.shape[:2], -1)
-                remaining.append(unnamed("", c.target, rest))
+            if not new.all():
+                others = (X @ V[new].T).reshape(*own.shape[:2], -1)
+                remaining.append(unnamed("", c.target, others))
                 continue
         remaining.append((c, own))
     return remaining
@@ -232,7 +230,7 @@ def _beyond_loads(
 def _named_candidates(
     observation: Observation, model: Model, withheld: Iterable[str], base: tuple[Term, ...]
 ) -> list[Candidate]:
-    """Return the named candidates that the observation can show, bounded, at a model's terms."""
+    """Return the named candidates that are observable, with bounds, at a model's terms."""
     turns = [
         float(np.ptp(observation.quantities.get(joint_quantity(observation, i), np.zeros(1))))
         / (2 * np.pi)
@@ -240,35 +238,36 @@ def _named_candidates(
     ]
     rotation = observation.measured.shape[1] > 3
     return [
-        with_what_it_needs(observation, _bounded(c, model, observation))
+        with_requirement(observation, _bounded(c, model, observation))
         for c in named_candidates(model.arm, observation.channel, withheld, rotation, base, turns)
-        if _has_what_it_needs(c, observation)
+        if _observable(c, observation)
     ]
 
 
-def _named_alone(
+def _without_unnamed(
     space: SampleSpace, best: CandidateFit, observation: Observation
 ) -> tuple[CandidateFit, CandidateFit]:
-    """Return the named part of a set, as it stands without the unnamed functions, and with them.
+    """Return the named part of a set, fitted without its unnamed functions and with them.
 
-    What goes into a model has to predict without the unnamed function beside it, nor may that
-    stand where a named cause would without it: friction of the same joint. What an unknown moves
-    one joint, of those that are measured one by one, says nothing of the causes at the others.
+    The model has to predict without the unnamed functions, and these may hide a named cause
+    (friction of the same joint). If each coordinate is a joint, each is weighted by its residual,
+    because an unknown effect at one joint says nothing of the causes at others.
     """
     named = [c for c in best.chosen if space.candidates[c].named]
-    near = space
+    search_space = space
     if observation.channel in ("tracking", "torque"):
-        near = by_what_is_left(space, named, observation.measured.shape[1])
-    alone = pruned(near, forward_selected(near, fit(near, named), named_only=True)).chosen
-    rest = (c for c in best.chosen if c not in named)
-    return fit(space, alone), fit(space, (*alone, *rest))
+        search_space = weighted_by_residual(space, named, observation.measured.shape[1])
+    grown = forward_selected(search_space, fit(search_space, named), named_only=True)
+    named_fit = pruned(search_space, grown).chosen
+    others = (c for c in best.chosen if c not in named)
+    return fit(space, named_fit), fit(space, (*named_fit, *others))
 
 
-def _exactly(space: SampleSpace, best: CandidateFit, state: SelectionState) -> CandidateFit:
-    """Return what of a set is refitted: of delays and lags the named alone.
+def _refit_set(space: SampleSpace, best: CandidateFit, state: SelectionState) -> CandidateFit:
+    """Return the part of a set that is refitted; in tracking only named effects.
 
-    Beside them an unnamed function takes up what their curves lack at a first guess, and they would
-    never come to where it is not needed.
+    There an unnamed function would absorb the error of the first linearisation, so that delays and
+    lags would not converge to the values without it.
     """
     if state.observation.channel != "tracking":
         return best
@@ -282,10 +281,10 @@ def _without_smooth_part(
     smooth: list[tuple[Candidate, Array]],
     residual: Array,
 ) -> Array:
-    """Return the residual (N, k) less what the set's unnamed functions take of it.
+    """Return the residual (N, k) without the part that the set's unnamed functions explain.
 
-    They are part of the explanation: what they account for is no noise. Not so in a large log of
-    poses, where causes and a function of time share out the same: the causes stand alone there.
+    That part is no noise. In a large log of poses the residual of the named causes alone is
+    returned.
     """
     named = len(state.candidates)
     columns = [smooth[c - named][1] for c in best.chosen if c >= named]
@@ -298,9 +297,9 @@ def _without_smooth_part(
 
 
 def _bounded(candidate: Candidate, model: Model, observation: Observation) -> Candidate:
-    """Return the candidate with bounds that keep the whole model physical (flexibility >= 0).
+    """Return the candidate with bounds that keep the model physical (flexibility >= 0).
 
-    Of a curve the bound holds for what its two parts come to together.
+    Of a stiffness curve the bound holds for the sum of its two parts.
     """
     if candidate.effect.adds_mass:
         least, most = _payload_bounds(model, observation)
@@ -318,20 +317,20 @@ def _bounded(candidate: Candidate, model: Model, observation: Observation) -> Ca
 
 
 def _payload_bounds(model: Model, observation: Observation) -> tuple[float, float]:
-    """Return how far a payload may be off: the true one is no less than nothing, and no giant."""
+    """Return bounds of a payload's error: the true mass is from 0 to the largest plausible."""
     declared = observation.quantities.get("payload", np.array([model.payload_mass]))
-    most = HEAVIEST * max(float(declared.max()), LoadBounds.of(model).rated)
+    most = MAX_PAYLOAD_FACTOR * max(float(declared.max()), LoadBounds.of(model).rated)
     return -float(declared.min()), most
 
 
-def _has_what_it_needs(candidate: Candidate, observation: Observation) -> bool:
+def _observable(candidate: Candidate, observation: Observation) -> bool:
     if candidate.periodic:  # of a joint that moves at all
         assert candidate.site.joint is not None
         return joint_quantity(observation, candidate.site.joint - 1) in observation.quantities
     return all(
         any(q == need or q.startswith(f"{need}_") for q in observation.quantities)
         for need in candidate.effect.needs
-        if need != "approach"  # without reversals play is an offset: a tie to be reported
+        if need != "approach"  # without reversals backlash is tied with an offset
     )
 
 

@@ -1,9 +1,9 @@
-"""The search: which set of candidates explains a gap best, at the penalty of having tried so many.
+"""The search for the set of candidates that explains a gap best, penalised for hypotheses tried.
 
 All candidates compete in one whitened sample space out of which the nuisance (frames) has been
 projected. A set's score is -2 log likelihood plus a penalty per term (extended BIC, Chen and Chen
 2008: it grows with the number of parameters *and* with the number of hypotheses that were tried).
-Sets grow in a beam and are then improved by dropping and swapping.
+Sets are built by beam search and then improved by dropping and swapping terms.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from gapbridge.core.diagnosis.criteria import LARGE_SAMPLE
 from gapbridge.core.diagnosis.selection.candidate import Candidate
-from gapbridge.core.diagnosis.selection.forward import (
+from gapbridge.core.diagnosis.selection.forward_selection import (
     DEPTH,
     beam_search,
     joining,
@@ -29,7 +29,7 @@ from gapbridge.core.diagnosis.selection.local_search import (
     pruned,
     with_fewest_families,
 )
-from gapbridge.core.diagnosis.selection.problem import (
+from gapbridge.core.diagnosis.selection.sample_space import (
     USUAL_ORDERS,
     CandidateFit,
     SampleSpace,
@@ -37,33 +37,33 @@ from gapbridge.core.diagnosis.selection.problem import (
     gains,
 )
 
-BEST_LINES = 10  # lines of a joint that a search looks at
-BEST_SMOOTH = 60  # smooth functions that a search looks at
-DEEP = 40  # terms that a large log may show
+BEST_LINES = 10  # periodic lines of a joint that are searched
+BEST_SMOOTH = 60  # smooth functions that are searched
+MAX_TERMS_OF_LARGE_LOG = 40
 
 
 def screened_search(
     space: SampleSpace, depth: int = DEPTH, base: Sequence[int] = (),
-    beside: Callable[[SampleSpace], SampleSpace] = lambda space: space,
+    transform: Callable[[SampleSpace], SampleSpace] = lambda space: space,
 ) -> CandidateFit:  # fmt: skip
     """Return the best set among the candidates worth a search, in the indices of ``space``.
 
-    ``beside`` changes the part of the space that is searched (links that are noise in it).
+    ``transform`` is applied to the space of these candidates (whitening by links).
     """
     keep = screened(space, base)
     place = {int(c): i for i, c in enumerate(keep)}
-    near = beside(part(space, keep))
-    best = with_fewest_families(near, search(near, depth, [place[c] for c in base]))
+    part_space = transform(part(space, keep))
+    best = with_fewest_families(part_space, search(part_space, depth, [place[c] for c in base]))
     return replace(best, chosen=tuple(int(keep[c]) for c in best.chosen))
 
 
 def search(space: SampleSpace, depth: int = DEPTH, base: Sequence[int] = ()) -> CandidateFit:
-    """Return the best set: named causes alone, unless an unnamed function beside them pays.
+    """Return the best set: named causes alone, unless adding an unnamed function improves it.
 
-    ``base`` is a set already found (named causes), from which the search starts as well.
+    ``base`` is a set already found (named causes), used as a further start.
 
-    The catalogue is searched by itself first, so that a smooth function, which imitates several
-    causes at once, does not stand in their way.
+    The catalogue is searched by itself first, because a smooth function can imitate several causes
+    at once.
     """
     if len(space.y) >= LARGE_SAMPLE:
         return _deep_search(space, base)
@@ -79,25 +79,25 @@ def search(space: SampleSpace, depth: int = DEPTH, base: Sequence[int] = ()) -> 
 
 
 def _deep_search(space: SampleSpace, base: Sequence[int]) -> CandidateFit:
-    """Return the best set of a large log: many causes at once, each cheap to separate.
+    """Return the best set of a large log, by forward selection, since many causes separate well.
 
-    Terms are added one by one and dropped again where later ones make them needless; an unnamed
-    function joins at the end, where one still pays.
+    Terms are added one by one and dropped when later ones make them redundant; an unnamed function
+    is added at the end if it improves the score.
     """
-    best = beam_search(space, DEEP, beam=1, named_only=True)[0]
+    best = beam_search(space, MAX_TERMS_OF_LARGE_LOG, beam=1, named_only=True)[0]
     best = pruned(space, best)
     if base:
         again = forward_selected(space, pruned(space, fit(space, tuple(base))), named_only=True)
         best = min([best, pruned(space, again)], key=lambda f: f.score)
-    beside = [fit(space, (*best.chosen, c)) for _, c in joining(space, best.chosen, 4)]
-    nearest = min([best, *beside], key=lambda f: f.score)
-    if nearest.score < best.score:  # no named cause goes for an unknown beside them; one that was
-        return forward_selected(space, nearest, named_only=True)  # small beside what it took joins
+    extended = [fit(space, (*best.chosen, c)) for _, c in joining(space, best.chosen, 4)]
+    nearest = min([best, *extended], key=lambda f: f.score)
+    if nearest.score < best.score:  # an unnamed function may let further named causes in
+        return forward_selected(space, nearest, named_only=True)
     return min([best, *joined_sets(space, best)], key=lambda f: f.score)
 
 
-def by_what_is_left(space: SampleSpace, chosen: Sequence[int], k: int) -> SampleSpace:
-    """Return the space with each of its k coordinates weighed by what a set leaves of it."""
+def weighted_by_residual(space: SampleSpace, chosen: Sequence[int], k: int) -> SampleSpace:
+    """Return the space with each of its k coordinates weighted by the residual of a set."""
     values = np.concatenate([*fit(space, chosen).values, np.zeros(0)])
     residual = (space.y - space.columns(chosen) @ values).reshape(-1, k)
     size = np.maximum(np.sqrt(np.mean(residual**2, axis=0)), 1.0)
@@ -106,11 +106,10 @@ def by_what_is_left(space: SampleSpace, chosen: Sequence[int], k: int) -> Sample
 
 
 def screened(space: SampleSpace, base: Sequence[int] = ()) -> NDArray[np.int64]:
-    """Return the candidates worth a search: all single causes, the best of the many alike.
+    """Return the candidates to search: all single causes, the best of the numerous ones.
 
-    Periodic lines and smooth functions come by the thousand; of each joint's lines and of all
-    smooth functions only those are kept that take most of the gap as it is, of what a fit of all
-    single causes leaves, or of what ``base`` leaves.
+    Of each joint's thousands of periodic lines, and of the smooth functions, those are kept that
+    explain most of the gap, of the residual of all single causes, or of the residual of ``base``.
     """
     many = np.array([_many(c) for c in space.candidates])
     keep = {int(c) for c in np.flatnonzero(~many)}
@@ -135,7 +134,7 @@ def screened(space: SampleSpace, base: Sequence[int] = ()) -> NDArray[np.int64]:
 
 
 def _many(candidate: Candidate) -> bool:
-    """Return whether a candidate is one of very many alike."""
+    """Return whether a candidate is one of a numerous kind."""
     usual = candidate.site.order in USUAL_ORDERS
     return not candidate.named or (candidate.periodic and not usual)
 

@@ -1,4 +1,4 @@
-"""What a search found in an observation: the terms that explain it, and what they leave."""
+"""The result of a search in an observation: terms with covariances, noise and residual."""
 
 from __future__ import annotations
 
@@ -11,35 +11,23 @@ from numpy.typing import NDArray
 
 from gapbridge.core.arm import Arm
 from gapbridge.core.arrays import Array, Mask
-from gapbridge.core.diagnosis.criteria import (
-    LARGE_SAMPLE,
-    OWN_SIGMAS,
-    SIGMAS,
-)
+from gapbridge.core.diagnosis.criteria import LARGE_SAMPLE, MIN_SIGMAS, MIN_SIGMAS_WITH_UNNAMED
 from gapbridge.core.diagnosis.observation import Observation
-from gapbridge.core.diagnosis.selection.geometry import (
-    Links,
-    link_candidates,
-    links_of,
-    prior,
-)
+from gapbridge.core.diagnosis.selection.geometry import Links, link_candidates, links_of, prior
 from gapbridge.core.diagnosis.selection.local_search import pruned
 from gapbridge.core.diagnosis.selection.noise import Noise
-from gapbridge.core.diagnosis.selection.problem import CandidateFit, SampleSpace, fit
-from gapbridge.core.diagnosis.selection.refit import Remainder, refit
-from gapbridge.core.diagnosis.selection.state import (
-    SelectionState,
-    UnprojectedRows,
-)
+from gapbridge.core.diagnosis.selection.refit import UnnamedPart, refit
+from gapbridge.core.diagnosis.selection.sample_space import CandidateFit, SampleSpace, fit
+from gapbridge.core.diagnosis.selection.state import SelectionState, UnprojectedRows
 from gapbridge.core.effects import Term
 from gapbridge.core.estimation.least_squares import projected_out, solve
 
 
 @dataclass(frozen=True)
 class Selection:
-    """What explains an observation, and the space in which it won."""
+    """The terms that explain an observation, and the space in which they were selected."""
 
-    observation: Observation  # frame as finally estimated
+    observation: Observation  # with the final estimate of the frame
     space: SampleSpace  # columns at the final model; kept samples only
     best: CandidateFit  # without the links, where their geometry as a whole is a cause
     terms: tuple[Term, ...]  # the named part, refitted exactly
@@ -52,11 +40,11 @@ class Selection:
     unprojected: UnprojectedRows  # the space before the nuisance was projected out
     prior: dict[int, Array] = field(default_factory=dict)  # 1 sigma (d,) of the numbers of each
     # link's candidate, where the geometry of all links is a cause
-    held: dict[int, Mask] = field(default_factory=dict)  # numbers (d,) of these that stay nominal
-    rows_each: float = 1.0  # rows of the log that each sample stands for, squares added up
+    nominal: dict[int, Mask] = field(default_factory=dict)  # their parameters (d,) kept nominal
+    rows_each: float = 1.0  # rows of the log that each sample represents (their squares added)
 
     def unwhitener(self) -> Array:
-        """Return what makes whitened kept samples (n, k, k) those of one row, channel unit."""
+        """Return the matrices (n, k, k) from whitened kept samples to one row in channel units."""
         whitener = self.noise.whitener[self.kept]
         return np.asarray(np.linalg.inv(whitener) / np.sqrt(self.rows_each))
 
@@ -71,18 +59,17 @@ class Selection:
         return tuple(self.prior)
 
     def judged_together(self, positions: Sequence[int]) -> list[tuple[int, ...]]:
-        """Return positions of terms in the groups of which one term has to be sure by itself.
+        """Return positions of terms in groups, of each of which one term has to be significant.
 
-        The links' geometry is accused as a whole, the joints' zeros in it: without these a UR10's
-        links stand for them. Everything else goes by joints: these zeros once more, first moments
-        and friction too.
+        The links' geometry is one group, joint zeros included. All other terms, and each zero
+        again, are groups by themselves.
         """
         whole = tuple(p for p in positions if self._in_geometry(p))
         single = [(p,) for p in positions if not self.is_link(p)]
         return [*single, whole] if whole else list(single)
 
     def is_link(self, position: int) -> bool:
-        """Return whether a term is of the links' geometry, where that is a cause as a whole."""
+        """Return whether a term is a link's geometry, where all links are a cause."""
         together = self.space.candidates[self.term_index[position]].effect.together
         return self._in_geometry(position) and together
 
@@ -91,13 +78,14 @@ class Selection:
 
     @cached_property
     def links(self) -> Links | None:
-        """Return the links' geometry as a whole, where it is a cause."""
+        """Return the links' geometry where it is a cause as a whole."""
         return links_of(self.space, self.prior) if self.prior else None
 
     @cached_property
     def working(self) -> SampleSpace:
-        """Return the space in which ``best`` won: beside the links, where they are a cause."""
-        return self.space if self.links is None else self.links.beside(self.space, self.block)
+        """Return the space in which ``best`` was found: whitened by links that are a cause."""
+        links = self.links
+        return self.space if links is None else links.whitened_space(self.space, self.block)
 
     def rows_of(self, columns: Array) -> Array:
         """Return columns (N, k, d) as rows (m, d) of the working space."""
@@ -105,62 +93,59 @@ class Selection:
         return rows if self.links is None else self.links.whitened(rows)
 
     def plain_rows_of(self, columns: Array) -> Array:
-        """Return columns (N, k, d) as rows (m, d) of the space in which the links are no noise."""
+        """Return columns (N, k, d) as rows (m, d) of the space not whitened by the links."""
         kept, B = self.kept, self.nuisance_basis
         rows = (self.noise.whitener[kept] @ columns[kept]).reshape(len(B), -1)
         return projected_out(B, rows)
 
     def pull(self, chosen: Sequence[int]) -> Array:
-        """Return one over the prior sigma of each number of a set of candidates; 0: none."""
+        """Return one over the prior sigma of each parameter of a set of candidates; 0: none."""
         size = np.diff(self.space.start)
         each = [1 / self.prior[c] if c in self.prior else np.zeros(int(size[c])) for c in chosen]
         return np.concatenate([*each, np.zeros(0)])
 
     def fitted(self, chosen: Sequence[int]) -> dict[int, Array]:
-        """Return the linear values (d,) of a set of candidates; links are kept near nominal."""
+        """Return the linear values (d,) of a set of candidates, links with their prior."""
         space, size = self.space, np.diff(self.space.start)
         X = space.columns(chosen)
         x = solve(X, space.y, self.pull(chosen))
         return dict(zip(chosen, np.split(x, np.cumsum(size[list(chosen)])[:-1]), strict=True))
 
-    def sized_beside(self, chosen: Sequence[int]) -> Selection:
-        """Return the selection with the links of the size that is most likely beside a set.
-
-        What falls leaves them more to account for, or nothing to be large for.
-        """
+    def with_prior_for(self, chosen: Sequence[int]) -> Selection:
+        """Return the selection with the links' prior re-estimated for a set of other terms."""
         if not self.prior:
             return self
-        rest = [c for c in chosen if c not in self.block]
-        sigma = prior(self.space, self.block, rest, self.held)
+        others = [c for c in chosen if c not in self.block]
+        sigma = prior(self.space, self.block, others, self.nominal)
         if all(np.array_equal(sigma[c], own) for c, own in self.prior.items()):
             return self
         return replace(self, prior=sigma)
 
-    def far_off(self, positions: Sequence[int]) -> dict[int, Mask]:
-        """Return, by candidate, numbers of the links (d,) that neither prior nor data vouch for.
+    def implausible_parameters(self, positions: Sequence[int]) -> dict[int, Mask]:
+        """Return, by candidate, link parameters (d,) far outside the prior and not significant.
 
-        Where all others are of one size, a number several times as large is no machining: it
-        stands by itself, and has to be as sure as what is accused by itself.
+        A value several times the machining tolerance of all others has to be as significant as a
+        single cause.
         """
-        doubtful = {}
+        implausible = {}
         for p in positions:
             c = self.term_index[p]
             if c in self.prior and self.observation.channel == "position":
                 size = np.abs(self.terms[p].values)
-                unsure = size < SIGMAS * np.sqrt(np.diag(self.covariance[p]))
-                far = (size > OWN_SIGMAS * self.prior[c]) & unsure
+                unsure = size < MIN_SIGMAS_WITH_UNNAMED * np.sqrt(np.diag(self.covariance[p]))
+                far = (size > MIN_SIGMAS * self.prior[c]) & unsure
                 if far.any():
-                    doubtful[c] = far
-        return doubtful
+                    implausible[c] = far
+        return implausible
 
     def with_nominal(self, numbers: Mapping[int, Mask]) -> Selection:
-        """Return the selection with further numbers of the links (d,) held nominal."""
-        return replace(self, held=self.held | {
-            c: own | self.held.get(c, False) for c, own in numbers.items()
+        """Return the selection with further link parameters (d,) kept nominal."""
+        return replace(self, nominal=self.nominal | {
+            c: own | self.nominal.get(c, False) for c, own in numbers.items()
         })  # fmt: skip
 
     def without_links(self) -> Selection:
-        """Return the selection with the links' geometry no cause, the rest as it is."""
+        """Return the selection without the links' geometry as a cause."""
         index = [p for p, c in enumerate(self.term_index) if c not in self.block]
         return replace(
             self, prior={}, best=fit(self.space, self.best.chosen),
@@ -170,16 +155,16 @@ class Selection:
         )  # fmt: skip
 
     def with_all_links(self, arm: Arm) -> Selection | None:
-        """Return the selection with the links' geometry as a whole in the place of single links.
+        """Return the selection with all links as a cause instead of single links.
 
-        What else was found stays as far as it pays beside them; None where the arm has no links.
+        Other terms are kept if they still improve the score. None if the arm has no such links.
         """
         space, block = self.space, link_candidates(self.space)
         if len(block) < 2:
             return None
         chosen = [c for c in self.best.chosen if c not in block]
         sigma = prior(space, block, chosen)
-        near = links_of(space, sigma).beside(space, block)
+        near = links_of(space, sigma).whitened_space(space, block)
         best = pruned(near, fit(near, chosen))
         state = SelectionState(self.observation, arm, [], self.noise, self.kept)
         state, terms, index, covariance, residual = refit(state, space, best, sigma)
@@ -190,12 +175,10 @@ class Selection:
 
     @property
     def used(self) -> float:
-        """Return the number of fitted unknowns, nuisance included; of the links what they use."""
+        """Return the number of fitted parameters, nuisance included, effective ones of links."""
         links = 0.0 if self.links is None else self.links.used
-        return (
-            float(self.unprojected.nuisance.shape[1] + sum(len(v) for v in self.best.values))
-            + links
-        )
+        linear = self.unprojected.nuisance.shape[1] + sum(len(v) for v in self.best.values)
+        return float(linear) + links
 
     @property
     def groups(self) -> NDArray[np.int64]:
@@ -205,33 +188,33 @@ class Selection:
 
 
 def refitted_alone(
-    selection: Selection, arm: Arm, accused: Sequence[int], remainder: Remainder | None = None
+    selection: Selection, arm: Arm, accused: Sequence[int], unnamed_part: UnnamedPart | None = None
 ) -> Selection:
-    """Return the selection with some of its terms (positions) refitted as all there is.
+    """Return the selection with the ``accused`` terms (positions) refitted without the others.
 
-    Values that were fitted beside a withdrawn term are not those that stand without it. The
-    ``remainder`` accounts for what is left: in a short log it would bias the values; a long one
-    averages over it, and its model has to predict without it. Beside all links it would take what
-    their prior holds back.
+    In a short log the ``unnamed_part`` is fitted too, because the residual structure would bias the
+    values. A long log averages over it, and the functions would absorb the links' part.
     """
-    whole = len(accused) == len(selection.terms) and remainder is None
-    if not accused or (whole and not selection.held):
+    whole = len(accused) == len(selection.terms) and unnamed_part is None
+    if not accused or (whole and not selection.nominal):
         return selection
     chosen = [selection.term_index[p] for p in accused]
-    selection = selection.sized_beside(chosen)
+    selection = selection.with_prior_for(chosen)
     links = {c: sigma for c, sigma in selection.prior.items() if c in chosen}
-    if remainder is not None and (links or len(selection.space.y) >= LARGE_SAMPLE):
-        remainder = remainder.scatter_alone()
+    if unnamed_part is not None and (links or len(selection.space.y) >= LARGE_SAMPLE):
+        unnamed_part = unnamed_part.scatter_alone()
     state = SelectionState(selection.observation, arm, [], selection.noise, selection.kept)
     space = selection.working if links else selection.space
     alone = fit(space, [c for c in chosen if c not in links])
-    state, fitted, index, spread, residual = refit(state, selection.space, alone, links, remainder)
+    state, fitted, index, spread, residual = refit(
+        state, selection.space, alone, links, unnamed_part
+    )
     terms, covariance = list(selection.terms), list(selection.covariance)
     for c, term, term_covariance in zip(index, fitted, spread, strict=True):
         position = selection.term_index.index(c)
-        if (nominal := selection.held.get(c)) is not None:
-            term = term.with_values(np.where(nominal, 0.0, term.values))
-            term_covariance = term_covariance * ~(nominal | nominal[:, None])
+        if (fixed := selection.nominal.get(c)) is not None:
+            term = term.with_values(np.where(fixed, 0.0, term.values))
+            term_covariance = term_covariance * ~(fixed | fixed[:, None])
         terms[position], covariance[position] = term, term_covariance
     return replace(
         selection, observation=state.observation, terms=tuple(terms),

@@ -1,7 +1,7 @@
-"""Smooth candidates: unnamed functions of one quantity, the rivals of the catalogue.
+"""Smooth candidates: unnamed functions of one quantity, which compete with the catalogue.
 
-Where one of them wins, the answer is ``unexplained`` and what it depends on. Each moves one target:
-a joint's angle, the measurement in base axes, the tool in flange axes, or the scale of the arm.
+If one is selected, the result is ``unexplained``, with the quantity. Each moves one target: a
+joint's angle, the measurement in base axes, the tool in flange axes, or the scale of the arm.
 """
 
 from __future__ import annotations
@@ -9,36 +9,31 @@ from __future__ import annotations
 import numpy as np
 
 from gapbridge.core.arrays import Array
-from gapbridge.core.diagnosis.observation import Observation
-from gapbridge.core.diagnosis.selection.candidate import (
-    Candidate,
-    carrying,
-    joint_target,
-    own_target,
-)
+from gapbridge.core.diagnosis.observation import HELD_TORQUE, Observation
+from gapbridge.core.diagnosis.selection.candidate import Candidate, joint_target, target_of
 from gapbridge.core.effects import Parameter, Site
 
-Pair = tuple[Candidate, Array]
+CandidateColumns = tuple[Candidate, Array]
 KNOTS = 5
-BUMPS = 24  # places along a joint's range where something local may sit
+BUMPS = 24  # centres of local bumps over a joint's range
 CHANGES_FRICTION = ("timestamp", "payload")
-SLOW = (0.03, 0.1, 0.3)  # shares of the greatest speed over which friction may fall (Stribeck)
-STEPS = 23  # moments at which something may have jumped
+SLOW = (0.03, 0.1, 0.3)  # shares of the largest speed over which friction may decay (Stribeck)
+STEPS = 23  # times of a possible jump
 
 
-def smooth_candidates(observation: Observation) -> list[Pair]:
+def smooth_candidates(observation: Observation) -> list[CandidateColumns]:
     """Return the smooth candidates of an observation with their columns (N, k, d)."""
-    pairs: list[Pair] = []
+    pairs: list[CandidateColumns] = []
     moved = targets(observation)
     for name, z in observation.quantities.items():
         shapes = [linear_basis(z)]
         if len(np.unique(z)) > 2:
             shapes.append(spline_basis(z))
         for target, directions in moved.items():
-            own = target == own_target(name)
-            carries = target == carrying(name)
+            own = target == target_of(name, "actual_q", "target_q")
+            holds = target == target_of(name, HELD_TORQUE)
             for shape in shapes:
-                full = np.hstack([np.ones((len(z), 1)), shape]) if own or carries else shape
+                full = np.hstack([np.ones((len(z), 1)), shape]) if own or holds else shape
                 pairs.append(_spread(name, target, directions, full))
             if own:
                 pairs += _bumps(name, target, z, directions)
@@ -51,8 +46,8 @@ def smooth_candidates(observation: Observation) -> list[Pair]:
     return pairs
 
 
-def _springs(observation: Observation) -> list[Pair]:
-    """Return joints that give way to their own moment by a curve of any shape."""
+def _springs(observation: Observation) -> list[CandidateColumns]:
+    """Return joint deflections as a function of the joint's own moment."""
     J, moment = observation.joint_columns, observation.axial_moment
     if J is None or moment is None:
         return []
@@ -63,17 +58,16 @@ def _springs(observation: Observation) -> list[Pair]:
     ]
 
 
-def _frictions(name: str, z: Array, observation: Observation) -> list[Pair]:
-    """Return friction that changes with time, load, or the joint's own warmth or slowness."""
+def _frictions(name: str, z: Array, observation: Observation) -> list[CandidateColumns]:
+    """Return friction that depends on time, load, or the joint's own temperature or speed."""
     if observation.friction is None:
         return []
     pairs = []
-    stem, _, index = name.rpartition("_")
     for j in range(observation.friction.shape[1]):
-        shapes = []
-        if name in CHANGES_FRICTION or (stem == "joint_temperatures" and index == str(j)):
+        shapes, joint = [], joint_target(j + 1)
+        if name in CHANGES_FRICTION or target_of(name, "joint_temperatures") == joint:
             shapes = [linear_basis(z)]
-        elif stem == "actual_qd" and index == str(j):
+        elif target_of(name, "actual_qd") == joint:
             slow = np.abs(z) / max(float(np.abs(z).max()), 1e-300)
             shapes = [np.exp(-slow / share)[:, None] for share in SLOW]
         columns = np.zeros((*observation.friction.shape, 1))
@@ -83,14 +77,14 @@ def _frictions(name: str, z: Array, observation: Observation) -> list[Pair]:
 
 
 def targets(observation: Observation) -> dict[str, Array]:
-    """Return what may be moved: name -> directions (N, k, directions)."""
+    """Return the targets: name -> directions (N, k, directions) in which they can move."""
     N, k = observation.measured.shape
     J = observation.joint_columns
     if J is None:
         return {axis: np.tile(np.eye(k)[:, i : i + 1], (N, 1, 1))
                 for i, axis in enumerate(observation.axes)}  # fmt: skip
     directions = {joint_target(i + 1): J[:, :, i : i + 1] for i in range(J.shape[2])}
-    if observation.channel != "position":  # each coordinate is a joint
+    if observation.channel != "position":  # coordinates are joints
         return directions
     shift = np.zeros((N, k, 3))
     shift[:, :3] = np.eye(3)
@@ -105,12 +99,12 @@ def targets(observation: Observation) -> dict[str, Array]:
     return directions
 
 
-def _spread(quantity: str, target: str, directions: Array, shape: Array) -> Pair:
+def _spread(quantity: str, target: str, directions: Array, shape: Array) -> CandidateColumns:
     columns = directions[:, :, :, None] * shape[:, None, None, :]
     return unnamed(quantity, target, columns.reshape(*columns.shape[:2], -1))
 
 
-def unnamed(quantity: str, target: str, columns: Array) -> Pair:
+def unnamed(quantity: str, target: str, columns: Array) -> CandidateColumns:
     """Return a smooth candidate with its columns (N, k, d)."""
     size = columns.shape[-1]
     scale = (Parameter("", "", 1e-3),) * size
@@ -118,7 +112,7 @@ def unnamed(quantity: str, target: str, columns: Array) -> Pair:
     return smooth, columns
 
 
-def _bumps(name: str, target: str, z: Array, directions: Array) -> list[Pair]:
+def _bumps(name: str, target: str, z: Array, directions: Array) -> list[CandidateColumns]:
     pairs = []
     low, high = float(z.min()), float(z.max())
     for width in ((high - low) / BUMPS, (high - low) / (2.5 * BUMPS), 2.4 * (high - low) / BUMPS):
@@ -129,7 +123,7 @@ def _bumps(name: str, target: str, z: Array, directions: Array) -> list[Pair]:
     return pairs
 
 
-def _steps(name: str, z: Array, targets: dict[str, Array]) -> list[Pair]:
+def _steps(name: str, z: Array, targets: dict[str, Array]) -> list[CandidateColumns]:
     pairs = []
     for quantile in np.linspace(0.06, 0.94, STEPS):
         after = (z > np.quantile(z, quantile)).astype(float)[:, None]

@@ -1,4 +1,4 @@
-"""The state of a selection: what is observed, by whom it may be explained, and how it scatters."""
+"""The state of a selection: observation, candidates, noise and outliers."""
 
 from __future__ import annotations
 
@@ -10,23 +10,19 @@ from numpy.typing import NDArray
 
 from gapbridge.core.arm import Arm
 from gapbridge.core.arrays import Array
-from gapbridge.core.diagnosis.criteria import (
-    ANY_CONSTANT_PENALTY,
-    KNOWN_SHARE,
-    NO_REVERSAL_PENALTY,
-)
+from gapbridge.core.diagnosis.criteria import ANY_CONSTANT_PENALTY, KNOWN_SHARE, NO_REVERSAL_PENALTY
 from gapbridge.core.diagnosis.observation import Observation
 from gapbridge.core.diagnosis.selection.candidate import Candidate
 from gapbridge.core.diagnosis.selection.noise import Noise
-from gapbridge.core.diagnosis.selection.problem import AT_ONCE, SampleSpace, penalties
+from gapbridge.core.diagnosis.selection.sample_space import AT_ONCE, SampleSpace, penalties
 from gapbridge.core.effects import CATALOGUE, Term
 
-DEAD = 1e-7  # share of a column that the nuisance leaves: below, nothing is left
+MIN_REMAINING = 1e-7  # share of a column outside the nuisance; below it is rounding
 
 
 @dataclass(frozen=True)
 class SelectionState:
-    """What a selection works on; each round goes on with another."""
+    """The state of a search; each round makes another."""
 
     observation: Observation
     arm: Arm
@@ -39,18 +35,18 @@ class SelectionState:
 class UnprojectedRows:
     """The whitened rows of the kept samples before the nuisance was projected out.
 
-    All columns are as large as the sample space itself, so they are put together when asked for.
+    Columns are computed on request, because all of them are as large as the sample space.
     """
 
     nuisance: Array  # (m, p)
     target: Array  # (m,)
     basis: Array  # (m, p) orthonormal, of the nuisance
-    taken: Array  # (p, K) what the nuisance took of every column
+    coefficients: Array  # (p, K) of every column in the basis
 
     def columns(self, space: SampleSpace, chosen: Sequence[int]) -> Array:
-        """Return the columns (m, sum d) of a set of candidates as they were."""
-        taken = self.taken[:, space.column_indices(chosen)]
-        return np.asarray(space.columns(chosen) + self.basis @ taken)
+        """Return the unprojected columns (m, sum d) of a set of candidates."""
+        coefficients = self.coefficients[:, space.column_indices(chosen)]
+        return np.asarray(space.columns(chosen) + self.basis @ coefficients)
 
 
 def flat(columns: Array, state: SelectionState) -> Array:
@@ -65,7 +61,7 @@ def sample_space(
     base: tuple[Term, ...],
     smooth: list[tuple[Candidate, Array]],
 ) -> tuple[SampleSpace, UnprojectedRows]:
-    """Return the sample space at the model found so far, and what it was before projection."""
+    """Return the sample space at the current model ``base``, and its unprojected rows."""
     observation = state.observation
     candidates = [*state.candidates, *(c for c, _ in smooth)]
     size = np.array([len(c.parameters) for c in candidates])
@@ -78,7 +74,7 @@ def sample_space(
             X[:, start[few[0]] : start[few[-1] + 1]] = flat(together, state)
     chords = chords_only(observation, base)
     gap = (observation.measured - observation.predict(() if chords else base))[..., None]
-    # what the terms already in the model explain is put back, in the linear form at hand
+    # the linear part of the terms in the model is added back
     for term in () if chords else base:
         c, x = candidate_of(state.candidates, term)
         gap = gap + columns[c] @ x[:, None]
@@ -86,10 +82,10 @@ def sample_space(
     nuisance = flat(observation.nuisance, state)
     Q = np.linalg.qr(nuisance)[0] if nuisance.shape[1] else nuisance
     whole = _sizes(X)
-    taken, y = Q.T @ X, target - Q @ (Q.T @ target)
+    coefficients, y = Q.T @ X, target - Q @ (Q.T @ target)
     for few in np.array_split(np.arange(X.shape[1]), 1 + X.size // AT_ONCE):
-        X[:, few] -= Q @ taken[:, few]
-    X[:, _sizes(X) < DEAD * whole] = 0.0  # the frame takes it up wholly; the rest is rounding
+        X[:, few] -= Q @ coefficients[:, few]
+    X[:, _sizes(X) < MIN_REMAINING * whole] = 0.0  # wholly in the nuisance
     freedom = float(len(target) - Q.shape[1])
     penalty = penalties(candidates, freedom) + np.array(
         [_tie_penalty(c, observation) for c in candidates]
@@ -98,11 +94,11 @@ def sample_space(
         y, X, start, tuple(candidates), penalty, freedom,
         KNOWN_SHARE if observation.sigma_is_whole else state.noise.floor_share,
     )  # fmt: skip
-    return space, UnprojectedRows(nuisance, target, Q, taken)
+    return space, UnprojectedRows(nuisance, target, Q, coefficients)
 
 
 def chords_only(observation: Observation, base: Sequence[Term]) -> bool:
-    """Return whether all columns are chords from nothing: no term's part is to be put back."""
+    """Return whether all columns are chords from zero: no term's part is added back."""
     delays = all(CATALOGUE[term.effect].delays for term in base)
     return observation.channel == "tracking" and delays
 
@@ -112,10 +108,10 @@ def _sizes(X: Array) -> Array:
 
 
 def _tie_penalty(candidate: Candidate, observation: Observation) -> float:
-    """Return what an effect pays more that another equals in this log: it stands behind that one.
+    """Return the extra penalty of an effect that another one equals in this log.
 
-    So does play without reversals, behind the plain offset; and any constant of a sensor, behind
-    what reads a constant at these poses alone, which further poses decide.
+    Without reversals, backlash ranks behind the offset. A sensor's constant ranks behind effects
+    that are constant at these poses only, because further poses can tell these apart.
     """
     if candidate.effect.any_constant:
         return ANY_CONSTANT_PENALTY

@@ -1,4 +1,4 @@
-"""Stiffness curves: whether curved at all, and the straight ones as plain compliance."""
+"""Stiffness curves: the nonlinearity test; linear ones are replaced by axial compliance."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from gapbridge.core.arrays import Array
 from gapbridge.core.diagnosis.criteria import CURVATURE_GAIN
-from gapbridge.core.diagnosis.selection.problem import SampleSpace
+from gapbridge.core.diagnosis.selection.sample_space import SampleSpace
 from gapbridge.core.effects import CATALOGUE, Term
 from gapbridge.core.estimation.least_squares import basis_of, projected_out
 
@@ -18,18 +18,18 @@ def straight_curves(
     index: Sequence[int],
     terms: Sequence[Term],
     covariance: Sequence[Array],
-    beside: Array | None = None,
+    further: Array | None = None,
 ) -> dict[int, int]:
-    """Return the stiffness curves among candidates that a straight line fits as well, and that.
+    """Return the stiffness curves that are linear, and the axial compliance of each.
 
-    By the likelihood, since a softening's sigma grows with it; one of less than its sigma is at its
-    bound: what stiffens is no such curve. ``index`` gives the candidate of each term, ``beside``
-    (m, d) stands beside all. Where axial compliance is no candidate, the curve stays.
+    By the likelihood, because a softening's sigma grows with its value. A softening below its sigma
+    is at its bound (the joint stiffens). ``index`` gives the candidate of each term, ``further``
+    (m, d) are other columns in the fit. Without axial compliance as a candidate the curve is kept.
     """
-    further = space.X[:, :0] if beside is None else beside
+    others = space.X[:, :0] if further is None else further
 
     def misfit(candidates: Sequence[int]) -> float:
-        basis = basis_of(np.hstack([space.columns(candidates), further]))
+        basis = basis_of(np.hstack([space.columns(candidates), others]))
         rss = np.sum(projected_out(basis, space.y) ** 2)
         return float(space.misfit(np.asarray(rss)))
 
@@ -56,7 +56,7 @@ def with_straight_stiffness(
     terms: Sequence[Term],
     covariance: Sequence[Array],
 ) -> tuple[int, ...] | None:
-    """Return the set with straight curves as axial compliance, or None if there is none."""
-    rest = [c for c in chosen if c not in set(index)]
-    instead = straight_curves(space, index, terms, covariance, space.columns(rest))
+    """Return the set with linear curves as axial compliance, or None if there is none."""
+    others = [c for c in chosen if c not in set(index)]
+    instead = straight_curves(space, index, terms, covariance, space.columns(others))
     return tuple(instead.get(c, c) for c in chosen) if instead else None

@@ -1,7 +1,7 @@
-"""Rivals of the catalogue that follow no single quantity: something gives way, something pulls.
+"""Unnamed causes that are no function of one quantity: compliances, loads and forces.
 
-They stand for causes that the catalogue does not hold. Where one of them wins over named causes the
-answer is ``unexplained``.
+They model causes that are not in the catalogue. If one is selected instead of named causes, the
+result is ``unexplained``.
 """
 
 from __future__ import annotations
@@ -19,32 +19,32 @@ from gapbridge.core.model import Model
 from gapbridge.core.motion import Motion
 from gapbridge.core.rotation import rotation_vector
 
-SHORTEST = 1e-3  # m: shorter links do not bend
-OFF = 0.1  # m, of a load from the TCP
-PULL = 1.0  # N, step of the central differences
+MIN_LENGTH = 1e-3  # m: shorter links do not bend
+LOAD_OFFSET = 0.1  # m, of a load from the TCP
+FORCE_STEP = 1.0  # N, of the central differences
 
 
-def unnamed_rivals(model: Model, q: Array, loads: Loads, k: int) -> tuple[tuple[str, Array], ...]:
-    """Return target and columns (N, k, d) of every rival; ``q`` (N, n) rad, k is 3 or 6.
+def unnamed_causes(model: Model, q: Array, loads: Loads, k: int) -> tuple[tuple[str, Array], ...]:
+    """Return target and columns (N, k, d) of every unnamed cause; ``q`` (N, n) rad, k is 3 or 6.
 
-    Each joint bending across its axis as it likes; each link bending across its length, however its
-    stiffness is spread; the base tilting; a pull at the tool that nobody declared: downwards, in
-    any direction of base, in any direction of the tool.
+    Compliance of each joint across its axis in two directions, bending of each link with any
+    distribution of stiffness, tilt of the base, and an undeclared force at the tool: downwards, in
+    any base direction, in any tool direction.
     """
     return (
-        *_compliance_rivals(model, q, loads, k),
-        *_links(model, q, loads, k),
-        *_pulls(model, q, loads, k),
+        *_joint_compliances(model, q, loads, k),
+        *_link_bending(model, q, loads, k),
+        *_forces(model, q, loads, k),
     )
 
 
-def _compliance_rivals(model: Model, q: Array, loads: Loads, k: int) -> list[tuple[str, Array]]:
+def _joint_compliances(model: Model, q: Array, loads: Loads, k: int) -> list[tuple[str, Array]]:
     chain, rows = model.chain(), model.rows(q, loads)
     step = 1e-2 * 1e-3 / typical_moment(model.arm)
     rivals = []
     for i in range(model.arm.n + 1):
         columns = np.zeros((len(q), k, 2))
-        for axis in range(2):  # about z it would only blur the catalogue's own stiffness
+        for axis in range(2):  # about z: axial_compliance
             ends = []
             for h in (step, -step):
                 bent, tilted = chain.compliance.copy(), chain.base_compliance.copy()
@@ -59,8 +59,8 @@ def _compliance_rivals(model: Model, q: Array, loads: Loads, k: int) -> list[tup
     return rivals
 
 
-def _links(model: Model, q: Array, loads: Loads, k: int) -> list[tuple[str, Array]]:
-    """Return three hinges along each link, at its ends and its middle, each with its own give."""
+def _link_bending(model: Model, q: Array, loads: Loads, k: int) -> list[tuple[str, Array]]:
+    """Return three compliant hinges along each link, at its ends and its middle."""
     still = np.zeros_like(q)
     frames = frames_of(model.chain(), q, still, still)
     tip = model.predict(q, loads).position
@@ -70,7 +70,7 @@ def _links(model: Model, q: Array, loads: Loads, k: int) -> list[tuple[str, Arra
         near, far = frames.origin[:, i], frames.origin[:, i + 1]
         along = far - near
         length = np.linalg.norm(along, axis=1, keepdims=True)
-        if float(length.min()) < SHORTEST:
+        if float(length.min()) < MIN_LENGTH:
             continue
         along = along / length
         hinges = (near, (near + far) / 2, far)
@@ -85,20 +85,20 @@ def _links(model: Model, q: Array, loads: Loads, k: int) -> list[tuple[str, Arra
     return rivals
 
 
-def _pulls(model: Model, q: Array, loads: Loads, k: int) -> list[tuple[str, Array]]:
+def _forces(model: Model, q: Array, loads: Loads, k: int) -> list[tuple[str, Array]]:
     if not model.chain().compliance.any():
-        return []  # a rigid arm does not show what pulls at it
+        return []  # a force does not move a rigid arm
     chain = model.chain()
     tool_axes = model.predict(q, loads).rotation
     declared = np.zeros((len(q), 6)) if loads.wrench is None else loads.wrench
     in_base = np.zeros((len(q), k, 3))
     for axis in range(3):
         ends = []
-        for h in (PULL, -PULL):
+        for h in (FORCE_STEP, -FORCE_STEP):
             pulled = np.array(np.broadcast_to(declared, (len(q), 6)))
             pulled[:, axis] += h
             ends.append(_poses(chain, model.rows(q, replace(loads, wrench=pulled))))
-        in_base[:, :, axis] = _change(ends, 2 * PULL, k)
+        in_base[:, :, axis] = _change(ends, 2 * FORCE_STEP, k)
     down = model.gravity / max(float(np.linalg.norm(model.gravity)), 1e-300)
     return [
         ("load", in_base @ down[:, None]),
@@ -107,11 +107,11 @@ def _pulls(model: Model, q: Array, loads: Loads, k: int) -> list[tuple[str, Arra
     ]
 
 
-def unnamed_pulls(model: Model, motion: Motion, channel: str) -> tuple[tuple[str, Array], ...]:
-    """Return what an undeclared pull at the tool does to torques (N, n, d) or wrenches (N, 6, d).
+def unnamed_loads(model: Model, motion: Motion, channel: str) -> tuple[tuple[str, Array], ...]:
+    """Return the columns of undeclared loads on torques (N, n, d) or wrenches (N, 6, d).
 
-    A mass somewhere at the tool, a pull in any direction of base and, for torques, in any direction
-    of the tool (to a sensor on the flange that is a bias).
+    A mass anywhere at the tool, a force in any base direction and, for torques, in any tool
+    direction (for a sensor on the flange that is a bias).
     """
     count, columns = len(motion), []
     for axis in range(3):
@@ -121,21 +121,21 @@ def unnamed_pulls(model: Model, motion: Motion, channel: str) -> tuple[tuple[str
         pieces = pieces_of(model, pulled)
         columns.append(pieces.external_torque if channel == "torque" else pieces.external_wrench)
     in_base = np.stack(columns, axis=2)
-    rivals = [("load", _loads_anywhere(model, motion, channel)), ("pull", in_base)]
+    rivals = [("load", _mass_anywhere(model, motion, channel)), ("pull", in_base)]
     if channel == "torque":
         rivals.append(("tool pull", in_base @ model.rigid_pose(motion.q).rotation))
     return tuple(rivals)
 
 
-def _loads_anywhere(model: Model, motion: Motion, channel: str) -> Array:
-    """Return columns (N, k, 4) of a mass at the TCP and of its being off there along each axis."""
+def _mass_anywhere(model: Model, motion: Motion, channel: str) -> Array:
+    """Return columns (N, k, 4) of a mass at the TCP and of its offset along each axis."""
     at_tool = model.tool_in_flange[:3, 3]
     columns = []
-    for off in (np.zeros(3), *(OFF * np.eye(3))):
+    for off in (np.zeros(3), *(LOAD_OFFSET * np.eye(3))):
         place = np.tile(at_tool + off, (len(motion), 1))
         pieces = pieces_of(model, replace(motion, loads=replace(motion.loads, payload_cog=place)))
         columns.append(pieces.payload_torque if channel == "torque" else pieces.payload_wrench)
-    columns[1:] = [(c - columns[0]) / OFF for c in columns[1:]]
+    columns[1:] = [(c - columns[0]) / LOAD_OFFSET for c in columns[1:]]
     return np.stack(columns, axis=2)
 
 

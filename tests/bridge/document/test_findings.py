@@ -67,7 +67,7 @@ def test_a_value_that_is_not_constant_names_the_quantity() -> None:
          "target_slip: the target on the tool moved by 0.5 mm between 7 s and 8 s"),
         (ParameterNote(ParameterState.ON_BOUND, "backlash_2", 0.0, "rad"),
          "backlash_2 is at its bound (0 rad)"),
-        (ParameterNote(ParameterState.HELD, "link_geometry_5_alpha", 0.0, "rad"),
+        (ParameterNote(ParameterState.NOMINAL, "link_geometry_5_alpha", 0.0, "rad"),
          "link_geometry_5_alpha is held nominal: its estimate is several times as large as those "
          "of similar parameters and not significant; an unnamed effect may be its cause"),
         (ParameterNote(ParameterState.NOT_IDENTIFIABLE, "backlash_2", 1e-4, "rad"),

@@ -22,7 +22,7 @@ def flexible():
     return [replace(c, parameters=(replace(c.parameters[0], lower=0.0),)) for c in found[:2]]
 
 
-def test_what_stands_on_a_bound_stays_and_the_rest_solves_without_it(flexible):
+def test_a_parameter_on_its_bound_is_fixed_and_the_others_are_solved(flexible):
     rng = np.random.default_rng(1)
     A = rng.normal(size=(40, 3))
     A[:, 0] += 0.9 * A[:, 1]

@@ -11,14 +11,18 @@ import small_arm as small
 
 from benchmarks.blind.measuring import axial_moments
 from benchmarks.blind.session import play
-from gapbridge.core.diagnosis.bump import bumps
+from gapbridge.core.diagnosis.all_rows.refit_on_all_rows import (
+    accused_on_all_rows,
+    fitted_on_all_rows,
+    refitted,
+)
 from gapbridge.core.diagnosis.constancy import not_constant
 from gapbridge.core.diagnosis.diagnosis import diagnose
-from gapbridge.core.diagnosis.every_row.refitted import on_every_row, refitted, still_accused
 from gapbridge.core.diagnosis.finding import Check
 from gapbridge.core.diagnosis.held_out import HeldOut
 from gapbridge.core.diagnosis.judgement import Judgement
-from gapbridge.core.diagnosis.selection.problem import fit
+from gapbridge.core.diagnosis.periodicity import not_periodic
+from gapbridge.core.diagnosis.selection.sample_space import fit
 from gapbridge.core.metrology import Metrology
 
 GAP = 9e-4  # rad, of joint 2
@@ -91,7 +95,7 @@ def test_a_gears_line_is_the_same_in_every_part_of_the_range():
 
 
 @pytest.mark.parametrize("beside", [True, False])
-def test_less_than_a_period_is_no_line_beside_the_unknown(beside):
+def test_less_than_a_period_is_no_line_with_an_unknown(beside):
     """Any curve of one bend is a sine's piece; alone, an eccentric gear is the usual guess."""
     selection = fading(0.0)
     space = selection.space
@@ -105,8 +109,8 @@ def test_less_than_a_period_is_no_line_beside_the_unknown(beside):
     selection = replace(selection, best=found)
     q = selection.observation.quantities["actual_q_1"]
     assert np.ptp(q) / (2 * np.pi) < 0.75
-    assert (slow in bumps(selection)) is beside
-    assert line_in(selection) not in bumps(selection)
+    assert (slow in not_periodic(selection)) is beside
+    assert line_in(selection) not in not_periodic(selection)
 
 
 def test_only_numbers_of_poses_are_judged():
@@ -123,8 +127,8 @@ def test_only_numbers_of_poses_are_judged():
     assert list(not_constant(selection, [play_of_2], nothing).values()) == ["load"]
 
 
-@pytest.mark.parametrize(("fades", "stays"), [(0.0, True), (1.0, False)])
-def test_all_rows_judge_whether_a_line_is_one(fades, stays):
+@pytest.mark.parametrize(("fades", "kept"), [(0.0, True), (1.0, False)])
+def test_all_rows_judge_whether_a_line_is_one(fades, kept):
     """A search saw a tenth of a UR10's rows: its lines helped there, and in no other series."""
     selection, model = fading(fades), small.model_of()
     line, space = line_in(selection), selection.space
@@ -134,7 +138,9 @@ def test_all_rows_judge_whether_a_line_is_one(fades, stays):
         terms=(space.candidates[line].term(found.values[0]),),
     )  # fmt: skip
     accused = Judgement((0,), True, 0.0, (), {}, ())
-    whole = on_every_row(selection, accused, selection.observation, model)
-    _, decided = still_accused(whole, accused, HeldOut(whole), partial(refitted, model, False))
-    assert decided.accused == ((0,) if stays else ())
-    assert stays or dict(decided.withdrawn)[0].failed is Check.CONSTANT
+    whole = fitted_on_all_rows(selection, accused, selection.observation, model)
+    _, decided = accused_on_all_rows(
+        whole, accused, HeldOut(whole), partial(refitted, model, False)
+    )
+    assert decided.accused == ((0,) if kept else ())
+    assert kept or dict(decided.withdrawn)[0].failed is Check.CONSTANT

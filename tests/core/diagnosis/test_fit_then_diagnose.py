@@ -49,7 +49,7 @@ def sigmas_off(found):
 @pytest.mark.parametrize(
     ("tool", "registered"), [(False, True), (False, False), (True, True), (True, False)]
 )
-def test_nothing_is_left_to_name(tool: bool, registered: bool, seed: int):
+def test_no_further_cause_is_named(tool: bool, registered: bool, seed: int):
     log, metrology, found = fitted(moved(tool, zeros=False), registered, seed)
     shift = found.written.tool_in_flange[:3, 3] - small.TOOL
     np.testing.assert_allclose(shift, SHIFT if tool else 0.0, atol=2e-5)
@@ -76,7 +76,7 @@ def test_zeros_that_are_off_become_no_flexibilities(tool: bool, registered: bool
     assert channel.remaining_rms < 1.15 * small.FLOOR
 
 
-def test_a_cause_is_as_unsure_as_the_flexibilities_that_it_stands_on():
+def test_a_cause_has_the_uncertainty_of_the_flexibilities_it_depends_on():
     """By how far it moves with them; a flexibility that is accused itself makes nothing unsure."""
     session = small.session_of(11)
     real = moved(tool=False, zeros=True)
@@ -103,7 +103,7 @@ def test_a_cause_is_as_unsure_as_the_flexibilities_that_it_stands_on():
     assert spread.sigma_columns(cell, q, loads, (term,)).shape == (len(q), 6, 0)
 
 
-def test_an_arm_as_drawn_is_fitted_as_if_its_links_were_known(monkeypatch):
+def test_an_arm_with_nominal_links_is_fitted_as_if_they_were_known(monkeypatch):
     """The links are let in where the poses are likelier with them, and cost nothing elsewhere."""
     _, _, found = fitted(SOFT, True, 11)
     monkeypatch.setattr("gapbridge.core.estimation.geometry.SURE", np.inf)
@@ -111,7 +111,7 @@ def test_an_arm_as_drawn_is_fitted_as_if_its_links_were_known(monkeypatch):
     np.testing.assert_array_equal(found.covariance, alone.covariance)
 
 
-def test_a_tool_point_that_the_poses_do_not_determine_stays_the_cells():
+def test_a_tool_point_that_is_not_identifiable_is_the_cells():
     """One attitude: a shift of the tool is one of the frame."""
     session = small.session_of(3)
     session = replace(session, q=np.tile(session.q[:1], (len(session.q), 1)))

@@ -10,7 +10,7 @@ import small_arm as small
 from gapbridge.core.diagnosis.generalisation import held_out_regions
 
 
-def test_regions_are_left_out_whole_and_hold_no_neighbour() -> None:
+def test_regions_are_held_out_whole_without_neighbours_in_the_fit() -> None:
     observation = small.diagnosed("none").channels[0].selection.observation
     kept = np.ones(len(observation.rows), dtype=bool)
     fold, near = held_out_regions(observation, kept)

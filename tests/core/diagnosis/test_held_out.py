@@ -37,7 +37,7 @@ def paired(selection):
 
 def left_of(selection, chosen) -> np.ndarray:
     """Return the whitened held-out residual (N, 3) of each sample."""
-    return HeldOut(selection)._left(tuple(sorted(chosen))).reshape(-1, 3)
+    return HeldOut(selection)._residuals(tuple(sorted(chosen))).reshape(-1, 3)
 
 
 def test_a_sample_never_helps_to_predict_itself(selection):
@@ -84,7 +84,7 @@ def test_held_out_figures_are_those_of_a_cross_validation_by_hand(selection):
     assert held.rms(chosen) == pytest.approx(small.FLOOR, rel=0.2)
 
 
-def test_a_needless_cause_does_not_shrink_the_held_out_gap(selection):
+def test_an_unnecessary_cause_does_not_reduce_the_held_out_gap(selection):
     space, chosen = selection.space, selection.best.chosen
     needless = next(c for c, k in enumerate(space.candidates) if k.family == "link_geometry")
     held = HeldOut(selection)
@@ -110,7 +110,7 @@ def test_a_shrink_is_one_less_the_ratio_of_its_gaps_and_repeats(selection):
 
 
 @pytest.mark.parametrize("twins", [False, True])
-def test_the_interval_of_a_shrink_is_that_of_poses_drawn_anew(selection, twins):
+def test_the_interval_of_a_shrink_is_a_bootstrap_over_poses(selection, twins):
     """95 % over draws of whole conditions, done here the slow way."""
     held = HeldOut(paired(selection) if twins else selection)
     chosen = selection.best.chosen
@@ -145,16 +145,16 @@ def test_two_conditions_are_needed(selection):
     assert not HeldOut(one).possible
 
 
-def test_a_number_that_moves_nothing_takes_nothing_from_the_others(selection):
+def test_a_parameter_without_effect_does_not_change_the_others(selection):
     """Of a link kept near nominal that the samples do not show only its prior is there."""
     chosen = list(selection.best.chosen)
     dead = next(c for c in range(len(selection.space.candidates)) if c not in chosen)
     own = selection.space.column_indices([dead])
-    X, taken = selection.space.X.copy(), selection.unprojected.taken.copy()
-    X[:, own] = taken[:, own] = 0.0
+    X, coefficients = selection.space.X.copy(), selection.unprojected.coefficients.copy()
+    X[:, own] = coefficients[:, own] = 0.0
     blind = replace(
         selection, space=replace(selection.space, X=X),
-        unprojected=replace(selection.unprojected, taken=taken),
+        unprojected=replace(selection.unprojected, coefficients=coefficients),
         prior={dead: np.full(len(own), 1e-3)},
     )  # fmt: skip
     held = HeldOut(blind)

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import small_arm as small
-import toy_space as toy
+import toy_candidates as toy
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -27,8 +27,14 @@ from gapbridge.core.diagnosis.finding import (
     Withdrawal,
 )
 from gapbridge.core.diagnosis.held_out import HeldOut
-from gapbridge.core.diagnosis.judgement import Judgement, judge, pure_error, still_sure, ties_of
-from gapbridge.core.diagnosis.selection.problem import fit
+from gapbridge.core.diagnosis.judgement import (
+    Judgement,
+    judge,
+    pure_error,
+    significant_alone,
+    ties_of,
+)
+from gapbridge.core.diagnosis.selection.sample_space import fit
 from gapbridge.core.diagnosis.selection.selection import Selection
 from gapbridge.core.effects import CATALOGUE, Site, Term, effect_named
 from gapbridge.core.metrology import Metrology
@@ -64,7 +70,7 @@ def test_every_term_is_accused_or_withdrawn(effect):
     assert named == sorted(channel.selection.terms[p].effect for p in accused)
 
 
-def test_an_accusation_beside_residual_structure_is_withdrawn_and_reported_so():
+def test_an_effect_not_stable_with_residual_structure_is_withdrawn():
     found = small.diagnosed("cross_coupling")
     (channel,) = found.channels
     assert channel.judgement.structured
@@ -80,7 +86,7 @@ def test_an_accusation_beside_residual_structure_is_withdrawn_and_reported_so():
     assert found.model.terms == small.model_of().terms  # nothing withdrawn reaches the model
 
 
-def test_more_left_than_the_stated_noise_is_structure():
+def test_a_residual_above_the_stated_noise_is_structure():
     session = small.session_of(0)
     log = small.log_of(session, small.readings(small.NOMINAL, session))
     stated = np.sqrt(small.FLOOR**2 - small.SIGMA**2)
@@ -94,16 +100,16 @@ def test_more_left_than_the_stated_noise_is_structure():
     assert verdicts == ["no_gap", "unexplained"]
 
 
-def test_what_does_not_shrink_the_gap_of_unseen_samples_is_withdrawn():
+def test_a_term_without_held_out_gain_is_withdrawn():
     selection = channel_of("backlash").selection
     rng = np.random.default_rng(0)
     drawn = rng.normal(size=len(selection.unprojected.target))
     noise = replace(selection, unprojected=replace(selection.unprojected, target=drawn))
     kept = judge(selection, HeldOut(selection))
     assert len(kept.accused) == 1
-    left = judge(selection, HeldOut(noise))
-    assert left.accused == ()
-    assert [why for _, why in left.withdrawn] == [Withdrawal(Check.HELD_OUT_GAIN)]
+    judged = judge(selection, HeldOut(noise))
+    assert judged.accused == ()
+    assert [why for _, why in judged.withdrawn] == [Withdrawal(Check.HELD_OUT_GAIN)]
 
 
 def test_a_value_on_its_bound_is_no_accusation():
@@ -128,7 +134,7 @@ def test_a_value_that_may_as_well_be_none_is_no_accusation(sigmas, stays):
     assert (len(judged.accused) == 1) is stays
 
 
-def test_a_known_effect_is_named_beside_an_unknown_one_that_is_admitted():
+def test_a_known_effect_is_accused_besides_an_unknown_one_that_is_reported():
     """Play in one joint, and another that a third carries along."""
     session = small.session_of(5)
     errors = [small.REAL[e].angle_errors for e in ("backlash", "cross_coupling")]
@@ -192,7 +198,7 @@ def test_a_cause_that_is_needed_is_more_probable_than_not(effect):
     assert probability(channel.selection, own) == channel.causes[0].probability
 
 
-def test_a_loser_that_scores_well_alone_is_not_probable_beside_the_cause():
+def test_an_effect_that_scores_well_alone_is_not_probable_given_the_cause():
     channel = channel_of("backlash")
     alone = {c.effect: c for c in channel.considered}
     assert max(c.shrink_alone or 0 for c in alone.values()) < channel.causes[0].shrink_alone
@@ -231,7 +237,7 @@ def test_what_a_log_cannot_show_reports_what_it_needs():
 
 
 @pytest.mark.parametrize(("third", "stays"), [(2.9e-4, (0,)), (3.1e-4, (0, 1, 2))])
-def test_links_as_a_whole_stand_only_where_one_of_them_is_sure(monkeypatch, third, stays):
+def test_all_links_are_accused_only_if_one_of_them_is_significant(monkeypatch, third, stays):
     """A block moves the gap by sums of numbers none of which the data show: three sessions did."""
     terms = (
         Term("joint_offset", Site(1), (1.0,)),
@@ -245,11 +251,11 @@ def test_links_as_a_whole_stand_only_where_one_of_them_is_sure(monkeypatch, thir
         observation=SimpleNamespace(channel="position"),
     )  # fmt: skip
     found.judged_together = partial(Selection.judged_together, found)
-    found.far_off = partial(Selection.far_off, found)
+    found.implausible_parameters = partial(Selection.implausible_parameters, found)
     found.covariance[0] = found.covariance[0] * 1e-4
     monkeypatch.setattr(judging, "refitted_alone", lambda *_: found)
     given = Judgement((0, 1, 2), False, None, (), {}, ())
-    selection, judgement = still_sure(found, given, None)
+    selection, judgement = significant_alone(found, given, None)
     assert selection is found
     assert judgement.accused == stays
     assert {p for p, _ in judgement.withdrawn} == {0, 1, 2} - {*stays}
@@ -257,7 +263,7 @@ def test_links_as_a_whole_stand_only_where_one_of_them_is_sure(monkeypatch, thir
 
 
 @pytest.mark.parametrize(("offset", "stays"), [(2.9e-4, (0, 1)), (3.1e-4, (0, 1, 2))])
-def test_of_joints_zeros_among_the_links_each_has_to_be_sure_by_itself(monkeypatch, offset, stays):
+def test_each_joint_zero_of_the_links_has_to_be_significant(monkeypatch, offset, stays):
     """Series of a UR10 and a Motoman named all joints, with not one number over three sigmas."""
     terms = (
         Term("link_geometry", Site(2), (1e-3, 1e-3, 1e-3)),
@@ -271,22 +277,22 @@ def test_of_joints_zeros_among_the_links_each_has_to_be_sure_by_itself(monkeypat
         observation=SimpleNamespace(channel="position"),
         space=SimpleNamespace(candidates=[SimpleNamespace(effect=e) for e in own]),
     )  # fmt: skip
-    for name in ("_in_geometry", "is_link", "judged_together", "far_off"):
+    for name in ("_in_geometry", "is_link", "judged_together", "implausible_parameters"):
         setattr(found, name, partial(getattr(Selection, name), found))
     monkeypatch.setattr(judging, "refitted_alone", lambda *_: found)
-    _, judgement = still_sure(found, Judgement((0, 1, 2), False, None, (), {}, ()), None)
+    _, judgement = significant_alone(found, Judgement((0, 1, 2), False, None, (), {}, ()), None)
     assert judgement.accused == stays
     assert not judgement.structured
 
 
 @pytest.mark.parametrize(("spread", "held"), [(9e-3, True), (5e-3, False)])
-def test_a_twist_far_from_all_others_has_to_be_sure_by_itself(monkeypatch, spread, held):
+def test_a_twist_far_outside_the_prior_has_to_be_significant(monkeypatch, spread, held):
     """A WAM's wrist: 41 mrad beside links of 2 mrad, where its joints turn each other. A UR5's
     twist, as far off, is sure."""
     sizes, prior = np.array([1e-3, 1e-3, 41e-3]), np.full(3, 8e-3)
     found = SimpleNamespace(
         terms=(Term("link_geometry", Site(5), tuple(sizes)),), term_index=(4,), block=(4,),
-        covariance=[np.diag([1e-4, 1e-4, spread]) ** 2], prior={4: prior}, held={},
+        covariance=[np.diag([1e-4, 1e-4, spread]) ** 2], prior={4: prior}, nominal={},
         is_link=lambda p: True, _in_geometry=lambda p: True,
         observation=SimpleNamespace(channel="position"),
     )  # fmt: skip
@@ -295,18 +301,18 @@ def test_a_twist_far_from_all_others_has_to_be_sure_by_itself(monkeypatch, sprea
     )
     for own in (found, again):
         own.judged_together = partial(Selection.judged_together, own)
-        own.far_off = partial(Selection.far_off, own)
-    asked = []
+        own.implausible_parameters = partial(Selection.implausible_parameters, own)
+    requested = []
 
     def with_nominal(numbers):
-        asked.append({c: far.tolist() for c, far in numbers.items()})
+        requested.append({c: far.tolist() for c, far in numbers.items()})
         return again
 
     found.with_nominal = with_nominal
     monkeypatch.setattr(judging, "refitted_alone", lambda selection, *_: selection)
-    selection, judgement = still_sure(found, Judgement((0,), False, None, (), {}, ()), None)
+    selection, judgement = significant_alone(found, Judgement((0,), False, None, (), {}, ()), None)
     assert selection is (again if held else found)
-    assert asked == ([{4: [False, False, True]}] if held else [])
+    assert requested == ([{4: [False, False, True]}] if held else [])
     assert judgement.accused == (0,)
 
 

@@ -35,7 +35,7 @@ def repeated(effect: str, times: int = 3):
     return small.log_of(session, small.readings(small.REAL[effect], session, 3))
 
 
-def test_repeats_measure_the_floor_beside_an_unknown_that_is_thirty_times_as_large() -> None:
+def test_repeats_measure_the_floor_under_an_unknown_thirty_times_as_large() -> None:
     metrology = Metrology(registered=True, sigma=small.SIGMA)
     (channel,) = diagnose(small.model_of(), repeated("cross_coupling"), metrology).channels
     assert channel.noise_floor_source == "repeats"
@@ -43,7 +43,7 @@ def test_repeats_measure_the_floor_beside_an_unknown_that_is_thirty_times_as_lar
     assert channel.gap_rms > 4 * small.FLOOR
 
 
-def test_without_repeats_what_is_left_is_no_measure_of_noise() -> None:
+def test_without_repeats_a_structured_residual_is_no_measure_of_noise() -> None:
     (channel,) = small.diagnosed("cross_coupling").channels
     assert channel.structured
     assert (channel.noise_floor_rms, channel.noise_floor_source) == (small.SIGMA, "stated")
@@ -98,7 +98,7 @@ def test_white_noise_is_white_and_a_ripple_is_not() -> None:
 
 
 def test_every_row_is_fitted_and_judged(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(whole, "MOST", {**whole.MOST, "position": 60})
+    monkeypatch.setattr(whole, "MAX_SAMPLES", {**whole.MAX_SAMPLES, "position": 60})
     drawn = small.session_of(1, small.Plan(poses=400))
     metrology = Metrology(registered=True, sigma=small.SIGMA)
     log = small.log_of(drawn, small.readings(small.REAL["axial_compliance"], drawn, 1))
@@ -126,7 +126,7 @@ def test_a_cause_that_few_rows_suggest_falls_by_all_of_them(
     position[taken] = off[taken]
     position[np.setdiff1d(np.arange(200), taken)[:60]] -= (off - small.readings(
         small.NOMINAL, drawn, 1))[np.setdiff1d(np.arange(200), taken)[:60]]  # fmt: skip
-    monkeypatch.setattr(whole, "MOST", {**whole.MOST, "position": 60})
+    monkeypatch.setattr(whole, "MAX_SAMPLES", {**whole.MAX_SAMPLES, "position": 60})
     metrology = Metrology(registered=True, sigma=small.SIGMA)
     (channel,) = diagnose(small.model_of(), small.log_of(drawn, position), metrology).channels
     assert not channel.causes

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import toy_space as toy
+import toy_candidates as toy
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -52,7 +52,7 @@ def test_the_unit_of_the_gap_does_not_matter(share):
     assert structure_p_value(other, FRAME, ()) == structure_p_value(one, FRAME, ())
 
 
-def test_what_the_frame_takes_up_is_no_structure():
+def test_what_a_frame_absorbs_is_no_structure():
     clean = space(3)
     tilted = replace(clean, y=clean.y + FRAME @ np.full(6, 50.0))
     assert structure_p_value(tilted, FRAME, ()) == pytest.approx(

@@ -44,15 +44,17 @@ def tied():
     return diagnose(small.model_of(), log, Metrology(registered=True, sigma=small.SIGMA))
 
 
-def test_a_tie_is_reported_and_asked(tied):
+def test_a_tie_is_reported_with_a_measurement_that_resolves_it(tied):
     (cause,) = tied.channels[0].causes
     names = {cause.effect, *cause.indistinguishable_from}
     assert {"joint_offset", "backlash"} <= names
-    asked = [m for m in tied.next_measurements if set(m.separates) == {"joint_offset", "backlash"}]
-    assert asked
+    requested = [
+        m for m in tied.next_measurements if set(m.separates) == {"joint_offset", "backlash"}
+    ]
+    assert requested
 
 
-def test_proposed_poses_stand_within_the_joint_limits_and_the_rated_load(tied):
+def test_proposed_poses_are_within_the_joint_limits_and_the_rated_load(tied):
     for reported in tied.next_measurements:
         assert np.all(np.array(reported.q) >= small.LIMITS.lower)
         assert np.all(np.array(reported.q) <= small.LIMITS.upper)
@@ -60,10 +62,12 @@ def test_proposed_poses_stand_within_the_joint_limits_and_the_rated_load(tied):
 
 
 def test_at_a_proposed_pose_the_tied_pair_really_differs(tied):
-    """The two real arms that the tie holds stand apart there by what was promised."""
+    """The two real arms differ there by the expected gain."""
     play = small.turned(2, lambda s, q: s.approach[:, 1] * -PLAY / 2)
-    seen = small.session_of(3, ONE_SIDED)
-    assert np.allclose(stand(OFFSET, seen).tcp, stand(play, seen).tcp, atol=1e-9)  # on the log
+    session = small.session_of(3, ONE_SIDED)
+    assert np.allclose(
+        stand(OFFSET, session).tcp, stand(play, session).tcp, atol=1e-9
+    )  # on the log
     for reported in tied.next_measurements:
         if set(reported.separates) != {"joint_offset", "backlash"}:
             continue
@@ -80,11 +84,11 @@ def test_proposals_of_one_question_differ(tied):
         assert all(np.abs(a - b).max() > 0.1 for a in poses for b in poses if a is not b)
 
 
-def test_what_a_frame_takes_up_is_never_asked():
+def test_a_difference_that_a_frame_absorbs_is_never_proposed():
     """Joint 1 and the frame of an unregistered instrument are the same at every pose."""
     found = small.diagnosed("none", 0, False)
-    asked = {e for m in found.next_measurements for e in m.separates}
-    assert "joint_offset" not in asked
+    requested = {e for m in found.next_measurements for e in m.separates}
+    assert "joint_offset" not in requested
 
 
 def test_the_same_question_gets_the_same_answer(tied):
@@ -142,15 +146,15 @@ def one_attitude():
     return diagnose(small.model_of(), Log("small.csv", columns, 3))
 
 
-def test_a_tie_of_the_flange_sensor_is_asked(one_attitude):
+def test_a_tie_of_the_flange_sensor_has_a_proposed_measurement(one_attitude):
     (channel,) = one_attitude.channels
     (cause,) = channel.causes
     pair = {"ft_bias", "ft_gain"}
     assert pair <= {cause.effect, *cause.indistinguishable_from}
-    asked = [m for m in one_attitude.next_measurements if set(m.separates) == pair]
-    assert asked
+    requested = [m for m in one_attitude.next_measurements if set(m.separates) == pair]
+    assert requested
     bias = (flange_reading([0.0, 0.7, -1.1], 4.0) * GAIN)[0]
-    for reported in asked:
+    for reported in requested:
         q = np.array(reported.q)
         assert np.all((small.LIMITS.lower <= q) & (q <= small.LIMITS.upper))
         apart = flange_reading(q, reported.payload)[0] * GAIN - bias
@@ -165,7 +169,7 @@ def test_no_pose_is_proposed_for_what_no_pose_decides(one_attitude):
     assert all(m.expected_gain >= 1 for m in one_attitude.next_measurements)
 
 
-def test_an_effect_the_log_cannot_show_is_asked_for_where_it_shows():
+def test_an_effect_that_is_not_excited_has_a_measurement_that_excites_it():
     """Few nearly equal poses show nothing of the gravity's direction; others would."""
     near = small.session_of(4, Plan(poses=60, span=0.03, blocks=1, pulled=0.0))
     model = small.model_of(small.COMPLIANT)
@@ -173,10 +177,10 @@ def test_an_effect_the_log_cannot_show_is_asked_for_where_it_shows():
     found = diagnose(model, small.log_of(near, read), Metrology(sigma=small.SIGMA))
     silent = {c.effect for c in found.channels[0].considered if not c.excited}
     assert "gravity_direction" in silent
-    asked = [m for m in found.next_measurements if m.separates == ("gravity_direction",)]
-    assert asked
+    requested = [m for m in found.next_measurements if m.separates == ("gravity_direction",)]
+    assert requested
     assert {e for m in found.next_measurements for e in m.separates} <= silent
-    spread = np.abs(np.array([m.q for m in asked]) - near.q.mean(axis=0)).max(axis=1)
+    spread = np.abs(np.array([m.q for m in requested]) - near.q.mean(axis=0)).max(axis=1)
     assert np.all(spread > 0.5)
     # what the frame, fitted anew on the log, leaves of a gravity of usual size that leans
     (size, _) = CATALOGUE["gravity_direction"].parameters(model.arm, Site())
@@ -184,7 +188,7 @@ def test_an_effect_the_log_cannot_show_is_asked_for_where_it_shows():
         small.COMPLIANT,
         gravity=turn(np.array([[size.scale, size.scale, 0.0]]))[0] @ small.NOMINAL.gravity,
     )
-    for reported in asked:
+    for reported in requested:
         there = session_at(reported.q, reported.payload, np.ones(3))
         there = small.replace(there, payload_cog=near.payload_cog[-1:])
         promised = beside_a_frame(leaning, small.COMPLIANT, near, there)

@@ -48,10 +48,10 @@ def test_rows_enough_decide_what_few_of_them_leave_open():
     assert (cause.effect, cause.joints, cause.indistinguishable_from) == ("latency", (3,), ())
 
 
-def test_the_motion_asked_for_is_one_the_arm_can_make_and_quicker_than_the_recording(slow):
-    asked = [m for m in slow.next_measurements if len(m.separates) == 2]
-    assert asked
-    for reported in asked:
+def test_a_proposed_motion_is_feasible_and_faster_than_the_recording(slow):
+    requested = [m for m in slow.next_measurements if len(m.separates) == 2]
+    assert requested
+    for reported in requested:
         assert np.all(np.abs(reported.velocity) <= MODEL.arm.limits.velocity)
         began = np.array(reported.velocity) - 0.5 * np.array(reported.acceleration)
         assert np.all(np.abs(began) <= MODEL.arm.limits.velocity * 1.000001)
@@ -63,14 +63,14 @@ def test_the_motion_asked_for_is_one_the_arm_can_make_and_quicker_than_the_recor
 
 def test_the_expected_gain_is_what_the_two_explanations_come_to_there(slow):
     """To second order a lag T runs T**2 qdd / 2 off a delay of the same T."""
-    asked = next(m for m in slow.next_measurements if len(m.separates) == 2)
+    requested = next(m for m in slow.next_measurements if len(m.separates) == 2)
     floor = slow.channels[0].noise_floor_rms
-    assert asked.expected_gain == pytest.approx(
-        0.5 * DELAY**2 * abs(asked.acceleration[2]) / floor, rel=0.25
+    assert requested.expected_gain == pytest.approx(
+        0.5 * DELAY**2 * abs(requested.acceleration[2]) / floor, rel=0.25
     )
 
 
-def test_speed_and_acceleration_stand_in_the_document(slow):
+def test_speed_and_acceleration_are_in_the_document(slow):
     reported = [m for m in document(slow)["next_measurements"] if len(m["separates"]) == 2]
     assert reported
     assert all(len(m["velocity"]) == len(m["acceleration"]) == N for m in reported)

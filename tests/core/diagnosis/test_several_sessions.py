@@ -14,7 +14,7 @@ import small_arm as small
 
 from benchmarks.blind.mechanics import turn
 from gapbridge.bridge.document.diagnosis_json import document
-from gapbridge.core.diagnosis.across_sessions import carried
+from gapbridge.core.diagnosis.across_sessions import session_transfer
 from gapbridge.core.diagnosis.diagnosis import diagnose
 from gapbridge.core.errors import LogError
 from gapbridge.core.estimation.identification import identify_compliance
@@ -80,14 +80,14 @@ def test_a_cause_is_found_across_frames_and_tool_points(compliant) -> None:
     assert (cause.effect, cause.joints) == ("axial_compliance", (2,))
     (parameter,) = cause.parameters
     assert abs(parameter.value - 4e-6) < 4 * parameter.std
-    (across,) = channel.carried
-    assert across.carries
+    (across,) = channel.session_transfer
+    assert across.transfers
     assert [s for s, _ in across.values] == [0, 1]
 
 
 def test_what_is_reported_of_a_new_session_holds_for_further_ones(compliant) -> None:
     real = small.REAL["axial_compliance"]
-    found = compliant.channels[0].elsewhere
+    found = compliant.channels[0].generalisation
     further = [placed(compliant.model, session(real, s, remounted=True), True) for s in (44, 45)]
     assert 0.8 < found.new_session / rms(np.concatenate(further)) < 1.25
     assert [s for s, _ in found.by_session] == [0, 1]
@@ -99,22 +99,22 @@ def test_figures_of_an_unknown_hold_in_a_new_session_too() -> None:
     (channel,) = found.channels
     assert not channel.causes
     further = [placed(found.model, session(real, s), False) for s in (11, 12, 13)]
-    assert 0.8 < channel.elsewhere.new_session / rms(np.concatenate(further)) < 1.25
+    assert 0.8 < channel.generalisation.new_session / rms(np.concatenate(further)) < 1.25
 
 
 def test_a_target_that_was_remounted_unsaid_is_no_noise() -> None:
     """The same logs as of the fixture, without the word that the target was taken off."""
     log = together(small.REAL["axial_compliance"], (34, 35), remounted=True)
     (channel,) = diagnose(MODEL, log, Metrology(sigma=small.SIGMA)).channels
-    assert channel.elsewhere.new_session > 20 * small.FLOOR or channel.structured
+    assert channel.generalisation.new_session > 20 * small.FLOOR or channel.structured
 
 
 def test_a_value_that_changed_is_named_as_changed() -> None:
     logs = [session(small.soft(2, 4e-6), 34), session(small.soft(2, 8e-6), 35)]
     found = diagnose(MODEL, join_sessions(logs, MODEL), Metrology(sigma=small.SIGMA))
     (channel,) = found.channels
-    (across,) = [c for c in channel.carried if c.effect == "axial_compliance"]
-    assert not across.carries
+    (across,) = [c for c in channel.session_transfer if c.effect == "axial_compliance"]
+    assert not across.transfers
     values = [p[0].value for _, p in across.values]
     assert values == pytest.approx([4e-6, 8e-6], rel=0.1)
     (cause,) = [
@@ -135,7 +135,7 @@ def test_what_holds_in_one_session_only_depends_on_the_session() -> None:
 
 
 def test_one_session_has_no_figure_for_a_new_one() -> None:
-    found = small.diagnosed("axial_compliance").channels[0].elsewhere
+    found = small.diagnosed("axial_compliance").channels[0].generalisation
     assert found.new_session is None
     assert found.by_session == ()
     assert found.new_region is not None
@@ -177,12 +177,12 @@ def test_a_parameter_that_one_session_does_not_show_is_not_compared() -> None:
     other = own - 1 if own else own + 1
     column = selection.space.start[other]
     X[:, column] = np.where(rows == 0, X[:, column] + 1e-3, 0.0)
-    taken = selection.unprojected.taken.copy()
-    taken[:, column] = 0.0
+    coefficients = selection.unprojected.coefficients.copy()
+    coefficients[:, column] = 0.0
     changed = replace(
         selection, space=replace(selection.space, X=X),
-        unprojected=replace(selection.unprojected, taken=taken),
+        unprojected=replace(selection.unprojected, coefficients=coefficients),
     )  # fmt: skip
-    reported = carried(changed, (own, other), MODEL.arm)
+    reported = session_transfer(changed, (own, other), MODEL.arm)
     assert all(np.isfinite(c.p_value) for c in reported)
     assert "axial_compliance" in {c.effect for c in reported}

@@ -15,7 +15,7 @@ from gapbridge.core.diagnosis.diagnosis import diagnose
 from gapbridge.core.diagnosis.finding import Check
 from gapbridge.core.diagnosis.held_out import HeldOut
 from gapbridge.core.diagnosis.judgement import judge
-from gapbridge.core.diagnosis.selection.problem import fit
+from gapbridge.core.diagnosis.selection.sample_space import fit
 from gapbridge.core.effects import Site, Term
 from gapbridge.core.loads import Loads
 from gapbridge.core.log.log import Log
@@ -110,7 +110,7 @@ def test_a_target_that_slips_is_no_joint_that_does() -> None:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_slips_beside_larger_ones_are_found_at_their_own_moments(seed: int) -> None:
+def test_slips_among_larger_ones_are_found_at_their_times(seed: int) -> None:
     terms = [Term("joint_slip", Site(2), (3e-3,)), Term("joint_slip", Site(5), (6e-4,)),
              Term("joint_slip", Site(3), (-2e-3,))]  # fmt: skip
     channel, _ = position(sampled(terms, seed=seed, at=(0.3, 0.5, 0.8)))
@@ -119,7 +119,7 @@ def test_slips_beside_larger_ones_are_found_at_their_own_moments(seed: int) -> N
     assert {effect for effect, _ in named} == {"joint_slip"}
 
 
-def test_a_slip_beside_an_offset_that_was_there_all_the_time() -> None:
+def test_a_slip_in_addition_to_a_constant_offset() -> None:
     terms = [Term("joint_slip", Site(4), (-3e-3,)), Term("joint_offset", Site(2), (1e-3,))]
     channel, _ = position(sampled(terms, seed=2))
     found = {(c.effect, c.joints) for c in channel.causes}
@@ -127,7 +127,7 @@ def test_a_slip_beside_an_offset_that_was_there_all_the_time() -> None:
 
 
 @pytest.mark.parametrize(("goes_by", "other"), [("payload", "payload"), ("actual_q_1", None)])
-def test_a_target_that_moves_as_the_load_changes_goes_by_the_load(goes_by, other) -> None:
+def test_a_target_that_moves_as_the_load_changes_depends_on_the_load(goes_by, other) -> None:
     """Only beside something unnamed that goes by the load, too: else a slip comes when it comes."""
     log = sampled([Term("target_slip", Site(), (1e-3, -5e-4, 2e-3))], at=0.5)
     late = np.arange(70) >= 35
@@ -190,7 +190,7 @@ def test_droop_and_dead_band_are_found_side_by_side() -> None:
     assert channel.verdict == "explained"
 
 
-def test_a_wrist_gives_way_to_little() -> None:
+def test_a_droop_of_a_wrist_is_found() -> None:
     """It holds a newton metre where the shoulder holds a hundred: that makes no droop absurd."""
     channel = followed([Term("servo_droop", Site(5), (8e-3,))])
     ((value,),) = ([p.value for p in c.parameters] for c in channel.causes)
@@ -222,7 +222,7 @@ def test_a_joint_that_holds_the_same_all_the_time_shows_no_droop_and_the_motion_
     assert "change the torque that the joint holds" in droop.needs
 
 
-def test_a_small_slip_of_the_target_is_named_beside_a_tool_that_bends() -> None:
+def test_a_small_slip_of_the_target_is_accused_with_a_flexible_tool() -> None:
     """Of three numbers that are sure together none has to be as sure as one by itself."""
     log = sampled([Term("target_slip", Site(), (2e-4, -1.2e-4, 1e-4))], seed=1)
     loads = Loads(payload_mass=log.columns["payload"])

@@ -33,7 +33,7 @@ def test_an_unnamed_function_that_the_search_needs_is_structure(seed):
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_a_tools_turn_is_no_less_sure_beside_a_function_of_the_last_joint(seed):
+def test_a_tool_rotation_keeps_its_significance_with_a_function_of_the_last_joint(seed):
     """That function's constant is the same motion as a turn of the tool: the tool holds it."""
     session = small.session_of(seed, replace(small.PLAN, poses=40))
     model, rng = small.model_of(), np.random.default_rng(seed)

@@ -54,21 +54,21 @@ def test_a_remounted_tools_columns_are_those_of_the_arm_found():
     """At the nominal arm they are off by as much as its zeros: a turn of the last joint stood."""
     session, model = small.session_of(0), small.model_of()
     log = small.log_of(session, small.readings(small.NOMINAL, session))
-    seen = observe(model, log, Metrology(sigma=small.SIGMA, remounted=True))
+    observation = observe(model, log, Metrology(sigma=small.SIGMA, remounted=True))
     terms = (Term("joint_offset", Site(2), (0.05,)), Term("joint_offset", Site(3), (0.04,)))
-    there = seen.rebase(np.zeros(seen.nuisance.shape[2]), terms)
+    there = observation.rebase(np.zeros(observation.nuisance.shape[2]), terms)
     tool, h = there.nuisance[:, :, 6:9], 1e-6
     for k in range(3):
-        step = np.zeros(seen.nuisance.shape[2])
+        step = np.zeros(observation.nuisance.shape[2])
         step[6 + k] = h
-        moved = seen.rebase(step, terms)
+        moved = observation.rebase(step, terms)
         slope = (moved.predict(terms) - there.predict(terms)) / h
         assert np.abs(tool[:, :, k] - slope).max() < 1e-6
-    assert np.abs(tool - seen.nuisance[:, :, 6:9]).max() > 0.01
+    assert np.abs(tool - observation.nuisance[:, :, 6:9]).max() > 0.01
 
 
 @pytest.mark.parametrize("registered", [True, False])
-def test_a_clean_log_accuses_nobody(registered):
+def test_a_clean_log_has_no_cause(registered):
     found = small.diagnosed("none", 0, registered)
     (channel,) = found.channels
     assert (found.verdict, channel.causes, channel.structured) == ("no_gap", (), False)
@@ -79,7 +79,7 @@ def test_a_clean_log_accuses_nobody(registered):
     assert found.terms == ()
 
 
-def test_what_stands_in_no_catalogue_is_reported_as_unexplained():
+def test_an_effect_outside_the_catalogue_is_reported_as_unexplained():
     found = small.diagnosed("cross_coupling")
     (channel,) = found.channels
     assert (found.verdict, channel.causes) == ("unexplained", ())
@@ -88,7 +88,7 @@ def test_what_stands_in_no_catalogue_is_reported_as_unexplained():
     assert "actual_q_1" in [name for name, _ in channel.depends_on[:3]]
 
 
-def test_a_withheld_effect_is_not_replaced_by_an_innocent_one():
+def test_a_withheld_effect_is_not_replaced_by_another():
     found = small.diagnosed("backlash", withhold=("backlash",))
     (channel,) = found.channels
     assert channel.causes == ()
@@ -116,7 +116,7 @@ def test_two_causes_are_both_named_the_larger_share_first():
         assert cause.shrink_alone < cause.shrink.shrink
 
 
-def test_the_found_model_predicts_the_real_arm_elsewhere():
+def test_the_model_with_causes_predicts_the_real_arm_at_other_poses():
     found = small.diagnosed("thermal_drift")
     assert isinstance(found.model, Model)
     session = small.session_of(77)

@@ -8,11 +8,16 @@ import numpy as np
 import pytest
 import small_arm as small
 
+from gapbridge.core.diagnosis.all_rows import long_recording
 from gapbridge.core.diagnosis.channels import torque, tracking
 from gapbridge.core.diagnosis.channels.position import observe
-from gapbridge.core.diagnosis.channels.simulation import SHOWN_BY, Observe, joined, predicted_by
+from gapbridge.core.diagnosis.channels.simulation import (
+    COLUMN_OF_CHANNEL,
+    Observe,
+    joined,
+    predicted_by,
+)
 from gapbridge.core.diagnosis.diagnosis import diagnose
-from gapbridge.core.diagnosis.every_row import long_recording
 from gapbridge.core.effects import Site, Term
 from gapbridge.core.errors import LogError
 from gapbridge.core.log.log import Log
@@ -63,12 +68,12 @@ def test_a_simulator_that_predicts_what_the_model_predicts_changes_nothing():
 
 def test_an_effect_changes_the_simulators_values_as_it_changes_the_models():
     log, term = log_of(small.NOMINAL), Term("joint_offset", Site(2), (0.01,))
-    seen = predicted_by("position", observe)(
+    observation = predicted_by("position", observe)(
         small.model_of(), joined(log, simulated(BOTH)), METROLOGY
     )
     own = observe(small.model_of(), log, METROLOGY)
-    assert np.array_equal(seen.predict(()), simulated(BOTH).require("measured_position"))
-    change = seen.predict([term]) - seen.predict(())
+    assert np.array_equal(observation.predict(()), simulated(BOTH).require("measured_position"))
+    change = observation.predict([term]) - observation.predict(())
     assert np.allclose(change, own.predict([term]) - own.predict(()))
     assert np.abs(change).max() > 1e-3
 
@@ -78,11 +83,11 @@ def test_rows_stay_together_where_some_have_no_reading():
     read = log.require("measured_position").copy()
     read[[0, 7]] = np.nan
     log = replace(log, columns={**log.columns, "measured_position": read})
-    seen = predicted_by("position", observe)(
+    observation = predicted_by("position", observe)(
         small.model_of(), joined(log, simulated(small.NOMINAL)), METROLOGY
     )
-    assert len(seen.measured) == 58
-    assert np.abs(seen.measured - seen.predict(())).max() < 5 * small.FLOOR
+    assert len(observation.measured) == 58
+    assert np.abs(observation.measured - observation.predict(())).max() < 5 * small.FLOOR
 
 
 @pytest.mark.parametrize(
@@ -122,19 +127,19 @@ def moving_log(seed: int = 0) -> Log:
 @pytest.mark.parametrize("channel", ["torque", "tracking"])
 def test_a_search_over_fewer_rows_keeps_the_simulators_prediction(channel: str):
     log = moving_log()
-    name = SHOWN_BY[channel]
+    name = COLUMN_OF_CHANNEL[channel]
     simulator = Log("sim.csv", {name: log.require(name) + 0.05}, 3)
     observers = {"torque": torque.observe, "tracking": tracking.observe}
-    seen = predicted_by(channel, observers[channel])(
+    observation = predicted_by(channel, observers[channel])(
         small.model_of(), joined(log, simulator), METROLOGY
     )
-    take = np.arange(0, len(seen.rows), 3)
-    assert seen.fewer is not None
-    fewer = seen.fewer(take)
-    assert np.allclose(fewer.predict(()), simulator.require(name)[seen.rows[take]])
+    take = np.arange(0, len(observation.rows), 3)
+    assert observation.subset is not None
+    subset = observation.subset(take)
+    assert np.allclose(subset.predict(()), simulator.require(name)[observation.rows[take]])
 
 
-def test_a_delay_is_sought_behind_the_simulators_own_servo():
+def test_a_delay_is_in_series_with_the_simulated_servo():
     """The simulator comes 30 ms late of itself, the real arm 20 ms later still."""
     log, late, own = moving_log(), 0.02, 0.03
     t = log.require("timestamp")
@@ -144,12 +149,15 @@ def test_a_delay_is_sought_behind_the_simulators_own_servo():
         return np.column_stack([np.interp(t - by, t, command[:, j]) for j in range(3)])
 
     simulator = Log("sim.csv", {"actual_q": shifted(own)}, 3)
-    seen = predicted_by("tracking", tracking.observe)(
+    observation = predicted_by("tracking", tracking.observe)(
         small.model_of(), joined(log, simulator), METROLOGY
     )
-    found = seen.predict([Term("latency", Site(1), (late,))])[:, 0]
-    assert np.abs(found - shifted(own + late)[seen.rows, 0]).max() < 2e-4
-    assert np.abs(shifted(own)[seen.rows, 0] - shifted(own + late)[seen.rows, 0]).max() > 1e-2
+    found = observation.predict([Term("latency", Site(1), (late,))])[:, 0]
+    assert np.abs(found - shifted(own + late)[observation.rows, 0]).max() < 2e-4
+    assert (
+        np.abs(shifted(own)[observation.rows, 0] - shifted(own + late)[observation.rows, 0]).max()
+        > 1e-2
+    )
 
 
 def test_a_block_of_a_long_log_keeps_its_motion_behind_the_simulator(monkeypatch):

@@ -84,8 +84,8 @@ def test_an_effect_is_recovered_and_leaves_the_noise_alone(plant, recorded, effe
     (found,), spread = truth.fit(plant.arm, seen, [term(effect, joint)])
     assert abs(found.values[0] - value) < 3.5 * spread[0]
     assert spread[0] < 0.1 * abs(value)
-    left = (seen.measured - seen.predict([found])).std()
-    assert left == pytest.approx(NOISE, rel=0.05)
+    residual = (seen.measured - seen.predict([found])).std()
+    assert residual == pytest.approx(NOISE, rel=0.05)
 
 
 def test_many_effects_together_are_recovered(plant, recorded):
@@ -105,9 +105,9 @@ def test_many_effects_together_are_recovered(plant, recorded):
 
 def test_a_clean_log_leaves_the_noise(plant, recorded):
     seen = observe(plant.model(2.0), log_of(recorded, recorded[4]), METROLOGY)
-    left = seen.measured - seen.predict(())
-    assert left.std() == pytest.approx(NOISE, rel=0.03)
-    assert np.abs(left.mean(axis=0)).max() < 0.02
+    residual = seen.measured - seen.predict(())
+    assert residual.std() == pytest.approx(NOISE, rel=0.03)
+    assert np.abs(residual.mean(axis=0)).max() < 0.02
 
 
 def test_poses_at_rest_are_observed_without_friction(plant):
@@ -133,7 +133,7 @@ def test_an_outside_pull_is_no_gap(plant):
     assert np.abs(seen.measured - seen.predict(())).max() < 1e-8
 
 
-def test_rows_in_which_a_joint_turns_round_are_left_out(plant, recorded):
+def test_rows_at_a_reversal_are_left_out(plant, recorded):
     seen = observe(plant.model(2.0), log_of(recorded, recorded[4]), METROLOGY)
     speed = np.abs(recorded[2][seen.rows])
     assert speed.min() > 1e-3
@@ -149,7 +149,7 @@ def test_joints_that_move_one_at_a_time_keep_their_rows(plant):
     assert len(seen.rows) > 2000
 
 
-def test_a_long_log_is_looked_at_whole_and_held_out_by_stretches_of_time(plant):
+def test_a_long_log_is_used_whole_and_held_out_by_stretches_of_time(plant):
     t = np.arange(15000) / 500
     log = truth.log_of(N, timestamp=t, actual_q=COURSE.at(t),
                        actual_current_as_torque=COURSE.at(t),
@@ -258,7 +258,7 @@ def test_first_moments_of_all_links_are_found_as_a_whole(plant, recorded, monkey
 
 
 @pytest.mark.slow
-def test_friction_of_all_joints_goes_with_the_links_and_each_that_is_named_is_sure(
+def test_friction_of_all_joints_belongs_to_the_links_and_accused_ones_are_significant(
     plant, recorded, monkeypatch
 ):
     """A real arm: every joint rubs, every centre of gravity is off; one zero is, and is named."""

@@ -64,13 +64,13 @@ def test_a_lag_is_no_latency():
     t = times(500)
     log = log_of(COURSE.lagged(t, np.full(N, 0.02)), COURSE.at(t), t)
     seen = observe(MODEL, log, METROLOGY)
-    left = []
+    residual = []
     for effect in ("tracking_lag", "latency"):
         terms = [Term(effect, Site(j + 1), (0.0,)) for j in range(N)]
         found, _ = truth.fit(MODEL.arm, seen, terms)
-        left.append((seen.measured - seen.predict(found)).std())
-    assert left[0] < 1.3e-5
-    assert left[1] > 5e-5
+        residual.append((seen.measured - seen.predict(found)).std())
+    assert residual[0] < 1.3e-5
+    assert residual[1] > 5e-5
 
 
 def test_slow_motion_gives_only_the_sum_of_lag_and_latency():
@@ -173,7 +173,7 @@ def drooping(t, joint, droop):
     return actual
 
 
-def test_a_droop_stands_beside_an_unknown_that_goes_by_the_joints_own_speed():
+def test_a_droop_is_accused_besides_an_unknown_function_of_the_joints_own_speed():
     """It is more than the delay that it holds at first order."""
     t = times(125)
     actual, speed = drooping(t, 3, 1e-3), COURSE.at(t, 1)[:, 2]

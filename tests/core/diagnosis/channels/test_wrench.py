@@ -74,15 +74,15 @@ def test_an_effect_is_recovered(plant, session, effect):
         scores.append((np.array(found.values) - expected) / spread)
     assert np.abs(scores).max() < 4.5
     assert np.sqrt(np.mean(np.square(scores))) < 1.5
-    left = (seen.measured - seen.predict([found])) / NOISE
-    assert left.std() == pytest.approx(1, abs=0.12)
+    residual = (seen.measured - seen.predict([found])) / NOISE
+    assert residual.std() == pytest.approx(1, abs=0.12)
 
 
 def test_a_clean_session_leaves_the_noise_with_comparable_axes(plant, session):
     seen = observe(plant.model(), log_of(session, session[3]), METROLOGY)
-    left = (seen.measured - seen.predict(())) * seen.weight
+    residual = (seen.measured - seen.predict(())) * seen.weight
     assert seen.weight[5] == pytest.approx(30, rel=0.4)
-    assert left.std() == pytest.approx(0.3, rel=0.2)
+    assert residual.std() == pytest.approx(0.3, rel=0.2)
     assert len(np.unique(seen.groups)) == ROWS
 
 
@@ -180,7 +180,7 @@ def test_poses_that_turn_the_flange_separate_a_sensors_zero_from_a_weight(plant)
     assert named_at(plant, q, 20.0, 1.2 * weight)[0] == {"payload"}
 
 
-def test_gains_that_stand_for_a_load_do_not_take_it_along(plant):
+def test_gains_that_imitate_a_load_do_not_replace_it(plant):
     """One load that nobody declared: equal gains are its mass, and leave neither of them sure.
 
     Gains that differ are a little better than none, beside a zero that jumps.

@@ -98,7 +98,7 @@ def test_a_coordinate_without_a_number_is_no_warning_of_numpy(column, size):
         findings(log, MODEL, REGISTERED)
 
 
-def test_an_arm_without_rated_payload_knows_grams_by_its_own_weight():
+def test_without_a_rated_payload_grams_are_detected_by_the_arms_mass():
     unrated = replace(MODEL, arm=replace(MODEL.arm, payload=np.inf))
     check_units(unrated, LOG)
     with pytest.raises(LogError, match="grams"):
@@ -148,7 +148,7 @@ def test_rows_without_a_reading_are_counted(name, phrase):
     )
 
 
-def test_positions_that_stand_still_and_few_poses_are_reported():
+def test_constant_positions_and_few_poses_are_reported():
     assert "hardly change" in reported(with_columns(measured_position=np.ones_like(READ)))
     few = LOG.select(np.arange(5))
     assert "5 different pose(s) are few" in reported(few)
@@ -215,7 +215,7 @@ PULLS = {
 
 @pytest.mark.parametrize("mistake", PULLS)
 @pytest.mark.parametrize("nominal", [small.NOMINAL, AXIAL], ids=["rigid model", "soft model"])
-def test_a_pull_that_the_arm_gives_way_against_is_suspected(mistake, nominal):
+def test_a_force_opposite_to_the_deflection_is_reported(mistake, nominal):
     log = with_columns(actual_TCP_force=PULLS[mistake])
     (line,) = findings(log, small.model_of(nominal), FREE)
     assert line.startswith(f"actual_TCP_force seems {mistake};")
@@ -250,10 +250,10 @@ def moving(tmp_path_factory):
 )
 def test_a_sensor_or_a_pull_of_the_wrong_sign_is_suspected(moving, turned):
     model, columns = moving
-    for seen in ("ft_raw_wrench", "actual_current_as_torque"):
-        if turned not in (seen, "actual_TCP_force"):
+    for sensor in ("ft_raw_wrench", "actual_current_as_torque"):
+        if turned not in (sensor, "actual_TCP_force"):
             continue
-        kept = {k: v for k, v in columns.items() if k == seen or "_q" in k or "pa" in k}
+        kept = {k: v for k, v in columns.items() if k == sensor or "_q" in k or "pa" in k}
         kept["actual_TCP_force"] = columns["actual_TCP_force"]
         assert findings(truth.log_of(7, **kept), model, FREE) == []
         kept[turned] = -kept[turned]

@@ -11,7 +11,7 @@ from benchmarks.fleet.simulating import TYPE, Habits, TrueArm, columns, write_ty
 from gapbridge.bridge.cell import load_cell
 from gapbridge.bridge.document.findings import finding_text
 from gapbridge.core.diagnosis.diagnosis import diagnose
-from gapbridge.core.diagnosis.log_checks.missing_flexibility import softness_findings
+from gapbridge.core.diagnosis.log_checks.missing_flexibility import flexibility_findings
 from gapbridge.core.estimation.identification import identify_compliance
 from gapbridge.core.log.log import Log
 from gapbridge.core.metrology import Metrology
@@ -34,7 +34,7 @@ def test_a_soft_arm_behind_a_rigid_cell_is_sent_to_the_fit(rigid: Model) -> None
     found = diagnose(rigid, log_of(TYPE), FREE)
     assert found.verdict in ("explained", "partly_explained")  # a dozen flexibilities, one by one
     assert {c.effect for c in found.channels[0].causes} & {"axial_compliance", "radial_compliance"}
-    (advice,) = softness_findings(rigid, log_of(TYPE), FREE)
+    (advice,) = flexibility_findings(rigid, log_of(TYPE), FREE)
     assert (advice in found.findings) is (found.verdict == "partly_explained")
     reported = re.search(r"from ([\d.]+) mm to ([\d.]+) mm", finding_text(advice))
     assert reported is not None
@@ -45,18 +45,18 @@ def test_a_soft_arm_behind_a_rigid_cell_is_sent_to_the_fit(rigid: Model) -> None
 
 def test_nothing_is_reported_where_the_cell_names_flexibilities(rigid: Model) -> None:
     half = rigid.with_compliance(TYPE.axial / 2, TYPE.radial / 2)
-    assert softness_findings(half, log_of(TYPE), FREE) == []
+    assert flexibility_findings(half, log_of(TYPE), FREE) == []
 
 
 def test_nothing_is_reported_where_softness_is_not_the_main_thing(rigid: Model) -> None:
     log = log_of(STIFF)
     log.columns["actual_q"][:, 1] += 2e-3 * np.sin(3 * log.columns["actual_q"][:, 0])
-    assert softness_findings(rigid, log, FREE) == []
+    assert flexibility_findings(rigid, log, FREE) == []
 
 
 def test_nothing_is_reported_where_no_fit_can_be_made(rigid: Model) -> None:
     few = log_of(TYPE, poses=4)
-    assert softness_findings(rigid, few, FREE) == []
+    assert flexibility_findings(rigid, few, FREE) == []
 
 
 def test_what_is_withheld_is_not_offered(rigid: Model) -> None:

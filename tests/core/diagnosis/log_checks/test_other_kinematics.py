@@ -61,8 +61,8 @@ def test_another_builtin_arm_is_named() -> None:
 
 def test_a_point_of_the_cell_seen_from_the_tool_is_named_without_rotations() -> None:
     poses = TRUE.rigid_pose(Q)
-    seen = np.einsum("nji,nj->ni", poses.rotation, np.array([1.5, 0.2, 0.4]) - poses.position)
-    (note,) = reported(TRUE, Q, measured_position=seen)
+    inverted = np.einsum("nji,nj->ni", poses.rotation, np.array([1.5, 0.2, 0.4]) - poses.position)
+    (note,) = reported(TRUE, Q, measured_position=inverted)
     assert "they look inverted: the base seen from the tool: then 0.0 mm" in note
 
 

@@ -10,7 +10,7 @@ import small_arm as small
 
 from gapbridge.core.diagnosis.diagnosis import diagnose
 from gapbridge.core.diagnosis.selection import geometry
-from gapbridge.core.diagnosis.selection.problem import fit
+from gapbridge.core.diagnosis.selection.sample_space import fit
 from gapbridge.core.metrology import Metrology
 
 STRETCHED = tuple(
@@ -36,7 +36,7 @@ def singles():
     return space, fit(space, own)
 
 
-def test_a_search_that_finds_nothing_takes_no_links_away(singles, monkeypatch):
+def test_links_are_kept_if_the_search_with_them_finds_nothing(singles, monkeypatch):
     space, best = singles
     worse = replace(fit(space, ()), score=np.inf)
     monkeypatch.setattr(geometry, "screened_search", lambda *_, **__: worse)
@@ -55,7 +55,7 @@ def test_links_that_pay_less_than_the_set_are_no_cause(singles):
     assert links == {}
 
 
-def test_joints_zeros_have_a_size_of_their_own(singles):
+def test_joint_zeros_have_a_prior_of_their_own(singles):
     """An IRB 120's lengths are machined, its zeros are off by up to 35 mrad."""
     space, _ = singles
     block = geometry.link_candidates(space)
@@ -95,7 +95,7 @@ def test_the_size_of_the_links_errors_is_the_most_likely_one(singles, times, lea
     assert least <= np.median(found) <= most
 
 
-def test_numbers_held_nominal_of_a_link_that_is_accused_no_longer_are_of_no_account(singles):
+def test_nominal_parameters_of_a_withdrawn_link_are_ignored(singles):
     """All rows of a UR10 let a link fall of which a twist had been held."""
     space, _ = singles
     gone, kept, *_ = block = geometry.link_candidates(space)

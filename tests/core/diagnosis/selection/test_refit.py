@@ -15,8 +15,8 @@ from gapbridge.core.diagnosis.channels.position import observe
 from gapbridge.core.diagnosis.observation import Observation
 from gapbridge.core.diagnosis.selection.candidate import named_candidates, named_columns
 from gapbridge.core.diagnosis.selection.noise import estimate_noise
-from gapbridge.core.diagnosis.selection.problem import fit
 from gapbridge.core.diagnosis.selection.refit import refit
+from gapbridge.core.diagnosis.selection.sample_space import fit
 from gapbridge.core.diagnosis.selection.state import SelectionState, sample_space
 from gapbridge.core.metrology import Metrology
 
@@ -68,7 +68,7 @@ def test_a_large_offset_is_found_exactly_where_a_line_is_far_off(angle, joint):
         assert abs(found.values[0][0] - angle) > 1e-6  # the line alone
 
 
-def test_a_flexibility_is_refitted_from_nominal_where_no_arm_of_its_linear_value_stands():
+def test_a_flexibility_is_refitted_from_nominal_if_its_linear_value_has_no_equilibrium():
     soft = replace(small.NOMINAL, axial=np.array([0.0, 2e-5, 0.0]))
     start = (np.array([0.1]),)  # rad/Nm: the arm would turn over
     _, (term,), _, residual = refitted(exact(soft), [("axial_compliance", 2)], start=start)
@@ -92,7 +92,7 @@ def test_effects_that_meet_in_one_joint_are_refitted_together():
 
 @settings(max_examples=8, deadline=None)
 @given(seed=st.integers(0, 999))
-def test_where_the_instrument_stands_changes_nothing(seed):
+def test_the_instruments_pose_changes_nothing(seed):
     rng = np.random.default_rng(seed)
     frame = turn(rng.normal(0, 1.5, (1, 3)))[0], rng.uniform(-5, 5, 3)
     _, (term,), _, residual = refitted(
@@ -117,7 +117,7 @@ def test_the_reported_deviation_is_the_scatter_over_sessions():
     assert 0.6 < np.sqrt(np.mean(np.square(scores))) < 1.4
 
 
-def test_what_cannot_be_negative_stays_on_its_bound():
+def test_a_parameter_that_cannot_be_negative_is_kept_on_its_bound():
     ahead = small.turned(2, lambda s, q: 2e-4 * s.approach[:, 1])  # play the wrong way round
     _, (term,), _, _ = refitted(exact(ahead), [("backlash", 2)])
     assert term.values[0] == 0.0

@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import toy_space as toy
+import toy_candidates as toy
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gapbridge.core.diagnosis.selection.forward import exclusive
+from gapbridge.core.diagnosis.selection.forward_selection import exclusive
 from gapbridge.core.diagnosis.selection.local_search import improve, pruned, rivals
-from gapbridge.core.diagnosis.selection.problem import fit
+from gapbridge.core.diagnosis.selection.sample_space import fit
 from gapbridge.core.diagnosis.selection.search import (
-    by_what_is_left,
     part,
     screened,
     screened_search,
     search,
+    weighted_by_residual,
 )
 
 FAMILIES = [
@@ -41,7 +41,7 @@ def test_what_is_planted_is_found_whatever_the_order_of_candidates(seed, planted
     assert {len(FAMILIES) - 1 - c for c in search(turned).chosen} == found
 
 
-def test_hardly_anything_is_found_besides():
+def test_few_false_causes_are_found():
     spaces = [toy.random_space(seed, FAMILIES, rows=120, planted=(0,)) for seed in range(60)]
     assert sum(set(search(space).chosen) != {0} for space in spaces) <= 2
 
@@ -59,8 +59,8 @@ def test_no_term_may_be_dropped_or_exchanged_for_a_better_score(seed, size):
     assert found.score <= fit(space, ()).score
     assert found.score <= fit(space, (0, 7)).score + 1e-9
     for c in found.chosen:
-        rest = tuple(o for o in found.chosen if o != c)
-        assert fit(space, rest).score >= found.score - 1e-9
+        others = tuple(o for o in found.chosen if o != c)
+        assert fit(space, others).score >= found.score - 1e-9
     assert improve(space, found).score <= found.score
     assert pruned(space, found).chosen == found.chosen
 
@@ -81,7 +81,7 @@ def test_an_unnamed_function_wins_only_where_no_cause_does_its_work():
     assert search(toy.space_of(FAMILIES, both.y, X)).chosen == (3,)
 
 
-def test_what_stands_for_the_same_is_never_named_beside_each_other():
+def test_effects_that_exclude_each_other_are_never_in_one_set():
     candidates = [toy.named("axial_compliance", 1, 2), toy.named("stiffness_nonlinearity", 2, 2),
                   toy.named("axial_compliance", 1, 3)]  # fmt: skip
     candidates += FAMILIES[-6:]
@@ -105,7 +105,7 @@ def test_of_hundreds_of_lines_the_right_one_is_found_by_its_place_in_the_whole_s
     )
 
 
-def test_what_was_found_before_stays_within_reach():
+def test_a_known_set_is_among_the_screened_candidates():
     lines = [toy.named("transmission_error", 2, 1, order=float(o)) for o in range(1, 129)]
     space = toy.random_space(0, lines, planted=(20,), size=2.0)
     assert {3, 99} <= set(screened(space, base=(3, 99)))
@@ -134,13 +134,13 @@ def two_joints(rows: int = 600):
     return toy.space_of(candidates, y, X)
 
 
-def test_what_an_unknown_moves_one_joint_hides_no_cause_at_another():
+def test_an_unknown_at_one_joint_hides_no_cause_at_another():
     space = two_joints()
     assert set(search(space).chosen) == {4, NAMED}
 
 
-def test_without_the_unknown_each_joint_is_weighed_by_what_is_left_of_it():
+def test_each_joint_is_weighted_by_its_residual():
     space = two_joints()
     assert pruned(space, fit(space, (4,))).chosen == ()
-    near = by_what_is_left(space, (4,), 2)
+    near = weighted_by_residual(space, (4,), 2)
     assert pruned(near, fit(near, (4,))).chosen == (4,)

@@ -15,7 +15,7 @@ from gapbridge.core.log.log import read_log
     [("mixed:3", 1060004, ("stiffness_nonlinearity", (2,))),
      ("axial_compliance", 1090000, None)],
 )  # fmt: skip
-def test_a_curve_is_named_though_its_sigma_is_a_third_of_it_and_a_line_stays_one(
+def test_a_curve_with_a_sigma_of_a_third_is_accused_and_a_line_is_kept_linear(
     kind: str, seed: int, cause: tuple[str, tuple[int, ...]] | None, tmp_path
 ) -> None:
     """The softening's sigma grows with it: 2.4 of them where the likelihood gains 87."""

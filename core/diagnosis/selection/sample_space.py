@@ -1,4 +1,4 @@
-"""The sample space in which candidates compete: whitened, without nuisance, every try penalised."""
+"""The sample space in which candidates compete, the fit of a set in it, and the penalties."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ from gapbridge.core.diagnosis.criteria import (
 )
 from gapbridge.core.diagnosis.selection.candidate import Candidate
 
-RANK = 1e-10  # share of a column's square below which it counts as already explained
-DEPENDENT = 1e-8  # the same of one among several columns
+RANK = 1e-10  # share of a column's square below which it is linearly dependent on the set
+DEPENDENT = 1e-8  # the same of a candidate with several columns
 AT_ONCE = 60_000  # numbers of a temporary: 0.5 MB
-SENSED = ("N", "Nm", "N/s", "Nm/s")  # units of sensor biases, which may have any size
-USUAL_ORDERS = (1.0, 2.0, 3.0, 4.0)  # eccentricity and its kin
+SENSOR_UNITS = ("N", "Nm", "N/s", "Nm/s")  # of sensor biases, which may have any size
+USUAL_ORDERS = (1.0, 2.0, 3.0, 4.0)  # cycles per turn, of eccentricity and its harmonics
 
 
 @dataclass(frozen=True)
 class Blocks:
-    """Candidates with equally many columns, these at unit size."""
+    """Candidates with equally many columns, with the Gram matrices of their unit columns."""
 
     index: NDArray[np.int64]  # (n,) candidates
     columns: NDArray[np.int64]  # (n, d)
@@ -59,11 +59,11 @@ class SampleSpace:
     candidates: tuple[Candidate, ...]
     penalty: Array  # (C,)
     freedom: float  # m minus nuisance
-    floor: float  # variance of one coordinate that is known to be there
+    floor: float  # lower bound of the whitened variance
 
     @cached_property
     def blocks(self) -> tuple[Blocks, ...]:
-        """Return the candidates by their number of columns."""
+        """Return the candidates grouped by their number of columns."""
         size = np.diff(self.start)
         return tuple(
             _blocks(self.X, index, self.start[index][:, None] + np.arange(d))
@@ -82,7 +82,7 @@ class SampleSpace:
         return np.concatenate(parts) if parts else np.zeros(0, dtype=np.int64)
 
     def misfit(self, rss: Array) -> Array:
-        """Return -2 log likelihood of residual sums of squares, variance profiled out."""
+        """Return -2 log likelihood of residual sums of squares, with the variance profiled out."""
         variance = np.maximum(rss / self.freedom, self.floor)
         return np.asarray(self.freedom * np.log(variance) + rss / variance)
 
@@ -99,7 +99,7 @@ class CandidateFit:
 
 
 def penalties(candidates: Sequence[Candidate], freedom: float) -> Array:
-    """Return what each candidate pays: d log m + 2 log(number of its like) + a margin."""
+    """Return the penalty of each candidate: d log m + 2 log(number of its kind) + a margin."""
     families = {c.family for c in candidates if c.named} or {""}
     count: dict[str, int] = {}
     for c in candidates:
@@ -114,29 +114,29 @@ def penalties(candidates: Sequence[Candidate], freedom: float) -> Array:
 
 
 def _kind(candidate: Candidate) -> str:
-    """Return among how many of its like a candidate was tried: usual lines are few."""
+    """Return the kind among which a candidate counts as one of many hypotheses."""
     if candidate.periodic and (candidate.site.order or 0) in USUAL_ORDERS:
         return "usual lines"
-    if candidate.of_no_quantity:
+    if candidate.without_quantity:
         return "rivals"
     return candidate.family
 
 
 def gains(space: SampleSpace, r: Array, along: Array | None = None) -> tuple[Array, Array]:
-    """Return how much of |r|^2 each candidate takes (C,), and its first value's sign (C,).
+    """Return by how much each candidate reduces |r|^2 (C,), and the sign of its first value (C,).
 
-    ``along`` (p, K) are the columns' parts along an orthonormal basis that is projected out of
-    them; ``r`` is free of it.
+    ``along`` (p, K) are the columns' components along an orthonormal basis that is projected out;
+    ``r`` is orthogonal to it.
     """
     within = np.zeros((0, space.X.shape[1])) if along is None else along
     g = space.X.T @ r
     gain, sign = np.zeros(len(space.candidates)), np.ones(len(space.candidates))
     for blocks in space.blocks:
         products = (g[blocks.columns] * blocks.unit).T
-        taken = within[:, blocks.columns] * blocks.unit
+        inside = within[:, blocks.columns] * blocks.unit
         d, n = products.shape
         whole = np.zeros((d + 1, d + 1, n))  # products of the columns and, last, of r
-        np.subtract(blocks.gram, np.einsum("pci,pcj->ijc", taken, taken), out=whole[:d, :d])
+        np.subtract(blocks.gram, np.einsum("pci,pcj->ijc", inside, inside), out=whole[:d, :d])
         whole[d, :d] = whole[:d, d] = products
         gain[blocks.index] = -_eliminated(whole, RANK if d == 1 else DEPENDENT)
         if d == 1:
@@ -145,7 +145,7 @@ def gains(space: SampleSpace, r: Array, along: Array | None = None) -> tuple[Arr
 
 
 def _eliminated(products: Array, least: float) -> Array:
-    """Return what n matrices (d, d, n) have last on the diagonal (n,) after Gaussian elimination.
+    """Return the last diagonal element (n,) of n matrices (d, d, n) after Gaussian elimination.
 
     They are overwritten. A pivot of ``least`` or less counts as zero, and so does its column.
     """
@@ -156,14 +156,14 @@ def _eliminated(products: Array, least: float) -> Array:
 
 
 def fit(space: SampleSpace, chosen: Sequence[int]) -> CandidateFit:
-    """Return the joint fit of a set; its score is infinite where it breaks a bound or is absurd."""
+    """Return the joint fit of a set; its score is infinite if a value is not plausible."""
     if not chosen:
         rss = float(space.y @ space.y)
         return CandidateFit((), float(space.misfit(np.array(rss))), rss)
     X = space.columns(chosen)
     unit = 1 / np.sqrt(np.einsum("ij,ij->j", X, X) + 1e-300)
     U, s, V = np.linalg.svd(X * unit, full_matrices=False)
-    V = V[s > 1e-6 * s[0]] / s[s > 1e-6 * s[0], None]  # of nearly dependent columns the mean
+    V = V[s > 1e-6 * s[0]] / s[s > 1e-6 * s[0], None]  # minimum norm if nearly dependent
     solution = V.T @ (space.y @ U)[: len(V)]
     rss = float(np.sum((space.y - (X * unit) @ solution) ** 2))
     variance = max(rss / max(space.freedom - X.shape[1], 1.0), space.floor)
@@ -175,7 +175,7 @@ def fit(space: SampleSpace, chosen: Sequence[int]) -> CandidateFit:
     parts, spread = [values[o] for o in slices], [deviation[o] for o in slices]
     families = {"", *(space.candidates[c].family for c in chosen)}
     for c, x, s in zip(chosen, parts, spread, strict=True):
-        if space.candidates[c].beside not in families:
+        if space.candidates[c].requires not in families:
             score = np.inf
         if not _plausible(space.candidates[c], x, s):
             score = np.inf
@@ -191,9 +191,9 @@ def _plausible(candidate: Candidate, x: Array, s: Array) -> bool:
         lower = -np.inf if candidate.curve is not None else parameter.lower
         if value < lower - OUT_OF_BOUNDS_SIGMAS * deviation or value > parameter.upper:
             return False
-        most = (
+        limit = (
             MAX_SOFTENING if parameter.name == "softening" else MAX_TIMES_USUAL
         ) * parameter.scale
-        if parameter.unit not in SENSED and abs(value) - TOO_LARGE_SIGMAS * deviation > most:
+        if parameter.unit not in SENSOR_UNITS and abs(value) - TOO_LARGE_SIGMAS * deviation > limit:
             return False
     return True

@@ -1,4 +1,4 @@
-"""How large a channel's gap is, nothing fitted and with the causes in the model."""
+"""Sizes of a channel's gap, with the nominal model and with the causes in it."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapbridge.core.arrays import Array
-from gapbridge.core.diagnosis.every_row.streamed import Streamed
+from gapbridge.core.diagnosis.all_rows.row_sums import Streamed
 from gapbridge.core.diagnosis.noise_floor import block_means, own_coordinates
 from gapbridge.core.diagnosis.observation import Observation
 from gapbridge.core.diagnosis.selection.selection import Selection
@@ -18,24 +18,24 @@ from gapbridge.core.estimation.least_squares import solve
 
 @dataclass(frozen=True)
 class Sizes:
-    """How large a channel's gap is over all rows that are no outliers, in the channel's unit."""
+    """Sizes of a channel's gap over all inliers, in the channel's unit."""
 
-    samples: int  # outliers too
+    samples: int  # outliers included
     gap_rms: float
     gap_max: float
     remaining_rms: float  # rms with the causes in the model
     outliers: NDArray[np.int64]  # rows of the log
-    means: Array | None  # (bins, k) of what is left, over time
+    means: Array | None  # (bins, k) of the residual, over time
 
 
 def _counted(observation: Observation) -> int:
-    """Return how many coordinates count in an rms: a wrench's torques weighed."""
+    """Return how many coordinates count in an rms: a wrench's weighted torques do."""
     k = observation.measured.shape[1]
     return own_coordinates(observation) if observation.channel == "position" else k
 
 
 def sizes_of(selection: Selection, gap: Array, remaining: Array) -> Sizes:
-    """Return the sizes of a gap (N, k) and of what remains of it, in a selection's samples."""
+    """Return the sizes of a gap (N, k) and of the remaining one, in a selection's samples."""
     observation, kept = selection.observation, selection.kept
     counted, in_unit = _counted(observation), own_coordinates(observation)
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from gapbridge.core.diagnosis.selection.candidate import Candidate
-from gapbridge.core.diagnosis.selection.problem import SampleSpace, penalties
+from gapbridge.core.diagnosis.selection.sample_space import SampleSpace, penalties
 from gapbridge.core.effects import Parameter, Site
 
 

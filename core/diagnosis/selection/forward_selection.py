@@ -1,4 +1,4 @@
-"""Sets of candidates that grow term by term, several side by side (a beam)."""
+"""Forward selection of sets of candidates, several in parallel (beam search)."""
 
 from __future__ import annotations
 
@@ -9,34 +9,34 @@ import numpy as np
 
 from gapbridge.core.arrays import Array
 from gapbridge.core.diagnosis.criteria import MAX_LINES, MAX_SMOOTH_TERMS, MIN_ORDERS_APART
-from gapbridge.core.diagnosis.selection.problem import CandidateFit, SampleSpace, fit, gains
+from gapbridge.core.diagnosis.selection.sample_space import CandidateFit, SampleSpace, fit, gains
 from gapbridge.core.estimation.least_squares import basis_of, projected_out
 
 BEAM = 6
 DEPTH = 9
 PATIENCE = 2  # depths without a better set before the beam stops
-DEPENDENT = 1e-5  # share of a block below which a direction counts as given by its others
+DEPENDENT = 1e-5  # share of a block below which a direction counts as linearly dependent
 
 
 @dataclass
 class State:
-    """A set that grows: what its terms leave of the columns and of the gap."""
+    """A set with the projection of all columns and of the gap on its terms."""
 
     chosen: tuple[int, ...]
     basis: Array  # (m, r) orthonormal, of the chosen columns
     along: Array  # (r, K) parts of all columns along it
-    r: Array
+    r: Array  # (m,) residual
     rss: float
     score: float
 
 
 def exclusive(space: SampleSpace, chosen: Sequence[int], new: int) -> bool:
-    """Return whether a candidate stands instead of, not beside, one that is chosen."""
+    """Return whether a candidate cannot be in a set together with the chosen ones."""
     b = space.candidates[new]
     lines = 0
     if not b.named and sum(not space.candidates[c].named for c in chosen) >= MAX_SMOOTH_TERMS:
         return True
-    if b.beside and b.beside not in {space.candidates[c].family for c in chosen}:
+    if b.requires and b.requires not in {space.candidates[c].family for c in chosen}:
         return True
     for c in chosen:
         a = space.candidates[c]
@@ -99,7 +99,7 @@ def joining(space: SampleSpace, chosen: Sequence[int], width: int) -> list[tuple
 def beam_search(
     space: SampleSpace, allowed_depth: int = DEPTH, beam: int = BEAM, named_only: bool = False
 ) -> list[CandidateFit]:
-    """Return the best sets met, best first (the empty one among them)."""
+    """Return the best sets tried, best first (the empty one among them)."""
     rss = float(space.y @ space.y)
     empty = replace(projected(space, ()), score=float(space.misfit(np.array(rss))))
     states, best, waited = [empty], empty.score, 0

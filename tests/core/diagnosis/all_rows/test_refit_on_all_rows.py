@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 import small_arm as small
 
-from gapbridge.core.diagnosis.every_row import refitted as every_row
-from gapbridge.core.diagnosis.every_row.refitted import (
-    on_every_row,
+from gapbridge.core.diagnosis.all_rows import refit_on_all_rows as all_rows
+from gapbridge.core.diagnosis.all_rows.refit_on_all_rows import (
+    accused_on_all_rows,
+    fitted_on_all_rows,
     refitted,
-    still_accused,
-    with_uncertain_terms,
+    with_undecided_terms,
 )
 from gapbridge.core.diagnosis.held_out import HeldOut
-from gapbridge.core.diagnosis.judgement import VAGUE, Judgement, judge
+from gapbridge.core.diagnosis.judgement import NOT_SIGNIFICANT, Judgement, judge
 from gapbridge.core.diagnosis.selection.selection import Selection
 from gapbridge.core.effects import Site, Term, effect_named
 
@@ -31,7 +31,7 @@ def searched():
     return selection, judge(selection, HeldOut(selection))
 
 
-def test_what_stays_beside_the_unknown_keeps_its_scatter_among_regions():
+def test_covariances_with_an_unknown_effect_include_the_scatter_among_regions():
     """One accusation falls: the others' intervals were those of white noise from then on."""
     selection = small.diagnosed("cross_coupling").channels[0].selection
     everything = tuple(range(len(selection.terms)))
@@ -43,39 +43,41 @@ def test_what_stays_beside_the_unknown_keeps_its_scatter_among_regions():
 
 def on_all(selection, judgement):
     """Return the selection on all rows, and its held-out figures."""
-    whole = on_every_row(selection, judgement, selection.observation, small.model_of())
+    whole = fitted_on_all_rows(selection, judgement, selection.observation, small.model_of())
     return whole, HeldOut(whole)
 
 
 def withdrawn_as_vague(judgement, position):
     rest = tuple(p for p in judgement.accused if p != position)
-    return replace(judgement, accused=rest, withdrawn=(*judgement.withdrawn, (position, VAGUE)))
+    return replace(
+        judgement, accused=rest, withdrawn=(*judgement.withdrawn, (position, NOT_SIGNIFICANT))
+    )
 
 
-def test_what_was_too_vague_on_some_rows_is_accused_where_all_rows_are_sure(searched):
+def test_a_term_not_significant_on_some_rows_is_accused_if_significant_on_all(searched):
     selection, judgement = searched
     position = judgement.accused[0]
-    asked = with_uncertain_terms(withdrawn_as_vague(judgement, position))
-    assert asked.vague == (position,)
-    whole, held = on_all(selection, asked)
-    _, decided = still_accused(whole, asked, held, ALONE)
+    requested = with_undecided_terms(withdrawn_as_vague(judgement, position))
+    assert requested.undecided == (position,)
+    whole, held = on_all(selection, requested)
+    _, decided = accused_on_all_rows(whole, requested, held, ALONE)
     assert position in decided.accused
     assert position not in dict(decided.withdrawn)
 
 
-def test_what_is_vague_on_all_rows_too_is_withdrawn(searched):
+def test_a_term_not_significant_on_all_rows_is_withdrawn(searched):
     selection, judgement = searched
     position = judgement.accused[0]
-    asked = with_uncertain_terms(withdrawn_as_vague(judgement, position))
-    whole, held = on_all(selection, asked)
+    requested = with_undecided_terms(withdrawn_as_vague(judgement, position))
+    whole, held = on_all(selection, requested)
     covariance = list(whole.covariance)
     value = np.array(whole.terms[position].values[: len(covariance[position])])
     covariance[position] = np.diag((value / 4.0) ** 2)  # enough for a word, not for an accusation
     unsure = replace(whole, covariance=tuple(covariance))
-    _, decided = still_accused(unsure, asked, held, ALONE)
+    _, decided = accused_on_all_rows(unsure, requested, held, ALONE)
     assert position not in decided.accused
-    assert dict(decided.withdrawn)[position] == VAGUE
-    _, kept = still_accused(unsure, judgement, held, ALONE)
+    assert dict(decided.withdrawn)[position] == NOT_SIGNIFICANT
+    _, kept = accused_on_all_rows(unsure, judgement, held, ALONE)
     assert position in kept.accused  # what some rows were sure of is not asked again
 
 
@@ -93,44 +95,51 @@ class OnAllRows:
         self.space = SimpleNamespace(candidates=own)
 
     _in_geometry, is_link = Selection._in_geometry, Selection.is_link
-    judged_together, far_off = Selection.judged_together, Selection.far_off
+    judged_together, implausible_parameters = (
+        Selection.judged_together,
+        Selection.implausible_parameters,
+    )
 
     def with_nominal(self, numbers):
         (held,) = numbers.values()
         return OnAllRows(tuple(np.where(held, 0.0, self.terms[0].values)), self.terms[1].values)
 
 
-def test_a_length_that_all_rows_leave_open_is_held_nominal():
+def test_a_length_not_identifiable_on_all_rows_is_kept_nominal():
     """9,529 rows of a UR10 named a link of 71 mm +- 37 mm under a prior of 0.5 mm."""
     found = OnAllRows((1e-3, 0.071, 1e-3), (5e-4,))
-    asked = Judgement((0, 1), True, 0.0, (), {}, ())
-    left, decided = every_row._sure(found, asked, lambda selection, accused: selection)
-    assert left.terms[0].values == (1e-3, 0.0, 1e-3)
+    requested = Judgement((0, 1), True, 0.0, (), {}, ())
+    selection, decided = all_rows._significant(
+        found, requested, lambda selection, accused: selection
+    )
+    assert selection.terms[0].values == (1e-3, 0.0, 1e-3)
     assert decided.accused == (0, 1)
 
 
-def test_what_is_left_once_others_fell_is_asked_anew(monkeypatch):
+def test_remaining_terms_are_tested_again_after_a_withdrawal(monkeypatch):
     """Without its lines a UR10's link took 55 mm +- 18 mm, after all had been sure."""
     found = OnAllRows((1e-3, 1e-3, 1e-3), (5e-4,))
     without_line = OnAllRows((1e-3, 0.055, 1e-3), (5e-4,))
-    monkeypatch.setattr(every_row, "not_constant", lambda *_: {1: "actual_q_1"})
-    monkeypatch.setattr(every_row, "ties_of", lambda *_: {})
+    monkeypatch.setattr(all_rows, "not_constant", lambda *_: {1: "actual_q_1"})
+    monkeypatch.setattr(all_rows, "ties_of", lambda *_: {})
     monkeypatch.setattr(OnAllRows, "working", None, raising=False)
     monkeypatch.setattr(OnAllRows, "best", None, raising=False)
 
     def alone(selection, accused):
         return selection if 1 in accused or selection is not found else without_line
 
-    asked = Judgement((0, 1), True, 0.0, (), {}, ())
-    left, decided = still_accused(found, asked, SimpleNamespace(possible=False), alone)
+    requested = Judgement((0, 1), True, 0.0, (), {}, ())
+    selection, decided = accused_on_all_rows(
+        found, requested, SimpleNamespace(possible=False), alone
+    )
     assert decided.accused == (0,)
-    assert left.terms[0].values == (1e-3, 0.0, 1e-3)
+    assert selection.terms[0].values == (1e-3, 0.0, 1e-3)
 
 
 @pytest.mark.parametrize(("zero", "stays"), [(2.9e-4, (0,)), (3.1e-4, (0, 1))])
-def test_a_zero_among_the_links_that_some_rows_left_open_needs_three_sigmas(zero, stays):
+def test_an_undecided_joint_zero_of_the_links_needs_three_sigmas(zero, stays):
     """It has a prior: without it the links of a UR10 stood for 0.57 mrad +- 0.13 mrad."""
     found = OnAllRows((1e-3, 1e-3, 1e-3), (zero,))
-    asked = Judgement((0, 1), True, 0.0, (), {}, (), vague=(1,))
-    _, decided = every_row._sure(found, asked, lambda selection, accused: selection)
+    requested = Judgement((0, 1), True, 0.0, (), {}, (), undecided=(1,))
+    _, decided = all_rows._significant(found, requested, lambda selection, accused: selection)
     assert decided.accused == stays

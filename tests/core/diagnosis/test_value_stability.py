@@ -10,18 +10,18 @@ import pytest
 import small_arm as small
 
 from benchmarks.blind.session import Plan
-from gapbridge.core.diagnosis import remainder
+from gapbridge.core.diagnosis import value_stability
 from gapbridge.core.diagnosis.channels.position import observe as observe_position
 from gapbridge.core.diagnosis.channels.wrench import observe
-from gapbridge.core.diagnosis.criteria import NEGLIGIBLE
+from gapbridge.core.diagnosis.criteria import NEGLIGIBLE_SIZE
 from gapbridge.core.diagnosis.diagnosis import diagnose
 from gapbridge.core.diagnosis.finding import Check, Withdrawal
 from gapbridge.core.diagnosis.held_out import HeldOut
-from gapbridge.core.diagnosis.judgement import Judgement, judge, judge_geometry, still_sure
-from gapbridge.core.diagnosis.remainder import closes_everywhere, withstanding
+from gapbridge.core.diagnosis.judgement import Judgement, judge, judge_geometry, significant_alone
 from gapbridge.core.diagnosis.selection import rounds
-from gapbridge.core.diagnosis.selection.candidate import named_candidates, with_what_it_needs
-from gapbridge.core.diagnosis.selection.refit import Remainder, _cluster_covariance, worth
+from gapbridge.core.diagnosis.selection.candidate import named_candidates, with_requirement
+from gapbridge.core.diagnosis.selection.refit import UnnamedPart, _cluster_covariance, worth
+from gapbridge.core.diagnosis.value_stability import links_close_gap, stable_effects
 from gapbridge.core.effects import CATALOGUE, Site, Term
 from gapbridge.core.metrology import Metrology
 
@@ -64,14 +64,14 @@ def accused_of(plant, error):
     return {c.effect for c in channel.causes}, channel
 
 
-def test_the_mean_of_an_unknown_wrench_is_no_bias_of_the_sensor(plant):
+def test_the_mean_of_an_unknown_wrench_is_not_a_bias(plant):
     accused, channel = accused_of(plant, hose)
     assert accused == set()
     assert channel.structured
     assert "actual_q_4" in [name for name, _ in channel.depends_on[:3]]
 
 
-def test_a_bias_that_the_unknown_cannot_be_is_accused_beside_it(plant):
+def test_a_bias_outside_the_span_of_the_unknown_is_accused(plant):
     accused, channel = accused_of(plant, lambda q: hose(q) + 12 * WAY)
     assert accused == {"ft_bias"}
     (cause,) = channel.causes
@@ -86,9 +86,9 @@ def test_gain_and_turn_and_centre_wait_for_a_load(plant):
     def beside(mass, effect):
         log = wrench_log(plant, hose, declared=mass > 0)
         model = plant.model(mass)
-        seen = observe(model, log, Metrology())
+        observation = observe(model, log, Metrology())
         (own,) = [c for c in named_candidates(model.arm, "wrench") if c.family == effect]
-        return with_what_it_needs(seen, own).beside
+        return with_requirement(observation, own).requires
 
     for effect in ("ft_gain", "ft_misalignment", "payload_cog"):
         assert (beside(0.0, effect), beside(2.0, effect)) == ("payload", "")
@@ -111,8 +111,8 @@ def linear(seed, shift):
     region = np.repeat(np.arange(24), 10)
     A = np.column_stack([np.ones(240), rng.normal(size=240)])
     b = A @ [1.0, 2.0] + rng.normal(size=240) + shift * rng.normal(size=24)[region]
-    left = b - A @ np.linalg.lstsq(A, b, rcond=None)[0]
-    white = np.linalg.inv(A.T @ A) * float(left @ left) / 238
+    residual = b - A @ np.linalg.lstsq(A, b, rcond=None)[0]
+    white = np.linalg.inv(A.T @ A) * float(residual @ residual) / 238
     return white, A, b, region
 
 
@@ -133,7 +133,7 @@ def test_intervals_hold_where_regions_differ():
     assert np.mean(np.abs(naive) < 1.96) < 0.8
 
 
-def test_rows_after_the_regions_are_a_prior_that_always_stays():
+def test_rows_of_the_prior_are_never_left_out():
     white, A, b, region = linear(0, 0.0)
     held = np.vstack([A, [1e6, 0.0]])
     spread = _cluster_covariance(white * 0, held, np.append(b, 1e6), region)
@@ -172,44 +172,46 @@ def test_all_links_are_accused_where_they_close_the_gap_everywhere(links):
 @pytest.mark.parametrize("effect", ["cross_coupling", "backlash"])
 def test_links_that_close_no_gap_are_not_accused(effect):
     whole, judgement = fallen(small.diagnosed(effect).channels[0].selection)
-    assert not closes_everywhere(whole, ())
+    assert not links_close_gap(whole, ())
     found, again = judge_geometry(replace(whole, prior={}), judgement, small.model_of().arm)
     assert again is judgement
     assert not found.block
 
 
-def test_a_tool_point_goes_with_the_links_where_it_helps_elsewhere(monkeypatch):
+def test_a_tool_point_is_accused_with_the_links_if_it_helps_in_new_regions(monkeypatch):
     session = small.session_of(0)
     off = np.array([2e-3, -1e-3, 3e-3])
     real = replace(small.NOMINAL, rows=STRETCHED, tool_position=small.TOOL + off)
     log = small.log_of(session, small.readings(real, session))
-    seen = diagnose(small.model_of(), log, Metrology(registered=True, sigma=small.SIGMA))
-    whole, _ = fallen(seen.channels[0].selection)
+    result = diagnose(small.model_of(), log, Metrology(registered=True, sigma=small.SIGMA))
+    whole, _ = fallen(result.channels[0].selection)
     own = whole.space.candidates
     point = [c for c, k in enumerate(own) if k.family == "tool_frame"]
     lines = [c for c, k in enumerate(own) if k.periodic][:1]
-    asked = []
+    requested = []
 
     def strengths(_, accused):  # beside an unknown that moves the tool its point is the least sure
-        asked.append(set(accused))
+        requested.append(set(accused))
         return np.array([0.0 if c in point else 0.5 + (len(accused) < 3) for c in accused])
 
-    monkeypatch.setattr(remainder._Beside, "strengths", strengths)
-    monkeypatch.setattr(remainder._Closing, "takes", lambda *_: False)  # by their strengths alone
+    monkeypatch.setattr(value_stability._UnnamedFunctions, "strengths", strengths)
+    monkeypatch.setattr(
+        value_stability._GapClosure, "needs_any", lambda *_: False
+    )  # by their strengths alone
     zero = [c for c, k in enumerate(own) if k.family == "backlash"][:1]
-    stays, *_ = withstanding(whole, [*point, *lines, *zero])
-    assert asked[1] > {*point}  # the others are judged with the point, not with its gap
-    assert {*stays} >= {*point}
-    found, *_ = withstanding(replace(whole, prior={}), point)
+    kept, *_ = stable_effects(whole, [*point, *lines, *zero])
+    assert requested[1] > {*point}  # the others are judged with the point, not with its gap
+    assert {*kept} >= {*point}
+    found, *_ = stable_effects(replace(whole, prior={}), point)
     assert found == []  # no links are a cause
 
 
-def test_links_are_sized_anew_beside_what_stays(links):
+def test_the_links_prior_is_estimated_again_for_the_remaining_terms(links):
     whole, _ = fallen(links)
     wrong = replace(whole, prior={c: 8 * own for c, own in whole.prior.items()})
-    sized = wrong.sized_beside(whole.best.chosen)
+    sized = wrong.with_prior_for(whole.best.chosen)
     assert all(np.array_equal(sized.prior[c], own) for c, own in whole.prior.items())
-    assert whole.sized_beside(whole.best.chosen) is whole
+    assert whole.with_prior_for(whole.best.chosen) is whole
 
 
 @pytest.mark.parametrize(
@@ -224,7 +226,7 @@ def test_links_are_sized_anew_beside_what_stays(links):
         ("transmission_error", 17.0, (2.0, 2.0), np.array([[1.0, 0.9], [0.9, 1.0]]), False),
     ],
 )
-def test_a_finding_has_a_number_that_is_sure(effect, order, values, spread, sure):
+def test_a_significant_term_has_a_significant_parameter(effect, order, values, spread, sure):
     assert (worth(Term(effect, Site(2, order), values), spread) >= 1) is sure
 
 
@@ -241,13 +243,13 @@ def beside_a_single_link():
     return replace(whole, prior={}), Judgement((one,), True, 0.0, (), {}, ())
 
 
-def test_all_links_and_zeros_stand_for_the_one_that_leaves_much(beside_a_single_link):
+def test_all_links_replace_a_single_one_that_leaves_a_large_residual(beside_a_single_link):
     alone, judgement = beside_a_single_link
     found, again = judge_geometry(alone, judgement, small.model_of().arm)
     assert {found.terms[p].effect for p in again.accused} == {"link_geometry", "joint_offset"}
 
 
-def test_a_link_beside_which_nothing_is_left_stays_the_only_one(beside_a_single_link):
+def test_a_single_link_that_closes_the_gap_is_kept(beside_a_single_link):
     alone, judgement = beside_a_single_link
     enough = replace(judgement, structured=False)
     assert judge_geometry(alone, enough, small.model_of().arm) == (alone, enough)
@@ -257,26 +259,29 @@ def test_a_value_far_below_its_usual_size_is_no_accusation():
     found = small.diagnosed("backlash").channels[0].selection
     (term,), (c,) = found.terms, found.term_index
     usual = found.space.candidates[c].parameters[0].scale
-    for size, stays in ((0.5 * NEGLIGIBLE * usual, False), (2 * NEGLIGIBLE * usual, True)):
+    for size, kept in (
+        (0.5 * NEGLIGIBLE_SIZE * usual, False),
+        (2 * NEGLIGIBLE_SIZE * usual, True),
+    ):
         small_one = replace(
             found, terms=(term.with_values(np.array([size])),),
             covariance=(np.array([[(size / 50) ** 2]]),),
         )  # fmt: skip
         judged = judge(small_one, HeldOut(found))
-        assert (len(judged.accused) == 1) is stays
-        assert stays or judged.withdrawn == ((0, Withdrawal(Check.USUAL_SIZE)),)
+        assert (len(judged.accused) == 1) is kept
+        assert kept or judged.withdrawn == ((0, Withdrawal(Check.USUAL_SIZE)),)
 
 
-def test_what_is_no_longer_sure_beside_the_unknown_is_taken_back():
+def test_a_term_not_significant_with_unnamed_functions_is_withdrawn():
     found = small.diagnosed("backlash").channels[0].selection
     judgement = judge(found, HeldOut(found))
     arm = small.model_of().arm
-    assert still_sure(found, judgement, arm)[1] is judgement
+    assert significant_alone(found, judgement, arm)[1] is judgement
     rows = len(found.space.y)
     # an unnamed function that does the very same as the accused
     twin = found.space.columns(found.term_index)
-    unknown = Remainder(twin, np.full(twin.shape[1], np.inf), np.arange(rows) // 3 % 20)
-    _, judged = still_sure(found, replace(judgement, remainder=unknown), arm)
+    unknown = UnnamedPart(twin, np.full(twin.shape[1], np.inf), np.arange(rows) // 3 % 20)
+    _, judged = significant_alone(found, replace(judgement, unnamed_part=unknown), arm)
     assert judged.accused == ()
     assert judged.structured
     assert [p for p, _ in judged.withdrawn] == [0]
@@ -289,18 +294,20 @@ def test_every_member_that_waits_for_another_names_one_of_its_channel():
             assert set(effect.channels) & set(other.channels)
 
 
-def test_what_the_exact_refit_takes_back_gives_its_place_to_another(monkeypatch):
+def test_a_term_removed_by_the_refit_is_replaced_by_another(monkeypatch):
     """Without reversals play is an offset: where the one has no value, the other is found."""
     one_sided = small.session_of(3, Plan(poses=60, both_sides=False))
     real = small.turned(2, lambda s, q: np.full(len(q), -4.5e-4))
     log = small.log_of(one_sided, small.readings(real, one_sided, 3))
-    seen = observe_position(small.model_of(), log, Metrology(registered=True, sigma=small.SIGMA))
-    (first,) = rounds.select(seen, small.model_of()).terms
+    observation = observe_position(
+        small.model_of(), log, Metrology(registered=True, sigma=small.SIGMA)
+    )
+    (first,) = rounds.select(observation, small.model_of()).terms
 
     def worthless(term, spread):
         return 0.0 if term.effect == first.effect else worth(term, spread)
 
     monkeypatch.setattr(rounds, "worth", worthless)
-    (instead,) = rounds.select(seen, small.model_of()).terms
+    (instead,) = rounds.select(observation, small.model_of()).terms
     assert {first.effect, instead.effect} == {"joint_offset", "backlash"}
     assert instead.site.joint == 2

@@ -1,7 +1,7 @@
-"""Recordings too long for memory: an excerpt to search in, and blocks that each row is judged in.
+"""Recordings too long for memory: an excerpt for the search, and blocks for the validation.
 
-Blocks follow each other; each brings the rows before it that its delays look back to, and the
-derivatives of the rows around it.
+Blocks are consecutive. Each has the preceding rows that delays need, and derivatives computed with
+the neighbouring rows.
 """
 
 from __future__ import annotations
@@ -16,18 +16,18 @@ from gapbridge.core.arrays import Index
 from gapbridge.core.log.log import Log
 from gapbridge.core.motion import EDGE, LEAD, check_order, is_moving, motion_of, with_motion
 
-WHOLE = 30_000  # rows of a recording that are looked at as a whole
+WHOLE = 30_000  # rows up to which a recording is processed at once
 EXCERPT = 20_000  # rows of an excerpt
 WINDOW, FEWEST = 1.0, 500  # s and rows of each window of an excerpt, at least
 WINDOWS = 12  # at least
-DERIVED = 32_768  # rows whose derivatives are taken at a time
-BLOCK = 4096  # rows judged at a time: what the processor's cache holds
-BLOCKS = 120  # at least: conditions, regions and their borders are made of blocks
+DERIVED = 32_768  # rows whose derivatives are computed at a time
+BLOCK = 4096  # rows of a block, for the processor's cache
+BLOCKS = 120  # at least, because conditions and regions consist of blocks
 
 
 @dataclass(frozen=True)
 class Block:
-    """Rows ``begin`` to ``end`` of a recording, with those before them that they need."""
+    """Rows ``begin`` to ``end`` of a recording, with the preceding ones that they need."""
 
     log: Log  # of rows ``first`` to ``end``
     first: int
@@ -37,7 +37,7 @@ class Block:
 
 @dataclass(frozen=True)
 class LongRecording:
-    """A log of motion that is searched by an excerpt, and judged block by block."""
+    """A recording that is searched in an excerpt and validated block by block."""
 
     log: Log
     excerpt: Log  # windows of neighbouring rows, evenly spread
@@ -45,7 +45,7 @@ class LongRecording:
     step: float  # s between rows
 
     def __iter__(self) -> Iterator[Block]:
-        """Yield the blocks in order; no block reaches over two sessions."""
+        """Yield the blocks in order, each within one session."""
         start, still = float(self.log.columns["timestamp"][0]), motion_of(self.excerpt).still
         lead = min(int(np.ceil(LEAD / self.step)), BLOCK)
         for ends in self._groups():
@@ -60,7 +60,7 @@ class LongRecording:
                 yield Block(with_motion(rows, own), first, begin, end)
 
     def _groups(self) -> Iterator[list[int]]:
-        """Yield the borders of neighbouring blocks whose derivatives are taken together."""
+        """Yield the limits of neighbouring blocks whose derivatives are computed together."""
         count = len(self.log)
         session = self.log.columns["session"] if self.log.session_names else np.zeros(1)
         changes = [int(c) + 1 for c in np.flatnonzero(np.diff(session))]
@@ -74,9 +74,9 @@ class LongRecording:
 
 
 def long_recording(log: Log) -> LongRecording | None:
-    """Return a log of motion that is too long to be looked at as a whole; None: it is not.
+    """Return a recording that is too long to be processed at once; None: it is not.
 
-    Raises LogError where a time or an angle is no number, or time runs backwards.
+    Raises LogError if a time or an angle is not finite, or time decreases.
     """
     if len(log) <= WHOLE or not log.has("timestamp"):
         return None

@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import toy_space as toy
+import toy_candidates as toy
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gapbridge.core.diagnosis.selection.forward import forward_step, joining, projected
-from gapbridge.core.diagnosis.selection.problem import fit, gains, penalties
+from gapbridge.core.diagnosis.selection.forward_selection import forward_step, joining, projected
+from gapbridge.core.diagnosis.selection.sample_space import fit, gains, penalties
 
 FAMILIES = [toy.named("a", 1, 1), toy.named("a", 1, 2), toy.named("b", 3), toy.named("c", 2),
             toy.smooth("time", size=4)]  # fmt: skip
@@ -27,8 +27,8 @@ def test_a_fit_is_the_least_squares_solution(seed, chosen):
     found = fit(space, chosen)
     X = space.columns(chosen)
     expected = np.linalg.lstsq(X, space.y, rcond=None)[0] if chosen else np.zeros(0)
-    left = space.y - X @ expected
-    assert found.rss == pytest.approx(float(left @ left))
+    residual = space.y - X @ expected
+    assert found.rss == pytest.approx(float(residual @ residual))
     assert np.allclose(np.concatenate([*found.values, []]), expected)
     paid = space.penalty[list(chosen)].sum()
     assert found.score == pytest.approx(float(space.misfit(np.array(found.rss))) + paid)

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from gapbridge.core.diagnosis import diagnosis, remainder
+from gapbridge.core.diagnosis import diagnosis, value_stability
 from gapbridge.core.diagnosis.causes import Considered, Outcome
 from gapbridge.core.diagnosis.finding import Check, Withdrawal
 from gapbridge.core.diagnosis.judgement import Judgement
@@ -23,49 +23,49 @@ def closing(monkeypatch):
             return np.asarray(shares.get(frozenset(chosen), np.ones(4)))[PARTS] ** 2
 
         held = SimpleNamespace(possible=True, squares=squares)
-        monkeypatch.setattr(remainder, "HeldOut", lambda selection, parts: held)
-        monkeypatch.setattr(remainder, "parts", lambda observation, kept: PARTS)
+        monkeypatch.setattr(value_stability, "HeldOut", lambda selection, parts: held)
+        monkeypatch.setattr(value_stability, "parts", lambda observation, kept: PARTS)
         candidates = [SimpleNamespace(periodic=c in periodic) for c in range(4)]
         space = SimpleNamespace(candidates=candidates)
         selection = SimpleNamespace(
             block=(), space=space, observation=SimpleNamespace(channel=channel), kept=None
         )
-        return remainder._Closing(selection)
+        return value_stability._GapClosure(selection)
 
     return made
 
 
 def test_two_that_close_the_gap_only_together_are_needed(closing):
     pair = closing({frozenset({0, 1}): np.full(4, 0.25)})
-    assert pair.takes([0, 1], [0])
-    assert pair.takes([0, 1], [1])
+    assert pair.needs_any([0, 1], [0])
+    assert pair.needs_any([0, 1], [1])
     assert pair.needed == {0, 1}
 
 
-def test_what_others_do_as_well_is_not_needed_until_they_are_gone(closing):
+def test_an_effect_is_not_needed_while_others_close_the_gap(closing):
     small = np.full(4, 0.25)
     either = closing(
         dict.fromkeys([frozenset({0, 1}), frozenset({0, 2}), frozenset({0, 1, 2})], small)
     )
-    assert not either.takes([0, 1, 2], [2])
-    assert either.takes([0, 1], [1])
+    assert not either.needs_any([0, 1, 2], [2])
+    assert either.needs_any([0, 1], [1])
     assert either.needed == {1}
 
 
 def test_an_imitation_leaves_too_much_in_one_part_or_in_all(closing):
-    assert not closing({frozenset({0}): [0.1, 0.1, 0.1, 0.6]}).takes([0], [0])
-    assert not closing({frozenset({0}): np.full(4, 0.4)}).takes([0], [0])
-    assert closing({frozenset({0}): [0.3, 0.3, 0.3, 0.4]}).takes([0], [0])
+    assert not closing({frozenset({0}): [0.1, 0.1, 0.1, 0.6]}).needs_any([0], [0])
+    assert not closing({frozenset({0}): np.full(4, 0.4)}).needs_any([0], [0])
+    assert closing({frozenset({0}): [0.3, 0.3, 0.3, 0.4]}).needs_any([0], [0])
 
 
 def test_a_periodic_line_is_not_needed(closing):
     line = closing({frozenset({0, 1}): np.full(4, 0.1)}, periodic=(1,))
-    assert not line.takes([0, 1], [1])
-    assert line.takes([0, 1], [0])
+    assert not line.needs_any([0, 1], [1])
+    assert line.needs_any([0, 1], [0])
 
 
 def test_of_other_channels_than_position_nothing_is_needed(closing):
-    assert not closing({frozenset({0}): np.full(4, 0.1)}, channel="wrench").takes([0], [0])
+    assert not closing({frozenset({0}): np.full(4, 0.1)}, channel="wrench").needs_any([0], [0])
 
 
 class Searched:
@@ -79,14 +79,14 @@ class Searched:
 @pytest.fixture
 def two_searches(monkeypatch):
     """Return a maker of a first search whose line falls and a second one; and what they saw."""
-    asked = []
+    requested = []
 
     def made(closes, channel="position"):
         stays = Judgement((0,), True, 0.0, (), {}, ())
         falls = Judgement((), True, 0.0, (), {}, ((0, Withdrawal(Check.STABLE_VALUE)),))
 
         def select(observation, model, without, progress):
-            asked.append(without)
+            requested.append(without)
             return Searched("axial_compliance" if without else "transmission_error")
 
         def judge(found, held):
@@ -102,19 +102,19 @@ def two_searches(monkeypatch):
         }.items():  # fmt: skip
             monkeypatch.setattr(diagnosis, name, value)
         model = SimpleNamespace(arm=None)
-        found, judgement, fallen = diagnosis._found(
+        found, judgement, withdrawn = diagnosis._search(
             SimpleNamespace(channel=channel), model, (), None
         )
-        return found.terms[0].effect, judgement.accused, [c.effect for c in fallen]
+        return found.terms[0].effect, judgement.accused, [c.effect for c in withdrawn]
 
-    return made, asked
+    return made, requested
 
 
-def test_where_nothing_stays_a_second_search_goes_without_what_fell(two_searches):
+def test_without_a_cause_the_search_is_repeated_without_the_withdrawn_effects(two_searches):
     """Of an iiwa under three loads 0.92 mm were left in one draw of the poses in two, not 0.2."""
-    made, asked = two_searches
+    made, requested = two_searches
     assert made(closes=True) == ("axial_compliance", (0,), ["transmission_error"])
-    assert asked == [(), ("transmission_error",)]
+    assert requested == [(), ("transmission_error",)]
 
 
 def test_a_second_search_that_does_not_close_the_gap_counts_for_nothing(two_searches):
@@ -123,6 +123,6 @@ def test_a_second_search_that_does_not_close_the_gap_counts_for_nothing(two_sear
 
 
 def test_only_poses_are_searched_a_second_time(two_searches):
-    made, asked = two_searches
+    made, requested = two_searches
     assert made(closes=True, channel="torque") == ("transmission_error", (), [])
-    assert asked == [()]
+    assert requested == [()]

@@ -9,9 +9,9 @@ import pytest
 
 from gapbridge.bridge.document.findings import finding_text
 from gapbridge.core.arm import builtin_arm
+from gapbridge.core.diagnosis.all_rows import long_recording as blocks
+from gapbridge.core.diagnosis.all_rows.row_sums import rows_of
 from gapbridge.core.diagnosis.diagnosis import diagnose
-from gapbridge.core.diagnosis.every_row import long_recording as blocks
-from gapbridge.core.diagnosis.every_row.streamed import rows_of
 from gapbridge.core.dynamics import predict_torque, with_pieces
 from gapbridge.core.log.log import Log
 from gapbridge.core.model import Model
@@ -85,7 +85,9 @@ def test_blocks_find_what_the_whole_shows(both):
         assert other.gap_rms == pytest.approx(one.gap_rms, rel=0.01)
         assert other.remaining_rms == pytest.approx(one.remaining_rms, rel=0.02)
         assert other.remaining_rms_held_out == pytest.approx(one.remaining_rms_held_out, rel=0.02)
-        assert other.elsewhere.new_region == pytest.approx(one.elsewhere.new_region, rel=0.02)
+        assert other.generalisation.new_region == pytest.approx(
+            one.generalisation.new_region, rel=0.02
+        )
         for own, its in zip(one.causes, other.causes, strict=True):
             for a, b in zip(own.parameters, its.parameters, strict=True):
                 assert b.value == pytest.approx(a.value, abs=3 * a.std)

@@ -1,7 +1,7 @@
-"""Every row judges: what a search on some rows found is fitted anew, and judged, on all of them.
+"""Validation on all rows: the terms found by a search on some rows are refitted on all of them.
 
-A search needs thousands of columns and looks at a part of a long log; the few candidates that it
-found, and their rivals, fit into memory for every row. There values, ties and gains are decided.
+A search needs thousands of columns and uses a part of a long log. The few selected candidates and
+their rivals fit into memory for all rows, which decide values, ties and held-out gains.
 """
 
 from __future__ import annotations
@@ -13,15 +13,15 @@ import numpy as np
 
 from gapbridge.core.arrays import Mask
 from gapbridge.core.diagnosis.constancy import not_constant
-from gapbridge.core.diagnosis.criteria import OWN_SIGMAS, SIGMAS, TIE_SCORE
+from gapbridge.core.diagnosis.criteria import MIN_SIGMAS, MIN_SIGMAS_WITH_UNNAMED, TIE_SCORE
 from gapbridge.core.diagnosis.finding import Check, Withdrawal
 from gapbridge.core.diagnosis.held_out import HeldOut
 from gapbridge.core.diagnosis.judgement import (
-    VAGUE,
+    NOT_SIGNIFICANT,
     Judgement,
     covering_effects,
-    gainless,
     ties_of,
+    without_gain,
 )
 from gapbridge.core.diagnosis.observation import Observation
 from gapbridge.core.diagnosis.regions import regions
@@ -31,8 +31,8 @@ from gapbridge.core.diagnosis.selection.geometry import links_of
 from gapbridge.core.diagnosis.selection.local_search import rivals
 from gapbridge.core.diagnosis.selection.noise import carried_to
 from gapbridge.core.diagnosis.selection.outliers import inliers
-from gapbridge.core.diagnosis.selection.problem import fit
-from gapbridge.core.diagnosis.selection.refit import Remainder, refit, worth
+from gapbridge.core.diagnosis.selection.refit import UnnamedPart, refit, worth
+from gapbridge.core.diagnosis.selection.sample_space import fit
 from gapbridge.core.diagnosis.selection.selection import Selection, refitted_alone
 from gapbridge.core.diagnosis.selection.state import SelectionState, sample_space
 from gapbridge.core.effects import Term
@@ -41,26 +41,26 @@ from gapbridge.core.estimation.robust import start_weights
 from gapbridge.core.model import Model
 
 Alone = Callable[[Selection, Sequence[int]], Selection]
-MOST_RIVALS = 12  # of all causes together
-GAINLESS = Withdrawal(Check.ALL_ROWS_GAIN)
+MAX_RIVALS = 12  # of all causes together
+NO_GAIN = Withdrawal(Check.ALL_ROWS_GAIN)
 
 
-def with_uncertain_terms(judgement: Judgement) -> Judgement:
-    """Return the judgement with what was too vague on some rows accused: all rows decide on it."""
-    vague = tuple(p for p, why in judgement.withdrawn if why == VAGUE)
+def with_undecided_terms(judgement: Judgement) -> Judgement:
+    """Return the judgement with terms accused that were not significant on some rows."""
+    undecided = tuple(p for p, why in judgement.withdrawn if why == NOT_SIGNIFICANT)
     return replace(
-        judgement, accused=(*judgement.accused, *vague), vague=vague,
-        withdrawn=tuple((p, why) for p, why in judgement.withdrawn if p not in vague),
+        judgement, accused=(*judgement.accused, *undecided), undecided=undecided,
+        withdrawn=tuple((p, why) for p, why in judgement.withdrawn if p not in undecided),
     )  # fmt: skip
 
 
-def on_every_row(
+def fitted_on_all_rows(
     selection: Selection, judgement: Judgement, whole: Observation, model: Model
 ) -> Selection:
     """Return the selection with its accused terms refitted on ``whole``.
 
-    Its space holds the named terms found, at their positions, and the accused ones' rivals. Where
-    something unknown is left, covariances are those of its scatter among regions.
+    Its space has the named terms, at their positions, and the rivals of the accused. If there is
+    an unnamed part, covariances include the scatter among regions.
     """
     accused = judgement.accused
     candidates = [
@@ -79,10 +79,10 @@ def on_every_row(
     space, unprojected = sample_space(state, columns, terms, [])
     links = {p: selection.prior[c] for p, c in enumerate(selection.term_index)
              if c in selection.prior and p in accused}  # fmt: skip
-    near = links_of(space, links).beside(space, links) if links else space
+    near = links_of(space, links).whitened_space(space, links) if links else space
     linear = fit(near, tuple(p for p in accused if p not in links))
-    remainder = None if judgement.remainder is None else _scatter(placed, state.kept)
-    state, fitted, index, spread, residual = refit(state, space, linear, links, remainder)
+    unnamed_part = None if judgement.unnamed_part is None else _scatter(placed, state.kept)
+    state, fitted, index, spread, residual = refit(state, space, linear, links, unnamed_part)
     values, covariance = list(selection.terms), list(selection.covariance)
     for c, term, term_covariance in zip(index, fitted, spread, strict=True):
         values[c], covariance[c] = term, term_covariance
@@ -92,37 +92,37 @@ def on_every_row(
     )  # fmt: skip
 
 
-def _scatter(observation: Observation, kept: Mask) -> Remainder:
-    """Return the regions that values scatter among, where something unknown is left."""
+def _scatter(observation: Observation, kept: Mask) -> UnnamedPart:
+    """Return the regions for covariances by scatter, without unnamed functions."""
     region = np.repeat(regions(observation, kept), observation.measured.shape[1])
-    return Remainder(np.zeros((len(region), 0)), np.zeros(0), region)
+    return UnnamedPart(np.zeros((len(region), 0)), np.zeros(0), region)
 
 
 def _shaped_as(candidate: Candidate, term: Term) -> Candidate:
-    """Return the candidate with the shape that the term's last refit came to."""
+    """Return the candidate with the shape of the term's last refit."""
     if not candidate.effect.shapes:
         return candidate
     return replace(candidate, fixed=(*candidate.fixed[:-1], term.values[-1]))
 
 
-def still_accused(
-    selection: Selection, judgement: Judgement, held: HeldOut, alone: Alone
+def accused_on_all_rows(
+    selection: Selection, judgement: Judgement, held_out: HeldOut, alone: Alone
 ) -> tuple[Selection, Judgement]:
-    """Return what all rows leave accused: effects that shrink the gap where nothing was fitted.
+    """Return selection and judgement of the effects that are validated on all rows.
 
-    The weakest goes first; of what was vague before, it has to be sure now; a line has to be one
-    in every quarter of its joint's range. Ties that all rows decide are none any more. ``alone``
-    refits some of the selection's terms.
+    Values have to be significant, lines constant over the quarters of the joint's range, and each
+    effect has to reduce the held-out gap. Ties are evaluated again. ``alone`` refits some of the
+    selection's terms.
     """
-    selection, judgement = _sure(selection, judgement, alone)
+    selection, judgement = _significant(selection, judgement, alone)
     varying = {
         p: Withdrawal(Check.CONSTANT, by)
         for p, by in not_constant(selection, judgement.accused).items()
     }
     selection, judgement = _without(varying, selection, judgement, alone)
     # in the space of all rows a term's position is its candidate
-    fallen = gainless(selection, judgement.accused, held) if held.possible else []
-    selection, judgement = _without(dict.fromkeys(fallen, GAINLESS), selection, judgement, alone)
+    failed = without_gain(selection, judgement.accused, held_out) if held_out.possible else []
+    selection, judgement = _without(dict.fromkeys(failed, NO_GAIN), selection, judgement, alone)
     single = [p for p in judgement.accused if p not in selection.prior]
     ties = ties_of(selection.working, selection.best, single)
     return selection, replace(judgement, ties=ties)
@@ -131,9 +131,9 @@ def still_accused(
 def _without(
     reasons: Mapping[int, Withdrawal], selection: Selection, judgement: Judgement, alone: Alone
 ) -> tuple[Selection, Judgement]:
-    """Return selection and judgement without some positions, the others refitted and sure.
+    """Return selection and judgement without some positions, the others refitted and significant.
 
-    Without its lines a UR10's links take lengths of 55 mm, of which the data show little.
+    (Without its lines, a UR10's links took lengths of 55 mm that were not significant.)
     """
     if not reasons:
         return selection, judgement
@@ -141,45 +141,47 @@ def _without(
     judgement = replace(
         judgement, accused=accused, withdrawn=(*judgement.withdrawn, *reasons.items())
     )
-    return _sure(alone(selection, accused), judgement, alone)
+    return _significant(alone(selection, accused), judgement, alone)
 
 
-def _sure(selection: Selection, judgement: Judgement, alone: Alone) -> tuple[Selection, Judgement]:
-    """Return what stays: values of three sigmas, of what was vague on some rows of many.
+def _significant(
+    selection: Selection, judgement: Judgement, alone: Alone
+) -> tuple[Selection, Judgement]:
+    """Return selection and judgement with significant terms only; undecided ones need six sigmas.
 
-    Of the links, accused as a whole, one term at least has to be sure, and no number far off that
-    is not. The weakest goes first, by its own evidence: of two that can stand for each other the
-    one with more of it is judged last.
+    Of the links, accused as a whole, one term at least has to be significant, and no parameter
+    implausible without being so. The weakest term is removed first.
     """
     accused, withdrawn = list(judgement.accused), list(judgement.withdrawn)
-    beside_links = {p for p in accused if p in selection.prior}  # of known size: three sigmas do
-    least = dict.fromkeys(set(judgement.vague) - beside_links, (SIGMAS / OWN_SIGMAS) ** 2)
+    link_terms = {p for p in accused if p in selection.prior}  # three sigmas suffice
+    square = (MIN_SIGMAS_WITH_UNNAMED / MIN_SIGMAS) ** 2
+    least = dict.fromkeys(set(judgement.undecided) - link_terms, square)
     while True:
-        if far := selection.far_off(accused):
+        if far := selection.implausible_parameters(accused):
             selection = alone(selection.with_nominal(far), accused)
             continue
-        sure = {p: worth(selection.terms[p], selection.covariance[p]) for p in accused}
-        unsure = [
+        strength = {p: worth(selection.terms[p], selection.covariance[p]) for p in accused}
+        weak = [
             kind for kind in selection.judged_together(accused)
-            if max(sure[p] / least.get(p, 1.0) for p in kind) < 1
+            if max(strength[p] / least.get(p, 1.0) for p in kind) < 1
         ]  # fmt: skip
-        weakest = min(unsure, key=lambda kind: max(sure[p] for p in kind), default=())
+        weakest = min(weak, key=lambda kind: max(strength[p] for p in kind), default=())
         if not weakest:
             return selection, replace(judgement, accused=tuple(accused), withdrawn=tuple(withdrawn))
         accused = [p for p in accused if p not in weakest]
-        withdrawn += [(p, VAGUE) for p in weakest]
+        withdrawn += [(p, NOT_SIGNIFICANT) for p in weakest]
         selection = alone(selection, accused)
 
 
 def refitted(
     model: Model, unknown: bool, selection: Selection, accused: Sequence[int]
 ) -> Selection:
-    """Return the selection on all rows with some of its terms refitted as all there is.
+    """Return the selection on all rows with only some of its terms, refitted.
 
-    Beside something ``unknown`` covariances stay those of its scatter among regions.
+    If something is ``unknown``, covariances include the scatter among regions.
     """
-    remainder = _scatter(selection.observation, selection.kept) if unknown else None
-    whole = refitted_alone(selection, model.arm, accused, remainder)
+    unnamed_part = _scatter(selection.observation, selection.kept) if unknown else None
+    whole = refitted_alone(selection, model.arm, accused, unnamed_part)
     links = {p: own for p, own in whole.prior.items() if p in accused}
     whole = replace(whole, prior=links)
     single = tuple(p for p in accused if p not in links)
@@ -187,7 +189,7 @@ def refitted(
 
 
 def _rivals(selection: Selection, accused: Sequence[int]) -> list[Candidate]:
-    """Return the named candidates that explain as well, on the searched rows, as an accused one."""
+    """Return the named candidates that tie with an accused one on the searched rows."""
     space = selection.working
     near: dict[int, float] = {}
     for p in accused:
@@ -198,12 +200,12 @@ def _rivals(selection: Selection, accused: Sequence[int]) -> list[Candidate]:
         for score, other in [*rivals(space, selection.best, c, TIE_SCORE), *equal]:
             if space.candidates[other].named and other not in selection.term_index:
                 near[other] = min(score, near.get(other, np.inf))
-    best = sorted(near, key=lambda c: near[c])[:MOST_RIVALS]
+    best = sorted(near, key=lambda c: near[c])[:MAX_RIVALS]
     return [space.candidates[c] for c in best]
 
 
 def _placed(whole: Observation, terms: Sequence[Term]) -> Observation:
-    """Return the observation with its frames fitted to the terms found."""
+    """Return the observation with its frames fitted, given the terms."""
     if whole.rebase is None:
         return whole
     gap = whole.measured - whole.predict(terms)

@@ -1,8 +1,8 @@
-"""Every row of a long recording judges, block by block: sums take the place of rows.
+"""Validation on all rows of a long recording, block by block, by sums of products.
 
-What a fit and its judgement ask of rows are sums of products of their columns, coordinate by
-coordinate and block by block of time. From these come as many rows as there are columns, with the
-same sums: the sample space of all rows.
+A fit and its validation need only the sums of products of the rows' columns, by coordinate and
+block of time. These give as many rows as there are columns with the same sums: the sample space of
+all rows.
 """
 
 from __future__ import annotations
@@ -14,17 +14,17 @@ import numpy as np
 
 from gapbridge.core.arm import Arm
 from gapbridge.core.arrays import Array, Index
+from gapbridge.core.diagnosis.all_rows.long_recording import Block, LongRecording
 from gapbridge.core.diagnosis.channels.recording import STRETCHES
-from gapbridge.core.diagnosis.criteria import OUTLIER_SHARE
-from gapbridge.core.diagnosis.every_row.long_recording import Block, LongRecording
+from gapbridge.core.diagnosis.criteria import MAX_OUTLIER_SHARE
 from gapbridge.core.diagnosis.noise_floor import BLOCK, own_coordinates
 from gapbridge.core.diagnosis.observation import NotObservable, Observation
 from gapbridge.core.diagnosis.regions import REGIONS
 from gapbridge.core.diagnosis.selection.candidate import Candidate, jacobian, named_columns
 from gapbridge.core.diagnosis.selection.delay_columns import chord_columns, chord_value
 from gapbridge.core.diagnosis.selection.noise import Noise
-from gapbridge.core.diagnosis.selection.problem import SampleSpace, fit, penalties
-from gapbridge.core.diagnosis.selection.refit import Reduced, freed_of, step_on
+from gapbridge.core.diagnosis.selection.refit import ReducedRows, single_step, with_free_shape
+from gapbridge.core.diagnosis.selection.sample_space import SampleSpace, fit, penalties
 from gapbridge.core.diagnosis.selection.selection import Selection
 from gapbridge.core.diagnosis.selection.state import UnprojectedRows, candidate_of, chords_only
 from gapbridge.core.effects import Term
@@ -36,27 +36,27 @@ Observe = Callable[[Log], Observation | NotObservable]
 
 @dataclass(frozen=True)
 class Gap:
-    """The gap over all rows that are no outliers, per coordinate of the channel."""
+    """The gap over all inliers, per coordinate of the channel."""
 
-    samples: int  # outliers too
-    squares: Array  # (k,) sum of squares, nothing fitted
-    largest: float  # length of its own coordinates
+    samples: int  # outliers included
+    squares: Array  # (k,) sum of squares, nominal model
+    largest: float  # vector norm of the channel's own coordinates
     outliers: Index  # rows of the log
 
     @property
     def kept(self) -> int:
-        """Return how many rows are no outliers."""
+        """Return the number of inliers."""
         return self.samples - len(self.outliers)
 
 
 class Columns:
-    """What a block's rows are made into: candidates' columns, target, the terms' Jacobian, gap."""
+    """The columns of a block: candidates' columns, target, the terms' Jacobian, gap."""
 
     def __init__(self, selection: Selection, accused: Sequence[int], arm: Arm) -> None:
         self.candidates = selection.space.candidates
         self.accused = tuple(accused)
         self.terms = tuple(selection.terms[p] for p in accused)
-        self.freed = [freed_of(arm, self.candidates[p]) for p in accused]
+        self.freed = [with_free_shape(arm, self.candidates[p]) for p in accused]
         self.x = [
             np.array(term.values)[: len(c.parameters)]
             for term, c in zip(self.terms, self.freed, strict=True)
@@ -76,33 +76,34 @@ class Columns:
         """Return how many columns there are."""
         return int(self.start[-1]) + 2 + len(self.jacobian)
 
-    def at_samples(self, seen: Observation, bare: Array, gap: Array) -> Array:
-        """Return the columns (N, k, width) of an observation; ``bare`` is its gap without terms."""
+    def at_samples(self, observation: Observation, nominal_gap: Array, gap: Array) -> Array:
+        """Return the columns (N, k, width) of an observation; ``nominal_gap`` has no terms."""
         columns = [
-            self._candidate(seen, c, chord)
+            self._candidate(observation, c, chord)
             for c, chord in zip(self.candidates, self._chords, strict=True)
         ]
-        target = bare
-        if not self._from_nothing:  # the terms' part is put back, in the linear form at hand
+        target = nominal_gap
+        if not self._from_nothing:  # the terms' linear part is added back
             target = gap
             for term in self.terms:
                 c, x = candidate_of(list(self.candidates), term)
                 target = target + columns[c] @ x
         blocks = [
-            jacobian(seen, c, x, self.terms[:i] + self.terms[i + 1 :])
+            jacobian(observation, c, x, self.terms[:i] + self.terms[i + 1 :])
             for i, (c, x) in enumerate(zip(self.freed, self.x, strict=True))
         ]
         return np.concatenate([*columns, target[..., None], *blocks, gap[..., None]], axis=2)
 
-    def _candidate(self, seen: Observation, c: Candidate, chord: float | None) -> Array:
+    def _candidate(self, observation: Observation, c: Candidate, chord: float | None) -> Array:
         if chord is not None:
-            return chord_columns(seen, c, self.terms, chord)
-        return named_columns(seen, c, () if seen.channel == "tracking" else self.terms)
+            return chord_columns(observation, c, self.terms, chord)
+        base = () if observation.channel == "tracking" else self.terms
+        return named_columns(observation, c, base)
 
 
 @dataclass(frozen=True)
 class Streamed:
-    """The sums over all rows of a recording, and what they say of terms near those at hand."""
+    """The sums of products over all rows of a recording, linearised at the accused terms."""
 
     excerpt: Selection
     columns: Columns
@@ -112,11 +113,11 @@ class Streamed:
     row: Index  # (B,) first row of each block in the log
     gap: Gap
     means: Array  # (bins, k, p + 1): Jacobian and gap over every BLOCK seconds, whitened
-    white: Array  # (k,) one over 1 sigma of each coordinate
-    by_region: bool  # something unknown is left: covariances are those of regions
+    inverse_sigma: Array  # (k,) one over 1 sigma of each coordinate
+    by_region: bool  # covariances include the scatter among regions
 
     def selection(self, accused: Sequence[int]) -> Selection:
-        """Return the selection of some of the terms on all rows, fitted as all there is."""
+        """Return the selection of some of the terms only, fitted on all rows."""
         terms, covariance = list(self.excerpt.terms), list(self.excerpt.covariance)
         values, spread = self._fitted(accused)
         freed = dict(zip(self.columns.accused, self.columns.freed, strict=True))
@@ -136,22 +137,24 @@ class Streamed:
         return self.selection(accused)
 
     def remaining(self, selection: Selection, accused: Sequence[int]) -> tuple[Array, Array]:
-        """Return what terms leave: squares (k,) summed over rows, means (bins, k) over time."""
-        mix = self._mix(accused)
+        """Return the residual's squares (k,) summed over rows, and means (bins, k) over time."""
+        selector = self._selector(accused)
         freed = dict(zip(self.columns.accused, self.columns.freed, strict=True))
         x = dict(zip(self.columns.accused, self.columns.x, strict=True))
-        moved = [
+        changes = [
             np.array(selection.terms[p].values)[: len(freed[p].parameters)] - x[p] for p in accused
         ]
-        away = mix @ np.concatenate([*(-m for m in moved), [1.0]])
+        combination = selector @ np.concatenate([*(-m for m in changes), [1.0]])
         used = [*self.columns.jacobian, self.columns.width - 1]
         sums = self.sums.sum(axis=0)[:, used][:, :, used]
-        squares = np.einsum("i,kij,j->k", away, sums, away) / self.white**2
+        squares = np.einsum("i,kij,j->k", combination, sums, combination) / self.inverse_sigma**2
         in_unit = own_coordinates(self.excerpt.observation)
-        return np.maximum(squares, 0.0), (self.means @ away / self.white)[:, :in_unit]
+        return np.maximum(squares, 0.0), (self.means @ combination / self.inverse_sigma)[
+            :, :in_unit
+        ]
 
-    def _mix(self, accused: Sequence[int]) -> Array:
-        """Return Jacobian and gap of some terms alone (p + 1, d + 1): others put back."""
+    def _selector(self, accused: Sequence[int]) -> Array:
+        """Return the matrix (p + 1, d + 1) to Jacobian and gap of some terms, others added back."""
         size = len(self.columns.jacobian) + 1
         kept, gap, start = [], np.zeros(size), 0
         gap[-1] = 1.0
@@ -167,20 +170,20 @@ class Streamed:
     def _fitted(self, accused: Sequence[int]) -> tuple[list[Array], list[Array]]:
         if not accused:
             return [], []
-        mix, used = self._mix(accused), [*self.columns.jacobian, self.columns.width - 1]
+        selector, used = self._selector(accused), [*self.columns.jacobian, self.columns.width - 1]
         span = max(float(np.ptp(self.time)), 1e-9)
         part = ((self.time - self.time.min()) / span * REGIONS).astype(np.int64)
         part = np.minimum(part, REGIONS - 1) if self.by_region else np.zeros_like(part)
         names = np.unique(part)
         sums = np.stack([self.sums[part == name].sum(axis=(0, 1)) for name in names])
-        rows = rows_of(mix.T @ sums[:, used][:, :, used] @ mix)
+        rows = rows_of(selector.T @ sums[:, used][:, :, used] @ selector)
         flat = rows.reshape(-1, rows.shape[2])
         known = dict(zip(self.columns.accused, range(len(self.columns.accused)), strict=True))
-        return step_on(
-            Reduced(
+        return single_step(
+            ReducedRows(
                 flat[:, :-1], flat[:, -1],
                 np.repeat(names, rows.shape[1]) if self.by_region else None,
-                float(self.gap.kept * len(self.white)),
+                float(self.gap.kept * len(self.inverse_sigma)),
             ),
             [self.columns.freed[known[p]] for p in accused],
             [self.columns.x[known[p]] for p in accused],
@@ -193,7 +196,7 @@ class Streamed:
         rows = rows_of(self.sums[:, :, : target + 1, : target + 1])
         flat = rows.transpose(0, 2, 1, 3).reshape(-1, target + 1)  # coordinates side by side
         X, y = np.ascontiguousarray(flat[:, :target]), flat[:, target]
-        space, freedom = self.excerpt.space, float(self.gap.kept * len(self.white))
+        space, freedom = self.excerpt.space, float(self.gap.kept * len(self.inverse_sigma))
         extra = space.penalty - penalties(space.candidates, space.freedom)
         nothing = np.zeros((len(y), 0))
         return (
@@ -205,8 +208,8 @@ class Streamed:
         )  # fmt: skip
 
     def _samples(self) -> tuple[Observation, Noise]:
-        """Return the samples that stand for the rows: so many to a block."""
-        each, k = int(self.columns.start[-1]) + 1, len(self.white)
+        """Return the samples that represent the rows, the same number for each block."""
+        each, k = int(self.columns.start[-1]) + 1, len(self.inverse_sigma)
         span = max(float(np.ptp(self.time)), 1e-9)
         stretch = ((self.time - self.time.min()) / span * STRETCHES).astype(np.int64)
         samples = each * len(self.time)
@@ -219,14 +222,14 @@ class Streamed:
             groups=np.repeat(np.minimum(stretch, STRETCHES - 1), each),
             rows=np.repeat(self.row, each),
             session=None if whole.session is None else np.repeat(self.session, each),
-            joint_columns=None, friction=None, times=None, fewer=None, unnamed=tuple,
+            joint_columns=None, friction=None, times=None, subset=None, unnamed=tuple,
         )  # fmt: skip
-        whitener = np.broadcast_to(np.diag(self.white), (samples, k, k))
+        whitener = np.broadcast_to(np.diag(self.inverse_sigma), (samples, k, k))
         return observation, replace(self.excerpt.noise, whitener=whitener)
 
 
 def rows_of(sums: Array) -> Array:
-    """Return rows (..., p, p) with the sums of products (..., p, p): R with R^T R as given."""
+    """Return rows R (..., p, p) with given sums of products R^T R (..., p, p)."""
     size = np.sqrt(np.maximum(np.einsum("...ii->...i", sums), 0.0))
     unit = np.where(size > 0, 1 / np.where(size > 0, size, 1.0), 0.0)
     value, V = np.linalg.eigh(sums * unit[..., :, None] * unit[..., None, :])
@@ -237,7 +240,7 @@ def rows_of(sums: Array) -> Array:
 class RowSums:
     """The sums over all rows of a recording, at the accused terms of its excerpt, block by block.
 
-    ``observe`` gives the channel in a block; covariances are those of regions where ``by_region``.
+    ``observe`` returns the channel in a block; ``by_region``: covariances by scatter among regions.
     """
 
     def __init__(
@@ -246,35 +249,36 @@ class RowSums:
     ) -> None:  # fmt: skip
         self._selection, self._observe, self._by_region = selection, observe, by_region
         self._columns = Columns(selection, accused, arm)
-        self._white = np.asarray(np.diag(selection.noise.whitener[0]))
-        self._limit = _limit(selection, self._columns.terms, self._white)
+        self._inverse_sigma = np.asarray(np.diag(selection.noise.whitener[0]))
+        self._limit = _limit(selection, self._columns.terms, self._inverse_sigma)
         self._own = own_coordinates(selection.observation)
         self._blocks: list[tuple[Array, float, int, int]] = []
         self._outliers: list[Index] = []
-        self._means = _Means(self._columns)
-        self._samples, self._squares, self._largest = 0, np.zeros(len(self._white)), 0.0
+        self._means = _BlockMeans(self._columns)
+        self._samples, self._squares, self._largest = 0, np.zeros(len(self._inverse_sigma)), 0.0
 
     def add(self, recording: LongRecording, block: Block) -> None:
         """Add the rows of a block."""
-        seen = self._observe(block.log)
-        if isinstance(seen, NotObservable):
+        observation = self._observe(block.log)
+        if isinstance(observation, NotObservable):
             return
-        inside = seen.rows + block.first >= block.begin
-        rows = seen.rows[inside] + block.first
+        inside = observation.rows + block.first >= block.begin
+        rows = observation.rows[inside] + block.first
         if not len(rows):
             return
-        bare = seen.measured - seen.predict(())
+        nominal_gap = observation.measured - observation.predict(())
         terms = self._columns.terms
-        gap = seen.measured - seen.predict(terms) if terms else bare
-        whole = self._columns.at_samples(seen, bare, gap)[inside] * self._white[:, None]
+        gap = observation.measured - observation.predict(terms) if terms else nominal_gap
+        columns = self._columns.at_samples(observation, nominal_gap, gap)
+        whole = columns[inside] * self._inverse_sigma[:, None]
         kept = np.sqrt(np.mean(whole[:, :, -1] ** 2, axis=1)) <= self._limit
-        whole, bare = whole[kept], bare[inside][kept]
+        whole, nominal_gap = whole[kept], nominal_gap[inside][kept]
         self._samples += len(rows)
         self._outliers.append(rows[~kept])
-        if not len(bare):
+        if not len(nominal_gap):
             return
-        self._squares += np.einsum("ij,ij->j", bare, bare)
-        farthest = float(np.linalg.norm(bare[:, : self._own], axis=1).max())
+        self._squares += np.einsum("ij,ij->j", nominal_gap, nominal_gap)
+        farthest = float(np.linalg.norm(nominal_gap[:, : self._own], axis=1).max())
         self._largest = max(self._largest, farthest)
         time = recording.log.columns["timestamp"][rows[kept]]
         self._means.add(time, whole)
@@ -285,12 +289,12 @@ class RowSums:
         )  # fmt: skip
 
     def streamed(self) -> Streamed:
-        """Return what all blocks come to."""
+        """Return the sums over all blocks."""
         sums, time, session, first = zip(*self._blocks, strict=True)
         gap = Gap(self._samples, self._squares, self._largest, np.concatenate(self._outliers))
         return Streamed(
             self._selection, self._columns, np.stack(sums), np.array(time), np.array(session),
-            np.array(first), gap, self._means.whole(), self._white, self._by_region,
+            np.array(first), gap, self._means.whole(), self._inverse_sigma, self._by_region,
         )  # fmt: skip
 
 
@@ -299,15 +303,15 @@ def _session(recording: LongRecording, block: Block) -> int:
     return int(recording.log.columns["session"][block.begin]) if named else 0
 
 
-def _limit(selection: Selection, terms: Sequence[Term], white: Array) -> float:
-    """Return the whitened distance from which a row is an outlier; few are, or none is."""
+def _limit(selection: Selection, terms: Sequence[Term], inverse_sigma: Array) -> float:
+    """Return the whitened distance from which a row is an outlier, at most a share of all."""
     observation = selection.observation
-    left = (observation.measured - observation.predict(terms)) * white
-    far = float(np.quantile(distance_of(left, 1.0), 1 - OUTLIER_SHARE))
-    return max(OUTLIER * scale_of(left), far)
+    residual = (observation.measured - observation.predict(terms)) * inverse_sigma
+    high = float(np.quantile(distance_of(residual, 1.0), 1 - MAX_OUTLIER_SHARE))
+    return max(OUTLIER * scale_of(residual), high)
 
 
-class _Means:
+class _BlockMeans:
     """Means of the Jacobian and the gap over every BLOCK seconds."""
 
     def __init__(self, columns: Columns) -> None:
