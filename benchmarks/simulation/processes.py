@@ -16,11 +16,11 @@ from gapbridge.bridge.cell.run_settings import Configuration
 from gapbridge.bridge.daemon.daemon import Daemon
 from gapbridge.bridge.daemon.processes import LoopProcess
 from gapbridge.bridge.ipc.command_memory import CommandMemory, Commands
+from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.ipc.shared_memory import Phase, RunMemory, SharedMemory
 from gapbridge.bridge.loop.loop import Exit, Loop
 from gapbridge.bridge.loop.offset_in_force import OffsetInForce
 from gapbridge.bridge.loop.setpoint_stream import SetpointStream
-from gapbridge.bridge.loop.supervisor import State
 from gapbridge.bridge.setpoint_source.glide import Glide
 from gapbridge.bridge.setpoint_source.source import Source
 from gapbridge.bridge.setpoint_source.target import TargetSource

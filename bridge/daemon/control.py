@@ -7,8 +7,9 @@ from typing import Any, Protocol
 
 from gapbridge.bridge.ipc.control_socket import Peer, refusal
 from gapbridge.bridge.ipc.events import Event, EventKind
+from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.ipc.shared_memory import Phase
-from gapbridge.bridge.loop.supervisor import Cause, State
+from gapbridge.bridge.loop.supervisor import Cause
 from gapbridge.drivers.clock import SYSTEM, Clock
 
 LONGEST_ARMING = 25.0  # s: uploads a program to the robot

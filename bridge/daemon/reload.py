@@ -15,8 +15,8 @@ from gapbridge.bridge.cell.cell import complaints
 from gapbridge.bridge.cell.run_settings import Configuration, read_configuration
 from gapbridge.bridge.daemon.service_manager import ServiceManager
 from gapbridge.bridge.ipc.events import EventKind, EventLog
+from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.ipc.shared_memory import Phase
-from gapbridge.bridge.loop.supervisor import State
 from gapbridge.core.errors import GapbridgeError
 from gapbridge.drivers.controller_address import address_of
 

@@ -7,8 +7,9 @@ from collections import deque
 from typing import Any
 
 from gapbridge.bridge.ipc.events import Event, EventKind
+from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.loop.checks import NOTHING, UNSOLVED
-from gapbridge.bridge.loop.supervisor import CLEARED_BY_RECONNECTING, Cause, State
+from gapbridge.bridge.loop.supervisor import CLEARED_BY_RECONNECTING, Cause
 from gapbridge.core.arrays import Array
 from gapbridge.drivers.clock import SYSTEM, Clock
 

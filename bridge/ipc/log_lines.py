@@ -15,13 +15,14 @@ from datetime import UTC, datetime
 from typing import IO, Any
 
 from gapbridge.bridge.ipc.events import EventKind
+from gapbridge.bridge.ipc.loop_state import State
 
 HIDDEN = re.compile(
     r"token|password|secret|passwd|api_?key|private|credential|^key$", re.IGNORECASE
 )
 LEFT_OUT = ("text", "monotonic", "kind", "time", "detail")  # text: the whole cell file
 LONGEST = 2000  # characters of one value
-_GRAVE = (EventKind.FAULT, EventKind.REFUSED)
+_ERRORS = (EventKind.FAULT, EventKind.REFUSED)
 
 
 def log_line(event: Mapping[str, Any]) -> str:
@@ -53,9 +54,9 @@ class JsonLines:
 
 
 def _level(event: Mapping[str, Any]) -> str:
-    if event.get("kind") in _GRAVE or "failure" in event:
+    if event.get("kind") in _ERRORS or "failure" in event:
         return "error"
-    if str(event.get("to", "")).lower() == "fault":
+    if str(event.get("to", "")).upper() == State.FAULT.name:
         return "error"
     if event.get("kind") == EventKind.SIDE or "paused" in event or "lost" in event:
         return "warning"

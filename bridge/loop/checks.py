@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 
 from gapbridge.bridge.ipc.events import EventKind
 from gapbridge.bridge.ipc.loop_counters import LoopCounter
+from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.loop.link_monitor import hold_time
 from gapbridge.bridge.loop.reports import Reports
-from gapbridge.bridge.loop.supervisor import Cause, State, Supervisor
+from gapbridge.bridge.loop.supervisor import Cause, Supervisor
 from gapbridge.core.arrays import Array
 from gapbridge.core.limits import ENVELOPE, JOINT_LIMIT, JOINT_OFFSET
 from gapbridge.core.state import RobotState

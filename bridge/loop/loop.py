@@ -16,6 +16,7 @@ from gapbridge.bridge.cell.daemon_settings import DaemonSettings
 from gapbridge.bridge.ipc.command_memory import Command, Commands
 from gapbridge.bridge.ipc.events import EventKind
 from gapbridge.bridge.ipc.loop_counters import LoopCounter
+from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.ipc.shared_memory import Phase, SharedMemory, write_cycle
 from gapbridge.bridge.loop.checks import NOTHING, RAMPING_OUT, RESYNC, UNSOLVED, LoopChecks
 from gapbridge.bridge.loop.link_monitor import ControllerClock, LinkMonitor, hold_time
@@ -23,7 +24,7 @@ from gapbridge.bridge.loop.live_loads import LiveLoads
 from gapbridge.bridge.loop.offset_in_force import OffsetInForce
 from gapbridge.bridge.loop.reports import Reports
 from gapbridge.bridge.loop.setpoint_stream import SetpointStream, longest_withdrawal
-from gapbridge.bridge.loop.supervisor import Cause, State, Supervisor
+from gapbridge.bridge.loop.supervisor import Cause, Supervisor
 from gapbridge.bridge.loop.writing import Writing
 from gapbridge.bridge.setpoint_source.source import Source, SourceStatus
 from gapbridge.core.arrays import Array

@@ -12,12 +12,13 @@ from typing import Any, cast
 import numpy as np
 
 from gapbridge.bridge.ipc.events import EventKind
+from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.loop.checks import RAMPING_OUT, RESYNC
 from gapbridge.bridge.loop.live_loads import LiveLoads
 from gapbridge.bridge.loop.loop import UNSENT, CycleInput, Exit, Loop
 from gapbridge.bridge.loop.offset_in_force import InForce, OffsetInForce
 from gapbridge.bridge.loop.setpoint_stream import SetpointStream
-from gapbridge.bridge.loop.supervisor import Cause, State
+from gapbridge.bridge.loop.supervisor import Cause
 from gapbridge.core.errors import GateError, LimitError
 from gapbridge.core.load_bounds import LoadBounds
 from gapbridge.core.loads import Loads

@@ -8,8 +8,9 @@ from typing import Any
 
 from gapbridge.bridge.ipc.events import EventKind
 from gapbridge.bridge.ipc.loop_counters import LoopCounter
+from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.ipc.shared_memory import SharedMemory
-from gapbridge.bridge.loop.supervisor import Cause, State
+from gapbridge.bridge.loop.supervisor import Cause
 
 
 @dataclass(frozen=True)

@@ -3,23 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from enum import IntEnum, StrEnum
+from enum import StrEnum
 
-
-class State(IntEnum):
-    """What the loop is doing."""
-
-    DISCONNECTED = 0
-    OBSERVING = 1  # reads, computes, records; writes nothing
-    ARMED = 2  # asked to write; waits for the source's first setpoint
-    COMPENSATING = 3  # writes; the offset ramps in and stays
-    HOLDING = 4  # writes; the offset ramps out, the arm comes to rest
-    FAULT = 5  # writes nothing until a person has acknowledged it
-
-    @property
-    def writes(self) -> bool:
-        """Return whether setpoints leave in this state."""
-        return self in (State.COMPENSATING, State.HOLDING)
+from gapbridge.bridge.ipc.loop_state import State
 
 
 class Cause(StrEnum):

@@ -34,9 +34,9 @@ from gapbridge.bridge.cell.daemon_settings import DaemonSettings
 from gapbridge.bridge.cell.updated_settings import UpdatedSettings
 from gapbridge.bridge.ipc.events import EventKind
 from gapbridge.bridge.ipc.loop_counters import DROPPED
+from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.ipc.shared_memory import SharedMemory
 from gapbridge.bridge.ipc.side_main import StartData, run_side
-from gapbridge.bridge.loop.supervisor import State
 from gapbridge.bridge.served.credentials import read_token
 from gapbridge.bridge.served.guard import Guard
 from gapbridge.bridge.served.server import serve
@@ -137,7 +137,7 @@ class Counts:
         if "to" in event:
             to, cause = str(event["to"]).lower(), str(event.get("cause", ""))
             self.transitions[to, cause] += 1
-            if to == "fault":
+            if to == State.FAULT.name.lower():
                 self.faults[cause] += 1
 
 

@@ -14,14 +14,15 @@ import numpy as np
 
 from gapbridge.bridge.cell.daemon_settings import DaemonSettings
 from gapbridge.bridge.cell.updated_settings import UpdatedSettings
+from gapbridge.bridge.ipc.events import EventKind
+from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.ipc.shared_memory import ROWS, SharedMemory
-from gapbridge.bridge.loop.supervisor import State
 from gapbridge.bridge.web.prediction import Prediction
 from gapbridge.core.arrays import Array
 from gapbridge.core.limits import CLAMPS
 
 Message = tuple[str, dict[str, Any]]  # kind, data
-ENDS = ("fault", "failure")  # kinds of events with which a process of the loop ends
+ENDS = (EventKind.FAULT, EventKind.FAILURE)  # events with which a process of the loop ends
 EVENTS = 200  # kept to show
 TIMING_EVERY = 1.0  # s
 ARM_EVERY = 0.2  # s
@@ -99,7 +100,7 @@ class Watched:
         return messages
 
     def _on_event(self, event: dict[str, Any]) -> list[Message]:
-        if event.get("kind") == "status":
+        if event.get("kind") == EventKind.STATUS:
             self.status = event
             return [("status", event)]
         if "to" in event:

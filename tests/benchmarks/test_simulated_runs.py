@@ -23,10 +23,11 @@ from gapbridge.bridge.daemon.control import Control
 from gapbridge.bridge.daemon.processes import LoopProcess
 from gapbridge.bridge.daemon.status import DaemonStatus
 from gapbridge.bridge.ipc.command_memory import Command, Commands
+from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.loop import checks
 from gapbridge.bridge.loop.link_monitor import ControllerClock, LinkMonitor
 from gapbridge.bridge.loop.loop import Loop
-from gapbridge.bridge.loop.supervisor import Cause, State, Supervisor
+from gapbridge.bridge.loop.supervisor import Cause, Supervisor
 from gapbridge.core.errors import StaleStateError
 from gapbridge.core.state import Setpoint
 from gapbridge.drivers.driver import Driver

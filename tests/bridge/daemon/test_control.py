@@ -20,8 +20,8 @@ from gapbridge.bridge.daemon import control
 from gapbridge.bridge.ipc import control_socket
 from gapbridge.bridge.ipc.control_client import ask, ask_socket, running
 from gapbridge.bridge.ipc.control_socket import ControlSocket, Peer
+from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.ipc.shared_memory import Phase
-from gapbridge.bridge.loop.supervisor import State
 from gapbridge.core.errors import InputError, RunError
 
 PATIENT = ", state_timeout: 0.25"  # a busy machine holds the simulated controller up

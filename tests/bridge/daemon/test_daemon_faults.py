@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from daemon_cell import Robot, Run, gapbridge, offsets, only_recording, read_cycles, wait_for
 
-from gapbridge.bridge.loop.supervisor import State
+from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.core.errors import CellError, InputError, LinkError
 
 

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.ipc.shared_memory import SharedMemory
 from gapbridge.bridge.loop.checks import (
     DEGRADED,
@@ -22,7 +23,7 @@ from gapbridge.bridge.loop.checks import (
 )
 from gapbridge.bridge.loop.link_monitor import LinkMonitor, hold_time
 from gapbridge.bridge.loop.reports import Reports
-from gapbridge.bridge.loop.supervisor import State, Supervisor
+from gapbridge.bridge.loop.supervisor import Supervisor
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.errors import Implausible, InvalidStateError, StaleStateError
 from gapbridge.core.limits import ENVELOPE, RATE

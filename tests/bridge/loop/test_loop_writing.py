@@ -14,12 +14,13 @@ import numpy as np
 import pytest
 
 from gapbridge.bridge.cell.sections import LimitSettings, SetpointSettings
+from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.ipc.shared_memory import SharedMemory
 from gapbridge.bridge.loop.live_loads import LiveLoads
 from gapbridge.bridge.loop.offset_in_force import OffsetInForce
 from gapbridge.bridge.loop.reports import Reports
 from gapbridge.bridge.loop.setpoint_stream import SetpointStream
-from gapbridge.bridge.loop.supervisor import Cause, State, Supervisor
+from gapbridge.bridge.loop.supervisor import Cause, Supervisor
 from gapbridge.bridge.loop.writing import PARTS_IN_A_ROW, Writing
 from gapbridge.bridge.setpoint_source import make_source
 from gapbridge.core.arm import builtin_arm
