@@ -38,5 +38,5 @@ def make_driver(settings: DriverSettings, model: Model, bounds: GateBounds | Non
         raise LinkError(f"link.driver {name}: its library cannot be imported: {error}") from None
     driver = cast("Driver", driver_class(settings, model))
     if bounds is not None:
-        driver.gate.hold_to(bounds)
+        driver.gate.set_bounds(bounds)
     return driver

@@ -179,7 +179,7 @@ def _watched(run: Run, driver: Driver) -> Driver:
     """Return a driver whose setpoints are noted as they are handed to it."""
     from gapbridge.bridge.loop.setpoint_stream import gate_bounds
 
-    driver.gate.hold_to(gate_bounds(run.link.setting.configuration.settings.limits))
+    driver.gate.set_bounds(gate_bounds(run.link.setting.configuration.settings.limits))
     send = driver._send
 
     def noted(setpoint: Setpoint) -> None:

@@ -14,9 +14,9 @@ from gapbridge.drivers.clock import SYSTEM, Clock
 
 LONGEST_ARMING = 25.0  # s: uploads a program to the robot
 LONGEST_RAMP = 20.0  # s
-LONGEST_TAKING = 20.0  # s: a new process of the loop may have to start first
+LONGEST_PICKUP = 20.0  # s: a new process of the loop may have to start first
 SOURCE_SILENT = 1.0  # s without a first setpoint after which arming is reported to be waiting
-LOOK = 0.02  # s
+POLL_EVERY = 0.02  # s
 ARMED = State.ARMED.name
 
 
@@ -116,7 +116,7 @@ class Control:
             waiting = (waiting or self._clock.monotonic()) if idle else None
             if waiting is not None and self._clock.monotonic() - waiting > SOURCE_SILENT:
                 return _done("armed; waits for the first setpoint of its source")
-            self._clock.sleep(LOOK)
+            self._clock.sleep(POLL_EVERY)
         return refusal(f"no answer of the loop within {LONGEST_ARMING:g} s")
 
     def _disarm(self, by: str) -> dict[str, Any]:
@@ -125,9 +125,9 @@ class Control:
         observed = daemon.state == State.OBSERVING and not daemon.latched
         fault = daemon.latched
         number = daemon.disarm(by)
-        if not self._wait_for(lambda: daemon.last_taken >= number, LONGEST_TAKING):
+        if not self._wait_for(lambda: daemon.last_taken >= number, LONGEST_PICKUP):
             return refusal(
-                f"no loop has taken it within {LONGEST_TAKING:g} s (the state is "
+                f"no loop has taken it within {LONGEST_PICKUP:g} s (the state is "
                 f"{daemon.state.name.lower()}); it is kept for the next one"
             )
 
@@ -147,7 +147,7 @@ class Control:
         while not what():
             if self._clock.monotonic() > until:
                 return False
-            self._clock.sleep(LOOK)
+            self._clock.sleep(POLL_EVERY)
         return True
 
 

@@ -37,8 +37,8 @@ from gapbridge.bridge.ipc.events import Event, EventKind, EventLog
 from gapbridge.bridge.ipc.loop_counters import DROPPED
 from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.ipc.shared_memory import Phase, RunMemory
-from gapbridge.bridge.loop.loop import LONGEST_STOP, Exit
-from gapbridge.bridge.loop.setpoint_stream import longest_withdrawal
+from gapbridge.bridge.loop.loop import STOP_TIMEOUT, Exit
+from gapbridge.bridge.loop.setpoint_stream import longest_ramp_out
 from gapbridge.bridge.loop.supervisor import Cause
 from gapbridge.bridge.recording.folder import LOOP_LOG, new_session
 from gapbridge.core.errors import InputError, LinkError
@@ -53,7 +53,7 @@ STOP_MARGIN = 0.4  # s on top of the loop's own time: then it is ended by force
 STATUS_EVERY = 0.5  # s
 PROGRAM = f"the daemon's own program (pid {os.getpid()})"
 
-UNSPOKEN = (EventKind.FAILURE, EventKind.GRANTED, EventKind.SUMMARY, EventKind.REQUEST)
+NOT_SHOWN = (EventKind.FAILURE, EventKind.GRANTED, EventKind.SUMMARY, EventKind.REQUEST)
 """Kinds of events that the terminal does not show: after a failure a fault follows."""
 
 Say = Callable[[str], None]
@@ -279,7 +279,7 @@ class Daemon:
                 if not self._stopping.is_set() and not swap.in_order:
                     self._pause()
                     self.restarts += 1
-            self._take()
+            self._read_loop()
             return self._summary()
 
     def _open(self, stack: ExitStack, arm: bool, by: str) -> bool:
@@ -338,7 +338,7 @@ class Daemon:
         """Look after everything but the loop."""
         if self._clock.monotonic() >= self._ends_at:
             self._stopping.set()
-        self._take()
+        self._read_loop()
         self._forward_requests()
         if self.memory.promote():
             self.side_processes.show(self.memory)
@@ -374,7 +374,7 @@ class Daemon:
                 if self._reload.step(self.state, self.phase, self.configuration):
                     self._commands.ask(Command.RAMP_OUT)  # by nobody's wish
                 if (self._stopping.is_set() or self._reload.wants_end) and stop_by is None:
-                    needed = LONGEST_STOP + longest_withdrawal(self.settings.limits)
+                    needed = STOP_TIMEOUT + longest_ramp_out(self.settings.limits)
                     stop_by = self._clock.monotonic() + needed + STOP_MARGIN
                     if self._stopping.is_set():
                         self.manager.stopping()
@@ -383,8 +383,8 @@ class Daemon:
                     detail = f"the loop stood still for {self.memory.silence:.2f} s and was ended"
                     loop.kill()  # reported when it is over: nothing is written after that
                     self._fault("hang", detail)
-            self._take()
-            self._after(loop)
+            self._read_loop()
+            self._on_loop_end(loop)
             if first_cycle is not None and self._clock.monotonic() - first_cycle > HEALTHY:
                 self._wait = self.settings.backoff[0]
         finally:
@@ -414,7 +414,7 @@ class Daemon:
             self.configuration, self.memory, self._commands, order, self._output, self._clock
         )
 
-    def _take(self) -> None:
+    def _read_loop(self) -> None:
         """Take cycles and events over from the loop."""
         last_taken = self.memory.last_taken
         # in this order: who has heard of a change finds the state changed, and its rows counted
@@ -453,10 +453,10 @@ class Daemon:
             self._refused |= event["cause"] == Cause.START_REFUSED
             if detail:
                 self._faults.append(text)
-        elif detail and kind not in UNSPOKEN:
+        elif detail and kind not in NOT_SHOWN:
             self._say(detail)
 
-    def _after(self, loop: LoopProcess) -> None:
+    def _on_loop_end(self, loop: LoopProcess) -> None:
         """Judge how the loop's process ended; raises where it is no use to start it again."""
         code = loop.exit_code
         if code == Exit.DONE:

@@ -18,8 +18,8 @@ SIDE_PROCESSES: dict[str, tuple[str, Callable[[DaemonSettings], bool]]] = {
 }
 """Name -> (module to run, whether a run's settings want it)."""
 
-PATIENCE = {"recorder": 10.0}  # s to finish in, where it is not LITTLE
-LITTLE = 0.3
+END_TIMEOUTS = {"recorder": 10.0}  # s to finish in, where it is not DEFAULT_END_TIMEOUT
+DEFAULT_END_TIMEOUT = 0.3
 
 
 class SideProcesses:
@@ -80,5 +80,5 @@ class SideProcesses:
         for side in self._running.values():
             side.begin_close()
         for name, side in self._running.items():
-            side.close(PATIENCE.get(name, LITTLE))
+            side.close(END_TIMEOUTS.get(name, DEFAULT_END_TIMEOUT))
         self._running.clear()

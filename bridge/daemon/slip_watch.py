@@ -33,23 +33,23 @@ WINDOW = 0.3  # s of one mean
 WINDOWS = 20  # of a rest that count
 SAME_POSE = 0.02  # rad
 SAME_MASS = 0.01  # kg
-TURNED = 0.01  # rad: a joint that came at least this far has come from that side
-KEPT = 120  # rests
-PLACES = 64  # poses at most; a program with more forgets those not seen for longest
+APPROACH_STEP = 0.01  # rad: smallest motion that determines a joint's approach direction
+MAX_RESTS = 120  # stored rests
+MAX_POSES = 64  # stored poses; a program with more drops the least recent ones
 SUFFIXES = (4, 5, 6, 8, 12, 18, 27, 40)  # rests since the moment that is tried
-LEARNED = 18  # differences between rests at one pose that the noise is taken from
-FEWEST_PLACES = 4  # poses that a slip must show at
-BEFORE_STEPS = 0.5  # of the threshold: how far a slip is ahead of any step of zeros and payload
-WITHOUT_ONE = 0.25  # share of the threshold that a slip keeps whichever pose is left out
+NOISE_SAMPLES = 18  # differences between rests at one pose that the noise is taken from
+MIN_POSES = 4  # poses that a slip must show at
+LEAD_OVER_STEPS = 0.5  # of the threshold: how far a slip is ahead of any step of zeros and payload
+LEFT_OUT = 0.25  # share of the threshold that a slip keeps whichever pose is left out
 THRESHOLD = 45.0  # of the likelihood ratio (chi-square of one number)
 CONSISTENT = 3.0  # chi-square per number that a slip may leave: more, it is something else
-TIE = 9.0  # of the ratio: a joint that explains as much is reported beside the best
+TIE_MARGIN = 9.0  # of the ratio: joints within it of the best one are reported too
 FLOORS = (0.05, 0.005, 0.05)  # N, Nm of the flange sensor, Nm of a motor: 1 sigma at least
 LARGEST_SLIP = 0.05  # rad: what no slip makes is a force
 FORCE = 1.0  # N on top of that
 FORCE_SIGMAS = 8.0
-LASTING = 3  # rests in a row after which a force counts as the new state of things
-TIPS = 0.1  # rad: poses closer than this are one to the test
+LASTING_RESTS = 3  # rests in a row after which a force counts as the new state of things
+DISTINCT_POSE = 0.1  # rad: poses closer than this are one to the test
 
 
 @dataclass(frozen=True)
@@ -153,9 +153,9 @@ class SlipWatch:
         self.reset()
 
     def reset(self) -> None:
-        """Learn anew: the arm is another from now on."""
+        """Start learning again: the arm has changed."""
         self._places: list[Place] = []
-        self._rests: deque[_Rest] = deque(maxlen=KEPT)
+        self._rests: deque[_Rest] = deque(maxlen=MAX_RESTS)
         self._standstill: _Standstill | None = None
         self._touched = False  # a force has come or gone during this rest
         self._previous_q: Array | None = None  # (n,) rad: the rest before this one
@@ -243,7 +243,7 @@ class SlipWatch:
         self._under_force.append(rest)
         if len(self._under_force) == 1:
             return [_force(excess, rest.time, "beside what this pose had at its rests before")]
-        if len(self._under_force) > LASTING:  # not a touch: a slip, a load, a sensor's new zero
+        if len(self._under_force) > LASTING_RESTS:  # a slip, a load, or a sensor's new zero
             self._rests.extend(self._under_force[:-1])
             self._under_force = []
         return []
@@ -263,12 +263,12 @@ class SlipWatch:
         n = self._n
         q, mass = mean[:n], self._model.payload(mean)[0]
         step = np.zeros(n) if self._previous_q is None else q - self._previous_q
-        side = np.where(np.abs(step) > TURNED, np.sign(step), 0).astype(np.int8).tobytes()
+        side = np.where(np.abs(step) > APPROACH_STEP, np.sign(step), 0).astype(np.int8).tobytes()
         for number, place in enumerate(self._places):
             near = np.abs(place.q - q).max() < SAME_POSE and abs(place.mass - mass) < SAME_MASS
             if near and place.side == side:
                 return number
-        if len(self._places) >= PLACES:
+        if len(self._places) >= MAX_POSES:
             self._drop_oldest()
         self._places.append(Place(q, mass, side, *self._model.columns(mean)))
         return len(self._places) - 1
@@ -283,7 +283,7 @@ class SlipWatch:
             for rest in self._rests
             if rest.place != oldest
         ]
-        self._rests = deque(remaining, maxlen=KEPT)
+        self._rests = deque(remaining, maxlen=MAX_RESTS)
 
     # -- the test ---------------------------------------------------------------------------------
 
@@ -295,7 +295,7 @@ class SlipWatch:
             if rest.place in last:
                 steps.append(rest.readings - last[rest.place])
             last[rest.place] = rest.readings
-        if len(steps) < LEARNED:
+        if len(steps) < NOISE_SAMPLES:
             return None
         # the median: a slip, or a touch, among them does not raise it
         spread = 1.4826 * _median(np.abs(steps)) / np.sqrt(2.0)
@@ -315,10 +315,10 @@ class SlipWatch:
         length = min(known, key=lambda one: chi_square(count - one))  # the likeliest moment
         gains, values, stds, _ = known[length]
         order = np.argsort(-gains)
-        joints = tuple(int(j) + 1 for j in order if gains[j] > gains[order[0]] - TIE)
+        joints = tuple(int(j) + 1 for j in order if gains[j] > gains[order[0]] - TIE_MARGIN)
         # as sure as the moment is: other moments that are nearly as likely have sizes of their own
         best = order[0]
-        likely = [f[1][best] for f in known.values() if f[0][best] > gains[best] - TIE]
+        likely = [f[1][best] for f in known.values() if f[0][best] > gains[best] - TIE_MARGIN]
         size, std = float(values[best]), float(np.hypot(stds[best], np.std(likely)))
         return Slip(
             joints, size, std, list(self._rests)[-length].time,
@@ -328,7 +328,7 @@ class SlipWatch:
         )  # fmt: skip
 
     def _is_significant(self, length: int) -> bool:
-        """Return whether a slip before the last ``length`` rests is beyond doubt."""
+        """Return whether a slip before the last ``length`` rests is significant."""
         changes = self._changes(length)
         ratios = _ratios(changes)
         if ratios is None:
@@ -339,14 +339,14 @@ class SlipWatch:
             return False
         for i in range(len(changes)):  # a hand on the arm is at one pose, a slip at all
             part = _ratios(changes[:i] + changes[i + 1 :])
-            if part is None or part[0][j] < WITHOUT_ONE * THRESHOLD or part[1][j] * values[j] < 0.0:
+            if part is None or part[0][j] < LEFT_OUT * THRESHOLD or part[1][j] * values[j] < 0.0:
                 return False
-        return self._lead_over_steps(length, j) > BEFORE_STEPS * THRESHOLD
+        return self._lead_over_steps(length, j) > LEAD_OVER_STEPS * THRESHOLD
 
     def _lead_over_steps(self, length: int, joint: int) -> float:
         """Return by how much of chi-square a slip beats what is free, at any other moment.
 
-        A sensor that was zeroed anew two rests before a moment looks like much at that moment.
+        A sensor that was zeroed two rests before a moment looks like a slip at that moment.
         """
         count = len(self._rests)
         free = self._chi_square(None)
@@ -391,7 +391,7 @@ class SlipWatch:
             return []
         old, new = _by_place(rests[:-length]), _by_place(rests[-length:])
         common = [p for p in new if len(old.get(p, ())) >= 2]
-        if self._distinct(common) < FEWEST_PLACES:
+        if self._distinct(common) < MIN_POSES:
             return []
         changes = []
         for p in common:
@@ -412,7 +412,7 @@ class SlipWatch:
         distinct: list[Array] = []
         for p in places:
             q = self._places[p].q
-            if all(np.abs(q - other).max() > TIPS for other in distinct):
+            if all(np.abs(q - other).max() > DISTINCT_POSE for other in distinct):
                 distinct.append(q)
         return len(distinct)
 

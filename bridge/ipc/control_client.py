@@ -11,7 +11,7 @@ from typing import Any
 from gapbridge.bridge.cell.runtime_folder import candidates, cell_key
 from gapbridge.core.errors import InputError, RunError
 
-PATIENCE = 60.0  # s: a loop may have to start anew, arming uploads a program to the robot
+ANSWER_TIMEOUT = 60.0  # s: a loop may have to start anew, arming uploads a program to the robot
 
 
 def ask(cell: Path, command: str) -> Any:
@@ -36,7 +36,7 @@ def ask(cell: Path, command: str) -> Any:
 def ask_socket(path: Path, command: str) -> Any:
     """Return the answer from a daemon's socket. Raises OSError, RunError."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as link:
-        link.settimeout(PATIENCE)
+        link.settimeout(ANSWER_TIMEOUT)
         link.connect(str(path))
         link.sendall(json.dumps({"command": command}).encode() + b"\n")
         with link.makefile("rb") as file:

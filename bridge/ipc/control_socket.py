@@ -19,8 +19,8 @@ from pathlib import Path
 from typing import Any, Self
 
 LONGEST_REQUEST = 4096  # bytes
-PATIENCE = 5.0  # s for a request to come
-MOST_AT_ONCE = 8
+REQUEST_TIMEOUT = 5.0  # s for a request to come
+MAX_CONNECTIONS = 8
 COMMANDS = ("status", "arm", "disarm")
 _CREDENTIALS = struct.Struct("3i")
 
@@ -43,7 +43,7 @@ class ControlSocket:
         self.path = path
         self._answer = answer
         self._listener: socket.socket | None = None
-        self._slots = threading.BoundedSemaphore(MOST_AT_ONCE)
+        self._slots = threading.BoundedSemaphore(MAX_CONNECTIONS)
 
     def open(self) -> None:
         """Listen; what a killed daemon left behind is replaced. The caller holds the cell's lock.
@@ -57,7 +57,7 @@ class ControlSocket:
         try:
             listener.bind(str(self.path))
             self.path.chmod(0o600)  # its folder is 0700: nobody came in between
-            listener.listen(MOST_AT_ONCE)
+            listener.listen(MAX_CONNECTIONS)
         except OSError:
             listener.close()
             raise
@@ -88,7 +88,7 @@ class ControlSocket:
     def _handle(self, connection: socket.socket) -> None:
         try:
             with connection, contextlib.suppress(OSError):
-                connection.settimeout(PATIENCE)
+                connection.settimeout(REQUEST_TIMEOUT)
                 reply = self._reply(connection)
                 connection.sendall(json.dumps(reply).encode() + b"\n")
         finally:

@@ -23,7 +23,7 @@ from gapbridge.bridge.ipc.shared_memory import FollowedMemory, SharedMemory
 from gapbridge.core.errors import GapbridgeError
 from gapbridge.drivers.clock import SYSTEM
 
-FAREWELL = 5.0  # s that a side process may take to end after the daemon
+END_TIMEOUT = 5.0  # s that a side process may take to end after the daemon
 NICENESS = 5  # the loop comes first
 _PIECE = 1 << 16
 
@@ -161,5 +161,5 @@ def _end_after_daemon(fd: int) -> None:
     watch = select.poll()
     watch.register(fd, 0)  # hang-ups only, which are always reported
     watch.poll()
-    SYSTEM.sleep(FAREWELL)
+    SYSTEM.sleep(END_TIMEOUT)
     os._exit(1)

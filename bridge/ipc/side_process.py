@@ -96,12 +96,12 @@ class SideProcess:
         self._wait = min(2.0 * self._wait, BACKOFF[1])
         return f"{self.module} ended with {code}"
 
-    def close(self, patience: float = 3.0) -> None:
+    def close(self, timeout: float = 3.0) -> None:
         """Notify it that the daemon ends, give it ``patience`` s to finish, then end it."""
         self.begin_close()
         if self._process is not None:
             with contextlib.suppress(subprocess.TimeoutExpired):
-                self._process.wait(patience)
+                self._process.wait(timeout)
             self._process.kill()
             self._process.wait()
             self._release()
@@ -157,8 +157,8 @@ class SideProcess:
         if unread == 0:
             self._read_at = now
             self._has_read = self._has_read or self._down.sent > 0
-        patience = STALLED if self._has_read else STARTING
-        if now - self._read_at < patience:
+        timeout = STALLED if self._has_read else STARTING
+        if now - self._read_at < timeout:
             return None
         self.stalls += 1
         self._process.kill()

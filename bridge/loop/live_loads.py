@@ -35,7 +35,7 @@ class LiveLoads:
         self._cog = np.zeros((1, 3))
         self._temperature = np.zeros((1, n))
         self._approach = np.zeros((1, n))
-        self._turned_at: Array | None = None
+        self._q_at_motion: Array | None = None
         self._last = -math.inf  # s, controller clock
 
     def update(self, state: RobotState) -> Loads:
@@ -96,9 +96,9 @@ class LiveLoads:
         self._wrench[0] += share * (state.actual_TCP_force - self._wrench[0])
 
     def _follow_motion(self, q: Array) -> None:
-        before = self._turned_at
+        before = self._q_at_motion
         if before is None:
-            self._turned_at = q.copy()
+            self._q_at_motion = q.copy()
             return
         step = q - before
         moved = np.abs(step) > MOVED

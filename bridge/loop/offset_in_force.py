@@ -19,7 +19,7 @@ from gapbridge.core.arrays import Array
 from gapbridge.drivers.controller_address import address_of
 from gapbridge.drivers.link_settings import DriverSettings
 
-STAYED = 0.02  # rad: an arm that is farther from its last setpoint has been moved by somebody
+MOVED_AWAY = 0.02  # rad: an arm that is farther from its last setpoint has been moved by somebody
 
 
 class InForce(NamedTuple):
@@ -73,7 +73,7 @@ class OffsetInForce:
         if self._which[0] not in (1.0, 2.0):
             return None
         row, n = self._places[int(self._which[0]) - 1], self._n
-        stayed = bool((np.abs(row[:n] - q) <= STAYED).all()) and bool(np.isfinite(row).all())
+        stayed = bool((np.abs(row[:n] - q) <= MOVED_AWAY).all()) and bool(np.isfinite(row).all())
         if not stayed or not row[n : 2 * n].any():
             return None
         return InForce(row[n : 2 * n].copy(), row[2 * n :].copy())

@@ -86,7 +86,7 @@ class ReplayedLoop(Loop):
     def _follow(self, state: State) -> None:
         changed = self._supervisor.follow(state, cast("Cause", _ReplayCause.RECORDED))
         if changed and state == State.ARMED:
-            self._skip()
+            self._restart_checks()
 
     def _began_with(self, cycle: Cycle) -> InForce | None:
         """Return the offset in force that a stream began with: nominal joints are without it."""

@@ -29,8 +29,8 @@ from gapbridge.core.loads import Loads
 from gapbridge.core.state import RobotState, Setpoint
 from gapbridge.drivers.driver import Driver
 
-SETTLED, LONGEST_SETTLING = 2e-6, 0.3  # rad, s
-PARTS_IN_A_ROW = 3  # setpoints that left in part only, after which the motion is ended
+SETTLED, SETTLING_TIMEOUT = 2e-6, 0.3  # rad, s
+PARTIAL_WRITE_LIMIT = 3  # setpoints that left in part only, after which the motion is ended
 
 
 class Writing:
@@ -59,7 +59,7 @@ class Writing:
         self._failed = 0  # setpoints in a row that left in part only
         self._settling = 0.0  # s, monotonic: since when the last setpoint stands
 
-    def paused(self) -> bool:
+    def take_paused(self) -> bool:
         """Return, once, whether arming or letting go kept the loop from looking at states."""
         paused, self._paused = self._paused, False
         return paused
@@ -67,7 +67,7 @@ class Writing:
     @property
     def transit_time(self) -> float:
         """Return how long the last sample may have been under way, s: as measured when arming."""
-        return self._driver.way() if self.ready else 0.0
+        return self._driver.transit_time() if self.ready else 0.0
 
     def abandon(self) -> None:
         """Take note that the driver is not armed any more: its watchdog, or a person, has it."""
@@ -148,7 +148,7 @@ class Writing:
         if self._now() > expiry:
             stream.reset_solver()
             return None
-        source_q = self._next(state, nominal_q)
+        source_q = self._next_setpoint(state, nominal_q)
         self.ramps_out = self._supervisor.state == State.HOLDING
         goal = 0.0 if self.ramps_out else 1.0
         try:
@@ -161,17 +161,17 @@ class Writing:
             return None
         except WriteError as error:
             stream.reset_solver()
-            self._fail(error)
+            self._on_write_error(error)
             return None
         except LimitError as error:
             stream.reset_solver()
-            self._end(LoopCounter.SETPOINT_REFUSED, Cause.SETPOINT_REFUSED, str(error))
+            self._end_motion(LoopCounter.SETPOINT_REFUSED, Cause.SETPOINT_REFUSED, str(error))
             return None
         try:
             if not stream.finite:
                 self.unsent = _copied(setpoint)
                 detail = "the model's correction is no number"
-                self._end(LoopCounter.BAD_OUTPUT, Cause.BAD_OUTPUT, detail)
+                self._end_motion(LoopCounter.BAD_OUTPUT, Cause.BAD_OUTPUT, detail)
             elif self._now() > expiry:  # the system stopped this process since it was judged
                 self.unsent = _copied(setpoint)
                 self._reports.count(LoopCounter.LATE)
@@ -179,21 +179,21 @@ class Writing:
                 self._driver.write_setpoint(setpoint)
                 self._in_force.note(setpoint.q, stream.joint_offset, setpoint.offset_in_base)
                 self._failed = 0
-                self._judge_correction()
-                self._judge_sending(expiry)
+                self._check_solved()
+                self._check_late(expiry)
                 return setpoint
         except WriteError as error:
             self.unsent = _copied(setpoint)
-            self._fail(error)
+            self._on_write_error(error)
         return None
 
-    def _judge_correction(self) -> None:
+    def _check_solved(self) -> None:
         """End the motion where the model has no correction; the offset is on its way out."""
         detail = self._stream.unsolved
         if detail and self._supervisor.take(Cause.UNSOLVED, detail):
             self._reports.count(LoopCounter.UNSOLVED)
 
-    def _judge_sending(self, expiry: float) -> None:
+    def _check_late(self, expiry: float) -> None:
         """End the motion where the system stopped this process between judging and sending."""
         late = self._now() - expiry
         if late > 0.0:
@@ -201,31 +201,31 @@ class Writing:
             self._reports.count(LoopCounter.OVERRUN)
             self._supervisor.take(Cause.OVERRUN, detail)
 
-    def _fail(self, error: WriteError) -> None:
+    def _on_write_error(self, error: WriteError) -> None:
         """Act on a setpoint that could not be delivered."""
         if isinstance(error, GateError):
-            self._end(LoopCounter.SETPOINT_REFUSED, Cause.SETPOINT_REFUSED, str(error))
+            self._end_motion(LoopCounter.SETPOINT_REFUSED, Cause.SETPOINT_REFUSED, str(error))
         elif isinstance(error, PartialWriteError):
-            self._repeat(str(error))
+            self._on_partial_write(str(error))
         elif isinstance(error, IneffectiveWriteError):
-            self._end(LoopCounter.WRITE_INEFFECTIVE, Cause.INEFFECTIVE, str(error))
+            self._end_motion(LoopCounter.WRITE_INEFFECTIVE, Cause.INEFFECTIVE, str(error))
         elif isinstance(error, ForeignCommandError):
-            self._end(LoopCounter.FOREIGN, Cause.FOREIGN, str(error))
+            self._end_motion(LoopCounter.FOREIGN, Cause.FOREIGN, str(error))
         else:
             self._reports.count(LoopCounter.WRITE_FAILED)
             self._supervisor.take(Cause.WRITE_FAILED, str(error))
             self.ready = False
             self.lost = str(error)
 
-    def _repeat(self, detail: str) -> None:
+    def _on_partial_write(self, detail: str) -> None:
         """Leave it to the next cycle, whose setpoint goes out whole; after some, end the motion."""
         self._reports.count(LoopCounter.WRITE_PARTIAL)
         self._failed += 1
-        if self._failed >= PARTS_IN_A_ROW:
+        if self._failed >= PARTIAL_WRITE_LIMIT:
             self._failed = 0
-            self._end(LoopCounter.WRITE_INEFFECTIVE, Cause.INEFFECTIVE, detail)
+            self._end_motion(LoopCounter.WRITE_INEFFECTIVE, Cause.INEFFECTIVE, detail)
 
-    def _end(self, what: LoopCounter, cause: Cause, detail: str) -> None:
+    def _end_motion(self, what: LoopCounter, cause: Cause, detail: str) -> None:
         """End the motion as the table says; let go where it says that nothing more is written."""
         self._reports.count(what)
         self._supervisor.take(cause, detail)
@@ -238,18 +238,18 @@ class Writing:
         The controller's target follows late: who lets go at once leaves the arm short of it.
         """
         if not self._driver.moves_arm:
-            return self._stream.is_bare
-        if not self._stream.rests:
+            return self._stream.has_no_offset
+        if not self._stream.at_rest:
             return False
         now = self._now()
         self._settling = self._settling or now
         near = bool((np.abs(state.target_q - setpoint.q) < SETTLED).all())
-        if near or now - self._settling > LONGEST_SETTLING:
+        if near or now - self._settling > SETTLING_TIMEOUT:
             self._settling = 0.0
             return True
         return False
 
-    def _next(self, state: RobotState, nominal_q: Array) -> Array | None:
+    def _next_setpoint(self, state: RobotState, nominal_q: Array) -> Array | None:
         """Return the source's setpoint; None: the motion must brake."""
         if self._supervisor.state == State.HOLDING:
             return None if self._driver.moves_arm else nominal_q

@@ -45,7 +45,7 @@ from gapbridge.core.limits import CLAMPS
 
 AGE_BOUNDS = (0.00025, 0.0005, 0.001, 0.002, 0.004, 0.008, 0.016, 0.032, 0.064, 0.128)  # s
 WORK_BOUNDS = (0.00005, 0.0001, 0.0002, 0.0004, 0.0008, 0.0016, 0.0032, 0.0064, 0.0128)  # s
-TURN = 0.25  # s between two looks at the shared memory
+POLL_EVERY = 0.25  # s between two looks at the shared memory
 TEXT = "text/plain; version=0.0.4; charset=utf-8"
 AXES = ("x", "y", "z")
 
@@ -158,7 +158,7 @@ def run(start: StartData) -> None:
     registry.register(Families(start.session, counts, guard.refused))
     serve(
         guard, settings, "metrics", lambda: start.events.closed,
-        lambda: counts.turn(start.events.poll()), TURN,
+        lambda: counts.turn(start.events.poll()), POLL_EVERY,
     )  # fmt: skip
 
 

@@ -19,12 +19,9 @@ import numpy as np
 
 from gapbridge.core.arrays import Array
 from gapbridge.drivers.can.profile import CanProfile, Incoming, Key, Status
-from gapbridge.drivers.robot_modes import StopReason
 
 QUANTITIES = ("position", "velocity", "torque", "temperature")
-UNSTEADY = (
-    0.3  # periods: a frame waits for a cycle's six setpoint frames, 3.1 of 10 ms at 250 kbit/s
-)
+UNSTEADY = 0.3  # periods: six setpoint frames delay a frame by 3.1 of 10 ms at 250 kbit/s
 
 
 class Sample(NamedTuple):
@@ -41,7 +38,7 @@ class Sample(NamedTuple):
 
 
 class Assembler:
-    """Takes frames one by one and gives a sample whenever one is complete."""
+    """Takes frames one by one and returns a sample whenever one is complete."""
 
     def __init__(self, profile: CanProfile) -> None:
         self._profile = profile
@@ -58,9 +55,7 @@ class Assembler:
         self._began = 0.0  # s, monotonic
         self._count: float | None = None
         self._tied = profile.ordered or profile.counted or bool(profile.request)
-        self._last_stamps: dict[
-            Key, float
-        ] = {}  # s, bus clock: last frame of each message of the sample
+        self._last_stamps: dict[Key, float] = {}  # s, bus clock: last frame of each message
         self._steady = True  # all frames of the sample begun came a period after their own last one
         self._order: list[Key] = []  # of the sample last given
         self._sample_stamp = -math.inf  # s, bus clock: that sample's last frame
@@ -69,9 +64,7 @@ class Assembler:
         self.enabled: dict[tuple[Key, str], bool] = {}
         self.received_at: dict[Key, float] = {}  # s, monotonic, of each message that we read
         self.stopping: set[tuple[Key, str]] = set()  # members of ``status`` that report a stop
-        self.cleared: dict[
-            tuple[Key, str], tuple[float, StopReason | None, bool]
-        ] = {}  # those that have ended
+        self.ended_stops: dict[tuple[Key, str], Status] = {}  # the last status before the end
         self._last_bytes: dict[Key, bytes] = {}  # last bytes of messages outside the sample
 
     @property
@@ -100,9 +93,7 @@ class Assembler:
         incoming = self._profile.incoming.get(key)
         if incoming is None:
             return None
-        if (
-            self._last_bytes.get(key) == data
-        ):  # the same bytes say the same: most of an arm's status
+        if self._last_bytes.get(key) == data:  # unchanged, as most status messages are
             self.received_at[key] = received
             return None
         try:
@@ -120,7 +111,7 @@ class Assembler:
         return None
 
     def _note(self, incoming: Incoming, values: dict[str, float]) -> None:
-        """Remember what a message says about the arm's health."""
+        """Store what a message reports about the arm's status."""
         for check in incoming.checks:
             value = values[check.signal]
             reason = check.stop_reason(int(value)) if math.isfinite(value) else check.otherwise
@@ -129,7 +120,7 @@ class Assembler:
                 self.stopping.add(place)
             elif place in self.stopping:
                 self.stopping.discard(place)
-                self.cleared[place] = self.status[place]
+                self.ended_stops[place] = self.status[place]
             self.status[place] = (value, reason, check.while_writing)
         for signal in incoming.enabled:
             self.enabled[incoming.key, signal] = values[signal] in self._profile.enabled_values
@@ -162,7 +153,7 @@ class Assembler:
                 self.dropped["repeated"] += 1
                 return None
             self._count = values[incoming.counter]
-        if not self._tied and self._doubtful(list(frames), stamp):
+        if not self._tied and self._may_mix_cycles(list(frames), stamp):
             self.dropped["out of order"] += 1
             return None
         for member, signals in frames.items():
@@ -181,10 +172,10 @@ class Assembler:
         count = values[counter]
         return any(v[counter] != count for v in self._frames.values())
 
-    def _doubtful(self, order: list[Key], stamp: float) -> bool:
-        """Return whether a whole sample may be of two cycles: another order, off the cadence.
+    def _may_mix_cycles(self, order: list[Key], stamp: float) -> bool:
+        """Return whether a complete sample may mix two cycles: another order, off the cadence.
 
-        An order is forgotten with ``status_timeout``: after it the arm may have started anew.
+        An order is kept for ``status_timeout``: after it the arm may have restarted.
         """
         remembered = 0.0 <= stamp - self._sample_stamp <= self._profile.status_timeout
         if remembered and order != self._order and not self._steady:

@@ -37,7 +37,7 @@ def not_following(profile: CanopenProfile, sample: SyncSet) -> int | None:
 
 
 class StateBuilder:
-    """Makes states; remembers the samples before, for velocities."""
+    """Makes states; keeps the previous samples, for velocities."""
 
     def __init__(self, profile: CanopenProfile) -> None:
         self._profile = profile
@@ -49,12 +49,12 @@ class StateBuilder:
         """Return the joints (n,) of the sample before, rad."""
         return self._last[-1][1] if self._last else None
 
-    def forget(self) -> None:
-        """Take no velocity out of the next sample and those before."""
+    def reset(self) -> None:
+        """Compute no velocity from the next sample and those before."""
         self._last.clear()
 
     def remember(self, state: RobotState) -> None:
-        """Take note of a state that can be believed."""
+        """Store a state that passed the plausibility check."""
         self._last.append((state.timestamp, state.actual_q))
 
     def build(self, sample: SyncSet, target: Array | None, armed: bool) -> RobotState:

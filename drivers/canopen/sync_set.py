@@ -133,11 +133,8 @@ class SyncCollector:
         """Return what is wrong with this set."""
         if self._rejected:
             reason, who, detail = self._rejected
-            return (
-                f"{who} came twice after one SYNC"
-                if reason == DropReason.TWICE
-                else f"{who}: {detail}"
-            )
+            twice = reason == DropReason.TWICE
+            return f"{who} came twice after one SYNC" if twice else f"{who}: {detail}"
         missing = [
             f"{layout.name} of node {self._nodes[joint]}"
             for cob_id, (joint, layout) in self._members.items()

@@ -26,7 +26,7 @@ GAUGES, MATRIX, COUNTS, UNITS = 0x0, 0x2, 0x7, 0x8
 ANSWER = 0.1  # s: an answer about the calibration that has not come by then is asked for again
 ATTEMPTS = 3
 SAMPLE = 0.03  # s: a sample that has not come by then is lost (a USB adapter may take 0.016)
-TOGETHER = 0.005  # s between the frames of a sample at most
+FRAME_WINDOW = 0.005  # s between the frames of a sample at most
 SATURATED = 0x10000  # our own bit: a gauge at the end of its range
 # code -> N or Nm
 FORCE_UNITS = {1: 4.4482216152605, 2: 1.0, 3: 4448.2216152605, 4: 1e3, 5: 9.80665, 6: 9.80665e-3}
@@ -57,16 +57,16 @@ class AnswerDecoder:
     def __init__(self, first_id: int, frames: int, window: float) -> None:
         self._first_id, self._frames = first_id, frames
         self._window = window  # s from the first frame to the last at most
-        self._found: list[bytes] = []
+        self._received: list[bytes] = []
         self._begun = 0.0
         self.dropped = 0
 
     def take(self, identifier: int, data: bytes, stamp: float) -> list[bytes] | None:
         """Take one frame with its time stamp (s); returns the answer where it is complete."""
-        frames = self._found
+        frames = self._received
         if identifier == self._first_id:
             self.dropped += len(frames)
-            self._found, self._begun = [data], stamp
+            self._received, self._begun = [data], stamp
         elif frames and identifier == self._first_id + len(frames):
             if 0.0 <= stamp - self._begun <= self._window:
                 frames.append(data)
@@ -74,14 +74,14 @@ class AnswerDecoder:
                 self._drop()
         else:
             self._drop()
-        if len(self._found) < self._frames:
+        if len(self._received) < self._frames:
             return None
-        answer, self._found = self._found, []
+        answer, self._received = self._received, []
         return answer
 
     def _drop(self) -> None:
-        self.dropped += 1 + len(self._found)
-        self._found = []
+        self.dropped += 1 + len(self._received)
+        self._received = []
 
 
 class AtiNetCanOem(CanSensor):
@@ -167,7 +167,7 @@ class AtiNetCanOem(CanSensor):
         requested_at = time.monotonic()
         self._due = max(self._due + 1.0 / self.settings.rate, requested_at)
         self._send(self._base | GAUGES, b"")
-        answer = self._answer(GAUGES, 2, requested_at + SAMPLE, TOGETHER)
+        answer = self._answer(GAUGES, 2, requested_at + SAMPLE, FRAME_WINDOW)
         received = time.monotonic()
         if answer is None:
             return None

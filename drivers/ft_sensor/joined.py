@@ -82,10 +82,10 @@ class DriverWithSensor(Driver):
         force = self._tcp_force.of(wrench, state)
         return state._replace(ft_raw_wrench=wrench, actual_TCP_force=force)
 
-    def forget(self) -> None:
-        """See Driver.forget."""
-        super().forget()
-        self._arm.forget()
+    def reset_check(self) -> None:
+        """See Driver.reset_check."""
+        super().reset_check()
+        self._arm.reset_check()
 
     def keep_alive(self) -> None:
         """See Driver.keep_alive."""
@@ -95,9 +95,9 @@ class DriverWithSensor(Driver):
         """See Driver.round_trip."""
         return self._arm.round_trip()
 
-    def way(self) -> float:
-        """See Driver.way."""
-        return self._arm.way()
+    def transit_time(self) -> float:
+        """See Driver.transit_time."""
+        return self._arm.transit_time()
 
     def unanswered_since(self) -> float:
         """See Driver.unanswered_since."""
@@ -135,7 +135,7 @@ class DriverWithSensor(Driver):
                 "arming (ft_sensor.connect_timeout)"
             )
 
-    def _let_go(self) -> None:
+    def _release(self) -> None:
         """Stop writing to the arm."""
         self._arm.release()
 
@@ -166,7 +166,7 @@ class TcpForce:
     def __init__(self, model: Model) -> None:
         self._model = model
         self._tool = np.array(model.tool_in_flange, dtype=float)
-        self._undo, self._bias = _undoing(model)
+        self._undo, self._bias = _sensor_correction(model)
         # laid out once: Model.predict would do it anew in every cycle
         rigid = model.without_terms()
         self._chain, self._rows = rigid.chain(), rigid.rows(np.zeros((1, model.arm.n)))
@@ -204,19 +204,19 @@ def _cross(a: Array, b: Array) -> Array:
     )
 
 
-def _undoing(model: Model) -> tuple[Array, Array]:
+def _sensor_correction(model: Model) -> tuple[Array, Array]:
     """Return matrix (6, 6) and bias (6,): what acts = matrix (reading - bias)."""
     probes = np.vstack([np.zeros((1, 6)), np.eye(6)])
     for term in acting(model.terms, "wrench"):
         effect = CATALOGUE[term.effect]
         # the sensor's own; a drift needs the time of its log
         if effect.channels == ("wrench",) and "timestamp" not in effect.needs:
-            probes = effect.sense(term, model.arm, probes, _standing(model))
+            probes = effect.sense(term, model.arm, probes, _motion_at_rest(model))
     bias = probes[0]
     return np.linalg.inv((probes[1:] - bias).T), bias
 
 
-def _standing(model: Model) -> Motion:
+def _motion_at_rest(model: Model) -> Motion:
     """Return seven rows of an arm at rest, for the probes."""
     zeros, rows = np.zeros((7, model.arm.n)), np.arange(7)
     return Motion(
@@ -234,7 +234,7 @@ class SensorReader:
         self._readings: deque[Reading] = deque(maxlen=KEPT)
         self._broken = ""  # why the link is down
         self._stopping = threading.Event()
-        self._came = threading.Event()
+        self._new_sample = threading.Event()
         self._thread: threading.Thread | None = None
 
     def start(self) -> None:
@@ -253,8 +253,8 @@ class SensorReader:
 
     def wait(self, timeout: float) -> bool:
         """Wait for the next sample up to ``timeout`` s; returns whether one has come."""
-        self._came.clear()
-        return self._came.wait(timeout)
+        self._new_sample.clear()
+        return self._new_sample.wait(timeout)
 
     def _why(self) -> str:
         """Return why there may be no sample, for messages."""
@@ -280,7 +280,7 @@ class SensorReader:
             if reading is not None:
                 pause = BACKOFF[0]
                 self._readings.append(reading)
-                self._came.set()
+                self._new_sample.set()
 
     def at(self, moment: float) -> Reading:
         """Return what the sensor read at a ``moment`` (s, monotonic), between two samples if need.
@@ -292,15 +292,15 @@ class SensorReader:
         readings = list(self._readings)
         self._require_fresh(readings)
         later = readings[-1]
-        self._require_sound(later)
+        self._require_valid(later)
         for earlier in reversed(readings[:-1]):
             if later.timestamp <= moment:
                 break
             if earlier.timestamp <= moment:
-                self._require_sound(earlier)
+                self._require_valid(earlier)
                 return _between(earlier, later, moment)
             later = earlier
-        self._require_sound(later)
+        self._require_valid(later)
         return later
 
     def _require_fresh(self, readings: list[Reading]) -> None:
@@ -312,7 +312,7 @@ class SensorReader:
                 f"expected at most {limit:g} s (ft_sensor.max_age)"
             )
 
-    def _require_sound(self, reading: Reading) -> None:
+    def _require_valid(self, reading: Reading) -> None:
         name, limits = self._sensor.name, self._settings.overload
         if reading.status:
             raise InvalidStateError(f"{name}: {self._sensor.describe(reading.status)}")

@@ -98,7 +98,7 @@ class RobotiqFt300(ForceTorqueSensor):
 
     def _begin(self, tries: int) -> None:
         """End a stream that runs, and start ours; again where that fails and tries are left."""
-        self._quieten()
+        self._stop_stream()
         if self.settings.mode != "stream":
             return
         try:
@@ -108,7 +108,7 @@ class RobotiqFt300(ForceTorqueSensor):
                 raise
             self._begin(tries - 1)
 
-    def _quieten(self) -> None:
+    def _stop_stream(self) -> None:
         """End a stream and drop what is left of it."""
         line = self._line()
         try:

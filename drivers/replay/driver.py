@@ -70,7 +70,7 @@ class ReplayDriver(Driver):
                 f"{settings.file}: found {n} joints, expected {model.arm.n} as the cell's arm has"
             )
         super().__init__(float(first["rate"]), model, clock=clock)
-        self.gate.count_by(lambda: self._last)  # a recording may go by faster than it was made
+        self.gate.set_clock(lambda: self._last)  # a recording may go by faster than it was made
         self.cycle: Cycle | None = None
         self._left: Iterator[Mapping[str, Array]] = iter(())
         self._begun = 0.0  # s, monotonic: when the recording's time 0 was

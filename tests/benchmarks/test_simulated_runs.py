@@ -118,7 +118,7 @@ def test_a_way_longer_than_a_state_may_be_old_lets_no_setpoint_leave(
     monkeypatch: Patch, driver: type[Driver], seed: int
 ) -> None:
     assert run(seed, plan=[]).oldest > 0.0
-    monkeypatch.setattr(driver, "way", lambda _: 0.11)
+    monkeypatch.setattr(driver, "transit_time", lambda _: 0.11)
     assert run(seed, plan=[]).oldest == 0.0  # no setpoint at all; arming writes too
 
 
@@ -248,7 +248,7 @@ def _takes_old_states(patch: Patch) -> None:
 
 def _ties_clocks_while_writing(patch: Patch) -> None:
     take = ControllerClock.take
-    patch.setattr(ControllerClock, "take", lambda self, state, way_known=False: take(self, state))
+    patch.setattr(ControllerClock, "take", lambda self, state, **_: take(self, state))
     patch.setattr(OffsetWriter, "unanswered_since", lambda _: math.inf)
     patch.setattr(Supervisor, "take", _without(Supervisor.take, Cause.STALE))
 

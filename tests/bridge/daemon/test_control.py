@@ -274,7 +274,7 @@ class NoLoop:
 def test_a_disarming_that_no_loop_has_taken_is_not_called_done(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(control, "LONGEST_TAKING", 0.1)
+    monkeypatch.setattr(control, "LONGEST_PICKUP", 0.1)
     daemon = NoLoop()
     reply = control.Control(daemon).answer("disarm", Peer(1, 2))  # type: ignore[arg-type]
     assert not reply["ok"]

@@ -134,7 +134,7 @@ def test_half_a_setpoint_is_taken_back(served, at):
     assert breaking.sent[at:] == [
         (key[0], data) for key, data in first
     ]  # whole, and last on the wire
-    assert served.driver.writer.mended == 1
+    assert served.driver.writer.reverted == 1
     time.sleep(0.1)
     assert served.controller.target_q == pytest.approx(q, abs=UNIT)
 

@@ -156,7 +156,7 @@ def test_a_part_of_a_setpoint_never_takes_effect(
     for _ in range(5):
         settled(driver)
     assert np.abs(hold - generic.controller.q).max() < 1e-5
-    assert driver.writer.mended > 0
+    assert driver.writer.reverted > 0
     driver.write_setpoint(setpoint(hold + 0.001, settled(driver)))
 
 
