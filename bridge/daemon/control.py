@@ -1,4 +1,4 @@
-"""What the daemon answers over its local socket; every request leaves an event behind."""
+"""The daemon's answers over its local socket; every request emits an event."""
 
 from __future__ import annotations
 
@@ -14,26 +14,26 @@ from gapbridge.drivers.clock import SYSTEM, Clock
 
 LONGEST_ARMING = 25.0  # s: uploads a program to the robot
 LONGEST_RAMP = 20.0  # s
-LONGEST_PICKUP = 20.0  # s: a new process of the loop may have to start first
-SOURCE_SILENT = 1.0  # s without a first setpoint after which arming is reported to be waiting
+LONGEST_PICKUP = 20.0  # s until a loop receives a request: a new one may have to start
+SOURCE_SILENT = 1.0  # s without a first setpoint after which "armed; waits" is answered
 POLL_EVERY = 0.02  # s
 ARMED = State.ARMED.name
 
 
 class Controlled(Protocol):
-    """The part of the daemon that is asked; called from other threads than its own."""
+    """The part of the daemon that requests use, from other threads."""
 
     @property
     def state(self) -> State:
-        """Return what the loop is doing."""
+        """Return the state of the loop."""
 
     @property
     def phase(self) -> Phase:
-        """Return what the loop's process is at."""
+        """Return the phase of the loop's process."""
 
     @property
     def latched(self) -> str:
-        """Return the fault that waits for being acknowledged; empty: none."""
+        """Return the latched fault, not acknowledged yet; empty: none."""
 
     @property
     def may_write(self) -> bool:
@@ -51,20 +51,20 @@ class Controlled(Protocol):
 
     @property
     def last_taken(self) -> int:
-        """Return the number of the newest request that a loop has taken."""
+        """Return the number of the newest request that a loop has received."""
 
     def arm(self, by: str) -> int:
-        """Ask the loop to write; returns the request's number, 0 where none is made."""
+        """Request writing; returns the request's number, 0 if it cannot be made."""
 
     def disarm(self, by: str) -> int:
-        """Ask this loop or the next one to ramp out, or acknowledge a fault; returns its number."""
+        """Request ramping out, or acknowledge a fault; returns the request's number."""
 
     def note(self, event: Event) -> None:
         """Emit an event."""
 
 
 class Control:
-    """Answers requests; ``answer`` may take as long as the arm does."""
+    """Answers requests; ``answer`` may take as long as arming or ramping out."""
 
     def __init__(self, daemon: Controlled, clock: Clock = SYSTEM) -> None:
         self._daemon, self._clock = daemon, clock
@@ -120,7 +120,7 @@ class Control:
         return refusal(f"no answer of the loop within {LONGEST_ARMING:g} s")
 
     def _disarm(self, by: str) -> dict[str, Any]:
-        """Ask, always; what is answered is what a loop has taken, never what was hoped for."""
+        """Request it in any state, and answer what a loop has confirmed."""
         daemon = self._daemon
         observed = daemon.state == State.OBSERVING and not daemon.latched
         fault = daemon.latched

@@ -1,8 +1,8 @@
 """Structured logs: each of the daemon's events as one line of JSON (``run --log json``).
 
 Fields that every line has: ``time`` (ISO 8601, UTC), ``level``, ``event`` (its kind), ``message``.
-What else an event carries follows under its own name. Nothing of a cell's text, keys or tokens is
-among it: see HIDDEN.
+The other fields of an event follow under their own names, without the cell's text, keys or tokens:
+see HIDDEN.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _ERRORS = (EventKind.FAULT, EventKind.REFUSED)
 
 
 def log_line(event: Mapping[str, Any]) -> str:
-    """Return an event as one line of JSON, without its end."""
+    """Return an event as one line of JSON, without the newline."""
     time = datetime.fromtimestamp(float(event.get("time", 0.0)), UTC)
     line: dict[str, Any] = {
         "time": time.isoformat(timespec="milliseconds").replace("+00:00", "Z"),
@@ -41,7 +41,7 @@ def log_line(event: Mapping[str, Any]) -> str:
 
 
 class JsonLines:
-    """Writes events to a stream, usually stderr; a stream that is gone or full stops nothing."""
+    """Writes events to a stream, usually stderr; ignores a closed or full stream."""
 
     def __init__(self, stream: IO[str]) -> None:
         self._stream = stream
@@ -74,7 +74,7 @@ def _message(event: Mapping[str, Any]) -> str:
 
 
 def _shown(key: str, value: Any) -> Any:
-    """Return a value as it may be shown: no secrets, at any depth, and not endless."""
+    """Return a value without secrets, at any depth, and with strings cut to LONGEST."""
     if HIDDEN.search(key) and not isinstance(value, bool):
         return "(hidden)"
     if isinstance(value, Mapping):

@@ -1,4 +1,4 @@
-"""The writing half of the loop: begin, send, bring to rest, let go."""
+"""The writing half of the loop: start, send, bring to rest, release."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ from gapbridge.core.loads import Loads
 from gapbridge.core.state import RobotState, Setpoint
 from gapbridge.drivers.driver import Driver
 
-SETTLED, SETTLING_TIMEOUT = 2e-6, 0.3  # rad, s
-PARTIAL_WRITE_LIMIT = 3  # setpoints that left in part only, after which the motion is ended
+SETTLED, SETTLING_TIMEOUT = 2e-6, 0.3  # rad from the last setpoint, s until release anyway
+PARTIAL_WRITE_LIMIT = 3  # setpoints in a row sent only in part that end the motion
 
 
 class Writing:
-    """Sends what the states of the supervisor allow, and nothing else."""
+    """Sends setpoints in the states of the supervisor that allow it."""
 
     def __init__(
         self,
@@ -51,32 +51,32 @@ class Writing:
         self._stream, self._supervisor, self._reports = stream, supervisor, reports
         self._in_force = in_force or OffsetInForce(driver.n, None)
         self.ready = False  # the driver is armed
-        self.has_armed = False  # it was, at some time in this process
-        self.unsent: Setpoint | None = None  # computed in the last cycle, and not (wholly) sent
-        self.ramps_out = False  # the last one's offset was to go
-        self.lost: str | None = None  # why the link must be given up
-        self._paused = False  # see ``paused``
-        self._failed = 0  # setpoints in a row that left in part only
-        self._settling = 0.0  # s, monotonic: since when the last setpoint stands
+        self.has_armed = False  # the driver has been armed in this process
+        self.unsent: Setpoint | None = None  # computed in the last cycle, not (completely) sent
+        self.ramps_out = False  # the last setpoint's offset was ramping out
+        self.lost: str | None = None  # why the link is lost
+        self._paused = False  # see ``take_paused``
+        self._failed = 0  # setpoints in a row sent only in part
+        self._settling = 0.0  # s, monotonic: since when the setpoint is at rest
 
     def take_paused(self) -> bool:
-        """Return, once, whether arming or letting go kept the loop from looking at states."""
+        """Return, once, whether arming or releasing kept the loop from reading states."""
         paused, self._paused = self._paused, False
         return paused
 
     @property
     def transit_time(self) -> float:
-        """Return how long the last sample may have been under way, s: as measured when arming."""
+        """Return the bound of the last sample's transit time, s; see Driver.transit_time."""
         return self._driver.transit_time() if self.ready else 0.0
 
     def abandon(self) -> None:
-        """Take note that the driver is not armed any more: its watchdog, or a person, has it."""
+        """Record that the driver is not armed any more: the robot has stopped by itself."""
         self.ready = False
 
     def start(self, state: RobotState, nominal_q: Array) -> bool:
-        """Begin writing once the source has a first setpoint and the driver is ready.
+        """Start writing once the source has a first setpoint and the driver is ready.
 
-        Returns whether it took so long that a fresh state is needed.
+        Returns whether a fresh state is needed, because it took too long.
         """
         first = self._source.first(nominal_q)
         if first is None:
@@ -109,7 +109,7 @@ class Writing:
         return False
 
     def _arm_driver(self, state: RobotState) -> None:
-        """Make the driver ready, which takes a moment: a fresh state is needed after it."""
+        """Arm the driver; a fresh state is needed afterwards. Raises WriteError."""
         self._reports.memory.enter(Phase.ARMING)
         self.has_armed = True
         try:
@@ -123,9 +123,9 @@ class Writing:
             self._paused = True
 
     def _check_round_trip(self) -> None:
-        """Refuse a link on which no state can be fresh. Raises WriteError."""
+        """Raise WriteError if the round trip is too long for fresh states."""
         round_trip, rate = self._driver.round_trip(), self._driver.rate
-        most = hold_time(rate) - 1.0 / rate  # a setpoint leaves within a cycle
+        most = hold_time(rate) - 1.0 / rate  # a setpoint is sent within a cycle
         if round_trip is not None and round_trip > most:
             raise WriteError(
                 f"link: a question and its answer take {1e3 * round_trip:.0f} ms, expected at most "
@@ -139,9 +139,9 @@ class Writing:
     def write(
         self, state: RobotState, nominal_q: Array, loads: Loads, expiry: float = np.inf
     ) -> Setpoint | None:
-        """Send one setpoint; returns it, or None where none has left.
+        """Send one setpoint; returns it, or None if none was sent.
 
-        ``expiry`` (s, monotonic): later than that nothing may leave that is made of this state.
+        ``expiry`` (s, monotonic): after it no setpoint from this state may be sent.
         """
         stream, self.unsent = self._stream, None
         self.ramps_out = self._supervisor.state == State.HOLDING
@@ -152,7 +152,7 @@ class Writing:
         self.ramps_out = self._supervisor.state == State.HOLDING
         goal = 0.0 if self.ramps_out else 1.0
         try:
-            self._driver.keep_alive()  # may wait for the robot: before the state's age is judged
+            self._driver.keep_alive()  # may block: before the state's age is checked
             expiry = min(expiry, self._driver.unanswered_since() + self._hold)
             setpoint = stream.advance(state, source_q, loads, goal, expiry)
         except StaleStateError:
@@ -172,7 +172,7 @@ class Writing:
                 self.unsent = _copied(setpoint)
                 detail = "the model's correction is no number"
                 self._end_motion(LoopCounter.BAD_OUTPUT, Cause.BAD_OUTPUT, detail)
-            elif self._now() > expiry:  # the system stopped this process since it was judged
+            elif self._now() > expiry:  # the system suspended this process since the check
                 self.unsent = _copied(setpoint)
                 self._reports.count(LoopCounter.LATE)
             else:
@@ -188,13 +188,13 @@ class Writing:
         return None
 
     def _check_solved(self) -> None:
-        """End the motion where the model has no correction; the offset is on its way out."""
+        """End the motion if the model has no correction; the offset ramps out."""
         detail = self._stream.unsolved
         if detail and self._supervisor.take(Cause.UNSOLVED, detail):
             self._reports.count(LoopCounter.UNSOLVED)
 
     def _check_late(self, expiry: float) -> None:
-        """End the motion where the system stopped this process between judging and sending."""
+        """End the motion if the system suspended this process between check and sending."""
         late = self._now() - expiry
         if late > 0.0:
             detail = f"a setpoint left {1e3 * late:.0f} ms after its state was too old"
@@ -218,7 +218,7 @@ class Writing:
             self.lost = str(error)
 
     def _on_partial_write(self, detail: str) -> None:
-        """Leave it to the next cycle, whose setpoint goes out whole; after some, end the motion."""
+        """Leave it to the next cycle's setpoint; after PARTIAL_WRITE_LIMIT, end the motion."""
         self._reports.count(LoopCounter.WRITE_PARTIAL)
         self._failed += 1
         if self._failed >= PARTIAL_WRITE_LIMIT:
@@ -226,16 +226,16 @@ class Writing:
             self._end_motion(LoopCounter.WRITE_INEFFECTIVE, Cause.INEFFECTIVE, detail)
 
     def _end_motion(self, what: LoopCounter, cause: Cause, detail: str) -> None:
-        """End the motion as the table says; let go where it says that nothing more is written."""
+        """End the motion as the transition table says; release if no more may be written."""
         self._reports.count(what)
         self._supervisor.take(cause, detail)
         if not self._supervisor.state.writes:
             self.release()
 
     def at_rest(self, setpoint: Setpoint, state: RobotState) -> bool:
-        """Return whether the offset is out, and the arm, where it is ours, stands.
+        """Return whether the offset is zero and, if setpoints move the arm, the arm is at rest.
 
-        The controller's target follows late: who lets go at once leaves the arm short of it.
+        The controller's target lags: an early release would stop the arm short of the setpoint.
         """
         if not self._driver.moves_arm:
             return self._stream.has_no_offset
@@ -250,7 +250,7 @@ class Writing:
         return False
 
     def _next_setpoint(self, state: RobotState, nominal_q: Array) -> Array | None:
-        """Return the source's setpoint; None: the motion must brake."""
+        """Return the source's setpoint (n,) rad; None: the motion must brake."""
         if self._supervisor.state == State.HOLDING:
             return None if self._driver.moves_arm else nominal_q
         try:
@@ -266,7 +266,7 @@ class Writing:
         return source_q
 
     def release(self) -> None:
-        """Leave the robot to itself; the arm has come to rest, or its watchdog stops it."""
+        """Release the driver; the arm is at rest, or the robot's watchdog stops it."""
         self._stream.end()
         if not self.ready:
             return
@@ -281,7 +281,7 @@ class Writing:
 
 
 def _copied(setpoint: Setpoint) -> Setpoint:
-    """Return a setpoint whose arrays stay, whatever the limiter does next."""
+    """Return a setpoint with copies of its arrays, which the limiter reuses."""
     return setpoint._replace(
         q=setpoint.q.copy(),
         nominal_q=setpoint.nominal_q.copy(),
