@@ -1,4 +1,4 @@
-"""Watching for a joint whose zero has moved: rests at the same pose, compared over a run.
+"""Detecting a joint whose zero has moved: readings at rest at the same pose, over a run.
 
 A robot's program comes back to the same poses. What the flange sensor and the motors measure there
 repeats but for noise, whatever the model gets wrong, so that each rest is compared with earlier
@@ -27,29 +27,29 @@ from gapbridge.bridge.ipc.events import Event, EventKind
 from gapbridge.core.arrays import Array
 from gapbridge.core.model import Model
 
-STILL = 1e-3  # rad from where a rest began: farther, the arm has moved on
-SETTLING = 0.1  # s at the begin of a rest that are left out
+STILL = 1e-3  # rad from the start of a rest, within which the arm is at rest
+SETTLING = 0.1  # s at the start of a rest that are skipped
 WINDOW = 0.3  # s of one mean
-WINDOWS = 20  # of a rest that count
+WINDOWS = 20  # per rest
 SAME_POSE = 0.02  # rad
 SAME_MASS = 0.01  # kg
 APPROACH_STEP = 0.01  # rad: smallest motion that determines a joint's approach direction
 MAX_RESTS = 120  # stored rests
 MAX_POSES = 64  # stored poses; a program with more drops the least recent ones
 SUFFIXES = (4, 5, 6, 8, 12, 18, 27, 40)  # rests since the moment that is tried
-NOISE_SAMPLES = 18  # differences between rests at one pose that the noise is taken from
+NOISE_SAMPLES = 18  # differences between rests at one pose for the noise estimate
 MIN_POSES = 4  # poses that a slip must show at
 LEAD_OVER_STEPS = 0.5  # of the threshold: how far a slip is ahead of any step of zeros and payload
 LEFT_OUT = 0.25  # share of the threshold that a slip keeps whichever pose is left out
 THRESHOLD = 45.0  # of the likelihood ratio (chi-square of one number)
-CONSISTENT = 3.0  # chi-square per number that a slip may leave: more, it is something else
+CONSISTENT = 3.0  # largest chi-square per number after fitting a slip
 TIE_MARGIN = 9.0  # of the ratio: joints within it of the best one are reported too
 FLOORS = (0.05, 0.005, 0.05)  # N, Nm of the flange sensor, Nm of a motor: 1 sigma at least
-LARGEST_SLIP = 0.05  # rad: what no slip makes is a force
+LARGEST_SLIP = 0.05  # rad: larger changes are forces
 FORCE = 1.0  # N on top of that
 FORCE_SIGMAS = 8.0
-LASTING_RESTS = 3  # rests in a row after which a force counts as the new state of things
-DISTINCT_POSE = 0.1  # rad: poses closer than this are one to the test
+LASTING_RESTS = 3  # rests in a row after which a force counts as permanent
+DISTINCT_POSE = 0.1  # rad: poses closer than this count as one
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ class Slip:
 
 @dataclass(frozen=True)
 class Force:
-    """A force that came while the arm stood, or held during a rest."""
+    """An external force that changed or lasted during a rest."""
 
     size: float  # N
     since: float  # s, controller's clock
@@ -96,7 +96,7 @@ class _Rest:
 
 
 class _Change(NamedTuple):
-    """The rests at one pose after a moment, less those before it; whitened."""
+    """Difference of readings at one pose, after minus before a moment; whitened."""
 
     b: Array  # (k,)
     slip: Array  # (k, n)
@@ -114,7 +114,7 @@ class _Standstill:
         self._count, self._begun = 0, 0.0  # rows of the window, and s of the first
 
     def take(self, rows: Array, begun: float, ended: float) -> tuple[Array, Array] | None:
-        """Return a window that has ended, and how it differs from the one before it, if any."""
+        """Return a finished window's mean, and its difference from the one before, if any."""
         self._begun = self._begun if self._count else begun
         self._sum, self._count = self._sum + rows.sum(axis=0), self._count + len(rows)
         if ended - self._begun < WINDOW:
@@ -164,12 +164,12 @@ class SlipWatch:
 
     @property
     def learned(self) -> bool:
-        """Return whether poses have come back often enough to compare them."""
+        """Return whether enough poses were repeated to compare them."""
         return self._model is not None and self._sigma is not None
 
     @property
     def detail(self) -> str:
-        """Return in words what is watched."""
+        """Return the progress as text."""
         if self._model is None:
             return "not watched"
         poses = len({rest.place for rest in self._rests})
@@ -198,7 +198,7 @@ class SlipWatch:
     # -- one rest ---------------------------------------------------------------------------------
 
     def _force_step(self, mean: Array, change: Array, now: float) -> list[Slip | Force]:
-        """Report a force that comes or goes while the arm stands: nobody's zero, once a rest."""
+        """Report a force that changes while the arm is at rest, once a rest; not a slip."""
         if self._touched or self._sigma is None:
             return []
         assert self._model is not None
@@ -208,17 +208,17 @@ class SlipWatch:
         return [_force(size, now, "came or went while the arm stood still")] * self._touched
 
     def _threshold(self, slip: float) -> float:
-        """Return the force, N, above which a change is more than noise and a slip's ``slip``, N."""
+        """Return the force, N, above which a change exceeds noise and a slip's ``slip``, N."""
         assert self._sigma is not None
         return slip + max(FORCE, FORCE_SIGMAS * float(self._sigma[:3].max()))
 
     def _end_rest(self) -> list[Slip | Force]:
-        """Take the rest that has ended into the comparison."""
+        """Add the finished rest to the comparison."""
         standing = self._standstill
         if standing is None or not standing.windows:
             return []
         assert self._model is not None
-        # the middle window: a touch that is shorter than half of the rest leaves no trace
+        # the median window: a touch shorter than half of the rest has no effect
         mean = _median(standing.windows)
         place = self._place_of(mean)
         rest = _Rest(place, standing.since, self._model.readings(mean, self._places[place]))
@@ -235,7 +235,7 @@ class SlipWatch:
         return findings
 
     def _forces(self, rest: _Rest) -> list[Slip | Force]:
-        """Keep rests under a force out, as long as they are few in a row."""
+        """Exclude rests under a force, up to LASTING_RESTS in a row."""
         excess = self._excess(rest)
         if excess is None:
             self._under_force = []
@@ -249,7 +249,7 @@ class SlipWatch:
         return []
 
     def _excess(self, rest: _Rest) -> float | None:
-        """Return the force, N, that no slip makes beside the former rests at a pose, or None."""
+        """Return the change of force, N, at a pose if it is too large for a slip, or None."""
         former = [r.readings for r in self._rests if r.place == rest.place]
         if self._sigma is None or len(former) < 2:
             return None
@@ -258,7 +258,7 @@ class SlipWatch:
         return size if size > self._threshold(float(slip)) else None  # NaN: no sensor
 
     def _place_of(self, mean: Array) -> int:
-        """Return the number of the pose, a new one where it has not been seen yet."""
+        """Return the number of the pose, a new one if it was not seen yet."""
         assert self._model is not None
         n = self._n
         q, mass = mean[:n], self._model.payload(mean)[0]
@@ -302,7 +302,7 @@ class SlipWatch:
         return np.asarray(np.maximum(spread, self._floor))
 
     def _slip(self) -> Slip | None:
-        """Return the slip that the rests up to now show."""
+        """Return the slip that the rests show, or None."""
         if self._sigma is None or not any(self._is_significant(length) for length in SUFFIXES):
             return None
         tried = {

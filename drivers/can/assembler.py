@@ -1,12 +1,12 @@
-"""Frames -> samples: a sample counts only when all its frames belong together.
+"""Frames -> samples: a sample is valid only if all its frames belong to one cycle.
 
-All of its messages must come within the profile's window, none twice, in order where the profile
-says so, and with the same count where they carry one. Everything else is dropped and counted.
+All of its messages must arrive within the profile's window, none twice, in order if the profile
+requires it, and with the same count if they have one. Everything else is dropped and counted.
 
-Where neither order nor count ties them together, the window alone does, and it is blind where
-frames are held up and then come in a burst (an adapter that stamps what it hands on, an arm that is
-late): with a frame lost, two cycles can fill one window. Such a sample shows in its order: what
-was lost comes last. Drifting nodes change their order too, but each keeps its own cadence.
+Without order or count, only the window relates the frames. It fails if frames are delayed and then
+arrive in a burst (an adapter that stamps on delivery, a late arm): with a frame lost, two cycles
+can fill one window. Such a sample differs in its order: the lost frame comes last. Drifting nodes
+change their order too, but each keeps its own period.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ UNSTEADY = 0.3  # periods: six setpoint frames delay a frame by 3.1 of 10 ms at 
 class Sample(NamedTuple):
     """One complete sample, SI units; (n,) each, NaN where a joint has not reported yet.
 
-    A tuple, because one is made in every cycle.
+    A tuple, because one is created in every cycle.
     """
 
     position: Array  # rad
@@ -56,8 +56,8 @@ class Assembler:
         self._count: float | None = None
         self._tied = profile.ordered or profile.counted or bool(profile.request)
         self._last_stamps: dict[Key, float] = {}  # s, bus clock: last frame of each message
-        self._steady = True  # all frames of the sample begun came a period after their own last one
-        self._order: list[Key] = []  # of the sample last given
+        self._steady = True  # each frame of the present sample came one period after its last one
+        self._order: list[Key] = []  # of the last sample
         self._sample_stamp = -math.inf  # s, bus clock: that sample's last frame
         self.dropped: Counter[str] = Counter()  # reason -> frames or sets
         self.status: dict[tuple[Key, str], Status] = {}
@@ -69,12 +69,12 @@ class Assembler:
 
     @property
     def broken(self) -> int:
-        """Return how often frames made no sample."""
+        """Return how often frames formed no sample."""
         return self.dropped.total()
 
     @property
     def missing(self) -> list[str]:
-        """Return the messages that a sample still lacks which has been begun; none: not begun."""
+        """Return the messages that the present sample lacks; empty if none has begun."""
         if not self._frames:
             return []
         return [
@@ -82,7 +82,7 @@ class Assembler:
         ]
 
     def reset(self) -> None:
-        """Forget a sample that has been begun."""
+        """Discard the present incomplete sample."""
         self._frames.clear()
 
     def take(self, key: Key, data: bytes, stamp: float, received: float) -> Sample | None:
@@ -161,7 +161,7 @@ class Assembler:
         return self._sample(stamp, received)
 
     def _breaks(self, incoming: Incoming, values: dict[str, float], stamp: float) -> bool:
-        """Return whether a frame cannot belong to the sample that has been begun."""
+        """Return whether a frame cannot belong to the present sample."""
         if incoming.key in self._frames or not 0.0 <= stamp - self._first <= self._profile.window:
             return True
         if self._profile.ordered and self._profile.sample[len(self._frames)] != incoming.key:

@@ -1,4 +1,4 @@
-"""The reading half: frames from the bus, samples and another commander's frames out of them."""
+"""The reading half: samples and another commander's frames from the frames of the bus."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class ForeignCommand:
 
 
 class FrameReader:
-    """Reads one bus for one profile. Opens and closes it; knows nothing of writing."""
+    """Reads one bus for one profile. Opens and closes it; independent of writing."""
 
     def __init__(self, settings: CanSettings, profile: CanProfile, clock: Clock = SYSTEM) -> None:
         self._now = clock.monotonic
@@ -38,11 +38,11 @@ class FrameReader:
         self.assembler = Assembler(profile)
         self.foreign: ForeignCommand | None = None
         self.error_frames = 0
-        self.identifiers: set[int] = set()  # heard at all, for messages
+        self.identifiers: set[int] = set()  # received, for messages
         self._targets = {f.key: f for f in profile.setpoint if f.joints}
         self._motors = sum(len(incoming.enabled) for incoming in profile.incoming.values())
         self._longest = max(QUEUED_CYCLES / settings.rate, QUEUED_TIME)  # s
-        self._empty = 0.0  # s, monotonic: when nothing was waiting to be read
+        self._empty = 0.0  # s, monotonic: when the queue was last empty
         self._foreign_wire = np.full(profile.n, np.nan)
 
     def open(self) -> None:

@@ -1,4 +1,4 @@
-"""A profile's keys, and what may stand there."""
+"""The schema of a profile."""
 
 from __future__ import annotations
 

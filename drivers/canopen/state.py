@@ -13,7 +13,7 @@ from gapbridge.drivers.canopen.profile import CanopenProfile
 from gapbridge.drivers.canopen.sync_set import SyncSet
 from gapbridge.drivers.robot_modes import StopReason, modes_of
 
-SPAN, OLDEST = 5, 0.1  # samples, s: what a velocity is reckoned from where drives report none
+SPAN, OLDEST = 5, 0.1  # samples, s: for a velocity, if drives report none
 
 
 def states(sample: SyncSet) -> list[State]:
@@ -90,9 +90,9 @@ class StateBuilder:
         return None if following else StopReason.NOT_READY
 
     def _velocity(self, sample: SyncSet, q: Array) -> Array:
-        """Return (n,) rad/s: the drives' own where the profile knows its unit.
+        """Return (n,) rad/s: from the drives, if the profile has the unit.
 
-        Else out of the last samples: one step alone would show the SYNC's jitter.
+        Otherwise from the last samples: a single step would contain the SYNC's jitter.
         """
         scale = self._profile.file.velocity_scale
         reported = [counts.get("Velocity actual value") for counts in sample.counts]

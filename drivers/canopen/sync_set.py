@@ -1,4 +1,4 @@
-"""One SYNC's TPDOs: they count only where all were received, once each, after that SYNC."""
+"""The TPDOs of one SYNC: valid only if all were received, once each, after that SYNC."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from gapbridge.drivers.canopen.profile import CanopenProfile
 
 
 class DropReason(StrEnum):
-    """Why a frame or a set does not count."""
+    """Why a frame or a set was dropped."""
 
     TWICE = "twice"
     MALFORMED = "malformed"
@@ -23,10 +23,10 @@ class DropReason(StrEnum):
 
 
 class SyncSet(NamedTuple):
-    """What all drives reported at one SYNC. A tuple, because one is made in every cycle."""
+    """The reports of all drives at one SYNC. A tuple, because one is created in every cycle."""
 
     counts: tuple[dict[str, int], ...]  # per joint: object name -> counts
-    synced: float  # s, time.monotonic() when the SYNC left
+    synced: float  # s, time.monotonic() when the SYNC was sent
     received: float  # s, time.monotonic() of the last TPDO
 
 
