@@ -97,7 +97,7 @@ class SideProcess:
         return f"{self.module} ended with {code}"
 
     def close(self, timeout: float = 3.0) -> None:
-        """Notify it that the daemon ends, give it ``patience`` s to finish, then end it."""
+        """Notify it that the daemon ends, give it ``timeout`` s to finish, then end it."""
         self.begin_close()
         if self._process is not None:
             with contextlib.suppress(subprocess.TimeoutExpired):

@@ -146,11 +146,11 @@ class BenchServer:
         mass, x, y, z = numbers
         if not 0.0 <= mass <= HEAVIEST:
             raise BenchError(f"payload: found {mass:g} kg, expected 0 to {HEAVIEST:g}")
-        self._controller.plant.hang(mass, (x, y, z))
+        self._controller.plant.set_load(mass, (x, y, z))
 
     def _wrench(self, numbers: list[float]) -> None:
         fx, fy, fz, tx, ty, tz = numbers
-        self._controller.plant.pull((fx, fy, fz), (tx, ty, tz))
+        self._controller.plant.set_force((fx, fy, fz), (tx, ty, tz))
 
     def _slip(self, numbers: list[float]) -> None:
         plant, joint = self._controller.plant, numbers[0]
