@@ -245,7 +245,7 @@ class Planner:
 
 
 class PlannedSource(Source):
-    """What a planner sends, by the product's own glide; its socket is not simulated."""
+    """What a planner sends, by the product's own interpolator; its socket is not simulated."""
 
     def listen(self, planner: Planner, clock: SimulatedClock) -> None:
         """Take what the planner sends from now on."""

@@ -252,7 +252,7 @@ class Daemon:
         while not self._requests.empty():
             number, command, by = self._requests.get()
             name = "arm" if command == Command.ARM else "disarm"
-            detail = f"{name} asked for by {by}"
+            detail = f"{name} requested by {by}"
             self.event_log.add(
                 {"kind": EventKind.REQUEST, "command": name, "number": number, "by": by,
                  "acknowledges": command == Command.DISARM, "detail": detail}
@@ -380,7 +380,7 @@ class Daemon:
                         self.manager.stopping()
                     loop.ask_to_stop()
                 if loop.hangs or (stop_by is not None and self._clock.monotonic() > stop_by):
-                    detail = f"the loop stood still for {self.memory.silence:.2f} s and was ended"
+                    detail = f"no heartbeat of the loop for {self.memory.silence:.2f} s: killed"
                     loop.kill()  # reported after its end: nothing is written any more
                     self._fault("hang", detail)
             self._read_loop()

@@ -49,7 +49,7 @@ class FittedWatch:
                 low, high = self._fitted[name]
                 reported.append(
                     f"{label(name)}: found {values[out][0]:.4g} {UNITS[stem_of(name)]}, outside "
-                    f"what was fitted, {low:.4g} to {high:.4g}: the correction is a guess there"
+                    f"what was fitted, {low:.4g} to {high:.4g}: the correction is an extrapolation"
                 )
             self._outside[name] = now
         return reported

@@ -10,7 +10,7 @@ Changes" (1993), ch. 2.4). A step of the sensor's or the motors' zeros, and of p
 moment, is free on both sides, so that none of them counts as a slip.
 
 A person who touches the arm makes a force that comes and goes: it does not repeat at the next
-poses in the shares of a joint. It is reported as what it is, and kept out of the comparison.
+poses in the shares of a joint. It is reported as a force, and excluded from the comparison.
 """
 
 from __future__ import annotations
@@ -130,7 +130,7 @@ class _Standstill:
 class SlipWatch:
     """Compares the rests of a run with each other; ``model`` None, or ``smallest`` 0: never.
 
-    ``slices``: where each field stands in a cycle's row (SharedMemory.slices). ``smallest``: rad,
+    ``slices``: where each field is in a cycle's row (SharedMemory.slices). ``smallest``: rad,
     of a slip that is reported.
     """
 
@@ -177,7 +177,7 @@ class SlipWatch:
         return detail if self.learned else f"{detail}; learning, until poses have come back"
 
     def take(self, rows: Array) -> list[Slip | Force]:
-        """Return what has just been found. ``rows`` (k, width): cycles of the loop, in order."""
+        """Return new findings. ``rows`` (k, width): cycles of the loop, in order."""
         if self._model is None or not len(rows):
             return []
         findings: list[Slip | Force] = []
@@ -205,7 +205,7 @@ class SlipWatch:
         n = self._n
         size = float(np.linalg.norm(_first_finite(change[n : n + 3], change[n + 6 : n + 9])))
         self._touched = size > self._threshold(LARGEST_SLIP * 9.81 * self._model.payload(mean)[0])
-        return [_force(size, now, "came or went while the arm stood still")] * self._touched
+        return [_force(size, now, "came or went while the arm was at rest")] * self._touched
 
     def _threshold(self, slip: float) -> float:
         """Return the force, N, above which a change exceeds noise and a slip's ``slip``, N."""
@@ -242,7 +242,7 @@ class SlipWatch:
             return []
         self._under_force.append(rest)
         if len(self._under_force) == 1:
-            return [_force(excess, rest.time, "beside what this pose had at its rests before")]
+            return [_force(excess, rest.time, "compared with earlier rests at this pose")]
         if len(self._under_force) > LASTING_RESTS:  # a slip, a load, or a sensor's new zero
             self._rests.extend(self._under_force[:-1])
             self._under_force = []
@@ -323,8 +323,8 @@ class SlipWatch:
         return Slip(
             joints, size, std, list(self._rests)[-length].time,
             f"the zero of joint {' or '.join(map(str, joints))} has moved by {1e3 * size:.1f} mrad "
-            f"(1 sigma {1e3 * std:.1f}): what is measured at rest has changed in {length} rests in "
-            "a row as that changes it, beside former rests at the same poses",
+            f"(1 sigma {1e3 * std:.1f}): in {length} rests in a row the readings have changed as "
+            "this slip changes them, compared with earlier rests at the same poses",
         )  # fmt: skip
 
     def _is_significant(self, length: int) -> bool:
@@ -344,7 +344,7 @@ class SlipWatch:
         return self._lead_over_steps(length, j) > LEAD_OVER_STEPS * THRESHOLD
 
     def _lead_over_steps(self, length: int, joint: int) -> float:
-        """Return by how much of chi-square a slip beats what is free, at any other moment.
+        """Return how much lower chi-square is with a slip than with free steps at any moment.
 
         A sensor that was zeroed two rests before a moment looks like a slip at that moment.
         """
@@ -353,7 +353,7 @@ class SlipWatch:
         return min(map(free, range(2, count - 1))) - self._chi_square(joint)(count - length)
 
     def _chi_square(self, joint: int | None) -> Callable[[int], float]:
-        """Return what gives chi-square of all rests for a step of what is free at a moment.
+        """Return a function: chi-square of all rests for steps of the free parameters at a moment.
 
         Each pose's own mean is fitted too, and where one is given the slip of a joint (from 0). A
         moment is the number of the first rest after it.
@@ -397,7 +397,7 @@ class SlipWatch:
         for p in common:
             before, after, place = old[p], new[p], self._places[p]
             change = _median(after) - _median(before)
-            # pi / 2: the variance of a median beside that of a mean
+            # pi / 2: the variance of a median relative to that of a mean
             share = np.pi / 2.0 / len(before) + (np.pi / 2.0 if len(after) > 2 else 1.0) / len(
                 after
             )

@@ -11,13 +11,13 @@ class LoopCounter(IntEnum):
     """Index of each counter; its name in lower case is its label."""
 
     LATE = 0  # no new state by the deadline; the last offset is held
-    STALE = 1  # the controller's clock stood still for longer than the hold time
+    STALE = 1  # the controller's clock did not change for longer than the hold time
     DROPPED_TORN = 2  # the driver dropped the sample: torn, short, wrong answer
     DROPPED_NOT_FINITE = 3
     DROPPED_IMPLAUSIBLE = 4
     DROPPED_STEP = 5
     DROPPED_BACKWARDS = 6
-    FROZEN = 7  # values stood still while the clock went on
+    FROZEN = 7  # joint values did not change while the clock went on
     BAD_OUTPUT = 8  # the model's correction was no number
     SATURATED = 9  # the offset was at its limits for too long
     OVERRUN = 10  # too many deadlines missed within a second

@@ -162,7 +162,7 @@ class SideProcess:
             return None
         self.stalls += 1
         self._process.kill()
-        return f"{self.module} stood still for {now - self._read_at:.0f} s and was ended"
+        return f"{self.module} read nothing for {now - self._read_at:.0f} s and was killed"
 
     def _close_down(self) -> None:
         if self._down_fd is not None:

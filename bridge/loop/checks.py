@@ -114,7 +114,7 @@ class SaturationWatch:
             self._since = now
         if now - self._since <= SATURATION_TIMEOUT:
             return None
-        return f"the offset has been held back by its limits for {now - self._since:.2f} s"
+        return f"the offset has been clamped at its limits for {now - self._since:.2f} s"
 
 
 class RateCheck:

@@ -51,7 +51,7 @@ SLACK = 1000  # ns
 PRIORITY = 30  # SCHED_FIFO: below interrupt threads (50) and a simulated controller (40)
 LOCK_ALL = 3  # MCL_CURRENT | MCL_FUTURE
 LATENCY = "/dev/cpu_dma_latency"  # the kernel's PM QoS interface
-IDLE_DRIVER = "/sys/devices/system/cpu/cpuidle/current_driver"  # what the kernel sleeps by
+IDLE_DRIVER = "/sys/devices/system/cpu/cpuidle/current_driver"  # the kernel's idle driver
 FAST = 0.005  # s: loops with this cycle or a shorter one keep the processors awake
 _open_files: list[int] = []  # kept open: closing one would undo its effect
 _PR_SET_PDEATHSIG = 1
@@ -178,7 +178,7 @@ def _end_with_parent(parent: int) -> None:
 
 
 def become_realtime(cycle: float) -> list[str]:
-    """Prepare this thread, and those it starts from now on; returns what was granted.
+    """Prepare this thread, and those it starts from now on; returns the measures granted.
 
     ``cycle`` is that of the loop, s. Afterwards Python collects no garbage by itself.
     """

@@ -178,7 +178,7 @@ def _index(chunk: Chunk, offset: int, length: int) -> ChunkIndex:
 
 
 def _tail(whole: _Whole) -> bytes:
-    """Return what comes behind what is whole: indexes that were torn, summary, footer, magic."""
+    """Return the bytes after the complete records: missing indexes, summary, footer, magic."""
     data = RecordBuilder()
     chunks = whole.chunks
     if whole.torn:

@@ -116,7 +116,7 @@ def _end_with_parent() -> None:
 
 
 def main() -> None:
-    """Serve as one line of JSON on stdin says: host, port, n, memory (descriptors)."""
+    """Serve with the settings on stdin, one line of JSON: host, port, n, memory (descriptors)."""
     logging.getLogger("pymodbus").setLevel(logging.CRITICAL)
     order = json.loads(sys.stdin.readline())
     threading.Thread(target=_end_with_parent, daemon=True).start()

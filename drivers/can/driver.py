@@ -78,7 +78,7 @@ class CanDriver(Driver):
         self._reset_reading()
 
     def _reset_reading(self) -> None:
-        """Discard what came while no states were read: torn frames, stops that have ended."""
+        """Discard torn frames and ended stops from before, when no states were read."""
         self._broken, self._pending = self.reader.assembler.broken, None
         self._builder.reset()
         self.reader.clear_ended_stops()
@@ -193,12 +193,12 @@ class CanDriver(Driver):
             self._changed = now
         elif now - self._changed > self.settings.frozen_after:
             raise StaleStateError(
-                f"{self.profile.name}: joints have stood still for {now - self._changed:.2f} s, "
+                f"{self.profile.name}: joints have not changed for {now - self._changed:.2f} s, "
                 f"commanded {away:.3f} rad away"
             )
 
     def _target(self) -> Array | None:
-        """Return what the arm was last commanded, by us or by another commander."""
+        """Return the joints (n,) rad commanded last, by us or by another commander, or None."""
         if self._armed_at is not None:
             return self.writer.target
         return self.reader.foreign_target(self.settings.foreign_quiet)

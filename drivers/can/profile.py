@@ -139,7 +139,7 @@ class CanProfile:
 
     @property
     def quantities(self) -> frozenset[str]:
-        """Return what the feedback reports."""
+        """Return the quantities in the feedback."""
         return frozenset(self.joints.scale)
 
     @property

@@ -17,7 +17,7 @@ from gapbridge.drivers.clock import SYSTEM, Clock
 from gapbridge.drivers.robot_modes import StopReason
 
 QUEUED_CYCLES, QUEUED_TIME = 4.0, 0.03  # cycles, s: a sample queued for longer is not fresh
-BACKLOG_TIME = 0.05  # s that reading what has piled up may take
+BACKLOG_TIME = 0.05  # s that reading queued frames may take
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +46,7 @@ class FrameReader:
         self._foreign_wire = np.full(profile.n, np.nan)
 
     def open(self) -> None:
-        """Open the bus, filtered to what is read where the kernel does it. Raises LinkError.
+        """Open the bus, with kernel filters for the frames read, if possible. Raises LinkError.
 
         Elsewhere python-can filters, and then returns None for each foreign frame: reading a
         backlog would stop in the middle of it.

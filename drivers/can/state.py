@@ -31,7 +31,7 @@ class StateBuilder:
     ) -> RobotState:
         """Return the state of a sample.
 
-        ``target`` (n,) is what the arm was last commanded, where anyone commanded it.
+        ``target`` (n,) rad: the joints commanded last, None if there are none.
         """
         q = sample.position
         present = {name: v for name, v in sample.others.items() if np.isfinite(v).all()}

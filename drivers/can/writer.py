@@ -95,8 +95,8 @@ class FrameWriter:
     ) -> None:
         """Go through a sequence. Raises WriteError where a frame or an ``until`` fails.
 
-        ``hold`` gives the joints of a hold step, ``listen(s)`` reads meanwhile, ``reached`` says
-        whether an ``until`` is there.
+        ``hold`` returns the joints of a hold step, ``listen(s)`` reads for s seconds, ``reached``
+        returns whether an ``until`` is fulfilled.
         """
         for action in actions:
             end = self._now() + action.within

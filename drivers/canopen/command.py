@@ -12,7 +12,7 @@ from gapbridge.drivers.canopen.master import Master
 from gapbridge.drivers.canopen.profile import CanopenProfile
 
 Frames = list[tuple[int, bytes, str]]
-OURS = ("Controlword",)  # beside the mode's own target
+OURS = ("Controlword",)  # that we command, in addition to the mode's target
 
 
 class RpdoWriter:

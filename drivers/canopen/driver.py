@@ -185,7 +185,7 @@ class CanopenDriver(Driver):
             self._moved_at = now
         elif now - self._moved_at > self.settings.frozen_after:
             raise StaleStateError(
-                f"{self.profile.name}: joints have stood still for {now - self._moved_at:.2f} s, "
+                f"{self.profile.name}: joints have not changed for {now - self._moved_at:.2f} s, "
                 f"commanded {away:.3f} rad away"
             )
 

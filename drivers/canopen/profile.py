@@ -215,7 +215,7 @@ class _Pdos:
     def layouts(
         self, key: str, names_of_pdo: Mapping[int, Sequence[str | int]], wanted: tuple[str, ...]
     ) -> tuple[PdoLayout, ...]:
-        """Return the layouts of a section; refuses what is missing, twice or too long."""
+        """Return the layouts of a section; refuses missing, repeated or too long ones."""
         layouts: list[PdoLayout] = []
         keys_of_name: dict[str, Keys] = {}
         for number, names in sorted(names_of_pdo.items()):

@@ -60,7 +60,7 @@ class StateBuilder:
     def build(self, sample: SyncSet, target: Array | None, armed: bool) -> RobotState:
         """Return the state.
 
-        ``target`` (n,) is what the drives were last commanded, rad. The time of the sample is that
+        ``target`` (n,): joints commanded last, rad. The time of the sample is that
         of its SYNC, at which all drives latched their positions.
         """
         q = positions(self._profile, sample)

@@ -66,7 +66,7 @@ class SyncCollector:
             self._open = False
 
     def take(self, cob_id: int, data: bytes, now: float) -> None:
-        """Add one frame. Raises nothing; what is no TPDO of the profile is ignored."""
+        """Add one frame. Raises nothing; ignores frames that are no TPDO of the profile."""
         member = self._members.get(cob_id)
         if member is None:
             return
@@ -130,7 +130,7 @@ class SyncCollector:
         return not self._frames and not self._rejected
 
     def why(self) -> str:
-        """Return what is wrong with this set."""
+        """Return why this set is invalid."""
         if self._rejected:
             reason, who, detail = self._rejected
             twice = reason == DropReason.TWICE

@@ -165,8 +165,8 @@ class Decoder:
 
 
 def _answer_of(registers: Registers, block: int, first: int) -> tuple[int, int]:
-    number, says = words_in(registers[block], first, 2)
-    return number, says
+    number, program = words_in(registers[block], first, 2)
+    return number, program
 
 
 def _picked(data: bytes, indices: Sequence[int]) -> list[int]:

@@ -52,7 +52,7 @@ class ModbusSettings(ProfileSettings):
 
     @model_validator(mode="after")
     def _has_its_transport(self) -> Self:
-        """Refuse a transport without what it needs."""
+        """Refuse a transport without its required keys."""
         if self.transport == "rtu" and self.serial is None:
             raise ValueError("expected serial, the port to open, with transport rtu")
         if self.transport == "tls" and self.authority is None and self.fingerprint is None:

@@ -23,7 +23,7 @@ from gapbridge.drivers.ur_rtde.state import StateReader
 
 
 class UrRtdeDriver(Driver):
-    """One UR arm over RTDE. ``settings.mode`` says how setpoints get there.
+    """One UR arm over RTDE. ``settings.mode``: how setpoints are sent.
 
     Use it in a process that may be killed: the library can hang, abort or crash it when the link
     breaks. After a LinkError the object cannot be used again: start a new process.

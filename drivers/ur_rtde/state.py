@@ -135,7 +135,7 @@ class StateReader:
         while timestamp == self._last:
             if self._now() > until:
                 raise StaleStateError(
-                    f"{self._settings.host}: the controller's clock has stood still at "
+                    f"{self._settings.host}: the controller's clock has stopped at "
                     f"{timestamp:.3f} s for {self.age:.3f} s"
                 )
             self._sleep(POLL)
@@ -164,7 +164,7 @@ class StateReader:
             self._changed = self._now()
         raise InvalidStateError(
             f"{self._settings.host}: found a new sample in each of {ATTEMPTS} readings, expected "
-            "one that stands still while it is read: this process is too slow for its rate"
+            "one that does not change while it is read: this process is too slow for its rate"
         )
 
     def _read_registers(self) -> None:

@@ -108,7 +108,7 @@ def test_the_first_state_after_a_standstill_is_judged_by_the_clock_before_it() -
     assert not [str(outcome) for outcome in found if outcome.violations]
 
 
-def test_an_arm_that_is_let_go_of_in_silence_is_sent_where_it_was_sent_before() -> None:
+def test_an_arm_released_in_silence_is_sent_where_it_was_sent_before() -> None:
     """Seed 3243: stopped while the arm was silent; enabling frames say the last joints again."""
     assert not run(3243).violations
 

@@ -118,7 +118,7 @@ class Ft300Device(SimulatedSensor):
         return body + FramerRTU.compute_CRC(body).to_bytes(2, "big")
 
     def put(self, data: bytes) -> None:
-        """Send bytes to whoever reads the line; what does not fit is lost, as on a line."""
+        """Send bytes on the line; bytes that do not fit are lost."""
         with contextlib.suppress(BlockingIOError, OSError):
             os.write(self._outside, data)
 

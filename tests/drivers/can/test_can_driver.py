@@ -254,7 +254,7 @@ def test_joints_that_stand_still_though_commanded_away_are_stale(served):
     served.controller.frozen = True  # the same joints again and again
     goal = state.actual_q + 0.04
     served.driver.write_setpoint(setpoint_of(goal))
-    with pytest.raises(StaleStateError, match="joints have stood still"):
+    with pytest.raises(StaleStateError, match="joints have not changed"):
         read(served.driver, 500)
 
 
