@@ -57,7 +57,7 @@ class Ft300Device(SimulatedSensor):
             self._link_to(self._link)
 
     def _link_to(self, link: Path) -> None:
-        """Make ``link`` lead to the line. Raises LinkError where something else stands there."""
+        """Make ``link`` a symbolic link to the line. Raises LinkError if it is another file."""
         try:
             if link.is_symlink():
                 link.unlink()

@@ -1,4 +1,4 @@
-"""What a simulated controller's registers hold: its own state, laid out by the profile."""
+"""The registers of a simulated controller: its state in the profile's layout."""
 
 from __future__ import annotations
 
