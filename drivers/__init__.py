@@ -1,4 +1,4 @@
-"""Drivers: what stands between a controller's wire and the loop, one folder per protocol."""
+"""Drivers: the interface between controllers and the loop, one folder per protocol."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ DRIVERS: dict[str, str] = {
 def make_driver(settings: DriverSettings, model: Model, bounds: GateBounds | None = None) -> Driver:
     """Return the driver that the settings name, not yet connected.
 
-    ``model`` gives it the arm and the tool, ``bounds`` what its gate lets pass (left out: the
-    defaults of a cell file). Raises LinkError where the driver's library is missing.
+    ``model`` gives it the arm and the tool, ``bounds`` the limits of its gate (None: the defaults
+    of a cell file). Raises LinkError if the driver's library is missing.
     """
     name = str(getattr(settings, "driver", ""))
     if name not in DRIVERS:
@@ -38,5 +38,5 @@ def make_driver(settings: DriverSettings, model: Model, bounds: GateBounds | Non
         raise LinkError(f"link.driver {name}: its library cannot be imported: {error}") from None
     driver = cast("Driver", driver_class(settings, model))
     if bounds is not None:
-        driver.gate.hold_to(bounds)
+        driver.gate.set_bounds(bounds)
     return driver

@@ -1,8 +1,8 @@
-"""The one clock that everything in control reads, and waits by.
+"""The clock that loop, daemon and drivers read and wait by.
 
-No module of the bridge or of the drivers reads the time by itself: each is given a clock, so that a
-simulation can run a loop, a daemon and a controller in a time of its own. Where real processes and
-sockets are waited for, time is the system's (see the list in pyproject.toml).
+Modules of the bridge and of the drivers get a clock as an argument, so that a simulation can run a
+loop, a daemon and a controller in simulated time. Modules that wait for real processes and sockets
+use the system's time (see the list in pyproject.toml).
 """
 
 from __future__ import annotations
@@ -13,9 +13,9 @@ from collections.abc import Callable
 
 
 class Clock:
-    """The system's time. Its readings are plain attributes: a call costs what the system's does."""
+    """The system's time. Its functions are attributes, so that a call has no overhead."""
 
-    monotonic: Callable[[], float]  # s, never goes back; of no date
+    monotonic: Callable[[], float]  # s, never decreases; arbitrary origin
     time: Callable[[], float]  # s since 1970
     sleep: Callable[[float], None]  # s
 

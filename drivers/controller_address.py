@@ -1,4 +1,4 @@
-"""What distinguishes one controller from another."""
+"""The identity of a controller: its address."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ OWN_PORTS = (502, 802, 30004)  # Modbus/TCP, Modbus/TCP Security, RTDE
 
 
 def address_of(link: DriverSettings) -> str:
-    """Return what distinguishes controllers: the same for whatever driver reaches one.
+    """Return the identity of a controller, the same for every driver that reaches it.
 
-    A host is what its name resolves to, once for the whole run. A port is left out where it is the
-    protocol's own: RTDE and Modbus of one robot are one controller, ports of a gateway are not.
+    A host name is resolved, once for the whole run. A protocol's default port is omitted: RTDE and
+    Modbus of one robot are one controller, other ports of a gateway are not.
     """
     settings = link.model_dump(mode="json")
-    if "interface" in settings:  # a bus, with a whole arm by each profile
+    if "interface" in settings:  # a bus, with one arm per profile
         host = settings.get("host")
         bus = {**settings, "host": None if host is None else resolved(str(host))}
         names = ("interface", "host", "port", "channel", "profile")
@@ -38,7 +38,7 @@ def address_of(link: DriverSettings) -> str:
 def resolved(host: str) -> str:
     """Return the numeric address of a host name, the first in order where it has several.
 
-    A name that nobody knows stays as it is, in small letters: connecting will say so.
+    A name that cannot be resolved is returned in lower case: connecting will fail.
     """
     with contextlib.suppress(ValueError):
         return str(ipaddress.ip_address(host))
@@ -50,5 +50,5 @@ def resolved(host: str) -> str:
 
 
 def _real(path: str) -> str:
-    """Return a serial port without the links that lead to it."""
+    """Return a serial port with symbolic links resolved."""
     return os.path.realpath(path)

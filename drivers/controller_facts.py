@@ -1,4 +1,4 @@
-"""What a controller says of its arm, and where a cell says otherwise."""
+"""What a controller reports about its arm, and the differences from a cell."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from gapbridge.core.estimation.registration import register_robustly
 from gapbridge.core.model import Model
 from gapbridge.core.plausibility import flange_in_first
 
-TCP_TURNED = 0.02  # rad: turned further, the controller's TCP is not the cell's
-OTHER_ARM, OTHER_CALIBRATION = 0.01, 5e-5  # m at the flange, in the frame that fits best
-MASS, COG = 0.1, 0.005  # kg, m: the controller's payload beside the cell's
-TILTED = 0.2  # m/s2 of gravity
+TCP_TURNED = 0.02  # rad: largest rotation between the controller's TCP and the cell's
+OTHER_ARM, OTHER_CALIBRATION = 0.01, 5e-5  # m at the flange, after registration
+MASS, COG = 0.1, 0.005  # kg, m: largest difference of the controller's payload
+TILTED = 0.2  # m/s2: largest difference of gravity
 POSES = 24
 
 
 @dataclass(frozen=True)
 class ControllerFacts:
-    """What a controller says of itself; None where it does not say it."""
+    """What a controller reports about itself; None if it does not."""
 
     n: int  # joints
     model: str | None = None  # a built-in arm
@@ -42,7 +42,7 @@ class ControllerFacts:
 
 @dataclass(frozen=True)
 class Difference:
-    """One value of the cell that is not the controller's; ``sure``: nothing may be written so."""
+    """One value of the cell that differs from the controller's; ``sure``: it forbids writing."""
 
     keys: tuple[str, ...]  # of the cell
     found: str
@@ -111,12 +111,12 @@ def _tool(facts: ControllerFacts, model: Model, tolerance: float) -> Iterator[Di
     cosine = 0.5 * (float(np.trace(model_tcp[:3, :3].T @ controller_tcp[:3, :3])) - 1.0)
     turned = float(np.arccos(np.clip(cosine, -1.0, 1.0)))
     if apart > 1e-5 or turned > 1e-4:
-        given_text = ", ".join(f"{v:.5g}" for v in controller_tcp[:3, 3])
+        reported = ", ".join(f"{v:.5g}" for v in controller_tcp[:3, 3])
         # the flange of a URDF may have other axes than the controller's
         sure = (apart > tolerance or turned > TCP_TURNED) and not model.arm.joint_names
         yield Difference(
             ("tool", "tcp"), f"a TCP {1e3 * apart:.3g} mm and {turned:.2g} rad from the "
-            "controller's", f"the same TCP in both (controller: xyz [{given_text}])", sure=sure,
+            "controller's", f"the same TCP in both (controller: xyz [{reported}])", sure=sure,
         )  # fmt: skip
 
 
@@ -128,19 +128,19 @@ def _load(facts: ControllerFacts, model: Model) -> Iterator[Difference]:
         )  # fmt: skip
     cog = facts.payload_cog
     if cog is not None and facts.payload and np.linalg.norm(cog - model.payload_cog) > COG:
-        given_text = ", ".join(f"{v:.4g}" for v in cog)
+        reported = ", ".join(f"{v:.4g}" for v in cog)
         yield Difference(
             ("payload", "cog"), f"[{', '.join(f'{v:g}' for v in model.payload_cog)}]",
-            f"[{given_text}], as the controller has it", sure=False,
+            f"[{reported}], as the controller has it", sure=False,
         )  # fmt: skip
     gravity = facts.gravity
     if gravity is not None and np.linalg.norm(gravity) > 1.0:
         apart = np.abs(gravity - model.gravity)
         if np.linalg.norm(apart) > TILTED:
-            given_text = ", ".join(f"{v + 0.0:.4g}" for v in gravity)
+            reported = ", ".join(f"{v + 0.0:.4g}" for v in gravity)
             # the base of a URDF may have other horizontal axes than the controller's
             sure = not model.arm.joint_names or bool(apart[2] > TILTED)
             yield Difference(
                 ("gravity",), f"[{', '.join(f'{v:g}' for v in model.gravity)}]",
-                f"[{given_text}], as the arm is mounted in the controller", sure=sure,
+                f"[{reported}], as the arm is mounted in the controller", sure=sure,
             )  # fmt: skip

@@ -1,9 +1,9 @@
-"""What a driver is: four methods between a controller's wire and the loop.
+"""The base class of drivers: the interface between a controller's protocol and the loop.
 
 ``connect``, ``read_state``, ``write_setpoint`` and ``close`` are what every driver has; ``arm`` and
-``release`` begin and end the writing. Whatever is read passes the check (drivers/state_check.py)
-and whatever is written the gate (drivers/gate.py) here, in the base: a driver implements
-``_read_state``, ``_send``, ``_make_ready`` and ``_let_go``, and cannot go around either.
+``release`` begin and end writing. The base class checks every sample (drivers/state_check.py) and
+every setpoint (drivers/gate.py): a driver implements ``_read_state``, ``_send``, ``_make_ready``
+and ``_release``, and cannot bypass either check.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from gapbridge.drivers.controller_facts import ControllerFacts, Difference, diff
 from gapbridge.drivers.gate import Gate
 from gapbridge.drivers.state_check import FASTEST, SampleCheck
 
-GATED = ("read_state", "write_setpoint", "arm", "release")  # of the base alone
+GATED = ("read_state", "write_setpoint", "arm", "release")  # not to be overridden
 
 
 class Driver(ABC):
     """One link to one controller, for one thread.
 
-    Constructors never touch hardware, nor does garbage collection: only ``connect`` opens a link,
-    and only the side that reads. ``write_setpoint`` is the only call after which an arm moves.
+    Constructors and garbage collection never touch hardware: only ``connect`` opens a link, and
+    only for reading. ``write_setpoint`` is the only call that moves an arm.
     """
 
     def __init__(
@@ -39,23 +39,23 @@ class Driver(ABC):
         clock: Clock = SYSTEM,
         fastest: float = FASTEST,
     ) -> None:
-        self.clock = clock  # what its states are stamped by, and all who judge their age
+        self.clock = clock  # its states' time stamps, and the clock that their age is measured by
         self._now = clock.monotonic
-        self.rate = rate  # Hz: cycles per second that read_state is paced at
+        self.rate = rate  # Hz: rate at which read_state returns samples
         self.n = model.arm.n  # joints
-        self.moves_arm = moves_arm  # setpoints are the arm's motion; False: they ride on its own
+        self.moves_arm = moves_arm  # False: setpoints are offsets on the robot's own motion
         self.gate = Gate(rate, model, moves_arm, clock.monotonic)
-        self._check = SampleCheck(model.arm, fastest)  # rad/s that no joint can pass
-        self._cell_model = model  # what the controller is compared with
+        self._check = SampleCheck(model.arm, fastest)  # rad/s that no joint exceeds
+        self._cell_model = model  # compared with what the controller reports
 
     def __init_subclass__(cls, **keys: Any) -> None:
-        """Refuse a driver that goes around check or gate. Raises TypeError."""
+        """Refuse a driver that bypasses check or gate. Raises TypeError."""
         super().__init_subclass__(**keys)
         for name in GATED:
             if name in cls.__dict__:
                 raise TypeError(
                     f"{cls.__name__}.{name}: found a driver's own, expected _read_state, _send, "
-                    "_make_ready and _let_go: the base checks what is read and what is written"
+                    "_make_ready and _release: the base checks what is read and what is written"
                 )
 
     @abstractmethod
@@ -66,8 +66,8 @@ class Driver(ABC):
     def read_state(self) -> RobotState:
         """Wait for the next sample of the controller and return it.
 
-        Blocks until a sample with a new controller timestamp is there. Raises StaleStateError where
-        none comes within the settings' timeout, InvalidStateError where it cannot be believed.
+        Blocks until a sample with a new controller timestamp arrives. Raises StaleStateError if
+        none arrives within the settings' timeout, InvalidStateError if it is implausible.
         """
         state = self._read_state()
         self._validate(state)
@@ -75,24 +75,24 @@ class Driver(ABC):
 
     @abstractmethod
     def _read_state(self) -> RobotState:
-        """Do what ``read_state`` promises, up to the check; a torn sample is refused here."""
+        """Implement ``read_state`` up to the check; raises InvalidStateError for a torn sample."""
 
     def _validate(self, state: RobotState) -> None:
-        """Compare a sample with the arm's limits and with the one before.
+        """Compare a sample with the arm's limits and with the previous sample.
 
-        Raises InvalidStateError. A driver that remembers samples does it here, after this.
+        Raises InvalidStateError. A driver that stores samples extends this method.
         """
         self._check.check(state)
 
-    def forget(self) -> None:
-        """Take the next sample without comparing it to the ones before."""
-        self._check.forget()
+    def reset_check(self) -> None:
+        """Accept the next sample without comparing it with the previous one."""
+        self._check.reset()
 
     @final
     def write_setpoint(self, setpoint: Setpoint) -> None:
-        """Send one setpoint that came out of the limiter; needs ``arm`` before.
+        """Send one setpoint from the limiter; needs ``arm`` before.
 
-        Raises WriteError: GateError where the gate refuses it, and then nothing was sent.
+        Raises WriteError; GateError if the gate refuses it, and then nothing was sent.
         """
         self.gate.check(setpoint)
         self._send(setpoint)
@@ -104,31 +104,31 @@ class Driver(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """Leave the link: the arm stops where setpoints moved it. Never raises; may be repeated."""
+        """Close the link; an arm moved by setpoints stops. Never raises; may be repeated."""
 
     @final
     def arm(self, state: RobotState) -> list[Difference]:
-        """Make ready for writing; may take seconds and never moves the arm. Raises WriteError.
+        """Prepare for writing; may take seconds and never moves the arm. Raises WriteError.
 
-        ``state`` is the sample last read; states read before are stale afterwards. Refuses where
-        the controller's arm, TCP or gravity are not the cell's; returns what else differs.
+        ``state`` is the sample read last; it is stale afterwards. Refuses if the controller's arm,
+        TCP or gravity differ from the cell's; returns the other differences.
         """
         self.gate.end()
         differing = self.differences(state)
-        for wrong in differing:
-            if wrong.sure:
-                raise WriteError(f"{wrong} (gapbridge check --live)")
+        for difference in differing:
+            if difference.sure:
+                raise WriteError(f"{difference} (gapbridge check --live)")
         self._make_ready(state)
         self.gate.begin(state.target_q, state.actual_q)
         return differing
 
     def _make_ready(self, state: RobotState) -> None:
-        """Do what ``arm`` promises; see there."""
+        """Implement ``arm``; see there."""
 
     def facts(self, state: RobotState) -> ControllerFacts:
-        """Return what the controller says of its arm; ``state`` is the sample last read.
+        """Return what the controller reports about its arm; ``state`` is the sample read last.
 
-        Reads only. Raises LinkError where it has to be asked and does not answer.
+        Reads only. Raises LinkError if the controller does not answer.
         """
         return ControllerFacts(
             n=len(state.actual_q), payload=state.payload, payload_cog=state.payload_cog,
@@ -136,11 +136,11 @@ class Driver(ABC):
         )  # fmt: skip
 
     def differences(self, state: RobotState) -> list[Difference]:
-        """Return where the cell differs from what the controller says. Raises LinkError."""
+        """Return the differences between cell and controller. Raises LinkError."""
         return differences(self.facts(state), self._cell_model, self.rate)
 
     def keep_alive(self) -> None:
-        """Feed the robot's own watchdog where that may wait; before each setpoint.
+        """Feed the robot's watchdog, which may block; called before each setpoint.
 
         Raises WriteError.
         """
@@ -149,47 +149,46 @@ class Driver(ABC):
     def release(self) -> None:
         """Stop writing: the arm comes to rest and the controller is as before ``arm``.
 
-        Takes no offset out by itself: the limiter has done that, or the robot's program does it at
-        the cell's rates. May take a while. Raises WriteError where the link is gone.
+        Does not ramp out an offset: the limiter has done so, or the robot's program does it at the
+        cell's rates. May take seconds. Raises WriteError if the link is lost.
         """
         self.gate.end()
-        self._let_go()
+        self._release()
 
-    def _let_go(self) -> None:
-        """Do what ``release`` promises; see there."""
+    def _release(self) -> None:
+        """Implement ``release``; see there."""
 
     def round_trip(self) -> float | None:
-        """Return how long a question and its answer take now, s; None where nothing can be asked.
+        """Return the round-trip time of a request now, s; None if the link has no requests.
 
-        No state is younger than that way lets it be: asked before arming. Raises WriteError where
-        no answer comes.
+        It bounds the age of a state; measured before arming. Raises WriteError if no answer comes.
         """
         return None
 
-    def way(self) -> float:
-        """Return the longest time, s, that the last sample may have been under way to here.
+    def transit_time(self) -> float:
+        """Return an upper bound of the last sample's transit time from the controller, s.
 
-        Beyond what its timestamp shows beside those before; asked in each cycle. 0: not known.
+        Only the part that timestamps do not show; read in each cycle. 0: not known.
         """
         return 0.0
 
     def unanswered_since(self) -> float:
-        """Return when the oldest setpoint left that the last sample does not answer, s monotonic.
+        """Return when the oldest unacknowledged setpoint was sent, s monotonic; infinite: none.
 
-        A sample that answers all that left before some moment was taken after it, whatever clocks
-        say. Infinite where there is none, or the link answers none.
+        A sample that acknowledges a setpoint was taken after it was sent, whatever the clocks say.
+        Infinite too where the link acknowledges none.
         """
         return math.inf
 
     def mismatch(self) -> str | None:
-        """Return in words how the controller is set otherwise than the cell says; None: it is not.
+        """Return how the controller's settings differ from the cell's, as text; None: they agree.
 
-        Asked about once a second while the arm is armed; where the link does not show it: None.
+        Called about once a second while the arm is armed; None too where the link cannot tell.
         """
         return None
 
     def nominal_q(self, state: RobotState) -> Array:
-        """Return the joints (n,) that the robot itself wants, without our correction, rad."""
+        """Return the robot's own target joints (n,), without our correction, rad."""
         return state.target_q
 
     def __enter__(self) -> Self:

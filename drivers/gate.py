@@ -1,7 +1,8 @@
-"""The last check before the wire: every setpoint of every driver passes it, whatever computed it.
+"""The last check before a setpoint is sent: every setpoint of every driver passes it.
 
-It shares no code and no memory with the limiter (core/limits.py): joint limits, the TCP's offset by
-forward kinematics of its own, and the step against what was last sent, over this machine's clock.
+It shares no code and no memory with the limiter (core/limits.py). It checks joint limits, the TCP
+offset (by its own forward kinematics), and the step from the setpoint sent last, timed by this
+machine's clock.
 """
 
 from __future__ import annotations
@@ -20,21 +21,23 @@ from gapbridge.core.model import Model
 from gapbridge.core.state import Setpoint
 from gapbridge.drivers.clock import SYSTEM
 
-GAP = 5.0  # cycles: no step is larger than this many cycles' allowance
-HELD = 0.04  # s for which a wire may hold setpoints back and then hand them on at once
-DRIFT = 1.02  # how much faster than ours a controller's clock may be
-START = 0.05  # rad: a first setpoint is where the arm was when it was armed, or gave since
-SECOND_ORDER = 1.05  # an offset shared out by joints is its own length to first order only
-USUAL_VELOCITY = math.pi  # rad/s: of joints whose limit is not known
-GRAIN = 1e-9  # rad, m
-OUTERMOST, OUTERMOST_TURN = 0.1, 0.5  # m, rad: the largest offset that any cell may allow
+MAX_STEP_CYCLES = 5.0  # no step is larger than the rates allow in this many cycles
+MAX_WIRE_DELAY = 0.04  # s for which a link may delay setpoints and then send them in a burst
+CLOCK_RATIO = 1.02  # largest ratio of the controller's clock rate to this machine's
+START = 0.05  # rad from where the arm was when armed to the first setpoint (the arm may sag)
+SECOND_ORDER = 1.05  # the offset that joints realise has the limited length to first order only
+DEFAULT_VELOCITY = math.pi  # rad/s: of joints whose limit is not known
+ROUNDING = 1e-9  # rad, m: tolerance of every comparison
+MAX_OFFSET, MAX_OFFSET_ROTATION = 0.1, 0.5  # m, rad: the largest offset that any cell may allow
 
-FINE, NOT_FINITE, OUTSIDE, FAR_OFFSET, FAR_TURN, JOINT_OFFSET, STEP, RATE, AWAY = range(9)
+PASSED, NOT_FINITE, OUTSIDE, LONG_OFFSET, LARGE_ROTATION, JOINT_OFFSET, STEP, RATE, FAR_START = (
+    range(9)
+)
 
 
 @dataclass(frozen=True)
 class GateBounds:
-    """What no setpoint passes: m, rad, m/s, rad/s. The defaults are those of a cell file."""
+    """Limits of setpoints: m, rad, m/s, rad/s. The defaults are those of a cell file."""
 
     offset: float = 0.010
     offset_rotation: float = 0.02
@@ -47,7 +50,7 @@ class GateBounds:
 
 @njit(**JIT)
 def _copy(frame, out):  # type: ignore[no-untyped-def]
-    """Copy a frame (3, 4); ``out[:] = frame`` would bring the text of an error with it."""
+    """Copy a frame (3, 4); ``out[:] = frame`` would compile an error message too."""
     for a in range(3):
         for b in range(4):
             out[a, b] = frame[a, b]
@@ -73,7 +76,7 @@ def _place(links, q, frame, turn):  # type: ignore[no-untyped-def]
 
 @njit(**JIT)
 def _gap(a, b):  # type: ignore[no-untyped-def]
-    """Return how far two frames (3, 4) are apart: m, rad."""
+    """Return the distance (m) and the angle (rad) between two frames (3, 4)."""
     square = trace = 0.0
     for k in range(3):
         square += (a[k, 3] - b[k, 3]) ** 2
@@ -95,7 +98,7 @@ def _length(vector, first):  # type: ignore[no-untyped-def]
 
 @njit(**JIT)
 def _judge_joints(links, joints, numbers, first):  # type: ignore[no-untyped-def]
-    """Return what ``_judge`` does, of joints that are written."""
+    """Return what ``_judge`` does, for joint setpoints."""
     n, travel = joints.shape[1], 0.0
     q, nominal, last = joints[0], joints[1], joints[2]
     here, there, was = np.empty((3, 4)), np.empty((3, 4)), np.empty((3, 4))
@@ -106,47 +109,48 @@ def _judge_joints(links, joints, numbers, first):  # type: ignore[no-untyped-def
     nearer = True
     for i in range(n):
         lag = abs(last[i] - nominal[i])
-        nearer = nearer and abs(q[i] - nominal[i]) <= lag + GRAIN
-        if abs(q[i] - nominal[i]) > max(numbers[4], lag) + GRAIN:
+        nearer = nearer and abs(q[i] - nominal[i]) <= lag + ROUNDING
+        if abs(q[i] - nominal[i]) > max(numbers[4], lag) + ROUNDING:
             return JOINT_OFFSET, i, abs(q[i] - nominal[i]), 0.0
-        if not first:  # it may have given since
-            travel = max(travel, (abs(q[i] - last[i]) - GRAIN) / joints[5, i])
+        if not first:  # before the first setpoint the arm may have sagged
+            travel = max(travel, (abs(q[i] - last[i]) - ROUNDING) / joints[5, i])
     if not nearer and (
-        length > numbers[0] * SECOND_ORDER + GRAIN or turn > numbers[1] * SECOND_ORDER + GRAIN
+        length > numbers[0] * SECOND_ORDER + ROUNDING or turn > numbers[1] * SECOND_ORDER + ROUNDING
     ):
-        # a command that its joints' speed holds back may be far from where it goes to,
-        # but it does not go farther
+        # a command that lags by the joints' velocity limits may be far from its goal, but it must
+        # not move away from it
         _place(links, last, was, scratch)
         far, turned = _gap(was, there)
-        if length > max(numbers[0] * SECOND_ORDER, far) + GRAIN:
-            return FAR_OFFSET, -1, length, 0.0
-        if turn > max(numbers[1] * SECOND_ORDER, turned) + GRAIN:
-            return FAR_TURN, -1, turn, 0.0
-    return FINE, -1, 0.0, travel
+        if length > max(numbers[0] * SECOND_ORDER, far) + ROUNDING:
+            return LONG_OFFSET, -1, length, 0.0
+        if turn > max(numbers[1] * SECOND_ORDER, turned) + ROUNDING:
+            return LARGE_ROTATION, -1, turn, 0.0
+    return PASSED, -1, 0.0, travel
 
 
 @njit(**JIT)
 def _judge_offsets(offsets, numbers, length, turn):  # type: ignore[no-untyped-def]
-    """Return what ``_judge`` does, of an offset that is written."""
-    if length > numbers[0] * (1.0 + GRAIN) + GRAIN:
-        return FAR_OFFSET, -1, length, 0.0
-    if turn > numbers[1] * (1.0 + GRAIN) + GRAIN:
-        return FAR_TURN, -1, turn, 0.0
+    """Return what ``_judge`` does, for TCP offsets."""
+    if length > numbers[0] * (1.0 + ROUNDING) + ROUNDING:
+        return LONG_OFFSET, -1, length, 0.0
+    if turn > numbers[1] * (1.0 + ROUNDING) + ROUNDING:
+        return LARGE_ROTATION, -1, turn, 0.0
     shift, angle = 0.0, 0.0
     for k in range(3):
         shift += (offsets[0, k] - offsets[1, k]) ** 2
         angle += (offsets[0, 3 + k] - offsets[1, 3 + k]) ** 2
-    travel = max((math.sqrt(shift) - GRAIN) / numbers[2], (math.sqrt(angle) - GRAIN) / numbers[3])
-    return FINE, -1, 0.0, travel
+    shift, angle = math.sqrt(shift) - ROUNDING, math.sqrt(angle) - ROUNDING
+    travel = max(shift / numbers[2], angle / numbers[3])
+    return PASSED, -1, 0.0, travel
 
 
 @njit(**JIT)
 def _judge(links, joints, offsets, numbers, budget, moves, first):  # type: ignore[no-untyped-def]
-    """Return (reason, joint, found, s of travel that the step takes).
+    """Return (reason, joint, value found, time (s) that the step takes at the limiting rates).
 
     joints (6, n): q, nominal, last q, lower, upper, velocity. offsets (2, 6): this, last. numbers:
     envelope, its rotation, its rates, joint offset, longest step (s). first: nothing was sent yet,
-    last q is where the arm stood.
+    and last q is the arm's position when it was armed.
     """
     n, q, nominal = joints.shape[1], joints[0], joints[1]
     for i in range(n):
@@ -156,30 +160,30 @@ def _judge(links, joints, offsets, numbers, budget, moves, first):  # type: igno
         if not math.isfinite(offsets[0, k]):
             return NOT_FINITE, -1, offsets[0, k], 0.0
     for i in range(n):
-        if not joints[3, i] - GRAIN <= q[i] <= joints[4, i] + GRAIN:
+        if not joints[3, i] - ROUNDING <= q[i] <= joints[4, i] + ROUNDING:
             return OUTSIDE, i, q[i], 0.0
     length, turn = _length(offsets[0], 0), _length(offsets[0], 3)
     if moves:
-        if length > OUTERMOST * SECOND_ORDER:
-            return FAR_OFFSET, -1, length, 0.0
-        if turn > OUTERMOST_TURN * SECOND_ORDER:
-            return FAR_TURN, -1, turn, 0.0
+        if length > MAX_OFFSET * SECOND_ORDER:
+            return LONG_OFFSET, -1, length, 0.0
+        if turn > MAX_OFFSET_ROTATION * SECOND_ORDER:
+            return LARGE_ROTATION, -1, turn, 0.0
         reason, joint, value, travel = _judge_joints(links, joints, numbers, first)
     else:
         reason, joint, value, travel = _judge_offsets(offsets, numbers, length, turn)
-    if reason != FINE:
+    if reason != PASSED:
         return reason, joint, value, 0.0
-    if travel > numbers[5] * (1.0 + GRAIN):
+    if travel > numbers[5] * (1.0 + ROUNDING):
         return STEP, -1, travel, 0.0
     if travel > budget:
         return RATE, -1, travel, 0.0
-    return FINE, -1, 0.0, max(travel, 0.0)
+    return PASSED, -1, 0.0, max(travel, 0.0)
 
 
 class Gate:
-    """Judges one link's setpoints; ``begin`` opens it and ``end`` shuts it.
+    """Checks the setpoints of one link; ``begin`` opens the gate and ``end`` shuts it.
 
-    ``clock`` gives the time over which steps count, s. Some microseconds a setpoint.
+    ``clock`` gives the time (s) between setpoints. A check takes some microseconds.
     """
 
     def __init__(
@@ -192,31 +196,31 @@ class Gate:
         links = np.array(arm.link_in_link[:, :3, :], dtype=float)
         links[n] = (arm.link_in_link[n] @ model.tool_in_flange)[:3, :]
         self._links = np.ascontiguousarray(links)
-        self._own_velocity = np.where(
-            np.isfinite(arm.limits.velocity), arm.limits.velocity, USUAL_VELOCITY
+        self._arm_velocity = np.where(
+            np.isfinite(arm.limits.velocity), arm.limits.velocity, DEFAULT_VELOCITY
         )
         self._joints = np.zeros((6, n))
         self._joints[3], self._joints[4] = arm.limits.lower, arm.limits.upper
         self._offsets, self._numbers = np.zeros((2, 6)), np.zeros(6)
         self._moves_arm = moves_arm
-        self._longest = GAP / rate  # s
-        self._most = self._longest + max(HELD, GAP / rate)  # s
-        self._started: tuple[Array, Array] | None = None  # rad, where the arm was when armed
+        self._longest = MAX_STEP_CYCLES / rate  # s
+        self._most = self._longest + max(MAX_WIRE_DELAY, MAX_STEP_CYCLES / rate)  # s
+        self._started: tuple[Array, Array] | None = None  # rad, until a setpoint is sent
         self._open = False
         self._budget = self._at = self._travel = 0.0  # s
         self._clock = clock
         self.bounds = GateBounds()
-        self.hold_to(self.bounds)
-        self._judged(0.0)  # compiled here: the first setpoint must not wait for a compiler
+        self.set_bounds(self.bounds)
+        self._judged(0.0)  # compiles the kernel: the first setpoint must not wait for it
 
-    def count_by(self, clock: Callable[[], float]) -> None:
+    def set_clock(self, clock: Callable[[], float]) -> None:
         """Measure time by another clock (s) than this machine's monotonic one."""
         self._clock = clock
 
-    def hold_to(self, bounds: GateBounds) -> None:
-        """Judge by these bounds from now on."""
+    def set_bounds(self, bounds: GateBounds) -> None:
+        """Use these limits from now on."""
         self.bounds = bounds
-        velocity = bounds.velocity_share * self._own_velocity
+        velocity = bounds.velocity_share * self._arm_velocity
         if bounds.joint_velocity is not None:
             velocity = np.minimum(velocity, bounds.joint_velocity)
         self._joints[5] = velocity
@@ -225,18 +229,21 @@ class Gate:
             bounds.joint_offset, self._longest,
         )  # fmt: skip
 
-    def begin(self, *stands: Array) -> None:
-        """Open for a stream that begins without an offset where the arm stands, (n,) rad each."""
-        self._started = (stands[0].copy(), stands[-1].copy())
+    def begin(self, *start_q: Array) -> None:
+        """Open for a stream that begins without an offset.
+
+        ``start_q``: target and actual joints of the arm when armed, (n,) rad; one of them will do.
+        """
+        self._started = (start_q[0].copy(), start_q[-1].copy())
         self._offsets[:] = 0.0
         self._open, self._budget, self._at = True, self._most, self._clock()
 
     def end(self) -> None:
-        """Let nothing pass until ``begin``."""
+        """Refuse every setpoint until ``begin``."""
         self._open, self._started = False, None
 
     def check(self, setpoint: Setpoint) -> None:
-        """Raise GateError, a WriteError, for a setpoint that must not leave."""
+        """Raise GateError, a WriteError, for a setpoint that must not be sent."""
         if not self._open:
             raise GateError("found a setpoint, expected arm() first")
         joints, offsets = self._joints, self._offsets
@@ -247,9 +254,9 @@ class Gate:
         offsets[0] = setpoint.offset_in_base
         if self._started is not None:
             self._check_start(joints[0])
-        budget = min(self._budget + DRIFT * max(self._clock() - self._at, 0.0), self._most)
+        budget = min(self._budget + CLOCK_RATIO * max(self._clock() - self._at, 0.0), self._most)
         code, joint, value, self._travel = self._judged(budget)
-        if code != FINE:
+        if code != PASSED:
             raise GateError(self._reason(code, joint, value))
 
     def _judged(self, budget: float) -> tuple[int, int, float, float]:
@@ -262,16 +269,16 @@ class Gate:
     def _check_start(self, q: Array) -> None:
         assert self._started is not None
         was, is_at = self._started
-        stood = np.where(np.abs(q - was) <= np.abs(q - is_at), was, is_at)
-        away = np.abs(q - stood)
+        start_q = np.where(np.abs(q - was) <= np.abs(q - is_at), was, is_at)
+        away = np.abs(q - start_q)
         if self._moves_arm and not (away <= START).all():  # NaN is not
-            raise GateError(self._reason(AWAY, int(np.argmax(away)), float(away.max())))
-        self._joints[2] = stood
+            raise GateError(self._reason(FAR_START, int(np.argmax(away)), float(away.max())))
+        self._joints[2] = start_q
 
     def sent(self) -> None:
-        """Take note that the setpoint that was checked has left."""
+        """Record that the setpoint checked last was sent."""
         now = self._clock()
-        self._budget = min(self._budget + DRIFT * max(now - self._at, 0.0), self._most)
+        self._budget = min(self._budget + CLOCK_RATIO * max(now - self._at, 0.0), self._most)
         self._budget, self._at, self._travel = self._budget - self._travel, now, 0.0
         self._joints[2], self._offsets[1] = self._joints[0], self._offsets[0]
         self._started = None
@@ -283,13 +290,14 @@ class Gate:
         message = {
             NOT_FINITE: f"found {value}, expected a finite number",
             OUTSIDE: f"found {value:.4f} rad, expected {lower:.4f} to {upper:.4f}",
-            FAR_OFFSET: f"found an offset of {value:.6f} m, expected at most {bounds.offset:g}",
-            FAR_TURN: f"found an offset of {value:.6f} rad, expected at most "
+            LONG_OFFSET: f"found an offset of {value:.6f} m, expected at most {bounds.offset:g}",
+            LARGE_ROTATION: f"found an offset of {value:.6f} rad, expected at most "
             f"{bounds.offset_rotation:g}",
             JOINT_OFFSET: f"found {value:.4f} rad from its nominal setpoint, expected at most "
             f"{bounds.joint_offset:g}",
             STEP: f"{takes}, expected at most {1e3 * self._longest:.1f} ms",
             RATE: f"{takes}, more than has passed",
-            AWAY: f"found a first setpoint {value:.4f} rad from the arm, expected at most {START}",
+            FAR_START: f"found a first setpoint {value:.4f} rad from the arm, expected at most "
+            f"{START}",
         }
         return where + message[code]

@@ -1,4 +1,4 @@
-"""What every link's settings have; read by processes that never open a link."""
+"""Settings that every link has; read also by processes that never open a link."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from gapbridge.drivers.section import Section
 
 
 class DriverSettings(Section):
-    """What every link says, whatever the driver."""
+    """Settings of a link that every driver has."""
 
     rate: float = Field(500.0, gt=0.0, le=1000.0, description="cycles per second asked for")
     state_timeout: float = Field(
@@ -25,7 +25,7 @@ class DriverSettings(Section):
 
     @property
     def moves_arm(self) -> bool:
-        """Return whether setpoints are the arm's motion; False: they ride on the robot's own."""
+        """Return whether setpoints are the arm's motion; False: offsets on the robot's own."""
         return True
 
     def read_files(self) -> None:
@@ -52,7 +52,7 @@ class ProfileSettings(DriverSettings):
         return Path(self.profile) if self.names_file else self.shipped / f"{self.profile}.yaml"
 
     def located(self, folder: Path) -> Self:
-        """Return the settings with whole paths. Raises InputError for no such profile."""
+        """Return the settings with absolute paths. Raises InputError for an unknown profile."""
         settings = super().located(folder)
         if self.names_file:
             return settings.model_copy(update={"profile": str((folder / self.profile).resolve())})

@@ -1,4 +1,4 @@
-"""A profile's YAML with the places of its keys, so that messages can point at the line."""
+"""A profile's YAML with the lines of its keys, for messages."""
 
 from __future__ import annotations
 
@@ -18,25 +18,25 @@ class ProfileError(InputError):
 
 
 class ProfileDocument(Document):
-    """One profile: its nodes, which know their lines, and its data."""
+    """One profile: its nodes with their lines, and its data."""
 
     def error(self, keys: Keys, message: str) -> ProfileError:
-        """Return the error that says ``message`` about a key path."""
+        """Return an error with ``message`` about a key path."""
         return ProfileError(f"{self.path}, line {self.line(keys)}: {name_of(keys)}: {message}")
 
     def require_joints(self, count: int, expected: int | None) -> None:
-        """Raise ProfileError where a profile has not as many joints as the arm; None: any."""
+        """Raise ProfileError if a profile has not ``expected`` joints; None: any number."""
         if expected is not None and count != expected:
             raise self.error(("joints",), f"found {count}, expected {expected}: the arm has those")
 
 
 def name_of(keys: Keys) -> str:
-    """Return a key path as messages have it, items of lists counted from 1."""
+    """Return a key path for messages, with list items counted from 1."""
     return ".".join(str(key + 1) if isinstance(key, int) else key for key in keys)
 
 
 def found_and_expected(detail: ErrorDetails) -> str:
-    """Return what a file has where another value belongs."""
+    """Return "found ..., expected ..." for an error of pydantic."""
     expected = detail["msg"].removeprefix("Input should be ")
     return f"found {quoted(detail['input'])}, expected {expected}"
 
@@ -51,10 +51,10 @@ def read_profile_file(
     schema: type[Schema],
     refusal: Callable[[ProfileDocument, ErrorDetails], ProfileError],
 ) -> tuple[ProfileDocument, Schema]:
-    """Return a profile's YAML and what ``schema`` makes of it.
+    """Return a profile's YAML and its validated ``schema``.
 
-    ``refusal`` makes an error of the first thing that pydantic objects to; a misspelt key comes
-    before the one it lacks. Raises ProfileError, also where the file cannot be read or is broken.
+    ``refusal`` turns pydantic's first error into a ProfileError; an unknown key comes before a
+    missing one. Raises ProfileError, also if the file cannot be read or parsed.
     """
     source = read_yaml(path, PROFILE)
     document = ProfileDocument(source.path, source.text, source.root, source.data)

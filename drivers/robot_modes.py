@@ -1,4 +1,4 @@
-"""Robot and safety modes in RTDE's numbers, whatever the controller: one table for all drivers.
+"""Robot and safety modes in RTDE's numbers for every controller: one table for all drivers.
 
 Source: Universal Robots, RTDE guide (robot_mode, safety_mode, safety_status_bits): bits 0 normal, 2
 protective stop, 6 robot emergency stop, 7 emergency stop, 9 fault, 10 stopped due to safety.
@@ -20,7 +20,7 @@ PLAYING = 2  # runtime_state
 
 
 class StopReason(StrEnum):
-    """What keeps a robot from moving, as profiles name it."""
+    """The reason why a robot cannot move, as profiles name it."""
 
     NOT_READY = "not_ready"
     PROTECTIVE_STOP = "protective_stop"
@@ -56,7 +56,7 @@ def why_not_ready(state: RobotState) -> str:
 
 
 def modes_of(stop_reasons: Iterable[StopReason | None]) -> Modes:
-    """Return the modes of all ``stop_reasons`` at once: the gravest of each, all stops' bits."""
+    """Return the combined modes of ``stop_reasons``: the most severe of each, all bits."""
     combined = MODES[None]
     for reason in stop_reasons:
         mode = MODES[reason]

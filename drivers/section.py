@@ -1,4 +1,4 @@
-"""What every mapping of a user's file is: a cell's sections, a driver's profile."""
+"""The base class of mappings in users' files: a cell's sections, a driver's profile."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ Positive = Annotated[Number, Field(gt=0.0)]
 
 
 class Section(BaseModel):
-    """One mapping: unknown keys are refused, and nothing changes once it has been read."""
+    """One mapping: unknown keys are refused, and instances are immutable."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 

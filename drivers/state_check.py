@@ -1,4 +1,4 @@
-"""Whether a sample can be believed: one set of limits and one check, for all drivers."""
+"""The plausibility check of a sample: one set of limits and one check, for all drivers."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from gapbridge.core.errors import Implausible, InvalidStateError
 from gapbridge.core.state import RobotState
 
 FASTEST = 20.0  # rad/s, of a joint whose URDF gives no velocity limit
-HASTE = 1.5  # times its velocity limit: a joint that moved faster is a mistake
-JITTER = 0.01  # rad: of one reading
-BEYOND = 0.35  # rad past a joint limit: another arm, another zero, or other units
+VELOCITY_FACTOR = 1.5  # times its velocity limit: a larger step of a joint is implausible
+JITTER = 0.01  # rad: noise of one reading
+LIMIT_MARGIN = 0.35  # rad past a joint limit: another arm, another zero, or other units
 LARGEST_ANGLE = 1e4  # rad, of a joint without limits
-TARGET = 20.0  # rad: a target at least this large is a mistake, where the joint has limits
+TARGET = 20.0  # rad: bound of target_q, unless the joint's own limits are wider
 FORCE, MOMENT = 1e4, 1e4  # N, Nm
 LARGEST: dict[str, float] = {
     "actual_qd": 60.0, "joint_temperatures": 300.0, "actual_current_as_torque": 1e4,
@@ -28,16 +28,16 @@ HEAVIEST = 1e3  # kg, of a payload
 
 
 class SampleCheck:
-    """Checks each sample by itself and against the last one that was believed.
+    """Checks each sample by itself and against the last plausible one.
 
-    In plain numbers: some dozens of them cost less than the calls on arrays.
+    It uses lists of floats: for some dozens of numbers they are faster than arrays.
     """
 
     def __init__(self, arm: Arm, fastest: float = FASTEST) -> None:
         limits, speed = arm.limits, arm.limits.velocity
-        lower = np.maximum(limits.lower - BEYOND, -LARGEST_ANGLE)
-        upper = np.minimum(limits.upper + BEYOND, LARGEST_ANGLE)
-        fast = np.minimum(HASTE * np.where(np.isfinite(speed), speed, FASTEST), fastest)
+        lower = np.maximum(limits.lower - LIMIT_MARGIN, -LARGEST_ANGLE)
+        upper = np.minimum(limits.upper + LIMIT_MARGIN, LARGEST_ANGLE)
+        fast = np.minimum(VELOCITY_FACTOR * np.where(np.isfinite(speed), speed, FASTEST), fastest)
         self._fastest: list[float] = fast.tolist()
         self._bounds: dict[str, tuple[list[float], list[float]]] = {
             "actual_q": (lower.tolist(), upper.tolist()),
@@ -52,12 +52,12 @@ class SampleCheck:
         self._q: list[float] | None = None
         self._timestamp = 0.0
 
-    def forget(self) -> None:
-        """Take the next sample without comparing it to the ones before."""
+    def reset(self) -> None:
+        """Accept the next sample without comparing it with the previous one."""
         self._q = None
 
     def check(self, state: RobotState) -> None:
-        """Remember a sample that can be believed. Raises InvalidStateError for one that cannot."""
+        """Store a plausible sample. Raises InvalidStateError for an implausible one."""
         q = state.actual_q.tolist()
         self._check_bounds("actual_q", q)
         self._check_motion(q, state.timestamp)  # first: a velocity may be computed from the step

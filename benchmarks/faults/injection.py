@@ -7,7 +7,8 @@ import time
 from benchmarks.faults.punctual import Witness
 from benchmarks.faults.rig import Rig
 from benchmarks.faults.row import Result, Row
-from gapbridge.bridge.loop.supervisor import Cause, State
+from gapbridge.bridge.ipc.loop_state import State
+from gapbridge.bridge.loop.supervisor import Cause
 
 POLL = 0.001  # s
 AFTERWARDS = 0.25  # s for which the end state must stay

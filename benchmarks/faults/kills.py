@@ -24,7 +24,7 @@ from benchmarks.faults.links import LIMITS, LINKS, own_address
 from benchmarks.faults.process_run import END_LIMIT, ProcessRun
 from benchmarks.faults.report import PAGE, fill
 from gapbridge.bridge.ipc.control_client import ask
-from gapbridge.bridge.loop.supervisor import State
+from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.core.errors import GapbridgeError
 from gapbridge.core.log.mcap_reading import last_batch
 

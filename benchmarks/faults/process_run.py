@@ -17,8 +17,8 @@ import psutil
 from benchmarks.faults.punctual import go_first
 from benchmarks.faults.running import Event, SourceStatus
 from gapbridge.bridge.cell import load_cell
+from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.ipc.shared_memory import NAME, SharedMemory
-from gapbridge.bridge.loop.supervisor import State
 
 CODE = """
 import ctypes, json, signal, sys

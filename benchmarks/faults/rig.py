@@ -15,7 +15,7 @@ from benchmarks.faults.proxy import Proxy
 from benchmarks.faults.punctual import be_ordinary, be_punctual
 from benchmarks.faults.running import Running
 from benchmarks.faults.tap import Tap
-from gapbridge.bridge.loop.supervisor import State
+from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.core.errors import LinkError
 
 SOME = 40  # messages decoded at a time

@@ -11,7 +11,7 @@ from benchmarks.faults.punctual import go_first
 from gapbridge.bridge.cell import load_cell
 from gapbridge.bridge.daemon.daemon import Daemon, settings_of
 from gapbridge.bridge.daemon.summary import RunSummary
-from gapbridge.bridge.loop.supervisor import State
+from gapbridge.bridge.ipc.loop_state import State
 
 BACKOFF = (0.1, 0.5)  # s before a restart: not to wait long between faults
 WRITES = tuple(state.name for state in State if state.writes)

@@ -92,7 +92,7 @@ def _cycles(driver: CanDriver, ours: OurCycle, pause: Pause) -> Cycles:
         if is_ours:
             driver.reader.newest()
             driver.reader.assembler.reset()
-            driver._begin_anew()
+            driver._reset_reading()
 
     socket = getattr(bus, "_link", None)  # of a socketcand bus
 

@@ -9,8 +9,9 @@ from typing import Any
 
 from benchmarks.faults.invariants import Checker
 from benchmarks.faults.wire.seen import Fresh, Numbers, Write
+from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.loop.link_monitor import DRIFT, hold_time
-from gapbridge.bridge.loop.supervisor import CLEARED_BY_RECONNECTING, TRANSITIONS, Cause, State
+from gapbridge.bridge.loop.supervisor import CLEARED_BY_RECONNECTING, TRANSITIONS, Cause
 from gapbridge.core.state import Setpoint
 
 MARGIN = 0.01  # s: a cycle of the controller and what computing takes

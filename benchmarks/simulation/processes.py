@@ -16,12 +16,12 @@ from gapbridge.bridge.cell.run_settings import Configuration
 from gapbridge.bridge.daemon.daemon import Daemon
 from gapbridge.bridge.daemon.processes import LoopProcess
 from gapbridge.bridge.ipc.command_memory import CommandMemory, Commands
+from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.ipc.shared_memory import Phase, RunMemory, SharedMemory
 from gapbridge.bridge.loop.loop import Exit, Loop
 from gapbridge.bridge.loop.offset_in_force import OffsetInForce
 from gapbridge.bridge.loop.setpoint_stream import SetpointStream
-from gapbridge.bridge.loop.supervisor import State
-from gapbridge.bridge.setpoint_source.glide import Glide
+from gapbridge.bridge.setpoint_source.interpolator import SetpointInterpolator
 from gapbridge.bridge.setpoint_source.source import Source
 from gapbridge.bridge.setpoint_source.target import TargetSource
 from gapbridge.core.errors import GapbridgeError, InputError
@@ -179,7 +179,7 @@ def _watched(run: Run, driver: Driver) -> Driver:
     """Return a driver whose setpoints are noted as they are handed to it."""
     from gapbridge.bridge.loop.setpoint_stream import gate_bounds
 
-    driver.gate.hold_to(gate_bounds(run.link.setting.configuration.settings.limits))
+    driver.gate.set_bounds(gate_bounds(run.link.setting.configuration.settings.limits))
     send = driver._send
 
     def noted(setpoint: Setpoint) -> None:
@@ -245,27 +245,27 @@ class Planner:
 
 
 class PlannedSource(Source):
-    """What a planner sends, by the product's own glide; its socket is not simulated."""
+    """What a planner sends, by the product's own interpolator; its socket is not simulated."""
 
     def listen(self, planner: Planner, clock: SimulatedClock) -> None:
         """Take what the planner sends from now on."""
-        self._glide = Glide(self.settings.timeout, "line", clock)
+        self._interpolator = SetpointInterpolator(self.settings.timeout, "line", clock)
         planner.take = self._take
 
     def _take(self, q: Vector) -> None:
         if not np.isfinite(q).all():
             return  # a line that is no setpoint never comes so far
-        self._glide.take(q)
-        self._glide.turn()
+        self._interpolator.take(q)
+        self._interpolator.restart()
 
     def first(self, robot_q: Vector) -> Vector | None:
         """See Source.first."""
-        return self._glide.first()
+        return self._interpolator.first()
 
     def begin(self, timestamp: float, robot_q: Vector) -> None:
         """See Source.begin."""
-        self._glide.begin(robot_q)
+        self._interpolator.begin(robot_q)
 
     def sample(self, timestamp: float, robot_q: Vector) -> Vector:
         """See Source.sample."""
-        return self._glide.sample()
+        return self._interpolator.sample()

@@ -17,7 +17,7 @@ from benchmarks.simulation.processes import PLANNED_JOINT, Run
 from benchmarks.simulation.ur import UrLink, library
 from benchmarks.simulation.world import BEGIN, Process, SimulatedClock, World
 from gapbridge.bridge.ipc.control_socket import Peer
-from gapbridge.bridge.loop.supervisor import State
+from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.core.state import Setpoint
 
 LINKS: dict[str, type[SimulatedLink]] = {

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.simulation.links import SimulatedLink
-from gapbridge.bridge.loop.link_monitor import LEAP
+from gapbridge.bridge.loop.link_monitor import CLOCK_STEP
 from gapbridge.drivers.controller_facts import ControllerFacts
 from gapbridge.drivers.driver import Driver
 from gapbridge.drivers.simulated.plant.kinematics import (
@@ -273,7 +273,7 @@ class UrLink(SimulatedLink):
             return
         gap = packet["timestamp"] - before["timestamp"]
         leap = gap - (packet["sampled"] - before["sampled"])
-        if leap > LEAP / 2 and gap - (self.world.now - self._arrived) <= LEAP:
+        if leap > CLOCK_STEP / 2 and gap - (self.world.now - self._arrived) <= CLOCK_STEP:
             self.hidden_leap = max(self.hidden_leap, leap)
 
     def _on_up(self, message: tuple[str, Any]) -> None:

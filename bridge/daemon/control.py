@@ -1,4 +1,4 @@
-"""What the daemon answers over its local socket; every request leaves an event behind."""
+"""The daemon's answers over its local socket; every request emits an event."""
 
 from __future__ import annotations
 
@@ -7,32 +7,33 @@ from typing import Any, Protocol
 
 from gapbridge.bridge.ipc.control_socket import Peer, refusal
 from gapbridge.bridge.ipc.events import Event, EventKind
+from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.ipc.shared_memory import Phase
-from gapbridge.bridge.loop.supervisor import Cause, State
+from gapbridge.bridge.loop.supervisor import Cause
 from gapbridge.drivers.clock import SYSTEM, Clock
 
 LONGEST_ARMING = 25.0  # s: uploads a program to the robot
 LONGEST_RAMP = 20.0  # s
-LONGEST_TAKING = 20.0  # s: a new process of the loop may have to start first
-SOURCE_SILENT = 1.0  # s without a first setpoint after which arming is reported to be waiting
-LOOK = 0.02  # s
+LONGEST_PICKUP = 20.0  # s until a loop receives a request: a new one may have to start
+SOURCE_SILENT = 1.0  # s without a first setpoint after which "armed; waits" is answered
+POLL_EVERY = 0.02  # s
 ARMED = State.ARMED.name
 
 
 class Controlled(Protocol):
-    """The part of the daemon that is asked; called from other threads than its own."""
+    """The part of the daemon that requests use, from other threads."""
 
     @property
     def state(self) -> State:
-        """Return what the loop is doing."""
+        """Return the state of the loop."""
 
     @property
     def phase(self) -> Phase:
-        """Return what the loop's process is at."""
+        """Return the phase of the loop's process."""
 
     @property
     def latched(self) -> str:
-        """Return the fault that waits for being acknowledged; empty: none."""
+        """Return the latched fault, not acknowledged yet; empty: none."""
 
     @property
     def may_write(self) -> bool:
@@ -50,20 +51,20 @@ class Controlled(Protocol):
 
     @property
     def last_taken(self) -> int:
-        """Return the number of the newest request that a loop has taken."""
+        """Return the number of the newest request that a loop has received."""
 
     def arm(self, by: str) -> int:
-        """Ask the loop to write; returns the request's number, 0 where none is made."""
+        """Request writing; returns the request's number, 0 if it cannot be made."""
 
     def disarm(self, by: str) -> int:
-        """Ask this loop or the next one to ramp out, or acknowledge a fault; returns its number."""
+        """Request ramping out, or acknowledge a fault; returns the request's number."""
 
     def note(self, event: Event) -> None:
         """Emit an event."""
 
 
 class Control:
-    """Answers requests; ``answer`` may take as long as the arm does."""
+    """Answers requests; ``answer`` may take as long as arming or ramping out."""
 
     def __init__(self, daemon: Controlled, clock: Clock = SYSTEM) -> None:
         self._daemon, self._clock = daemon, clock
@@ -115,18 +116,18 @@ class Control:
             waiting = (waiting or self._clock.monotonic()) if idle else None
             if waiting is not None and self._clock.monotonic() - waiting > SOURCE_SILENT:
                 return _done("armed; waits for the first setpoint of its source")
-            self._clock.sleep(LOOK)
+            self._clock.sleep(POLL_EVERY)
         return refusal(f"no answer of the loop within {LONGEST_ARMING:g} s")
 
     def _disarm(self, by: str) -> dict[str, Any]:
-        """Ask, always; what is answered is what a loop has taken, never what was hoped for."""
+        """Request it in any state, and answer what a loop has confirmed."""
         daemon = self._daemon
         observed = daemon.state == State.OBSERVING and not daemon.latched
         fault = daemon.latched
         number = daemon.disarm(by)
-        if not self._wait_for(lambda: daemon.last_taken >= number, LONGEST_TAKING):
+        if not self._wait_for(lambda: daemon.last_taken >= number, LONGEST_PICKUP):
             return refusal(
-                f"no loop has taken it within {LONGEST_TAKING:g} s (the state is "
+                f"no loop has taken it within {LONGEST_PICKUP:g} s (the state is "
                 f"{daemon.state.name.lower()}); it is kept for the next one"
             )
 
@@ -146,7 +147,7 @@ class Control:
         while not what():
             if self._clock.monotonic() > until:
                 return False
-            self._clock.sleep(LOOK)
+            self._clock.sleep(POLL_EVERY)
         return True
 
 

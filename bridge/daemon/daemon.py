@@ -1,8 +1,8 @@
-"""The daemon: the parent that survives its loop.
+"""The daemon: the parent process, which survives its loop.
 
-It starts the loop in a process of its own, watches the heartbeat, ends what hangs, starts anew what
-died (observing, never writing), looks after the processes that record and show, and says at the end
-how it went.
+It starts the loop as a process, monitors its heartbeat, kills it if it hangs, restarts it if it
+died (observing, never writing), manages the side processes (recorder, status page, metrics), and
+returns a summary of the run.
 """
 
 from __future__ import annotations
@@ -35,10 +35,11 @@ from gapbridge.bridge.ipc.command_memory import Command, CommandMemory
 from gapbridge.bridge.ipc.control_socket import ControlSocket
 from gapbridge.bridge.ipc.events import Event, EventKind, EventLog
 from gapbridge.bridge.ipc.loop_counters import DROPPED
+from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.ipc.shared_memory import Phase, RunMemory
-from gapbridge.bridge.loop.loop import LONGEST_STOP, Exit
-from gapbridge.bridge.loop.setpoint_stream import longest_withdrawal
-from gapbridge.bridge.loop.supervisor import Cause, State
+from gapbridge.bridge.loop.loop import STOP_TIMEOUT, Exit
+from gapbridge.bridge.loop.setpoint_stream import longest_ramp_out
+from gapbridge.bridge.loop.supervisor import Cause
 from gapbridge.bridge.recording.folder import LOOP_LOG, new_session
 from gapbridge.core.errors import InputError, LinkError
 from gapbridge.drivers.clock import SYSTEM, Clock
@@ -46,13 +47,13 @@ from gapbridge.drivers.controller_address import address_of
 
 __all__ = ["Daemon", "Say", "settings_of"]
 
-TICK = 0.02  # s between two looks at the loop
-HEALTHY = 10.0  # s after which a restart counts as the first again
-STOP_MARGIN = 0.4  # s on top of the loop's own time: then it is ended by force
+TICK = 0.02  # s between two checks of the loop
+HEALTHY = 10.0  # s of running after which the backoff is reset
+STOP_MARGIN = 0.4  # s after the loop's own deadline until it is killed
 STATUS_EVERY = 0.5  # s
 PROGRAM = f"the daemon's own program (pid {os.getpid()})"
 
-UNSPOKEN = (EventKind.FAILURE, EventKind.GRANTED, EventKind.SUMMARY, EventKind.REQUEST)
+NOT_SHOWN = (EventKind.FAILURE, EventKind.GRANTED, EventKind.SUMMARY, EventKind.REQUEST)
 """Kinds of events that the terminal does not show: after a failure a fault follows."""
 
 Say = Callable[[str], None]
@@ -61,7 +62,7 @@ Say = Callable[[str], None]
 class Daemon:
     """One run. ``stop``, ``reload``, ``arm`` and ``disarm`` may be called from other threads."""
 
-    loop_process: type[LoopProcess] = LoopProcess  # a simulation has one of its own
+    loop_process: type[LoopProcess] = LoopProcess  # simulations replace it
 
     def __init__(
         self,
@@ -74,12 +75,12 @@ class Daemon:
         self._clock = clock
         if not isinstance(configuration, Configuration):
             configuration = configuration_for(configuration)
-        self.configuration = configuration  # read once; loops get these very bytes
+        self.configuration = configuration  # read once; loops get the same bytes
         settings = configuration.settings
         self.may_write, self._say = may_write, say
         n = self.configuration.n
-        self.memory = RunMemory(n, clock)  # of the loop's process, one after the other
-        self._commands = CommandMemory()  # one for the whole run; nobody else can write to it
+        self.memory = RunMemory(n, clock)  # of the present process of the loop
+        self._commands = CommandMemory()  # one for the whole run; only the daemon can write
         self._requests: queue.SimpleQueue[tuple[int, Command, str]] = queue.SimpleQueue()
         self._last_taken = 0
         self._request_lock = threading.RLock()
@@ -89,7 +90,7 @@ class Daemon:
         self.tally = Tally(n, settings.link.rate)
         listeners = [self._on_event, self.side_processes.emit]
         self.event_log = EventLog(*listeners, *([log] if log else []), clock=clock)
-        self._posted: queue.SimpleQueue[Event] = queue.SimpleQueue()  # by other threads
+        self._posted: queue.SimpleQueue[Event] = queue.SimpleQueue()  # from other threads
         self.manager = ServiceManager(clock)
         self.session = ""
         self._status = DaemonStatus(self.memory.slices, clock)
@@ -102,35 +103,35 @@ class Daemon:
         self._failure: Event = {}
         self._faults: list[str] = []
         self._lost_rows = 0
-        self._refused = False  # writing was asked for and could not begin
-        self._has_state = False  # a state has been read, by this or a former loop
-        self._ends_at = float("inf")  # s, monotonic: when a run of given length is over
+        self._refused = False  # arming was requested and refused
+        self._has_state = False  # a state has been read in this run
+        self._ends_at = float("inf")  # s, monotonic: end of a run with a duration
         self.restarts = 0
-        self._loops = 0  # processes of the loop so far, those of a reload among them
+        self._loops = 0  # processes of the loop so far, including those after a reload
         self._wait = settings.backoff[0]
         self._last_state = State.DISCONNECTED
         self._stopping = threading.Event()
 
-    # -- for others -------------------------------------------------------------------------------
+    # -- status and requests ----------------------------------------------------------------------
 
     @property
     def settings(self) -> DaemonSettings:
-        """Return what runs now; a reload changes it."""
+        """Return the present settings; a reload changes them."""
         return self.configuration.settings
 
     @property
     def state(self) -> State:
-        """Return what the loop is doing."""
+        """Return the state of the loop."""
         return self._last_state
 
     @property
     def phase(self) -> Phase:
-        """Return what the loop's process is at."""
+        """Return the phase of the loop's process."""
         return self.memory.phase
 
     @property
     def latched(self) -> str:
-        """Return the fault that waits for being acknowledged; empty: none."""
+        """Return the latched fault, not acknowledged yet; empty: none."""
         return self._status.latched
 
     @property
@@ -146,13 +147,13 @@ class Daemon:
 
     @property
     def recording(self) -> Path | None:
-        """Return the run's recording as a whole: its files' name without their numbers."""
+        """Return the path of the run's recording: its files' names without their numbers."""
         folder = self.settings.recording.folder
         return None if folder is None or not self.session else folder / self.session
 
     @property
     def lost_rows(self) -> int:
-        """Return how many cycles the recorder says that no file holds."""
+        """Return how many cycles the recorder has lost."""
         return self._lost_rows
 
     def events_since(self, sequence: int) -> list[Event]:
@@ -207,7 +208,7 @@ class Daemon:
         return SlipWatch(self.configuration.model, self.memory.slices, smallest)
 
     def note(self, event: Event) -> None:
-        """Emit an event from the daemon's own thread."""
+        """Queue an event, which the daemon's thread emits."""
         self._posted.put(event)
 
     def stop(self) -> None:
@@ -215,25 +216,25 @@ class Daemon:
         self._stopping.set()
 
     def reload(self) -> None:
-        """Read the cell file again; what is wrong is reported, and the old one stays."""
+        """Read the cell file again; if it has errors, they are reported and the old one stays."""
         self._reload.ask()
 
     @property
     def last_taken(self) -> int:
-        """Return the number of the newest request that a loop has taken."""
+        """Return the number of the newest request that a loop has received."""
         return self._last_taken
 
     def arm(self, by: str = PROGRAM) -> int:
-        """Ask the loop to write setpoints; returns the request's number, 0 where none is made."""
+        """Request writing; returns the request's number, 0 if it cannot be made."""
         if self.loop is None or not self.may_write:
             return 0
         return self._request(Command.ARM, by)
 
     def disarm(self, by: str = PROGRAM) -> int:
-        """Ask the loop, this or the next one, to ramp out and observe; in a fault, acknowledge it.
+        """Request ramping out and observing, from this loop or the next; acknowledge a fault.
 
-        A fault that comes meanwhile is not: nobody has seen it. Returns the request's number: it
-        counts once ``taken`` has come to it.
+        A fault that occurs after this call is not acknowledged. Returns the request's number: the
+        loop has received it once ``last_taken`` reaches it.
         """
         return self._request(Command.DISARM if self.latched else Command.RAMP_OUT, by)
 
@@ -244,14 +245,14 @@ class Daemon:
         return number
 
     def _forward_requests(self) -> None:
-        """Write what was asked for, each request behind the event that says who asked.
+        """Pass requests to the loop, each after an event that names the requester.
 
-        There is no other way by which an ARM is written.
+        Only this method writes an ARM command.
         """
         while not self._requests.empty():
             number, command, by = self._requests.get()
             name = "arm" if command == Command.ARM else "disarm"
-            detail = f"{name} asked for by {by}"
+            detail = f"{name} requested by {by}"
             self.event_log.add(
                 {"kind": EventKind.REQUEST, "command": name, "number": number, "by": by,
                  "acknowledges": command == Command.DISARM, "detail": detail}
@@ -261,9 +262,9 @@ class Daemon:
     # -- the run ----------------------------------------------------------------------------------
 
     def run(self, arm: bool = False, duration: float | None = None, by: str = "") -> RunSummary:
-        """Run until stopped; ``by`` says who or what has asked for arming. See run_cell.
+        """Run until stopped; ``by``: who or what requested arming. See run_cell.
 
-        ``duration``, s, counts from the first cycle of the run, whatever becomes of the controller.
+        ``duration``, s, counts from the first cycle of the run, also through lost links.
         """
         with ExitStack() as stack:
             arm = self._open(stack, arm, by)
@@ -273,19 +274,19 @@ class Daemon:
                 self.configuration = swap.configuration or self.configuration
                 self._fitted = FittedWatch(self.configuration.fitted, self.memory.slices)
                 self._slips = self._slip_watch()
-                arm = swap.rearms  # else only a person starts the writing again
+                arm = swap.rearms  # otherwise only a person can arm again
                 by = "the cell file" if arm else ""
                 if not self._stopping.is_set() and not swap.in_order:
                     self._pause()
                     self.restarts += 1
-            self._take()
+            self._read_loop()
             return self._summary()
 
     def _open(self, stack: ExitStack, arm: bool, by: str) -> bool:
         """Open locks, sockets and processes; ``stack`` closes them.
 
-        Returns whether the first loop may arm by itself. Raises InputError where the controller has
-        an owner already, or a folder cannot be used.
+        Returns whether the first loop may arm by itself. Raises InputError if another daemon owns
+        the controller, or a folder cannot be used.
         """
         settings = self.settings
         stack.callback(self._commands.close)
@@ -298,12 +299,12 @@ class Daemon:
         if folder is not None:
             log = folder / f"{self.session}{LOOP_LOG}"
             self._output = stack.enter_context(open(log, "ab", opener=private))  # noqa: SIM115
-        order = {
+        start_data = {
             "settings": settings.model_dump(mode="json"), "n": self.configuration.n,
             "session": self.session, "extra": {"text": self.configuration.text},
         }  # fmt: skip
         stack.callback(self.side_processes.close)
-        self.side_processes.start(settings, order, self.memory, self._output)
+        self.side_processes.start(settings, start_data, self.memory, self._output)
         stack.callback(lambda: self.event_log.add({"kind": EventKind.ENDED}))
         path = runtime_folder() / f"{cell_key(settings.cell)}.sock"
         try:
@@ -316,7 +317,7 @@ class Daemon:
         if settings.setpoints.source == "planner":
             where = f"setpoints: a planner writes to {settings.setpoints.socket}"
             self.event_log.add({"kind": EventKind.NOTE, "detail": where})
-        # a person at the terminal may arm after a crash; a service that was started anew may not
+        # after a crash --arm from a terminal may arm, a restarted service may not
         if arm and lock.before and (by != "--arm" or self.manager.present):
             detail = (
                 f"the run before (process {lock.before.get('pid')}) did not end in order: "
@@ -327,17 +328,17 @@ class Daemon:
         return arm
 
     def _pause(self) -> None:
-        """Wait before the next process of the loop, and go on looking after the rest."""
+        """Wait before the next process of the loop; the side processes are served meanwhile."""
         until = self._clock.monotonic() + self._wait
         self._wait = min(2.0 * self._wait, self.settings.backoff[1])
         while self._clock.monotonic() < until and not self._clock.wait(self._stopping, TICK):
             self._tick()
 
     def _tick(self) -> None:
-        """Look after everything but the loop."""
+        """Serve requests, side processes and events."""
         if self._clock.monotonic() >= self._ends_at:
             self._stopping.set()
-        self._take()
+        self._read_loop()
         self._forward_requests()
         if self.memory.promote():
             self.side_processes.show(self.memory)
@@ -353,7 +354,7 @@ class Daemon:
             self.manager.kick()
 
     def _run_loop(self, armed_by: str, duration: float | None) -> None:
-        """Run one process of the loop to its end; ``armed_by``: who has it arm at its start."""
+        """Run one process of the loop to its end; ``armed_by``: who lets it arm at its start."""
         self._last_state = State.DISCONNECTED
         self._failure = {}
         loop = self.loop = self._start_loop(armed_by)
@@ -371,19 +372,19 @@ class Daemon:
                 if self.memory.ended and duration is None:
                     self._stopping.set()
                 if self._reload.step(self.state, self.phase, self.configuration):
-                    self._commands.ask(Command.RAMP_OUT)  # by nobody's wish
+                    self._commands.ask(Command.RAMP_OUT)  # not a person's request
                 if (self._stopping.is_set() or self._reload.wants_end) and stop_by is None:
-                    needed = LONGEST_STOP + longest_withdrawal(self.settings.limits)
+                    needed = STOP_TIMEOUT + longest_ramp_out(self.settings.limits)
                     stop_by = self._clock.monotonic() + needed + STOP_MARGIN
                     if self._stopping.is_set():
                         self.manager.stopping()
                     loop.ask_to_stop()
                 if loop.hangs or (stop_by is not None and self._clock.monotonic() > stop_by):
-                    detail = f"the loop stood still for {self.memory.silence:.2f} s and was ended"
-                    loop.kill()  # reported when it is over: nothing is written after that
+                    detail = f"no heartbeat of the loop for {self.memory.silence:.2f} s: killed"
+                    loop.kill()  # reported after its end: nothing is written any more
                     self._fault("hang", detail)
-            self._take()
-            self._after(loop)
+            self._read_loop()
+            self._on_loop_end(loop)
             if first_cycle is not None and self._clock.monotonic() - first_cycle > HEALTHY:
                 self._wait = self.settings.backoff[0]
         finally:
@@ -391,11 +392,11 @@ class Daemon:
             loop.close()
 
     def _start_loop(self, armed_by: str) -> LoopProcess:
-        """Start a process of the loop, for which only requests count that are still to come.
+        """Start a process of the loop, which receives only requests made from now on.
 
-        Beside them, a disarming that no loop has taken: who asked for it still waits.
+        In addition, a disarm request that no loop has received is repeated.
         """
-        with self._request_lock:  # none is numbered and not yet written
+        with self._request_lock:  # no request is numbered and not yet written
             self._forward_requests()
             after = self._commands.number()
         order = {
@@ -413,10 +414,10 @@ class Daemon:
             self.configuration, self.memory, self._commands, order, self._output, self._clock
         )
 
-    def _take(self) -> None:
-        """Take cycles and events over from the loop."""
+    def _read_loop(self) -> None:
+        """Read cycles and events of the loop."""
         last_taken = self.memory.last_taken
-        # in this order: who has heard of a change finds the state changed, and its rows counted
+        # in this order: when an event is emitted, its state and rows are up to date
         events = [] if self.loop is None else self.loop.events()
         if self.loop is not None:
             self._last_state = State(self.memory.state)
@@ -433,10 +434,10 @@ class Daemon:
         for finding in self._slips.take(rows):
             self.event_log.add(finding.event)
             if isinstance(finding, Slip):
-                self._commands.ask(Command.ZERO_MOVED)  # behind the event that says why
+                self._commands.ask(Command.ZERO_MOVED)  # after the event that says why
 
     def _on_event(self, event: Event) -> None:
-        """Act on an event, and report it to the person at the terminal."""
+        """Act on an event, and print it on the terminal."""
         kind, detail = event["kind"], str(event.get("detail", ""))
         self._status.on_event(event)
         if kind == EventKind.FAILURE:
@@ -452,11 +453,11 @@ class Daemon:
             self._refused |= event["cause"] == Cause.START_REFUSED
             if detail:
                 self._faults.append(text)
-        elif detail and kind not in UNSPOKEN:
+        elif detail and kind not in NOT_SHOWN:
             self._say(detail)
 
-    def _after(self, loop: LoopProcess) -> None:
-        """Judge how the loop's process ended; raises where it is no use to start it again."""
+    def _on_loop_end(self, loop: LoopProcess) -> None:
+        """Act on the end of the loop's process; raises if a restart is useless."""
         code = loop.exit_code
         if code == Exit.DONE:
             if not self._reload.wants_end:
@@ -468,7 +469,7 @@ class Daemon:
         if self._stopping.is_set() and not self._failure:
             return
         if code == Exit.INPUT and not self._has_state:
-            raise InputError(detail)  # later, it is a file that somebody is at: tried again
+            raise InputError(detail)  # later, a file may be in the middle of an edit: retry
         if not self._has_state:
             raise LinkError(detail)
         self._fault("loop", detail)

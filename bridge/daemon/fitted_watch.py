@@ -1,7 +1,6 @@
-"""Watching for what was never fitted: a run whose joints, loads or temperatures lie beyond it.
+"""Warning of extrapolation: joints, loads or temperatures outside the range of the fit.
 
-A model fitted at other poses or loads is a guess there; nothing is held back for it, a person is
-warned once for as long as it lasts.
+Outside its range the model is extrapolated; compensation goes on, with one warning while it lasts.
 """
 
 from __future__ import annotations
@@ -13,13 +12,13 @@ from gapbridge.core.fitted_range import UNITS, Range, beyond, stem_of
 from gapbridge.core.log.columns import label
 
 WATCHED = ("actual_q", "payload", "joint_temperatures", "actual_TCP_force")
-QUIET = 5.0  # s within what was fitted, after which leaving it again is reported again
+QUIET = 5.0  # s within the fitted range after which leaving it is reported again
 
 
 class FittedWatch:
-    """Compares the cycles of a run with what the cell's model was fitted on.
+    """Compares the cycles of a run with the range of the data that the model was fitted on.
 
-    ``slices``: where each field stands in a cycle's row (SharedMemory.slices).
+    ``slices``: where each field is in a cycle's row (SharedMemory.slices).
     """
 
     def __init__(self, fitted: Range, slices: Mapping[str, slice]) -> None:
@@ -31,10 +30,10 @@ class FittedWatch:
                 if name in fitted:
                     self._places.append((name, place))
         self._fitted = fitted
-        self._outside: dict[str, float] = {}  # column -> s, when it last lay outside
+        self._outside: dict[str, float] = {}  # column -> s, monotonic: when it was last outside
 
     def take(self, rows: Array, now: float) -> list[str]:
-        """Return one sentence for each quantity that has just left what was fitted.
+        """Return a message for each quantity that has just left the fitted range.
 
         ``rows`` (k, width): cycles of the loop; ``now``: s, monotonic.
         """
@@ -50,7 +49,7 @@ class FittedWatch:
                 low, high = self._fitted[name]
                 reported.append(
                     f"{label(name)}: found {values[out][0]:.4g} {UNITS[stem_of(name)]}, outside "
-                    f"what was fitted, {low:.4g} to {high:.4g}: the correction is a guess there"
+                    f"what was fitted, {low:.4g} to {high:.4g}: the correction is an extrapolation"
                 )
             self._outside[name] = now
         return reported

@@ -1,4 +1,4 @@
-"""One owner per controller: a lock that is held for a run and never outlives its process."""
+"""One owner per controller: a lock held during a run, released by the kernel with the process."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from gapbridge.core.errors import InputError
 
 
 class OwnerLock:
-    """The right to talk to one controller, machine-wide; the kernel takes it back at any end.
+    """Machine-wide exclusive access to one controller.
 
-    ``before`` is what the last owner left behind, empty where it ended in order.
+    ``before``: the note of the last owner, empty if it ended normally.
     """
 
     def __init__(self, address: str, cell: Path) -> None:
@@ -30,7 +30,7 @@ class OwnerLock:
         self.before: dict[str, Any] = {}
 
     def acquire(self) -> None:
-        """Take the lock. Raises InputError where another daemon has it."""
+        """Take the lock. Raises InputError if another daemon has it."""
         key = hashlib.sha256(self.address.encode()).hexdigest()[:16]
         path = runtime_folder() / f"{key}.lock"
         fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
@@ -49,7 +49,7 @@ class OwnerLock:
         self.note({})
 
     def _claim_name(self, key: str) -> None:
-        """Take a name that daemons of other users see too, whatever their folder is."""
+        """Bind a socket name that is visible to all users, whose folders differ."""
         if sys.platform.startswith("linux"):
             self._name = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
             try:
@@ -59,7 +59,7 @@ class OwnerLock:
                 raise
 
     def note(self, fields: dict[str, Any]) -> None:
-        """Leave word for whoever comes after an end that was not in order."""
+        """Store a note for the next owner, which ``release`` deletes."""
         self._write(json.dumps({"pid": os.getpid(), "cell": str(self._cell), **fields}))
 
     def _write(self, text: str) -> None:
@@ -70,7 +70,7 @@ class OwnerLock:
                 os.ftruncate(self._fd, len(data))
 
     def release(self) -> None:
-        """Give the lock back; the end was in order."""
+        """Release the lock after a normal end."""
         self._write("")
         if self._fd is not None:
             os.close(self._fd)

@@ -29,8 +29,8 @@ class LoopProcess:
     """One process of the loop, from its start to its end.
 
     It gets the files of its configuration as the daemon has read them, and reads no others.
-    ``order`` holds ``may_write``, ``number`` (processes counted from 0), ``latched``
-    and ``after`` (number of the last request that is not for it); see loop_main.
+    ``order`` holds ``may_write``, ``number`` (of the process, from 0), ``latched`` and ``after``
+    (number of the last request that is not for it); see bridge/loop/main.py.
     """
 
     def __init__(
@@ -42,7 +42,7 @@ class LoopProcess:
         self.memory, self._commands = memory, commands
         self._settings = settings = configuration.settings
         files = sealed_bytes("gapbridge-files", pickle.dumps(dict(configuration.files)))
-        # sockets, not pipes: nobody can open them a second time through /proc
+        # sockets, not pipes: they cannot be opened again through /proc
         events, remote = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         orders, stdin = socket.socketpair()
         self._events = events
@@ -55,8 +55,8 @@ class LoopProcess:
             "parent": os.getpid(),
         }  # fmt: skip
         try:
-            # spawned, never forked: nothing of this process's threads and locks may be inherited;
-            # in a session of its own, so that a Ctrl-C reaches it through the daemon only
+            # spawned, not forked: no threads and locks are inherited; in a new session, so that
+            # Ctrl-C reaches only the daemon
             self._process = subprocess.Popen(
                 [sys.executable, "-X", "faulthandler", "-m", "gapbridge.bridge.loop.main"],
                 stdin=stdin.fileno(), stdout=log, stderr=log, env=environment(),
@@ -66,7 +66,7 @@ class LoopProcess:
             os.close(files)
             remote.close()
             stdin.close()
-        with orders, contextlib.suppress(OSError):  # it is gone already, which the daemon sees
+        with orders, contextlib.suppress(OSError):  # it has ended already, which the daemon detects
             orders.sendall((json.dumps(order) + "\n").encode())
 
     @property
@@ -81,7 +81,7 @@ class LoopProcess:
 
     @property
     def hangs(self) -> bool:
-        """Return whether its heartbeat has stood still for longer than what it is at may take."""
+        """Return whether its heartbeat has stopped for longer than its phase allows."""
         memory, settings = self.memory, self._settings
         limit = {
             Phase.STARTING: STARTING_LIMIT,
@@ -102,24 +102,24 @@ class LoopProcess:
         return events
 
     def ask_to_stop(self) -> None:
-        """Ask it to ramp out and end."""
+        """Request it to ramp out and end."""
         self._commands.ask(Command.STOP)
         if self.memory.phase in (Phase.STARTING, Phase.CONNECTING):
-            self.kill()  # nothing is written yet, and a constructor cannot be interrupted
+            self.kill()  # nothing is written yet, and connecting cannot be interrupted
 
     def kill(self) -> None:
-        """End it by force; the robot's own watchdog stops the arm."""
+        """Kill it; the robot's watchdog stops the arm."""
         if self._process.poll() is None:
             self._process.send_signal(signal.SIGKILL)
             self._process.wait()
 
     def close(self) -> None:
-        """Give everything back; ends the process where it still lives."""
+        """Kill the process if it runs, and close its socket."""
         self.kill()
         self._events.close()
 
     def describe_end(self) -> str:
-        """Return in words how it ended."""
+        """Return how it ended, as text."""
         code = self.exit_code
         if code is None:
             return "is alive"

@@ -1,7 +1,7 @@
-"""A changed cell file while the daemon runs: taken whole, or not at all.
+"""Reloading a changed cell file while the daemon runs: applied completely, or not at all.
 
-The motion is ramped out, the loop ends, and one with the new cell begins: observing, unless the arm
-was compensating before and the new cell says itself that it arms.
+The offset is ramped out, the loop ends, and one with the new cell starts: observing, unless the arm
+was compensating and the new cell has ``setpoints.arm``.
 """
 
 from __future__ import annotations
@@ -15,25 +15,25 @@ from gapbridge.bridge.cell.cell import cell_errors
 from gapbridge.bridge.cell.run_settings import Configuration, read_configuration
 from gapbridge.bridge.daemon.service_manager import ServiceManager
 from gapbridge.bridge.ipc.events import EventKind, EventLog
+from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.ipc.shared_memory import Phase
-from gapbridge.bridge.loop.supervisor import State
 from gapbridge.core.errors import GapbridgeError
 from gapbridge.drivers.controller_address import address_of
 
 KEPT_UNTIL_RESTART = ("recording", "web", "metrics")
-"""Sections whose processes go on as they are; a changed one takes effect at the next start."""
+"""Sections of side processes, which keep running; a change takes effect at the next start."""
 
 
 class Swap(NamedTuple):
-    """What the next loop begins with."""
+    """What the next loop starts with."""
 
-    configuration: Configuration | None  # None: what the last one had
+    configuration: Configuration | None  # None: unchanged
     rearms: bool  # it was compensating, and the new cell arms by itself
-    in_order: bool  # the last loop was ended for this
+    in_order: bool  # the last loop was stopped for the reload
 
 
 class Reload:
-    """One request to read the cell again, from asking to the new loop."""
+    """A reload from its request to the new loop."""
 
     def __init__(self, manager: ServiceManager, event_log: EventLog) -> None:
         self._manager, self._event_log = manager, event_log
@@ -43,11 +43,11 @@ class Reload:
         self.wants_end = False  # the loop is to be stopped: nothing is being written
 
     def ask(self) -> None:
-        """Ask for the cell to be read again; from any thread."""
+        """Request a reload; from any thread."""
         self._requested.set()
 
     def step(self, state: State, phase: Phase, running: Configuration) -> bool:
-        """Go on with a reload that was asked for; returns whether the loop is to ramp out now."""
+        """Continue a requested reload; returns whether the loop must ramp out now."""
         if self._requested.is_set():
             self._requested.clear()
             self._read(state, running)
@@ -59,9 +59,9 @@ class Reload:
         return False
 
     def swap(self) -> Swap:
-        """Return what the next loop begins with; one that died instead begins with it too.
+        """Return what the next loop starts with, also if the last one died meanwhile.
 
-        The service manager hears of it with the new loop's first cycle.
+        The service manager is notified at the new loop's first cycle.
         """
         following, ended = self._next, self.wants_end
         rearm = self._rearm and ended
@@ -98,24 +98,24 @@ class Reload:
 
 
 def _compatible(new: Configuration, running: Configuration) -> Configuration:
-    """Return a configuration that this run can go on with. Raises GapbridgeError."""
+    """Return the new configuration with what must not change in a run. Raises GapbridgeError."""
     settings, before = new.settings, running.settings
     if new.n != running.n:
         raise GapbridgeError(
             f"{settings.cell}: robot: found {new.n} joints, expected {running.n} as before: "
-            "stop the daemon and start it anew"
+            "stop and restart the daemon"
         )
     if address_of(settings.link) != address_of(before.link):
         raise GapbridgeError(
             f"{settings.cell}: link: found {address_of(settings.link)}, expected "
-            f"{address_of(before.link)} as before: stop the daemon and start it anew"
+            f"{address_of(before.link)} as before: stop and restart the daemon"
         )
     fixed = {name: getattr(before, name) for name in ("model_source", "hang_timeout", "backoff")}
     return replace(new, settings=settings.model_copy(update=fixed))
 
 
 def _messages(cell: Path, error: GapbridgeError) -> list[str]:
-    """Return everything that is wrong with a cell file, where it is more than one thing."""
+    """Return all errors of a cell file."""
     try:
         return cell_errors(cell) or [str(error)]
     except GapbridgeError:

@@ -1,4 +1,4 @@
-"""What the rigid arm's model says of a rest, and how a zero that has moved changes it."""
+"""Readings at rest predicted by the rigid arm's model, and how a moved zero changes them."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from gapbridge.core.model import Model
 from gapbridge.core.motion import Motion
 from gapbridge.core.rotation import rotation_matrix
 
-STEP = 1e-4  # rad, kg, kg m: of the differences
+STEP = 1e-4  # rad, kg, kg m: of finite differences
 
 
 @dataclass
 class Place:
-    """A pose that the program comes back to."""
+    """A pose to which the program returns."""
 
     q: Array  # (n,) rad
     mass: float  # kg, declared
-    side: bytes  # from which each joint has come
+    side: bytes  # direction of approach of each joint
     predicted: Array  # (m,) readings of the rigid arm
     slip: Array  # (m, n) change of the readings per rad of each joint's zero
-    free: Array  # (m, f) what a step of sensors' zeros and of the payload changes
+    free: Array  # (m, f) change of the readings per step of sensor zeros and payload
 
 
 class RestModel:
@@ -39,20 +39,20 @@ class RestModel:
         self._model, self._n = model, model.arm.n
 
     def payload(self, mean: Array) -> tuple[float, Array]:
-        """Return mass, kg, and centre (3,), m, that the controller declares, or else the cell."""
+        """Return mass, kg, and centre (3,), m, declared by the controller, else by the cell."""
         declared = mean[2 * self._n + 12 :]
         if np.isfinite(declared).all():
             return float(declared[0]), declared[1:]
         return self._model.payload_mass, np.asarray(self._model.payload_cog)
 
     def readings(self, mean: Array, place: Place) -> Array:
-        """Return what was measured less the model's (6 + n,): flange wrench, motor torques."""
+        """Return measured minus predicted readings (6 + n,): flange wrench, motor torques."""
         n = self._n
         wrench, at_tcp = mean[n : n + 6], mean[n + 6 : n + 12]
         predicted = place.predicted + place.slip @ (mean[:n] - place.q)
         if np.isfinite(wrench).all():
             at_flange = wrench - predicted[:6]
-        else:  # the controller's own, its payload taken off: the flange feels what is left of it
+        else:  # the controller's TCP wrench, without the declared payload
             at_flange = self._at_flange(mean[:n], at_tcp)
         return np.concatenate([at_flange, mean[n + 12 : 2 * n + 12] - predicted[6:]])
 
@@ -65,7 +65,7 @@ class RestModel:
         return np.concatenate([force, torque + np.cross(tool[:3, 3], force)])
 
     def columns(self, mean: Array) -> tuple[Array, Array, Array]:
-        """Return readings, and how each joint's zero changes them, and what is no slip."""
+        """Return readings (m,), their changes by joint zeros (m, n) and by other steps (m, f)."""
         n = self._n
         mass, cog = self.payload(mean)
         steps = STEP * np.vstack([np.eye(n), -np.eye(n), np.zeros(n)])

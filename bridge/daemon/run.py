@@ -1,4 +1,4 @@
-"""Running a daemon from a cell: signals, words on the terminal, exit code."""
+"""Running a daemon from a cell: signals, output on the terminal, exit code."""
 
 from __future__ import annotations
 

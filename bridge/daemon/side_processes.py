@@ -1,4 +1,4 @@
-"""The processes beside the loop: which there are, and looking after them together."""
+"""The side processes of a run: recorder, status page and metrics, managed together."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ SIDE_PROCESSES: dict[str, tuple[str, Callable[[DaemonSettings], bool]]] = {
     "web": ("gapbridge.bridge.web.main", lambda s: s.web is not None),
     "metrics": ("gapbridge.bridge.metrics.main", lambda s: s.metrics is not None),
 }
-"""Name -> (module to run, whether a run's settings want it)."""
+"""Name -> (module to run, whether a run's settings enable it)."""
 
-PATIENCE = {"recorder": 10.0}  # s to finish in, where it is not LITTLE
-LITTLE = 0.3
+END_TIMEOUTS = {"recorder": 10.0}  # s to finish in after the daemon's end, by name
+DEFAULT_END_TIMEOUT = 0.3  # s, of the others
 
 
 class SideProcesses:
@@ -32,17 +32,17 @@ class SideProcesses:
     def start(
         self,
         settings: DaemonSettings,
-        order: dict[str, Any],
+        start_data: dict[str, Any],
         memory: SharedMemory,
         log: IO[Any] | int,
     ) -> None:
-        """Start those that the settings want."""
-        for name, (module, wanted) in SIDE_PROCESSES.items():
-            if wanted(settings):
-                self._running[name] = SideProcess(module, order, memory, log, self._clock)
+        """Start those that the settings enable."""
+        for name, (module, is_enabled) in SIDE_PROCESSES.items():
+            if is_enabled(settings):
+                self._running[name] = SideProcess(module, start_data, memory, log, self._clock)
 
     def show(self, memory: SharedMemory) -> None:
-        """Have all change over to another memory."""
+        """Switch all of them to another memory."""
         for side in self._running.values():
             side.show(memory)
 
@@ -52,13 +52,13 @@ class SideProcesses:
             side.emit(event)
 
     def check(self) -> list[dict[str, Any]]:
-        """Look after all; returns what they have reported and what became of them, as events."""
+        """Check and restart them; returns their events, and events on their problems."""
         events = []
         for name, side in self._running.items():
             for event in side.events():
                 if event.get("kind") == name:
                     events.append(event)
-                else:  # states and requests are not a side process's to emit
+                else:  # a side process may emit only events of its own kind
                     detail = f"{name} emitted {str(event.get('kind'))[:40]!r}, which is not its own"
                     events.append({"kind": EventKind.SIDE, "side": name, "detail": detail})
             if (problem := side.check()) is not None:
@@ -76,9 +76,9 @@ class SideProcesses:
         }  # fmt: skip
 
     def close(self) -> None:
-        """Notify all that the daemon ends, and wait for what they have to finish."""
+        """Notify all that the daemon ends, and wait until they have finished."""
         for side in self._running.values():
             side.begin_close()
         for name, side in self._running.items():
-            side.close(PATIENCE.get(name, LITTLE))
+            side.close(END_TIMEOUTS.get(name, DEFAULT_END_TIMEOUT))
         self._running.clear()

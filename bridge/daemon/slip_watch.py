@@ -1,4 +1,4 @@
-"""Watching for a joint whose zero has moved: rests at the same pose, compared over a run.
+"""Detecting a joint whose zero has moved: readings at rest at the same pose, over a run.
 
 A robot's program comes back to the same poses. What the flange sensor and the motors measure there
 repeats but for noise, whatever the model gets wrong, so that each rest is compared with earlier
@@ -10,7 +10,7 @@ Changes" (1993), ch. 2.4). A step of the sensor's or the motors' zeros, and of p
 moment, is free on both sides, so that none of them counts as a slip.
 
 A person who touches the arm makes a force that comes and goes: it does not repeat at the next
-poses in the shares of a joint. It is reported as what it is, and kept out of the comparison.
+poses in the shares of a joint. It is reported as a force, and excluded from the comparison.
 """
 
 from __future__ import annotations
@@ -27,29 +27,29 @@ from gapbridge.bridge.ipc.events import Event, EventKind
 from gapbridge.core.arrays import Array
 from gapbridge.core.model import Model
 
-STILL = 1e-3  # rad from where a rest began: farther, the arm has moved on
-SETTLING = 0.1  # s at the begin of a rest that are left out
+STILL = 1e-3  # rad from the start of a rest, within which the arm is at rest
+SETTLING = 0.1  # s at the start of a rest that are skipped
 WINDOW = 0.3  # s of one mean
-WINDOWS = 20  # of a rest that count
+WINDOWS = 20  # per rest
 SAME_POSE = 0.02  # rad
 SAME_MASS = 0.01  # kg
-TURNED = 0.01  # rad: a joint that came at least this far has come from that side
-KEPT = 120  # rests
-PLACES = 64  # poses at most; a program with more forgets those not seen for longest
+APPROACH_STEP = 0.01  # rad: smallest motion that determines a joint's approach direction
+MAX_RESTS = 120  # stored rests
+MAX_POSES = 64  # stored poses; a program with more drops the least recent ones
 SUFFIXES = (4, 5, 6, 8, 12, 18, 27, 40)  # rests since the moment that is tried
-LEARNED = 18  # differences between rests at one pose that the noise is taken from
-FEWEST_PLACES = 4  # poses that a slip must show at
-BEFORE_STEPS = 0.5  # of the threshold: how far a slip is ahead of any step of zeros and payload
-WITHOUT_ONE = 0.25  # share of the threshold that a slip keeps whichever pose is left out
+NOISE_SAMPLES = 18  # differences between rests at one pose for the noise estimate
+MIN_POSES = 4  # poses that a slip must show at
+LEAD_OVER_STEPS = 0.5  # of the threshold: how far a slip is ahead of any step of zeros and payload
+LEFT_OUT = 0.25  # share of the threshold that a slip keeps whichever pose is left out
 THRESHOLD = 45.0  # of the likelihood ratio (chi-square of one number)
-CONSISTENT = 3.0  # chi-square per number that a slip may leave: more, it is something else
-TIE = 9.0  # of the ratio: a joint that explains as much is reported beside the best
+CONSISTENT = 3.0  # largest chi-square per number after fitting a slip
+TIE_MARGIN = 9.0  # of the ratio: joints within it of the best one are reported too
 FLOORS = (0.05, 0.005, 0.05)  # N, Nm of the flange sensor, Nm of a motor: 1 sigma at least
-LARGEST_SLIP = 0.05  # rad: what no slip makes is a force
+LARGEST_SLIP = 0.05  # rad: larger changes are forces
 FORCE = 1.0  # N on top of that
 FORCE_SIGMAS = 8.0
-LASTING = 3  # rests in a row after which a force counts as the new state of things
-TIPS = 0.1  # rad: poses closer than this are one to the test
+LASTING_RESTS = 3  # rests in a row after which a force counts as permanent
+DISTINCT_POSE = 0.1  # rad: poses closer than this count as one
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ class Slip:
 
 @dataclass(frozen=True)
 class Force:
-    """A force that came while the arm stood, or held during a rest."""
+    """An external force that changed or lasted during a rest."""
 
     size: float  # N
     since: float  # s, controller's clock
@@ -96,7 +96,7 @@ class _Rest:
 
 
 class _Change(NamedTuple):
-    """The rests at one pose after a moment, less those before it; whitened."""
+    """Difference of readings at one pose, after minus before a moment; whitened."""
 
     b: Array  # (k,)
     slip: Array  # (k, n)
@@ -114,7 +114,7 @@ class _Standstill:
         self._count, self._begun = 0, 0.0  # rows of the window, and s of the first
 
     def take(self, rows: Array, begun: float, ended: float) -> tuple[Array, Array] | None:
-        """Return a window that has ended, and how it differs from the one before it, if any."""
+        """Return a finished window's mean, and its difference from the one before, if any."""
         self._begun = self._begun if self._count else begun
         self._sum, self._count = self._sum + rows.sum(axis=0), self._count + len(rows)
         if ended - self._begun < WINDOW:
@@ -130,7 +130,7 @@ class _Standstill:
 class SlipWatch:
     """Compares the rests of a run with each other; ``model`` None, or ``smallest`` 0: never.
 
-    ``slices``: where each field stands in a cycle's row (SharedMemory.slices). ``smallest``: rad,
+    ``slices``: where each field is in a cycle's row (SharedMemory.slices). ``smallest``: rad,
     of a slip that is reported.
     """
 
@@ -153,9 +153,9 @@ class SlipWatch:
         self.reset()
 
     def reset(self) -> None:
-        """Learn anew: the arm is another from now on."""
+        """Start learning again: the arm has changed."""
         self._places: list[Place] = []
-        self._rests: deque[_Rest] = deque(maxlen=KEPT)
+        self._rests: deque[_Rest] = deque(maxlen=MAX_RESTS)
         self._standstill: _Standstill | None = None
         self._touched = False  # a force has come or gone during this rest
         self._previous_q: Array | None = None  # (n,) rad: the rest before this one
@@ -164,12 +164,12 @@ class SlipWatch:
 
     @property
     def learned(self) -> bool:
-        """Return whether poses have come back often enough to compare them."""
+        """Return whether enough poses were repeated to compare them."""
         return self._model is not None and self._sigma is not None
 
     @property
     def detail(self) -> str:
-        """Return in words what is watched."""
+        """Return the progress as text."""
         if self._model is None:
             return "not watched"
         poses = len({rest.place for rest in self._rests})
@@ -177,7 +177,7 @@ class SlipWatch:
         return detail if self.learned else f"{detail}; learning, until poses have come back"
 
     def take(self, rows: Array) -> list[Slip | Force]:
-        """Return what has just been found. ``rows`` (k, width): cycles of the loop, in order."""
+        """Return new findings. ``rows`` (k, width): cycles of the loop, in order."""
         if self._model is None or not len(rows):
             return []
         findings: list[Slip | Force] = []
@@ -198,27 +198,27 @@ class SlipWatch:
     # -- one rest ---------------------------------------------------------------------------------
 
     def _force_step(self, mean: Array, change: Array, now: float) -> list[Slip | Force]:
-        """Report a force that comes or goes while the arm stands: nobody's zero, once a rest."""
+        """Report a force that changes while the arm is at rest, once a rest; not a slip."""
         if self._touched or self._sigma is None:
             return []
         assert self._model is not None
         n = self._n
         size = float(np.linalg.norm(_first_finite(change[n : n + 3], change[n + 6 : n + 9])))
         self._touched = size > self._threshold(LARGEST_SLIP * 9.81 * self._model.payload(mean)[0])
-        return [_force(size, now, "came or went while the arm stood still")] * self._touched
+        return [_force(size, now, "came or went while the arm was at rest")] * self._touched
 
     def _threshold(self, slip: float) -> float:
-        """Return the force, N, above which a change is more than noise and a slip's ``slip``, N."""
+        """Return the force, N, above which a change exceeds noise and a slip's ``slip``, N."""
         assert self._sigma is not None
         return slip + max(FORCE, FORCE_SIGMAS * float(self._sigma[:3].max()))
 
     def _end_rest(self) -> list[Slip | Force]:
-        """Take the rest that has ended into the comparison."""
+        """Add the finished rest to the comparison."""
         standing = self._standstill
         if standing is None or not standing.windows:
             return []
         assert self._model is not None
-        # the middle window: a touch that is shorter than half of the rest leaves no trace
+        # the median window: a touch shorter than half of the rest has no effect
         mean = _median(standing.windows)
         place = self._place_of(mean)
         rest = _Rest(place, standing.since, self._model.readings(mean, self._places[place]))
@@ -235,21 +235,21 @@ class SlipWatch:
         return findings
 
     def _forces(self, rest: _Rest) -> list[Slip | Force]:
-        """Keep rests under a force out, as long as they are few in a row."""
+        """Exclude rests under a force, up to LASTING_RESTS in a row."""
         excess = self._excess(rest)
         if excess is None:
             self._under_force = []
             return []
         self._under_force.append(rest)
         if len(self._under_force) == 1:
-            return [_force(excess, rest.time, "beside what this pose had at its rests before")]
-        if len(self._under_force) > LASTING:  # not a touch: a slip, a load, a sensor's new zero
+            return [_force(excess, rest.time, "compared with earlier rests at this pose")]
+        if len(self._under_force) > LASTING_RESTS:  # a slip, a load, or a sensor's new zero
             self._rests.extend(self._under_force[:-1])
             self._under_force = []
         return []
 
     def _excess(self, rest: _Rest) -> float | None:
-        """Return the force, N, that no slip makes beside the former rests at a pose, or None."""
+        """Return the change of force, N, at a pose if it is too large for a slip, or None."""
         former = [r.readings for r in self._rests if r.place == rest.place]
         if self._sigma is None or len(former) < 2:
             return None
@@ -258,17 +258,17 @@ class SlipWatch:
         return size if size > self._threshold(float(slip)) else None  # NaN: no sensor
 
     def _place_of(self, mean: Array) -> int:
-        """Return the number of the pose, a new one where it has not been seen yet."""
+        """Return the number of the pose, a new one if it was not seen yet."""
         assert self._model is not None
         n = self._n
         q, mass = mean[:n], self._model.payload(mean)[0]
         step = np.zeros(n) if self._previous_q is None else q - self._previous_q
-        side = np.where(np.abs(step) > TURNED, np.sign(step), 0).astype(np.int8).tobytes()
+        side = np.where(np.abs(step) > APPROACH_STEP, np.sign(step), 0).astype(np.int8).tobytes()
         for number, place in enumerate(self._places):
             near = np.abs(place.q - q).max() < SAME_POSE and abs(place.mass - mass) < SAME_MASS
             if near and place.side == side:
                 return number
-        if len(self._places) >= PLACES:
+        if len(self._places) >= MAX_POSES:
             self._drop_oldest()
         self._places.append(Place(q, mass, side, *self._model.columns(mean)))
         return len(self._places) - 1
@@ -283,7 +283,7 @@ class SlipWatch:
             for rest in self._rests
             if rest.place != oldest
         ]
-        self._rests = deque(remaining, maxlen=KEPT)
+        self._rests = deque(remaining, maxlen=MAX_RESTS)
 
     # -- the test ---------------------------------------------------------------------------------
 
@@ -295,14 +295,14 @@ class SlipWatch:
             if rest.place in last:
                 steps.append(rest.readings - last[rest.place])
             last[rest.place] = rest.readings
-        if len(steps) < LEARNED:
+        if len(steps) < NOISE_SAMPLES:
             return None
         # the median: a slip, or a touch, among them does not raise it
         spread = 1.4826 * _median(np.abs(steps)) / np.sqrt(2.0)
         return np.asarray(np.maximum(spread, self._floor))
 
     def _slip(self) -> Slip | None:
-        """Return the slip that the rests up to now show."""
+        """Return the slip that the rests show, or None."""
         if self._sigma is None or not any(self._is_significant(length) for length in SUFFIXES):
             return None
         tried = {
@@ -315,20 +315,20 @@ class SlipWatch:
         length = min(known, key=lambda one: chi_square(count - one))  # the likeliest moment
         gains, values, stds, _ = known[length]
         order = np.argsort(-gains)
-        joints = tuple(int(j) + 1 for j in order if gains[j] > gains[order[0]] - TIE)
+        joints = tuple(int(j) + 1 for j in order if gains[j] > gains[order[0]] - TIE_MARGIN)
         # as sure as the moment is: other moments that are nearly as likely have sizes of their own
         best = order[0]
-        likely = [f[1][best] for f in known.values() if f[0][best] > gains[best] - TIE]
+        likely = [f[1][best] for f in known.values() if f[0][best] > gains[best] - TIE_MARGIN]
         size, std = float(values[best]), float(np.hypot(stds[best], np.std(likely)))
         return Slip(
             joints, size, std, list(self._rests)[-length].time,
             f"the zero of joint {' or '.join(map(str, joints))} has moved by {1e3 * size:.1f} mrad "
-            f"(1 sigma {1e3 * std:.1f}): what is measured at rest has changed in {length} rests in "
-            "a row as that changes it, beside former rests at the same poses",
+            f"(1 sigma {1e3 * std:.1f}): in {length} rests in a row the readings have changed as "
+            "this slip changes them, compared with earlier rests at the same poses",
         )  # fmt: skip
 
     def _is_significant(self, length: int) -> bool:
-        """Return whether a slip before the last ``length`` rests is beyond doubt."""
+        """Return whether a slip before the last ``length`` rests is significant."""
         changes = self._changes(length)
         ratios = _ratios(changes)
         if ratios is None:
@@ -339,21 +339,21 @@ class SlipWatch:
             return False
         for i in range(len(changes)):  # a hand on the arm is at one pose, a slip at all
             part = _ratios(changes[:i] + changes[i + 1 :])
-            if part is None or part[0][j] < WITHOUT_ONE * THRESHOLD or part[1][j] * values[j] < 0.0:
+            if part is None or part[0][j] < LEFT_OUT * THRESHOLD or part[1][j] * values[j] < 0.0:
                 return False
-        return self._lead_over_steps(length, j) > BEFORE_STEPS * THRESHOLD
+        return self._lead_over_steps(length, j) > LEAD_OVER_STEPS * THRESHOLD
 
     def _lead_over_steps(self, length: int, joint: int) -> float:
-        """Return by how much of chi-square a slip beats what is free, at any other moment.
+        """Return how much lower chi-square is with a slip than with free steps at any moment.
 
-        A sensor that was zeroed anew two rests before a moment looks like much at that moment.
+        A sensor that was zeroed two rests before a moment looks like a slip at that moment.
         """
         count = len(self._rests)
         free = self._chi_square(None)
         return min(map(free, range(2, count - 1))) - self._chi_square(joint)(count - length)
 
     def _chi_square(self, joint: int | None) -> Callable[[int], float]:
-        """Return what gives chi-square of all rests for a step of what is free at a moment.
+        """Return a function: chi-square of all rests for steps of the free parameters at a moment.
 
         Each pose's own mean is fitted too, and where one is given the slip of a joint (from 0). A
         moment is the number of the first rest after it.
@@ -391,13 +391,13 @@ class SlipWatch:
             return []
         old, new = _by_place(rests[:-length]), _by_place(rests[-length:])
         common = [p for p in new if len(old.get(p, ())) >= 2]
-        if self._distinct(common) < FEWEST_PLACES:
+        if self._distinct(common) < MIN_POSES:
             return []
         changes = []
         for p in common:
             before, after, place = old[p], new[p], self._places[p]
             change = _median(after) - _median(before)
-            # pi / 2: the variance of a median beside that of a mean
+            # pi / 2: the variance of a median relative to that of a mean
             share = np.pi / 2.0 / len(before) + (np.pi / 2.0 if len(after) > 2 else 1.0) / len(
                 after
             )
@@ -412,7 +412,7 @@ class SlipWatch:
         distinct: list[Array] = []
         for p in places:
             q = self._places[p].q
-            if all(np.abs(q - other).max() > TIPS for other in distinct):
+            if all(np.abs(q - other).max() > DISTINCT_POSE for other in distinct):
                 distinct.append(q)
         return len(distinct)
 

@@ -1,4 +1,4 @@
-"""What the daemon knows of its run at a moment, as the status document."""
+"""The present status of a run, for the status document."""
 
 from __future__ import annotations
 
@@ -7,18 +7,19 @@ from collections import deque
 from typing import Any
 
 from gapbridge.bridge.ipc.events import Event, EventKind
+from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.loop.checks import NOTHING, UNSOLVED
-from gapbridge.bridge.loop.supervisor import CLEARED_BY_RECONNECTING, Cause, State
+from gapbridge.bridge.loop.supervisor import CLEARED_BY_RECONNECTING, Cause
 from gapbridge.core.arrays import Array
 from gapbridge.drivers.clock import SYSTEM, Clock
 
-RATE_SPAN = 2.0  # s that the rate is taken over
+RATE_SPAN = 2.0  # s over which the rate is averaged
 
 
 def correction(flags: int, residual: float) -> dict[str, Any]:
-    """Return what the status document says of the model at the present pose.
+    """Return the status document's part on the model at the present pose.
 
-    ``flags`` of a cycle; ``residual``: its correction's distance from the wanted pose, m.
+    ``flags`` of a cycle; ``residual``: distance of the corrected pose from the wanted one, m.
     """
     detail = ""
     if flags & UNSOLVED:
@@ -33,7 +34,7 @@ def correction(flags: int, residual: float) -> dict[str, Any]:
 
 
 class DaemonStatus:
-    """Keeps of cycles and events what the status document says; ``slices`` of a cycle's row."""
+    """Keeps what the status document reports; ``slices``: where fields are in a cycle's row."""
 
     def __init__(self, slices: dict[str, slice], clock: Clock = SYSTEM) -> None:
         self._now = clock.monotonic
@@ -42,9 +43,9 @@ class DaemonStatus:
         self._down = False  # the loop has ended and no other is connected
         self.armed_by = ""
         self._asked_by = ""  # of the last request to arm
-        self.latched = ""  # the fault that waits for being acknowledged
-        self._clears_with_link = False  # it ends with the link
-        self._slipped = False  # it is a joint's zero, of which the loop only holds
+        self.latched = ""  # the fault that is not acknowledged yet
+        self._clears_with_link = False  # the fault ends with the link
+        self._slipped = False  # the fault is a joint's zero that moved
         self._batches: deque[tuple[float, int]] = deque()  # s, cycles
         self._last_state: float | None = None  # s, monotonic: when the last state was received
         self._received = slices["received"].start
@@ -52,10 +53,10 @@ class DaemonStatus:
         self._residual_at = slices["residual"].start
         self._correction = (0, 0.0)  # flags and residual, m, of the last cycle
         self.configured: Event = {}  # the last attempt to reload
-        self._compiling = ""  # what the loop's process is at before its first cycle
+        self._compiling = ""  # what the loop's process compiles before its first cycle
 
     def take(self, rows: Array) -> None:
-        """Take note of cycles."""
+        """Update from cycles: rows (k, width)."""
         now = self._now()
         if len(rows):
             self._last_state = float(rows[-1, self._received])
@@ -65,7 +66,7 @@ class DaemonStatus:
             self._batches.popleft()
 
     def on_event(self, event: Event) -> None:
-        """Take note of an event."""
+        """Update from an event."""
         if event["kind"] == EventKind.CONFIGURATION:
             self.configured = event
         if event["kind"] == EventKind.REQUEST and event["command"] == "arm":
@@ -89,7 +90,7 @@ class DaemonStatus:
         self._since, self._down = event["time"], to == State.DISCONNECTED.name
         self._why = f"{cause}: {detail}" if detail else cause
         if to == State.FAULT.name:
-            if cause != Cause.LATCHED:  # else it is the one that is known already
+            if cause != Cause.LATCHED:  # else the fault is known
                 self.latched, self._clears_with_link = self._why, cause in CLEARED_BY_RECONNECTING
         elif event["from"] == State.FAULT.name and to == State.OBSERVING.name:
             self.latched = ""
@@ -101,31 +102,28 @@ class DaemonStatus:
             self.armed_by = ""
 
     def named(self, state: State) -> str:
-        """Return the state as the document names it: compiling is one of its own."""
-        return (
-            self._compiling
-            if state == State.DISCONNECTED and self._compiling
-            else (state.name.lower())
-        )
+        """Return the state's name in the document, which has one more for compiling."""
+        name = state.name.lower()
+        return (self._compiling or name) if state == State.DISCONNECTED else name
 
     def lost_loop(self) -> None:
-        """Take note that link and loop are gone: faults of the link end with them."""
+        """Record that link and loop have ended: faults of the link end with them."""
         self._compiling = ""
         if self._clears_with_link:
             self.latched, self._clears_with_link = "", False
         self.armed_by = ""
 
     def history(self) -> dict[str, Any]:
-        """Return since when the state is what it is, and why."""
+        """Return since when the loop is in its state, and why."""
         return {"since": self._since, "why": self._why}
 
     @property
     def correction(self) -> dict[str, Any]:
-        """Return what the document says of the model at the present pose."""
+        """Return the document's part on the model at the present pose."""
         return correction(*self._correction)
 
     def link(self) -> dict[str, float | None]:
-        """Return how old the last state is, s, and how many come in a second."""
+        """Return the age of the last state, s, and the rate of states, Hz."""
         now, batches = self._now(), tuple(self._batches)
         rate = sum(n for _, n in batches[1:]) / max(now - batches[0][0], 1e-9) if batches else 0.0
         return {

@@ -1,4 +1,4 @@
-"""How a run went, in numbers and in words."""
+"""The summary of a run: figures and text."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from gapbridge.core.arrays import Array
 from gapbridge.core.limits import CLAMPS
 
 UNIT = 1e-6  # s: bin of a histogram
-BATCH = 50  # looks at the cycles, whose rows are counted at once
-BINS = 50_000  # to 50 ms; what is beyond counts as the last
+BATCH = 50  # batches of rows that are counted together
+BINS = 50_000  # to 50 ms; longer durations count in the last bin
 
 
 class Histogram:
@@ -32,7 +32,7 @@ class Histogram:
             self.largest = max(self.largest, float(values.max()))
 
     def quantile(self, share: float) -> float:
-        """Return the duration (s) that this share stays within; 0 without any."""
+        """Return a quantile of the durations, s; 0 without any."""
         total = self._counts.sum()
         if not total:
             return 0.0
@@ -45,7 +45,7 @@ class RunSummary:
     """One run of the daemon. Times in ms and us as the names say."""
 
     cycles: int  # distinct controller timestamps seen
-    missed: int  # timestamps between them that were not; arming, a break of its own, is left out
+    missed: int  # timestamps not seen, except those during arming
     late: int  # cycles finished later than one period after their state
     rate_hz: float  # cycles per second of the controller's clock
     setpoints_written: int
@@ -121,7 +121,7 @@ class Tally:
                 self._count()
 
     def _count(self) -> None:
-        """Count what waits: a call on many rows costs as much as one on a few."""
+        """Count the queued rows together: a call on many rows costs as much as one on a few."""
         if not self.waiting:
             return
         rows, self.waiting = np.concatenate(self.waiting), []
@@ -137,7 +137,7 @@ class Tally:
         gaps = stamps.copy()
         gaps[1:] -= stamps[:-1]
         gaps[0] -= self.last_timestamp
-        # a gap without cycles missed is a break: the loop armed, or was started anew
+        # a gap without missed cycles: the loop was arming, or was restarted
         gaps = gaps[np.abs(gaps - (missed + 1.0) / self.rate) < 0.5 / self.rate]
         self.last_timestamp = float(stamps[-1])
         self.steps += len(gaps)
@@ -153,7 +153,7 @@ class Tally:
         """Return the fields of RunSummary that are counted here."""
         self._count()
         quantiles = {"p50": 0.5, "p99": 0.99}
-        # a run that only observes has no setpoints; then every cycle stands for one
+        # a run that only observes has no setpoints; then every cycle counts
         ages = self.age_written if self.written else self.age
         age = {k: 1e3 * ages.quantile(v) for k, v in quantiles.items()}
         work = {k: 1e6 * self.work.quantile(v) for k, v in quantiles.items()}

@@ -17,7 +17,8 @@ from gapbridge.bridge.demo.links.link import DemoLink
 from gapbridge.bridge.demo.measurements import FEW_READINGS, Measurements, joined, measurements_at
 from gapbridge.bridge.demo.poses import Load
 from gapbridge.bridge.demo.result import LoopFigures
-from gapbridge.bridge.loop.supervisor import Cause, State
+from gapbridge.bridge.ipc.loop_state import State
+from gapbridge.bridge.loop.supervisor import Cause
 from gapbridge.core.arrays import Array
 from gapbridge.core.errors import LinkError, RunError
 from gapbridge.core.log.mcap_reading import read_columns

@@ -1,9 +1,9 @@
-"""What the daemon asks of its loop, through memory that only the daemon can write to.
+"""The daemon's commands to its loop, through memory that only the daemon can write to.
 
-One word for each command, holding the number of its last request; numbers only grow, over all
-processes of the loop. So no command overwrites another one and none has to be taken back: the loop
-compares a word with what it has taken, and says in a word of its own (SharedMemory.note_taken) up
-to which number it has. A STOP stays what it is until the process that it was meant for has ended.
+One word for each command holds the number of its last request; numbers only grow, over all
+processes of the loop. So no command overwrites another and none has to be cleared: the loop
+compares each word with the last number it has received, and reports that number
+(SharedMemory.note_taken). A STOP stays in force until its process of the loop has ended.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _SIZE, _WORD = 4096, 8  # bytes
 
 
 class Command(IntEnum):
-    """What the daemon asks for."""
+    """A command of the daemon."""
 
     ARM = 1  # a person's, or the cell file's at the start
     DISARM = 2  # a person's: ramp out and observe; in a fault, acknowledge it
@@ -47,37 +47,37 @@ class CommandMemory:
             return self.last
 
     def ask(self, command: Command, number: int = 0) -> int:
-        """Write a request, by its number where it has one already; returns the number."""
+        """Write a request under its number, or a new one; returns the number."""
         number = number or self.number()
         with self._lock:
             self._words[command] = max(number, int(self._words[command]))
         return number
 
     def last_of(self, command: Command) -> int:
-        """Return the number of the last request of a kind that was written; 0: none."""
+        """Return the number of the last request written for a command; 0: none."""
         return int(self._words[command])
 
     def close(self) -> None:
-        """Let go of the memory."""
+        """Unmap and close the memory."""
         self._words = np.zeros(1 + max(Command), np.int64)
         self._map.close()
         os.close(self.fd)
 
 
 class Commands:
-    """The loop's side: takes what is new. ``after`` is the last request that is not for it."""
+    """The loop's side: receives new requests, with numbers above ``after``."""
 
     def __init__(self, fd: int, after: int = 0) -> None:
         self._map = map_as_reader(fd, _SIZE)
         self._last_words = b""
         self._taken_numbers = dict.fromkeys(Command, after)
-        self.last_taken = after  # number of the newest request that was taken
-        self.stop = False  # has been asked for, and stays
+        self.last_taken = after  # number of the newest request received
+        self.stop = False  # STOP was received
 
     def take(self) -> list[Command]:
-        """Return what was asked for since the last call, in the order of asking.
+        """Return the commands since the last call, in the order of their requests.
 
-        An ARM that is older than something taken already is void: what came after it stands.
+        An ARM older than a request received before is dropped: the later request wins.
         """
         words = self._map[: _WORD * (1 + max(Command))]
         if words == self._last_words:

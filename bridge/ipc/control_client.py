@@ -1,4 +1,4 @@
-"""Talking to running daemons over their local sockets."""
+"""Requests to running daemons over their local sockets."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from typing import Any
 from gapbridge.bridge.cell.runtime_folder import candidates, cell_key
 from gapbridge.core.errors import InputError, RunError
 
-PATIENCE = 60.0  # s: a loop may have to start anew, arming uploads a program to the robot
+ANSWER_TIMEOUT = 60.0  # s: a loop may have to restart, arming uploads a program to the robot
 
 
 def ask(cell: Path, command: str) -> Any:
     """Return a daemon's answer to a command.
 
-    Raises InputError where no daemon runs for the cell, RunError where it refuses.
+    Raises InputError if no daemon runs for the cell, RunError if it refuses.
     """
     if not cell.exists():
         raise InputError(f"{cell}: file not found, expected a cell file (YAML)")
@@ -36,7 +36,7 @@ def ask(cell: Path, command: str) -> Any:
 def ask_socket(path: Path, command: str) -> Any:
     """Return the answer from a daemon's socket. Raises OSError, RunError."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as link:
-        link.settimeout(PATIENCE)
+        link.settimeout(ANSWER_TIMEOUT)
         link.connect(str(path))
         link.sendall(json.dumps({"command": command}).encode() + b"\n")
         with link.makefile("rb") as file:
@@ -51,7 +51,7 @@ def ask_socket(path: Path, command: str) -> Any:
 
 
 def running() -> list[Any]:
-    """Return the status of every daemon that can be asked."""
+    """Return the status of every daemon that answers."""
     statuses = []
     for folder in dict.fromkeys(candidates()):
         with contextlib.suppress(OSError):

@@ -1,7 +1,7 @@
 """The daemon's local socket: status, arm, disarm. Only its owner, and root, can open it.
 
-One line of JSON in, ``{"command": "arm"}``, one out, ``{"ok": true, "answer": ...}``. Arming has no
-other way in than this one and the cell file.
+One line of JSON in, ``{"command": "arm"}``, one out, ``{"ok": true, "answer": ...}``. Only this
+socket and the cell file can arm.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from pathlib import Path
 from typing import Any, Self
 
 LONGEST_REQUEST = 4096  # bytes
-PATIENCE = 5.0  # s for a request to come
-MOST_AT_ONCE = 8
+REQUEST_TIMEOUT = 5.0  # s until a request must arrive
+MAX_CONNECTIONS = 8
 COMMANDS = ("status", "arm", "disarm")
 _CREDENTIALS = struct.Struct("3i")
 
 
 @dataclass(frozen=True)
 class Peer:
-    """Who is at the other end, as the kernel says."""
+    """The process at the other end, as the kernel reports it."""
 
     pid: int
     uid: int
@@ -43,10 +43,10 @@ class ControlSocket:
         self.path = path
         self._answer = answer
         self._listener: socket.socket | None = None
-        self._slots = threading.BoundedSemaphore(MOST_AT_ONCE)
+        self._slots = threading.BoundedSemaphore(MAX_CONNECTIONS)
 
     def open(self) -> None:
-        """Listen; what a killed daemon left behind is replaced. The caller holds the cell's lock.
+        """Listen; replaces the socket of a killed daemon. The caller holds the cell's lock.
 
         Raises OSError.
         """
@@ -56,8 +56,8 @@ class ControlSocket:
         listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         try:
             listener.bind(str(self.path))
-            self.path.chmod(0o600)  # its folder is 0700: nobody came in between
-            listener.listen(MOST_AT_ONCE)
+            self.path.chmod(0o600)  # its folder is 0700: no other user could connect before
+            listener.listen(MAX_CONNECTIONS)
         except OSError:
             listener.close()
             raise
@@ -65,7 +65,7 @@ class ControlSocket:
         threading.Thread(target=self._serve, args=(listener,), daemon=True).start()
 
     def close(self) -> None:
-        """Stop listening and take the socket away; may be repeated."""
+        """Stop listening and remove the socket; may be repeated."""
         listener, self._listener = self._listener, None
         if listener is not None:
             with contextlib.suppress(OSError):
@@ -88,14 +88,14 @@ class ControlSocket:
     def _handle(self, connection: socket.socket) -> None:
         try:
             with connection, contextlib.suppress(OSError):
-                connection.settimeout(PATIENCE)
+                connection.settimeout(REQUEST_TIMEOUT)
                 reply = self._reply(connection)
                 connection.sendall(json.dumps(reply).encode() + b"\n")
         finally:
             self._slots.release()
 
     def _reply(self, connection: socket.socket) -> dict[str, Any]:
-        line = _read_line(connection)  # first: who is refused while it writes loses the answer
+        line = _read_line(connection)  # first: a client refused while it writes loses the answer
         peer = peer_of(connection)
         if peer.uid not in (0, os.geteuid()):
             return refusal(f"found user {peer.uid}, expected the daemon's own ({os.geteuid()})")
@@ -117,14 +117,14 @@ class ControlSocket:
 
 
 def refusal(message: str) -> dict[str, Any]:
-    """Return the answer to what is not done."""
+    """Return the answer that refuses a request."""
     return {"ok": False, "error": message}
 
 
 def peer_of(connection: socket.socket) -> Peer:
-    """Return who opened a unix connection."""
+    """Return the process that opened a unix connection."""
     option = getattr(socket, "SO_PEERCRED", None)
-    if option is None:  # not Linux: the folder's and the socket's modes stand alone
+    if option is None:  # not Linux: only the modes of folder and socket protect
         return Peer(0, os.geteuid())
     credentials = connection.getsockopt(socket.SOL_SOCKET, option, _CREDENTIALS.size)
     pid, uid, _ = _CREDENTIALS.unpack(credentials)

@@ -1,4 +1,4 @@
-"""Every event of a run: numbered, counted, kept for a while and handed to who wants it."""
+"""The events of a run: numbered, counted, stored for a while and passed to listeners."""
 
 from __future__ import annotations
 
@@ -14,28 +14,28 @@ Event = dict[str, Any]
 
 
 class EventKind(StrEnum):
-    """What an event is about; those of a side process are called as it is."""
+    """The kind of an event; those of a side process have its name."""
 
-    NOTE = "note"  # what a person may want to know
+    NOTE = "note"  # information
     TRANSITION = "transition"  # the supervisor changed state
     STATUS = "status"  # the status document, to side processes only
     REQUEST = "request"  # somebody asked to arm or to disarm
-    CONTROL = "control"  # what a request over the local socket was answered
-    REFUSED = "refused"  # writing cannot begin
-    FAULT = "fault"  # the loop's process ended in disorder, or was ended
+    CONTROL = "control"  # the answer to a request over the local socket
+    REFUSED = "refused"  # arming was refused
+    FAULT = "fault"  # the loop's process failed or was killed
     FAILURE = "failure"  # why the loop's process is about to end
-    WARNING = "warning"  # nothing is held back for it
+    WARNING = "warning"  # compensation goes on
     DEGRADED = "degraded"  # compensation goes on with less
-    DROPPED = "dropped"  # a sample could not be believed
+    DROPPED = "dropped"  # a sample failed the plausibility check
     LINK = "link"  # the link stalls
     SOURCE = "source"  # the setpoint source ended
-    GRANTED = "granted"  # what the system granted the loop, which is compiled and about to connect
+    GRANTED = "granted"  # real-time measures in force; the loop is compiled and about to connect
     COMPILING = "compiling"  # what the loop compiles
     CONFIGURATION = "configuration"  # the cell file was read again
     SLIP = "slip"  # a joint's zero has moved
     RECORDER = "recorder"  # the recorder's own
-    SIDE = "side"  # a side process ended, stalled or emitted what is not its own
-    SUMMARY = "summary"  # how the run went
+    SIDE = "side"  # a side process ended, stalled or emitted a foreign kind of event
+    SUMMARY = "summary"  # of the run
     ENDED = "ended"  # the run is over
 
 

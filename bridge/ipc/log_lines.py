@@ -1,8 +1,8 @@
 """Structured logs: each of the daemon's events as one line of JSON (``run --log json``).
 
 Fields that every line has: ``time`` (ISO 8601, UTC), ``level``, ``event`` (its kind), ``message``.
-What else an event carries follows under its own name. Nothing of a cell's text, keys or tokens is
-among it: see HIDDEN.
+The other fields of an event follow under their own names, without the cell's text, keys or tokens:
+see HIDDEN.
 """
 
 from __future__ import annotations
@@ -15,17 +15,18 @@ from datetime import UTC, datetime
 from typing import IO, Any
 
 from gapbridge.bridge.ipc.events import EventKind
+from gapbridge.bridge.ipc.loop_state import State
 
 HIDDEN = re.compile(
     r"token|password|secret|passwd|api_?key|private|credential|^key$", re.IGNORECASE
 )
 LEFT_OUT = ("text", "monotonic", "kind", "time", "detail")  # text: the whole cell file
 LONGEST = 2000  # characters of one value
-_GRAVE = (EventKind.FAULT, EventKind.REFUSED)
+_ERRORS = (EventKind.FAULT, EventKind.REFUSED)
 
 
 def log_line(event: Mapping[str, Any]) -> str:
-    """Return an event as one line of JSON, without its end."""
+    """Return an event as one line of JSON, without the newline."""
     time = datetime.fromtimestamp(float(event.get("time", 0.0)), UTC)
     line: dict[str, Any] = {
         "time": time.isoformat(timespec="milliseconds").replace("+00:00", "Z"),
@@ -40,7 +41,7 @@ def log_line(event: Mapping[str, Any]) -> str:
 
 
 class JsonLines:
-    """Writes events to a stream, usually stderr; a stream that is gone or full stops nothing."""
+    """Writes events to a stream, usually stderr; ignores a closed or full stream."""
 
     def __init__(self, stream: IO[str]) -> None:
         self._stream = stream
@@ -53,9 +54,9 @@ class JsonLines:
 
 
 def _level(event: Mapping[str, Any]) -> str:
-    if event.get("kind") in _GRAVE or "failure" in event:
+    if event.get("kind") in _ERRORS or "failure" in event:
         return "error"
-    if str(event.get("to", "")).lower() == "fault":
+    if str(event.get("to", "")).upper() == State.FAULT.name:
         return "error"
     if event.get("kind") == EventKind.SIDE or "paused" in event or "lost" in event:
         return "warning"
@@ -73,7 +74,7 @@ def _message(event: Mapping[str, Any]) -> str:
 
 
 def _shown(key: str, value: Any) -> Any:
-    """Return a value as it may be shown: no secrets, at any depth, and not endless."""
+    """Return a value without secrets, at any depth, and with strings cut to LONGEST."""
     if HIDDEN.search(key) and not isinstance(value, bool):
         return "(hidden)"
     if isinstance(value, Mapping):

@@ -1,4 +1,4 @@
-"""What the loop counts, by kind: words of the shared memory, so that no crash loses a count."""
+"""The loop's counters: words of the shared memory, so that a crash loses no count."""
 
 from __future__ import annotations
 
@@ -8,20 +8,20 @@ from gapbridge.core.errors import Implausible
 
 
 class LoopCounter(IntEnum):
-    """Places of the counters; the name in small letters is what people read."""
+    """Index of each counter; its name in lower case is its label."""
 
-    LATE = 0  # no new state by the deadline; the last offset stays
-    STALE = 1  # the controller's clock stood still for longer than the hold time
-    DROPPED_TORN = 2  # the driver could not believe the sample: torn, short, wrong answer
+    LATE = 0  # no new state by the deadline; the last offset is held
+    STALE = 1  # the controller's clock did not change for longer than the hold time
+    DROPPED_TORN = 2  # the driver dropped the sample: torn, short, wrong answer
     DROPPED_NOT_FINITE = 3
     DROPPED_IMPLAUSIBLE = 4
     DROPPED_STEP = 5
     DROPPED_BACKWARDS = 6
-    FROZEN = 7  # values stood still while the clock went on
+    FROZEN = 7  # joint values did not change while the clock went on
     BAD_OUTPUT = 8  # the model's correction was no number
-    SATURATED = 9  # the offset stood at its envelope for too long
+    SATURATED = 9  # the offset was at its limits for too long
     OVERRUN = 10  # too many deadlines missed within a second
-    RESYNC = 11  # a gap so long that what was before means nothing
+    RESYNC = 11  # a gap after which filters restart
     UNSAFE = 12  # protective stop, emergency stop, mode
     FOREIGN = 13  # another commander
     WRITE_INEFFECTIVE = 14
@@ -33,14 +33,14 @@ class LoopCounter(IntEnum):
     SILENCE = 21
     LINK_LOST = 22
     UNSOLVED = 23  # the model's correction did not meet the wanted pose
-    LOAD = 24  # a payload or force that the arm cannot bear
-    NOT_FOLLOWING = 25  # the robot's program does not play, or at another speed
-    MISMATCH = 26  # the controller is set otherwise than the cell says
-    ZERO_MOVED = 27  # a joint's zero has slipped, as the daemon's watch has found
+    LOAD = 24  # an implausible payload or force
+    NOT_FOLLOWING = 25  # the robot's program does not run, or at another speed
+    MISMATCH = 26  # the controller's settings differ from the cell's
+    ZERO_MOVED = 27  # a joint's zero has slipped, found by the daemon
 
     @property
     def label(self) -> str:
-        """Return the name as people and metrics have it."""
+        """Return its name in status documents and metrics."""
         return self.name.lower()
 
 
@@ -51,4 +51,4 @@ DROPPED = {
     Implausible.STEP: LoopCounter.DROPPED_STEP,
     Implausible.BACKWARDS: LoopCounter.DROPPED_BACKWARDS,
 }
-"""Why a sample could not be believed -> where it is counted."""
+"""Reason of an implausible sample -> its counter."""

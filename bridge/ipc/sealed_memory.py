@@ -1,10 +1,9 @@
-"""Memory that one process writes to and nobody else ever can: not by a descriptor, nor by /proc.
+"""Memory that only one process can write to: no other can, by a descriptor or through /proc.
 
-A descriptor opened for reading protects nothing by itself: whoever has it opens the same memory for
-writing through ``/proc/self/fd``. So the writer maps its memory first and then seals it
-(``F_SEAL_FUTURE_WRITE``, memfd_create(2)): its own mapping stays, and every later one, by whatever
-process and descriptor, is for reading only. Where the system has no seals (not Linux) modes stand
-alone.
+A descriptor opened for reading is no protection: its owner can open the same memory for writing
+through ``/proc/self/fd``. So the writer maps its memory first and then seals it
+(``F_SEAL_FUTURE_WRITE``, memfd_create(2)): its own mapping stays writable, and every later one, in
+any process, is for reading only. Without seals (not Linux) only modes protect.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ HAS_SEALS = hasattr(os, "memfd_create") and hasattr(fcntl, "F_ADD_SEALS")
 
 
 def make_memory(name: str, size: int) -> int:
-    """Return the descriptor of ``size`` zeroed bytes that no path leads to, not sealed yet."""
+    """Return the descriptor of ``size`` zeroed bytes of anonymous memory, not sealed yet."""
     if HAS_SEALS:
         fd = os.memfd_create(name, os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
     else:
@@ -30,9 +29,9 @@ def make_memory(name: str, size: int) -> int:
 
 
 def map_as_writer(fd: int, size: int) -> mmap.mmap:
-    """Return the memory mapped for writing, the last mapping of that kind that there can be.
+    """Return the memory mapped for writing, and seal it against further such mappings.
 
-    Raises OSError where somebody else has sealed it before.
+    Raises OSError if it is sealed already.
     """
     memory = mmap.mmap(fd, size, access=mmap.ACCESS_WRITE)
     seal(fd)
@@ -45,14 +44,14 @@ def map_as_reader(fd: int, size: int) -> mmap.mmap:
 
 
 def seal(fd: int) -> None:
-    """Refuse all further writing, growing and shrinking, and that this be taken back."""
+    """Forbid new writable mappings, resizing, and removing the seals."""
     if HAS_SEALS:
         every = fcntl.F_SEAL_GROW | fcntl.F_SEAL_SHRINK | _FUTURE_WRITE | fcntl.F_SEAL_SEAL
         fcntl.fcntl(fd, fcntl.F_ADD_SEALS, every)
 
 
 def sealed_bytes(name: str, data: bytes) -> int:
-    """Return the descriptor of memory that holds ``data`` and that nobody can change."""
+    """Return the descriptor of sealed memory that holds ``data``."""
     fd = make_memory(name, len(data))
     remaining, offset = memoryview(data), 0
     while remaining:
@@ -63,14 +62,14 @@ def sealed_bytes(name: str, data: bytes) -> int:
 
 
 def all_bytes(fd: int) -> bytes:
-    """Return what ``sealed_bytes`` was given, and close the descriptor."""
+    """Return the data of ``sealed_bytes``, and close the descriptor."""
     with os.fdopen(fd, "rb") as file:
         file.seek(0)
         return file.read()
 
 
 def is_sealed(fd: int) -> bool:
-    """Return whether nobody can begin to write any more."""
+    """Return whether no new writable mapping is possible."""
     if not HAS_SEALS:
         return True
     seals = fcntl.fcntl(fd, fcntl.F_GET_SEALS)

@@ -1,13 +1,13 @@
 """Memory that the loop's process writes and all others read: heartbeat, state, counts, cycles.
 
-One writer, words of 8 bytes each, and no locks: whichever side dies, stands still or is killed, the
-others go on. Cycles go through a ring; each row begins with its own number, so that a reader knows
-a row that is not whole, or was overwritten.
+One writer, words of 8 bytes, and no locks: if one process dies or hangs, the others go on. Cycles
+are written to a ring; each row begins with its number, so that a reader detects a row that is
+incomplete or overwritten.
 
-A process of the loop maps its memory and seals it (sealed_memory.py): nobody else can write to it.
-The next process gets a memory of its own that begins as a copy, so cycles and counts go on over all
-processes of a run; the daemon and who reads along change over to it (RunMemory, FollowedMemory).
-Nothing is asked for through this memory: commands have their own (command_memory.py).
+A process of the loop maps its memory and seals it (sealed_memory.py): no other process can write.
+The next process gets a new memory that starts as a copy, so that cycles and counts continue over
+all processes of a run; the daemon and the side processes switch to it (RunMemory, FollowedMemory).
+Commands have their own memory (command_memory.py).
 """
 
 from __future__ import annotations
@@ -45,10 +45,10 @@ OPTIONAL = ("ft_raw_wrench", "joint_temperatures", "actual_current_as_torque", "
 
 
 class Phase(IntEnum):
-    """What the loop's process is at; each may take a different time without a heartbeat."""
+    """The phase of the loop's process; each has its own limit without a heartbeat."""
 
     STARTING = 0  # imports, compilation
-    CONNECTING = 1  # constructors of the robot's library, which can hang for ever
+    CONNECTING = 1  # constructors of the robot's library, which can hang
     RUNNING = 2
     ARMING = 3
     ENDING = 4
@@ -56,7 +56,7 @@ class Phase(IntEnum):
 
 @functools.cache
 def slices_of(n: int) -> dict[str, slice]:
-    """Return where each field of a cycle stands in its row: 1, n, 3 or 6 numbers, n joints."""
+    """Return the slice of each field in a cycle's row: 1, n, 3 or 6 numbers, n joints."""
     slices, start = {}, 0
     for name, size in (
         ("number", 1), ("timestamp", 1), ("state", 1), ("written", 1), ("missed", 1),
@@ -107,8 +107,8 @@ def write_cycle(
 class SharedMemory:
     """The shared memory, as any side reads it.
 
-    Without ``fd`` it is made; with one it is joined, for reading only unless ``writable``. Who
-    joins it for writing is the last who can.
+    Without ``fd`` it is created; with one it is mapped, for reading only unless ``writable``.
+    Mapping it for writing seals it.
     """
 
     def __init__(
@@ -122,7 +122,7 @@ class SharedMemory:
         self._attach(make_memory(NAME, self._size) if fd is None else fd, writable)
 
     def _attach(self, fd: int, writable: bool) -> None:
-        """Look at this memory from now on; what was looked at before stays for who still does."""
+        """Map this memory from now on; arrays of the former mapping stay valid."""
         self.fd = fd
         self._map = (map_as_writer if writable else map_as_reader)(fd, self._size)
         self._words = np.frombuffer(self._map, np.int64, WORDS)
@@ -138,7 +138,7 @@ class SharedMemory:
         self._words[_BEATS] += 1
 
     def enter(self, phase: Phase) -> None:
-        """Report what comes next."""
+        """Report the phase that begins."""
         self.beat()
         self._words[_PHASE] = phase
 
@@ -151,7 +151,7 @@ class SharedMemory:
         self._words[_ENDED] = 1
 
     def note_state_read(self) -> None:
-        """Report that a state has been read: the link works."""
+        """Report that a state has been read."""
         self._words[_SEEN] = 1
 
     def count(self, what: LoopCounter, times: int = 1) -> None:
@@ -159,38 +159,38 @@ class SharedMemory:
         self._words[_COUNTS + what] += times
 
     def next_row(self) -> Array:
-        """Return the row of the next cycle, to be filled from column 1 on."""
+        """Return the row of the next cycle; fill it from column 1 on, then call ``publish``."""
         row: Array = self._rows[self._words[_WRITTEN] % ROWS]
         row[0] = -1.0
         return row
 
     def publish(self) -> None:
-        """Hand the filled row over."""
+        """Make the filled row visible to readers."""
         written = int(self._words[_WRITTEN])
         self._rows[written % ROWS, 0] = written
         self._words[_WRITTEN] = written + 1
 
     def note_taken(self, number: int) -> None:
-        """Report up to which number requests have been taken; see command_memory.py."""
+        """Report the number of the newest request received; see command_memory.py."""
         self._words[_TAKEN] = number
 
-    # -- who reads --------------------------------------------------------------------------------
+    # -- the readers' side ------------------------------------------------------------------------
 
     def follow(self) -> None:
-        """Change over to the memory of the newest process of the loop, where there is another."""
+        """Switch to the memory of the newest process of the loop."""
 
     def open_for_reading(self) -> int:
-        """Return a further descriptor of the memory, to be closed by the caller; read-only."""
+        """Return a new read-only descriptor of the memory, to be closed by the caller."""
         return _read_only(self.fd)
 
     @property
     def last_taken(self) -> int:
-        """Return the number of the newest request that the loop has taken."""
+        """Return the number of the newest request that the loop has received."""
         return int(self._words[_TAKEN])
 
     @property
     def phase(self) -> Phase:
-        """Return what the loop's process is at."""
+        """Return the phase of the loop's process."""
         return Phase(int(self._words[_PHASE]))
 
     @property
@@ -216,7 +216,7 @@ class SharedMemory:
 
     @property
     def written(self) -> int:
-        """Return how many cycles have been handed over since the daemon's start."""
+        """Return how many cycles have been published since the daemon's start."""
         return int(self._words[_WRITTEN])
 
     def counts(self) -> dict[str, int]:
@@ -224,12 +224,12 @@ class SharedMemory:
         return {what.label: int(self._words[_COUNTS + what]) for what in LoopCounter}
 
     def reader(self, first: int = 0) -> CycleReader:
-        """Return a reader of its own cursor that begins at row number ``first``."""
+        """Return a reader that begins at row number ``first``."""
         return CycleReader(self, first)
 
     def rows(self, first: int, last: int) -> tuple[Array, int]:
-        """Return copies of the rows (k, width) of numbers first..last-1, and how many are gone."""
-        oldest = max(first, last - ROWS + ROWS // 8)  # what is older may be under the pen
+        """Return copies of rows first..last-1 (k, width), and how many were overwritten."""
+        oldest = max(first, last - ROWS + ROWS // 8)  # older rows may be overwritten now
         index = np.arange(oldest, last)
         places = index % ROWS
         rows = self._rows.take(places, 0)
@@ -237,7 +237,7 @@ class SharedMemory:
         return rows[whole], oldest - first + int(np.count_nonzero(~whole))
 
     def close(self) -> None:
-        """Let go of the memory."""
+        """Unmap and close the memory."""
         self._words = self._times = np.empty(0)  # type: ignore[assignment]
         self._rows = np.empty((0, 0))
         self._map.close()
@@ -245,16 +245,16 @@ class SharedMemory:
 
 
 class RunMemory(SharedMemory):
-    """The daemon's view, for reading only: one loop after the other, cycles and counts go on."""
+    """The daemon's read-only view of one loop after the other; cycles and counts continue."""
 
     def __init__(self, n: int, clock: Clock = SYSTEM) -> None:
         super().__init__(n, writable=False, clock=clock)
-        seal(self.fd)  # of no loop: it only says that nothing has happened yet
-        self._shown = os.dup(self.fd)  # the newest one that nobody but its loop can write to
+        seal(self.fd)  # initial memory, before the first loop
+        self._shown = os.dup(self.fd)  # the newest one that is sealed
         self._is_shown = True
 
     def renew(self) -> None:
-        """Make memory for a new process of the loop, the former being dead; cycles go on."""
+        """Create the memory of a new process of the loop as a copy; the last one has ended."""
         fd = make_memory(NAME, self._size)
         head = self._words.copy()
         head[[_BEATS, _PHASE, _STATE, _ENDED, _SEEN]] = 0
@@ -263,7 +263,7 @@ class RunMemory(SharedMemory):
         if self.written:
             _write_whole(fd, self._rows[: self.written], head.nbytes)
         before = self.fd
-        self._attach(fd, writable=False)  # first: other threads read along
+        self._attach(fd, writable=False)  # first: other threads are reading
         self._is_shown = False
         os.close(before)
 
@@ -276,17 +276,17 @@ class RunMemory(SharedMemory):
         return True
 
     def open_for_reading(self) -> int:
-        """Return a descriptor of the memory that is shown, to be closed by the caller."""
+        """Return a read-only descriptor of the newest sealed memory, to be closed by the caller."""
         return _read_only(self._shown)
 
     def close(self) -> None:
-        """Let go of the memory."""
+        """Unmap and close the memory."""
         super().close()
         os.close(self._shown)
 
 
 class FollowedMemory(SharedMemory):
-    """A side process's view: it changes over to each memory that the daemon sends it."""
+    """A side process's view: it switches to each memory that the daemon sends."""
 
     def __init__(self, n: int, fd: int, successors: socket.socket) -> None:
         super().__init__(n, fd, writable=False)
@@ -294,7 +294,7 @@ class FollowedMemory(SharedMemory):
         successors.setblocking(False)
 
     def follow(self) -> None:
-        """Change over to the newest memory that has come."""
+        """Switch to the newest memory received."""
         with contextlib.suppress(OSError):
             while True:
                 data, fds, _, _ = socket.recv_fds(self._successors, 1, 4)
@@ -307,7 +307,7 @@ class FollowedMemory(SharedMemory):
 
 
 class CycleReader:
-    """One reader of the cycles; any number of them read side by side."""
+    """One reader of the cycles; any number may read concurrently."""
 
     def __init__(self, memory: SharedMemory, first: int) -> None:
         self._memory = memory

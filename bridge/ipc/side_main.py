@@ -1,8 +1,8 @@
-"""A side process's own half: its start data, the shared memory, the daemon's events.
+"""A side process's part: its start data, the shared memory, the daemon's events.
 
-Recorder, status page and metrics are such processes. They read along and never hold up the loop;
-the daemon starts them (side_process.py). A module for one of them begins with ``read_start_data()``
-and ends when ``start.events.closed`` says that the daemon is gone.
+Recorder, status page and metrics are side processes: they only read and cannot delay the loop. The
+daemon starts them (side_process.py). Their module begins with ``read_start_data()`` and ends when
+``start.events.closed`` shows that the daemon has ended.
 """
 
 from __future__ import annotations
@@ -23,19 +23,19 @@ from gapbridge.bridge.ipc.shared_memory import FollowedMemory, SharedMemory
 from gapbridge.core.errors import GapbridgeError
 from gapbridge.drivers.clock import SYSTEM
 
-FAREWELL = 5.0  # s that a side process may take to end after the daemon
+END_TIMEOUT = 5.0  # s that a side process may take to end after the daemon
 NICENESS = 5  # the loop comes first
 _PIECE = 1 << 16
 
 
 class EventLines:
-    """The daemon's events as they come in through a pipe, one JSON object a line."""
+    """Reads the daemon's events from a pipe, one JSON object a line."""
 
     def __init__(self, fd: int) -> None:
         self.fd = fd  # for select and event loops
         os.set_blocking(fd, False)
         self._buffer = b""
-        self.closed = False  # the daemon is gone: finish and end
+        self.closed = False  # the daemon has ended: finish and end
 
     def poll(self) -> list[dict[str, Any]]:
         """Return the events that have arrived; never blocks."""
@@ -50,28 +50,28 @@ class EventLines:
         return [event for event in map(read_event, lines) if event is not None]
 
     def wait(self, timeout: float) -> None:
-        """Sleep until something arrives, the daemon is gone, or ``timeout`` s are over."""
+        """Sleep until something arrives, the daemon has ended, or ``timeout`` s are over."""
         if not self.closed:
             select.select([self.fd], [], [], timeout)
 
     def close(self) -> None:
-        """Close the pipe; nothing comes any more."""
+        """Close the pipe."""
         os.close(self.fd)
         self.closed = True
 
 
 class EventWriter:
-    """Writes events into a pipe, one JSON object a line; never blocks and never tears a line."""
+    """Writes events to a pipe, one JSON object a line; never blocks, never writes half a line."""
 
     def __init__(self, fd: int) -> None:
         self._fd = fd
         os.set_blocking(fd, False)
         self._buffer = b""
         self.sent = 0
-        self.dropped = 0  # events that found the pipe full
+        self.dropped = 0  # events dropped because the pipe was full
 
     def emit(self, event: dict[str, Any]) -> bool:
-        """Write an event; returns False where the pipe is full or nobody reads it."""
+        """Write an event; returns False if the pipe is full or closed."""
         self._flush()
         if self._buffer:
             self.dropped += 1
@@ -79,7 +79,7 @@ class EventWriter:
         self._buffer = (json.dumps(event, default=str) + "\n").encode()
         whole = len(self._buffer)
         self._flush()
-        if len(self._buffer) == whole:  # nothing of it has left: as if it had never been
+        if len(self._buffer) == whole:  # nothing was written: drop it
             self._buffer = b""
             self.dropped += 1
             return False
@@ -92,7 +92,7 @@ class EventWriter:
         return dropped
 
     def _flush(self) -> None:
-        """Write what is left of an event that has left in part."""
+        """Write the rest of a partly written event."""
         with contextlib.suppress(OSError):
             while self._buffer:
                 self._buffer = self._buffer[os.write(self._fd, self._buffer) :]
@@ -100,7 +100,7 @@ class EventWriter:
 
 @dataclass(frozen=True)
 class StartData:
-    """What the daemon hands a side process at its start."""
+    """The data that the daemon passes to a side process at its start."""
 
     settings: DaemonSettings
     n: int  # joints
@@ -111,12 +111,12 @@ class StartData:
     extra: dict[str, Any]
 
     def emit(self, event: dict[str, Any]) -> None:
-        """Notify the daemon of an event (a dict with "kind"), who hands it to all; never blocks."""
+        """Send the daemon an event (a dict with "kind"), which it distributes; never blocks."""
         self.up.emit({"time": SYSTEM.time(), "monotonic": SYSTEM.monotonic(), **event})
 
 
 def read_start_data() -> StartData:
-    """Return the order that the daemon has written on stdin."""
+    """Return the start data that the daemon has written on stdin."""
     start_data = json.loads(sys.stdin.readline())
     with contextlib.suppress(OSError):
         os.nice(NICENESS)
@@ -136,7 +136,7 @@ def read_start_data() -> StartData:
 
 
 def run_side(kind: str, run: Callable[[StartData], None]) -> int:
-    """Run a serving process of the daemon's until the daemon is gone; returns the exit code."""
+    """Run a side process until the daemon has ended; returns the exit code."""
     start = read_start_data()
     try:
         run(start)
@@ -148,7 +148,7 @@ def run_side(kind: str, run: Callable[[StartData], None]) -> int:
 
 
 def read_event(line: bytes) -> dict[str, Any] | None:
-    """Return the event of a line; None where it is none."""
+    """Return the event of a line; None if it is not one."""
     try:
         event = json.loads(line)
     except ValueError:
@@ -157,9 +157,9 @@ def read_event(line: bytes) -> dict[str, Any] | None:
 
 
 def _end_after_daemon(fd: int) -> None:
-    """End the process, hanging or not, some time after the daemon's end of the pipe closed."""
+    """End this process END_TIMEOUT s after the daemon has closed the pipe, even if it hangs."""
     watch = select.poll()
     watch.register(fd, 0)  # hang-ups only, which are always reported
     watch.poll()
-    SYSTEM.sleep(FAREWELL)
+    SYSTEM.sleep(END_TIMEOUT)
     os._exit(1)

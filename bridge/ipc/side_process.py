@@ -1,6 +1,6 @@
-"""The daemon's half of a side process: start it, send it events, restart it.
+"""The daemon's part of a side process: start it, send it events, restart it.
 
-Whatever a side process does - hang, die, stop reading - the daemon never waits for it.
+The daemon never waits for a side process, whether it hangs, dies or stops reading.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from gapbridge.bridge.ipc.side_main import EventLines, EventWriter
 from gapbridge.drivers.clock import SYSTEM, Clock
 
 BACKOFF = (0.2, 10.0)  # s before a restart: first, most
-HEALTHY = 10.0  # s after which a restart counts as the first again
-STALLED = 10.0  # s in which a process that lives has read its events at least once
-STARTING = 60.0  # s that its imports may take on a busy machine
+HEALTHY = 10.0  # s of running after which the backoff is reset
+STALLED = 10.0  # s without reading events after which a process counts as stalled
+STARTING = 60.0  # s, before it has read for the first time: imports on a busy machine
 PIPE_SIZE = 1 << 18  # bytes
 
 
 class SideProcess:
-    """``python -m module``, reading along, restarted with backoff when it died or stands still.
+    """``python -m module``, restarted with backoff if it dies or stalls.
 
     ``start_data`` holds ``settings`` (a DaemonSettings as JSON), ``n``, ``session`` and
     ``extra``; see side_main.StartData.
@@ -59,14 +59,14 @@ class SideProcess:
         return self._dropped + self._down.dropped
 
     def emit(self, event: dict[str, Any]) -> None:
-        """Pass an event on; where its pipe is full the event is dropped and counted."""
+        """Send an event; if the pipe is full, the event is dropped and counted."""
         if self._down_fd is None:
             self._dropped += 1
         else:
             self._down.emit(event)
 
     def show(self, memory: SharedMemory) -> None:
-        """Have it change over to another memory; a restarted one begins with it."""
+        """Switch it to another memory; after a restart it uses that one."""
         if self._process is None:
             return
         fd = memory.open_for_reading()
@@ -79,7 +79,7 @@ class SideProcess:
         return self._up.poll()
 
     def check(self) -> str | None:
-        """Look after it; returns in words what went wrong, None where nothing did."""
+        """Check it and restart it if needed; returns its problem as text, or None."""
         now = self._now()
         if self._process is None:
             if now >= self._retry_at:
@@ -96,12 +96,12 @@ class SideProcess:
         self._wait = min(2.0 * self._wait, BACKOFF[1])
         return f"{self.module} ended with {code}"
 
-    def close(self, patience: float = 3.0) -> None:
-        """Notify it that the daemon ends, give it ``patience`` s to finish, then end it."""
+    def close(self, timeout: float = 3.0) -> None:
+        """Notify it that the daemon ends, give it ``timeout`` s to finish, then end it."""
         self.begin_close()
         if self._process is not None:
             with contextlib.suppress(subprocess.TimeoutExpired):
-                self._process.wait(patience)
+                self._process.wait(timeout)
             self._process.kill()
             self._process.wait()
             self._release()
@@ -123,8 +123,8 @@ class SideProcess:
         self._successors.setblocking(False)
         passed = (down_read, up_write, memory, successors.detach())
         try:
-            # spawned, never forked; in a session of its own, so that a Ctrl-C reaches the daemon
-            # only, which then ends it in order
+            # spawned, not forked; in a new session, so that Ctrl-C reaches only the daemon, which
+            # then ends it
             self._process = subprocess.Popen(
                 [sys.executable, "-X", "faulthandler", "-m", self.module],
                 stdin=subprocess.PIPE, stdout=self._log, stderr=self._log, env=environment(),
@@ -142,12 +142,12 @@ class SideProcess:
             "successors": passed[3],
         }  # fmt: skip
         assert self._process.stdin is not None
-        with contextlib.suppress(BrokenPipeError):  # gone already, which check() sees
+        with contextlib.suppress(BrokenPipeError):  # it has ended, which check() detects
             self._process.stdin.write((json.dumps(start_data) + "\n").encode())
             self._process.stdin.close()
 
     def _check_reading(self, now: float) -> str | None:
-        """End it where it lives but has not emptied its pipe for too long."""
+        """Kill it if it has not emptied its pipe for too long."""
         assert self._process is not None
         if self._down_fd is None:
             return None
@@ -157,12 +157,12 @@ class SideProcess:
         if unread == 0:
             self._read_at = now
             self._has_read = self._has_read or self._down.sent > 0
-        patience = STALLED if self._has_read else STARTING
-        if now - self._read_at < patience:
+        timeout = STALLED if self._has_read else STARTING
+        if now - self._read_at < timeout:
             return None
         self.stalls += 1
         self._process.kill()
-        return f"{self.module} stood still for {now - self._read_at:.0f} s and was ended"
+        return f"{self.module} read nothing for {now - self._read_at:.0f} s and was killed"
 
     def _close_down(self) -> None:
         if self._down_fd is not None:

@@ -1,4 +1,4 @@
-"""What is looked at in every cycle beside the link itself; each finding is reported once."""
+"""Checks of every cycle, except those of the link; each finding is reported once."""
 
 from __future__ import annotations
 
@@ -10,37 +10,38 @@ from numpy.typing import NDArray
 
 from gapbridge.bridge.ipc.events import EventKind
 from gapbridge.bridge.ipc.loop_counters import LoopCounter
+from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.loop.link_monitor import hold_time
 from gapbridge.bridge.loop.reports import Reports
-from gapbridge.bridge.loop.supervisor import Cause, State, Supervisor
+from gapbridge.bridge.loop.supervisor import Cause, Supervisor
 from gapbridge.core.arrays import Array
 from gapbridge.core.limits import ENVELOPE, JOINT_LIMIT, JOINT_OFFSET
 from gapbridge.core.state import RobotState
 from gapbridge.drivers.driver import Driver
 from gapbridge.drivers.robot_modes import PLAYING, why_not_ready
 
-SLOWED = 0.95  # speed_scaling: slower, an arm that we move falls behind its setpoints
-FASTEST = 2.0  # speed_scaling: more is a mistake
-LONG_GAP = 10.0  # cycles: after a longer one, what was before means nothing
-SETTINGS_EVERY = 1.0  # s between two looks at how the controller is set
-STILL = 1.0  # s for which joints may be the same to the last bit while they should move
-AWAY = 2e-3  # rad: the command has come this far meanwhile
-TURNING = 0.02  # rad/s: or a joint says that it turns this fast
+MIN_SPEED_SCALING = 0.95  # below it, an arm that we move lags behind its setpoints
+MAX_SPEED_SCALING = 2.0  # above it, the value is implausible
+MAX_GAP_CYCLES = 10.0  # cycles: after a longer gap between states, filters restart
+SETTINGS_EVERY = 1.0  # s between two checks of the controller's settings
+FROZEN_AFTER = 1.0  # s for which joints may stay bit-identical while they should move
+COMMANDED_AWAY = 2e-3  # rad: they should move if the command has moved this far,
+MOVING = 0.02  # rad/s: or if a joint reports this velocity
 OVERRUN_SPAN = 1.0  # s over which missed cycles are counted
-MOST_MISSED = 0.05  # share of a span's cycles that may be missed
-LONGEST_SATURATION = 1.0  # s that an offset may stand at its limits
+MAX_MISSED_SHARE = 0.05  # share of a span's cycles that may be missed
+SATURATION_TIMEOUT = 1.0  # s that an offset may be at its limits
 _AT_LIMIT = 1 << ENVELOPE | 1 << JOINT_OFFSET | 1 << JOINT_LIMIT
 GAPS = 5  # between states, before the controller's rate counts as known
 GAPS_KEPT = 50  # gaps between states that are remembered
-SLOWER = 1.5  # times the cell's cycle: the shortest gap between states is not longer
+RATE_TOLERANCE = 1.5  # cycles of the cell: bound of the shortest gap between states
 # bits of a cycle's flags
 DEGRADED, LATE, RESYNC, RAMPING_OUT, UNSOLVED, NOTHING = 1, 2, 4, 8, 16, 32
 
 
 class FrozenWatch:
-    """Watches the joints; an arm at rest under a command at rest is not frozen.
+    """Detects frozen joint values; an arm at rest under a constant command is not frozen.
 
-    Nor is one that begins to move: velocity and command lead joints that are reported in counts.
+    Nor is one that begins to move: velocity and command change before joints reported in counts.
     """
 
     def __init__(self) -> None:
@@ -49,7 +50,7 @@ class FrozenWatch:
         self._since = 0.0  # s, controller clock: since when they should have moved
 
     def update(self, state: RobotState, commanded: Array) -> str | None:
-        """Return in words that the values are frozen, None where they are not."""
+        """Return a message if the values are frozen, else None."""
         q, now = state.actual_q, state.timestamp
         joints = q.tolist()
         if now < self._since or joints != self._q:
@@ -58,18 +59,18 @@ class FrozenWatch:
         assert self._target is not None
         away = float(np.abs(commanded - self._target).max())
         turning = float(np.abs(state.actual_qd).max())
-        if away < AWAY and turning < TURNING:
+        if away < COMMANDED_AWAY and turning < MOVING:
             self._since = now
-        if now - self._since < STILL:
+        if now - self._since < FROZEN_AFTER:
             return None
         return (
-            f"joints are the same to the last bit for {now - self._since:.2f} s, while the command "
-            f"went {away:.4f} rad and they are said to turn at {turning:.3f} rad/s"
+            f"joints have been bit-identical for {now - self._since:.2f} s, while the command "
+            f"moved {away:.4f} rad and the reported velocity is {turning:.3f} rad/s"
         )
 
 
 class OverrunWatch:
-    """Counts the cycles that the loop's own work took from those after it, within a span."""
+    """Counts the cycles missed because the loop took too long, within a span."""
 
     def __init__(self, rate: float) -> None:
         self._rate = rate
@@ -77,12 +78,12 @@ class OverrunWatch:
         self._sum = 0
 
     def reset(self) -> None:
-        """Begin anew: the loop did something else meanwhile."""
+        """Restart: the loop read no states meanwhile."""
         self._missed.clear()
         self._sum = 0
 
     def update(self, now: float, missed: int) -> str | None:
-        """Take the cycles missed before this one; return in words that they are too many."""
+        """Add the cycles missed before this one; returns a message if there are too many."""
         queue = self._missed
         while queue and now - queue[0][0] > OVERRUN_SPAN:
             self._sum -= queue.popleft()[1]
@@ -90,8 +91,8 @@ class OverrunWatch:
             return None
         queue.append((now, missed))
         self._sum += missed
-        if self._sum <= MOST_MISSED * OVERRUN_SPAN * self._rate or len(queue) < 2:
-            return None  # a single long one is judged by the gap that it leaves
+        if self._sum <= MAX_MISSED_SHARE * OVERRUN_SPAN * self._rate or len(queue) < 2:
+            return None  # a single long cycle is checked by its gap
         cycles = OVERRUN_SPAN * self._rate
         detail = f"{self._sum} of {cycles:.0f} cycles missed within {OVERRUN_SPAN:g} s"
         self.reset()
@@ -99,25 +100,25 @@ class OverrunWatch:
 
 
 class SaturationWatch:
-    """Watches the limiter's bits."""
+    """Detects an offset that stays at its limits."""
 
     def __init__(self) -> None:
         self._since: float | None = None
 
     def update(self, now: float, clamped: int) -> str | None:
-        """Return in words that the offset has stood at a limit for too long."""
+        """Return a message if the offset has been at a limit for too long, else None."""
         if not clamped & _AT_LIMIT:
             self._since = None
             return None
         if self._since is None or now < self._since:
             self._since = now
-        if now - self._since <= LONGEST_SATURATION:
+        if now - self._since <= SATURATION_TIMEOUT:
             return None
-        return f"the offset has been held back by its limits for {now - self._since:.2f} s"
+        return f"the offset has been clamped at its limits for {now - self._since:.2f} s"
 
 
 class RateCheck:
-    """Compares the cell's rate with the one at which the controller has new states."""
+    """Compares the cell's rate with the controller's update rate."""
 
     def __init__(self, rate: float) -> None:
         self._rate = rate
@@ -125,24 +126,24 @@ class RateCheck:
         self._gaps: deque[float] = deque(maxlen=GAPS_KEPT)
 
     def take(self, timestamp: float) -> None:
-        """Take a state's time, s, controller clock."""
+        """Add a state's timestamp, s, controller clock."""
         if self._last is not None and timestamp > self._last:
             self._gaps.append(timestamp - self._last)
         self._last = timestamp
 
     @property
     def known(self) -> bool:
-        """Return whether enough states have come to judge by."""
+        """Return whether there are enough states for the check."""
         return len(self._gaps) >= GAPS
 
     @property
     def problem(self) -> str:
-        """Return in words that the cell asks for more than the controller has; empty: it does not.
+        """Return a message if the cell's rate is above the controller's; empty: it is not.
 
-        The shortest gap is the controller's own: whatever is late on the way only lengthens gaps.
+        The shortest gap is the controller's period: delays only lengthen gaps.
         """
         shortest = min(self._gaps, default=0.0)
-        if shortest <= SLOWER / self._rate:
+        if shortest <= RATE_TOLERANCE / self._rate:
             return ""
         return (
             f"link.rate: found {self._rate:g} Hz, expected at most {1.0 / shortest:.4g} Hz: the "
@@ -151,7 +152,7 @@ class RateCheck:
 
 
 class LoopChecks:
-    """The checks of one loop, and what they have found that still lasts."""
+    """The checks of one loop, and their active findings."""
 
     def __init__(
         self,
@@ -163,26 +164,26 @@ class LoopChecks:
     ) -> None:
         self._supervisor, self._reports = supervisor, reports
         self._period = 1.0 / rate
-        self._longest_gap = max(LONG_GAP / rate, hold_time(rate), stale_after)
+        self._longest_gap = max(MAX_GAP_CYCLES / rate, hold_time(rate), stale_after)
         self._frozen, self._overrun = FrozenWatch(), OverrunWatch(rate)
         self._saturation = SaturationWatch()
-        self._moves_arm, self._patience = moves_arm, hold_time(rate)
+        self._moves_arm, self._hold = moves_arm, hold_time(rate)
         self.rate = RateCheck(rate)
         self._not_following: float | None = None  # s, controller clock: since when
         self._settings_at = -1.0  # s, controller clock: of the next look
-        self._lasting: set[LoopCounter] = set()
+        self._active: set[LoopCounter] = set()
         self._last: float | None = None  # s, controller clock
         self.not_ready = "no state has been read"  # why the robot cannot move; empty: it can
 
     def reset(self) -> None:
-        """Begin anew: the loop did something else meanwhile."""
+        """Restart: the loop read no states meanwhile."""
         self._last = None
         self._overrun.reset()
 
     def begin(self, state: RobotState, missed: int) -> int:
         """Check a state before it is used; returns the cycle's flags.
 
-        RESYNC among them: what was before means nothing now.
+        With RESYNC among them, filters must restart.
         """
         flags = (LATE if missed else 0) | (DEGRADED if state.sensor_lost else 0)
         if missed:
@@ -190,81 +191,82 @@ class LoopChecks:
         gap = 0.0 if self._last is None else state.timestamp - self._last
         self._last = state.timestamp
         resync = gap > self._longest_gap
-        detail = f"found a gap of {gap:.3f} s between two states: begun anew" if resync else None
-        self._judge(LoopCounter.RESYNC, detail, Cause.RESYNC)
+        detail = f"found a gap of {gap:.3f} s between two states: restarted" if resync else None
+        self._report(LoopCounter.RESYNC, detail, Cause.RESYNC)
         if resync:
             flags |= RESYNC
             self._overrun.reset()
         else:
-            self._judge(
+            self._report(
                 LoopCounter.OVERRUN, self._overrun.update(state.timestamp, missed), Cause.OVERRUN
             )
-        self._judge(LoopCounter.SENSOR_LOST, state.sensor_lost or None, None)
+        self._report(LoopCounter.SENSOR_LOST, state.sensor_lost or None, None)
         self.rate.take(state.timestamp)
         self.not_ready = why_not_ready(state)
-        self._judge(LoopCounter.UNSAFE, self.not_ready or None, Cause.UNSAFE)
+        self._report(LoopCounter.UNSAFE, self.not_ready or None, Cause.UNSAFE)
         self._check_following(state)
         return flags
 
-    def judge_loads(self, detail: str | None) -> None:
-        """Hold where a payload or a force is none that the arm can bear."""
-        self._judge(LoopCounter.LOAD, detail, Cause.LOAD)
+    def check_loads(self, detail: str | None) -> None:
+        """Hold if a payload or force is implausible (``detail``)."""
+        self._report(LoopCounter.LOAD, detail, Cause.LOAD)
 
-    def judge_settings(self, state: RobotState, driver: Driver) -> None:
+    def check_settings(self, state: RobotState, driver: Driver) -> None:
         """Compare the controller's own settings with the cell's, once a second while armed."""
         armed = self._supervisor.state in (State.ARMED, State.COMPENSATING, State.HOLDING)
         if not armed or 0.0 <= self._settings_at - state.timestamp <= SETTINGS_EVERY:
             return
         self._settings_at = state.timestamp + SETTINGS_EVERY
-        self._judge(LoopCounter.MISMATCH, driver.mismatch(), Cause.MISMATCH)
+        self._report(LoopCounter.MISMATCH, driver.mismatch(), Cause.MISMATCH)
 
     def end(
         self, state: RobotState, commanded: NDArray[float64], clamped: int, duration: float
     ) -> None:
         """Check a cycle after its setpoint; ``commanded`` (n,) rad, ``duration`` s."""
-        self._judge(LoopCounter.FROZEN, self._frozen.update(state, commanded), Cause.FROZEN)
-        self._judge(
+        self._report(LoopCounter.FROZEN, self._frozen.update(state, commanded), Cause.FROZEN)
+        self._report(
             LoopCounter.SATURATED,
             self._saturation.update(state.timestamp, clamped),
             Cause.SATURATED,
         )
-        # its own work only: what a controller sends late or never is the link's affair
+        # computing time only: late or missing states are checked by the link monitor
         detail = self._overrun.update(state.timestamp, int(duration / self._period))
-        self._judge(LoopCounter.OVERRUN, detail, Cause.OVERRUN)
+        self._report(LoopCounter.OVERRUN, detail, Cause.OVERRUN)
 
     def _check_following(self, state: RobotState) -> None:
-        """Hold where the robot's program does not play, or plays slower than we move the arm."""
+        """Hold if the robot's program does not run, or runs slower than our setpoints."""
         scaling, detail = state.speed_scaling, None
         if state.runtime_state != PLAYING:
             detail = f"runtime_state: found {state.runtime_state}, expected {PLAYING} (playing)"
-        elif not 0.0 <= scaling <= FASTEST:  # NaN is not
-            detail = f"speed_scaling: found {scaling:g}, expected 0 to {FASTEST:g}"
-        elif self._moves_arm and scaling < SLOWED:
+        elif not 0.0 <= scaling <= MAX_SPEED_SCALING:  # NaN is not
+            detail = f"speed_scaling: found {scaling:g}, expected 0 to {MAX_SPEED_SCALING:g}"
+        elif self._moves_arm and scaling < MIN_SPEED_SCALING:
             detail = (
-                f"speed_scaling: found {scaling:g}, expected {SLOWED:g} or more: it falls behind"
+                f"speed_scaling: found {scaling:g}, expected {MIN_SPEED_SCALING:g} or more: "
+                "the arm would lag behind its setpoints"
             )
         if detail is None or not self._supervisor.state.writes:
             self._not_following = None
         elif self._not_following is None:
             self._not_following = state.timestamp
         since = self._not_following
-        lasts = since is not None and state.timestamp - since > self._patience
-        self._judge(LoopCounter.NOT_FOLLOWING, detail if lasts else None, Cause.NOT_FOLLOWING)
+        lasts = since is not None and state.timestamp - since > self._hold
+        self._report(LoopCounter.NOT_FOLLOWING, detail if lasts else None, Cause.NOT_FOLLOWING)
 
-    def _judge(self, counter: LoopCounter, detail: str | None, cause: Cause | None) -> None:
-        """Notify the supervisor of a finding; count and report it once for as long as it lasts."""
+    def _report(self, counter: LoopCounter, detail: str | None, cause: Cause | None) -> None:
+        """Notify the supervisor of a finding (``detail``); count and emit it once."""
         if detail is None:
-            if counter in self._lasting:
-                self._lasting.discard(counter)
+            if counter in self._active:
+                self._active.discard(counter)
                 if counter == LoopCounter.SENSOR_LOST:
                     self._reports.emit(
                         {"kind": EventKind.DEGRADED, "what": "", "detail": "the sensor is back"}
                     )
             return
         changed = cause is not None and self._supervisor.take(cause, detail)
-        if counter in self._lasting:
+        if counter in self._active:
             return
-        self._lasting.add(counter)
+        self._active.add(counter)
         self._reports.count(counter)
         if not changed and self._supervisor.state != State.FAULT:
             lost = counter == LoopCounter.SENSOR_LOST

@@ -1,4 +1,4 @@
-"""Watching the link: which states are believed, and how long silence may last."""
+"""Monitoring the link: the age of states, invalid states, and how long silence may last."""
 
 from __future__ import annotations
 
@@ -13,100 +13,100 @@ from gapbridge.core.state import RobotState
 from gapbridge.drivers.clock import SYSTEM, Clock
 from gapbridge.drivers.driver import Driver
 
-DRIFT = 5e-3  # s per s: how fast the bound follows a clock that drifts or stumbles
-INVALID_IN_A_ROW = 3  # states that cannot be believed, after which they count as silence
-LEAP = 0.01  # s that the controller's clock may pass ours by from one sample to the next
-AGREES = 2e-3  # s by which two samples may have come differently quickly and agree
-AGREEING_IN_A_ROW = 5  # samples as quick as before a leap, after which it was none
-OLD_IN_A_ROW = 2  # states too old to write by, after which they count as none
+DRIFT = 5e-3  # s per s: how fast the clock offset may grow
+INVALID_STATE_LIMIT = 3  # implausible states in a row that end the compensation
+CLOCK_STEP = 0.01  # s that the controller's clock may gain on ours from one sample to the next
+STEP_TOLERANCE = 2e-3  # s: clock offsets that differ by less agree
+STEP_REVOKED_AFTER = 5  # samples with the offset from before a step: the clock was not set
+OLD_STATE_LIMIT = 2  # states in a row too old to write by, after which the link is stale
 SILENCE = 0.2  # s without a state: a fault
 LOST = 3.0  # s without a state: the link is lost
-LOST_AFTER_WRITING = 0.5  # s: the library's writing half does not survive a break
-SUSPENDED = 0.1  # s that a reading takes longer than it may: this process was stopped meanwhile
+LOST_AFTER_WRITING = 0.5  # s, once armed: the library cannot write after a break
+SUSPENDED = 0.1  # s over the read timeout: this process was suspended meanwhile
 REPORT_EVERY = 1.0  # s between two events of samples dropped for the same reason
 
 
 def hold_time(rate: float) -> float:
-    """Return for how long the last offset may stay without a new state, s: 5 cycles or 40 ms."""
+    """Return how long the last offset may be held without a new state, s: 5 cycles or 40 ms."""
     return min(max(5.0 / rate, 0.04), SILENCE)
 
 
 class ControllerClock:
-    """Ties controller time to this machine's monotonic clock by the quickest sample seen.
+    """Estimates the offset between the controller's clock and this machine's monotonic clock.
 
-    The age of a state counts from when its sample could have been here at the earliest, so that
-    late packets, late wake-ups and long computing all count. The shortest way over the wire, which
-    one clock alone cannot show, does not: see ``Driver.way``. ``hold``: s after which a state is
-    too old to write by.
-    What a stalled link hands on at once is old for a moment only. Where all samples are older than
-    that for as long, either the controller's clock has stood still or the way has become longer,
-    which no clock shows: the two are tied anew only while the driver is not armed, since arming
-    measures the way to the controller and nothing is written before.
-    Where the controller's clock passes this machine's, either it has been set forward or the link
-    hands on what it held back: the sample counts as the next one after the last, until some in a
-    row come as quick as those before.
+    The offset is the smallest difference (arrival minus timestamp) seen, so that the age of a state
+    includes late packets, late wake-ups and computing time. It excludes the shortest transit time
+    over the link, which one clock cannot show: see ``Driver.transit_time``. ``hold``: s after which
+    a state is too old to write by.
+    Samples that a stalled link delivers in a burst are old only for a moment. If all samples are
+    older than ``hold`` for as long, either the controller's clock stopped or the transit time grew,
+    which no clock shows: the offset is estimated again only while the driver is not armed, since
+    arming measures the round trip before anything is written.
+    If the controller's clock gains on this machine's, either it was set forward or the link
+    delivers delayed samples: the sample counts as one period after the last, until some in a row
+    agree with the offset from before.
     """
 
     def __init__(self, rate: float, hold: float = 1.0, clock: Clock = SYSTEM) -> None:
         self._now = clock.monotonic
         self._rate, self._hold = rate, hold
-        self._lead: float | None = None  # s: monotonic minus controller time, quickest sample
+        self._offset: float | None = None  # s: monotonic minus controller time
         self._last: tuple[float, float] | None = None  # s: controller clock, monotonic
-        self._counts = True  # the cycles missed since the last sample are this loop's
-        self._quickest: float | None = None  # s, as _lead, before the controller's clock leapt
-        self._agreeing = 0  # samples in a row that are as quick as that
-        self._old_since: float | None = None  # s, monotonic: all samples have been old since
+        self._counts = True  # cycles missed since the last sample count
+        self._offset_before_step: float | None = None  # s, of the controller's clock
+        self._agreeing = 0  # samples in a row that agree with that offset
+        self._old_since: float | None = None  # s, monotonic: all samples since were old
 
-    def take(self, state: RobotState, way_known: bool = False) -> int:
+    def take(self, state: RobotState, transit_known: bool = False) -> int:
         """Take a new sample; returns the cycles missed since the one before.
 
-        ``way_known``: arming has measured the way to the controller, beside the samples so far;
-        later ones that are older stay old.
+        ``transit_known``: arming has measured the round trip, which holds for the present offset:
+        samples that are older stay old.
         """
-        lead, before, counts = state.received - state.timestamp, self._last, self._counts
+        offset, before, counts = state.received - state.timestamp, self._last, self._counts
         self._last, self._counts = (state.timestamp, state.received), True
         gap = 0.0 if before is None else state.timestamp - before[0]
-        if self._lead is None or (self._stood_still(lead, state.received) and not way_known):
-            self._lead, self._old_since, self._quickest = lead, None, None
+        if self._offset is None or (self._outdated(offset, state.received) and not transit_known):
+            self._offset, self._old_since, self._offset_before_step = offset, None, None
         else:
-            # not over a break: the first state after it would count as younger than it can be
-            drifted = self._lead + DRIFT * (gap if gap <= self._hold else 0.0)
+            # no drift over a gap: the first state after it would seem younger than it can be
+            drifted = self._offset + DRIFT * (gap if gap <= self._hold else 0.0)
             elapsed = 0.0 if before is None else state.received - before[1]
-            leapt = gap - 1.0 / self._rate if gap - elapsed > LEAP else 0.0
-            self._lead = min(lead, self._lead_after_leap(lead, drifted, leapt))
+            step = gap - 1.0 / self._rate if gap - elapsed > CLOCK_STEP else 0.0
+            self._offset = min(offset, self._offset_after_step(offset, drifted, step))
         return max(round(gap * self._rate) - 1, 0) if counts and before is not None else 0
 
-    def _lead_after_leap(self, lead: float, drifted: float, leapt: float) -> float:
-        """Return the lead (s) that counts where the controller's clock may have leapt.
+    def _offset_after_step(self, offset: float, drifted: float, step: float) -> float:
+        """Return the offset (s) to use, given a possible step of the controller's clock.
 
-        ``leapt``: by how much (s) at this sample, zero where it has not; ``drifted``: the lead
-        that counts where it never has.
+        ``offset``: of this sample, s; ``drifted``: the present offset with drift, s; ``step``: the
+        step at this sample, s, or zero.
         """
-        if leapt > 0.0:
-            if self._quickest is None:
-                self._quickest = drifted
+        if step > 0.0:
+            if self._offset_before_step is None:
+                self._offset_before_step = drifted
             self._agreeing = 0
-            drifted = min(drifted, self._quickest - leapt)
-        if self._quickest is None:
+            drifted = min(drifted, self._offset_before_step - step)
+        if self._offset_before_step is None:
             return drifted
-        later = lead - self._quickest
-        self._agreeing = self._agreeing + 1 if abs(later) <= AGREES else 0
-        if self._agreeing >= AGREEING_IN_A_ROW:
-            drifted, self._quickest = self._quickest, None
-        elif later < -AGREES:  # quicker than any before: it has been set
-            self._quickest = None
+        later = offset - self._offset_before_step
+        self._agreeing = self._agreeing + 1 if abs(later) <= STEP_TOLERANCE else 0
+        if self._agreeing >= STEP_REVOKED_AFTER:
+            drifted, self._offset_before_step = self._offset_before_step, None
+        elif later < -STEP_TOLERANCE:  # earlier than any sample before: the clock was set
+            self._offset_before_step = None
         return drifted
 
-    def _stood_still(self, lead: float, now: float) -> bool:
-        """Return whether samples have come too old for long enough."""
-        if self._lead is None or lead - self._lead <= self._hold:
+    def _outdated(self, offset: float, now: float) -> bool:
+        """Return whether all samples have been too old for longer than ``hold``."""
+        if self._offset is None or offset - self._offset <= self._hold:
             self._old_since = None
         elif self._old_since is None:
             self._old_since = now
         return self._old_since is not None and now - self._old_since > self._hold
 
     def skip(self) -> None:
-        """Do not count what the loop does not see now as missed: it does something else."""
+        """Do not count the cycles until the next sample as missed: the loop does not read."""
         self._counts = False
 
     def age(self, state: RobotState) -> float:
@@ -114,17 +114,17 @@ class ControllerClock:
         return self._now() - self._due(state)
 
     def expiry(self, state: RobotState) -> float:
-        """Return when a state becomes too old for a setpoint to be made of it, s monotonic."""
+        """Return when a state becomes too old to compute a setpoint from it, s monotonic."""
         return self._due(state) + self._hold
 
     def _due(self, state: RobotState) -> float:
-        return state.timestamp + (self._lead or 0.0)
+        return state.timestamp + (self._offset or 0.0)
 
 
 class LinkMonitor:
-    """Takes states from a driver and notifies the supervisor when they fail to come.
+    """Reads states from a driver and notifies the supervisor when none arrives.
 
-    ``lost`` says why the link must be given up, from then on.
+    ``lost``: why the link is lost, once it is.
     """
 
     def __init__(
@@ -132,24 +132,24 @@ class LinkMonitor:
         driver: Driver,
         supervisor: Supervisor,
         reports: Reports,
-        patience: float = 0.0,
+        read_timeout: float = 0.0,
     ) -> None:
         self._driver, self._supervisor, self._reports = driver, supervisor, reports
         self._now = driver.clock.monotonic
         self.lost: str | None = None
         self._hold = hold_time(driver.rate)
-        self._patience = max(patience, self._hold)  # s that one reading takes at most
+        self._read_timeout = max(read_timeout, self._hold)  # s that one reading takes at most
         self._invalid = self._old = 0
         self._last_read_end = 0.0  # s, monotonic: when the last reading ended
-        self._stale = self._silent = False  # has been reported since the last believable state
+        self._stale = self._silent = False  # reported since the last valid state
         self._reported: dict[Implausible, float] = {}  # s, monotonic
-        self._last_state = self._now()  # s, of the last believable state
+        self._last_state = self._now()  # s, monotonic: of the last valid state
         self._has_armed = False
 
     def next(self, has_armed: bool = False) -> RobotState | None:
-        """Return the next state, or None where none came that can be used.
+        """Return the next valid state, or None.
 
-        ``has_armed``: the writing half of the robot's library exists in this process.
+        ``has_armed``: the driver has been armed in this process.
         """
         self._has_armed = has_armed
         begun, self._last_read_end = self._now(), self._last_read_end or self._now()
@@ -160,12 +160,12 @@ class LinkMonitor:
             self._last_read_end = self._now()
 
     def _read(self, begun: float, suspended: bool) -> RobotState | None:
-        """Return the next state; ``away``: this process itself stood still before ``begun``."""
+        """Return the next state; ``suspended``: this process was, before ``begun`` (s)."""
         try:
             state = self._driver.read_state()
         except StaleStateError as error:
-            if suspended or self._now() - begun > self._patience + SUSPENDED:
-                self._last_state = self._now()  # it was this process that slept: ask once more
+            if suspended or self._now() - begun > self._read_timeout + SUSPENDED:
+                self._last_state = self._now()  # this process was suspended: try again
                 self._reports.count(LoopCounter.LATE)
             else:
                 self._judge_stale(str(error))
@@ -178,15 +178,15 @@ class LinkMonitor:
         return None
 
     def accept(self, expiry: float = math.inf) -> bool:
-        """Take note of a state that is fine; returns whether it is fresh enough to write by.
+        """Record a valid state; returns whether it is fresh enough to write by.
 
-        One that was too old (``expiry``, s monotonic) when it could be used is late, and several
-        in a row are a link on which nothing fresh comes any more.
+        A state past its ``expiry`` (s, monotonic) counts as late; several in a row make the link
+        stale.
         """
         now = self._now()
         self._old = self._old + 1 if now > expiry else 0
         self._invalid = 0
-        if self._old >= OLD_IN_A_ROW:
+        if self._old >= OLD_STATE_LIMIT:
             self._judge_stale(f"states are {now - expiry + self._hold:.3f} s old as they come")
             return False
         if self._old:
@@ -197,11 +197,11 @@ class LinkMonitor:
         return True
 
     def reset(self) -> None:
-        """Take note that nobody asked for states meanwhile."""
+        """Restart all timers: no states were read meanwhile."""
         self._last_state = self._last_read_end = self._now()
 
     def _judge_stale(self, detail: str) -> None:
-        """Judge a clock that stands still: late at first, then stale, then silent."""
+        """Act on a missing state: late at first, then stale, then silent."""
         if self._now() - self._last_state <= self._hold:
             self._reports.count(LoopCounter.LATE)
             return
@@ -213,7 +213,7 @@ class LinkMonitor:
         self._judge_silence(detail)
 
     def drop(self, error: InvalidStateError) -> None:
-        """Drop a state that cannot be believed; several in a row end the compensation."""
+        """Drop an implausible state; several in a row end the compensation."""
         detail, reason = str(error), error.reason
         count = DROPPED[reason]
         self._reports.count(count)
@@ -222,9 +222,9 @@ class LinkMonitor:
         if now - self._reported.get(reason, -REPORT_EVERY) >= REPORT_EVERY:
             self._reported[reason] = now
             self._reports.emit({"kind": EventKind.DROPPED, "what": count.label, "detail": detail})
-        if self._invalid >= INVALID_IN_A_ROW:
+        if self._invalid >= INVALID_STATE_LIMIT:
             self._supervisor.take(Cause.IMPLAUSIBLE, detail)
-            self._driver.forget()  # the arm may well be there: judge what comes by itself
+            self._driver.reset_check()  # the arm may be there: check the next state by itself
         self._judge_silence(detail)
 
     def _judge_silence(self, detail: str) -> None:

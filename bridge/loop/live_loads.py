@@ -1,4 +1,4 @@
-"""What acts on the arm now, for the model: from one state after the other."""
+"""The present loads on the arm, for the model, from the stream of states."""
 
 from __future__ import annotations
 
@@ -11,23 +11,23 @@ from gapbridge.core.load_bounds import LoadBounds
 from gapbridge.core.loads import Loads
 from gapbridge.core.state import RobotState
 
-MOVED = 1e-5  # rad: a joint that has come this far has moved, in that direction
+MOVED = 1e-5  # rad: smallest motion that determines a joint's direction of approach
 
 
 class LiveLoads:
     """Keeps one row of loads up to date: filtered force, payload, temperature, last motion.
 
-    The controller's declared payload stands instead of the model's own, because its TCP force has
-    that payload taken off. Where a load is beyond ``bounds``, none of the state's is taken: the
-    last ones stay, and ``problem`` says why.
+    The controller's declared payload replaces the model's, because the controller subtracts it from
+    its TCP force. If a load is beyond ``bounds``, none of that state's is used: the last ones are
+    held, and ``problem`` says why.
     """
 
     def __init__(
         self, n: int, use_force: bool, time_constant: float, bounds: LoadBounds | None = None
     ) -> None:
         self._bounds = bounds or LoadBounds(math.inf)
-        self._has_payload = False  # a payload has been taken
-        self.problem: str | None = None  # why a load of the last state cannot be
+        self._has_payload = False  # the last valid state had a payload
+        self.problem: str | None = None  # why a load of the last state is implausible
         self._use_force = use_force
         self._constant = time_constant
         self._wrench = np.zeros((1, 6))
@@ -35,11 +35,11 @@ class LiveLoads:
         self._cog = np.zeros((1, 3))
         self._temperature = np.zeros((1, n))
         self._approach = np.zeros((1, n))
-        self._turned_at: Array | None = None
+        self._q_at_motion: Array | None = None
         self._last = -math.inf  # s, controller clock
 
     def update(self, state: RobotState) -> Loads:
-        """Return the loads (one row) of this state; the arrays are this object's own."""
+        """Return the loads (one row) of this state; the arrays are reused by the next call."""
         self.problem = self._problem(state)
         if self.problem is None:
             self._filter_force(state)
@@ -57,9 +57,9 @@ class LiveLoads:
         )
 
     def _problem(self, state: RobotState) -> str | None:
-        """Return in words which load of a state cannot be; None: all can.
+        """Return which load of a state is implausible, as text; None: none is.
 
-        Together: the controller takes the declared payload off its force.
+        Payload and force belong together: the controller subtracts one from the other.
         """
         problem = None
         if state.payload is not None and state.payload_cog is not None:
@@ -69,20 +69,20 @@ class LiveLoads:
         return problem
 
     def _take_payload(self, state: RobotState) -> None:
-        """Take the declared payload over, where there is one."""
+        """Store the declared payload, if there is one."""
         self._has_payload = state.payload is not None and state.payload_cog is not None
         if self._has_payload:
             self._mass[0] = state.payload
             self._cog[0] = state.payload_cog
 
     def reset(self) -> None:
-        """Begin anew after a gap: an old force means nothing."""
+        """Restart the force filter after a gap."""
         self._last = -math.inf
 
     def _filter_force(self, state: RobotState) -> None:
-        """Low-pass the force: its noise must not shake the arm. A long gap begins anew.
+        """Low-pass the force, so that its noise does not move the arm; restart after a gap.
 
-        A sensor that was lost counts as no force; the limiter leads over.
+        A lost sensor counts as zero force; the limiter makes the transition smooth.
         """
         if state.sensor_lost and not np.isfinite(state.actual_TCP_force).all():
             self._wrench[0], self._last = 0.0, -math.inf
@@ -96,9 +96,9 @@ class LiveLoads:
         self._wrench[0] += share * (state.actual_TCP_force - self._wrench[0])
 
     def _follow_motion(self, q: Array) -> None:
-        before = self._turned_at
+        before = self._q_at_motion
         if before is None:
-            self._turned_at = q.copy()
+            self._q_at_motion = q.copy()
             return
         step = q - before
         moved = np.abs(step) > MOVED

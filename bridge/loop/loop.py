@@ -1,12 +1,13 @@
-"""The loop: read a state, check it, compensate, limit, write. One owner of the link.
+"""The control loop: read a state, check it, compensate, limit, write. It owns the link.
 
-No setpoint leaves without a fresh, valid state behind it; starting never moves the arm; silence is
-a fault. What the loop is doing is one of the states in supervisor.py.
+Every setpoint is computed from a fresh, valid state; starting never moves the arm; silence of the
+controller is a fault. The states of the loop and their transitions are in supervisor.py.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from enum import IntEnum
 from typing import Any, NamedTuple
 
@@ -16,14 +17,15 @@ from gapbridge.bridge.cell.daemon_settings import DaemonSettings
 from gapbridge.bridge.ipc.command_memory import Command, Commands
 from gapbridge.bridge.ipc.events import EventKind
 from gapbridge.bridge.ipc.loop_counters import LoopCounter
+from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.ipc.shared_memory import Phase, SharedMemory, write_cycle
 from gapbridge.bridge.loop.checks import NOTHING, RAMPING_OUT, RESYNC, UNSOLVED, LoopChecks
 from gapbridge.bridge.loop.link_monitor import ControllerClock, LinkMonitor, hold_time
 from gapbridge.bridge.loop.live_loads import LiveLoads
 from gapbridge.bridge.loop.offset_in_force import OffsetInForce
 from gapbridge.bridge.loop.reports import Reports
-from gapbridge.bridge.loop.setpoint_stream import SetpointStream, longest_withdrawal
-from gapbridge.bridge.loop.supervisor import Cause, State, Supervisor
+from gapbridge.bridge.loop.setpoint_stream import SetpointStream, longest_ramp_out
+from gapbridge.bridge.loop.supervisor import Cause, Supervisor
 from gapbridge.bridge.loop.writing import Writing
 from gapbridge.bridge.setpoint_source.source import Source, SourceStatus
 from gapbridge.core.arrays import Array
@@ -35,15 +37,15 @@ from gapbridge.core.model import Model
 from gapbridge.core.state import RobotState, Setpoint
 from gapbridge.drivers.driver import Driver
 
-LONGEST_STOP = 1.0  # s from a request to stop to letting go, beside what the cell's rates take
-HASTY_RAMP = 0.5  # s: what a stop takes for the ramp at most
+STOP_TIMEOUT = 1.0  # s from a stop request to the release, plus the ramp at the cell's rates
+STOP_RAMP_TIME = 0.5  # s: longest ramp when stopping
 
-UNSENT = 2  # "attempted" of a cycle whose setpoint was computed and did not (wholly) leave
+UNSENT = 2  # "attempted" of a cycle whose setpoint was computed and not (completely) sent
 
 Emit = Callable[[dict[str, Any]], None]
-LEAST = 1e-9  # m, rad: a smaller offset is none
-PULL = 10.0  # N: a model that bends under a pull corrects something
-POSES, SEED = 16, 14  # tried beside the present one
+NEGLIGIBLE_OFFSET = 1e-9  # m, rad: a smaller offset counts as zero
+TEST_FORCE = 10.0  # N: force on the TCP under which a compliant model has an offset
+TEST_POSES, SEED = 16, 14  # random poses at which the model is tried
 
 
 class Exit(IntEnum):
@@ -56,10 +58,10 @@ class Exit(IntEnum):
 
 
 class CycleInput(NamedTuple):
-    """What one cycle begins with."""
+    """Input of one cycle."""
 
     state: RobotState
-    missed: int  # cycles before it
+    missed: int  # cycles missed before it
     nominal_q: Array  # (n,) rad: of the robot's own program
     loads: Loads
     flags: int
@@ -78,7 +80,7 @@ class Loop:
         emit: Emit,
         number: int = 0,
     ) -> None:
-        self._number = number  # which process of the loop this is, from 0
+        self._number = number  # of this process of the loop, from 0
         self._settings, self._driver, self._source = settings, driver, source
         self._memory, self._emit = memory, emit
         clock, self._now = driver.clock, driver.clock.monotonic
@@ -92,39 +94,39 @@ class Loop:
         self._clock = ControllerClock(driver.rate, hold_time(driver.rate), clock)
         reports = Reports(memory, emit)
         self._supervisor = Supervisor(reports.transition)
-        patience = settings.link.state_timeout
-        self._watch = LinkMonitor(driver, self._supervisor, reports, patience)
+        read_timeout = settings.link.state_timeout
+        self._watch = LinkMonitor(driver, self._supervisor, reports, read_timeout)
         self._checks = LoopChecks(
-            driver.rate, self._supervisor, reports, patience, driver.moves_arm
+            driver.rate, self._supervisor, reports, read_timeout, driver.moves_arm
         )
         self._in_force = self._open_offset_in_force()
         self._writing = Writing(
             settings.setpoints, driver, source, self._stream, self._supervisor, reports,
             self._in_force,
         )  # fmt: skip
-        self._zero_moved = False  # the daemon has found it, and nobody has acknowledged it
-        self._acknowledged = False  # a person has seen the fault; it ends when the robot is fine
+        self._zero_moved = False  # reported by the daemon, not acknowledged
+        self._acknowledged = False  # the fault is; it ends when the robot is ready
         self._stop_by: float | None = None  # s, monotonic
         self._exit: Exit | None = None
         self._stop_requested = False
 
     def _open_offset_in_force(self) -> OffsetInForce:
-        """Return where the offset that an arm is left with is kept."""
-        if not self._driver.moves_arm:  # the robot's own program takes it out
+        """Return the store of the offset that remains in the arm after a fault."""
+        if not self._driver.moves_arm:  # the robot's program ramps it out
             return OffsetInForce(self._driver.n, None)
         return OffsetInForce.of_link(self._driver.n, self._settings.link)
 
     def request_stop(self) -> None:
-        """Have the loop ramp out and end; for signal handlers."""
+        """Ramp out and end the loop; for signal handlers."""
         self._stop_requested = True
 
     # -- the frame --------------------------------------------------------------------------------
 
     def run(self, commands: Commands, may_write: bool, latched: str = "") -> Exit:
-        """Connect and loop until asked to stop, or until the link is lost.
+        """Connect and loop until a stop request, or until the link is lost.
 
-        ``commands``: the daemon's, and the only way to arm. ``may_write`` False: nothing can arm.
-        ``latched``: the fault of a loop before this one that nobody has acknowledged.
+        ``commands``: from the daemon; only they can arm. ``may_write`` False: arming is impossible.
+        ``latched``: an unacknowledged fault of a former process of the loop.
         """
         self._memory.enter(Phase.CONNECTING)
         try:
@@ -146,7 +148,7 @@ class Loop:
                 if command in (Command.DISARM, Command.RAMP_OUT):
                     self._disarm(command == Command.DISARM)
                 if command == Command.ZERO_MOVED:
-                    self._hold_for_zero()
+                    self._on_zero_moved()
             if requests:
                 self._memory.note_taken(commands.last_taken)
             if self._stop_requested or commands.stop:
@@ -162,21 +164,21 @@ class Loop:
         return self._exit
 
     def _arm(self) -> None:
-        """Arm where a robot is that can move, and nothing that waits for a person."""
+        """Arm, or emit why not."""
         if self._supervisor.state == State.FAULT:
             detail = "a fault is latched: acknowledge it first (gapbridge disarm)"
         elif self._checks.not_ready:
             detail = f"the robot is not ready: {self._checks.not_ready}"
-        elif not_ready := self._not_ready():
-            detail = not_ready
+        elif obstacle := self._arming_obstacle():
+            detail = obstacle
         else:
             if self._supervisor.take(Cause.ARM):
-                self._skip()
+                self._restart_checks()
             return
         self._emit({"kind": EventKind.REFUSED, "what": "arm", "detail": detail})
 
-    def _not_ready(self) -> str:
-        """Return in words why writing could come to nothing here; empty: it can."""
+    def _arming_obstacle(self) -> str:
+        """Return why arming is refused, as text; empty: it is not."""
         stream = self._stream
         if self._zero_moved:
             return "a joint's zero has moved: acknowledge it first (gapbridge disarm)"
@@ -196,8 +198,8 @@ class Loop:
             )
         return ""
 
-    def _hold_for_zero(self) -> None:
-        """Ramp out: every pose is off by what the zero has moved."""
+    def _on_zero_moved(self) -> None:
+        """Ramp out: the zero of a joint has moved, so that every pose is wrong."""
         self._zero_moved = True
         self._memory.count(LoopCounter.ZERO_MOVED)
         self._supervisor.take(Cause.ZERO_MOVED, "the slip was reported just before")
@@ -209,18 +211,18 @@ class Loop:
         else:
             self._supervisor.take(Cause.DISARM)
 
-    def _skip(self) -> None:
-        """Do not count what the loop does not see now: it does something else."""
+    def _restart_checks(self) -> None:
+        """Restart clock, checks and link monitor after a time without reading states."""
         self._clock.skip()
         self._checks.reset()
         self._watch.reset()
 
     def _stop(self) -> None:
-        """Ramp out, then end; a deadline makes sure of the end."""
+        """Ramp out, then end; at the deadline in any case."""
         if self._stop_by is None:
-            needed = LONGEST_STOP + longest_withdrawal(self._settings.limits)
+            needed = STOP_TIMEOUT + longest_ramp_out(self._settings.limits)
             self._stop_by = self._now() + needed
-            self._stream.shorten_ramp(HASTY_RAMP)
+            self._stream.shorten_ramp(STOP_RAMP_TIME)
             self._supervisor.take(Cause.STOP)
         if not self._supervisor.state.writes or self._now() > self._stop_by:
             self._release()
@@ -232,13 +234,13 @@ class Loop:
         self._check_writing()
 
     def _check_writing(self) -> None:
-        """Act on what writing came to: states not looked at meanwhile, or a link that broke."""
-        if self._writing.paused():
-            self._skip()
-        self._give_up(self._writing.lost)
+        """Act on the result of writing: states not read meanwhile, or a lost link."""
+        if self._writing.take_paused():
+            self._restart_checks()
+        self._end_on_lost_link(self._writing.lost)
 
-    def _give_up(self, detail: str | None) -> None:
-        """Give the process up where a link broke (``detail``): it is only safe in a new one."""
+    def _end_on_lost_link(self, detail: str | None) -> None:
+        """End this process if the link is lost (``detail``): only a new one may reconnect."""
         if detail is None or self._exit is not None:
             return
         self._memory.count(LoopCounter.LINK_LOST)
@@ -251,35 +253,35 @@ class Loop:
     def _cycle(self) -> None:
         state = self._watch.next(self._writing.has_armed)
         if state is None:
-            self._give_up(self._watch.lost)
+            self._end_on_lost_link(self._watch.lost)
             return
         try:
             nominal_q = self._driver.nominal_q(state)
         except InvalidStateError as error:
             self._watch.drop(error)
-            self._give_up(self._watch.lost)
+            self._end_on_lost_link(self._watch.lost)
             return
-        missed = self._clock.take(state, way_known=self._writing.ready)
+        missed = self._clock.take(state, transit_known=self._writing.ready)
         expiry = self._clock.expiry(state) - self._writing.transit_time
         is_fresh = self._watch.accept(expiry)
-        self._give_up(self._watch.lost)
+        self._end_on_lost_link(self._watch.lost)
         self._memory.note_state_read()
         flags = self._checks.begin(state, missed)
         if flags & RESYNC:
             self._loads.reset()
-            is_fresh = False  # how long it lay here only the next one shows: clocks drift meanwhile
+            is_fresh = False  # how long it was queued only the next shows: clocks drift meanwhile
         self._acknowledge()
         supervisor, writing = self._supervisor, self._writing
         if supervisor.state == State.FAULT:
             writing.abandon()
         loads = self._last_loads = self._loads.update(state)
-        self._checks.judge_loads(self._loads.problem)
-        self._checks.judge_settings(state, self._driver)
+        self._checks.check_loads(self._loads.problem)
+        self._checks.check_settings(state, self._driver)
         start = self._now()
         if is_fresh and supervisor.state == State.ARMED:
             used_up = writing.start(state, nominal_q)
             self._check_writing()
-            if used_up:  # the state is old by now
+            if used_up:  # the state is too old now
                 self._record(CycleInput(state, missed, nominal_q, loads, flags), None, since=start)
                 return
         holding = supervisor.state == State.HOLDING
@@ -301,7 +303,7 @@ class Loop:
             supervisor.take(Cause.RAMPED_OUT)
 
     def _acknowledge(self) -> None:
-        """Leave a fault that a person has acknowledged, once the robot is fine."""
+        """Leave an acknowledged fault once the robot is ready."""
         fault = self._supervisor.state == State.FAULT
         if self._acknowledged and fault and not self._checks.not_ready:
             self._acknowledged = False
@@ -315,7 +317,7 @@ class Loop:
         sent: bool = False,
         since: float | None = None,
     ) -> None:
-        """Publish a cycle: ``setpoint`` was computed for writing, and has ``left`` or not."""
+        """Publish a cycle: ``setpoint`` was computed for writing, and was ``sent`` or not."""
         memory, stream = self._memory, self._stream
         state, missed, nominal_q, loads, flags = cycle_input
         if setpoint is None:
@@ -352,24 +354,24 @@ class Loop:
 
 
 class ModelCheck:
-    """Says whether a model corrects anything at all; tries poses once, then remembers."""
+    """Whether a model has an offset at any pose; computed once, then stored."""
 
     def __init__(self, model: Model, use_force: bool) -> None:
         self._compensator = Compensator(model)
         limits, n = model.arm.limits, model.arm.n
         lower, upper = np.maximum(limits.lower, -np.pi), np.minimum(limits.upper, np.pi)
-        self._poses = np.random.default_rng(SEED).uniform(lower, upper, (POSES, n))
+        self._poses = np.random.default_rng(SEED).uniform(lower, upper, (TEST_POSES, n))
         self._use_force = use_force
         self._known: bool | None = None
 
     def corrects(self, loads: Loads) -> bool:
-        """Return whether some pose gets an offset under these loads (one row), or under a pull."""
+        """Return whether a pose has an offset under these loads (one row) or a test force."""
         if self._known is None:
             self._known = any(self._has_offset(q, loads) for q in self._poses)
         return self._known
 
     def reset(self) -> None:
-        """Try anew the next time: the loads may be others."""
+        """Compute it again the next time: the loads may differ."""
         self._known = None
 
     def _has_offset(self, q: Array, loads: Loads) -> bool:
@@ -377,16 +379,11 @@ class ModelCheck:
         tried = [wrench]
         if self._use_force:
             pulls = np.zeros((3, 1, 6))
-            pulls[range(3), 0, range(3)] = PULL
+            pulls[range(3), 0, range(3)] = TEST_FORCE
             tried += [wrench + pull for pull in pulls]
         for pull in tried:
-            correction = self._compensator.correct(
-                q,
-                Loads(
-                    loads.payload_mass, loads.payload_cog, pull, loads.temperature, loads.approach
-                ),
-            )
-            # what cannot be solved is not nothing: it is said where it happens
-            if not correction.residual < np.inf or np.abs(correction.offset_in_base).max() > LEAST:
+            correction = self._compensator.correct(q, replace(loads, wrench=pull))
+            size = np.abs(correction.offset_in_base).max()
+            if not correction.residual < np.inf or size > NEGLIGIBLE_OFFSET:
                 return True
         return False

@@ -1,9 +1,9 @@
 """The loop's process: ``python -m gapbridge.bridge.loop.main``, started by the daemon alone.
 
-It holds the loop and one driver, and is expendable: the robot's library can abort it, crash it or
-hang it. Settings come as one line of JSON on stdin, requests through memory that only the daemon
-writes to; cycles go out through shared memory, events as JSON through a socket. It always ends by
-``os._exit``, because destroying the library's objects is not safe.
+It runs the loop and one driver, and may be killed: the robot's library can abort, crash or hang it.
+Settings come as one line of JSON on stdin, requests through memory that only the daemon writes to;
+cycles are published in shared memory, events as JSON over a socket. It always ends by ``os._exit``,
+because destroying the library's objects is not safe.
 """
 
 from __future__ import annotations
@@ -51,9 +51,9 @@ SLACK = 1000  # ns
 PRIORITY = 30  # SCHED_FIFO: below interrupt threads (50) and a simulated controller (40)
 LOCK_ALL = 3  # MCL_CURRENT | MCL_FUTURE
 LATENCY = "/dev/cpu_dma_latency"  # the kernel's PM QoS interface
-IDLE_DRIVER = "/sys/devices/system/cpu/cpuidle/current_driver"  # what the kernel sleeps by
+IDLE_DRIVER = "/sys/devices/system/cpu/cpuidle/current_driver"  # the kernel's idle driver
 FAST = 0.005  # s: loops with this cycle or a shorter one keep the processors awake
-_open_files: list[int] = []  # files whose closing would take a measure back
+_open_files: list[int] = []  # kept open: closing one would undo its effect
 _PR_SET_PDEATHSIG = 1
 LONGEST_DETAIL = 1000  # of an event
 
@@ -86,7 +86,7 @@ def _run(order: dict[str, Any], emit: Callable[[dict[str, Any]], None]) -> Exit:
     memory = SharedMemory(order["n"], order["memory"])
     memory.enter(Phase.STARTING)
     files = pickle.loads(all_bytes(order["files"]))  # by the daemon, which started this process
-    read_only_from(files)  # the disk is the daemon's to read, at start and reload
+    read_only_from(files)  # only the daemon reads the disk, at start and reload
     settings = DaemonSettings.model_validate(order["settings"])
     model = _read_model(settings)
     driver = make_driver(settings.link, model, gate_bounds(settings.limits))
@@ -105,7 +105,7 @@ def _run(order: dict[str, Any], emit: Callable[[dict[str, Any]], None]) -> Exit:
 
 
 def _make_source(settings: DaemonSettings, model: Model, driver: Driver) -> Source:
-    """Return where setpoints come from; on a recording they are in the recording."""
+    """Return the setpoint source; a recording needs none."""
     is_replay = isinstance(driver, ReplayDriver)
     setpoints = SetpointSettings() if is_replay else settings.setpoints
     return make_source(setpoints, model.arm.n, driver.moves_arm, settings.cell.parent, driver.rate)
@@ -114,7 +114,7 @@ def _make_source(settings: DaemonSettings, model: Model, driver: Driver) -> Sour
 def _make_loop(
     settings: DaemonSettings, model: Model, driver: Driver, source: Source, *arguments: Any
 ) -> Loop:
-    """Return the loop of a link; a recording has the sensor's readings in it."""
+    """Return the loop of a link; a recording contains the sensor's readings."""
     if isinstance(driver, ReplayDriver):
         return ReplayedLoop(settings, model, driver, source, *arguments)
     if settings.ft_sensor is not None:
@@ -129,7 +129,7 @@ def _emitter(events: int) -> Callable[[dict[str, Any]], None]:
         if len(event.get("detail", "")) > LONGEST_DETAIL:
             event = {**event, "detail": event["detail"][:LONGEST_DETAIL]}
         now = {"time": SYSTEM.time(), "monotonic": SYSTEM.monotonic()}
-        with contextlib.suppress(OSError):  # a message each: taken whole, or not at all
+        with contextlib.suppress(OSError):  # one datagram: sent completely or not at all
             os.write(events, json.dumps({**now, **event}).encode())
 
     return emit
@@ -154,7 +154,7 @@ def _read_model(settings: DaemonSettings) -> Model:
 
 
 def _compile(settings: DaemonSettings, model: Model) -> None:
-    """Have everything compiled, or loaded, before the first cycle: it may take seconds."""
+    """Compile or load all kernels before the first cycle; may take seconds."""
     arm = model.arm
     stream = SetpointStream(model, settings.limits, settings.link.rate)
     q = np.clip(np.zeros(arm.n), arm.limits.lower, arm.limits.upper)
@@ -170,7 +170,7 @@ def _compile(settings: DaemonSettings, model: Model) -> None:
 
 
 def _end_with_parent(parent: int) -> None:
-    """Have the kernel send SIGTERM when the daemon dies, so that the arm is not left to itself."""
+    """Have the kernel send SIGTERM when the daemon dies, so that the loop ramps out and ends."""
     if sys.platform.startswith("linux"):
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0)
     if os.getppid() != parent:
@@ -178,7 +178,7 @@ def _end_with_parent(parent: int) -> None:
 
 
 def become_realtime(cycle: float) -> list[str]:
-    """Prepare this thread, and those it starts from now on; returns what was granted.
+    """Prepare this thread, and those it starts from now on; returns the measures granted.
 
     ``cycle`` is that of the loop, s. Afterwards Python collects no garbage by itself.
     """
@@ -196,7 +196,7 @@ def become_realtime(cycle: float) -> list[str]:
     gc.collect()
     gc.freeze()
     gc.disable()
-    # last: locking memory takes some 100 ms, for which nothing else would run on this processor
+    # last: with priority, locking memory would block this processor for some 100 ms
     with contextlib.suppress(OSError, AttributeError):
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
         granted.append("real-time priority")
@@ -204,17 +204,17 @@ def become_realtime(cycle: float) -> list[str]:
 
 
 def become_ordinary() -> None:
-    """Give real-time priority back: ending a process frees its memory, which takes its time."""
+    """Drop real-time priority: freeing this process's memory takes long."""
     with contextlib.suppress(OSError, AttributeError):
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 
 
 def _keep_awake() -> bool:
-    """Have idle processors wait without sleep until this process ends; returns whether they do.
+    """Keep idle processors out of sleep states until this process ends; returns whether they are.
 
-    A processor that sleeps wakes late, and with cold caches; kept awake it takes more power. Only
-    root may ask for it, unless the system's owner lets others write to LATENCY. Without a driver
-    that knows kinds of sleep, as in many virtual machines, the request would change nothing.
+    A sleeping processor wakes late and with cold caches; awake it takes more power. Only root may
+    request it, unless others may write to LATENCY. Without a cpuidle driver, as in many virtual
+    machines, the request has no effect.
     """
     with contextlib.suppress(OSError):
         with open(IDLE_DRIVER, encoding="ascii") as kinds:
@@ -227,7 +227,7 @@ def _keep_awake() -> bool:
 
 
 def _may_lock() -> bool:
-    """Return whether locking has no limit: below one, later allocations would fail."""
+    """Return whether locked memory is unlimited: with a limit, allocations would fail later."""
     try:
         import resource
 

@@ -1,7 +1,7 @@
-"""The offset that an arm was left with, known to whoever begins writing next.
+"""The offset that remains in an arm after a fault, kept for the next start.
 
-Where setpoints are the arm's only motion, a fault leaves it at its last setpoint: where it was
-wanted, and the offset. The next beginning counts on from there; else each arming would add one.
+If setpoints are the arm's only motion, a fault leaves it at its last setpoint: nominal joints plus
+offset. The next start subtracts that offset; otherwise each arming would add another one.
 """
 
 from __future__ import annotations
@@ -19,21 +19,21 @@ from gapbridge.core.arrays import Array
 from gapbridge.drivers.controller_address import address_of
 from gapbridge.drivers.link_settings import DriverSettings
 
-STAYED = 0.02  # rad: an arm that is farther from its last setpoint has been moved by somebody
+MOVED_AWAY = 0.02  # rad: an arm farther from its last setpoint has been moved meanwhile
 
 
 class InForce(NamedTuple):
-    """A joint offset (n,) rad and the TCP offset (6,) in base that it makes, m and rad."""
+    """A joint offset (n,) rad and its TCP offset (6,) in base, m and rad."""
 
     delta: Array
     offset_in_base: Array
 
 
 class OffsetInForce:
-    """What was sent last, kept in a file of the runtime folder that outlives any kill.
+    """The setpoint sent last, kept in a file of the runtime folder that survives the process.
 
-    Two places are written in turn, and then which of them is whole: a process that ends in between
-    leaves the one before. ``path`` None: kept in memory alone.
+    Two records are written in turn, then the index of the valid one: if the process ends in
+    between, the previous record stays valid. ``path`` None: kept in memory only.
     """
 
     def __init__(self, n: int, path: Path | None) -> None:
@@ -52,28 +52,28 @@ class OffsetInForce:
             finally:
                 os.close(fd)
         numbers = np.frombuffer(self._memory, np.float64)
-        self._which = numbers[:1]  # 0: nothing; 1, 2: the place that is whole
+        self._which = numbers[:1]  # 0: none; 1, 2: the valid record
         self._places = numbers[1:].reshape(2, size)
 
     @classmethod
     def of_link(cls, n: int, link: DriverSettings) -> Self:
-        """Return what is kept for one controller. Raises InputError where no folder can be had."""
+        """Return the store for one controller. Raises InputError without a runtime folder."""
         key = hashlib.sha256(address_of(link).encode()).hexdigest()[:16]
         return cls(n, runtime_folder() / f"{key}.offset")
 
     def note(self, q: Array, delta: Array, offset_in_base: Array) -> None:
-        """Keep what has been sent: joints (n,) rad, the offset in them, and its TCP offset (6,)."""
+        """Store a sent setpoint: joints (n,) rad, their offset (n,), and its TCP offset (6,)."""
         place = 0 if self._which[0] == 2.0 else 1
         row, n = self._places[place], self._n
         row[:n], row[n : 2 * n], row[2 * n :] = q, delta, offset_in_base
         self._which[0] = place + 1.0
 
     def offset_at(self, q: Array) -> InForce | None:
-        """Return the offset that an arm at q (n,) still has; None: it has none, or was moved."""
+        """Return the offset that an arm at q (n,) rad still has; None: none, or it was moved."""
         if self._which[0] not in (1.0, 2.0):
             return None
         row, n = self._places[int(self._which[0]) - 1], self._n
-        stayed = bool((np.abs(row[:n] - q) <= STAYED).all()) and bool(np.isfinite(row).all())
+        stayed = bool((np.abs(row[:n] - q) <= MOVED_AWAY).all()) and bool(np.isfinite(row).all())
         if not stayed or not row[n : 2 * n].any():
             return None
         return InForce(row[n : 2 * n].copy(), row[2 * n :].copy())

@@ -1,7 +1,7 @@
-"""The loop on a recording: it computes anew, and is in the states that it was in then.
+"""The loop on a recording: states of the loop are the recorded ones, setpoints are computed again.
 
-Who armed, what ran dry and when, is the recording's; the correction, the ramp and the limiter are
-computed. With the same cell every offset comes out bit for bit as it was.
+Arming, a dry source and other transitions come from the recording; correction, ramp and limiter are
+computed. With the same cell every offset is bit-identical to the recorded one.
 """
 
 from __future__ import annotations
@@ -12,12 +12,13 @@ from typing import Any, cast
 import numpy as np
 
 from gapbridge.bridge.ipc.events import EventKind
+from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.loop.checks import RAMPING_OUT, RESYNC
 from gapbridge.bridge.loop.live_loads import LiveLoads
 from gapbridge.bridge.loop.loop import UNSENT, CycleInput, Exit, Loop
 from gapbridge.bridge.loop.offset_in_force import InForce, OffsetInForce
 from gapbridge.bridge.loop.setpoint_stream import SetpointStream
-from gapbridge.bridge.loop.supervisor import Cause, State
+from gapbridge.bridge.loop.supervisor import Cause
 from gapbridge.core.errors import GateError, LimitError
 from gapbridge.core.load_bounds import LoadBounds
 from gapbridge.core.loads import Loads
@@ -38,11 +39,11 @@ class ReplayedLoop(Loop):
     def __init__(self, settings: Any, model: Model, driver: ReplayDriver, *arguments: Any) -> None:
         super().__init__(settings, model, driver, *arguments)
         self._model, self._recording = model, driver
-        self._process: int | None = None  # of the loop then
+        self._process: int | None = None  # number of the recorded loop process
         self._streaming = False  # between the first setpoint of a stream and its last
 
     def _open_offset_in_force(self) -> OffsetInForce:
-        """Keep it in memory: a recording leaves no arm anywhere."""
+        """Keep it in memory only: a recording moves no arm."""
         return OffsetInForce(self._driver.n, None)
 
     def _cycle(self) -> None:
@@ -69,7 +70,7 @@ class ReplayedLoop(Loop):
         self._record(cycle_input, setpoint, cycle.attempted > 0, sent)
 
     def _renew(self, process: int) -> None:
-        """Begin as a new process of the loop begins, knowing nothing of the former."""
+        """Reset all state, as a new process of the loop does."""
         first, self._process = self._process is None, process
         if first:
             return
@@ -85,10 +86,10 @@ class ReplayedLoop(Loop):
     def _follow(self, state: State) -> None:
         changed = self._supervisor.follow(state, cast("Cause", _ReplayCause.RECORDED))
         if changed and state == State.ARMED:
-            self._skip()
+            self._restart_checks()
 
     def _began_with(self, cycle: Cycle) -> InForce | None:
-        """Return the offset in force that a stream began with: nominal joints are without it."""
+        """Return the offset in force that a recorded stream started with, or None."""
         offset = self._in_force.offset_at(cycle.own_q)
         if offset is None:
             return None
@@ -96,7 +97,7 @@ class ReplayedLoop(Loop):
         return offset if np.linalg.norm(before + offset.delta) < np.linalg.norm(before) else None
 
     def _write_again(self, cycle: Cycle, state: RobotState, loads: Loads) -> Setpoint | None:
-        """Compute the setpoint of a cycle that had one; None where none left."""
+        """Compute the setpoint of a cycle that had one; None if none was sent."""
         stream = self._stream
         if not cycle.attempted:
             if self._streaming:
@@ -111,7 +112,7 @@ class ReplayedLoop(Loop):
                 self._recording.arm(state)
                 self._streaming = True
             if not cycle.written and cycle.attempted != UNSENT:
-                stream.reset_solver()  # it was refused, and left no trace
+                stream.reset_solver()  # it was refused
                 return None
             stream.shorten_ramp(cycle.ramp_time)
             goal = 0.0 if cycle.flags & RAMPING_OUT else 1.0
@@ -119,7 +120,7 @@ class ReplayedLoop(Loop):
             if cycle.written:
                 self._recording.write_setpoint(setpoint)
                 self._in_force.note(setpoint.q, stream.joint_offset, setpoint.offset_in_base)
-        except (LimitError, GateError) as error:  # of another cell than it was then
+        except (LimitError, GateError) as error:  # the cell differs from the recorded one
             stream.reset_solver()
             self._emit({"kind": EventKind.REFUSED, "detail": str(error)})
             return None

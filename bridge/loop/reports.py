@@ -1,4 +1,4 @@
-"""How the loop reports to the daemon: counts and state in shared memory, events over a socket."""
+"""The loop's reports to the daemon: counts and state in shared memory, events over a socket."""
 
 from __future__ import annotations
 
@@ -8,13 +8,14 @@ from typing import Any
 
 from gapbridge.bridge.ipc.events import EventKind
 from gapbridge.bridge.ipc.loop_counters import LoopCounter
+from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.ipc.shared_memory import SharedMemory
-from gapbridge.bridge.loop.supervisor import Cause, State
+from gapbridge.bridge.loop.supervisor import Cause
 
 
 @dataclass(frozen=True)
 class Reports:
-    """What every part of the loop reports by."""
+    """The channels by which every part of the loop reports."""
 
     memory: SharedMemory
     emit: Callable[[dict[str, Any]], None]  # one event; never blocks

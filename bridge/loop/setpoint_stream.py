@@ -24,17 +24,17 @@ from gapbridge.drivers.gate import GateBounds
 
 DECELERATION = 8.0  # rad/s^2 of the fastest joint
 SMOOTHING = 0.02  # s: over which the velocity is averaged
-PLACE, RATE, LIMIT = range(3)  # rows of what is kept
-STEEPEST = 1.5  # of a smooth step's mean slope
-LEADING = 0.5  # of an offset's rate, to where a source begins: the offset changes meanwhile
-SOLVED = 1e-5  # m: corrections that miss the wanted pose by more are not used
-USUAL_VELOCITY = np.pi  # rad/s: of joints whose limit is not known
+POSITION, RATE, LIMIT = range(3)  # rows of NominalStream's array
+PEAK_SLOPE = 1.5  # of a smooth step, in units of its mean slope
+LEAD_IN_SHARE = 0.5  # of the offset's rate limit for the lead-in: the offset changes meanwhile
+SOLVED = 1e-5  # m: corrections with a larger residual are not used
+DEFAULT_VELOCITY = np.pi  # rad/s: of joints whose limit is not known
 
 
 def limits_of(settings: LimitSettings, arm: Arm, rate: float) -> Limits:
     """Return the limits of a cell for its arm."""
-    velocity_limit = np.where(np.isfinite(arm.limits.velocity), arm.limits.velocity, USUAL_VELOCITY)
-    velocity = settings.velocity_share * velocity_limit
+    known = np.isfinite(arm.limits.velocity)
+    velocity = settings.velocity_share * np.where(known, arm.limits.velocity, DEFAULT_VELOCITY)
     if settings.joint_velocity is not None:
         velocity = np.minimum(velocity, settings.joint_velocity)
     return Limits(
@@ -52,7 +52,7 @@ def limits_of(settings: LimitSettings, arm: Arm, rate: float) -> Limits:
 
 
 def gate_bounds(settings: LimitSettings) -> GateBounds:
-    """Return the limits of a cell for the gate before the wire."""
+    """Return the limits of a cell for the drivers' gate."""
     return GateBounds(
         settings.offset, settings.offset_rotation, settings.offset_rate,
         settings.offset_rotation_rate, settings.joint_offset, settings.joint_velocity,
@@ -60,8 +60,8 @@ def gate_bounds(settings: LimitSettings) -> GateBounds:
     )  # fmt: skip
 
 
-def longest_withdrawal(settings: LimitSettings) -> float:
-    """Return how long an offset of the whole envelope takes to go at the cell's rates, s."""
+def longest_ramp_out(settings: LimitSettings) -> float:
+    """Return how long the largest offset takes to ramp out at the cell's rates, s."""
     return max(
         settings.offset / settings.offset_rate,
         settings.offset_rotation / settings.offset_rotation_rate,
@@ -70,29 +70,29 @@ def longest_withdrawal(settings: LimitSettings) -> float:
 
 @njit(**JIT)
 def _track(motion, q, gap):  # type: ignore[no-untyped-def]
-    """Take a setpoint (n,) over: the velocity to it, averaged, and its place."""
+    """Update position and averaged velocity with a setpoint (n,), ``gap`` s after the last."""
     share = min(gap / SMOOTHING, 1.0)
     for i in range(motion.shape[1]):
         most = motion[LIMIT, i]
-        rate = min(max((q[i] - motion[PLACE, i]) / gap, -most), most)
+        rate = min(max((q[i] - motion[POSITION, i]) / gap, -most), most)
         motion[RATE, i] += share * (rate - motion[RATE, i])
-        motion[PLACE, i] = q[i]
+        motion[POSITION, i] = q[i]
 
 
 class NominalStream:
-    """Remembers where the nominal setpoint is and how fast it goes, so that it can stop smoothly.
+    """Tracks position and velocity of the nominal setpoint, so that it can brake smoothly.
 
-    A source that dries up in the middle of a motion must not stop the arm dead: joints brake along
-    their way, the fastest with DECELERATION.
+    If a source runs dry in the middle of a motion, the joints brake along their path, the fastest
+    with DECELERATION.
     """
 
     def __init__(self, velocity_limit: Array) -> None:
-        # one array: each that is handed to compiled code is unwrapped anew in every call
+        # one array: each argument of compiled code costs time in every call
         self._motion = np.zeros((3, len(velocity_limit)))
         self._motion[LIMIT] = velocity_limit
-        self.q: Array = self._motion[PLACE]
+        self.q: Array = self._motion[POSITION]
         self._rate: Array = self._motion[RATE]
-        _track(self._motion, self.q.copy(), 1.0)  # compiled now: the loop waits for no compiler
+        _track(self._motion, self.q.copy(), 1.0)  # compiles it now: the loop must not wait
 
     def start(self, q: Array) -> None:
         """Begin at rest at ``q`` (n,) rad."""
@@ -100,11 +100,11 @@ class NominalStream:
         self._rate[:] = 0.0
 
     def follow(self, q: Array, gap: float) -> None:
-        """Take the source's setpoint (n,), ``gap`` s after the last one."""
+        """Track the source's setpoint (n,) rad, ``gap`` s after the last one."""
         _track(self._motion, q, gap)
 
     def brake(self, gap: float) -> Array:
-        """Return the setpoint ``gap`` s later on the way to rest; it holds until the next call."""
+        """Return the setpoint (n,) ``gap`` s later while braking; valid until the next call."""
         fastest = float(np.abs(self._rate).max())
         if fastest > 0.0:
             speed = max(fastest - DECELERATION * gap, 0.0)
@@ -114,13 +114,13 @@ class NominalStream:
         return self.q
 
     @property
-    def rests(self) -> bool:
+    def at_rest(self) -> bool:
         """Return whether it has come to rest."""
         return not self._rate.any()
 
 
 class SetpointStream:
-    """One stream of setpoints between ``start`` and coming to rest."""
+    """One stream of setpoints from ``start`` until it is at rest."""
 
     def __init__(
         self, model: Model, settings: LimitSettings, rate: float, clock: Clock = SYSTEM
@@ -133,14 +133,14 @@ class SetpointStream:
         self._ramp_time = settings.ramp_time
         self._longest_gap = LONGEST_GAP / rate
         self._ramp = 0.0
-        self._resumes = False  # begun with an offset in force, which the ramp goes on from
+        self._resumes = False  # started with an offset in force, from which the ramp continues
         self._last = 0.0  # s, controller time of the last setpoint
-        self._start_gap: Array | None = None  # rad: where the arm stood minus the first setpoint
-        self._lead_time = 0.0  # s that the way over it takes at least
-        self._time_over(np.zeros(model.arm.n))  # compiled now
+        self._start_gap: Array | None = None  # rad: start joints minus the first setpoint
+        self._lead_time = 0.0  # s that the lead-in over it takes at least
+        self._time_over(np.zeros(model.arm.n))  # compiles it now
         self._since_start = 0.0  # s
         self.residual = 0.0  # m, of the last correction
-        self.finite = True  # the last correction is numbers
+        self.finite = True  # the last correction is finite
         self._loads = Loads()  # of the last correction
         self._solved = np.zeros(model.arm.n + 6)  # joint and TCP offset of the last one solved
         self.clamped = 0  # bits of the last setpoint
@@ -149,7 +149,7 @@ class SetpointStream:
         """Return the correction alone, neither ramped nor limited."""
         correction = self._compensator.correct(nominal_q, loads)
         self.residual = float(correction.residual)
-        # plain numbers: twelve of them cost four calls on arrays more
+        # lists: for twelve numbers faster than arrays
         numbers = correction.q.tolist() + correction.offset_in_base.tolist()
         self.finite = math.isfinite(sum(numbers))
         self._loads = loads
@@ -157,7 +157,7 @@ class SetpointStream:
 
     @property
     def unsolved(self) -> str:
-        """Return in words why the last correction does not meet the wanted pose; empty: it does."""
+        """Return why the last correction misses the wanted pose, as text; empty: it does not."""
         if self.residual < SOLVED:
             return ""
         loads = self._loads
@@ -177,10 +177,10 @@ class SetpointStream:
     def start(
         self, start_q: Array, timestamp: float, led: bool = False, in_force: InForce | None = None
     ) -> Array:
-        """Begin at rest at ``own_q`` (n,); returns the nominal joints there. Raises LimitError.
+        """Begin at rest at ``start_q`` (n,); returns the nominal joints there. Raises LimitError.
 
-        ``led``: the setpoints that follow are led over from where the arm stands already.
-        ``in_force``: an offset that the arm stands at; left out: there is none.
+        ``led``: the setpoints that follow need no lead-in from the start joints.
+        ``in_force``: an offset that the arm already has; None: none.
         """
         nominal = start_q
         if in_force is None:
@@ -202,13 +202,13 @@ class SetpointStream:
     ) -> Setpoint:  # fmt: skip
         """Return the next setpoint; ``source_q`` None: the motion brakes.
 
-        ``goal`` is where the ramp goes: 1 in, 0 out. The setpoint's arrays hold until the next
-        call. Raises LimitError, and StaleStateError where it is later than ``expiry`` (s,
-        monotonic) by now: then nothing has changed and nothing may leave.
+        ``goal`` of the ramp: 1 in, 0 out. The setpoint's arrays are valid until the next call.
+        Raises LimitError, and StaleStateError after ``expiry`` (s, monotonic): then nothing has
+        changed and nothing may be sent.
         """
         gap = state.timestamp - self._last
         if gap < 0.0 and goal == 0.0:
-            # the clock went back, which has ended the motion: what is left goes out step by step
+            # the clock went back, which has ended the motion: the offset ramps out step by step
             gap = self.limiter.limits.cycle
         usable = min(max(gap, 0.0), self._longest_gap)
         stream = self._nominal
@@ -219,7 +219,7 @@ class SetpointStream:
         corrected, offset, n = correction.q, correction.offset_in_base, len(nominal)
         if self.residual < SOLVED:
             self._solved[:n], self._solved[n:] = corrected - nominal, offset
-        else:  # the last one that was solved is ramped out: the loop ends the motion
+        else:  # the last solved one is ramped out: the loop ends the motion
             corrected, offset = nominal + self._solved[:n], self._solved[n:]
         step, before = usable / self._ramp_time, self._share(offset)
         ramp = min(max(goal, before - step), before + step)
@@ -234,9 +234,9 @@ class SetpointStream:
         return Setpoint(limited.q, nominal, limited.offset_in_base)
 
     def _share(self, offset_in_base: Array) -> float:
-        """Return where the ramp is; at a beginning with an offset in force, its share of this one.
+        """Return the ramp (0..1); at a start with an offset in force, that offset's share.
 
-        0..1, by the length of the TCP's shift.
+        The share is by the length of the TCP's translation.
         """
         if not self._resumes:
             return self._ramp
@@ -246,26 +246,26 @@ class SetpointStream:
 
     @property
     def joint_offset(self) -> Array:
-        """Return the joint offset (n,) in the last setpoint, rad: read-only, of this moment."""
+        """Return the joint offset (n,) in the last setpoint, rad: a read-only view."""
         return self.limiter.joint_offset
 
     def reset_solver(self) -> None:
-        """Solve the next correction from nothing: a refused setpoint leaves no trace in it."""
+        """Solve the next correction without a warm start, as after a refused setpoint."""
         self._compensator.forget()
 
     @property
     def ramp_time(self) -> float:
-        """Return the time that ramps take now at least, s."""
+        """Return the shortest time of a ramp, s."""
         return self._ramp_time
 
     @property
-    def is_bare(self) -> bool:
+    def has_no_offset(self) -> bool:
         """Return whether no offset is left."""
         bare = self._ramp == 0.0 and not self._resumes
         return bare and not self.limiter.offset_in_base.any()
 
     def _without_start_gap(self, source_q: Array, gap: float) -> Array:
-        """Return the source's setpoint, led over to from where the arm stood: no first jump."""
+        """Return the source's setpoint with the lead-in from the start joints: no jump."""
         if self._start_gap is None:
             self._start_gap = self._nominal.q - source_q
             self._lead_time = self._time_over(source_q)
@@ -276,27 +276,27 @@ class SetpointStream:
         return source_q + remaining * self._start_gap
 
     def _time_over(self, source_q: Array) -> float:
-        """Return the time (s) from the nominal joints to a source's, slower than an offset changes.
+        """Return the time (s) of the lead-in, slower than the offset's rate limits.
 
-        Where an offset was left in the arm, a source that begins where the arm stands is that far
-        from what was wanted.
+        If an offset remained in the arm, a source that starts at the arm's joints is that far from
+        the nominal joints.
         """
         poses = wanted_pose(self._compensator.model, np.stack([self._nominal.q, source_q]))
         away = float(np.linalg.norm(poses.position[1] - poses.position[0]))
         turn = float(np.linalg.norm(rotation_vector(poses.rotation[0].T @ poses.rotation[1])))
         limits = self.limiter.limits
         mean = max(away / limits.offset_rate, turn / limits.offset_rotation_rate)
-        return STEEPEST / LEADING * mean
+        return PEAK_SLOPE / LEAD_IN_SHARE * mean
 
     @property
-    def rests(self) -> bool:
+    def at_rest(self) -> bool:
         """Return whether no offset is left and the motion has come to rest."""
-        return self.is_bare and self._nominal.rests
+        return self.has_no_offset and self._nominal.at_rest
 
     def shorten_ramp(self, ramp_time: float) -> None:
-        """Ramp within ``ramp_time`` s from now on, where it was to take longer."""
+        """Ramp within ``ramp_time`` s from now on, if it would take longer."""
         self._ramp_time = min(self._ramp_time, ramp_time)
 
     def end(self) -> None:
-        """End the stream; nothing leaves until the next ``start``."""
+        """End the stream; nothing may be sent until the next ``start``."""
         self.limiter.reset()

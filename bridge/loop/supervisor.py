@@ -1,32 +1,18 @@
-"""The states of a run and what leads from one to the other: one explicit table."""
+"""The state machine of the loop: one explicit table of transitions."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from enum import IntEnum, StrEnum
+from enum import StrEnum
 
-
-class State(IntEnum):
-    """What the loop is doing."""
-
-    DISCONNECTED = 0
-    OBSERVING = 1  # reads, computes, records; writes nothing
-    ARMED = 2  # asked to write; waits for the source's first setpoint
-    COMPENSATING = 3  # writes; the offset ramps in and stays
-    HOLDING = 4  # writes; the offset ramps out, the arm comes to rest
-    FAULT = 5  # writes nothing until a person has acknowledged it
-
-    @property
-    def writes(self) -> bool:
-        """Return whether setpoints leave in this state."""
-        return self in (State.COMPENSATING, State.HOLDING)
+from gapbridge.bridge.ipc.loop_state import State
 
 
 class Cause(StrEnum):
-    """Why a state was left."""
+    """The cause of a transition."""
 
     CONNECTED = "connected"
-    LATCHED = "fault latched"  # one that a process of the loop before this one has found
+    LATCHED = "fault latched"  # by a former process of the loop
     ARM = "arm"
     DISARM = "disarm"
     STOP = "stop"
@@ -59,14 +45,14 @@ class Cause(StrEnum):
 _S, _C = State, Cause
 
 STOPS_AT_ONCE = (_C.SILENCE, _C.UNSAFE, _C.WRITE_FAILED, _C.BAD_OUTPUT)
-"""Faults after which nothing more is written, whatever was going on."""
+"""Faults after which nothing more is written, in any state."""
 
 RAMPS_OUT = (
     _C.DISARM, _C.STOP, _C.SOURCE_DRY, _C.SETPOINT_REFUSED, _C.STALE, _C.IMPLAUSIBLE, _C.FROZEN,
     _C.RESYNC, _C.OVERRUN, _C.SATURATED, _C.UNSOLVED, _C.LOAD, _C.NOT_FOLLOWING, _C.MISMATCH,
     _C.FOREIGN, _C.INEFFECTIVE, _C.ZERO_MOVED,
 )  # fmt: skip
-"""Causes that end compensating by way of a ramp."""
+"""Causes that end compensating by a ramp."""
 
 TRANSITIONS: dict[tuple[State, Cause], State] = {
     (_S.DISCONNECTED, _C.CONNECTED): _S.OBSERVING,
@@ -79,7 +65,7 @@ TRANSITIONS: dict[tuple[State, Cause], State] = {
     **{(_S.COMPENSATING, cause): _S.HOLDING for cause in RAMPS_OUT},
     **{(_S.COMPENSATING, cause): _S.FAULT for cause in STOPS_AT_ONCE},
     (_S.HOLDING, _C.RAMPED_OUT): _S.OBSERVING,
-    # what cannot be ramped out must not be written either
+    # if ramping out fails, writing ends
     (_S.HOLDING, _C.SETPOINT_REFUSED): _S.FAULT,
     (_S.HOLDING, _C.FOREIGN): _S.FAULT,
     (_S.HOLDING, _C.INEFFECTIVE): _S.FAULT,
@@ -87,16 +73,16 @@ TRANSITIONS: dict[tuple[State, Cause], State] = {
     (_S.FAULT, _C.ACKNOWLEDGED): _S.OBSERVING,
     **{(s, _C.LINK_LOST): _S.DISCONNECTED for s in State if s},
 }
-"""(state, cause) -> next state. What is not in the table changes nothing.
+"""(state, cause) -> next state. A pair that is not in the table changes nothing.
 
-Only a person's ARM leads to writing; no fault leads back to it. While observing nothing is written,
-so that nothing found then latches: what still lasts when somebody arms is refused there. FAULT is
-left by a person's ACKNOWLEDGED, or with the link.
+Only ARM leads to writing; no fault leads back to it. While observing nothing is written, so that
+no finding latches a fault: arming is refused while it lasts. FAULT ends by ACKNOWLEDGED, which only
+a person can send, or with the link.
 """
 
 CLEARED_BY_RECONNECTING = (_C.SILENCE, _C.WRITE_FAILED, _C.INEFFECTIVE)
-"""Faults of a link. They end with it: its successor begins by observing. All others stay latched
-over a new link and a new process, until a person acknowledges them."""
+"""Faults that end with the link: the next link begins in OBSERVING. All others stay latched, also
+for a new link or process, until a person acknowledges them."""
 
 Listener = Callable[[State, State, Cause, str], None]
 
@@ -109,7 +95,7 @@ class Supervisor:
         self._listener = listener
 
     def take(self, cause: Cause, detail: str = "") -> bool:
-        """Change state as the table says; returns whether it did."""
+        """Change the state as the table says; returns whether it changed."""
         before = self.state
         after = TRANSITIONS.get((before, cause))
         if after is None:
@@ -119,7 +105,7 @@ class Supervisor:
         return True
 
     def follow(self, state: State, cause: Cause) -> bool:
-        """Be in the state that a recording was in; returns whether it is another."""
+        """Take the state of a recording, whatever the table says; returns whether it changed."""
         before, self.state = self.state, state
         if state != before:
             self._listener(before, state, cause, "")
@@ -127,7 +113,7 @@ class Supervisor:
 
 
 def states_table() -> str:
-    """Return the table of transitions in Markdown: what each cause leads to from each state."""
+    """Return the transition table in Markdown: the next state for each cause and state."""
     names = [state.name.lower() for state in State]
     lines = [f"| cause | {' | '.join(names)} |", "| --- " * (len(names) + 1) + "|"]
     for cause in Cause:

@@ -1,7 +1,7 @@
 """Compile the inner loops: ``python -m gapbridge.bridge.loop.warm_up``, once per installation.
 
-Numba keeps what it has compiled beside the sources. Without this, the first command of a new
-installation spends half a minute on it, in the middle of its work.
+Numba caches compiled code next to the sources. Without this, the first command of a new
+installation compiles for half a minute.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ FOUR = np.repeat(Q, 4, axis=0)
 
 
 def warm_up() -> None:
-    """Call each compiled function once: what all need first, then two halves on two cores."""
+    """Call each compiled function once: common ones first, then two halves on two cores."""
     model = _model()
     model.predict(Q).rotation_vector  # noqa: B018 (compiled when asked for)
     model.linear_form(Q)
@@ -41,11 +41,11 @@ def warm_up() -> None:
     other.start()
     _logs()
     other.join()
-    _setpoints()  # of what was compiled there this process has nothing, and nothing if it failed
+    _setpoints()  # loads the other process's cache here; compiles if it failed
 
 
 def _setpoints() -> None:
-    """Call what the live loop needs, and signals in time."""
+    """Call the kernels of the live loop, and of signals in time."""
     model = _model()
     corrected = Compensator(model).correct(Q[0])
     Gate(500.0, model, True)
@@ -66,7 +66,7 @@ def _setpoints() -> None:
 
 
 def _logs() -> None:
-    """Call what logs need: blocks of rows, their Jacobians, rigid dynamics."""
+    """Call the kernels for logs: blocks of rows, their Jacobians, rigid dynamics."""
     model = _model()
     model.predict(FOUR).rotation_vector  # noqa: B018 (compiled when asked for)
     model.linear_form(FOUR)

@@ -1,4 +1,4 @@
-"""The writing half of the loop: begin, send, bring to rest, let go."""
+"""The writing half of the loop: start, send, bring to rest, release."""
 
 from __future__ import annotations
 
@@ -7,12 +7,13 @@ import numpy as np
 from gapbridge.bridge.cell.sections import SetpointSettings
 from gapbridge.bridge.ipc.events import EventKind
 from gapbridge.bridge.ipc.loop_counters import LoopCounter
+from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.ipc.shared_memory import Phase
 from gapbridge.bridge.loop.link_monitor import hold_time
 from gapbridge.bridge.loop.offset_in_force import OffsetInForce
 from gapbridge.bridge.loop.reports import Reports
 from gapbridge.bridge.loop.setpoint_stream import SetpointStream
-from gapbridge.bridge.loop.supervisor import Cause, State, Supervisor
+from gapbridge.bridge.loop.supervisor import Cause, Supervisor
 from gapbridge.bridge.setpoint_source.source import Source, SourceDryError
 from gapbridge.core.arrays import Array
 from gapbridge.core.errors import (
@@ -28,12 +29,12 @@ from gapbridge.core.loads import Loads
 from gapbridge.core.state import RobotState, Setpoint
 from gapbridge.drivers.driver import Driver
 
-SETTLED, LONGEST_SETTLING = 2e-6, 0.3  # rad, s
-PARTS_IN_A_ROW = 3  # setpoints that left in part only, after which the motion is ended
+SETTLED, SETTLING_TIMEOUT = 2e-6, 0.3  # rad from the last setpoint, s until release anyway
+PARTIAL_WRITE_LIMIT = 3  # setpoints in a row sent only in part that end the motion
 
 
 class Writing:
-    """Sends what the states of the supervisor allow, and nothing else."""
+    """Sends setpoints in the states of the supervisor that allow it."""
 
     def __init__(
         self,
@@ -50,32 +51,32 @@ class Writing:
         self._stream, self._supervisor, self._reports = stream, supervisor, reports
         self._in_force = in_force or OffsetInForce(driver.n, None)
         self.ready = False  # the driver is armed
-        self.has_armed = False  # it was, at some time in this process
-        self.unsent: Setpoint | None = None  # computed in the last cycle, and not (wholly) sent
-        self.ramps_out = False  # the last one's offset was to go
-        self.lost: str | None = None  # why the link must be given up
-        self._paused = False  # see ``paused``
-        self._failed = 0  # setpoints in a row that left in part only
-        self._settling = 0.0  # s, monotonic: since when the last setpoint stands
+        self.has_armed = False  # the driver has been armed in this process
+        self.unsent: Setpoint | None = None  # computed in the last cycle, not (completely) sent
+        self.ramps_out = False  # the last setpoint's offset was ramping out
+        self.lost: str | None = None  # why the link is lost
+        self._paused = False  # see ``take_paused``
+        self._failed = 0  # setpoints in a row sent only in part
+        self._settling = 0.0  # s, monotonic: since when the setpoint is at rest
 
-    def paused(self) -> bool:
-        """Return, once, whether arming or letting go kept the loop from looking at states."""
+    def take_paused(self) -> bool:
+        """Return, once, whether arming or releasing kept the loop from reading states."""
         paused, self._paused = self._paused, False
         return paused
 
     @property
     def transit_time(self) -> float:
-        """Return how long the last sample may have been under way, s: as measured when arming."""
-        return self._driver.way() if self.ready else 0.0
+        """Return the bound of the last sample's transit time, s; see Driver.transit_time."""
+        return self._driver.transit_time() if self.ready else 0.0
 
     def abandon(self) -> None:
-        """Take note that the driver is not armed any more: its watchdog, or a person, has it."""
+        """Record that the driver is not armed any more: the robot has stopped by itself."""
         self.ready = False
 
     def start(self, state: RobotState, nominal_q: Array) -> bool:
-        """Begin writing once the source has a first setpoint and the driver is ready.
+        """Start writing once the source has a first setpoint and the driver is ready.
 
-        Returns whether it took so long that a fresh state is needed.
+        Returns whether a fresh state is needed, because it took too long.
         """
         first = self._source.first(nominal_q)
         if first is None:
@@ -108,7 +109,7 @@ class Writing:
         return False
 
     def _arm_driver(self, state: RobotState) -> None:
-        """Make the driver ready, which takes a moment: a fresh state is needed after it."""
+        """Arm the driver; a fresh state is needed afterwards. Raises WriteError."""
         self._reports.memory.enter(Phase.ARMING)
         self.has_armed = True
         try:
@@ -122,9 +123,9 @@ class Writing:
             self._paused = True
 
     def _check_round_trip(self) -> None:
-        """Refuse a link on which no state can be fresh. Raises WriteError."""
+        """Raise WriteError if the round trip is too long for fresh states."""
         round_trip, rate = self._driver.round_trip(), self._driver.rate
-        most = hold_time(rate) - 1.0 / rate  # a setpoint leaves within a cycle
+        most = hold_time(rate) - 1.0 / rate  # a setpoint is sent within a cycle
         if round_trip is not None and round_trip > most:
             raise WriteError(
                 f"link: a question and its answer take {1e3 * round_trip:.0f} ms, expected at most "
@@ -138,20 +139,20 @@ class Writing:
     def write(
         self, state: RobotState, nominal_q: Array, loads: Loads, expiry: float = np.inf
     ) -> Setpoint | None:
-        """Send one setpoint; returns it, or None where none has left.
+        """Send one setpoint; returns it, or None if none was sent.
 
-        ``expiry`` (s, monotonic): later than that nothing may leave that is made of this state.
+        ``expiry`` (s, monotonic): after it no setpoint from this state may be sent.
         """
         stream, self.unsent = self._stream, None
         self.ramps_out = self._supervisor.state == State.HOLDING
         if self._now() > expiry:
             stream.reset_solver()
             return None
-        source_q = self._next(state, nominal_q)
+        source_q = self._next_setpoint(state, nominal_q)
         self.ramps_out = self._supervisor.state == State.HOLDING
         goal = 0.0 if self.ramps_out else 1.0
         try:
-            self._driver.keep_alive()  # may wait for the robot: before the state's age is judged
+            self._driver.keep_alive()  # may block: before the state's age is checked
             expiry = min(expiry, self._driver.unanswered_since() + self._hold)
             setpoint = stream.advance(state, source_q, loads, goal, expiry)
         except StaleStateError:
@@ -160,96 +161,96 @@ class Writing:
             return None
         except WriteError as error:
             stream.reset_solver()
-            self._fail(error)
+            self._on_write_error(error)
             return None
         except LimitError as error:
             stream.reset_solver()
-            self._end(LoopCounter.SETPOINT_REFUSED, Cause.SETPOINT_REFUSED, str(error))
+            self._end_motion(LoopCounter.SETPOINT_REFUSED, Cause.SETPOINT_REFUSED, str(error))
             return None
         try:
             if not stream.finite:
                 self.unsent = _copied(setpoint)
                 detail = "the model's correction is no number"
-                self._end(LoopCounter.BAD_OUTPUT, Cause.BAD_OUTPUT, detail)
-            elif self._now() > expiry:  # the system stopped this process since it was judged
+                self._end_motion(LoopCounter.BAD_OUTPUT, Cause.BAD_OUTPUT, detail)
+            elif self._now() > expiry:  # the system suspended this process since the check
                 self.unsent = _copied(setpoint)
                 self._reports.count(LoopCounter.LATE)
             else:
                 self._driver.write_setpoint(setpoint)
                 self._in_force.note(setpoint.q, stream.joint_offset, setpoint.offset_in_base)
                 self._failed = 0
-                self._judge_correction()
-                self._judge_sending(expiry)
+                self._check_solved()
+                self._check_late(expiry)
                 return setpoint
         except WriteError as error:
             self.unsent = _copied(setpoint)
-            self._fail(error)
+            self._on_write_error(error)
         return None
 
-    def _judge_correction(self) -> None:
-        """End the motion where the model has no correction; the offset is on its way out."""
+    def _check_solved(self) -> None:
+        """End the motion if the model has no correction; the offset ramps out."""
         detail = self._stream.unsolved
         if detail and self._supervisor.take(Cause.UNSOLVED, detail):
             self._reports.count(LoopCounter.UNSOLVED)
 
-    def _judge_sending(self, expiry: float) -> None:
-        """End the motion where the system stopped this process between judging and sending."""
+    def _check_late(self, expiry: float) -> None:
+        """End the motion if the system suspended this process between check and sending."""
         late = self._now() - expiry
         if late > 0.0:
             detail = f"a setpoint left {1e3 * late:.0f} ms after its state was too old"
             self._reports.count(LoopCounter.OVERRUN)
             self._supervisor.take(Cause.OVERRUN, detail)
 
-    def _fail(self, error: WriteError) -> None:
+    def _on_write_error(self, error: WriteError) -> None:
         """Act on a setpoint that could not be delivered."""
         if isinstance(error, GateError):
-            self._end(LoopCounter.SETPOINT_REFUSED, Cause.SETPOINT_REFUSED, str(error))
+            self._end_motion(LoopCounter.SETPOINT_REFUSED, Cause.SETPOINT_REFUSED, str(error))
         elif isinstance(error, PartialWriteError):
-            self._repeat(str(error))
+            self._on_partial_write(str(error))
         elif isinstance(error, IneffectiveWriteError):
-            self._end(LoopCounter.WRITE_INEFFECTIVE, Cause.INEFFECTIVE, str(error))
+            self._end_motion(LoopCounter.WRITE_INEFFECTIVE, Cause.INEFFECTIVE, str(error))
         elif isinstance(error, ForeignCommandError):
-            self._end(LoopCounter.FOREIGN, Cause.FOREIGN, str(error))
+            self._end_motion(LoopCounter.FOREIGN, Cause.FOREIGN, str(error))
         else:
             self._reports.count(LoopCounter.WRITE_FAILED)
             self._supervisor.take(Cause.WRITE_FAILED, str(error))
             self.ready = False
             self.lost = str(error)
 
-    def _repeat(self, detail: str) -> None:
-        """Leave it to the next cycle, whose setpoint goes out whole; after some, end the motion."""
+    def _on_partial_write(self, detail: str) -> None:
+        """Leave it to the next cycle's setpoint; after PARTIAL_WRITE_LIMIT, end the motion."""
         self._reports.count(LoopCounter.WRITE_PARTIAL)
         self._failed += 1
-        if self._failed >= PARTS_IN_A_ROW:
+        if self._failed >= PARTIAL_WRITE_LIMIT:
             self._failed = 0
-            self._end(LoopCounter.WRITE_INEFFECTIVE, Cause.INEFFECTIVE, detail)
+            self._end_motion(LoopCounter.WRITE_INEFFECTIVE, Cause.INEFFECTIVE, detail)
 
-    def _end(self, what: LoopCounter, cause: Cause, detail: str) -> None:
-        """End the motion as the table says; let go where it says that nothing more is written."""
+    def _end_motion(self, what: LoopCounter, cause: Cause, detail: str) -> None:
+        """End the motion as the transition table says; release if no more may be written."""
         self._reports.count(what)
         self._supervisor.take(cause, detail)
         if not self._supervisor.state.writes:
             self.release()
 
     def at_rest(self, setpoint: Setpoint, state: RobotState) -> bool:
-        """Return whether the offset is out, and the arm, where it is ours, stands.
+        """Return whether the offset is zero and, if setpoints move the arm, the arm is at rest.
 
-        The controller's target follows late: who lets go at once leaves the arm short of it.
+        The controller's target lags: an early release would stop the arm short of the setpoint.
         """
         if not self._driver.moves_arm:
-            return self._stream.is_bare
-        if not self._stream.rests:
+            return self._stream.has_no_offset
+        if not self._stream.at_rest:
             return False
         now = self._now()
         self._settling = self._settling or now
         near = bool((np.abs(state.target_q - setpoint.q) < SETTLED).all())
-        if near or now - self._settling > LONGEST_SETTLING:
+        if near or now - self._settling > SETTLING_TIMEOUT:
             self._settling = 0.0
             return True
         return False
 
-    def _next(self, state: RobotState, nominal_q: Array) -> Array | None:
-        """Return the source's setpoint; None: the motion must brake."""
+    def _next_setpoint(self, state: RobotState, nominal_q: Array) -> Array | None:
+        """Return the source's setpoint (n,) rad; None: the motion must brake."""
         if self._supervisor.state == State.HOLDING:
             return None if self._driver.moves_arm else nominal_q
         try:
@@ -265,7 +266,7 @@ class Writing:
         return source_q
 
     def release(self) -> None:
-        """Leave the robot to itself; the arm has come to rest, or its watchdog stops it."""
+        """Release the driver; the arm is at rest, or the robot's watchdog stops it."""
         self._stream.end()
         if not self.ready:
             return
@@ -280,7 +281,7 @@ class Writing:
 
 
 def _copied(setpoint: Setpoint) -> Setpoint:
-    """Return a setpoint whose arrays stay, whatever the limiter does next."""
+    """Return a setpoint with copies of its arrays, which the limiter reuses."""
     return setpoint._replace(
         q=setpoint.q.copy(),
         nominal_q=setpoint.nominal_q.copy(),

@@ -1,1 +1,1 @@
-"""Metrics for Prometheus: a process of its own that counts what the daemon does."""
+"""Metrics for Prometheus: a side process that counts what the daemon does."""

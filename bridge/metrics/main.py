@@ -1,8 +1,7 @@
 """The metrics' process: ``python -m gapbridge.bridge.metrics.main``, started by the daemon.
 
-It reads along as the status page does, and answers Prometheus at /metrics.
-
-Names, units and help are by Prometheus' conventions.
+It reads shared memory and events, and answers Prometheus at /metrics. Names, units and help texts
+follow Prometheus' conventions.
 """
 
 from __future__ import annotations
@@ -34,9 +33,9 @@ from gapbridge.bridge.cell.daemon_settings import DaemonSettings
 from gapbridge.bridge.cell.updated_settings import UpdatedSettings
 from gapbridge.bridge.ipc.events import EventKind
 from gapbridge.bridge.ipc.loop_counters import DROPPED
+from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.ipc.shared_memory import SharedMemory
 from gapbridge.bridge.ipc.side_main import StartData, run_side
-from gapbridge.bridge.loop.supervisor import State
 from gapbridge.bridge.served.credentials import read_token
 from gapbridge.bridge.served.guard import Guard
 from gapbridge.bridge.served.server import serve
@@ -45,7 +44,7 @@ from gapbridge.core.limits import CLAMPS
 
 AGE_BOUNDS = (0.00025, 0.0005, 0.001, 0.002, 0.004, 0.008, 0.016, 0.032, 0.064, 0.128)  # s
 WORK_BOUNDS = (0.00005, 0.0001, 0.0002, 0.0004, 0.0008, 0.0016, 0.0032, 0.0064, 0.0128)  # s
-TURN = 0.25  # s between two looks at the shared memory
+POLL_EVERY = 0.25  # s between two readings of the shared memory
 TEXT = "text/plain; version=0.0.4; charset=utf-8"
 AXES = ("x", "y", "z")
 
@@ -59,7 +58,7 @@ class Buckets:
         self.sum = 0.0
 
     def add(self, values: Array) -> None:
-        """Count values (k,); what is no number is left out."""
+        """Count values (k,), s, except NaN."""
         values = values[np.isfinite(values)]
         places = np.searchsorted(self.bounds, values)
         self._counts += np.bincount(places, minlength=len(self._counts))
@@ -72,7 +71,7 @@ class Buckets:
 
 
 class Counts:
-    """Everything that is counted since this process began to read, and the last of what changes."""
+    """Counts since this process started, and the latest values."""
 
     def __init__(
         self, memory: SharedMemory, settings: DaemonSettings, text: str | None = None
@@ -94,7 +93,7 @@ class Counts:
 
     @property
     def settings(self) -> DaemonSettings:
-        """Return the settings of the run by now."""
+        """Return the present settings of the run."""
         return self._updated.settings
 
     @property
@@ -102,8 +101,8 @@ class Counts:
         """Return s since the last state of the robot; infinite before the first."""
         return time.monotonic() - self.received if self.received else float("inf")
 
-    def turn(self, events: list[dict[str, Any]]) -> None:
-        """Take what has come."""
+    def update(self, events: list[dict[str, Any]]) -> None:
+        """Process new events and cycles."""
         for event in events:
             self._on_event(event)
         rows, s = self.reader.drain(), self._slices
@@ -137,12 +136,12 @@ class Counts:
         if "to" in event:
             to, cause = str(event["to"]).lower(), str(event.get("cause", ""))
             self.transitions[to, cause] += 1
-            if to == "fault":
+            if to == State.FAULT.name.lower():
                 self.faults[cause] += 1
 
 
 def run(start: StartData) -> None:
-    """Serve metrics until the daemon is gone. Raises LinkError, InputError."""
+    """Serve metrics until the daemon has ended. Raises LinkError, InputError."""
     settings = start.settings.metrics
     assert settings is not None
     path = settings.token_file
@@ -151,14 +150,14 @@ def run(start: StartData) -> None:
     registry = CollectorRegistry(auto_describe=False)
 
     async def metrics(request: Request) -> Response:
-        counts.turn(start.events.poll())
+        counts.update(start.events.poll())
         return Response(generate_latest(registry), media_type=TEXT)
 
     guard = Guard(Starlette(routes=[Route("/metrics", metrics)]), settings, token)
     registry.register(Families(start.session, counts, guard.refused))
     serve(
         guard, settings, "metrics", lambda: start.events.closed,
-        lambda: counts.turn(start.events.poll()), TURN,
+        lambda: counts.update(start.events.poll()), POLL_EVERY,
     )  # fmt: skip
 
 
@@ -208,19 +207,19 @@ class Families(Collector):
             ("cycles", "Cycles of the controller that were seen.", counts.cycles),
             ("missed_cycles", "Cycles of the controller that were not seen.", counts.missed),
             ("late_cycles", "Cycles finished later than a period after their state.", counts.late),
-            ("setpoints_written", "Setpoints that left for the robot.", counts.written),
+            ("setpoints_written", "Setpoints sent to the robot.", counts.written),
             ("uncounted_cycles", "Cycles overwritten before they could be counted.", lost),
         ):
             yield CounterMetricFamily(f"gapbridge_{name}", message, float(value))
         yield _counter(
-            "gapbridge_setpoints_clamped", "Setpoints that a limit held back.", counts.clamped,
+            "gapbridge_setpoints_clamped", "Setpoints clamped by a limit.", counts.clamped,
             "limit",
         )  # fmt: skip
         rate = counts.settings.link.rate
         for name, message, number in (
-            ("link_rate_hertz", "Cycles a second that the link is to have.", rate),
+            ("link_rate_hertz", "Nominal cycles per second of the link.", rate),
             ("link_silence_seconds", "Time since the last state of the robot.", counts.silence),
-            ("loop_heartbeat_age_seconds", "Time since the loop's last sign of life.",
+            ("loop_heartbeat_age_seconds", "Time since the loop's last heartbeat.",
              counts.memory.silence),
         ):  # fmt: skip
             yield GaugeMetricFamily(f"gapbridge_{name}", message, number)
@@ -233,7 +232,7 @@ class Families(Collector):
             counts.age,
         )
         yield _histogram(
-            "gapbridge_loop_duration_seconds", "From seeing a state to having written.", counts.work
+            "gapbridge_loop_duration_seconds", "From receiving a state to writing.", counts.work
         )
 
     def _offset(self) -> Iterator[Metric]:
@@ -252,11 +251,11 @@ class Families(Collector):
         yield offset
         yield rotation
         yield GaugeMetricFamily(
-            "gapbridge_offset_limit_meters", "Longest offset that may leave.", limits.offset
+            "gapbridge_offset_limit_meters", "Longest offset that may be sent.", limits.offset
         )
         yield GaugeMetricFamily(
             "gapbridge_offset_rotation_limit_radians",
-            "Largest rotation of an offset that may leave.",
+            "Largest rotation of an offset that may be sent.",
             limits.offset_rotation,
         )
 
@@ -276,10 +275,8 @@ class Families(Collector):
             for reason, count in DROPPED.items()
             if count.label in reported
         }
-        yield _counter(
-            "gapbridge_dropped_samples", "Samples that could not be believed.", dropped, "reason"
-        )
-        yield _counter("gapbridge_incidents", "What the loop met with, by kind.", reported, "kind")
+        yield _counter("gapbridge_dropped_samples", "Implausible samples.", dropped, "reason")
+        yield _counter("gapbridge_incidents", "What the loop counted, by kind.", reported, "kind")
 
     def _processes(self) -> Iterator[Metric]:
         status = self._counts.status
@@ -331,7 +328,7 @@ def _histogram(name: str, message: str, buckets: Buckets) -> Metric:
 
 
 def _numbers(part: Any) -> dict[str, float]:
-    """Return what of a document's part are numbers."""
+    """Return the finite numbers of a part of a document."""
     if not isinstance(part, Mapping):
         return {}
     return {

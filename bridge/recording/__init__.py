@@ -1,1 +1,1 @@
-"""The recorder: a process of its own that writes what the daemon does into MCAP files."""
+"""The recorder: a side process that writes cycles and events into MCAP files."""

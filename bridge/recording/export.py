@@ -1,4 +1,4 @@
-"""From a recording to a log: a log's columns, and what the daemon made of them beside."""
+"""From a recording to a log: the log's columns, and the daemon's results as further columns."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ GROUP = 20_000  # rows of a Parquet row group at least
 
 @dataclass
 class Exported:
-    """What was exported."""
+    """The result of an export."""
 
     rows: int = 0
-    gaps: int = 0  # cycles that the recording lacks between its first and its last
+    gaps: int = 0  # cycles missing between the first and the last
     back: int | None = None  # row (from 0) at which the controller's clock goes back
     first: float | None = None  # s since 1970
     last: float | None = None
@@ -40,7 +40,7 @@ class Exported:
     _timestamp: float = -np.inf
 
     def take(self, batch: Batch, every: int) -> None:
-        """Count a batch."""
+        """Add a batch to the counts."""
         numbers, times = batch.columns["number"], batch.columns["timestamp"]
         before = numbers[0] - every if self._number is None else self._number
         steps = np.diff(numbers, prepend=before)
@@ -61,16 +61,16 @@ class Exported:
 
 @dataclass(frozen=True)
 class Span:
-    """A stretch of a recording: bounds as ``moment`` reads them, None = open."""
+    """A time span of a recording: bounds as ``moment`` reads them, None = open."""
 
     start: float | datetime | None = None
     stop: float | datetime | None = None
 
 
 def moment(text: str) -> float | datetime:
-    """Return a bound of a stretch: s from the beginning (negative: from the end), or a time.
+    """Return a bound of a span: s from the beginning (negative: from the end), or a time.
 
-    Raises InputError where it is neither.
+    Raises InputError if it is neither.
     """
     with contextlib.suppress(ValueError):
         if math.isfinite(seconds := float(text)):
@@ -87,9 +87,8 @@ def moment(text: str) -> float | datetime:
 def export(recording: Path, out: Path, span: Span | None = None) -> Exported:
     """Write a recording's cycles as a log: CSV, or Parquet where the suffix of ``out`` says so.
 
-    Columns that no cycle carries are left out. A recording that was cut off is finished on the way,
-    where its folder can be written to. Raises LogError where the recording cannot be used
-    or holds no cycle of the stretch.
+    Columns without values are left out. A recording that was cut off is finished, if its folder can
+    be written to. Raises LogError if the recording cannot be used or has no cycle in the span.
     """
     finish_recording(recording)
     first, last = _bounds(recording, span or Span())
@@ -125,7 +124,7 @@ def _within(recording: Path, first: int, last: int) -> Iterator[Batch]:
 
 
 def _bounds(recording: Path, span: Span) -> tuple[int, int]:
-    """Return a stretch as ns since 1970."""
+    """Return a span as ns since 1970."""
     begin, end = None, 0
     if isinstance(span.start, float) or isinstance(span.stop, float):
         for batch in read_batches(recording):
@@ -144,7 +143,7 @@ def _bounds(recording: Path, span: Span) -> tuple[int, int]:
 
 
 def _columns_of(recording: Path, first: int, last: int) -> list[str]:
-    """Return the columns that some cycle carries, in the log's order."""
+    """Return the columns with values, in the log's order."""
     carried: set[str] = set()
     empty = True
     for batch in _within(recording, first, last):
@@ -176,7 +175,7 @@ def _state(batch: Batch, value: float) -> str:
 
 
 class _Csv:
-    """Rows of CSV, numbers as short as they read back exactly."""
+    """Writes rows of CSV; numbers read back exactly."""
 
     def __init__(self, file: Any) -> None:
         self._file = file
@@ -199,7 +198,7 @@ class _Csv:
 
 
 class _Parquet:
-    """Row groups of a Parquet file."""
+    """Writes row groups of a Parquet file."""
 
     def __init__(self, file: Any) -> None:
         self._file = file

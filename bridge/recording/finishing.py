@@ -1,7 +1,7 @@
-"""Finishing a recording that was cut off: the summary of what is whole, as its writer would have.
+"""Finishing a recording that was cut off: writing the summary of its complete records.
 
-A recorder that was killed leaves whole chunks and no summary; readers that seek cannot open such a
-file. What lies behind the last whole record is cut off. Format: the MCAP specification.
+A recorder that was killed leaves complete chunks and no summary; readers that seek cannot open such
+a file. Data after the last complete record is removed. Format: the MCAP specification.
 """
 
 from __future__ import annotations
@@ -42,21 +42,21 @@ FOOTER_SIZE = 20
 
 @dataclass
 class _Whole:
-    """What is whole in a file, record by record."""
+    """The complete records of a file."""
 
     schemas: dict[int, Schema] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
     chunks: list[ChunkIndex] = field(default_factory=list)
     counts: dict[int, int] = field(default_factory=dict)  # messages by channel
-    end: int = 0  # bytes of the file that stay
+    end: int = 0  # bytes of the file that are kept
     last: dict[int, MessageIndex] = field(default_factory=dict)  # of the last chunk
-    torn: bool = False  # the last chunk's indexes are written anew behind it
+    torn: bool = False  # the last chunk's indexes must be written again
     _chunk: ChunkIndex | None = None  # the last one, its indexes not read yet
-    _indexed: dict[int, int] = field(default_factory=dict)  # where these stand
+    _indexed: dict[int, int] = field(default_factory=dict)  # channel -> offset of its index
     _index_length: int = 0
 
     def take(self, file: IO[bytes], code: int, offset: int, length: int) -> bool:
-        """Take a record over; returns False for a broken chunk, behind which all is lost."""
+        """Add a record; returns False for a broken chunk, after which nothing can be read."""
         if code == Opcode.CHUNK:
             unpacked = records.unpacked(file, offset, length)
             if unpacked is None:
@@ -75,7 +75,7 @@ class _Whole:
         return True
 
     def finish(self) -> None:
-        """End with the last chunk; its indexes go where they are not whole."""
+        """End with the last chunk; incomplete indexes are dropped."""
         self.torn = self._chunk is not None and set(self._indexed) != set(self.last)
         if self._chunk is not None and self.torn:
             self.end = self._chunk.chunk_start_offset + self._chunk.chunk_length
@@ -109,8 +109,8 @@ class _Whole:
 def finish(path: Path) -> bool:
     """Write the summary of a file that has none; returns whether it lacked one and got it.
 
-    A file that somebody is writing stays as it is. Raises OSError where it cannot be written,
-    LogError where it is no MCAP file.
+    A file that is being written is left unchanged. Raises OSError if it cannot be written, LogError
+    if it is not an MCAP file.
     """
     if records.is_whole(path):
         return False
@@ -134,9 +134,9 @@ def finish(path: Path) -> bool:
 
 
 def finish_recording(recording: Path) -> list[Path]:
-    """Finish the files of a recording that can be; returns them. Raises LogError for no recording.
+    """Finish the files of a recording; returns those finished. Raises LogError for no recording.
 
-    A file in a folder that cannot be written to stays as it is: it can be read all the same.
+    A file in a read-only folder is left unchanged: it can be read all the same.
     """
     return [path for path in files_of(recording) if _finished(path)]
 
@@ -159,7 +159,7 @@ def _finished(path: Path) -> bool:
 
 
 def _scan(file: IO[bytes], path: Path) -> _Whole:
-    """Return what is whole, up to the first record that is not."""
+    """Return the complete records, up to the first incomplete one."""
     whole = _Whole()
     for code, offset, length in records.all_records(file, path):
         if not whole.take(file, code, offset, length):
@@ -178,7 +178,7 @@ def _index(chunk: Chunk, offset: int, length: int) -> ChunkIndex:
 
 
 def _tail(whole: _Whole) -> bytes:
-    """Return what comes behind what is whole: indexes that were torn, summary, footer, magic."""
+    """Return the bytes after the complete records: missing indexes, summary, footer, magic."""
     data = RecordBuilder()
     chunks = whole.chunks
     if whole.torn:

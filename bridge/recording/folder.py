@@ -1,4 +1,4 @@
-"""The folder of recordings: which file comes next, where a run goes on, which files may go."""
+"""The folder of recordings: names of files, where a run continues, which files are removed."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ MB = 1e6
 
 
 def new_session(folder: Path | None) -> str:
-    """Return a name for a run that begins now, run-YYYYmmdd-HHMMSS, not taken in the folder."""
+    """Return an unused name for a run that begins now, run-YYYYmmdd-HHMMSS."""
     stem, number = time.strftime("run-%Y%m%d-%H%M%S"), 1
     name = stem
     while folder is not None and _is_taken(folder, name):
@@ -49,7 +49,7 @@ def next_path(folder: Path, session: str) -> Path:
 
 
 def number_after(path: Path) -> int:
-    """Return the number of the first cycle behind the last one of a file; 0 where it has none."""
+    """Return the number after a file's last cycle; 0 if it has none."""
     batch = last_batch(path)
     return 0 if batch is None else int(batch.columns["number"].max()) + 1
 
@@ -57,8 +57,8 @@ def number_after(path: Path) -> int:
 def prune(folder: Path, session: str, keep_total: float | None) -> list[Path]:
     """Remove the oldest files until recordings take no more than ``keep_total`` MB; return them.
 
-    Files of other runs go first, then this run's own oldest. Only names that a recorder gives are
-    touched. Raises nothing: what cannot be removed stays.
+    Files of other runs are removed first, then this run's oldest. Only files named by a recorder
+    are removed. Raises nothing: files that cannot be removed are kept.
     """
     if keep_total is None:
         return []

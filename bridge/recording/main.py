@@ -1,7 +1,7 @@
 """The recorder's process: ``python -m gapbridge.bridge.recording.main``, started by the daemon.
 
-It reads along in the shared memory and can be stalled, killed and started anew without the loop
-noticing. It outlives a daemon that was killed for as long as the loop still ramps out.
+It reads the shared memory and can be stalled, killed and restarted without any effect on the loop.
+If the daemon is killed, it goes on recording until the loop has ramped out.
 """
 
 from __future__ import annotations
@@ -15,20 +15,21 @@ from typing import Any
 
 import yaml
 
+from gapbridge.bridge.ipc.events import EventKind
 from gapbridge.bridge.ipc.side_main import StartData, read_start_data
 from gapbridge.bridge.recording.recorder import Recorder
 from gapbridge.drivers.clock import SYSTEM
 
 LOOK_EVERY = 0.1  # s
-QUIET = 0.6  # s without a heartbeat of the loop after which a lost daemon's run is over
-LONGEST_FAREWELL = 4.0  # s: then the process is ended by force
+HEARTBEAT_TIMEOUT = 0.6  # s without a heartbeat of the loop: the run of a lost daemon is over
+LONGEST_REMAINDER = 4.0  # s for which a recorder without a daemon goes on at most
 HIDDEN = "REDACTED"
 _SECRET = re.compile(r"token|password|passwd|passphrase|secret|credential|api_?key", re.I)
 
 
 def main() -> None:
     """Record until the daemon has ended."""
-    # a service manager ends all processes at once; this one ends when it has everything
+    # a service manager signals all processes at once; this one ends after the last cycle
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, signal.SIG_IGN)
     start = read_start_data()
@@ -42,33 +43,32 @@ def main() -> None:
 
 
 def _follow(start: StartData, recorder: Recorder) -> bool:
-    """Record while the daemon is there; returns whether it ended in order."""
+    """Record while the daemon runs; returns whether it sent its end event."""
     ended = False
     while not start.events.closed:
         start.events.wait(LOOK_EVERY)
-        SYSTEM.sleep(LOOK_EVERY / 2)  # events may come in crowds; cycles wait in the ring
+        SYSTEM.sleep(LOOK_EVERY / 2)  # events come in bursts; cycles wait in the ring
         for event in start.events.poll():
             recorder.take(event)
-            ended |= event.get("kind") == "ended"
-            if event.get("kind") == "configuration":
+            ended |= event.get("kind") == EventKind.ENDED
+            if event.get("kind") == EventKind.CONFIGURATION:
                 recorder.change_configuration(_configuration(start, event))
         recorder.step()
     return ended
 
 
 def _record_remaining(start: StartData, recorder: Recorder) -> None:
-    """Record on until the loop, which has lost its daemon, has stopped too."""
-    until = SYSTEM.monotonic() + LONGEST_FAREWELL
-    recorder.take(
-        {"time": SYSTEM.time(), "kind": "recorder", "detail": "the daemon is gone without an end"}
-    )
-    while start.memory.silence < QUIET and SYSTEM.monotonic() < until:
+    """Go on recording until the loop, which has lost its daemon, has stopped too."""
+    until = SYSTEM.monotonic() + LONGEST_REMAINDER
+    detail = "the daemon is gone without an end"
+    recorder.take({"time": SYSTEM.time(), "kind": EventKind.RECORDER, "detail": detail})
+    while start.memory.silence < HEARTBEAT_TIMEOUT and SYSTEM.monotonic() < until:
         recorder.step()
         SYSTEM.sleep(LOOK_EVERY)
 
 
 def _configuration(start: StartData, event: dict[str, Any] | None = None) -> dict[str, Any]:
-    """Return what the run is made of, without secrets."""
+    """Return program, cell file and driver of the run, without secrets."""
     cell = start.settings.cell
     content = _text_of(cell, (event or start.extra).get("text"))
     return {
@@ -82,7 +82,7 @@ def _configuration(start: StartData, event: dict[str, Any] | None = None) -> dic
 
 
 def _text_of(cell: Path, text: object) -> bytes:
-    """Return the cell file's bytes: what the daemon has read, where it says so."""
+    """Return the cell file's bytes: ``text`` as the daemon has read it, else the file's."""
     if isinstance(text, str):
         return text.encode()
     try:
@@ -101,37 +101,37 @@ def _version() -> str:
 def redacted(text: str) -> str:
     """Return the text of a cell file without the values of keys that hold secrets.
 
-    A key holds one where its name says so: token, password, secret, credential, api_key, ... A
-    path to a file that holds the secret is no secret: keys that end in ``_file`` stay. Text that
-    is no YAML is hidden as a whole.
+    A key holds a secret if its name does: token, password, secret, credential, api_key, ... The
+    path of a file is no secret: keys that end in ``_file`` stay. Text that is not YAML is hidden as
+    a whole.
     """
     try:
         root = yaml.compose(text, yaml.SafeLoader)
     except yaml.YAMLError:
         return HIDDEN
     spans: set[tuple[int, int]] = set()
-    _find(root, spans, set())
+    _find_secrets(root, spans, set())
     for start, end in sorted(spans, reverse=True):
         tail = text[start:end]
         text = text[:start] + HIDDEN + tail[len(tail.rstrip()) :] + text[end:]
     return text
 
 
-def _find(node: yaml.Node | None, spans: set[tuple[int, int]], visited: set[int]) -> None:
-    """Collect where the values of secret keys stand."""
+def _find_secrets(node: yaml.Node | None, spans: set[tuple[int, int]], visited: set[int]) -> None:
+    """Collect the spans (start, end) of the values of secret keys."""
     if not isinstance(node, yaml.CollectionNode) or id(node) in visited:
         return
     visited.add(id(node))
     for item in node.value:
         if isinstance(item, yaml.Node):
-            _find(item, spans, visited)
+            _find_secrets(item, spans, visited)
             continue
         key, value = item
         name = str(key.value)
         if _SECRET.search(name) and not name.lower().endswith("_file"):
             spans.add((value.start_mark.index, value.end_mark.index))
         else:
-            _find(value, spans, visited)
+            _find_secrets(value, spans, visited)
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
-"""The recorder: from the shared memory into files, whatever happens to the disk or to itself.
+"""The recorder: writes cycles from the shared memory into files and survives failures of the disk.
 
-What counts is the number of the last cycle that a whole flush has written. After a failure, or in a
-new process, reading goes on behind it as long as the ring still holds what comes next; what it no
-longer holds is counted and reported.
+It keeps the number of the last cycle that a complete flush has written. After a failure, or in a
+new process, it goes on with the next cycle if the ring still holds it; cycles that were overwritten
+are counted and reported as lost.
 """
 
 from __future__ import annotations
@@ -17,8 +17,9 @@ from typing import Any
 
 from gapbridge.bridge.cell.settings.recording import RecordingSettings
 from gapbridge.bridge.document.output_file import make_folder
+from gapbridge.bridge.ipc.events import EventKind
+from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.ipc.shared_memory import SharedMemory
-from gapbridge.bridge.loop.supervisor import State
 from gapbridge.bridge.recording.finishing import finish, unfinished
 from gapbridge.bridge.recording.folder import next_path, number_after, prune, segments
 from gapbridge.bridge.recording.segment import Segment
@@ -27,7 +28,7 @@ from gapbridge.core.log.mcap_schema import CONFIGURATION, EVENTS, LOG, STATUS
 from gapbridge.drivers.clock import SYSTEM, Clock
 
 FLUSH_EVERY = 0.4  # s
-RETRY_EVERY = 2.0  # s after which a disk that refused is tried again
+RETRY_EVERY = 2.0  # s between attempts while the disk cannot be written to
 MOST_EVENTS = 10_000  # kept while nothing can be written
 MB = 1e6
 
@@ -38,7 +39,7 @@ _PLAIN = ("time", "monotonic", "sequence", "kind", "cycle")
 
 
 class Recorder:
-    """Records one run. ``step`` is called some ten times a second; it never raises for the disk.
+    """Records one run. ``step`` is called about ten times a second and never raises OSError.
 
     ``configuration`` is the document that every file begins with; ``emit`` takes events of the
     recorder's own (kind "recorder").
@@ -63,14 +64,14 @@ class Recorder:
         self._events: deque[Event] = deque(maxlen=MOST_EVENTS)  # not yet flushed
         self._flushed = self._clock.monotonic()
         self._retry_at = 0.0
-        self._why_paused = ""
-        self.lost = 0  # cycles of this process's time that no file holds
-        self._next = self._resume()  # number of the first cycle that no whole flush holds
+        self._pause_reason = ""
+        self.lost = 0  # cycles since this process began that no file holds
+        self._next = self._resume()  # number of the first cycle that is in no complete flush
         self._reader = memory.reader(self._next)
         self._cut_off = unfinished(self._folder)  # files of recorders that were killed
 
     def _resume(self) -> int:
-        """Return where a former process of this run has stopped."""
+        """Return the number of the cycle after the last one that this run's files hold."""
         number = 0
         for path in segments(self._folder, self._session):
             with contextlib.suppress(OSError, LogError):
@@ -83,11 +84,11 @@ class Recorder:
         return None if self._segment is None else self._segment.path
 
     def take(self, event: Event) -> None:
-        """Take an event over; it is in the file after the next flush."""
+        """Queue an event; it is in the file after the next flush."""
         self._events.append(event)
 
     def step(self, flush: bool = False) -> int:
-        """Take the new cycles; flush, rotate, pause, resume. Returns the cycles taken."""
+        """Read the new cycles; flush, rotate, pause, resume. Returns the number of cycles read."""
         now = self._clock.monotonic()
         if self._segment is None and now < self._retry_at and not flush:
             return 0
@@ -107,7 +108,7 @@ class Recorder:
         return len(rows)
 
     def _finish_one(self) -> None:
-        """Write the summary of one file that a kill has cut off; the ring waits meanwhile."""
+        """Write the summary of one file whose recorder was killed; cycles wait in the ring."""
         if self._cut_off and self._segment is not None:
             path = self._cut_off.pop(0)
             with contextlib.suppress(OSError, LogError):
@@ -115,7 +116,7 @@ class Recorder:
                     self._report(f"finished {path}, which had been cut off", file=str(path))
 
     def close(self) -> None:
-        """Write what is there and finish the file."""
+        """Write the remaining cycles and finish the file."""
         self.step(flush=True)
         if self._segment is None:
             self._report_lost(max(self._memory.written - self._next, 0))
@@ -129,7 +130,7 @@ class Recorder:
     # -- inside -----------------------------------------------------------------------------------
 
     def _flush(self, now: float) -> None:
-        """Write events and cycles so far into the file, then see how much room there is."""
+        """Write events and cycles so far into the file, then check the free space."""
         segment = self._segment
         assert segment is not None
         for event in self._events:
@@ -138,7 +139,7 @@ class Recorder:
         self._events.clear()
         self._report_lost(self._reader.take_lost())
         self._next, self._flushed = self._reader.next, now
-        room = self._room()
+        room = self._free_space()
         if room < self._settings.keep_free:
             segment.close()
             self._pause(f"{room:.0f} MB free, recording.keep_free is {self._settings.keep_free:g}")
@@ -153,7 +154,7 @@ class Recorder:
     def _write_event(self, segment: Segment, event: Event) -> None:
         time = event.get("time")
         time = time if isinstance(time, int | float) else self._clock.time()
-        if event.get("kind") == "status":
+        if event.get("kind") == EventKind.STATUS:
             segment.emit(STATUS, event, time)
             return
         segment.emit(EVENTS, event, time)
@@ -165,11 +166,11 @@ class Recorder:
         segment.emit(LOG, log, time)
 
     def _open(self) -> bool:
-        """Begin a new file; returns whether there is one."""
+        """Begin a new file; returns False where the disk does not allow one."""
         try:
             make_folder(self._folder)
             prune(self._folder, self._session, self._settings.keep_total)
-            if self._room() < self._settings.keep_free:
+            if self._free_space() < self._settings.keep_free:
                 raise OSError(0, f"less than {self._settings.keep_free:g} MB free")
             path = next_path(self._folder, self._session)
             self._segment = Segment(path, self._memory.slices, self._states, self._clock)
@@ -178,7 +179,7 @@ class Recorder:
         except OSError as error:
             self._pause(error.strerror or str(error))
             return False
-        self._why_paused = ""
+        self._pause_reason = ""
         self._reader = self._memory.reader(self._next)
         self._flushed = self._clock.monotonic()
         self._report(f"recording into {path}", file=str(path))
@@ -195,21 +196,21 @@ class Recorder:
         self._segment.emit(CONFIGURATION, document)
 
     def change_configuration(self, configuration: Mapping[str, Any]) -> None:
-        """Note that the daemon runs by another configuration from now on."""
+        """Write the configuration that the daemon uses from now on into the file."""
         self.configuration = dict(configuration)
         if self._segment is not None:
             self._describe()
 
-    def _pause(self, why: str) -> None:
-        """Give the file up, keep what whole flushes have written, and try again later."""
+    def _pause(self, reason: str) -> None:
+        """Abandon the file, keep what complete flushes have written, and retry later."""
         if self._segment is not None:
             self._segment.abandon()
             self._cut_off.append(self._segment.path)
         self._segment = None
         self._retry_at = self._clock.monotonic() + RETRY_EVERY
-        if why != self._why_paused:
-            self._report(f"recording paused: {why}", paused=why, next_cycle=self._next)
-        self._why_paused = why
+        if reason != self._pause_reason:
+            self._report(f"recording paused: {reason}", paused=reason, next_cycle=self._next)
+        self._pause_reason = reason
 
     def _report_lost(self, lost: int) -> None:
         if lost:
@@ -218,27 +219,27 @@ class Recorder:
 
     def _report(self, message: str, **fields: Any) -> None:
         event = {
-            "time": self._clock.time(), "monotonic": self._clock.monotonic(), "kind": "recorder",
-            "detail": message, **fields,
+            "time": self._clock.time(), "monotonic": self._clock.monotonic(),
+            "kind": EventKind.RECORDER, "detail": message, **fields,
         }  # fmt: skip
         self._emit(event)
 
-    def _room(self) -> float:
-        """Return the MB that are free for us."""
+    def _free_space(self) -> float:
+        """Return the free space of the folder's file system, MB."""
         stats = os.statvfs(self._folder)
         return stats.f_bavail * stats.f_frsize / MB
 
 
 def level_of(event: Mapping[str, Any]) -> str:
-    """Return how grave an event is."""
-    if event.get("kind") == "fault" or event.get("to") == "FAULT":
+    """Return the level of an event: a key of LEVELS."""
+    if event.get("kind") == EventKind.FAULT or event.get("to") == State.FAULT.name:
         return "error"
-    grave = event.get("kind") == "refused" or "paused" in event or "lost" in event
-    return "warning" if grave or event.get("to") == "HOLDING" else "info"
+    warns = event.get("kind") == EventKind.REFUSED or "paused" in event or "lost" in event
+    return "warning" if warns or event.get("to") == State.HOLDING.name else "info"
 
 
 def text_of(event: Mapping[str, Any]) -> str:
-    """Return an event in words."""
+    """Return an event as one line of text."""
     if "from" in event and "to" in event:
         text = f"{event['from']} -> {event['to']} ({event.get('cause', '')})"
         return f"{text}: {event['detail']}" if event.get("detail") else text

@@ -1,7 +1,7 @@
-"""One file of a recording: whole chunks of MCAP, handed to the disk as they come.
+"""One file of a recording: complete chunks of MCAP, written at each flush.
 
-The library builds records; they reach the file in one write per flush, so that whatever ends the
-process leaves a file that is good up to its last flush.
+The library builds records; they are written to the file in one write per flush, so that the file is
+valid up to its last flush however the process ends.
 """
 
 from __future__ import annotations
@@ -32,19 +32,19 @@ from gapbridge.core.log.mcap_schema import (
 from gapbridge.drivers.clock import SYSTEM, Clock
 
 LARGEST_CHUNK = 1 << 26  # bytes: chunks end by flush, long before this
-SYNC_SHARE = 0.1  # of the time may be spent in waiting for the disk
+SYNC_SHARE = 0.1  # largest share of the time spent waiting for the disk
 SYNC_EVERY = 0.4  # s between two such waits at least
 
 
 class _File:
-    """What the library writes to: kept until ``flush``, then written in one go."""
+    """The library's output: buffered until ``flush``, then written at once."""
 
     def __init__(self, path: Path) -> None:
         self.fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, MODE)
-        with contextlib.suppress(OSError):  # who finishes files after a kill leaves this one alone
+        with contextlib.suppress(OSError):  # so that ``finish`` leaves this file unchanged
             fcntl.flock(self.fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
         sync_folder(path.parent)  # else a power cut may take the name
-        self.good = 0  # bytes of the file that were written by whole flushes
+        self.good = 0  # bytes written by complete flushes
         self._waiting = bytearray()
 
     def write(self, data: bytes) -> int:
@@ -55,7 +55,7 @@ class _File:
         return self.good + len(self._waiting)
 
     def flush(self) -> None:
-        """Write what waits. Raises OSError; then the file is to be given up."""
+        """Write the buffer. Raises OSError; then the file must be abandoned."""
         view = memoryview(self._waiting)
         done = 0
         while done < len(view):
@@ -79,7 +79,7 @@ class Segment:
         """Open a new file. Raises OSError, FileExistsError where the name is taken."""
         self.path, self._clock = path, clock
         self.opened = clock.monotonic()
-        self.rows = 0  # handed over, flushed or not
+        self.rows = 0  # added, flushed or not
         self._slices = slices
         self._next_sync = 0.0
         # ns between this machine's monotonic clock and the calendar, the same for the whole file
@@ -116,11 +116,11 @@ class Segment:
 
     @property
     def size(self) -> int:
-        """Return the bytes that are in the file."""
+        """Return the bytes written to the file."""
         return self._file.good
 
     def write(self, rows: Array) -> None:
-        """Take cycles (k, width) over; they are in the file after the next flush."""
+        """Add cycles (k, width); they are in the file after the next flush."""
         if not len(rows):
             return
         numbers = rows[:, self._slices["number"].start].astype(np.int64) & 0xFFFFFFFF
@@ -137,13 +137,13 @@ class Segment:
         self.rows += len(rows)
 
     def emit(self, topic: str, document: Mapping[str, Any], time: float | None = None) -> None:
-        """Take a JSON message over; ``at``: s since 1970, else now."""
+        """Add a JSON message; ``time``: s since 1970, else now."""
         stamp = int((self._clock.time() if time is None else time) * 1e9)
         data = json_text(document).encode()
         self._writer.add_message(self._channels[topic], stamp, data, stamp)
 
     def flush(self) -> None:
-        """Hand over what was taken; now and then wait for the disk. Raises OSError."""
+        """Write what was added; every SYNC_EVERY s or more wait for the disk. Raises OSError."""
         self._writer.flush()  # type: ignore[no-untyped-call]
         now = self._clock.monotonic()
         if now >= self._next_sync:
@@ -163,7 +163,7 @@ class Segment:
         self._file.close()
 
     def abandon(self) -> None:
-        """Close, leaving what whole flushes have written; never raises."""
+        """Close, keeping what complete flushes have written; never raises."""
         if self._file.fd >= 0:
             with contextlib.suppress(OSError):
                 os.ftruncate(self._file.fd, self._file.good)

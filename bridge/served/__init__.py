@@ -1,1 +1,1 @@
-"""What the daemon serves to people and programs: who may listen, who may ask, and how much."""
+"""The daemon's HTTP servers: addresses, authentication and limits."""

@@ -1,4 +1,4 @@
-"""The files that guard what is served: token, certificate and key, checked before a run."""
+"""The credential files of a server: token, certificate and key, checked before a run."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from gapbridge.bridge.served.settings import ServedSettings
 from gapbridge.core.errors import InputError
 from gapbridge.core.files import is_given, read_bytes
 
-SHORTEST_TOKEN = 32  # characters: beyond guessing, however fast
+SHORTEST_TOKEN = 32  # characters: too long to be guessed
 LONGEST_TOKEN = 1024
 
 
@@ -27,7 +27,7 @@ def read_token(path: Path, key: str) -> str:
     ``key`` names the cell's key in messages; the token itself is in none.
     """
     try:
-        mode = 0o600 if is_given() else path.stat().st_mode  # else who handed it on has checked
+        mode = 0o600 if is_given() else path.stat().st_mode  # else the daemon has checked
         content = read_bytes(path)[: LONGEST_TOKEN + 2]
     except OSError as error:
         raise InputError(f"{key}: {path}: {error.strerror}, expected a file with a token") from None

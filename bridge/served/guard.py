@@ -1,4 +1,4 @@
-"""What every request passes before anything answers it: who asks, under which name, with what."""
+"""The check of every request before it is answered: host name, method, size and token."""
 
 from __future__ import annotations
 
@@ -34,11 +34,10 @@ WRONG_TOKEN_DELAY = 0.5  # s
 
 
 class Guard:
-    """ASGI middleware. Lets read-only requests without a body through to those who may see it.
+    """ASGI middleware that passes only authorised, read-only requests without a body.
 
-    Host: an address, localhost or one of ``settings.names``; a page of a stranger's that points
-    its own name here (DNS rebinding) has another. Token, where there is one: as ``Authorization:
-    Bearer``, or as the cookie that signing in with it has given.
+    Host: an address, localhost or one of ``settings.names``, against DNS rebinding. Token, if there
+    is one: as ``Authorization: Bearer``, or as the cookie set by signing in.
     """
 
     def __init__(
@@ -54,7 +53,7 @@ class Guard:
         self.refused: dict[str, int] = {}  # by reason
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer, or let through."""
+        """Refuse a request, or pass it to the application."""
         if scope["type"] == "lifespan":
             await self._app(scope, receive, send)
             return
@@ -75,9 +74,9 @@ class Guard:
         await app(scope, receive, guarded)
 
     async def _refusal(self, scope: Scope) -> ASGIApp | None:
-        """Return what answers a request that may not pass."""
+        """Return the application that refuses a request; None: it may pass."""
         headers = Headers(scope=scope)
-        # the library limits heads that come in pieces only
+        # the library limits only heads that arrive in pieces
         size = len(scope["raw_path"]) + len(scope["query_string"])
         if size + sum(len(k) + len(v) + 4 for k, v in scope["headers"]) > LARGEST_HEAD:
             return self._refuse("size", 431, "the request is too large", connection="close")
@@ -143,10 +142,10 @@ class Guard:
 
 
 def cookie_name(settings: ServedSettings) -> str:
-    """Return the cookie's name: browsers keep one jar for all ports of a host."""
+    """Return the cookie's name, with the port: browsers share cookies between ports."""
     return f"gapbridge-{settings.port}"
 
 
 def cookie_of(token: bytes) -> str:
-    """Return what a browser keeps instead of the token; the same after a restart."""
+    """Return the cookie's value for a token; the same after a restart."""
     return hmac.new(token, b"gapbridge session", hashlib.sha256).hexdigest()

@@ -1,4 +1,4 @@
-"""HTTP connections that end when the other side is too slow, and that are no more than so many."""
+"""HTTP connections with time limits for slow clients, and a limit of their number."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from typing import Any
 
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-HEADER_TIME = 5.0  # s that a request's head may take to come, from its first byte or the connection
-STALL_TIME = 10.0  # s that a client may leave what was sent to it lying
+HEADER_TIME = 5.0  # s for a request's head, from its first byte or the connection
+STALL_TIME = 10.0  # s that a client may not read what was sent to it
 MOST_CONNECTIONS = 64
 LARGEST_HEAD = 16 * 1024  # bytes of request line and headers
 
@@ -16,8 +16,8 @@ LARGEST_HEAD = 16 * 1024  # bytes of request line and headers
 class GuardedProtocol(H11Protocol):
     """The server's own protocol, with the time limits that it lacks.
 
-    Its base waits for ever for a request that never ends (slowloris) and for a client that takes
-    nothing; here both are cut off, and connections beyond MOST_CONNECTIONS are closed at once.
+    The base class waits without limit for the end of a request (slowloris) and for a client that
+    does not read; here both are cut off, and connections beyond MOST_CONNECTIONS are closed.
     """
 
     header_time = HEADER_TIME
@@ -30,7 +30,7 @@ class GuardedProtocol(H11Protocol):
         self._stalled: asyncio.TimerHandle | None = None
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Take a connection, unless there are too many."""
+        """Accept a connection, unless there are too many."""
         super().connection_made(transport)
         if len(self.connections) > self.most_connections:
             transport.abort()
@@ -38,13 +38,13 @@ class GuardedProtocol(H11Protocol):
         self._waiting_for_head = self.loop.call_later(self.header_time, transport.abort)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Forget the timers."""
+        """Cancel the timers."""
         self._cancel_head_timer()
         self._cancel_stall_timer()
         super().connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:
-        """Take bytes; a head that is not whole keeps the time that it had."""
+        """Read bytes; the timer of an incomplete head goes on."""
         super().data_received(data)
         if self.transport.is_closing():
             return
@@ -59,13 +59,13 @@ class GuardedProtocol(H11Protocol):
         self._cancel_head_timer()
 
     def pause_writing(self) -> None:
-        """Give a client that does not take what was sent its last chance."""
+        """Start the timer of a client that does not read."""
         super().pause_writing()
         if self._stalled is None:
             self._stalled = self.loop.call_later(self.stall_time, self.transport.abort)
 
     def resume_writing(self) -> None:
-        """Go on: the client takes again."""
+        """Stop the timer: the client reads again."""
         self._cancel_stall_timer()
         super().resume_writing()
 

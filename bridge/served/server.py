@@ -1,4 +1,4 @@
-"""One server for a side process: its socket, its limits, its end with the daemon."""
+"""The HTTP server of a side process: its socket, its limits, its end with the daemon."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from gapbridge.bridge.served.protocol import LARGEST_HEAD, MOST_CONNECTIONS, Gua
 from gapbridge.bridge.served.settings import ServedSettings
 from gapbridge.core.errors import LinkError
 
-SEND_BUFFER = 64 * 1024  # bytes that the system holds for a client that is slow
-GONE = 20_000  # ms without a sign from the other side
+SEND_BUFFER = 64 * 1024  # bytes that the system buffers for a slow client
+GONE = 20_000  # ms without an acknowledgement from the client
 KEEP_ALIVE = 15  # s
 
 
@@ -33,7 +33,7 @@ class _Config(uvicorn.Config):
 
 
 def listen(settings: ServedSettings) -> socket.socket:
-    """Return the listening socket. Raises LinkError where it cannot be had."""
+    """Return the listening socket. Raises LinkError if it cannot be opened."""
     host = "127.0.0.1" if settings.host == "localhost" else settings.host
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     server = socket.socket(family, socket.SOCK_STREAM)
@@ -55,12 +55,12 @@ def serve(
     settings: ServedSettings,
     section: str,
     over: Callable[[], bool],
-    turn: Callable[[], None],
+    update: Callable[[], None],
     every: float,
 ) -> None:
-    """Serve until ``over()``, calling ``turn()`` every so many s beside it, in the same thread.
+    """Serve until ``over()``, calling ``update()`` every ``every`` s in the same thread.
 
-    Raises LinkError where the address is taken, InputError where certificates cannot be used.
+    Raises LinkError if the address is taken, InputError if certificates cannot be used.
     """
     context = tls_context(settings, section)
     with listen(settings) as listener:
@@ -72,22 +72,22 @@ def serve(
             h11_max_incomplete_event_size=LARGEST_HEAD,
         )  # fmt: skip
         config.context = context
-        # strangers must not fill the log: what is refused is counted
+        # refused requests are counted, not logged
         logging.getLogger("uvicorn.error").setLevel(logging.CRITICAL)
-        asyncio.run(_serve(uvicorn.Server(config), listener, over, turn, every))
+        asyncio.run(_serve(uvicorn.Server(config), listener, over, update, every))
 
 
 async def _serve(
     server: uvicorn.Server,
     listener: socket.socket,
     over: Callable[[], bool],
-    turn: Callable[[], None],
+    update: Callable[[], None],
     every: float,
 ) -> None:
     serving = asyncio.create_task(server.serve(sockets=[listener]))
     try:
         while not serving.done():
-            turn()
+            update()
             if over():
                 server.should_exit = True
                 break

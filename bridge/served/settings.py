@@ -14,7 +14,7 @@ GUARDS = ("certificate", "key", "token_file")
 
 
 class ServedSettings(Section):
-    """Where something is served. Elsewhere than on this machine only by TLS and with a token."""
+    """Address and credentials of a server; beyond loopback it needs TLS and a token."""
 
     host: str = Field("127.0.0.1", description="an address of this machine, or localhost")
     port: int = Field(0, ge=0, le=65535, description="TCP port; 0: any that is free")
@@ -34,7 +34,7 @@ class ServedSettings(Section):
 
     @property
     def url(self) -> str:
-        """Return where a browser finds it."""
+        """Return its URL."""
         scheme = "http" if self.certificate is None else "https"
         host = f"[{self.host}]" if ":" in self.host else self.host
         return f"{scheme}://{host}:{self.port}/"
@@ -42,7 +42,7 @@ class ServedSettings(Section):
     @field_validator("host")
     @classmethod
     def _address(cls, value: str) -> str:
-        """Refuse names: what they lead to may change after the check."""
+        """Refuse names: their addresses may change after the check."""
         if value != "localhost":
             try:
                 ipaddress.ip_address(value)

@@ -1,4 +1,4 @@
-"""Where nominal setpoints come from; an explicit table of sources."""
+"""Sources of nominal setpoints, in an explicit table."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def make_source(
     """Return the source that the settings name, not yet open.
 
     ``n``: joints; ``moves_arm``: whether setpoints are the arm's only motion; ``folder``: where
-    relative paths start; ``rate``: of the robot's cycles, Hz. Raises InputError where it cannot be
+    relative paths start; ``rate``: of the robot's cycles, Hz. Raises InputError if it cannot be
     used.
     """
     source_class = resolve_name(SOURCES[settings.source])

@@ -1,4 +1,4 @@
-"""Setpoints from a PLC over Modbus TCP; the registers stand in modbus_server.py."""
+"""Setpoints from a PLC over Modbus TCP; the register map is in modbus_server.py."""
 
 from __future__ import annotations
 
@@ -11,23 +11,23 @@ from pathlib import Path
 import numpy as np
 
 from gapbridge.bridge.cell.sections import SetpointSettings
-from gapbridge.bridge.setpoint_source.glide import GlidingSource
+from gapbridge.bridge.setpoint_source.interpolator import InterpolatedSource
 from gapbridge.bridge.setpoint_source.plc_memory import MOST_JOINTS, PlcMemory
 from gapbridge.bridge.setpoint_source.source import SourceStatus
 from gapbridge.core.errors import InputError, RunError
 
 WRITTEN, LIMITED = 1, 2  # flags
 
-SERVER = "gapbridge.bridge.setpoint_source.modbus_server"  # module that the PLC talks to
+SERVER = "gapbridge.bridge.setpoint_source.modbus_server"  # module of the server process
 
 
-class ModbusSource(GlidingSource):
-    """Listens, in a process of its own, for a PLC; reports back what became of its setpoints.
+class ModbusSource(InterpolatedSource):
+    """Serves a PLC in a separate process, and reports the loop's status to it.
 
     Raises InputError for an arm with more joints than the registers hold.
     """
 
-    counted = "new sequence number"
+    expected = "new sequence number"
 
     def __init__(
         self, settings: SetpointSettings, n: int, moves_arm: bool, folder: Path, rate: float
@@ -52,8 +52,8 @@ class ModbusSource(GlidingSource):
         )  # fmt: skip
         assert server.stdin is not None
         assert server.stdout is not None
-        order = {"host": self.settings.host, "port": self.settings.port, "n": self.n}
-        server.stdin.write(json.dumps({**order, "memory": memory.fds}) + "\n")
+        address = {"host": self.settings.host, "port": self.settings.port, "n": self.n}
+        server.stdin.write(json.dumps({**address, "memory": memory.fds}) + "\n")
         server.stdin.flush()
         reply = json.loads(server.stdout.readline() or '{"failure": "its server ended"}')
         if "failure" in reply:
@@ -82,11 +82,11 @@ class ModbusSource(GlidingSource):
         if record is None or record[0] == self._sequence:
             return False
         self._sequence = record[0]
-        self._glide.take(record[1])
+        self._interpolator.take(record[1])
         return True
 
     def emit(self, reported: SourceStatus) -> None:
-        """Hand state, corrected and nominal joints on to the PLC."""
+        """Report state, corrected and nominal joints to the PLC."""
         if self._memory is None:
             return
         self._cycle += 1

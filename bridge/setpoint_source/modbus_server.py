@@ -1,16 +1,16 @@
 """The server that a PLC talks to: ``python -m gapbridge.bridge.setpoint_source.modbus_server``.
 
-A process of its own, so that a client's traffic never delays the loop. Numbers are signed 32 bit,
-high word first, in 1e-6 rad or 1e-6 m.
+It is a separate process, so that a client's traffic never delays the loop. Numbers are signed 32
+bit, high word first, in 1e-6 rad or 1e-6 m.
 
 =================  ==============================================================================
-holding 0          sequence: any change hands the joints below over; write all with one request
+holding 0          sequence: any change makes the joints valid; write all in one request
 holding 2 to 2n+1  nominal joints
 input 0, 1         version of this map (1); number of joints
-input 2            what the loop is doing: 0 disconnected, 1 observing, 2 armed, 3 compensating,
+input 2            state of the loop: 0 disconnected, 1 observing, 2 armed, 3 compensating,
                    4 holding, 5 fault
-input 3            sequence taken last
-input 4            cycle counter: it moves as long as the loop is alive
+input 3            last sequence accepted
+input 4            cycle counter: it changes as long as the loop runs
 input 5            bit 0: the corrected setpoint was sent to the robot; bit 1: it was limited
 input 10 on        corrected joints
 input 30 on        nominal joints that they belong to
@@ -40,11 +40,11 @@ UNIT = 1e-6  # rad or m a count
 CORRECTED, NOMINAL, OFFSET, INPUTS = 10, 30, 50, 62
 JOINTS = 2  # holding register of the first joint
 CODING = Coding("i32")
-LIMIT = 2147.0  # rad or m: what a number can hold
+LIMIT = 2147.0  # rad or m: largest number
 
 
 class PlcServer:
-    """Holds the registers; answers from the newest record of the loop."""
+    """The registers; input registers show the newest status of the loop."""
 
     def __init__(self, memory: PlcMemory) -> None:
         self._memory = memory
@@ -92,7 +92,7 @@ class PlcServer:
 
 
 async def serve(memory: PlcMemory, host: str, port: int) -> None:
-    """Serve until the process ends; reports the port, or the reason, in a line on stdout."""
+    """Serve until the process ends; prints the port or a failure as JSON on stdout."""
     server = ModbusTcpServer(PlcServer(memory).device(), address=(host, port))
     try:
         await server.serve_forever(background=True)
@@ -110,13 +110,13 @@ def _print(what: dict[str, Any]) -> None:
 
 
 def _end_with_parent() -> None:
-    """End when the loop's process is gone: it holds the other end of stdin."""
+    """End with the loop's process, which holds the other end of stdin."""
     sys.stdin.read()
     os._exit(0)
 
 
 def main() -> None:
-    """Serve as one line of JSON on stdin says: host, port, n, memory (descriptors)."""
+    """Serve with the settings on stdin, one line of JSON: host, port, n, memory (descriptors)."""
     logging.getLogger("pymodbus").setLevel(logging.CRITICAL)
     order = json.loads(sys.stdin.readline())
     threading.Thread(target=_end_with_parent, daemon=True).start()

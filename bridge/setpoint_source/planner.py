@@ -1,13 +1,12 @@
 """Setpoints from a planner on this machine over a Unix socket: one line per setpoint.
 
-A line is JSON, ``{"q": [..n..]}``, or n numbers with commas between, rad. The newest line counts.
-Where a planner is slower than the loop, joints glide from setpoint to setpoint over the time that
-two lines are apart.
+A line is JSON, ``{"q": [..n..]}``, or n comma-separated numbers, rad. The newest line counts. If a
+planner is slower than the loop, joints are interpolated over the time between two lines.
 
-Whoever writes here moves the arm, so nobody gets a second guess: the first line that is no
-setpoint, or more lines than the robot has cycles, is answered with ``error: ...`` and ends the
-connection. A connection holds the feed from its first good line on, until it closes, or until it
-has been silent for the timeout and another planner sends a good line.
+Writing here moves the arm, so there is no second attempt: a line that is not a setpoint, or more
+lines than the robot has cycles, is answered with ``error: ...`` and ends the connection. From its
+first valid line on a connection is the only source, until it closes, or until it has been silent
+for the timeout and another planner sends a valid line.
 """
 
 from __future__ import annotations
@@ -24,14 +23,14 @@ import numpy as np
 
 from gapbridge.bridge.cell.sections import SetpointSettings
 from gapbridge.bridge.ipc.control_socket import peer_of
-from gapbridge.bridge.setpoint_source.glide import GlidingSource
+from gapbridge.bridge.setpoint_source.interpolator import InterpolatedSource
 from gapbridge.core.errors import RunError
 from gapbridge.drivers.clock import SYSTEM
 
 LONGEST_LINE = 4096  # bytes
 MOST_BYTES = 16384  # read in one cycle
-MOST_LINES = 8  # taken in one cycle; what is left is taken in the next ones
-MOST_WAITING = 4  # connections without a good line yet
+MOST_LINES = 8  # read in one cycle; the rest is read in the next ones
+MOST_WAITING = 4  # connections without a valid line yet
 SPAN = 2.0  # s over which lines are counted against the robot's cycles
 
 
@@ -45,20 +44,20 @@ class Connection:
         self._buffer = b""
         self._credit = SPAN * rate
         self._credit_time = self.opened = self._now()
-        self.received = 0.0  # s, monotonic: of the last good line
-        self.admitted = False  # a token has been given, or none is asked for
+        self.received = 0.0  # s, monotonic: of the last valid line
+        self.admitted = False  # the token was sent, or none is needed
         self.closed = False
 
     def admit(self) -> None:
-        """Take note that a token has been given, or none is asked for."""
+        """Record that the token was sent, or none is needed."""
         self.admitted = True
 
     def note_line(self) -> None:
-        """Take note of a good line now."""
+        """Record the time of a valid line."""
         self.received = self._now()
 
     def lines(self) -> list[bytes]:
-        """Return the lines that have arrived, some of them; closes where there is no end."""
+        """Return up to MOST_LINES lines that have arrived; closes after too long a line."""
         if b"\n" not in self._buffer:
             self._read()
         *lines, remainder = self._buffer.split(b"\n", MOST_LINES)
@@ -87,7 +86,7 @@ class Connection:
         self._buffer += data
 
     def refuse(self, message: str) -> None:
-        """Say why, and close."""
+        """Send an error message, and close."""
         with contextlib.suppress(OSError):
             self._link.send(f"error: {message}\n".encode())
         self.close()
@@ -99,13 +98,13 @@ class Connection:
         self._link.close()
 
 
-class PlannerSource(GlidingSource):
+class PlannerSource(InterpolatedSource):
     """Listens for one planner at a time on a Unix socket of mode 0600. Never blocks.
 
     A second planner is refused with a line as long as the first one sends.
     """
 
-    counted = "line"
+    expected = "line"
 
     def __init__(
         self, settings: SetpointSettings, n: int, moves_arm: bool, folder: Path, rate: float
@@ -114,7 +113,7 @@ class PlannerSource(GlidingSource):
         self._listener: socket.socket | None = None
         self._planner: Connection | None = None
         self._waiting: list[Connection] = []
-        self.refused = 0  # connections that were ended for what they sent
+        self.refused = 0  # connections ended because of their data
 
     def open(self) -> None:
         """Listen. Raises RunError where that is not possible."""
@@ -130,7 +129,7 @@ class PlannerSource(GlidingSource):
 
     @property
     def where(self) -> str:
-        """Return where it listens."""
+        """Return the address that it listens on, for messages."""
         return str(self.settings.socket)
 
     def _listen(self) -> socket.socket:
@@ -138,11 +137,11 @@ class PlannerSource(GlidingSource):
         path = self.settings.socket
         if path is None:
             raise OSError("no path, expected setpoints.socket")
-        with contextlib.suppress(FileNotFoundError):  # left behind by a loop that was killed
+        with contextlib.suppress(FileNotFoundError):  # left by a killed loop
             if stat.S_ISSOCK(path.lstat().st_mode):
                 path.unlink()
         listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-        mask = os.umask(0o177)  # nobody comes in between bind and chmod
+        mask = os.umask(0o177)  # no other user can connect before a chmod
         try:
             listener.bind(str(path))
         except OSError:
@@ -153,16 +152,16 @@ class PlannerSource(GlidingSource):
         return listener
 
     def _may_connect(self, link: socket.socket) -> bool:
-        """Return whether the kernel says that it is the daemon's own user, or root."""
+        """Return whether the peer is the daemon's user or root, as the kernel reports."""
         return peer_of(link).uid in (0, os.geteuid())
 
     def _admit(self, connection: Connection, line: bytes) -> bool:
-        """Return whether a first line admits a connection and is used up by that."""
+        """Admit a connection by its first line; returns whether the line was a token."""
         connection.admit()
         return False
 
     def close(self) -> None:
-        """Close planner and listener, and take the socket away."""
+        """Close planner and listener, and remove the socket."""
         for connection in (self._planner, *self._waiting):
             if connection is not None:
                 connection.close()
@@ -178,7 +177,7 @@ class PlannerSource(GlidingSource):
                 self.settings.socket.unlink()
 
     def _receive(self) -> bool:
-        """Take what has arrived; returns whether there is a new setpoint."""
+        """Read what has arrived; returns whether there is a new setpoint."""
         self._accept()
         new = self._planner is not None and self._read(self._planner)
         for connection in tuple(self._waiting):
@@ -190,7 +189,7 @@ class PlannerSource(GlidingSource):
 
     @property
     def _is_held(self) -> bool:
-        """Return whether a planner is at work, which no other one may push aside."""
+        """Return whether a planner is active, which another one must not replace."""
         planner = self._planner
         if planner is None or planner.closed:
             return False
@@ -214,7 +213,7 @@ class PlannerSource(GlidingSource):
                 self._waiting.pop(0).refuse("too many connections without a setpoint")
 
     def _read(self, connection: Connection) -> bool:
-        """Take the lines of a connection; returns whether one of them is a new setpoint."""
+        """Read the lines of a connection; returns whether one of them is a new setpoint."""
         new = False
         for line in connection.lines():
             text = line.strip()
@@ -248,7 +247,7 @@ class PlannerSource(GlidingSource):
                 self._planner.refuse("silent, and another planner has taken the feed")
             self._planner = connection
         connection.note_line()
-        self._glide.take(np.array(values))
+        self._interpolator.take(np.array(values))
         return True
 
     def _end(self, connection: Connection, message: str) -> None:

@@ -1,4 +1,4 @@
-"""What the loop and its Modbus server exchange, through memory that neither waits for."""
+"""Data exchange between the loop and its Modbus server, in shared memory without locks."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ ATTEMPTS = 100
 
 
 class Record:
-    """One way's newest numbers, whole or not seen; sealed by its writer (sealed_memory.py).
+    """The newest numbers in one direction, read consistently; sealed by its writer.
 
-    Its first word is a version: odd while it is being written.
+    The first word is a version, which is odd during a write (a sequence lock).
     """
 
     def __init__(self, fd: int, writes: bool) -> None:
@@ -37,7 +37,7 @@ class Record:
         struct.pack_into("<q", self._map, 0, version + 2)
 
     def read(self, count: int) -> tuple[tuple[int, ...], Array] | None:
-        """Return words and numbers, or None where they are being written all the while."""
+        """Return words and numbers, or None if each attempt met a write."""
         for _ in range(ATTEMPTS):
             version, *words = _HEAD.unpack_from(self._map)
             values = np.frombuffer(self._map, "<f8", count, _HEAD.size).copy()
@@ -46,7 +46,7 @@ class Record:
         return None
 
     def close(self) -> None:
-        """Let go of the memory."""
+        """Unmap and close the memory."""
         self._map.close()
         os.close(self.fd)
 
@@ -54,7 +54,7 @@ class Record:
 class PlcMemory:
     """Two records, one a direction: each side writes its own and only reads the other's.
 
-    Without descriptors it is the loop's side, which makes both; with the two (setpoint, status) it
+    Without descriptors it is the loop's side, which creates both; with both (setpoint, status) it
     is the server's.
     """
 
@@ -73,17 +73,17 @@ class PlcMemory:
 
     @property
     def is_sealed(self) -> bool:
-        """Return whether nobody but its own side can write to either."""
+        """Return whether only its own side can write to each."""
         return all(map(is_sealed, self.fds))
 
     # -- from the PLC -----------------------------------------------------------------------------
 
     def put_setpoint(self, sequence: int, q: Array) -> None:
-        """Hand a setpoint (n,) rad to the loop."""
+        """Pass a setpoint (n,) rad to the loop."""
         self._setpoint.write((sequence, 1, 0, 0), q)
 
     def setpoint(self) -> tuple[int, Array] | None:
-        """Return sequence number and joints (n,) rad; None where there are none yet."""
+        """Return sequence number and joints (n,) rad; None if there are none yet."""
         record = self._setpoint.read(self.n)
         if record is None or not record[0][1]:
             return None
@@ -92,7 +92,7 @@ class PlcMemory:
     # -- to the PLC -------------------------------------------------------------------------------
 
     def put_status(self, words: tuple[int, int, int, int], values: Array) -> None:
-        """Report state, sequence taken, cycle and flags; corrected, nominal (n,), offset (6,)."""
+        """Report state, sequence accepted, cycle, flags; corrected, nominal (n,), offset (6,)."""
         self._status.write(words, values)
 
     def status(self) -> tuple[tuple[int, ...], Array] | None:
@@ -100,6 +100,6 @@ class PlcMemory:
         return self._status.read(2 * self.n + 6)
 
     def close(self) -> None:
-        """Let go of the memory."""
+        """Unmap and close the memory."""
         self._setpoint.close()
         self._status.close()

@@ -11,7 +11,7 @@ from gapbridge.core.arrays import Array
 
 
 def quintic_time(distance: Array, top_speed: Array | float, acceleration: float) -> float:
-    """Return s that a move by ``way`` (n,), rad, takes at least, joints together.
+    """Return the shortest time (s) of a move by ``distance`` (n,), rad, joints together.
 
     ``top_speed`` in rad/s, of each joint or all; ``acceleration`` in rad/s2, of the fastest joint.
     """

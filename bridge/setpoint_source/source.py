@@ -1,4 +1,4 @@
-"""What a source of nominal setpoints is."""
+"""The base class of sources of nominal setpoints."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ class SourceStatus(NamedTuple):
     nominal_q: Array  # (n,) rad
     corrected_q: Array  # (n,) rad
     offset_in_base: Array  # (6,) m, rad
-    written: bool  # the corrected setpoint has left
+    written: bool  # the corrected setpoint was sent
     clamped: int  # bits of the limiter
 
 
 class SourceDryError(RunError):
-    """A source has no setpoint where it should have one: the arm must hold."""
+    """A source has no setpoint in time: the arm must hold."""
 
 
 class Source(ABC):
@@ -44,10 +44,10 @@ class Source(ABC):
 
     @abstractmethod
     def first(self, robot_q: Array) -> Array | None:
-        """Return where the source would start (n,), rad; None where it has nothing yet.
+        """Return the first setpoint (n,), rad; None if there is none yet.
 
-        ``own_q`` is what the robot itself wants now, (n,) rad. The caller checks that the start is
-        near the arm: starting never jumps.
+        ``robot_q``: the robot's own target joints, (n,) rad. The caller checks that the first
+        setpoint is near the arm.
         """
 
     def begin(self, timestamp: float, robot_q: Array) -> None:
@@ -58,11 +58,11 @@ class Source(ABC):
         """Return the setpoint (n,) rad at controller time ``timestamp``. Raises SourceDryError."""
 
     def emit(self, reported: SourceStatus) -> None:
-        """Take note of what the loop did in this cycle, for whom it concerns. Never blocks."""
+        """Report what the loop did in this cycle to the sender. Never blocks."""
 
     @property
     def ended(self) -> bool:
-        """Return whether the source has come to its end, and stays there."""
+        """Return whether the source has reached its end and holds its last setpoint."""
         return False
 
     def close(self) -> None:

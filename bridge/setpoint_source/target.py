@@ -1,4 +1,4 @@
-"""Setpoints of the robot's own: what its program, or its standing still, wants."""
+"""Setpoints of the robot's own program, or its present joints."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from gapbridge.core.arrays import Array
 class TargetSource(Source):
     """The arm's own ``target_q``.
 
-    Where setpoints are the arm's only motion there is none of its own, and its target is what was
-    written last: then it is where the arm stood when writing began.
+    If setpoints are the arm's only motion, its target is the setpoint written last: then the source
+    holds the joints at which writing began.
     """
 
     def __init__(
@@ -28,9 +28,9 @@ class TargetSource(Source):
         return robot_q
 
     def begin(self, timestamp: float, robot_q: Array) -> None:
-        """Remember where the arm stands."""
+        """Store the arm's joints, if setpoints are its only motion."""
         self._start = robot_q.copy() if self._holds_start else None
 
     def sample(self, timestamp: float, robot_q: Array) -> Array:
-        """Return the robot's own target, or where the arm stood."""
+        """Return the robot's own target, or the joints at the start."""
         return robot_q if self._start is None else self._start

@@ -1,7 +1,7 @@
 """Setpoints from a planner over TCP on loopback, behind a token; lines as in planner.py.
 
-The first line is ``token TOKEN``. Anything else ends the connection: an HTTP request, which any
-web page can have a browser send here, ends with its first line.
+The first line is ``token TOKEN``. Anything else ends the connection, also an HTTP request, which
+any web page can make a browser send here.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from gapbridge.bridge.setpoint_source.planner import Connection, PlannerSource
 from gapbridge.core.errors import InputError
 from gapbridge.drivers.clock import SYSTEM
 
-FIRST_LINE = 2.0  # s in which the token has to come
+FIRST_LINE = 2.0  # s within which the token must arrive
 
 
 class TcpSource(PlannerSource):
-    """Listens for one planner at a time; who does not know the token is turned away."""
+    """Listens for one planner at a time; refuses connections without the token."""
 
     _token = b""
 
@@ -30,7 +30,7 @@ class TcpSource(PlannerSource):
 
     @property
     def where(self) -> str:
-        """Return where it listens."""
+        """Return the address that it listens on, for messages."""
         return f"{self.settings.host}:{self.settings.port}"
 
     def open(self) -> None:
@@ -42,7 +42,7 @@ class TcpSource(PlannerSource):
         super().open()
 
     def _listen(self) -> socket.socket:
-        # the name is not asked for: what it leads to may change
+        # the name is not resolved: its address may change
         host = "127.0.0.1" if self.settings.host == "localhost" else self.settings.host
         v6 = ipaddress.ip_address(host).version == 6
         listener = socket.socket(socket.AF_INET6 if v6 else socket.AF_INET, socket.SOCK_STREAM)
@@ -74,4 +74,4 @@ class TcpSource(PlannerSource):
         return super()._receive()
 
     def _remove_socket(self) -> None:
-        """Leave nothing: a port needs no tidying."""
+        """Do nothing: a port leaves no file."""

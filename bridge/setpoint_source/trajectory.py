@@ -16,8 +16,8 @@ from gapbridge.core.log.log import read_log
 class TrajectorySource(Source):
     """A recorded or planned motion, replayed at the controller's clock.
 
-    Between two rows joints move linearly; after the last row the arm stays there, which is no
-    fault. Raises LogError where the file is not a trajectory of n joints.
+    Between two rows joints are interpolated linearly; after the last row the arm holds it. Raises
+    LogError if the file is not a trajectory of n joints.
     """
 
     def __init__(

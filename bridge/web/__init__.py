@@ -1,1 +1,1 @@
-"""The status page: a process of its own that shows what the daemon does, and can do nothing."""
+"""The status page: a side process that shows what the daemon does, read-only."""

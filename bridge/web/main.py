@@ -1,8 +1,7 @@
 """The status page's process: ``python -m gapbridge.bridge.web.main``, started by the daemon.
 
-It reads along - the shared memory through a descriptor that cannot be written to - and answers
-browsers: the page itself, /status, /events, /history. All of them only read: it has no way to the
-robot and none to arm anything.
+It reads the shared memory through a read-only descriptor, and answers browsers: the page itself,
+/status, /events, /history. All of them are read-only: this process cannot reach the robot or arm.
 """
 
 from __future__ import annotations
@@ -28,12 +27,12 @@ from gapbridge.bridge.ipc.side_main import StartData, run_side
 from gapbridge.bridge.served.credentials import read_token
 from gapbridge.bridge.served.guard import WRONG_TOKEN_DELAY, Guard, cookie_name, cookie_of
 from gapbridge.bridge.served.server import serve
-from gapbridge.bridge.web.watched import Watched
+from gapbridge.bridge.web.page_data import PageData
 
-WAITING = 100  # messages that a page may be behind
+WAITING = 100  # messages queued for one page
 RETRY = 1000  # ms after which a browser tries again
-COMMENT = 5.0  # s without a message after which a sign of life is sent
-TURN = 0.1  # s between two looks at the shared memory
+COMMENT = 5.0  # s without a message after which a comment is sent to keep the stream alive
+POLL_EVERY = 0.1  # s between two readings of the shared memory
 FILES = {
     "index.html": "text/html", "style.css": "text/css", "page.js": "text/javascript",
     "drawing.js": "text/javascript", "view.js": "text/javascript",
@@ -41,11 +40,11 @@ FILES = {
 }  # fmt: skip
 MOST_POINTS = 2000
 LARGEST_FORM = 4096  # bytes
-FORM_TIME = 5.0  # s that it may take to come
+FORM_TIME = 5.0  # s within which it must arrive
 
 
 class Stream:
-    """One hub: ``publish`` puts a message into every subscriber's queue and never waits."""
+    """Server-sent events: ``publish`` queues a message for every subscriber, never blocks."""
 
     def __init__(self, most: int) -> None:
         self._most = most
@@ -53,7 +52,7 @@ class Stream:
 
     @property
     def full(self) -> bool:
-        """Return whether as many pages are open as may be."""
+        """Return whether the limit of open pages is reached."""
         return len(self._queues) >= self._most
 
     @property
@@ -81,7 +80,7 @@ class Stream:
             queue.put_nowait(None)
 
     async def subscribe(self, first: Callable[[], str]) -> AsyncIterator[str]:
-        """Give the text of ``first()``, then every message, until the stream ends."""
+        """Yield the text of ``first()``, then every message, until the stream ends."""
         queue: asyncio.Queue[str | None] = asyncio.Queue(WAITING)
         self._queues.add(queue)
         try:
@@ -99,16 +98,16 @@ class Stream:
 
 
 def run(start: StartData) -> None:
-    """Serve the page until the daemon is gone. Raises LinkError, InputError."""
+    """Serve the page until the daemon has ended. Raises LinkError, InputError."""
     settings = start.settings.web
     assert settings is not None
     path = settings.token_file
     token = None if path is None else read_token(path, "web.token_file")
-    watched = Watched(start.settings, start.n, start.session, start.memory, start.extra.get("text"))
+    page = PageData(start.settings, start.n, start.session, start.memory, start.extra.get("text"))
     stream = Stream(settings.clients)
 
-    def turn() -> None:
-        for kind, data in watched.turn(start.events.poll()):
+    def update() -> None:
+        for kind, data in page.update(start.events.poll()):
             if stream.is_watched:
                 stream.publish(kind, _text(data))
 
@@ -117,14 +116,14 @@ def run(start: StartData) -> None:
             stream.close()
         return start.events.closed
 
-    serve(make_app(watched, stream, settings, token), settings, "web", over, turn, TURN)
+    serve(make_app(page, stream, settings, token), settings, "web", over, update, POLL_EVERY)
 
 
-def make_app(watched: Watched, stream: Stream, settings: WebSettings, token: str | None) -> Guard:
-    """Return the application behind its guard."""
+def make_app(page: PageData, stream: Stream, settings: WebSettings, token: str | None) -> Guard:
+    """Return the application with its guard."""
 
     async def status(request: Request) -> Response:
-        return _json(_text(watched.snapshot()))
+        return _json(_text(page.snapshot()))
 
     async def history(request: Request) -> Response:
         query = {}
@@ -141,13 +140,13 @@ def make_app(watched: Watched, stream: Stream, settings: WebSettings, token: str
                     f"{name}: found {text[:40]!r}, expected 1 to {most:g}\n", 400
                 )
             query[name] = value
-        return _json(_text(watched.history(query["seconds"], int(query["points"]))))
+        return _json(_text(page.history(query["seconds"], int(query["points"]))))
 
     async def events(request: Request) -> Response:
         if stream.full:
             return PlainTextResponse("too many pages are open\n", 503, {"retry-after": "10"})
         return StreamingResponse(
-            _bytes(stream, watched), media_type="text/event-stream",
+            _bytes(stream, page), media_type="text/event-stream",
             headers={"x-accel-buffering": "no"},
         )  # fmt: skip
 
@@ -160,13 +159,13 @@ def make_app(watched: Watched, stream: Stream, settings: WebSettings, token: str
     return Guard(Starlette(routes=routes), settings, token, sign_in)
 
 
-async def _bytes(stream: Stream, watched: Watched) -> AsyncIterator[str]:
-    async for text in stream.subscribe(lambda: message("hello", _text(watched.snapshot()))):
+async def _bytes(stream: Stream, page: PageData) -> AsyncIterator[str]:
+    async for text in stream.subscribe(lambda: message("hello", _text(page.snapshot()))):
         yield text
 
 
 class SignIn:
-    """A form that takes the token once and gives the browser a cookie instead."""
+    """A form that accepts the token once and sets a cookie."""
 
     def __init__(self, settings: WebSettings, token: str) -> None:
         self._token = token.encode()
@@ -178,7 +177,7 @@ class SignIn:
         self._page = _read("sign-in.html")
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer with the form, or take it."""
+        """Answer with the form, or evaluate it."""
         request = Request(scope, receive)
         response = await self._take(request) if request.method == "POST" else self._form()
         await response(scope, receive, send)
@@ -200,7 +199,7 @@ class SignIn:
 
     @staticmethod
     async def _token_of(request: Request) -> str:
-        """Return what a form holds. Raises ValueError where it is too large or none."""
+        """Return the token in a form. Raises ValueError if the form is too large."""
         body = b""
         async for chunk in request.stream():
             body += chunk
@@ -210,7 +209,7 @@ class SignIn:
 
 
 def _file(name: str) -> Callable[[Request], Awaitable[Response]]:
-    """Return what answers with one of the page's files."""
+    """Return the handler that answers with one of the page's files."""
     content = _read(name)
 
     async def answer(request: Request) -> Response:

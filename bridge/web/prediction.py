@@ -1,4 +1,4 @@
-"""What the model says at this moment: the wrench at the flange sensor, and the arm as it bends."""
+"""The model's prediction for the page: the flange sensor's wrench, and the deflected arm."""
 
 from __future__ import annotations
 
@@ -20,26 +20,26 @@ from gapbridge.core.loads import Loads
 from gapbridge.core.model import Model
 from gapbridge.core.motion import Motion
 
-DRAWN = 0.15  # of the reach: how far the stretched arm's bend is drawn
+DRAWN = 0.15  # of the reach: drawn deflection of the stretched arm
 
 
 class Prediction:
-    """Predicts for rows of the shared memory, in this process and never in the loop's.
+    """Predicts for rows of the shared memory, in this process, not in the loop's.
 
-    The model is read in a thread of its own, which takes a moment; until then, and where it cannot
-    be read, there is no prediction.
+    The model is read in a thread; until it is ready, and if it cannot be read, there is no
+    prediction.
     """
 
     def __init__(self, settings: DaemonSettings, slices: Mapping[str, slice]) -> None:
         self._settings, self._slices = settings, slices
         self._model: Model | None = None
-        self._factor = 1.0  # by which the bend is drawn larger
+        self._factor = 1.0  # by which the deflection is magnified in the drawing
         threading.Thread(target=self._read, daemon=True).start()
 
     def _read(self) -> None:
         try:
             model = resolve_name(self._settings.model_source)(self._settings.cell).model
-            # compiled before it is needed
+            # compiles before the first use
             q = np.zeros(model.arm.n)
             self._predict(model, q[None], Loads())
             bend = np.linalg.norm(skeleton(model, q)[-1] - skeleton(model.without_terms(), q)[-1])
@@ -49,7 +49,7 @@ class Prediction:
         self._model = model
 
     def arm(self, row: Array) -> dict[str, Any] | None:
-        """Return the arm at a row (width,): joints, TCP, load and a scene of it; None: unknown."""
+        """Return the arm at a row (width,): joints, TCP, load and a drawing; None: unknown."""
         s, model = self._slices, self._model
         q = row[s["actual_q"]]
         if model is None or not np.isfinite(q).all():
@@ -91,8 +91,8 @@ class Prediction:
     def wrenches(self, rows: Array) -> Array:
         """Return the wrenches (k, 6), N and Nm, flange axes, for rows (k, width).
 
-        Accelerations are left out: what is predicted is the weight of the payload and the pull of
-        the surroundings on the tool; NaN where there is no prediction.
+        Static: the weight of the payload and the force of the surroundings on the tool, without
+        inertia; NaN if there is no prediction.
         """
         nothing = np.full((len(rows), 6), np.nan)
         s, model = self._slices, self._model

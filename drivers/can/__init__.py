@@ -1,1 +1,1 @@
-"""Frame-mapped CAN arms: the map is data, a DBC and a small YAML beside it."""
+"""Frame-mapped CAN arms: the map is data, a DBC and a YAML profile."""

@@ -1,12 +1,12 @@
-"""Frames -> samples: a sample counts only when all its frames belong together.
+"""Frames -> samples: a sample is valid only if all its frames belong to one cycle.
 
-All of its messages must come within the profile's window, none twice, in order where the profile
-says so, and with the same count where they carry one. Everything else is dropped and counted.
+All of its messages must arrive within the profile's window, none twice, in order if the profile
+requires it, and with the same count if they have one. Everything else is dropped and counted.
 
-Where neither order nor count ties them together, the window alone does, and it is blind where
-frames are held up and then come in a burst (an adapter that stamps what it hands on, an arm that is
-late): with a frame lost, two cycles can fill one window. Such a sample shows in its order: what
-was lost comes last. Drifting nodes change their order too, but each keeps its own cadence.
+Without order or count, only the window relates the frames. It fails if frames are delayed and then
+arrive in a burst (an adapter that stamps on delivery, a late arm): with a frame lost, two cycles
+can fill one window. Such a sample differs in its order: the lost frame comes last. Drifting nodes
+change their order too, but each keeps its own period.
 """
 
 from __future__ import annotations
@@ -19,18 +19,15 @@ import numpy as np
 
 from gapbridge.core.arrays import Array
 from gapbridge.drivers.can.profile import CanProfile, Incoming, Key, Status
-from gapbridge.drivers.robot_modes import StopReason
 
 QUANTITIES = ("position", "velocity", "torque", "temperature")
-UNSTEADY = (
-    0.3  # periods: a frame waits for a cycle's six setpoint frames, 3.1 of 10 ms at 250 kbit/s
-)
+UNSTEADY = 0.3  # periods: six setpoint frames delay a frame by 3.1 of 10 ms at 250 kbit/s
 
 
 class Sample(NamedTuple):
     """One complete sample, SI units; (n,) each, NaN where a joint has not reported yet.
 
-    A tuple, because one is made in every cycle.
+    A tuple, because one is created in every cycle.
     """
 
     position: Array  # rad
@@ -41,7 +38,7 @@ class Sample(NamedTuple):
 
 
 class Assembler:
-    """Takes frames one by one and gives a sample whenever one is complete."""
+    """Takes frames one by one and returns a sample whenever one is complete."""
 
     def __init__(self, profile: CanProfile) -> None:
         self._profile = profile
@@ -58,30 +55,26 @@ class Assembler:
         self._began = 0.0  # s, monotonic
         self._count: float | None = None
         self._tied = profile.ordered or profile.counted or bool(profile.request)
-        self._last_stamps: dict[
-            Key, float
-        ] = {}  # s, bus clock: last frame of each message of the sample
-        self._steady = True  # all frames of the sample begun came a period after their own last one
-        self._order: list[Key] = []  # of the sample last given
+        self._last_stamps: dict[Key, float] = {}  # s, bus clock: last frame of each message
+        self._steady = True  # each frame of the present sample came one period after its last one
+        self._order: list[Key] = []  # of the last sample
         self._sample_stamp = -math.inf  # s, bus clock: that sample's last frame
         self.dropped: Counter[str] = Counter()  # reason -> frames or sets
         self.status: dict[tuple[Key, str], Status] = {}
         self.enabled: dict[tuple[Key, str], bool] = {}
         self.received_at: dict[Key, float] = {}  # s, monotonic, of each message that we read
         self.stopping: set[tuple[Key, str]] = set()  # members of ``status`` that report a stop
-        self.cleared: dict[
-            tuple[Key, str], tuple[float, StopReason | None, bool]
-        ] = {}  # those that have ended
+        self.ended_stops: dict[tuple[Key, str], Status] = {}  # the last status before the end
         self._last_bytes: dict[Key, bytes] = {}  # last bytes of messages outside the sample
 
     @property
     def broken(self) -> int:
-        """Return how often frames made no sample."""
+        """Return how often frames formed no sample."""
         return self.dropped.total()
 
     @property
     def missing(self) -> list[str]:
-        """Return the messages that a sample still lacks which has been begun; none: not begun."""
+        """Return the messages that the present sample lacks; empty if none has begun."""
         if not self._frames:
             return []
         return [
@@ -89,7 +82,7 @@ class Assembler:
         ]
 
     def reset(self) -> None:
-        """Forget a sample that has been begun."""
+        """Discard the present incomplete sample."""
         self._frames.clear()
 
     def take(self, key: Key, data: bytes, stamp: float, received: float) -> Sample | None:
@@ -100,9 +93,7 @@ class Assembler:
         incoming = self._profile.incoming.get(key)
         if incoming is None:
             return None
-        if (
-            self._last_bytes.get(key) == data
-        ):  # the same bytes say the same: most of an arm's status
+        if self._last_bytes.get(key) == data:  # unchanged, as most status messages are
             self.received_at[key] = received
             return None
         try:
@@ -120,7 +111,7 @@ class Assembler:
         return None
 
     def _note(self, incoming: Incoming, values: dict[str, float]) -> None:
-        """Remember what a message says about the arm's health."""
+        """Store what a message reports about the arm's status."""
         for check in incoming.checks:
             value = values[check.signal]
             reason = check.stop_reason(int(value)) if math.isfinite(value) else check.otherwise
@@ -129,7 +120,7 @@ class Assembler:
                 self.stopping.add(place)
             elif place in self.stopping:
                 self.stopping.discard(place)
-                self.cleared[place] = self.status[place]
+                self.ended_stops[place] = self.status[place]
             self.status[place] = (value, reason, check.while_writing)
         for signal in incoming.enabled:
             self.enabled[incoming.key, signal] = values[signal] in self._profile.enabled_values
@@ -162,7 +153,7 @@ class Assembler:
                 self.dropped["repeated"] += 1
                 return None
             self._count = values[incoming.counter]
-        if not self._tied and self._doubtful(list(frames), stamp):
+        if not self._tied and self._may_mix_cycles(list(frames), stamp):
             self.dropped["out of order"] += 1
             return None
         for member, signals in frames.items():
@@ -170,7 +161,7 @@ class Assembler:
         return self._sample(stamp, received)
 
     def _breaks(self, incoming: Incoming, values: dict[str, float], stamp: float) -> bool:
-        """Return whether a frame cannot belong to the sample that has been begun."""
+        """Return whether a frame cannot belong to the present sample."""
         if incoming.key in self._frames or not 0.0 <= stamp - self._first <= self._profile.window:
             return True
         if self._profile.ordered and self._profile.sample[len(self._frames)] != incoming.key:
@@ -181,10 +172,10 @@ class Assembler:
         count = values[counter]
         return any(v[counter] != count for v in self._frames.values())
 
-    def _doubtful(self, order: list[Key], stamp: float) -> bool:
-        """Return whether a whole sample may be of two cycles: another order, off the cadence.
+    def _may_mix_cycles(self, order: list[Key], stamp: float) -> bool:
+        """Return whether a complete sample may mix two cycles: another order, off the cadence.
 
-        An order is forgotten with ``status_timeout``: after it the arm may have started anew.
+        An order is kept for ``status_timeout``: after it the arm may have restarted.
         """
         remembered = 0.0 <= stamp - self._sample_stamp <= self._profile.status_timeout
         if remembered and order != self._order and not self._steady:

@@ -20,7 +20,7 @@ FLOATS = {16, 32, 64}
 
 @dataclass(frozen=True)
 class Dbc:
-    """The messages of a DBC by name (cantools objects), and where they stand in the file."""
+    """The messages of a DBC by name (cantools objects), and their lines in the file."""
 
     path: Path
     messages: dict[str, Any]
@@ -31,7 +31,7 @@ class Dbc:
         return self.lines.get((message, signal), self.lines.get((message, ""), 1))
 
     def error(self, message: str, signal: str, detail: str) -> ProfileError:
-        """Return the error that says ``words`` about a signal, or about its message."""
+        """Return an error with ``detail`` about a signal, or about its message."""
         name = f"{message}.{signal}" if signal else message
         return ProfileError(f"{self.path}, line {self.line(message, signal)}: {name}: {detail}")
 
@@ -45,7 +45,7 @@ class Dbc:
 
 
 def read_dbc(path: Path) -> Dbc:
-    """Return the checked DBC. Raises ProfileError, naming the line, where it cannot be used."""
+    """Return the checked DBC. Raises ProfileError, naming the line, if it cannot be used."""
     import cantools
 
     try:
@@ -104,7 +104,7 @@ def _check_message(dbc: Dbc, message: Any) -> None:
 
 
 def _check_types(path: Path, text: str) -> None:
-    """Refuse types that no DBC knows; cantools would take them for integers."""
+    """Refuse types that DBC does not define; cantools would read them as integers."""
     for number, line in enumerate(text.splitlines(), 1):
         match = _TYPE.match(line)
         if match and match[3] not in "012":

@@ -34,8 +34,8 @@ ANSWER = 0.02  # s after which an answer that is not there does not come
 class CanDriver(Driver):
     """One arm whose joints are reported and commanded in CAN frames, as a profile maps them.
 
-    Who else sends our control identifiers is another commander: then nothing is armed, and what is
-    armed writes no more.
+    Another node that sends our control identifiers is another commander: then arming is refused,
+    and an armed driver stops writing.
     """
 
     def __init__(self, settings: CanSettings, model: Model, clock: Clock = SYSTEM) -> None:
@@ -52,13 +52,13 @@ class CanDriver(Driver):
         self._builder = StateBuilder(profile.n)
         self._armed_at: float | None = None  # s, monotonic
         self._returned_at = -1.0  # s, received of the sample last returned
-        self._slot = 0.0  # s, when an arm that must be asked is asked next
+        self._slot = 0.0  # s, monotonic: when the next request is due
         self._changed = 0.0  # s, monotonic: when the joints last changed
         self._q: Array | None = None
         self._angles: list[float] = []  # the same, as they were reported in the last sample
-        self._broken = 0  # samples dropped, as far as they were reported
-        self._pending: Sample | None = None  # came before a dropped one was reported
-        self._listening = 0.0  # s, monotonic: since when other commanders would be heard
+        self._broken = 0  # dropped samples that were reported
+        self._pending: Sample | None = None  # received before a dropped one was reported
+        self._listening = 0.0  # s, monotonic: listening for other commanders since
 
     # -- reading ----------------------------------------------------------------------------------
 
@@ -75,16 +75,16 @@ class CanDriver(Driver):
             self._ask()
             received = self.reader.listen(max(1.0 / self.rate, SLICE)) is not None or received
         self._changed = self._now()
-        self._begin_anew()
+        self._reset_reading()
 
-    def _begin_anew(self) -> None:
-        """Let what came while nobody asked for states be: torn frames, stops that are over."""
+    def _reset_reading(self) -> None:
+        """Discard torn frames and ended stops from before, when no states were read."""
         self._broken, self._pending = self.reader.assembler.broken, None
-        self._builder.forget()
-        self.reader.forget_cleared()
+        self._builder.reset()
+        self.reader.clear_ended_stops()
 
     def _nothing_received(self, complete: bool) -> LinkError:
-        """Return what was missed, and close: a link that is not there is not half open."""
+        """Close the link and return an error that names the messages not received."""
         received_at = self.reader.assembler.received_at
         missing = [i.name for key, i in self.profile.incoming.items() if key not in received_at]
         dropped = dict(self.reader.assembler.dropped)
@@ -100,7 +100,7 @@ class CanDriver(Driver):
             self.writer.request()
 
     def _read_state(self) -> RobotState:
-        """Return the newest complete sample that was not returned yet; see Driver.read_state."""
+        """Return the newest complete sample not returned before; see Driver.read_state."""
         sample = self._requested() if self.profile.request else self._received()
         self._returned_at = sample.received
         if silent := self.reader.silent_status():
@@ -109,8 +109,8 @@ class CanDriver(Driver):
             )
         self._check_frozen(sample)
         armed = self._armed_at is not None
-        # a stop that came and went while frames made no sample was a stop
-        stop_reason = self.reader.stop_reason(armed)[0] or self.reader.cleared_stop_reason(armed)
+        # a stop counts too if it began and ended between two samples
+        stop_reason = self.reader.stop_reason(armed)[0] or self.reader.ended_stop_reason(armed)
         ready = not armed or not self.profile.enabled_values or self.reader.enabled
         return self._builder.build(sample, self._target(), stop_reason, ready)
 
@@ -118,10 +118,10 @@ class CanDriver(Driver):
         """See Driver._validate."""
         super()._validate(state)
         self._builder.remember()
-        self.reader.forget_cleared()
+        self.reader.clear_ended_stops()
 
     def _received(self) -> Sample:
-        """Return the next sample of an arm that sends by itself; slower where we want fewer."""
+        """Return the next sample of an arm that sends unasked, at ``rate`` or slower."""
         end = self._now() + self.settings.state_timeout
         earliest = self._returned_at + 1.0 / self.rate - 0.5 / self.profile.rate
         sample, self._pending = self.reader.newest() or self._pending, None
@@ -135,7 +135,7 @@ class CanDriver(Driver):
         return sample
 
     def _check_torn(self, sample: Sample | None) -> None:
-        """Report, once, that frames have come which make no sample; a good one is kept."""
+        """Raise InvalidStateError once for frames that form no sample; keeps a good sample."""
         broken, self._broken = self._broken, self.reader.assembler.broken
         if self._broken > broken:
             self._pending = sample
@@ -145,7 +145,7 @@ class CanDriver(Driver):
             )
 
     def _requested(self) -> Sample:
-        """Return the sample that an arm gives when it is asked, once per cycle."""
+        """Request a sample, once per cycle, and return it."""
         now = self._now()
         self._slot = max(self._slot + 1.0 / self.rate, now - 1.0 / self.rate)
         if self._slot > now:
@@ -166,7 +166,7 @@ class CanDriver(Driver):
             if missing := self.reader.assembler.missing:
                 raise InvalidStateError(f"{self.profile.name}: no answer of {', '.join(missing)}")
             whole = now + patience
-            self._ask()  # nobody has heard the question
+            self._ask()  # the request was lost
         raise self._stale()
 
     def _stale(self) -> StaleStateError:
@@ -180,9 +180,9 @@ class CanDriver(Driver):
         )
 
     def _check_frozen(self, sample: Sample) -> None:
-        """Refuse joints that stand still bit by bit though they were sent elsewhere."""
+        """Raise StaleStateError for joints that do not change though commanded elsewhere."""
         now, target = sample.received, self.writer.target
-        # plain numbers: arrays of six cost more
+        # lists: faster than arrays of six
         q = sample.position.tolist()
         if q != self._angles:
             self._q, self._angles, self._changed = sample.position, q, now
@@ -193,12 +193,12 @@ class CanDriver(Driver):
             self._changed = now
         elif now - self._changed > self.settings.frozen_after:
             raise StaleStateError(
-                f"{self.profile.name}: joints have stood still for {now - self._changed:.2f} s, "
+                f"{self.profile.name}: joints have not changed for {now - self._changed:.2f} s, "
                 f"commanded {away:.3f} rad away"
             )
 
     def _target(self) -> Array | None:
-        """Return what the arm was last commanded, by us or by another commander."""
+        """Return the joints (n,) rad commanded last, by us or by another commander, or None."""
         if self._armed_at is not None:
             return self.writer.target
         return self.reader.foreign_target(self.settings.foreign_quiet)
@@ -206,7 +206,7 @@ class CanDriver(Driver):
     # -- writing ----------------------------------------------------------------------------------
 
     def _make_ready(self, state: RobotState) -> None:
-        """Enable the motors where they stand. Raises WriteError, and then nothing is enabled."""
+        """Enable the motors at the present joints. Raises WriteError, and then none is enabled."""
         if not self.profile.writes:
             raise WriteError(f"{self.profile.name}: this profile is read only")
         quiet = self.settings.foreign_quiet
@@ -221,9 +221,11 @@ class CanDriver(Driver):
         start = self._present()
         try:
             self.writer.run(self.profile.enable, self._present, self._listen, self._reached)
-            gave = float(np.abs(self._present() - start).max())
-            if gave > self.settings.arming_distance:
-                raise WriteError(f"{self.profile.name}: the arm gave {gave:.3f} rad when enabled")
+            displacement = float(np.abs(self._present() - start).max())
+            if displacement > self.settings.arming_distance:
+                raise WriteError(
+                    f"{self.profile.name}: the arm moved {displacement:.3f} rad when enabled"
+                )
         except LinkError:
             with contextlib.suppress(LinkError):
                 self._run_release(self._present)
@@ -231,7 +233,7 @@ class CanDriver(Driver):
         if self.writer.target is None:
             self.writer.write(self._present())
         self._armed_at = self._changed = self._now()
-        self._begin_anew()
+        self._reset_reading()
 
     def _present(self) -> Array:
         if self._q is None:
@@ -239,7 +241,7 @@ class CanDriver(Driver):
         return self._q
 
     def _listen(self, seconds: float) -> None:
-        """Read for a while, asking those that must be asked; keeps the present joints."""
+        """Read for ``seconds``, sending requests where needed; updates the present joints."""
         end = self._now() + seconds
         while (remaining := end - self._now()) > 0.0 or seconds == 0.0:
             self._ask()
@@ -252,8 +254,8 @@ class CanDriver(Driver):
     def _reached(self, goal: str) -> bool:
         if goal == "disabled":
             return self.reader.disabled
-        detail = not self.profile.enabled_values or self.reader.enabled
-        return detail and (goal == "enabled" or not self.reader.stop_reason(writing=True)[0])
+        enabled = not self.profile.enabled_values or self.reader.enabled
+        return enabled and (goal == "enabled" or not self.reader.stop_reason(writing=True)[0])
 
     def _commanded_by_another(self) -> ForeignCommandError:
         foreign = self.reader.foreign
@@ -272,8 +274,8 @@ class CanDriver(Driver):
             raise self._commanded_by_another()
         self.writer.write(setpoint.q)
 
-    def _let_go(self) -> None:
-        """Let the arm rest where it was last sent, and give the control back."""
+    def _release(self) -> None:
+        """Hold the last setpoint and run the release sequence."""
         if self._armed_at is None:
             return
         self._armed_at = None
@@ -281,16 +283,16 @@ class CanDriver(Driver):
         try:
             self._run_release(self._present if target is None else lambda: target)
         finally:
-            self.writer.forget()
-            self._begin_anew()
+            self.writer.reset()
+            self._reset_reading()
 
     def _run_release(self, hold: object) -> None:
         assert callable(hold)
         self.writer.run(self.profile.release, hold, self._listen, self._reached)
-        self.writer.forget()
+        self.writer.reset()
 
     def close(self) -> None:
-        """Release where the link lives, and close the bus; see Driver.close."""
+        """Release if the link works, and close the bus; see Driver.close."""
         with contextlib.suppress(LinkError, InvalidStateError):
             self.release()
         self._armed_at = None

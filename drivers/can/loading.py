@@ -1,4 +1,4 @@
-"""A profile out of its YAML and its DBC, checked as a whole before anything touches a bus."""
+"""Loading a profile from its YAML and its DBC, checked completely before a bus is opened."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Names:
         self.document, self.file, self.dbc = document, file, dbc
 
     def error(self, keys: Sequence[str | int], text: str) -> ProfileError:
-        """Return the error that says ``words`` about a key of the profile."""
+        """Return an error with ``text`` about a key of the profile."""
         return self.document.error(keys, text)
 
     def message(self, name: str, keys: Keys) -> tuple[Any, Key]:
@@ -79,7 +79,7 @@ class Names:
         )
 
     def key(self, identifier: int) -> Key:
-        """Return an identifier with its length: 29 bits where the DBC or its value says so."""
+        """Return an identifier with its length: 29 bits if the DBC or its value says so."""
         extended = identifier > 0x7FF or any(
             m.frame_id == identifier and m.is_extended_frame for m in self.dbc.messages.values()
         )
@@ -87,7 +87,7 @@ class Names:
 
 
 class OutgoingLoading:
-    """What may be sent, put together from a profile's keys."""
+    """Builds the frames that may be sent from a profile's keys."""
 
     def __init__(self, names: Names) -> None:
         self.names, self.file = names, names.file
@@ -165,7 +165,7 @@ class OutgoingLoading:
         return tuple(result)
 
     def control(self, sends: frozenset[Key]) -> frozenset[Key]:
-        """Return what only a commander sends; asking for feedback is no commanding."""
+        """Return the identifiers that only a commander sends; requests for feedback are not."""
         declared = frozenset(self.names.key(identifier) for identifier in self.file.control)
         requests = {
             self.names.message(frame.message, ("request",))[1] for frame in self.file.request
@@ -173,7 +173,7 @@ class OutgoingLoading:
         return (sends | declared) - requests
 
     def check_sends(self, profile: CanProfile) -> None:
-        """Refuse a frame that the allow-list does not have, and feedback that we would send."""
+        """Refuse a frame that is not on the allow-list, and feedback that we would send."""
         groups: list[tuple[Keys, Sequence[Outgoing]]] = [
             (("request",), profile.request),
             (("setpoint", "frames"), profile.setpoint),
@@ -207,7 +207,7 @@ def read_profile(path: Path, installation: Mapping[str, list[float]] | None = No
 
 
 def _schema_error(document: ProfileDocument, worst: ErrorDetails) -> ProfileError:
-    """Return one line out of what pydantic says."""
+    """Return an error in one line for an error of pydantic."""
     keys = tuple(key for key in worst["loc"] if key != "list[constrained-float]")
     value = worst["input"] if not isinstance(worst["input"], dict | list) else "something else"
     if worst["type"] == "missing":
@@ -222,7 +222,7 @@ def _schema_error(document: ProfileDocument, worst: ErrorDetails) -> ProfileErro
 
 
 class _Loading:
-    """One profile being put together."""
+    """Builds one profile."""
 
     def __init__(self, document: ProfileDocument, file: ProfileFile, dbc: Dbc) -> None:
         self.document, self.file, self.dbc = document, file, dbc
@@ -291,7 +291,7 @@ class _Loading:
         return [float(v) for v in values]
 
     def _units(self, quantity: Quantity, name: str, keys: Keys) -> Array:
-        """Return SI in one wire unit (n,); checks that every joint is there, once."""
+        """Return SI units per wire unit (n,); checks that each joint has one signal."""
         if len(quantity.signals) != self.n:
             missing = f"joint {len(quantity.signals) + 1} is missing"
             missing = missing if len(quantity.signals) < self.n else "there are too many"
@@ -366,7 +366,7 @@ class _Loading:
         return counter
 
     def _check_sample(self, profile: CanProfile) -> None:
-        """Refuse a sample without a joint's position, or with a message that says nothing."""
+        """Refuse a sample without a joint's position, or with a message without signals."""
         names = self.file.sample.messages
         for i, name in enumerate(names):
             keys: Keys = ("sample", "messages", i)

@@ -1,4 +1,4 @@
-"""What a profile comes to: messages, joints, sequences, ready for the wire."""
+"""A loaded profile: messages, joints and sequences."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Reading:
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """A signal that reports whether the arm is well."""
+    """A signal that reports whether the arm may be used."""
 
     signal: str
     normal: frozenset[int]
@@ -33,7 +33,7 @@ class Check:
     while_writing: bool = False  # counts only then
 
     def stop_reason(self, value: int) -> StopReason | None:
-        """Return what a value means; None where the arm is well."""
+        """Return the meaning of a value; None if the arm may be used."""
         return None if value in self.normal else self.values.get(value, self.otherwise)
 
 
@@ -135,11 +135,11 @@ class CanProfile:
     release: tuple[Action, ...]
     stop: tuple[Action, ...]
     sends: frozenset[Key]  # allow-list
-    control: frozenset[Key]  # who sends these commands the arm
+    control: frozenset[Key]  # identifiers that command the arm
 
     @property
     def quantities(self) -> frozenset[str]:
-        """Return what the feedback reports."""
+        """Return the quantities in the feedback."""
         return frozenset(self.joints.scale)
 
     @property

@@ -1,4 +1,4 @@
-"""The reading half: frames from the bus, samples and another commander's frames out of them."""
+"""The reading half: samples and another commander's frames from the frames of the bus."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from gapbridge.drivers.can_bus.bus import close_bus, open_bus
 from gapbridge.drivers.clock import SYSTEM, Clock
 from gapbridge.drivers.robot_modes import StopReason
 
-LONGEST_WAY, LEAST_WAY = 4.0, 0.03  # cycles, s: what has lain here for longer is not fresh
-BACKLOG_TIME = 0.05  # s that reading what has piled up may take
+QUEUED_CYCLES, QUEUED_TIME = 4.0, 0.03  # cycles, s: a sample queued for longer is not fresh
+BACKLOG_TIME = 0.05  # s that reading queued frames may take
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,7 +29,7 @@ class ForeignCommand:
 
 
 class FrameReader:
-    """Reads one bus for one profile. Opens and closes it; knows nothing of writing."""
+    """Reads one bus for one profile. Opens and closes it; independent of writing."""
 
     def __init__(self, settings: CanSettings, profile: CanProfile, clock: Clock = SYSTEM) -> None:
         self._now = clock.monotonic
@@ -38,18 +38,18 @@ class FrameReader:
         self.assembler = Assembler(profile)
         self.foreign: ForeignCommand | None = None
         self.error_frames = 0
-        self.identifiers: set[int] = set()  # heard at all, for messages
+        self.identifiers: set[int] = set()  # received, for messages
         self._targets = {f.key: f for f in profile.setpoint if f.joints}
         self._motors = sum(len(incoming.enabled) for incoming in profile.incoming.values())
-        self._longest = max(LONGEST_WAY / settings.rate, LEAST_WAY)  # s
-        self._empty = 0.0  # s, monotonic: when nothing was waiting to be read
+        self._longest = max(QUEUED_CYCLES / settings.rate, QUEUED_TIME)  # s
+        self._empty = 0.0  # s, monotonic: when the queue was last empty
         self._foreign_wire = np.full(profile.n, np.nan)
 
     def open(self) -> None:
-        """Open the bus, filtered to what is read where the kernel does it. Raises LinkError.
+        """Open the bus, with kernel filters for the frames read, if possible. Raises LinkError.
 
-        Elsewhere python-can filters itself, and then says "nothing there" at each foreign frame:
-        who empties a backlog would stop in the middle of it.
+        Elsewhere python-can filters, and then returns None for each foreign frame: reading a
+        backlog would stop in the middle of it.
         """
         keys = set(self._profile.incoming) | set(self._profile.control)
         filters: Any = [
@@ -77,7 +77,7 @@ class FrameReader:
         return self._fresh(self._take(frame, self._now()), self._empty)
 
     def newest(self) -> Sample | None:
-        """Take everything that has piled up; returns the newest complete sample of it."""
+        """Read all queued frames; returns the newest complete sample of them."""
         newest, until = None, self._now() + BACKLOG_TIME
         empty = self._empty  # before all that is read now
         while (frame := self._receive(0.0)) is not None:
@@ -88,9 +88,9 @@ class FrameReader:
         return self._fresh(newest, empty)
 
     def _fresh(self, sample: Sample | None, empty: float) -> Sample | None:
-        """Return a sample unless it may have lain here for long, this process being late.
+        """Return a sample; None if it may have been queued for too long, this process being late.
 
-        ``empty`` (s, monotonic): when nothing was waiting, the last time before it came.
+        ``empty`` (s, monotonic): when the queue was last empty before it arrived.
         """
         late = sample is not None and sample.received - empty > self._longest
         return None if late else sample
@@ -129,7 +129,7 @@ class FrameReader:
         return self.assembler.take(key, bytes(frame.data), frame.timestamp or now, now)
 
     def _decode_foreign_target(self, key: Key, data: bytes) -> None:
-        """Note what another commander has the arm do."""
+        """Store the joints that another commander asks for."""
         target = self._targets.get(key)
         if target is None or len(data) != target.message.length:
             return
@@ -149,33 +149,33 @@ class FrameReader:
             return None
         return self._foreign_wire * joints.setpoint_scale + joints.zero
 
-    # -- what the arm says of itself --------------------------------------------------------------
+    # -- status of the arm ------------------------------------------------------------------------
 
     @property
     def enabled(self) -> bool:
-        """Return whether every motor has said that it is enabled."""
+        """Return whether every motor reports that it is enabled."""
         motors = self.assembler.enabled
         return len(motors) == self._motors and all(motors.values())
 
     @property
     def disabled(self) -> bool:
-        """Return whether every motor has said that it is not enabled."""
+        """Return whether every motor reports that it is not enabled."""
         motors = self.assembler.enabled
         return bool(motors) and not any(motors.values())
 
     def stop_reason(self, writing: bool) -> tuple[StopReason | None, str]:
-        """Return why the arm cannot move and the signal that says so; None where it can."""
+        """Return why the arm cannot move and the signal that reports it; None where it can."""
         if not self.assembler.stopping:
             return None, ""
         return self._first_stop_reason(self.assembler.status, writing)
 
-    def cleared_stop_reason(self, writing: bool) -> StopReason | None:
-        """Return what was wrong since ``forget_cleared`` and is no longer; None: nothing."""
-        return self._first_stop_reason(self.assembler.cleared, writing)[0]
+    def ended_stop_reason(self, writing: bool) -> StopReason | None:
+        """Return a stop that has ended since ``clear_ended_stops``; None: there was none."""
+        return self._first_stop_reason(self.assembler.ended_stops, writing)[0]
 
-    def forget_cleared(self) -> None:
-        """Forget stops that have ended: they have been reported, or nobody was to act on them."""
-        self.assembler.cleared.clear()
+    def clear_ended_stops(self) -> None:
+        """Drop stops that have ended: they were reported, or no state was read meanwhile."""
+        self.assembler.ended_stops.clear()
 
     def _first_stop_reason(
         self, status: dict[tuple[Key, str], Status], writing: bool
@@ -187,7 +187,7 @@ class FrameReader:
         return None, ""
 
     def silent_status(self) -> str:
-        """Return the name of a status message that has not come for too long; empty: none."""
+        """Return the name of a status message that is overdue; empty: none."""
         now, all_received = self._now(), self.assembler.received_at
         oldest = min(all_received.values(), default=0.0)
         complete = len(all_received) == len(self._profile.incoming)

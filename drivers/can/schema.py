@@ -1,4 +1,4 @@
-"""A profile's keys, and what may stand there."""
+"""The schema of a profile."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ class FrameEntry(Section):
 
     @model_validator(mode="after")
     def _one_of_both(self) -> FrameEntry:
-        """Refuse signals beside bytes."""
+        """Refuse signals together with bytes."""
         if self.data is not None and self.signals:
             raise ValueError("found data and signals, expected one of them")
         return self

@@ -36,7 +36,7 @@ class CanSettings(ProfileSettings, ArmBusSettings):
 
     @property
     def installation(self) -> dict[str, list[float]]:
-        """Return what this arm's installation says instead of the profile."""
+        """Return the values that replace the profile's for this arm."""
         values = {name: getattr(self, name) for name in ("direction", "zero", "gear")}
         return {name: list(value) for name, value in values.items() if value is not None}
 

@@ -11,19 +11,19 @@ from gapbridge.drivers.robot_modes import StopReason, modes_of
 
 
 class StateBuilder:
-    """Makes states; remembers the sample before, for velocities."""
+    """Makes states; keeps the previous sample, for velocities."""
 
     def __init__(self, n: int) -> None:
         self._before: Sample | None = None
         self._last: Sample | None = None  # of the state last made
         self._qd = np.zeros(n)
 
-    def forget(self) -> None:
-        """Take no velocity out of the next sample and those before."""
+    def reset(self) -> None:
+        """Compute no velocity from the next sample and those before."""
         self._before = None
 
     def remember(self) -> None:
-        """Take velocities from the state last made on: it can be believed."""
+        """Use the last state for velocities: it passed the plausibility check."""
         self._before = self._last
 
     def build(
@@ -31,7 +31,7 @@ class StateBuilder:
     ) -> RobotState:
         """Return the state of a sample.
 
-        ``target`` (n,) is what the arm was last commanded, where anyone commanded it.
+        ``target`` (n,) rad: the joints commanded last, None if there are none.
         """
         q = sample.position
         present = {name: v for name, v in sample.others.items() if np.isfinite(v).all()}

@@ -1,4 +1,4 @@
-"""The writing half: frames out, only those that the profile allows, and never half a setpoint."""
+"""The writing half: sends only frames that the profile allows, and only whole setpoints."""
 
 from __future__ import annotations
 
@@ -23,37 +23,37 @@ class FrameWriter:
         self._now = clock.monotonic
         self._settings, self._profile = settings, profile
         self._bus: Any = None
-        self._last: Frames | None = None  # the setpoint that got out whole
+        self._last: Frames | None = None  # the last setpoint that was sent completely
         self.target: Array | None = None  # rad, the same as joints
-        self.mended = 0  # setpoints that had to be taken back
+        self.reverted = 0  # setpoints that were sent in part and reverted
 
     def use(self, bus: Any) -> None:
         """Send over this bus from now on; None: there is none any more."""
         self._bus = bus
 
-    def forget(self) -> None:
-        """Forget the last setpoint: it is no longer what the arm holds."""
+    def reset(self) -> None:
+        """Drop the last setpoint: the arm does not hold it any more."""
         self._last = self.target = None
 
     def write(self, q: Array) -> None:
-        """Send one setpoint (n,), rad, all its frames or none that is left standing.
+        """Send one setpoint (n,), rad: all its frames, or the previous setpoint again.
 
-        Raises WriteError; then the arm has its previous setpoint again, or its stop sequence,
-        unless the bus takes nothing any more, which the message says.
+        Raises WriteError; then the previous setpoint, or else the stop sequence, was sent after
+        the partial one, unless the bus accepts no frame, which the message says.
         """
         frames = self._encode(q)
         for sent, (key, data) in enumerate(frames):
             try:
                 self._send(key, data)
             except WriteError as error:
-                done = self._mend() if sent else "nothing of it was sent"
+                done = self._revert() if sent else "nothing of it was sent"
                 message = f"{error} ({sent} of {len(frames)} frames out; {done})"
                 raise PartialWriteError(message) from None
         self._last, self.target = frames, q.copy()
 
-    def _mend(self) -> str:
-        """Take back a setpoint of which a part is out; returns what was done."""
-        self.mended += 1
+    def _revert(self) -> str:
+        """Replace a setpoint that was sent in part; returns what was done."""
+        self.reverted += 1
         for frames, message in (
             (self._last, "the setpoint before was sent again"),
             (self._stop_frames(), "the stop sequence was sent"),
@@ -95,8 +95,8 @@ class FrameWriter:
     ) -> None:
         """Go through a sequence. Raises WriteError where a frame or an ``until`` fails.
 
-        ``hold`` gives the joints of a hold step, ``listen(s)`` reads meanwhile, ``reached`` says
-        whether an ``until`` is there.
+        ``hold`` returns the joints of a hold step, ``listen(s)`` reads for s seconds, ``reached``
+        returns whether an ``until`` is fulfilled.
         """
         for action in actions:
             end = self._now() + action.within

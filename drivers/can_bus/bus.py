@@ -1,4 +1,4 @@
-"""A CAN bus by its settings: python-can's interfaces, opened and closed without their traps.
+"""A CAN bus by its settings: python-can's interfaces, opened and closed safely.
 
 python-can is the top-level package ``can``; this package is ``drivers.can``. It is imported when a
 bus is opened, so that a cell is read without it.
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     import can
 
 SOCKETCAND_PORT = 29536
-REACHABLE = 2.0  # s: a server that has not answered by then is not there
+REACHABLE = 2.0  # s until a server must have answered
 
 
 class BusSettings(BaseModel):
@@ -54,7 +54,7 @@ class BusSettings(BaseModel):
 
 
 class ArmBusSettings(BusSettings):
-    """A bus on which an arm is moved: who else may command it, and when a joint is stuck."""
+    """A bus on which an arm is moved: other masters, frozen joints, motion when enabled."""
 
     foreign_quiet: float = Field(
         1.0, gt=0.0, le=10.0, description="s without a frame of another master before we may write"
@@ -72,9 +72,9 @@ class ArmBusSettings(BusSettings):
 
 
 def open_bus(settings: BusSettings, filters: list[can.typechecking.CanFilter] | None = None) -> Any:
-    """Return an open ``can.BusABC``. Raises LinkError, soon, where the bus is not there.
+    """Return an open ``can.BusABC``. Raises LinkError, soon, if there is no such bus.
 
-    ``filters`` are python-can's: in the kernel or the adapter where it can, here elsewhere.
+    ``filters`` are python-can's, in the kernel or the adapter if it supports them.
     """
     arguments: dict[str, Any] = {"interface": settings.interface, "channel": settings.channel}
     if settings.interface == "socketcand":
@@ -88,7 +88,7 @@ def open_bus(settings: BusSettings, filters: list[can.typechecking.CanFilter] | 
 
 
 def _is_terminal(channel: str) -> bool:
-    """Return whether a pseudo-terminal answers, which need not be waited for like an adapter."""
+    """Return whether the channel is a pseudo-terminal, which needs no start-up time."""
     return os.path.realpath(channel).startswith("/dev/pts/")
 
 

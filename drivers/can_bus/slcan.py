@@ -49,7 +49,7 @@ class BufferedPort:
         return data
 
     def reset_input_buffer(self) -> None:
-        """Forget what has come and was not read."""
+        """Drop unread input."""
         self._piece, self._next = b"", 0
         self._port.reset_input_buffer()
 

@@ -13,7 +13,7 @@ from typing import Any
 import can
 from can.interfaces.socketcand.socketcand import SocketCanDaemonBus
 
-# It warns of every message that comes in two pieces, which is what a stream does.
+# It warns of every message that arrives in two pieces, which is normal for a stream.
 logging.getLogger("can.interfaces.socketcand.socketcand").setLevel(logging.ERROR)
 
 

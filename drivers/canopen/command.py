@@ -12,27 +12,27 @@ from gapbridge.drivers.canopen.master import Master
 from gapbridge.drivers.canopen.profile import CanopenProfile
 
 Frames = list[tuple[int, bytes, str]]
-OURS = ("Controlword",)  # beside the mode's own target
+OURS = ("Controlword",)  # that we command, in addition to the mode's target
 
 
 class RpdoWriter:
     """Sends RPDOs of transmission type 1: drives act on them at the next SYNC, all at once.
 
-    A set of which only a part got out is followed by the set before; where not even that gets out,
-    no SYNC may leave, so that the part never counts.
+    After a set that was sent in part the previous set is sent again; if that fails too, no SYNC is
+    sent, so that the partial set never takes effect.
     """
 
     def __init__(self, master: Master, profile: CanopenProfile) -> None:
         self._master, self._profile = master, profile
         self._image: list[dict[str, int]] = [{} for _ in profile.nodes]
         self._last: Frames = []
-        self.partial = False  # a part of a set stands in the drives, waiting for a SYNC
-        self.mended = 0  # sets of which a part had to be taken back
+        self.partial = False  # the drives hold a part of a set, until a SYNC
+        self.reverted = 0  # sets that were sent in part and reverted
         self.target: Array | None = None  # (n,) rad, of the last whole set
 
     def load(self) -> None:
-        """Fill objects that we do not command with what the drives hold. Raises LinkError."""
-        self.forget()
+        """Read the objects that we do not command from the drives. Raises LinkError."""
+        self.reset()
         for joint, node in enumerate(self._profile.nodes):
             for layout in self._profile.rpdo:
                 for entry in layout.entries:
@@ -40,14 +40,14 @@ class RpdoWriter:
                         counts = self._master.read(node, entry.address)
                         self._image[joint][entry.name] = counts
 
-    def forget(self) -> None:
-        """Forget what was sent: the drives' own state holds."""
+    def reset(self) -> None:
+        """Drop the last set: the drives' own state is valid now."""
         self._last, self.partial, self.target = [], False, None
 
     def send(self, controlwords: Sequence[int], q: Array) -> None:
         """Send Controlwords and joint targets (n,), rad; they count at the next SYNC.
 
-        Raises WriteError where not all got out; then none of them will count.
+        Raises WriteError if not all were sent; then none of them takes effect.
         """
         frames = self._encode(controlwords, q)
         for sent, (cob_id, data, name) in enumerate(frames):
@@ -55,7 +55,7 @@ class RpdoWriter:
                 self._master.send(cob_id, data, name)
             except LinkError as error:
                 self.partial = self.partial or sent > 0
-                done = "" if not sent else f" ({sent} of {len(frames)} out; {self._mend()})"
+                done = "" if not sent else f" ({sent} of {len(frames)} out; {self._revert()})"
                 raise WriteError(f"{error}{done}") from None
         self._last, self.partial, self.target = frames, False, q.copy()
 
@@ -77,9 +77,9 @@ class RpdoWriter:
                 frames.append((layout.cob_id(node), data, f"{layout.name} of node {node}"))
         return frames
 
-    def _mend(self) -> str:
-        """Take back a set of which a part is out; returns what was done."""
-        self.mended += 1
+    def _revert(self) -> str:
+        """Replace a set that was sent in part; returns what was done."""
+        self.reverted += 1
         if not self._last:
             return "no SYNC will follow"
         try:
@@ -90,10 +90,10 @@ class RpdoWriter:
         self.partial = False
         return "the set before was sent again"
 
-    def make_whole(self) -> None:
-        """Make sure that a SYNC may leave. Raises LinkError where a part still stands."""
+    def complete_set(self) -> None:
+        """Make sure that a SYNC may be sent. Raises LinkError if a set is still partial."""
         if self.partial:
-            done = self._mend()
+            done = self._revert()
             if self.partial:
                 raise LinkError(
                     f"{self._master.where}: a setpoint is out in part: {done}; the drives stop "

@@ -1,4 +1,4 @@
-"""Setting drives up when connecting: who they are, their PDOs, their times. Enables nothing."""
+"""Configuring drives when connecting: identity, PDOs, times. Enables nothing."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ PERIOD_VALUE, PERIOD_INDEX = Address(0x60C2, 1), Address(0x60C2, 2)
 LOWEST, HIGHEST = Address(0x607D, 1), Address(0x607D, 2)
 CIA402 = 402
 SYNCHRONOUS = 1  # transmission type: at every SYNC
-OTHER_SIZE = 4.0  # how many times the arm's range a drive's software limits may be, or a part of it
+OTHER_SIZE = 4.0  # largest ratio between the range of a drive's software limits and the joint's
 UNLIMITED = 0x7FFFFFFE  # counts
 
 
 def check_identity(master: Master, profile: CanopenProfile, node: int) -> None:
-    """Refuse what is no CiA 402 drive, or lacks the profile's mode. Raises LinkError."""
+    """Raise LinkError for a node that is not a CiA 402 drive with the profile's mode."""
     device_profile = master.read(node, DEVICE_TYPE) & 0xFFFF
     if device_profile != CIA402:
         raise LinkError(
@@ -40,7 +40,7 @@ def check_identity(master: Master, profile: CanopenProfile, node: int) -> None:
 def check_units(master: Master, profile: CanopenProfile, arm: Arm) -> None:
     """Compare the drives' software position limits with the arm's range. Raises LinkError.
 
-    Where the two are of quite another size, counts_per_turn or gear is wrong.
+    If their sizes differ by more than OTHER_SIZE, counts_per_turn or gear is wrong.
     """
     span = arm.limits.upper - arm.limits.lower
     for joint, node in enumerate(profile.nodes):
@@ -77,7 +77,7 @@ def interpolation_period(period: float) -> tuple[int, int]:
 
     Raises InputError where one byte cannot hold it.
     """
-    for index in (-3, -4, -5, -6, -2):  # ms first: some drives know nothing else
+    for index in (-3, -4, -5, -6, -2):  # ms first: some drives support nothing else
         value = period * 10.0**-index
         if 1.0 <= round(value) <= 255 and abs(value - round(value)) < 1e-6 * value:
             return round(value), index
@@ -134,7 +134,7 @@ def _check_pdo(master: Master, node: int, layout: PdoLayout) -> None:
 
 
 def _silence_others(master: Master, profile: CanopenProfile, node: int) -> None:
-    """Switch off the PDOs that the profile does not use: no frame that nobody asked for."""
+    """Disable the PDOs that the profile does not use."""
     for base, layouts in ((0x1800, profile.tpdo), (0x1400, profile.rpdo)):
         used = {layout.number for layout in layouts}
         for number in range(1, PDO_COUNT + 1):

@@ -37,7 +37,7 @@ from gapbridge.drivers.driver import Driver
 
 log = logging.getLogger("drivers.canopen")
 
-MOST_LEFT_OUT = 3  # SYNCs after a torn set
+MAX_SKIPPED_SYNCS = 3  # SYNCs after a torn set
 STARTING = 2.0  # s in which drives must be OPERATIONAL and answer a SYNC
 
 
@@ -69,7 +69,7 @@ class CanopenDriver(Driver):
         self._fresh_at = 0.0  # s, monotonic: of the last whole sample
         self._connected_at = 0.0
         self._armed_at: float | None = None  # s, monotonic
-        self._moved_at = 0.0  # s, monotonic: when the joints last changed, or were not sent away
+        self._moved_at = 0.0  # s, monotonic: when the joints last changed, or were at their target
         self._reported: Emergency | None = None  # that was written to the log last
 
     # -- connecting -------------------------------------------------------------------------------
@@ -98,8 +98,8 @@ class CanopenDriver(Driver):
             raise
         self._connected_at = self._now()
         self._armed_at = None
-        self.forget()
-        self._builder.forget()
+        self.reset_check()
+        self._builder.reset()
 
     def _first_sample(self) -> None:
         """Wait until all drives are OPERATIONAL and answer a SYNC. Raises LinkError."""
@@ -161,7 +161,7 @@ class CanopenDriver(Driver):
         if node is not None:
             raise StaleStateError(
                 f"{self.master.where}: node {node}: no heartbeat for "
-                f"{self.profile.heartbeat.lost_after:g} s{self.power.complaint(node)}"
+                f"{self.profile.heartbeat.lost_after:g} s{self.power.emergency(node)}"
             )
 
     def _validate(self, state: RobotState) -> None:
@@ -177,7 +177,7 @@ class CanopenDriver(Driver):
         return state
 
     def _check_frozen(self, state: RobotState, before: Array | None) -> None:
-        """Refuse joints that stand still count by count though they were sent elsewhere."""
+        """Raise StaleStateError for joints that do not change though commanded elsewhere."""
         now, q = state.received, state.actual_q
         away = float(np.abs(state.target_q - q).max())
         moved = before is None or (q != before).any()
@@ -185,7 +185,7 @@ class CanopenDriver(Driver):
             self._moved_at = now
         elif now - self._moved_at > self.settings.frozen_after:
             raise StaleStateError(
-                f"{self.profile.name}: joints have stood still for {now - self._moved_at:.2f} s, "
+                f"{self.profile.name}: joints have not changed for {now - self._moved_at:.2f} s, "
                 f"commanded {away:.3f} rad away"
             )
 
@@ -203,7 +203,7 @@ class CanopenDriver(Driver):
         )
 
     def _make_ready(self, state: RobotState) -> None:
-        """Enable the drives where they stand. Raises WriteError, and then none is enabled."""
+        """Enable the drives at the present joints. Raises WriteError, and then none is enabled."""
         if self._armed_at is not None:
             return
         try:
@@ -213,7 +213,7 @@ class CanopenDriver(Driver):
                     node = self.profile.nodes[joint]
                     raise WriteError(
                         f"{self.master.where}: node {node}: found {reported}"
-                        f"{self.power.complaint(node)}, expected none; link.clear_faults resets it"
+                        f"{self.power.emergency(node)}, expected none; link.clear_faults resets it"
                     )
             self._enable(sample)
         except WriteError:
@@ -222,7 +222,7 @@ class CanopenDriver(Driver):
             raise WriteError(str(error)) from None
 
     def _quiet_sample(self) -> SyncSet:
-        """Return a sample after a while without another master. Raises LinkError."""
+        """Return a sample after ``foreign_quiet`` s without another master. Raises LinkError."""
         begun = self._now()
         quiet = self.settings.foreign_quiet
         while True:
@@ -242,9 +242,12 @@ class CanopenDriver(Driver):
             self.power.prepare()
             hold = self.power.enable(sample, self.settings.arming_time, self.settings.clear_faults)
             assert self.sync_cycle.sample is not None
-            gave = float(np.abs(positions(self.profile, self.sync_cycle.sample) - start).max())
-            if gave > self.settings.arming_distance:
-                raise WriteError(f"{self.profile.name}: the arm gave {gave:.3f} rad when enabled")
+            moved_to = positions(self.profile, self.sync_cycle.sample)
+            displacement = float(np.abs(moved_to - start).max())
+            if displacement > self.settings.arming_distance:
+                raise WriteError(
+                    f"{self.profile.name}: the arm moved {displacement:.3f} rad when enabled"
+                )
             self.writer.send([self.power.following] * self.n, hold)
         except LinkError:
             with contextlib.suppress(LinkError):
@@ -252,7 +255,7 @@ class CanopenDriver(Driver):
                 self.power.restore()
             raise
         self._armed_at = self._moved_at = self._fresh_at = self._now()
-        self._builder.forget()
+        self._builder.reset()
 
     def _send(self, setpoint: Setpoint) -> None:
         """Send one setpoint, which counts at the next SYNC; needs ``arm`` before."""
@@ -267,11 +270,11 @@ class CanopenDriver(Driver):
             node = self.profile.nodes[joint]
             raise WriteError(
                 f"{self.master.where}: node {node}: found {states(sample)[joint]}, expected "
-                f"a drive that follows setpoints{self.power.complaint(node)}"
+                f"a drive that follows setpoints{self.power.emergency(node)}"
             )
         self.writer.send([self.power.following] * self.n, setpoint.q)
 
-    def _let_go(self) -> None:
+    def _release(self) -> None:
         """Quick stop, then switch the drives off and give them back their mode."""
         if self._armed_at is None:
             return
@@ -284,11 +287,11 @@ class CanopenDriver(Driver):
         except LinkError as error:
             raise WriteError(str(error)) from None
         finally:
-            self._builder.forget()
+            self._builder.reset()
             self._fresh_at = self._now()
 
     def close(self) -> None:
-        """Release where the link lives, end the drives' PDOs and leave the bus."""
+        """Release if the link works, end the drives' PDOs and close the bus."""
         with contextlib.suppress(LinkError):
             self.release()
         with contextlib.suppress(LinkError):
@@ -298,7 +301,7 @@ class CanopenDriver(Driver):
 
 
 class SyncCycle:
-    """Sends SYNCs at absolute deadlines and takes what answers them."""
+    """Sends SYNCs at absolute deadlines and collects the TPDOs that answer them."""
 
     def __init__(
         self, master: Master, writer: RpdoWriter, period: float, window: float, clock: Clock
@@ -312,12 +315,12 @@ class SyncCycle:
     def exchange(self) -> SyncSet | None:
         """Send one SYNC when it is due and return its TPDOs, None where they are torn.
 
-        Raises LinkError where the bus has gone, or where a part of a setpoint stands in the drives.
+        Raises LinkError if the bus is lost, or if the drives hold a part of a setpoint.
         """
         if self._torn:
             self._skip_syncs()
         self._wait_for_slot()
-        self._writer.make_whole()
+        self._writer.complete_set()
         collector = self._master.collector
         collector.clear_stray()
         sample = collector.wait(self._master.sync() + self._window)
@@ -337,9 +340,9 @@ class SyncCycle:
     def _skip_syncs(self) -> None:
         """Leave SYNCs out after a torn set: one, and up to three while TPDOs are missing.
 
-        Else what comes late would be taken for the next SYNC's.
+        Otherwise late TPDOs would be attributed to the next SYNC.
         """
-        for _ in range(MOST_LEFT_OUT):
+        for _ in range(MAX_SKIPPED_SYNCS):
             self._wait_for_slot()
             self._master.beat()
             if not self._master.collector.awaits_late:

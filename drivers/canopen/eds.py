@@ -1,4 +1,4 @@
-"""A drive's EDS or DCF: what its object dictionary holds, read with the canopen library."""
+"""A drive's EDS or DCF: its object dictionary, read with the canopen library."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Eds:
         return _import(self.path, node)
 
     def variable(self, address: Address) -> Variable | None:
-        """Return what lies at an address, None where the EDS has no number there."""
+        """Return the variable at an address, None if the EDS has no number there."""
         import canopen.objectdictionary as library
 
         entry = _entry(_cached(self.path), address)
@@ -53,7 +53,7 @@ class Eds:
 
 
 def read_eds(path: Path, node: int) -> Eds:
-    """Return an EDS that can be used. Raises ProfileError with a reason in one line."""
+    """Return an EDS of a drive. Raises ProfileError with a reason in one line."""
     if path.suffix.lower() not in SUFFIXES:
         raise ProfileError(f"found {path.name}, expected a file ending in {' or '.join(SUFFIXES)}")
     eds = Eds(path)

@@ -1,4 +1,4 @@
-"""What is heard on the bus: TPDOs, heartbeats, emergencies, and who else commands the drives."""
+"""Listening on the bus: TPDOs, heartbeats, emergencies, and commands of another master."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from gapbridge.drivers.canopen.objects import (
 from gapbridge.drivers.canopen.profile import CanopenProfile
 from gapbridge.drivers.canopen.sync_set import SyncCollector
 
-KEPT = 64  # emergencies remembered
-PAUSE = 0.02  # s between two readings of a bus that has gone
+KEPT = 64  # emergencies stored
+PAUSE = 0.02  # s between two readings of a lost bus
 OPERATIONAL = 5  # NMT state
 
 
@@ -48,7 +48,7 @@ class Emergency:
 
 
 class BusListener(MessageListener):
-    """Feeds the collector and the canopen library; a bus never gives us back our own frames."""
+    """Passes frames to the collector and the canopen library; our own are not received."""
 
     def __init__(self, network: Network, profile: CanopenProfile, collector: SyncCollector) -> None:
         super().__init__(network)
@@ -73,15 +73,15 @@ class BusListener(MessageListener):
         super().on_message_received(msg)  # type: ignore[no-untyped-call]
 
     def on_error(self, exc: Exception) -> None:
-        """Keep the notifier's thread from a traceback; ``Network.check`` says what ended the bus.
+        """Suppress the notifier thread's traceback; ``Network.check`` reports the error.
 
-        The thread goes on until it is stopped, so that it must not spin.
+        The thread runs until it is stopped, so it must pause.
         """
         time.sleep(PAUSE)
 
 
 def _commands(profile: CanopenProfile) -> dict[int, str]:
-    """Return the identifiers that a master of our drives uses, and how messages call them."""
+    """Return the identifiers that a master of our drives uses, and their names for messages."""
     names = {SYNC: "SYNC", NMT: "NMT command"}
     names[HEARTBEAT_BASE + profile.heartbeat.our_node] = "heartbeat with our node id"
     for node in profile.nodes:
@@ -92,7 +92,7 @@ def _commands(profile: CanopenProfile) -> dict[int, str]:
 
 
 class HeartbeatMonitor:
-    """When each drive was last heard, in which NMT state, and what it complained of."""
+    """The last heartbeat, NMT state and emergencies of each drive."""
 
     def __init__(self, network: Network, profile: CanopenProfile) -> None:
         self._profile = profile
@@ -129,7 +129,7 @@ class HeartbeatMonitor:
         return note
 
     def started(self) -> None:
-        """Forget restarts: the drives have just been set up, and count from now on."""
+        """Reset states and restarts: the drives have just been configured."""
         self.restarted.clear()
         self.nmt.clear()
         now = time.monotonic()

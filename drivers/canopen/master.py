@@ -1,4 +1,4 @@
-"""The bus with our drives on it: NMT, SDO, SYNC and RPDOs by the canopen library, errors in words.
+"""The master of the drives on a bus: NMT, SDO, SYNC and RPDOs by the canopen library.
 
 The library's heartbeat callbacks, SDO client and notifier thread are used as they are; its p402
 setters are not, because each blocks for up to a second.
@@ -46,7 +46,7 @@ _DOWNLOAD, _UPLOAD, _UPLOAD_SEGMENT, _ABORT = 1, 2, 3, 4  # SDO client command s
 
 
 class _Network(canopen.Network):
-    """The library's network; it sends what is allowed, and its thread ends soon when asked to."""
+    """The library's network, which sends only allowed frames, and whose thread ends soon."""
 
     NOTIFIER_CYCLE = 0.05
     NOTIFIER_SHUTDOWN_TIMEOUT = 1.0
@@ -56,7 +56,7 @@ class _Network(canopen.Network):
         self._allowed = allowed
 
     def send_message(self, can_id: int, data: Any, remote: bool = False) -> None:
-        """Send a frame that the profile allows; all of the library's go this way."""
+        """Send a frame that the profile allows; the library sends all frames through here."""
         self._allowed.check(can_id, data)
         super().send_message(can_id, data, remote)
 
@@ -74,7 +74,7 @@ class Master:
 
     @property
     def where(self) -> str:
-        """Return how messages call the link."""
+        """Return the name of the link in messages."""
         return f"{self._settings.where()}: {self._profile.name}"
 
     def open(self) -> None:
@@ -92,7 +92,7 @@ class Master:
         self.network = network
 
     def close(self) -> None:
-        """Leave the bus; may be repeated."""
+        """Close the bus; may be repeated."""
         network, self.network = self.network, None
         if network is None:
             return
@@ -102,7 +102,7 @@ class Master:
         close_bus(bus)
 
     def check(self) -> None:
-        """Raise LinkError where the bus, or the thread that reads it, has gone."""
+        """Raise LinkError if the bus, or the thread that reads it, has ended."""
         if self.network is None:
             raise LinkError(f"{self.where}: found no bus, expected connect() first")
         try:
@@ -123,7 +123,7 @@ class Master:
             ) from None
 
     def sync(self) -> float:
-        """Send one SYNC, and our heartbeat where it is due; returns when it left (s, monotonic)."""
+        """Send one SYNC, and our heartbeat if due; returns when it was sent (s, monotonic)."""
         self.beat()
         now = time.monotonic()
         self.collector.begin(now)
@@ -131,7 +131,7 @@ class Master:
         return now
 
     def beat(self) -> None:
-        """Send our heartbeat where it is due. From the loop: it ends when the loop hangs."""
+        """Send our heartbeat if due. Called by the loop, so that it stops if the loop hangs."""
         now = time.monotonic()
         if now < self._beat_at:
             return
@@ -179,7 +179,7 @@ class Master:
         self.sdo(node, str(address), act)
 
     def read_where_present(self, node: int, address: Address) -> int | None:
-        """Return an object's value, None where the EDS or the drive has none."""
+        """Return an object's value, None if the EDS or the drive has none. Raises LinkError."""
         if not self._profile.eds.has(address):
             return None
 
@@ -210,8 +210,8 @@ def _variable(remote: Any, address: Address) -> Any:
 class AllowedFrames:
     """The allow-list of one profile: identifiers, NMT nodes, objects that SDOs may write.
 
-    No object of a drive's limits, gains, offsets or identity is among them, nor is a node that
-    the profile does not have, nor NMT to all nodes.
+    It contains no object of a drive's limits, gains, offsets or identity, no node outside the
+    profile, and no NMT command to all nodes.
     """
 
     def __init__(self, profile: CanopenProfile) -> None:

@@ -1,4 +1,4 @@
-"""CiA 402's objects, modes and states by their names in the standard."""
+"""Objects, modes and states of CiA 402 by their names in the standard."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ FAULTS: tuple[State, ...] = ("FAULT REACTION ACTIVE", "FAULT")
 
 @dataclass(frozen=True, slots=True)
 class Address:
-    """Where an object lies in a drive's object dictionary."""
+    """The address of an object in a drive's object dictionary."""
 
     index: int
     subindex: int
@@ -87,7 +87,7 @@ TOWARDS_ENABLED: dict[State, int] = {
 
 
 def state_of(statusword: int) -> State:
-    """Return the state that a Statusword reports; what no state has counts as a fault."""
+    """Return the state that a Statusword reports; an undefined one counts as a fault."""
     for state, (mask, bits) in _MASKS.items():
         if statusword & mask == bits:
             return state

@@ -27,14 +27,14 @@ MODES_OF_OPERATION, CONSUMER_HEARTBEAT = Address(0x6060, 0), Address(0x1016, 1)
 ABORT_CONNECTION = Address(0x6007, 0)
 STOP_AT_LOSS = 3  # Abort connection option code: quick stop
 STOPPING = 2.0  # s that a quick stop and disabling may take
-STANDING = 3  # SYNCs without a change of any count: the arm stands
+STILL_SYNCS = 3  # SYNCs without a change of any count, after which the arm is at rest
 OFF: tuple[State, ...] = (
     "SWITCH ON DISABLED", "READY TO SWITCH ON", "NOT READY TO SWITCH ON", "FAULT",
 )  # fmt: skip
 
 
 class Power:
-    """Leads all drives of one arm to OPERATION ENABLED and back."""
+    """Brings all drives of one arm to OPERATION ENABLED and back."""
 
     def __init__(
         self,
@@ -83,9 +83,9 @@ class Power:
             del self._modes[node]
 
     def enable(self, sample: SyncSet, within: float, clear_faults: bool) -> Array:
-        """Enable all drives where they stand; returns the joints (n,) that they hold, rad.
+        """Enable all drives at the present joints; returns the joints (n,) that they hold, rad.
 
-        ``sample`` is the newest sample. Raises WriteError where one does not get there.
+        ``sample`` is the newest sample. Raises WriteError if a drive is not enabled in time.
         """
         hold: Array | None = None
         resetting = False
@@ -98,10 +98,10 @@ class Power:
             if hold is not None and enabled and not_following(self._profile, sample) is None:
                 return hold
             if time.monotonic() > end:
-                raise self._not_there(sample)
+                raise self._not_enabled(sample)
             resetting = not resetting and clear_faults
-            detail = [self._towards(state, enabled, resetting) for state in reported]
-            self._writer.send(detail, positions(self._profile, sample) if hold is None else hold)
+            commands = [self._towards(state, enabled, resetting) for state in reported]
+            self._writer.send(commands, positions(self._profile, sample) if hold is None else hold)
             sample = self._exchange() or sample
 
     def _towards(self, state: State, all_enabled: bool, resetting: bool) -> int:
@@ -112,26 +112,26 @@ class Power:
             return self.following
         return TOWARDS_ENABLED.get(state, DISABLE_VOLTAGE)
 
-    def _not_there(self, sample: SyncSet) -> WriteError:
+    def _not_enabled(self, sample: SyncSet) -> WriteError:
         joint = not_following(self._profile, sample) or 0
         counts, node = sample.counts[joint], self._profile.nodes[joint]
         mode = counts.get("Modes of operation display", self._profile.mode_number)
         return WriteError(
             f"{self._master.where}: node {node} does not follow setpoints: found "
             f"{states(sample)[joint]}, Statusword 0x{counts['Statusword']:04X}, mode {mode}, "
-            f"expected OPERATION ENABLED in mode {self._profile.mode_number}{self.complaint(node)}"
+            f"expected OPERATION ENABLED in mode {self._profile.mode_number}{self.emergency(node)}"
         )
 
-    def complaint(self, node: int) -> str:
-        """Return what a node complained of last, for messages."""
+    def emergency(self, node: int) -> str:
+        """Return a node's active emergency as text for messages; empty: none."""
         heartbeats = self._master.heartbeats
-        emergency = heartbeats.active.get(node) if heartbeats is not None else None
-        return f" ({emergency})" if emergency is not None else ""
+        active = heartbeats.active.get(node) if heartbeats is not None else None
+        return f" ({active})" if active is not None else ""
 
     def disable(self) -> None:
-        """Stop by quick stop, wait until the arm stands, and switch off. Raises LinkError.
+        """Stop by quick stop, wait until the arm is at rest, and switch off. Raises LinkError.
 
-        Drives that answer no more get the message too; they have at least our last word.
+        Drives that do not answer are sent the commands too.
         """
         profile, end = self._profile, time.monotonic() + STOPPING
         reported: list[State] = ["OPERATION ENABLED"] * profile.n
@@ -139,17 +139,17 @@ class Power:
         while True:
             if q is not None:
                 late = time.monotonic() > end - 0.5 * STOPPING
-                word = DISABLE_VOLTAGE if still >= STANDING or late else QUICK_STOP
+                word = DISABLE_VOLTAGE if still >= STILL_SYNCS or late else QUICK_STOP
                 moving = "OPERATION ENABLED"
-                detail = [QUICK_STOP if s == moving and not late else word for s in reported]
-                self._writer.send(detail, q)
+                commands = [QUICK_STOP if s == moving and not late else word for s in reported]
+                self._writer.send(commands, q)
             sample = self._exchange()
             if sample is not None:
                 reported, now = states(sample), positions(profile, sample)
                 still = still + 1 if q is not None and (now == q).all() else 0
                 q = now
                 if all(state in OFF for state in reported):
-                    self._writer.forget()
+                    self._writer.reset()
                     return
             if time.monotonic() > end:
                 raise WriteError(

@@ -1,4 +1,4 @@
-"""A CANopen profile out of its YAML and its EDS, checked before anything touches a bus."""
+"""Loading a CANopen profile from its YAML and its EDS, checked before a bus is opened."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ PdoNumber = Annotated[int, Field(ge=1, le=4, strict=True)]
 ObjectName = Annotated[str | int, Field(union_mode="left_to_right")]
 Keys = tuple[str | int, ...]
 MOST_BITS = 64
-WINDOW = 0.7  # of the SYNC period: the last moment of a TPDO, where the profile says none
+WINDOW = 0.7  # of the SYNC period: when TPDOs must have arrived, unless the profile says
 
 
 class Joint(Section):
-    """One drive and the joint that it turns."""
+    """One drive and its joint."""
 
     node: NodeId = Field(description="node id")
     counts_per_turn: Positive = Field(description="position units in one turn before the gear")
@@ -46,7 +46,7 @@ class Joint(Section):
 
 
 class Heartbeat(Section):
-    """Who sends heartbeats to whom."""
+    """Periods and timeouts of heartbeats."""
 
     drives: Positive = Field(default=0.1, description="s between two heartbeats of a drive")
     lost_after: Positive = Field(default=0.3, description="s without one: the drive is lost")
@@ -119,7 +119,7 @@ class CanopenProfile:
 
     @property
     def heartbeat(self) -> Heartbeat:
-        """Return who sends heartbeats to whom."""
+        """Return periods and timeouts of heartbeats."""
         return self.file.heartbeat
 
     @property
@@ -215,7 +215,7 @@ class _Pdos:
     def layouts(
         self, key: str, names_of_pdo: Mapping[int, Sequence[str | int]], wanted: tuple[str, ...]
     ) -> tuple[PdoLayout, ...]:
-        """Return the layouts of a section; refuses what is missing, twice or too long."""
+        """Return the layouts of a section; refuses missing, repeated or too long ones."""
         layouts: list[PdoLayout] = []
         keys_of_name: dict[str, Keys] = {}
         for number, names in sorted(names_of_pdo.items()):
@@ -285,7 +285,7 @@ def _near(name: str, known: Mapping[str, object] | Sequence[str]) -> str:
 
 
 def _refusal(document: ProfileDocument, worst: ErrorDetails) -> ProfileError:
-    """Return one line out of what pydantic says."""
+    """Return an error in one line for an error of pydantic."""
     keys: Keys = tuple(key for key in worst["loc"] if key not in ("str", "int", "[key]"))
     if keys and keys[0] in ("tpdo", "rpdo"):
         keys = (keys[0], *(str(key) for key in keys[1:2]), *keys[2:])  # a PDO's number counts as is

@@ -13,7 +13,7 @@ from gapbridge.drivers.canopen.profile import CanopenProfile
 from gapbridge.drivers.canopen.sync_set import SyncSet
 from gapbridge.drivers.robot_modes import StopReason, modes_of
 
-SPAN, OLDEST = 5, 0.1  # samples, s: what a velocity is reckoned from where drives report none
+SPAN, OLDEST = 5, 0.1  # samples, s: for a velocity, if drives report none
 
 
 def states(sample: SyncSet) -> list[State]:
@@ -37,7 +37,7 @@ def not_following(profile: CanopenProfile, sample: SyncSet) -> int | None:
 
 
 class StateBuilder:
-    """Makes states; remembers the samples before, for velocities."""
+    """Makes states; keeps the previous samples, for velocities."""
 
     def __init__(self, profile: CanopenProfile) -> None:
         self._profile = profile
@@ -49,18 +49,18 @@ class StateBuilder:
         """Return the joints (n,) of the sample before, rad."""
         return self._last[-1][1] if self._last else None
 
-    def forget(self) -> None:
-        """Take no velocity out of the next sample and those before."""
+    def reset(self) -> None:
+        """Compute no velocity from the next sample and those before."""
         self._last.clear()
 
     def remember(self, state: RobotState) -> None:
-        """Take note of a state that can be believed."""
+        """Store a state that passed the plausibility check."""
         self._last.append((state.timestamp, state.actual_q))
 
     def build(self, sample: SyncSet, target: Array | None, armed: bool) -> RobotState:
         """Return the state.
 
-        ``target`` (n,) is what the drives were last commanded, rad. The time of the sample is that
+        ``target`` (n,): joints commanded last, rad. The time of the sample is that
         of its SYNC, at which all drives latched their positions.
         """
         q = positions(self._profile, sample)
@@ -90,9 +90,9 @@ class StateBuilder:
         return None if following else StopReason.NOT_READY
 
     def _velocity(self, sample: SyncSet, q: Array) -> Array:
-        """Return (n,) rad/s: the drives' own where the profile knows its unit.
+        """Return (n,) rad/s: from the drives, if the profile has the unit.
 
-        Else out of the last samples: one step alone would show the SYNC's jitter.
+        Otherwise from the last samples: a single step would contain the SYNC's jitter.
         """
         scale = self._profile.file.velocity_scale
         reported = [counts.get("Velocity actual value") for counts in sample.counts]

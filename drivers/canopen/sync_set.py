@@ -1,4 +1,4 @@
-"""One SYNC's TPDOs: they count only where all were received, once each, after that SYNC."""
+"""The TPDOs of one SYNC: valid only if all were received, once each, after that SYNC."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from gapbridge.drivers.canopen.profile import CanopenProfile
 
 
 class DropReason(StrEnum):
-    """Why a frame or a set does not count."""
+    """Why a frame or a set was dropped."""
 
     TWICE = "twice"
     MALFORMED = "malformed"
@@ -23,10 +23,10 @@ class DropReason(StrEnum):
 
 
 class SyncSet(NamedTuple):
-    """What all drives reported at one SYNC. A tuple, because one is made in every cycle."""
+    """The reports of all drives at one SYNC. A tuple, because one is created in every cycle."""
 
     counts: tuple[dict[str, int], ...]  # per joint: object name -> counts
-    synced: float  # s, time.monotonic() when the SYNC left
+    synced: float  # s, time.monotonic() when the SYNC was sent
     received: float  # s, time.monotonic() of the last TPDO
 
 
@@ -66,7 +66,7 @@ class SyncCollector:
             self._open = False
 
     def take(self, cob_id: int, data: bytes, now: float) -> None:
-        """Add one frame. Raises nothing; what is no TPDO of the profile is ignored."""
+        """Add one frame. Raises nothing; ignores frames that are no TPDO of the profile."""
         member = self._members.get(cob_id)
         if member is None:
             return
@@ -130,14 +130,11 @@ class SyncCollector:
         return not self._frames and not self._rejected
 
     def why(self) -> str:
-        """Return what is wrong with this set."""
+        """Return why this set is invalid."""
         if self._rejected:
             reason, who, detail = self._rejected
-            return (
-                f"{who} came twice after one SYNC"
-                if reason == DropReason.TWICE
-                else f"{who}: {detail}"
-            )
+            twice = reason == DropReason.TWICE
+            return f"{who} came twice after one SYNC" if twice else f"{who}: {detail}"
         missing = [
             f"{layout.name} of node {self._nodes[joint]}"
             for cob_id, (joint, layout) in self._members.items()

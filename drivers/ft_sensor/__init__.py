@@ -1,4 +1,4 @@
-"""Force-torque sensors: a link of their own that any arm's driver can be joined with."""
+"""Force-torque sensors: separate links that can be joined with any arm's driver."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ FT_SENSORS: dict[str, str] = {
 def make_sensor(settings: FtSensorSettings) -> ForceTorqueSensor:
     """Return the sensor that the settings name, not yet connected.
 
-    Raises LinkError where it is unknown or its library is missing.
+    Raises LinkError if it is unknown or its library is missing.
     """
     name = settings.driver
     if name not in FT_SENSORS:

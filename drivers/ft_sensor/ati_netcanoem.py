@@ -1,4 +1,4 @@
-"""ATI NETCANOEM on CAN: asked sample by sample; calibration and units are read from it.
+"""ATI NETCANOEM on CAN: polled sample by sample; calibration and units are read from it.
 
 The lower four bits of an id are the operation, the upper seven the sensor. Everything is
 big-endian. Operation 0 answers with status, gauges 0, 2, 4 (id 0) and gauges 1, 3, 5 (id 1), all
@@ -23,11 +23,11 @@ from gapbridge.drivers.ft_sensor.sensor import Reading
 from gapbridge.drivers.ft_sensor.settings import AtiSettings
 
 GAUGES, MATRIX, COUNTS, UNITS = 0x0, 0x2, 0x7, 0x8
-ANSWER = 0.1  # s: an answer about the calibration that has not come by then is asked for again
+ANSWER = 0.1  # s until a request for calibration data is repeated
 ATTEMPTS = 3
-SAMPLE = 0.03  # s: a sample that has not come by then is lost (a USB adapter may take 0.016)
-TOGETHER = 0.005  # s between the frames of a sample at most
-SATURATED = 0x10000  # our own bit: a gauge at the end of its range
+SAMPLE = 0.03  # s until a sample is lost (a USB adapter may take 0.016)
+FRAME_WINDOW = 0.005  # s between the frames of a sample at most
+SATURATED = 0x10000  # added to the sensor's status bits: a gauge at the end of its range
 # code -> N or Nm
 FORCE_UNITS = {1: 4.4482216152605, 2: 1.0, 3: 4448.2216152605, 4: 1e3, 5: 9.80665, 6: 9.80665e-3}
 TORQUE_UNITS = {1: 0.1129848290276, 2: 1.3558179483314, 3: 1.0, 4: 1e-3, 5: 9.80665e-2, 6: 1e3}
@@ -40,7 +40,7 @@ STATUS = (
 
 
 def decode_gauges(first: bytes, second: bytes) -> tuple[int, tuple[int, ...]] | None:
-    """Return status and gauges 0..5 of the two frames of an answer; None where they are none."""
+    """Return status and gauges 0..5 of the two frames of an answer; None if invalid."""
     if len(first) != 8 or len(second) != 6:
         return None
     status, a, c, e = struct.unpack(">H3h", first)
@@ -52,21 +52,21 @@ def decode_gauges(first: bytes, second: bytes) -> tuple[int, tuple[int, ...]] | 
 
 
 class AnswerDecoder:
-    """Puts the frames of one answer together: consecutive ids, in order, soon after each other."""
+    """Assembles the frames of one answer: consecutive ids, in order, within a window."""
 
     def __init__(self, first_id: int, frames: int, window: float) -> None:
         self._first_id, self._frames = first_id, frames
         self._window = window  # s from the first frame to the last at most
-        self._found: list[bytes] = []
+        self._received: list[bytes] = []
         self._begun = 0.0
         self.dropped = 0
 
     def take(self, identifier: int, data: bytes, stamp: float) -> list[bytes] | None:
         """Take one frame with its time stamp (s); returns the answer where it is complete."""
-        frames = self._found
+        frames = self._received
         if identifier == self._first_id:
             self.dropped += len(frames)
-            self._found, self._begun = [data], stamp
+            self._received, self._begun = [data], stamp
         elif frames and identifier == self._first_id + len(frames):
             if 0.0 <= stamp - self._begun <= self._window:
                 frames.append(data)
@@ -74,18 +74,18 @@ class AnswerDecoder:
                 self._drop()
         else:
             self._drop()
-        if len(self._found) < self._frames:
+        if len(self._received) < self._frames:
             return None
-        answer, self._found = self._found, []
+        answer, self._received = self._received, []
         return answer
 
     def _drop(self) -> None:
-        self.dropped += 1 + len(self._found)
-        self._found = []
+        self.dropped += 1 + len(self._received)
+        self._received = []
 
 
 class AtiNetCanOem(CanSensor):
-    """The sensor on its bus."""
+    """Driver of the sensor."""
 
     def __init__(self, settings: AtiSettings) -> None:
         super().__init__()
@@ -126,7 +126,7 @@ class AtiNetCanOem(CanSensor):
         return np.asarray(self.settings.sign * unit[:, None] * matrix)
 
     def _ask(self, operation: int, data: bytes, lengths: tuple[int, ...]) -> list[bytes]:
-        """Return the frames of an answer, of these lengths; asks again where none comes."""
+        """Return the frames of an answer, of these lengths; repeats the request if none comes."""
         for _ in range(ATTEMPTS):
             self._drain()
             self._send(self._base | operation, data)
@@ -141,7 +141,7 @@ class AtiNetCanOem(CanSensor):
     def _answer(
         self, operation: int, frames: int, until: float, window: float = ANSWER
     ) -> list[bytes] | None:
-        """Return the data of an answer's frames; None where it has not come in time."""
+        """Return the data of an answer's frames; None if it has not come in time."""
         decoder = AnswerDecoder(self._base | operation, frames, window)
         while (remaining := until - time.monotonic()) > 0.0:
             frame = self._receive(remaining)
@@ -152,12 +152,12 @@ class AtiNetCanOem(CanSensor):
                 self.dropped += decoder.dropped
                 return answer
             if frame.arbitration_id == (self._base | operation) + frames - 1:
-                break  # the last one, and not all before it: asking again is quicker
+                break  # the last frame, but some before it are missing: a new request is faster
         self.dropped += decoder.dropped
         return None
 
     def read(self, timeout: float) -> Reading | None:
-        """Ask for a sample when it is due and return it; see ForceTorqueSensor.read."""
+        """Request a sample when it is due and return it; see ForceTorqueSensor.read."""
         self._connected()
         until = time.monotonic() + timeout
         time.sleep(max(min(self._due, until) - time.monotonic(), 0.0))
@@ -167,7 +167,7 @@ class AtiNetCanOem(CanSensor):
         requested_at = time.monotonic()
         self._due = max(self._due + 1.0 / self.settings.rate, requested_at)
         self._send(self._base | GAUGES, b"")
-        answer = self._answer(GAUGES, 2, requested_at + SAMPLE, TOGETHER)
+        answer = self._answer(GAUGES, 2, requested_at + SAMPLE, FRAME_WINDOW)
         received = time.monotonic()
         if answer is None:
             return None
@@ -176,18 +176,18 @@ class AtiNetCanOem(CanSensor):
             self.dropped += 1
             return None
         status, gauges = decoded
-        # it samples between question and answer, whose ways are taken for equally long
+        # sampled halfway between request and answer, whose delays are assumed equal
         return Reading(
             0.5 * (requested_at + received), received, self._matrix @ np.array(gauges), status
         )
 
     def _drain(self) -> None:
-        """Drop late answers to former questions."""
+        """Drop late answers to former requests."""
         while self._receive(0.0) is not None:
             self.dropped += 1
 
     def describe(self, status: int) -> str:
-        """Return the bits of the status in words."""
+        """Return the bits of the status as text."""
         faults = [word for i, word in enumerate(STATUS) if status >> i & 1]
         return f"status 0x{status & 0xFFFF:04X}: {', '.join(faults)}"
 

@@ -1,4 +1,4 @@
-"""What force-torque sensors on a CAN bus share: sending, receiving and leaving the bus."""
+"""Base class of force-torque sensors on a CAN bus: sending, receiving, closing."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from gapbridge.drivers.ft_sensor.sensor import ForceTorqueSensor
 
 
 class CanSensor(ForceTorqueSensor):
-    """A sensor that speaks in standard frames; ``connect`` opens ``_bus``."""
+    """A sensor with standard CAN frames; ``connect`` opens ``_bus``."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -52,7 +52,7 @@ class CanSensor(ForceTorqueSensor):
                 return frame
 
     def close(self) -> None:
-        """Leave the bus."""
+        """Close the bus."""
         if self._bus is not None:
             close_bus(self._bus)
             self._bus = None

@@ -1,6 +1,6 @@
 """Any arm's driver joined with a force-torque sensor: one driver for the loop.
 
-The sensor is read by a thread of its own, so that nobody waits for it.
+The sensor is read in a thread, so that the loop never waits for it.
 """
 
 from __future__ import annotations
@@ -27,17 +27,17 @@ from gapbridge.drivers.ft_sensor import make_sensor
 from gapbridge.drivers.ft_sensor.sensor import ClockOffset, ForceTorqueSensor, Reading
 from gapbridge.drivers.ft_sensor.settings import FtSensorSettings, SensorFrame
 
-KEPT = 64  # samples: enough to look up what was sampled when an arm's state was
+KEPT = 64  # samples stored, to interpolate at the time of an arm's state
 LISTEN = 0.1  # s that one read may take
-BACKOFF = (0.1, 1.0)  # s before the link is opened anew: first, most
+BACKOFF = (0.1, 1.0)  # s before the link is reopened: first, most
 
 
 class DriverWithSensor(Driver):
     """An arm's driver whose states carry the wrench of a sensor on the flange.
 
-    The arm's clock is tied to this machine's by the quickest arrivals, the sensor's samples carry
-    this machine's time, and each state gets the wrench of the moment it was sampled at. The arm's
-    cycle never waits for the sensor.
+    The offset of the arm's clock is estimated from arrivals, the sensor's samples have this
+    machine's time, and each state gets the wrench at its sampling time. The arm's cycle never waits
+    for the sensor.
     """
 
     def __init__(self, arm: Driver, settings: FtSensorSettings, model: Model) -> None:
@@ -63,8 +63,8 @@ class DriverWithSensor(Driver):
     def _read_state(self) -> RobotState:
         """Return the arm's next sample with the sensor's wrench; see Driver.read_state.
 
-        Where the sensor is silent, overloaded or not well, the state has no force and says why; or,
-        with ``when_lost: stop``, raises StaleStateError, InvalidStateError.
+        If the sensor is silent, overloaded or faulty, the state has no force and the reason in
+        ``sensor_lost``; with ``when_lost: stop`` raises StaleStateError, InvalidStateError.
         """
         state = self._arm.read_state()
         moment = self._clock.take(state.timestamp, state.received)
@@ -82,10 +82,10 @@ class DriverWithSensor(Driver):
         force = self._tcp_force.of(wrench, state)
         return state._replace(ft_raw_wrench=wrench, actual_TCP_force=force)
 
-    def forget(self) -> None:
-        """See Driver.forget."""
-        super().forget()
-        self._arm.forget()
+    def reset_check(self) -> None:
+        """See Driver.reset_check."""
+        super().reset_check()
+        self._arm.reset_check()
 
     def keep_alive(self) -> None:
         """See Driver.keep_alive."""
@@ -95,9 +95,9 @@ class DriverWithSensor(Driver):
         """See Driver.round_trip."""
         return self._arm.round_trip()
 
-    def way(self) -> float:
-        """See Driver.way."""
-        return self._arm.way()
+    def transit_time(self) -> float:
+        """See Driver.transit_time."""
+        return self._arm.transit_time()
 
     def unanswered_since(self) -> float:
         """See Driver.unanswered_since."""
@@ -120,14 +120,14 @@ class DriverWithSensor(Driver):
         self._arm.write_setpoint(setpoint)
 
     def close(self) -> None:
-        """Leave both links."""
+        """Close both links."""
         try:
             self._arm.close()
         finally:
             self._reader.stop()
 
     def _make_ready(self, state: RobotState) -> None:
-        """Make the arm ready, and see that the sensor has not been held up by it."""
+        """Arm the arm's driver, and wait for a new sample of the sensor."""
         self._arm.arm(state)
         if not self._reader.wait(self.settings.connect_timeout):
             raise WriteError(
@@ -135,19 +135,19 @@ class DriverWithSensor(Driver):
                 "arming (ft_sensor.connect_timeout)"
             )
 
-    def _let_go(self) -> None:
+    def _release(self) -> None:
         """Stop writing to the arm."""
         self._arm.release()
 
     def nominal_q(self, state: RobotState) -> Array:
-        """Return the joints (n,) that the robot itself wants, rad."""
+        """See Driver.nominal_q."""
         return self._arm.nominal_q(state)
 
 
 def sensor_to_flange(frame: SensorFrame) -> Array:
-    """Return the matrix (6, 6) that takes a wrench in sensor axes to one in flange axes.
+    """Return the matrix (6, 6) from a wrench in sensor axes to one in flange axes.
 
-    Torques are about the sensor's origin before and about the flange's origin after.
+    Torques are about the sensor's origin, then about the flange's origin.
     """
     rotation, position = rpy_matrix(np.array(frame.rpy)), np.array(frame.xyz)
     matrix = np.zeros((6, 6))
@@ -159,19 +159,19 @@ def sensor_to_flange(frame: SensorFrame) -> Array:
 class TcpForce:
     """Derives ``actual_TCP_force`` from the flange sensor, as controllers do from their own.
 
-    The declared payload's weight is taken off (its inertia is not: the figure holds for slow
-    motion), and the sensor's errors that the model knows are undone. Bending is left out.
+    The declared payload's weight is subtracted (not its inertia: the result holds for slow motion),
+    and the sensor errors in the model are corrected. Deflection is neglected.
     """
 
     def __init__(self, model: Model) -> None:
         self._model = model
         self._tool = np.array(model.tool_in_flange, dtype=float)
-        self._undo, self._bias = _undoing(model)
-        # laid out once: Model.predict would do it anew in every cycle
+        self._undo, self._bias = _sensor_correction(model)
+        # prepared once: Model.predict would do it in every cycle
         rigid = model.without_terms()
         self._chain, self._rows = rigid.chain(), rigid.rows(np.zeros((1, model.arm.n)))
         self._place = np.empty((1, 3)), np.empty((1, 3, 3))
-        self._flange_in_base()  # loads what is compiled, before the first cycle
+        self._flange_in_base()  # loads compiled code before the first cycle
 
     def of(self, wrench_in_flange: Array, state: RobotState) -> Array:
         """Return force and torque (6,) of the surroundings on the tool, at the TCP, base axes.
@@ -198,25 +198,25 @@ class TcpForce:
 
 
 def _cross(a: Array, b: Array) -> Array:
-    """Return a x b of two vectors (3,); numpy's own takes ten times as long."""
+    """Return a x b of two vectors (3,), ten times as fast as numpy.cross."""
     return np.array(
         (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
     )
 
 
-def _undoing(model: Model) -> tuple[Array, Array]:
-    """Return matrix (6, 6) and bias (6,): what acts = matrix (reading - bias)."""
+def _sensor_correction(model: Model) -> tuple[Array, Array]:
+    """Return matrix (6, 6) and bias (6,): wrench = matrix (reading - bias)."""
     probes = np.vstack([np.zeros((1, 6)), np.eye(6)])
     for term in acting(model.terms, "wrench"):
         effect = CATALOGUE[term.effect]
-        # the sensor's own; a drift needs the time of its log
+        # errors of the sensor; a drift needs the time of its log
         if effect.channels == ("wrench",) and "timestamp" not in effect.needs:
-            probes = effect.sense(term, model.arm, probes, _standing(model))
+            probes = effect.sense(term, model.arm, probes, _motion_at_rest(model))
     bias = probes[0]
     return np.linalg.inv((probes[1:] - bias).T), bias
 
 
-def _standing(model: Model) -> Motion:
+def _motion_at_rest(model: Model) -> Motion:
     """Return seven rows of an arm at rest, for the probes."""
     zeros, rows = np.zeros((7, model.arm.n)), np.arange(7)
     return Motion(
@@ -227,14 +227,14 @@ def _standing(model: Model) -> Motion:
 
 
 class SensorReader:
-    """Keeps the last samples of a sensor. A link that breaks is opened anew, again and again."""
+    """Stores the last samples of a sensor. A broken link is reopened until it works."""
 
     def __init__(self, sensor: ForceTorqueSensor, settings: FtSensorSettings) -> None:
         self._sensor, self._settings = sensor, settings
         self._readings: deque[Reading] = deque(maxlen=KEPT)
-        self._broken = ""  # why the link is down
+        self._broken = ""  # why the link is broken
         self._stopping = threading.Event()
-        self._came = threading.Event()
+        self._new_sample = threading.Event()
         self._thread: threading.Thread | None = None
 
     def start(self) -> None:
@@ -253,8 +253,8 @@ class SensorReader:
 
     def wait(self, timeout: float) -> bool:
         """Wait for the next sample up to ``timeout`` s; returns whether one has come."""
-        self._came.clear()
-        return self._came.wait(timeout)
+        self._new_sample.clear()
+        return self._new_sample.wait(timeout)
 
     def _why(self) -> str:
         """Return why there may be no sample, for messages."""
@@ -280,27 +280,27 @@ class SensorReader:
             if reading is not None:
                 pause = BACKOFF[0]
                 self._readings.append(reading)
-                self._came.set()
+                self._new_sample.set()
 
     def at(self, moment: float) -> Reading:
-        """Return what the sensor read at a ``moment`` (s, monotonic), between two samples if need.
+        """Return the reading at a ``moment`` (s, monotonic), interpolated between two samples.
 
-        Never waits, and never looks ahead: for a moment after the last sample, that sample holds.
-        Raises StaleStateError where that is older than ``max_age``, InvalidStateError where the
-        sensor is overloaded or says that it is not well.
+        Never waits and never extrapolates: after the last sample, returns that one. Raises
+        StaleStateError if it is older than ``max_age``, InvalidStateError if the sensor is
+        overloaded or reports a fault.
         """
         readings = list(self._readings)
         self._require_fresh(readings)
         later = readings[-1]
-        self._require_sound(later)
+        self._require_valid(later)
         for earlier in reversed(readings[:-1]):
             if later.timestamp <= moment:
                 break
             if earlier.timestamp <= moment:
-                self._require_sound(earlier)
+                self._require_valid(earlier)
                 return _between(earlier, later, moment)
             later = earlier
-        self._require_sound(later)
+        self._require_valid(later)
         return later
 
     def _require_fresh(self, readings: list[Reading]) -> None:
@@ -312,7 +312,7 @@ class SensorReader:
                 f"expected at most {limit:g} s (ft_sensor.max_age)"
             )
 
-    def _require_sound(self, reading: Reading) -> None:
+    def _require_valid(self, reading: Reading) -> None:
         name, limits = self._sensor.name, self._settings.overload
         if reading.status:
             raise InvalidStateError(f"{name}: {self._sensor.describe(reading.status)}")
@@ -339,7 +339,7 @@ class SensorReader:
 
 
 def _between(earlier: Reading, later: Reading, moment: float) -> Reading:
-    """Return the sample at a moment between two."""
+    """Return the interpolated reading at a moment between two."""
     share = (moment - earlier.timestamp) / max(later.timestamp - earlier.timestamp, 1e-9)
     wrench = earlier.wrench + min(share, 1.0) * (later.wrench - earlier.wrench)
     return Reading(moment, later.received, wrench)

@@ -25,24 +25,24 @@ HEAD = b"\x20\x4e"
 FRAME = struct.Struct("<2x6h2x")
 QUIET = b"\xff" * 50  # ends the stream
 UNIT = np.array((1e-2, 1e-2, 1e-2, 1e-3, 1e-3, 1e-3))  # N, Nm per count
-RESPONSE = 0.2  # s: of the registers, which are asked for on and on
-START = 1.0  # s: of the command that starts the stream
-TRIES = 3  # that it is given when connecting, where nobody answers
-TURN = 0.1  # s that the sensor takes from its stream back to Modbus
+RESPONSE = 0.2  # s until the registers must be answered
+START = 1.0  # s until the command that starts the stream must be answered
+TRIES = 3  # attempts to start it when connecting
+TURN = 0.1  # s that the sensor needs to switch from its stream to Modbus
 BITS = 10.0  # per byte on the line, 8N1
-SILENCE = 0.5  # s without a sample after which the stream is asked for again
-LONGEST = 4096  # bytes kept at most
+SILENCE = 0.5  # s without a sample after which the stream is started again
+LONGEST = 4096  # bytes read at once
 
 
 class StreamDecoder:
-    """Finds samples in the bytes of the stream; what has no right CRC is dropped."""
+    """Finds samples in the bytes of the stream; bytes without a correct CRC are dropped."""
 
     def __init__(self) -> None:
         self._bytes = bytearray()
         self.dropped = 0  # bytes that belonged to no sample
 
     def take(self, data: bytes) -> list[tuple[int, ...]]:
-        """Take bytes as they come; returns the counts (6 each) of the samples completed."""
+        """Add bytes; returns the counts (6 each) of the samples completed."""
         from pymodbus.framer import FramerRTU
 
         buffer, samples = self._bytes, []
@@ -66,7 +66,7 @@ class StreamDecoder:
 
 
 class RobotiqFt300(ForceTorqueSensor):
-    """The sensor on its line."""
+    """Driver of the sensor."""
 
     def __init__(self, settings: RobotiqSettings) -> None:
         super().__init__()
@@ -78,7 +78,7 @@ class RobotiqFt300(ForceTorqueSensor):
         self._last_received = 0.0  # s, monotonic
 
     def connect(self) -> None:
-        """Open the line, end a stream that was left running, start ours. Raises LinkError."""
+        """Open the line, end a running stream, start a new one. Raises LinkError."""
         from pymodbus.client import ModbusSerialClient
 
         settings = self.settings
@@ -97,8 +97,8 @@ class RobotiqFt300(ForceTorqueSensor):
             raise
 
     def _begin(self, tries: int) -> None:
-        """End a stream that runs, and start ours; again where that fails and tries are left."""
-        self._quieten()
+        """End a running stream and start a new one, in up to ``tries`` attempts."""
+        self._stop_stream()
         if self.settings.mode != "stream":
             return
         try:
@@ -108,8 +108,8 @@ class RobotiqFt300(ForceTorqueSensor):
                 raise
             self._begin(tries - 1)
 
-    def _quieten(self) -> None:
-        """End a stream and drop what is left of it."""
+    def _stop_stream(self) -> None:
+        """End a stream and drop its remaining bytes."""
         line = self._line()
         try:
             line.write(QUIET)
@@ -151,13 +151,13 @@ class RobotiqFt300(ForceTorqueSensor):
             remaining = until - time.monotonic()
             if remaining <= 0.0:
                 if time.monotonic() - self._last_received > SILENCE:
-                    self._start_stream()  # it may have been switched off meanwhile
+                    self._start_stream()  # the sensor may have been switched off
                 return None
             self._take_bytes(remaining)
         return self._waiting.pop(0)
 
     def _take_bytes(self, timeout: float) -> None:
-        """Wait for bytes of the stream and keep the samples that they complete."""
+        """Wait for bytes of the stream and store the samples that they complete."""
         line = self._line()
         try:
             line.timeout = timeout
@@ -176,7 +176,7 @@ class RobotiqFt300(ForceTorqueSensor):
             self._last_received = received
 
     def _ask(self) -> Reading | None:
-        """Return the registers' sample; None where the answer is none."""
+        """Return the registers' sample; None if the answer is invalid."""
         from pymodbus.exceptions import ConnectionException, ModbusException
 
         line = self._line()
@@ -203,7 +203,7 @@ class RobotiqFt300(ForceTorqueSensor):
         return Reading(stamp, received, self.settings.sign * UNIT * np.array(counts))
 
     def close(self) -> None:
-        """End the stream and leave the line."""
+        """End the stream and close the line."""
         client, self._client = self._client, None
         if client is None:
             return

@@ -21,11 +21,11 @@ from gapbridge.drivers.ft_sensor.settings import RobotousSettings
 
 START, STOP = 0x0B, 0x0C
 LAYOUT = struct.Struct(">B6hB2x")
-SILENCE = 0.5  # s without a sample after which the stream is asked for again
+SILENCE = 0.5  # s without a sample after which the stream is started again
 
 
 class PairDecoder:
-    """Puts the two frames of a sample together; what does not belong together is dropped."""
+    """Assembles the two frames of a sample; other frames are dropped."""
 
     def __init__(self, reply_ids: tuple[int, int], window: float) -> None:
         self._first_id, self._second_id = reply_ids
@@ -54,7 +54,7 @@ class PairDecoder:
 
 
 class RobotousRft(CanSensor):
-    """The sensor on its bus."""
+    """Driver of the sensor."""
 
     def __init__(self, settings: RobotousSettings) -> None:
         super().__init__()
@@ -96,15 +96,15 @@ class RobotousRft(CanSensor):
                 wrench = np.array(counts[:6]) * self._unit
                 return Reading(self._clock.take(stamp, received), received, wrench, counts[6])
         if time.monotonic() - self._last_received > SILENCE:
-            self._command(START)  # it may have been switched off meanwhile
+            self._command(START)  # the sensor may have been switched off
         return None
 
     def describe(self, status: int) -> str:
-        """Return what the overload status says."""
+        """Return the overload status as text."""
         return f"overload (status 0x{status:02X})"
 
     def close(self) -> None:
-        """Stop the stream and leave the bus."""
+        """Stop the stream and close the bus."""
         if self._bus is not None:
             with contextlib.suppress(Exception):
                 self._command(STOP)

@@ -1,4 +1,4 @@
-"""What a force-torque sensor is: connect, read, close; the same for every wire."""
+"""The base class of force-torque sensors: connect, read, close."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from typing import Self
 
 from gapbridge.core.arrays import Array
 
-DRIFT = 1e-4  # s per s: what two clocks may drift apart, and how fast the bound follows
-JUMP = 0.5  # s: a clock that is off by more was set anew
+DRIFT = 1e-4  # s per s: largest drift between two clocks
+JUMP = 0.5  # s: a clock that is off by more was set
 
 
 class ClockOffset:
@@ -38,14 +38,14 @@ class ClockOffset:
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """One sample of a sensor: what the load does to it.
+    """One sample of a sensor: the wrench of the load on the sensor.
 
-    A tool that hangs on the sensor at rest reads its weight, pointing down (docs/conventions.md,
-    ``ft_raw_wrench``); ``settings.sign`` turns sensors around that report the reaction.
+    A tool at rest reads its weight, pointing down (docs/conventions.md, ``ft_raw_wrench``);
+    ``settings.sign`` inverts sensors that report the reaction.
     """
 
-    timestamp: float  # s, monotonic: when the sensor is reckoned to have sampled it
-    received: float  # s, monotonic: when it had come in whole
+    timestamp: float  # s, monotonic: estimated sampling time
+    received: float  # s, monotonic: when it was received completely
     wrench: Array  # (6,) N, Nm: sensor axes, torque about the sensor's origin
     status: int = 0  # the sensor's own status or overload bits, 0 = fine
 
@@ -53,29 +53,28 @@ class Reading:
 class ForceTorqueSensor(ABC):
     """One link to one sensor, for one thread. Constructors never touch hardware."""
 
-    name = "force-torque sensor"  # how messages call it
+    name = "force-torque sensor"  # in messages
 
     def __init__(self) -> None:
-        self.dropped = 0  # frames or pairs that were not believed
+        self.dropped = 0  # invalid frames or pairs
 
     @abstractmethod
     def connect(self) -> None:
-        """Open the link and have the sensor measure. Raises LinkError."""
+        """Open the link and start measuring. Raises LinkError."""
 
     @abstractmethod
     def read(self, timeout: float) -> Reading | None:
-        """Wait up to ``timeout`` s for the next sample; None where none has come.
+        """Wait up to ``timeout`` s for the next sample; None if none has come.
 
-        Garbage on the wire is dropped and counted in ``dropped``. Raises LinkError where the link
-        itself is broken.
+        Invalid data is dropped and counted in ``dropped``. Raises LinkError if the link is broken.
         """
 
     @abstractmethod
     def close(self) -> None:
-        """Leave the link. Never raises; may be repeated."""
+        """Close the link. Never raises; may be repeated."""
 
     def describe(self, status: int) -> str:
-        """Return in words what a status that is not 0 means."""
+        """Return a status other than 0 as text."""
         return f"status 0x{status:04X}"
 
     def __enter__(self) -> Self:

@@ -1,4 +1,4 @@
-"""Section ``ft_sensor`` of a cell: which sensor, how it is mounted, when it is believed."""
+"""Section ``ft_sensor`` of a cell: the sensor, its mounting, and its limits."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ class SensorFrame(Section):
 
 
 class Overload(Section):
-    """What the sensor may carry; more is not believed. Left out: the sensor's own bits alone."""
+    """Overload limits: larger readings are invalid. None: only the sensor's own bits count."""
 
     force: float | None = Field(None, gt=0.0, description="N, length of the force")
     torque: float | None = Field(None, gt=0.0, description="Nm, length of the torque")
 
 
 class FtSensorSettings(Section):
-    """What every sensor's section says. A zero that is off is the model's ``ft_bias``."""
+    """Keys that every sensor has. A zero offset belongs in the model (``ft_bias``)."""
 
     driver: str = Field(description="the kind of sensor")
     sensor_in_flange: SensorFrame = Field(SensorFrame(), description="how it is mounted")

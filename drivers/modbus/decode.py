@@ -1,4 +1,4 @@
-"""Registers as they came over the wire -> one sample, SI; no socket, no clock."""
+"""Registers -> one sample, SI; no socket, no clock."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ from gapbridge.drivers.modbus.schema import Condition, Mailbox, Place, ProfileFi
 from gapbridge.drivers.robot_modes import StopReason
 
 Registers = Sequence[bytes]  # of each of RegisterMap.blocks, two bytes each, as on the wire
-Spot = tuple[int, int, Coding]  # a number's block and its first register there
+Spot = tuple[int, int, Coding]  # a number's block, its first register there, its coding
 
 TURN = 2.0 * math.pi
 
 
 class Sample(NamedTuple):
-    """What one reading of the blocks says. A tuple, because one is made in every cycle."""
+    """One reading of the blocks. A tuple, because one is created in every cycle."""
 
     vectors: dict[str, Array]  # by the profile's names, SI; echo (6,) m, rad: offset applied
     clock: float | None  # counts of the clock register
     stop_reasons: tuple[tuple[StopReason, str], ...]  # conditions that are not met
-    motion: tuple[tuple[str, str], ...]  # of the last target: ("busy" or "result", what it says)
-    answer: tuple[int, int] | None  # the mailbox's: number of the offset applied, what it says
+    motion: tuple[tuple[str, str], ...]  # of the last target: ("busy" or "result", message)
+    answer: tuple[int, int] | None  # mailbox: sequence of the offset applied, program state
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +50,7 @@ class _Field:
 
 
 class Decoder:
-    """Decodes the blocks of one profile; what a reading says depends on nothing before it."""
+    """Decodes the blocks of one profile; each reading independently of those before."""
 
     def __init__(self, profile: ProfileFile, compiled: RegisterMap) -> None:
         self._profile, self._map = profile, compiled
@@ -92,7 +92,7 @@ class Decoder:
         )  # fmt: skip
 
     def _echo(self, box: Mailbox) -> _Field:
-        """Return the offset that the robot's program says it applies."""
+        """Return the field of the offset that the robot's program applies."""
         block, first = self._map.place_of(box.echo_table, box.echo_address, ECHO_WORDS)
         self._answer = (block, first)
         indices = tuple(range(first + 2, first + ECHO_WORDS))
@@ -111,7 +111,7 @@ class Decoder:
     def decode(self, registers: Registers) -> Sample:
         """Return the sample in the registers of every block.
 
-        Raises InvalidStateError where the sample is torn.
+        Raises InvalidStateError if the sample is torn.
         """
         self._check_lengths(registers)
         clock = None if self._clock is None else _number(registers, self._clock)
@@ -135,7 +135,7 @@ class Decoder:
         )
 
     def _stop_reasons_of(self, registers: Registers) -> tuple[tuple[StopReason, str], ...]:
-        """Return the conditions that are not met; looked at anew where a register has changed."""
+        """Return the conditions that are not met; evaluated again if a register has changed."""
         condition_bytes = [bytes_of(registers[block]) for block, bytes_of in self._looked]
         if condition_bytes != self._last_bytes:
             self._stop_reasons = tuple(
@@ -165,8 +165,8 @@ class Decoder:
 
 
 def _answer_of(registers: Registers, block: int, first: int) -> tuple[int, int]:
-    number, says = words_in(registers[block], first, 2)
-    return number, says
+    number, program = words_in(registers[block], first, 2)
+    return number, program
 
 
 def _picked(data: bytes, indices: Sequence[int]) -> list[int]:
@@ -174,7 +174,7 @@ def _picked(data: bytes, indices: Sequence[int]) -> list[int]:
 
 
 def _getters(spots: Iterable[Spot]) -> list[tuple[int, Callable[[bytes], Any]]]:
-    """Return for each block what takes the spots' bytes out of it, all at once."""
+    """Return for each block a function that returns the bytes of its spots."""
     places: dict[int, list[int]] = {}
     for block, start, coding in spots:
         places.setdefault(block, []).extend(range(2 * start, 2 * (start + coding.words)))
@@ -182,7 +182,7 @@ def _getters(spots: Iterable[Spot]) -> list[tuple[int, Callable[[bytes], Any]]]:
 
 
 def check_identity(profile: ProfileFile, compiled: RegisterMap, registers: Registers) -> None:
-    """Refuse a controller that is another than the profile's. Raises InvalidStateError.
+    """Raise InvalidStateError for a controller that is not the profile's.
 
     ``registers`` are those of RegisterMap.identity.
     """

@@ -26,12 +26,12 @@ from gapbridge.drivers.modbus.write import make_writer
 from gapbridge.drivers.offset_inverse import Nominal
 from gapbridge.drivers.robot_modes import modes_of, why_not_ready
 
-SLOW_EVERY = 0.2  # s between two readings of conditions that lie apart
-LONGEST_ANSWER, LEAST_ANSWER = 4.0, 0.03  # cycles, s: an older answer is not fresh
+SLOW_EVERY = 0.2  # s between two readings of the slow blocks
+ANSWER_CYCLES, ANSWER_TIME = 4.0, 0.03  # cycles, s: an older answer is not fresh
 
 
 class ModbusDriver(Driver):
-    """One arm on Modbus. What lies where, and how setpoints get there, says the profile."""
+    """One arm on Modbus. The profile gives the register map and the way to write setpoints."""
 
     def __init__(self, settings: ModbusSettings, model: Model, clock: Clock = SYSTEM) -> None:
         self.profile = profile = read_profile(settings.profile_path, model.arm.n)
@@ -55,12 +55,12 @@ class ModbusDriver(Driver):
         self._due = 0.0  # s, monotonic: when the next reading is due
         self._fresh_at = 0.0  # s, monotonic: of the last new sample
         self._sample: Sample | None = None
-        self._before: RobotState | None = None  # the last one that was believed
-        self._longest_answer = max(LONGEST_ANSWER / self.rate, LEAST_ANSWER)  # s
-        self._given = 0.0  # s, monotonic: when the last setpoint was given
+        self._before: RobotState | None = None  # the last plausible one
+        self._longest_answer = max(ANSWER_CYCLES / self.rate, ANSWER_TIME)  # s
+        self._given = 0.0  # s, monotonic: when the last setpoint was passed to the writer
         self._connected = False
-        self._answer: float | None = None  # s that the last question and its answer took
-        self._quickest = math.inf  # s: the quickest of them since the link was opened
+        self._answer: float | None = None  # s: round-trip time of the last reading
+        self._quickest = math.inf  # s: the shortest of them since the link was opened
 
     # -- reading ----------------------------------------------------------------------------------
 
@@ -69,13 +69,13 @@ class ModbusDriver(Driver):
         self.transport.open()
         try:
             identity = [self.transport.read(block) for block in self.map.identity]
-            with self._named():
+            with self._naming_link():
                 check_identity(self.profile, self.map, identity)
             self._slow_at, self._quickest = 0.0, math.inf
             blocks = self._read_blocks()
-            with self._named():
+            with self._naming_link():
                 self._freshness.restart()
-                self._begin_with(self._decoder.decode(blocks))
+                self._check_first_sample(self._decoder.decode(blocks))
         except InvalidStateError as error:
             self.transport.close()
             raise LinkError(str(error)) from None
@@ -86,21 +86,21 @@ class ModbusDriver(Driver):
         self._due = self._fresh_at = self._now()
 
     @contextlib.contextmanager
-    def _named(self) -> Iterator[None]:
-        """Name the link in what a check finds; errors of the transport have its name already."""
+    def _naming_link(self) -> Iterator[None]:
+        """Add the link's name to errors of a check; errors of the transport have it."""
         try:
             yield
         except InvalidStateError as error:
             raise InvalidStateError(f"{self.transport.name}: {error}") from None
 
-    def _begin_with(self, sample: Sample) -> None:
-        """Take the sample of connecting: the first one that is read must agree with it.
+    def _check_first_sample(self, sample: Sample) -> None:
+        """Check the sample read when connecting; the next one is compared with it.
 
         Raises InvalidStateError where the arm cannot be there: units, word order or signs are
         wrong.
         """
         self._before = None
-        self.forget()
+        self.reset_check()
         try:
             self._validate(self._state(sample, self._now()))
         except InvalidStateError as error:
@@ -116,7 +116,7 @@ class ModbusDriver(Driver):
             self.clock.sleep(self._due - now)
         limit = max(self._fresh_at, now) + self.settings.state_timeout
         while True:
-            sample = self._attempt()
+            sample = self._try_reading()
             received = self._now()
             if sample is not None:
                 q = sample.vectors["position"]
@@ -130,13 +130,13 @@ class ModbusDriver(Driver):
                 )
             self.clock.sleep(min(self.profile.period / 4.0, 0.01))
 
-    def _attempt(self) -> Sample | None:
-        """Return a sample, or None where the controller kept silent once.
+    def _try_reading(self) -> Sample | None:
+        """Return a sample, or None if there was no answer, or a late one.
 
-        An answer that was long under way, or lay here while this process stood still, is none.
+        Late are answers delayed by the link, or by this process being suspended.
         """
         if not self.transport.is_open:
-            self.transport.open()  # raises LinkError where nobody is there any more
+            self.transport.open()  # raises LinkError if the controller is gone
         requested_at = self._now()
         try:
             sample = self._decoder.decode(self._read_blocks())
@@ -153,14 +153,14 @@ class ModbusDriver(Driver):
             self._slow = [self.transport.read(block) for block in self.map.slow]
             self._slow_at = now
         first = self._first_block
-        problem = self._writer.pending()
+        pending = self._writer.pending()
         if now - self._given > self._longest_answer:
-            problem = None  # of a state that is old by now
-        if problem is not None and first.table == "holding":
-            registers = [self.transport.exchange(first, *problem)]
+            pending = None  # computed from a state that is too old now
+        if pending is not None and first.table == "holding":
+            registers = [self.transport.exchange(first, *pending)]
         else:
-            if problem is not None:
-                self.transport.write("holding", *problem)
+            if pending is not None:
+                self.transport.write("holding", *pending)
             registers = [self.transport.read(first)]
         for block in self._other_blocks:
             registers.append(self.transport.read(block))
@@ -197,7 +197,7 @@ class ModbusDriver(Driver):
         )  # fmt: skip
 
     def nominal_q(self, state: RobotState) -> Array:
-        """Return what the robot itself wants (n,), rad: with a mailbox, without its offset."""
+        """Return the robot's own target joints (n,), rad: with a mailbox, without the offset."""
         if self._nominal is None or self._sample is None:
             return state.target_q
         return self._nominal.without(state.target_q, self._sample.vectors["echo"])
@@ -206,24 +206,23 @@ class ModbusDriver(Driver):
         """Return how long the last reading took, s; see Driver.round_trip."""
         return self._answer
 
-    def way(self) -> float:
-        """Return how long the last reading took, s; see Driver.way.
+    def transit_time(self) -> float:
+        """Return how long the last reading took, s; see Driver.transit_time.
 
-        With a clock of the controller's the quickest one: what others took longer, that shows.
+        With a clock of the controller the shortest reading: timestamps show what exceeds it.
         """
         return self._quickest if self._freshness.has_clock else self._answer or 0.0
 
     # -- writing ----------------------------------------------------------------------------------
 
     def _make_ready(self, state: RobotState) -> None:
-        """Check robot and resolution, and make ready for writing; moves nothing."""
+        """Check robot and resolution, and prepare for writing; moves nothing."""
         name = self.transport.name
         if self.profile.write.mode != "read_only":
             if why_not_ready(state):
-                problem = (
-                    "; ".join(text for _, text in self._sample.stop_reasons) if self._sample else ""
-                )
-                raise WriteError(f"{name}: the robot is not ready: {problem}")
+                reasons = self._sample.stop_reasons if self._sample else ()
+                detail = "; ".join(text for _, text in reasons)
+                raise WriteError(f"{name}: the robot is not ready: {detail}")
             self._check_resolution(state.actual_q)
         self._writer.arm(state, self._look)
 
@@ -238,7 +237,7 @@ class ModbusDriver(Driver):
             raise WriteError(str(error)) from None
 
     def _check_resolution(self, q: Array) -> None:
-        """Refuse where one count of a target moves the TCP farther than the offset at hand."""
+        """Raise WriteError if one count of a target moves the TCP more than the present offset."""
         write = self.profile.write
         if write.mode != "target_trigger":
             return
@@ -246,7 +245,7 @@ class ModbusDriver(Driver):
         offset = float(np.linalg.norm(predicted - wanted_pose(self._model, q[None]).position[0]))
         coarsest = self.settings.coarsest or offset
         if coarsest == 0.0:
-            return  # nothing bends in the model: there is no offset that could get lost
+            return  # a rigid model: there is no offset
         count = abs(write.target.scale) * UNITS[write.target.unit][1]
         if write.target.type.startswith("f"):
             count *= 1e-6  # a float's own resolution, of an angle of some radians
@@ -269,7 +268,7 @@ class ModbusDriver(Driver):
     def _send(self, setpoint: Setpoint) -> None:
         """Send one setpoint; needs ``arm`` before.
 
-        With a mailbox and function 23 it leaves together with the next reading.
+        With a mailbox and function 23 it is sent together with the next reading.
         """
         if self._sample is None:
             raise WriteError(f"{self.transport.name}: found no state, expected read_state() first")
@@ -281,8 +280,8 @@ class ModbusDriver(Driver):
         except LinkError as error:
             raise WriteError(str(error)) from None
 
-    def _let_go(self) -> None:
-        """Stop writing: no heartbeat any more, or the controller's stop."""
+    def _release(self) -> None:
+        """Stop writing: no more heartbeats, or the controller's stop."""
         try:
             self._writer.release()
         except WriteError:
@@ -291,7 +290,7 @@ class ModbusDriver(Driver):
             raise WriteError(str(error)) from None
 
     def close(self) -> None:
-        """Release where the link lives, and disconnect."""
+        """Release if the link works, and disconnect."""
         try:
             if self._connected:
                 self.release()

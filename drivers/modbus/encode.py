@@ -16,7 +16,7 @@ MODULUS, SEED = 65521, 0x4742  # of the checksum: the largest prime below 65536
 LARGEST = 0x7FFF  # counts
 RATE_COUNTS = 2.0e-5, 1.0e-4  # m/s and rad/s per count of the cell's rates
 
-ABSENT, RUNNING, EXPIRED, REJECTED = 0, 1, 2, 3  # what the robot's program says of itself
+ABSENT, RUNNING, EXPIRED, REJECTED = 0, 1, 2, 3  # state that the robot's program reports
 
 
 def next_number(number: int) -> int:

@@ -1,4 +1,4 @@
-"""Whether a sample is new, by the controller's own clock, and what its time is."""
+"""Whether a sample is new, by the controller's clock, and its timestamp."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from gapbridge.core.arrays import Array
 from gapbridge.drivers.modbus.registers import UNITS
 from gapbridge.drivers.modbus.schema import Clock, ProfileFile
 
-MOVING = 0.05  # rad/s: a joint that says it is this fast must change its angle
+MOVING = 0.05  # rad/s: a joint that reports this velocity must change its angle
 
 
 class Freshness:
     """Follows the controller's clock, counter or heartbeat from sample to sample.
 
-    Without one, an answer is as fresh as its arrival, unless the joints stand still to the last
-    bit while their velocities say otherwise.
+    Without one, an answer is new when it arrives, unless the joints are bit-identical while their
+    velocities are not zero.
     """
 
     def __init__(self, profile: ProfileFile) -> None:
@@ -28,22 +28,22 @@ class Freshness:
         self._q: Array | None = None
 
     def restart(self) -> None:
-        """Forget the samples before: the next one is new whatever it says."""
+        """Drop the previous sample: the next one counts as new."""
         self._count, self._q = None, None
 
     def is_new(self, count: float | None, q: Array, qd: Array | None) -> bool:
         """Return whether a sample with this clock count is not the one before."""
         if self._clock is not None:
             return count != self._count
-        # plain numbers: six of them cost an array more
+        # a list: faster than an array of six
         if self._q is None or qd is None or max(map(abs, qd.tolist())) <= MOVING:
             return True
         return not np.array_equal(q, self._q)
 
     def take(self, count: float | None, q: Array, received: float) -> float:
-        """Take a new sample; returns its time, s, on a clock that never runs back.
+        """Store a new sample; returns its timestamp, s, which never decreases.
 
-        A timestamp or counter gives the controller's time; anything else the time of arrival here.
+        It is the controller's time with a timestamp or counter, otherwise the time of arrival.
         """
         before, self._count, self._q = self._count, count, q
         if count is None or not self.has_clock:
@@ -55,7 +55,7 @@ class Freshness:
         ahead = count - before
         if self._wrap:
             ahead %= self._wrap
-            if ahead > 0.5 * self._wrap:  # it ran back: the controller has started anew
+            if ahead > 0.5 * self._wrap:  # it went back: the controller has restarted
                 ahead = 1.0
         self._time += max(ahead, 1.0 if self._wrap else 0.0) * self._step
         return self._time
@@ -71,7 +71,7 @@ def _step(clock: Clock | None, period: float) -> float:
 
 
 def _wrap(clock: Clock | None) -> float:
-    """Return after how many counts the clock starts anew; 0: never."""
+    """Return after how many counts the clock wraps; 0: never."""
     if clock is None or clock.type.startswith("f"):
         return 0.0
     low, high = clock.coding.limits

@@ -1,4 +1,4 @@
-"""A register map compiled: which blocks are read how often, and what may ever be written."""
+"""The compiled register map: blocks to read, how often, and registers that may be written."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ class Block:
 
 @dataclass(frozen=True, slots=True)
 class RegisterMap:
-    """What one profile comes to.
+    """The blocks and writable registers of a profile.
 
-    fast: blocks read in every cycle, the one with the joints first; where the map allows it there
-    is one. slow: blocks of mere conditions, read now and then. identity: read once. writable: the
-    only table and address pairs that a request may write.
+    fast: blocks read in every cycle, the one with the joints first; if the map allows it, only one.
+    slow: blocks of conditions, read less often. identity: read once. writable: the only table and
+    address pairs that a request may write.
     """
 
     fast: tuple[Block, ...]
@@ -40,7 +40,7 @@ class RegisterMap:
 
     @property
     def blocks(self) -> tuple[Block, ...]:
-        """Return what one sample is made of, in this order."""
+        """Return the blocks of one sample, in order."""
         return self.fast + self.slow
 
     def place_of(self, table: Table, address: int, words: int) -> tuple[int, int]:
@@ -67,7 +67,7 @@ def compile_map(profile: ProfileFile) -> RegisterMap:
     conditions = [g for k, g in groups.items() if k[0] == "status"]
     identity = [g for k, g in groups.items() if k[0] == "identity"]
     fast = _blocks(every, profile.gaps)
-    # conditions that lie within reach of a block that is read anyway cost nothing there
+    # conditions that fit into a block that is read in every cycle are read with it
     if profile.gaps:
         fast, conditions = _joined(fast, conditions)
     conditions = [g for g in conditions if not any(_inside(b, g) for b in fast)]
@@ -80,7 +80,7 @@ def compile_map(profile: ProfileFile) -> RegisterMap:
 
 
 def _group(keys: Keys) -> Keys:
-    """Return what belongs together: angles and their turns, a clock and its repetition."""
+    """Return the key of a group: angles with their turns, a clock with its repetition."""
     return keys[:1] if keys[0] == "clock" else keys[:2] if keys[0] == "state" else keys
 
 

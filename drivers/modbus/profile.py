@@ -1,4 +1,4 @@
-"""Reading a register map and refusing one that cannot be right, with the line that is wrong."""
+"""Reading a register map and refusing an inconsistent one, with the line of the error."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ THREE = ("force", "moment")
 
 @dataclass(frozen=True, slots=True)
 class Span:
-    """Registers that one entry of the file takes."""
+    """Registers that one entry of the file uses."""
 
     keys: Keys
     table: Table
@@ -191,8 +191,8 @@ def spans(profile: ProfileFile) -> list[Span]:
 def _check_overlap(document: ProfileDocument, profile: ProfileFile) -> None:
     """Refuse two entries on one register.
 
-    Bits of one register may be looked at by several conditions, and a register may be ordered
-    several values; a target may be read back where it is written.
+    Several conditions may read bits of one register, and several values may be written to one
+    register; a target may be read back from where it is written.
     """
     ordered = sorted(spans(profile), key=lambda s: (s.table, s.first))
     for i, one in enumerate(ordered):
@@ -225,7 +225,7 @@ def _may_share(one: Span, other: Span) -> bool:
 
 
 def _refusal(document: ProfileDocument, worst: ErrorDetails) -> ProfileError:
-    """Return one line out of what pydantic says."""
+    """Return an error in one line for an error of pydantic."""
     modes = ("mailbox", "target_trigger", "read_only")
     keys = tuple(k for i, k in enumerate(worst["loc"]) if not (i == 1 and k in modes))
     if worst["type"] == "extra_forbidden":
@@ -239,7 +239,7 @@ def _refusal(document: ProfileDocument, worst: ErrorDetails) -> ProfileError:
 
 
 def _wanted(keys: Keys) -> str:
-    """Return what belongs at a key, in the schema's words."""
+    """Return the schema's description of a key."""
     text: Any = ProfileFile
     for key in keys:
         field = getattr(text, "model_fields", {}).get(key)

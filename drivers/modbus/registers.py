@@ -68,7 +68,7 @@ def _limits(name: TypeName) -> tuple[float, float]:
 
 @dataclass(frozen=True, slots=True)
 class Coding:
-    """How numbers of one kind lie in registers."""
+    """How numbers of one kind are coded in registers."""
 
     type: TypeName
     order: WordOrder = "high_first"
@@ -124,7 +124,7 @@ class Coding:
         return count
 
     def _ordered(self, registers: Sequence[int]) -> Sequence[int]:
-        """Return registers with the words of each number turned round where the low one leads."""
+        """Return registers with the words of each number reversed if the low one is first."""
         words = self.words
         if words == 1 or self.order == "high_first":
             return registers

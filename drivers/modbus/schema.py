@@ -1,4 +1,4 @@
-"""A register map's keys, and what may stand there."""
+"""The schema of a register map."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Address = Annotated[int, Field(ge=0, le=LAST_ADDRESS, strict=True)]
 
 
 class Place(Section):
-    """Where numbers lie."""
+    """The address and type of numbers."""
 
     table: Table = Field(description="coil, discrete, holding or input")
     address: Address = Field(description="of the first register, counted from 0")
@@ -23,12 +23,12 @@ class Place(Section):
 
     @property
     def coding(self) -> Coding:
-        """Return how a number lies in its registers."""
+        """Return the coding of a number."""
         return Coding(self.type, self.word_order)
 
 
 class Turns(Section):
-    """Revolution counters beside angles that start anew with each turn."""
+    """Revolution counters for angles that wrap at each turn."""
 
     address: Address
     type: TypeName = "i16"
@@ -37,7 +37,7 @@ class Turns(Section):
 
 
 class Vector(Place):
-    """One number per joint (six for a wrench), side by side or ``stride`` registers apart."""
+    """One number per joint (six for a wrench), adjacent or ``stride`` registers apart."""
 
     scale: Number = Field(default=1.0, description="units per count, not zero")
     unit: str = Field(description="rad, mrad, deg, turn, rad/s, degC, N, ...")
@@ -60,7 +60,7 @@ class State(Section):
 
 
 class Clock(Place):
-    """A register that moves with every new sample of the controller."""
+    """A register that changes with every new sample of the controller."""
 
     kind: Literal["timestamp", "counter", "heartbeat"]
     scale: Positive = Field(default=1.0, description="units per count")
@@ -71,7 +71,7 @@ class Clock(Place):
 
 
 class Condition(Place):
-    """What a register must say."""
+    """A condition on the value of a register."""
 
     name: str = Field(min_length=1, description="what messages call it")
     good: list[int] = Field(min_length=1, description="counts that are fine")
@@ -79,7 +79,7 @@ class Condition(Place):
     otherwise: StopReason = StopReason.NOT_READY
 
     def fine(self, count: int) -> bool:
-        """Return whether the register says what it must."""
+        """Return whether the condition is met."""
         return (count if self.mask is None else count & self.mask) in self.good
 
 

@@ -52,7 +52,7 @@ class ModbusSettings(ProfileSettings):
 
     @model_validator(mode="after")
     def _has_its_transport(self) -> Self:
-        """Refuse a transport without what it needs."""
+        """Refuse a transport without its required keys."""
         if self.transport == "rtu" and self.serial is None:
             raise ValueError("expected serial, the port to open, with transport rtu")
         if self.transport == "tls" and self.authority is None and self.fingerprint is None:
@@ -85,7 +85,7 @@ class ModbusSettings(ProfileSettings):
     def moves_arm(self) -> bool:
         """Return whether setpoints are the arm's motion. Raises InputError: it reads the profile.
 
-        With a mailbox they ride on the robot's own.
+        With a mailbox they are offsets on the robot's own motion.
         """
         from gapbridge.drivers.modbus.profile import read_profile
 
@@ -93,7 +93,7 @@ class ModbusSettings(ProfileSettings):
 
     @property
     def address(self) -> str:
-        """Return what messages call the controller."""
+        """Return the controller's name in messages."""
         return self.serial or self.host if self.transport == "rtu" else self.host
 
     def read_files(self) -> None:

@@ -1,7 +1,7 @@
 """One synchronous pymodbus client (TCP, TLS, RTU) whose answers are checked.
 
-The library takes an answer of another function or with too few registers for good, and raises its
-own errors as well as the operating system's; here an answer is what was asked for, or a LinkError.
+The library accepts an answer of another function or with too few registers, and raises its own
+errors as well as the operating system's; here an answer matches its request, or raises LinkError.
 """
 
 from __future__ import annotations
@@ -43,18 +43,18 @@ EXCEPTIONS = {
 
 
 class CheckedContext(ssl.SSLContext):
-    """A context whose sockets know whom they are to reach.
+    """A context whose sockets check the server's name or certificate.
 
-    The Modbus library hands no name to ``wrap_socket``, and connects again by itself; so the name
-    is handed on here, and a pinned certificate is compared at the end of every handshake.
+    The Modbus library passes no name to ``wrap_socket``, and reconnects by itself; so the name is
+    added here, and a pinned certificate is compared at the end of every handshake.
     """
 
     server_name: str
     pinned: bytes | None = None  # SHA-256 of the controller's certificate
-    refused = ""  # why the last handshake failed: the library keeps it to itself
+    refused = ""  # why the last handshake failed, which the library does not report
 
     def note_refusal(self, detail: str) -> None:
-        """Keep why the last handshake failed; empty: it did not."""
+        """Store why the last handshake failed; empty: it did not."""
         self.refused = detail
 
     def wrap_socket(self, *arguments: Any, **keys: Any) -> ssl.SSLSocket:
@@ -67,7 +67,7 @@ class _CheckedSocket(ssl.SSLSocket):
     """A socket that compares the peer's certificate with the pinned one."""
 
     def do_handshake(self, block: bool = False) -> None:
-        """Shake hands. Raises SSLError where the certificate is another than the pinned one."""
+        """Shake hands. Raises SSLError if the certificate is not the pinned one."""
         context = self.context
         assert isinstance(context, CheckedContext)
         context.note_refusal("")
@@ -99,13 +99,13 @@ class Transport:
         self._calls: dict[Table, Any] = {}  # the client's methods that read
 
     def allow(self, compiled: RegisterMap) -> None:
-        """Let requests write what the map says, and nothing else."""
+        """Allow writing the registers of the map, and no others."""
         self._writable = compiled.writable
         self._allowed.clear()
 
     @property
     def name(self) -> str:
-        """Return what messages call the controller."""
+        """Return the controller's name in messages."""
         settings = self._settings
         if settings.transport == "rtu":
             return f"{settings.serial} device {self._device}"
@@ -152,7 +152,7 @@ class Transport:
 
     @property
     def is_open(self) -> bool:
-        """Return whether there is a socket to ask through."""
+        """Return whether there is an open socket."""
         return self._client is not None
 
     def close(self) -> None:
@@ -166,7 +166,7 @@ class Transport:
     def read(self, block: Block) -> bytes:
         """Return the registers (or bits, 0 and 1) of a block, two bytes each.
 
-        Raises LinkError where the link broke, InvalidStateError for an answer that is none.
+        Raises LinkError if the link is broken, InvalidStateError for an invalid answer.
         """
         table = block.table
         function = READ_FUNCTIONS[table]
@@ -192,7 +192,7 @@ class Transport:
     ) -> None:
         """Write coils or holding registers; ``single``: one request each (functions 5 and 6).
 
-        Raises WriteError where the map does not allow it or the controller refuses.
+        Raises WriteError if the map does not allow it or the controller refuses.
         """
         self._check_allowed(table, address, values)
         client = self._opened()
@@ -254,7 +254,7 @@ class Transport:
         return f"{self.name}: no answer within {self._settings.timeout:g} s"
 
     def _give_up(self, error: LinkError) -> NoReturn:
-        """Raise; an answer that comes late must not be taken for the next one's."""
+        """Close and raise: a late answer must not be taken for that to the next request."""
         self.close()
         raise error from None
 

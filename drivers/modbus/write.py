@@ -1,7 +1,7 @@
 """Writing: Setpoint -> registers, by mailbox, by target and trigger, or not at all.
 
-Knows nothing of reading: it is given the newest sample. What counts is what the controller says
-afterwards, not that a request was answered.
+Independent of reading: it gets the newest sample. A write is confirmed by the samples that follow,
+not by the answer to the request.
 """
 
 from __future__ import annotations
@@ -34,20 +34,20 @@ from gapbridge.drivers.modbus.transport import Transport
 
 Rates = Callable[[], tuple[float, float]]
 ANNOUNCE = 0.02  # s between two heartbeats while arming
-NEAR = 2.0  # counts: how near a target must be come to
+TARGET_TOLERANCE = 2.0  # counts from the target within which it is reached
 
 
 class Writer(Protocol):
     """The writing half of a link."""
 
     def arm(self, state: RobotState, look: Callable[[], Sample]) -> None:
-        """Make ready; moves nothing. ``look`` reads a sample. Raises WriteError."""
+        """Prepare for writing; moves nothing. ``look`` reads a sample. Raises WriteError."""
 
     def write(self, setpoint: Setpoint, sample: Sample) -> None:
         """Send one setpoint; ``sample`` is the one last read. Raises WriteError."""
 
     def pending(self) -> tuple[int, list[int]] | None:
-        """Return holding registers that are to go out with the next reading, once."""
+        """Return, once, holding registers to be written with the next reading."""
 
     def release(self) -> None:
         """End the writing so that the arm comes to rest. Raises WriteError."""
@@ -57,17 +57,17 @@ class Writer(Protocol):
 
 
 def make_writer(
-    profile: ProfileFile, transport: Transport, rates: Rates, patience: float,
+    profile: ProfileFile, transport: Transport, rates: Rates, zero_timeout: float,
     clock: Clock = SYSTEM,
 ) -> Writer:  # fmt: skip
     """Return the writer of a profile.
 
-    ``rates`` gives the cell's, m/s and rad/s; ``patience``: s until what an owner before has left
-    must be out of the arm.
+    ``rates`` returns the cell's offset rates, m/s and rad/s; ``zero_timeout``: s within which the
+    robot's program must have removed an offset of a former owner.
     """
     write = profile.write
     if isinstance(write, Mailbox):
-        return MailboxWriter(write, transport, profile.function_23, rates, patience, clock)
+        return MailboxWriter(write, transport, profile.function_23, rates, zero_timeout, clock)
     if isinstance(write, TargetTrigger):
         return TargetWriter(write, transport, clock)
     return ReadOnlyWriter(profile, write, transport)
@@ -103,38 +103,38 @@ class ReadOnlyWriter:
 class MailboxWriter:
     """Offsets in eleven registers; a program on the robot checks, applies and answers them.
 
-    The cell's rates go with them: the program takes offsets in and out no faster, also when nobody
-    sends any more.
+    The cell's rates are sent with them: the program ramps offsets in and out no faster, also when
+    nothing is sent any more.
     """
 
     def __init__(
-        self, box: Mailbox, transport: Transport, together: bool, rates: Rates, patience: float,
+        self, box: Mailbox, transport: Transport, together: bool, rates: Rates, zero_timeout: float,
         clock: Clock = SYSTEM,
     ) -> None:  # fmt: skip
         self._clock, self._now = clock, clock.monotonic
         self._box, self._transport, self._together = box, transport, together
-        self._patience = patience
+        self._zero_timeout = zero_timeout
         self._cell_rates, self._rates = rates, [0, 0]
         self._units = encode.units_of(box)
         self._armed = False
         self._sequence = self._heartbeat = 0
         self._counts: list[int] = [0] * 6
-        self._awaited = 0  # a sequence number that has not come back yet
-        self._sent = 0  # numbers since arming, as far as an echo can lie back
+        self._awaited = 0  # a sequence number that was not echoed yet
+        self._sent = 0  # numbers since arming, up to the largest lag of an echo
         self._since = 0.0
         self._pending: list[int] | None = None
 
     def arm(self, state: RobotState, look: Callable[[], Sample]) -> None:
         """Send offsets of zero until the robot's program answers them. Raises WriteError.
 
-        Before, wait until the program has taken out what was left of an offset.
+        First waits until the program has ramped out any former offset.
         """
         try:
             self._rates = encode.rate_counts(self._cell_rates())
         except ValueError as error:
             raise WriteError(f"limits.{error}: what the robot's program can be given") from None
-        number = self._wait_bare(look)
-        # a number that the program cannot take for the one it has seen last
+        number = self._wait_for_zero_offset(look)
+        # a number that differs from the last one that the program has seen
         self._sequence = (number + encode.SEQUENCES // 4) % (encode.SEQUENCES - 1) + 1
         self._counts = [0] * 6
         until = self._now() + self._box.echo
@@ -148,19 +148,19 @@ class MailboxWriter:
             self._clock.sleep(ANNOUNCE)
         self._awaited, self._sent, self._armed = 0, 0, True
 
-    def _wait_bare(self, look: Callable[[], Sample]) -> int:
-        """Wait for the end of an offset that somebody left; returns the number of the echo.
+    def _wait_for_zero_offset(self, look: Callable[[], Sample]) -> int:
+        """Wait until a former offset is ramped out; returns the number of the echo.
 
         Raises WriteError.
         """
-        until = self._now() + self._patience
+        until = self._now() + self._zero_timeout
         while True:
             sample = look()
-            number, says = sample.answer or (0, 0)
-            if says == encode.ABSENT:  # an answer of nothing but zeros is none of no offset
+            number, program = sample.answer or (0, 0)
+            if program == encode.ABSENT:  # all zeros is no answer
                 raise WriteError(
                     f"{self._transport.name}: {self._box.echo_table} {self._box.echo_address + 1}: "
-                    f"found {says}, expected a running mailbox program on the robot "
+                    f"found {program}, expected a running mailbox program on the robot "
                     "(docs/porting.md)"
                 )
             length = float(np.abs(sample.vectors["echo"]).max())
@@ -175,7 +175,7 @@ class MailboxWriter:
             self._clock.sleep(ANNOUNCE)
 
     def write(self, setpoint: Setpoint, sample: Sample) -> None:
-        """Send one offset. Raises WriteError where the program does not take them."""
+        """Send one offset. Raises WriteError if the program does not accept them."""
         if not self._armed:
             raise WriteError(f"{self._transport.name}: found no mailbox, expected arm() first")
         try:
@@ -196,8 +196,8 @@ class MailboxWriter:
         try:
             self._transport.write("holding", self._box.address, words)
         except StaleStateError:
-            # not again: its state would be old by then. The next one carries the offset on, and
-            # the echo says whether any has come
+            # no retry: its state would be too old. The next cycle sends the offset, and the echo
+            # shows whether one has arrived
             self._transport.open()
 
     def _words(self) -> list[int]:
@@ -213,29 +213,29 @@ class MailboxWriter:
             self._transport.write("holding", self._box.address, words)
 
     def _check_echo(self, sample: Sample) -> None:
-        """Raise WriteError where an offset has not come back in time, or nobody applies it."""
-        number, says = sample.answer or (0, 0)
+        """Raise WriteError if an offset is not echoed in time, or the program does not run."""
+        number, program = sample.answer or (0, 0)
         if self._awaited:
             ahead = (number - self._awaited) % (encode.SEQUENCES - 1)
             if ahead < encode.SEQUENCES // 2:
                 self._awaited = 0
         late = self._awaited and self._now() - self._since > self._box.echo
-        if says != encode.RUNNING:
+        if program != encode.RUNNING:
             self._armed = False
-            raise WriteError(self._silence(number, says))
+            raise WriteError(self._silence(number, program))
         if (self._sequence - number) % (encode.SEQUENCES - 1) > self._sent:
             raise ForeignCommandError(
                 f"{self._transport.name}: found number {number} in the mailbox's echo, which was "
                 "not sent from here: somebody else writes the mailbox"
             )
         if late:  # it was sent again in every cycle since
-            raise IneffectiveWriteError(self._silence(number, says))
+            raise IneffectiveWriteError(self._silence(number, program))
 
-    def _silence(self, number: int, says: int) -> str:
+    def _silence(self, number: int, program: int) -> str:
         states = {0: "absent", 1: "running", 2: "watchdog expired", 3: "checksum rejected"}
         return (
             f"{self._transport.name}: offsets do not arrive: number {self._sequence} was sent, "
-            f"{number} came back last, the robot's program says {states.get(says, says)}"
+            f"{number} came back last, the robot's program says {states.get(program, program)}"
         )
 
     def pending(self) -> tuple[int, list[int]] | None:
@@ -244,13 +244,13 @@ class MailboxWriter:
         return None if words is None else (self._box.address, words)
 
     def release(self) -> None:
-        """Send nothing more: without a heartbeat the program takes out what is left of an offset.
+        """Send nothing more: without a heartbeat the program ramps out the offset.
 
         At the rates it was given; a zero from here would be a step.
         """
         self._armed, pending, self._pending = False, self._pending, None
         if pending is not None and not any(self._counts):
-            # the last setpoint of a ramp, which would have left with the next reading
+            # the last setpoint of a ramp, which would have been sent with the next reading
             self._transport.write("holding", self._box.address, pending)
 
     def target(self) -> Array | None:
@@ -298,7 +298,7 @@ class TargetWriter:
         self._target = np.round(setpoint.q / self._size) * self._size
 
     def _check(self, sample: Sample) -> None:
-        """Raise WriteError where the last target was refused, or is not come to."""
+        """Raise WriteError if the last target was refused, or is not reached in time."""
         for what, words in sample.motion:
             if what == "result" and self._target is not None:
                 self._armed = False
@@ -306,7 +306,7 @@ class TargetWriter:
         if self._target is None or self._now() - self._since < self._entry.following:
             return
         away = np.abs(sample.vectors["position"] - self._target)
-        if (away > NEAR * abs(self._size) + 2e-3).any():
+        if (away > TARGET_TOLERANCE * abs(self._size) + 2e-3).any():
             joint = int(np.argmax(away))
             self._armed = False
             raise WriteError(

@@ -1,7 +1,7 @@
-"""A recording of the daemon as a controller: its states once more, in their own time.
+"""A recording of the daemon as a controller: its states again, with their timing.
 
-What the daemon computed then it computes again from the same numbers: with the same cell, the same
-offsets bit for bit; with another, what that one would have made of it. Nothing is written anywhere.
+The daemon computes again from the same numbers: with the same cell, bit-identical offsets; with
+another cell, what that one would have computed. Nothing is written to a robot.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class EndOfRecordingError(LinkError):
 
 @dataclass(frozen=True, slots=True)
 class Cycle:
-    """What a recorded cycle was, beside the controller's state."""
+    """A recorded cycle, except the controller's state."""
 
     number: int
     loop: int  # which process of the loop it was
@@ -44,16 +44,16 @@ class Cycle:
     written: bool
     attempted: int  # 0: not writing; 1: a setpoint was, or was refused; 2: computed, not sent
     flags: int  # of the loop's own
-    own_q: Array  # (n,) rad, what the robot itself wanted
-    nominal_q: Array  # (n,) rad, what the correction was computed for
+    own_q: Array  # (n,) rad, the robot's own target joints
+    nominal_q: Array  # (n,) rad, for which the correction was computed
     ramp_time: float  # s
 
 
 class ReplayDriver(Driver):
-    """Gives the states of a recording, one after the other; ``cycle`` is the present one's.
+    """Returns the states of a recording, one after the other; ``cycle`` is the present one.
 
-    The constructor reads the recording's first cycle: its rate is the driver's. Raises LogError
-    where the recording holds none, or was made of another arm.
+    The constructor reads the recording's first cycle: its rate is the driver's. Raises LogError if
+    the recording has none, or is of another arm.
     """
 
     def __init__(self, settings: ReplaySettings, model: Model, clock: Clock = SYSTEM) -> None:
@@ -70,21 +70,21 @@ class ReplayDriver(Driver):
                 f"{settings.file}: found {n} joints, expected {model.arm.n} as the cell's arm has"
             )
         super().__init__(float(first["rate"]), model, clock=clock)
-        self.gate.count_by(lambda: self._last)  # a recording may go by faster than it was made
+        self.gate.set_clock(lambda: self._last)  # a replay may be faster than the recording
         self.cycle: Cycle | None = None
         self._left: Iterator[Mapping[str, Array]] = iter(())
         self._begun = 0.0  # s, monotonic: when the recording's time 0 was
         self._last = -np.inf  # s, controller clock
 
     def connect(self) -> None:
-        """Begin at the recording's beginning."""
+        """Go to the beginning of the recording."""
         self._left = self._rows()
         self._last = -np.inf
 
     def _read_state(self) -> RobotState:
-        """Wait as long as it took then, and return the next state.
+        """Wait for the recorded time, and return the next state.
 
-        Raises EndOfRecordingError where there is none.
+        Raises EndOfRecordingError if there is none.
         """
         row = next(self._left, None)
         if row is None:
@@ -98,18 +98,18 @@ class ReplayDriver(Driver):
         return _state(row, self._now())
 
     def _validate(self, state: RobotState) -> None:
-        """Believe it: it was checked when it was recorded."""
+        """Accept it: it was checked when it was recorded."""
 
     def nominal_q(self, state: RobotState) -> Array:
-        """Return what the robot itself wanted then, (n,) rad."""
+        """Return the robot's own target joints in the recording, (n,) rad."""
         assert self.cycle is not None
         return self.cycle.own_q
 
     def _send(self, setpoint: Setpoint) -> None:
-        """Move nothing: there is no arm."""
+        """Do nothing: there is no arm."""
 
     def close(self) -> None:
-        """Leave the recording."""
+        """Close the recording."""
         self._left = iter(())
 
     def _rows(self) -> Iterator[Mapping[str, Array]]:
@@ -128,7 +128,7 @@ class ReplayDriver(Driver):
 
 
 def _state(row: Mapping[str, Array], received: float) -> RobotState:
-    """Return the state of a recorded cycle; what it lacked is NaN there."""
+    """Return the state of a recorded cycle; missing fields are NaN in the recording."""
 
     def known(name: str) -> Array | None:
         value = row.get(name)

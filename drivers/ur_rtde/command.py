@@ -1,8 +1,8 @@
 """Writing: Setpoint -> wire, by servoJ or as an offset in RTDE input registers.
 
-Knows nothing of reading. Neither way confirms anything: the library's True means that a call was
-made. What counts is what the controller says afterwards, in its samples: the target joints that
-follow a setpoint, the sequence number that comes back.
+Independent of reading. Neither mode confirms a setpoint: the library's True only means that a call
+was made. The confirmation is in the samples that follow: target joints that follow a setpoint, the
+sequence number that comes back.
 """
 
 from __future__ import annotations
@@ -28,24 +28,19 @@ from gapbridge.drivers.ur_rtde.settings import UrRtdeSettings
 
 NO_REMOTE_CHECK = 0x80  # FLAG_DISABLE_REMOTE_CONTROL_CHECK
 KICK = 0.02  # s between kicks of the watchdog
-FOLLOWING = 0.02  # rad: how near the controller's target must come to a setpoint
-LOOKS, ANNOUNCED = 8, 0.3  # samples in which a first offset comes back; s until it is given up
-DECIMATION, KEPT = 5, 64  # setpoints between two remembered ones; how many are remembered
+FOLLOWING = 0.02  # rad: largest distance of the controller's target from recent setpoints
+ECHO_SAMPLES, ANNOUNCE_TIMEOUT = 8, 0.3  # samples per attempt and s for all, until the first echo
+DECIMATION, KEPT = 5, 64  # every so many setpoints one is stored; how many are stored
 DESCRIPTORS = Path("/proc/self/fd")  # the open sockets of this process
 CONTROL = (
     "setWatchdog", "kickWatchdog", "servoJ", "servoStop", "stopScript", "reuploadScript",
     "isConnected", "isProgramRunning",
 )  # fmt: skip
 DOUBLES = frozenset(registers.OFFSET_DOUBLES)
-INTEGERS = frozenset(
-    (
-        registers.OFFSET_RZ,
-        registers.SEQUENCE,
-        registers.CHECKSUM,
-        registers.HEARTBEAT,
-        registers.RATES,
-    )
-)
+INTEGERS = frozenset((
+    registers.OFFSET_RZ, registers.SEQUENCE, registers.CHECKSUM, registers.HEARTBEAT,
+    registers.RATES,
+))  # fmt: skip
 """Calls and registers that may be used. The library's control script can run any motion and set any
 output, and RTDE inputs are anybody's: whatever these lists lack raises before the socket."""
 
@@ -54,10 +49,10 @@ class Writer(Protocol):
     """The writing half of a link."""
 
     def arm(self, state: RobotState, look: Callable[[], None]) -> None:
-        """Make ready; moves nothing. ``look`` reads a sample. Raises WriteError."""
+        """Prepare for writing; moves nothing. ``look`` reads a sample. Raises WriteError."""
 
     def keep_alive(self) -> None:
-        """Feed the robot's watchdog, which may wait for the robot. Raises WriteError."""
+        """Feed the robot's watchdog, which may block. Raises WriteError."""
 
     def write(self, setpoint: Setpoint, state: RobotState) -> None:
         """Send one setpoint; ``state`` is the sample last read. Raises WriteError."""
@@ -66,12 +61,12 @@ class Writer(Protocol):
         """End the stream so that the arm comes to rest. Raises WriteError."""
 
     def abandon(self) -> None:
-        """Let go of a link that may be dead, without touching it."""
+        """Drop the library's objects of a link that may be dead, without calling them."""
 
 
 _ABANDONED: list[Any] = []
-"""Library objects of dead links: destroying them hangs, aborts or crashes the process, so they are
-kept until its end, which must be ``os._exit``."""
+"""Library objects of dead links: destroying them hangs or crashes the process, so they are kept
+until it ends by ``os._exit``."""
 
 
 def check_ready(host: str, state: RobotState) -> None:
@@ -113,7 +108,7 @@ class ServoWriter:
         control = self._control
         if not control.setWatchdog(self._settings.watchdog):
             raise WriteError(f"{host}: the controller refused the watchdog")
-        # comes back when the script takes commands again: else the first servoJ would wait for it
+        # returns when the script accepts commands: otherwise the first servoJ would block
         control.kickWatchdog()
         self._count, self._kicked = 0, 0.0
 
@@ -141,9 +136,9 @@ class ServoWriter:
         self._clock.sleep(0.05)
 
     def keep_alive(self) -> None:
-        """Kick the watchdog, which waits until the script has heard it.
+        """Kick the watchdog, which blocks until the script has received it.
 
-        Before servoJ, which writes the same register: the command must be what stays in it.
+        Call it before servoJ, which writes the same register and must write last.
         """
         now = self._now()
         if now - self._kicked > KICK:
@@ -164,10 +159,10 @@ class ServoWriter:
         return control
 
     def write(self, setpoint: Setpoint, state: RobotState) -> None:
-        """Send one setpoint. Raises WriteError where the robot does not obey."""
+        """Send one setpoint. Raises WriteError if the robot does not follow."""
         control, settings = self._running(), self._settings
         if self._now() - self._kicked > 0.4 / self._settings.watchdog:
-            self.keep_alive()  # for who does not call it
+            self.keep_alive()  # if the caller does not
         self._check_following(setpoint, state)
         if not control.servoJ(
             setpoint.q.tolist(), 0.0, 0.0, self._period, settings.lookahead, settings.gain
@@ -175,10 +170,10 @@ class ServoWriter:
             raise WriteError(f"{settings.host}: the controller refused servoJ")
 
     def _check_following(self, setpoint: Setpoint, state: RobotState) -> None:
-        """Compare the controller's target with the setpoints of the last moments.
+        """Compare the controller's target with the recent setpoints.
 
-        servoJ goes on returning True when nothing arrives any more; a target that is outside the
-        range of what was sent lately is the only sign of it.
+        servoJ returns True even if nothing arrives; a target outside the range of the setpoints
+        sent within ``link.following`` s is the only sign of it.
         """
         count, self._count = self._count, self._count + 1
         if count % DECIMATION:
@@ -211,7 +206,7 @@ class ServoWriter:
             raise WriteError(f"{self._settings.host}: the controller refused servoStop")
 
     def abandon(self) -> None:
-        """Let go of the control object, whose end is not safe on a dead link."""
+        """Keep the control object undestroyed: destroying it on a dead link is not safe."""
         if self._control is not None:
             _ABANDONED.append(self._control)
             self._control = None
@@ -222,7 +217,7 @@ class OffsetWriter:
 
     One call sends one register, so an offset arrives in nine packets; the sequence number goes
     last, and the checksum shows the program whether they belong together. ``rates`` (m/s, rad/s)
-    are the cell's: the program takes offsets in and out no faster, also when nobody sends any more.
+    are the cell's: the program ramps offsets in and out no faster, also when nothing is sent.
     """
 
     def __init__(
@@ -235,27 +230,27 @@ class OffsetWriter:
         self._settings, self._cell_rates = settings, rates
         self._io: Any = None
         self._sequence = self._rates = 0
-        # sequence numbers that have not come back, and when each left, s monotonic
+        # sequence numbers not echoed yet, and when each was sent, s monotonic
         self._unanswered: deque[tuple[int, float]] = deque()
         self._echo = 0
         self._program = 0
         self._applied: Sequence[float] | np.ndarray = ()
 
     def note_answer(self, echo: int, program: int, applied: Sequence[float] | np.ndarray) -> None:
-        """Take what the robot's program says: last number accepted, its state, offset (6,)."""
+        """Store the program's answer: last sequence accepted, its state, offset applied (6,)."""
         self._echo, self._program, self._applied = echo, program, applied
         unanswered = self._unanswered
         while unanswered and registers.reached(echo, unanswered[0][0]):
             unanswered.popleft()
 
     def unanswered_since(self) -> float:
-        """Return when the oldest offset left that has not come back, s; infinite: none."""
+        """Return when the oldest offset not echoed yet was sent, s monotonic; infinite: none."""
         return self._unanswered[0][1] if self._unanswered else math.inf
 
     def arm(self, state: RobotState, look: Callable[[], None]) -> None:
-        """Open the registers and send the rates. Raises WriteError where the program is not there.
+        """Open the registers and send the rates. Raises WriteError if the program does not run.
 
-        Waits until the program has taken out what was left of an offset, and sends one of zero.
+        Waits until the program has ramped out any former offset, and sends an offset of zero.
         """
         host = self._settings.host
         check_ready(host, state)
@@ -269,10 +264,10 @@ class OffsetWriter:
             self._rates = registers.rates(*self._cell_rates())
         except ValueError as error:
             raise WriteError(f"limits.{error}: what the robot's program can be given") from None
-        self._wait_bare(look)
+        self._wait_for_zero_offset(look)
         if self._io is None:
             self._io = self._open()
-        # a number that the program cannot take for the one it has seen last
+        # a number that differs from the last one that the program has seen
         self._sequence = (self._echo + registers.LAST_SEQUENCE // 4) % registers.LAST_SEQUENCE
         self._unanswered.clear()
         self._announce(look)
@@ -288,8 +283,8 @@ class OffsetWriter:
             raise WriteError(f"{host}: {first_line(error)}") from None
         return io
 
-    def _wait_bare(self, look: Callable[[], None]) -> None:
-        """Wait for the program to take out the offset of whoever ended before, at that one's rates.
+    def _wait_for_zero_offset(self, look: Callable[[], None]) -> None:
+        """Wait until the program has ramped out the offset of a former session, at its rates.
 
         Raises WriteError.
         """
@@ -306,12 +301,12 @@ class OffsetWriter:
     def _announce(self, look: Callable[[], None]) -> None:
         """Send rates and an offset of zero until the program answers. Raises WriteError."""
         self._set(lambda io: io.setInputIntRegister(registers.RATES, self._rates))
-        until = self._now() + max(self._settings.echo, ANNOUNCED)
+        until = self._now() + max(self._settings.echo, ANNOUNCE_TIMEOUT)
         while True:
             self._sequence = registers.next_sequence(self._sequence)
             first = self._sequence
             self._send([0] * 6)
-            for _ in range(LOOKS):
+            for _ in range(ECHO_SAMPLES):
                 look()
                 if registers.reached(self._echo, first):
                     return
@@ -321,7 +316,7 @@ class OffsetWriter:
                 )
 
     def keep_alive(self) -> None:
-        """Raise WriteError where an offset sent has not been taken in time.
+        """Raise WriteError if an offset has not been accepted in time.
 
         The sequence number of each offset is the heartbeat.
         """
@@ -330,10 +325,10 @@ class OffsetWriter:
             raise WriteError(f"{self._silence()} (sent {late:.3f} s ago)")
 
     def write(self, setpoint: Setpoint, state: RobotState) -> None:
-        """Send one offset. Raises WriteError where the program stopped taking them."""
+        """Send one offset. Raises WriteError if the program has stopped accepting them."""
         if self._io is None:
             raise WriteError(f"{self._settings.host}: found no registers, expected arm() first")
-        self.keep_alive()  # for who does not call it
+        self.keep_alive()  # if the caller does not
         self._sequence = registers.next_sequence(self._sequence)
         self._unanswered.append((self._sequence, self._now()))
         self._send(registers.counts(setpoint.offset_in_base.tolist()))
@@ -369,13 +364,13 @@ class OffsetWriter:
         )
 
     def release(self) -> None:
-        """Send nothing more: without a heartbeat the program takes out what is left of an offset.
+        """Send nothing more: without a heartbeat the program ramps out the offset.
 
         At the rates it was given; a zero from here would be a step.
         """
 
     def abandon(self) -> None:
-        """Let go of the library's object, whose destruction on a dead link aborts the process."""
+        """Keep the library's object undestroyed: destroying it on a dead link aborts."""
         if self._io is not None:
             _ABANDONED.append(self._io)
             self._io = None
@@ -385,7 +380,7 @@ class AllowedControl:
     """The library's control interface with the calls of CONTROL and no others."""
 
     def __init__(self, host: str, library: Any) -> None:
-        self._host, self._library = host, library  # kept: its end is not safe
+        self._host, self._library = host, library  # kept: destroying it is not safe
         for name in CONTROL:
             setattr(self, name, getattr(library, name))
 

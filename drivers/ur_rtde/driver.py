@@ -23,10 +23,10 @@ from gapbridge.drivers.ur_rtde.state import StateReader
 
 
 class UrRtdeDriver(Driver):
-    """One UR arm over RTDE. ``settings.mode`` says how setpoints get there.
+    """One UR arm over RTDE. ``settings.mode``: how setpoints are sent.
 
-    To be used in a process that may be killed: the library can hang, abort or crash it when the
-    link breaks. After a LinkError the object is finished; a new process makes a new one.
+    Use it in a process that may be killed: the library can hang, abort or crash it when the link
+    breaks. After a LinkError the object cannot be used again: start a new process.
     """
 
     def __init__(self, settings: UrRtdeSettings, model: Model, clock: Clock = SYSTEM) -> None:
@@ -42,10 +42,10 @@ class UrRtdeDriver(Driver):
             else OffsetWriter(settings, self._rates, clock)
         )
         self._state: RobotState | None = None
-        self._way = 0.0  # s: the last round trip
+        self._round_trip = 0.0  # s: the last round trip
 
     def connect(self) -> None:
-        """Open the receiving side only: no program is touched, no input claimed."""
+        """Open the receiving side only: changes no program and claims no input."""
         self.reader.open()
 
     def _read_state(self) -> RobotState:
@@ -69,41 +69,41 @@ class UrRtdeDriver(Driver):
             raise WriteError(str(error)) from None
 
     def nominal_q(self, state: RobotState) -> Array:
-        """Return what the robot itself wants (6,), rad.
+        """Return the robot's own target joints (6,), rad.
 
-        Offset mode: ``target_q`` without the offset that the robot's program says it applied in
-        that cycle (see nominal.py); holds for the sample last read. servoj mode: ``target_q``.
+        Offset mode: ``target_q`` without the offset that the robot's program applied in that cycle
+        (see drivers/offset_inverse.py), of the sample read last. servoj mode: ``target_q``.
         """
         if self.moves_arm:
             return state.target_q
         return self._nominal.without(state.target_q, self.reader.applied)
 
     def _make_ready(self, state: RobotState) -> None:
-        """Make ready for writing: upload the control script, or claim the registers."""
+        """Prepare for writing: upload the control script, or claim the registers."""
         message = self.mismatch()
         if message is not None:
             raise WriteError(f"{self.settings.host}: {message}")
         self._writer.arm(state, self._look)
 
     def round_trip(self) -> float | None:
-        """Return how long a question to the RTDE server takes, s; see Driver.round_trip."""
-        self._way = duration = round_trip(self.settings.host)
+        """Return the round-trip time of an RTDE request, s; see Driver.round_trip."""
+        self._round_trip = duration = round_trip(self.settings.host)
         return duration
 
-    def way(self) -> float:
-        """Return the round trip when the arm was armed; see Driver.way."""
-        return self._way
+    def transit_time(self) -> float:
+        """Return the round-trip time measured when arming, s; see Driver.transit_time."""
+        return self._round_trip
 
     def unanswered_since(self) -> float:
-        """Return when the oldest offset left that the robot's program has not accepted, s.
+        """Return when the oldest offset not accepted by the robot's program was sent, s.
 
-        See Driver.unanswered_since; servoJ has no answer.
+        See Driver.unanswered_since; servoJ is not acknowledged.
         """
         writer = self._writer
         return writer.unanswered_since() if isinstance(writer, OffsetWriter) else math.inf
 
     def mismatch(self) -> str | None:
-        """Return in words how the controller's TCP differs from the cell's; see Driver.mismatch.
+        """Return how the controller's TCP differs from the cell's; see Driver.mismatch.
 
         Offset mode only: offsets act at the controller's TCP, joint setpoints do not.
         """
@@ -125,7 +125,7 @@ class UrRtdeDriver(Driver):
         )
 
     def facts(self, state: RobotState) -> ControllerFacts:
-        """Return what RTDE and the primary interface say; see Driver.facts."""
+        """Return what RTDE and the primary interface report; see Driver.facts."""
         return enquire(self.settings.host)
 
     def differences(self, state: RobotState) -> list[Difference]:
@@ -134,9 +134,9 @@ class UrRtdeDriver(Driver):
             facts = self.facts(state)
         except LinkError as error:
             raise WriteError(str(error)) from None
-        all_of = differences(facts, self._model, self.rate, self.settings.tcp_tolerance)
-        # offset mode: mismatch compares the TCP where it is, before arming and all along
-        return all_of if self.moves_arm else [d for d in all_of if d.keys[0] != "tool"]
+        found = differences(facts, self._model, self.rate, self.settings.tcp_tolerance)
+        # offset mode: ``mismatch`` compares the TCP pose, when arming and while armed
+        return found if self.moves_arm else [d for d in found if d.keys[0] != "tool"]
 
     def keep_alive(self) -> None:
         """Feed the watchdog of the control script; see Driver.keep_alive."""
@@ -149,14 +149,14 @@ class UrRtdeDriver(Driver):
             raise WriteError(f"{self.settings.host}: found no state, expected read_state() first")
         self._writer.write(setpoint, state)
 
-    def _let_go(self) -> None:
-        """Stop writing: servoStop and end of the script, or no heartbeat any more."""
+    def _release(self) -> None:
+        """Stop writing: servoStop and end of the script, or no more heartbeats."""
         if self.reader.age > self.settings.state_timeout:
             raise WriteError(f"{self.settings.host}: the link is silent; the robot's watchdog acts")
         self._writer.release()
 
     def close(self) -> None:
-        """Release where the link lives, let go where it does not, and disconnect."""
+        """Release if the link works, drop the library's objects, and disconnect."""
         try:
             self.release()
         except LinkError:

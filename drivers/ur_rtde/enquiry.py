@@ -1,12 +1,12 @@
-"""What a UR controller says of its arm: RTDE (TCP, payload) and the primary interface.
+"""What a UR controller reports about its arm: RTDE (TCP, payload) and the primary interface.
 
 Reads only: no input is claimed, no program touched. Sources: Universal Robots, RTDE guide (port
 30004), and the client interfaces' description of the primary interface (port 30001): packages of
 int32 size and int8 type, robot states (16) of sub-packages, kinematics info (5) with the factory
 calibration, configuration data (6) with joint limits and nominal DH rows; big-endian.
 
-RTDE's samples come by themselves, so that nothing in them says how long they were under way:
-``round_trip`` measures it on a connection of its own.
+RTDE streams its samples, which therefore do not show their transit time: ``round_trip`` measures it
+on a separate connection.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ N = 6
 SAME = 1e-3  # m, rad: nominal DH rows of one model
 TIMEOUT = 2.0  # s for each of the two
 LONGEST = 1.0  # s that the answer of a round trip may take
-TRIES = 5  # the median counts: neither a busy moment of this process nor one lucky answer does
+TRIES = 5  # requests, of which the median is taken
 STATE, KINEMATICS, CONFIGURATION = 16, 5, 6  # types of a package and its sub-packages
 LARGEST = 1 << 20  # bytes of a package
 _VERSION = struct.pack(">H", 2)  # of the protocol
@@ -42,7 +42,7 @@ _FIELDS = {
 
 @dataclass(frozen=True)
 class PrimaryFacts:
-    """What the primary interface says: rows are (theta, a, d, alpha) of each joint."""
+    """What the primary interface reports: rows are (theta, a, d, alpha) of each joint."""
 
     calibrated: Array | None = None  # (6, 4) rad, m, m, rad
     nominal: Array | None = None  # (6, 4)
@@ -50,7 +50,7 @@ class PrimaryFacts:
 
 
 def enquire(host: str) -> ControllerFacts:
-    """Return what a UR controller says of itself.
+    """Return what a UR controller reports about its arm.
 
     Where its primary interface cannot be read, model, calibration and limits stay None. Raises
     LinkError where RTDE cannot.
@@ -91,7 +91,7 @@ def enquire(host: str) -> ControllerFacts:
 
 
 def require_listening(host: str) -> None:
-    """Raise LinkError where nobody listens: ur_rtde would print lines of its own."""
+    """Raise LinkError if no server listens: ur_rtde would print messages instead."""
     try:
         socket.create_connection((host, RTDE), TIMEOUT).close()
     except OSError:
@@ -102,7 +102,7 @@ def require_listening(host: str) -> None:
 
 
 def round_trip(host: str) -> float:
-    """Return the median time of some questions and their answers, s: what bounds a sample's age.
+    """Return the median round-trip time of some requests, s: a bound of a sample's transit time.
 
     Raises WriteError where none comes.
     """

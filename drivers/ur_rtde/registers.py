@@ -1,4 +1,4 @@
-"""The RTDE registers of the offset mode: what is sent, what the robot's program answers.
+"""The RTDE registers of the offset mode: inputs, and the answers of the robot's program.
 
 =========================  ====================================================================
 input_double_register_18   offset x, m; 19 y, 20 z, 21 rotation vector x (rad), 22 y; base axes
@@ -27,15 +27,15 @@ OFFSET_RZ, SEQUENCE, CHECKSUM, HEARTBEAT, RATES = 18, 19, 20, 21, 22
 ECHO, PROGRAM = 12, 13
 APPLIED = (12, 13, 14, 15, 16, 17)
 
-UNIT = 1e-9  # m and rad: grain of what is sent
-RATE_UNIT, TURN_RATE_UNIT = 4e-5, 1e-4  # m/s, rad/s: grain of the rates
+UNIT = 1e-9  # m and rad: resolution of the offset
+RATE_UNIT, TURN_RATE_UNIT = 4e-5, 1e-4  # m/s, rad/s: resolution of the rates
 LARGEST_RATE, LARGEST_TURN_RATE = 0x7FFF, 0xFFFF  # counts
 LAST_SEQUENCE = 1_000_000  # 31 times it fits a 32 bit integer
 MODULUS = 2**31
 
 
 class Program(IntEnum):
-    """What the robot's program says of itself."""
+    """State that the robot's program reports."""
 
     ABSENT = 0
     RUNNING = 1

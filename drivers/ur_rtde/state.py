@@ -1,9 +1,9 @@
-"""Reading: RTDE samples of the ur_rtde library -> RobotState. Knows nothing of writing.
+"""Reading: RTDE samples of the ur_rtde library -> RobotState. Independent of writing.
 
-The library keeps the last sample for ever, whatever becomes of the link, and its ``isConnected``
-says True for seconds after the link is dead. So only the controller's own clock counts: a sample is
-fresh when ``getTimestamp`` has moved. Getters lock one by one, so that a packet may arrive between
-two of them: the clock is read again after the last one, and a torn sample is read anew.
+The library keeps the last sample after the link is lost, and its ``isConnected`` returns True for
+seconds after that. So a sample is fresh only if ``getTimestamp``, the controller's clock, has
+changed. Getters lock one by one, so that a packet may arrive between two of them: the clock is read
+again after the last getter, and a torn sample is read again.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ class StateReader:
         self.echo = 0
         self.program = 0
         self.applied = np.zeros(6)  # m, rad: offset in the target joints of the last sample
-        self.torn = 0  # samples that had to be read again
+        self.torn = 0  # samples that were read again
 
     def open(self) -> None:
         """Connect and take the first sample. Raises LinkError."""
@@ -113,9 +113,9 @@ class StateReader:
 
     @property
     def age(self) -> float:
-        """Return for how long the controller's clock has stood still, s; 0 where it has moved.
+        """Return for how long the controller's clock has not changed, s.
 
-        A sample that has come but was not read yet counts: who was busy is not cut off.
+        0 if a sample waits that was not read yet: this process may have been busy.
         """
         if self._receive is not None and self._receive.getTimestamp() != self._last:
             return 0.0
@@ -124,7 +124,7 @@ class StateReader:
     def read(self) -> RobotState:
         """Wait for a sample with a new timestamp. Raises StaleStateError, InvalidStateError.
 
-        Waits a cycle at least: whoever asks again and again where nobody answers takes no core.
+        Waits at least one cycle, so that repeated calls without an answer do not occupy a core.
         """
         receive = self._receive
         if receive is None:
@@ -135,7 +135,7 @@ class StateReader:
         while timestamp == self._last:
             if self._now() > until:
                 raise StaleStateError(
-                    f"{self._settings.host}: the controller's clock has stood still at "
+                    f"{self._settings.host}: the controller's clock has stopped at "
                     f"{timestamp:.3f} s for {self.age:.3f} s"
                 )
             self._sleep(POLL)
@@ -144,7 +144,7 @@ class StateReader:
         return self._sample(timestamp)
 
     def _sample(self, timestamp: float) -> RobotState:
-        """Return all fields of one cycle; reads again where a packet came in between."""
+        """Return all fields of one cycle; reads again if a packet arrived in between."""
         receive = self._receive
         for _ in range(ATTEMPTS):
             received = self._changed
@@ -164,7 +164,7 @@ class StateReader:
             self._changed = self._now()
         raise InvalidStateError(
             f"{self._settings.host}: found a new sample in each of {ATTEMPTS} readings, expected "
-            "one that stands still while it is read: this process is too slow for its rate"
+            "one that does not change while it is read: this process is too slow for its rate"
         )
 
     def _read_registers(self) -> None:
@@ -203,8 +203,8 @@ class StateReader:
     def joints_and_tcp(self) -> tuple[Array, Array] | None:
         """Return joints (6,) and the controller's own TCP pose (6,) of one sample, or None.
 
-        The pose is in base, m and rotation vector. None where the controller does not report it, or
-        a new sample came between the two each time.
+        The pose is in base, m and rotation vector. None if the controller does not report it, or if
+        each time a new sample arrived between the two.
         """
         receive = self._receive
         for _ in range(ATTEMPTS if self._has_pose else 0):

@@ -23,10 +23,11 @@ from gapbridge.bridge.daemon.control import Control
 from gapbridge.bridge.daemon.processes import LoopProcess
 from gapbridge.bridge.daemon.status import DaemonStatus
 from gapbridge.bridge.ipc.command_memory import Command, Commands
+from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.loop import checks
 from gapbridge.bridge.loop.link_monitor import ControllerClock, LinkMonitor
 from gapbridge.bridge.loop.loop import Loop
-from gapbridge.bridge.loop.supervisor import Cause, State, Supervisor
+from gapbridge.bridge.loop.supervisor import Cause, Supervisor
 from gapbridge.core.errors import StaleStateError
 from gapbridge.core.state import Setpoint
 from gapbridge.drivers.driver import Driver
@@ -107,7 +108,7 @@ def test_the_first_state_after_a_standstill_is_judged_by_the_clock_before_it() -
     assert not [str(outcome) for outcome in found if outcome.violations]
 
 
-def test_an_arm_that_is_let_go_of_in_silence_is_sent_where_it_was_sent_before() -> None:
+def test_an_arm_released_in_silence_is_sent_where_it_was_sent_before() -> None:
     """Seed 3243: stopped while the arm was silent; enabling frames say the last joints again."""
     assert not run(3243).violations
 
@@ -117,7 +118,7 @@ def test_a_way_longer_than_a_state_may_be_old_lets_no_setpoint_leave(
     monkeypatch: Patch, driver: type[Driver], seed: int
 ) -> None:
     assert run(seed, plan=[]).oldest > 0.0
-    monkeypatch.setattr(driver, "way", lambda _: 0.11)
+    monkeypatch.setattr(driver, "transit_time", lambda _: 0.11)
     assert run(seed, plan=[]).oldest == 0.0  # no setpoint at all; arming writes too
 
 
@@ -247,7 +248,7 @@ def _takes_old_states(patch: Patch) -> None:
 
 def _ties_clocks_while_writing(patch: Patch) -> None:
     take = ControllerClock.take
-    patch.setattr(ControllerClock, "take", lambda self, state, way_known=False: take(self, state))
+    patch.setattr(ControllerClock, "take", lambda self, state, **_: take(self, state))
     patch.setattr(OffsetWriter, "unanswered_since", lambda _: math.inf)
     patch.setattr(Supervisor, "take", _without(Supervisor.take, Cause.STALE))
 

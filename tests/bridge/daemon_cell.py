@@ -23,7 +23,7 @@ from benchmarks.server_thread import OFFSET_SCRIPT
 from gapbridge.bridge.cell import load_cell
 from gapbridge.bridge.daemon.daemon import Daemon, settings_of
 from gapbridge.bridge.daemon.summary import RunSummary
-from gapbridge.bridge.loop.supervisor import State
+from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.core.log.mcap_reading import read_columns
 from gapbridge.drivers.simulated.ur.settings import BENCH_PORT, ServerSettings, simulated_cell
 

@@ -14,8 +14,8 @@ from gapbridge.bridge.cell import load_cell
 from gapbridge.bridge.cell.saving import save_cell
 from gapbridge.bridge.document.output_file import replacing, require_folder, write_text
 from gapbridge.bridge.fleet.journal import Journal as FleetJournal
+from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.ipc.shared_memory import slices_of
-from gapbridge.bridge.loop.supervisor import State
 from gapbridge.bridge.recording.segment import Segment
 
 CELL = "robot: {model: ur10e}\npayload: {mass: 5.0}\n"

@@ -15,8 +15,8 @@ from gapbridge.bridge.calibration.session.journal import FILE, Journal, read_ent
 from gapbridge.bridge.cell.saving import write_text
 from gapbridge.bridge.fleet.journal import Journal as FleetJournal
 from gapbridge.bridge.fleet.task import DONE, Outcome
+from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.ipc.shared_memory import slices_of
-from gapbridge.bridge.loop.supervisor import State
 from gapbridge.bridge.recording import finishing
 from gapbridge.bridge.recording.segment import Segment
 from gapbridge.core.errors import GapbridgeError

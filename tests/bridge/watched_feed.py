@@ -17,9 +17,9 @@ from ports import free_port
 
 from gapbridge.bridge.cell import load_cell
 from gapbridge.bridge.cell.daemon_settings import DaemonSettings
+from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.ipc.shared_memory import Phase, SharedMemory
 from gapbridge.bridge.ipc.side_process import SideProcess
-from gapbridge.bridge.loop.supervisor import State
 
 Array = NDArray[np.float64]
 N, RATE = 6, 125.0

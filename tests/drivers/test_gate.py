@@ -38,8 +38,8 @@ class Clock:
 
 def opened(moves_arm: bool, bounds: GateBounds | None = None) -> tuple[Gate, Clock]:
     found, clock = Gate(RATE, MODEL, moves_arm), Clock()
-    found.count_by(clock)
-    found.hold_to(bounds or GateBounds())
+    found.set_clock(clock)
+    found.set_bounds(bounds or GateBounds())
     found.begin(Q, Q)
     return found, clock
 
@@ -98,7 +98,7 @@ def test_no_driver_writes_before_it_is_armed_or_after_it_was_released(
     driver = make_driver(link(name, host="127.255.255.254"), Model(builtin_arm("ur10e")))
     for hook in ("_send", "_make_ready"):
         monkeypatch.setattr(driver, hook, lambda _: None)
-    monkeypatch.setattr(driver, "_let_go", lambda: None)
+    monkeypatch.setattr(driver, "_release", lambda: None)
     monkeypatch.setattr(driver, "differences", lambda _: [])  # nobody is there to be asked
     state = RobotState(1.0, 0.0, Q, NOTHING, Q, NOTHING)
     with pytest.raises(WriteError, match="expected arm"):

@@ -12,7 +12,13 @@ from gapbridge.core.errors import Implausible, InvalidStateError, WriteError
 from gapbridge.core.state import RobotState
 from gapbridge.drivers.robot_modes import MODES, StopReason, modes_of, why_not_ready
 from gapbridge.drivers.simulated.ur.modes import SAFETY_BITS
-from gapbridge.drivers.state_check import BEYOND, FASTEST, HASTE, JITTER, SampleCheck
+from gapbridge.drivers.state_check import (
+    FASTEST,
+    JITTER,
+    LIMIT_MARGIN,
+    VELOCITY_FACTOR,
+    SampleCheck,
+)
 from gapbridge.drivers.ur_rtde.command import check_ready
 
 ARM = builtin_arm("ur10e")
@@ -50,7 +56,7 @@ def state(q: np.ndarray, at: float = 0.0) -> RobotState:
     return RobotState(at, at, q, np.zeros(6), q, np.zeros(6))
 
 
-@pytest.mark.parametrize("angle", [np.nan, np.inf, -np.inf, 2 * np.pi + 2 * BEYOND])
+@pytest.mark.parametrize("angle", [np.nan, np.inf, -np.inf, 2 * np.pi + 2 * LIMIT_MARGIN])
 def test_an_angle_that_no_such_arm_has_is_named(angle: float) -> None:
     q = np.zeros(6)
     check = SampleCheck(ARM)
@@ -75,9 +81,9 @@ def test_every_vector_that_a_driver_reports_is_checked(field: str) -> None:
 def test_a_step_that_no_joint_makes_is_named(fastest: float) -> None:
     check, q = SampleCheck(ARM, fastest), np.zeros(6)
     check.check(state(q))
-    q[1] = -0.9 * (min(HASTE * ARM.limits.velocity[1], fastest) * 0.01 + JITTER)
+    q[1] = -0.9 * (min(VELOCITY_FACTOR * ARM.limits.velocity[1], fastest) * 0.01 + JITTER)
     check.check(state(q, 0.01))
-    check.forget()
+    check.reset()
     check.check(state(np.zeros(6)))
     with pytest.raises(InvalidStateError, match="actual_q_1: found a step") as caught:
         check.check(state(1.2 * q, 0.01))

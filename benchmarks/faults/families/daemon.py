@@ -14,7 +14,7 @@ from benchmarks.faults.process_run import END_LIMIT, ProcessRun
 from benchmarks.faults.rig import RECOVERY_LIMIT, START_LIMIT, Rig
 from benchmarks.faults.row import Apart, Result, Row, seconds
 from benchmarks.faults.running import Running
-from gapbridge.bridge.loop.supervisor import State
+from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.core.errors import GapbridgeError
 from gapbridge.drivers import modbus
 

@@ -22,8 +22,8 @@ from gapbridge.bridge.cell.daemon_settings import DaemonSettings
 from gapbridge.bridge.cell.sections import SetpointSettings
 from gapbridge.bridge.cell.settings.recording import RecordingSettings
 from gapbridge.bridge.daemon.daemon import Daemon, settings_of
+from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.ipc.shared_memory import CycleReader, Phase
-from gapbridge.bridge.loop.supervisor import State
 from gapbridge.bridge.setpoint_source.quintic import quintic, quintic_time, write_trajectory
 from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.plan import PlannedPose

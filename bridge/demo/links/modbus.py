@@ -20,7 +20,7 @@ from gapbridge.bridge.demo.bench import Bench
 from gapbridge.bridge.demo.links.link import DemoLink
 from gapbridge.bridge.demo.poses import UR10E, Load, Workspace
 from gapbridge.bridge.demo.result import Resolution
-from gapbridge.bridge.loop.supervisor import State
+from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.core.arrays import Array
 from gapbridge.core.errors import LinkError
 from gapbridge.drivers.modbus.profile import read_profile

@@ -169,7 +169,7 @@ function showFigures() {
   tile('late', count(now.late));
   tile('setpoints sent', count(now.written));
   const held = Object.values(now.clamped).reduce((a, b) => a + b, 0);
-  tile('held back', count(held));
+  tile('clamped', count(held));
 }
 
 function gauge(id, size, limit, unit) {
@@ -243,7 +243,7 @@ function showHealth() {
     rows.push(row(`dropped: ${reason.replace(/_/g, ' ')}`, count(times), true));
   }
   for (const [name, times] of Object.entries(now.clamped)) {
-    if (times) rows.push(row(`held back: ${name.replace(/_/g, ' ')}`, count(times)));
+    if (times) rows.push(row(`clamped: ${name.replace(/_/g, ' ')}`, count(times)));
   }
   for (const [name, side] of Object.entries(status.sides || {})) {
     const dead = !side.pid;

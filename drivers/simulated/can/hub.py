@@ -22,17 +22,17 @@ MOST_PORTS = 64
 
 
 class Hub:
-    """One simulated bus, served by a thread of its own between ``start`` and ``close``."""
+    """One simulated bus, served by a thread between ``start`` and ``close``."""
 
     def __init__(self, host: str = "127.0.0.1", port: int = 0) -> None:
         if not is_loopback(host):
             raise ValueError(f"host: found {host!r}, expected a loopback address (127.x.x.x)")
         self.host = host
-        self.port = port  # TCP; 0 until start() where the system chooses
-        self.frames = 0  # that went over the bus
+        self.port = port  # TCP; 0 until start() if the system chooses it
+        self.frames = 0  # sent over the bus
         self._selector = selectors.DefaultSelector()
         self._ports: dict[int, Port] = {}
-        self._full: set[int] = set()  # lines of ports that wait for room to write
+        self._full: set[int] = set()  # descriptors of ports that wait until they can write
         self._listener: socket.socket | None = None
         self._thread: threading.Thread | None = None
         self._wake_in, self._wake_out = -1, -1
@@ -41,7 +41,7 @@ class Hub:
         self._lock = threading.RLock()  # the thread's ports against frames from this process
 
     def start(self) -> Hub:
-        """Listen, and serve in a thread. Raises OSError where the port is taken."""
+        """Listen, and serve in a thread. Raises OSError if the port is taken."""
         listener = socket.create_server((self.host, self.port), backlog=16)
         listener.setblocking(False)
         self.port = listener.getsockname()[1]
@@ -54,39 +54,39 @@ class Hub:
         return self
 
     def add_terminal(self) -> str:
-        """Return the path of a serial line behind which an slcan adapter hangs on this bus."""
+        """Return the path of a serial line of a new slcan adapter on this bus."""
         master, slave = os.openpty()
         path = os.ttyname(slave)
-        self._terminals.append(slave)  # kept open, so that a client may come and go
+        self._terminals.append(slave)  # kept open, so that clients may reconnect
         self._add(SerialPort(master))
-        self._poke()
+        self._wake()
         return path
 
     def send(self, frame: Frame, source: Port | None = None) -> None:
-        """Put one frame on the bus from this process; it goes to every connection but ``source``.
+        """Send one frame from this process to every connection but ``source``.
 
-        It leaves in the caller's own time: no other thread has to wake up first.
+        It is sent in the caller's thread, without a delay by another thread.
         """
         with self._lock:
-            self._spread(frame, source)
+            self._broadcast(frame, source)
 
     def attach(self, port: Port) -> None:
-        """Have a port of this process, without a line of its own, receive what others send."""
+        """Attach a port of this process, which receives the frames of others."""
         with self._lock:
             self._ports[port.fd] = port
 
     def detach(self, port: Port) -> None:
-        """Take such a port off the bus; may be repeated."""
+        """Detach such a port; may be repeated."""
         with self._lock:
             self._ports.pop(port.fd, None)
 
     def close(self) -> None:
-        """Cut every connection; may be repeated."""
+        """Close every connection; may be repeated."""
         self._stopping = True
         thread, self._thread = self._thread, None
         if thread is None:
             return
-        self._poke()
+        self._wake()
         thread.join(5.0)
         for port in list(self._ports.values()):
             self._drop(port)
@@ -103,7 +103,7 @@ class Hub:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _poke(self) -> None:
+    def _wake(self) -> None:
         with contextlib.suppress(OSError):
             os.write(self._wake_in, b".")
 
@@ -116,7 +116,7 @@ class Hub:
                     os.read(self._wake_out, 64)
                 elif (port := self._ports.get(key.fd)) is not None:
                     with self._lock:
-                        self._attend(port, events)
+                        self._serve_port(port, events)
 
     def _accept(self) -> None:
         assert self._listener is not None
@@ -136,7 +136,7 @@ class Hub:
             self._ports[port.fd] = port
             self._selector.register(port.fd, self._wanted(port))
 
-    def _attend(self, port: Port, events: int) -> None:
+    def _serve_port(self, port: Port, events: int) -> None:
         try:
             frames = port.receive() if events & selectors.EVENT_READ else []
             port.flush()
@@ -145,9 +145,9 @@ class Hub:
             return
         self._watch(port)
         for frame in frames:
-            self._spread(frame, port)
+            self._broadcast(frame, port)
 
-    def _spread(self, frame: Frame, source: Port | None) -> None:
+    def _broadcast(self, frame: Frame, source: Port | None) -> None:
         self.frames += 1
         stamp = time.time()
         for port in list(self._ports.values()):

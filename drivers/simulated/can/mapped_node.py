@@ -1,4 +1,4 @@
-"""A simulated arm out of a profile alone: what its map says, it sends and obeys.
+"""A simulated arm from a profile alone: it sends and executes what the map defines.
 
 It shows a map at work before the arm is there. Being made of the same map, it cannot show that the
 map is right.
@@ -17,7 +17,7 @@ from gapbridge.drivers.robot_modes import StopReason
 from gapbridge.drivers.simulated.can.nodes import CanNodes
 from gapbridge.drivers.simulated.server.arm_controller import ArmController
 
-HEALTHY_EVERY = 5  # cycles between messages that are no part of a sample
+HEALTHY_EVERY = 5  # cycles between messages that are not part of a sample
 
 
 class MappedNodes(CanNodes):
@@ -40,16 +40,16 @@ class MappedNodes(CanNodes):
         return {(f.key[0], f.encode()) for action in actions for f in action.frames}
 
     def take(self, identifier: int, data: bytes, controller: ArmController) -> None:
-        """Obey the enable sequence and setpoints; answer requests."""
+        """Execute the enable sequence and setpoints; answer requests."""
         if (identifier, data) in self._asked:
             if (identifier, data) == max(self._asked):
                 self._send_sample(controller)
         elif (identifier, data) in self._enabling:
             self._enabled = True
         elif identifier in self._setpoint:
-            self._aim(self._setpoint[identifier], data, controller)
+            self._set_target(self._setpoint[identifier], data, controller)
 
-    def _aim(self, frame: Outgoing, data: bytes, controller: ArmController) -> None:
+    def _set_target(self, frame: Outgoing, data: bytes, controller: ArmController) -> None:
         if self._wire is None or len(data) != frame.message.length:
             return
         if self._enabling and not self._enabled:
@@ -62,7 +62,7 @@ class MappedNodes(CanNodes):
             controller.command(tuple(self._wire * joints.setpoint_scale + joints.zero))
 
     def publish(self, controller: ArmController) -> None:
-        """Send the sample, unless it must be asked for, and more seldom everything else."""
+        """Send the sample, unless it must be requested, and less often all other messages."""
         if not self._asked:
             self._send_sample(controller)
         if self._cycles % HEALTHY_EVERY == 0:
@@ -78,7 +78,7 @@ class MappedNodes(CanNodes):
             self.send(key[0], self._encode(self._profile.incoming[key], controller))
 
     def _encode(self, incoming: Incoming, controller: ArmController) -> bytes:
-        """Return a message of a healthy arm: its joints where they are, everything else normal."""
+        """Return a message with the present joints and normal status."""
         profile, values = self._profile, {s.name: 0.0 for s in incoming.message.signals}
         reported = {
             "position": np.array(self._kept) + self._shift - profile.joints.zero,

@@ -15,7 +15,7 @@ from gapbridge.drivers.simulated.server.arm_controller import ArmController
 
 
 class Ranges(NamedTuple):
-    """What an actuator's fields reach, from minus to plus."""
+    """Ranges of an actuator's fields, from minus to plus."""
 
     velocity: float  # rad/s
     torque: float  # Nm
@@ -37,7 +37,7 @@ class MitNodes(CanNodes):
         self._target = list(controller.target_q)
 
     def take(self, identifier: int, data: bytes, controller: ArmController) -> None:
-        """Obey enable, disable and MIT commands; answer these and queries."""
+        """Execute enable, disable and MIT commands; answer these and queries."""
         motor = identifier - 1
         if identifier == QUERY and len(data) >= 3 and data[2] == REFRESH:
             motor = int.from_bytes(data[:2], "little") - 1
@@ -50,11 +50,11 @@ class MitNodes(CanNodes):
             self.enabled[motor] = False
             controller.let_go()
         else:
-            self._aim(motor, data, controller)
+            self._set_target(motor, data, controller)
         if 0 <= motor < controller.n:
             self._answer(motor, controller)
 
-    def _aim(self, motor: int, data: bytes, controller: ArmController) -> None:
+    def _set_target(self, motor: int, data: bytes, controller: ArmController) -> None:
         stiffness = ((data[3] & 0xF) << 8) | data[4]
         if not self.enabled[motor] or not stiffness:
             return
@@ -77,7 +77,7 @@ class MitNodes(CanNodes):
         self.send(0x11 + motor, head + packed.to_bytes(5, "big") + bytes([warm, warm]))
 
     def publish(self, controller: ArmController) -> None:
-        """Say nothing: an actuator speaks when it is spoken to."""
+        """Send nothing: an actuator only answers."""
 
 
 def _count(value: float, reach: float, bits: int) -> int:

@@ -1,4 +1,4 @@
-"""What every simulated arm on CAN shares: its bus, its hub, and how joints stand on the wire."""
+"""Base class of simulated arms on CAN: the bus, its hub, and joints in wire units."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from gapbridge.drivers.simulated.server.arm_controller import ArmController
 from gapbridge.drivers.simulated.server.bench import Command
 from gapbridge.drivers.simulated.server.protocol_server import ProtocolServer
 
-BACKLOG = 500  # frames taken in one cycle at most
-TORN = 0.05  # rad that the joints of a torn sample are off
+BACKLOG = 500  # frames read in one cycle at most
+TORN = 0.05  # rad: error of the joints of a torn sample
 
 
 class CanNodes(ProtocolServer):
@@ -47,8 +47,8 @@ class CanNodes(ProtocolServer):
         self.withheld: set[int] = set()  # identifiers that are not sent now
         self._kept: Joints = controller.q
         self._tears: deque[frozenset[int]] = deque()
-        self._lost: frozenset[int] = frozenset()  # identifiers lost out of this sample
-        self._shift = 0.0  # rad, of a torn sample: who takes it for one is found out
+        self._lost: frozenset[int] = frozenset()  # identifiers not sent in this sample
+        self._shift = 0.0  # rad: error of a torn sample, which makes its use visible
 
     # -- the bus ----------------------------------------------------------------------------------
 
@@ -84,11 +84,11 @@ class CanNodes(ProtocolServer):
 
     @property
     def port(self) -> int:
-        """Return the TCP port of the bus that is served here; 0 where none is."""
+        """Return the TCP port of the bus that is served here; 0: none."""
         return self._hub.port if self._hub else 0
 
     def close(self) -> None:
-        """Leave the bus, and end it where it is served here."""
+        """Close the bus, and end it if it is served here."""
         bus, self._bus = self._bus, None
         if bus is not None:
             close_bus(bus)
@@ -100,7 +100,7 @@ class CanNodes(ProtocolServer):
             symbol.unlink(missing_ok=True)
 
     def cycle(self, controller: ArmController) -> None:
-        """Take the frames that have come, then send the arm's own."""
+        """Read the frames that have arrived, then send the arm's frames."""
         if self._bus is None and self._hub is None:
             return
         for _ in range(BACKLOG):
@@ -115,7 +115,7 @@ class CanNodes(ProtocolServer):
             self.publish(controller)
 
     def _receive(self) -> Frame | None:
-        """Return the next data frame that has come. Raises LinkError where the bus has gone."""
+        """Return the next data frame, or None. Raises LinkError if the bus is lost."""
         if self._hub is not None:
             return self._inner.frames.popleft() if self._inner.frames else None
         while True:
@@ -130,14 +130,14 @@ class CanNodes(ProtocolServer):
                 return Frame(int(message.arbitration_id), bytes(message.data), extended)
 
     def tear(self, first: int, second: int) -> None:
-        """Lose frame ``second`` of the next sample, ``first`` of the one after; the first is off.
+        """Drop frame ``second`` of the next sample and ``first`` of the one after, with an error.
 
-        Who only waits until each identifier has come mixes the two.
+        A reader that only waits for each identifier mixes the two.
         """
         self._tears.extend((frozenset({second}), frozenset({first})))
 
     def begin_sample(self) -> None:
-        """Begin the frames of another sample; protocols call it."""
+        """Begin a new sample; protocols call it."""
         before, self._shift = self._shift, 0.0
         self._lost = self._tears.popleft() if self._tears else frozenset()
         if self._lost and not before:
@@ -156,7 +156,7 @@ class CanNodes(ProtocolServer):
             self._bus.send(frame)
 
     def commands(self, controller: ArmController) -> Mapping[str, Command]:
-        """Return the bench commands of a bus: frames that get lost."""
+        """Return the bench commands of a bus: lost frames."""
         return {
             "withhold": (1, lambda arguments: self.withheld.add(int(arguments[0])),
                          "withhold ID: frames of this identifier get lost"),
@@ -166,25 +166,25 @@ class CanNodes(ProtocolServer):
     # -- joints -----------------------------------------------------------------------------------
 
     def wire(self, unit: float) -> list[float]:
-        """Return the encoders as they stand on the wire, in ``unit`` (rad)."""
+        """Return the encoders in wire units of ``unit`` rad."""
         rows = zip(self._kept, self._zero, self._sign, self._gear, strict=True)
         return [(q + self._shift - zero) * sign * gear / unit for q, zero, sign, gear in rows]
 
     def speeds(self, controller: ArmController, unit: float) -> list[float]:
-        """Return the joint velocities on the wire, in ``unit`` (rad/s)."""
+        """Return the joint velocities in wire units of ``unit`` rad/s."""
         rows = zip(controller.qd, self._sign, self._gear, strict=True)
         return [qd * sign * gear / unit for qd, sign, gear in rows]
 
     def joint(self, i: int, value: float, unit: float) -> float:
-        """Return joint ``i`` (from 0), rad, of a value on the wire."""
+        """Return joint ``i`` (from 0), rad, of a value in wire units."""
         return value * unit * self._sign[i] / self._gear[i] + self._zero[i]
 
-    # -- what one protocol adds -------------------------------------------------------------------
+    # -- of one protocol --------------------------------------------------------------------------
 
     @abstractmethod
     def take(self, identifier: int, data: bytes, controller: ArmController) -> None:
-        """Take one frame that somebody sent."""
+        """Process one received frame."""
 
     @abstractmethod
     def publish(self, controller: ArmController) -> None:
-        """Send what the arm sends in this cycle."""
+        """Send the arm's frames of this cycle."""

@@ -28,10 +28,10 @@ class OdriveNodes(CanNodes):
         self.mode = [(0, 0)] * controller.n
         self._target = list(controller.target_q)
         self._count = 0
-        self._due = 0.0  # s, monotonic: no encoder estimate leaves before
+        self._due = 0.0  # s, monotonic: when the next encoder estimate is sent
 
     def take(self, identifier: int, data: bytes, controller: ArmController) -> None:
-        """Obey state, mode, position, e-stop and clear."""
+        """Execute state, mode, position, e-stop and clear."""
         node, command = identifier >> 5, identifier & 0x1F
         if node >= controller.n:
             return
@@ -40,7 +40,7 @@ class OdriveNodes(CanNodes):
         elif command == SET_MODE and len(data) == 8:
             self.mode[node] = struct.unpack("<II", data)
         elif command == INPUT_POSITION and len(data) == 8:
-            self._aim(node, struct.unpack("<f", data[:4])[0], controller)
+            self._set_target(node, struct.unpack("<f", data[:4])[0], controller)
         elif command == ESTOP:
             controller.emergency_stop()
         elif command == CLEAR:
@@ -54,7 +54,7 @@ class OdriveNodes(CanNodes):
             controller.let_go()
         self.state[node] = state
 
-    def _aim(self, node: int, turns: float, controller: ArmController) -> None:
+    def _set_target(self, node: int, turns: float, controller: ArmController) -> None:
         if self.state[node] != CLOSED_LOOP or self.mode[node] != (POSITION_CONTROL, PASSTHROUGH):
             return
         self._target[node] = self.joint(node, turns, TURN)

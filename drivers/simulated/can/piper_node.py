@@ -13,7 +13,7 @@ from gapbridge.drivers.simulated.can.nodes import CanNodes
 from gapbridge.drivers.simulated.server.arm_controller import ArmController
 
 UNIT = math.radians(0.001)
-FACTORS = (1.18125, 1.18125, 1.18125, 0.95844, 0.95844, 0.95844)  # Nm per A, as piper_sdk has them
+FACTORS = (1.18125, 1.18125, 1.18125, 0.95844, 0.95844, 0.95844)  # Nm per A, as in piper_sdk
 STANDBY, CAN_CONTROL = 0, 1
 MOVE_J = 1
 LOW_EVERY = 5  # cycles between the motors' low speed feedback
@@ -31,7 +31,7 @@ class PiperNode(CanNodes):
         self._count = 0
 
     def take(self, identifier: int, data: bytes, controller: ArmController) -> None:
-        """Obey 0x150 (stop, resume), 0x151 (mode), 0x155-0x157 (targets), 0x471 (motors)."""
+        """Execute 0x150 (stop, resume), 0x151 (mode), 0x155-0x157 (targets), 0x471 (motors)."""
         if len(data) != 8:
             return
         if identifier == 0x150:
@@ -39,7 +39,7 @@ class PiperNode(CanNodes):
         elif identifier == 0x151:
             self._set_mode(data[0], data[1], controller)
         elif identifier in TARGETS:
-            self._aim(TARGETS[identifier], data, controller)
+            self._set_target(TARGETS[identifier], data, controller)
         elif identifier == 0x471:
             self._switch(data[0], data[1], controller)
 
@@ -60,7 +60,7 @@ class PiperNode(CanNodes):
         if control in (STANDBY, CAN_CONTROL):
             self.control_mode, self.move_mode = control, move
 
-    def _aim(self, first: int, data: bytes, controller: ArmController) -> None:
+    def _set_target(self, first: int, data: bytes, controller: ArmController) -> None:
         if self.control_mode != CAN_CONTROL or self.move_mode != MOVE_J or not all(self.enabled):
             return
         for i, value in enumerate(struct.unpack(">ii", data), first):
@@ -76,7 +76,7 @@ class PiperNode(CanNodes):
             controller.let_go()
 
     def publish(self, controller: ArmController) -> None:
-        """Send joints, motors' high speed feedback and status; low speed feedback seldom."""
+        """Send joints, motors' high speed feedback and status; low speed feedback less often."""
         self.begin_sample()
         wire = [round(value) for value in self.wire(UNIT)]
         for k in range(3):

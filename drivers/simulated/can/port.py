@@ -1,4 +1,4 @@
-"""What hangs on the hub: a socketcand connection, or a serial line with an slcan adapter."""
+"""Connections of the hub: a socketcand client, or a serial line with an slcan adapter."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from collections import deque
 
 from gapbridge.drivers.simulated.can.frame import Frame
 
-BACKLOG = 1 << 20  # bytes that a client may leave unread before it is cut off
+BACKLOG = 1 << 20  # unread bytes after which a client is disconnected
 LONGEST = 200  # bytes of one message
 QUIET = 0.02  # s after the handshake without a frame
 
 
 class Port(ABC):
-    """One connection: bytes in, frames out, and the other way round. Never blocks."""
+    """One connection: converts bytes to frames and back. Never blocks."""
 
     def __init__(self, fd: int) -> None:
         self.fd = fd
@@ -29,12 +29,12 @@ class Port(ABC):
 
     @property
     def waiting(self) -> bool:
-        """Return whether there are bytes left to be written."""
+        """Return whether there are unsent bytes."""
         return bool(self._out)
 
     @abstractmethod
     def receive(self) -> list[Frame]:
-        """Return the frames that have come in. Raises OSError where the line has ended."""
+        """Return the frames received. Raises OSError if the connection has ended."""
 
     @abstractmethod
     def deliver(self, frame: Frame, stamp: float) -> None:
@@ -45,7 +45,7 @@ class Port(ABC):
         """Close the line."""
 
     def flush(self) -> None:
-        """Write what the line takes now. Raises OSError."""
+        """Write as many bytes as possible now. Raises OSError."""
         if self._out:
             try:
                 written = os.write(self.fd, self._out)
@@ -80,18 +80,18 @@ class SocketcandPort(Port):
         self._write(b"< hi >")
 
     def receive(self) -> list[Frame]:
-        """Return the frames of all complete messages that have come."""
+        """Return the frames of all complete messages received."""
         self._read()
         frames: list[Frame] = []
         while (end := self._in.find(b">")) >= 0:
             text = bytes(self._in[:end]).decode("ascii", "replace")
             del self._in[: end + 1]
-            self._obey(text.replace("<", " ").split(), frames)
+            self._execute(text.replace("<", " ").split(), frames)
         if len(self._in) > LONGEST:
             raise OSError(errno.EPROTO, "no end of a message")
         return frames
 
-    def _obey(self, arguments: list[str], frames: list[Frame]) -> None:
+    def _execute(self, arguments: list[str], frames: list[Frame]) -> None:
         match arguments:
             case ["open", _]:
                 self._write(b"< ok >")
@@ -101,7 +101,7 @@ class SocketcandPort(Port):
             case ["echo"]:
                 self._write(b"< echo >")
             case ["send", identifier, length, *data]:
-                frame = _sent(identifier, length, data)
+                frame = _parse_send(identifier, length, data)
                 if frame is None:
                     self._write(b"< error could not parse send command >")
                 else:
@@ -120,7 +120,7 @@ class SocketcandPort(Port):
         self._link.close()
 
 
-def _sent(identifier: str, length: str, data: list[str]) -> Frame | None:
+def _parse_send(identifier: str, length: str, data: list[str]) -> Frame | None:
     try:
         content = bytes(int(byte, 16) for byte in data)
         if len(content) != int(length, 16):
@@ -148,19 +148,19 @@ class SerialPort(Port):
         while (end := self._in.find(b"\r")) >= 0:
             text = bytes(self._in[:end]).decode("ascii", "replace").strip("\n")
             del self._in[: end + 1]
-            self._obey(text, frames)
+            self._execute(text, frames)
         if len(self._in) > LONGEST:
             self._in.clear()
         return frames
 
-    def _obey(self, text: str, frames: list[Frame]) -> None:
+    def _execute(self, text: str, frames: list[Frame]) -> None:
         kind = text[:1]
         if kind in ("O", "L"):
             self._open = True
         elif kind == "C":
             self._open = False
         elif kind in ("t", "T"):
-            frame = _typed(text)
+            frame = _parse_frame(text)
             if frame is None or not self._open:
                 self._write(b"\a")
                 return
@@ -176,11 +176,11 @@ class SerialPort(Port):
             self._write(f"{head}{len(frame.data)}{frame.data.hex().upper()}\r".encode())
 
     def close(self) -> None:
-        """Close our end: the client sees the line hang up."""
+        """Close our end: the client sees a hang-up."""
         os.close(self.fd)
 
 
-def _typed(text: str) -> Frame | None:
+def _parse_frame(text: str) -> Frame | None:
     extended = text[0] == "T"
     head = 9 if extended else 4
     try:
@@ -197,9 +197,9 @@ _numbers = itertools.count(2)
 
 
 class InnerPort(Port):
-    """A participant in the hub's own process: frames wait in a bounded queue until they are taken.
+    """A participant in the hub's process: frames are stored in a bounded queue.
 
-    Its ``fd`` is a negative number, which is no descriptor.
+    Its ``fd`` is a negative number, which is not a descriptor.
     """
 
     def __init__(self) -> None:
@@ -207,13 +207,13 @@ class InnerPort(Port):
         self.frames: deque[Frame] = deque(maxlen=10_000)
 
     def receive(self) -> list[Frame]:
-        """Return nothing: it has no line."""
+        """Return nothing: it has no connection."""
         return []
 
     def deliver(self, frame: Frame, stamp: float) -> None:
-        """Keep the frame."""
+        """Store the frame."""
         self.frames.append(frame)
 
     def close(self) -> None:
-        """Forget what waits."""
+        """Clear the queue."""
         self.frames.clear()

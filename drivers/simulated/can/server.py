@@ -1,4 +1,4 @@
-"""Which simulated arm stands behind a CAN profile."""
+"""The simulated arm of a CAN profile."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ NODES: dict[str, str] = {
     "openarm": "gapbridge.drivers.simulated.can.mit_node:MitNodes",
     "odrive": "gapbridge.drivers.simulated.can.odrive_node:OdriveNodes",
 }
-"""Shipped profile -> ``module:Class`` of its nodes; any other profile: nodes out of its map."""
+"""Shipped profile -> ``module:Class`` of its nodes; any other profile: nodes from its map."""
 MAPPED = "gapbridge.drivers.simulated.can.mapped_node:MappedNodes"
 
 
 def make_servers(link: CanSettings, host: str, controller: ArmController) -> list[ProtocolServer]:
-    """Return the nodes of an arm, not yet on a bus. Raises InputError where they do not fit."""
+    """Return the nodes of an arm, not yet on a bus. Raises InputError if they do not fit."""
     nodes = resolve_name(NODES.get(link.profile, MAPPED))
     if link.profile == "piper" and controller.n != 6:
         raise InputError(

@@ -1,4 +1,4 @@
-"""One simulated drive: an object dictionary with what CiA 301 and CiA 402 ask of it.
+"""One simulated drive: an object dictionary with the objects of CiA 301 and CiA 402.
 
 The canopen library's LocalNode is its SDO server and EMCY producer; PDOs, SYNC, heartbeats and the
 state machine are written here.
@@ -23,14 +23,14 @@ INVALID = 1 << 31  # of a PDO's COB-ID
 LAST = 0x7FFFFFFF  # of an INTEGER32
 COMMUNICATION = 0x10  # error register
 BRAKING = 12.0  # rad/s^2, of a quick stop and of a fault's reaction
-FOLLOWING = 0.35  # rad that the joint may be away from its setpoint
+FOLLOWING = 0.35  # rad: largest following error
 INTERPOLATED, SYNCHRONOUS = 7, 8  # modes of operation
 RUN = 0x10  # Controlword: interpolate
 
 
 @dataclass(frozen=True, slots=True)
 class Mapping:
-    """One PDO as the object dictionary has it."""
+    """One PDO's mapping in the object dictionary."""
 
     cob_id: int
     synchronous: bool
@@ -48,7 +48,7 @@ class Units:
 
 
 class _Nmt(NmtSlave):
-    """The library's NMT slave, but heartbeats are the server's: their period is only noted."""
+    """The library's NMT slave; the server sends the heartbeats, here only their period is set."""
 
     period = 0.0  # s
 
@@ -75,14 +75,14 @@ class Drive(canopen.LocalNode):
         self.error_code = 0
         self.watched: dict[int, float] = {}  # node id -> s of its last heartbeat
         self._limits = (-LAST, LAST)
-        self._received: dict[int, bytes] = {}  # RPDO's COB-ID -> data that waits for a SYNC
+        self._received: dict[int, bytes] = {}  # RPDO's COB-ID -> data until a SYNC
         self._mappings: dict[int, Mapping | None] = {}
         self.add_read_callback(self._live)  # type: ignore[no-untyped-call]
         self.add_write_callback(self.nmt.on_write)  # type: ignore[no-untyped-call]
         self.add_write_callback(self._written)  # type: ignore[no-untyped-call]
 
     def boot(self, q: float, low: float, high: float) -> None:
-        """Start anew at ``q`` with the EDS's defaults, between the joint's limits (rad)."""
+        """Restart at ``q`` with the EDS's defaults and the joint's limits (rad)."""
         self.data_store.clear()
         self._mappings.clear()
         self._received.clear()
@@ -106,12 +106,12 @@ class Drive(canopen.LocalNode):
     # -- the object dictionary --------------------------------------------------------------------
 
     def number(self, index: int, subindex: int = 0) -> int:
-        """Return what an object holds."""
+        """Return an object's value."""
         entry = self._find_object(index, subindex)  # type: ignore[no-untyped-call]
         return int(entry.decode_raw(self.get_data(index, subindex)))
 
     def _live(self, index: int, subindex: int, od: Any) -> int | None:
-        """Return what the drive itself puts into an object."""
+        """Return the present value of an object that the drive updates; None: another object."""
         axis, units = self.axis, self.units
         match index, subindex:
             case 0x6041, 0:
@@ -133,7 +133,7 @@ class Drive(canopen.LocalNode):
         return None
 
     def _written(self, index: int, subindex: int, od: Any, data: bytes) -> None:
-        """Check and obey what a master writes. Raises SdoAbortedError."""
+        """Check and execute a master's write. Raises SdoAbortedError."""
         value = (
             int(od.decode_raw(data))
             if od.data_type in canopen.objectdictionary.INTEGER_TYPES
@@ -191,7 +191,7 @@ class Drive(canopen.LocalNode):
         return self._mappings[index]
 
     def receive(self, cob_id: int, data: bytes) -> None:
-        """Take a frame that may be one of our RPDOs."""
+        """Store a frame if it is one of our RPDOs."""
         for index in range(0x1400, 0x1404):
             mapping = self._mapping(index)
             if mapping is None or mapping.cob_id != cob_id:
@@ -211,7 +211,7 @@ class Drive(canopen.LocalNode):
             self.set_data(index, subindex, part)
 
     def take_setpoints(self) -> bool:
-        """Let what came before this SYNC count; returns False where it cannot be followed."""
+        """Apply the RPDOs received before this SYNC; returns False if they cannot be followed."""
         for index, data in self._received.items():
             mapping = self._mapping(index)
             if mapping is not None:
@@ -224,18 +224,18 @@ class Drive(canopen.LocalNode):
         return self.axis.setpoint(counts / self.units.per_radian + self.units.zero)
 
     def measure(self, q: float, qd: float, torque: float) -> None:
-        """Take the plant's joint over: rad, rad/s, Nm."""
+        """Store the plant's joint: rad, rad/s, Nm."""
         self.q, self.qd, self.torque = q, qd, torque
 
     def samples_off_by(self, angle: float) -> list[tuple[int, bytes]]:
-        """Return the frames that a joint ``angle`` (rad) further on would have."""
+        """Return the frames of a joint that is ``angle`` (rad) further."""
         here, self.q = self.q, self.q + angle
         frames = self.samples()
         self.q = here
         return frames
 
     def samples(self) -> list[tuple[int, bytes]]:
-        """Return the frames of all synchronous TPDOs, of this moment."""
+        """Return the present frames of all synchronous TPDOs."""
         frames = []
         for index in range(0x1800, 0x1804):
             mapping = self._mapping(index)
@@ -257,13 +257,13 @@ class Drive(canopen.LocalNode):
 
 
 def _fit(value: float) -> int:
-    """Return a whole number that an INTEGER32 holds."""
+    """Return a value rounded and clipped to INTEGER32."""
     return max(-LAST - 1, min(LAST, round(value))) if math.isfinite(value) else 0
 
 
 @dataclass
 class Axis:
-    """One joint under its drive, rad; ``demand`` is where the drive wants it now."""
+    """One joint under its drive, rad; ``demand`` is the drive's present position demand."""
 
     demand: float
     speed: float = 0.0  # rad/s, of the demand
@@ -292,7 +292,7 @@ class Axis:
         self.mode = mode
 
     def setpoint(self, angle: float) -> bool:
-        """Take the setpoint of a SYNC; returns False where it is too far away to be followed."""
+        """Store the setpoint of a SYNC; returns False if it is too far away to be followed."""
         if not self.active:
             self._to = None
             return True
@@ -300,7 +300,7 @@ class Axis:
         return math.isfinite(angle) and abs(angle - self.demand) <= FOLLOWING
 
     def step(self, dt: float, period: float, actual: float) -> None:
-        """Advance by ``dt`` s; ``period`` (s) lies between two SYNCs."""
+        """Advance by ``dt`` s; ``period``: s between two SYNCs."""
         phase = self.machine.phase
         if phase in (Phase.QUICK_STOP, Phase.REACTION):
             self._brake(dt)
@@ -323,4 +323,4 @@ class Axis:
         self.demand += self.speed * dt
         self._to = None
         if self.speed == 0.0:
-            self.machine.come_to_rest()
+            self.machine.end_braking()

@@ -1,4 +1,4 @@
-"""The state machine of one drive, as CiA 402 draws it: Controlword in, Statusword out."""
+"""The state machine of one drive by CiA 402: Controlword in, Statusword out."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ class Phase(Enum):
     FAULT = 0x0008
 
 
-VOLTAGE = 0x0010  # Statusword: there is supply
-REMOTE = 0x0200  # Statusword: the Controlword is obeyed
+VOLTAGE = 0x0010  # Statusword: voltage enabled
+REMOTE = 0x0200  # Statusword: the Controlword is executed
 
 
 class Machine:
@@ -31,11 +31,11 @@ class Machine:
         self._quick_stop_stays = False  # option codes 5 to 8 of 0x605A
 
     def set_quick_stop_option(self, code: int) -> None:
-        """Take over the option code of 0x605A."""
+        """Set the option code of 0x605A."""
         self._quick_stop_stays = code >= 5
 
     def control(self, word: int) -> bool:
-        """Obey a Controlword; returns whether it resets a fault."""
+        """Execute a Controlword; returns whether it resets a fault."""
         rising = word & ~self.word
         self.word = word
         if self.phase in (Phase.FAULT, Phase.REACTION):
@@ -68,7 +68,7 @@ class Machine:
             self.phase = Phase.READY
 
     def _switch_on(self, enable: bool) -> None:
-        """Take one step a Controlword: a drive does not jump over a state."""
+        """Make one transition per Controlword: a drive does not skip a state."""
         if self.phase is Phase.READY:
             self.phase = Phase.SWITCHED_ON
         elif self.phase is Phase.SWITCHED_ON and enable:
@@ -79,12 +79,12 @@ class Machine:
             self.phase = Phase.ENABLED
 
     def fault(self) -> None:
-        """Go to FAULT, by way of its reaction where the drive was moving."""
+        """Go to FAULT, through the fault reaction if the drive was moving."""
         moving = self.phase in (Phase.ENABLED, Phase.QUICK_STOP)
         self.phase = Phase.REACTION if moving else Phase.FAULT
 
-    def come_to_rest(self) -> None:
-        """Note that a quick stop or a fault reaction has ended: the axis stands."""
+    def end_braking(self) -> None:
+        """End a quick stop or a fault reaction: the axis is at rest."""
         if self.phase is Phase.REACTION:
             self.phase = Phase.FAULT
         elif self.phase is Phase.QUICK_STOP and not self._quick_stop_stays:
@@ -92,5 +92,5 @@ class Machine:
 
     @property
     def statusword(self) -> int:
-        """Return the Statusword without what the mode adds."""
+        """Return the Statusword without the mode's bits."""
         return self.phase.value | VOLTAGE | REMOTE

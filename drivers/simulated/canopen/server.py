@@ -25,18 +25,18 @@ from gapbridge.drivers.simulated.server.protocol_server import ProtocolServer
 SYNC = 0x80
 HEARTBEAT = 0x700
 BLOCKED, EMERGENCY, FOLLOWING_ERROR, HEARTBEAT_ERROR = 0x7121, 0x5441, 0x8611, 0x8130
-OFF_BY = 0.05  # rad that a TPDO of a SYNC before is off: who takes it for a new one is found out
+OFF_BY = 0.05  # rad: error of a late TPDO, which makes its use for the next SYNC visible
 PAUSE = 0.02  # s
 
 
-class HeldPdo(NamedTuple):
-    """A TPDO that is held back."""
+class DelayedPdo(NamedTuple):
+    """A TPDO that is sent late."""
 
     due: float  # s, monotonic
-    sync: int  # the SYNC that it answers
+    sync: int  # number of the SYNC that it answers
     cob_id: int
     data: bytes
-    off: bytes  # the data by which it goes where another SYNC has come meanwhile
+    off: bytes  # its data if another SYNC has come meanwhile
 
 
 class _Network(canopen.Network):
@@ -51,17 +51,17 @@ class _Network(canopen.Network):
         self._mute = False
 
     def set_mute(self, mute: bool) -> None:
-        """Have all nodes send nothing, or send again."""
+        """Mute or unmute all nodes."""
         self._mute = mute
 
     def send_message(self, can_id: int, data: Any, remote: bool = False) -> None:
         if not self._mute and can_id & 0x7F not in self.silent:
-            with contextlib.suppress(Exception):  # the bus has gone: the server's cycle notices
+            with contextlib.suppress(Exception):  # the bus is lost: the server's cycle detects it
                 super().send_message(can_id, data, remote)
 
 
 class _Listener(MessageListener):
-    """Gives each frame to the server, one at a time."""
+    """Passes frames to the server, one at a time."""
 
     def __init__(self, server: CanopenServer, network: Any) -> None:
         super().__init__(network)
@@ -75,13 +75,13 @@ class _Listener(MessageListener):
             self._server.take_frame(int(msg.arbitration_id), bytes(msg.data))
 
     def on_error(self, exc: Exception) -> None:
-        time.sleep(PAUSE)  # the bus has gone: the server's cycle notices
+        time.sleep(PAUSE)  # the bus is lost: the server's cycle detects it
 
 
 class CanopenServer(ProtocolServer):
     """All drives of one arm.
 
-    With socketcand the bus is served here; on virtual and socketcan the drives join what is there.
+    With socketcand the bus is served here; on virtual and socketcan the drives join the bus.
     """
 
     def __init__(self, link: CanopenSettings, host: str, controller: ArmController) -> None:
@@ -92,9 +92,9 @@ class CanopenServer(ProtocolServer):
         self._hub: Hub | None = None
         self._network: Any = None
         self._controller = controller
-        self._late: dict[int, tuple[int, float]] = {}  # node -> SYNCs still, s of delay
-        self._held: list[HeldPdo] = []
-        self._syncs = 0  # that were answered
+        self._late: dict[int, tuple[int, float]] = {}  # node -> SYNCs left, s of delay
+        self._delayed: list[DelayedPdo] = []
+        self._syncs = 0  # answered
         self._beaten: dict[int, float] = {}  # node -> s, of its last heartbeat
         self._was_able = True
         self.drives = tuple(self._drive(joint) for joint in range(controller.n))
@@ -142,11 +142,11 @@ class CanopenServer(ProtocolServer):
 
     @property
     def port(self) -> int:
-        """Return the TCP port of the bus that is served here; 0 where none is."""
+        """Return the TCP port of the bus that is served here; 0: none."""
         return self._hub.port if self._hub else 0
 
     def close(self) -> None:
-        """Leave the bus, and end it where it is served here."""
+        """Close the bus, and end it if it is served here."""
         with self.lock:
             network, self._network = self._network, None
         if network is not None:
@@ -163,7 +163,7 @@ class CanopenServer(ProtocolServer):
     # -- frames -----------------------------------------------------------------------------------
 
     def take_frame(self, cob_id: int, data: bytes) -> None:
-        """Act on one frame, after the library has; from the notifier's thread."""
+        """Process one frame, after the library; from the notifier's thread."""
         if self._network is None or self._controller.stalled:
             return
         if cob_id == 0:
@@ -182,13 +182,13 @@ class CanopenServer(ProtocolServer):
                     drive.receive(cob_id, data)
 
     def _answer_sync(self) -> None:
-        """Send every drive's TPDOs, then let the setpoints that came before this SYNC count."""
+        """Send every drive's TPDOs, then apply the setpoints received before this SYNC."""
         self._syncs += 1
         for drive in self.drives:
             if not drive.operational:
                 continue
             if drive.node in self._late:
-                self._hold(drive)
+                self._delay(drive)
                 continue
             for cob_id, data in drive.samples():
                 self._network.send_message(cob_id, data)
@@ -197,26 +197,26 @@ class CanopenServer(ProtocolServer):
             if listens and not drive.take_setpoints():
                 drive.fail(FOLLOWING_ERROR)
 
-    def _hold(self, drive: Drive) -> None:
+    def _delay(self, drive: Drive) -> None:
         count, delay = self._late.pop(drive.node)
         if count > 1:
             self._late[drive.node] = (count - 1, delay)
         due, right = time.monotonic() + delay, drive.samples()
         wrong = drive.samples_off_by(OFF_BY)
-        self._held += [
-            HeldPdo(due, self._syncs, cob_id, data, off)
+        self._delayed += [
+            DelayedPdo(due, self._syncs, cob_id, data, off)
             for (cob_id, data), (_, off) in zip(right, wrong, strict=True)
         ]
 
-    def _send_held(self, now: float) -> None:
-        due = [pdo for pdo in self._held if pdo.due <= now]
-        self._held = [pdo for pdo in self._held if pdo.due > now]
+    def _send_delayed(self, now: float) -> None:
+        due = [pdo for pdo in self._delayed if pdo.due <= now]
+        self._delayed = [pdo for pdo in self._delayed if pdo.due > now]
         for pdo in due:
             data = pdo.data if pdo.sync == self._syncs else pdo.off
             self._network.send_message(pdo.cob_id, data)
 
-    def hold_back(self, node: float, delay: float, count: int = 1) -> None:
-        """Have a node's TPDOs come ``delay`` s late, at the next ``count`` SYNCs."""
+    def delay_tpdos(self, node: float, delay: float, count: int = 1) -> None:
+        """Delay a node's TPDOs by ``delay`` s at the next ``count`` SYNCs."""
         with self.lock:
             self._late[self.drives[self._joint_of(node)].node] = (count, delay)
 
@@ -229,12 +229,12 @@ class CanopenServer(ProtocolServer):
                 return
             self._network.set_mute(controller.stalled)
             self._follow_stops(controller)
-            self._send_held(time.monotonic())
+            self._send_delayed(time.monotonic())
             self._watch_heartbeats(controller)
             self._move(controller)
             if not controller.frozen:
-                self._feel(controller)
-            self._beat(controller)
+                self._measure(controller)
+            self._send_heartbeats(controller)
             try:
                 self._network.check()
             except Exception as error:
@@ -263,7 +263,7 @@ class CanopenServer(ProtocolServer):
 
     @staticmethod
     def _abort_connection(drive: Drive) -> None:
-        """Do what 0x6007 says of a master that has gone."""
+        """Execute the abort connection option (0x6007)."""
         option = drive.number(0x6007)
         if option == 1:
             drive.fail(HEARTBEAT_ERROR, COMMUNICATION)
@@ -283,12 +283,12 @@ class CanopenServer(ProtocolServer):
         elif controller.commanded:
             controller.let_go()
 
-    def _feel(self, controller: ArmController) -> None:
+    def _measure(self, controller: ArmController) -> None:
         torque = controller.joint_torque
         for joint, drive in enumerate(self.drives):
             drive.measure(controller.q[joint], controller.qd[joint], torque[joint])
 
-    def _beat(self, controller: ArmController) -> None:
+    def _send_heartbeats(self, controller: ArmController) -> None:
         for drive in self.drives:
             period = drive.nmt.period
             if period and controller.running - self._beaten.get(drive.node, -1.0) >= period:
@@ -304,18 +304,18 @@ class CanopenServer(ProtocolServer):
             raise BenchError(f"found node {node:g}, expected one of {self.profile.nodes}")
         return self.profile.nodes.index(int(node))
 
-    def silence(self, node: float) -> None:
-        """Have a node send nothing, as one whose plug is pulled."""
+    def mute(self, node: float) -> None:
+        """Mute a node, as if its plug were pulled."""
         with self.lock:
             self._network.silent.add(self.drives[self._joint_of(node)].node)
 
-    def speak(self) -> None:
-        """Have all nodes send again."""
+    def unmute(self) -> None:
+        """Unmute all nodes."""
         with self.lock:
             self._network.silent.clear()
 
     def restart(self, node: float) -> None:
-        """Have a node start anew, as after a dip of its supply."""
+        """Restart a node, as after a dip of its supply."""
         with self.lock:
             self._boot(self._joint_of(node))
 
@@ -327,14 +327,14 @@ class CanopenServer(ProtocolServer):
     def commands(self, controller: ArmController) -> Mapping[str, Command]:
         """Return the bench commands of drives."""
         return {
-            "silence": (1, lambda arguments: self.silence(arguments[0]),
+            "silence": (1, lambda arguments: self.mute(arguments[0]),
                         "NODE: this drive sends nothing any more"),
-            "speak": (0, lambda _: self.speak(), "all drives send again"),
+            "speak": (0, lambda _: self.unmute(), "all drives send again"),
             "restart": (1, lambda arguments: self.restart(arguments[0]),
                         "NODE: this drive restarts"),
             "fail": (2, lambda arguments: self.fail(arguments[0], int(arguments[1]) & 0xFFFF),
                      "NODE CODE: this drive goes to FAULT with an error code"),
-            "late": (2, lambda arguments: self.hold_back(arguments[0], max(arguments[1], 0.0)),
+            "late": (2, lambda arguments: self.delay_tpdos(arguments[0], max(arguments[1], 0.0)),
                      "NODE SECONDS: its next TPDOs come so late"),
         }  # fmt: skip
 
@@ -342,5 +342,5 @@ class CanopenServer(ProtocolServer):
 def make_servers(
     link: CanopenSettings, host: str, controller: ArmController
 ) -> list[ProtocolServer]:
-    """Return the drives of an arm, not yet on a bus. Raises InputError where they do not fit."""
+    """Return the drives of an arm, not yet on a bus. Raises InputError if they do not fit."""
     return [CanopenServer(link, host, controller)]

@@ -1,4 +1,4 @@
-"""An ATI NETCANOEM on a CAN bus: gauges, a calibration matrix of its own, units."""
+"""An ATI NETCANOEM on a CAN bus: gauges, its own calibration matrix, units."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ class AtiNode(SimulatedSensor):
                         timeout=0.1,
                     )  # fmt: skip
         except (can.CanError, OSError):
-            return  # the bus has gone
+            return  # the bus is lost
 
     def close_wire(self) -> None:
         """Leave the bus."""
@@ -134,7 +134,7 @@ class RobotousNode(SimulatedSensor):
                     if self.streaming and not self.silent:
                         self._send_sample()
         except (can.CanError, OSError):
-            return  # the bus has gone
+            return  # the bus is lost
 
     def sample(self) -> bytes:
         """Return the sixteen bytes of a sample."""

@@ -54,10 +54,10 @@ class Ft300Device(SimulatedSensor):
             os.set_blocking(end, False)
         self.path, self._server_path = os.ttyname(client), os.ttyname(server)
         if self._link is not None:
-            self._point(self._link)
+            self._link_to(self._link)
 
-    def _point(self, link: Path) -> None:
-        """Make ``link`` lead to the line. Raises LinkError where something else stands there."""
+    def _link_to(self, link: Path) -> None:
+        """Make ``link`` a symbolic link to the line. Raises LinkError if it is another file."""
         try:
             if link.is_symlink():
                 link.unlink()
@@ -79,7 +79,7 @@ class Ft300Device(SimulatedSensor):
                 SimData(REGISTERS, values=[0] * 6, datatype=DataType.REGISTERS),
                 SimData(STREAM_REGISTER, values=[0], datatype=DataType.REGISTERS),
             ],
-            action=self._touched,
+            action=self._on_request,
         )
         server = ModbusSerialServer(device, port=self._server_path, baudrate=19200)
         await server.serve_forever(background=True)
@@ -93,7 +93,7 @@ class Ft300Device(SimulatedSensor):
             await asyncio.sleep(0.001)
         await server.shutdown()  # type: ignore[no-untyped-call]
 
-    async def _touched(
+    async def _on_request(
         self,
         function_code: int,
         start_address: int,
@@ -118,7 +118,7 @@ class Ft300Device(SimulatedSensor):
         return body + FramerRTU.compute_CRC(body).to_bytes(2, "big")
 
     def put(self, data: bytes) -> None:
-        """Send bytes to whoever reads the line; what does not fit is lost, as on a line."""
+        """Send bytes on the line; bytes that do not fit are lost."""
         with contextlib.suppress(BlockingIOError, OSError):
             os.write(self._outside, data)
 

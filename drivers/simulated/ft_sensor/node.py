@@ -24,7 +24,7 @@ Reaction = Callable[[], Vector6]
 
 
 class SimulatedSensor(ABC):
-    """What the simulated sensors share: what they measure, faults, start and stop."""
+    """Base class of simulated sensors: measured wrench, faults, start and stop."""
 
     def __init__(self, reaction: Reaction) -> None:
         self.reaction = reaction

@@ -1,1 +1,1 @@
-"""Simulated Modbus controllers: any profile served from its own map, a plant behind it."""
+"""Simulated Modbus controllers: any profile, served from its map, with a plant."""

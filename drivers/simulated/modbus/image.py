@@ -1,4 +1,4 @@
-"""What a simulated controller's registers hold: its own state, laid out by the profile."""
+"""The registers of a simulated controller: its state in the profile's layout."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def clock_registers(profile: ProfileFile, seconds: float) -> list[tuple[Table, i
 
 
 def clock_count(clock: Clock, seconds: float, period: float) -> float:
-    """Return the counts of a clock register, which starts anew where its type ends."""
+    """Return the counts of a clock register, which wraps at the range of its type."""
     if clock.kind == "timestamp":
         count = seconds / (clock.scale * UNITS[clock.unit][1])
     else:

@@ -45,7 +45,7 @@ class NoProgram:
 
 
 class MailboxProgram:
-    """Checks offsets (sequence, checksum, heartbeat) and rides them on the robot's own motion.
+    """Checks offsets (sequence, checksum, heartbeat) and adds them to the robot's own motion.
 
     A checksum that does not fit leaves the offset as it was; a heartbeat that stands still takes
     it out, at the rates that came with the last offset. What stands in the registers when the
@@ -65,7 +65,7 @@ class MailboxProgram:
         self._wanted: Vector6 = NOTHING
         self.applied: Vector6 = NOTHING
         self._state = encode.EXPIRED
-        self._solved: tuple[Joints, Vector6] | None = None  # what joint offsets were found for
+        self._solved: tuple[Joints, Vector6] | None = None  # inputs of the last joint offsets
 
     def run(self, running: bool) -> None:
         """Start the program, or stop it."""
@@ -78,7 +78,7 @@ class MailboxProgram:
 
     def cycle(self, controller: ArmController, read: Read) -> None:
         """Read the mailbox, and move the applied offset towards the one wanted."""
-        if not controller.can_move:  # a stop ends the program's part: the arm stays where it is
+        if not controller.can_move:  # a stop ends the program: the arm stays where it is
             self._wanted = self.applied = NOTHING
         elif self.running:
             self._take(read(self._box.table, self._box.address, MAILBOX_WORDS), controller.period)
@@ -192,7 +192,7 @@ class TargetProgram:
             self._refused = True
 
     def registers(self, controller: ArmController) -> list[tuple[Table, int, int]]:
-        """Return whether a motion runs, and what the last one came to."""
+        """Return whether a motion runs, and the result of the last one."""
         moving = not (isinstance(controller.motion, Hold) or controller.motion is HOLD)
         entries: list[tuple[Table, int, int]] = []
         busy, result = self._entry.busy, self._entry.result

@@ -1,4 +1,4 @@
-"""A Modbus server for any profile, before an ArmController: pymodbus's own server in a thread.
+"""A Modbus server for any profile and an ArmController: pymodbus's server in a thread.
 
 The server loop lays out an image of all registers each time the controller would renew them; a
 request is answered from one whole image. What clients write is kept in order and acted on in the
@@ -74,7 +74,7 @@ class ModbusServer(ProtocolServer):
     # -- the thread -------------------------------------------------------------------------------
 
     def open(self, controller: ArmController) -> None:
-        """Start serving. Raises LinkError where the port is taken."""
+        """Start serving. Raises LinkError if the port is taken."""
         self._controller, self._failure = controller, None
         self._publish(controller)
         listening = threading.Event()
@@ -184,7 +184,7 @@ class ModbusServer(ProtocolServer):
     # -- the controller's scan --------------------------------------------------------------------
 
     def cycle(self, controller: ArmController) -> None:
-        """Take what was written, step the robot's program, renew the image where it is time."""
+        """Process writes, step the robot's program, update the image when due."""
         while self._queue:
             table, address, values = self._queue.popleft()
             allowed = {a: v for a, v in enumerate(values, address) if (table, a) in self._writable}
@@ -250,7 +250,7 @@ def _stop_reasons(controller: ArmController) -> frozenset[StopReason]:
 def make_servers(
     settings: ModbusSettings, host: str, controller: ArmController
 ) -> list[ProtocolServer]:
-    """Return the server of a cell's link. Raises InputError where its profile cannot be used.
+    """Return the server of a cell's link. Raises InputError if its profile cannot be used.
 
     A link over TLS is served by plain TCP nowhere: it needs the server's key, which a cell has not.
     """

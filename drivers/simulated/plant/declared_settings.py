@@ -1,4 +1,4 @@
-"""What the controller has been given: tool, payload, gravity. The plant may be another thing."""
+"""The controller's declared settings: tool, payload, gravity. The plant may differ."""
 
 from __future__ import annotations
 

@@ -86,7 +86,7 @@ def solve(
 
 
 def between(start: Frame, end: Frame, share: float) -> Frame:
-    """Return the frame at `share` (0..1) of the straight way with an even turn."""
+    """Return the frame at `share` (0..1) of a straight path with constant rotation rate."""
     step = gap(start, end)
     turn = from_vector((step[3] * share, step[4] * share, step[5] * share))
     shift: Vector3 = (step[0] * share, step[1] * share, step[2] * share)

@@ -1,4 +1,4 @@
-"""Motions: what turns a command into one joint target per cycle.
+"""Motions: they turn a command into one joint target per cycle.
 
 A motion is stepped once per cycle and says when it is done. Servo and speed motions never are.
 """
@@ -30,7 +30,7 @@ class Motion(Protocol):
 
 
 def ramp_share(distance: float, speed: float, acceleration: float, t: float) -> tuple[float, bool]:
-    """Return how far (0..1) a trapezoid of speed has gone after `t` s, and whether it is over."""
+    """Return the share (0..1) of a trapezoidal move after `t` s, and whether it has ended."""
     if distance <= 0.0:
         return 1.0, True
     rise = min(speed / acceleration, math.sqrt(distance / acceleration))
@@ -49,7 +49,7 @@ def ramp_share(distance: float, speed: float, acceleration: float, t: float) -> 
 
 
 class Stateless:
-    """A motion that cannot fail and that a pause does not set back."""
+    """A motion that cannot fail and is not affected by a pause."""
 
     failed = False
 
@@ -58,7 +58,7 @@ class Stateless:
 
 
 class Hold(Stateless):
-    """Stay."""
+    """Hold the present joints."""
 
     scaled = False
     done = True
@@ -80,7 +80,7 @@ class MoveJoints:
         self.restart(start)
 
     def restart(self, q: Joints) -> None:
-        """Begin anew from `q`, with the same goal."""
+        """Restart from `q`, with the same goal."""
         self._start, self._t = q, 0.0
         self._way = max(abs(b - a) for a, b in zip(q, self._goal, strict=True))
 
@@ -114,14 +114,14 @@ class MoveLine:
         self.restart(start)
 
     def restart(self, q: Joints) -> None:
-        """Begin anew from `q`, with the same goal."""
+        """Restart from `q`, with the same goal."""
         self._start, self._t = tcp_in_base(self._arm, q, self._tool), 0.0
         step = gap(self._start, self._goal)
         shift, turn = math.hypot(*step[:3]), math.hypot(*step[3:])
         self._way = max(shift, 0.2 * turn)  # a pure turn has a pace too: 1 rad as 0.2 m
 
     def step(self, q: Joints, qd: Joints, dt: float) -> Joints:
-        """Return the next joint target; the motion fails where the line leaves the workspace."""
+        """Return the next joint target; the motion fails if the line leaves the workspace."""
         self._t += dt
         share, self.done = ramp_share(self._way, self._speed, self._acceleration, self._t)
         joints = solve(self._arm, between(self._start, self._goal, share), q, self._tool, steps=12)
@@ -132,7 +132,7 @@ class MoveLine:
 
 
 class Stop(Stateless):
-    """stopJ: every joint brakes along its way, the fastest with `deceleration` (rad/s^2)."""
+    """stopJ: every joint brakes along its path, the fastest with `deceleration` (rad/s^2)."""
 
     scaled = False
 
@@ -153,7 +153,7 @@ class Stop(Stateless):
 
 
 class MovePath:
-    """Several motions, one after the other; each is made when its turn comes."""
+    """Several motions, one after the other; each is created when it starts."""
 
     scaled = True
 

@@ -85,7 +85,7 @@ class Plant:
         gain = 1.0 - math.exp(-dt / self.settings.servo_lag)
         most = self.settings.acceleration_limit * dt
         q, qd = [], []
-        target = self._given_way(target)
+        target = self._drooped_target(target)
         for now, speed, goal, limit in zip(self.q, self.qd, target, self.arm.velocity, strict=True):
             gap = goal - now
             if -1e-10 < gap < 1e-10 and -1e-4 < speed < 1e-4:
@@ -98,22 +98,22 @@ class Plant:
             q.append(now + wanted * dt)
             qd.append(wanted)
         self.q, self.qd = tuple(q), tuple(qd)
-        self._follow_rest(dt)
+        self._update_scatter(dt)
 
-    def _given_way(self, target: Sequence[float]) -> Sequence[float]:
-        """Return where the servos rest (n, rad) for `target`, by what they hold where they are.
+    def _drooped_target(self, target: Sequence[float]) -> Sequence[float]:
+        """Return the joints (n, rad) at which the servos settle for `target`, with droop.
 
-        The bent arm's weight, one step nearer to its equilibrium each time: a cycle has no time for
-        all steps, and an arm at rest comes to it within some cycles.
+        Each call makes one iteration towards the equilibrium of the deflected arm: a cycle is too
+        short for all, and an arm at rest converges within some cycles.
         """
         droop = self.settings.droop
         if not any(droop):
             return target
-        moments = self._bent(self.true_angles(), self._bend, self.load).moments
-        self._bend = self._turns(moments)
+        moments = self._deflected(self.true_angles(), self._bend, self.load).moments
+        self._bend = self._joint_deflections(moments)
         return tuple(t + c * m[2] for t, c, m in zip(target, droop, moments, strict=True))
 
-    def _follow_rest(self, dt: float) -> None:
+    def _update_scatter(self, dt: float) -> None:
         """Draw a new placement error each time the arm comes to rest after a move."""
         fastest = max(map(abs, self.qd))
         if fastest > MOVING:
@@ -126,19 +126,19 @@ class Plant:
                 self.placements += 1
 
     def true_angles(self) -> tuple[float, ...]:
-        """Return what the joints really stand at (rad): encoders, zeros, the placement error."""
+        """Return the true joint angles (rad): encoders, zeros, the placement error."""
         return tuple(a + b + c for a, b, c in zip(self.q, self.scatter, self.zero, strict=True))
 
-    def hang(self, mass: float, cog: Vector3) -> None:
-        """Hang a load on the flange: kg, m in the flange frame."""
+    def set_load(self, mass: float, cog: Vector3) -> None:
+        """Set the load on the flange: kg, m in the flange frame."""
         self.load = replace(self.load, mass=mass, cog=cog)
 
-    def pull(self, force: Vector3, torque: Vector3) -> None:
-        """Pull at the TCP, in base axes: N, Nm."""
+    def set_force(self, force: Vector3, torque: Vector3) -> None:
+        """Set force and torque at the TCP, in base axes: N, Nm."""
         self.load = replace(self.load, force=force, torque=torque)
 
     def slip(self, joint: int, angle: float) -> None:
-        """Have the zero of a joint (from 0) slip: its true angle is ``angle`` rad more from now."""
+        """Shift the zero of a joint (from 0): its true angle is ``angle`` rad more from now on."""
         zero = list(self.zero)
         zero[joint] += angle
         self.zero = tuple(zero)
@@ -148,8 +148,8 @@ class Plant:
         load = self.load if load is None else load
         bend: list[Vector3] = [(0.0, 0.0, 0.0)] * len(angles)
         for _ in range(ITERATIONS):
-            shape = self._bent(angles, bend, load)
-            new = self._turns(shape.moments)
+            shape = self._deflected(angles, bend, load)
+            new = self._joint_deflections(shape.moments)
             change = max(
                 abs(a - b)
                 for v, w in zip(new, bend, strict=True)
@@ -160,15 +160,15 @@ class Plant:
                 break
         return shape
 
-    def _turns(self, moments: Sequence[Vector3]) -> list[Vector3]:
-        """Return how far the joints bend under moments, in their own frames."""
+    def _joint_deflections(self, moments: Sequence[Vector3]) -> list[Vector3]:
+        """Return the joint deflections (rad) under moments, in the joints' frames."""
         axial, radial = self.settings.axial, self.settings.radial
         return [
             (c_r * m[0], c_r * m[1], c_a * m[2])
             for m, c_a, c_r in zip(moments, axial, radial, strict=True)
         ]
 
-    def _bent(self, angles: Sequence[float], bend: Sequence[Vector3], load: Load) -> Shape:
+    def _deflected(self, angles: Sequence[float], bend: Sequence[Vector3], load: Load) -> Shape:
         """Return frames and moments of the arm with given joint deflections."""
         frames: list[Frame] = []
         rotation, origin = IDENTITY, (0.0, 0.0, 0.0)
@@ -201,5 +201,5 @@ class Plant:
         return tuple(reversed(moments))
 
     def true_tcp(self) -> Frame:
-        """Return where the TCP really is, in base."""
+        """Return the true TCP in base."""
         return place(self.shape(self.true_angles()).frames[-1], self.tool)

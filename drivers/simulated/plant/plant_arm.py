@@ -1,4 +1,4 @@
-"""The arm that the plant and its controller are made of: plain numbers, no mathematics of core."""
+"""The arm of the plant and its controller, independent of core's mathematics."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is hidden in the plant, and how it is drawn."""
+"""The hidden parameters of the plant, and how they are drawn."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class PlantSettings:
     servo_lag: time constant with which the joints follow the command, s.
     acceleration_limit: of every joint, rad/s^2.
     joint_scatter: placement error of each joint (n,), 1 sigma, rad, unseen by the encoder and
-        drawn anew whenever the arm comes to rest.
+        drawn again whenever the arm comes to rest.
     force_noise, torque_noise: flange sensor, 1 sigma of one sample, N and Nm.
     sensor_bias: flange sensor, N and Nm in flange axes.
     joint_torque_noise: 1 sigma, Nm.

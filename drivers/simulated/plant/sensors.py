@@ -47,7 +47,7 @@ class Sensors:
         self._memory = memory
         self._random = np.random.default_rng((plant.settings.seed, 1))
         self._noise: list[list[float]] = []
-        self._zero = plant.settings.sensor_bias  # taken off actual_TCP_force; zeroFt sets it anew
+        self._zero = plant.settings.sensor_bias  # subtracted from actual_TCP_force; set by zeroFt
         self._bend = IDENTITY  # true flange in the rigid one
         self._bent_at: object = None
         self._wrench: tuple[float, ...] = (0.0,) * len(plant.q)
@@ -186,7 +186,7 @@ class Sensors:
         memory["tool_temperature"] = s.ambient_temperature + 0.8 * rise
 
     def _set_torques(self) -> None:
-        """Set what the joints hold: truly (measured) and as the controller reckons (target)."""
+        """Set the joint torques: measured (true) and target (the controller's model)."""
         plant, memory, declared = self._plant, self._memory, self._declared
         load, s = plant.load, plant.settings
         pull = (*load.force, *load.torque)

@@ -73,7 +73,7 @@ class SpeedJoints(_Speed):
     _now: Joints | None = None
 
     def restart(self, q: Joints) -> None:
-        """Gather speed anew."""
+        """Restart from standstill."""
         self._now = (0.0,) * len(q)
 
     def step(self, q: Joints, qd: Joints, dt: float) -> Joints:
@@ -94,7 +94,7 @@ class SpeedTool(_Speed):
         self._arm, self._tool = arm, tool
 
     def restart(self, q: Joints) -> None:
-        """Gather speed anew."""
+        """Restart from standstill."""
         self._now = (0.0,) * 6
 
     def step(self, q: Joints, qd: Joints, dt: float) -> Joints:

@@ -1,6 +1,6 @@
-"""What every simulated controller shares, whatever its protocol: plant, clock, sensors, own motion.
+"""The protocol-independent part of a simulated controller: plant, clock, sensors, own motion.
 
-An ArmController knows no wire. Protocol servers read its state and command it;
+An ArmController has no protocol. Protocol servers read its state and command it;
 ``protocol_server.py`` runs them.
 """
 
@@ -30,22 +30,22 @@ class ArmController:
     """A controller without a protocol, for an arm of any number of joints.
 
     The robot's own program moves ``own_q`` (the bench's ``move``); ``command`` takes the arm over;
-    ``offset_by`` rides on the own program's motion. A stop brakes the arm and refuses commands
+    ``offset_by`` adds offsets to that motion. A stop brakes the arm and refuses commands
     until it is released.
     """
 
     def __init__(self, plant: Plant, declared: DeclaredSettings, cycle: float) -> None:
         self.plant, self.declared = plant, declared
         self.period = cycle  # s
-        self.clock = 0.0  # s, the controller's clock; stands still when frozen
-        self.running = 0.0  # s since the start; never stands still
+        self.clock = 0.0  # s, the controller's clock; stops when frozen
+        self.running = 0.0  # s since the start; never stops
         self.frozen = False
         self.protective = False  # a protective stop is active
         self.emergency = False  # the button is pressed
         self.largest_servo_step = 0.0  # rad, between two commands
         self.target_q: Joints = plant.q
         self.target_qd: Joints = (0.0,) * len(plant.q)
-        self.own_q: Joints = plant.q  # rad, what the robot's own program wants
+        self.own_q: Joints = plant.q  # rad, target of the robot's own program
         self.motion: Motion = HOLD  # of the robot's own program
         self.joint_offset: Joints = (0.0,) * len(plant.q)
         self.commanded = False  # a client moves the arm, not the robot's own program
@@ -105,7 +105,7 @@ class ArmController:
     # -- commands ---------------------------------------------------------------------------------
 
     def command(self, q: Sequence[float]) -> None:
-        """Have the plant follow joints `q` (n, rad) from now on; ends the robot's own motion.
+        """Let the plant follow joints `q` (n, rad) from now on; ends the robot's own motion.
 
         Joints outside the limits, or not finite, are a protective stop; a stop ignores commands.
         """
@@ -123,17 +123,17 @@ class ArmController:
         self._goal = goal
 
     def offset_by(self, joint_offset: Sequence[float]) -> None:
-        """Put joint offsets (n, rad) on top of the robot's own motion."""
+        """Add joint offsets (n, rad) to the robot's own motion."""
         self.joint_offset = tuple(float(v) for v in joint_offset)
 
     def let_go(self) -> None:
-        """Give the arm back to the robot's own program, which stays where it is."""
+        """Return control to the robot's own program, which holds the present joints."""
         self.commanded = False
         self.own_q = self.target_q
         self.joint_offset = (0.0,) * self.n
 
     def move_own(self, goal: Joints) -> None:
-        """Have the robot's own program move to `goal` (n, rad). Raises BenchError."""
+        """Let the robot's own program move to `goal` (n, rad). Raises BenchError."""
         if not self.can_move:
             raise BenchError("move: the robot is not running")
         if not within_limits(self.plant.arm, goal):
@@ -143,7 +143,7 @@ class ArmController:
         self.motion = MoveJoints(self.own_q, goal, OWN_SPEED, OWN_ACCELERATION)
 
     def stop_own(self) -> None:
-        """Brake what the robot's own program does."""
+        """Brake the motion of the robot's own program."""
         self.motion = Stop(self.target_qd, BRAKING)
 
     # -- stops ------------------------------------------------------------------------------------
@@ -163,7 +163,7 @@ class ArmController:
         self._brake()
 
     def release_emergency_stop(self) -> None:
-        """Let the button go."""
+        """Release the button."""
         self.emergency = False
 
     def _brake(self) -> None:
@@ -171,7 +171,7 @@ class ArmController:
         self.stop_own()
 
     def freeze(self, frozen: bool) -> None:
-        """Let the clock stand still, or go on."""
+        """Stop the clock, or let it go on."""
         self.frozen = frozen
 
     def stall(self, seconds: float) -> None:
@@ -197,7 +197,7 @@ class ArmController:
         self.sensors.update(self.target_q, dt)
 
     def _follow_own(self, dt: float) -> None:
-        """Let the robot's own program go on, with the offsets on top."""
+        """Advance the robot's own program, with the offsets added."""
         self.own_q = self.motion.step(self.own_q, self.target_qd, dt)
         if self.motion.done:
             self.motion = HOLD

@@ -1,4 +1,4 @@
-"""The bench on port 30100: what a person and a laser tracker do beside a real cell.
+"""The bench on port 30100: the actions of a person and a laser tracker at a real cell.
 
 One command a line, one line back; `help` lists them. None of it is known to the controller.
 """
@@ -27,22 +27,22 @@ LONGEST_LINE = 1000  # characters
 
 Joints = tuple[float, ...]
 Command = tuple[int, Callable[[list[float]], str | None], str]
-"""How many numbers a command takes, what it does (None: the answer is ok), what help says of it."""
+"""Number of arguments of a command, its function (None: the answer is ok), its help text."""
 
 
 class BenchError(ValueError):
-    """A command that cannot be done; the message goes back to the person."""
+    """A command that cannot be executed; the message is sent back."""
 
 
 class BenchSubject(Protocol):
-    """The controller beside the bench: a UR controller or an ArmController."""
+    """The controller of the bench: a UR controller or an ArmController."""
 
     plant: Plant
     memory: dict[str, Any]
     largest_servo_step: float
 
     def freeze(self, frozen: bool) -> None:
-        """Let the clock stand still, or go on."""
+        """Stop the clock, or let it go on."""
         ...
 
     def stall(self, seconds: float) -> None:
@@ -62,7 +62,7 @@ class BenchSubject(Protocol):
         ...
 
     def release_emergency_stop(self) -> None:
-        """Let the button go."""
+        """Release the button."""
         ...
 
 
@@ -108,7 +108,7 @@ class BenchServer:
         }  # fmt: skip
 
     def handle(self, connection: Connection) -> None:
-        """Answer every whole line."""
+        """Answer every complete line."""
         while connection.open and b"\n" in connection.received:
             end = connection.received.index(b"\n")
             line = connection.received[:end].decode("utf-8", "replace").strip()
@@ -146,11 +146,11 @@ class BenchServer:
         mass, x, y, z = numbers
         if not 0.0 <= mass <= HEAVIEST:
             raise BenchError(f"payload: found {mass:g} kg, expected 0 to {HEAVIEST:g}")
-        self._controller.plant.hang(mass, (x, y, z))
+        self._controller.plant.set_load(mass, (x, y, z))
 
     def _wrench(self, numbers: list[float]) -> None:
         fx, fy, fz, tx, ty, tz = numbers
-        self._controller.plant.pull((fx, fy, fz), (tx, ty, tz))
+        self._controller.plant.set_force((fx, fy, fz), (tx, ty, tz))
 
     def _slip(self, numbers: list[float]) -> None:
         plant, joint = self._controller.plant, numbers[0]

@@ -12,7 +12,7 @@ CHUNK = 65536
 
 
 def listen(host: str, port: int) -> socket.socket:
-    """Return a listening socket on `host` only. Raises OSError where the port is taken."""
+    """Return a listening socket on `host` only. Raises OSError if the port is taken."""
     listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
@@ -42,7 +42,7 @@ class Connection:
         return self.sock.fileno()
 
     def read(self) -> bool:
-        """Take what has arrived; False where the client is gone or floods."""
+        """Read what has arrived; returns False if the client has closed or sends too much."""
         try:
             data = self.sock.recv(CHUNK)
         except BlockingIOError:
@@ -55,7 +55,7 @@ class Connection:
         return self.open
 
     def send(self, data: bytes) -> None:
-        """Send `data` after everything pending; a client that lets too much pile up is closed."""
+        """Send `data` after everything pending; a client that does not read is closed."""
         self.pending += data
         self.flush()
         if len(self.pending) > MOST_PENDING:

@@ -39,13 +39,13 @@ class ProtocolServer:
     name = "server"
 
     def open(self, controller: ArmController) -> None:
-        """Open ports. Raises OSError or LinkError where that fails."""
+        """Open ports. Raises OSError or LinkError if that fails."""
 
     def cycle(self, controller: ArmController) -> None:
-        """Take what clients have sent, command the arm, publish its state; after each cycle."""
+        """Read what clients have sent, command the arm, publish its state; after each cycle."""
 
     def sockets(self) -> Iterable[Waitable]:
-        """Return what to wait for between cycles; none where ``cycle`` polls."""
+        """Return the sockets to wait for between cycles; none if ``cycle`` polls."""
         return ()
 
     def serve(self, ready: Waitable, controller: ArmController) -> None:
@@ -87,7 +87,7 @@ class ServerLoop:
         return int(self._listener.getsockname()[1]) if self._listener else self._port
 
     def open(self) -> None:
-        """Open every port. Raises LinkError where one is taken."""
+        """Open every port. Raises LinkError if one is taken."""
         try:
             self._listener = listen(self.host, self._port)
             for server in self.servers:
@@ -163,7 +163,7 @@ def serve_controller(
     bench_port: int,
     stop: Callable[[], bool] | None = None,
 ) -> None:
-    """Serve a controller in this process until `stop()` is true (never, where it is left out).
+    """Serve a controller in this process until `stop()` is true (never, if it is None).
 
     Prints ``ready <host>`` to stdout when every port listens. Raises LinkError where one is taken.
     """

@@ -55,13 +55,13 @@ class Controller:
     target_q: Joints = ()
     target_qd: Joints = ()
     motion: Motion = HOLD
-    paused: Motion = HOLD  # what goes on after a pause
+    paused: Motion = HOLD  # continued after a pause
     largest_servo_step: float = 0.0  # rad, between two setpoints of a servo stream
     program: Program | None = None
     starts_in: float = 0.0  # s until the program's first line
     watchdogs: dict[str, Watchdog] = field(default_factory=dict)
-    clock: float = 0.0  # s since the controller started; never stands still
-    frozen: bool = False  # the timestamp stands still
+    clock: float = 0.0  # s since the controller started; never stops
+    frozen: bool = False  # the timestamp does not change
     stall_until: float = 0.0  # controller clock until which no RTDE packet leaves
     stopped_at: float = -math.inf  # controller clock of the last protective stop
     loaded_program: str = ""
@@ -197,7 +197,7 @@ class Controller:
             raise ScriptError("the line leaves the workspace")
 
     def start_motion(self, motion: Motion) -> None:
-        """Have the arm do this from the next cycle on."""
+        """Start a motion with the next cycle."""
         self.motion = motion
 
     def servo(self, goal: Joints, lookahead: float) -> None:
@@ -220,7 +220,7 @@ class Controller:
             self.watchdogs[name] = Watchdog(1.0 / frequency, 1.0 / frequency)
 
     def write_inputs(self, values: dict[str, Any]) -> None:
-        """Take the input fields that a client has sent."""
+        """Store the input fields that a client has sent."""
         apply_inputs(self.memory, values)
         for name, (period, _) in self.watchdogs.items():
             if name in values:
@@ -235,7 +235,7 @@ class Controller:
         return memory["robot_mode"] == modes.RUNNING and memory["safety_mode"] in (1, 2)
 
     def set_runtime(self, state: int) -> None:
-        """Set runtime_state and what follows from it."""
+        """Set runtime_state and the fields that depend on it."""
         memory = self.memory
         memory["runtime_state"] = state
         bits = 1 if memory["robot_mode"] >= modes.POWER_ON else 0
@@ -281,7 +281,7 @@ class Controller:
             self.set_safety(modes.SAFETY_NORMAL)
 
     def emergency_stop(self) -> None:
-        """Stop: the program is gone, power is off."""
+        """Stop: the program ends, power is off."""
         log.warning("emergency stop")
         self.end_program()
         self.motion = Stop(self.target_qd, 2.0 * DEFAULT_STOP)
@@ -294,15 +294,15 @@ class Controller:
             self.set_safety(modes.SAFETY_NORMAL)
 
     def stall(self, seconds: float) -> None:
-        """Let no RTDE packet leave for `seconds`."""
+        """Send no RTDE packet for `seconds`."""
         self.stall_until = self.clock + seconds
 
     def freeze(self, frozen: bool) -> None:
-        """Let the timestamp stand still, or go on."""
+        """Stop the timestamp, or let it go on."""
         self.frozen = frozen
 
     def finite(self, values: Sequence[float], what: str) -> Joints:
-        """Return `values` as joints or pose; raises ScriptError where one is not finite."""
+        """Return `values` as joints or pose; raises ScriptError if one is not finite."""
         numbers = tuple(float(v) for v in values)
         if not all(map(math.isfinite, numbers)):
             raise ScriptError(f"{what} is not finite: {numbers}")
@@ -314,7 +314,7 @@ class ScriptError(Exception):
 
 
 def apply_inputs(memory: dict[str, Any], values: dict[str, Any]) -> None:
-    """Put a client's input fields into memory, with what they set off."""
+    """Store a client's input fields, with their effects."""
     memory.update(values)
     for mask, (value, first) in _DIGITAL.items():
         if mask in values:

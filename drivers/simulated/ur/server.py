@@ -34,7 +34,7 @@ LATE = 0.1  # s: behind by more than this, the missed cycles are left out
 
 @dataclass(slots=True)
 class Listener:
-    """A port: its socket, and what happens to a new client and to what it sends."""
+    """A port: its socket, and handlers for new clients and their data."""
 
     sock: socket.socket
     accept: Callable[[socket.socket], Connection]
@@ -169,7 +169,7 @@ def serve(
     stop: Callable[[], bool] | None = None,
     beside: Beside = lambda _: nullcontext(),
 ) -> None:
-    """Serve a simulated controller until `stop()` is true (never, where it is left out).
+    """Serve a simulated controller until `stop()` is true (never, if it is None).
 
     ``beside`` serves what else feels the plant. Prints ``ready <host>`` to stdout when every port
     listens. Raises LinkError where a port is taken. Must run in a process of its own: ur_rtde's

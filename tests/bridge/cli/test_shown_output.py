@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from gapbridge.bridge.loop.supervisor import State
+from gapbridge.bridge.ipc.loop_state import State
 
 ROOT = Path(__file__).resolve().parents[3]
 PAGES = ("docs/transcript.md", "docs/first-cell.md")

@@ -10,7 +10,7 @@ import pytest
 from daemon_cell import Robot, Run, offsets, wait_for
 
 from gapbridge.bridge.cell.run_settings import read_configuration
-from gapbridge.bridge.loop.supervisor import State
+from gapbridge.bridge.ipc.loop_state import State
 
 PATIENT = ", state_timeout: 0.25"
 

@@ -20,8 +20,8 @@ from gapbridge.bridge.daemon import control
 from gapbridge.bridge.ipc import control_socket
 from gapbridge.bridge.ipc.control_client import ask, ask_socket, running
 from gapbridge.bridge.ipc.control_socket import ControlSocket, Peer
+from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.ipc.shared_memory import Phase
-from gapbridge.bridge.loop.supervisor import State
 from gapbridge.core.errors import InputError, RunError
 
 PATIENT = ", state_timeout: 0.25"  # a busy machine holds the simulated controller up
@@ -274,7 +274,7 @@ class NoLoop:
 def test_a_disarming_that_no_loop_has_taken_is_not_called_done(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(control, "LONGEST_TAKING", 0.1)
+    monkeypatch.setattr(control, "LONGEST_PICKUP", 0.1)
     daemon = NoLoop()
     reply = control.Control(daemon).answer("disarm", Peer(1, 2))  # type: ignore[arg-type]
     assert not reply["ok"]

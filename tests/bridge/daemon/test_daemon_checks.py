@@ -13,7 +13,7 @@ import pytest
 from daemon_cell import Robot, Run, offsets, wait_for
 
 from gapbridge.bridge.daemon.status_document import lines
-from gapbridge.bridge.loop.supervisor import State
+from gapbridge.bridge.ipc.loop_state import State
 
 pytestmark = pytest.mark.usefixtures("runtime")
 

@@ -13,7 +13,7 @@ from daemon_cell import Robot, Run, offsets, wait_for
 from recorded_documents import read_documents
 
 from gapbridge.bridge.cell import load_cell
-from gapbridge.bridge.loop.supervisor import State
+from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.recording.export import export
 from gapbridge.core.log.log import read_log
 from gapbridge.core.log.mcap_reading import read_configuration

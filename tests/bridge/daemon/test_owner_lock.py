@@ -16,7 +16,7 @@ from link_settings import link_settings
 
 from gapbridge.bridge.daemon.owner_lock import OwnerLock
 from gapbridge.bridge.ipc.control_client import ask
-from gapbridge.bridge.loop.supervisor import State
+from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.core.errors import InputError
 from gapbridge.drivers.controller_address import address_of
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from daemon_cell import Robot, Run, offsets, wait_for
 
-from gapbridge.bridge.loop.supervisor import State
+from gapbridge.bridge.ipc.loop_state import State
 
 pytestmark = pytest.mark.usefixtures("runtime")
 

@@ -14,7 +14,7 @@ from ports import free_port
 
 from gapbridge.bridge.daemon import side_processes
 from gapbridge.bridge.ipc.control_client import ask
-from gapbridge.bridge.loop.supervisor import State
+from gapbridge.bridge.ipc.loop_state import State
 
 SIDES = tuple(side_processes.SIDE_PROCESSES)
 

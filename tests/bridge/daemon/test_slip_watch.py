@@ -18,7 +18,7 @@ from benchmarks.zero_slips import COUNTS, SETUPS, SLICES, Program, Setup, found_
 from gapbridge.bridge.daemon.slip_watch import Slip, SlipWatch
 from gapbridge.bridge.daemon.status_document import lines
 from gapbridge.bridge.ipc.control_socket import Peer
-from gapbridge.bridge.loop.supervisor import State
+from gapbridge.bridge.ipc.loop_state import State
 
 LEARNING = 6 * COUNTS  # rests
 ROUNDS = 2  # of the program, within which a slip of 10 mrad is found

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from gapbridge.bridge.daemon.status import DaemonStatus
+from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.ipc.shared_memory import slices_of
 from gapbridge.bridge.loop.main import _report_compiling
-from gapbridge.bridge.loop.supervisor import State
 
 
 def test_compiling_is_a_state_until_the_loop_connects() -> None:

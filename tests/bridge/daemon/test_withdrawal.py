@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from daemon_cell import Robot, Run, offsets, wait_for
 
-from gapbridge.bridge.loop.supervisor import State
+from gapbridge.bridge.ipc.loop_state import State
 
 RATE = 0.0005  # m/s: a hundredth of what the robot's program would allow
 LIMITS = (

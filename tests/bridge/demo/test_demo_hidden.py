@@ -53,7 +53,7 @@ def measured(link: DemoLink, plant: Plant) -> Measurements:
         for q in poses:
             plant.q, plant.scatter = tuple(q), plant._draw_scatter()
             for _ in range(8):
-                plant.q = tuple(plant._given_way(q))
+                plant.q = tuple(plant._drooped_target(q))
             frames.append(plant.true_tcp())
             count = np.radians(0.001) if link.name == "can" else 1e-9  # rad, of what is read
             read.append(np.round(np.array(plant.q) / count) * count)

@@ -155,7 +155,7 @@ def test_one_that_does_not_read_loses_events_holds_up_nothing_and_is_ended(
     assert side.dropped > 1000
     monkeypatch.setattr(side_process, "STALLED", 0.3)
     monkeypatch.setattr(side_process, "STARTING", 0.3)
-    assert "stood still" in wait_for(side.check)
+    assert "read nothing" in wait_for(side.check)
     assert side.stalls == 1
     wait_for(lambda: side.check() is None and side.restarts)
 

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.ipc.shared_memory import SharedMemory
 from gapbridge.bridge.loop.checks import (
     DEGRADED,
@@ -22,7 +23,7 @@ from gapbridge.bridge.loop.checks import (
 )
 from gapbridge.bridge.loop.link_monitor import LinkMonitor, hold_time
 from gapbridge.bridge.loop.reports import Reports
-from gapbridge.bridge.loop.supervisor import State, Supervisor
+from gapbridge.bridge.loop.supervisor import Supervisor
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.errors import Implausible, InvalidStateError, StaleStateError
 from gapbridge.core.limits import ENVELOPE, RATE
@@ -348,7 +349,7 @@ def test_a_program_that_does_not_play_is_nobodys_fault_while_nothing_is_written(
 def test_a_load_that_cannot_be_holds_and_is_reported_with_its_reason(memory: SharedMemory) -> None:
     bench = Bench(memory, State.COMPENSATING)
     for _ in range(3):
-        bench.checks.judge_loads("payload: found 400 kg, expected 0 to 7.5 kg")
+        bench.checks.check_loads("payload: found 400 kg, expected 0 to 7.5 kg")
     assert bench.supervisor.state == State.HOLDING
     assert bench.changes[0][3] == "payload: found 400 kg, expected 0 to 7.5 kg"
     assert memory.counts()["load"] == 1
@@ -369,15 +370,15 @@ def test_the_controllers_settings_are_compared_every_second_while_armed(
 ) -> None:
     bench, driver = Bench(memory, State.OBSERVING), Otherwise()
     for k in range(1000):
-        bench.checks.judge_settings(state(1.0 + k * T), driver)
+        bench.checks.check_settings(state(1.0 + k * T), driver)
     assert driver.asked == 0
     bench.supervisor.state = State.COMPENSATING
     for k in range(1000):
-        bench.checks.judge_settings(state(3.0 + k * T), driver)
+        bench.checks.check_settings(state(3.0 + k * T), driver)
     assert driver.asked == 2
     driver.phrase = "the controller's TCP is 50.0 mm from the cell's"
     for k in range(501):
-        bench.checks.judge_settings(state(5.0 + k * T), driver)
+        bench.checks.check_settings(state(5.0 + k * T), driver)
     assert bench.supervisor.state == State.HOLDING
     assert bench.changes[0][3] == driver.phrase
 

@@ -130,11 +130,11 @@ def test_a_clock_that_drifts_is_followed() -> None:
 
 def test_a_break_does_not_make_the_state_after_it_younger() -> None:
     clock = ControllerClock(500.0, hold=0.04)
-    clock.take(state(1.0, 10.0), way_known=True)
+    clock.take(state(1.0, 10.0), transit_known=True)
     after = state(1.6, 10.6 + 0.041)  # 41 ms old when it came to be read
-    clock.take(after, way_known=True)
+    clock.take(after, transit_known=True)
     assert clock.expiry(after) == pytest.approx(10.64)
-    clock.take(state(1.602, 10.643), way_known=True)  # from then on drift is followed as before
+    clock.take(state(1.602, 10.643), transit_known=True)  # from then on drift is followed as before
     assert clock.expiry(state(1.604, 10.645)) == pytest.approx(10.644 + 0.002 * DRIFT, abs=1e-7)
 
 
@@ -152,12 +152,12 @@ def test_a_clock_that_stood_still_is_tied_anew_once_nothing_younger_comes() -> N
 def test_once_armed_samples_that_come_later_for_good_stay_old() -> None:
     clock = ControllerClock(500.0, hold=0.04)
     now = time.monotonic()
-    clock.take(state(1.0, now - 3.0), way_known=True)
+    clock.take(state(1.0, now - 3.0), transit_known=True)
     for k in range(1, 1000):  # from then on 0.21 s later than before
         late = state(1.0 + 0.002 * k, now - 3.0 + 0.21 + 0.002 * k)
-        clock.take(late, way_known=True)
+        clock.take(late, transit_known=True)
         assert clock.expiry(late) < late.received
-    clock.take(state(3.0, now - 0.79), way_known=False)  # the driver has been released
+    clock.take(state(3.0, now - 0.79), transit_known=False)  # the driver has been released
     late = state(3.002, now - 0.788)
     clock.take(late)
     assert clock.expiry(late) > late.received
@@ -166,27 +166,27 @@ def test_once_armed_samples_that_come_later_for_good_stay_old() -> None:
 def test_a_clock_that_is_set_forward_behind_late_samples_makes_none_of_them_younger() -> None:
     clock = ControllerClock(500.0, hold=0.04)
     for k in range(50):
-        clock.take(state(1.0 + 0.002 * k, 10.0 + 0.002 * k), way_known=True)
+        clock.take(state(1.0 + 0.002 * k, 10.0 + 0.002 * k), transit_known=True)
     for k in range(50, 500):  # 45 to 60 ms late; meanwhile it is set forward by 50 ms
         set_by = 0.05 if k > 55 else 0.0
         late = state(1.0 + set_by + 0.002 * k, 10.045 + 0.002 * k + 0.015 * (k % 7) / 6)
-        clock.take(late, way_known=True)
+        clock.take(late, transit_known=True)
         assert clock.expiry(late) < late.received
     for k in range(500, 520):  # they come in time again
         fresh = state(1.05 + 0.002 * k, 10.0 + 0.002 * k)
-        clock.take(fresh, way_known=True)
+        clock.take(fresh, transit_known=True)
         assert clock.expiry(fresh) == pytest.approx(fresh.received + 0.04, abs=1e-6)
 
 
 def test_the_newest_of_what_a_link_held_back_counts_once_others_come_as_quickly() -> None:
     clock = ControllerClock(500.0, hold=0.04)
     for k in range(50):
-        clock.take(state(1.0 + 0.002 * k, 10.0 + 0.002 * k), way_known=True)
-    clock.take(state(1.1, 10.16), way_known=True)  # 60 ms late; the next that is read is in time
+        clock.take(state(1.0 + 0.002 * k, 10.0 + 0.002 * k), transit_known=True)
+    clock.take(state(1.1, 10.16), transit_known=True)  # 60 ms late; the next one read is in time
     fresh = []
     for k in range(80, 90):
         newest = state(1.0 + 0.002 * k, 10.0 + 0.002 * k)
-        clock.take(newest, way_known=True)
+        clock.take(newest, transit_known=True)
         fresh.append(clock.expiry(newest) > newest.received)
     assert fresh == [False] * 4 + [True] * 6
 

@@ -14,13 +14,14 @@ import numpy as np
 import pytest
 
 from gapbridge.bridge.cell.sections import LimitSettings, SetpointSettings
+from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.ipc.shared_memory import SharedMemory
 from gapbridge.bridge.loop.live_loads import LiveLoads
 from gapbridge.bridge.loop.offset_in_force import OffsetInForce
 from gapbridge.bridge.loop.reports import Reports
 from gapbridge.bridge.loop.setpoint_stream import SetpointStream
-from gapbridge.bridge.loop.supervisor import Cause, State, Supervisor
-from gapbridge.bridge.loop.writing import PARTS_IN_A_ROW, Writing
+from gapbridge.bridge.loop.supervisor import Cause, Supervisor
+from gapbridge.bridge.loop.writing import PARTIAL_WRITE_LIMIT, Writing
 from gapbridge.bridge.setpoint_source import make_source
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.compensation import Correction
@@ -64,7 +65,7 @@ class Failing(Driver):
             raise self.error
         self.sent.append(setpoint.q.copy())
 
-    def _let_go(self) -> None:
+    def _release(self) -> None:
         self.released += 1
 
     def close(self) -> None: ...
@@ -119,7 +120,7 @@ class Bench:
             state = self.state()
             if self.supervisor.state.writes:
                 self.writing.write(state, self.q, self.loads.update(state))
-                self.driver.gate.count_by(lambda: self.at)
+                self.driver.gate.set_clock(lambda: self.at)
 
     def count(self, name: str) -> int:
         return self.memory.counts()[name]
@@ -161,7 +162,7 @@ def test_an_unsolved_correction_ends_the_motion_and_its_offset_is_ramped_out(
     for _ in range(400):
         bench.cycles(1)
         offsets.append(bench.stream.limiter.offset_in_base.copy())
-    assert bench.stream.is_bare
+    assert bench.stream.has_no_offset
     assert len(bench.driver.sent) == before + 401  # ramped out, not dropped
     assert np.abs(bench.driver.sent[-1] - Q).max() < 1e-12
     lengths = np.linalg.norm(offsets, axis=1)
@@ -245,19 +246,19 @@ def test_a_process_that_was_stopped_while_it_sent_reports_so_and_ends_the_motion
 def test_a_setpoint_that_left_in_part_is_followed_by_a_whole_one(bench: Bench) -> None:
     bench.cycles(10)
     bench.driver.error = PartialWriteError("1 of 3 frames")
-    bench.cycles(PARTS_IN_A_ROW - 1)
+    bench.cycles(PARTIAL_WRITE_LIMIT - 1)
     bench.driver.error = None
     bench.cycles(10)
     assert bench.supervisor.state == State.COMPENSATING
     assert len(bench.driver.sent) == 20
-    assert bench.count("write_partial") == PARTS_IN_A_ROW - 1
+    assert bench.count("write_partial") == PARTIAL_WRITE_LIMIT - 1
     assert bench.count("write_ineffective") == 0
 
 
 @pytest.mark.parametrize(
     ("error", "cycles", "counter"),
     [
-        (PartialWriteError("1 of 3"), PARTS_IN_A_ROW, "write_ineffective"),
+        (PartialWriteError("1 of 3"), PARTIAL_WRITE_LIMIT, "write_ineffective"),
         (IneffectiveWriteError("no echo"), 1, "write_ineffective"),
         (ForeignCommandError("two masters"), 1, "foreign"),
     ],
@@ -382,7 +383,7 @@ def test_a_clock_that_goes_back_withdraws_the_offset_step_by_step(bench: Bench) 
     assert np.linalg.norm(offset[0]) > 1e-4
     bench.supervisor.take(Cause.IMPLAUSIBLE)  # what the watch over states makes of it
     bench.at -= 5.0
-    bench.driver.gate.count_by(time.monotonic)
+    bench.driver.gate.set_clock(time.monotonic)
     for _ in range(700):
         bench.cycles(1)
         offset.append(bench.stream.limiter.offset_in_base)

@@ -17,8 +17,8 @@ from gapbridge.bridge.cell.run_settings import read_configuration
 from gapbridge.bridge.cell.settings.recording import RecordingSettings
 from gapbridge.bridge.daemon.processes import LoopProcess
 from gapbridge.bridge.ipc.command_memory import Command, CommandMemory
+from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.ipc.shared_memory import RunMemory
-from gapbridge.bridge.loop.supervisor import State
 from gapbridge.bridge.recording.recorder import Recorder
 from gapbridge.core.log.mcap_reading import read_columns
 

@@ -43,7 +43,7 @@ class Scripted(Driver):
     def __init__(self, cycles: int, commands: CommandMemory, model: Model) -> None:
         super().__init__(20.0, model, moves_arm=False)  # no deadline that a busy machine misses
         self._now = 0.0  # s, of the script
-        self.gate.count_by(lambda: self._now)
+        self.gate.set_clock(lambda: self._now)
         self._count = iter(range(cycles))
         self._commands = commands
         self._writes = itertools.count(1)

@@ -70,7 +70,7 @@ def test_the_offset_ramps_in_to_the_whole_correction_and_out_to_none() -> None:
     assert np.diff(lengths).min() > -1e-9
     end = run.cycles(400, goal=0.0)
     assert end.q == pytest.approx(Q, abs=1e-15)
-    assert run.stream.rests
+    assert run.stream.at_rest
     assert np.abs(run.steps()).max() < 1e-4
 
 
@@ -94,9 +94,9 @@ def test_a_source_that_dries_up_in_motion_brakes_smoothly_and_comes_to_rest() ->
     run.cycles(300)
     for k in range(1, 200):
         run.cycles(1, source=Q + speed * k * CYCLE)
-    assert not run.stream.rests
+    assert not run.stream.at_rest
     run.cycles(400, source=None, goal=0.0)
-    assert run.stream.rests
+    assert run.stream.at_rest
     acceleration = np.diff(run.steps(), axis=0)[520:] / CYCLE**2
     assert np.abs(acceleration).max() < 1.2 * DECELERATION
     way = run.sent[-1].q - Q
@@ -169,7 +169,7 @@ def test_braking_keeps_the_direction_and_ends_after_the_right_way() -> None:
     for k in range(1, 200):
         stream.follow(speed * k * CYCLE, CYCLE)
     begin = stream.q.copy()
-    while not stream.rests:
+    while not stream.at_rest:
         stream.brake(CYCLE)
     way = stream.q - begin
     assert way[0] == pytest.approx(1.0 / (2 * DECELERATION), rel=0.03)

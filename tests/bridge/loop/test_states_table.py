@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 
 from gapbridge.bridge.ipc.loop_counters import LoopCounter
-from gapbridge.bridge.loop.supervisor import TRANSITIONS, State, states_table
+from gapbridge.bridge.ipc.loop_state import State
+from gapbridge.bridge.loop.supervisor import TRANSITIONS, states_table
 
 PAGE = (Path(__file__).parents[3] / "docs" / "daemon.md").read_text(encoding="utf-8")
 ELSEWHERE = {LoopCounter.SILENCE, LoopCounter.LINK_LOST}  # what stale comes to, reported in its row

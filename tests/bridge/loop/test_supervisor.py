@@ -8,13 +8,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.loop.supervisor import (
     CLEARED_BY_RECONNECTING,
     RAMPS_OUT,
     STOPS_AT_ONCE,
     TRANSITIONS,
     Cause,
-    State,
     Supervisor,
 )
 

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapbridge.bridge.cell.settings.recording import RecordingSettings
+from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.ipc.shared_memory import SharedMemory
-from gapbridge.bridge.loop.supervisor import State
 from gapbridge.bridge.recording.recorder import Recorder
 
 N = 6

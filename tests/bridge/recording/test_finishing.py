@@ -13,7 +13,7 @@ from mcap.exceptions import McapError
 from mcap.reader import NonSeekingReader, SeekingReader
 from recorded import SESSION, Desk, publish
 
-from gapbridge.bridge.loop.supervisor import State
+from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.recording.export import export
 from gapbridge.bridge.recording.finishing import finish, unfinished
 from gapbridge.bridge.recording.folder import segments

@@ -102,7 +102,7 @@ def test_recording_pauses_before_the_disk_is_full(
     desk = Desk(tmp_path, keep_free=50.0)
     room = {"free": 1000.0}
     recorder = desk.recorder()
-    monkeypatch.setattr(recorder, "_room", lambda: room["free"])
+    monkeypatch.setattr(recorder, "_free_space", lambda: room["free"])
     publish(desk.memory, 20)
     recorder.step(flush=True)
     room["free"] = 40.0

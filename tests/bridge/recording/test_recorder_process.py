@@ -17,9 +17,9 @@ from recorded_documents import read_documents
 from gapbridge.bridge.cell.daemon_settings import DaemonSettings
 from gapbridge.bridge.cell.settings.recording import RecordingSettings
 from gapbridge.bridge.ipc import side_process
+from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.ipc.shared_memory import SharedMemory
 from gapbridge.bridge.ipc.side_process import SideProcess
-from gapbridge.bridge.loop.supervisor import State
 from gapbridge.core.log.mcap_reading import read_columns, read_configuration
 from gapbridge.core.log.mcap_records import is_whole
 

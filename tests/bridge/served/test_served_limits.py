@@ -96,7 +96,7 @@ def test_an_address_that_is_taken_is_reported_in_one_line():
             listen(ServedSettings(port=port))
 
 
-def test_a_page_that_does_not_keep_up_is_let_go_and_the_others_miss_nothing():
+def test_a_page_that_does_not_keep_up_is_closed_and_the_others_miss_nothing():
     async def both():
         stream = Stream(most=4)
         slow, quick = stream.subscribe(lambda: "first"), stream.subscribe(lambda: "first")

@@ -20,7 +20,7 @@ from on_a_phone import PATIENCE
 from ports import free_port
 
 from gapbridge.bridge.cell.sections import SetpointSettings
-from gapbridge.bridge.loop.supervisor import State
+from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.setpoint_source import make_source
 
 TOKEN = "0d9b7a63c1f24e58b6a7d3c2e1f09485"

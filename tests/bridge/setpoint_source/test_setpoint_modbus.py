@@ -15,7 +15,7 @@ import pytest
 from daemon_cell import Robot, Run, wait_for
 
 from gapbridge.bridge.cell.sections import SetpointSettings
-from gapbridge.bridge.loop.supervisor import State
+from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.setpoint_source import make_source
 from gapbridge.bridge.setpoint_source.modbus import ModbusSource
 from gapbridge.bridge.setpoint_source.plc_memory import PlcMemory

@@ -176,7 +176,7 @@ def test_a_line_is_a_setpoint(line: str, feed: PlannerSource) -> None:
         assert feed.sample(0.002, HERE) == pytest.approx([0.1, 0.2, 0.3])
 
 
-def test_joints_glide_between_lines(feed: PlannerSource) -> None:
+def test_joints_are_interpolated_between_lines(feed: PlannerSource) -> None:
     with planner(feed) as socket_:
         socket_.sendall(b"0,0,0\n")
         first_of(feed)

@@ -9,8 +9,8 @@ import pytest
 from on_a_phone import CUT, PATIENCE
 from watched_feed import Feed
 
+from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.ipc.shared_memory import Phase
-from gapbridge.bridge.loop.supervisor import State
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")

@@ -18,7 +18,7 @@ CELLS = [CONFIG / f"{name}_can_simulated.yaml" for name in ("piper", "odrive")]
 
 
 @pytest.mark.parametrize("path", CELLS, ids=lambda path: path.stem)
-def test_a_ready_cell_is_served_read_armed_and_let_go(path):
+def test_a_ready_cell_is_served_read_armed_and_released(path):
     cell = load_cell(path)
     given = {"port": free_port(), "state_timeout": 0.5, "foreign_quiet": 0.1}
     link = cell.link.model_copy(update=given)

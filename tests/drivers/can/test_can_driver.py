@@ -134,7 +134,7 @@ def test_half_a_setpoint_is_taken_back(served, at):
     assert breaking.sent[at:] == [
         (key[0], data) for key, data in first
     ]  # whole, and last on the wire
-    assert served.driver.writer.mended == 1
+    assert served.driver.writer.reverted == 1
     time.sleep(0.1)
     assert served.controller.target_q == pytest.approx(q, abs=UNIT)
 
@@ -254,7 +254,7 @@ def test_joints_that_stand_still_though_commanded_away_are_stale(served):
     served.controller.frozen = True  # the same joints again and again
     goal = state.actual_q + 0.04
     served.driver.write_setpoint(setpoint_of(goal))
-    with pytest.raises(StaleStateError, match="joints have stood still"):
+    with pytest.raises(StaleStateError, match="joints have not changed"):
         read(served.driver, 500)
 
 

@@ -156,7 +156,7 @@ def test_a_part_of_a_setpoint_never_takes_effect(
     for _ in range(5):
         settled(driver)
     assert np.abs(hold - generic.controller.q).max() < 1e-5
-    assert driver.writer.mended > 0
+    assert driver.writer.reverted > 0
     driver.write_setpoint(setpoint(hold + 0.001, settled(driver)))
 
 
@@ -176,10 +176,10 @@ def test_a_setpoint_that_is_not_finite_or_leaves_the_counts_is_refused(
 
 def test_a_set_without_one_drives_pdo_is_torn(generic: DriveArm, driver: CanopenDriver) -> None:
     settled(driver)
-    generic.server.silence(node_of(generic, 3))
+    generic.server.mute(node_of(generic, 3))
     with pytest.raises(InvalidStateError, match=r"10 of 12 TPDOs, without TPDO1 of node 4"):
         driver.read_state()
-    generic.server.speak()
+    generic.server.unmute()
     settled(driver)
 
 
@@ -191,7 +191,7 @@ def test_a_pdo_of_the_sync_before_is_never_taken_for_this_ones(
     torn = 0
     for _ in range(5):
         settled(driver)
-        generic.server.hold_back(node_of(generic, 2), delay, count)
+        generic.server.delay_tpdos(node_of(generic, 2), delay, count)
         for _ in range(6):
             try:
                 state = driver.read_state()
@@ -234,7 +234,7 @@ def test_frames_of_others_are_no_samples(
 
 def test_a_lost_node_is_stale_and_named(generic: DriveArm, driver: CanopenDriver) -> None:
     settled(driver)
-    generic.server.silence(node_of(generic, 4))
+    generic.server.mute(node_of(generic, 4))
     begun = time.monotonic()
     with pytest.raises(StaleStateError, match="node 5"):
         read_on(driver)
@@ -369,7 +369,7 @@ def test_a_bus_with_a_master_on_it_is_not_joined(generic: DriveArm) -> None:
 
 def test_a_node_that_is_not_there_is_named() -> None:
     with served("cia402") as arm:
-        arm.server.silence(6)
+        arm.server.mute(6)
         with pytest.raises(LinkError, match="node 6 does not answer"):
             arm.driver(sdo_timeout=0.1).connect()
 

@@ -95,8 +95,8 @@ def test_a_million_frames_give_no_exception_and_no_wrong_sample() -> None:
             refused += 1
             assert not true, collector.why()
             continue
-        builder.forget()
-        check.forget()
+        builder.reset()
+        check.reset()
         try:
             state = builder.build(found, None, False)
             check.check(state)
@@ -127,8 +127,8 @@ def test_random_payloads_are_refused_or_are_what_their_bytes_say() -> None:
             collector.take(cob_id, sent[cob_id], 0.0)
         found = collector.wait(0.0)
         assert found is not None
-        builder.forget()
-        check.forget()
+        builder.reset()
+        check.reset()
         try:
             state = builder.build(found, None, True)
             check.check(state)

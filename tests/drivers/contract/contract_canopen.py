@@ -50,7 +50,7 @@ class CanopenCase(Case):
         """Have one drive's PDOs, off by 0.05 rad, come so late that they meet the next SYNC's."""
         server = self.servers[0]
         assert isinstance(server, CanopenServer)
-        server.hold_back(server.profile.nodes[1], LATE, 2)
+        server.delay_tpdos(server.profile.nodes[1], LATE, 2)
 
 
 def canopen_cases() -> dict[str, Callable[[], Case]]:

@@ -16,7 +16,7 @@ sys.path.insert(0, BRIDGE)
 from daemon_cell import Robot, Run, offsets, wait_for  # noqa: E402
 from sensor_wires import Reaction  # noqa: E402
 
-from gapbridge.bridge.loop.supervisor import State  # noqa: E402
+from gapbridge.bridge.ipc.loop_state import State  # noqa: E402
 from gapbridge.drivers.can_bus.bus import BusSettings  # noqa: E402
 from gapbridge.drivers.simulated.can.hub import Hub  # noqa: E402
 from gapbridge.drivers.simulated.ft_sensor.ati_node import RobotousNode  # noqa: E402

@@ -256,7 +256,7 @@ def test_the_sensors_own_overload_bits_are_not_believed_and_pass() -> None:
         heal(driver)
 
 
-def test_no_sensor_is_a_link_error_and_the_arm_is_let_go() -> None:
+def test_no_sensor_is_a_link_error_and_the_arm_is_released() -> None:
     controller = resting_controller(TURNED)
     wire = make_wire("robotous_rft", Reaction())
     wire.device.silent = True

@@ -102,7 +102,7 @@ def test_a_client_that_dies_is_withdrawn_at_the_rates_of_its_cell(
 ) -> None:
     rate, turn = 0.002, 0.004  # m/s, rad/s
     with ModbusCase("ur", watchdog=None) as ur, ur.driver() as driver:
-        driver.gate.hold_to(GateBounds(offset_rate=rate, offset_rotation_rate=turn))
+        driver.gate.set_bounds(GateBounds(offset_rate=rate, offset_rotation_rate=turn))
         driver.arm(next_state(driver))
         begun = time.monotonic()
 
@@ -136,7 +136,7 @@ def test_an_offset_that_registers_cannot_hold_is_refused(ur: ModbusCase) -> None
         driver.arm(next_state(driver))
         state = next_state(driver)
         q = driver.nominal_q(state)
-        driver.gate.hold_to(GateBounds(offset=0.1, offset_rate=1.0))
+        driver.gate.set_bounds(GateBounds(offset=0.1, offset_rate=1.0))
         with pytest.raises(
             WriteError, match=r"found an offset of 0\.04 m, expected at most 0\.0327"
         ):

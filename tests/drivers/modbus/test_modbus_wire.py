@@ -128,7 +128,7 @@ def test_a_readings_time_is_the_longest_way_of_its_state(
     with driver_through(case, proxy) as driver:
         proxy.wait = 0.02
         next_state(driver)
-        assert 0.02 <= driver.way() <= (driver.round_trip() or 0.0)
+        assert 0.02 <= driver.transit_time() <= (driver.round_trip() or 0.0)
 
 
 def test_an_offset_whose_answer_is_lost_once_is_sent_once_more(

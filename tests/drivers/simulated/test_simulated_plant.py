@@ -55,8 +55,8 @@ def test_servos_give_way_by_what_the_bent_arm_holds() -> None:
     """As the model has it; a rigid arm's torques are 4 % others at joint 2, 20 % at joint 4."""
     soft, droop = (0.0, 3e-4, 3e-4, 8e-4, 8e-4, 8e-4), (0.0, 2e-5, 5e-5, 1e-3, 1e-3, 0.0)
     plant = make_plant(axial=soft, radial=soft, droop=droop)
-    plant.hang(8.0, (0.05, 0.02, 0.1))
-    plant.pull((20.0, -10.0, -30.0), (0.0, 2.0, 0.0))
+    plant.set_load(8.0, (0.05, 0.02, 0.1))
+    plant.set_force((20.0, -10.0, -30.0), (0.0, 2.0, 0.0))
     tool = np.eye(4)
     tool[:3, :3] = np.reshape(rot.from_vector(TCP[3:]), (3, 3))
     tool[:3, 3] = TCP[:3]

@@ -125,7 +125,7 @@ def test_whoever_is_killed_is_withdrawn_at_the_rates_of_the_cell(
         offset_robot.host,
         """
         from gapbridge.drivers.gate import GateBounds
-        driver.gate.hold_to(GateBounds(offset_rate=0.0005, offset_rotation_rate=0.001))
+        driver.gate.set_bounds(GateBounds(offset_rate=0.0005, offset_rotation_rate=0.001))
         driver.connect()
         driver.arm(read_for(20))
         nominal = driver.nominal_q(driver.read_state()).copy()

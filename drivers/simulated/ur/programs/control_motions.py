@@ -30,12 +30,12 @@ from gapbridge.drivers.simulated.ur.controller import (
 from gapbridge.drivers.simulated.ur.programs.control_registers import Registers
 from gapbridge.drivers.simulated.ur.programs.path_program import path_motion
 
-CONTACT_FORCE = 10.0  # N: a pull against the way that is taken for a touch
+CONTACT_FORCE = 10.0  # N: force against the motion that counts as contact
 JOG_ACCELERATION = 0.5  # m/s^2
 
 
 def _move(r: Registers, motion: Motion) -> Steps:
-    """Run a motion to its end, or beside the script where the client asked for that."""
+    """Run a motion to its end, or concurrently if the client requested that."""
     if r.integer(1) == 1:
         r.start_operation(motion)
         return

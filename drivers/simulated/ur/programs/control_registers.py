@@ -46,11 +46,11 @@ class Registers:
         return int(self._memory[self._in_int[index]])
 
     def number(self, index: int) -> float:
-        """Return a real argument. Raises ScriptError where it is not finite."""
+        """Return a real argument. Raises ScriptError if it is not finite."""
         return self.controller.finite((self._memory[self._in_double[index]],), "argument")[0]
 
     def joints(self, first: int = 0) -> Joints:
-        """Return six real arguments. Raises ScriptError where one is not finite."""
+        """Return six real arguments. Raises ScriptError if one is not finite."""
         memory = self._memory
         values = [memory[name] for name in self._in_double[first : first + 6]]
         return self.controller.finite(values, "argument")
@@ -73,7 +73,7 @@ class Registers:
         self._memory.update(zip(self._out_double, map(float, values), strict=False))
 
     def clear(self) -> None:
-        """Leave nothing behind that the next program could take for its own."""
+        """Clear the registers for the next program."""
         memory: dict[str, Any] = self._memory
         for name in (self._in_int[0], *self._out_int):
             memory[name] = 0
@@ -81,13 +81,13 @@ class Registers:
     # -- asynchronous operations ------------------------------------------------------------------
 
     def start_operation(self, motion: Motion) -> None:
-        """Run a motion beside the script and report it."""
+        """Start a motion concurrently with the script, and report it."""
         self.controller.start_motion(motion)
         self._running = motion
         self.progress(0)
 
     def follow_operation(self) -> None:
-        """Report the end of an asynchronous motion when it has come, or was replaced."""
+        """Report the end of an asynchronous motion when it has ended or was replaced."""
         running = self._running
         if running is not None and (running.done or self.controller.motion is not running):
             self.finish_operation()

@@ -1,4 +1,4 @@
-"""Emulation of the offset program that the project ships for robots with a program of their own.
+"""Emulation of the shipped offset program, for robots that run their own program.
 
 A client streams a Cartesian offset in base axes through RTDE input registers; the program adds it
 to the robot's own motion through the inverse kinematics of the nominal arm. Registers:
@@ -46,7 +46,7 @@ def checksum(offset: Sequence[float], sequence: int, rates: int) -> int:
 
 
 class OffsetMotion:
-    """The robot's own motion with the applied offset on top."""
+    """The robot's own motion with the applied offset added."""
 
     done = False
     scaled = False
@@ -64,16 +64,16 @@ class OffsetMotion:
         self.applied = offset
 
     def move_own(self, goal: Joints, speed: float, acceleration: float) -> None:
-        """Have the own motion go to `goal` (n, rad)."""
+        """Move the robot's own motion to `goal` (n, rad)."""
         self.own = MoveJoints(self._nominal, goal, speed, acceleration)
 
     @property
     def nominal(self) -> Joints:
-        """Where the robot's own program wants the joints (n, rad)."""
+        """Target joints of the robot's own program (n, rad)."""
         return self._nominal
 
     def restart(self, q: Joints) -> None:
-        """Go on after a pause: the own motion from where `q` is without the offset."""
+        """Continue after a pause: the own motion restarts from `q` without the offset."""
         if self.applied != NOTHING:
             x, y, z, rx, ry, rz = (-v for v in self.applied)
             arm, tool = self._controller.plant.arm, self._controller.declared.tool
@@ -83,7 +83,7 @@ class OffsetMotion:
         self.own.restart(q)
 
     def step(self, q: Joints, qd: Joints, dt: float) -> Joints:
-        """Return the next joint target: the own motion's, moved by the offset."""
+        """Return the next joint target: the own motion's plus the offset."""
         scaled = dt * self._controller.memory["speed_scaling"] if self.own.scaled else dt
         new = self.own.step(self._nominal, self._rate, scaled)
         if new is not self._nominal or any(self._rate):
@@ -101,7 +101,7 @@ class OffsetMotion:
 
 
 class OffsetRegisters:
-    """What the client has written, checked; what the program answers."""
+    """The client's inputs, checked, and the program's answers."""
 
     def __init__(self, memory: dict[str, Any]) -> None:
         self._memory = memory
@@ -113,7 +113,7 @@ class OffsetRegisters:
         self._rejected = False
 
     def cycle(self, dt: float) -> int:
-        """Take what is new; returns the program's state."""
+        """Process new inputs; returns the program's state."""
         memory = self._memory
         if memory["input_int_register_21"] != self._heartbeat:
             self._heartbeat, self._silent = memory["input_int_register_21"], 0.0

@@ -55,7 +55,7 @@ def _run(controller: Controller, name: str, call: Call) -> Steps:
 
 
 def _set(controller: Controller, call: Call) -> bool:
-    """Run a call that takes no time; False for an unknown one."""
+    """Run an immediate call; returns False for an unknown one."""
     memory, declared = controller.memory, controller.declared
     first = call.get(0, "n", None)
     if call.name.startswith("write_output_"):
@@ -84,7 +84,7 @@ def _set(controller: Controller, call: Call) -> bool:
 
 
 def move_own(controller: Controller, goal: Joints) -> None:
-    """Have the robot's own program move to `goal` (n, rad). Raises BenchError where it cannot."""
+    """Let the robot's own program move to `goal` (n, rad). Raises BenchError if it cannot."""
     if not controller.can_move:
         raise BenchError("move: the robot is not running")
     motion = controller.motion

@@ -1,4 +1,4 @@
-"""Reading URScript text: whole programs out of a byte stream, and single calls out of a line.
+"""Parsing URScript text: programs from a byte stream, and single calls from a line.
 
 Only what clients upload is understood: straight lines of calls with numbers. Source: the URScript
 manual for the forms of calls.

@@ -60,7 +60,7 @@ class DashboardServer:
         connection.send(GREETING)
 
     def handle(self, connection: Connection) -> None:
-        """Answer every whole line."""
+        """Answer every complete line."""
         while connection.open and b"\n" in connection.received:
             end = connection.received.index(b"\n")
             line = connection.received[:end].decode("utf-8", "replace").strip()

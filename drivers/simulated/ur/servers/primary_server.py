@@ -1,4 +1,4 @@
-"""Port 30001: who connects gets a version message and robot states, and may send programs.
+"""Port 30001: clients get a version message and robot states, and may send programs.
 
 Of a state's sub-packages it has the robot mode (0), kinematics info (5) and configuration data (6).
 Source: Universal Robots, description of the client interfaces; layouts as in the Universal Robots
@@ -53,7 +53,7 @@ class PrimaryServer:
         return connection
 
     def publish(self) -> None:
-        """Count a cycle; send a state to everyone where one is due."""
+        """Count a cycle; send a state to every client when due."""
         self._cycles += 1
         if self._cycles % EVERY or not self._clients:
             return

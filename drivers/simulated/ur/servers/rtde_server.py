@@ -38,7 +38,7 @@ class RtdeSession(Connection):
         self.version = version
 
     def set_outputs(self, recipe: wire.OutputRecipe) -> None:
-        """Take another recipe of packets; they start when the client asks for them."""
+        """Set a new recipe; packets start when the client requests them."""
         self.recipe, self.started = recipe, False
 
     def start(self) -> bool:
@@ -52,7 +52,7 @@ class RtdeSession(Connection):
         self.started = False
 
     def publish(self, memory: dict[str, Any], dt: float) -> None:
-        """Send the cycle's packet where it is due and there is room."""
+        """Send the cycle's packet if it is due and there is room."""
         if self.pending:
             self.flush()
         if not self.started or self.recipe is None:
@@ -83,7 +83,7 @@ class RtdeServer:
         self.sessions: list[RtdeSession] = []
 
     def accept(self, sock: socket.socket) -> RtdeSession:
-        """Take a new client."""
+        """Accept a new client."""
         session = RtdeSession(sock)
         self.sessions.append(session)
         return session
@@ -106,7 +106,7 @@ class RtdeServer:
             self.sessions = [session for session in self.sessions if session.open]
 
     def handle(self, session: RtdeSession) -> None:
-        """Answer every whole request that has arrived."""
+        """Answer every complete request that has arrived."""
         try:
             while session.open and (got := wire.take_frame(session.received)) is not None:
                 self._dispatch(session, *got)

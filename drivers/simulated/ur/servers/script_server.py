@@ -1,4 +1,4 @@
-"""Port 30003: programs arrive as text; what runs depends on what they are.
+"""Port 30003: programs arrive as text, and the matching emulation is run.
 
 The control script that ur_rtde uploads is emulated, a handshake over registers. The client writes a
 command code to input_int_register_0 with arguments behind it, waits for output_int_register_0 to
@@ -42,7 +42,7 @@ class ScriptServer:
         self._controller = controller
 
     def handle(self, connection: Connection) -> None:
-        """Start every whole program that has arrived; the last one stays."""
+        """Start every complete program that has arrived; the last one keeps running."""
         while (script := take_script(connection.received)) is not None:
             self._start(script)
 
@@ -75,7 +75,7 @@ class ControlText:
 
 
 def read_control_text(script: ScriptText) -> ControlText | None:
-    """Return what was written into an uploaded control script; None if it is none."""
+    """Return register offsets and path of an uploaded control script; None: another program."""
     body = "\n".join(script.lines)
     offsets = {kind: int(number) for kind, number in _OFFSET.findall(body)}
     if script.name != "rtde_control" and len(offsets) < 2:
@@ -122,7 +122,7 @@ def _main_loop(registers: Registers) -> Steps:
 
 
 def _execute(registers: Registers, command: int) -> Steps:
-    """Run a command to its end; an unknown one is done at once."""
+    """Run a command to its end; an unknown one ends at once."""
     action = COMMANDS.get(command)
     if action is None:
         log.warning("control script: command %d is unknown and ignored", command)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from gapbridge.bridge.calibration.joints.link import LinkedJoints
-from gapbridge.bridge.loop.supervisor import State
+from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.core.calibration.plan import PlannedPose
 from gapbridge.core.errors import RunError
 

@@ -1,4 +1,4 @@
-"""From setpoints that come now and then to one for every cycle."""
+"""Interpolation: from setpoints at irregular times to one for every cycle."""
 
 from __future__ import annotations
 
@@ -11,18 +11,19 @@ from gapbridge.bridge.setpoint_source.source import Source, SourceDryError
 from gapbridge.core.arrays import Array
 from gapbridge.drivers.clock import SYSTEM, Clock
 
-LONGEST_GLIDE = 0.1  # s
+MAX_INTERVAL = 0.1  # s: longest time over which one setpoint is approached
 
 
-class Glide:
-    """The newest setpoint, come to over the time that two of them are apart.
+class SetpointInterpolator:
+    """Moves linearly to the newest setpoint over the time between the last two.
 
-    What has not been renewed for ``timeout`` s is dry.
+    Without a new setpoint for ``timeout`` s the source is dry. ``expected``: what should have come,
+    for messages.
     """
 
-    def __init__(self, timeout: float, what: str, clock: Clock = SYSTEM) -> None:
+    def __init__(self, timeout: float, expected: str, clock: Clock = SYSTEM) -> None:
         self._now = clock.monotonic
-        self._timeout, self._what = timeout, what
+        self._timeout, self._expected = timeout, expected
         self._newest: Array | None = None
         self._last_received = 0.0  # s, monotonic
         self._from: Array | None = None
@@ -30,33 +31,32 @@ class Glide:
         self._present: Array | None = None
 
     def take(self, q: Array) -> None:
-        """Take a new setpoint (n,), rad."""
+        """Store a new setpoint (n,), rad."""
         now = self._now()
-        self._length = (
-            min(now - self._last_received, LONGEST_GLIDE) if self._newest is not None else 0.0
-        )
+        interval = min(now - self._last_received, MAX_INTERVAL)
+        self._length = interval if self._newest is not None else 0.0
         self._newest, self._last_received = q, now
 
     def first(self) -> Array | None:
-        """Return the newest setpoint where one has come lately."""
+        """Return the newest setpoint (n,) rad, None if it is older than the timeout."""
         if self._newest is None or self._now() - self._last_received > self._timeout:
             return None
         return self._newest
 
     def begin(self, robot_q: Array) -> None:
-        """Start from where the arm stands."""
+        """Start at the arm's joints ``robot_q`` (n,) rad."""
         self._present = robot_q.copy()
-        self.turn()
+        self.restart()
 
-    def turn(self) -> None:
-        """Glide to the newest setpoint from where the stream is."""
+    def restart(self) -> None:
+        """Start a new segment from the present to the newest setpoint."""
         self._from = self._present if self._present is not None else self._newest
 
     def sample(self) -> Array:
-        """Return the setpoint of this moment. Raises SourceDryError where none came in time."""
+        """Return the present setpoint (n,) rad. Raises SourceDryError after the timeout."""
         silent = self._now() - self._last_received
         if self._newest is None or silent > self._timeout:
-            raise SourceDryError(f"setpoints: found no {self._what} for {silent:.3f} s")
+            raise SourceDryError(f"setpoints: found no {self._expected} for {silent:.3f} s")
         share = min(silent / self._length, 1.0) if self._length > 0.0 else 1.0
         if share >= 1.0 or self._from is None:
             self._present = self._newest
@@ -65,32 +65,32 @@ class Glide:
         return self._present
 
 
-class GlidingSource(Source):
-    """A source whose setpoints come when their sender likes; the stream glides between them."""
+class InterpolatedSource(Source):
+    """A source whose setpoints arrive at irregular times and are interpolated."""
 
-    counted: ClassVar[str]  # what a sender sends anew, for messages
+    expected: ClassVar[str]  # what the sender should send, for messages
 
     def __init__(
         self, settings: SetpointSettings, n: int, moves_arm: bool, folder: Path, rate: float
     ) -> None:
         super().__init__(settings, n, moves_arm, folder, rate)
-        self._glide = Glide(settings.timeout, self.counted)
+        self._interpolator = SetpointInterpolator(settings.timeout, self.expected)
 
     @abstractmethod
     def _receive(self) -> bool:
-        """Take what has arrived; returns whether there is a new setpoint."""
+        """Read what has arrived; returns whether there is a new setpoint."""
 
     def first(self, robot_q: Array) -> Array | None:
-        """Return the newest setpoint where one has come lately."""
+        """Return the newest setpoint (n,) rad, None if it is older than the timeout."""
         self._receive()
-        return self._glide.first()
+        return self._interpolator.first()
 
     def begin(self, timestamp: float, robot_q: Array) -> None:
-        """Start from where the arm stands."""
-        self._glide.begin(robot_q)
+        """Start at the arm's joints ``robot_q`` (n,) rad."""
+        self._interpolator.begin(robot_q)
 
     def sample(self, timestamp: float, robot_q: Array) -> Array:
-        """Return the setpoint of this moment. Raises SourceDryError where none came in time."""
+        """Return the present setpoint (n,) rad. Raises SourceDryError after the timeout."""
         if self._receive():
-            self._glide.turn()
-        return self._glide.sample()
+            self._interpolator.restart()
+        return self._interpolator.sample()

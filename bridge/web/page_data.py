@@ -1,6 +1,6 @@
-"""All that the page shows, kept up to date from the shared memory and the daemon's events.
+"""The data that the page shows, updated from the shared memory and the daemon's events.
 
-What it draws over time is thinned to a few points a second.
+Time series are thinned to a few points a second.
 """
 
 from __future__ import annotations
@@ -14,22 +14,23 @@ import numpy as np
 
 from gapbridge.bridge.cell.daemon_settings import DaemonSettings
 from gapbridge.bridge.cell.updated_settings import UpdatedSettings
+from gapbridge.bridge.ipc.events import EventKind
+from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.ipc.shared_memory import ROWS, SharedMemory
-from gapbridge.bridge.loop.supervisor import State
 from gapbridge.bridge.web.prediction import Prediction
 from gapbridge.core.arrays import Array
 from gapbridge.core.limits import CLAMPS
 
 Message = tuple[str, dict[str, Any]]  # kind, data
-ENDS = ("fault", "failure")  # kinds of events with which a process of the loop ends
-EVENTS = 200  # kept to show
+ENDS = (EventKind.FAULT, EventKind.FAILURE)  # events with which a process of the loop ends
+EVENTS = 200  # stored to be shown
 TIMING_EVERY = 1.0  # s
 ARM_EVERY = 0.2  # s
-RATE_SPAN = 2.0  # s that the rate is taken over
-DIGITS = 6  # significant ones of what is drawn
-SPAN = 60.0  # s that are looked back
+RATE_SPAN = 2.0  # s over which the rate is averaged
+DIGITS = 6  # significant digits of drawn values
+SPAN = 60.0  # s of the timing histograms
 EDGES = np.logspace(-5, -1, 41)  # s: bounds of the bins, ten to a decade
-STEP = 0.05  # s that one point stands for
+STEP = 0.05  # s of one point
 
 COLUMNS = (
     "time", "state",
@@ -37,13 +38,13 @@ COLUMNS = (
     "measured_fx", "measured_fy", "measured_fz", "measured_mx", "measured_my", "measured_mz",
     "predicted_fx", "predicted_fy", "predicted_fz", "predicted_mx", "predicted_my", "predicted_mz",
 )  # fmt: skip
-"""time: s since the epoch; state: number; offsets: m and rad in base; wrenches: N and Nm, their
-axes as the page is given; NaN where there is none."""
+"""time: s since the epoch; state: number; offsets: m and rad in base; wrenches: N and Nm, axes
+as the page names them; NaN if there is none."""
 OFFSET, MEASURED, PREDICTED = slice(2, 8), slice(8, 14), slice(14, 20)
 
 
-class Watched:
-    """Reads along; ``turn`` returns what is new since the last call."""
+class PageData:
+    """Collects the data; ``update`` returns messages on what is new since the last call."""
 
     def __init__(
         self,
@@ -57,7 +58,7 @@ class Watched:
         self._updated = UpdatedSettings(settings, text)  # text: the cell file's
         self._session, self._memory = session, memory
         self._slices, self._n = memory.slices, n
-        # whoever comes late still shows what the ring holds
+        # a page opened late shows what the ring holds
         self._reader = memory.reader(max(memory.written - ROWS + ROWS // 4, 0))
         self._prediction = Prediction(settings, memory.slices)
         self._history = History(settings.web.history)
@@ -80,13 +81,13 @@ class Watched:
 
     # -- in ---------------------------------------------------------------------------------------
 
-    def turn(self, events: list[dict[str, Any]]) -> list[Message]:
-        """Take what has come; returns messages for the pages that are open."""
+    def update(self, events: list[dict[str, Any]]) -> list[Message]:
+        """Process new events and cycles; returns messages for the open pages."""
         messages = [message for event in events for message in self._on_event(event)]
         changed = [self._updated.on_event(event) for event in events]
         if any(changed):
             self._prediction = Prediction(self._settings, self._slices)
-            messages.append(("hello", self.snapshot()))  # limits and rate may be others
+            messages.append(("hello", self.snapshot()))  # limits and rate may have changed
         points = self._take(self._reader.drain())
         messages.append(("tick", {**self.now(), "points": plain(points)}))
         if time.monotonic() >= self._timing_at:
@@ -99,7 +100,7 @@ class Watched:
         return messages
 
     def _on_event(self, event: dict[str, Any]) -> list[Message]:
-        if event.get("kind") == "status":
+        if event.get("kind") == EventKind.STATUS:
             self.status = event
             return [("status", event)]
         if "to" in event:
@@ -136,7 +137,7 @@ class Watched:
             cycles[:, 0], cycles[:, 1] = received + wall, rows[:, s["state"].start]
             cycles[:, 2:8] = rows[:, s["offset"]]
             cycles[:, 8:14] = rows[:, s[self._sensor]]
-            # a few for each point are plenty: points are means
+            # a few cycles for each point: points are means
             step = max(int(rate * STEP / 2), 1)
             picked = np.arange(len(rows) - 1, -1, -step)[::-1]
             cycles[picked, 14:20] = self._prediction.wrenches(rows[picked])
@@ -145,7 +146,7 @@ class Watched:
     # -- out --------------------------------------------------------------------------------------
 
     def now(self) -> dict[str, Any]:
-        """Return what is the case at this moment."""
+        """Return the present state, rate and counts."""
         times, now = self._times, time.monotonic()
         silence = now - self._last if self._last else None
         alive = len(times) > 1 and silence is not None and silence < RATE_SPAN
@@ -189,7 +190,7 @@ class Watched:
         }
 
     def history(self, seconds: float, most: int) -> dict[str, Any]:
-        """Return the last ``seconds`` of what is drawn, in ``most`` points or fewer."""
+        """Return the last ``seconds`` of the time series, in ``most`` points or fewer."""
         return {
             "session": self._session,
             "columns": COLUMNS,
@@ -198,7 +199,7 @@ class Watched:
 
 
 def plain(points: Array) -> list[list[float | None]]:
-    """Return points as JSON has them: None where there is no number, six digits, times in ms."""
+    """Return points for JSON: None for NaN, six digits, times rounded to ms."""
     return [
         [
             round(row[0], 3),
@@ -209,13 +210,13 @@ def plain(points: Array) -> list[list[float | None]]:
 
 
 class Timing:
-    """Duration of the loop's work and age of the state behind it, over the last minute."""
+    """Durations of the loop's cycles and ages of their states, over the last SPAN s."""
 
     def __init__(self) -> None:
         self._rows = np.empty((0, 3))  # time, duration, age; s
 
     def add(self, time: Array, duration: Array, age: Array) -> None:
-        """Take cycles (k,) each."""
+        """Add cycles: arrays (k,), s."""
         rows = np.concatenate([self._rows, np.column_stack([time, duration, age])])
         self._rows = rows[rows[:, 0] > rows[-1, 0] - SPAN] if len(rows) else rows
 
@@ -240,18 +241,18 @@ def _of(values: Array) -> dict[str, Any]:
 
 
 class History:
-    """A ring of points. Offsets are those of the cycle in which they were largest, wrenches means.
+    """A ring of points. Wrenches are means; offsets are of the cycle with the largest one.
 
-    So a peak is never thinned away.
+    So thinning keeps peaks of the offset.
     """
 
     def __init__(self, length: float) -> None:
         self._most = max(int(length / STEP), 1)
         self._points = np.empty((0, len(COLUMNS)))
-        self._pending = np.empty((0, len(COLUMNS)))  # cycles of a point that is not whole
+        self._pending = np.empty((0, len(COLUMNS)))  # cycles of an incomplete point
 
     def add(self, cycles: Array, now: float) -> Array:
-        """Take cycles (k, columns) in order of time; returns the points that are whole by now."""
+        """Add cycles (k, columns) in time order; returns the points that are complete now."""
         pending = np.concatenate([self._pending, cycles])
         if not len(pending):
             return pending
