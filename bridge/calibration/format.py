@@ -10,7 +10,7 @@ from gapbridge.bridge.report.labels import unit_of
 from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.plan import Payload
 from gapbridge.core.calibration.result import Estimate
-from gapbridge.core.calibration.verify import Suspect, Verification
+from gapbridge.core.calibration.verify import CandidateChange, Verification
 from gapbridge.core.effects import CATALOGUE
 
 
@@ -90,7 +90,7 @@ def verdict_text(found: Verification) -> str:
     return f"the calibration no longer holds: {text} (chance {found.chance:.1g}); {moved}"
 
 
-def moved_text(moved: Suspect) -> str:
+def moved_text(moved: CandidateChange) -> str:
     """Return what moved, and by how much."""
     if moved.reading is not None:
         return f"reading {moved.reading} alone does not fit: measure it again"

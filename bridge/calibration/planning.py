@@ -24,7 +24,7 @@ from gapbridge.core.calibration.plan import Payload, Plan
 from gapbridge.core.errors import CellError
 from gapbridge.core.metrology import Metrology
 from gapbridge.core.planning.capsules import Box
-from gapbridge.core.planning.design import SessionDesign, far_end, plan
+from gapbridge.core.planning.design import SessionDesign, load_extent, plan
 from gapbridge.core.planning.workspace import Place, Reflector, Workspace
 
 REPEATABILITY = 5e-5  # m, 1 sigma of one coordinate, where the cell does not report it
@@ -139,7 +139,7 @@ def _places(cell: Cell, kind: str) -> list[Place]:
 
 def with_loads(space: Workspace, loads: Sequence[Payload]) -> Workspace:
     """Return the space of an arm on whose flange such loads hang, in turn."""
-    return replace(space, hung=(*space.hung, *(far_end(load) for load in loads)))
+    return replace(space, loads_end=(*space.loads_end, *(load_extent(load) for load in loads)))
 
 
 def _boxes(cell: Cell, given: CalibrationSettings) -> list[BoxEntry]:

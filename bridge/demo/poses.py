@@ -10,7 +10,7 @@ from gapbridge.core.arrays import Array
 from gapbridge.core.kernels.single import LEVER
 from gapbridge.core.loads import Loads
 from gapbridge.core.model import Model
-from gapbridge.core.planning.travel import shortest_way
+from gapbridge.core.planning.travel import shortest_order
 
 CANDIDATES = 400
 
@@ -114,7 +114,7 @@ def informative(model: Model, q: Array, load: Load, count: int, known: Array) ->
 
 def tour(q: Array, start: Array) -> Array:
     """Return a short way from the start through the poses (N, 6): their order."""
-    return np.array(shortest_way(_apart(q, q), _apart(start[None], q)[0]), dtype=int)
+    return np.array(shortest_order(_apart(q, q), _apart(start[None], q)[0]), dtype=int)
 
 
 def _apart(q: Array, to: Array) -> Array:

@@ -104,10 +104,10 @@ class _Formatter(Formatter):
                 return " and ".join(value)
             case "or":
                 return " or ".join(value)
-            case "hindered":  # a sentence in older journals
-                from gapbridge.core.planning.candidates import Hindered  # a plan's, and large
+            case "rejected":  # a sentence in older journals
+                from gapbridge.core.planning.candidates import RejectedPoses  # a plan's, and large
 
-                return value if isinstance(value, str) else str(Hindered(*value))
+                return value if isinstance(value, str) else str(RejectedPoses(*value))
             case "place":
                 return " and ".join((*value, "where instrument or target stand"))
             case "kg":

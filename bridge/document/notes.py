@@ -81,7 +81,7 @@ TEXTS = {
     Reason.SIGHT_UNKNOWN: "nobody said where the instrument stands: whether it sees the target was "
     "not looked at",
     Reason.DETOURS: "no straight way in joint space, go round: stops {0:ways}",
-    Reason.FEW_POSES: "few poses to choose from: {0:hindered}",
+    Reason.FEW_POSES: "few poses to choose from: {0:rejected}",
     Reason.NO_STAMPS: "{0}: {1} of {2} messages have no stamp in their header; the time of "
     "recording stands in its place",
     Reason.NO_TARGET: "target_q: no topic has it, so that tracking cannot be observed",

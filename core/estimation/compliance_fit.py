@@ -403,7 +403,7 @@ def stepped(
     return Fit(found_model, frame, weights, linear, now.geometry)
 
 
-def beside_geometry(fit: Fit, data: Data) -> Fit:
+def with_free_geometry(fit: Fit, data: Data) -> Fit:
     """Return the fit with the geometry as further nuisances, where the rows are likelier with it.
 
     The tool point is one of them where the cell's counts as known otherwise.

@@ -23,7 +23,6 @@ from gapbridge.core.estimation.compliance_fit import (
     Fit,
     Placements,
     as_written,
-    beside_geometry,
     fit_flexibilities,
     fit_nuisances,
     placed_gap,
@@ -31,6 +30,7 @@ from gapbridge.core.estimation.compliance_fit import (
     residual,
     tool_deviation,
     weighed,
+    with_free_geometry,
 )
 from gapbridge.core.estimation.geometry import TOOL, Geometry
 from gapbridge.core.estimation.held_out import FOLDS, joint_regions, pose_groups, random_folds
@@ -137,7 +137,7 @@ def identify_compliance(
     rest = replace(task, converged=NEAR, look=1)
     fit, shown = task.run(before, data)
     held_out, held = (UNSEEN, UNSEEN), False
-    beside = beside_geometry(fit, data)
+    beside = with_free_geometry(fit, data)
     if beside.geometry is not None:
         other, other_shown = task.run(beside, data)
         held_out = _held_out(data, rest, (before, other), other.weights > 0)

@@ -26,7 +26,6 @@ from gapbridge.core.estimation.compliance_fit import (
     Fit,
     Linear,
     as_written,
-    beside_geometry,
     fit_flexibilities,
     fit_nuisances,
     prior_of,
@@ -35,6 +34,7 @@ from gapbridge.core.estimation.compliance_fit import (
     solve,
     stepped,
     weights_at,
+    with_free_geometry,
 )
 from gapbridge.core.estimation.geometry import Geometry
 from gapbridge.core.estimation.held_out import FOLDS
@@ -256,7 +256,7 @@ def _beside_geometry(before: Fit, sample: Data, task: _Task) -> _BesideGeometry 
     All rows are then fitted with it as it is.
     """
     some = sample.part(slice(None, None, max(len(sample.q) // LINK_ROWS, 1)))
-    fit = beside_geometry(task.near(before, some), some)
+    fit = with_free_geometry(task.near(before, some), some)
     if fit.geometry is None:
         return None
     fit = task.near(fit, some)

@@ -27,8 +27,8 @@ from gapbridge.bridge.document.provenance import fitted as fitted_on
 from gapbridge.bridge.document.provenance import provenance
 from gapbridge.bridge.report.labels import unit_of
 from gapbridge.core.arrays import Array
-from gapbridge.core.calibration.accuracy_baseline import document_of
-from gapbridge.core.calibration.fit import SessionFit, fit_session, judged
+from gapbridge.core.calibration.accuracy_baseline import baseline_document
+from gapbridge.core.calibration.fit import SessionFit, evaluate_fit, fit_session
 from gapbridge.core.calibration.identifiability import identifiable_parameters
 from gapbridge.core.calibration.missing_effects import MissingEffect
 from gapbridge.core.calibration.plan import Plan
@@ -148,7 +148,7 @@ class WholeJob(Job):
         metrology = metrology_of(self.cell, options.instrument, self.session.places)
         write_log(found.readings, metrology.registered, folder / "readings.csv")
         origin = provenance({"log": [folder / "readings.csv"], "cell": [self.cell.path]})
-        baseline = document_of(found, sigma=metrology.sigma)
+        baseline = baseline_document(found, sigma=metrology.sigma)
         baseline |= {"verdict": calibration_text(found), "provenance": origin}
         write_document(folder / "promise.json", baseline)
         from gapbridge.bridge.calibration.jobs.facts import (
@@ -231,7 +231,7 @@ def calibration_of(
     """Return the fit judged on the held-out poses: the one look at them."""
     assert session.plan is not None
     with prompt.waiting("verifying") as emit:
-        return judged(
+        return evaluate_fit(
             cell.model, fit, declined=declined, expected=session.plan.expected,
             diagnose=options.instrument.measures in DIAGNOSED,
             progress=lambda text: emit(f"verifying: {text}"),

@@ -28,12 +28,12 @@ from gapbridge.bridge.calibration.planning import (
 from gapbridge.bridge.calibration.session.session import seconds_left
 from gapbridge.bridge.document.notes import note_texts
 from gapbridge.core.arrays import Array
-from gapbridge.core.calibration.accuracy_baseline import baseline_in
+from gapbridge.core.calibration.accuracy_baseline import read_baseline
 from gapbridge.core.calibration.plan import Plan, PlannedPose
 from gapbridge.core.calibration.verify import Verification, verify
 from gapbridge.core.errors import InputError
-from gapbridge.core.planning.candidates import candidates_of
-from gapbridge.core.planning.travel import far_apart, joint_speed, leg_times, shortest_way
+from gapbridge.core.planning.candidates import sample_candidates
+from gapbridge.core.planning.travel import joint_speed, move_times, shortest_order, spread_rows
 
 POSES = 10
 
@@ -60,7 +60,7 @@ class VerifyJob(Job):
 
     def plan(self, begin: Array | None, emit: Callable[[str, float], None]) -> Plan:
         """Return poses far from each other."""
-        baseline = baseline_in(self._baseline())
+        baseline = read_baseline(self._baseline())
         if baseline.kind != self.options.instrument.measures:
             raise InputError(
                 f"{baseline_beside(self.cell.path)}: found a calibration by {baseline.kind}, "
@@ -71,16 +71,16 @@ class VerifyJob(Job):
         space = replace(space, places=space.places[:1])  # a few poses from one place
         observable = observable_of(self.cell, self.options.instrument)
         emit("looking for poses", 0.2)
-        found = candidates_of(
+        found = sample_candidates(
             baseline.parameters(self.cell.model), observable, loads, space, self.options.seed
         )
         count = min(self.options.poses or POSES, len(found.q))
-        chosen = far_apart(self.cell.model.rigid_pose(found.q).position, count)
+        chosen = spread_rows(self.cell.model.rigid_pose(found.q).position, count)
         speed = joint_speed(self.cell.arm.limits.velocity)
         poses: list[PlannedPose] = []
         for load, part in enumerate(np.array_split(chosen, len(loads))):
             q = found.q[part]
-            way = shortest_way(leg_times(q, q, speed), np.zeros(len(q)))
+            way = shortest_order(move_times(q, q, speed), np.zeros(len(q)))
             free = np.zeros(q.shape[1])
             poses += [
                 PlannedPose(len(poses) + i, q[k], load, free, held_out=True)
@@ -114,7 +114,7 @@ class VerifyJob(Job):
         for file in write_report(VerificationMaterial(found, facts, readings), folder):
             prompt.say(f"{file}: written")
         moved = None if found.moved is None else found.moved.name
-        others = [other.name for other in found.suspects]
+        others = [other.name for other in found.alternatives]
         self.session.add("ended", holds=found.holds, moved=moved, or_else=others)
 
     def _report(self, found: Verification) -> None:
@@ -129,7 +129,7 @@ class VerifyJob(Job):
                 f"  {estimate.name} {parameter(estimate.value, estimate.unit)} "
                 f"± {parameter(estimate.std, estimate.unit)}"
             )
-        for other in found.suspects:
+        for other in found.alternatives:
             prompt.say(f"  these readings cannot distinguish it from: {moved_text(other)}")
         for note in note_texts(found.notes):
             prompt.say(f"  note: {note}")

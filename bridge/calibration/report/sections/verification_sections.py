@@ -23,7 +23,7 @@ from gapbridge.bridge.report.labels import (
     sentence,
 )
 from gapbridge.core.calibration.readings import Readings
-from gapbridge.core.calibration.verify import Suspect, Verification
+from gapbridge.core.calibration.verify import CandidateChange, Verification
 
 HOLDS = (
     "Nothing: use the cell as it is. Check it again after some months, and after every collision, "
@@ -130,8 +130,8 @@ def moved(material: VerificationMaterial) -> list[blocks.Block]:
     ]
     if v.moved.estimates:
         shown.append(estimates_table(list(v.moved.estimates), planned=False))
-    if v.suspects:
-        rows = [[suspect_title(s), likelihood(s.chance)] for s in v.suspects]
+    if v.alternatives:
+        rows = [[suspect_title(s), likelihood(s.chance)] for s in v.alternatives]
         shown += [
             blocks.Heading("What explains it nearly as well"),
             blocks.Table(("change", "chance of what is left"), rows, (3, 1), (1,)),
@@ -139,7 +139,7 @@ def moved(material: VerificationMaterial) -> list[blocks.Block]:
     return shown
 
 
-def suspect_title(suspect: Suspect) -> str:
+def suspect_title(suspect: CandidateChange) -> str:
     """Return what may have moved, for people."""
     if suspect.reading is not None:
         return f"reading {suspect.reading} alone is wrong"
