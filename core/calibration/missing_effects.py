@@ -17,7 +17,7 @@ from gapbridge.core.calibration.converged_fit import FitState
 from gapbridge.core.calibration.parameters import Parameters
 from gapbridge.core.calibration.problem import PRIOR_SIZES, Problem
 from gapbridge.core.effects import CATALOGUE
-from gapbridge.core.estimation.held_out import missed, pose_groups, random_folds
+from gapbridge.core.estimation.held_out import held_out_residual, pose_groups, random_folds
 from gapbridge.core.estimation.least_squares import basis_of, projected_out
 
 MAX_EFFECTS = 3
@@ -127,7 +127,7 @@ class _Folds:
 
     def _held_out_residual(self) -> Array:
         """Return the residual of each row (M,) by the fit without its pose."""
-        return missed(self.A, self.target, self.fold, self.ridge)
+        return held_out_residual(self.A, self.target, self.fold, self.ridge)
 
 
 def _candidate_columns(problem: Problem, state: FitState) -> dict[str, Candidate]:

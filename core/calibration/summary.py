@@ -16,7 +16,7 @@ from gapbridge.core.calibration.staging import AT_ODDS
 from gapbridge.core.diagnosis.channel_diagnosis import Verdict
 from gapbridge.core.diagnosis.diagnosis import Diagnosis
 from gapbridge.core.effects import names_part_of
-from gapbridge.core.estimation.base_parameters import CLOSE, hardly_separated
+from gapbridge.core.estimation.base_parameters import COLLINEAR, correlated_pairs
 from gapbridge.core.notes import Note, Reason
 
 MIN_SIGMAS = 3.0  # distance from zero, in its sigmas, of a supported effect
@@ -34,20 +34,20 @@ def combinations(
     for i in np.flatnonzero(~shown):
         partners = [int(j) for j in np.argsort(-np.abs(correlation[i])) if j != i]
         best = partners[0] if partners else -1
-        if best >= 0 and abs(correlation[i, best]) > CLOSE:
+        if best >= 0 and abs(correlation[i, best]) > COLLINEAR:
             known = Reason.ONLY_DIFFERENCE if correlation[i, best] > 0 else Reason.ONLY_SUM
             notes.append(Note(known, (names[i], names[best])))
         elif others := _correlated_group(correlation, int(i)):
             notes.append(Note(Reason.ONLY_TOGETHER, (names[i], tuple(names[j] for j in others))))
         else:
             notes.append(Note(Reason.HARDLY_SHOWN, (names[i],)))
-    return (*notes, *hardly_separated(state.covariance, shown, names))
+    return (*notes, *correlated_pairs(state.covariance, shown, names))
 
 
 def _correlated_group(correlation: Array, i: int) -> list[int]:
     """Return the parameters (three at most) that together are collinear with one, if any."""
     variance_inflation = float(np.linalg.pinv(correlation, rcond=1e-12, hermitian=True)[i, i])
-    if variance_inflation * (1 - CLOSE**2) < 1:
+    if variance_inflation * (1 - COLLINEAR**2) < 1:
         return []
     correlations = np.abs(correlation[i])
     return [int(j) for j in np.argsort(-correlations) if j != i and correlations[j] > MEMBER][:3]

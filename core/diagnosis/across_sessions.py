@@ -19,7 +19,7 @@ from gapbridge.core.diagnosis.criteria import CHANCE, EXCITED, MATERIAL_SHARE
 from gapbridge.core.diagnosis.selection.candidate import Candidate
 from gapbridge.core.diagnosis.selection.selection import Selection
 from gapbridge.core.effects import Reported
-from gapbridge.core.estimation.least_squares import inverse, sigmas_square, solve
+from gapbridge.core.estimation.least_squares import inverse, solve, squared_sigmas
 
 DEAD = 1e-7  # share of a parameter's column that a session has: below, it shows nothing of it
 
@@ -118,7 +118,7 @@ def _differing(
     C = np.kron(np.eye(count)[1:] - np.eye(count)[0], np.eye(width))  # each against the first
     apart = C @ values.ravel()
     spread = C @ covariance @ C.T
-    square = sigmas_square(apart, spread)
+    square = squared_sigmas(apart, spread)
     p_value = float(gammaincc(len(apart) / 2, square / 2))
     mean = values.mean(axis=0)
     change = np.concatenate(

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from gapbridge.core.arrays import Array
 from gapbridge.core.diagnosis.selection.selection import Selection
-from gapbridge.core.estimation.held_out import missed, random_folds
+from gapbridge.core.estimation.held_out import held_out_residual, random_folds
 
 FOLDS = 10
 RESAMPLES = 400
@@ -86,7 +86,7 @@ class HeldOut:
             return self._target
         # with the pull: of a number that moves nothing only the pull is there
         pull = np.concatenate([self._pull(chosen), np.zeros(self._nuisance.shape[1])])
-        return missed(A, self._target, self._fold, pull)
+        return held_out_residual(A, self._target, self._fold, pull)
 
     def shrink(self, with_set: Sequence[int], without_set: Sequence[int]) -> Shrink:
         """Return how far the gap shrinks from one set to another, with its interval."""

@@ -29,7 +29,7 @@ SCRATCH = 42  # numbers that a search needs besides
 
 
 @njit(**FAST)
-def next_offset(b, n, w, wanted, k0):  # type: ignore[no-untyped-def]
+def newton_offset(b, n, w, wanted, k0):  # type: ignore[no-untyped-def]
     """Write the next joint offset (after the workspace), as ``compensation.next_offset`` does.
 
     The wanted pose stands in the block ``wanted`` from ``k0`` on, twelve numbers.
@@ -170,7 +170,7 @@ def correct(b, nominal, mass, cog, wrench, found):  # type: ignore[no-untyped-de
         steps += 1
         for i in range(n):
             b[U(row + i)] = nominal[i] + b[U(at + i)]
-        distance = next_offset(b, n, w, r, wanted)
+        distance = newton_offset(b, n, w, r, wanted)
         if distance < 0:
             break
         if distance < best:
@@ -255,7 +255,7 @@ def take_out(b, found):  # type: ignore[no-untyped-def]
     for _ in range(FEWER):
         for i in range(n):
             b[U(row + i)] = given[i] + b[U(at + i)]
-        distance = next_offset(b, n, w, b, wanted)
+        distance = newton_offset(b, n, w, b, wanted)
         if distance < NEARER:
             break
     distance = distance if distance >= 0.0 else np.inf

@@ -71,7 +71,7 @@ def fit(logs: tuple[Path, ...], cell: Path, remounted: bool, out: Path) -> None:
     spread = Spread.of_fit(found.identifiable, found.covariance).beside(given.spread)
     intervals = given.intervals | fit_intervals(found)
     origin = fitted(provenance({"log": logs, "cell": [cell]}), ranges, spread, intervals)
-    save_cell(given, out, found.written, {"provenance": origin})
+    save_cell(given, out, found.cell_model, {"provenance": origin})
     for line in wrong:
         click.echo(f"warning: {', '.join(map(str, logs))}: {line}", err=True)
     print_identification(found)

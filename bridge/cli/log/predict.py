@@ -25,7 +25,7 @@ from gapbridge.bridge.cli.progress import progress
 from gapbridge.bridge.document.output_file import require_table, writing_table
 from gapbridge.core.arrays import Array
 from gapbridge.core.log.log import Log
-from gapbridge.core.predicted_channels import in_context, predicted_channels
+from gapbridge.core.predicted_channels import predicted_channels, with_neighbours
 
 SHOWN = 8  # rows named at most
 
@@ -72,7 +72,7 @@ def _predicted(cell: Cell, log: Path, channels: bool) -> Iterator[tuple[Log, Pre
     if not channels:
         yield from ((piece, predicted(cell, piece)) for piece in pieces)
         return
-    for around, own in in_context(pieces):
+    for around, own in with_neighbours(pieces):
         piece = around.select(own)
         further, needs = predicted_channels(cell.model, around)
         further = {name: values[own] for name, values in further.items()}

@@ -18,13 +18,13 @@ from gapbridge.core.diagnosis.selection.problem import CandidateFit, SampleSpace
 from gapbridge.core.diagnosis.selection.state import SelectionState, flat
 from gapbridge.core.effects import CATALOGUE, Term
 from gapbridge.core.errors import EquilibriumError, InputError
-from gapbridge.core.estimation.held_out import jackknife, without_each
+from gapbridge.core.estimation.held_out import jackknife, leave_one_out
 from gapbridge.core.estimation.least_squares import (
     basis_of,
     inverse,
     projected_out,
-    sigmas_square,
     solve,
+    squared_sigmas,
 )
 
 REFITS = 8
@@ -259,7 +259,7 @@ def _cluster_covariance(white: Array, A: Array, b: Array, region: NDArray[np.int
 
     ``A`` (m, p) are the rows of the regression; those after ``region`` always stay.
     """
-    without = np.array([x for _, x in without_each(A, b, region)])
+    without = np.array([x for _, x in leave_one_out(A, b, region)])
     from scipy.special import ndtri, stdtrit  # a fifth of a second, only beside the unknown
 
     # few regions: as wide as a normal distribution of the same 95 % interval
@@ -287,7 +287,7 @@ def worth(term: Term, spread: Array) -> float:
     as has what shapes a curve.
     """
     effect, value = CATALOGUE[term.effect], np.array(term.values[: len(spread)])
-    whole = sigmas_square(value, spread) / len(value)
+    whole = squared_sigmas(value, spread) / len(value)
     if effect.periodic:
         single = float(value @ value) ** 2 / max(float(value @ spread @ value), 1e-300)
     else:
