@@ -83,7 +83,7 @@ def verdict_text(found: Verification) -> str:
     if found.holds:
         return f"the calibration holds: {text}"
     moved = (
-        "no single change of tool, load, instrument or one joint explains it: calibrate anew"
+        "no single change of tool, load, instrument or one joint explains it: recalibrate"
         if found.moved is None
         else moved_text(found.moved)
     )

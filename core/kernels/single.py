@@ -61,7 +61,7 @@ def newton_offset(b, n, w, wanted, k0):  # type: ignore[no-untyped-def]
         z = pz - b[U(j + ORIGIN + 2)]
         b[U(c)], b[U(c + 1)], b[U(c + 2)] = zy * z - zz * y, zz * x - zx * z, zx * y - zy * x
         b[U(c + 3)], b[U(c + 4)], b[U(c + 5)] = LEVER * zx, LEVER * zy, LEVER * zz
-        # the whole offset is solved for anew, not a step on top
+        # the whole offset is solved for, not an increment
         o = b[U(at + i)]
         e0, e1, e2 = e0 + b[U(c)] * o, e1 + b[U(c + 1)] * o, e2 + b[U(c + 2)] * o
         e3, e4, e5 = e3 + b[U(c + 3)] * o, e4 + b[U(c + 4)] * o, e5 + b[U(c + 5)] * o

@@ -129,7 +129,7 @@ def test_what_no_single_change_explains_asks_for_a_new_calibration(calibrated: C
     seen = verify(found.model, _again(other, instrument, poses=6), document, METROLOGY)
     assert not seen.holds
     assert seen.moved is None
-    assert "calibrate anew" in verdict_text(seen)
+    assert "recalibrate" in verdict_text(seen)
 
 
 def test_a_registered_instrument_that_was_knocked_is_named(calibrated: Calibrated) -> None:

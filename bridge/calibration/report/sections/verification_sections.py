@@ -32,7 +32,7 @@ HOLDS = (
 BROKEN = (
     "Do not rely on this cell's correction: gapbridge disarm CELL.",
     "Look at what the report names: loose screws, the tool and its load, the instrument's target.",
-    "Then measure it anew: gapbridge calibrate CELL, or --tool-only or --payload-only where only "
+    "Then measure it again: gapbridge calibrate CELL, or --tool-only or --payload-only where only "
     "those have changed.",
 )
 TWICE = 2.0  # predicted sigmas that an error hardly exceeds
@@ -123,7 +123,7 @@ def moved(material: VerificationMaterial) -> list[blocks.Block]:
     if v.moved is None:
         return [blocks.Paragraph(
             "No single change (tool, load, one joint's zero, instrument, one bad reading) "
-            "explains the errors. Calibrate anew."
+            "explains the errors. Recalibrate."
         )]  # fmt: skip
     shown: list[blocks.Block] = [
         blocks.Paragraph(f"What explains it best: {suspect_title(v.moved)}.")
