@@ -93,9 +93,8 @@ def _planned(
     loads = _checked_loads(parameters, loads)
     _require_numbers(parameters, observable, design)
     emit("looking for poses", 0.0)
-    workspace = replace(
-        workspace, loads_end=(*workspace.loads_end, *(load_extent(load) for load in loads))
-    )
+    ends = (load_extent(load) for load in loads)
+    workspace = replace(workspace, loads_end=(*workspace.loads_end, *ends))
     candidates = sample_candidates(
         parameters, observable, loads, workspace, design.seed, design.stops
     )
@@ -132,20 +131,10 @@ def _planned(
     emit("planned", 1.0)
     used_loads = set(candidates.readings.load[len(rows) :])
     sight = () if workspace.places or observable.unknown else (Note(Reason.SIGHT_UNKNOWN),)
-    notes = (
-        *candidates.notes,
-        *sight,
-        *route.notes,
-        *_notes(parameters, loads, used_loads, expected.std),
-    )
-    return Plan(
-        tuple(loads),
-        route.poses(candidates),
-        expected,
-        tuple(sorted(std_of.items())),
-        route.travel,
-        notes,
-    )
+    warnings = _notes(parameters, loads, used_loads, expected.std)
+    notes = (*candidates.notes, *sight, *route.notes, *warnings)
+    accuracy = tuple(sorted(std_of.items()))
+    return Plan(tuple(loads), route.poses(candidates), expected, accuracy, route.travel, notes)
 
 
 def _checked_loads(parameters: Parameters, loads: Sequence[Payload]) -> list[Payload]:
