@@ -1,4 +1,4 @@
-"""The nominal arm: where its joints sit, what its links weigh, how far its joints may turn."""
+"""The nominal arm: kinematics, masses and joint limits."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ class JointLimits:
 
     @classmethod
     def none(cls, n: int) -> JointLimits:
-        """Return limits that forbid nothing."""
-        wide = np.full(n, np.inf)
-        return cls(-wide, wide, wide.copy(), wide.copy())
+        """Return infinite limits."""
+        infinite = np.full(n, np.inf)
+        return cls(-infinite, infinite, infinite.copy(), infinite.copy())
 
 
 @dataclass(frozen=True)
@@ -82,36 +82,38 @@ def arm_from_dh(
     n = len(rows)
     links = np.tile(np.eye(4), (n + 1, 1, 1))
     mass, cog, axes = np.zeros(n), np.zeros((n, 3)), np.empty((n, 3, 3))
-    turn = np.eye(4)
+    rotation = np.eye(4)
     for i, row in enumerate(rows):
         where = f"robot.dh row {i + 1}"
-        a, alpha, d = (_number(row, key, where) for key in ("a", "alpha", "d"))
-        offset = _number(row, "offset", where, 0.0)
+        a, alpha, d = (_read_number(row, key, where) for key in ("a", "alpha", "d"))
+        offset = _read_number(row, "offset", where, 0.0)
         c, s = np.cos(offset), np.sin(offset)
-        turn[:2, :2] = [[c, -s], [s, c]]
-        links[i] = links[i] @ turn
+        rotation[:2, :2] = [[c, -s], [s, c]]
+        links[i] = links[i] @ rotation
         links[i + 1] = dh_transform(a, alpha, d)
-        mass[i] = _number(row, "mass", where, 0.0)
+        mass[i] = _read_number(row, "mass", where, 0.0)
         if mass[i] < 0:
             raise ArmError(f"{where}: mass: found {mass[i]:g}, expected 0 or more kg")
-        in_row, axes[i] = _centre(row, where), links[i + 1][:3, :3]
+        in_row, axes[i] = _read_cog(row, where), links[i + 1][:3, :3]
         cog[i] = axes[i] @ in_row + links[i + 1][:3, 3]
     inertia, limits = np.zeros((n, 3, 3)), limits or JointLimits.none(n)
     return Arm(name, links, mass, cog, inertia, limits, body_axes=axes)
 
 
-def _centre(row: Mapping[str, Any], where: str) -> Array:
-    given = row.get("cog")
+def _read_cog(row: Mapping[str, Any], where: str) -> Array:
+    value = row.get("cog")
     try:
-        centre = np.zeros(3) if given is None else np.array(given, dtype=float)
+        centre = np.zeros(3) if value is None else np.array(value, dtype=float)
     except (TypeError, ValueError):
         centre = np.full(3, np.nan)
     if centre.shape != (3,) or not np.isfinite(centre).all():
-        raise ArmError(f"{where}: cog: found {given}, expected three numbers (m)")
+        raise ArmError(f"{where}: cog: found {value}, expected three numbers (m)")
     return centre
 
 
-def _number(row: Mapping[str, Any], key: str, where: str, default: float | None = None) -> float:
+def _read_number(
+    row: Mapping[str, Any], key: str, where: str, default: float | None = None
+) -> float:
     value = row.get(key, default)
     if value is None:
         raise ArmError(f"{where}: {key}: found nothing, expected a number")
@@ -131,7 +133,7 @@ def builtin_names() -> tuple[str, ...]:
 
 
 def builtin_rows(name: str) -> dict[str, Any]:
-    """Return a built-in table as it stands in its file (``core/arms/NAME.yaml``).
+    """Return the content of a built-in table (``core/arms/NAME.yaml``).
 
     Raises ArmError naming the nearest known arm where there is no such table.
     """
@@ -153,12 +155,12 @@ def builtin_arm(name: str, calibration: Mapping[str, Sequence[float]] | None = N
     """Return a built-in arm, with its factory calibration where one is given.
 
     ``calibration`` holds UR's ``delta_theta``, ``delta_a``, ``delta_d``, ``delta_alpha`` (n each),
-    the entries of the controller's calibration.conf, which are added to the DH rows. Joints sit
-    where the metal is all the same (``_on_own_axes``).
+    the entries of the controller's calibration.conf, which are added to the DH rows. Joint origins
+    stay at their nominal places on the axes (``_on_nominal_axes``).
     """
     table = builtin_rows(name)
     rows = table["dh"]
-    plain = arm_from_dh(rows, name)
+    nominal = arm_from_dh(rows, name)
     for delta, key in (("theta", "offset"), ("a", "a"), ("d", "d"), ("alpha", "alpha")):
         values = (calibration or {}).get(f"delta_{delta}")
         if values is None:
@@ -173,33 +175,33 @@ def builtin_arm(name: str, calibration: Mapping[str, Sequence[float]] | None = N
     columns = {key: np.array([float(row[key]) for row in limits]) for key in limits[0]}
     arm = arm_from_dh(rows, name, JointLimits(**columns))
     if calibration:
-        arm = _on_own_axes(arm, plain)
+        arm = _on_nominal_axes(arm, nominal)
     return replace(arm, payload=float(table["payload"]))
 
 
-def _on_own_axes(arm: Arm, plain: Arm) -> Arm:
-    """Return ``arm`` with each joint frame slid along its own axis to where ``plain`` has it.
+def _on_nominal_axes(arm: Arm, nominal: Arm) -> Arm:
+    """Return ``arm`` with each joint frame slid along its own axis to where ``nominal`` has it.
 
-    On axes that are parallel but for a calibration, DH rows meet far out: real calibrations hold d
-    of hundreds of metres that cancel from joint 2 to 3, and angles that cancel likewise. Turning
-    about an axis and sliding along it commute, so that every pose stays what it is; but joints
-    bend at their origins, and weights hang in the frames of their links. The links' masses stay
-    where they are in base with all joints at zero. Frames keep their direction.
+    The common normals of nearly parallel axes are far away: factory calibrations have d of hundreds
+    of metres that cancel from joint 2 to 3, and angles that cancel likewise. Rotation about an axis
+    and translation along it commute, so that every rigid pose is unchanged; but joints bend at
+    their origins. The links' masses keep their place in base with all joints at zero. Frames keep
+    their direction.
     """
-    found, wanted = _at_zero(arm), _at_zero(plain)
+    frames, nominal_frames = _joint_frames_at_zero(arm), _joint_frames_at_zero(nominal)
     links, cog = arm.link_in_link.copy(), arm.cog.copy()
     for i in range(arm.n):
         slide = np.eye(4)
-        slide[2, 3] = (wanted[i, :3, 3] - found[i, :3, 3]) @ found[i, :3, 2]
+        slide[2, 3] = (nominal_frames[i, :3, 3] - frames[i, :3, 3]) @ frames[i, :3, 2]
         links[i] = links[i] @ slide
         slide[2, 3] *= -1
         links[i + 1] = slide @ links[i + 1]
-        at_zero = wanted[i, :3, :3] @ plain.cog[i] + wanted[i, :3, 3]
-        cog[i] = (at_zero - found[i, :3, 3]) @ found[i, :3, :3] + slide[:3, 3]
+        at_zero = nominal_frames[i, :3, :3] @ nominal.cog[i] + nominal_frames[i, :3, 3]
+        cog[i] = (at_zero - frames[i, :3, 3]) @ frames[i, :3, :3] + slide[:3, 3]
     return replace(arm, link_in_link=links, cog=cog)
 
 
-def _at_zero(arm: Arm) -> Array:
+def _joint_frames_at_zero(arm: Arm) -> Array:
     """Return the frames of the joints in base (n, 4, 4), all joints at zero."""
     frames = [arm.link_in_link[0]]
     for i in range(1, arm.n):

@@ -1,4 +1,4 @@
-"""The arrays that functions take and return: how they are called in annotations."""
+"""Array types for annotations."""
 
 from __future__ import annotations
 

@@ -1,9 +1,8 @@
 """The correction: the setpoint whose predicted real pose is the wanted one.
 
-Solved in joint space by Newton's method on the exact prediction with the Jacobian of the bent arm,
-damped near singularities (Levenberg; Nakamura, Hanafusa 1986), where the offset stays within
-LARGEST_OFFSET. Works for fewer, six and more joints; with more, the joint offset is the smallest
-one.
+Newton's method in joint space on the exact prediction, with the Jacobian of the deflected arm,
+damped near singularities (Levenberg; Nakamura, Hanafusa 1986), where the offset is limited to
+LARGEST_OFFSET. For any number of joints; with more than six, the joint offset has minimum norm.
 """
 
 from __future__ import annotations
@@ -37,9 +36,9 @@ from gapbridge.core.kernels.threads import in_ranges
 from gapbridge.core.loads import Loads
 from gapbridge.core.model import Model, Poses
 
-NOTHING = Loads()
-ROW = np.int64  # of a number of a row: a literal would compile anew all that is called with it
-LEADS = 2  # times that a servo's rest is looked at for the command that leads there
+NO_LOADS = Loads()
+ROW_INDEX = np.int64  # type of a row number: a literal would be compiled as another signature
+SERVO_ROUNDS = 2  # fixed-point iterations of the inverse servo model
 
 
 class Correction(NamedTuple):
@@ -76,16 +75,16 @@ def _pose_error(shape, pose, error):  # type: ignore[no-untyped-def]
 
 
 @njit(**JIT)
-def next_offset(chain_block, row_block, shape_block, pose, offset):  # type: ignore[no-untyped-def]
+def newton_offset(chain_block, row_block, shape_block, pose, offset):  # type: ignore[no-untyped-def]
     """Write the next joint offset (n,), given the one that the row's q holds; returns the distance.
 
     The distance (m) is that of the present shape from the wanted pose (12,); -1 where the arm has
-    no equilibrium or a number is not finite. The whole offset is solved for anew, not a step on
-    top: what turns joints without moving the tool cannot pile up from setpoint to setpoint.
+    no equilibrium or a number is not finite. The whole offset is solved for, not an increment:
+    null-space motion does not accumulate from setpoint to setpoint.
     """
     n = offset.shape[0]
     shape = shape_of(shape_block, n)
-    if kernel.equilibrium(chain_of(chain_block, n), row_of(row_block, n), ROW(0), shape) < 0:
+    if kernel.equilibrium(chain_of(chain_block, n), row_of(row_block, n), ROW_INDEX(0), shape) < 0:
         return -1.0
     error, J = np.empty(6), np.empty((6, n))
     distance = _pose_error(shape, pose, error)
@@ -103,13 +102,13 @@ def next_offset(chain_block, row_block, shape_block, pose, offset):  # type: ign
 
 @njit(**JIT)
 def _rigid_pose(rigid_block, row_block, shape_block, q, pose):  # type: ignore[no-untyped-def]
-    """Write the rigid TCP pose (12,) at q (n,), position first; nothing of the shape bends."""
+    """Write the rigid TCP pose (12,) at q (n,), position (m) first."""
     n = q.shape[0]
     row, shape = row_of(row_block, n), shape_of(shape_block, n)
     for i in range(n):
         row.q[0, i] = q[i]
     A, B, base_rotation = np.empty((3, 3)), np.empty((3, 3)), np.zeros(3)
-    kernel.place(chain_of(rigid_block, n), row, ROW(0), shape, base_rotation, A, B)
+    kernel.place(chain_of(rigid_block, n), row, ROW_INDEX(0), shape, base_rotation, A, B)
     for i in range(3):
         pose[i] = shape.tcp_position[i]
         for j in range(3):
@@ -117,13 +116,13 @@ def _rigid_pose(rigid_block, row_block, shape_block, q, pose):  # type: ignore[n
 
 
 def block_of(chain: Chain, rigid: Chain) -> Array:
-    """Return what the compiled correction of one setpoint keeps: ``kernels.single.correct``."""
-    own = np.zeros(chain.mass.shape[0] + SCRATCH)
-    return np.concatenate([arm_block(chain), own, arm_block(rigid), np.zeros(24)])
+    """Return the working memory of the compiled correction, ``kernels.single.correct``."""
+    workspace = np.zeros(chain.mass.shape[0] + SCRATCH)
+    return np.concatenate([arm_block(chain), workspace, arm_block(rigid), np.zeros(24)])
 
 
-def _parts(block: Array, n: int) -> tuple[Array, Array, Array, Array]:
-    """Return chain, row, shape, and what else is in a block, as views of it."""
+def _views(block: Array, n: int) -> tuple[Array, Array, Array, Array]:
+    """Return chain, row, shape, and the remainder of a block, as views of it."""
     c, r = sizes_of(n)
     s = c + r + shape_size(n)
     return block[:c], block[c : c + r], block[c + r : s], block[s:]
@@ -140,44 +139,44 @@ class Compensator:
         self._n = n = model.arm.n
         chain = model.chain()
         self._block = block_of(chain, model.without_terms().chain())
-        self._chain, self._row, self._shape, rest = _parts(self._block, n)
-        self._offset = rest[:n]
-        rest = rest[n + SCRATCH :]
-        self._rigid, self._rigid_row, self._rigid_shape, rest = _parts(rest, n)
-        self._wanted = rest[:12]
+        self._chain, self._row, self._shape, other = _views(self._block, n)
+        self._offset = other[:n]
+        other = other[n + SCRATCH :]
+        self._rigid, self._rigid_row, self._rigid_shape, other = _views(other, n)
+        self._wanted = other[:12]
         self._view = view_row(self._row, n)
         self._conditions = model.conditions()
-        self._settling = settling(model.terms)
-        # one compiled call does it all: links are stiff, and no effect looks at the joint angles
-        self._plain = not (chain.flexibility.any() or self._conditions or self._settling)
+        self._servo_terms = settling(model.terms)
+        # one compiled call suffices: rigid links, and no effect depends on the joint angles
+        self._unconditional = not (chain.flexibility.any() or self._conditions or self._servo_terms)
         self._pose = np.zeros(12)
-        # what acts where nothing is given
+        # loads where none are given
         self._mass, self._wrench = np.array([float(model.payload_mass)]), np.zeros((1, 6))
         self._cog = np.array(model.payload_cog, dtype=float).reshape(1, 3)
 
     def correct(self, nominal_q: Array, loads: Loads | None = None) -> Correction:
         """Return the corrected setpoint for ``nominal_q`` (n,); ``loads`` holds one row.
 
-        The wanted pose is the rigid, effect-free arm's at ``nominal_q``. Where servos are known to
-        rest elsewhere than commanded, the setpoint makes up for that too. A row that cannot be
-        solved comes back with the distance left in ``residual`` (inf: no equilibrium).
+        The wanted pose is the rigid, effect-free arm's at ``nominal_q``. Servo effects in the model
+        (droop, dead band) are compensated too. A row that cannot be solved is returned with the
+        remaining distance in ``residual`` (inf: no equilibrium).
         """
-        n, loads = self._n, loads or NOTHING
-        found, nominal = np.empty(n + 6), np.ascontiguousarray(nominal_q, dtype=float)
-        q, moved = found[:n], found[n:]
-        if self._plain:
+        n, loads = self._n, loads or NO_LOADS
+        result, nominal = np.empty(n + 6), np.ascontiguousarray(nominal_q, dtype=float)
+        q, moved = result[:n], result[n:]
+        if self._unconditional:
             mass, cog, wrench = loads.payload_mass, loads.payload_cog, loads.wrench
             best, steps = single.correct(
                 self._block, nominal, self._mass if mass is None else mass,
                 self._cog if cog is None else cog, self._wrench if wrench is None else wrench,
-                found,
+                result,
             )  # fmt: skip
         else:
             rigid = self._rigid
             _rigid_pose(rigid, self._rigid_row, self._rigid_shape, nominal, self._wanted)
-            best, steps = self._solve_conditioned(nominal, loads, q)
+            best, steps = self._solve_rows(nominal, loads, q)
             self._offset[:] = q - nominal if best < np.inf else 0.0
-            self._lead(loads, q)
+            self._invert_servos(loads, q)
             _rigid_pose(rigid, self._rigid_row, self._rigid_shape, q, self._pose)
             single.motion(self._wanted, self._pose, bool((q != nominal).any()), moved)
         return Correction(q, moved, best, steps)
@@ -186,21 +185,23 @@ class Compensator:
         """Return the corrected setpoints for ``nominal_q`` (N, n), as ``correct`` does."""
         n, count = self._n, len(nominal_q)
         nominal = np.ascontiguousarray(nominal_q, dtype=float)
-        found, residual = np.empty((count, n + 6)), np.empty(count)
+        result, residual = np.empty((count, n + 6)), np.empty(count)
         steps = np.empty(count, dtype=np.int64)
-        if self._plain:
-            self._plain_rows(nominal, loads, (found, residual, steps))
+        if self._unconditional:
+            self._correct_blocks(nominal, loads, (result, residual, steps))
         else:
             for r in range(count):
                 one = self.correct(nominal[r], loads[r : r + 1])
-                found[r, :n], found[r, n:] = one.q, one.offset_in_base
+                result[r, :n], result[r, n:] = one.q, one.offset_in_base
                 residual[r], steps[r] = one.residual, one.steps
-        return Correction(found[:, :n], found[:, n:], residual, steps)
+        return Correction(result[:, :n], result[:, n:], residual, steps)
 
-    def _plain_rows(self, nominal: Array, loads: Loads, out: tuple[Array, Array, Index]) -> None:
-        """Write the corrections of rows that nothing but the chain's bending changes.
+    def _correct_blocks(
+        self, nominal: Array, loads: Loads, out: tuple[Array, Array, Index]
+    ) -> None:
+        """Write the corrections of rows without effects that depend on the joint angles.
 
-        In blocks; then, one after the other, those that the blocks leave: near singularities.
+        In blocks; rows near singularities, which the blocks do not solve, one after the other.
         """
         rows, chain = self.model.rows(nominal, loads), self.model.chain()
         rigid = self.model.without_terms().chain()
@@ -209,54 +210,54 @@ class Compensator:
             correct_blocks(chain, rigid, rows, first, last, out)
 
         in_ranges(work, len(nominal))
-        left = np.flatnonzero(out[2] == 0)
-        if len(left):
-            some = tuple(part[left] for part in out)
-            given = [part[left] for part in (rows.q, *rows[2:])]
-            single.correct_rows(self._block, *given, some)
+        unsolved = np.flatnonzero(out[2] == 0)
+        if len(unsolved):
+            some = tuple(part[unsolved] for part in out)
+            columns = [part[unsolved] for part in (rows.q, *rows[2:])]
+            single.correct_rows(self._block, *columns, some)
             for part, values in zip(out, some, strict=True):
-                part[left] = values
+                part[unsolved] = values
 
     def forget(self) -> None:
-        """Begin the next correction from nothing, whatever was solved last."""
+        """Start the next correction from zero, not from the last solution."""
         self._offset[:] = 0.0
         self._shape[:] = 0.0
 
-    def _solve_conditioned(self, nominal: Array, loads: Loads, q: Array) -> tuple[float, int]:
-        """Solve where links bend, or effects look at the joint angles anew in each step."""
+    def _solve_rows(self, nominal: Array, loads: Loads, q: Array) -> tuple[float, int]:
+        """Solve one row with flexible links, or with effects evaluated in each step."""
         best, steps, row, offset = np.inf, 0, self._view, self._offset
         q[:] = nominal
         for steps in range(1, MAX_STEPS + 1):  # noqa: B007
-            tried = nominal + offset
-            self._load(loads)
-            row.q[0], row.link_scale[0] = tried, 1.0
-            self.model.condition(row, loads, tried[None], self._conditions)
-            distance = next_offset(self._chain, self._row, self._shape, self._wanted, offset)
+            trial = nominal + offset
+            self._write_loads(loads)
+            row.q[0], row.link_scale[0] = trial, 1.0
+            self.model.condition(row, loads, trial[None], self._conditions)
+            distance = newton_offset(self._chain, self._row, self._shape, self._wanted, offset)
             if distance < 0:
                 break
             if distance < best:
-                q[:], best = tried, distance
+                q[:], best = trial, distance
             if distance < TOLERANCE:
                 break
         return best, steps
 
-    def _lead(self, loads: Loads, q: Array) -> None:
-        """Change encoder angles ``q`` (n,) into the commands whose servos rest there."""
-        if not self._settling:
+    def _invert_servos(self, loads: Loads, q: Array) -> None:
+        """Change encoder angles ``q`` (n,), rad, into the commands for which servos rest there."""
+        if not self._servo_terms:
             return
         shape = view_shape(self._shape, self._n)
-        held = -np.sum(shape.axis * shape.moment, axis=1)[None]
+        torque = -np.sum(shape.axis * shape.moment, axis=1)[None]
         wanted, command = q.copy(), q[None].copy()
-        for _ in range(LEADS):
-            rests = command
-            for term in self._settling:
+        for _ in range(SERVO_ROUNDS):
+            resting = command
+            for term in self._servo_terms:
                 effect = CATALOGUE[term.effect]
-                rests = effect.settle(term, self.model.arm, rests, held, loads.approach)
-            command = command + (wanted - rests)
+                resting = effect.settle(term, self.model.arm, resting, torque, loads.approach)
+            command = command + (wanted - resting)
         q[:] = command[0]
 
-    def _load(self, loads: Loads) -> None:
-        """Write what acts into the row's own buffers."""
+    def _write_loads(self, loads: Loads) -> None:
+        """Write the loads into the row's buffers."""
         row, mass, cog, wrench = self._view, loads.payload_mass, loads.payload_cog, loads.wrench
         row.payload_mass[0] = (self._mass if mass is None else mass)[0]
         row.payload_cog[0] = (self._cog if cog is None else cog)[0]
@@ -266,10 +267,10 @@ class Compensator:
 def correct(model: Model, nominal_q: Array, loads: Loads | None = None) -> Correction:
     """Return the corrected setpoints of many rows (N, n), as ``Compensator.correct`` does."""
     q = np.atleast_2d(np.asarray(nominal_q, dtype=float))
-    # what slipped once has slipped: setpoints are for what comes
+    # without times: slips have happened before any setpoint
     return Compensator(model).correct_rows(q, replace(loads or Loads(), time=None))
 
 
 def wanted_pose(model: Model, nominal_q: Array) -> Poses:
-    """Return the poses that setpoints ``nominal_q`` (N, n) mean: the rigid, effect-free arm's."""
+    """Return the wanted poses of setpoints ``nominal_q`` (N, n): the rigid, effect-free arm's."""
     return model.rigid_pose(np.atleast_2d(nominal_q))

@@ -1,10 +1,9 @@
-"""Derivatives of sampled signals: Savitzky-Golay filters whose window follows the noise.
+"""Derivatives of sampled signals by Savitzky-Golay filters with adaptive windows.
 
-A short window lets noise through, a long one flattens the motion. The window grows as long as the
-derivative changes by no more than its own noise explains (Lepski's rule), joint by joint. Where
-the motion jumps (the corners of a trapezoidal speed), no window is right: there short and long
-windows disagree, and the rows are marked. Source of the filter: Savitzky, Golay, Analytical
-Chemistry 36 (1964) 1627.
+A short window passes noise, a long one biases the derivative. Per joint, the window grows while the
+derivative changes by no more than its noise explains (Lepski's rule). At jumps of the motion (the
+corners of a trapezoidal speed) short and long windows disagree; these rows are marked. Source of
+the filter: Savitzky, Golay, Analytical Chemistry 36 (1964) 1627.
 """
 
 from __future__ import annotations
@@ -19,23 +18,26 @@ import numpy as np
 from gapbridge.core.arrays import Array, Mask
 
 HALF_WIDTHS = (3, 4, 6, 9, 13, 19, 28, 42, 63)  # samples either side
-LONGEST = 0.3  # s, no window reaches further either side
-BIAS_SHARE = 0.5  # of the noise: how much flattening a longer window may bring
-SMOOTH_SHARE = 0.7  # of the rows decide on the window; the rest may hold jumps
+MAX_REACH = 0.3  # s, no window reaches further either side
+BIAS_SHARE = 0.5  # allowed bias of a longer window, over the noise
+SMOOTH_SHARE = 0.7  # share of the rows, those without jumps, by which the window is chosen
 TRIMMED = 0.3096  # mean square of the smallest 70 % of normal deviates, sigma 1
-FALLING, AHEAD = 0.7, 3  # times a change, within so many windows: below, it is noise that falls
-CLEAR = 4.5  # sigma of the noise beyond which windows disagree
-COARSE = 0.01  # of the derivative's rms: a smaller disagreement matters to nobody
-JUDGED = 20_000  # samples beyond which evenly spread pieces of PIECE choose the windows
+FALLING, LOOK_AHEAD = (
+    0.7,
+    3,
+)  # times a change, within so many windows: below, it is noise that falls
+JUMP_SIGMAS = 4.5  # sigma of the noise beyond which windows disagree
+MIN_JUMP = 0.01  # of the derivative's rms: a smaller disagreement matters to nobody
+MAX_SAMPLES = 20_000  # samples beyond which evenly spread pieces of PIECE choose the windows
 PIECE = 2048
 
 
 @dataclass(frozen=True)
 class Derivative:
-    """A derivative of N samples of n signals, and what is known of its error."""
+    """A derivative of N samples of n signals, and its noise."""
 
     value: Array  # (N, n) unit of the signal per s^order
-    noise: Array  # (n,) 1 sigma that the signal's noise makes in it
+    noise: Array  # (n,) 1 sigma due to the signal's noise
     half_width: int  # samples at either end that the longest window did not cover
     unsure: Mask  # (N, n) the signal jumps here
 
@@ -43,8 +45,8 @@ class Derivative:
 def signal_noise(signal: Array) -> Array:
     """Return 1 sigma of the white noise on each of n smooth signals (N, n), by 4th differences.
 
-    The tails are cut at the 95th percentile, so that a few corners of the motion do not count. Of a
-    long signal evenly spread pieces are looked at.
+    Values above the 95th percentile are excluded, for corners of the motion. Of a long signal
+    evenly spread pieces are used.
     """
     if len(signal) < 8:
         return np.zeros(signal.shape[1])
@@ -56,7 +58,7 @@ def signal_noise(signal: Array) -> Array:
     return np.asarray(np.sqrt(np.nanmean(kept**2, axis=0)) / 0.871)
 
 
-def differentiate(signal: Array, step: float, order: int, longest: float = LONGEST) -> Derivative:
+def differentiate(signal: Array, step: float, order: int, longest: float = MAX_REACH) -> Derivative:
     """Return the ``order``-th derivative (1 or 2) of ``signal`` (N, n), sampled every ``step`` s.
 
     No window reaches further than ``longest`` (s) either side. N must be at least 7. The windows of
@@ -68,35 +70,37 @@ def differentiate(signal: Array, step: float, order: int, longest: float = LONGE
     sigma = signal_noise(signal)
     filters = [_polynomials(h, order)[h, ::-1] / step**order for h in halves]
     pieces = _pieces(signal)
-    tried = [[_filtered(part, h, order, step) for part in pieces] for h in halves]
+    results = [[_filtered(part, h, order, step) for part in pieces] for h in halves]
     value, noise = np.empty((count, n)), np.zeros(n)
     chosen, unsure = np.zeros(n, dtype=int), np.zeros((count, n), dtype=bool)
     for j in range(n):
-        changes = _changes([np.concatenate([part[:, j] for part in parts]) for parts in tried])
-        k = _widest(changes, float(sigma[j]), filters)
+        changes = _changes_between(
+            [np.concatenate([part[:, j] for part in parts]) for parts in results]
+        )
+        k = _widest_window(changes, float(sigma[j]), filters)
         other = k - 1 if k else min(1, len(halves) - 1)
 
-        def along(window: int, j: int = j) -> Array:
+        def of_window(window: int, j: int = j) -> Array:
             if len(pieces) == 1:
-                return tried[window][0][:, j]
+                return results[window][0][:, j]
             return _filtered(signal[:, j : j + 1], halves[window], order, step)[:, 0]
 
-        value[:, j], chosen[j] = along(k), halves[k]
-        # a jittering clock, held samples and vibration are no white noise: more passes a window
-        passed = changes[k - 1] / _difference(filters[k - 1], filters[k]) if k else 0.0
-        spread = max(float(sigma[j]), float(np.sqrt(passed)))
+        value[:, j], chosen[j] = of_window(k), halves[k]
+        # clock jitter, repeated samples and vibration are not white: a window passes more of them
+        variance = changes[k - 1] / _difference(filters[k - 1], filters[k]) if k else 0.0
+        spread = max(float(sigma[j]), float(np.sqrt(variance)))
         noise[j] = spread * np.linalg.norm(filters[k])
-        change = np.abs(along(other) - value[:, j])
+        change = np.abs(of_window(other) - value[:, j])
         typical = float(np.sqrt(np.mean(value[:, j] ** 2)))
         unsure[:, j] = _jumps(change, typical, spread, filters[other], filters[k])
     return Derivative(value, noise, int(chosen.max(initial=3)), unsure)
 
 
 def _pieces(signal: Array) -> list[Array]:
-    """Return the pieces of a signal (N, n) that choose its windows; a short one as a whole."""
-    if len(signal) <= JUDGED:
+    """Return the pieces of a signal (N, n) used to choose the windows; a short one as a whole."""
+    if len(signal) <= MAX_SAMPLES:
         return [signal]
-    begins = np.linspace(0, len(signal) - PIECE, JUDGED // PIECE).astype(int)
+    begins = np.linspace(0, len(signal) - PIECE, MAX_SAMPLES // PIECE).astype(int)
     return [signal[begin : begin + PIECE] for begin in begins]
 
 
@@ -104,51 +108,51 @@ def _pieces(signal: Array) -> list[Array]:
 def _polynomials(half: int, order: int) -> Array:
     """Return the derivative (2 half + 1, 2 half + 1) at each sample of a window, a step of one.
 
-    Row i has what each sample weighs in the ``order``-th derivative, at sample i, of the polynomial
-    of degree ``order`` + 2 that fits the window best.
+    Row i holds the weights of the samples in the ``order``-th derivative, at sample i, of the
+    least-squares polynomial of degree ``order`` + 2.
     """
-    place, degree = np.arange(-half, half + 1) / half, np.arange(order + 3)
-    fit = np.linalg.pinv(place[:, None] ** degree)  # (degrees, window)
-    left = np.where(degree >= order, degree - order, 0)
-    falling = [factorial(d) / factorial(d - order) if d >= order else 0.0 for d in degree]
-    found: Array = (np.array(falling) * place[:, None] ** left) @ fit / half**order
-    return found
+    position, degree = np.arange(-half, half + 1) / half, np.arange(order + 3)
+    fit = np.linalg.pinv(position[:, None] ** degree)  # (degrees, window)
+    exponent = np.where(degree >= order, degree - order, 0)
+    factors = [factorial(d) / factorial(d - order) if d >= order else 0.0 for d in degree]
+    filters: Array = (np.array(factors) * position[:, None] ** exponent) @ fit / half**order
+    return filters
 
 
 def _filtered(signal: Array, half: int, order: int, step: float) -> Array:
     """Return the derivative (N, n) of a signal; at its ends that of the last whole window."""
-    weights, found = _polynomials(half, order) / step**order, np.empty(signal.shape)
+    weights, filters = _polynomials(half, order) / step**order, np.empty(signal.shape)
     for j in range(signal.shape[1]):
-        found[half : len(signal) - half, j] = np.correlate(
+        filters[half : len(signal) - half, j] = np.correlate(
             np.ascontiguousarray(signal[:, j]), weights[half], "valid"
         )
-    found[:half] = weights[:half] @ signal[: 2 * half + 1]
-    found[len(signal) - half :] = weights[half + 1 :] @ signal[-2 * half - 1 :]
-    return found
+    filters[:half] = weights[:half] @ signal[: 2 * half + 1]
+    filters[len(signal) - half :] = weights[half + 1 :] @ signal[-2 * half - 1 :]
+    return filters
 
 
-def _changes(tried: list[Array]) -> list[float]:
+def _changes_between(results: list[Array]) -> list[float]:
     """Return the mean square change of a derivative from each window to the next wider one.
 
     The rows that change most are left out: the motion may jump there.
     """
     changes = []
-    for one, other in pairwise(tried):
+    for one, other in pairwise(results):
         squares = np.sort((other - one) ** 2)[: int(SMOOTH_SHARE * len(one))]
         changes.append(float(squares.mean()) / TRIMMED)
     return changes
 
 
-def _widest(changes: list[float], sigma: float, filters: list[Array]) -> int:
-    """Return the number of the widest window before the motion itself is flattened.
+def _widest_window(changes: list[float], sigma: float, filters: list[Array]) -> int:
+    """Return the number of the widest window without significant bias.
 
-    A change from window to window is noise where white noise explains it, or where it still falls
-    with the width: that of a motion being flattened grows (as the width squared).
+    A change from window to window is noise if white noise explains it, or if it decreases with the
+    width: a bias grows (as the width squared).
     """
     for k, change in enumerate(changes):
         explained = 1.1 * _difference(filters[k], filters[k + 1])
         allowed = BIAS_SHARE**2 * float(filters[k + 1] @ filters[k + 1])
-        ahead = changes[k + 1 : k + 1 + AHEAD]
+        ahead = changes[k + 1 : k + 1 + LOOK_AHEAD]
         falls = bool(ahead) and min(ahead) < FALLING * change
         if change > sigma**2 * (explained + allowed) and not falls:
             return k
@@ -156,8 +160,8 @@ def _widest(changes: list[float], sigma: float, filters: list[Array]) -> int:
 
 
 def _jumps(change: Array, typical: float, sigma: float, h: Array, other: Array) -> Mask:
-    """Return where (N,) two windows disagree, and the rows beside that the wider one mixes in."""
-    limit = max(CLEAR * sigma * np.sqrt(_difference(h, other)), COARSE * typical)
+    """Return where (N,) two windows disagree, and the rows within the wider window."""
+    limit = max(JUMP_SIGMAS * sigma * np.sqrt(_difference(h, other)), MIN_JUMP * typical)
     clear = (change > limit).astype(float)
     if not clear.any():
         return np.zeros(len(clear), dtype=bool)

@@ -1,15 +1,13 @@
 """Rigid dynamics of many rows: joint torques and the wrench at the flange sensor.
 
-Newton-Euler in base axes, one part of the arm at a time: what part i takes to be moved and held is
-f = m (a - g) at its centre of gravity and the moment I alpha + omega x I omega; the motor of joint
-j delivers the part of its moment about axis j. Parts are kept apart (``Pieces``) because effects
-scale them one by one. Signs: a torque is what the motor must deliver, positive about the joint's
-axis, so the weight it holds up counts positive against gravity, and a pull of the surroundings on
-the tool enters with -J^T F; this is the sign of UR's ``actual_current_as_torque`` and
-``target_moment``. A wrench is what the load does to the sensor: m (g - a), plus the pull. The
-payload is a point mass (a log declares no inertia for it). Bending is left out: it changes torques
-and wrenches by its own small angle. Source: Featherstone, "Rigid Body Dynamics Algorithms" (2008),
-ch. 5.
+Newton-Euler in base axes, per link: link i needs the force f = m (a - g) at its centre of gravity
+and the moment I alpha + omega x I omega; joint j delivers the component about its axis. The
+contributions are kept separate (``Contributions``), since effects scale them one by one. Signs: a
+torque is that of the motor, positive about the joint's axis; a wrench of the surroundings on the
+tool enters with -J^T F, as in UR's ``actual_current_as_torque`` and ``target_moment``. A sensor
+wrench is that of the load on the sensor: m (g - a), plus the external wrench. The payload is a
+point mass. Deflections are neglected in torques. Source: Featherstone, "Rigid Body Dynamics
+Algorithms" (2008), ch. 5.
 """
 
 from __future__ import annotations
@@ -25,13 +23,13 @@ from gapbridge.core.effects import CATALOGUE, Term, acting
 from gapbridge.core.kernels import rigid
 from gapbridge.core.kernels.reference import Chain
 from gapbridge.core.model import Model
-from gapbridge.core.motion import Motion, Pieces
+from gapbridge.core.motion import Contributions, Motion
 
-LIGHTEST = 1e-6  # kg, of a link whose centre of gravity is anywhere
+MIN_MASS = 1e-6  # kg, of a link, to divide a first moment by
 
 
 class Frames(NamedTuple):
-    """Where the frames of N rows are and how they move, base axes."""
+    """Poses, velocities and accelerations of the frames of N rows, base axes."""
 
     origin: Array  # (N, n+1, 3) m: joints, then the flange
     rotation: Array  # (N, n+1, 3, 3): links, then the flange
@@ -46,30 +44,31 @@ class Frames(NamedTuple):
         """
         body = min(link, self.omega.shape[1] - 1)
         omega, alpha = self.omega[:, body], self.alpha[:, body]
-        turning = np.cross(alpha, offset) + np.cross(omega, np.cross(omega, offset))
-        return self.origin[:, link] + offset, self.acceleration[:, link] + turning
+        relative = np.cross(alpha, offset) + np.cross(omega, np.cross(omega, offset))
+        return self.origin[:, link] + offset, self.acceleration[:, link] + relative
 
 
 def frames_of(chain: Chain, q: Array, qd: Array, qdd: Array) -> Frames:
     """Return the frames of a rigid chain at angles, speeds, accelerations (N, n each)."""
     count, n = q.shape
-    found = Frames(
+    frames = Frames(
         np.empty((count, n + 1, 3)), np.empty((count, n + 1, 3, 3)), np.empty((count, n, 3)),
         np.empty((count, n, 3)), np.empty((count, n + 1, 3)),
     )  # fmt: skip
-    rigid.frames_of_rows(chain, np.stack([q, qd, qdd]), found)
-    return found
+    rigid.frames_of_rows(chain, np.stack([q, qd, qdd]), frames)
+    return frames
 
 
-def pieces_of(model: Model, motion: Motion) -> Pieces:
-    """Return what each part of the model's rigid arm contributes along a motion.
+def contributions_of(model: Model, motion: Motion) -> Contributions:
+    """Return the contributions of links, payload and external wrench along a motion.
 
-    The model's own effects count where they move the geometry or the gravity (joint offsets, say);
-    what loads the sensor or the motors does not count here, it enters by ``sense`` and ``drive``.
+    The model's effects on geometry and gravity are included (joint offsets, say); those on sensor
+    and motors are applied later, by ``sense`` and ``drive``.
     """
-    own = {"wrench", "torque"}
+    load_channels = {"wrench", "torque"}
     geometry = replace(
-        model, terms=tuple(t for t in model.terms if not own & {*CATALOGUE[t.effect].channels})
+        model,
+        terms=tuple(t for t in model.terms if not load_channels & {*CATALOGUE[t.effect].channels}),
     )
     chain, rows = geometry.chain(), geometry.rows(motion.q, motion.loads)
     frames = frames_of(chain, rows.q, motion.qd, motion.qdd)
@@ -81,34 +80,34 @@ def pieces_of(model: Model, motion: Motion) -> Pieces:
 
     link_torque = np.stack([link_at(i, chain.cog[i]) for i in range(n)], axis=1)
     hand = frames.rotation[:, n]
-    sensor = _bent_flange(model, motion, frames)
-    tcp_in_hand = sensor.origin[:, n] + sensor.rotation[:, n] @ chain.tool_position
+    sensor = _with_deflection(model, motion, frames)
+    tcp_at_sensor = sensor.origin[:, n] + sensor.rotation[:, n] @ chain.tool_position
     tcp = frames.origin[:, n] + hand @ chain.tool_position
     pull, couple = rows.wrench[:, :3], rows.wrench[:, 3:]
-    nothing = np.zeros((count, 3))
+    zeros = np.zeros((count, 3))
 
     def payload_from(shift: Array) -> tuple[Array, Array]:
         cog = rows.payload_cog + shift
-        place, acceleration = frames.at(n, _times(hand, cog))
+        point, acceleration = frames.at(n, _rotated(hand, cog))
         force = acceleration - chain.gravity
-        in_hand, _ = sensor.at(n, _times(sensor.rotation[:, n], cog))
+        point_at_sensor, _ = sensor.at(n, _rotated(sensor.rotation[:, n], cog))
         return (
-            _about_axes(frames, n, place, force, nothing),
-            _at_flange(sensor, in_hand, -force, nothing),
+            _about_axes(frames, n, point, force, zeros),
+            _at_flange(sensor, point_at_sensor, -force, zeros),
         )
 
     def link_from(i: int, moment: Array) -> Array:
-        shift = moment / max(float(chain.mass[i]), LIGHTEST)
+        shift = moment / max(float(chain.mass[i]), MIN_MASS)
         return link_at(i, chain.cog[i] + shift) - link_torque[:, i]
 
     payload_torque, payload_wrench = payload_from(np.zeros(3))
-    return Pieces(
+    return Contributions(
         link_torque=link_torque,
         arm_torque=link_torque.sum(axis=1),
         payload_torque=payload_torque,
         external_torque=-_about_axes(frames, n, tcp, pull, couple),
         payload_wrench=payload_wrench,
-        external_wrench=_at_flange(sensor, tcp_in_hand, pull, couple),
+        external_wrench=_at_flange(sensor, tcp_at_sensor, pull, couple),
         payload_mass=rows.payload_mass,
         carried_mass=rows.payload_mass,
         payload_from=payload_from,
@@ -126,8 +125,8 @@ def _link_torque(frames: Frames, i: int, body: Array, gravity: Array) -> Array:
     return torque
 
 
-def _bent_flange(model: Model, motion: Motion, frames: Frames) -> Frames:
-    """Return the frames with the flange turned as the arm bends: a sensor there sees it."""
+def _with_deflection(model: Model, motion: Motion, frames: Frames) -> Frames:
+    """Return the frames with the flange's rotation of the deflected arm, for the sensor."""
     chain = model.chain()
     if not (chain.compliance.any() or chain.flexibility.any() or chain.base_compliance.any()):
         return frames
@@ -137,12 +136,12 @@ def _bent_flange(model: Model, motion: Motion, frames: Frames) -> Frames:
     return frames._replace(rotation=rotation)
 
 
-def _times(matrix: Array, vector: Array) -> Array:
+def _rotated(matrix: Array, vector: Array) -> Array:
     return np.asarray(np.einsum("rij,rj->ri", matrix, vector))
 
 
 def _about_axes(frames: Frames, joints: int, point: Array, force: Array, moment: Array) -> Array:
-    """Return the torques (N, joints) that hold ``force`` at ``point`` and ``moment``."""
+    """Return the torques (N, joints), Nm, that balance ``force`` at ``point`` and ``moment``."""
     torque = np.empty((len(point), joints))
     force, moment = np.ascontiguousarray(force), np.ascontiguousarray(moment)  # as compiled for
     rigid.about_axes(frames, point, force, moment, torque)
@@ -152,27 +151,27 @@ def _about_axes(frames: Frames, joints: int, point: Array, force: Array, moment:
 def _at_flange(frames: Frames, point: Array, force: Array, moment: Array) -> Array:
     """Return a force at a point and a moment as wrench (N, 6) in flange axes, about its origin."""
     hand = np.swapaxes(frames.rotation[:, -1], 1, 2)
-    whole = moment + np.cross(point - frames.origin[:, -1], force)
-    return np.concatenate([_times(hand, force), _times(hand, whole)], axis=1)
+    total = moment + np.cross(point - frames.origin[:, -1], force)
+    return np.concatenate([_rotated(hand, force), _rotated(hand, total)], axis=1)
 
 
-def with_held(model: Model, motion: Motion) -> Motion:
-    """Return the motion with the torques that the joints hold in it at rest."""
-    return replace(motion, held=model.held_torque(motion.q, motion.loads))
+def with_holding_torque(model: Model, motion: Motion) -> Motion:
+    """Return the motion with the holding torques of its poses at rest."""
+    return replace(motion, held=model.holding_torque(motion.q, motion.loads))
 
 
 def with_pieces(model: Model, motion: Motion) -> Motion:
     """Return the motion with the model's contributions, which effects and predictions need."""
-    return replace(motion, pieces=pieces_of(model, motion))
+    return replace(motion, pieces=contributions_of(model, motion))
 
 
 def predict_torque(model: Model, motion: Motion, terms: Sequence[Term] = ()) -> Array:
     """Return the joint torques (N, n), Nm, that would be measured, with further ``terms``."""
-    own = acting((*model.terms, *terms), "torque")
-    motion, pieces = _carrying(model, motion, own)
+    terms_used = acting((*model.terms, *terms), "torque")
+    motion, pieces = _with_payload(model, motion, terms_used)
     torque: Array = pieces.arm_torque + pieces.external_torque
     torque = torque + pieces.payload_mass[:, None] * pieces.payload_torque
-    for term in own:
+    for term in terms_used:
         effect = CATALOGUE[term.effect]
         if motion.load is None and not effect.carried:
             motion = replace(motion, load=torque)
@@ -185,29 +184,31 @@ def predict_wrench(model: Model, motion: Motion, terms: Sequence[Term] = ()) -> 
 
     Flange axes, about the flange origin, payload included (docs/conventions.md, Loads).
     """
-    own = acting((*model.terms, *terms), "wrench")
-    motion, pieces = _carrying(model, motion, own)
+    terms_used = acting((*model.terms, *terms), "wrench")
+    motion, pieces = _with_payload(model, motion, terms_used)
     wrench = pieces.payload_mass[:, None] * pieces.payload_wrench + pieces.external_wrench
-    for term in own:
+    for term in terms_used:
         wrench = CATALOGUE[term.effect].sense(term, model.arm, wrench, motion)
     return wrench
 
 
 def predict_tracking(model: Model, motion: Motion, terms: Sequence[Term] = ()) -> Array:
-    """Return where the encoders (N, n), rad, would stand for the motion's commands."""
+    """Return the predicted encoder angles (N, n), rad, for the motion's commands."""
     if motion.target_q is None:
         raise ValueError("the motion has no target_q")
     q = motion.target_q
     if motion.held is None:
-        motion = with_held(model, motion)
+        motion = with_holding_torque(model, motion)
     for term in acting((*model.terms, *terms), "tracking"):
         q = CATALOGUE[term.effect].track(term, model.arm, q, motion)
     return q
 
 
-def _carrying(model: Model, motion: Motion, terms: Sequence[Term]) -> tuple[Motion, Pieces]:
-    """Return the motion, with pieces that know what the terms add to the payload's mass."""
-    pieces = pieces_of(model, motion) if motion.pieces is None else motion.pieces
+def _with_payload(
+    model: Model, motion: Motion, terms: Sequence[Term]
+) -> tuple[Motion, Contributions]:
+    """Return the motion with the terms' payload mass added to the contributions."""
+    pieces = contributions_of(model, motion) if motion.pieces is None else motion.pieces
     more = sum(t.values[0] for t in terms if CATALOGUE[t.effect].adds_mass)
     pieces = replace(pieces, carried_mass=pieces.payload_mass + more)
     return replace(motion, pieces=pieces, load=None), pieces

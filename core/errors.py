@@ -8,18 +8,18 @@
     │   ├── CellError         a cell file
     │   ├── LogError          a log or a trajectory
     │   ├── EquilibriumError  a load under which the model's arm would buckle
-    │   ├── ExcitationError   the data cannot speak about what was asked of it
-    │   └── PlanError         no poses can be planned for what was asked
+    │   ├── ExcitationError   the data do not determine what was requested
+    │   └── PlanError         no poses can be planned for the request
     └── RunError              something failed while running: exit 1, one clear line
         ├── LinkError         a controller cannot be reached, or broke off
         │   ├── StaleStateError     no fresh state in time
         │   ├── InvalidStateError   a state that is torn, not finite or implausible
         │   └── WriteError          a setpoint could not be delivered
-        │       ├── PartialWriteError       a part of it has left; the next one is sent whole
-        │       ├── IneffectiveWriteError   it was sent and nothing came of it
+        │       ├── PartialWriteError       only a part was sent; the next one is sent whole
+        │       ├── IneffectiveWriteError   it was sent and had no effect
         │       ├── ForeignCommandError     somebody else commands the arm
         │       └── GateError               the gate before the wire refused it: nothing was sent
-        └── LimitError        a setpoint that must not leave
+        └── LimitError        a setpoint outside the limits, not sent
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from enum import StrEnum
 
 
 class GapbridgeError(Exception):
-    """Base of everything that Gapbridge raises on purpose."""
+    """Base of all errors that Gapbridge raises."""
 
     exit_code = 1
 
@@ -53,7 +53,7 @@ class LogError(InputError):
 
 
 class EquilibriumError(InputError):
-    """The arm finds no equilibrium under its load in one row of several."""
+    """The arm has no equilibrium under its load in one row of several."""
 
     text = "the arm finds no equilibrium under its load; expected smaller flexibilities or loads"
 
@@ -63,11 +63,11 @@ class EquilibriumError(InputError):
 
 
 class ExcitationError(InputError):
-    """The data cannot speak about what was asked of it; the message names what is missing."""
+    """The data do not determine what was requested; the message names what is missing."""
 
 
 class PlanError(InputError):
-    """No poses can be planned for what was asked; the message names what stands in the way."""
+    """No poses can be planned for the request; the message names the reason."""
 
 
 class RunError(GapbridgeError):
@@ -83,7 +83,7 @@ class StaleStateError(LinkError):
 
 
 class Implausible(StrEnum):
-    """Why a state could not be believed; metrics and events have these names."""
+    """Why a state was rejected; metrics and events have these names."""
 
     TORN = "torn"  # or of the wrong length, or a wrong answer
     NOT_FINITE = "not_finite"
@@ -105,11 +105,11 @@ class WriteError(LinkError):
 
 
 class PartialWriteError(WriteError):
-    """A part of a setpoint has left, the link lives: the next one may be sent, whole."""
+    """Only a part of a setpoint was sent, the link is up: the next one may be sent, whole."""
 
 
 class IneffectiveWriteError(WriteError):
-    """Setpoints were sent and nothing came of them, though the link lives."""
+    """Setpoints were sent without effect, though the link is up."""
 
 
 class ForeignCommandError(WriteError):
@@ -121,11 +121,11 @@ class GateError(WriteError):
 
 
 class LimitError(RunError):
-    """A setpoint that must not leave: not finite, or outside its limits."""
+    """A setpoint that is not sent: not finite, or outside its limits."""
 
 
 def first_line(error: BaseException) -> str:
-    """Return the first line of what an error says, or its kind."""
+    """Return the first line of an error's message, or its type."""
     if isinstance(error, OSError) and error.errno in errno.errorcode:
         return error.strerror or type(error).__name__
     lines = str(error).strip().splitlines()

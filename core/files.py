@@ -1,11 +1,10 @@
-"""Reading the files that a configuration is made of: once, and from then on the same bytes.
+"""Reading the files of a configuration.
 
-Every reader of a cell, and of what a cell names, reads through here. A process may record what it
-reads (``recorded``) and hand it to another one, which then reads those bytes and nothing else
-(``read_only_from``): a file that was edited meanwhile does not exist for it.
+All files of a cell are read by these functions. A process may record what it reads (``recorded``)
+and pass it to another process, which then reads those bytes only (``read_only_given``): both use
+the same configuration even if a file was edited meanwhile.
 
-A ``Document`` is a YAML file with the places of its keys, so that messages and edits can point at
-them.
+A ``Document`` is a YAML file with the positions of its keys, for messages and edits.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ import yaml
 from gapbridge.core.errors import InputError
 
 Keys = Sequence[str | int]
-LONGEST = 60  # characters of a value that a message quotes
+MAX_QUOTED = 60  # characters of a value that a message quotes
 
 _FLOAT = re.compile(
     r"^(?:[-+]?(?:[0-9][0-9_]*)(?:\.[0-9_]*)?(?:[eE][-+]?[0-9]+)"
@@ -41,25 +40,25 @@ PROBLEMS = {
 }
 
 _recording: ContextVar[dict[str, bytes] | None] = ContextVar("_recording", default=None)
-_given: Mapping[str, bytes] | None = None
+_given_files: Mapping[str, bytes] | None = None
 
 
 def read_bytes(path: Path) -> bytes:
     """Return a file's bytes. Raises OSError."""
-    if _given is not None:
+    if _given_files is not None:
         for key in _keys(path):
-            if key in _given:
-                return _given[key]
+            if key in _given_files:
+                return _given_files[key]
         message = "not among the files of the configuration that runs"
         raise FileNotFoundError(errno.ENOENT, message, str(path))
-    found = path.read_bytes()
+    content = path.read_bytes()
     if (recording := _recording.get()) is not None:
-        recording.update(dict.fromkeys(_keys(path), found))
-    return found
+        recording.update(dict.fromkeys(_keys(path), content))
+    return content
 
 
 def _keys(path: Path) -> tuple[str, str]:
-    """Return the names that a file may be asked for by: links on the way may be followed or not."""
+    """Return the absolute paths of a file, with symbolic links unresolved and resolved."""
     return os.path.abspath(path), os.path.realpath(path)
 
 
@@ -69,30 +68,32 @@ def read_text(path: Path, encoding: str = "utf-8") -> str:
 
 
 def is_given() -> bool:
-    """Return whether this process reads files that another one has read."""
-    return _given is not None
+    """Return whether this process reads only files passed by another one."""
+    return _given_files is not None
 
 
 def is_file(path: Path) -> bool:
     """Return whether there is a file to read."""
-    return path.is_file() if _given is None else any(key in _given for key in _keys(path))
+    return (
+        path.is_file() if _given_files is None else any(key in _given_files for key in _keys(path))
+    )
 
 
 @contextlib.contextmanager
 def recorded() -> Iterator[dict[str, bytes]]:
-    """Give what is read inside, by absolute path; in this thread only."""
-    found: dict[str, bytes] = {}
-    token = _recording.set(found)
+    """Collect the files read in this context, by absolute path; in this thread only."""
+    content: dict[str, bytes] = {}
+    token = _recording.set(content)
     try:
-        yield found
+        yield content
     finally:
         _recording.reset(token)
 
 
-def read_only_from(files: Mapping[str, bytes]) -> None:
-    """Have this process read these files from now on, and no others."""
-    global _given
-    _given = dict(files)
+def read_only_given(files: Mapping[str, bytes]) -> None:
+    """Restrict this process to these files from now on."""
+    global _given_files
+    _given_files = dict(files)
 
 
 def loaders(*, on_is_text: bool = False) -> tuple[Any, ...]:
@@ -102,22 +103,22 @@ def loaders(*, on_is_text: bool = False) -> tuple[Any, ...]:
     tenth of a second for a cell with a fit's covariance) comes first; the last one's messages are
     those that ``PROBLEMS`` knows.
     """
-    quick = (yaml.CSafeLoader,) if hasattr(yaml, "CSafeLoader") else ()
-    return tuple(_loader(base, on_is_text) for base in (*quick, yaml.SafeLoader))
+    fast = (yaml.CSafeLoader,) if hasattr(yaml, "CSafeLoader") else ()
+    return tuple(_loader(base, on_is_text) for base in (*fast, yaml.SafeLoader))
 
 
 def _loader(base: Any, on_is_text: bool) -> Any:
     resolvers = {
         first: [
-            (tag, found) for tag, found in all_of if not (on_is_text and tag == YAML_11_BOOLEAN)
+            (tag, content) for tag, content in all_of if not (on_is_text and tag == YAML_11_BOOLEAN)
         ]
         for first, all_of in base.yaml_implicit_resolvers.items()
     }
-    found: Any = type("_Loader", (base,), {"yaml_implicit_resolvers": resolvers})
-    found.add_implicit_resolver("tag:yaml.org,2002:float", _FLOAT, list("-+0123456789."))
+    content: Any = type("_Loader", (base,), {"yaml_implicit_resolvers": resolvers})
+    content.add_implicit_resolver("tag:yaml.org,2002:float", _FLOAT, list("-+0123456789."))
     if on_is_text:
-        found.add_implicit_resolver(YAML_11_BOOLEAN, _BOOLEAN, list("tTfF"))
-    return found
+        content.add_implicit_resolver(YAML_11_BOOLEAN, _BOOLEAN, list("tTfF"))
+    return content
 
 
 class Kind(NamedTuple):
@@ -131,9 +132,9 @@ class Kind(NamedTuple):
 
 
 def quoted(value: object) -> str:
-    """Return what was found in a file, in one short line."""
+    """Return the ``repr`` of a value in one short line."""
     text = " ".join(repr(value).split())
-    return text if len(text) <= LONGEST else f"{text[:LONGEST]}..."
+    return text if len(text) <= MAX_QUOTED else f"{text[:MAX_QUOTED]}..."
 
 
 @dataclass(frozen=True)
@@ -174,24 +175,24 @@ class Document:
 def parse_yaml(text: str, path: Path, kind: Kind) -> Document:
     """Return the document of a YAML text; ``path`` is for messages.
 
-    Raises the kind's error, naming the line, for broken YAML, for a key that stands twice, and
-    where the top is not a mapping.
+    Raises the kind's error, naming the line, for broken YAML, for a duplicate key, and where the
+    top level is not a mapping.
     """
     try:
-        loader, root = _loaded(text, kind)
+        loader, root = _load(text, kind)
         if not isinstance(root, yaml.MappingNode):
             where = path if root is None else f"{path}, line {root.start_mark.line + 1}"
-            found = "an empty file" if root is None else "no keys"
-            raise kind.error(f"{where}: found {found}, expected a {kind.name} ({kind.keys})")
-        _refuse_doubles(root, path, kind, set())
+            content = "an empty file" if root is None else "no keys"
+            raise kind.error(f"{where}: found {content}, expected a {kind.name} ({kind.keys})")
+        _require_unique_keys(root, path, kind, set())
         data = loader.construct_document(root)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         line = mark.line + 1 if mark else 1
         what = " ".join(str(error.problem or error.context or "broken YAML").split())
-        for problem, said in PROBLEMS.items():
+        for problem, text_of_problem in PROBLEMS.items():
             if problem in what:
-                text = said.format(name=kind.name)
+                text = text_of_problem.format(name=kind.name)
                 raise kind.error(f"{path}, line {line}: {text}") from None
         raise kind.error(f"{path}, line {line}: found broken YAML: {what}") from None
     except (yaml.YAMLError, ValueError, RecursionError) as error:
@@ -200,7 +201,7 @@ def parse_yaml(text: str, path: Path, kind: Kind) -> Document:
     return Document(path, text, root, data)
 
 
-def _loaded(text: str, kind: Kind) -> tuple[Any, yaml.Node | None]:
+def _load(text: str, kind: Kind) -> tuple[Any, yaml.Node | None]:
     """Return a loader of a text, and the text's one node."""
     for loader_class in kind.loaders[:-1]:
         try:
@@ -227,13 +228,13 @@ def read_yaml(path: Path, kind: Kind) -> Document:
     return parse_yaml(text, path, kind)
 
 
-def _refuse_doubles(node: yaml.Node, path: Path, kind: Kind, seen: set[int]) -> None:
+def _require_unique_keys(node: yaml.Node, path: Path, kind: Kind, seen: set[int]) -> None:
     if id(node) in seen:
         return
     seen.add(id(node))
     if isinstance(node, yaml.SequenceNode):
         for item in node.value:
-            _refuse_doubles(item, path, kind, seen)
+            _require_unique_keys(item, path, kind, seen)
     elif isinstance(node, yaml.MappingNode):
         keys: set[str] = set()
         for key, value in node.value:
@@ -244,4 +245,4 @@ def _refuse_doubles(node: yaml.Node, path: Path, kind: Kind, seen: set[int]) -> 
                         f"{path}, line {line}: {key.value}: found twice, expected once"
                     )
                 keys.add(key.value)
-            _refuse_doubles(value, path, kind, seen)
+            _require_unique_keys(value, path, kind, seen)

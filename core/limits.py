@@ -1,4 +1,4 @@
-"""The one limiter that every setpoint passes on its way out.
+"""The limiter of all setpoints before they are sent.
 
 A correction is limited as a whole: the joint offset ``corrected_q - nominal_q`` and the TCP offset
 that belongs to it shrink by the same factor, so that its direction is kept.
@@ -16,19 +16,19 @@ from gapbridge.core.arrays import Array
 from gapbridge.core.errors import LimitError
 from gapbridge.core.kernels.reference import JIT
 
-LONGEST_GAP = 5.0  # cycles: after a longer one, no more than this many cycles' steps are allowed
-HUGE = 1e6  # rad, m: no number of a setpoint is that large
-NUMBERS = 7  # limits that are one number each, first in the limiter's block
+MAX_GAP_CYCLES = 5.0  # of the time between setpoints that counts for the rate limits
+MAX_MAGNITUDE = 1e6  # rad, m, of any number of a setpoint
+SCALARS = 7  # scalar limits, first in the limiter's block
 SLACK = 1.0 - 1e-12  # keeps rounding on the allowed side
 
 ENVELOPE, RATE, JOINT_OFFSET, JOINT_LIMIT, VELOCITY = range(5)
 CLAMPS = ("envelope", "rate", "joint_offset", "joint_limit", "velocity")
-_FINE, _NOT_FINITE, _BAD_GAP, _NOMINAL_OUTSIDE, _JUMP, _FAR = range(6)
+_OK, _NOT_FINITE, _GAP_NOT_POSITIVE, _OUTSIDE_LIMITS, _JUMP, _TOO_FAR = range(6)
 
 
 @dataclass(frozen=True)
 class Limits:
-    """What no setpoint passes.
+    """The limits of every setpoint.
 
     offset, offset_rotation: length of the TCP offset, m, and of its rotation vector, rad.
     offset_rate, offset_rotation_rate: how fast the offset may change, m/s and rad/s.
@@ -51,7 +51,7 @@ class Limits:
     cycle: float = 0.002
 
     def __post_init__(self) -> None:
-        """Refuse limits that limit nothing or forbid everything. Raises LimitError."""
+        """Raise LimitError for limits that are not positive, not ordered or not numbers."""
         for field in fields(self):
             value = np.asarray(getattr(self, field.name), dtype=float)
             if np.isnan(value).any():
@@ -63,7 +63,7 @@ class Limits:
 
 
 class Limited(NamedTuple):
-    """What may leave; the arrays are the limiter's own, read-only, and hold until its next call.
+    """The limited setpoint; the arrays are the limiter's buffers, valid until its next call.
 
     A tuple, because one is made in every cycle.
     """
@@ -74,10 +74,10 @@ class Limited(NamedTuple):
 
 
 class Limiter:
-    """Limits one stream of setpoints. Deterministic, allocates next to nothing, never sleeps.
+    """Limits one stream of setpoints. Deterministic, with almost no allocation, never sleeps.
 
-    Whatever goes in, out of ``limit`` come finite numbers only, inside the envelope, within the
-    joint limits, and no step larger than allowed.
+    For any input, the output of ``limit`` is finite, inside the envelope, within the joint limits,
+    and no step is larger than allowed.
     """
 
     def __init__(self, limits: Limits, n: int) -> None:
@@ -89,11 +89,11 @@ class Limiter:
         self.counts = np.zeros(len(CLAMPS), dtype=np.int64)  # of each of CLAMPS
         numbers = [limits.offset, limits.offset_rotation, limits.offset_rate,
                    limits.offset_rotation_rate, limits.joint_offset, limits.following,
-                   LONGEST_GAP * limits.cycle]  # fmt: skip
+                   MAX_GAP_CYCLES * limits.cycle]  # fmt: skip
         bounds = (limits.lower, limits.upper, limits.velocity)
-        # one block: each array handed to compiled code is unwrapped anew in every call
+        # one block, to pass a single array to compiled code
         self._block = np.concatenate([numbers, *bounds, np.zeros(3 * n + 6)])
-        self._q, self._nominal, self._delta, self._offset = _kept(self._block)
+        self._q, self._nominal, self._delta, self._offset = _state_views(self._block)
         self._out = _read_only(self._q), _read_only(self._offset)
         self._q[:] = self._nominal[:] = np.nan
 
@@ -104,21 +104,21 @@ class Limiter:
 
     @property
     def joint_offset(self) -> Array:
-        """Return the joint offset (n,) that left last, rad: read-only, of this moment."""
+        """Return the last joint offset (n,), rad: a read-only view."""
         return _read_only(self._delta)
 
     @property
     def offset_in_base(self) -> Array:
-        """Return a copy of the TCP offset (6,) that left last, m and rad."""
+        """Return a copy of the last TCP offset (6,), m and rad."""
         return self._offset.copy()
 
     def start(
         self, q: Array, delta: Array | None = None, offset_in_base: Array | None = None
     ) -> None:
-        """Begin a stream: the arm is commanded to ``q`` (n,) rad.
+        """Start a stream at the present command ``q`` (n,), rad.
 
-        ``delta`` (n,) rad of it, with its TCP offset (6,), is an offset that is in force already;
-        left out: none is. Raises LimitError where that is not finite or outside the joint limits.
+        ``delta`` (n,), rad, and its TCP offset (6,) are the part of it that is a correction
+        already; default: none. Raises LimitError where they are not finite or outside the limits.
         """
         if not np.isfinite(q).all():
             raise LimitError(f"start: found {q}, expected finite joints")
@@ -144,19 +144,19 @@ class Limiter:
         actual_q: Array,
         dt: float,
     ) -> Limited:
-        """Return what may leave ``dt`` s after the last setpoint.
+        """Return the limited setpoint, ``dt`` s after the last one.
 
-        The offset wanted is ``ramp`` (0..1) times the correction ``corrected_q - nominal_q`` (n,)
-        with its TCP offset (6,); it is approached no faster than the rates allow, so that a ramp
-        of zero brings it to zero and keeps it there. A command that the velocity limit holds back
-        goes on towards its goal in the next cycle. Raises LimitError, and lets nothing out and
-        changes nothing, where a number is not finite, the nominal setpoint is outside the joint
-        limits or has jumped, or the command would be too far from the actual joints.
+        The target offset is ``ramp`` (0..1) times the correction ``corrected_q - nominal_q`` (n,)
+        with its TCP offset (6,), approached within the rate limits; a ramp of zero brings it to
+        zero. A command limited by the velocity continues towards its target in the next cycle.
+        Raises LimitError, without any change of state, where a number is not finite, the nominal
+        setpoint is outside the joint limits or has jumped, or the command would be too far from the
+        actual joints.
         """
         code, clamped = _limit(
             self._block, nominal_q, corrected_q, offset_in_base, ramp, actual_q, dt
         )
-        if code != _FINE:
+        if code != _OK:
             raise LimitError(self._reason(code, clamped, nominal_q, actual_q, dt))
         if clamped:
             for bit in range(len(CLAMPS)):
@@ -164,9 +164,9 @@ class Limiter:
         return Limited(*self._out, clamped)
 
     def _reason(self, code: int, joint: int, nominal_q: Array, actual_q: Array, dt: float) -> str:
-        if code == _BAD_GAP:
+        if code == _GAP_NOT_POSITIVE:
             return f"setpoint: found a gap of {dt:g} s to the last one, expected a positive one"
-        if code == _NOMINAL_OUTSIDE:
+        if code == _OUTSIDE_LIMITS:
             bad = (nominal_q < self.limits.lower) | (nominal_q > self.limits.upper)
             joint = int(np.argmax(bad))
             return (
@@ -180,11 +180,12 @@ class Limiter:
                 f"{nominal_q[joint] - self._nominal[joint]:+.4f} rad in {dt:.4f} s, more than its "
                 f"velocity limit of {self.limits.velocity[joint]:.3g} rad/s allows"
             )
-        if code == _FAR:
-            away = abs(self._q[joint] - actual_q[joint])
+        if code == _TOO_FAR:
+            behind = abs(self._q[joint] - actual_q[joint])
             return (
-                f"setpoint: joint {joint + 1} is {away:.4f} rad behind its last command, and would "
-                f"be more than {self.limits.following:g} rad behind this one (limits.following)"
+                f"setpoint: joint {joint + 1} is {behind:.4f} rad behind its last command, and "
+                f"would be more than {self.limits.following:g} rad behind this one "
+                "(limits.following)"
             )
         if not self.started:
             return "setpoint: found no start of the stream, expected start() before limit()"
@@ -192,126 +193,128 @@ class Limiter:
 
 
 def _read_only(array: Array) -> Array:
-    """Return a view through which nobody else changes the limiter's own numbers."""
+    """Return a read-only view."""
     view = array.view()
     view.flags.writeable = False
     return view
 
 
-def _kept(block: Array) -> tuple[Array, Array, Array, Array]:
+def _state_views(block: Array) -> tuple[Array, Array, Array, Array]:
     """Return the last command, its nominal joints, joint offset (n,) and TCP offset (6,): views."""
-    n = (block.shape[0] - NUMBERS - 6) // 6
-    at = NUMBERS + 3 * n
+    n = (block.shape[0] - SCALARS - 6) // 6
+    at = SCALARS + 3 * n
     return (
         block[at : at + n], block[at + n : at + 2 * n], block[at + 2 * n : at + 3 * n],
         block[at + 3 * n :],
     )  # fmt: skip
 
 
-_kept_of = njit(**JIT)(_kept)
+_compiled_views = njit(**JIT)(_state_views)
 
 
 @njit(**JIT)
-def _share(vector, first, last, most):  # type: ignore[no-untyped-def]
-    """Return the factor (<= 1) by which vector[first:last] must shrink to be `most` long."""
+def _shrink(vector, first, last, limit):  # type: ignore[no-untyped-def]
+    """Return the factor (<= 1) by which vector[first:last] must shrink to be `limit` long."""
     square = 0.0
     for k in range(first, last):
         square += vector[k] * vector[k]
     length = np.sqrt(square)
-    return 1.0 if length <= most else most / length * SLACK
+    return 1.0 if length <= limit else limit / length * SLACK
 
 
 @njit(**JIT)
 def _finite(q, nominal, corrected, actual, offset, ramp, dt):  # type: ignore[no-untyped-def]
-    """Return whether all is a number, and none of them huge."""
-    fine = np.isfinite(ramp) and np.isfinite(dt)
+    """Return whether all numbers are finite and below MAX_MAGNITUDE."""
+    ok = np.isfinite(ramp) and np.isfinite(dt)
     for i in range(q.shape[0]):
-        fine = fine and abs(nominal[i]) < HUGE and abs(corrected[i]) < HUGE
-        fine = fine and abs(actual[i]) < HUGE and np.isfinite(q[i])
+        ok = ok and abs(nominal[i]) < MAX_MAGNITUDE and abs(corrected[i]) < MAX_MAGNITUDE
+        ok = ok and abs(actual[i]) < MAX_MAGNITUDE and np.isfinite(q[i])
     for k in range(6):
-        fine = fine and abs(offset[k]) < HUGE
-    return fine
+        ok = ok and abs(offset[k]) < MAX_MAGNITUDE
+    return ok
 
 
 @njit(**JIT)
 def _check(bounds, nominal, before, dt):  # type: ignore[no-untyped-def]
-    """Return the reason why nothing may leave, or _FINE."""
+    """Return the reason for refusing the setpoint, or _OK."""
     if dt <= 0.0:
-        return _BAD_GAP
+        return _GAP_NOT_POSITIVE
     for i in range(nominal.shape[0]):
         if nominal[i] < bounds[0, i] or nominal[i] > bounds[1, i]:
-            return _NOMINAL_OUTSIDE
+            return _OUTSIDE_LIMITS
     for i in range(nominal.shape[0]):
-        # twice: a source may catch up a cycle; what is between is slowed down, not refused
+        # factor 2: a source may catch up one cycle; up to that the command is slowed, not refused
         if abs(nominal[i] - before[i]) > 2.0 * bounds[2, i] * dt:
             return _JUMP
-    return _FINE
+    return _OK
 
 
 @njit(**JIT)
-def _whole(numbers, bounds, nominal, corrected, offset, ramp):  # type: ignore[no-untyped-def]
-    """Return the factor on the whole correction that keeps it in bounds, and the clamped bits."""
+def _correction_factor(numbers, bounds, nominal, corrected, offset, ramp):  # type: ignore[no-untyped-def]
+    """Return the factor on the correction that keeps it within bounds, and the clamped bits."""
     clamped = 0
-    share = min(ramp, _share(offset, 0, 3, numbers[0]), _share(offset, 3, 6, numbers[1]))
-    if share < ramp:
+    factor = min(ramp, _shrink(offset, 0, 3, numbers[0]), _shrink(offset, 3, 6, numbers[1]))
+    if factor < ramp:
         clamped |= 1 << ENVELOPE
     for i in range(nominal.shape[0]):
-        over = abs(corrected[i] - nominal[i]) * share
-        if over > numbers[4]:
-            share *= numbers[4] / over * SLACK
+        offset_size = abs(corrected[i] - nominal[i]) * factor
+        if offset_size > numbers[4]:
+            factor *= numbers[4] / offset_size * SLACK
             clamped |= 1 << JOINT_OFFSET
     for i in range(nominal.shape[0]):
-        turn = (corrected[i] - nominal[i]) * share
-        room = bounds[1, i] - nominal[i] if turn > 0.0 else nominal[i] - bounds[0, i]
-        if abs(turn) > room:
-            share *= room / abs(turn) * SLACK
+        joint_offset = (corrected[i] - nominal[i]) * factor
+        margin = bounds[1, i] - nominal[i] if joint_offset > 0.0 else nominal[i] - bounds[0, i]
+        if abs(joint_offset) > margin:
+            factor *= margin / abs(joint_offset) * SLACK
             clamped |= 1 << JOINT_LIMIT
-    return share, clamped
+    return factor, clamped
 
 
 @njit(**JIT)
 def _limit(block, nominal, corrected, offset, ramp, actual, dt):  # type: ignore[no-untyped-def]
-    """Advance what the block keeps by one setpoint; returns (reason, clamped bits).
+    """Advance the state in the block by one setpoint; returns (reason, clamped bits).
 
-    With _FAR the second is the joint.
+    With _TOO_FAR the second is the joint.
     """
-    q, before, delta, applied = _kept_of(block)
+    q, before, delta, applied = _compiled_views(block)
     n = q.shape[0]
-    numbers, bounds = block[:NUMBERS], block[NUMBERS : NUMBERS + 3 * n].reshape((3, n))
+    numbers, bounds = block[:SCALARS], block[SCALARS : SCALARS + 3 * n].reshape((3, n))
     if not _finite(q, nominal, corrected, actual, offset, ramp, dt):
         return _NOT_FINITE, 0
     code = _check(bounds, nominal, before, dt)
-    if code != _FINE:
+    if code != _OK:
         return code, 0
     gap = min(dt, numbers[6])
-    share, clamped = _whole(numbers, bounds, nominal, corrected, offset, min(max(ramp, 0.0), 1.0))
+    factor, clamped = _correction_factor(
+        numbers, bounds, nominal, corrected, offset, min(max(ramp, 0.0), 1.0)
+    )
 
-    # approached no faster than the rates allow
+    # rate limits of the TCP offset
     step = np.empty(6)
     for k in range(6):
-        step[k] = share * offset[k] - applied[k]
-    part = min(_share(step, 0, 3, numbers[2] * gap), _share(step, 3, 6, numbers[3] * gap))
-    if part < 1.0:
+        step[k] = factor * offset[k] - applied[k]
+    rate_factor = min(_shrink(step, 0, 3, numbers[2] * gap), _shrink(step, 3, 6, numbers[3] * gap))
+    if rate_factor < 1.0:
         clamped |= 1 << RATE
 
-    # the joint command with it, no faster than the joints may
-    goal, pace = np.empty(n), 1.0
+    # velocity limits of the joint command
+    goal, speed_factor = np.empty(n), 1.0
     for i in range(n):
-        wanted = delta[i] + part * (share * (corrected[i] - nominal[i]) - delta[i])
-        goal[i] = min(max(nominal[i] + wanted, bounds[0, i]), bounds[1, i])
-        if goal[i] != nominal[i] + wanted:
+        joint_offset = delta[i] + rate_factor * (factor * (corrected[i] - nominal[i]) - delta[i])
+        goal[i] = min(max(nominal[i] + joint_offset, bounds[0, i]), bounds[1, i])
+        if goal[i] != nominal[i] + joint_offset:
             clamped |= 1 << JOINT_LIMIT
-        way = abs(goal[i] - q[i])
-        if way > bounds[2, i] * gap:
-            pace = min(pace, bounds[2, i] * gap / way * SLACK)
+        distance = abs(goal[i] - q[i])
+        if distance > bounds[2, i] * gap:
+            speed_factor = min(speed_factor, bounds[2, i] * gap / distance * SLACK)
             clamped |= 1 << VELOCITY
     for i in range(n):
-        if abs(q[i] + pace * (goal[i] - q[i]) - actual[i]) > numbers[5]:
-            return _FAR, i
+        if abs(q[i] + speed_factor * (goal[i] - q[i]) - actual[i]) > numbers[5]:
+            return _TOO_FAR, i
     for i in range(n):
-        q[i] = goal[i] if pace == 1.0 else q[i] + pace * (goal[i] - q[i])
-        delta[i] += part * (share * (corrected[i] - nominal[i]) - delta[i])
+        q[i] = goal[i] if speed_factor == 1.0 else q[i] + speed_factor * (goal[i] - q[i])
+        delta[i] += rate_factor * (factor * (corrected[i] - nominal[i]) - delta[i])
         before[i] = nominal[i]
     for k in range(6):
-        applied[k] += part * step[k]
-    return _FINE, clamped
+        applied[k] += rate_factor * step[k]
+    return _OK, clamped

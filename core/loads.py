@@ -1,4 +1,4 @@
-"""What acts on the arm, row by row: payload, pull on the tool, temperatures, last motion."""
+"""Loads on the arm per row: payload, external wrench, temperatures, direction of approach."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class Loads:
     wrench: Array | None = None  # (N, 6) N, Nm: surroundings on the tool, at the TCP, base axes
     temperature: Array | None = None  # (N, n) °C, joint temperatures
     approach: Array | None = None  # (N, n) sign of each joint's last motion: -1, 0, +1
-    time: Array | None = None  # (N,) s, or numbers of rows; None: after all that happened once
+    time: Array | None = None  # (N,) s, or numbers of rows; None: after all slips
 
     def __getitem__(self, rows: slice | NDArray[Any]) -> Loads:
         """Return the loads of some of the rows."""

@@ -17,11 +17,11 @@ from gapbridge.core.kernels.reference import Chain, Rows
 from gapbridge.core.kernels.turns import rotation_vectors
 from gapbridge.core.loads import Loads
 
-SETTLING = 10  # times that servos are looked at where they have given way
-CONVERGED = 1e-10  # rad: less is no change
+SERVO_ROUNDS = 10  # fixed-point iterations of the servos' deflection
+CONVERGED = 1e-10  # rad
 STANDARD_GRAVITY = (0.0, 0.0, -9.80665)
 Uncertain = Callable[[Array, Loads, Sequence[Term]], Array]
-"""q (N, n), loads, terms known -> (N, 6, r): 1 sigma of poses by a model's own numbers, m, rad."""
+"""q (N, n), loads, known terms -> (N, 6, r): 1 sigma of poses by other parameters, m, rad."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ class Model:
         return chain.compliance[:, 2].copy(), chain.compliance[:, 0].copy()
 
     def chain(self) -> Chain:
-        """Return what holds for all rows, effects included."""
+        """Return the kinematic chain with effects, the same for all rows."""
         arm, n = self.arm, self.arm.n
         chain = Chain(
             rotation=np.array(arm.link_in_link[:, :3, :3], dtype=float, order="C"),
@@ -111,7 +111,7 @@ class Model:
         return chain
 
     def rows(self, q: Array, loads: Loads | None = None) -> Rows:
-        """Return what differs from row to row, effects included; ``q`` is (N, n) encoder angles."""
+        """Return joint angles and loads per row with effects; ``q`` (N, n) are encoder angles."""
         loads = loads or Loads()
         count, n = q.shape
         mass = np.full(count, float(self.payload_mass)) if loads.payload_mass is None else (
@@ -129,18 +129,18 @@ class Model:
 
     def conditions(self) -> tuple[Term, ...]:
         """Return the terms that change rows, not the chain alone."""
-        own = Effect.condition
-        return tuple(t for t in self.terms if type(CATALOGUE[t.effect]).condition is not own)
+        base_hook = Effect.condition
+        return tuple(t for t in self.terms if type(CATALOGUE[t.effect]).condition is not base_hook)
 
     def condition(self, rows: Rows, loads: Loads, q: Array, terms: Sequence[Term]) -> None:
         """Change ``rows`` in place by ``terms``; ``q`` is (N, n) encoder angles."""
         if terms:
-            warmed = self._warmed(loads)
+            relative = self._relative_temperatures(loads)
             for term in terms:
-                CATALOGUE[term.effect].condition(term, self.arm, rows, warmed, q)
+                CATALOGUE[term.effect].condition(term, self.arm, rows, relative, q)
 
-    def _warmed(self, loads: Loads) -> Loads:
-        """Return loads whose temperatures count from the reference."""
+    def _relative_temperatures(self, loads: Loads) -> Loads:
+        """Return loads with temperatures relative to the reference."""
         if loads.temperature is None:
             return loads
         return replace(loads, temperature=loads.temperature - self.reference_temperature)
@@ -148,8 +148,8 @@ class Model:
     def predict(self, q: Array, loads: Loads | None = None) -> Poses:
         """Return the TCP poses in base for encoder angles ``q`` (N, n): the exact equilibrium.
 
-        Loads act where the bent arm really is. Raises InputError where a row has no equilibrium
-        (the arm would buckle).
+        Loads act on the deflected arm. Raises InputError where a row has no equilibrium (the arm
+        would buckle).
         """
         chain, rows = self.chain(), self.rows(np.atleast_2d(q), loads)
         count = len(rows.q)
@@ -160,23 +160,23 @@ class Model:
                 CATALOGUE[term.effect].before(term, chain, position, rotation, loads)
         return Poses(position, rotation)
 
-    def held_torque(self, q: Array, loads: Loads | None = None) -> Array:
-        """Return the torques (N, n), Nm, that the joints hold at rest at encoder angles ``q``.
+    def holding_torque(self, q: Array, loads: Loads | None = None) -> Array:
+        """Return the motor torques (N, n), Nm, at rest at encoder angles ``q``.
 
-        Gravity, payload and pull, about the joints' axes where the bent arm has them; positive
-        where the motor pushes towards positive q. Raises InputError where a row has no equilibrium.
+        For gravity, payload and external wrench, about the axes of the deflected arm, positive
+        towards positive q. Raises InputError where a row has no equilibrium.
         """
         form = self.linear_form(q, loads)
         return -np.asarray(np.einsum("nij,nji->ni", form.moment, form.jacobian[:, 3:]))
 
     def settled(self, commands: Array, loads: Loads | None = None) -> Array:
-        """Return where the encoders (N, n) come to rest for ``commands`` (N, n), rad."""
+        """Return the encoder angles (N, n), rad, at rest for ``commands`` (N, n), rad."""
         terms, commands, loads = settling(self.terms), np.atleast_2d(commands), loads or Loads()
         q = commands
-        for _ in range(SETTLING if terms else 0):
-            held, before, q = self.held_torque(q, loads), q, commands
+        for _ in range(SERVO_ROUNDS if terms else 0):
+            torque, before, q = self.holding_torque(q, loads), q, commands
             for term in terms:
-                q = CATALOGUE[term.effect].settle(term, self.arm, q, held, loads.approach)
+                q = CATALOGUE[term.effect].settle(term, self.arm, q, torque, loads.approach)
             if np.abs(q - before).max(initial=0.0) < CONVERGED:
                 break
         return q

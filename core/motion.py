@@ -1,4 +1,4 @@
-"""The motion that a log shows: angles, speeds and accelerations, and what acted meanwhile.
+"""The motion of a log: angles, speeds, accelerations and loads.
 
 A log is either a recording of motion (sampled trajectory) or a list of poses at rest; only the
 first has derivatives. Which one it is follows from its timestamps and steps.
@@ -20,9 +20,9 @@ from gapbridge.core.loads import Loads
 from gapbridge.core.log.log import Log
 from gapbridge.core.log.log_finding import LogCheck, LogFinding
 
-SLOWEST_SAMPLING = 0.2  # s between rows beyond which they count as poses at rest
-FASTEST_JOINT = 15.0  # rad/s: rows that jump faster are poses, whatever their timestamps say
-FEWEST_SMOOTH = 0.5  # share of rows without jumps that windows must leave, or be shorter
+MAX_SAMPLE_TIME = 0.2  # s between rows beyond which they count as poses at rest
+MAX_JOINT_SPEED = 15.0  # rad/s between rows beyond which they count as poses at rest
+MIN_SMOOTH_SHARE = 0.5  # share of rows without jumps below which a shorter window is tried
 WINDOWS = (0.3, 0.1, 0.05, 0.025)  # s either side at most, tried in turn
 GAP = 4.0  # sampling steps without a row that end a stretch
 COPIES = 0.9  # share of repeated rows alike in every column that makes them copies of one cycle
@@ -34,8 +34,8 @@ SMALLEST_MOTION = 1e-4  # rad/s, what counts as standing still at least
 
 
 @dataclass(frozen=True)
-class Pieces:
-    """What the rigid arm's parts contribute, row by row: the effects scale and add them.
+class Contributions:
+    """Contributions of the rigid arm's parts to torques and wrenches, scaled by effects.
 
     Torques are those the motors must deliver; wrenches are what the load does to the flange sensor
     (flange axes, about the flange origin).
@@ -71,7 +71,7 @@ class Motion:
     start: float  # s, the log's first timestamp
     moving: bool  # False: poses at rest
     still: Array  # (n,) rad/s below which the direction of motion is unsure
-    pieces: Pieces | None = None
+    pieces: Contributions | None = None
     load: Array | None = None  # (N, n) Nm of the rigid arm with payload and pull, no friction
     held: Array | None = None  # (N, n) Nm that each joint holds at rest: gravity, payload, pull
 
@@ -108,27 +108,27 @@ class Motion:
 
     @property
     def turning(self) -> Mask:
-        """Return where (N, n) a joint that moves in this log stands or turns round."""
+        """Return where (N, n) a joint that moves in this log is at rest or reverses."""
         moves = np.abs(self.qd).max(axis=0, initial=0.0) > 3 * self.still
         return np.asarray(moves & (np.abs(self.qd) < self.still))
 
 
 def motion_of(log: Log) -> Motion:
-    """Return the motion that a log shows.
+    """Return the motion of a log.
 
     Needs ``actual_q`` or ``target_q``; speeds come from ``actual_qd`` where the log has them.
     A cycle that was recorded twice counts once; timestamps rounded so far that they repeat are
     replaced by an even clock if they fit one (``time_finding`` reports). Raises LogError naming the
     row where time runs backwards or repeats in any other way.
     """
-    known: Motion | None = log.derived.get(MOTION)
-    if known is None:
-        known = log.derived[MOTION] = _motion_of(log)
-    return known
+    cached: Motion | None = log.derived.get(MOTION)
+    if cached is None:
+        cached = log.derived[MOTION] = _motion_of(log)
+    return cached
 
 
 def with_motion(log: Log, motion: Motion) -> Log:
-    """Return the log with its motion, derived beside rows before and after its own."""
+    """Return the log with a motion that was derived with the rows before and after."""
     log.derived[MOTION] = motion
     return log
 
@@ -144,40 +144,40 @@ def _motion_of(log: Log) -> Motion:
         if moving:
             rows, t, finding = _clock(log, time)
             if finding is not None and finding.check is LogCheck.AMBIGUOUS_TIME:
-                line, first, repeats, count = finding.values
+                line, first, repeated, count = finding.values
                 raise LogError(
                     f"{log.path}: row {line}, column timestamp: found {first:g} again (as in "
-                    f"{repeats} of {count} rows), expected a time of its own per row"
+                    f"{repeated} of {count} rows), expected a time of its own per row"
                 )
     still = np.full(q.shape[1], SMALLEST_MOTION)
-    given = log.require("actual_qd")[rows] if log.has("actual_qd") else None
+    measured_qd = log.require("actual_qd")[rows] if log.has("actual_qd") else None
     target = log.require("target_q")[rows] if log.has("target_q") else None
     motion = Motion(
-        t=t, q=q[rows], qd=np.zeros_like(q[rows]) if given is None else given,
+        t=t, q=q[rows], qd=np.zeros_like(q[rows]) if measured_qd is None else measured_qd,
         qdd=np.zeros_like(q[rows]), target_q=target, loads=log.loads()[rows], rows=rows,
         valid=np.ones(len(rows), dtype=bool), stretch=np.zeros(len(rows), dtype=np.int64),
         start=float(t[0]), moving=moving, still=still,
     )  # fmt: skip
     session = log.columns["session"][rows] if log.session_names else np.zeros(len(rows))
-    return _with_derivatives(motion, given, np.diff(session) != 0) if moving else motion
+    return _with_derivatives(motion, measured_qd, np.diff(session) != 0) if moving else motion
 
 
 def is_moving(time: Array, q: Array, speed: Array | None = None) -> bool:
     """Return whether rows sample a motion (True) or list poses at rest (False)."""
     steps = np.diff(time)
-    fresh = steps > 0
-    if len(time) < 20 or fresh.sum() < 10 or np.median(steps[fresh]) > SLOWEST_SAMPLING:
+    advancing = steps > 0
+    if len(time) < 20 or advancing.sum() < 10 or np.median(steps[advancing]) > MAX_SAMPLE_TIME:
         return False
-    jump = np.abs(np.diff(q, axis=0)).max(axis=1)[fresh] / steps[fresh]
-    if np.median(jump) > FASTEST_JOINT:
+    jump = np.abs(np.diff(q, axis=0)).max(axis=1)[advancing] / steps[advancing]
+    if np.median(jump) > MAX_JOINT_SPEED:
         return False
     # speeds of zero between poses that differ: each row was taken at rest
-    rests = speed is not None and float(np.abs(speed).max()) < SMALLEST_MOTION
-    return not (rests and float(np.median(jump)) > 0.01)
+    at_rest = speed is not None and float(np.abs(speed).max()) < SMALLEST_MOTION
+    return not (at_rest and float(np.median(jump)) > 0.01)
 
 
 def time_finding(log: Log) -> LogFinding | None:
-    """Return what is odd about the timestamps of a moving log: how they repeat; or None."""
+    """Return the finding on repeated timestamps of a moving log; or None."""
     time, q = log.get("timestamp"), log.get("actual_q")
     if time is None or q is None or not is_moving(time, q, log.get("actual_qd")):
         return None
@@ -186,9 +186,9 @@ def time_finding(log: Log) -> LogFinding | None:
 
 def check_order(log: Log, time: Array) -> None:
     """Raise LogError where timestamps (N,) run backwards."""
-    back = np.flatnonzero(np.diff(time) < 0)
-    if len(back):
-        row = int(back[0]) + 1
+    backwards = np.flatnonzero(np.diff(time) < 0)
+    if len(backwards):
+        row = int(backwards[0]) + 1
         raise LogError(
             f"{log.path}: row {log.line(row)}, column timestamp: found {time[row]:g} after "
             f"{time[row - 1]:g}, expected rows in time order"
@@ -197,27 +197,27 @@ def check_order(log: Log, time: Array) -> None:
 
 def _clock(log: Log, time: Array) -> tuple[Index, Array, LogFinding | None]:
     """Return the rows of a recording that count, their times, and how its clock repeats."""
-    repeats = np.flatnonzero(np.diff(time) <= 0) + 1
-    everything: Index = np.arange(len(time))
-    if not len(repeats):
-        return everything, time, None
-    count, first = len(repeats), log.line(repeats[0])
-    same = np.ones(count, dtype=bool)
+    repeated = np.flatnonzero(np.diff(time) <= 0) + 1
+    all_rows: Index = np.arange(len(time))
+    if not len(repeated):
+        return all_rows, time, None
+    count, first = len(repeated), log.line(repeated[0])
+    identical = np.ones(count, dtype=bool)
     for column in log.columns.values():
         flat = column.reshape(len(column), -1)
-        same &= (flat[repeats] == flat[repeats - 1]).all(axis=1)
-    if same.mean() >= COPIES or count < FEW_REPEATS * len(time):
-        kept = np.delete(everything, repeats)
+        identical &= (flat[repeated] == flat[repeated - 1]).all(axis=1)
+    if identical.mean() >= COPIES or count < FEW_REPEATS * len(time):
+        kept = np.delete(all_rows, repeated)
         return kept, time[kept], LogFinding(LogCheck.COPIED_ROWS, (count, len(time), first))
-    even: Array = np.asarray(np.polyval(np.polyfit(everything, time, 1), everything), dtype=float)
-    grain = float(np.diff(time)[np.diff(time) > 0].min())
-    if np.abs(time - even).max() <= grain:
-        return everything, even, LogFinding(LogCheck.ROUNDED_TIME, (grain, count, first))
-    values = first, float(time[repeats[0]]), count, len(time)
-    return everything, time, LogFinding(LogCheck.AMBIGUOUS_TIME, values)
+    uniform: Array = np.asarray(np.polyval(np.polyfit(all_rows, time, 1), all_rows), dtype=float)
+    resolution = float(np.diff(time)[np.diff(time) > 0].min())
+    if np.abs(time - uniform).max() <= resolution:
+        return all_rows, uniform, LogFinding(LogCheck.ROUNDED_TIME, (resolution, count, first))
+    values = first, float(time[repeated[0]]), count, len(time)
+    return all_rows, time, LogFinding(LogCheck.AMBIGUOUS_TIME, values)
 
 
-def _with_derivatives(motion: Motion, given: Array | None, new_session: Mask) -> Motion:
+def _with_derivatives(motion: Motion, measured_qd: Array | None, new_session: Mask) -> Motion:
     steps = np.diff(motion.t)
     step = float(np.median(steps))
     stretch = np.concatenate([[0], np.cumsum((steps > GAP * step) | new_session)])
@@ -228,7 +228,7 @@ def _with_derivatives(motion: Motion, given: Array | None, new_session: Mask) ->
         if len(part) < 15:
             continue
         result = _derivatives(
-            motion.t[part], step, motion.q[part], None if given is None else given[part]
+            motion.t[part], step, motion.q[part], None if measured_qd is None else measured_qd[part]
         )
         qd[part], qdd[part], valid[part], noise_here = result
         noise = np.maximum(noise, noise_here)
@@ -237,51 +237,51 @@ def _with_derivatives(motion: Motion, given: Array | None, new_session: Mask) ->
     return replace(motion, qd=qd, qdd=qdd, valid=valid, stretch=stretch, still=still)
 
 
-def _at(time: Array, value: Array, wanted: Array) -> Array:
+def _interpolated(time: Array, value: Array, at: Array) -> Array:
     """Return signals (N, k) at other times (M,) by cubic splines."""
     from gapbridge.core.kernels.interpolation import splined  # brings numba
 
-    return np.stack([splined(time, column, wanted) for column in value.T], axis=1)
+    return np.stack([splined(time, column, at) for column in value.T], axis=1)
 
 
 def _derivatives(
-    t: Array, step: float, q: Array, given: Array | None
+    t: Array, step: float, q: Array, measured_qd: Array | None
 ) -> tuple[Array, Array, Mask, Array]:
     """Return speeds, accelerations, the rows where they are good, and noise of the speeds (n,)."""
     grid = np.linspace(t[0], t[-1], max(round((t[-1] - t[0]) / step), 14) + 1)
-    even = len(grid) == len(t) and bool(np.abs(grid - t).max() < 1e-2 * step)
+    uniform = len(grid) == len(t) and bool(np.abs(grid - t).max() < 1e-2 * step)
     step = float(grid[1] - grid[0])
-    on_grid = q if even else _at(t, q, grid)
-    known = given if even or given is None else _at(t, given, grid)
+    on_grid = q if uniform else _interpolated(t, q, grid)
+    cached = measured_qd if uniform or measured_qd is None else _interpolated(t, measured_qd, grid)
     speed = differentiate(on_grid, step, 1)
     for longest in WINDOWS:
-        qdd, unsure, edge = _accelerations(on_grid, known, step, longest)
-        good: Mask = ~np.any(unsure, axis=1)
-        if good.mean() >= FEWEST_SMOOTH:
+        qdd, unsure, edge = _accelerations(on_grid, cached, step, longest)
+        valid: Mask = ~np.any(unsure, axis=1)
+        if valid.mean() >= MIN_SMOOTH_SHARE:
             break
     else:
-        good[:] = True  # no smooth motion at all: better rough accelerations than none
+        valid[:] = True  # no smooth motion at all: use rough accelerations
     edge = max(edge, speed.half_width)
-    good[:edge] = good[len(good) - edge :] = False
+    valid[:edge] = valid[len(valid) - edge :] = False
     qd = speed.value
-    if not even:
-        qd, qdd = _at(grid, qd, t), _at(grid, qdd, t)
-        good = np.interp(t, grid, good) > 0.999
-    return qd, qdd, good, speed.noise
+    if not uniform:
+        qd, qdd = _interpolated(grid, qd, t), _interpolated(grid, qdd, t)
+        valid = np.interp(t, grid, valid) > 0.999
+    return qd, qdd, valid, speed.noise
 
 
 def _accelerations(
     q: Array, qd: Array | None, step: float, longest: float
 ) -> tuple[Array, Mask, int]:
     """Return accelerations (N, n), where (N, n) they jump, and the rows to drop at either end."""
-    bend = differentiate(q, step, 2, longest)
+    from_angles = differentiate(q, step, 2, longest)
     if qd is None:
-        return bend.value, bend.unsure, bend.half_width
-    slope = differentiate(qd, step, 1, longest)
-    # speeds that were measured count, unless their noise is worse than that of angles
-    better = slope.noise <= np.maximum(bend.noise, 1e-9)
+        return from_angles.value, from_angles.unsure, from_angles.half_width
+    from_speeds = differentiate(qd, step, 1, longest)
+    # from measured speeds, unless they are noisier than the angles
+    use_speeds = from_speeds.noise <= np.maximum(from_angles.noise, 1e-9)
     return (
-        np.where(better, slope.value, bend.value),
-        np.where(better, slope.unsure, bend.unsure),
-        max(slope.half_width, bend.half_width),
+        np.where(use_speeds, from_speeds.value, from_angles.value),
+        np.where(use_speeds, from_speeds.unsure, from_angles.unsure),
+        max(from_speeds.half_width, from_angles.half_width),
     )

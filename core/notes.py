@@ -1,4 +1,4 @@
-"""What a fit, a calibration or a plan reports beside its figures; ``bridge`` words it."""
+"""Notes of a fit, a calibration or a plan; ``bridge`` makes their text."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 
 class Reason(Enum):
-    """What is noted; the comment says what the note's values are."""
+    """What is noted; the comment lists the note's values."""
 
     # of any fit
     OUTLIERS = auto()  # rows
@@ -34,8 +34,8 @@ class Reason(Enum):
     ONLY_TOGETHER = auto()  # parameter, the others
     HARDLY_SHOWN = auto()  # parameter
     NEVER_SHOWN = auto()  # parameter
-    REDUNDANT = auto()  # parameter, those that stand for it
-    REDUNDANT_WITH_PLACE = auto()  # the same; where instrument or target stand does too
+    REDUNDANT = auto()  # parameter, those that it is equivalent to
+    REDUNDANT_WITH_PLACE = auto()  # the same, with the place of instrument or target
     # of a calibration
     ON_BOUND = auto()  # parameters
     HELD_OUT_FAR = auto()  # rows, from 1
@@ -44,10 +44,10 @@ class Reason(Enum):
     VERIFYING_FITTED = auto()  # readings
     FRAME_FITTED = auto()
     FEW_NUMBERS = auto()  # how many
-    # what a calibration leaves
+    # of a calibration's residual
     NOTHING = auto()
     UNCONVERGED = auto()
-    EFFECTS_MISSING = auto()  # pairs of effect and share of what is left
+    EFFECTS_MISSING = auto()  # pairs of effect and share of the residual
     EFFECTS_ACCUSED = auto()  # effects
     STRUCTURE = auto()
     FAR_OFF = auto()  # times as far as predicted
@@ -62,7 +62,7 @@ class Reason(Enum):
     ONE_LOAD = auto()
     SIGHT_UNKNOWN = auto()
     DETOURS = auto()  # pairs of stops, from 1
-    FEW_POSES = auto()  # what hinders the others
+    FEW_POSES = auto()  # RejectedPoses
     # of a recording that is read as a log
     NO_STAMPS = auto()  # topic, messages without a stamp, messages
     NO_TARGET = auto()

@@ -1,7 +1,7 @@
-"""Whether an arm can be one: reach, masses, limits, and what its URDF says before it is an arm.
+"""Plausibility of an arm: reach, masses, limits, and the values of its URDF.
 
-A length in millimetres or an angle in degrees is a hundred or a thousand times too large, which no
-arm is: such values are mistakes. What only few arms are is odd.
+A length in millimetres or an angle in degrees is a hundred or a thousand times too large for any
+arm: such values are errors. Values that few arms have are warnings.
 """
 
 from __future__ import annotations
@@ -20,19 +20,19 @@ from gapbridge.core.files import read_text
 
 URDF = ("robot", "urdf")  # key of the cell that names the file
 POSES = 64
-LONGEST, LONG, SHORT = 20.0, 5.0, 0.05  # m of reach: no arm, few arms, few arms
-TURN = 6.4  # rad: a little more than one turn; a fixed angle beyond is in degrees
-TURNS = 25.0  # rad: no revolute joint is limited further out
-QUICK = 60.0  # rad/s: no joint of an arm turns quicker
-HEAVY, HEAVIEST = 500.0, 5000.0  # kg of one link: few arms, no arm
-DENSEST = 2000.0  # kg of the arm by the cube of its reach, m: arms have 10 to 250
+MAX_REACH, LARGE_REACH, SMALL_REACH = 20.0, 5.0, 0.05  # m of reach: no arm, few arms, few arms
+MAX_FIXED_ANGLE = 6.4  # rad: a little more than one turn; a fixed angle beyond is in degrees
+MAX_LIMIT = 25.0  # rad: no revolute joint is limited further out
+MAX_SPEED = 60.0  # rad/s: no joint of an arm turns quicker
+LARGE_MASS, MAX_MASS = 500.0, 5000.0  # kg of one link: few arms, no arm
+MAX_DENSITY = 2000.0  # kg of the arm by the cube of its reach, m: arms have 10 to 250
 
 
 @dataclass(frozen=True)
 class Implausible:
-    """One implausible value: surely a mistake, or only one that few arms have.
+    """One implausible value: an error (``sure``) or a warning.
 
-    ``keys`` is its path in the cell, where it stands there; ``where`` a place in another file.
+    ``keys`` is its path in the cell; ``where`` its place in another file.
     """
 
     keys: tuple[str | int, ...]
@@ -43,10 +43,10 @@ class Implausible:
 
 
 def reach(arm: Arm, seed: int = 0) -> float:
-    """Return how far (m) the flange gets from joint 1, by random poses.
+    """Return the largest distance (m) of the flange from joint 1, over random poses.
 
-    Poses rather than the sum of lengths: lengths of a factory calibration may be hundreds of metres
-    that cancel.
+    Not the sum of lengths: a factory calibration may have lengths of hundreds of metres, which
+    cancel.
     """
     q = np.random.default_rng(seed).uniform(-np.pi, np.pi, (POSES, arm.n))
     return float(np.linalg.norm(flange_in_first(arm, q)[:, :3, 3], axis=1).max())
@@ -57,39 +57,41 @@ def flange_in_first(arm: Arm, q: Array) -> Array:
     frame = np.tile(np.eye(4), (len(q), 1, 1))
     for i in range(arm.n):
         c, s = np.cos(q[:, i]), np.sin(q[:, i])
-        turn = np.tile(np.eye(4), (len(q), 1, 1))
-        turn[:, 0, 0], turn[:, 0, 1], turn[:, 1, 0], turn[:, 1, 1] = c, -s, s, c
-        frame = frame @ turn @ arm.link_in_link[i + 1]
+        rotation = np.tile(np.eye(4), (len(q), 1, 1))
+        rotation[:, 0, 0], rotation[:, 0, 1], rotation[:, 1, 0], rotation[:, 1, 1] = c, -s, s, c
+        frame = frame @ rotation @ arm.link_in_link[i + 1]
     return np.asarray(frame)
 
 
 def implausible_in_arm(arm: Arm, keys: tuple[str | int, ...]) -> Iterator[Implausible]:
-    """Yield what is implausible about an arm as a whole; ``keys`` is where the cell names it."""
-    far = reach(arm)
-    if far > LONGEST:
-        yield Implausible(keys, f"an arm of {far:.4g} m reach", "lengths in m (these look like mm)")
-    elif not SHORT <= far <= LONG:
-        yield Implausible(keys, f"an arm of {far:.3g} m reach", "0.05 to 5 m", sure=False)
+    """Yield the implausible values of an arm; ``keys`` is its path in the cell."""
+    reach_m = reach(arm)
+    if reach_m > MAX_REACH:
+        yield Implausible(
+            keys, f"an arm of {reach_m:.4g} m reach", "lengths in m (these look like mm)"
+        )
+    elif not SMALL_REACH <= reach_m <= LARGE_REACH:
+        yield Implausible(keys, f"an arm of {reach_m:.3g} m reach", "0.05 to 5 m", sure=False)
     for i, mass in enumerate(arm.mass):
-        if mass < 0 or mass > HEAVIEST:
+        if mass < 0 or mass > MAX_MASS:
             yield Implausible(keys, f"{mass:.4g} kg of link {i + 1}", "kg, 0 or more (grams?)")
-        elif mass > HEAVY:
+        elif mass > LARGE_MASS:
             yield Implausible(keys, f"{mass:.4g} kg of link {i + 1}", "at most 500 kg", sure=False)
-        away = float(np.linalg.norm(arm.cog[i])) if mass > 0 else 0.0
-        if far <= LONGEST and away > 2.0 * far + 1.0:
+        distance = float(np.linalg.norm(arm.cog[i])) if mass > 0 else 0.0
+        if reach_m <= MAX_REACH and distance > 2.0 * reach_m + 1.0:
             yield Implausible(
-                keys, f"a centre of gravity of link {i + 1} {away:.4g} m off", "m (mm?)"
+                keys, f"a centre of gravity of link {i + 1} {distance:.4g} m off", "m (mm?)"
             )
-    if (mass := float(arm.mass.sum())) > DENSEST * far**3 and mass > HEAVY:
-        yield Implausible(keys, f"an arm of {mass:.4g} kg and {far:.3g} m reach", "kg (grams?)")
-    weightless = [str(i + 1) for i in range(arm.n) if arm.mass[i] == 0]
-    if len(weightless) == arm.n:
+    if (mass := float(arm.mass.sum())) > MAX_DENSITY * reach_m**3 and mass > LARGE_MASS:
+        yield Implausible(keys, f"an arm of {mass:.4g} kg and {reach_m:.3g} m reach", "kg (grams?)")
+    massless = [str(i + 1) for i in range(arm.n) if arm.mass[i] == 0]
+    if len(massless) == arm.n:
         yield Implausible(
             keys, "an arm without masses", "the links' masses: without them only payload and "
             "pulls bend the model", sure=False,
         )  # fmt: skip
-    elif weightless:
-        yield Implausible(keys, f"no mass of link {', '.join(weightless)}", "one", sure=False)
+    elif massless:
+        yield Implausible(keys, f"no mass of link {', '.join(massless)}", "one", sure=False)
 
 
 def implausible_in_urdf(path: Path, arm: Arm) -> Iterator[Implausible]:
@@ -110,15 +112,19 @@ def implausible_in_urdf(path: Path, arm: Arm) -> Iterator[Implausible]:
                 "this one follows another", where=where,
             )  # fmt: skip
         origin, limit = joint.find("origin"), joint.find("limit")
-        if (far := _largest(origin, "xyz")) > LONGEST:
-            yield Implausible(URDF, f"origin xyz {far:g}", "m (it looks like mm)", where=where)
-        if (angle := _largest(origin, "rpy")) > TURN:
+        if (reach_m := _largest(origin, "xyz")) > MAX_REACH:
+            yield Implausible(URDF, f"origin xyz {reach_m:g}", "m (it looks like mm)", where=where)
+        if (angle := _largest(origin, "rpy")) > MAX_FIXED_ANGLE:
             yield Implausible(
                 URDF, f"origin rpy {angle:g}", "rad (it looks like degrees)", where=where
             )
         if joint.get("type") != "revolute":
             continue
-        for key, most in (("lower", TURNS), ("upper", TURNS), ("velocity", QUICK)):
+        for key, most in (
+            ("lower", MAX_LIMIT),
+            ("upper", MAX_LIMIT),
+            ("velocity", MAX_SPEED),
+        ):
             if (value := _largest(limit, key)) > most:
                 yield Implausible(
                     URDF, f"limit {key} {value:g}", "rad (it looks like degrees)", where=where

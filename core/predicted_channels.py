@@ -1,4 +1,4 @@
-"""What a model predicts of each channel of a log, row by row, whether it was measured or not."""
+"""A model's prediction of each channel of a log, per row, measured or not."""
 
 from __future__ import annotations
 
@@ -26,50 +26,54 @@ def predicted_channels(model: Model, log: Log) -> tuple[dict[str, Array], dict[s
     wrench. Raises LogError where the log holds something unusable.
     """
     motion = motion_of(log)
-    found: dict[str, Array] = {}
+    predicted: dict[str, Array] = {}
     needs: dict[str, str] = {}
-    whole = with_pieces(model, motion)
+    with_loads = with_pieces(model, motion)
     if model.arm.mass.any():
-        found["predicted_torque"] = _spread(predict_torque, model, whole, len(log), whole.valid)
+        predicted["predicted_torque"] = _at_rows(
+            predict_torque, model, with_loads, len(log), with_loads.valid
+        )
     else:
         needs["torque"] = NO_MASSES
-    found["predicted_wrench"] = _spread(predict_wrench, model, whole, len(log), whole.valid)
+    predicted["predicted_wrench"] = _at_rows(
+        predict_wrench, model, with_loads, len(log), with_loads.valid
+    )
     if motion.target_q is None:
         needs["tracking"] = "target_q"
     else:
-        every = np.ones(len(motion), dtype=bool)
-        found["predicted_q"] = _spread(predict_tracking, model, motion, len(log), every)
-    return found, needs
+        all_rows = np.ones(len(motion), dtype=bool)
+        predicted["predicted_q"] = _at_rows(predict_tracking, model, motion, len(log), all_rows)
+    return predicted, needs
 
 
-def in_context(pieces: Iterable[Log], rows: int = ROWS) -> Iterator[tuple[Log, slice]]:
-    """Yield the pieces of one recording with the rows around that their channels depend on.
+def with_neighbours(pieces: Iterable[Log], rows: int = ROWS) -> Iterator[tuple[Log, slice]]:
+    """Yield pieces of one recording, each with the neighbouring rows that its channels depend on.
 
-    Each comes as a log, and which rows of it are its own: those before and after are there for
-    derivatives, and for delays that look back. What is not longer than ``rows`` comes as a whole.
+    Each is a log, and the slice of its own rows: the others are for derivatives and delays. A
+    recording of at most ``rows`` is one piece.
     """
-    held: Log | None = None
-    done, start = 0, None  # rows of what is held that were given; s
+    buffer: Log | None = None
+    given, start = 0, None  # rows of what is held that were given; s
     for piece in pieces:
         if start is None and piece.has("timestamp"):
             start = float(piece.columns["timestamp"][0])
-        if held is not None and set(held.columns) != set(piece.columns):
-            yield _from(held, start), slice(done, len(held))
-            held, done = None, 0
-        held = piece if held is None else _joined(held, piece)
-        while len(held) - done > rows + EDGE:
-            end = done + rows
-            yield _from(held.select(slice(0, end + EDGE)), start), slice(done, end)
-            first = max(end - _rows_before(held), 0)
-            held, done = held.select(slice(first, None)), end - first
-    if held is not None:
-        yield _from(held, start), slice(done, len(held))
+        if buffer is not None and set(buffer.columns) != set(piece.columns):
+            yield _with_start(buffer, start), slice(given, len(buffer))
+            buffer, given = None, 0
+        buffer = piece if buffer is None else _appended(buffer, piece)
+        while len(buffer) - given > rows + EDGE:
+            end = given + rows
+            yield _with_start(buffer.select(slice(0, end + EDGE)), start), slice(given, end)
+            first = max(end - _rows_before(buffer), 0)
+            buffer, given = buffer.select(slice(first, None)), end - first
+    if buffer is not None:
+        yield _with_start(buffer, start), slice(given, len(buffer))
 
 
-def _joined(log: Log, further: Log) -> Log:
+def _appended(log: Log, further: Log) -> Log:
     """Return a log with the rows that follow it."""
-    whole = slice(None)
-    one, other = log.select(whole), further.select(whole)  # each row with its line
+    with_loads = slice(None)
+    one, other = log.select(with_loads), further.select(with_loads)  # each row with its line
     assert one.lines is not None
     assert other.lines is not None
     return replace(
@@ -86,12 +90,12 @@ def _rows_before(log: Log) -> int:
     return EDGE + (int(np.ceil(LEAD / step)) if step > 0 else 0)
 
 
-def _from(log: Log, start: float | None) -> Log:
-    """Return a part of a recording that knows when the recording begins."""
+def _with_start(log: Log, start: float | None) -> Log:
+    """Return a part of a recording with the recording's start time."""
     return log if start is None else with_motion(log, replace(motion_of(log), start=start))
 
 
-def _spread(
+def _at_rows(
     predict: Callable[[Model, Motion], Array], model: Model, motion: Motion, count: int,
     valid: Mask,
 ) -> Array:  # fmt: skip

@@ -42,17 +42,17 @@ def one_rotation_matrix(vector: Array) -> Array:
 
 
 def left_jacobian(vector: Array) -> Array:
-    """Return the turns (3, 3), as columns, that one more rad of each number of a vector makes.
-
-    exp(v + dv) = exp(J dv) exp(v) to first order; ``vector`` (3,) in rad.
-    """
+    """Return J (3, 3): exp(v + dv) = exp(J dv) exp(v) to first order; ``vector`` v (3,) in rad."""
     K = skew(vector)
     square = float(np.dot(vector, vector))
     angle = sqrt(square)
     if angle < 1e-3:
         second, third = 0.5 - square / 24, 1 / 6 - square / 120
     else:
-        second, third = 2 * (sin(angle / 2) / angle) ** 2, (angle - sin(angle)) / (angle * square)
+        second, third = (
+            2 * (sin(angle / 2) / angle) ** 2,
+            (angle - sin(angle)) / (angle * square),
+        )
     return np.asarray(np.eye(3) + second * K + third * (K @ K))
 
 
@@ -67,7 +67,7 @@ def rotation_vector(matrix: Array) -> Array:
 
 
 def mean_rotation(vectors: Array) -> Array:
-    """Return the mean (3,) of close rotation vectors (N, 3), rad: of matrices, as vectors flip."""
+    """Return the mean rotation (3,) of close rotation vectors (N, 3), rad, by their matrices."""
     U, _, Vt = np.linalg.svd(rotation_matrix(vectors).mean(axis=0))
     return rotation_vector(U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt)
 
@@ -103,7 +103,7 @@ def rpy_matrix(roll_pitch_yaw: Array) -> Array:
 def roll_pitch_yaw(matrix: Array) -> Array:
     """Return roll, pitch, yaw (3,) in rad of a rotation (3, 3), as URDF has them; see rpy_matrix.
 
-    Where the pitch is a right angle, roll and yaw turn about one axis: yaw is zero then.
+    At a pitch of a right angle, where only their sum is defined, yaw is zero.
     """
     level = float(np.hypot(matrix[0, 0], matrix[1, 0]))
     pitch = np.arctan2(-matrix[2, 0], level)

@@ -1,8 +1,8 @@
 """Several logs of one arm: each a session with its own frame, all with the same effects.
 
-Joined, they are one log whose column ``session`` holds the index (from 0) of each row's session.
-Sessions share one clock; where their clocks overlap (each began at zero), later sessions are
-shifted behind the earlier ones, so that rows stay in time order, and ``one_clock`` is False.
+Joined, they are one log with a column ``session``, the index (from 0) of each row's session.
+Sessions share one clock; where their clocks overlap (each started at zero), later sessions are
+shifted after the earlier ones, and ``one_clock`` is False.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from gapbridge.core.log.log import Log
 from gapbridge.core.model import Model
 from gapbridge.core.motion import is_moving
 
-PAUSE = 60.0  # s between sessions whose clocks overlap
-LEAST_ROWS = 20  # from which a session shows whether it records motion
+GAP = 60.0  # s between sessions whose clocks overlap
+MIN_ROWS = 20  # of a session, to detect whether it records motion
 MEASURED = ("measured_position", "measured_rotation", "ft_raw_wrench", "actual_current_as_torque")
 
 
@@ -51,26 +51,26 @@ def with_sessions(log: Log, model: Model) -> Log:
     if not log.has("session") or log.session_names:
         return log
     number = log.require("session")
-    odd = np.flatnonzero(number != np.round(number))
-    if len(odd):
-        row = int(odd[0])
+    not_whole = np.flatnonzero(number != np.round(number))
+    if len(not_whole):
+        row = int(not_whole[0])
         raise LogError(
             f"{log.path}: row {log.line(row)}, column session: found {number[row]:g}, expected a "
             "whole number"
         )
-    begins = np.concatenate([[0], np.flatnonzero(np.diff(number)) + 1])
-    order = number[begins]
+    starts = np.concatenate([[0], np.flatnonzero(np.diff(number)) + 1])
+    order = number[starts]
     for k, value in enumerate(order):
         if value in order[:k]:
             raise LogError(
-                f"{log.path}: row {log.line(begins[k])}, column session: found {value:g} again "
+                f"{log.path}: row {log.line(starts[k])}, column session: found {value:g} again "
                 f"after {order[k - 1]:g}, expected the rows of a session side by side"
             )
     if len(order) == 1:
         return log
-    ends = [*begins[1:], len(number)]
-    parts = [log.select(slice(a, b)) for a, b in zip(begins, ends, strict=True)]
-    return _joined(parts, tuple(f"{value:g}" for value in order), model, log.path)
+    ends = [*starts[1:], len(number)]
+    parts = [log.select(slice(a, b)) for a, b in zip(starts, ends, strict=True)]
+    return _join(parts, tuple(f"{value:g}" for value in order), model, log.path)
 
 
 def join_sessions(logs: Sequence[Log], model: Model) -> Log:
@@ -90,7 +90,7 @@ def join_sessions(logs: Sequence[Log], model: Model) -> Log:
                 "expected one log a session, or one log with all of them"
             )
     paths = [log.path for log in logs]
-    return replace(_joined(logs, names, model, ", ".join(paths)), files=tuple(paths))
+    return replace(_join(logs, names, model, ", ".join(paths)), files=tuple(paths))
 
 
 def _names(paths: Sequence[str]) -> tuple[str, ...]:
@@ -103,11 +103,11 @@ def _names(paths: Sequence[str]) -> tuple[str, ...]:
     raise LogError(f"{paths[0]}: found twice, expected each log once")
 
 
-def _joined(logs: Sequence[Log], names: tuple[str, ...], model: Model, path: str) -> Log:
+def _join(logs: Sequence[Log], names: tuple[str, ...], model: Model, path: str) -> Log:
     _check_kinds(logs)
     logs = [_with_approach(log) for log in logs]
-    given = [set(log.columns) for log in logs]
-    everywhere, somewhere = set.intersection(*given), set.union(*given)
+    names_of_each = [set(log.columns) for log in logs]
+    everywhere, somewhere = set.intersection(*names_of_each), set.union(*names_of_each)
     columns: dict[str, Array] = {}
     for name in sorted(somewhere - {"session", "timestamp"}):
         parts = [_column(log, name, model, everywhere) for log in logs]
@@ -132,7 +132,7 @@ def _check_kinds(logs: Sequence[Log]) -> None:
     for log in logs:
         q = log.columns.get("actual_q", log.columns.get("target_q"))
         time = log.get("timestamp")
-        if q is None or time is None or len(log) < LEAST_ROWS:
+        if q is None or time is None or len(log) < MIN_ROWS:
             continue
         log.require("timestamp")
         kinds.setdefault(is_moving(time, q, log.get("actual_qd")), log.path)
@@ -144,23 +144,23 @@ def _check_kinds(logs: Sequence[Log]) -> None:
 
 
 def _with_approach(log: Log) -> Log:
-    """Return the log with the last motions of its own joints, not of the session before."""
+    """Return the log with its directions of approach, before sessions are joined."""
     approach = log.approach()
     return log if approach is None else replace(log, columns={**log.columns, "approach": approach})
 
 
 def _column(log: Log, name: str, model: Model, everywhere: set[str]) -> Array | None:
-    """Return a session's column, or what stands for it; None: the joined log goes without."""
+    """Return a session's column, or its default; None: the joined log lacks it."""
     if name in log.columns:
         return log.columns[name]
-    own: dict[str, Array] = {
+    defaults: dict[str, Array] = {
         "payload": np.array(model.payload_mass),
         "payload_cog": model.payload_cog,
         "joint_temperatures": np.full(log.n, model.reference_temperature),
         "actual_TCP_force": np.zeros(6),
     }
-    if name in own:
-        return np.tile(own[name], (len(log), *(1 for _ in own[name].shape)))
+    if name in defaults:
+        return np.tile(defaults[name], (len(log), *(1 for _ in defaults[name].shape)))
     if name in MEASURED and name != "measured_rotation":
         width = {"measured_position": 3, "ft_raw_wrench": 6}.get(name, log.n)
         return np.full((len(log), width), np.nan)
@@ -174,6 +174,6 @@ def _clock(times: Sequence[Array]) -> tuple[Array, bool]:
         return np.concatenate(times), True
     shifted, end = [times[0]], float(times[0][-1])
     for time in times[1:]:
-        shifted.append(time - time[0] + end + PAUSE)
+        shifted.append(time - time[0] + end + GAP)
         end = float(shifted[-1][-1])
     return np.concatenate(shifted), False

@@ -1,4 +1,4 @@
-"""What layers exchange: a sample that a controller reports, and a setpoint that goes to it."""
+"""The records between layers: a sample of a controller's state, and a setpoint to it."""
 
 from __future__ import annotations
 
@@ -31,15 +31,15 @@ class RobotState(NamedTuple):
     runtime_state: int = 2  # RTDE runtime_state; 2 = playing
     safety_status_bits: int = 1  # RTDE safety_status_bits; bit 0 = normal mode
     speed_scaling: float = 1.0
-    sensor_lost: str = ""  # why the force is missing: then actual_TCP_force is NaN
+    sensor_lost: str = ""  # why the force is missing; actual_TCP_force is then NaN
 
 
 class Setpoint(NamedTuple):
     """One corrected joint setpoint, as it leaves the limiter.
 
-    ``offset_in_base`` is the same correction seen at the rigid arm's TCP: where ``q`` puts it minus
-    where ``nominal_q`` puts it, position (m) and rotation vector (rad) in base axes. Drivers whose
-    controller takes a Cartesian offset send it instead of ``q``. A tuple, as RobotState is.
+    ``offset_in_base`` is the same correction at the rigid arm's TCP: pose at ``q`` minus pose at
+    ``nominal_q``, position (m) and rotation vector (rad) in base axes. Drivers whose controller
+    takes a Cartesian offset send it instead of ``q``. A tuple, as RobotState is.
     """
 
     q: Array  # (n,) rad, the setpoint to be commanded

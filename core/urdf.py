@@ -14,17 +14,17 @@ from gapbridge.core.errors import ArmError
 from gapbridge.core.files import read_text
 from gapbridge.core.rotation import rotation_matrix, rpy_matrix, transform
 
-TURNING = ("revolute", "continuous")
+REVOLUTE = ("revolute", "continuous")
 XACRO = "ros.org/wiki/xacro"  # in the namespace of its macros
 
 
 @dataclass(frozen=True)
 class _Body:
-    """What is rigidly joined to one moving link, in that link's frame."""
+    """Mass properties of the bodies fixed to one moving link, in that link's frame."""
 
     mass: float
-    first: Array  # sum of mass x position
-    second: Array  # inertia about the frame's origin
+    first: Array  # kg m, first moment of mass
+    second: Array  # kg m2, inertia about the frame's origin
 
     def __add__(self, other: _Body) -> _Body:
         return _Body(
@@ -32,14 +32,14 @@ class _Body:
         )  # fmt: skip
 
 
-NOTHING = _Body(0.0, np.zeros(3), np.zeros((3, 3)))
+NO_BODY = _Body(0.0, np.zeros(3), np.zeros((3, 3)))
 
 
 def arm_from_urdf(path: Path | str, tip: str | None = None) -> Arm:
     """Return the arm of a URDF file, from its root link to ``tip`` (default: the last link).
 
-    Fixed joints are folded into the links they join; side branches (grippers, covers) must be
-    fixed and their masses count where they hang. Joint frames are turned so that z is the axis.
+    Fixed joints are merged into their parent links; side branches (grippers, covers) add their
+    masses to the link that they are on. Joint frames are rotated so that z is the axis.
     Raises ArmError where the file is not a URDF, the tip is unknown or ambiguous, or a joint on the
     way is neither revolute, continuous nor fixed.
     """
@@ -75,7 +75,7 @@ def _parse(path: Path) -> ElementTree.Element:
             "-o robot.urdf)"
         )
     links = {str(link.get("name")) for link in root.findall("link")}
-    moved: dict[str, str | None] = {}  # by the joint that turns or holds it
+    moved_by: dict[str, str | None] = {}  # by the joint that turns or holds it
     for joint in root.findall("joint"):
         label = f"{path}: joint {joint.get('name')!r}"
         if joint.find("child") is None or joint.find("parent") is None:
@@ -83,12 +83,12 @@ def _parse(path: Path) -> ElementTree.Element:
         for link in (_parent(joint), _child(joint)):
             if link not in links:
                 raise ArmError(f"{label}: found link {link!r}, expected one that the file has")
-        if _child(joint) in moved:
+        if _child(joint) in moved_by:
             raise ArmError(
                 f"{label}: found child link {_child(joint)!r}, expected one that joint "
-                f"{moved[_child(joint)]!r} does not move already"
+                f"{moved_by[_child(joint)]!r} does not move already"
             )
-        moved[_child(joint)] = joint.get("name")
+        moved_by[_child(joint)] = joint.get("name")
     return root
 
 
@@ -99,7 +99,7 @@ def _only_leaf(
     leaves = [name for name in links if name not in parents]
     if len(leaves) == 1:
         return leaves[0]
-    depth = {leaf: sum(j.get("type") in TURNING for j in _chain(leaf, joints)) for leaf in leaves}
+    depth = {leaf: sum(j.get("type") in REVOLUTE for j in _chain(leaf, joints)) for leaf in leaves}
     deepest = [leaf for leaf in leaves if depth[leaf] == max(depth.values())]
     if len(deepest) == 1:
         return deepest[0]
@@ -130,19 +130,19 @@ def _assemble(
     joints: dict[str, ElementTree.Element],
     links: dict[str, ElementTree.Element],
 ) -> Arm:
-    fixed, bodies, moving = [np.eye(4)], [NOTHING], []
+    fixed, bodies, moving = [np.eye(4)], [NO_BODY], []
     on_chain = {_child(j) for j in chain}
     root = _parent(chain[0]) if chain else ""
     bodies[-1] += _branches(path, root, np.eye(4), joints, links, on_chain)
     for joint in chain:
         kind, label = joint.get("type"), f"{path}: joint {joint.get('name')!r}"
         step = fixed[-1] @ _origin(joint, label)
-        if kind in TURNING:
+        if kind in REVOLUTE:
             align = _align_z(_axis(joint, label))
             fixed[-1] = step @ align
             moving.append(joint)
             fixed.append(align.T)  # align is a pure rotation
-            bodies.append(NOTHING)
+            bodies.append(NO_BODY)
         elif kind == "fixed":
             fixed[-1] = step
         else:
@@ -166,8 +166,8 @@ def _arm(
         label = f"{path}: joint {joint.get('name')!r}: limit"
         free = joint.get("type") == "continuous"
         for key, default in (("lower", -np.inf), ("upper", np.inf)):
-            given = limit is not None and not free and limit.get(key) is not None
-            columns[key].append(_vector(limit, key, "0", label)[0] if given else default)
+            declared = limit is not None and not free and limit.get(key) is not None
+            columns[key].append(_vector(limit, key, "0", label)[0] if declared else default)
         for key in ("velocity", "effort"):
             value = _vector(limit, key, "0", label)[0]
             columns[key].append(value if value > 0 else np.inf)
@@ -187,23 +187,23 @@ def _branches(
     joints: dict[str, ElementTree.Element], links: dict[str, ElementTree.Element],
     on_chain: set[str],
 ) -> _Body:  # fmt: skip
-    """Return what hangs on a link beside the way to the tip."""
-    body = NOTHING
+    """Return the mass properties of a link's side branches."""
+    body = NO_BODY
     for child, joint in joints.items():
         if _parent(joint) != link or child in on_chain:
             continue
-        # a gripper's fingers count where they stand at zero
-        beyond = frame @ _origin(joint, f"{path}: joint {joint.get('name')!r}")
-        body += _link(path, links[child], beyond)
-        body += _branches(path, child, beyond, joints, links, on_chain)
+        # movable side joints (a gripper's fingers) are taken at zero
+        child_frame = frame @ _origin(joint, f"{path}: joint {joint.get('name')!r}")
+        body += _link(path, links[child], child_frame)
+        body += _branches(path, child, child_frame, joints, links, on_chain)
     return body
 
 
 def _link(path: Path, link: ElementTree.Element, frame: Array) -> _Body:
-    """Return a link's own mass and inertia, in the frame's axes."""
+    """Return the mass properties of one link, in the frame's axes."""
     inertial = link.find("inertial")
     if inertial is None:
-        return NOTHING
+        return NO_BODY
     label = f"{path}: link {link.get('name')!r}"
     element = inertial.find("mass")
     mass = _vector(element, "value", "0", label)[0]

@@ -22,7 +22,7 @@ from benchmarks.blind.arms import ARMS
 from benchmarks.calibration import laid_out
 from benchmarks.calibration.drawings import model_of, real_arm
 from gapbridge.core.calibration.converged_fit import converged_fit
-from gapbridge.core.calibration.fit import estimates_of
+from gapbridge.core.calibration.fit import make_estimates
 from gapbridge.core.calibration.held_out_check import predicted
 from gapbridge.core.calibration.identifiability import identifiable_parameters
 from gapbridge.core.calibration.observables import make_observable
@@ -91,7 +91,7 @@ def run(setting: Setting, seed: int) -> Outcome:
     fitted = readings[~readings.held_out]
     problem, rest = converged_fit(setting.parameters, how, fitted, metrology, lambda text: None)
     seconds = time.perf_counter() - begun
-    estimates = estimates_of(setting.parameters, rest, None)
+    estimates = make_estimates(setting.parameters, rest, None)
     held = [
         (e.name, bool(e.interval[0] <= truth[e.name] <= e.interval[1]))
         for e in estimates

@@ -32,14 +32,14 @@ from gapbridge.core.calibration.identifiability import identifiable_parameters
 from gapbridge.core.calibration.observables import make_observable
 from gapbridge.core.calibration.observables.nuisance import Nuisance
 from gapbridge.core.calibration.observables.observable import Observable
-from gapbridge.core.calibration.observables.predicted_readings import empty_readings
+from gapbridge.core.calibration.observables.predicted_readings import unmeasured_readings
 from gapbridge.core.calibration.parameters import Parameters
 from gapbridge.core.calibration.plan import Plan
 from gapbridge.core.calibration.readings import Readings
 from gapbridge.core.loads import Loads
-from gapbridge.core.planning.candidates import candidates_of
-from gapbridge.core.planning.design import SessionDesign, far_end, plan, reference_of
-from gapbridge.core.planning.information import Reference, blocks, information_of, inverse
+from gapbridge.core.planning.candidates import sample_candidates
+from gapbridge.core.planning.design import SessionDesign, draw_reference, load_extent, plan
+from gapbridge.core.planning.information import Reference, information_of, inverse, whitened_rows
 
 Array = NDArray[np.float64]
 SIGMA = 3e-5
@@ -80,7 +80,7 @@ def readings_of(planned: Plan, kind: str) -> Readings:
         payload_cog=np.array([one.cog for one in planned.loads], dtype=float)[load],
         approach=np.array([pose.approach for pose in poses]),
     )
-    readings = empty_readings(
+    readings = unmeasured_readings(
         kind, np.array([pose.q for pose in poses]), loads, load=load,
         station=np.array([pose.station for pose in poses]),
         target=np.array([pose.target for pose in poses]),
@@ -99,9 +99,9 @@ def row_of(cell: RandomCell, observable: Observable, poses: int, sessions: int, 
         SessionDesign(poses=poses, repeats=0, sigma=SIGMA, seed=seed),
     )  # fmt: skip
     seconds = time.process_time() - begin
-    hung = tuple(far_end(load) for load in planned.loads)
-    cell = replace(cell, space=replace(cell.space, hung=hung))  # the planner's, loads and all
-    reference = reference_of(parameters, planned.loads, cell.space, seed)
+    hung = tuple(load_extent(load) for load in planned.loads)
+    cell = replace(cell, space=replace(cell.space, loads_end=hung))  # the planner's, loads and all
+    reference = draw_reference(parameters, planned.loads, cell.space, seed)
     rms, worst = chosen_at_random(cell, parameters, observable, reference, poses, seed)
     possible = least_of_all(cell, parameters, observable, reference, planned)
     scatter = repeated_sessions(
@@ -130,8 +130,8 @@ def chosen_at_random(
 ) -> tuple[list[float], list[float]]:
     """Return medians of rms and worst deviation of random choices, for each of TIMES."""
     loads = sorted(cell.loads, key=lambda load: load.mass)
-    found = candidates_of(parameters, observable, loads, cell.space, seed + 1000, 500)
-    rows = blocks(parameters, observable, found.readings, found.nuisance, SIGMA)
+    found = sample_candidates(parameters, observable, loads, cell.space, seed + 1000, 500)
+    rows = whitened_rows(parameters, observable, found.readings, found.nuisance, SIGMA)
     random = np.random.default_rng(seed)
     rms, worst = [], []
     for times in TIMES:
@@ -149,12 +149,12 @@ def least_of_all(
     planned: Plan,
 ) -> float:  # fmt: skip
     """Return the rms below which no choice of as many poses comes, of a pool and the planned."""
-    found = candidates_of(parameters, observable, planned.loads, cell.space, 0, POOL)
+    found = sample_candidates(parameters, observable, planned.loads, cell.space, 0, POOL)
     own = readings_of(planned, observable.kind)
     own = own[~own.held_out]
     own = replace(own, value=observable.predict(parameters.nominal, own, found.nuisance))
     rows = np.concatenate([
-        blocks(parameters, observable, given, found.nuisance, SIGMA)
+        whitened_rows(parameters, observable, given, found.nuisance, SIGMA)
         for given in (found.readings, own)
     ])  # fmt: skip
     return least_possible(rows, reference.weight(rows.shape[2]), len(own))

@@ -28,7 +28,7 @@ from benchmarks.calibration.dh_fit import fit_dh
 from benchmarks.calibration.drawings import model_of, real_arm
 from benchmarks.calibration.urdf import urdf_of
 from gapbridge.bridge.cell import load_cell
-from gapbridge.core.calibration.fit import fit_session, judged
+from gapbridge.core.calibration.fit import evaluate_fit, fit_session
 from gapbridge.core.calibration.identifiability import identifiable_parameters
 from gapbridge.core.calibration.observables import make_observable
 from gapbridge.core.calibration.parameters import DEFAULT, Parameters
@@ -76,7 +76,7 @@ def simulated(arm: str, seed: int, *, loads: bool = True) -> DataSet:
     rng, kind = np.random.default_rng([seed, 5]), ARMS[arm]
     layout = laid_out.Layout(held_out=60) if loads else laid_out.Layout(poses=60, held_out=180)
     model = model_of(real_arm(kind))
-    names = [n for n in Parameters.every(model, DEFAULT).names if "tool_frame_r" not in n]
+    names = [n for n in Parameters.of_effects(model, DEFAULT).names if "tool_frame_r" not in n]
     real, laid = (
         laid_out.arm_with(kind, laid_out.draw_values(kind, names, rng)),
         laid_out.lay_out(kind, layout, rng),
@@ -115,7 +115,9 @@ def by_gapbridge(data: DataSet) -> tuple[float, float, int, str]:
     bends = data.readings.loads.payload_mass is not None or bool(data.model.arm.mass.any())
     effects = DEFAULT if bends else ("tool_frame", "joint_offset", "link_geometry")
     parameters = identifiable_parameters(data.model, effects, observable=how)
-    found = judged(data.model, fit_session(data.readings, parameters, Metrology()), diagnose=False)
+    found = evaluate_fit(
+        data.model, fit_session(data.readings, parameters, Metrology()), diagnose=False
+    )
     seconds = time.process_time() - begun
     return _coordinate(found.held_out_after.vector), seconds, len(parameters), found.verdict
 

@@ -24,7 +24,7 @@ from benchmarks.blind.arms import ARMS
 from benchmarks.calibration import laid_out
 from benchmarks.calibration.drawings import model_of, real_arm
 from gapbridge.core.calibration.budget.budget import budget
-from gapbridge.core.calibration.fit import fit_session, judged
+from gapbridge.core.calibration.fit import evaluate_fit, fit_session
 from gapbridge.core.calibration.identifiability import identifiable_parameters
 from gapbridge.core.calibration.observables import make_observable
 from gapbridge.core.metrology import Metrology
@@ -58,7 +58,7 @@ def run(arm: str, repeats: str, seed: int) -> Outcome:
     instrument = laid_out.instrument_for(kind, layout, rng)
     readings = laid_out.readings_of(real, laid_out.lay_out(kind, layout, rng), instrument, rng)
     metrology = Metrology(True, layout.sigma)
-    found = judged(model, fit_session(readings, parameters, metrology), diagnose=False)
+    found = evaluate_fit(model, fit_session(readings, parameters, metrology), diagnose=False)
     given = budget(found)
     # the arm alone: it comes to rest as it repeats, seen by an instrument without noise
     visits = laid_out.lay_out(kind, replace(layout, held_out=AWAY), rng)

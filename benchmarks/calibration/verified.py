@@ -31,10 +31,10 @@ from benchmarks.blind.mechanics import Array, RealArm, stand
 from benchmarks.blind.session import Plan
 from benchmarks.calibration.drawings import model_of
 from benchmarks.calibration.laid_out import draw_values, with_values
-from gapbridge.core.calibration.fit import fit_session, judged
+from gapbridge.core.calibration.fit import evaluate_fit, fit_session
 from gapbridge.core.calibration.identifiability import identifiable_parameters
 from gapbridge.core.calibration.observables import make_observable
-from gapbridge.core.calibration.parameters import DEFAULT, ORDERS, Parameters
+from gapbridge.core.calibration.parameters import DEFAULT, PERIODIC_ORDERS, Parameters
 from gapbridge.core.calibration.readings import Readings
 from gapbridge.core.calibration.result import Calibration
 from gapbridge.core.loads import Loads
@@ -83,7 +83,7 @@ def draw_case(arm: str, effect: str, rng: Generator) -> tuple[Bench, list[Ingred
             continue
         orders = [float(n.split("order")[1].split("_")[0]) for p in parts for n in p.names[:1]
                   if "order" in n]  # fmt: skip
-        if all(order in ORDERS for order in orders):
+        if all(order in PERIODIC_ORDERS for order in orders):
             return bench, parts
     raise RuntimeError(f"{arm}: no {effect} shows in {TRIES} draws")
 
@@ -99,7 +99,7 @@ def run(arm: str, effect: str, seed: int, asked: bool = False) -> Outcome:
     turned = bench.instrument.sigma_turn is not None
     how = make_observable("pose" if turned else "position", registered=bench.instrument.registered)
     more = () if effect in (*DEFAULT, "none") else (_named(effect, parts),)
-    every = Parameters.every(model, DEFAULT).names
+    every = Parameters.of_effects(model, DEFAULT).names
     instead = [f"axial_compliance_{p.joint}" for p in parts if effect == "stiffness_nonlinearity"]
     names = [n for n in every if n not in instead and (turned or "tool_frame_r" not in n)]
     real = with_values(combined(bench, parts), draw_values(bench.kind, names, rng))
@@ -109,7 +109,7 @@ def run(arm: str, effect: str, seed: int, asked: bool = False) -> Outcome:
 
     def fit() -> Calibration:
         parameters = identifiable_parameters(model, (*chosen, *DEFAULT), observable=how, pulls=True)
-        return judged(
+        return evaluate_fit(
             model, fit_session(readings, parameters, metrology, observable=how), diagnose=False
         )
 

@@ -18,7 +18,7 @@ from gapbridge.core.estimation.compliance_fit import (
     Data,
     fit_nuisances,
     residual,
-    usual_flexibility,
+    typical_flexibility,
 )
 from gapbridge.core.estimation.hierarchical import fit_type
 from gapbridge.core.estimation.hierarchical_evidence import evidence
@@ -53,7 +53,7 @@ def run_fleet(model: Model, metrology: Metrology, poses: list[int], seed: int) -
         held.append(log.select(np.sort(order[count:])))
     given = [evidence(model, log, metrology) for log in seen]
     n = model.arm.n
-    fit = fit_type(given, range(len(poses)), np.zeros(2 * n), usual_flexibility(model))
+    fit = fit_type(given, range(len(poses)), np.zeros(2 * n), typical_flexibility(model))
     ways: dict[str, list[float]] = {"cell": [], "type alone": [], "separate": [], "fleet": []}
     for i in range(len(poses)):
         flexibility = {
@@ -67,7 +67,7 @@ def run_fleet(model: Model, metrology: Metrology, poses: list[int], seed: int) -
     inside = np.array([
         np.abs(fit.arms[i].flexibility - truths[i]) <= 1.96 * fit.arms[i].std
         for i in range(len(poses))
-    ])[:, fit.scatter.shown]  # fmt: skip
+    ])[:, fit.scatter.identifiable]  # fmt: skip
     few = np.array(poses) == min(poses)
     gaps = {name: np.array(values) for name, values in ways.items()}
     return Fleet(gaps, inside.ravel(), inside[few].ravel())

@@ -15,7 +15,7 @@ from benchmarks.speed.peers.pinocchio_task import PinocchioTask
 from benchmarks.speed.sides import Side, compared, interleaved
 from gapbridge.core.calibration.identifiability import identifiable_parameters
 from gapbridge.core.calibration.observables import make_observable
-from gapbridge.core.calibration.observables.predicted_readings import empty_readings
+from gapbridge.core.calibration.observables.predicted_readings import unmeasured_readings
 from gapbridge.core.calibration.parameters import Parameters
 from gapbridge.core.kernels import reference as kernel
 from gapbridge.core.loads import Loads
@@ -69,7 +69,7 @@ def whole(count: int, turns: int = 1) -> dict[str, Any]:
     truth = np.clip(rng.normal(0, size), parameters.lower, parameters.upper)
     true = parameters.model(truth)
     value = true.predict(q, loads).position + rng.normal(0, NOISE, (count, 3))
-    readings = replace(empty_readings("position", q, loads), value=value)
+    readings = replace(unmeasured_readings("position", q, loads), value=value)
     nuisance = observable.start(model, readings)
     rounds: list[tuple[float, float]] = []
     for _ in range(turns):

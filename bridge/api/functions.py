@@ -92,7 +92,7 @@ def fit(cell: Cell, log: Log, *, remounted: bool = False) -> Fitted:
     estimate = identify_compliance(cell.model, log, metrology)
     held_out = estimate.remaining_rms_held_out
     return Fitted(
-        cell=cell, model=estimate.written,
+        cell=cell, model=estimate.cell_model,
         axial=estimate.axial, radial=estimate.radial, std_axial=estimate.std_axial,
         std_radial=estimate.std_radial, shown=estimate.identifiable, samples=estimate.samples,
         gap_rms=estimate.gap_rms, remaining_rms=estimate.remaining_rms,

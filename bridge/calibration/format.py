@@ -10,7 +10,7 @@ from gapbridge.bridge.report.labels import unit_of
 from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.plan import Payload
 from gapbridge.core.calibration.result import Estimate
-from gapbridge.core.calibration.verify import Suspect, Verification
+from gapbridge.core.calibration.verify import CandidateChange, Verification
 from gapbridge.core.effects import CATALOGUE
 
 
@@ -90,7 +90,7 @@ def verdict_text(verification: Verification) -> str:
     return f"the calibration no longer holds: {text} (chance {verification.chance:.1g}); {change}"
 
 
-def change_text(change: Suspect) -> str:
+def change_text(change: CandidateChange) -> str:
     """Return what has changed since the calibration, and by how much."""
     if change.reading is not None:
         return f"reading {change.reading} alone does not fit: measure it again"

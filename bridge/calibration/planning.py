@@ -24,7 +24,7 @@ from gapbridge.core.calibration.plan import Payload, Plan
 from gapbridge.core.errors import CellError
 from gapbridge.core.metrology import Metrology
 from gapbridge.core.planning.capsules import Box
-from gapbridge.core.planning.design import SessionDesign, far_end, plan
+from gapbridge.core.planning.design import SessionDesign, load_extent, plan
 from gapbridge.core.planning.workspace import Place, Reflector, Workspace
 
 REPEATABILITY = 5e-5  # m, 1 sigma of one coordinate, if the cell does not give it
@@ -140,7 +140,8 @@ def _places(cell: Cell, kind: str) -> list[Place]:
 
 def with_loads(workspace: Workspace, loads: Sequence[Payload]) -> Workspace:
     """Return the workspace with the extent of these loads in collision checks."""
-    return replace(workspace, hung=(*workspace.hung, *(far_end(load) for load in loads)))
+    ends = (load_extent(load) for load in loads)
+    return replace(workspace, loads_end=(*workspace.loads_end, *ends))
 
 
 def _boxes(cell: Cell, settings: CalibrationSettings) -> list[BoxEntry]:

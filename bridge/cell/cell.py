@@ -29,7 +29,7 @@ from gapbridge.core.arm import Arm
 from gapbridge.core.calibration.spread import Spread
 from gapbridge.core.errors import ArmError, CellError, InputError
 from gapbridge.core.files import Document
-from gapbridge.core.load_bounds import HEAVIEST
+from gapbridge.core.load_bounds import PAYLOAD_FACTOR
 from gapbridge.core.metrology import Metrology
 from gapbridge.core.model import Model, Uncertain
 from gapbridge.core.rotation import rpy_matrix, transform
@@ -243,7 +243,7 @@ def _paths(keys: tuple[str | int, ...], value: object) -> Iterator[tuple[str | i
 
 def _check_payload(file: CellFile, arm: Arm) -> list[str]:
     mass, rated = file.payload.mass, arm.payload
-    if mass > HEAVIEST * rated:
+    if mass > PAYLOAD_FACTOR * rated:
         raise CellError(
             f"payload.mass: found {mass:g} kg, out of range: expected 0 to {rated:g} kg, what "
             f"{arm.name} is rated for"

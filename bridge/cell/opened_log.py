@@ -12,7 +12,7 @@ from gapbridge.bridge.cell.cell import Cell
 from gapbridge.bridge.document.notes import note_texts
 from gapbridge.core.diagnosis.log_checks.units_and_clocks import check_units
 from gapbridge.core.errors import LogError
-from gapbridge.core.load_bounds import HEAVIEST
+from gapbridge.core.load_bounds import PAYLOAD_FACTOR
 from gapbridge.core.log.alignment import aligned
 from gapbridge.core.log.log import Log, read_log
 from gapbridge.core.log.sources import SourceOptions, source_of
@@ -76,8 +76,8 @@ def check_log(log: Log, cell: Cell) -> None:
             log.require(name)  # names the cell
     check_units(cell.model, log)
     mass, rated = log.get("payload"), cell.arm.payload
-    if mass is not None and (mass > HEAVIEST * rated).any():
-        row = int(np.argmax(mass > HEAVIEST * rated))
+    if mass is not None and (mass > PAYLOAD_FACTOR * rated).any():
+        row = int(np.argmax(mass > PAYLOAD_FACTOR * rated))
         raise LogError(
             f"{log.path}: row {log.line(row)}, column payload: found {mass[row]:g} kg, out of "
             f"range: expected 0 to {rated:g} kg, what {cell.arm.name} is rated for"

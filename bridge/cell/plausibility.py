@@ -19,9 +19,9 @@ from gapbridge.core.files import Document
 from gapbridge.core.load_bounds import LEVER, LoadBounds
 from gapbridge.core.model import Model
 from gapbridge.core.plausibility import (
-    QUICK,
-    TURN,
-    TURNS,
+    MAX_FIXED_ANGLE,
+    MAX_LIMIT,
+    MAX_SPEED,
     Implausible,
     flange_in_first,
     implausible_in_arm,
@@ -88,14 +88,14 @@ def implausible_values(file: CellFile, document: Document, arm: Arm) -> Iterator
         yield from _lengths(("ft_sensor", "sensor_in_flange", "xyz"), mounted.xyz, arm_reach, "")
         yield from _angles(("ft_sensor", "sensor_in_flange", "rpy"), mounted.rpy)
     yield from _session(file.calibration, arm, arm_reach)
-    if (velocity := file.limits.joint_velocity or 0.0) > QUICK:
+    if (velocity := file.limits.joint_velocity or 0.0) > MAX_SPEED:
         yield Implausible(
             ("limits", "joint_velocity"), f"{velocity:g}", "rad/s (it looks like degrees)"
         )
     if file.simulation.payload is not None:
         yield from _payload(("simulation", "payload"), file.simulation.payload, arm, arm_reach)
     for i, angle in enumerate(file.simulation.start_q or []):
-        if abs(angle) > TURNS:
+        if abs(angle) > MAX_LIMIT:
             yield Implausible(
                 ("simulation", "start_q", i), f"{angle:g}", "rad (it looks like degrees)"
             )
@@ -129,7 +129,7 @@ def _session(section: CalibrationSettings, arm: Arm, arm_reach: float) -> Iterat
         if (size := max(map(abs, xyz), default=0.0)) > MAX_DISTANCE:
             yield Implausible(where, f"{size:g}", "m (it looks like mm)")
     for end in ("lower", "upper") if section.joint_range is not None else ():
-        if (angle := max(map(abs, getattr(section.joint_range, end)))) > TURNS:
+        if (angle := max(map(abs, getattr(section.joint_range, end)))) > MAX_LIMIT:
             yield Implausible(
                 (top, "joint_range", end), f"{angle:g}", "rad (it looks like degrees)"
             )
@@ -162,7 +162,7 @@ def _dh(file: CellFile, arm: Arm) -> Iterator[Implausible]:
         )
     for i, row in enumerate(rows):
         for key in ("alpha", "offset"):
-            if abs(value := getattr(row, key)) > TURN:
+            if abs(value := getattr(row, key)) > MAX_FIXED_ANGLE:
                 yield Implausible(
                     ("robot", "dh", i, key), f"{value:g}", "rad (it looks like degrees)"
                 )
@@ -196,7 +196,7 @@ def _angles(
     keys: tuple[str | int, ...], rpy: list[float] | tuple[float, ...]
 ) -> Iterator[Implausible]:
     worst = max(abs(v) for v in rpy)
-    if worst > TURN:
+    if worst > MAX_FIXED_ANGLE:
         yield Implausible(keys, f"{worst:g}", "rad (it looks like degrees)")
     elif worst > 3.2:
         yield Implausible(keys, f"{worst:g}", "rad, at most half a turn", sure=False)

@@ -10,7 +10,7 @@ from gapbridge.core.arrays import Array
 from gapbridge.core.kernels.single import LEVER
 from gapbridge.core.loads import Loads
 from gapbridge.core.model import Model
-from gapbridge.core.planning.travel import shortest_way
+from gapbridge.core.planning.travel import shortest_order
 
 CANDIDATES = 400
 
@@ -114,7 +114,7 @@ def informative(model: Model, q: Array, load: Load, count: int, information: Arr
 def visit_order(q: Array, start: Array) -> Array:
     """Return the order of the poses (N, n) on a short path from ``start`` (n,)."""
     between, first = _joint_distance(q, q), _joint_distance(start[None], q)[0]
-    return np.array(shortest_way(between, first), dtype=int)
+    return np.array(shortest_order(between, first), dtype=int)
 
 
 def _joint_distance(q: Array, to: Array) -> Array:

@@ -103,10 +103,10 @@ class _Formatter(Formatter):
                 return " and ".join(value)
             case "or":
                 return " or ".join(value)
-            case "hindered":  # a sentence in older journals
-                from gapbridge.core.planning.candidates import Hindered  # a plan's, and large
+            case "rejected":  # a sentence in older journals
+                from gapbridge.core.planning.candidates import RejectedPoses  # a plan's, and large
 
-                return value if isinstance(value, str) else str(Hindered(*value))
+                return value if isinstance(value, str) else str(RejectedPoses(*value))
             case "place":
                 return " and ".join((*value, "the place of instrument or target"))
             case "kg":

@@ -123,7 +123,7 @@ def _drifts(kind: FittedType) -> Iterator[Drift]:
         names = tuple(s.outcome.session for s in arm.sessions)
         for j, parameter in enumerate(kind.parameters):
             slope, std = float(arm.fit.drift[j]), float(arm.fit.drift_std[j])
-            if math.isfinite(slope) and kind.scatter.shown[j]:
+            if math.isfinite(slope) and kind.scatter.identifiable[j]:
                 yield Drift(
                     arm.name, parameter, UNIT, "session", slope, std,
                     float(2 * norm.sf(abs(slope) / std)),
@@ -135,7 +135,8 @@ def _drifts(kind: FittedType) -> Iterator[Drift]:
 
 def _outliers(kind: FittedType) -> Iterator[Outlier]:
     for arm in kind.arms:
-        for j in np.flatnonzero((np.abs(arm.fit.beside_type) > ARM_OUTLIER) & kind.scatter.shown):
+        far = np.abs(arm.fit.beside_type) > ARM_OUTLIER
+        for j in np.flatnonzero(far & kind.scatter.identifiable):
             yield Outlier(
                 arm.name, "", kind.parameters[j], float(arm.fit.flexibility[j]),
                 float(kind.scatter.mean[j]), UNIT, float(arm.fit.beside_type[j]),
@@ -155,7 +156,8 @@ def flexibility_rows(fleet: FleetFit) -> Iterator[dict[str, Any]]:
         for j, parameter in enumerate(kind.parameters):
             shared = {
                 "type": kind.name, "parameter": parameter, "unit": UNIT,
-                "joint": j % (len(kind.parameters) // 2) + 1, "shown": bool(kind.scatter.shown[j]),
+                "joint": j % (len(kind.parameters) // 2) + 1,
+                "shown": bool(kind.scatter.identifiable[j]),
             }  # fmt: skip
             yield (
                 shared
@@ -164,7 +166,7 @@ def flexibility_rows(fleet: FleetFit) -> Iterator[dict[str, Any]]:
             )
             for arm in kind.arms:
                 yield shared | {
-                    "level": "arm", "arm": arm.name, "own_share": float(arm.fit.own[j]),
+                    "level": "arm", "arm": arm.name, "own_share": float(arm.fit.own_share[j]),
                     "scatter": float(kind.scatter.between_sessions[j]),
                     "drift": _finite(arm.fit.drift[j]), "drift_std": _finite(arm.fit.drift_std[j]),
                     "drift_per": "session",

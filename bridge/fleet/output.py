@@ -114,7 +114,7 @@ def _diagnosis_lines(summary: FleetDiagnosis) -> list[str]:
 def _fit_lines(summary: FleetFit) -> list[str]:
     lines = []
     for kind in summary.types:
-        shown = kind.scatter.shown
+        shown = kind.scatter.identifiable
         spread = kind.scatter.between_arms[shown] / np.maximum(kind.scatter.mean[shown], 1e-12)
         before, after = (
             float(np.sqrt(np.mean([getattr(s, name) ** 2 for a in kind.arms for s in a.sessions])))
@@ -168,7 +168,7 @@ def write_cells(fit: FleetFit, folder: Path) -> list[Path]:
 
 def _write_cell(kind: FittedType, arm: FittedArm, path: Path) -> None:
     cell = load_cell(Path(arm.sessions[-1].outcome.cell))
-    values = np.where(kind.scatter.shown, arm.fit.flexibility, flexibilities(cell.model))
+    values = np.where(kind.scatter.identifiable, arm.fit.flexibility, flexibilities(cell.model))
     n = cell.arm.n
     save_cell(cell, path, cell.model.with_compliance(values[:n], values[n:]))
 

@@ -12,7 +12,7 @@ import numpy as np
 from gapbridge.bridge.cell import Cell
 from gapbridge.bridge.document.diagnosis_json import document
 from gapbridge.core.diagnosis.diagnosis import channels_of, diagnose
-from gapbridge.core.estimation.compliance_fit import flexibilities, usual_flexibility
+from gapbridge.core.estimation.compliance_fit import flexibilities, typical_flexibility
 from gapbridge.core.estimation.hierarchical_evidence import evidence
 from gapbridge.core.log.log import Log
 
@@ -95,6 +95,6 @@ def fit_session(cell: Cell, log: Log, options: Mapping[str, Any]) -> dict[str, A
     return {
         **facts(cell, log),
         "nominal": flexibilities(cell.model).tolist(),
-        "usual": usual_flexibility(cell.model),
+        "usual": typical_flexibility(cell.model),
         "evidence": asdict(equations) | arrays,
     }

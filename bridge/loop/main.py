@@ -36,7 +36,7 @@ from gapbridge.bridge.loop.setpoint_stream import SetpointStream, gate_bounds
 from gapbridge.bridge.setpoint_source import make_source
 from gapbridge.bridge.setpoint_source.source import Source
 from gapbridge.core.errors import GapbridgeError, InputError
-from gapbridge.core.files import read_only_from
+from gapbridge.core.files import read_only_given
 from gapbridge.core.kernels import compiling
 from gapbridge.core.loads import Loads
 from gapbridge.core.model import Model
@@ -86,7 +86,7 @@ def _run(order: dict[str, Any], emit: Callable[[dict[str, Any]], None]) -> Exit:
     memory = SharedMemory(order["n"], order["memory"])
     memory.enter(Phase.STARTING)
     files = pickle.loads(all_bytes(order["files"]))  # by the daemon, which started this process
-    read_only_from(files)  # only the daemon reads the disk, at start and reload
+    read_only_given(files)  # only the daemon reads the disk, at start and reload
     settings = DaemonSettings.model_validate(order["settings"])
     model = _read_model(settings)
     driver = make_driver(settings.link, model, gate_bounds(settings.limits))

@@ -14,7 +14,7 @@ from gapbridge.core.arrays import Array
 from gapbridge.core.compensation import Compensator, Correction, wanted_pose
 from gapbridge.core.errors import StaleStateError
 from gapbridge.core.kernels.reference import JIT
-from gapbridge.core.limits import LONGEST_GAP, Limiter, Limits
+from gapbridge.core.limits import MAX_GAP_CYCLES, Limiter, Limits
 from gapbridge.core.loads import Loads
 from gapbridge.core.model import Model
 from gapbridge.core.rotation import rotation_vector
@@ -131,7 +131,7 @@ class SetpointStream:
         self._compensator = Compensator(model)
         self._nominal = NominalStream(limits.velocity)
         self._ramp_time = settings.ramp_time
-        self._longest_gap = LONGEST_GAP / rate
+        self._longest_gap = MAX_GAP_CYCLES / rate
         self._ramp = 0.0
         self._resumes = False  # started with an offset in force, from which the ramp continues
         self._last = 0.0  # s, controller time of the last setpoint

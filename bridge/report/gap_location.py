@@ -31,7 +31,7 @@ from gapbridge.core.arrays import Array, Index
 from gapbridge.core.diagnosis.causes import Cause, Considered, Outcome
 from gapbridge.core.diagnosis.channel_diagnosis import ChannelDiagnosis
 from gapbridge.core.diagnosis.noise_floor import own_coordinates
-from gapbridge.core.planning.travel import far_apart
+from gapbridge.core.planning.travel import spread_rows
 
 MOST_QUANTITIES = 14
 MIN_SHARE = 0.02  # smallest dependence that is listed
@@ -184,7 +184,7 @@ def arm_view(channel: ChannelDiagnosis, material: Material) -> blocks.View:
     rigid = material.model.without_terms()
     large = float(np.quantile(per_sample(gap, 3), 0.95))
     factor = round_factor(ARROW_LENGTH * reach(rigid) / max(large, 1e-9))
-    chosen = far_apart(tip, DRAWN_POSES)
+    chosen = spread_rows(tip, DRAWN_POSES)
     arms = [
         Path(skeleton(rigid, q[i]), EDGE if k else SOFT, 3.0 if k else 7.0, dots=True)
         for k, i in enumerate(chosen)

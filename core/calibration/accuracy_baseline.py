@@ -1,4 +1,4 @@
-"""The accuracy of a calibration, as a document that is kept beside the cell for later checks."""
+"""The accuracy of a calibration, as a document stored next to the cell for later verification."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SCHEMA = "gapbridge.calibration/1"
 
 @dataclass(frozen=True)
 class AccuracyBaseline:
-    """How far off a calibrated model may be, and how noisy its readings were."""
+    """Covariance of a calibrated model's parameters, and the noise of its readings."""
 
     kind: str  # of the readings
     names: tuple[str, ...]  # of the parameters
@@ -34,11 +34,11 @@ class AccuracyBaseline:
     rms: float  # m, of the held-out errors (of the fitted ones where none were held out)
 
     def parameters(self, model: Model) -> Parameters:
-        """Return the same parameters, to be found beyond ``model`` (the calibrated one)."""
+        """Return the same parameters, as corrections to ``model`` (the calibrated one)."""
         return parameters_named(model, self.names, "calibration")
 
 
-def document_of(calibration: Calibration, sigma: float = float("nan")) -> dict[str, Any]:
+def baseline_document(calibration: Calibration, sigma: float = float("nan")) -> dict[str, Any]:
     """Return the accuracy baseline of a calibration as plain data, for JSON.
 
     ``sigma`` (m) is the instrument's own, as the cell states it.
@@ -66,8 +66,8 @@ def document_of(calibration: Calibration, sigma: float = float("nan")) -> dict[s
     }
 
 
-def baseline_in(document: Mapping[str, Any], where: str = "calibration") -> AccuracyBaseline:
-    """Return the baseline in a document; raises InputError naming what is wrong with it."""
+def read_baseline(document: Mapping[str, Any], where: str = "calibration") -> AccuracyBaseline:
+    """Return the baseline in a document; raises InputError naming the key that is wrong."""
     if document.get("schema") != SCHEMA:
         raise InputError(f"{where}: schema: found {document.get('schema')!r}, expected {SCHEMA!r}")
     try:

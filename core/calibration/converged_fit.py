@@ -1,10 +1,10 @@
-"""A calibration converges: staged, then everything together, then the noise along with it.
+"""The nonlinear fit of a calibration: stages first, then all parameters, then the noise as well.
 
-None of its steps makes the fit worse (Levenberg, Marquardt). A payload times a flexibility bends
-the arm: such products make Gauss and Newton's full steps overshoot. Each step is tried against the
-exact prediction; one that gains less than predicted is shortened, most along what the readings
-hardly separate (columns scaled to length one, Marquardt, J. SIAM 11 (1963) 431). Derivatives are
-computed anew where they predict too much.
+Levenberg-Marquardt with columns scaled to unit length (Marquardt, J. SIAM 11 (1963) 431), since
+products of parameters (payload times flexibility) make full Gauss-Newton steps overshoot. Each step
+is tried against the exact prediction, and accepted by its gain ratio: actual over predicted
+decrease.
+The Jacobian is recomputed after a poor ratio or a large move.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gapbridge.core.arrays import Array, Mask
-from gapbridge.core.calibration.noise import Noise, estimated, presumed
+from gapbridge.core.calibration.noise import Noise, estimate_noise, prior_noise
 from gapbridge.core.calibration.observables.nuisance import Nuisance
 from gapbridge.core.calibration.observables.observable import Observable
 from gapbridge.core.calibration.parameters import Parameters
@@ -32,53 +32,53 @@ from gapbridge.core.errors import InputError
 from gapbridge.core.estimation.linear_system import System, joint_covariance, posterior, solve
 from gapbridge.core.metrology import Metrology
 
-NOISES = 6  # times at most that the noise is estimated anew
-SAME = 0.02  # relative change of the noise that is none
+NOISE_ROUNDS = 6  # noise estimates at most
+NOISE_CONVERGED = 0.02  # relative change of the noise
 Columns = tuple[Array, Array]
-LOOKS = 20  # derivatives taken anew at most
-STEPS = 12  # steps tried with the same derivatives at most
-MOVED = 0.02  # of its deviation: a smaller step changes nothing that anybody reports
-LOOSE = 0.2  # of its deviation: what weights that still sway may leave at the end of patience
-STALE = 3.0  # deviations of movement beyond which derivatives are taken anew
-KEPT = 0.1  # share of the predicted decrease that an accepted step must reach
-POOR = 0.5  # share below which the next step is shorter, with new derivatives
-GOOD = 0.8  # share above which the next step may be longer
-LEAST, MOST = 1e-4, 1e8  # damping: below it is none; above it nothing is gained any more
-DAMPING_FACTOR = 8.0  # by which damping grows after a refused step, and falls after a good one
-NOTHING = 1e-6  # of the sum of squares, in which one is a standard deviation: rounding
+MAX_LINEARISATIONS = 20
+MAX_STEPS = 12  # with the same Jacobian
+STEP_CONVERGED = 0.02  # step size over standard deviation
+STEP_ACCEPTED = 0.2  # the same after MAX_STEPS, where the weights still change
+MAX_DRIFT = 3.0  # standard deviations from the linearisation point beyond which J is recomputed
+MIN_GAIN_RATIO = 0.1  # of an accepted step
+POOR_RATIO = 0.5  # below it the damping grows and J is recomputed
+GOOD_RATIO = 0.8  # above it the damping is reduced
+MIN_DAMPING, MAX_DAMPING = 1e-4, 1e8  # less counts as zero; more ends the search
+DAMPING_FACTOR = 8.0
+ROUNDING = 1e-6  # share of the sum of squares (in variances) that counts as rounding
 
 
 @dataclass(frozen=True)
 class FitState:
-    """Where a fit stands, with derivatives that hold there."""
+    """State of the iteration, with the linearised system there."""
 
     values: Array  # (p,)
     nuisance: Nuisance
     noise: Noise
     columns: Columns  # J (N*k, p) and F (N*k, m)
-    anchor: Array  # (p,) where the derivatives were taken
-    system: System  # divided by the noise, weighed
+    anchor: Array  # (p,) linearisation point
+    system: System  # divided by the noise, weighted
     weights: Array  # (N,) 0 outlier, 1 inlier
-    stuck: Mask  # (p,) on a bound
+    on_bound: Mask  # (p,) on a bound
     covariance: Array  # (p, p)
-    spent: float  # numbers that the fit spent
-    share: Array  # (N,) of them on each reading
-    converged: bool  # no step would change anything any more; False: patience ended before
+    fitted_numbers: float  # effective number of fitted parameters
+    leverage: Array  # (N,) share of each reading in it
+    converged: bool  # False: the limit of iterations came first
 
     @property
     def freedom(self) -> float:
-        """Return the degrees of freedom left."""
+        """Return the residual degrees of freedom."""
         width = len(self.system.residual) / max(len(self.weights), 1)
-        return max(float(self.weights.sum()) * width - self.spent, 1.0)
+        return max(float(self.weights.sum()) * width - self.fitted_numbers, 1.0)
 
     @property
     def inliers(self) -> Mask:
-        """Return which readings count (N,)."""
+        """Return which readings have a weight above zero (N,)."""
         return np.asarray(self.weights > 0)
 
     def stale(self) -> bool:
-        """Return whether the derivatives were taken too far away."""
-        return bool(_sizes(self.values - self.anchor, self.covariance) > STALE)
+        """Return whether the linearisation point is too far away."""
+        return bool(_largest_step(self.values - self.anchor, self.covariance) > MAX_DRIFT)
 
 
 def converged_fit(
@@ -90,66 +90,67 @@ def converged_fit(
 ) -> tuple[Problem, FitState]:
     """Return the fit of all parameters to the readings.
 
-    Raises ExcitationError where there are fewer readings than numbers to find, InputError where
-    the arm finds no equilibrium with what they ask for.
+    Raises ExcitationError where there are fewer equations than unknowns, InputError where the arm
+    has no equilibrium at the start.
     """
     require_enough(parameters, observable, readings)
     bounds, stages = bounds_of(parameters, readings), stages_of(parameters, readings)
     values = parameters.begin.copy()
     begin = parameters.model(values)
     nuisance = observable.start(begin, readings)
-    noise, known = presumed(begin, readings, observable, nuisance, metrology)
-    problem = Problem(parameters, observable, readings, bounds, stages, known)
+    noise, noise_prior = prior_noise(begin, readings, observable, nuisance, metrology)
+    problem = Problem(parameters, observable, readings, bounds, stages, noise_prior)
     progress("fitting, look 1")
-    at = _staged(problem, fit_state(problem, values, nuisance, noise))
-    at = converge(problem, at, noise)
-    for look in range(NOISES):  # the noise is determined by what is left once the fit is at rest
+    state = _after_stages(problem, fit_state(problem, values, nuisance, noise))
+    state = converge(problem, state, noise)
+    for look in range(NOISE_ROUNDS):  # noise by the residuals of a converged fit
         progress(f"fitting, look {look + 2}")
-        before, at = at.noise, converge(problem, at, _noise(problem, at))
-        if np.abs(at.noise.sizes / before.sizes - 1).max() < SAME:
+        before, state = state.noise, converge(problem, state, _updated_noise(problem, state))
+        if np.abs(state.noise.sizes / before.sizes - 1).max() < NOISE_CONVERGED:
             break
-    covariance = joint_covariance(at.system, bounds, readings.repeats())
+    covariance = joint_covariance(state.system, bounds, readings.repeats())
     p = len(parameters)
-    return problem, replace(at, covariance=covariance[:p, :p])
+    return problem, replace(state, covariance=covariance[:p, :p])
 
 
-def _staged(problem: Problem, at: FitState) -> FitState:
-    """Return the state after the stages, where they lead down."""
+def _after_stages(problem: Problem, state: FitState) -> FitState:
+    """Return the state after the stages, where they lower the cost."""
     k = problem.observable.equations
-    root = np.sqrt(at.weights)
-    step = staged_step(at.system, problem.stages, at.values, problem.bounds, k, root)
-    values = np.clip(at.values + step, problem.bounds.lower, problem.bounds.upper)
-    if problem.residual(values, at.nuisance) is None:
-        return at
+    root = np.sqrt(state.weights)
+    step = staged_step(state.system, problem.stages, state.values, problem.bounds, k, root)
+    values = np.clip(state.values + step, problem.bounds.lower, problem.bounds.upper)
+    if problem.residual(values, state.nuisance) is None:
+        return state
     poses = problem.parameters.model(values).predict(problem.readings.q, problem.readings.loads)
-    nuisance = problem.observable.refined(poses, problem.readings, at.nuisance)
-    here, there = (problem.residual(*p) for p in ((at.values, at.nuisance), (values, nuisance)))
-    if here is None or there is None:
-        return at
-    gain = cost(here, at.noise, at.weights) - cost(there, at.noise, at.weights)
-    if gain < problem.prior(values) - problem.prior(at.values):
-        return at
-    return fit_state(problem, values, nuisance, at.noise, at.columns, at.anchor)
+    nuisance = problem.observable.refined(poses, problem.readings, state.nuisance)
+    before = problem.residual(state.values, state.nuisance)
+    after = problem.residual(values, nuisance)
+    if before is None or after is None:
+        return state
+    gain = cost(before, state.noise, state.weights) - cost(after, state.noise, state.weights)
+    if gain < problem.prior(values) - problem.prior(state.values):
+        return state
+    return fit_state(problem, values, nuisance, state.noise, state.columns, state.anchor)
 
 
-def _noise(problem: Problem, at: FitState) -> Noise:
-    """Return the noise that the residual implies."""
-    J, F = at.columns
-    residual = problem.residual(at.values, at.nuisance)
+def _updated_noise(problem: Problem, state: FitState) -> Noise:
+    """Return the noise estimated from the residual."""
+    J, F = state.columns
+    residual = problem.residual(state.values, state.nuisance)
     assert residual is not None
-    off = at.values - problem.bounds.begin
-    precision = np.concatenate([problem.bounds.held**-2.0, np.zeros(F.shape[1])])
-    return estimated(
-        at.noise, problem.known, residual + (J @ off).reshape(residual.shape), np.hstack([J, F]),
-        precision, at.inliers,
+    offset = state.values - problem.bounds.begin
+    precision = np.concatenate([problem.bounds.prior_std**-2.0, np.zeros(F.shape[1])])
+    return estimate_noise(
+        state.noise, problem.noise_prior, residual + (J @ offset).reshape(residual.shape),
+        np.hstack([J, F]), precision, state.inliers,
     )  # fmt: skip
 
 
 def fit_state(
     problem: Problem, values: Array, nuisance: Nuisance, noise: Noise,
-    columns: Columns | None = None, anchor: Array | None = None, share: Array | None = None,
+    columns: Columns | None = None, anchor: Array | None = None, leverage: Array | None = None,
 ) -> FitState:  # fmt: skip
-    """Return the state at ``values``, derivatives taken there where none are given.
+    """Return the state at ``values``, linearised there unless ``columns`` are given.
 
     Raises InputError where the arm finds no equilibrium.
     """
@@ -159,83 +160,86 @@ def fit_state(
     if columns is None:
         columns = problem.observable.columns(problem.parameters, values, problem.readings, nuisance)
         anchor = values
-    system, weights = weighted_system(residual, noise, columns, share)
-    covariance, spent, each = posterior(system, problem.bounds)
-    share = each.reshape(residual.shape).sum(axis=1)
+    system, weights = weighted_system(residual, noise, columns, leverage)
+    covariance, fitted_numbers, leverages = posterior(system, problem.bounds)
+    leverage = leverages.reshape(residual.shape).sum(axis=1)
     return FitState(
         values, nuisance, noise, columns, values if anchor is None else anchor, system, weights,
-        np.zeros(len(values), dtype=bool), covariance, spent, share, False,
+        np.zeros(len(values), dtype=bool), covariance, fitted_numbers, leverage, converged=False,
     )  # fmt: skip
 
 
-def converge(problem: Problem, at: FitState, noise: Noise) -> FitState:
-    """Return where steps from ``at`` converge under this noise, or where patience ends."""
+def converge(problem: Problem, state: FitState, noise: Noise) -> FitState:
+    """Return the converged state for this noise, or the last one within the iteration limits."""
     damping = 0.0
-    at = fit_state(problem, at.values, at.nuisance, noise, at.columns, at.anchor, at.share)
-    for _ in range(LOOKS):
-        if at.stale():
-            at = fit_state(problem, at.values, at.nuisance, noise, share=at.share)
-        at, damping, renew = _stepped(problem, at, damping)
-        if not renew and ((at.converged and not at.stale()) or damping > MOST):
+    state = fit_state(
+        problem, state.values, state.nuisance, noise, state.columns, state.anchor, state.leverage
+    )
+    for _ in range(MAX_LINEARISATIONS):
+        if state.stale():
+            state = fit_state(problem, state.values, state.nuisance, noise, leverage=state.leverage)
+        state, damping, renew = _marquardt_steps(problem, state, damping)
+        if not renew and ((state.converged and not state.stale()) or damping > MAX_DAMPING):
             break
         if renew:
-            at = fit_state(problem, at.values, at.nuisance, noise, share=at.share)
-    return at
+            state = fit_state(problem, state.values, state.nuisance, noise, leverage=state.leverage)
+    return state
 
 
-def _stepped(problem: Problem, at: FitState, damping: float) -> tuple[FitState, float, bool]:
-    """Return the state after steps with the same derivatives, and the damping.
-
-    Last comes whether the derivatives predicted too much.
-    """
+def _marquardt_steps(
+    problem: Problem, state: FitState, damping: float
+) -> tuple[FitState, float, bool]:
+    """Return the state after steps with one Jacobian, the damping, and whether to recompute it."""
     layout, bounds = problem.observable.layout(problem.readings), problem.bounds
-    free = np.ones(len(at.values), dtype=bool)
+    free = np.ones(len(state.values), dtype=bool)
     size = np.inf
-    for _ in range(STEPS):
-        step, shift, stuck = solve(at.system, at.values, bounds, free, damping)
-        size = _sizes(step, at.covariance)
-        small = size < MOVED
-        values, nuisance = at.values + step, at.nuisance.moved(shift, layout)
-        kept = _kept(problem, at, step, shift, (values, nuisance))
-        fresh = bool((at.anchor == at.values).all())
-        if kept < KEPT:
+    for _ in range(MAX_STEPS):
+        step, shift, on_bound = solve(state.system, state.values, bounds, free, damping)
+        size = _largest_step(step, state.covariance)
+        small = size < STEP_CONVERGED
+        values, nuisance = state.values + step, state.nuisance.moved(shift, layout)
+        ratio = _gain_ratio(problem, state, step, shift, (values, nuisance))
+        fresh = bool((state.anchor == state.values).all())
+        if ratio < MIN_GAIN_RATIO:
             if not fresh:
-                return at, damping, True
+                return state, damping, True
             if small and damping == 0.0:
-                return replace(at, stuck=stuck, converged=True), damping, False
-            damping = max(DAMPING_FACTOR * damping, LEAST)
-            if damping > MOST:
-                return at, damping, False
+                return replace(state, on_bound=on_bound, converged=True), damping, False
+            damping = max(DAMPING_FACTOR * damping, MIN_DAMPING)
+            if damping > MAX_DAMPING:
+                return state, damping, False
             continue
-        at = fit_state(problem, values, nuisance, at.noise, at.columns, at.anchor, at.share)
-        at = replace(at, stuck=stuck, converged=small and damping == 0.0)
-        if at.converged:
-            return at, damping, False
-        if kept < POOR:
-            return at, max(damping * 2, LEAST), True
-        if kept > GOOD:
-            damping = damping / DAMPING_FACTOR if damping > LEAST else 0.0
-    converged = size < LOOSE and damping == 0.0
-    return replace(at, converged=converged), damping, not converged
+        state = fit_state(
+            problem, values, nuisance, state.noise, state.columns, state.anchor, state.leverage
+        )
+        state = replace(state, on_bound=on_bound, converged=small and damping == 0.0)
+        if state.converged:
+            return state, damping, False
+        if ratio < POOR_RATIO:
+            return state, max(damping * 2, MIN_DAMPING), True
+        if ratio > GOOD_RATIO:
+            damping = damping / DAMPING_FACTOR if damping > MIN_DAMPING else 0.0
+    converged = size < STEP_ACCEPTED and damping == 0.0
+    return replace(state, converged=converged), damping, not converged
 
 
-def _kept(
-    problem: Problem, at: FitState, step: Array, shift: Array, trial: tuple[Array, Nuisance]
+def _gain_ratio(
+    problem: Problem, state: FitState, step: Array, shift: Array, trial: tuple[Array, Nuisance]
 ) -> float:
     """Return the actual over the predicted decrease of a step; 1 where none is predicted."""
-    before = float(at.system.residual @ at.system.residual) + problem.prior(at.values)
-    rest = at.system.residual - at.system.J @ step - at.system.F @ shift
-    predicted = before - float(rest @ rest) - problem.prior(trial[0])
+    before = float(state.system.residual @ state.system.residual) + problem.prior(state.values)
+    remaining = state.system.residual - state.system.J @ step - state.system.F @ shift
+    predicted = before - float(remaining @ remaining) - problem.prior(trial[0])
     residual = problem.residual(*trial)
     if residual is None:
         return -1.0
-    found = before - cost(residual, at.noise, at.weights) - problem.prior(trial[0])
-    tiny = NOTHING * (1 + before)
-    if abs(predicted) < tiny and abs(found) < tiny:
+    actual = before - cost(residual, state.noise, state.weights) - problem.prior(trial[0])
+    tiny = ROUNDING * (1 + before)
+    if abs(predicted) < tiny and abs(actual) < tiny:
         return 1.0
-    return found / predicted if predicted > 0 else -1.0
+    return actual / predicted if predicted > 0 else -1.0
 
 
-def _sizes(step: Array, covariance: Array) -> float:
-    """Return the largest part of a step in its standard deviation."""
+def _largest_step(step: Array, covariance: Array) -> float:
+    """Return the largest element of a step over its standard deviation."""
     return float((np.abs(step) / np.sqrt(np.diag(covariance))).max(initial=0.0))

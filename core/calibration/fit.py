@@ -1,4 +1,4 @@
-"""The fit of a whole session: staged, then everything together, held-out poses never touched."""
+"""The fit of a whole session, and its evaluation on the held-out poses."""
 
 from __future__ import annotations
 
@@ -10,7 +10,11 @@ from threadpoolctl import threadpool_limits
 
 from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.converged_fit import FitState, converged_fit
-from gapbridge.core.calibration.held_out_check import check_held_out, diagnosed, repeatability_of
+from gapbridge.core.calibration.held_out_check import (
+    check_held_out,
+    diagnose_residual,
+    repeatability_of,
+)
 from gapbridge.core.calibration.missing_effects import MissingEffect, missing_effects
 from gapbridge.core.calibration.noise import Noise
 from gapbridge.core.calibration.observables import make_observable
@@ -21,7 +25,7 @@ from gapbridge.core.calibration.plan import Expectation
 from gapbridge.core.calibration.problem import Problem
 from gapbridge.core.calibration.readings import Readings
 from gapbridge.core.calibration.result import Calibration, Errors, Estimate
-from gapbridge.core.calibration.staging import at_odds
+from gapbridge.core.calibration.staging import hausman_chance
 from gapbridge.core.calibration.summary import combinations, notes_of, remaining_of
 from gapbridge.core.diagnosis.channel_diagnosis import Verdict
 from gapbridge.core.diagnosis.diagnosis import Diagnosis
@@ -31,25 +35,25 @@ from gapbridge.core.model import Model
 from gapbridge.core.notes import Note, Reason
 
 Progress = Callable[[str], None]
-IDENTIFIABLE = 1.0  # usual sizes: a parameter that is known no better counts as not identifiable
+IDENTIFIABLE = 1.0  # usual sizes: a parameter with a larger std counts as not identifiable
 
 
 @dataclass(frozen=True)
 class SessionFit:
-    """A converged fit that nobody has judged: the held-out readings have not been looked at."""
+    """A converged fit, not yet evaluated on the held-out readings."""
 
     parameters: Parameters
     observable: Observable
     metrology: Metrology
-    readings: Readings  # all, those held out too
+    readings: Readings  # all, with those held out
     problem: Problem
-    rest: FitState
+    state: FitState
     notes: tuple[Note, ...]
     missing: tuple[MissingEffect, ...]  # further effects that the fitted poses support
 
     def estimates(self, expected: Expectation | None = None) -> tuple[Estimate, ...]:
-        """Return the parameters, beside what a plan ``expected`` of them."""
-        return estimates_of(self.parameters, self.rest, expected)
+        """Return the parameters, with the std that a plan ``expected``."""
+        return make_estimates(self.parameters, self.state, expected)
 
 
 def fit_session(
@@ -60,26 +64,26 @@ def fit_session(
     observable: Observable | None = None,
     progress: Progress | None = None,
 ) -> SessionFit:
-    """Return the fit of a session's readings, without a look at those held out.
+    """Return the fit of a session's readings, those held out not used.
 
-    What to fit is chosen on fits like this one; ``judged`` then looks at the held-out readings.
+    Choose the parameters by fits like this one; ``evaluate_fit`` then uses the held-out readings.
     Raises ExcitationError where the readings are too few, InputError where they do not fit the arm.
     """
     metrology = metrology or Metrology()
-    how = observable or make_observable(readings.kind, registered=metrology.registered)
+    observable = observable or make_observable(readings.kind, registered=metrology.registered)
     if readings.held_out.all():
         raise ExcitationError("found no readings to fit: all are held out, expected others")
-    readings, lonely = _with_places(readings, how)
+    readings, notes = _with_determined_places(readings, observable)
     to_fit = np.flatnonzero(~readings.held_out)
     with threadpool_limits(1, "blas"):  # matrices of this size gain nothing from threads
-        problem, rest = converged_fit(
-            parameters, how, readings[to_fit], metrology, progress or _silent
+        problem, state = converged_fit(
+            parameters, observable, readings[to_fit], metrology, progress or _no_progress
         )
-        missing = missing_effects(problem, rest)
-    return SessionFit(parameters, how, metrology, readings, problem, rest, lonely, missing)
+        missing = missing_effects(problem, state)
+    return SessionFit(parameters, observable, metrology, readings, problem, state, notes, missing)
 
 
-def judged(
+def evaluate_fit(
     model: Model,
     fit: SessionFit,
     *,
@@ -88,114 +92,115 @@ def judged(
     diagnose: bool = True,
     progress: Progress | None = None,
 ) -> Calibration:
-    """Return a fit judged on the held-out readings: the one look at them.
+    """Return the calibration, with the errors of the held-out readings: call it once per session.
 
-    ``model`` is the arm as the cell had it; ``declined`` are further effects that were fitted and
-    not borne out.
+    ``model`` is the cell's model; ``declined`` are further effects that were fitted and not
+    supported by the data.
     """
-    report = progress or _silent
+    report = progress or _no_progress
     parameters, readings = fit.parameters, fit.readings
-    problem, rest, how = fit.problem, fit.rest, fit.observable
+    problem, state, observable = fit.problem, fit.state, fit.observable
     to_fit = np.flatnonzero(~readings.held_out)
     missing = tuple(e for e in fit.missing if e.name not in declined)
     with threadpool_limits(1, "blas"):
-        report("judging")
-        found = parameters.model(rest.values)
-        remainder = check_held_out(problem, rest, found, readings, fit.metrology)
-        diagnosis = diagnosed(found, readings, rest, fit.metrology, report) if diagnose else None
+        report("checking held-out poses")
+        calibrated = parameters.model(state.values)
+        check = check_held_out(problem, state, calibrated, readings, fit.metrology)
+        diagnosis = None
+        if diagnose:
+            diagnosis = diagnose_residual(calibrated, readings, state, fit.metrology, report)
     estimates = fit.estimates(expected)
     shown = np.array([e.shown for e in estimates], dtype=bool)
-    errors = _errors(model, found, how, readings, rest.nuisance)
-    odds = _stages_at_odds(problem, rest)
-    complete = rest.converged and remainder.is_consistent and not missing
+    errors = _errors(model, calibrated, observable, readings, state.nuisance)
+    hausman = _hausman_chance(problem, state)
+    complete = state.converged and check.is_consistent and not missing
     complete = complete and (diagnosis is None or diagnosis.verdict is Verdict.NO_GAP)
-    remaining = remaining_of(remainder, diagnosis, complete, missing, rest.converged)
-    notes = (*fit.notes, *notes_of(problem, rest, remainder, odds, estimates))
+    remaining = remaining_of(check, diagnosis, complete, missing, state.converged)
+    notes = (*fit.notes, *notes_of(problem, state, check, hausman, estimates))
     return Calibration(
-        model=found, nominal=model, readings=readings, estimates=estimates,
-        covariance=rest.covariance[np.ix_(shown, shown)],
-        combinations=(*parameters.redundant, *combinations(parameters, rest, shown)),
+        model=calibrated, nominal=model, readings=readings, estimates=estimates,
+        covariance=state.covariance[np.ix_(shown, shown)],
+        combinations=(*parameters.redundant, *combinations(parameters, state, shown)),
         before=errors[0], after=errors[1],
         held_out_before=errors[2], held_out_after=errors[3],
-        outliers=to_fit[~rest.inliers], noise=rest.noise.coordinate(),
-        repeatability=repeatability_of(problem, rest, found, readings),
-        stations=rest.nuisance.stations,
-        tcp_std=tcp_deviation(parameters, rest, readings[readings.held_out]),
+        outliers=to_fit[~state.inliers], noise=state.noise.coordinate(),
+        repeatability=repeatability_of(problem, state, calibrated, readings),
+        stations=state.nuisance.stations,
+        tcp_std=tcp_deviation(parameters, state, readings[readings.held_out]),
         diagnosis=diagnosis, complete=complete,
         remaining=remaining, notes=notes,
-        instrument_noise=rest.noise.instrument, turn_noise=_turn_noise(how, rest.noise),
-        joint_noise=rest.noise.joint, freedom=rest.freedom,
-        whole_covariance=rest.covariance, missing_effects=tuple(effect.name for effect in missing),
+        instrument_noise=state.noise.instrument, joint_noise=state.noise.joint,
+        turn_noise=_rotation_noise(observable, state.noise), freedom=state.freedom,
+        whole_covariance=state.covariance, missing_effects=tuple(effect.name for effect in missing),
         noise_floor=_floor(diagnosis),
     )  # fmt: skip
 
 
-def _silent(text: str) -> None:
-    """Report to nobody."""
+def _no_progress(text: str) -> None:
+    """Report nothing."""
 
 
 def _floor(diagnosis: Diagnosis | None) -> float:
-    """Return the noise floor of the measured positions (m); nan where nobody measured it."""
+    """Return the noise floor of the measured positions (m); nan where it is unknown."""
     channels = () if diagnosis is None else diagnosis.channels
     floors = [c.noise_floor_rms for c in channels if c.channel == "position"]
     return float("nan") if not floors or floors[0] is None else float(floors[0])
 
 
-def _with_places(readings: Readings, how: Observable) -> tuple[Readings, tuple[Note, ...]]:
-    """Return the readings with those to verify fitted where too few others determine their place.
-
-    Where an instrument stands, or a target sits, only readings there can say; and a note of it.
-    """
-    layout = how.layout(readings)
+def _with_determined_places(
+    readings: Readings, observable: Observable
+) -> tuple[Readings, tuple[Note, ...]]:
+    """Return the readings, with held-out ones fitted where a place or target has too few others."""
+    layout = observable.layout(readings)
     unknown = len(layout.frame) + int(layout.length)
-    # one reading more than there are equations for: two positions leave a frame free to turn
-    enough = unknown // how.equations + 1 if unknown else 1
-    held, fitted = readings.held_out, ~readings.held_out
+    # one reading more than the equations require: two positions do not determine a frame
+    enough = unknown // observable.equations + 1 if unknown else 1
+    held_out, fitted = readings.held_out, ~readings.held_out
     alone = np.zeros(len(readings), dtype=bool)
     for place, least in ((readings.station, enough), (readings.target, 1)):
-        for one in np.unique(place):  # poses, not readings: a second visit is no second point
+        for one in np.unique(place):  # poses, not readings: repeats add no point
             if len(np.unique(readings.pose[fitted & (place == one)])) < least:
-                alone |= held & (place == one)
+                alone |= held_out & (place == one)
     if not alone.any():
         return readings, ()
     note = Note(Reason.VERIFYING_FITTED, (int(alone.sum()),))
-    return replace(readings, held_out=held & ~alone), (note,)
+    return replace(readings, held_out=held_out & ~alone), (note,)
 
 
-def estimates_of(
-    parameters: Parameters, rest: FitState, expected: Expectation | None
+def make_estimates(
+    parameters: Parameters, state: FitState, expected: Expectation | None
 ) -> tuple[Estimate, ...]:
-    """Return the parameters as they are reported, beside what was ``expected`` of them."""
-    planned = {} if expected is None else dict(
+    """Return the parameters as they are reported, with the std that the plan ``expected``."""
+    planned_stds = {} if expected is None else dict(
         zip(expected.names, expected.std, strict=True)
     )  # fmt: skip
-    std = np.sqrt(np.diag(rest.covariance))
+    std = np.sqrt(np.diag(state.covariance))
     estimates = []
     for i, name in enumerate(parameters.names):
-        planned_std = planned.get(name)
+        planned_std = planned_stds.get(name)
         estimates.append(
             Estimate(
-                name, float(rest.values[i]), float(std[i]), parameters.units[i],
+                name, float(state.values[i]), float(std[i]), parameters.units[i],
                 None if planned_std is None else float(planned_std),
                 shown=bool(std[i] < IDENTIFIABLE * parameters.scales[i]),
-                on_bound=bool(rest.stuck[i]), freedom=rest.freedom,
+                on_bound=bool(state.on_bound[i]), freedom=state.freedom,
             )
         )  # fmt: skip
     return tuple(estimates)
 
 
 def _errors(
-    model: Model, found: Model, observable: Observable, readings: Readings, nuisance: Nuisance
+    model: Model, calibrated: Model, observable: Observable, readings: Readings, nuisance: Nuisance
 ) -> tuple[Errors, Errors, Errors, Errors]:
     """Return errors before and after over the fitted poses, then over the held-out ones.
 
-    Before, the instrument's place is the one that suits the nominal model best.
+    The errors before are with the instrument's place fitted to the nominal model.
     """
-    fitted, held = np.flatnonzero(~readings.held_out), np.flatnonzero(readings.held_out)
-    placed = observable.start(model, readings[fitted])
+    fitted, held_out = np.flatnonzero(~readings.held_out), np.flatnonzero(readings.held_out)
+    nominal_nuisance = observable.start(model, readings[fitted])
     errors = []
-    for rows in (fitted, held):
-        for one, place in ((model, placed), (found, nuisance)):
+    for rows in (fitted, held_out):
+        for one, place in ((model, nominal_nuisance), (calibrated, nuisance)):
             gap = np.zeros((0, min(observable.equations, 3)))
             if len(rows):
                 gap = observable.residual(one, readings[rows], place)[:, :3]
@@ -203,23 +208,23 @@ def _errors(
     return errors[0], errors[1], errors[2], errors[3]
 
 
-def _turn_noise(observable: Observable, noise: Noise) -> float:
+def _rotation_noise(observable: Observable, noise: Noise) -> float:
     """Return 1 sigma of a measured rotation (rad); nan where none is measured."""
     if len(noise.sizes) < 3:
         return float("nan")
     return float(noise.sizes[1] * observable.sigmas[3])
 
 
-def _stages_at_odds(problem: Problem, rest: FitState) -> float | None:
-    return at_odds(
-        rest.system, problem.stages, rest.covariance, problem.bounds,
-        problem.observable.equations, np.sqrt(rest.weights),
+def _hausman_chance(problem: Problem, state: FitState) -> float | None:
+    return hausman_chance(
+        state.system, problem.stages, state.covariance, problem.bounds,
+        problem.observable.equations, np.sqrt(state.weights),
     )  # fmt: skip
 
 
-def tcp_deviation(parameters: Parameters, rest: FitState, readings: Readings) -> Array:
+def tcp_deviation(parameters: Parameters, state: FitState, readings: Readings) -> Array:
     """Return 1 sigma (3D, m) of the predicted TCP at readings (M,): the parameters' part alone."""
     if not len(readings):
         return np.zeros(0)
-    J = parameters.tcp_jacobian(rest.values, readings.q, readings.loads)
-    return np.asarray(np.sqrt(np.einsum("nki,ij,nkj->n", J, rest.covariance, J)))
+    J = parameters.tcp_jacobian(state.values, readings.q, readings.loads)
+    return np.asarray(np.sqrt(np.einsum("nki,ij,nkj->n", J, state.covariance, J)))

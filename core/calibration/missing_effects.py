@@ -1,9 +1,7 @@
-"""Effects missing from a calibration: not asked for, and supported by the poses of the fit.
+"""Effects missing from a calibration: not requested, but supported by the fitted poses.
 
-Each further effect is tried beside all parameters, which move along: what it takes off the
-residuals counts, not how it looks beside values that have absorbed a part of it. It counts on poses
-that its fit did not see: the poses are left out in folds, those held out of the whole fit are not
-looked at.
+Each further effect is fitted together with all parameters, and judged by the reduction of the
+residuals in cross-validation over the fitted poses. The held-out poses of the session are not used.
 """
 
 from __future__ import annotations
@@ -17,20 +15,20 @@ from scipy.special import stdtrit
 from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.converged_fit import FitState
 from gapbridge.core.calibration.parameters import Parameters
-from gapbridge.core.calibration.problem import HELD, Problem
+from gapbridge.core.calibration.problem import PRIOR_SIZES, Problem
 from gapbridge.core.effects import CATALOGUE
-from gapbridge.core.estimation.held_out import missed, pose_groups, random_folds
+from gapbridge.core.estimation.held_out import held_out_residual, pose_groups, random_folds
 from gapbridge.core.estimation.least_squares import basis_of, projected_out
 
-MOST = 3  # effects at most
-SURE = 6.0  # how much more likely (log) than nothing, the number of effects tried paid for
-SMALL = 0.05  # share of the remainder below which an effect is not worth reporting
-SHOWN = 1e-6  # share of a column that the parameters leave of it, below which it is one of them
+MAX_EFFECTS = 3
+MIN_LOG_RATIO = 6.0  # log likelihood ratio, less the penalty for the number of effects tried
+MIN_SHARE = 0.05  # share of the residual's squares that an effect must remove to be reported
+MIN_COLUMN_SHARE = 1e-6  # share of a column that must be independent of the parameters
 FOLDS = 8
-DEPENDENT = 1e-8  # share below which a direction counts as given by the others
-FEWEST = 6  # poses, below which no further effect can be judged
-CONFIDENCE = 0.99  # one-sided, that an effect gains on poses that its fit did not see
-FREE = 1e-9  # ridge on the instrument's numbers, relative to their columns
+DEPENDENT = 1e-8  # relative singular value below which a direction is dependent
+MIN_POSES = 6
+CONFIDENCE = 0.99  # one-sided, of the gain on poses left out
+RIDGE = 1e-9  # ridge on the instrument's numbers, relative to their columns
 Candidate = tuple[Array, Array]  # columns (M, k), usual sizes (k,)
 
 
@@ -39,47 +37,48 @@ class MissingEffect:
     """An effect that would explain a part of the residuals."""
 
     name: str  # as identifiable_parameters takes it: backlash_3, thermal_drift
-    share: float  # of the residuals' squares on poses left out in folds that it takes off
+    share: float  # of the squared residuals of poses left out in folds that it removes
 
 
-def missing_effects(problem: Problem, rest: FitState) -> tuple[MissingEffect, ...]:
+def missing_effects(problem: Problem, state: FitState) -> tuple[MissingEffect, ...]:
     """Return the further effects that the poses of the fit support, the strongest first."""
-    tried = _columns(problem, rest)
-    folds = _Folds.of(problem, rest)
-    known = np.hstack([rest.system.J, rest.system.F])
-    found: list[MissingEffect] = []
-    for _ in range(MOST):
-        likely = _likely(tried, known, rest.system.residual, found)
+    tried = _candidate_columns(problem, state)
+    folds = _Folds.of(problem, state)
+    known = np.hstack([state.system.J, state.system.F])
+    effects: list[MissingEffect] = []
+    for _ in range(MAX_EFFECTS):
+        likely = _likely_effects(tried, known, state.system.residual, effects)
         gains = [(name, folds.gain(tried[name])) for name in likely]
-        held = [MissingEffect(name, gain) for name, gain in gains if gain >= SMALL]
-        if not held:
+        confirmed = [MissingEffect(name, gain) for name, gain in gains if gain >= MIN_SHARE]
+        if not confirmed:
             break
-        found.append(max(held, key=lambda lack: lack.share))
-        known = np.hstack([known, tried[found[-1].name][0]])
-        folds = folds.beside(tried[found[-1].name])
-    return tuple(found)
+        effects.append(max(confirmed, key=lambda effect: effect.share))
+        known = np.hstack([known, tried[effects[-1].name][0]])
+        folds = folds.with_candidate(tried[effects[-1].name])
+    return tuple(effects)
 
 
-def _likely(
-    tried: dict[str, Candidate], known: Array, residual: Array, found: list[MissingEffect]
+def _likely_effects(
+    tried: dict[str, Candidate], known: Array, residual: Array, effects: list[MissingEffect]
 ) -> list[str]:
-    """Return the effects that are far likelier than nothing, their number paid for."""
+    """Return the effects with a sufficient likelihood ratio, after the penalties."""
     Q = basis_of(known, DEPENDENT)
-    free = projected_out(Q, residual)
-    whole = max(float(free @ free), 1e-300)
+    residual_left = projected_out(Q, residual)
+    square = max(float(residual_left @ residual_left), 1e-300)
     likely = []
     for name, (columns, _) in tried.items():
-        if any(name == lack.name for lack in found):
+        if any(name == effect.name for effect in effects):
             continue
-        own = projected_out(Q, columns)
-        seen = np.linalg.norm(own, axis=0) > SHOWN * np.linalg.norm(columns, axis=0)
-        own = basis_of(own[:, seen], DEPENDENT)
-        spare = len(residual) - Q.shape[1] - own.shape[1]
-        if not own.shape[1] or spare < 1:
+        columns_left = projected_out(Q, columns)
+        size = np.linalg.norm(columns, axis=0)
+        visible = np.linalg.norm(columns_left, axis=0) > MIN_COLUMN_SHARE * size
+        basis = basis_of(columns_left[:, visible], DEPENDENT)
+        freedom = len(residual) - Q.shape[1] - basis.shape[1]
+        if not basis.shape[1] or freedom < 1:
             continue
-        taken = float(np.sum((own.T @ free) ** 2)) / whole
-        cost = 0.5 * own.shape[1] * np.log(spare) + np.log(len(tried))
-        if -0.5 * spare * np.log(max(1 - taken, 1e-12)) - cost > SURE:
+        explained = float(np.sum((basis.T @ residual_left) ** 2)) / square
+        cost = 0.5 * basis.shape[1] * np.log(freedom) + np.log(len(tried))
+        if -0.5 * freedom * np.log(max(1 - explained, 1e-12)) - cost > MIN_LOG_RATIO:
             likely.append(name)
     return likely
 
@@ -89,64 +88,64 @@ class _Folds:
     """The fit's linear system with its poses left out in turn."""
 
     A: Array  # (M, c) columns of parameters and instrument
-    target: Array  # (M,) residual, where each number begins taken off
-    hold: Array  # (c,) how firmly each number is held there
+    target: Array  # (M,) residual with every number at its start
+    ridge: Array  # (c,) inverse prior sigma of each number
     pose: NDArray[np.int64]  # (M,) number of each row's pose
     fold: NDArray[np.int64]  # (M,)
 
     @classmethod
-    def of(cls, problem: Problem, rest: FitState) -> _Folds:
+    def of(cls, problem: Problem, state: FitState) -> _Folds:
         """Return the folds of a converged fit; repeats and loads of a pose stay together."""
-        system, held = rest.system, problem.bounds.held
+        system, prior_std = state.system, problem.bounds.prior_std
         A = np.hstack([system.J, system.F])
-        target = system.residual - system.J @ (problem.bounds.begin - rest.values)
-        hold = np.concatenate([1 / held, np.sqrt(FREE) * np.linalg.norm(system.F, axis=0)])
+        target = system.residual - system.J @ (problem.bounds.begin - state.values)
+        ridge = np.concatenate([1 / prior_std, np.sqrt(RIDGE) * np.linalg.norm(system.F, axis=0)])
         pose = np.repeat(pose_groups(problem.readings.q), problem.observable.equations)
-        return cls(A, target, hold, pose, random_folds(pose, FOLDS))
+        return cls(A, target, ridge, pose, random_folds(pose, FOLDS))
 
-    def beside(self, candidate: Candidate) -> _Folds:
+    def with_candidate(self, candidate: Candidate) -> _Folds:
         """Return the folds of the fit with a further effect in it."""
         columns, sizes = candidate
-        hold = np.concatenate([self.hold, 1 / (HELD * sizes)])
-        return replace(self, A=np.hstack([self.A, columns]), hold=hold)
+        ridge = np.concatenate([self.ridge, 1 / (PRIOR_SIZES * sizes)])
+        return replace(self, A=np.hstack([self.A, columns]), ridge=ridge)
 
     def gain(self, candidate: Candidate) -> float:
-        """Return the share of the squares that an effect takes off poses left out of its fit.
+        """Return the share of the squared residuals of left-out poses that an effect removes.
 
-        0 where the poses do not agree that it takes any (one-sided t-test over poses).
+        0 where it is not significant (one-sided t-test over poses).
         """
         count = int(self.pose.max()) + 1
-        if count < FEWEST:
+        if count < MIN_POSES:
             return 0.0
-        without = np.bincount(self.pose, self._missed() ** 2)
-        gain = without - np.bincount(self.pose, self.beside(candidate)._missed() ** 2)
+        without = np.bincount(self.pose, self._held_out_residual() ** 2)
+        fitted = self.with_candidate(candidate)._held_out_residual()
+        gain = without - np.bincount(self.pose, fitted**2)
         spread = float(gain.std(ddof=1)) / np.sqrt(count)
         if gain.mean() <= float(stdtrit(count - 1, CONFIDENCE)) * spread:
             return 0.0
         return float(gain.sum() / max(without.sum(), 1e-300))
 
-    def _missed(self) -> Array:
-        """Return what each row misses (M,) where its pose was left out of the fit."""
-        return missed(self.A, self.target, self.fold, self.hold)
+    def _held_out_residual(self) -> Array:
+        """Return the residual of each row (M,) by the fit without its pose."""
+        return held_out_residual(self.A, self.target, self.fold, self.ridge)
 
 
-def _columns(problem: Problem, rest: FitState) -> dict[str, Candidate]:
-    """Return the columns and usual sizes of every further effect, weighed as the system is."""
+def _candidate_columns(problem: Problem, state: FitState) -> dict[str, Candidate]:
+    """Return the columns and usual sizes of every further effect, weighted as the system."""
     parameters, observable, readings = problem.parameters, problem.observable, problem.readings
-    found = parameters.model(rest.values)
-    had = {(t.effect, t.site.joint) for t in parameters.terms}
-    effects = [e for e, member in CATALOGUE.items() if member.calibratable]
-    every = Parameters.every(found, effects)
-    J, _ = observable.columns(every, every.begin, readings, rest.nuisance)
+    fitted = {(t.effect, t.site.joint) for t in parameters.terms}
+    names = [e for e, member in CATALOGUE.items() if member.calibratable]
+    candidates = Parameters.of_effects(parameters.model(state.values), names)
+    J, _ = observable.columns(candidates, candidates.begin, readings, state.nuisance)
     N, k = len(readings), observable.equations
-    J = (rest.noise.whitener @ J.reshape(N, k, -1)).reshape(N * k, -1)
-    J = J * np.repeat(np.sqrt(rest.weights), k)[:, None]
+    J = (state.noise.whitener @ J.reshape(N, k, -1)).reshape(N * k, -1)
+    J = J * np.repeat(np.sqrt(state.weights), k)[:, None]
     columns: dict[str, list[int]] = {}
-    for i, (t, _value) in enumerate(every.place):
-        term = every.terms[t]
-        if (term.effect, term.site.joint) in had:
+    for i, (t, _value) in enumerate(candidates.place):
+        term = candidates.terms[t]
+        if (term.effect, term.site.joint) in fitted:
             continue
         joint = term.site.joint
         name = term.effect if joint is None else f"{term.effect}_{joint}"
         columns.setdefault(name, []).append(i)
-    return {name: (J[:, own], every.scales[own]) for name, own in columns.items()}
+    return {name: (J[:, rows], candidates.scales[rows]) for name, rows in columns.items()}

@@ -1,4 +1,4 @@
-"""The parameters of a calibration: which effects at which sites are to be found."""
+"""The parameters of a calibration: the effects and sites to estimate."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from gapbridge.core.loads import Loads
 from gapbridge.core.model import Model
 from gapbridge.core.notes import Note
 
-DEFAULT = tuple(  # what a calibration looks for that names no effects; earlier ones come first
+DEFAULT = tuple(  # effects of a calibration where none are named, in order of priority
     sorted(
         (name for name, effect in CATALOGUE.items() if effect.calibrated),
         key=lambda name: CATALOGUE[name].calibrated,
     )
 )
-ORDERS = (1.0, 2.0)  # cycles a turn at which a transmission error is looked for
+PERIODIC_ORDERS = (1.0, 2.0)  # cycles per turn of a transmission error
 PRIOR = 10.0  # usual sizes
-SHARE = 0.01  # of a usual size, as the step where a derivative is a difference
-LEAST_LEVER = 0.05  # of the arm's reach, beyond a joint
+STEP_SHARE = 0.01  # of a usual size: step of numerical derivatives
+MIN_LEVER = 0.05  # of the arm's reach, beyond a joint
 
 
 @dataclass(frozen=True)
 class Parameters:
-    """The p numbers of a calibration: what the arm has beyond the nominal model."""
+    """The p parameters of a calibration, as corrections to the nominal model."""
 
     nominal: Model
     terms: tuple[Term, ...]  # one a site, all values zero
@@ -38,28 +38,28 @@ class Parameters:
     names: tuple[str, ...]  # (p) as cells and reports name them
     units: tuple[str, ...]
     scales: Array  # (p,) a usual size of each
-    lower: Array  # (p,) bounds; the whole flexibility, the nominal model's with it, is 0 or more
+    lower: Array  # (p,) bounds; nominal plus estimated flexibility is 0 or more
     upper: Array  # (p,)
-    begin: Array  # (p,) where a fit begins, and where plans are made
-    redundant: tuple[Note, ...] = ()  # what was left out, and what stands for it
+    begin: Array  # (p,) start of a fit, and linearisation point of plans
+    redundant: tuple[Note, ...] = ()  # redundant parameters, and those equivalent to them
 
     @classmethod
-    def every(cls, model: Model, effects: Sequence[str] = DEFAULT) -> Parameters:
-        """Return all parameters of some effects, the redundant ones among them."""
+    def of_effects(cls, model: Model, effects: Sequence[str] = DEFAULT) -> Parameters:
+        """Return all parameters of some effects, with the redundant ones."""
         terms = tuple(_terms(model, effects))
         names, units, place = [], [], []
         numbers: list[tuple[float, float, float, float]] = []
         for t, term in enumerate(terms):
             effect = CATALOGUE[term.effect]
-            had = _had(model, term)
+            nominal = _nominal_values(model, term)
             for k, parameter in enumerate(effect.parameters(model.arm, term.site)):
                 place.append((t, k))
                 names.append(_name(term, effect.label(term.site, parameter), parameter.name))
                 units.append(parameter.unit)
                 low = 0.0 if effect.softens else parameter.lower
-                scale = parameter.scale * _smaller(model, term, k)
+                scale = parameter.scale * _lever_factor(model, term, k)
                 start = scale if effect.curved else 0.0
-                bounds = low - had[k], parameter.upper - had[k]
+                bounds = low - nominal[k], parameter.upper - nominal[k]
                 numbers.append((scale, *bounds, start))
         scales, lower, upper, begin = np.array(numbers).T
         return cls(
@@ -71,7 +71,7 @@ class Parameters:
         return len(self.names)
 
     def part(self, kept: Sequence[int], redundant: tuple[Note, ...] = ()) -> Parameters:
-        """Return the parameters ``kept``; ``redundant``: the others, and what stands for them."""
+        """Return the parameters ``kept``; ``redundant`` are notes on the others."""
         rows = list(kept)
         return replace(
             self,
@@ -86,9 +86,9 @@ class Parameters:
         )
 
     def model(self, values: Array) -> Model:
-        """Return the nominal model with ``values`` (p,) beyond it.
+        """Return the nominal model with corrections ``values`` (p,).
 
-        What the nominal model has of the same effect at the same site is added to.
+        They are added to the nominal model's values of the same effect at the same site.
         """
         numbers = [list(term.values) for term in self.terms]
         for (t, k), value in zip(self.place, values, strict=True):
@@ -118,41 +118,41 @@ class Parameters:
         places = [(self.terms[t], k) for t, k in self.place]
         chosen = [(numbers[term.effect, term.site], k) for term, k in places]
         return pose_columns(
-            model, q, loads, chosen, SHARE * self.scales, coordinates=coordinates,
+            model, q, loads, chosen, STEP_SHARE * self.scales, coordinates=coordinates,
             converged=converged,
         )  # fmt: skip
 
     def tcp_jacobian(self, values: Array, q: Array, loads: Loads) -> Array:
         """Return d TCP position / d parameters (N, 3, p) at ``q`` (N, n), base axes."""
-        found = self.pose_columns(values, q, loads, coordinates=3)
-        return np.asarray(found.jacobian.transpose(2, 0, 1))
+        columns = self.pose_columns(values, q, loads, coordinates=3)
+        return np.asarray(columns.jacobian.transpose(2, 0, 1))
 
     @property
     def prior(self) -> Array:
-        """Return 1 sigma (p,) that weakly holds each at the nominal model: ten usual sizes."""
+        """Return 1 sigma (p,) of the weak prior at the nominal model: ten usual sizes."""
         return PRIOR * self.scales
 
-    def sided(self) -> tuple[int, ...]:
-        """Return the joints (from 1) of which something is to be found that acts by approach."""
+    def approach_joints(self) -> tuple[int, ...]:
+        """Return the joints (from 1) with an effect that depends on the direction of approach."""
         effects = {term.effect for term in self.terms if CATALOGUE[term.effect].by_approach}
         return tuple(sorted({j for effect in effects for j in self.joints(effect)}))
 
     def joints(self, effect: str) -> tuple[int, ...]:
-        """Return the joints (from 1) at which an effect is to be found."""
-        found = {self.terms[t].site.joint for t, _ in self.place if self.terms[t].effect == effect}
-        return tuple(sorted(j for j in found if j is not None))
+        """Return the joints (from 1) at which an effect is estimated."""
+        joints = {self.terms[t].site.joint for t, _ in self.place if self.terms[t].effect == effect}
+        return tuple(sorted(j for j in joints if j is not None))
 
 
 def _terms(model: Model, effects: Sequence[str]) -> Iterator[Term]:
     """Yield a term of zeros for each site of each effect."""
     contained = {
         (CATALOGUE[effect].contains, site.joint)
-        for named in effects
-        for effect, site in _sites(model, named)
+        for name in effects
+        for effect, site in _sites(model, name)
     }
     seen = set()
-    for named in effects:
-        for effect, site in _sites(model, named):
+    for name in effects:
+        for effect, site in _sites(model, name):
             if (effect, site.joint) in contained or (effect, site) in seen:
                 continue
             seen.add((effect, site))
@@ -160,31 +160,31 @@ def _terms(model: Model, effects: Sequence[str]) -> Iterator[Term]:
             yield Term(effect, site, (0.0,) * count)
 
 
-def _sites(model: Model, named: str) -> list[tuple[str, Site]]:
+def _sites(model: Model, name: str) -> list[tuple[str, Site]]:
     """Return effect and sites of ``effect`` or ``effect_JOINT``."""
-    stem, _, number = named.rpartition("_")
+    stem, _, number = name.rpartition("_")
     joint = int(number) if number.isdigit() and stem in CATALOGUE else None
-    effect = effect_named(named if joint is None else stem)
+    effect = effect_named(name if joint is None else stem)
     if not effect.calibratable:
         raise InputError(
-            f"effect: found {named!r}, expected one that measured positions show: "
+            f"effect: found {name!r}, expected one that measured positions show: "
             + ", ".join(e for e, member in CATALOGUE.items() if member.calibratable)
         )
     sites = [s for s in effect.sites(model.arm) if joint is None or s.joint == joint]
     if not sites:
         raise InputError(
-            f"effect: found {named!r}, expected a joint of this arm of {model.arm.n} joints"
+            f"effect: found {name!r}, expected a joint of this arm of {model.arm.n} joints"
         )
     if effect.periodic:
-        sites = [replace(s, order=order) for s in sites for order in ORDERS]
+        sites = [replace(s, order=order) for s in sites for order in PERIODIC_ORDERS]
     return [(effect.identifier, site) for site in sites]
 
 
-def _smaller(model: Model, term: Term, value: int) -> float:
-    """Return how a joint that carries less than the arm's foot changes a usual size.
+def _lever_factor(model: Model, term: Term, value: int) -> float:
+    """Return the factor on a usual size for a joint with less lever than the first one.
 
-    Where a curve bends is determined by the moment at the joint itself: a wrist's is reached long
-    before the moment that the whole arm puts on its first joint.
+    The saturation moment of a stiffness curve scales with the moments at the joint: those of a
+    wrist are much smaller than those of joint 1.
     """
     if not CATALOGUE[term.effect].curved or term.site.joint is None:
         return 1.0
@@ -192,17 +192,17 @@ def _smaller(model: Model, term: Term, value: int) -> float:
     length = np.linalg.norm(arm.link_in_link[:, :3, 3], axis=1)
     tool = float(np.linalg.norm(model.tool_in_flange[:3, 3]))
     share = (float(length[i + 1 :].sum()) + tool) / (float(length.sum()) + tool)
-    return max(share, LEAST_LEVER) ** -(1 + value)
+    return max(share, MIN_LEVER) ** -(1 + value)
 
 
-def _had(model: Model, term: Term) -> Array:
-    """Return what the nominal model has of the effect at the site."""
-    had = np.zeros(len(term.values))
+def _nominal_values(model: Model, term: Term) -> Array:
+    """Return the nominal model's values of the effect at the site."""
+    nominal = np.zeros(len(term.values))
     for other in model.terms:
         if (other.effect, other.site) == (term.effect, term.site):
-            size = min(len(had), len(other.values))
-            had[:size] += other.values[:size]
-    return had
+            size = min(len(nominal), len(other.values))
+            nominal[:size] += other.values[:size]
+    return nominal
 
 
 def _name(term: Term, label: str, parameter: str) -> str:

@@ -1,8 +1,8 @@
-"""A short session with the flange sensor: what hangs on the flange, and the sensor's own bias.
+"""Payload session: mass and centre of gravity of the payload, and the bias of the flange sensor.
 
-At rest the sensor reads the weight of what hangs on it and a constant of its own. Turned against
-gravity the weight turns and the constant does not; both are linear in mass, mass times centre of
-gravity, and bias, so that a handful of orientations determines all ten numbers.
+At rest the sensor reads the payload's weight plus a constant bias. Only the weight turns with the
+flange. The reading is linear in mass, mass times centre of gravity, and bias: a few orientations
+determine all ten numbers.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ AXES = ("fx", "fy", "fz", "mx", "my", "mz")
 (BIAS,) = correcting("sensor zero")
 NAMES = ("payload_mass", *(f"payload_cog_{k}" for k in "xyz"), *(f"{BIAS}_{k}" for k in AXES))
 UNITS = ("kg", "m", "m", "m", "N", "N", "N", "Nm", "Nm", "Nm")
-LIGHT = 3.0  # standard deviations of its mass below which a load has no centre to speak of
-FEWEST = 3
+MIN_MASS_SIGMAS = 3.0  # below it the centre of gravity is undetermined
+MIN_READINGS = 3
 
 
 @dataclass(frozen=True)
 class PayloadCalibration:
-    """What a session with the flange sensor found."""
+    """Result of a payload session."""
 
     mass: float  # kg, of everything beyond the sensor
     cog: Array  # (3,) m, flange axes
@@ -41,13 +41,13 @@ class PayloadCalibration:
     covariance: Array  # (10, 10)
     noise: tuple[float, float]  # N and Nm, 1 sigma of one axis of one reading
     residual: Array  # (N, 6) reading minus prediction
-    outliers: NDArray[np.int64]  # readings down-weighted as outlier
+    outliers: NDArray[np.int64]  # readings down-weighted as outliers
     notes: tuple[Note, ...]
 
     def applied(self, model: Model) -> Model:
-        """Return the model that carries this load and knows this bias, instead of its own."""
-        anew = (*correcting("payload"), BIAS)
-        kept = tuple(t for t in model.terms if t.effect not in anew)
+        """Return the model with this payload and bias, instead of its own."""
+        replaced = (*correcting("payload"), BIAS)
+        kept = tuple(t for t in model.terms if t.effect not in replaced)
         bias = Term(BIAS, Site(), tuple(float(v) for v in self.bias))
         return replace(
             model, payload_mass=self.mass, payload_cog=self.cog.copy(), terms=(*kept, bias)
@@ -57,26 +57,25 @@ class PayloadCalibration:
 def weight_columns(model: Model, q: Array) -> Array:
     """Return d reading / d (mass, mass x cog, bias) as (N, 6, 10), at rest at ``q`` (N, n).
 
-    The flange stands as the model bends; a sensor that the model knows to be turned or scaled
-    reads accordingly.
+    At the model's deflected flange; misalignment and gain of the sensor in the model are applied.
     """
     poses = model.predict(q)
-    hand = poses.rotation @ model.chain().tool_rotation.T
-    down = np.swapaxes(hand, 1, 2) @ model.gravity
+    flange_rotation = poses.rotation @ model.chain().tool_rotation.T
+    down = np.swapaxes(flange_rotation, 1, 2) @ model.gravity
     columns = np.zeros((len(q), 6, 10))
     columns[:, :3, 0] = down
     for k in range(3):
         columns[:, 3:, 1 + k] = np.cross(np.eye(3)[k], down)
-    shaping = [t for t in model.terms if CATALOGUE[t.effect].scales_reading]
+    scaling = [t for t in model.terms if CATALOGUE[t.effect].scales_reading]
     motion = motion_of(Log("readings", {"actual_q": q}, model.arm.n))
     for k in range(4):
-        columns[:, :, k] = _sensed(model, shaping, columns[:, :, k], motion)
+        columns[:, :, k] = _sensor_reading(model, scaling, columns[:, :, k], motion)
     columns[:, :, 4:] = np.eye(6)
     return columns
 
 
-def _sensed(model: Model, shaping: list[Term], wrench: Array, motion: Motion) -> Array:
-    for term in acting(shaping, "wrench"):
+def _sensor_reading(model: Model, scaling: list[Term], wrench: Array, motion: Motion) -> Array:
+    for term in acting(scaling, "wrench"):
         wrench = CATALOGUE[term.effect].sense(term, model.arm, wrench, motion)
     return wrench
 
@@ -89,13 +88,13 @@ def calibrate_payload(model: Model, q: Array, wrench: Array) -> PayloadCalibrati
     fit together, ExcitationError where the orientations do not separate load from bias.
     """
     q, wrench = np.asarray(q, dtype=float), np.asarray(wrench, dtype=float)
-    _check(model, q, wrench)
+    _check_shapes(model, q, wrench)
     columns = weight_columns(model, q)
-    _require_turning(columns, len(q))
+    _require_rotation(columns, len(q))
     flat, value = columns.reshape(-1, 10), wrench.reshape(-1)
-    unit = np.tile(np.repeat([0, 1], 3), len(q))  # forces and torques have a noise of their own
+    unit = np.tile(np.repeat([0, 1], 3), len(q))  # separate noise of forces and torques
     fit = robust_fit(flat, value, unit, row=np.repeat(np.arange(len(q)), 6))
-    covariance, cog = _about_centre(fit.values, fit.covariance)
+    covariance, cog = _in_terms_of_cog(fit.values, fit.covariance)
     mass = float(fit.values[0])
     values = np.concatenate([[mass], cog, fit.values[4:]])
     std = np.sqrt(np.diag(covariance))
@@ -111,7 +110,7 @@ def calibrate_payload(model: Model, q: Array, wrench: Array) -> PayloadCalibrati
     )  # fmt: skip
 
 
-def _check(model: Model, q: Array, wrench: Array) -> None:
+def _check_shapes(model: Model, q: Array, wrench: Array) -> None:
     if q.ndim != 2 or q.shape[1] != model.arm.n:
         raise InputError(f"payload session: found angles {q.shape}, expected (N, {model.arm.n})")
     if wrench.shape != (len(q), 6):
@@ -119,16 +118,17 @@ def _check(model: Model, q: Array, wrench: Array) -> None:
     if not (np.isfinite(q).all() and np.isfinite(wrench).all()):
         row = int(np.flatnonzero(~np.isfinite(np.hstack([q, wrench])).all(axis=1))[0])
         raise InputError(f"payload session: reading {row + 1} is not finite, expected numbers")
-    if len(q) < FEWEST:
+    if len(q) < MIN_READINGS:
         raise ExcitationError(
-            f"payload session: found {len(q)} reading(s), expected {FEWEST} or more orientations"
+            f"payload session: found {len(q)} reading(s), expected {MIN_READINGS} or more "
+            "orientations"
         )
 
 
-def _require_turning(columns: Array, count: int) -> None:
+def _require_rotation(columns: Array, count: int) -> None:
     scaled = columns * np.array([0.1, *[0.1] * 3, 1, 1, 1, 1, 1, 1])  # gravity brought near one
     size = np.linalg.svd(scaled.reshape(-1, 10), compute_uv=False)
-    # below a turn of about a degree the load would be read off the noise
+    # a rotation below about a degree does not separate the load from noise
     if size[-1] < 0.02 * np.sqrt(count):
         raise ExcitationError(
             f"payload session: in {count} readings gravity hardly turns in the flange, so that "
@@ -137,10 +137,10 @@ def _require_turning(columns: Array, count: int) -> None:
         )
 
 
-def _about_centre(values: Array, covariance: Array) -> tuple[Array, Array]:
-    """Return the covariance in terms of the centre of gravity itself, and that centre."""
+def _in_terms_of_cog(values: Array, covariance: Array) -> tuple[Array, Array]:
+    """Return the covariance with the centre of gravity for mass times it, and that centre (m)."""
     mass, moment = float(values[0]), values[1:4]
-    if abs(mass) < LIGHT * np.sqrt(covariance[0, 0]):
+    if abs(mass) < MIN_MASS_SIGMAS * np.sqrt(covariance[0, 0]):
         bounded = covariance.copy()
         bounded[1:4, :] = bounded[:, 1:4] = 0.0
         bounded[1:4, 1:4] = np.diag([np.inf] * 3)
@@ -153,7 +153,7 @@ def _about_centre(values: Array, covariance: Array) -> tuple[Array, Array]:
 
 def _notes(mass: float, std: float, outliers: NDArray[np.int64]) -> tuple[Note, ...]:
     notes = []
-    if abs(mass) < LIGHT * std:
+    if abs(mass) < MIN_MASS_SIGMAS * std:
         notes.append(Note(Reason.NOTHING_WEIGHS))
     elif mass < 0:
         notes.append(Note(Reason.NEGATIVE_MASS, (mass,)))

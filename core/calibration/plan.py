@@ -10,7 +10,7 @@ from gapbridge.core.notes import Note
 
 @dataclass(frozen=True)
 class Payload:
-    """A load that people hang on the flange."""
+    """A test load on the flange."""
 
     mass: float  # kg
     cog: tuple[float, float, float] = (0.0, 0.0, 0.0)  # m, flange axes
@@ -33,11 +33,11 @@ class PlannedPose:
 
 @dataclass(frozen=True)
 class Expectation:
-    """What readings at some poses will determine, before anyone moves."""
+    """Expected standard deviations of a planned session."""
 
     names: tuple[str, ...]  # of the parameters, as reports name them
     units: tuple[str, ...]
-    std: Array  # (p,) 1 sigma; inf where the poses do not show it
+    std: Array  # (p,) 1 sigma; inf where not identifiable
     prior: Array  # (p,) usual size of each before the session
     tcp_std: float  # m, rms over the workspace of the predicted TCP's 1 sigma (3D)
     tcp_std_worst: float  # m, the largest over the workspace
@@ -50,6 +50,6 @@ class Plan:
     loads: tuple[Payload, ...]
     poses: tuple[PlannedPose, ...]  # in the order of travel, one load after the other
     expected: Expectation
-    bought: tuple[tuple[int, float], ...]  # number of poses to fit, tcp_std (m) that they give
+    bought: tuple[tuple[int, float], ...]  # number of fitted poses, tcp_std (m) with them
     travel: float  # s, motion alone
-    notes: tuple[Note, ...] = ()  # what could not be planned, and why
+    notes: tuple[Note, ...] = ()

@@ -1,4 +1,4 @@
-"""What a calibration session measured, row by row, whatever the instrument."""
+"""The readings of a calibration session, for any instrument."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Readings:
     scatter: Array  # (N,) m, 1 sigma of one coordinate of the averaged reading; nan: not known
     loads: Loads
     load: Index  # (N,) number of the load in the plan, from 0; 0 is the lightest
-    station: Index  # (N,) number of the instrument's place, from 0: each has a frame of its own
+    station: Index  # (N,) number of the instrument's place, from 0: each has a separate frame
     target: Index  # (N,) number of the ball or reflector on the tool, from 0
     held_out: NDArray[np.bool_]  # (N,) never used in a fit
     pose: Index  # (N,) number of the planned pose; repeats share one

@@ -1,4 +1,4 @@
-"""What a calibration found, and how far it carries."""
+"""The result of a calibration: estimates, errors, and what remains."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ class Estimate:
     std: float  # 1 sigma
     unit: str
     expected_std: float | None = None  # what the plan predicted
-    shown: bool = True  # False: the data do not determine it; it stands where it stood
+    shown: bool = True  # False: not identifiable from the data; kept at its start
     on_bound: bool = False
-    freedom: float = np.inf  # degrees of freedom behind std: few make the interval wider
+    freedom: float = np.inf  # degrees of freedom of ``std``
 
     @property
     def interval(self) -> tuple[float, float]:
@@ -78,19 +78,19 @@ class Calibration:
     after: Errors
     held_out_before: Errors  # held-out poses
     held_out_after: Errors
-    outliers: NDArray[np.int64]  # rows of the readings that were down-weighted as outlier
-    noise: float  # m, 1 sigma of one coordinate that the fit leaves
+    outliers: NDArray[np.int64]  # rows of the readings that were down-weighted as outliers
+    noise: float  # m, 1 sigma of one coordinate of the residual
     repeatability: float  # m, 1 sigma of one coordinate, from repeated poses; nan: none were
     stations: tuple[Registration, ...]  # frame of each place of the instrument
     tcp_std: Array  # (M,) m, 1 sigma (3D) of the predicted TCP at the held-out poses
     diagnosis: Diagnosis | None  # of the residual; None where the readings do not allow it
-    complete: bool  # True: nothing is left that a further effect could explain
+    complete: bool  # True: no residual structure that a further effect could explain
     remaining: Note
     notes: tuple[Note, ...] = field(default=())
     instrument_noise: float = float("nan")  # m, 1 sigma of one coordinate, the instrument alone
     turn_noise: float = float("nan")  # rad, 1 sigma of a measured rotation; nan: none were
     joint_noise: float = float("nan")  # rad, 1 sigma of one joint's repeatability
-    freedom: float = float("inf")  # degrees of freedom that the fit left
-    missing_effects: tuple[str, ...] = ()  # supported by the fit's own poses, not asked for
+    freedom: float = float("inf")  # residual degrees of freedom
+    missing_effects: tuple[str, ...] = ()  # supported by the fitted poses, but not requested
     noise_floor: float = float("nan")  # m, 1 sigma of one coordinate, without the fit; nan: unknown
     whole_covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))  # of all estimates

@@ -15,17 +15,14 @@ from gapbridge.core.errors import EquilibriumError, InputError
 from gapbridge.core.loads import Loads
 from gapbridge.core.model import Model, Poses
 
-FIRST_ORDER = np.inf  # m/rad: no second round of the adjoints, which would change some thousandths
-BLOCK = 20_000  # rows at a time, so that memory does not grow with them
-FEW = 2048  # the same of products with the covariance
+FIRST_ORDER = np.inf  # m/rad: one round of the adjoints; a second changes some thousandths
+BLOCK_ROWS = 20_000  # rows at a time, to bound the memory
+CACHED_ROWS = 2048  # rows at a time of products with the covariance, to fit the CPU cache
 
 
 @dataclass(frozen=True)
 class Spread:
-    """Names of fitted parameters (p), as calibrations have them, and their covariance (p, p), SI.
-
-    ``Spread.none()`` where nothing is known.
-    """
+    """Names of fitted parameters (p), and their covariance (p, p), SI; maybe of none."""
 
     names: tuple[str, ...]
     covariance: Array
@@ -37,7 +34,7 @@ class Spread:
 
     @classmethod
     def of_fit(cls, shown: NDArray[np.bool_], covariance: Array) -> Spread:
-        """Return the flexibilities that a fit has ``shown`` (2n,), axial then radial."""
+        """Return the identifiable flexibilities (``shown``, 2n) of a fit, axial then radial."""
         names = flexibility_names(len(shown) // 2)
         rows = np.flatnonzero(shown)
         return cls(tuple(names[i] for i in rows), covariance[np.ix_(rows, rows)])
@@ -50,98 +47,98 @@ class Spread:
         """
         names: list[str] = []
         blocks: list[Array] = []
-        for term, own in zip(terms, covariance, strict=True):
+        for term, covariance_of_term in zip(terms, covariance, strict=True):
             if not CATALOGUE[term.effect].calibratable:
                 continue
-            every = Parameters.every(model, [term.effect])
-            at = {(every.terms[t].site, k): name for (t, k), name in
-                  zip(every.place, every.names, strict=True)}  # fmt: skip
-            known = [k for k in range(len(own)) if (term.site, k) in at]
-            names += [at[term.site, k] for k in known]
-            blocks.append(own[np.ix_(known, known)])
-        return cls(tuple(names), _blocks(blocks))
+            parameters = Parameters.of_effects(model, [term.effect])
+            index = {(parameters.terms[t].site, k): name for (t, k), name in
+                  zip(parameters.place, parameters.names, strict=True)}  # fmt: skip
+            known = [k for k in range(len(covariance_of_term)) if (term.site, k) in index]
+            names += [index[term.site, k] for k in known]
+            blocks.append(covariance_of_term[np.ix_(known, known)])
+        return cls(tuple(names), _block_diagonal(blocks))
 
     def beside(self, earlier: Spread) -> Spread:
-        """Return these parameters, and those of an earlier fit that this one left as they were."""
+        """Return these parameters, and those of an earlier fit that are not among them."""
         kept = [i for i, name in enumerate(earlier.names) if name not in self.names]
         names = (*self.names, *(earlier.names[i] for i in kept))
-        return Spread(names, _blocks([self.covariance, earlier.covariance[np.ix_(kept, kept)]]))
+        blocks = [self.covariance, earlier.covariance[np.ix_(kept, kept)]]
+        return Spread(names, _block_diagonal(blocks))
 
     def sigma_columns(
         self, model: Model, q: Array, loads: Loads | None, known: Sequence[Term]
     ) -> Array:
-        """Return 1 sigma (N, 6, r) of the poses, m and rad, base axes, along r directions.
+        """Return 1 sigma (N, 6, r) of poses, m and rad, base axes, along r principal directions.
 
-        Those of what the fit left open, the numbers of the terms ``known`` left out. Raises as
-        ``poses_and_std``.
+        The parameters of the terms ``known`` are excluded. Raises as ``poses_and_std``.
         """
-        every = parameters_named(model, self.names, "provenance")
-        own = {(term.effect, term.site) for term in known}
-        sites = [(every.terms[t].effect, every.terms[t].site) for t, _ in every.place]
-        rest = [i for i, site in enumerate(sites) if site not in own]
-        value, V = np.linalg.eigh(self.covariance[np.ix_(rest, rest)])
-        found = every.part(rest).pose_columns(np.zeros(len(rest)), q, loads)
+        parameters = parameters_named(model, self.names, "provenance")
+        excluded = {(term.effect, term.site) for term in known}
+        terms = [parameters.terms[t] for t, _ in parameters.place]
+        others = [i for i, t in enumerate(terms) if (t.effect, t.site) not in excluded]
+        value, V = np.linalg.eigh(self.covariance[np.ix_(others, others)])
+        columns = parameters.part(others).pose_columns(np.zeros(len(others)), q, loads)
         root = V * np.sqrt(np.maximum(value, 0.0))
-        return np.asarray(found.jacobian.transpose(2, 0, 1) @ root)
+        return np.asarray(columns.jacobian.transpose(2, 0, 1) @ root)
 
     def poses_and_std(self, model: Model, q: Array, loads: Loads | None) -> tuple[Poses, Array]:
-        """Return the poses, and 1 sigma (N, 3), m, base axes, of positions; one parameter at least.
+        """Return the poses, and 1 sigma (N, 3), m, base axes, of positions, due to the parameters.
 
-        The parameters' part alone. Raises InputError where a parameter is none of the model's arm,
-        or a row has no equilibrium.
+        At least one parameter. Raises InputError where the model's arm lacks a parameter, or a row
+        has no equilibrium.
         """
         parameters = parameters_named(model, self.names, "provenance")
         position, rotation = np.empty((len(q), 3)), np.empty((len(q), 3, 3))
         std = np.empty((len(q), 3))
-        for begin in range(0, len(q), BLOCK):
-            rows = slice(begin, begin + BLOCK)
+        for begin in range(0, len(q), BLOCK_ROWS):
+            rows = slice(begin, begin + BLOCK_ROWS)
             try:
-                found = parameters.pose_columns(
+                columns = parameters.pose_columns(
                     np.zeros(len(parameters)), q[rows], None if loads is None else loads[rows],
                     coordinates=3, converged=FIRST_ORDER,
                 )  # fmt: skip
             except EquilibriumError as error:
                 raise EquilibriumError(begin + error.row) from None
-            position[rows], rotation[rows] = found.poses.position, found.poses.rotation
-            self._spread_of(found.jacobian, std[rows])
+            position[rows], rotation[rows] = columns.poses.position, columns.poses.rotation
+            self._write_std(columns.jacobian, std[rows])
         return Poses(position, rotation), std
 
-    def _spread_of(self, jacobian: Array, std: Array) -> None:
+    def _write_std(self, jacobian: Array, std: Array) -> None:
         """Write 1 sigma (N, 3) of positions that change by ``jacobian`` (3, p, N)."""
-        for begin in range(0, len(std), FEW):  # temporaries that stay in the processor's cache
-            rows = slice(begin, begin + FEW)
+        for begin in range(0, len(std), CACHED_ROWS):
+            rows = slice(begin, begin + CACHED_ROWS)
             for k, J in enumerate(jacobian[:, :, rows]):
                 square = np.einsum("pn,pn->n", J, self.covariance @ J)
                 std[rows, k] = np.sqrt(np.maximum(square, 0.0))
 
 
 def parameters_named(model: Model, names: Sequence[str], where: str) -> Parameters:
-    """Return the parameters with these names, to be found beyond ``model``.
+    """Return the parameters with these names, as corrections to ``model``.
 
     Raises InputError, beginning with ``where``, for a name that its arm does not have.
     """
-    every = Parameters.every(model, effects_of(names))
-    at = {name: i for i, name in enumerate(every.names)}
-    missing = [name for name in names if name not in at]
+    parameters = Parameters.of_effects(model, effects_of(names))
+    index = {name: i for i, name in enumerate(parameters.names)}
+    missing = [name for name in names if name not in index]
     if missing:
         raise InputError(
             f"{where}: found parameter {missing[0]!r}, expected one of this cell's arm"
         )
-    return every.part([at[name] for name in names])
+    return parameters.part([index[name] for name in names])
 
 
 def effects_of(names: Sequence[str]) -> tuple[str, ...]:
     """Return the effects that parameters with these names belong to, each once."""
-    found = []
+    effects = []
     for name in names:
         parts = split_name(name)
         if parts is None:
             raise InputError(f"calibration: found parameter {name!r}, expected one of an effect")
-        found.append(parts.effect)
-    return tuple(dict.fromkeys(found))
+        effects.append(parts.effect)
+    return tuple(dict.fromkeys(effects))
 
 
-def _blocks(blocks: Sequence[Array]) -> Array:
+def _block_diagonal(blocks: Sequence[Array]) -> Array:
     size = sum(len(block) for block in blocks)
     whole, begin = np.zeros((size, size)), 0
     for block in blocks:

@@ -1,13 +1,12 @@
-"""Stages of a fit: what differs between loads first, which geometry cannot touch; then the rest.
+"""Stages of a fit: flexibilities from differences between loads, then the geometry.
 
-The same pose under two loads has the same geometry: the difference of its readings is bending
-alone. Flexibilities found from differences only are what the joint fit begins with, and what it is
-held against afterwards.
+A pose under two loads has the same geometry: the difference of its readings is due to bending
+alone. Flexibilities from such differences start the joint fit, and test it afterwards (Hausman).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from scipy.stats import chi2
@@ -18,12 +17,12 @@ from gapbridge.core.calibration.readings import Readings
 from gapbridge.core.effects import CATALOGUE
 from gapbridge.core.estimation.linear_system import Bounds, System, posterior, solve
 
-AT_ODDS = 1e-3  # chance below which differences and everything together count as at odds
+AT_ODDS = 1e-3  # p-value below which differences and the joint fit are inconsistent
 
 
 @dataclass(frozen=True)
 class Stages:
-    """Which parameters bending alone shows, and which readings belong together for it."""
+    """Which parameters act through bending, and the groups of readings of one pose."""
 
     elastic: Mask  # (p,)
     group: Index  # (N,) readings of one pose, place and target; -1: no other load there
@@ -39,30 +38,29 @@ def stages_of(parameters: Parameters, readings: Readings) -> Stages:
     effects = [CATALOGUE[parameters.terms[t].effect] for t, _ in parameters.place]
     elastic = np.array([effect.softens or effect.needs_softness for effect in effects], dtype=bool)
     group = readings.repeats()
-    load = _heaviness(readings)
+    load = _load_numbers(readings)
     for one in np.unique(group):
-        own = group == one
-        if len(np.unique(load[own])) < 2:
-            group[own] = -1
+        rows = group == one
+        if len(np.unique(load[rows])) < 2:
+            group[rows] = -1
     return Stages(elastic, group)
 
 
-def _heaviness(readings: Readings) -> Index:
-    """Return a number per different load (N,): the plan's, or what the readings say hung there."""
-    given = (readings.load, readings.loads.payload_mass, readings.loads.wrench)
-    parts = [np.round(one.reshape(len(readings), -1), 3) for one in given if one is not None]
+def _load_numbers(readings: Readings) -> Index:
+    """Return a number per distinct load (N,), by the plan and the recorded payload and wrench."""
+    columns = (readings.load, readings.loads.payload_mass, readings.loads.wrench)
+    parts = [np.round(one.reshape(len(readings), -1), 3) for one in columns if one is not None]
     return np.unique(np.hstack(parts), axis=0, return_inverse=True)[1].reshape(-1).astype(np.int64)
 
 
 def differences(system: System, group: Index, width: int, root: Array) -> System:
-    """Return the system of the differences within groups: each group's mean taken off.
+    """Return the system of the differences within groups: each group's mean subtracted.
 
-    ``root`` (N,) are the square roots of the readings' weights, with which the system is weighed
-    already.
+    ``root`` (N,) are the square roots of the readings' weights, already applied to the system.
     """
     kept = np.flatnonzero(group >= 0)
-    own, w = group[kept], root[kept]
-    _, number = np.unique(own, return_inverse=True)
+    rows, w = group[kept], root[kept]
+    _, number = np.unique(rows, return_inverse=True)
     number = number.reshape(-1)
     square = np.bincount(number, w**2)
     whole = np.column_stack([system.J, system.F, system.residual])
@@ -77,46 +75,46 @@ def differences(system: System, group: Index, width: int, root: Array) -> System
 
 
 def staged_step(
-    system: System, stages: Stages, at: Array, bounds: Bounds, width: int, root: Array
+    system: System, stages: Stages, values: Array, bounds: Bounds, width: int, root: Array
 ) -> Array:
-    """Return the step (p,) that differences and then geometry give, before everything together."""
+    """Return the step (p,) of the flexibilities from differences, then of the geometry."""
     if not stages.possible:
-        return np.zeros(len(at))
-    apart = differences(system, stages.group, width, root)
-    bending, _, _ = solve(apart, at, bounds, stages.elastic)
-    rest = System(system.J, system.F, system.residual - system.J @ bending)
-    geometry, _, _ = solve(rest, at + bending, bounds, ~stages.elastic)
+        return np.zeros(len(values))
+    differenced = differences(system, stages.group, width, root)
+    bending, _, _ = solve(differenced, values, bounds, stages.elastic)
+    remaining = System(system.J, system.F, system.residual - system.J @ bending)
+    geometry, _, _ = solve(remaining, values + bending, bounds, ~stages.elastic)
     return bending + geometry
 
 
-def at_odds(
+def hausman_chance(
     system: System, stages: Stages, covariance: Array, bounds: Bounds, width: int, root: Array
 ) -> float | None:
-    """Return the chance of so much disagreement between differences and all readings, or None.
+    """Return the p-value of flexibilities from differences against the joint fit; None: no test.
 
-    ``system`` is at the joint fit's rest. Hausman's test: the joint estimate is the sharper one,
-    so that the variance of the difference is the difference of the variances.
+    ``system`` is that of the converged joint fit. Hausman's test: the joint estimate is the
+    efficient one, so that the variance of the difference is the difference of the variances.
     """
     if not stages.possible:
         return None
-    mine = stages.elastic
-    apart = differences(system, stages.group, width, root)
+    elastic = stages.elastic
+    differenced = differences(system, stages.group, width, root)
     free = Bounds(
         np.full_like(bounds.lower, -np.inf), np.full_like(bounds.upper, np.inf),
-        bounds.held, bounds.begin,
+        bounds.prior_std, bounds.begin,
     )  # fmt: skip
-    # bounds left aside on both sides: what stops on one would count as disagreement
-    alone, _, _ = solve(apart, bounds.begin, free, mine)
-    together, _, _ = solve(system, bounds.begin, free, np.ones_like(mine))
-    off = alone - together
-    part = System(apart.J[:, mine], apart.F, apart.residual)
-    narrow = Bounds(bounds.lower[mine], bounds.upper[mine], bounds.held[mine], bounds.begin[mine])
-    variance = posterior(part, narrow)[0] - covariance[np.ix_(mine, mine)]
-    scale = 1 / bounds.held[mine]
+    # without bounds on either side: a value on a bound would count as disagreement
+    from_differences, _, _ = solve(differenced, bounds.begin, free, elastic)
+    from_all, _, _ = solve(system, bounds.begin, free, np.ones_like(elastic))
+    disagreement = from_differences - from_all
+    part = System(differenced.J[:, elastic], differenced.F, differenced.residual)
+    elastic_bounds = Bounds(*(getattr(bounds, f.name)[elastic] for f in fields(Bounds)))
+    variance = posterior(part, elastic_bounds)[0] - covariance[np.ix_(elastic, elastic)]
+    scale = 1 / bounds.prior_std[elastic]
     sizes, directions = np.linalg.eigh(variance * np.outer(scale, scale))
-    seen = sizes > 1e-4  # what differences alone hardly determine is no contradiction
-    seen &= sizes < 0.25
-    if not seen.any():
+    tested = sizes > 1e-4  # and below 0.25: directions that differences determine
+    tested &= sizes < 0.25
+    if not tested.any():
         return None
-    along = directions[:, seen].T @ (off[mine] * scale)
-    return float(chi2.sf(float(np.sum(along**2 / sizes[seen])), int(seen.sum())))
+    along = directions[:, tested].T @ (disagreement[elastic] * scale)
+    return float(chi2.sf(float(np.sum(along**2 / sizes[tested])), int(tested.sum())))

@@ -1,8 +1,7 @@
-"""A short session without any instrument: where the tool's tip sits, from joint angles alone.
+"""Tool session: the tool centre point from joint angles, without an instrument.
 
-The tip is brought onto one fixed point from several orientations, or a ball on the tool is held
-against a fixed ball. Flange poses follow from the joint angles and the model; what makes them all
-agree on one point is the tool.
+The tip touches one fixed point in several orientations, or a ball on the tool touches a fixed ball.
+Flange poses follow from joint angles and model; tool and point are fitted to them.
 """
 
 from __future__ import annotations
@@ -22,26 +21,26 @@ from gapbridge.core.model import Model
 from gapbridge.core.notes import Note, Reason
 
 NAMES = tuple(f"tool_tcp_{k}" for k in "xyz")
-FEWEST = {False: 3, True: 7}  # readings needed: tip on a point, ball on a ball
-TURNED = 0.15  # rad, about: orientations closer together leave a direction of the tool open
+MIN_READINGS = {False: 3, True: 7}  # readings needed: tip on a point, ball on a ball
+MIN_ROTATION = 0.15  # rad, about: spread of orientations that determines the tool
 ROUNDS = 30
 CONVERGED = 1e-10  # m
 
 
 @dataclass(frozen=True)
 class ToolCalibration:
-    """Where the tool's tip is."""
+    """Result of a tool session."""
 
     tcp: Array  # (3,) m, flange axes
     point: Array  # (3,) m, base: the fixed point, or the fixed ball's centre
     estimates: tuple[Estimate, ...]  # tool_tcp_x, _y, _z
     covariance: Array  # (3, 3)
-    noise: float  # m, 1 sigma of one coordinate of one touch: hand, arm, and what the model missing
-    residual: Array  # (N,) m, how far each touch is from the fixed point or ball
-    nominal_residual: Array  # (N,) m, the same with the tool that the cell had, point fitted
-    outliers: NDArray[np.int64]  # touches down-weighted as outlier
+    noise: float  # m, 1 sigma of one coordinate of one touch: operator, arm and model error
+    residual: Array  # (N,) m, distance of each touch from the fixed point or ball
+    nominal_residual: Array  # (N,) m, the same with the cell's tool, point fitted
+    outliers: NDArray[np.int64]  # touches down-weighted as outliers
     notes: tuple[Note, ...]
-    moved: float  # m, from the tool that the cell had
+    moved: float  # m, from the cell's tool
 
     def applied(self, model: Model) -> Model:
         """Return the model with this tool centre point; the tool's axes stay as they are."""
@@ -55,37 +54,37 @@ class ToolCalibration:
 def calibrate_tool(
     model: Model, q: Array, loads: Loads | None = None, *, distance: float = 0.0
 ) -> ToolCalibration:
-    """Return where the tip sits, from joint angles ``q`` (N, n) rad at which it touched.
+    """Return the tool centre point from joint angles ``q`` (N, n), rad, of the touches.
 
     ``distance`` (m) is 0 where the tip itself was brought onto a fixed point, else the distance of
     the two balls' centres when they touch (the sum of their radii). Outliers are down-weighted
     and listed. Raises InputError where the angles do not fit the arm, ExcitationError where the
-    orientations leave the tool open.
+    orientations do not determine the tool.
     """
     q = np.asarray(q, dtype=float)
-    _check(model, q, distance > 0)
+    _check_shapes(model, q, distance > 0)
     position, rotation = flange_poses(model, q, loads)
     nominal = model.chain().tool_position
-    start = _points(position, rotation, nominal)
-    before = np.concatenate([nominal, start])
-    values, inner = _fitted(position, rotation, before, distance)
-    std = np.sqrt(np.diag(inner.covariance))[:3]
+    point = _common_point(position, rotation, nominal)
+    before = np.concatenate([nominal, point])
+    values, fit = _fit_tip(position, rotation, before, distance)
+    std = np.sqrt(np.diag(fit.covariance))[:3]
     estimates = tuple(
-        Estimate(name, float(v), float(s), "m", freedom=inner.freedom)
+        Estimate(name, float(v), float(s), "m", freedom=fit.freedom)
         for name, v, s in zip(NAMES, values, std, strict=False)
     )
-    down = tuple(int(r) + 1 for r in inner.outliers)
+    outliers = tuple(int(r) + 1 for r in fit.outliers)
     return ToolCalibration(
-        values[:3].copy(), values[3:].copy(), estimates, inner.covariance[:3, :3].copy(),
-        float(inner.noise[0]), _off(position, rotation, values, distance),
-        _off(position, rotation, before, distance), inner.outliers,
-        (Note(Reason.TOUCHES_DOWN, (down,)),) if down else (),
+        values[:3].copy(), values[3:].copy(), estimates, fit.covariance[:3, :3].copy(),
+        float(fit.noise[0]), _distances(position, rotation, values, distance),
+        _distances(position, rotation, before, distance), fit.outliers,
+        (Note(Reason.TOUCHES_DOWN, (outliers,)),) if outliers else (),
         float(np.linalg.norm(values[:3] - nominal)),
     )  # fmt: skip
 
 
 def flange_poses(model: Model, q: Array, loads: Loads | None = None) -> tuple[Array, Array]:
-    """Return where the flange is (N, 3) and how it is turned (N, 3, 3), base, as the arm bends."""
+    """Return position (N, 3), m, and rotation (N, 3, 3) of the deflected flange, in base."""
     chain = model.chain()
     poses = model.predict(q, loads)
     rotation = poses.rotation @ chain.tool_rotation.T
@@ -98,44 +97,44 @@ def touch_columns(rotation: Array) -> Array:
     return np.concatenate([rotation, fixed], axis=2)
 
 
-def _check(model: Model, q: Array, ball: bool) -> None:
+def _check_shapes(model: Model, q: Array, ball: bool) -> None:
     if q.ndim != 2 or q.shape[1] != model.arm.n or not np.isfinite(q).all():
         raise InputError(
             f"tool session: found angles {q.shape}, expected finite ones of (N, {model.arm.n})"
         )
-    if len(q) < FEWEST[ball]:
+    if len(q) < MIN_READINGS[ball]:
         raise ExcitationError(
-            f"tool session: found {len(q)} touch(es), expected {FEWEST[ball]} or more orientations"
+            f"tool session: found {len(q)} touch(es), expected {MIN_READINGS[ball]} or more "
+            "orientations"
         )
 
 
-def _points(position: Array, rotation: Array, tcp: Array) -> Array:
-    """Return about where all tips meet (3,)."""
+def _common_point(position: Array, rotation: Array, tcp: Array) -> Array:
+    """Return the median tip position (3,), m, base."""
     return np.asarray(np.median(position + rotation @ tcp, axis=0))
 
 
-def _fitted(
+def _fit_tip(
     position: Array, rotation: Array, values: Array, distance: float
 ) -> tuple[Array, RobustFit]:
-    """Return tool and point (6,), and the weighed fit at rest."""
+    """Return tool and point (6,), and the converged robust fit."""
     count = len(position)
     columns = touch_columns(rotation)
     cells = 1 if distance else 3
     row = np.repeat(np.arange(count), cells)
     unit = np.zeros(count * cells, dtype=np.int64)
-    if distance:  # tip near the point alone: the first look ignores the balls' size
-        values = (
-            values + robust_fit(*_flat(columns, position, rotation, values), *_all(count)).values
-        )
+    if distance:  # start with the centres together
+        linear = _linear_rows(columns, position, rotation, values)
+        values = values + robust_fit(*linear, *_cells(count)).values
     fit: RobustFit | None = None
     for _ in range(ROUNDS):
-        apart = position + rotation @ values[:3] - values[3:]
-        A, b = columns.reshape(-1, 6), -apart.ravel()
+        offset = position + rotation @ values[:3] - values[3:]
+        A, b = columns.reshape(-1, 6), -offset.ravel()
         if distance:
-            length = np.maximum(np.linalg.norm(apart, axis=1), 1e-9)
-            A = np.einsum("ni,nij->nj", apart / length[:, None], columns)
+            length = np.maximum(np.linalg.norm(offset, axis=1), 1e-9)
+            A = np.einsum("ni,nij->nj", offset / length[:, None], columns)
             b = distance - length
-        _require_turning(A, count)
+        _require_rotation(A, count)
         fit = robust_fit(A, b, unit, row)
         values = values + fit.values
         if np.abs(fit.values).max() < CONVERGED:
@@ -144,24 +143,26 @@ def _fitted(
     return values, fit
 
 
-def _flat(columns: Array, position: Array, rotation: Array, values: Array) -> tuple[Array, Array]:
-    apart = position + rotation @ values[:3] - values[3:]
-    return columns.reshape(-1, 6), -apart.ravel()
+def _linear_rows(
+    columns: Array, position: Array, rotation: Array, values: Array
+) -> tuple[Array, Array]:
+    offset = position + rotation @ values[:3] - values[3:]
+    return columns.reshape(-1, 6), -offset.ravel()
 
 
-def _all(count: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _cells(count: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     return np.zeros(3 * count, dtype=np.int64), np.repeat(np.arange(count), 3)
 
 
-def _require_turning(A: Array, count: int) -> None:
+def _require_rotation(A: Array, count: int) -> None:
     size = np.linalg.svd(A, compute_uv=False)
-    if size[-1] < TURNED * np.sqrt(count) / 4:
+    if size[-1] < MIN_ROTATION * np.sqrt(count) / 4:
         raise ExcitationError(
             f"tool session: in {count} touches the tool hardly turns, or about one axis only, so "
             "that its tip is not found; expected orientations tens of degrees apart about two axes"
         )
 
 
-def _off(position: Array, rotation: Array, values: Array, distance: float) -> Array:
-    apart = np.linalg.norm(position + rotation @ values[:3] - values[3:], axis=1)
-    return np.asarray(np.abs(apart - distance))
+def _distances(position: Array, rotation: Array, values: Array, distance: float) -> Array:
+    distances = np.linalg.norm(position + rotation @ values[:3] - values[3:], axis=1)
+    return np.asarray(np.abs(distances - distance))

@@ -18,7 +18,7 @@ from gapbridge.core.diagnosis.criteria import MATERIAL_SHARE, MIN_EXCITATION, SE
 from gapbridge.core.diagnosis.selection.candidate import Candidate
 from gapbridge.core.diagnosis.selection.selection import Selection
 from gapbridge.core.effects import Reported
-from gapbridge.core.estimation.least_squares import inverse, sigmas_square, solve
+from gapbridge.core.estimation.least_squares import inverse, solve, squared_sigmas
 
 MIN_COLUMN_SHARE = 1e-7  # of a parameter's column in a session, for the session to show it
 
@@ -120,7 +120,7 @@ def _differing(
     C = np.kron(np.eye(count)[1:] - np.eye(count)[0], np.eye(width))  # each against the first
     differences = C @ values.ravel()
     spread = C @ covariance @ C.T
-    square = sigmas_square(differences, spread)
+    square = squared_sigmas(differences, spread)
     p_value = float(gammaincc(len(differences) / 2, square / 2))
     mean = values.mean(axis=0)
     change = np.concatenate(

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from gapbridge.core.arrays import Array
 from gapbridge.core.diagnosis.selection.selection import Selection
-from gapbridge.core.estimation.held_out import missed, random_folds
+from gapbridge.core.estimation.held_out import held_out_residual, random_folds
 
 FOLDS = 10
 RESAMPLES = 400
@@ -86,7 +86,7 @@ class HeldOut:
             return self._target
         # the prior keeps parameters without any effect on the data determined
         prior = np.concatenate([self._prior(chosen), np.zeros(self._nuisance.shape[1])])
-        return missed(A, self._target, self._fold, prior)
+        return held_out_residual(A, self._target, self._fold, prior)
 
     def shrink(self, with_set: Sequence[int], without_set: Sequence[int]) -> Shrink:
         """Return the reduction of the gap from one set to another, with a bootstrap interval."""

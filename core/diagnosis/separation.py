@@ -27,7 +27,7 @@ from gapbridge.core.dynamics import (
     predict_torque,
     predict_tracking,
     predict_wrench,
-    with_held,
+    with_holding_torque,
     with_pieces,
 )
 from gapbridge.core.effects import CATALOGUE, Site, Term
@@ -296,7 +296,7 @@ def _encoder_angles(model: Model, trials: Trials) -> Predict:
         stretch=np.repeat(np.arange(count), k), start=trials.start, moving=True,
         still=STILL * max_speed(model),
     )  # fmt: skip
-    motion = with_held(model, motion)
+    motion = with_holding_torque(model, motion)
     return lambda terms: predict_tracking(model, motion, terms)[k - 1 :: k]
 
 

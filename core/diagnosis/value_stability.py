@@ -40,7 +40,7 @@ from gapbridge.core.diagnosis.selection.sample_space import gains
 from gapbridge.core.diagnosis.selection.selection import Selection
 from gapbridge.core.diagnosis.selection.smooth import targets
 from gapbridge.core.estimation.held_out import jackknife
-from gapbridge.core.estimation.least_squares import basis_of, projected_out, sigmas_square, solve
+from gapbridge.core.estimation.least_squares import basis_of, projected_out, solve, squared_sigmas
 
 
 def stable_effects(
@@ -228,7 +228,7 @@ class _UnnamedFunctions:
                 sigmas.append(0.0)
                 ratio.append(0.0)
                 continue
-            square = sigmas_square(b, spread[np.ix_(index, index)])
+            square = squared_sigmas(b, spread[np.ix_(index, index)])
             numbers = float(len(index))
             if not self.space.candidates[c].periodic:  # a line's phase fits any shape
                 numbers = 1 + EXTRA_PARAMETER_WEIGHT * (numbers - 1)

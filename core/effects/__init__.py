@@ -153,7 +153,7 @@ def effect_named(identifier: str) -> Effect:
 def split_name(name: str, beside: Iterable[str] = ()) -> ParameterName | None:
     """Return the parts of a public name (``backlash``, ``backlash_5``, ``link_geometry_3_a``).
 
-    None for what no effect's name begins. ``beside``: beginnings of other names of parameters.
+    None if it does not start with an effect's name. ``beside``: further prefixes of names.
     """
     known = (e for e in (*CATALOGUE, *beside) if f"{name}_".startswith(f"{e}_"))
     effect = max(known, key=len, default="")
@@ -168,10 +168,10 @@ def split_name(name: str, beside: Iterable[str] = ()) -> ParameterName | None:
 
 def names_part_of(name: str, whole: str) -> bool:
     """Return whether a parameter belongs to an effect, or to one at a joint (``backlash_5``)."""
-    own, asked = split_name(name), split_name(whole)
-    if own is None or asked is None:
+    part, container = split_name(name), split_name(whole)
+    if part is None or container is None:
         return name == whole
-    return own.effect == asked.effect and asked.joint in (None, own.joint)
+    return part.effect == container.effect and container.joint in (None, part.joint)
 
 
 __all__ = [

@@ -31,9 +31,9 @@ CHANNELS = {"position": "m", "wrench": "N", "tracking": "rad", "torque": "Nm"}
 
 @dataclass(frozen=True)
 class Parameter:
-    """One number of an effect: what the real arm has more than the model."""
+    """One parameter of an effect, real minus model."""
 
-    name: str  # one word, '' where the effect's own name says it
+    name: str  # one word, '' if the effect's name suffices
     unit: str
     scale: float  # a usual size, for steps, priors and scaling
     lower: float = -math.inf
@@ -43,14 +43,14 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Site:
-    """Where an effect can sit: a joint (from 1) or the whole arm (None), and a period if it has."""
+    """Where an effect acts: a joint (from 1) or the whole arm (None), and the order of a period."""
 
     joint: int | None = None
     order: float | None = None  # cycles per turn of the joint
 
     @property
     def index(self) -> int:
-        """Return the joint's place in arrays, from 0."""
+        """Return the joint's index in arrays, from 0."""
         assert self.joint is not None
         return self.joint - 1
 
@@ -94,52 +94,52 @@ class ParameterName:
 class Effect(ABC):
     """One member of the catalogue; its docstring is what ``gapbridge explain`` prints.
 
-    What the program needs to know of an effect is asked of its attributes, never of its name.
+    Code that depends on an effect reads its attributes, never its name.
     """
 
     identifier: ClassVar[str]
     channels: ClassVar[tuple[str, ...]]
     needs: ClassVar[tuple[str, ...]] = ()  # log columns beyond those of its channel
-    motion: ClassVar[str] = ""  # what a log must contain so that the effect shows
-    alike: ClassVar[Mapping[str, str]] = {}  # another effect: the data on which it looks the same
-    instead: ClassVar[str] = ""  # what people do where a simulator's model cannot hold it
-    simulated_as: ClassVar[Kind | None] = None  # what a simulator's model calls its first value
-    of_the_arm: ClassVar[bool] = True  # False: of what measures, so that no model of an arm has it
+    motion: ClassVar[str] = ""  # what a log must contain for the effect to be identifiable
+    alike: ClassVar[Mapping[str, str]] = {}  # other effects: the data on which they are equivalent
+    instead: ClassVar[str] = ""  # the advice if a simulator's model cannot include it
+    simulated_as: ClassVar[Kind | None] = None  # the kind of its first value in a simulator's model
+    of_the_arm: ClassVar[bool] = True  # False: an effect of the measurement, not of the arm
 
-    # how people read it
-    title: ClassVar[str] = ""  # in plain words; left out: the identifier without underscores
+    # texts
+    title: ClassVar[str] = ""  # in plain words; default: the identifier without underscores
     label_template: ClassVar[str] = ""  # of one parameter, with {joint} and {part}
-    moved: ClassVar[str] = ""  # report of a verification that found it alone; '': not looked for
+    moved: ClassVar[str] = ""  # message of a verification that finds it; '': not checked there
 
     # how it acts
-    order: ClassVar[int] = 50  # place on the way from load to reading, in its channel
+    order: ClassVar[int] = 50  # order of application from load to reading, in its channel
     periodic: ClassVar[bool] = False  # True: sites have an order, and values are sine and cosine
-    delays: ClassVar[bool] = False  # True: its only value is a time that the joint comes late
-    at_moment: ClassVar[bool] = False  # True: steps once; the last value is when
-    by_approach: ClassVar[bool] = False  # True: acts by the joint's last motion
-    softens: ClassVar[bool] = False  # True: a flexibility, never below zero with the model's own
+    delays: ClassVar[bool] = False  # True: its only value is a delay of the joint, s
+    at_moment: ClassVar[bool] = False  # True: a step at one time, the last value
+    by_approach: ClassVar[bool] = False  # True: depends on the joint's direction of approach
+    softens: ClassVar[bool] = False  # True: a flexibility, 0 or more together with the model's
     flexibility: ClassVar[str] = ""  # which of a joint's linear flexibilities: axial, radial
-    needs_softness: ClassVar[bool] = False  # True: positions show it by what bends alone
-    carried: ClassVar[bool] = False  # True: a load on the joints, which friction may grow with
-    adds_mass: ClassVar[bool] = False  # True: kg beyond the declared payload
-    scales_reading: ClassVar[bool] = False  # True: the sensor reads zero where nothing acts
-    any_constant: ClassVar[bool] = False  # True: any reading that stays the same is of its form
-    together: ClassVar[bool] = False  # True: small at all places of a real arm, found as a whole
-    # True: goes with the links: a zero or a point with their geometry, friction with their masses
+    needs_softness: ClassVar[bool] = False  # True: affects positions only through deflections
+    carried: ClassVar[bool] = False  # True: a load on the joints, on which friction may depend
+    adds_mass: ClassVar[bool] = False  # True: kg in addition to the declared payload
+    scales_reading: ClassVar[bool] = False  # True: does not change a zero reading of the sensor
+    any_constant: ClassVar[bool] = False  # True: can represent any constant reading
+    together: ClassVar[bool] = False  # True: small at all sites of a real arm, estimated as a whole
+    # True: estimated with the links: joint zeros and TCP with geometry, friction with masses
     beside_links: ClassVar[bool] = False
-    shown_by: ClassVar[Term | None] = None  # what has to be there for its values to show at all
+    shown_by: ClassVar[Term | None] = None  # the term that must be present to identify its values
 
-    # how it is found
-    shapes: ClassVar[tuple[float, ...]] = ()  # last values that a search begins with
-    curved: ClassVar[bool] = False  # True: first value a slope, second what bends the line
-    contains: ClassVar[str] = ""  # the effect of the same joint that it stands instead of
-    sum_of: ClassVar[str] = ""  # the effect whose parameters together can be the same as this
-    calibrated: ClassVar[int] = 0  # turn in a calibration that names no effects; 0: none
-    corrects: ClassVar[str] = ""  # what of the cell a session measures anew instead
+    # how it is estimated
+    shapes: ClassVar[tuple[float, ...]] = ()  # start values of its last parameter
+    curved: ClassVar[bool] = False  # True: first value a slope, second a nonlinearity
+    contains: ClassVar[str] = ""  # the effect of the same joint that it replaces
+    sum_of: ClassVar[str] = ""  # the effect whose parameters in sum are equivalent to this one
+    calibrated: ClassVar[int] = 0  # rank among the default effects of a calibration; 0: not one
+    corrects: ClassVar[str] = ""  # the value of the cell that a session measures instead
 
     @property
     def calibratable(self) -> bool:
-        """Return whether a calibration can look for it: measured positions show it all the time."""
+        """Return whether a calibration can estimate it: from measured positions, at any time."""
         return "position" in self.channels and not self.at_moment
 
     def sites(self, arm: Arm) -> tuple[Site, ...]:
@@ -161,9 +161,9 @@ class Effect(ABC):
         """Change the chain in place: what holds for all rows (position channel)."""
 
     def shape_rate(self, term: Term, arm: Arm, chain: Chain, value: int, rate: ChainRate) -> bool:
-        """Write how the finished chain changes with one of the term's values, into zeros.
+        """Write d chain / d one of the term's values into ``rate``, which holds zeros.
 
-        Returns whether that is known; where not, derivatives are differences of predictions.
+        Returns False where it is not implemented: the derivatives are then numerical.
         """
         return False
 
@@ -173,9 +173,9 @@ class Effect(ABC):
     def before(
         self, term: Term, chain: Chain, position: Array, rotation: Array, loads: Loads
     ) -> None:
-        """Put predicted TCP poses (N, 3), (N, 3, 3) back in rows before the term's moment.
+        """Undo the effect in predicted TCP poses (N, 3), (N, 3, 3) of rows before its time.
 
-        For effects whose ``shape`` holds from a moment on.
+        For effects whose ``shape`` holds from a time on.
         """
 
     def sense(self, term: Term, arm: Arm, wrench: Array, motion: Motion) -> Array:
@@ -183,16 +183,16 @@ class Effect(ABC):
         return wrench
 
     def track(self, term: Term, arm: Arm, q: Array, motion: Motion) -> Array:
-        """Return where the encoders would stand instead of ``q`` (N, n)."""
+        """Return the encoder angles (N, n), rad, with this effect, for those without it ``q``."""
         assert motion.held is not None
         return self.settle(term, arm, q, motion.held, motion.loads.approach)
 
     def settle(self, term: Term, arm: Arm, q: Array, held: Array, approach: Array | None) -> Array:
-        """Return where the encoders come to rest for commands ``q`` (N, n), rad.
+        """Return the encoder angles at rest (N, n), rad, for commands ``q`` (N, n), rad.
 
-        ``held`` (N, n) is the torque that each joint holds there, Nm about its axis, positive where
-        the motor pushes towards positive q; ``approach`` (N, n) the sign of its last motion. What
-        differs from ``q`` is made up for in live setpoints.
+        ``held`` (N, n) is the motor torque of each joint at rest, Nm, positive towards positive q;
+        ``approach`` (N, n) the sign of its last motion. The difference from ``q`` is compensated in
+        live setpoints.
         """
         return q
 
@@ -201,7 +201,7 @@ class Effect(ABC):
         return torque
 
     def simulator(self, term: Term, arm: Arm) -> tuple[SimulatorChange, ...]:
-        """Return what to change in a simulator's model, beside what ``shape`` changes."""
+        """Return the changes of a simulator's model, in addition to those of ``shape``."""
         if self.simulated_as is None:
             return ()
         return (SimulatorChange(self.simulated_as, term.site.joint, term.values[0]),)
@@ -256,7 +256,7 @@ class ServoEffect(JointEffect):
     channels = ("tracking",)
 
     def track(self, term: Term, arm: Arm, q: Array, motion: Motion) -> Array:
-        """Let the joint follow, stretch by stretch."""
+        """Apply ``follow`` to each stretch without a gap in time."""
         if not motion.moving:
             return super().track(term, arm, q, motion)
         i, result = term.site.index, q.copy()
@@ -267,9 +267,9 @@ class ServoEffect(JointEffect):
 
     @abstractmethod
     def follow(self, term: Term, time: Array, command: Array, first: float) -> Array:
-        """Return where the joint stands (N,), rad, at ``time`` (N,), s, for its command (N,).
+        """Return the joint angles (N,), rad, at ``time`` (N,), s, for its command (N,), rad.
 
-        ``first`` is where it stood when the stretch began, rad.
+        ``first`` is its angle at the start of the stretch, rad.
         """
 
 
@@ -284,8 +284,7 @@ def rows_after(term: Term, loads: Loads) -> Any:
 def typical_moment(arm: Arm, joint: int = 0) -> float:
     """Return a usual moment (Nm): the weight beyond a joint (from 1) at half its stretched length.
 
-    Of the whole arm with 0. Scales parameters, so that solvers see numbers near one, and says what
-    is beyond any arm's size.
+    With 0: of the whole arm. Used to scale parameters, and for bounds.
     """
     import numpy as np
 

@@ -1,4 +1,4 @@
-"""What an effect asks of a simulator's model, in the simulator's own terms."""
+"""The change of a simulator's model that represents an effect, in the simulator's terms."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Cross-validation: folds, solutions with each fold left out, and the jackknife of those.
 
-A pose's repeats and neighbours lie in one fold; regions of joint space hold out whole
-neighbourhoods, so that nothing near a judged pose is in its fit.
+Repeats of a pose are in one fold. Regions of joint space leave out whole neighbourhoods, so that no
+neighbour of a tested pose is in its fit.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from gapbridge.core.arrays import Array, Index
-from gapbridge.core.estimation.least_squares import SUMS_RANK, unit_of
+from gapbridge.core.estimation.least_squares import SUMS_RANK, inverse_lengths
 
 FOLDS = 5
 SAME_POSE = 1e-3  # rad, of every joint
@@ -19,45 +19,45 @@ SAME_POSE = 1e-3  # rad, of every joint
 
 def random_folds(groups: Index, count: int = FOLDS, seed: int = 0) -> Index:
     """Return the fold (N,) of each row, drawn at random; rows of one group (N,) stay together."""
-    names, number = np.unique(groups, return_inverse=True)
-    return np.asarray((np.random.default_rng(seed).permutation(len(names)) % count)[number])
+    labels, number = np.unique(groups, return_inverse=True)
+    return np.asarray((np.random.default_rng(seed).permutation(len(labels)) % count)[number])
 
 
-def without_each(
-    A: Array, b: Array, part: Index, hold: Array | None = None
+def leave_one_out(
+    A: Array, b: Array, fold: Index, ridge: Array | None = None
 ) -> Iterator[tuple[Index, Array]]:
-    """Yield each part's rows, and the x (p,) that solves A @ x = b best without them.
+    """Yield each fold's rows, and the least-squares x (p,) of A @ x = b without them.
 
-    ``part`` (<= m,) numbers the rows' parts; those after it are in every fit. ``hold`` (p,), one
-    over a size, pulls each number towards zero.
+    ``fold`` (<= m,) is the fold of each row; further rows are in every fit. ``ridge`` (p,) is one
+    over the prior sigma of each number about zero.
     """
-    unit = unit_of(A, hold)
+    unit = inverse_lengths(A, ridge)
     A = A * unit
     sums, right = A.T @ A, A.T @ b
-    if hold is not None:
-        sums += np.diag((hold * unit) ** 2)
-    for name in np.unique(part):
-        out = np.flatnonzero(part == name)
-        own = A[out]
+    if ridge is not None:
+        sums += np.diag((ridge * unit) ** 2)
+    for name in np.unique(fold):
+        rows = np.flatnonzero(fold == name)
+        own = A[rows]
         inner = np.linalg.pinv(sums - own.T @ own, rcond=SUMS_RANK, hermitian=True)
-        yield out, unit * (inner @ (right - own.T @ b[out]))
+        yield rows, unit * (inner @ (right - own.T @ b[rows]))
 
 
-def missed(A: Array, b: Array, part: Index, hold: Array | None = None) -> Array:
-    """Return b - A @ x (m,) of each row by the fit that its part (m,) was left out of."""
-    left = np.empty_like(b)
-    for out, x in without_each(A, b, part, hold):
-        left[out] = b[out] - A[out] @ x
-    return left
+def held_out_residual(A: Array, b: Array, fold: Index, ridge: Array | None = None) -> Array:
+    """Return b - A @ x (m,) of each row by the fit without its fold (m,)."""
+    residual = np.empty_like(b)
+    for rows, x in leave_one_out(A, b, fold, ridge):
+        residual[rows] = b[rows] - A[rows] @ x
+    return residual
 
 
 def jackknife(without: Array) -> Array:
-    """Return the covariance (p, p) by fits (K, p) that left each of K parts out.
+    """Return the covariance (p, p) by fits (K, p) without each of K folds.
 
     Cameron, Miller, "A Practitioner's Guide to Cluster-Robust Inference" (2015), CV3.
     """
-    away = without - without.mean(axis=0)
-    return np.asarray((len(without) - 1) / len(without) * away.T @ away)
+    deviation = without - without.mean(axis=0)
+    return np.asarray((len(without) - 1) / len(without) * deviation.T @ deviation)
 
 
 def pose_groups(q: Array) -> Index:
@@ -78,8 +78,8 @@ def joint_regions(q: Array, count: int, seed: int = 0) -> Index:
     Repeats of a pose and its neighbours lie in one region.
     """
     distinct = len(np.unique(np.round(q, 3), axis=0))
-    found = k_means(q, min(count, distinct), seed, rounds=50)
-    return np.asarray(np.unique(found, return_inverse=True)[1].reshape(-1))
+    clusters = k_means(q, min(count, distinct), seed, rounds=50)
+    return np.asarray(np.unique(clusters, return_inverse=True)[1].reshape(-1))
 
 
 def k_means(points: Array, count: int, seed: int, rounds: int) -> Index:
@@ -93,20 +93,20 @@ def k_means(points: Array, count: int, seed: int, rounds: int) -> Index:
     chosen = int(rng.randint(len(points), dtype=np.int64))
     for i in range(count):
         if i > 0:
-            whole = nearest.sum()
-            if whole == 0.0:  # fewer places than centres
+            total_distance = nearest.sum()
+            if total_distance == 0.0:  # fewer distinct points than centres
                 centres[i:] = points[0]
                 break
-            share = nearest / whole
+            share = nearest / total_distance
             chosen = int(np.searchsorted(share.cumsum(), rng.uniform()))
         centres[i] = points[chosen]
         nearest = np.minimum(nearest, np.sum((points - centres[i]) ** 2, axis=1))
     for _ in range(rounds):
-        distance = np.sum(centres**2, axis=1) - 2.0 * points @ centres.T  # beside a point's own
+        distance = np.sum(centres**2, axis=1) - 2.0 * points @ centres.T  # without |point|^2
         label = np.argmin(distance, axis=1)
-        held = np.bincount(label, minlength=count)
-        some = held > 0
+        members = np.bincount(label, minlength=count)
+        occupied = members > 0
         for j in range(points.shape[1]):
             total = np.bincount(label, weights=points[:, j], minlength=count)
-            centres[some, j] = total[some] / held[some]
+            centres[occupied, j] = total[occupied] / members[occupied]
     return np.asarray(label)

@@ -1,7 +1,7 @@
-"""What one session says about the joint flexibilities, in as few numbers as it takes.
+"""The sufficient statistics of one session for the joint flexibilities.
 
-The session's poses, its instrument's frame and its tool point are folded into 2n equations for the
-2n flexibilities, so that a fleet's fit needs neither logs nor models (hierarchical.py).
+Poses, instrument frame and tool point are reduced to 2n equations for the 2n flexibilities; a
+fleet's fit needs neither logs nor models (hierarchical.py).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from gapbridge.core.estimation.compliance_fit import (
     noise_of,
     prior_of,
     residual,
-    weighed,
+    weighted_factor,
 )
 from gapbridge.core.estimation.identification import measured_rows
 from gapbridge.core.estimation.least_squares import basis_of, projected_out
@@ -30,7 +30,7 @@ from gapbridge.core.log.log import Log
 from gapbridge.core.metrology import Metrology
 from gapbridge.core.model import Model
 
-FEWEST = 4  # poses, where nobody has registered the instrument: three place its frame and tool
+MIN_POSES = 4  # with an instrument that is not registered
 RANK = 1e-9  # singular values below this share of the largest are rounding
 
 
@@ -38,61 +38,63 @@ RANK = 1e-9  # singular values below this share of the largest are rounding
 class Evidence:
     """Equations ``matrix @ flexibilities = right``, each with the noise of one coordinate.
 
-    Flexibilities are axial 1..n, then radial 1..n. What the instrument's frame and the tool point
-    can take up is projected out.
+    Flexibilities are axial 1..n, then radial 1..n. The instrument's frame and the tool point are
+    projected out.
     """
 
     matrix: Array  # (2n, 2n) m per rad/Nm
     right: Array  # (2n,) m
     squares: float  # m2, remaining with the best flexibilities
-    freedom: float  # coordinates, less what was fitted
-    least: float  # m, 1 sigma of one coordinate: the instrument alone
+    freedom: float  # coordinates minus fitted parameters
+    least: float  # m, 1 sigma of one coordinate of the instrument alone
     poses: int
     outliers: int  # poses left out
 
 
 def evidence(model: Model, log: Log, metrology: Metrology | None = None) -> Evidence:
-    """Return what a log says about the flexibilities of an arm.
+    """Return the equations of a log for the flexibilities of an arm.
 
-    The equations are taken at the shape that fits the log best, so that their linear form holds.
-    A log that excites little is no error here: it says little, and weighs little. Raises LogError
-    where columns are missing, ExcitationError where there are too few poses to say anything.
+    They are linearised at the fit of the log. Low excitation is no error here: the equations then
+    have little weight. Raises LogError where columns are missing, ExcitationError where there are
+    too few poses.
     """
     metrology = metrology or Metrology()
     data, used = measured_rows(log, metrology.registered)
-    least = 1 if metrology.registered else FEWEST
+    least = 1 if metrology.registered else MIN_POSES
     if len(used) < least:
         raise ExcitationError(
             f"found {len(used)} row(s) with measured poses, expected at least {least}"
         )
-    everything = np.ones(2 * model.arm.n, dtype=bool)
-    fit = fit_flexibilities(fit_nuisances(model, data), data, everything, prior_of(model))
-    return _folded(fit, data, metrology)
+    all_free = np.ones(2 * model.arm.n, dtype=bool)
+    fit = fit_flexibilities(fit_nuisances(model, data), data, all_free, prior_of(model))
+    return _reduced(fit, data, metrology)
 
 
-def _folded(fit: Fit, data: Data, metrology: Metrology) -> Evidence:
+def _reduced(fit: Fit, data: Data, metrology: Metrology) -> Evidence:
     gap, _ = residual(fit.model, data, fit.frame)
     count = 2 * fit.model.arm.n
-    units = _units(gap)
+    units = _unit_factors(gap)
     inlier = _inliers(gap * units, count + data.nuisances, metrology.sigma)
     if not inlier.any():
         raise ExcitationError("found outliers alone, expected measured poses")
-    own = gap[inlier]
-    factor = weighed(fit.model, fit.frame, data.part(inlier), (own, units * np.ones(own.shape)))
+    gaps = gap[inlier]
+    factor = weighted_factor(
+        fit.model, fit.frame, data.part(inlier), (gaps, units * np.ones(gaps.shape))
+    )
     F, A, b = np.split(factor, [data.nuisances, data.nuisances + count], axis=1)
     Q = basis_of(F, RANK)
-    whole = projected_out(Q, np.hstack([A, b + A @ fit.flexibility[:, None]]))
+    projected = projected_out(Q, np.hstack([A, b + A @ fit.flexibility[:, None]]))
     R = np.zeros((count + 1, count + 1))
-    upper = np.linalg.qr(whole, mode="r")
+    upper = np.linalg.qr(projected, mode="r")
     R[: len(upper)] = upper
     U, size, _ = np.linalg.svd(R[:count, :count])
     U = U[:, size > RANK * size.max()]
-    # what no flexibility reaches remains too
+    # the part of ``right`` outside the range of the flexibilities counts as residual
     right = U @ (U.T @ R[:count, count])
     squares = float(np.sum(R[:, count] ** 2) - right @ right)
     return Evidence(
         R[:count, :count], right, max(squares, 0.0),
-        max(float(own.size - Q.shape[1] - U.shape[1]), 0.0), metrology.sigma,
+        max(float(gaps.size - Q.shape[1] - U.shape[1]), 0.0), metrology.sigma,
         int(inlier.sum()), int((~inlier).sum()),
     )  # fmt: skip
 
@@ -100,16 +102,16 @@ def _folded(fit: Fit, data: Data, metrology: Metrology) -> Evidence:
 def _inliers(gap: Array, spent: int, least: float) -> NDArray[np.bool_]:
     """Return the rows (N,) that are no outliers.
 
-    ``spent`` numbers were fitted to them; ``least`` (m) is the noise that there is in any case.
+    ``spent`` parameters were fitted to them; ``least`` (m) is the smallest noise.
     """
-    # of few poses the fit takes up much of the noise: what is left understates it
+    # correct the residual for the fitted parameters
     share = max(1 - spent / gap.size, 0.1)
     scale = max(scale_of(gap) / np.sqrt(share), least)
     return np.asarray(distance_of(gap, scale) < OUTLIER)
 
 
-def _units(gap: Array) -> Array:
-    """Return what makes rotations (rad) as noisy as positions (m): (3,) or (6,)."""
+def _unit_factors(gap: Array) -> Array:
+    """Return factors (3,) or (6,) that scale rotations (rad) to the noise of positions (m)."""
     if gap.shape[1] == 3:
         return np.ones(3)
     position, rotation = noise_of(gap)

@@ -1,7 +1,6 @@
-"""One linear step of a calibration: parameters and nuisances against what readings leave over.
+"""One linear step of a calibration: parameters and nuisances fitted to the residuals.
 
-Everything is in units of the noise; parameters are weakly held at their beginning by their usual
-sizes, nuisances are free.
+Equations are divided by the noise; parameters have a weak prior, nuisances none.
 """
 
 from __future__ import annotations
@@ -16,17 +15,17 @@ from gapbridge.core.estimation.least_squares import bounded, inverse
 
 @dataclass(frozen=True)
 class Bounds:
-    """Bounds of the parameters (p,), and how firmly each is held at its beginning."""
+    """Bounds of the parameters (p,), and their prior."""
 
     lower: Array
     upper: Array
-    held: Array  # (p,) 1 sigma
+    prior_std: Array  # (p,) 1 sigma about ``begin``
     begin: Array  # (p,)
 
 
 @dataclass(frozen=True)
 class System:
-    """left = J step + F nuisance step + noise, all divided by the noise."""
+    """residual = J step + F nuisance step + noise, all divided by the noise."""
 
     J: Array  # (M, p)
     F: Array  # (M, m)
@@ -38,37 +37,35 @@ class System:
 
 
 def solve(
-    system: System, at: Array, bounds: Bounds, free: Mask, damping: float = 0.0
+    system: System, values: Array, bounds: Bounds, free: Mask, damping: float = 0.0
 ) -> tuple[Array, Array, Mask]:
-    """Return the steps of parameters (p,) and nuisances (m,), and who ends on a bound (p,).
+    """Return the steps of parameters (p,) and nuisances (m,), and which are on a bound (p,).
 
-    Parameters not ``free`` do not move. ``damping`` shortens the parameters' steps, in lengths of
-    their columns.
+    Parameters not ``free`` have a zero step. ``damping`` is Marquardt's, relative to the columns.
     """
-    J, held = system.J[:, free], bounds.held[free]
+    J, prior_std = system.J[:, free], bounds.prior_std[free]
     p, m = J.shape[1], system.F.shape[1]
-    rows = [np.hstack([J, system.F]), np.hstack([np.diag(1 / held), np.zeros((p, m))])]
-    right = [system.residual, (bounds.begin - at)[free] / held]
+    rows = [np.hstack([J, system.F]), np.hstack([np.diag(1 / prior_std), np.zeros((p, m))])]
+    right = [system.residual, (bounds.begin - values)[free] / prior_std]
     if damping > 0:
-        length = np.hypot(np.linalg.norm(J, axis=0), 1 / held)
+        length = np.hypot(np.linalg.norm(J, axis=0), 1 / prior_std)
         rows.append(np.hstack([np.diag(np.sqrt(damping) * length), np.zeros((p, m))]))
         right.append(np.zeros(p))
     wide = np.full(m, np.inf)
     found, on_bound = bounded(
         np.vstack(rows), np.concatenate(right),
-        np.concatenate([(bounds.lower - at)[free], -wide]),
-        np.concatenate([(bounds.upper - at)[free], wide]),
+        np.concatenate([(bounds.lower - values)[free], -wide]),
+        np.concatenate([(bounds.upper - values)[free], wide]),
     )  # fmt: skip
-    step, stuck = np.zeros(len(at)), np.zeros(len(at), dtype=bool)
-    step[free], stuck[free] = found[:p], on_bound[:p]
-    return step, found[p:], stuck
+    step, on_bound_all = np.zeros(len(values)), np.zeros(len(values), dtype=bool)
+    step[free], on_bound_all[free] = found[:p], on_bound[:p]
+    return step, found[p:], on_bound_all
 
 
 def posterior(system: System, bounds: Bounds) -> tuple[Array, float, Array]:
-    """Return the parameters' covariance (p, p), the numbers spent, and each equation's share (M,).
+    """Return the covariance (p, p), the effective number of parameters, and the leverages (M,).
 
-    Bounds left aside: a parameter on its bound keeps the width that the readings give it. The
-    nuisances are projected out.
+    Without the bounds; the nuisances are projected out of the covariance.
     """
     p = system.J.shape[1]
     A, whole = columns_and_covariance(system, bounds)
@@ -80,44 +77,44 @@ def posterior(system: System, bounds: Bounds) -> tuple[Array, float, Array]:
 def joint_covariance(system: System, bounds: Bounds, repeat: Index) -> Array:
     """Return the covariance of parameters and nuisances together (p + m, p + m).
 
-    ``repeat`` (N,) numbers the readings that may share an error: a joint that is rounded, or off,
-    is so at all repeats of a pose.
+    ``repeat`` (N,) groups the readings whose errors may be correlated: repeats of a pose share
+    encoder rounding and joint errors.
     """
     A, covariance = columns_and_covariance(system, bounds)
-    return covariance + _shared(A, system.residual, covariance, repeat)
+    return covariance + _shared_error_covariance(A, system.residual, covariance, repeat)
 
 
-def _shared(A: Array, residual: Array, core: Array, repeat: Index) -> Array:
-    """Return what errors that repeats share add to the covariance ``core`` of a fit.
+def _shared_error_covariance(A: Array, residual: Array, core: Array, repeat: Index) -> Array:
+    """Return the contribution of correlated errors of repeats to the covariance ``core`` of a fit.
 
-    Errors of one reading have variance 1, those of two repeats a correlation that is estimated by
-    the products of their residuals, what the fit took of these put back (analysis of variance).
+    Errors have variance 1; the correlation between repeats is estimated from the products of their
+    residuals, corrected for the fit (analysis of variance).
     """
     number, count = np.unique(repeat, return_inverse=True, return_counts=True)[1:]
     k = len(residual) // len(number)
-    sums, left = np.zeros((len(count), k, A.shape[1])), np.zeros((len(count), k))
+    sums, residual_sums = np.zeros((len(count), k, A.shape[1])), np.zeros((len(count), k))
     np.add.at(sums, number, A.reshape(len(number), k, -1))
-    np.add.at(left, number, residual.reshape(-1, k))
+    np.add.at(residual_sums, number, residual.reshape(-1, k))
     square = A.T @ A
     pairs = np.einsum("gki,gkj->ij", sums, sums) - square
     twice = np.einsum("g,gki,gkj->ij", count - 2.0, sums, sums) + square
-    taken = core @ pairs
-    # products of repeats' residuals by white noise, and how these grow with the correlation
-    white = -float(np.trace(taken))
+    influence = core @ pairs
+    # expected products of repeats' residuals for white noise, and their rate with the correlation
+    white = -float(np.trace(influence))
     slope = k * float(np.sum(count * (count - 1.0)))
-    slope += float(np.sum(taken * taken.T)) - 2 * float(np.sum(core * twice))
+    slope += float(np.sum(influence * influence.T)) - 2 * float(np.sum(core * twice))
     if slope <= 1.0:
         return np.zeros_like(core)
-    found = float(np.sum(left**2) - np.sum(residual**2))
-    shared = min(max((found - white) / slope, 0.0), 1.0)
-    return np.asarray(shared * (taken @ core))
+    excess = float(np.sum(residual_sums**2) - np.sum(residual**2))
+    shared = min(max((excess - white) / slope, 0.0), 1.0)
+    return np.asarray(shared * (influence @ core))
 
 
 def columns_and_covariance(system: System, bounds: Bounds) -> tuple[Array, Array]:
     """Return the columns of parameters and nuisances (M, p + m), and their covariance.
 
-    Zero along what neither the equations nor the parameters' usual sizes hold.
+    Zero along directions without information from equations or priors.
     """
     A = np.hstack([system.J, system.F])
-    held = np.concatenate([1 / bounds.held**2, np.zeros(system.F.shape[1])])
-    return A, inverse(A.T @ A + np.diag(held))
+    precision = np.concatenate([1 / bounds.prior_std**2, np.zeros(system.F.shape[1])])
+    return A, inverse(A.T @ A + np.diag(precision))

@@ -1,7 +1,6 @@
-"""The downhill simplex, as scipy's ``minimize(method="Nelder-Mead")`` goes it, without its import.
+"""The downhill simplex of scipy's ``minimize(method="Nelder-Mead")``, without its import time.
 
-scipy.optimize takes as long to import as a small diagnosis to search. Source: Nelder, Mead, "A
-Simplex Method for Function Minimization", Computer Journal 7 (1965) 308.
+Source: Nelder, Mead, "A Simplex Method for Function Minimization", Computer Journal 7 (1965) 308.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ def nelder_mead(
     function: Callable[[Array], float], start: Array, most: int,
     near: float = 1e-4, alike: float = 1e-4,
 ) -> tuple[Array, float]:  # fmt: skip
-    """Return where (d,) a function is least, near ``start``, and its value there.
+    """Return a local minimum (d,) of a function, near ``start``, and its value.
 
     Ends after ``most`` steps, or where all corners are within ``near`` of the best and their values
     within ``alike`` of its.

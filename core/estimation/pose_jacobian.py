@@ -1,8 +1,8 @@
-"""How the poses of an arm change with the parameters of its effects: exact, all rows at once.
+"""Jacobian of the predicted poses by the parameters of effects, exact, for all rows at once.
 
-An effect says how its parameter moves the chain (``Effect.shape_rate``) or the rows (differences of
-``Effect.condition``, which costs no prediction); one compiled sweep then gives every derivative,
-bending under load included. Only what an effect cannot say so is a difference of predictions.
+An effect gives the derivative of the chain (``Effect.shape_rate``) or of the rows (differences of
+``Effect.condition``); one compiled sweep then computes the derivatives of the deflected poses.
+Other effects are differentiated numerically, by whole predictions.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ Entries = tuple[NDArray[np.int64], NDArray[np.int64], Array]  # starts (p+1), sl
 
 @dataclass(frozen=True)
 class PoseColumns:
-    """TCP poses of N rows, and how they change with p parameters, base axes."""
+    """TCP poses of N rows, and their Jacobian by p parameters, base axes."""
 
     poses: Poses
     jacobian: Array  # (6 or 3, p, N) m and rad per unit: position, then turn
@@ -44,9 +44,9 @@ def pose_columns(
 ) -> PoseColumns:  # fmt: skip
     """Return poses and columns for encoder angles ``q`` (N, n) and some values in the model.
 
-    ``steps`` (p,): what a value is moved by where a difference is taken. ``coordinates``: 3 for
-    positions alone; ``converged``: how much the last round may change a derivative by a bending,
-    m/rad. Raises InputError where a row has no equilibrium.
+    ``steps`` (p,): step of each value for numerical derivatives. ``coordinates``: 3 for positions
+    alone; ``converged``: largest change of a derivative in the last round, m per rad of deflection.
+    Raises InputError where a row has no equilibrium.
     """
     loads = loads or Loads()
     jacobian = np.empty((coordinates, len(values), len(q)))
@@ -54,8 +54,8 @@ def pose_columns(
     rates, known = _chain_rates(model, chain, values)
     varying, first_order_ok = _row_rates(model, q, loads, values, steps)
     poses = None
-    if not _steps_once(model, loads):
-        poses = _swept(chain, rows, (_entries(rates), varying), jacobian, converged)
+    if not _has_steps(model, loads):
+        poses = _sweep(chain, rows, (_entries(rates), varying), jacobian, converged)
     if poses is None:
         poses, known = model.predict(q, loads), np.zeros(len(values), dtype=bool)
     for c in np.flatnonzero(~(known & first_order_ok)).tolist():
@@ -77,8 +77,8 @@ def _chain_rates(model: Model, chain: Chain, values: Sequence[Value]) -> tuple[A
 
 
 def _entries(rates: Array) -> Entries:
-    """Return what is not zero of rates (p, slots)."""
-    column, slot = np.nonzero(rates)  # views of one array, which would be compiled for separately
+    """Return the nonzero entries of rates (p, slots)."""
+    column, slot = np.nonzero(rates)  # strided views: made contiguous, to compile one signature
     starts = np.searchsorted(column, np.arange(len(rates) + 1))
     return starts, np.ascontiguousarray(slot), rates[column, slot]
 
@@ -86,20 +86,20 @@ def _entries(rates: Array) -> Entries:
 def _row_rates(
     model: Model, q: Array, loads: Loads, values: Sequence[Value], steps: Array
 ) -> tuple[Entries, Mask]:
-    """Return how the rows change, rates (entries, N), and whether slots can say it (p,)."""
-    n, terms, own = model.arm.n, model.conditions(), Effect.condition
+    """Return the derivatives of the rows (entries, N), and which parameters they cover (p,)."""
+    n, terms, base = model.arm.n, model.conditions(), Effect.condition
     first_order_ok = np.ones(len(values), dtype=bool)
-    if not terms:  # nothing changes the rows: copies of them all would be for nothing
+    if not terms:  # no effect changes the rows
         nothing = np.zeros(len(values) + 1, dtype=np.int64)
         return (nothing, np.zeros(0, dtype=np.int64), np.zeros((0, len(q)))), first_order_ok
-    bare = model.without_terms().rows(q, loads)
+    without_terms = model.without_terms().rows(q, loads)
     starts, found_slots, found = [0], [], []
     for c, (t, k) in enumerate(values):
-        if type(CATALOGUE[model.terms[t].effect]).condition is not own:
+        if type(CATALOGUE[model.terms[t].effect]).condition is not base:
             ends = []
             for step in (steps[c], -steps[c]):
-                moved = _moved(model, t, k, float(step)).terms[t]
-                ends.append(Rows(*(part.copy() for part in bare)))
+                moved = _with_step(model, t, k, float(step)).terms[t]
+                ends.append(Rows(*(part.copy() for part in without_terms)))
                 model.condition(
                     ends[-1], loads, q, [moved if o is model.terms[t] else o for o in terms]
                 )
@@ -116,17 +116,17 @@ def _row_rates(
     return (np.array(starts), np.array(found_slots, dtype=np.int64), rates), first_order_ok
 
 
-def _steps_once(model: Model, loads: Loads) -> bool:
-    """Return whether rows before a moment have a pose that the chain alone does not give."""
-    own = Effect.before
-    steps = any(type(CATALOGUE[t.effect]).before is not own for t in model.terms)
+def _has_steps(model: Model, loads: Loads) -> bool:
+    """Return whether an effect changes the poses of rows before a moment."""
+    base = Effect.before
+    steps = any(type(CATALOGUE[t.effect]).before is not base for t in model.terms)
     return steps and loads.time is not None
 
 
-def _swept(
+def _sweep(
     chain: Chain, rows: Rows, entries: tuple[Entries, Entries], jacobian: Array, converged: float
 ) -> Poses | None:
-    """Write the derivatives (3 or 6, p, N) and return the poses; None where the sweep cannot."""
+    """Write the derivatives (3 or 6, p, N) and return the poses; None if the sweep cannot do so."""
     if bool(chain.flexibility.any()) or bool(getattr(config, "DISABLE_JIT", 0)):
         return None
     count = len(rows.q)
@@ -140,7 +140,7 @@ def _swept(
     return Poses(*found[:2])
 
 
-def _moved(model: Model, t: int, k: int, step: float) -> Model:
+def _with_step(model: Model, t: int, k: int, step: float) -> Model:
     """Return the model with one value of one term changed."""
     term = model.terms[t]
     values = [v + step if i == k else v for i, v in enumerate(term.values)]
@@ -150,6 +150,8 @@ def _moved(model: Model, t: int, k: int, step: float) -> Model:
 
 def _difference(model: Model, q: Array, loads: Loads, value: Value, step: float) -> Array:
     """Return one column (6, N) by central differences of whole predictions."""
-    one, other = (_moved(model, *value, way).predict(q, loads) for way in (step, -step))
-    turn = rotation_vector(one.rotation @ np.swapaxes(other.rotation, 1, 2))
-    return np.hstack([one.position - other.position, turn]).T / (2 * step)
+    one, other = (
+        _with_step(model, *value, sign_step).predict(q, loads) for sign_step in (step, -step)
+    )
+    rotation = rotation_vector(one.rotation @ np.swapaxes(other.rotation, 1, 2))
+    return np.hstack([one.position - other.position, rotation]).T / (2 * step)

@@ -1,7 +1,7 @@
-"""How surely flexibilities are known: by fits that left poses out.
+"""Cluster-robust covariance of the flexibilities, by a jackknife over poses.
 
-The errors of one pose are not independent: those of its joints (repeatability, rounding of the
-encoders) reach all six coordinates through the Jacobian, and are larger where the lever is.
+The errors of one pose are correlated: joint errors (repeatability, encoder rounding) act on all six
+coordinates through the Jacobian, and grow with the lever.
 """
 
 from __future__ import annotations
@@ -16,51 +16,51 @@ from gapbridge.core.estimation.compliance_fit import (
     Data,
     Fit,
     nuisance_columns,
-    per_cell_of,
     regressor,
     residual,
     robust_weights,
+    whitening_factors,
 )
-from gapbridge.core.estimation.held_out import jackknife, pose_groups, random_folds, without_each
+from gapbridge.core.estimation.held_out import jackknife, leave_one_out, pose_groups, random_folds
 from gapbridge.core.estimation.least_squares import inverse
 
-PARTS = 50  # parts of the poses, left out in turn: a standard deviation to a tenth of itself
-ROWS = 2000  # rows that show how errors scatter; more cost time and add hardly anything
-FEWEST = 2  # times as many coordinates of parts as numbers fitted; of fewer poses noise is white
+POSE_PARTS = 50  # groups of poses, left out in turn: determines a std to 10 %
+MAX_ROWS = 2000  # used for the jackknife
+MIN_PARTS_FACTOR = 2  # coordinates of groups over fitted parameters; with fewer: white noise
 
 
-def by_poses(fit: Fit, data: Data, shown: Identifiable, sigma: float) -> Identifiable:
-    """Return what is shown, with the covariance (2n, 2n) by fits that left poses out in turn.
+def with_pose_scatter(fit: Fit, data: Data, shown: Identifiable, sigma: float) -> Identifiable:
+    """Return the identifiability with the covariance (2n, 2n) by fits without groups of poses.
 
-    Of many rows some say by how much it differs from that of white noise. ``sigma`` (rad/Nm) is the
-    prior's. Cameron, Miller, "A Practitioner's Guide to Cluster-Robust Inference" (2015), CV3.
+    Of many rows a sample gives its ratio to that of white noise. ``sigma`` (rad/Nm) is the prior's.
+    Cameron, Miller, "A Practitioner's Guide to Cluster-Robust Inference" (2015), CV3.
     """
     kept, count = shown.kept, int(shown.kept.sum())
-    some = data.part(slice(None, None, -(-len(data.q) // ROWS)))
-    A, b, prior = _rows(fit, some, shown, sigma)
-    width = len(b) // len(some.q)
-    part = random_folds(pose_groups(some.q), PARTS)
-    if not count or (int(part.max()) + 1) * width < FEWEST * A.shape[1]:
+    sample = data.part(slice(None, None, -(-len(data.q) // MAX_ROWS)))
+    A, b, prior = _rows(fit, sample, shown, sigma)
+    width = len(b) // len(sample.q)
+    parts = random_folds(pose_groups(sample.q), POSE_PARTS)
+    if not count or (int(parts.max()) + 1) * width < MIN_PARTS_FACTOR * A.shape[1]:
         return shown
-    own = np.arange(A.shape[1] - count, A.shape[1])
-    white = inverse(A.T @ A + np.diag(prior**2))[np.ix_(own, own)]
-    without = without_each(np.vstack([A, np.diag(prior)]), np.concatenate([b, 0 * prior]),
-                           np.repeat(part, width))  # fmt: skip
-    scatter = jackknife(np.array([x[own] for _, x in without]))
-    root, whole = (np.linalg.cholesky(C) for C in (
+    flexible = np.arange(A.shape[1] - count, A.shape[1])
+    white = inverse(A.T @ A + np.diag(prior**2))[np.ix_(flexible, flexible)]
+    without = leave_one_out(np.vstack([A, np.diag(prior)]), np.concatenate([b, 0 * prior]),
+                           np.repeat(parts, width))  # fmt: skip
+    scatter = jackknife(np.array([x[flexible] for _, x in without]))
+    white_root, covariance_root = (np.linalg.cholesky(C) for C in (
         white, shown.covariance[np.ix_(kept, kept)] / sigma**2,
     ))  # fmt: skip
-    change = whole @ np.linalg.inv(root)
+    scaling = covariance_root @ np.linalg.inv(white_root)
     covariance = shown.covariance.copy()
-    covariance[np.ix_(kept, kept)] = change @ scatter @ change.T * sigma**2
+    covariance[np.ix_(kept, kept)] = scaling @ scatter @ scaling.T * sigma**2
     return replace(shown, covariance=covariance)
 
 
 def _rows(fit: Fit, data: Data, shown: Identifiable, sigma: float) -> tuple[Array, Array, Array]:
-    """Return the rows (m, p) of [geometry | nuisances | kept flexibilities], the gap (m,) they see.
+    """Return rows (m, p) of [geometry | nuisances | kept flexibilities], gap (m,) and ridge (p,).
 
-    Everything is in units of the noise, the flexibilities in ``sigma``; last comes one over the
-    prior 1 sigma (p,) of each number, 0 of one that is free.
+    Rows are divided by the noise, flexibilities are in units of ``sigma``; the ridge is one over
+    the prior sigma, 0 without one.
     """
     gap, poses = residual(fit.model, data, fit.frame)
     weights, scale = robust_weights(gap)
@@ -73,6 +73,6 @@ def _rows(fit: Fit, data: Data, shown: Identifiable, sigma: float) -> tuple[Arra
     if fit.geometry is not None:
         columns.insert(0, fit.geometry.columns(fit.model, data.q, data.loads, width))
         prior.insert(0, 1 / fit.geometry.sigma)
-    cells = per_cell_of(weights, scale, width)
+    cells = whitening_factors(weights, scale, width)
     A = np.concatenate(columns, axis=2) * cells[..., None]
     return A.reshape(gap.size, -1), (gap * cells).ravel(), np.concatenate(prior)

@@ -1,4 +1,4 @@
-"""The frame of an instrument that nobody registered to the robot's base."""
+"""Registration of an instrument's frame to the robot's base."""
 
 from __future__ import annotations
 
@@ -30,9 +30,8 @@ class Registration:
 
     def moved(self, step: Array) -> Registration:
         """Return the frame after a small step (6,): what ``frame_columns`` multiplies."""
-        turn = rotation_matrix(step[3:])
-        # measured in base becomes turn @ (.) + step: fold that into the frame
-        rotation = self.rotation @ turn.T
+        # measured in base becomes R @ (.) + step[:3], with R the rotation of step[3:]
+        rotation = self.rotation @ rotation_matrix(step[3:]).T
         return Registration(rotation, self.position - rotation @ step[:3])
 
 
@@ -40,7 +39,7 @@ IDENTITY = Registration(np.eye(3), np.zeros(3))
 
 
 def register(measured: Array, predicted: Array, weights: Array | None = None) -> Registration:
-    """Return the rigid frame that best carries ``predicted`` (N, 3) to ``measured`` (N, 3).
+    """Return the rigid frame that maps ``predicted`` (N, 3) best to ``measured`` (N, 3), m.
 
     Weighted least squares (Kabsch 1976), a proper rotation.
     """
@@ -54,7 +53,7 @@ def register(measured: Array, predicted: Array, weights: Array | None = None) ->
 
 
 def register_robustly(measured: Array, predicted: Array) -> Registration:
-    """Return the frame with outliers down-weighted, for a fit to begin with."""
+    """Return the frame with outliers down-weighted, as the start of a fit."""
     frame = register(measured, predicted)
     for _ in range(ROUNDS):
         gap = frame.in_base(measured) - predicted

@@ -1,8 +1,8 @@
-"""The least squares of core.estimation.compliance_fit over rows that pass by in pieces.
+"""The least squares of core.estimation.compliance_fit over rows in blocks.
 
-Each step of Gauss and Newton passes once over the rows: the gap of every block weighs it, and the
-block is folded into the R factor of all weighed columns (core.kernels), a factor for each fold.
-What is noise and what an outlier the sample says, whose median stands for that of all rows.
+Each Gauss-Newton step is one pass over the rows: every block is weighted by its residuals and
+folded into the R factor of all weighted columns (core.kernels), one factor per fold. The noise is
+estimated from the sample.
 """
 
 from __future__ import annotations
@@ -20,21 +20,21 @@ from gapbridge.core.estimation.compliance_fit import (
     Fit,
     add_rows,
     fold_rows,
-    moved,
     noise_of,
-    per_cell_of,
     residual,
     weights_at,
+    whitening_factors,
+    with_step,
 )
 from gapbridge.core.estimation.held_out import FOLDS
 from gapbridge.core.estimation.least_squares import solve
 
-NONE = np.zeros(0)  # weights of a fit whose rows nobody keeps
+NO_WEIGHTS = np.zeros(0)  # of a fit to rows that are not stored
 
 
 @dataclass(frozen=True)
 class Piece:
-    """Some rows with measured poses, where they stand in the log, and in which folds."""
+    """Some rows with measured poses, their row numbers and folds."""
 
     data: Data
     rows: NDArray[np.int64]  # (k,) row in the log, from 0
@@ -42,8 +42,8 @@ class Piece:
 
 
 @dataclass(frozen=True)
-class Pass:
-    """What one pass over all rows has found at the shape of a fit."""
+class Accumulated:
+    """The sums of one pass over all rows, linearised at a fit."""
 
     factors: Array  # (FOLDS, k, k) R factors of each fold's rows
     inlier: list[Mask]  # piece by piece
@@ -52,7 +52,7 @@ class Pass:
 
 @dataclass(frozen=True)
 class Stream:
-    """All rows, piece by piece, as often as asked for."""
+    """All rows in pieces, which can be iterated repeatedly."""
 
     pieces: Callable[[], Iterator[Piece]]
     sample: Data  # rows from all over the log, few enough to be kept
@@ -61,17 +61,17 @@ class Stream:
     width: int  # numbers per row: 3, or 6 with rotations
     nuisances: int
 
-    def of_sample(self) -> Stream:
+    def sample_only(self) -> Stream:
         """Return the sample alone, a piece for each fold."""
         rows = [np.flatnonzero(self.fold == k) for k in range(FOLDS)]
         pieces = [
-            Piece(self.sample.part(own), own, ((k, slice(None)),))
-            for k, own in enumerate(rows) if len(own)
+            Piece(self.sample.part(rows_of_fold), rows_of_fold, ((k, slice(None)),))
+            for k, rows_of_fold in enumerate(rows) if len(rows_of_fold)
         ]  # fmt: skip
         return replace(self, pieces=lambda: iter(pieces), count=len(self.fold))
 
 
-def stretches(number: int, rows: int) -> Iterator[tuple[int, slice]]:
+def fold_slices(number: int, rows: int) -> Iterator[tuple[int, slice]]:
     """Yield each fold's rows of a piece, by its number: neighbours go together."""
     edges = np.linspace(0, rows, FOLDS + 1).astype(int)
     for k in range(FOLDS):
@@ -84,33 +84,33 @@ def scale_of(fit: Fit, sample: Data) -> Array:
     return noise_of(residual(fit.model, sample, fit.frame)[0])
 
 
-def passed(fit: Fit, scale: Array, stream: Stream) -> Pass:
+def accumulate(fit: Fit, scale: Array, stream: Stream) -> Accumulated:
     """Return the R factors of [nuisances | flexibilities | gap] of each fold's rows.
 
-    Columns at the shape of ``fit``, rows weighed by the noise ``scale`` (2,).
+    Columns are linearised at ``fit``, rows weighted by the noise ``scale`` (2,), m and rad.
     """
     k = stream.nuisances + 2 * fit.model.arm.n + 1
-    found, inliers, square = np.zeros((FOLDS, k, k)), list[Mask](), 0.0
+    factors, inliers, square = np.zeros((FOLDS, k, k)), list[Mask](), 0.0
     for piece in stream.pieces():
         gap, _ = residual(fit.model, piece.data, fit.frame)
         weights = weights_at(gap, scale)
-        cells = per_cell_of(weights, scale, stream.width)
+        cells = whitening_factors(weights, scale, stream.width)
         for fold, rows in piece.folds:
-            add_rows(fit.model, piece.data.part(rows), gap[rows], cells[rows], found[fold])
+            add_rows(fit.model, piece.data.part(rows), gap[rows], cells[rows], factors[fold])
         inliers.append(weights > 0)
         square += float(np.sum(gap[inliers[-1], :3] ** 2))
-    return Pass(found, inliers, square)
+    return Accumulated(factors, inliers, square)
 
 
-def placed(fit: Fit, left: Array, F: Array) -> Fit:
-    """Return the fit with its nuisances moved so that F @ step takes up what is ``left``."""
+def with_nuisance_step(fit: Fit, residual: Array, F: Array) -> Fit:
+    """Return the fit with its nuisances moved by the step that solves F @ step = residual."""
     if not F.shape[1]:
         return fit
-    step = solve(F, left, rank=RANK)
-    return Fit(*moved(fit.model, fit.frame, step), NONE)
+    step = solve(F, residual, rank=RANK)
+    return Fit(*with_step(fit.model, fit.frame, step), NO_WEIGHTS)
 
 
-def joined(factors: Array) -> Array:
+def merged_factor(factors: Array) -> Array:
     """Return the R factor (k, k) of all rows of several R factors (parts, k, k)."""
     R = np.zeros(factors.shape[1:])
     fold_rows(R, *factors)

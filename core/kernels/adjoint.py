@@ -1,9 +1,9 @@
-"""How one coordinate of the TCP changes with everything in a bending chain: exact, by adjoints.
+"""Gradient of one coordinate of the TCP by all parameters of a bending chain: exact, by adjoints.
 
-The bending x of all joints is what their moments make of it: x = C M(x, p). The coordinate y(x, p)
-then changes by dy/dp = y_p + a C M_p with a = y_x + a C M_x, which is solved by iteration (it
-contracts as fast as the equilibrium itself). All perturbations are twists of everything beyond a
-place of the chain, so that one sweep out and one back give the derivatives for every place.
+The bending x of all joints satisfies x = C M(x, p). A coordinate y(x, p) then has the derivative
+dy/dp = y_p + a C M_p with the adjoint a = y_x + a C M_x, solved by fixed-point iteration (with the
+contraction of the equilibrium). All perturbations are twists of the chain beyond some frame: one
+sweep out and one back give the derivatives for every frame.
 Source: implicit differentiation; statics as in core.kernels.reference (paper eqs. 6-8).
 """
 
@@ -33,23 +33,23 @@ from gapbridge.core.kernels.reference import INNER
 # slots of a record of this workspace; records as in layout
 MOMENT_RATE, GIVE, BODY, ADJOINT, REACTION, SHIFT, TWIST = 0, 9, 12, 15, 18, 21, 24
 SHARE = 27
-OWN = 28
-# slots beside the records: sums on the way
+ADJOINT_RECORD = 28
+# slots after the records: running sums
 SUM, OUTER, CHANGED = 0, 3, 12
-BESIDE = 13
+SUM_SLOTS = 13
 ROUNDS = 60
-CONVERGED = 1e-12  # of m/rad: the next round would change a thousandth of it
+CONVERGED = 1e-12  # m/rad, change of a derivative in one round
 _L = LANES
 
 
 @njit(**FAST)
 def _moment_rate(w, u, s, record, load):  # type: ignore[no-untyped-def]
-    """Write by how much the moment of the loads beyond changes per turn about a record's origin.
+    """Write the derivative of the moment of the loads beyond by a rotation about a record's origin.
 
     K' of K t = sum (t x d) x f, from the sum of r f' at ``OUTER``; ``load``: the record whose
     total is the force.
     """
-    a, b, c = record * RECORD * _L, load * RECORD * _L, record * OWN * _L
+    a, b, c = record * RECORD * _L, load * RECORD * _L, record * ADJOINT_RECORD * _L
     for k in range(_L):
         trace = 0.0
         for i in range(3):
@@ -97,7 +97,7 @@ def _hang_tool(w, v, s, n, g):  # type: ignore[no-untyped-def]
 @njit(**FAST)
 def _softness(w, u, record, compliance, softening):  # type: ignore[no-untyped-def]
     """Write a joint's moment in its own axes and what bending one more Nm makes."""
-    a, b = record * RECORD * _L, record * OWN * _L
+    a, b = record * RECORD * _L, record * ADJOINT_RECORD * _L
     c0, c1, c2 = compliance[0], compliance[1], compliance[2]
     for k in range(_L):
         mx, my, mz = three(w, a + MOMENT * _L, k)
@@ -133,7 +133,7 @@ def _out(w, v, u, s, record, axis, turning):  # type: ignore[no-untyped-def]
     ``axis`` of the coordinate, ``turning`` whether it is a rotation. Then add the record's own
     push to the sum.
     """
-    a, b = record * RECORD * _L, record * OWN * _L
+    a, b = record * RECORD * _L, record * ADJOINT_RECORD * _L
     # unit vector of the coordinate: for positions the force of the virtual work, else its moment
     ex, ey = 1.0 if axis == 0 else 0.0, 1.0 if axis == 1 else 0.0
     ez = 1.0 if axis == 2 else 0.0
@@ -159,7 +159,7 @@ def _out(w, v, u, s, record, axis, turning):  # type: ignore[no-untyped-def]
 @njit(**FAST)
 def _back(w, u, s, record):  # type: ignore[no-untyped-def]
     """Add what the joints from a record on see of a twist there; the sum goes with it."""
-    a, b = record * RECORD * _L, record * OWN * _L
+    a, b = record * RECORD * _L, record * ADJOINT_RECORD * _L
     turns = 1.0 if record > 0 else 0.0  # the base's moment counts about axes that do not turn
     for k in range(_L):
         px, py, pz = three(u, b + REACTION * _L, k)
@@ -181,7 +181,7 @@ def _adjoint(w, u, s, record):  # type: ignore[no-untyped-def]
 
     The turn that a changed bending makes is its right Jacobian (series as in ``turn_joint``).
     """
-    a, b = record * RECORD * _L, record * OWN * _L
+    a, b = record * RECORD * _L, record * ADJOINT_RECORD * _L
     for k in range(_L):
         x, y, z = three(u, b + TWIST * _L, k)
         tx, ty, tz = in_axes(w, a, k, x, y, z)
@@ -211,9 +211,9 @@ def _adjoint(w, u, s, record):  # type: ignore[no-untyped-def]
 def solve(lanes, axis, turning, deflected, converged):  # type: ignore[no-untyped-def]
     """Write the derivatives of one coordinate by twists, and adjoints; whether they converged."""
     w, v, u, s = lanes
-    n = u.shape[0] // (OWN * _L) - 2
+    n = u.shape[0] // (ADJOINT_RECORD * _L) - 2
     for record in range(n + 2):
-        a = record * OWN * _L
+        a = record * ADJOINT_RECORD * _L
         for k in range(ADJOINT * _L, SHIFT * _L):
             u[a + k] = 0.0
     for _ in range(ROUNDS if deflected else 1):

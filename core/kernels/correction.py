@@ -155,7 +155,7 @@ def _distance(v, x):  # type: ignore[no-untyped-def]
 def _column(w, v, x, i, n):  # type: ignore[no-untyped-def]
     """Write a joint's column of the Jacobian; add what its offset so far is to the error.
 
-    The whole offset is solved for anew, not a step on top.
+    The whole offset is solved for, not an increment.
     """
     a, c = (i + 1) * RECORD * _L, (OFFSET + 2 * n + 6 * i) * _L
     for k in range(_L):

@@ -47,9 +47,9 @@ def lagged(time: Array, command: Array, constant: float, first: float) -> Array:
 
 
 def played(command: Array, width: float, first: float) -> Array:
-    """Return what follows a command (N,) with play of half width ``width``, from ``first`` on.
+    """Return the output (N,) of play of half width ``width`` for a command, starting at ``first``.
 
-    It stands still while the command is within the width, and is pushed along at either end of it.
+    It is constant while the command is within the width, and follows at either end of it.
     A negative width, which only steps of a solver ask for, is continued oddly.
     """
     result = _pushed(np.ascontiguousarray(command), abs(width), first)

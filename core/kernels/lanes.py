@@ -1,10 +1,9 @@
-"""Many rows side by side: the exact equilibrium of a block of rows, in loops that vectorise.
+"""The exact equilibrium of a block of rows, in loops that the compiler vectorises.
 
-The same mechanics as reference.py, which stays the reference (tests hold both together to 1e-12).
-LANES rows lie side by side in one workspace, a slot of LANES numbers per quantity, so that each
-loop over the lanes is straight arithmetic at compile-time distances: what a compiler turns into
-vector instructions by itself. Sines come from polynomials for the same reason. Links that bend
-themselves are left to core.kernels.reference.
+The same mechanics as reference.py (tests compare both to 1e-12). A workspace holds LANES rows, a
+slot of LANES numbers per quantity: each loop over the lanes is plain arithmetic with compile-time
+strides. Sines are polynomials for the same reason. Flexible links are solved by
+core.kernels.reference.
 """
 
 from __future__ import annotations
@@ -17,16 +16,16 @@ from gapbridge.core.kernels.layout import (
     BEND,
     CHANGE,
     COG,
-    FARTHEST,
     FAST,
     LANES,
     LINK_SCALE,
     MASS,
-    MOST_ROUNDS,
+    MAX_ANGLE,
+    MAX_BEND_SQUARE,
+    MAX_ROUNDS,
     RECORD,
     ROTATION,
     ROW,
-    STEEPEST,
     TCP,
     TCP_ROTATION,
     TOTAL,
@@ -56,7 +55,7 @@ def lanes_of(n):  # type: ignore[no-untyped-def]
 
 @njit(**INNER)
 def _level(w):  # type: ignore[no-untyped-def]
-    """Write the base's record as it stands without turning."""
+    """Write the base's record without rotation."""
     for s in range(RECORD * LANES):
         w[s] = 0.0
     for k in range(LANES):
@@ -76,7 +75,7 @@ def gather(chain, rows, first, w, v):  # type: ignore[no-untyped-def]
     for i in range(n):
         a = ((i + 1) * RECORD + ANGLE) * LANES
         for k in range(LANES):
-            far += 0 if abs(w[U(a + k)]) < FARTHEST else 1  # what is no number is far, too
+            far += 0 if abs(w[U(a + k)]) < MAX_ANGLE else 1  # what is no number is far, too
     _spread(rows.link_scale, first, n, w, (RECORD + LINK_SCALE) * LANES, RECORD * LANES)
     _spread(rows.payload_mass.reshape((-1, 1)), first, 1, v, MASS * LANES, LANES)
     _spread(rows.payload_cog, first, 3, v, COG * LANES, LANES)
@@ -121,7 +120,7 @@ def settle(chain, w, v, deflected, warm):  # type: ignore[no-untyped-def]
     for i in range(n):
         sines(w, i + 1)
     before = 0.0
-    for step in range(MOST_ROUNDS):
+    for step in range(MAX_ROUNDS):
         turned = deflected and (warm or step > 0)
         _place(chain, w, v, n, soft_base and turned, turned)
         load_flange(w, v, n, chain.gravity)
@@ -192,7 +191,7 @@ def _change(w, v, n):  # type: ignore[no-untyped-def]
         for i in range(n + 1):
             a = i * RECORD * LANES + k
             x, y, z = w[a + BEND * LANES], w[a + (BEND + 1) * LANES], w[a + (BEND + 2) * LANES]
-            if not x * x + y * y + z * z < STEEPEST:
+            if not x * x + y * y + z * z < MAX_BEND_SQUARE:
                 return -1.0
     return change
 

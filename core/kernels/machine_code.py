@@ -206,7 +206,7 @@ class _Counting(caching.CodeLibraryCacheImpl):
 class _KeptCounting(caching.Cache):
     """The machine code of the functions that count references.
 
-    Numba compiles it anew in each process: 20 ms, and 20 MB of the compiler's own code.
+    Otherwise numba compiles it in each process: 20 ms, and 20 MB of the compiler's code.
     """
 
     _impl_class: Any = _Counting

@@ -82,7 +82,7 @@ def predict_blocks(chain, rows, first, last, position, rotation):  # type: ignor
 
 @njit(**JIT)
 def linear_blocks(chain, rows, first, last, A, jacobians, moments):  # type: ignore[no-untyped-def]
-    """Write what ``kernel.regressor_rows`` does, for rows first..last of links that are stiff.
+    """Write the regressors as ``kernel.regressor_rows``, for rows first..last with rigid links.
 
     Returns -1, or the first row of a block that does not settle at once: reference.py's from there.
     """

@@ -152,7 +152,7 @@ def place_joint(w, i, R, p):  # type: ignore[no-untyped-def]
 
 @njit(**FAST)
 def turn_joint(w, record):  # type: ignore[no-untyped-def]
-    """Turn a record by its bending (exact finite rotation; series up to STEEPEST)."""
+    """Turn a record by its bending (exact finite rotation; series up to MAX_BEND_SQUARE)."""
     b = record * RECORD * LANES
     for k in range(LANES):
         x, y, z = three(w, b + BEND * LANES, k)

@@ -10,12 +10,12 @@ from numba import njit
 from gapbridge.core.arrays import Array
 from gapbridge.core.kernels.adjoint import (
     ADJOINT,
-    BESIDE,
+    ADJOINT_RECORD,
     BODY,
-    OWN,
     REACTION,
     SHARE,
     SHIFT,
+    SUM_SLOTS,
     TWIST,
     prepare,
     solve,
@@ -82,7 +82,7 @@ def _of_tool(w, v, sums, n, axis, turning):  # type: ignore[no-untyped-def]
 @njit(**FAST)
 def _of_joint(w, u, B, n, i, p, c2):  # type: ignore[no-untyped-def]
     """Write the derivatives by joint i's compliance and softening, its angle, its link's scale."""
-    a, b = (i + 1) * RECORD * _L, (i + 1) * OWN * _L
+    a, b = (i + 1) * RECORD * _L, (i + 1) * ADJOINT_RECORD * _L
     give, soft, turn = 6 * (n + 2) + 3 * i, 6 * (n + 2) + 3 * n + i, 10 * n + 18 + i
     px, py, pz = p[0], p[1], p[2]
     for k in range(_L):
@@ -94,7 +94,7 @@ def _of_joint(w, u, B, n, i, p, c2):  # type: ignore[no-untyped-def]
         x, y, z = three(w, a + AXIS * _L, k)
         tx, ty, tz = three(u, b + TWIST * _L, k)
         B[U(turn * _L + k)] = x * tx + y * ty + z * tz
-        x, y, z = three(u, b + (OWN + SHIFT) * _L, k)
+        x, y, z = three(u, b + (ADJOINT_RECORD + SHIFT) * _L, k)
         x, y, z = in_axes(w, a, k, x, y, z)
         B[U((turn + n) * _L + k)] = px * x + py * y + pz * z
 
@@ -102,7 +102,7 @@ def _of_joint(w, u, B, n, i, p, c2):  # type: ignore[no-untyped-def]
 @njit(**FAST)
 def _reaction(w, u, sums, record):  # type: ignore[no-untyped-def]
     """Add a record's reaction, and its reaction crossed with its origin, to the two sums."""
-    a, b = record * RECORD * _L, record * OWN * _L
+    a, b = record * RECORD * _L, record * ADJOINT_RECORD * _L
     reaction, turned = sums.reaction, sums.turned
     for k in range(_L):
         px, py, pz = three(u, b + REACTION * _L, k)
@@ -160,7 +160,7 @@ def _derivatives(chain, lanes, sums, axis, turning, links, loads):  # type: igno
     gravity = 6 * (n + 2) + 4 * n
     if links:
         for j in range(n + 1):
-            source = (j + 1) * OWN * _L
+            source = (j + 1) * ADJOINT_RECORD * _L
             _in_axes(w, u, B, j, source + SHIFT * _L, 6 * j, True)
             _in_axes(w, u, B, j, source + TWIST * _L, 6 * j + 3, False)
     for i in range(n):
@@ -235,7 +235,7 @@ def jacobian_blocks(chain, rows, rates, first, last, found, converged):  # type:
     n = chain.mass.shape[0]
     position, rotation, J = found
     w, v = lanes_of(n)
-    u, s = np.empty((n + 2) * OWN * _L), np.empty(BESIDE * _L)
+    u, s = np.empty((n + 2) * ADJOINT_RECORD * _L), np.empty(SUM_SLOTS * _L)
     lanes, column = (w, v, u, s), np.empty(_L)
     sums = Sums(np.zeros(slots(n) * _L), np.empty(3 * _L), np.empty(3 * _L))
     deflected = bends(chain)

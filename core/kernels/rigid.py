@@ -92,7 +92,7 @@ def about_axes(frames, point, force, moment, torque):  # type: ignore[no-untyped
 
 @njit(**JIT)
 def taken_by_link(i, body, gravity, frames, point, force, moment):  # type: ignore[no-untyped-def]
-    """Write where link i (from 0) is pulled (N, 3), and what force and moment move and hold it.
+    """Write the centre of gravity (N, 3) of link i (from 0), and its required force and moment.
 
     ``body`` (5, 3): its centre of gravity, its mass in the first of the second row, its inertia.
     """

@@ -29,7 +29,7 @@ SCRATCH = 42  # numbers that a search needs besides
 
 
 @njit(**FAST)
-def next_offset(b, n, w, wanted, k0):  # type: ignore[no-untyped-def]
+def newton_offset(b, n, w, wanted, k0):  # type: ignore[no-untyped-def]
     """Write the next joint offset (after the workspace), as ``compensation.next_offset`` does.
 
     The wanted pose stands in the block ``wanted`` from ``k0`` on, twelve numbers.
@@ -61,7 +61,7 @@ def next_offset(b, n, w, wanted, k0):  # type: ignore[no-untyped-def]
         z = pz - b[U(j + ORIGIN + 2)]
         b[U(c)], b[U(c + 1)], b[U(c + 2)] = zy * z - zz * y, zz * x - zx * z, zx * y - zy * x
         b[U(c + 3)], b[U(c + 4)], b[U(c + 5)] = LEVER * zx, LEVER * zy, LEVER * zz
-        # the whole offset is solved for anew, not a step on top
+        # the whole offset is solved for, not an increment
         o = b[U(at + i)]
         e0, e1, e2 = e0 + b[U(c)] * o, e1 + b[U(c + 1)] * o, e2 + b[U(c + 2)] * o
         e3, e4, e5 = e3 + b[U(c + 3)] * o, e4 + b[U(c + 4)] * o, e5 + b[U(c + 5)] * o
@@ -170,7 +170,7 @@ def correct(b, nominal, mass, cog, wrench, found):  # type: ignore[no-untyped-de
         steps += 1
         for i in range(n):
             b[U(row + i)] = nominal[i] + b[U(at + i)]
-        distance = next_offset(b, n, w, r, wanted)
+        distance = newton_offset(b, n, w, r, wanted)
         if distance < 0:
             break
         if distance < best:
@@ -255,7 +255,7 @@ def take_out(b, found):  # type: ignore[no-untyped-def]
     for _ in range(FEWER):
         for i in range(n):
             b[U(row + i)] = given[i] + b[U(at + i)]
-        distance = next_offset(b, n, w, b, wanted)
+        distance = newton_offset(b, n, w, b, wanted)
         if distance < NEARER:
             break
     distance = distance if distance >= 0.0 else np.inf

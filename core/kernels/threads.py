@@ -25,7 +25,7 @@ def processors() -> int:
 
 
 def in_ranges(work: Callable[[int, int], Result], count: int) -> list[Result]:
-    """Return what ``work(first, last)`` returns for ranges that cover ``count`` rows, in order."""
+    """Return the results of ``work(first, last)`` for ranges of ``count`` rows, in order."""
     parts = max(min(processors(), count // FEWEST), 1)
     if parts == 1:
         return [work(0, count)]

@@ -1,4 +1,4 @@
-"""A simulator's log brought to the rows of a measured one: by time, and held to the same motion."""
+"""Alignment of a simulator's log to the rows of a measured one, by time and motion."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ APART = {"target_q": 0.01, "actual_q": 0.1}  # rad that a joint may be off: arms
 def aligned(simulated: Log, log: Log) -> Log:
     """Return the simulator's rows at the rows of ``log``; its TCP is ``measured_position``.
 
-    Where both have a ``timestamp``, each row gets the simulator's values of its time, interpolated
-    where the simulator's rows follow each other closely; clocks that differ by a constant over all
-    rows count as one. Else row goes with row. Raises LogError where a row has no counterpart, or
-    stands for another pose.
+    If both have a ``timestamp``, each row gets the simulator's values at its time, interpolated
+    between rows that are close in time; clocks with a constant difference over all rows count as
+    equal. Otherwise rows correspond by number. Raises LogError where a row has no counterpart, or
+    another pose.
     """
     simulated = _with_position(simulated)
     clocks = log.has("timestamp") and simulated.has("timestamp") and log.one_clock
@@ -58,7 +58,7 @@ def _by_row(simulated: Log, log: Log) -> Log:
 def _by_time(simulated: Log, log: Log) -> Log:
     wanted, given = log.require("timestamp"), simulated.require("timestamp")
     if len(wanted) == len(given) and np.ptp(wanted - given) < SAME:
-        return simulated  # each row its own, whatever the clocks' zeros
+        return simulated  # rows correspond, with any offset of the clocks
     stream = Stream(simulated.path, given, _numbers(simulated)).in_order()
     nearest = _nearest(stream.time, wanted)
     exact = np.abs(stream.time[nearest] - wanted) < SAME

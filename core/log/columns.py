@@ -30,7 +30,7 @@ COLUMNS: dict[str, int | None] = {
 }
 INDEXED = re.compile(r"(.+)_(\d+)$")
 ALIKE = 0.85  # likeness of two names from which one may be the other misspelt
-# RTDE fields that look like a log's columns and are none of them: never a slip of the pen
+# RTDE fields with names similar to a log's columns: not treated as misspelt
 OTHERS = {
     "target_qd", "target_qdd", "target_moment", "target_current", "target_TCP_pose",
     "target_TCP_speed", "actual_current", "actual_current_window",
@@ -45,12 +45,12 @@ def is_known(name: str) -> bool:
 
 
 def wanted_of(names: Sequence[str]) -> list[int]:
-    """Return where the columns stand that a log may hold."""
+    """Return the positions of the columns that a log may hold."""
     return [i for i, name in enumerate(names) if is_known(name)]
 
 
 def indices(name: str, n: int) -> list[str]:
-    """Return what follows ``name`` in the columns of an arm of n joints: '_0', '_1', ... or ''."""
+    """Return the suffixes of ``name`` in the columns of an arm of n joints: '_0', ... or ''."""
     count = COLUMNS[name]
     return [""] if count == 0 else [f"_{i}" for i in range(n if count is None else count)]
 
@@ -88,7 +88,7 @@ def did_you_mean(unknown: Sequence[str], names: Sequence[str], n: int) -> str:
 
 
 def nearest(names: Sequence[str]) -> str:
-    """Return what a file without any known column may mean, or what was expected."""
+    """Return the hint for a file without known columns: the nearest name, or those expected."""
     for name in names:
         stem = re.sub(r"_\d+$", "", name)
         near = difflib.get_close_matches(stem.lower(), COLUMNS, n=1, cutoff=0.6)

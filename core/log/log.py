@@ -1,7 +1,7 @@
-"""Logs: what was measured, in RTDE's column names.
+"""Logs of measured data, with RTDE's column names.
 
-Reading checks shape and numbers and names row and column of what is wrong; what a channel needs is
-asked for when it is used. CSV goes through numpy, Parquet through pyarrow.
+Reading checks shape and numbers; errors name row and column. The columns that a channel needs are
+checked when it is used. CSV is read by numpy, Parquet by pyarrow.
 """
 
 from __future__ import annotations
@@ -62,14 +62,14 @@ class Log:
     files: tuple[str, ...] = ()  # that several sessions came from; none: ``path`` alone
     numbers: Index | None = None  # (N,) of the rows of several sessions, from 1
     one_clock: bool = True  # False: timestamps of later sessions were shifted behind the first's
-    # what several readers derive of these rows, once (``motion_of``); other rows begin anew
+    # cache of data derived from these rows (``motion_of``); empty for a selection of rows
     derived: dict[str, Any] = field(init=False, repr=False, compare=False, default_factory=dict)
 
     def __len__(self) -> int:
         return len(next(iter(self.columns.values())))
 
     def line(self, row: int | np.integer[Any]) -> int:
-        """Return the line of the file that row ``row`` (from 0) stood in, for messages."""
+        """Return the line of row ``row`` (from 0) in the file, for messages."""
         return int(row) + self.first_row if self.lines is None else int(self.lines[row])
 
     def has(self, name: str) -> bool:
@@ -109,7 +109,7 @@ class Log:
         )
 
     def loads(self, motions: bool = True) -> Loads:
-        """Return what acts on the arm, row by row; ``motions`` False: without ``approach``."""
+        """Return the loads of the arm per row; ``motions`` False: without ``approach``."""
         given = {
             "payload_mass": "payload",
             "payload_cog": "payload_cog",
@@ -139,8 +139,8 @@ class Log:
     def approach(self) -> Array | None:
         """Return the sign (N, n) of each joint's last motion before the pose, 0 where unknown.
 
-        Where the log does not say, it is the sign of the change from the row before, carried on
-        where a joint did not move.
+        Without a column ``approach`` it is the sign of the change from the row before, or of the
+        last change where a joint did not move.
         """
         if self.has("approach"):
             return np.sign(self.require("approach"))
@@ -194,15 +194,15 @@ def read_log(path: Path | str, n: int) -> Log:
 
 
 def no_file(path: Path) -> LogError:
-    """Return the error of a log that is not there, or is a folder."""
+    """Return the error for a log that does not exist, or is a folder."""
     what = "found a folder that is no data source" if path.is_dir() else "file not found"
     return LogError(f"{path}: {what}, expected a CSV or Parquet log")
 
 
 def encoding_of(path: Path, head: bytes) -> str:
-    """Return how the text of a log is encoded, by its first bytes.
+    """Return the text encoding of a log, by its first bytes.
 
-    Raises LogError with the cure where they are those of a packed file.
+    Raises LogError with the remedy where they are those of a compressed file.
     """
     for first, what in PACKED.items():
         if head.startswith(first):
@@ -274,7 +274,7 @@ def is_comment(line: str) -> bool:
 
 
 def delimiter_of(header: str) -> str:
-    """Return what stands between the cells of a CSV file."""
+    """Return the separator of a CSV file."""
     return ";" if header.count(";") > header.count(",") else ","
 
 

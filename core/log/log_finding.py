@@ -8,7 +8,7 @@ from typing import Union
 
 
 class LogCheck(Enum):
-    """What a check of a log found; the comment says what the finding's values are."""
+    """What a check of a log found; the comment lists the finding's values."""
 
     # the file
     MISSPELT = auto()  # column found, column that may be meant

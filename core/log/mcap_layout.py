@@ -23,7 +23,7 @@ _VARINT, _FIXED64, _LENGTH = 0, 1, 2  # wire types
 
 @dataclass(frozen=True)
 class Place:
-    """Where the numbers of a field stand in every message."""
+    """The position of a field's numbers in every message."""
 
     name: str
     start: int  # byte

@@ -95,7 +95,7 @@ def is_whole(path: Path) -> bool:
 
 
 def read_chunk(file: IO[bytes], at: int, length: int) -> Contents | None:
-    """Return what a chunk holds, None where it is broken."""
+    """Return the content of a chunk; None where it is broken."""
     found = unpacked(file, at, length)
     try:
         return None if found is None else _contents(found[1])

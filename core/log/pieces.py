@@ -63,7 +63,7 @@ class LogPieces:
             first += len(table)
 
     def count(self) -> int:
-        """Return how many rows the log has, without reading them where the file says it."""
+        """Return the number of rows, from the file's metadata where it has it."""
         if self.path.suffix.lower() in PARQUET:
             from pyarrow import parquet
 

@@ -1,4 +1,4 @@
-"""Candidate readings of a plan: reachable poses that the instrument sees, under every load."""
+"""Candidate readings of a plan: reachable poses visible to the instrument, under every load."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from gapbridge.core.calibration.observables.fixed_point import fixed_at
 from gapbridge.core.calibration.observables.nuisance import Nuisance
 from gapbridge.core.calibration.observables.observable import Observable
 from gapbridge.core.calibration.observables.predicted_readings import (
-    beside,
-    empty_readings,
+    concatenated,
     predicted_readings,
+    unmeasured_readings,
 )
 from gapbridge.core.calibration.parameters import Parameters
 from gapbridge.core.calibration.plan import Payload
@@ -25,27 +25,27 @@ from gapbridge.core.errors import PlanError
 from gapbridge.core.loads import Loads
 from gapbridge.core.model import Model
 from gapbridge.core.notes import Note, Reason
-from gapbridge.core.planning.workspace import Hindrance, Obstacle, Place, Workspace
+from gapbridge.core.planning.workspace import Place, Rejection, RejectionReason, Workspace
 
 STOPS = 900  # candidate poses
-DRAWN = 4000  # random poses looked at in one go
-TRIES = 40
-HOPELESS = 6  # tries without any pose after which none is expected
-BALLS_APART = 0.2  # m, of two balls on the tool where nobody says it
+SAMPLES = 4000  # random poses drawn per round
+MAX_ROUNDS = 40
+EMPTY_ROUNDS = 6  # rounds without any accepted pose after which sampling stops
+DEFAULT_BALL_DISTANCE = 0.2  # m, of two balls on the tool where it is not declared
 
 
-class Hindered(NamedTuple):
-    """Random poses that were looked at, and what stands against most of them."""
+class RejectedPoses(NamedTuple):
+    """How many random poses were sampled, and the most frequent reasons for rejecting them."""
 
-    looked: int
-    poses: tuple[tuple[str, int, int], ...]  # an Obstacle's name, its number, poses
+    sampled: int
+    counts: tuple[tuple[str, int, int], ...]  # a RejectionReason's name, its number, poses
 
     def __str__(self) -> str:
         parts = [
-            f"{100 * n / max(self.looked, 1):.0f} % {Obstacle[name].value.format(number)}"
-            for name, number, n in self.poses
+            f"{100 * n / max(self.sampled, 1):.0f} % {RejectionReason[name].value.format(number)}"
+            for name, number, n in self.counts
         ]
-        return f"of {self.looked} random poses " + (", ".join(parts) or "none can be read")
+        return f"of {self.sampled} random poses " + (", ".join(parts) or "none can be read")
 
 
 @dataclass(frozen=True)
@@ -56,61 +56,65 @@ class Candidates:
     readings: Readings  # (R,) exact readings that the model predicts
     stop: Index  # (R,) number of the pose
     nuisance: Nuisance
-    hindered: Hindered
+    rejected: RejectedPoses
     notes: tuple[Note, ...]
 
 
-class _Sight:
-    """Random poses that can be read, found so far, and what hindered the others."""
+class _PoseSampler:
+    """Draws random poses and keeps those that can be measured; counts rejections by reason."""
 
     def __init__(
         self, nominal: Model, observable: Observable, workspace: Workspace, nuisance: Nuisance
     ) -> None:
         self._nominal, self._observable = nominal, observable
         self._workspace, self._nuisance = workspace, nuisance
-        self._found: list[tuple[Array, Index, Index]] = []  # joints, place, target
-        self._looked = 0
-        self._hindered: Counter[Hindrance] = Counter()
+        self._accepted: list[tuple[Array, Index, Index]] = []  # joints, place, target
+        self._sampled = 0
+        self._rejections: Counter[Rejection] = Counter()
 
     @property
     def count(self) -> int:
-        """Return how many there are."""
-        return sum(len(q) for q, _, _ in self._found)
+        """Return how many poses are accepted."""
+        return sum(len(q) for q, _, _ in self._accepted)
 
     @property
-    def hindered(self) -> Hindered:
-        """Return what hinders random poses most."""
-        most = self._hindered.most_common(3)
-        return Hindered(self._looked, tuple((h.obstacle.name, h.number, n) for h, n in most if n))
+    def rejected(self) -> RejectedPoses:
+        """Return the three most frequent reasons."""
+        most = self._rejections.most_common(3)
+        return RejectedPoses(
+            self._sampled, tuple((one.reason.name, one.number, n) for one, n in most if n)
+        )
 
     def first(self, most: int) -> tuple[Array, Index, Index]:
         """Return joints (C, n), place (C,) and target (C,) of the first ``most``."""
         q, station, target = (
-            np.concatenate(parts)[:most] for parts in zip(*self._found, strict=True)
+            np.concatenate(parts)[:most] for parts in zip(*self._accepted, strict=True)
         )
         return q, station, target
 
-    def look(self, random: np.random.Generator) -> None:
-        """Look at some random poses, each from a random place at a random target."""
+    def sample(self, random: np.random.Generator) -> None:
+        """Draw random poses, each measured from a random place at a random target."""
         observable, nuisance = self._observable, self._nuisance
-        q = self._workspace.draw(DRAWN, random)
-        self._looked += DRAWN
+        q = self._workspace.draw(SAMPLES, random)
+        self._sampled += SAMPLES
         first = 1 if observable.kind == "relative" else 0
-        station = random.integers(0, len(nuisance.stations), DRAWN)
-        target = random.integers(first, len(nuisance.targets), DRAWN)
+        station = random.integers(0, len(nuisance.stations), SAMPLES)
+        target = random.integers(first, len(nuisance.targets), SAMPLES)
         if observable.closes:
-            readings = empty_readings(observable.kind, q, Loads(), station=station, target=target)
+            readings = unmeasured_readings(
+                observable.kind, q, Loads(), station=station, target=target
+            )
             touching = predicted_readings(observable, self._nominal, readings, nuisance)
-            self._hindered[Hindrance(Obstacle.FIXED_POINT)] += DRAWN - len(touching)
+            self._rejections[Rejection(RejectionReason.FIXED_POINT)] += SAMPLES - len(touching)
             q, station, target = touching.q, touching.station, touching.target
         good = np.ones(len(q), dtype=bool)
-        for hindrance, hit in _hindrances(observable, self._workspace, q, station, target).items():
-            self._hindered[hindrance] += int(hit.sum())
+        for reason, hit in _rejections_of(observable, self._workspace, q, station, target).items():
+            self._rejections[reason] += int(hit.sum())
             good &= ~hit
-        self._found.append((q[good], station[good], target[good]))
+        self._accepted.append((q[good], station[good], target[good]))
 
 
-def candidates_of(
+def sample_candidates(
     parameters: Parameters,
     observable: Observable,
     loads: Sequence[Payload],
@@ -120,100 +124,104 @@ def candidates_of(
 ) -> Candidates:
     """Return candidates at up to ``stops`` poses.
 
-    Raises PlanError where no pose is reachable and seen.
+    Raises PlanError where no pose is reachable and visible.
     """
     if observable.unknown and not workspace.places:
         raise PlanError(
             f"places: found none, expected where in base the fixed point of the {observable.kind} "
             "readings is"
         )
-    nuisance = _nuisance(observable, workspace)
+    nuisance = _nominal_nuisance(observable, workspace)
     random = np.random.default_rng(seed)
-    sight = _Sight(parameters.nominal, observable, workspace, nuisance)
-    for tried in range(TRIES):
-        sight.look(random)
-        if sight.count >= stops or (tried >= HOPELESS and not sight.count):
+    sampler = _PoseSampler(parameters.nominal, observable, workspace, nuisance)
+    for round_number in range(MAX_ROUNDS):
+        sampler.sample(random)
+        if sampler.count >= stops or (round_number >= EMPTY_ROUNDS and not sampler.count):
             break
-    if not sight.count:
-        raise PlanError(f"no pose can be reached and seen: {sight.hindered}")
-    seen = sight.first(stops)
-    readings, stop = _under_loads(parameters, observable, loads, seen, random)
-    notes = () if sight.count >= stops else (Note(Reason.FEW_POSES, (sight.hindered,)),)
+    if not sampler.count:
+        raise PlanError(f"no pose is reachable and visible: {sampler.rejected}")
+    accepted = sampler.first(stops)
+    readings, stop = _with_loads(parameters, observable, loads, accepted, random)
+    notes = () if sampler.count >= stops else (Note(Reason.FEW_POSES, (sampler.rejected,)),)
     readings = replace(readings, value=observable.predict(parameters.nominal, readings, nuisance))
-    return Candidates(seen[0], readings, stop, nuisance, sight.hindered, notes)
+    return Candidates(accepted[0], readings, stop, nuisance, sampler.rejected, notes)
 
 
-def _nuisance(observable: Observable, workspace: Workspace) -> Nuisance:
-    """Return where the instruments are meant to stand, and the balls on the tool."""
+def _nominal_nuisance(observable: Observable, workspace: Workspace) -> Nuisance:
+    """Return the planned places of the instruments, and the balls on the tool."""
     places = workspace.places or (Place((0.0, 0.0, 0.0)),)
     targets = workspace.targets
     if observable.kind == "relative" and len(targets) < 2:
-        targets = np.vstack([targets, targets[0] + [BALLS_APART, 0, 0]])
+        targets = np.vstack([targets, targets[0] + [DEFAULT_BALL_DISTANCE, 0, 0]])
     radius = getattr(observable, "radius", None)
-    long = 0.03 if observable.kind == "sphere" and radius is None else float(radius or 0.0)
+    length = 0.03 if observable.kind == "sphere" and radius is None else float(radius or 0.0)
     return Nuisance(
         tuple(fixed_at(np.array(place.position)) for place in places),
-        targets - targets[0], np.full(len(places), long),
+        targets - targets[0], np.full(len(places), length),
     )  # fmt: skip
 
 
-def readable(observable: Observable, workspace: Workspace, readings: Readings) -> Mask:
-    """Return which readings (N,) can be taken: nothing in the way, nothing hit."""
-    hits = _hindrances(observable, workspace, readings.q, readings.station, readings.target)
+def measurable(observable: Observable, workspace: Workspace, readings: Readings) -> Mask:
+    """Return which readings (N,) can be taken: target visible, no collision."""
+    hits = _rejections_of(observable, workspace, readings.q, readings.station, readings.target)
     return np.asarray(~np.any(list(hits.values()), axis=0))
 
 
-def _hindrances(
+def _rejections_of(
     observable: Observable, workspace: Workspace, q: Array, station: Index, target: Index
-) -> dict[Hindrance, Mask]:
-    found = workspace.hindrances(q)
+) -> dict[Rejection, Mask]:
+    rejections = workspace.rejections(q)
     if workspace.places and not observable.closes:
-        found |= _unseen(workspace, q, station, np.minimum(target, len(workspace.targets) - 1))
-    return found
+        rejections |= _not_visible(
+            workspace, q, station, np.minimum(target, len(workspace.targets) - 1)
+        )
+    return rejections
 
 
-def joined(found: Candidates, more: Readings) -> Candidates:
-    """Return the candidates with further readings, each at a pose of its own."""
-    stop = np.concatenate([found.stop, len(found.q) + np.arange(len(more))])
-    q = np.concatenate([found.q, more.q])
-    return replace(found, q=q, readings=beside(found.readings, more), stop=stop)
+def with_readings(candidates: Candidates, more: Readings) -> Candidates:
+    """Return the candidates with further readings, each at a separate pose."""
+    stop = np.concatenate([candidates.stop, len(candidates.q) + np.arange(len(more))])
+    q = np.concatenate([candidates.q, more.q])
+    return replace(candidates, q=q, readings=concatenated(candidates.readings, more), stop=stop)
 
 
-def _unseen(workspace: Workspace, q: Array, station: Index, target: Index) -> dict[Hindrance, Mask]:
-    """Return by hindrance which targets are not seen from their places."""
-    found: dict[Hindrance, Mask] = {}
+def _not_visible(
+    workspace: Workspace, q: Array, station: Index, target: Index
+) -> dict[Rejection, Mask]:
+    """Return by reason which targets are not visible from their places."""
+    masks: dict[Rejection, Mask] = {}
     for s in range(len(workspace.places)):
         for t in range(len(workspace.targets)):
             rows = np.flatnonzero((station == s) & (target == t))
-            for hindrance, missed in workspace.sees(workspace.frames(q[rows]), s, t).items():
-                whole = found.setdefault(hindrance, np.zeros(len(q), dtype=bool))
-                whole[rows] |= missed
-    return found
+            for reason, missed in workspace.not_visible(workspace.frames(q[rows]), s, t).items():
+                mask = masks.setdefault(reason, np.zeros(len(q), dtype=bool))
+                mask[rows] |= missed
+    return masks
 
 
-def _under_loads(
+def _with_loads(
     parameters: Parameters,
     observable: Observable,
     loads: Sequence[Payload],
-    seen: tuple[Array, Index, Index],
+    poses: tuple[Array, Index, Index],
     random: np.random.Generator,
 ) -> tuple[Readings, Index]:
-    """Return each pose under every load, from both sides where joints have play."""
-    q, station, target = seen
+    """Return each pose under every load, approached from both sides where joints have play."""
+    q, station, target = poses
     count = len(q)
-    played = [j - 1 for j in parameters.sided()]
-    sides: list[Array] = [np.zeros(q.shape)]
-    if played:
-        side = np.zeros(q.shape)
-        side[:, played] = random.choice([-1.0, 1.0], (count, len(played)))
-        sides = [side, -side]
-    variants = [(number, side) for number in range(len(loads)) for side in sides]
+    with_play = [j - 1 for j in parameters.approach_joints()]
+    approaches: list[Array] = [np.zeros(q.shape)]
+    if with_play:
+        approach = np.zeros(q.shape)
+        approach[:, with_play] = random.choice([-1.0, 1.0], (count, len(with_play)))
+        approaches = [approach, -approach]
+    variants = [(number, approach) for number in range(len(loads)) for approach in approaches]
     stop = np.tile(np.arange(count), len(variants))
     load = np.repeat([number for number, _ in variants], count)
-    acting = Loads(
+    loads_of_rows = Loads(
         payload_mass=np.array([one.mass for one in loads])[load],
         payload_cog=np.array([one.cog for one in loads], dtype=float)[load],
-        approach=np.concatenate([side for _, side in variants]) if played else None,
+        approach=np.concatenate([approach for _, approach in variants]) if with_play else None,
     )
     columns = {"load": load, "station": station[stop], "target": target[stop], "pose": stop}
-    return empty_readings(observable.kind, q[stop], acting, **columns), stop
+    return unmeasured_readings(observable.kind, q[stop], loads_of_rows, **columns), stop

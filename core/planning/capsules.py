@@ -9,12 +9,12 @@ import numpy as np
 from gapbridge.core.arrays import Array, Mask
 
 TINY = 1e-12
-FINEST = 0.02  # m, between points at which a segment is held against a box
+MAX_SPACING = 0.02  # m, between points of a segment that are checked against a box
 
 
 @dataclass(frozen=True)
 class Box:
-    """A box in base axes into which nothing of the arm may come."""
+    """A keep-out box, aligned with base axes."""
 
     lower: tuple[float, float, float]  # m
     upper: tuple[float, float, float]  # m
@@ -38,10 +38,10 @@ def segment_distance(p: Array, q: Array, r: Array, s: Array) -> Array:
     a, e = np.sum(u * u, axis=-1), np.sum(v * v, axis=-1)
     b, c, f = np.sum(u * v, axis=-1), np.sum(u * w, axis=-1), np.sum(v * w, axis=-1)
     denominator = a * e - b * b
-    # parallel, or one of them a point: from where the other's beginning stands before the first
-    plumb = np.where(a > TINY, -c / np.maximum(a, TINY), 0.0)
+    # parallel, or one is a point: project the start of the second segment onto the first
+    perpendicular = np.where(a > TINY, -c / np.maximum(a, TINY), 0.0)
     skewed = (a > TINY) & (e > TINY) & (denominator > TINY * a * e)
-    along = np.where(skewed, (b * f - c * e) / np.where(skewed, denominator, 1.0), plumb)
+    along = np.where(skewed, (b * f - c * e) / np.where(skewed, denominator, 1.0), perpendicular)
     along = np.clip(along, 0, 1)
     across = np.where(e > TINY, (b * along + f) / np.maximum(e, TINY), 0.0)
     clipped = np.clip(across, 0, 1)
@@ -52,47 +52,47 @@ def segment_distance(p: Array, q: Array, r: Array, s: Array) -> Array:
 
 
 def in_box(capsules: Capsules, box: Box) -> Mask:
-    """Return at which poses (N,) some capsule comes into the box."""
+    """Return at which poses (N,) a capsule intersects the box."""
     lower, upper = np.array(box.lower), np.array(box.upper)
     hit = np.zeros(len(capsules.begin), dtype=bool)
     for i, radius in enumerate(capsules.radius):
         begin, end = capsules.begin[:, i], capsules.end[:, i]
         longest = float(np.linalg.norm(end - begin, axis=1).max(initial=0.0))
-        count = int(np.ceil(longest / max(0.5 * float(radius), FINEST))) + 1
+        count = int(np.ceil(longest / max(0.5 * float(radius), MAX_SPACING))) + 1
         for share in np.linspace(0, 1, count):
             point = begin + share * (end - begin)
-            away = point - np.clip(point, lower, upper)
-            hit |= np.sum(away**2, axis=1) < radius**2
+            offset = point - np.clip(point, lower, upper)
+            hit |= np.sum(offset**2, axis=1) < radius**2
     return hit
 
 
 def below(capsules: Capsules, height: float, first: int) -> Mask:
-    """Return at which poses (N,) a capsule from number ``first`` on dips below a height of base."""
+    """Return at which poses (N,) a capsule from ``first`` on is below a height (m, base)."""
     lowest = np.minimum(capsules.begin[:, first:, 2], capsules.end[:, first:, 2])
     return np.asarray((lowest - capsules.radius[first:] < height).any(axis=1))
 
 
-def touching(capsules: Capsules, pairs: tuple[tuple[int, int], ...]) -> Mask:
-    """Return at which poses (N,) two capsules of some pair touch."""
+def colliding(capsules: Capsules, pairs: tuple[tuple[int, int], ...]) -> Mask:
+    """Return at which poses (N,) the capsules of a pair intersect."""
     hit = np.zeros(len(capsules.begin), dtype=bool)
     for i, j in pairs:
-        apart = segment_distance(
+        distance = segment_distance(
             capsules.begin[:, i], capsules.end[:, i], capsules.begin[:, j], capsules.end[:, j]
         )
-        hit |= apart < capsules.radius[i] + capsules.radius[j]
+        hit |= distance < capsules.radius[i] + capsules.radius[j]
     return hit
 
 
-def hidden(capsules: Capsules, eye: Array, target: Array) -> Mask:
-    """Return at which poses (N,) a capsule stands between the eye (3,) and a target (N, 3).
+def occluded(capsules: Capsules, viewpoint: Array, target: Array) -> Mask:
+    """Return at which poses (N,) a capsule blocks the view from (3,) to a target (N, 3), m, base.
 
-    A target nearer to a capsule than its radius sits on it: there the capsule is only as thick as
-    leaves the target outside.
+    A target closer to a capsule's axis than its radius is mounted on it: the radius is then reduced
+    so that the target is outside.
     """
     hit = np.zeros(len(target), dtype=bool)
     for i, radius in enumerate(capsules.radius):
         begin, end = capsules.begin[:, i], capsules.end[:, i]
-        clear = segment_distance(target, target, begin, end)
-        apart = segment_distance(np.broadcast_to(eye, target.shape), target, begin, end)
-        hit |= apart < np.minimum(radius, 0.9 * clear)
+        clearance = segment_distance(target, target, begin, end)
+        distance = segment_distance(np.broadcast_to(viewpoint, target.shape), target, begin, end)
+        hit |= distance < np.minimum(radius, 0.9 * clearance)
     return hit

@@ -1,7 +1,7 @@
-"""What readings determine: the information matrix of parameters and nuisances.
+"""Information matrix of readings, for parameters and nuisances.
 
-Everything is counted in usual sizes: a parameter in its weak prior's sigma, a nuisance in metres
-and radians. The nuisances stay in the matrix, so that its inverse has them projected out.
+A parameter is scaled by the sigma of its weak prior; nuisances are in metres and radians. The
+nuisances are part of the matrix: its inverse marginalises over them.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ from gapbridge.core.calibration.plan import Expectation
 from gapbridge.core.calibration.readings import Readings
 from gapbridge.core.loads import Loads
 
-UNSHOWN = 0.95  # of the prior's sigma: what readings leave no better known they do not show
+UNIDENTIFIED = 0.95  # of the prior's sigma: a larger std counts as not identifiable
 
 
 @dataclass(frozen=True)
 class Reference:
-    """Where the TCP's prediction matters: M poses under loads that the arm will work with."""
+    """M poses and loads at which the accuracy of the predicted TCP is evaluated."""
 
     q: Array  # (M, n) rad
     loads: Loads
-    columns: Array  # (M, 3, p) m a prior's sigma: what each parameter does to the TCP there
+    columns: Array  # (M, 3, p) d TCP / d parameter, m per prior sigma
 
     @classmethod
     def of(cls, parameters: Parameters, q: Array, loads: Loads) -> Reference:
@@ -38,7 +38,7 @@ class Reference:
     def weight(self, size: int, share: Array | None = None) -> Array:
         """Return W (size, size): trace(W covariance) is the mean square TCP error, m^2.
 
-        ``share`` (M,), of mean 1, weighs the poses.
+        ``share`` (M,), of mean 1, are the weights of the poses.
         """
         p = self.columns.shape[2]
         root = 1.0 if share is None else np.sqrt(share)[:, None, None]
@@ -54,7 +54,7 @@ class Reference:
         return np.asarray(np.sqrt(np.maximum(spread, 0.0)))
 
 
-def blocks(
+def whitened_rows(
     parameters: Parameters,
     observable: Observable,
     readings: Readings,
@@ -62,11 +62,11 @@ def blocks(
     sigma: float,
     layout: Layout | None = None,
 ) -> Array:
-    """Return the equations of each reading (N, k, p+m), in units of noise and usual sizes."""
+    """Return the equations of each reading (N, k, p+m), divided by noise, times prior sigmas."""
     J, F = observable.columns(parameters, parameters.begin, readings, nuisance, layout)
-    whole = np.hstack([J * parameters.prior, F])
-    whole = whole.reshape(len(readings), observable.equations, whole.shape[1])
-    return np.asarray(whole / (sigma * observable.sigmas)[None, :, None])
+    columns = np.hstack([J * parameters.prior, F])
+    columns = columns.reshape(len(readings), observable.equations, columns.shape[1])
+    return np.asarray(columns / (sigma * observable.sigmas)[None, :, None])
 
 
 def information_of(rows: Array) -> Array:
@@ -81,11 +81,11 @@ def inverse(information: Array) -> Array:
     return np.asarray(root.T @ root)
 
 
-def expectation_of(parameters: Parameters, rows: Array, reference: Reference) -> Expectation:
-    """Return what equations (N, k, p+m) will determine."""
+def expected_accuracy(parameters: Parameters, rows: Array, reference: Reference) -> Expectation:
+    """Return the expected standard deviations for equations (N, k, p+m)."""
     covariance = inverse(information_of(rows))
     share = np.sqrt(np.diag(covariance))[: len(parameters)]
-    std = np.where(share < UNSHOWN, share * parameters.prior, np.inf)
+    std = np.where(share < UNIDENTIFIED, share * parameters.prior, np.inf)
     tcp = reference.std(covariance)
     return Expectation(
         parameters.names, parameters.units, std, parameters.scales.copy(),

@@ -1,4 +1,4 @@
-"""Which orientations of the flange a short session with the flange sensor needs, and how many."""
+"""Plan a payload session with a flange sensor: how many orientations, and which."""
 
 from __future__ import annotations
 
@@ -10,14 +10,19 @@ from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.payload_session import NAMES, UNITS, weight_columns
 from gapbridge.core.errors import ExcitationError
 from gapbridge.core.model import Model
-from gapbridge.core.planning.travel import in_order
+from gapbridge.core.planning.travel import ordered_poses
 
-WRIST = 3  # joints at the end that turn the flange and hardly move the arm
+WRIST_JOINTS = 3  # last joints, which turn the flange with little motion of the arm
 CANDIDATES = 600
-ROOM = 0.05  # rad, kept to every joint limit
-USUAL_NOISE = (0.3, 0.02)  # N, Nm, 1 sigma of an averaged reading of a flange sensor
-WANTED = {"payload_mass": 0.02, "payload_cog_x": 2e-3, "payload_cog_y": 2e-3, "payload_cog_z": 2e-3}
-SHORTEST, LONGEST = 6, 20
+LIMIT_MARGIN = 0.05  # rad, kept to every joint limit
+TYPICAL_NOISE = (0.3, 0.02)  # N, Nm, 1 sigma of an averaged reading of a flange sensor
+TARGET_STD = {
+    "payload_mass": 0.02,
+    "payload_cog_x": 2e-3,
+    "payload_cog_y": 2e-3,
+    "payload_cog_z": 2e-3,
+}
+MIN_POSES, MAX_POSES = 6, 20
 
 
 @dataclass(frozen=True)
@@ -37,16 +42,16 @@ def plan_payload(
     *,
     poses: int | None = None,
     mass: float | None = None,
-    noise: tuple[float, float] = USUAL_NOISE,
+    noise: tuple[float, float] = TYPICAL_NOISE,
     seed: int = 0,
 ) -> PayloadPlan:
     """Return poses around ``begin`` (n,) rad that separate load and sensor bias best (D-optimal).
 
-    Only the last three joints turn, within their limits: whoever stands by sees the tool turn on
-    the spot. ``mass`` (kg; default: the model's) is what is expected to hang there, ``noise``
-    1 sigma of one axis of an averaged reading (N, Nm). ``poses`` None takes as many as bring mass
-    and centre of gravity to 20 g and 2 mm, between 6 and 20. Raises ExcitationError where the
-    limits leave no orientations that separate load from bias.
+    Only the last three joints move, within their limits. ``mass`` (kg; default: the model's) is the
+    expected payload, ``noise`` 1 sigma of one axis of an averaged reading (N, Nm). With ``poses``
+    None, the number is the smallest (6 to 20) that determines mass to 20 g and the centre of
+    gravity to 2 mm. Raises ExcitationError where the limits leave no orientations that separate
+    load from bias.
     """
     begin = np.asarray(begin, dtype=float)
     candidates = _candidates(model, begin, np.random.default_rng(seed))
@@ -55,13 +60,13 @@ def plan_payload(
     columns = weight_columns(model, candidates) / sigma[None, :, None]
     columns[:, :, 1:4] *= mass  # the centre of gravity itself, at about this mass
     scale = np.array([1.0, *[0.1] * 3, *[noise[0]] * 3, *[noise[1]] * 3])
-    chosen = greedy(columns * scale, LONGEST if poses is None else poses)
+    chosen = select_d_optimal(columns * scale, MAX_POSES if poses is None else poses)
     bought = []
     std = np.full(10, np.inf)
-    for count in range(SHORTEST if poses is None else min(poses, 4), len(chosen) + 1):
+    for count in range(MIN_POSES if poses is None else min(poses, 4), len(chosen) + 1):
         std = _std(columns[chosen[:count]])
         bought.append((count, float(std[0]), float(std[1:4].max())))
-        enough = all(std[NAMES.index(name)] <= want for name, want in WANTED.items())
+        enough = all(std[NAMES.index(name)] <= target for name, target in TARGET_STD.items())
         if poses is None and enough:
             chosen = chosen[:count]
             break
@@ -70,24 +75,30 @@ def plan_payload(
             "payload session: within the joint limits the wrist cannot turn the flange far enough "
             "to separate load from sensor bias; begin elsewhere"
         )
-    return PayloadPlan(tuple(in_order(candidates[chosen], begin)), NAMES, UNITS, std, tuple(bought))
+    return PayloadPlan(
+        tuple(ordered_poses(candidates[chosen], begin)), NAMES, UNITS, std, tuple(bought)
+    )
 
 
 def _candidates(model: Model, begin: Array, rng: np.random.Generator) -> Array:
     n = model.arm.n
-    free = np.arange(max(n - WRIST, 0), n)
+    free = np.arange(max(n - WRIST_JOINTS, 0), n)
     limits = model.arm.limits
-    low = np.maximum(np.where(np.isfinite(limits.lower), limits.lower + ROOM, -np.pi), -np.pi)
-    high = np.minimum(np.where(np.isfinite(limits.upper), limits.upper - ROOM, np.pi), np.pi)
+    low = np.maximum(
+        np.where(np.isfinite(limits.lower), limits.lower + LIMIT_MARGIN, -np.pi), -np.pi
+    )
+    high = np.minimum(
+        np.where(np.isfinite(limits.upper), limits.upper - LIMIT_MARGIN, np.pi), np.pi
+    )
     candidates = np.tile(begin, (CANDIDATES, 1))
     candidates[1:, free] = rng.uniform(low[free], high[free], (CANDIDATES - 1, len(free)))
     return candidates
 
 
-def greedy(columns: Array, count: int, first: int | None = None) -> list[int]:
-    """Return the ``count`` candidates that shrink the volume of what is unknown most, in turn.
+def select_d_optimal(columns: Array, count: int, first: int | None = None) -> list[int]:
+    """Return ``count`` candidates by greedy D-optimal selection.
 
-    ``columns`` (C, k, p) are the readings' derivatives over their noise; ``first`` must be taken.
+    ``columns`` (C, k, p) are the readings' derivatives over their noise; ``first`` is kept.
     """
     information = 1e-6 * np.eye(columns.shape[2])
     chosen: list[int] = []

@@ -1,4 +1,4 @@
-"""The way through the chosen stops: one place and one load after the other, short legs within."""
+"""The order of the visits: grouped by place and load, short moves within each group."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from gapbridge.core.arrays import Array, Mask
 from gapbridge.core.calibration.plan import PlannedPose
 from gapbridge.core.notes import Note, Reason
 from gapbridge.core.planning.candidates import Candidates
-from gapbridge.core.planning.travel import joint_speed, leg_times, shortest_way
+from gapbridge.core.planning.travel import joint_speed, move_times, shortest_order
 from gapbridge.core.planning.workspace import Workspace
 
-BETWEEN = 9  # poses looked at on a leg
-ROUNDABOUT = 3.0  # times as long a leg counts on which the arm would hit something
+CHECKS_PER_LEG = 9  # intermediate poses checked for collision on a leg
+COLLISION_FACTOR = 3.0  # factor on the cost of a leg with a collision
 
 
 @dataclass(frozen=True)
-class Stop:
-    """One visit: a candidate's row, and what for."""
+class Visit:
+    """One visit: a candidate's row, and its purpose."""
 
     row: int
     held_out: bool = False
@@ -29,23 +29,23 @@ class Stop:
 
 
 @dataclass(frozen=True)
-class Itinerary:
+class Route:
     """The stops in the order of travel."""
 
-    stops: tuple[Stop, ...]
+    stops: tuple[Visit, ...]
     travel: float  # s
     notes: tuple[Note, ...]
 
-    def poses(self, found: Candidates) -> tuple[PlannedPose, ...]:
+    def poses(self, candidates: Candidates) -> tuple[PlannedPose, ...]:
         """Return the planned poses; those at the same joints share a number."""
         numbers: dict[tuple[int, int, bytes], int] = {}
         poses = []
-        readings = found.readings
+        readings = candidates.readings
         approach = readings.loads.approach
         for stop in self.stops:
             row = stop.row
-            side = np.zeros(found.q.shape[1]) if approach is None else approach[row]
-            key = (int(readings.load[row]), int(found.stop[row]), side.tobytes())
+            side = np.zeros(candidates.q.shape[1]) if approach is None else approach[row]
+            key = (int(readings.load[row]), int(candidates.stop[row]), side.tobytes())
             number = numbers.setdefault(key, len(numbers))
             poses.append(PlannedPose(
                 number, readings.q[row].copy(), int(readings.load[row]), side.copy(),
@@ -54,78 +54,82 @@ class Itinerary:
         return tuple(poses)
 
 
-def itinerary(
-    found: Candidates, stops: Sequence[Stop], workspace: Workspace, repeats: int
-) -> Itinerary:
-    """Return the way through all stops and ``repeats`` second visits.
+def plan_route(
+    candidates: Candidates, stops: Sequence[Visit], workspace: Workspace, repeats: int
+) -> Route:
+    """Return the route through all stops and ``repeats`` second visits.
 
-    A load's first pose is visited again at its end, which shows whether the instrument was moved.
+    The first pose of a load is repeated at its end, to detect an instrument that has moved.
     """
-    readings = found.readings
+    readings = candidates.readings
     speed = joint_speed(workspace.model.arm.limits.velocity)
-    blocks = _blocks(found, stops)
-    share = _shares([sum(not stop.held_out for stop in block) for block in blocks], repeats)
-    at, travel = None, 0.0
-    way: list[Stop] = []
-    hit: list[tuple[int, int]] = []
-    for block, again in zip(blocks, share, strict=True):
+    blocks = _blocks(candidates, stops)
+    counts = _repeats_per_block(
+        [sum(not stop.held_out for stop in block) for block in blocks], repeats
+    )
+    previous, travel = None, 0.0
+    ordered: list[Visit] = []
+    blocked_legs: list[tuple[int, int]] = []
+    for block, repeated in zip(blocks, counts, strict=True):
         q = readings.q[[stop.row for stop in block]]
-        legs, blocked = _legs(q, workspace, speed)
-        first = np.zeros(len(q)) if at is None else leg_times(at[None], q, speed)[0]
-        order = shortest_way(np.where(blocked, ROUNDABOUT * legs + 1.0, legs), first)
-        own = [block[i] for i in order]
+        legs, blocked = _legs_between(q, workspace, speed)
+        first = np.zeros(len(q)) if previous is None else move_times(previous[None], q, speed)[0]
+        order = shortest_order(np.where(blocked, COLLISION_FACTOR * legs + 1.0, legs), first)
+        visits = [block[i] for i in order]
         fitted = [i for i in order if not block[i].held_out]
-        order += [fitted[i] for i in _spread(len(fitted), again)]
+        order += [fitted[i] for i in _repeat_indices(len(fitted), repeated)]
         for step, (a, b) in enumerate(pairwise(order)):
             travel += float(legs[a, b])
             if blocked[a, b]:
-                hit.append((len(way) + step, len(way) + step + 1))
+                blocked_legs.append((len(ordered) + step, len(ordered) + step + 1))
         travel += float(first[order[0]])
-        way += own + [replace(block[i], repeat=1) for i in order[len(own) :]]
-        at = q[order[-1]]
-    ways = tuple((a + 1, b + 1) for a, b in hit)
-    return Itinerary(tuple(way), travel, (Note(Reason.DETOURS, (ways,)),) if ways else ())
+        ordered += visits + [replace(block[i], repeat=1) for i in order[len(visits) :]]
+        previous = q[order[-1]]
+    pairs = tuple((a + 1, b + 1) for a, b in blocked_legs)
+    return Route(tuple(ordered), travel, (Note(Reason.DETOURS, (pairs,)),) if pairs else ())
 
 
-def _shares(fitted: list[int], repeats: int) -> list[int]:
-    """Return how many fitted stops of each block are visited again, the blocks in turn."""
-    share = [0] * len(fitted)
+def _repeats_per_block(fitted: list[int], repeats: int) -> list[int]:
+    """Return how many fitted stops of each block are repeated, distributed evenly."""
+    counts = [0] * len(fitted)
     for _ in range(min(repeats, sum(fitted))):
-        block = min((b for b in range(len(share)) if share[b] < fitted[b]), key=lambda b: share[b])
-        share[block] += 1
-    return share
+        block = min(
+            (b for b in range(len(counts)) if counts[b] < fitted[b]), key=lambda b: counts[b]
+        )
+        counts[block] += 1
+    return counts
 
 
-def _spread(count: int, again: int) -> list[int]:
-    """Return which stops of a block are visited again: the first, then evenly through it."""
-    step = count / max(again, 1)
-    return [int(i * step) for i in range(min(again, count))]
+def _repeat_indices(count: int, repeated: int) -> list[int]:
+    """Return which stops of a block are repeated: the first, then evenly spaced ones."""
+    step = count / max(repeated, 1)
+    return [int(i * step) for i in range(min(repeated, count))]
 
 
-def _blocks(found: Candidates, stops: Sequence[Stop]) -> list[list[Stop]]:
-    """Return the stops by place, then load; the loads turn round from place to place."""
-    readings = found.readings
-    groups: dict[tuple[int, int], list[Stop]] = {}
+def _blocks(candidates: Candidates, stops: Sequence[Visit]) -> list[list[Visit]]:
+    """Return the stops by place, then load; the order of loads alternates between places."""
+    readings = candidates.readings
+    groups: dict[tuple[int, int], list[Visit]] = {}
     for stop in stops:
         key = (int(readings.station[stop.row]), int(readings.load[stop.row]))
         groups.setdefault(key, []).append(stop)
 
-    def turn(key: tuple[int, int]) -> tuple[int, int]:
+    def block_order(key: tuple[int, int]) -> tuple[int, int]:
         station, load = key
         return station, load if station % 2 == 0 else -load
 
-    return [groups[key] for key in sorted(groups, key=turn)]
+    return [groups[key] for key in sorted(groups, key=block_order)]
 
 
-def _legs(q: Array, workspace: Workspace, speed: Array) -> tuple[Array, Mask]:
-    """Return the times (B, B) between poses, and where the straight way hits something."""
+def _legs_between(q: Array, workspace: Workspace, speed: Array) -> tuple[Array, Mask]:
+    """Return the times (B, B), s, between poses, and which straight joint moves collide."""
     count = len(q)
-    legs = leg_times(q, q, speed)
+    legs = move_times(q, q, speed)
     blocked = np.zeros((count, count), dtype=bool)
     one, other = np.triu_indices(count, 1)
     if len(one):
-        share = np.linspace(0, 1, BETWEEN + 2)[1:-1]
+        share = np.linspace(0, 1, CHECKS_PER_LEG + 2)[1:-1]
         between = q[one][:, None] + share[:, None] * (q[other] - q[one])[:, None]
-        clear = workspace.clear(between.reshape(-1, q.shape[1])).reshape(-1, BETWEEN)
+        clear = workspace.clear(between.reshape(-1, q.shape[1])).reshape(-1, CHECKS_PER_LEG)
         blocked[one, other] = blocked[other, one] = ~clear.all(axis=1)
     return legs, blocked

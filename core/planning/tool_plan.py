@@ -1,4 +1,4 @@
-"""From which directions to bring a tool's tip onto a fixed point."""
+"""Plan a tool session: orientations in which the tip touches a fixed point."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from gapbridge.core.calibration.tool_session import NAMES, touch_columns
 from gapbridge.core.effects import CATALOGUE
 from gapbridge.core.errors import ExcitationError
 from gapbridge.core.model import Model
-from gapbridge.core.planning.payload_plan import ROOM, greedy
-from gapbridge.core.planning.travel import in_order
+from gapbridge.core.planning.payload_plan import LIMIT_MARGIN, select_d_optimal
+from gapbridge.core.planning.travel import ordered_poses
 from gapbridge.core.rotation import rotation_matrix, rotation_vector
 
 CANDIDATES = 80
-TILT = 1.0  # rad, largest tilt of the tool against how it stands at the beginning
-MET = 1e-6  # m and rad, at which a pose counts as reached
-USUAL_NOISE = 2e-4  # m, 1 sigma of one coordinate of a tip brought onto a point by eye
+MAX_TILT = 1.0  # rad, of the tool relative to its initial orientation
+REACHED = 1e-6  # m and rad, at which a pose counts as reached
+TYPICAL_NOISE = 2e-4  # m, 1 sigma of one coordinate of a tip brought onto a point by eye
 ROUNDS = 40
 STEP = 0.2  # rad, largest change of a joint in one step
 
@@ -34,12 +34,7 @@ class ToolPlan:
 
 
 def plan_tool(
-    model: Model,
-    begin: Array,
-    *,
-    poses: int = 6,
-    noise: float = USUAL_NOISE,
-    seed: int = 0,
+    model: Model, begin: Array, *, poses: int = 6, noise: float = TYPICAL_NOISE, seed: int = 0
 ) -> ToolPlan:
     """Return poses that keep the tip where it is at ``begin`` (n,) rad and turn the tool about it.
 
@@ -48,10 +43,10 @@ def plan_tool(
     touch. Raises ExcitationError where the arm reaches no orientations that determine the tip.
     """
     begin = np.asarray(begin, dtype=float)
-    reached = _candidates(model, begin, np.random.default_rng(seed))
-    rotation = model.predict(reached).rotation @ model.chain().tool_rotation.T
+    candidates = _candidates(model, begin, np.random.default_rng(seed))
+    rotation = model.predict(candidates).rotation @ model.chain().tool_rotation.T
     columns = touch_columns(rotation) / noise
-    chosen = greedy(columns * 1e-3, min(poses, len(reached)), first=0)
+    chosen = select_d_optimal(columns * 1e-3, min(poses, len(candidates)), first=0)
     bought = []
     for count in range(3, len(chosen) + 1):
         std = _std(columns[chosen[:count]])
@@ -61,27 +56,30 @@ def plan_tool(
             "tool session: the arm cannot turn the tool far enough about that point within its "
             "joint limits; expected a point in front of the arm, tool pointing down"
         )
-    return ToolPlan(tuple(in_order(reached[chosen], begin)), NAMES, std, tuple(bought))
+    return ToolPlan(tuple(ordered_poses(candidates[chosen], begin)), NAMES, std, tuple(bought))
 
 
 def _candidates(model: Model, begin: Array, rng: np.random.Generator) -> Array:
     """Return poses that hold the tip in place, ``begin`` first."""
     limits = model.arm.limits
-    here = model.predict(begin)
-    found = [begin]
+    start = model.predict(begin)
+    poses = [begin]
     for _ in range(CANDIDATES):
-        across = rng.normal(size=2)
-        lean = across / np.linalg.norm(across) * TILT * np.sqrt(rng.random())
+        axis = rng.normal(size=2)
+        tilt = axis / np.linalg.norm(axis) * MAX_TILT * np.sqrt(rng.random())
         spin = rng.uniform(-np.pi / 2, np.pi / 2)
-        turn = rotation_matrix(np.array([*lean, 0.0])) @ rotation_matrix(np.array([0, 0, spin]))
-        q = _reach(model, begin, here.position[0], here.rotation[0] @ turn)
-        if q is not None and ((q > limits.lower + ROOM) & (q < limits.upper - ROOM)).all():
-            found.append(q)
-    return np.array(found)
+        rotation = rotation_matrix(np.array([*tilt, 0.0])) @ rotation_matrix(np.array([0, 0, spin]))
+        q = _reach(model, begin, start.position[0], start.rotation[0] @ rotation)
+        if (
+            q is not None
+            and ((q > limits.lower + LIMIT_MARGIN) & (q < limits.upper - LIMIT_MARGIN)).all()
+        ):
+            poses.append(q)
+    return np.array(poses)
 
 
 def _reach(model: Model, q: Array, position: Array, rotation: Array) -> Array | None:
-    """Return joint angles of a pose, near ``q``; None where Newton's steps do not get there."""
+    """Return joint angles of a pose, near ``q``; None where Newton's method does not converge."""
     q = q.copy()
     rigid = replace(model, terms=tuple(t for t in model.terms if not CATALOGUE[t.effect].softens))
     for _ in range(ROUNDS):
@@ -89,7 +87,7 @@ def _reach(model: Model, q: Array, position: Array, rotation: Array) -> Array | 
         error = np.concatenate(
             [position - pose.position[0], rotation_vector(rotation @ pose.rotation[0].T)]
         )
-        if np.abs(error).max() < MET:
+        if np.abs(error).max() < REACHED:
             return q
         J = rigid.linear_form(q).jacobian[0]
         damping = 1e-4 * float(np.trace(J @ J.T)) * min(1.0, float(np.abs(error).max()))

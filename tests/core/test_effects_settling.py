@@ -52,7 +52,7 @@ def test_what_a_joint_holds_is_the_weight_beyond_it_about_its_axis() -> None:
             total += 9.80665 * model.arm.mass[i] * at[:, 2]
         return total + 9.80665 * 5.0 * model.predict(q).position[:, 2]
 
-    held = model.held_torque(q)
+    held = model.holding_torque(q)
     for j in range(6):
         ends = [height(q + s * np.eye(6)[j]) for s in (step, -step)]
         np.testing.assert_allclose(held[:, j], (ends[0] - ends[1]) / (2 * step), atol=1e-5)
@@ -75,7 +75,7 @@ def test_the_correction_of_droop_is_part_of_the_offset_that_is_limited() -> None
     rigid = Model(SOFT.arm, payload_mass=5.0)
     live, q = Compensator(rigid.with_terms(DROOP)), poses()[0][0]
     found = live.correct(q)
-    held = rigid.held_torque(q[None])[0]
+    held = rigid.holding_torque(q[None])[0]
     droop = np.array([0, 4e-5, 5e-5, 2e-4, 3e-4, 0])
     np.testing.assert_allclose(found.q - q, droop * held, rtol=1e-6, atol=1e-12)
     moved = rigid.predict(found.q[None]).position[0] - rigid.predict(q[None]).position[0]

@@ -13,8 +13,8 @@ from gapbridge.core.files import read_bytes, read_text, recorded
 CODE = """
 import pickle, sys
 from pathlib import Path
-from gapbridge.core.files import is_file, read_bytes, read_only_from, read_text
-read_only_from(pickle.loads(sys.stdin.buffer.read()))
+from gapbridge.core.files import is_file, read_bytes, read_only_given, read_text
+read_only_given(pickle.loads(sys.stdin.buffer.read()))
 path, link, other = map(Path, sys.argv[1:])
 assert read_text(path) == read_text(link) == "as it was", read_text(path)
 assert is_file(path) and not is_file(other)

@@ -132,9 +132,9 @@ def test_an_arm_keeps_what_its_data_say_and_takes_the_type_where_they_say_nothin
     given[1] = replace(given[1], matrix=np.zeros((4, 4)), right=np.zeros(4))
     fit = fit_type(given, list(range(20)), np.zeros(4), USUAL)
     assert fit.arms[0].flexibility == pytest.approx(truths[0], rel=0.02)
-    assert (fit.arms[0].own > 0.95).all()
+    assert (fit.arms[0].own_share > 0.95).all()
     assert fit.arms[1].flexibility == pytest.approx(fit.scatter.mean, rel=0.05)
-    assert (fit.arms[1].own < 1e-6).all()
+    assert (fit.arms[1].own_share < 1e-6).all()
     assert (fit.arms[1].std > fit.arms[0].std).all()
 
 
@@ -146,7 +146,7 @@ def test_what_no_session_shows_stays_at_the_nominal_and_is_reported() -> None:
         matrix[:, 1] = 0.0
         blind.append(replace(one, matrix=matrix))
     fit = fit_type(blind, list(range(10)), MEAN, USUAL)
-    assert fit.scatter.shown.tolist() == [True, False, True, True]
+    assert fit.scatter.identifiable.tolist() == [True, False, True, True]
     assert fit.scatter.mean[1] == pytest.approx(MEAN[1], rel=1e-6)
 
 

@@ -8,7 +8,14 @@ import numpy as np
 import pytest
 
 from gapbridge.core.arm import arm_from_dh, builtin_arm, builtin_names
-from gapbridge.core.load_bounds import GRAVITY, HEAVIEST, LEVER, STRONGEST, UNKNOWN, LoadBounds
+from gapbridge.core.load_bounds import (
+    DEFAULT_RATED,
+    FORCE_FACTOR,
+    GRAVITY,
+    LEVER,
+    PAYLOAD_FACTOR,
+    LoadBounds,
+)
 from gapbridge.core.model import Model
 
 COG = np.array([0.0, 0.0, 0.05])
@@ -24,7 +31,7 @@ def test_a_built_in_arm_has_bounds_from_its_rated_payload(name: str) -> None:
     assert bounds.payload_problem(1.5 * arm.payload, COG) is None
     assert bounds.wrench_problem(np.array([0, 0, -1.5 * GRAVITY * arm.payload, 0, 0, 0])) is None
     assert "payload: found" in (bounds.payload_problem(1.51 * arm.payload, COG) or "")
-    strongest = STRONGEST * GRAVITY * arm.payload
+    strongest = FORCE_FACTOR * GRAVITY * arm.payload
     assert "force: found" in (bounds.wrench_problem(np.array([1.01 * strongest] + [0] * 5)) or "")
     twisted = np.array([0, 0, 0, 1.01 * LEVER * strongest, 0, 0])
     assert "torque: found" in (bounds.wrench_problem(twisted) or "")
@@ -56,7 +63,9 @@ def test_an_arm_of_unknown_rating_gets_the_documented_default() -> None:
     heavy = arm_from_dh(rows)
     assert LoadBounds.of(Model(heavy)).rated == pytest.approx(9.0)
     light = arm_from_dh([{**row, "mass": 0.0} for row in rows])
-    assert LoadBounds.of(Model(light)).rated == UNKNOWN
+    assert LoadBounds.of(Model(light)).rated == DEFAULT_RATED
     assert LoadBounds.of(Model(light, payload_mass=30.0)).rated == 30.0
     reported = replace(light, payload=2.0)
-    assert LoadBounds.of(Model(reported, payload_mass=2.5)).mass == pytest.approx(HEAVIEST * 2.0)
+    assert LoadBounds.of(Model(reported, payload_mass=2.5)).mass == pytest.approx(
+        PAYLOAD_FACTOR * 2.0
+    )

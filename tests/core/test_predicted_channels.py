@@ -11,7 +11,7 @@ from gapbridge.core.arm import builtin_arm
 from gapbridge.core.effects import Site, Term
 from gapbridge.core.log.log import Log
 from gapbridge.core.model import Model
-from gapbridge.core.predicted_channels import in_context, predicted_channels
+from gapbridge.core.predicted_channels import predicted_channels, with_neighbours
 
 RATE, COUNT = 250.0, 6000
 MODEL = Model(
@@ -36,7 +36,7 @@ def ragged(log: Log) -> Iterator[Log]:
 def test_every_row_comes_once_with_its_line_and_predicted_as_in_the_whole(log: Log) -> None:
     whole, _ = predicted_channels(MODEL, log)
     lines, parts = [], []
-    for around, own in in_context(ragged(log), 900):
+    for around, own in with_neighbours(ragged(log), 900):
         found, needs = predicted_channels(MODEL, around)
         assert not needs
         lines += [around.line(row) for row in range(len(around))[own]]
@@ -51,5 +51,5 @@ def test_every_row_comes_once_with_its_line_and_predicted_as_in_the_whole(log: L
 
 
 def test_a_short_log_comes_as_a_whole(log: Log) -> None:
-    ((around, own),) = in_context(ragged(log), COUNT)
+    ((around, own),) = with_neighbours(ragged(log), COUNT)
     assert (len(around), own) == (COUNT, slice(0, COUNT))

@@ -27,8 +27,8 @@ from gapbridge.bridge.document.provenance import fitted as fit_provenance
 from gapbridge.bridge.document.provenance import provenance
 from gapbridge.bridge.report.labels import unit_of
 from gapbridge.core.arrays import Array
-from gapbridge.core.calibration.accuracy_baseline import document_of
-from gapbridge.core.calibration.fit import SessionFit, fit_session, judged
+from gapbridge.core.calibration.accuracy_baseline import baseline_document
+from gapbridge.core.calibration.fit import SessionFit, evaluate_fit, fit_session
 from gapbridge.core.calibration.identifiability import identifiable_parameters
 from gapbridge.core.calibration.missing_effects import MissingEffect
 from gapbridge.core.calibration.plan import Plan
@@ -145,12 +145,12 @@ class CalibrationJob(Job):
         prompt.say()
         fit = run_fit(self.cell, options, prompt, self.session)
         fit, rejected = self._with_missing_effects(fit)
-        result = evaluate_fit(self.cell, options, prompt, self.session, fit, rejected)
+        result = evaluate_session(self.cell, options, prompt, self.session, fit, rejected)
         report_calibration(prompt, result)
         metrology = metrology_of(self.cell, options.instrument, self.session.station_count)
         write_log(result.readings, metrology.registered, folder / "readings.csv")
         origin = provenance({"log": [folder / "readings.csv"], "cell": [self.cell.path]})
-        baseline = document_of(result, sigma=metrology.sigma)
+        baseline = baseline_document(result, sigma=metrology.sigma)
         baseline |= {"verdict": calibration_text(result), "provenance": origin}
         write_document(folder / "promise.json", baseline)
         from gapbridge.bridge.calibration.jobs.facts import (
@@ -219,14 +219,14 @@ def run_fit(
         )  # fmt: skip
 
 
-def evaluate_fit(
+def evaluate_session(
     cell: Cell, options: SessionOptions, prompt: Prompt, session: Session, fit: SessionFit,
     rejected: tuple[str, ...],
 ) -> Calibration:  # fmt: skip
     """Return the fit, ``rejected`` effects noted, evaluated on the held-out poses."""
     assert session.plan is not None
     with prompt.waiting("verifying") as emit:
-        return judged(
+        return evaluate_fit(
             cell.model, fit, declined=rejected, expected=session.plan.expected,
             diagnose=options.instrument.measures in DIAGNOSABLE_KINDS,
             progress=lambda text: emit(f"verifying: {text}"),

@@ -28,12 +28,12 @@ from gapbridge.bridge.calibration.planning import (
 from gapbridge.bridge.calibration.session.session import seconds_left
 from gapbridge.bridge.document.notes import note_texts
 from gapbridge.core.arrays import Array
-from gapbridge.core.calibration.accuracy_baseline import baseline_in
+from gapbridge.core.calibration.accuracy_baseline import read_baseline
 from gapbridge.core.calibration.plan import Plan, PlannedPose
 from gapbridge.core.calibration.verify import Verification, verify
 from gapbridge.core.errors import InputError
-from gapbridge.core.planning.candidates import candidates_of
-from gapbridge.core.planning.travel import far_apart, joint_speed, leg_times, shortest_way
+from gapbridge.core.planning.candidates import sample_candidates
+from gapbridge.core.planning.travel import joint_speed, move_times, shortest_order, spread_rows
 
 POSES = 10
 
@@ -60,7 +60,7 @@ class VerifyJob(Job):
 
     def plan(self, begin: Array | None, emit: Callable[[str, float], None]) -> Plan:
         """Return poses far apart from each other, in the order of travel, load by load."""
-        baseline = baseline_in(self._baseline())
+        baseline = read_baseline(self._baseline())
         if baseline.kind != self.options.instrument.measures:
             raise InputError(
                 f"{baseline_path(self.cell.path)}: found a calibration by {baseline.kind}, "
@@ -71,16 +71,16 @@ class VerifyJob(Job):
         workspace = replace(workspace, places=workspace.places[:1])  # a few poses from one place
         observable = observable_of(self.cell, self.options.instrument)
         emit("looking for poses", 0.2)
-        candidates = candidates_of(
+        candidates = sample_candidates(
             baseline.parameters(self.cell.model), observable, loads, workspace, self.options.seed
         )
         count = min(self.options.poses or POSES, len(candidates.q))
-        chosen = far_apart(self.cell.model.rigid_pose(candidates.q).position, count)
+        chosen = spread_rows(self.cell.model.rigid_pose(candidates.q).position, count)
         speed = joint_speed(self.cell.arm.limits.velocity)
         poses: list[PlannedPose] = []
         for load, part in enumerate(np.array_split(chosen, len(loads))):
             q = candidates.q[part]
-            order = shortest_way(leg_times(q, q, speed), np.zeros(len(q)))
+            order = shortest_order(move_times(q, q, speed), np.zeros(len(q)))
             approach = np.zeros(q.shape[1])  # any
             poses += [
                 PlannedPose(len(poses) + i, q[k], load, approach, held_out=True)
@@ -114,7 +114,7 @@ class VerifyJob(Job):
         for file in write_report(VerificationData(verification, facts, readings), folder):
             prompt.say(f"{file}: written")
         moved = None if verification.moved is None else verification.moved.name
-        others = [other.name for other in verification.suspects]
+        others = [other.name for other in verification.alternatives]
         self.session.add("ended", holds=verification.holds, moved=moved, or_else=others)
 
     def _report(self, verification: Verification) -> None:
@@ -130,7 +130,7 @@ class VerifyJob(Job):
                 f"  {estimate.name} {quantity_text(estimate.value, estimate.unit)} "
                 f"± {quantity_text(estimate.std, estimate.unit)}"
             )
-        for other in verification.suspects:
+        for other in verification.alternatives:
             prompt.say(f"  these readings cannot distinguish it from: {change_text(other)}")
         for note in note_texts(verification.notes):
             prompt.say(f"  note: {note}")

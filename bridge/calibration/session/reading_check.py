@@ -19,7 +19,7 @@ from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.observables import make_observable
 from gapbridge.core.calibration.parameters import Parameters
 from gapbridge.core.calibration.plan import Payload
-from gapbridge.core.calibration.reading_fit import ReadingFit, at_one_place, fit_readings
+from gapbridge.core.calibration.reading_fit import ReadingFit, at_single_place, fit_readings
 from gapbridge.core.calibration.readings import Readings
 from gapbridge.core.errors import GapbridgeError
 from gapbridge.core.metrology import Metrology
@@ -126,7 +126,7 @@ class ReadingCheck:
     def _fit(self, before: Readings, new: Readings) -> ReadingFit | None:
         """Return the fit to the readings ``before``; None if they are too few or it fails."""
         registered = self._metrology.registered and int(new.station[0]) == 0
-        before, new = at_one_place(before), at_one_place(new)
+        before, new = at_single_place(before), at_single_place(new)
         observable = make_observable(self._kind, registered=registered, **self._options)
         layout = observable.layout(before if len(before) else new)
         needed = layout.size + REDUNDANCY.get(self._kind, 0)
@@ -134,7 +134,7 @@ class ReadingCheck:
         if observable.closes or (few and layout.size):
             return None
         if registered not in self._parameters:
-            self._parameters[registered] = Parameters.every(self._model, self._effects)
+            self._parameters[registered] = Parameters.of_effects(self._model, self._effects)
         parameters = self._parameters[registered]
         with contextlib.suppress(GapbridgeError):
             return fit_readings(before, new, parameters, observable, self._sigma)

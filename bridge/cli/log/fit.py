@@ -71,7 +71,7 @@ def fit(logs: tuple[Path, ...], cell: Path, remounted: bool, out: Path) -> None:
     spread = Spread.of_fit(estimate.identifiable, estimate.covariance).beside(opened.spread)
     intervals = opened.intervals | fit_intervals(estimate)
     origin = fitted(provenance({"log": logs, "cell": [cell]}), ranges, spread, intervals)
-    save_cell(opened, out, estimate.written, {"provenance": origin})
+    save_cell(opened, out, estimate.cell_model, {"provenance": origin})
     for line in warnings:
         click.echo(f"warning: {', '.join(map(str, logs))}: {line}", err=True)
     print_identification(estimate)

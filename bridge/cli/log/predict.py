@@ -25,7 +25,7 @@ from gapbridge.bridge.cli.progress import progress
 from gapbridge.bridge.document.output_file import require_table, writing_table
 from gapbridge.core.arrays import Array
 from gapbridge.core.log.log import Log
-from gapbridge.core.predicted_channels import in_context, predicted_channels
+from gapbridge.core.predicted_channels import predicted_channels, with_neighbours
 
 MAX_SHOWN = 8  # rows listed
 
@@ -72,7 +72,7 @@ def _predicted_pieces(cell: Cell, log: Path, channels: bool) -> Iterator[tuple[L
     if not channels:
         yield from ((piece, predict_log(cell, piece)) for piece in pieces)
         return
-    for context, rows in in_context(pieces):
+    for context, rows in with_neighbours(pieces):
         piece = context.select(rows)
         channels_of_context, needs = predicted_channels(cell.model, context)
         further = {name: values[rows] for name, values in channels_of_context.items()}

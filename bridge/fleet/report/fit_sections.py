@@ -36,7 +36,7 @@ def _lead(kind: FittedType) -> str:
         with_unit(float(np.sqrt(np.mean([getattr(s, name) ** 2 for s in sessions]))), "m")
         for name in ("gap_before", "gap_after", "gap_held_out")
     )
-    shown = kind.scatter.shown
+    shown = kind.scatter.identifiable
     spread = kind.scatter.between_arms[shown] / np.maximum(kind.scatter.mean[shown], 1e-12)
     scatter = (
         f"Arms of the type scatter by {percent(float(np.median(spread)))}." if len(spread)
@@ -67,7 +67,7 @@ def types(summary: FleetFit) -> list[blocks.Block]:
 
 def _parameter(kind: FittedType, j: int) -> list[blocks.Cell]:
     scatter = kind.scatter
-    if not scatter.shown[j]:
+    if not scatter.identifiable[j]:
         return [parameter_title(kind.parameters[j]), "not identifiable from any session", "–", "–"]
     mean, std = scatter.mean[j] * MICRO, np.sqrt(scatter.covariance[j, j]) * MICRO
     share = [float(s[j] / max(scatter.mean[j], 1e-12))
@@ -97,8 +97,8 @@ def arms(summary: FleetFit) -> list[blocks.Block]:
 
 
 def _arm(kind: FittedType, arm: FittedArm) -> list[blocks.Cell]:
-    shown = np.flatnonzero(kind.scatter.shown)
-    own = float(np.mean(arm.fit.own[shown])) if len(shown) else 0.0
+    shown = np.flatnonzero(kind.scatter.identifiable)
+    own = float(np.mean(arm.fit.own_share[shown])) if len(shown) else 0.0
     far = "–"
     if len(shown):
         j = int(shown[np.argmax(np.abs(arm.fit.beside_type[shown]))])
@@ -113,7 +113,7 @@ def _arms_drawn(kind: FittedType) -> Sequence[FittedArm]:
     """Return the arms in the picture: if there are many, those farthest from their type."""
     if len(kind.arms) <= MAX_DRAWN:
         return kind.arms
-    shown = kind.scatter.shown
+    shown = kind.scatter.identifiable
     far = [float(np.max(np.abs(a.fit.beside_type[shown]), initial=0.0)) for a in kind.arms]
     return [kind.arms[i] for i in sorted(np.argsort(far)[-MAX_DRAWN:])]
 
@@ -127,8 +127,9 @@ def _arms_text(drawn: Sequence[FittedArm], kind: FittedType) -> str:
 def _pictures(kind: FittedType) -> blocks.Gallery:
     """Return a picture per flexibility, selected by a menu: each arm's value and interval."""
     drawn = _arms_drawn(kind)
-    own = np.mean([arm.fit.own for arm in kind.arms], axis=0)
-    order = sorted(range(len(kind.parameters)), key=lambda j: (not kind.scatter.shown[j], -own[j]))
+    own = np.mean([arm.fit.own_share for arm in kind.arms], axis=0)
+    known = kind.scatter.identifiable
+    order = sorted(range(len(kind.parameters)), key=lambda j: (not known[j], -own[j]))
     titles = tuple(parameter_title(kind.parameters[j]) for j in order)
     return blocks.Gallery(
         (("Show", titles),), tuple(_picture(kind, drawn, j) for j in order),

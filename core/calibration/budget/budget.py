@@ -1,9 +1,9 @@
 """The uncertainty of one coordinate of the TCP after a calibration (GUM, JCGM 100:2008).
 
-The measurand is the distance, along one axis of the base, between the place where the calibrated
-model puts the TCP and the place where it is. Standard uncertainties combine in squares with their
-sensitivities (5.1.2); correlated parameters of the model go in together, as one input, through
-their covariance (5.2); degrees of freedom combine by Welch and Satterthwaite (G.4.1).
+The measurand is the error of the calibrated model's TCP along one axis of the base. Standard
+uncertainties combine in squares with their sensitivities (5.1.2); the correlated parameters of the
+model are one input, by their covariance (5.2); degrees of freedom combine by Welch and
+Satterthwaite (G.4.1).
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from scipy.special import bdtr, stdtr, stdtrit
 from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.budget.inputs import (
     Input,
-    model_remainder,
+    model_residual,
     outlier_readings,
     parameters_of_model,
     reading_noise,
@@ -28,7 +28,7 @@ from gapbridge.core.calibration.result import Calibration
 
 COVERAGE = 2.0  # k
 PROBABILITY = 0.9545  # of a normal distribution within two standard deviations
-RARE = 0.01  # a chance below which the held-out poses speak against the budget
+MIN_CHANCE = 0.01  # p-value below which the held-out errors contradict the budget
 LENGTH_95 = 2.796  # length of a 3D normal vector that 95 % stay below, in sigmas of a coordinate
 
 
@@ -39,9 +39,9 @@ class Budget:
     inputs: tuple[Input, ...]
     combined: float  # m
     freedom: float  # effective degrees of freedom
-    parameters: Sensitivities | None  # what stands behind the first input, parameter by parameter
-    inside: int  # of the held-out coordinates looked at, those whose error is within the bound
-    looked_at: int  # 0: none were held out, or they do not show the TCP's place
+    parameters: Sensitivities | None  # of the first input, by parameter
+    inside: int  # checked held-out coordinates with an error within the bound
+    looked_at: int  # checked held-out coordinates; 0: none held out, or not positions of the TCP
     bound: float  # m: k times combined uncertainty and measurement of one reading
 
     @property
@@ -51,13 +51,13 @@ class Budget:
 
     @property
     def coverage(self) -> float:
-        """Return the share of cases that k = 2 holds, by Student's distribution."""
+        """Return the coverage probability of k = 2, by Student's distribution."""
         freedom = self.freedom if np.isfinite(self.freedom) else 1e9
         return float(1 - 2 * stdtr(freedom, -COVERAGE))
 
     @property
     def needed_factor(self) -> float:
-        """Return the factor that 95.45 % ask for, by Student's distribution."""
+        """Return the coverage factor for 95.45 %, by Student's distribution."""
         if not np.isfinite(self.freedom):
             return COVERAGE
         return float(stdtrit(self.freedom, 0.5 + PROBABILITY / 2))
@@ -67,13 +67,13 @@ class Budget:
         """Return whether fewer held-out coordinates are inside the bound than chance allows."""
         if not self.looked_at:
             return False
-        # errors of one pose go together: they count as one look in three
+        # the three errors of one pose are correlated: they count as one
         looks, found = self.looked_at / 3, self.inside / 3
-        return bool(bdtr(np.floor(found), round(looks), self.coverage) < RARE)
+        return bool(bdtr(np.floor(found), round(looks), self.coverage) < MIN_CHANCE)
 
     @property
     def expanded_length(self) -> float:
-        """Return the distance from its place that the TCP keeps to in 95 % of all poses, m."""
+        """Return the 95 % quantile of the TCP's distance from its predicted place, m."""
         return LENGTH_95 * self.combined
 
 
@@ -81,24 +81,24 @@ def budget(calibration: Calibration) -> Budget:
     """Return the budget of a calibration."""
     reading = reading_noise(calibration)
     repeatability = repeatability_of_arm(calibration, reading)
-    behind = sensitivities(calibration)
-    parameters = parameters_of_model(calibration, behind)
+    sensitivity = sensitivities(calibration)
+    parameters = parameters_of_model(calibration, sensitivity)
     scatter = float(np.hypot(repeatability.std, reading))
-    remainder = model_remainder(calibration, parameters.std, scatter)
-    inputs = (parameters, repeatability, remainder)
+    model = model_residual(calibration, parameters.std, scatter)
+    inputs = (parameters, repeatability, model)
     combined = float(np.sqrt(sum(i.std**2 for i in inputs)))
     bound = COVERAGE * float(np.hypot(combined, reading))
-    errors = _looked_at(calibration)
+    errors = _checked_errors(calibration)
     return Budget(
-        inputs, combined, _effective(inputs, combined), behind, int((errors <= bound).sum()),
-        len(errors), bound,
+        inputs, combined, _effective_freedom(inputs, combined), sensitivity,
+        int((errors <= bound).sum()), len(errors), bound,
     )  # fmt: skip
 
 
-def _looked_at(calibration: Calibration) -> Array:
+def _checked_errors(calibration: Calibration) -> Array:
     """Return the sizes of the held-out coordinates that check the budget (M,), m.
 
-    None for readings that do not show the TCP's place: their errors are of something else.
+    None for readings that are not positions of the TCP.
     """
     held = calibration.held_out_after
     if calibration.readings.kind not in KINDS:
@@ -106,6 +106,6 @@ def _looked_at(calibration: Calibration) -> Array:
     return np.abs(held.vector[~np.isin(held.rows, outlier_readings(calibration))]).ravel()
 
 
-def _effective(inputs: tuple[Input, ...], combined: float) -> float:
+def _effective_freedom(inputs: tuple[Input, ...], combined: float) -> float:
     weight = sum(i.std**4 / i.freedom for i in inputs)
     return float(combined**4 / weight) if weight > 0 else float("inf")

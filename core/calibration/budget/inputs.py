@@ -1,4 +1,4 @@
-"""The inputs of an uncertainty budget: what a session says of each."""
+"""The inputs of an uncertainty budget, from the data of a session."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from gapbridge.core.calibration.budget.pose_accuracy import KINDS, repeats
 from gapbridge.core.calibration.budget.sensitivity import Sensitivities
 from gapbridge.core.calibration.result import Calibration
 
-ENOUGH = 12  # degrees of freedom from which repeats alone determine the arm's scatter
-FAR = 8.0  # times the median error: a held-out reading beyond is a blunder
-FEW = 0.05  # share of the held-out readings that may be blunders
+MIN_REPEATS_FREEDOM = 12  # degrees of freedom from which repeats determine the repeatability
+OUTLIER_FACTOR = 8.0  # times the median error, beyond which a held-out reading is an outlier
+MAX_OUTLIER_SHARE = 0.05  # of the held-out readings
 
 
 class Basis(Enum):
@@ -39,15 +39,15 @@ class Input:
 
 
 def outlier_readings(calibration: Calibration) -> NDArray[np.int64]:
-    """Return the rows of readings that no budget can speak for: blunders, not uncertainty.
+    """Return the rows of outliers, which a budget excludes.
 
     Those that the fit down-weighted, and single held-out ones far beyond all others.
     """
     held = calibration.held_out_after
-    usual = float(np.median(held.norm)) if len(held.rows) else 0.0
-    far = held.rows[held.norm > FAR * usual]
-    if len(far) > max(1, FEW * len(held.rows)):
-        far = far[:0]  # so many are no blunders: the model is wrong there
+    median = float(np.median(held.norm)) if len(held.rows) else 0.0
+    far = held.rows[held.norm > OUTLIER_FACTOR * median]
+    if len(far) > max(1, MAX_OUTLIER_SHARE * len(held.rows)):
+        far = far[:0]  # too many for outliers: the model is wrong there
     return np.unique(np.concatenate([calibration.outliers, far])).astype(np.int64)
 
 
@@ -60,9 +60,9 @@ def reading_noise(calibration: Calibration) -> float:
     return float(np.sqrt(np.mean(known**2))) if len(known) else 0.0
 
 
-def parameters_of_model(calibration: Calibration, behind: Sensitivities | None) -> Input:
-    """Return what the fit leaves unsure, all parameters together with their correlations."""
-    std = behind.combined if behind else 0.0
+def parameters_of_model(calibration: Calibration, sensitivity: Sensitivities | None) -> Input:
+    """Return the uncertainty of all parameters together, with their correlations."""
+    std = sensitivity.combined if sensitivity else 0.0
     if len(calibration.tcp_std):
         std = float(np.sqrt(np.mean(calibration.tcp_std**2) / 3))
     counts = len(calibration.covariance), calibration.after.vector.size
@@ -70,10 +70,10 @@ def parameters_of_model(calibration: Calibration, behind: Sensitivities | None) 
 
 
 def repeatability_of_arm(calibration: Calibration, reading: float) -> Input:
-    """Return the scatter of the arm, without the part of the instrument."""
+    """Return the repeatability of the arm, without the noise of the instrument."""
     groups = repeats(calibration.readings)
     freedom = sum(3 * (len(g) - 1) for g in groups)
-    if np.isfinite(calibration.repeatability) and freedom >= ENOUGH:
+    if np.isfinite(calibration.repeatability) and freedom >= MIN_REPEATS_FREEDOM:
         counts = len(groups), sum(len(g) for g in groups)
         return Input(Basis.REPEATS, calibration.repeatability, float(freedom), counts)
     std = float(np.sqrt(max(calibration.noise**2 - reading**2, 0.0)))
@@ -87,13 +87,13 @@ def _fit_freedom(calibration: Calibration) -> float:
     return float(max(calibration.after.vector.size - spent, 1))
 
 
-def model_remainder(calibration: Calibration, parameters: float, noise: float) -> Input:
-    """Return what the held-out poses show beyond parameters, arm and instrument."""
+def model_residual(calibration: Calibration, parameters: float, noise: float) -> Input:
+    """Return the error of the held-out poses in excess of parameters, arm and instrument."""
     held_out = len(calibration.held_out_after.vector) > 0
     chosen = calibration.held_out_after if held_out else calibration.after
     outliers = np.intersect1d(outlier_readings(calibration), chosen.rows)
     errors = chosen.vector[~np.isin(chosen.rows, outliers)]
-    # of readings that show no place the parameters' share is not known: none is taken off
+    # of readings that are not positions the parameters' share is unknown: none is subtracted
     share = parameters if held_out and calibration.readings.kind in KINDS else 0.0
     excess = float(np.mean(errors**2)) - noise**2 - share**2
     std, rows = float(np.sqrt(max(excess, 0.0))), tuple(int(r) for r in outliers)

@@ -18,8 +18,8 @@ from gapbridge.core.calibration.readings import Readings
 from gapbridge.core.calibration.result import Calibration, Errors
 from gapbridge.core.rotation import rotation_matrix, rotation_vector
 
-KINDS = ("position", "pose")  # of readings that show where the TCP is
-SAME = 2e-4  # rad: encoders that differ by more were not given the same command
+KINDS = ("position", "pose")  # of readings that are positions of the TCP
+SAME_COMMAND = 2e-4  # rad: repeats whose encoders differ by more had different commands
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class PoseAccuracy:
     deviation: float  # m, S_l
     turn: Array | None  # (3,) rad, AP_a, AP_b, AP_c after, about the base's axes; None: unmeasured
     angles: Array | None  # (3,) rad, RP_a, RP_b, RP_c about the base's axes; None: unmeasured
-    steered: bool  # True: encoders differed, and what the model makes of that was taken out
+    steered: bool  # True: encoders differed, and the predicted difference was subtracted
 
     @property
     def accuracy(self) -> tuple[float, float]:
@@ -49,15 +49,15 @@ class PoseAccuracy:
 
 
 def pose_accuracies(calibration: Calibration) -> tuple[PoseAccuracy, ...]:
-    """Return AP and RP of every pose that was visited at least twice from the same side.
+    """Return AP and RP of every pose with two or more visits from the same side.
 
-    Nothing for readings that do not show where the TCP is.
+    None for readings that are not positions of the TCP.
     """
     readings = calibration.readings
     if readings.kind not in KINDS:
         return ()
-    before = _all(len(readings), calibration.before, calibration.held_out_before)
-    after = _all(len(readings), calibration.after, calibration.held_out_after)
+    before = _by_reading(len(readings), calibration.before, calibration.held_out_before)
+    after = _by_reading(len(readings), calibration.after, calibration.held_out_after)
     known = np.isfinite(before[:, 0])
     known[calibration.outliers] = False
     return tuple(
@@ -68,7 +68,7 @@ def pose_accuracies(calibration: Calibration) -> tuple[PoseAccuracy, ...]:
 def repeats(readings: Readings, known: NDArray[np.bool_] | None = None) -> list[Index]:
     """Return the rows of each pose that was visited at least twice.
 
-    Same pose, load, place of the instrument, target and side that the joints came from.
+    Same pose, load, place of the instrument, target and direction of approach.
     """
     keys = [readings.pose, readings.load, readings.station, readings.target]
     if readings.loads.approach is not None:
@@ -80,7 +80,7 @@ def repeats(readings: Readings, known: NDArray[np.bool_] | None = None) -> list[
     return [rows for rows in found if len(rows) > 1]
 
 
-def _all(count: int, *parts: Errors) -> Array:
+def _by_reading(count: int, *parts: Errors) -> Array:
     vector = np.full((count, 3), np.nan)
     for part in parts:
         if len(part.vector):
@@ -92,16 +92,16 @@ def _accuracy(calibration: Calibration, rows: Index, before: Array, after: Array
     readings = calibration.readings[rows]
     frame = calibration.stations[int(readings.station[0])]
     attained = frame.in_base(readings.value[:, :3])
-    steered = bool(np.ptp(readings.q, axis=0).max() > SAME)
-    wanted = calibration.model.predict(readings.q, readings.loads)
+    steered = bool(np.ptp(readings.q, axis=0).max() > SAME_COMMAND)
+    predicted = calibration.model.predict(readings.q, readings.loads)
     if steered:
-        attained = attained - (wanted.position - wanted.position.mean(axis=0))
+        attained = attained - (predicted.position - predicted.position.mean(axis=0))
     distance = np.linalg.norm(attained - attained.mean(axis=0), axis=1)
     turn = angles = None
     if readings.kind == "pose":
         rotation = frame.rotation_in_base(rotation_matrix(readings.value[:, 3:]))
         # small angles add up like a vector, so that no order of rotations has to be chosen
-        turns = rotation_vector(rotation @ np.swapaxes(wanted.rotation, 1, 2))
+        turns = rotation_vector(rotation @ np.swapaxes(predicted.rotation, 1, 2))
         turn, angles = turns.mean(axis=0), 3 * turns.std(axis=0, ddof=1)
     return PoseAccuracy(
         int(readings.pose[0]), int(readings.load[0]), len(rows), before.mean(axis=0),

@@ -1,4 +1,4 @@
-"""How much each parameter of a calibration moves the tool (GUM 5.1.3: sensitivity coefficients)."""
+"""Sensitivity coefficients of the TCP by the parameters of a calibration (GUM 5.1.3)."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from gapbridge.core.errors import InputError
 
 @dataclass(frozen=True)
 class Sensitivity:
-    """One parameter's part in the uncertainty of one coordinate of the TCP."""
+    """One parameter's contribution to the uncertainty of one coordinate of the TCP."""
 
     name: str
     unit: str
@@ -23,20 +23,20 @@ class Sensitivity:
 
     @property
     def contribution(self) -> float:
-        """Return what it would make alone, m."""
+        """Return the uncertainty due to this parameter alone, m."""
         return self.coefficient * self.std
 
 
 @dataclass(frozen=True)
 class Sensitivities:
-    """All parameters, and what their correlations add or take away."""
+    """All parameters, and the contribution of their correlations."""
 
     each: tuple[Sensitivity, ...]
     combined: float  # m, of one coordinate, all parameters with their correlations
 
     @property
     def correlation(self) -> float:
-        """Return what correlations add to the sum of squares, m2; negative where they take away."""
+        """Return the contribution of correlations to the sum of squares, m2; may be negative."""
         return self.combined**2 - sum(s.contribution**2 for s in self.each)
 
 
@@ -62,9 +62,9 @@ def sensitivities(calibration: Calibration) -> Sensitivities | None:
 def _columns(calibration: Calibration, names: list[str]) -> Array | None:
     """Return d TCP / d parameter (M, 3, p) at the calibrated model; None for an unknown name."""
     try:
-        own = parameters_named(calibration.model, names, "calibration")
+        parameters = parameters_named(calibration.model, names, "calibration")
     except InputError:
         return None
     readings = calibration.readings
     chosen = readings[readings.held_out] if readings.held_out.any() else readings
-    return own.tcp_jacobian(np.zeros(len(own)), chosen.q, chosen.loads)
+    return parameters.tcp_jacobian(np.zeros(len(parameters)), chosen.q, chosen.loads)

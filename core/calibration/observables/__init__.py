@@ -1,4 +1,4 @@
-"""What an instrument says about the TCP: one base, one file a kind, one table."""
+"""Kinds of readings of the TCP: one base class, one file a kind, one table."""
 
 from __future__ import annotations
 

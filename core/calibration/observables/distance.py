@@ -17,9 +17,9 @@ from gapbridge.core.model import Poses
 
 @dataclass(frozen=True)
 class Distance(Observable):
-    """Distance (m) from a fixed point, which nobody knows, to a target; each place has its own."""
+    """Distance (m) from an unknown fixed point to a target; each place has a separate point."""
 
-    registered: bool = False  # is no use here: the fixed point is always found along
+    registered: bool = False  # not used: the fixed point is always estimated
     zeroed: bool = False  # True: readings count from an unknown zero of the place (a dial gauge)
     kind: ClassVar[str] = "distance"
     width: ClassVar[int] = 1
@@ -37,26 +37,26 @@ class Distance(Observable):
         return readings.value - self.reading(poses, readings, nuisance)
 
     def reading(self, poses: Poses, readings: Readings, nuisance: Nuisance) -> Array:
-        """Return the distance from the place's fixed point, its zero taken off (N, 1)."""
+        """Return the distance from the place's fixed point, minus its zero (N, 1), m."""
         points = np.array([point_of(place) for place in nuisance.stations])
-        apart = self.seen(poses, readings, nuisance) - points[readings.station]
-        long = np.linalg.norm(apart, axis=1) - nuisance.lengths[readings.station]
-        return np.asarray(long[:, None])
+        offset = self.target_position(poses, readings, nuisance) - points[readings.station]
+        distance = np.linalg.norm(offset, axis=1) - nuisance.lengths[readings.station]
+        return np.asarray(distance[:, None])
 
-    def guess(self, poses: Poses, readings: Readings) -> Nuisance:
+    def initial_nuisance(self, poses: Poses, readings: Readings) -> Nuisance:
         """Return the points by trilateration; an unknown zero is tried over the arm's reach."""
         layout = self.layout(readings)
         points, zeros = [], np.zeros(layout.stations)
         for s in range(layout.stations):
-            own = readings.station == s
-            position, value = poses.position[own], readings.value[own, 0]
+            rows = readings.station == s
+            position, value = poses.position[rows], readings.value[rows, 0]
             reach = float(np.ptp(poses.position, axis=0).max(initial=0.0))
             tried = np.linspace(0, reach, 21) if self.zeroed else np.zeros(1)
-            left = []
+            fits = []
             for zero in tried:
                 point = trilaterated(position, value + zero)
                 gap = np.linalg.norm(position - point, axis=1) - zero - value
-                left.append((float(np.median(np.abs(gap))), float(zero), point))
-            _, zeros[s], point = min(left, key=lambda one: one[0])
+                fits.append((float(np.median(np.abs(gap))), float(zero), point))
+            _, zeros[s], point = min(fits, key=lambda one: one[0])
             points.append(fixed_at(point))
         return Nuisance(tuple(points), np.zeros((layout.targets, 3)), zeros)

@@ -1,4 +1,4 @@
-"""Points that stand still in the cell: spheres fitted to where the targets were."""
+"""Fixed points of the cell, from distances or spheres fitted to target positions."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import numpy as np
 from gapbridge.core.arrays import Array
 from gapbridge.core.estimation.registration import Registration
 
-TINY = 1e-9  # m: nearer to the point than this, no direction is known
+TINY = 1e-9  # m, smallest distance with a defined direction
 
 
 def fixed_at(point: Array) -> Registration:
@@ -23,7 +23,7 @@ def point_of(place: Registration) -> Array:
 def trilaterated(position: Array, distance: Array) -> Array:
     """Return the point (3,) at given distances (N,) from positions (N, 3), by linear least squares.
 
-    In |p - c|^2 = d^2 the unknown |c|^2 is taken as a fourth number.
+    |p - c|^2 = d^2 is linear in c with |c|^2 as a fourth unknown.
     """
     middle = position.mean(axis=0)
     p = position - middle
@@ -32,7 +32,7 @@ def trilaterated(position: Array, distance: Array) -> Array:
     return np.asarray(np.linalg.lstsq(A, right, rcond=1e-9)[0][:3] + middle)
 
 
-def sphere_through(position: Array) -> tuple[Array, float]:
+def fitted_sphere(position: Array) -> tuple[Array, float]:
     """Return centre (3,) and radius of the sphere nearest to positions (N, 3), least squares."""
     middle = position.mean(axis=0)
     p = position - middle

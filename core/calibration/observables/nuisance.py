@@ -1,4 +1,4 @@
-"""What is unknown beside the arm: where the instrument stands, and where its targets sit."""
+"""The nuisance parameters: places of the instrument, points of its targets."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from gapbridge.core.estimation.registration import IDENTITY, Registration
 
 @dataclass(frozen=True)
 class Layout:
-    """Which numbers of a Nuisance are unknown, in the order of a step."""
+    """Which values of a Nuisance are unknown, in the order of a step."""
 
     stations: int
     targets: int
@@ -32,12 +32,12 @@ class Nuisance:
     """Frames of the instrument's places, points of the targets, lengths of S places."""
 
     stations: tuple[Registration, ...]  # measured = rotation @ position_in_base + position
-    targets: Array  # (T, 3) m, TCP axes: each ball seen from the TCP
+    targets: Array  # (T, 3) m, TCP frame: position of each ball
     lengths: Array  # (S,) m: radius of a touched sphere, zero of a gauge
 
     @classmethod
     def zero(cls, stations: int = 1, targets: int = 1) -> Nuisance:
-        """Return instruments that stand in base, and targets at the TCP."""
+        """Return instruments with the frame of base, and targets at the TCP."""
         return cls((IDENTITY,) * stations, np.zeros((targets, 3)), np.zeros(stations))
 
     def frames(self, station: Index) -> tuple[Array, Array]:
@@ -47,7 +47,7 @@ class Nuisance:
         return rotation[station], position[station]
 
     def moved(self, step: Array, layout: Layout) -> Nuisance:
-        """Return the nuisance after a step (m,) of what is unknown in it."""
+        """Return the nuisance after a step (m,) of its unknown values."""
         stations, targets, lengths = list(self.stations), self.targets.copy(), self.lengths.copy()
         at, frame = 0, list(layout.frame)
         for s in range(layout.stations):

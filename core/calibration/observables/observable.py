@@ -1,8 +1,8 @@
-"""The base of the observables: what a reading is, and how it depends on arm and instrument.
+"""The base of the observables: a reading as a function of arm and instrument.
 
-A member says what its instrument reads at given poses of the TCP and how a reading differs from
-that; derivatives of the poses come from the effects (core.estimation.pose_jacobian) and are chained
-with those of the reading, so that every effect of the catalogue enters every kind by the same code.
+A member predicts the reading of its instrument for given TCP poses, and the residual of a reading.
+Derivatives of the poses by the effects (core.estimation.pose_jacobian) are chained with those of
+the reading: the same code for every effect and kind.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from gapbridge.core.estimation.robust import start_weights
 from gapbridge.core.model import Model, Poses
 from gapbridge.core.rotation import one_rotation_matrix
 
-STEP = 1e-5  # m and rad, of a nuisance: the gap is all but linear in it
-CONVERGED = 1e-9  # m and rad: a smaller step moves nothing that anybody measures
+STEP = 1e-5  # m and rad, of numerical derivatives by a nuisance
+CONVERGED = 1e-9  # m and rad, step size
 ROUNDS = 30
 
 
@@ -33,10 +33,10 @@ class Observable(ABC):
     kind: ClassVar[str]
     width: ClassVar[int]  # numbers of a reading (Readings.value)
     equations: ClassVar[int]  # numbers in which a reading is compared with its prediction (k)
-    frame: ClassVar[tuple[int, ...]]  # what of a place's frame the readings depend on
-    unknown: ClassVar[bool] = False  # the places are unknown whether registered or not
-    closes: ClassVar[bool] = False  # the arm was brought to something: no instrument reads a value
-    first_target: ClassVar[int] = 1  # target 0 is the TCP; those from here on are unknown points
+    frame: ClassVar[tuple[int, ...]]  # components of a place's frame that the readings depend on
+    unknown: ClassVar[bool] = False  # the places are unknown, registered or not
+    closes: ClassVar[bool] = False  # the arm touches an object: joint angles are the only reading
+    first_target: ClassVar[int] = 1  # target 0 is the TCP; from this one on the points are unknown
     registered: bool
 
     @property
@@ -58,11 +58,11 @@ class Observable(ABC):
         """Return what the instrument would read (N, width), in its own frame."""
 
     @abstractmethod
-    def guess(self, poses: Poses, readings: Readings) -> Nuisance:
+    def initial_nuisance(self, poses: Poses, readings: Readings) -> Nuisance:
         """Return a nuisance to start from, for predicted TCP poses of the readings."""
 
     def layout(self, readings: Readings) -> Layout:
-        """Return which numbers beside the arm's are unknown in these readings."""
+        """Return which nuisance parameters are unknown in these readings."""
         frame = () if self.registered and not self.unknown else self.frame
         stations = int(readings.station.max(initial=0)) + 1
         return Layout(
@@ -91,7 +91,7 @@ class Observable(ABC):
     ) -> tuple[Array, Array]:
         """Return J (N*k, p) and F (N*k, m): residual(new) = residual - J step - F nuisance step.
 
-        ``layout`` of all readings, where these are a part of them.
+        ``layout``: that of all readings, where these are some of them.
         """
         moved = parameters.pose_columns(values, readings.q, readings.loads)
         jacobian = self.jacobian(moved.poses, readings, nuisance)
@@ -99,9 +99,9 @@ class Observable(ABC):
         return J, self.nuisance_columns(moved.poses, readings, nuisance, layout)
 
     def jacobian(self, poses: Poses, readings: Readings, nuisance: Nuisance) -> Array:
-        """Return how the gap changes (N, k, 6) with the TCP's shift and turn, base axes.
+        """Return d gap / d (TCP translation, rotation) as (N, k, 6), base axes.
 
-        By differences, which cost no prediction; members with plain derivatives return those.
+        By central differences; overridden where there is a closed form.
         """
         found = np.empty((len(readings), self.equations, 6))
         for axis in range(3):
@@ -138,16 +138,16 @@ class Observable(ABC):
         return F
 
     def start(self, model: Model, readings: Readings) -> Nuisance:
-        """Return the nuisance that fits best to the model as it stands, outliers or not.
+        """Return the nuisance fitted to the model's predictions, outliers down-weighted.
 
-        Raises ExcitationError where there are too few readings to know where the instrument is.
+        Raises ExcitationError where there are too few readings to determine it.
         """
         self._require(readings)
         poses = model.predict(readings.q, readings.loads)
-        return self.refined(poses, readings, self.guess(poses, readings))
+        return self.refined(poses, readings, self.initial_nuisance(poses, readings))
 
     def refined(self, poses: Poses, readings: Readings, nuisance: Nuisance) -> Nuisance:
-        """Return the nuisance moved to where it fits best, outliers down-weighted."""
+        """Return the nuisance fitted from a start, outliers down-weighted."""
         layout = self.layout(readings)
         if not layout.size:
             return nuisance
@@ -162,12 +162,12 @@ class Observable(ABC):
                 break
         return nuisance
 
-    def brought(self, model: Model, q: Array, readings: Readings, nuisance: Nuisance) -> Array:
-        """Return joints (N, n) near ``q`` at which a reading can be taken; here ``q`` itself."""
+    def solve_joints(self, model: Model, q: Array, readings: Readings, nuisance: Nuisance) -> Array:
+        """Return joints (N, n), rad, near ``q`` at which a reading can be taken; here ``q``."""
         return q
 
-    def seen(self, poses: Poses, readings: Readings, nuisance: Nuisance) -> Array:
-        """Return where each reading's target is (N, 3), base."""
+    def target_position(self, poses: Poses, readings: Readings, nuisance: Nuisance) -> Array:
+        """Return each reading's target (N, 3), m, base."""
         offset = nuisance.targets[readings.target]
         return np.asarray(poses.position + np.einsum("nij,nj->ni", poses.rotation, offset))
 

@@ -12,7 +12,7 @@ from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.observables.nuisance import Nuisance
 from gapbridge.core.calibration.observables.observable import Observable
 from gapbridge.core.calibration.observables.position import (
-    FEWEST,
+    MIN_POINTS,
     in_instrument,
     measured_in_base,
     station_frame,
@@ -42,38 +42,41 @@ class Pose(Observable):
 
     def gap(self, poses: Poses, readings: Readings, nuisance: Nuisance) -> Array:
         """Return measured minus predicted (N, 6): position, then the turn between them."""
-        shift = measured_in_base(readings, nuisance) - self.seen(poses, readings, nuisance)
+        target = self.target_position(poses, readings, nuisance)
         frames = nuisance.frames(readings.station)[0]
         measured = np.swapaxes(frames, 1, 2) @ rotation_matrix(readings.value[:, 3:])
+        shift = measured_in_base(readings, nuisance) - target
         return np.hstack([shift, rotation_vector(measured @ np.swapaxes(poses.rotation, 1, 2))])
 
     def reading(self, poses: Poses, readings: Readings, nuisance: Nuisance) -> Array:
         """Return position and rotation vector in the instrument's frame (N, 6)."""
-        position = in_instrument(self.seen(poses, readings, nuisance), readings, nuisance)
+        target = self.target_position(poses, readings, nuisance)
+        position = in_instrument(target, readings, nuisance)
         rotation = nuisance.frames(readings.station)[0] @ poses.rotation
         return np.hstack([position, rotation_vector(rotation)])
 
-    def guess(self, poses: Poses, readings: Readings) -> Nuisance:
+    def initial_nuisance(self, poses: Poses, readings: Readings) -> Nuisance:
         """Return frames from the positions of each place, or from its rotations if too few."""
         layout = self.layout(readings)
         nuisance = Nuisance.zero(layout.stations, layout.targets)
         if layout.frame:
             frames = []
             for s in range(layout.stations):
-                own = readings.station == s
-                few = own.sum() <= FEWEST
-                found = _turned(poses, readings, own) if few else station_frame(poses, readings, s)
-                frames.append(found)
+                rows = readings.station == s
+                if rows.sum() > MIN_POINTS:
+                    frames.append(station_frame(poses, readings, s))
+                else:
+                    frames.append(_frame_of_rotations(poses, readings, rows))
             nuisance = Nuisance(tuple(frames), nuisance.targets, nuisance.lengths)
         return with_targets(poses, readings, nuisance)
 
 
-def _turned(poses: Poses, readings: Readings, own: NDArray[np.bool_]) -> Registration:
+def _frame_of_rotations(poses: Poses, readings: Readings, rows: NDArray[np.bool_]) -> Registration:
     """Return the frame that the measured rotations of some readings determine."""
-    if not own.any():
+    if not rows.any():
         return Registration(np.eye(3), np.zeros(3))
-    turns = rotation_matrix(readings.value[own, 3:]) @ np.swapaxes(poses.rotation[own], 1, 2)
+    turns = rotation_matrix(readings.value[rows, 3:]) @ np.swapaxes(poses.rotation[rows], 1, 2)
     U, _, Vt = np.linalg.svd(turns.sum(axis=0))
     rotation = U @ np.diag([1, 1, np.sign(np.linalg.det(U @ Vt))]) @ Vt
-    position = np.median(readings.value[own, :3] - poses.position[own] @ rotation.T, axis=0)
+    position = np.median(readings.value[rows, :3] - poses.position[rows] @ rotation.T, axis=0)
     return Registration(rotation, position)

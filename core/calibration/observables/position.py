@@ -15,7 +15,7 @@ from gapbridge.core.estimation.registration import Registration, register_robust
 from gapbridge.core.model import Poses
 from gapbridge.core.rotation import skew
 
-FEWEST = 3  # points that fix a frame
+MIN_POINTS = 3  # points that determine a frame
 
 
 @dataclass(frozen=True)
@@ -30,19 +30,20 @@ class Position(Observable):
 
     def gap(self, poses: Poses, readings: Readings, nuisance: Nuisance) -> Array:
         """Return measured minus predicted position (N, 3), base axes."""
-        return measured_in_base(readings, nuisance) - self.seen(poses, readings, nuisance)
+        target = self.target_position(poses, readings, nuisance)
+        return measured_in_base(readings, nuisance) - target
 
     def jacobian(self, poses: Poses, readings: Readings, nuisance: Nuisance) -> Array:
-        """Return how the gap changes (N, 3, 6) with the TCP's shift and turn."""
+        """Return d gap / d (TCP translation, rotation) as (N, 3, 6), base axes."""
         lever = np.einsum("nij,nj->ni", poses.rotation, nuisance.targets[readings.target])
         shift = np.broadcast_to(-np.eye(3), (len(lever), 3, 3))
         return np.concatenate([shift, skew(lever)], axis=2)
 
     def reading(self, poses: Poses, readings: Readings, nuisance: Nuisance) -> Array:
         """Return the position in the instrument's frame (N, 3)."""
-        return in_instrument(self.seen(poses, readings, nuisance), readings, nuisance)
+        return in_instrument(self.target_position(poses, readings, nuisance), readings, nuisance)
 
-    def guess(self, poses: Poses, readings: Readings) -> Nuisance:
+    def initial_nuisance(self, poses: Poses, readings: Readings) -> Nuisance:
         """Return frames from the readings of each place, then the targets' points."""
         layout = self.layout(readings)
         nuisance = Nuisance.zero(layout.stations, layout.targets)
@@ -59,16 +60,16 @@ def measured_in_base(readings: Readings, nuisance: Nuisance) -> Array:
 
 
 def in_instrument(position: Array, readings: Readings, nuisance: Nuisance) -> Array:
-    """Return positions in base (N, 3) as the frame of each reading's place has them."""
+    """Return positions (N, 3) of base in the frame of each reading's place."""
     rotation, origin = nuisance.frames(readings.station)
     return np.asarray(np.einsum("nij,nj->ni", rotation, position) + origin)
 
 
 def station_frame(poses: Poses, readings: Readings, station: int) -> Registration:
     """Return the frame of one place, from target 0 where it was read often enough."""
-    own = readings.station == station
-    first = own & (readings.target == 0)
-    use = first if first.sum() >= FEWEST else own
+    rows = readings.station == station
+    first = rows & (readings.target == 0)
+    use = first if first.sum() >= MIN_POINTS else rows
     if not use.any():
         return Registration(np.eye(3), np.zeros(3))
     return register_robustly(readings.value[use, :3], poses.position[use])
@@ -80,7 +81,7 @@ def with_targets(poses: Poses, readings: Readings, nuisance: Nuisance) -> Nuisan
     gap = measured_in_base(readings, nuisance) - poses.position
     in_tool = np.einsum("nji,nj->ni", poses.rotation, gap)
     for t in range(1, len(targets)):
-        own = readings.target == t
-        if own.any():
-            targets[t] = np.median(in_tool[own], axis=0)
+        rows = readings.target == t
+        if rows.any():
+            targets[t] = np.median(in_tool[rows], axis=0)
     return Nuisance(nuisance.stations, targets, nuisance.lengths)

@@ -1,7 +1,6 @@
-"""Bringing the arm to something that stands still, with joint angles as the only reading.
+"""Contact of the tool with a fixed object, with joint angles as the only reading.
 
-A point fixed in the cell, met with the tool's tip from many sides; a sphere, touched with a ball on
-the tool.
+The tool's tip on a fixed point from many sides, or a ball on the tool touching a fixed sphere.
 """
 
 from __future__ import annotations
@@ -15,9 +14,9 @@ import numpy as np
 from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.observables.fixed_point import (
     TINY,
+    fitted_sphere,
     fixed_at,
     point_of,
-    sphere_through,
     trilaterated,
 )
 from gapbridge.core.calibration.observables.nuisance import Nuisance
@@ -27,13 +26,13 @@ from gapbridge.core.model import Model, Poses
 from gapbridge.core.rotation import skew
 
 NEWTON_ROUNDS = 25
-CLOSED = 1e-10  # m
-MISSED = 1e-6  # m: farther off than this, no pose was found
-LONGEST = 0.3  # rad, of one joint in a step
+GAP_CONVERGED = 1e-10  # m
+MAX_GAP = 1e-6  # m: a larger gap counts as not converged
+MAX_STEP = 0.3  # rad, of one joint in a step
 
 
 class Closure(Observable):
-    """A kind without an instrument: the target touches where the gap is zero."""
+    """A kind without an instrument: the target is in contact where the gap is zero."""
 
     closes = True
     unknown = True
@@ -41,70 +40,71 @@ class Closure(Observable):
     width: ClassVar[int] = 0
 
     @abstractmethod
-    def directions(self, apart: Array) -> Array:
-        """Return the directions (N, k, 3) that measure the gap; ``apart`` (N, 3) is seen."""
+    def directions(self, offset: Array) -> Array:
+        """Return the directions (N, k, 3) of the gap for an ``offset`` (N, 3), m, base."""
 
-    def apart(self, poses: Poses, readings: Readings, nuisance: Nuisance) -> Array:
-        """Return the way from the place's fixed point to the target (N, 3), base."""
+    def offset(self, poses: Poses, readings: Readings, nuisance: Nuisance) -> Array:
+        """Return the vector from the place's fixed point to the target (N, 3), m, base."""
         points = np.array([point_of(place) for place in nuisance.stations])
-        return np.asarray(self.seen(poses, readings, nuisance) - points[readings.station])
+        target = self.target_position(poses, readings, nuisance)
+        return np.asarray(target - points[readings.station])
 
     def reading(self, poses: Poses, readings: Readings, nuisance: Nuisance) -> Array:
         """Return nothing (N, 0): no instrument is read."""
         return np.zeros((len(readings), 0))
 
-    def brought(self, model: Model, q: Array, readings: Readings, nuisance: Nuisance) -> Array:
-        """Return joints (N, n) near ``q`` that close the gap; rows of nan where none are found.
+    def solve_joints(self, model: Model, q: Array, readings: Readings, nuisance: Nuisance) -> Array:
+        """Return joints (N, n), rad, near ``q`` that close the gap; rows of nan where none do.
 
-        Newton with the smallest step in joint space; ``readings`` give load, place and target.
+        Newton with the smallest step in joint space; ``readings`` hold load, place and target.
         """
-        q, open_rows = q.copy(), np.arange(len(q))
+        q, rows = q.copy(), np.arange(len(q))
         for _ in range(NEWTON_ROUNDS):
-            part, at = readings[open_rows], q[open_rows]
-            poses = model.predict(at, part.loads)
+            part, q_rows = readings[rows], q[rows]
+            poses = model.predict(q_rows, part.loads)
             gap = self.gap(poses, part, nuisance)
-            left = np.abs(gap).max(axis=1) > CLOSED
-            if not left.any():
+            unsolved = np.abs(gap).max(axis=1) > GAP_CONVERGED
+            if not unsolved.any():
                 return q
-            step = self._step(model, poses, at, part, nuisance)
-            q[open_rows[left]] += step[left]
-            open_rows = open_rows[left]
+            step = self._step(model, poses, q_rows, part, nuisance)
+            q[rows[unsolved]] += step[unsolved]
+            rows = rows[unsolved]
         gap = self.gap(model.predict(q, readings.loads), readings, nuisance)
-        q[np.abs(gap).max(axis=1) > MISSED] = np.nan
+        q[np.abs(gap).max(axis=1) > MAX_GAP] = np.nan
         return q
 
     def _step(
         self, model: Model, poses: Poses, q: Array, readings: Readings, nuisance: Nuisance
     ) -> Array:
-        """Return the smallest steps (N, n) that close the gap to first order, cut to size."""
+        """Return the smallest steps (N, n), rad, that close the gap to first order, limited."""
         whole = model.linear_form(q, readings.loads).jacobian
         lever = np.einsum("nij,nj->ni", poses.rotation, nuisance.targets[readings.target])
         moving = whole[:, :3] - skew(lever) @ whole[:, 3:]
-        J = self.directions(self.apart(poses, readings, nuisance)) @ moving
+        J = self.directions(self.offset(poses, readings, nuisance)) @ moving
         gap = self.gap(poses, readings, nuisance)
         step = np.einsum("njk,nk->nj", np.linalg.pinv(J, rcond=1e-6), gap)
         size = np.abs(step).max(axis=1, keepdims=True)
-        return np.asarray(step * np.minimum(1.0, LONGEST / np.maximum(size, 1e-12)))
+        return np.asarray(step * np.minimum(1.0, MAX_STEP / np.maximum(size, 1e-12)))
 
 
 @dataclass(frozen=True)
 class Point(Closure):
-    """The target stands on a point that nobody knows, the same one at each reading of a place."""
+    """The target is at an unknown fixed point, the same for all readings of a place."""
 
     registered: bool = False
     kind: ClassVar[str] = "point"
     equations: ClassVar[int] = 3
 
     def gap(self, poses: Poses, readings: Readings, nuisance: Nuisance) -> Array:
-        """Return the way from the target to the point (N, 3), base axes."""
-        return -self.apart(poses, readings, nuisance)
+        """Return the vector from the target to the point (N, 3), m, base axes."""
+        return -self.offset(poses, readings, nuisance)
 
-    def directions(self, apart: Array) -> Array:
+    def directions(self, offset: Array) -> Array:
         """Return the base axes (N, 3, 3)."""
-        return np.broadcast_to(np.eye(3), (len(apart), 3, 3))
+        return np.broadcast_to(np.eye(3), (len(offset), 3, 3))
 
-    def guess(self, poses: Poses, readings: Readings) -> Nuisance:
-        """Return the middle of where the target was."""
+    def initial_nuisance(self, poses: Poses, readings: Readings) -> Nuisance:
+        """Return the median target position of each place."""
         layout = self.layout(readings)
         places = []
         for s in range(layout.stations):
@@ -115,10 +115,10 @@ class Point(Closure):
 
 @dataclass(frozen=True)
 class Sphere(Closure):
-    """The target touches a sphere: it stands one radius from a centre that nobody knows.
+    """The target touches a sphere: it is one radius away from an unknown centre.
 
-    ``radius`` (m) is the sphere's and the ball's together; None: found along, and with it the size
-    of the arm is known by its drawing alone.
+    ``radius`` (m) is the sum of the sphere's and the ball's; None: it is estimated, and the
+    readings then determine no absolute length.
     """
 
     registered: bool = False
@@ -132,23 +132,23 @@ class Sphere(Closure):
         return self.radius is None
 
     def gap(self, poses: Poses, readings: Readings, nuisance: Nuisance) -> Array:
-        """Return how far the target is inside the sphere (N, 1)."""
-        long = np.linalg.norm(self.apart(poses, readings, nuisance), axis=1)
-        return np.asarray((nuisance.lengths[readings.station] - long)[:, None])
+        """Return the penetration of the target into the sphere (N, 1), m."""
+        distance = np.linalg.norm(self.offset(poses, readings, nuisance), axis=1)
+        return np.asarray((nuisance.lengths[readings.station] - distance)[:, None])
 
-    def directions(self, apart: Array) -> Array:
+    def directions(self, offset: Array) -> Array:
         """Return the sphere's normal (N, 1, 3)."""
-        long = np.maximum(np.linalg.norm(apart, axis=1, keepdims=True), TINY)
-        return np.asarray((apart / long)[:, None])
+        distance = np.maximum(np.linalg.norm(offset, axis=1, keepdims=True), TINY)
+        return np.asarray((offset / distance)[:, None])
 
-    def guess(self, poses: Poses, readings: Readings) -> Nuisance:
+    def initial_nuisance(self, poses: Poses, readings: Readings) -> Nuisance:
         """Return the spheres through the target's positions."""
         layout = self.layout(readings)
         places, lengths = [], np.zeros(layout.stations)
         for s in range(layout.stations):
             position = poses.position[readings.station == s]
             if self.radius is None:
-                centre, lengths[s] = sphere_through(position)
+                centre, lengths[s] = fitted_sphere(position)
             else:
                 lengths[s] = self.radius
                 centre = trilaterated(position, np.full(len(position), self.radius))

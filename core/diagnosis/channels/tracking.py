@@ -19,7 +19,7 @@ from gapbridge.core.diagnosis.channels.recording import (
     subsampled,
 )
 from gapbridge.core.diagnosis.observation import NotObservable, Observation, Predict
-from gapbridge.core.dynamics import predict_tracking, with_held
+from gapbridge.core.dynamics import predict_tracking, with_holding_torque
 from gapbridge.core.effects import Term
 from gapbridge.core.log.log import Log
 from gapbridge.core.metrology import Metrology
@@ -43,7 +43,7 @@ def observe(model: Model, log: Log, metrology: Metrology) -> Observation | NotOb
     needs = tuple(name for name in ("target_q", "actual_q") if not log.has(name))
     if needs:
         return NotObservable("tracking", needs)
-    motion = with_held(model, motion_of(log))
+    motion = with_holding_torque(model, motion_of(log))
     return _observed(model, log, motion, subsampled(_known_past(motion)))
 
 

@@ -32,7 +32,7 @@ from gapbridge.core.diagnosis.selection.candidate import Candidate
 from gapbridge.core.diagnosis.selection.local_search import pruned
 from gapbridge.core.diagnosis.selection.sample_space import CandidateFit, SampleSpace, fit
 from gapbridge.core.diagnosis.selection.search import part, screened_search
-from gapbridge.core.estimation.geometry import ANGLE, LENGTH, TIMES_MACHINED
+from gapbridge.core.estimation.geometry import ANGLE_STD, LENGTH_STD, PRIOR_FACTORS
 from gapbridge.core.estimation.least_squares import solve
 
 Members = Callable[[SampleSpace], tuple[int, ...]]
@@ -72,7 +72,7 @@ def prior(
     arms differ in precision (empirical Bayes; MacKay, Neural Computation 4 (1992) 415). The joints'
     own parameters have a factor of their own: zeros are set, not machined.
     """
-    usual = {"m": LENGTH, "rad": ANGLE}
+    usual = {"m": LENGTH_STD, "rad": ANGLE_STD}
     few = _reduced(space, [*block, *others])
     place = {c: k for k, c in enumerate([*block, *others])}
     size = {
@@ -94,7 +94,7 @@ def prior(
         links = links_of(few, {place[c]: own for c, own in sized(*times).items()})
         return _score_with_links(few, [place[c] for c in others], links) + links.penalty
 
-    return sized(*min(itertools.product(TIMES_MACHINED, JOINT_ZERO_FACTORS), key=score))
+    return sized(*min(itertools.product(PRIOR_FACTORS, JOINT_ZERO_FACTORS), key=score))
 
 
 def _reduced(space: SampleSpace, chosen: Sequence[int]) -> SampleSpace:

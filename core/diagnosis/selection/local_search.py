@@ -12,7 +12,7 @@ from gapbridge.core.diagnosis.selection.forward_selection import (
     projected,
 )
 from gapbridge.core.diagnosis.selection.sample_space import CandidateFit, SampleSpace, fit
-from gapbridge.core.estimation.least_squares import inverse, sigmas_square
+from gapbridge.core.estimation.least_squares import inverse, squared_sigmas
 
 MAX_MERGED = 9  # terms up to which every pair may be replaced by one
 MAX_ADDED = 30  # terms added to a set at most
@@ -80,7 +80,7 @@ def _drops(space: SampleSpace, current: CandidateFit) -> list[tuple[float, int]]
     for c in current.chosen:
         values = slice(begin, begin + len(space.candidates[c].parameters))
         begin = values.stop
-        more = sigmas_square(x[values], spread[values, values])
+        more = squared_sigmas(x[values], spread[values, values])
         scores.append((float(space.misfit(np.array(rss + more))) + paid - space.penalty[c], c))
     return sorted(scores)
 

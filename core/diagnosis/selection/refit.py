@@ -18,13 +18,13 @@ from gapbridge.core.diagnosis.selection.sample_space import CandidateFit, Sample
 from gapbridge.core.diagnosis.selection.state import SelectionState, flat
 from gapbridge.core.effects import CATALOGUE, Term
 from gapbridge.core.errors import EquilibriumError, InputError
-from gapbridge.core.estimation.held_out import jackknife, without_each
+from gapbridge.core.estimation.held_out import jackknife, leave_one_out
 from gapbridge.core.estimation.least_squares import (
     basis_of,
     inverse,
     projected_out,
-    sigmas_square,
     solve,
+    squared_sigmas,
 )
 
 REFITS = 8
@@ -257,7 +257,7 @@ def _cluster_covariance(white_noise: Array, A: Array, b: Array, region: NDArray[
 
     ``A`` (m, p) are the rows of the regression; rows after ``region`` are never left out.
     """
-    without = np.array([x for _, x in without_each(A, b, region)])
+    without = np.array([x for _, x in leave_one_out(A, b, region)])
     from scipy.special import ndtri, stdtrit  # slow to import
 
     # few regions: normal distribution with the 95 % interval of Student's t
@@ -285,7 +285,7 @@ def worth(term: Term, spread: Array) -> float:
     that is the amplitude; parameters of shape do not count.
     """
     effect, value = CATALOGUE[term.effect], np.array(term.values[: len(spread)])
-    whole = sigmas_square(value, spread) / len(value)
+    whole = squared_sigmas(value, spread) / len(value)
     if effect.periodic:
         single = float(value @ value) ** 2 / max(float(value @ spread @ value), 1e-300)
     else:

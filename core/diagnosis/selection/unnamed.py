@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from gapbridge.core.arrays import Array
-from gapbridge.core.dynamics import frames_of, pieces_of
+from gapbridge.core.dynamics import contributions_of, frames_of
 from gapbridge.core.effects.effect import typical_moment
 from gapbridge.core.kernels.reference import Chain, Rows, predict_rows
 from gapbridge.core.loads import Loads
@@ -118,7 +118,7 @@ def unnamed_loads(model: Model, motion: Motion, channel: str) -> tuple[tuple[str
         unit = np.zeros((count, 6))
         unit[:, axis] = 1.0
         pulled = replace(motion, loads=replace(motion.loads, wrench=unit))
-        pieces = pieces_of(model, pulled)
+        pieces = contributions_of(model, pulled)
         columns.append(pieces.external_torque if channel == "torque" else pieces.external_wrench)
     in_base = np.stack(columns, axis=2)
     rivals = [("load", _mass_anywhere(model, motion, channel)), ("pull", in_base)]
@@ -133,7 +133,9 @@ def _mass_anywhere(model: Model, motion: Motion, channel: str) -> Array:
     columns = []
     for off in (np.zeros(3), *(LOAD_OFFSET * np.eye(3))):
         place = np.tile(at_tool + off, (len(motion), 1))
-        pieces = pieces_of(model, replace(motion, loads=replace(motion.loads, payload_cog=place)))
+        pieces = contributions_of(
+            model, replace(motion, loads=replace(motion.loads, payload_cog=place))
+        )
         columns.append(pieces.payload_torque if channel == "torque" else pieces.payload_wrench)
     columns[1:] = [(c - columns[0]) / LOAD_OFFSET for c in columns[1:]]
     return np.stack(columns, axis=2)

@@ -1,4 +1,4 @@
-"""Our own recordings: what a run of the daemon wrote."""
+"""Recordings of the Gapbridge daemon."""
 
 from __future__ import annotations
 

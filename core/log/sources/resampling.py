@@ -1,4 +1,4 @@
-"""Streams of one recording, each at its own times, brought to the times of one of them."""
+"""Resampling of a recording's streams to the times of one of them."""
 
 from __future__ import annotations
 

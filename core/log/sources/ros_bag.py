@@ -141,7 +141,7 @@ def _opened(path: Path) -> Iterator[AnyReader]:
 def _topic(
     path: Path, bag: AnyReader, role: str, options: SourceOptions, notes: list[Note]
 ) -> str | None:
-    """Return the topic of a role: the one that was asked for, or the only one of its type."""
+    """Return the topic of a role: the requested one, or the only one of its type."""
     found = sorted({c.topic for c in bag.connections if _type(c.msgtype) in TYPES[role]})
     asked = options.topics.get(role)
     if asked is not None:
@@ -194,7 +194,7 @@ def _collect(path: Path, bag: AnyReader, topic: str) -> _Samples:
 
 
 def _reader(path: Path, bag: AnyReader, kind: str, data: bytes) -> Callable[[bytes, str], Any]:
-    """Return what reads messages of a type, of which ``data`` is one.
+    """Return the reader of messages of a type, of which ``data`` is one.
 
     Bags of SQLite before ROS 2 Iron hold no definitions: a controller's state is then read by the
     first layout that fits its bytes. Raises LogError where none does.
@@ -222,7 +222,7 @@ def _reader(path: Path, bag: AnyReader, kind: str, data: bytes) -> Callable[[byt
 
 
 def _values(kind: str, message: Any) -> dict[str, Any]:
-    """Return what a message says: by joint where it has names."""
+    """Return the values of a message, in joint order where it has names."""
     if kind in TYPES["joints"]:
         return {
             "names": tuple(message.name), "actual_q": message.position,

@@ -169,9 +169,9 @@ def _kept(folder: Path) -> list[dict[str, object]]:
 
 def _same_within_intervals(one: Path, other: Path) -> None:
 
-    from gapbridge.core.calibration.accuracy_baseline import baseline_in
+    from gapbridge.core.calibration.accuracy_baseline import read_baseline
 
-    a, b = (baseline_in(json.loads((p / "promise.json").read_text())) for p in (one, other))
+    a, b = (read_baseline(json.loads((p / "promise.json").read_text())) for p in (one, other))
     assert a.names == b.names
     spread = np.sqrt(np.diag(a.covariance) + np.diag(b.covariance))
     assert (np.abs(a.values - b.values) < 3.5 * spread).all()

@@ -26,7 +26,7 @@ from scripted_session import (
 from gapbridge.bridge.calibration.planning import observable_of
 from gapbridge.bridge.calibration.session.journal import FILE, read_entries
 from gapbridge.bridge.cell import load_cell
-from gapbridge.core.calibration.accuracy_baseline import baseline_in
+from gapbridge.core.calibration.accuracy_baseline import read_baseline
 from gapbridge.core.calibration.observables.fixed_point import fixed_at
 from gapbridge.core.calibration.observables.nuisance import Nuisance
 from gapbridge.core.calibration.observables.predicted_readings import predicted_readings
@@ -106,7 +106,7 @@ def check_identified(session: Session, result: CommandResult, of: str = "") -> N
     assert (session.folder / "s" / "calibration.html").exists()
     assert "kept" in result.out
     reported = json.loads((session.folder / "s" / "promise.json").read_text())
-    baseline = baseline_in(reported)
+    baseline = read_baseline(reported)
     true = {**OFFSETS, **{f"axial_compliance_{i + 1}": c for i, c in enumerate(AXIAL)}}
     error = baseline.values - [true.get(name, 0.0) for name in baseline.names]
     selected = np.array([name.startswith(of) for name in baseline.names])

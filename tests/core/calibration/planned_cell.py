@@ -7,7 +7,7 @@ import numpy as np
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.calibration.identifiability import identifiable_parameters
 from gapbridge.core.calibration.observables import make_observable
-from gapbridge.core.calibration.observables.predicted_readings import empty_readings
+from gapbridge.core.calibration.observables.predicted_readings import unmeasured_readings
 from gapbridge.core.calibration.parameters import Parameters
 from gapbridge.core.calibration.plan import Payload, Plan
 from gapbridge.core.calibration.readings import Readings
@@ -47,7 +47,7 @@ def readings_of(plan: Plan, kind: str = "position") -> Readings:
         payload_cog=np.array([one.cog for one in plan.loads], dtype=float)[load],
         approach=np.array([pose.approach for pose in plan.poses]),
     )
-    readings = empty_readings(
+    readings = unmeasured_readings(
         kind, np.array([pose.q for pose in plan.poses]), loads, load=load,
         station=np.array([pose.station for pose in plan.poses]),
         target=np.array([pose.target for pose in plan.poses]),

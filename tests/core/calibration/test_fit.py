@@ -12,7 +12,7 @@ from benchmarks.blind.ingredients import backlash
 from benchmarks.blind.measuring import Instrument
 from benchmarks.calibration import laid_out
 from benchmarks.calibration.drawings import model_of, real_arm
-from gapbridge.core.calibration.fit import fit_session, judged
+from gapbridge.core.calibration.fit import evaluate_fit, fit_session
 from gapbridge.core.calibration.identifiability import identifiable_parameters
 from gapbridge.core.calibration.observables import make_observable
 from gapbridge.core.calibration.parameters import DEFAULT, Parameters
@@ -64,12 +64,12 @@ def session(parameters: Parameters) -> tuple[Readings, dict[str, float], Instrum
 def found(
     model: Model, parameters: Parameters, session: tuple[Readings, dict[str, float], Instrument]
 ) -> Calibration:
-    return judged(model, fit_session(session[0], parameters, METROLOGY), diagnose=False)
+    return evaluate_fit(model, fit_session(session[0], parameters, METROLOGY), diagnose=False)
 
 
 def test_without_noise_the_truth_is_found(model: Model, parameters: Parameters) -> None:
     readings, truth, _ = _session(parameters, 0, exact=True)
-    exact = judged(model, fit_session(readings, parameters, METROLOGY), diagnose=False)
+    exact = evaluate_fit(model, fit_session(readings, parameters, METROLOGY), diagnose=False)
     off = [abs(e.value - truth[e.name]) for e in exact.estimates]
     assert np.max(np.array(off) / parameters.scales) < 0.02
     assert exact.held_out_after.max < 1e-6 < 1e-3 < exact.held_out_before.rms
@@ -95,7 +95,7 @@ def test_an_instrument_that_moved_leaves_some_poses_to_verify_in_one_place_only(
     readings = session[0]
     held, second = readings.held_out, np.zeros(len(readings), dtype=np.int64)
     second[np.flatnonzero(held if verified == "after it" else ~held)[-6:]] = 1
-    some = judged(
+    some = evaluate_fit(
         model, fit_session(replace(readings, station=second), parameters, METROLOGY), diagnose=False
     )
     assert len(some.stations) == 2
@@ -119,7 +119,7 @@ def test_intervals_hold_the_truth_in_95_of_100(model: Model, parameters: Paramet
     held = []
     for seed in range(2, 8):
         readings, truth, _ = _session(parameters, seed)
-        some = judged(model, fit_session(readings, parameters, METROLOGY), diagnose=False)
+        some = evaluate_fit(model, fit_session(readings, parameters, METROLOGY), diagnose=False)
         held += [e.interval[0] <= truth[e.name] <= e.interval[1] for e in some.estimates if e.shown]
     assert 0.89 < np.mean(held) < 0.99  # six sessions; the benchmark takes 500
 
@@ -133,7 +133,7 @@ def test_held_out_readings_never_touch_the_fit(
     readings = session[0]
     value = readings.value.copy()
     value[readings.held_out] += 0.05
-    spoilt = judged(
+    spoilt = evaluate_fit(
         model, fit_session(replace(readings, value=value), parameters, METROLOGY), diagnose=False
     )
     assert [e.value for e in spoilt.estimates] == [e.value for e in found.estimates]
@@ -150,7 +150,7 @@ def test_outlier_readings_are_listed_and_change_little(
     readings = session[0]
     value = readings.value.copy()
     value[[4, 30]] += [[0.0, 3e-4, 0.0], [0.02, 0.0, 0.01]]
-    outlier = judged(
+    outlier = evaluate_fit(
         model, fit_session(replace(readings, value=value), parameters, METROLOGY), diagnose=False
     )
     assert list(outlier.outliers) == [4, 30]
@@ -174,7 +174,7 @@ def test_flexibilities_stay_at_zero_or_above(model: Model, parameters: Parameter
         laid_out.instrument_for(KIND, LAYOUT, rng),
     )
     readings = laid_out.readings_of(laid_out.arm_with(KIND, truth), laid, instrument, rng)
-    stiff = judged(model, fit_session(readings, parameters, METROLOGY), diagnose=False)
+    stiff = evaluate_fit(model, fit_session(readings, parameters, METROLOGY), diagnose=False)
     soft = [e for e in stiff.estimates if "compliance" in e.name]
     assert all(e.value >= 0 for e in soft)
     assert any(e.on_bound for e in soft)
@@ -196,7 +196,7 @@ def test_a_load_that_was_wrongly_declared_leaves_differences_at_odds_or_shows_he
     session = replace(laid.session, payload_mass=laid.session.payload_mass * np.where(heavy, 0, 1))
     readings = laid_out.readings_of(real, replace(laid, session=session), instrument, rng)
     declared = replace(readings.loads, payload_mass=laid.session.payload_mass)
-    wrong = judged(
+    wrong = evaluate_fit(
         model, fit_session(replace(readings, loads=declared), parameters, METROLOGY), diagnose=False
     )
     assert not wrong.complete or Reason.LOADS_AT_ODDS in reasons(wrong)
@@ -216,12 +216,12 @@ def test_what_is_left_to_be_added_is_named_and_then_completes_it(
     real = backlash(3, 8e-4).apply(laid_out.arm_with(KIND, truth))
     readings = laid_out.readings_of(real, replace(laid, session=came), instrument, rng)
     readings = replace(readings, loads=replace(readings.loads, approach=approach))
-    found = judged(model, fit_session(readings, parameters, METROLOGY), diagnose=False)
+    found = evaluate_fit(model, fit_session(readings, parameters, METROLOGY), diagnose=False)
     assert not found.complete
     assert found.missing_effects == ("backlash_3",)
     names = (*DEFAULT, *found.missing_effects)
     more = identifiable_parameters(model, names, observable=make_observable("position"))
-    whole = judged(model, fit_session(readings, more, METROLOGY), diagnose=False)
+    whole = evaluate_fit(model, fit_session(readings, more, METROLOGY), diagnose=False)
     assert whole.complete
     assert whole.missing_effects == ()
     play = next(e for e in whole.estimates if e.name == "backlash_3")
@@ -238,7 +238,7 @@ def test_a_place_that_too_few_fitted_poses_determine_takes_those_to_verify_as_we
     poses = np.unique(readings.pose[~readings.held_out])[:alone]
     second = np.isin(readings.pose, poses).astype(np.int64)
     second[np.flatnonzero(readings.held_out)[-4:]] = 1
-    some = judged(
+    some = evaluate_fit(
         model, fit_session(replace(readings, station=second), parameters, METROLOGY), diagnose=False
     )
     assert (Note(Reason.VERIFYING_FITTED, (4,)) in some.notes) == fitted
@@ -249,7 +249,7 @@ def test_a_place_that_too_few_fitted_poses_determine_takes_those_to_verify_as_we
 def test_the_diagnosis_finds_nothing_in_what_a_complete_calibration_leaves(
     model: Model, parameters: Parameters, session: tuple[Readings, dict[str, float], Instrument]
 ) -> None:
-    whole = judged(model, fit_session(session[0], parameters, METROLOGY))
+    whole = evaluate_fit(model, fit_session(session[0], parameters, METROLOGY))
     assert whole.complete
     assert whole.diagnosis is not None
     assert whole.diagnosis.verdict == "no_gap"
@@ -263,7 +263,7 @@ def test_two_places_of_the_instrument_each_have_their_frame(
     value = readings.value.copy()
     value[second] = value[second] @ np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]]) + [1, 2, 3]
     moved = replace(readings, value=value, station=second.astype(np.int64))
-    both = judged(model, fit_session(moved, parameters, METROLOGY), diagnose=False)
+    both = evaluate_fit(model, fit_session(moved, parameters, METROLOGY), diagnose=False)
     assert len(both.stations) == 2
     assert both.held_out_after.rms < 1e-4
 
@@ -272,7 +272,7 @@ def test_too_few_readings_are_refused(
     model: Model, parameters: Parameters, session: tuple[Readings, dict[str, float], Instrument]
 ) -> None:
     with pytest.raises(ExcitationError, match="measure more poses"):
-        judged(model, fit_session(session[0][np.arange(8)], parameters, METROLOGY))
+        evaluate_fit(model, fit_session(session[0][np.arange(8)], parameters, METROLOGY))
 
 
 def test_only_held_out_readings_are_refused(
@@ -280,4 +280,4 @@ def test_only_held_out_readings_are_refused(
 ) -> None:
     away = session[0][session[0].held_out]
     with pytest.raises(ExcitationError, match="all are held out"):
-        judged(model, fit_session(away, parameters, METROLOGY))
+        evaluate_fit(model, fit_session(away, parameters, METROLOGY))

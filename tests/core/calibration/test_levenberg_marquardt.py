@@ -11,7 +11,7 @@ from benchmarks.blind.arms import ARMS
 from benchmarks.blind.mechanics import RealArm
 from benchmarks.calibration import laid_out
 from benchmarks.calibration.drawings import model_of, real_arm
-from gapbridge.core.calibration.fit import fit_session, judged
+from gapbridge.core.calibration.fit import evaluate_fit, fit_session
 from gapbridge.core.calibration.identifiability import identifiable_parameters
 from gapbridge.core.calibration.observables import make_observable
 from gapbridge.core.calibration.parameters import DEFAULT, Parameters
@@ -62,7 +62,7 @@ def test_a_payload_beside_flexibilities_is_found_and_does_not_run_away(
 ) -> None:
     readings = _session(parameters, 2.5)
     metrology = Metrology(registered=False, sigma=LAYOUT.sigma)
-    found = judged(model, fit_session(readings, parameters, metrology), diagnose=False)
+    found = evaluate_fit(model, fit_session(readings, parameters, metrology), diagnose=False)
     payload = next(e for e in found.estimates if e.name == "payload")
     assert payload.interval[0] < 2.5 < payload.interval[1]
     assert found.held_out_after.rms < 1.5 * np.sqrt(3) * found.noise
@@ -75,7 +75,7 @@ def test_what_one_load_cannot_show_is_reported_and_harms_no_prediction(
     readings = _session(parameters, 1.0)
     one = readings[np.flatnonzero(readings.load == 0)]
     metrology = Metrology(registered=False, sigma=LAYOUT.sigma)
-    found = judged(model, fit_session(one, parameters, metrology), diagnose=False)
+    found = evaluate_fit(model, fit_session(one, parameters, metrology), diagnose=False)
     payload = next(e for e in found.estimates if e.name == "payload")
     assert payload.interval[0] < 1.0 < payload.interval[1]
     assert not payload.shown or payload.std > 0.2

@@ -57,7 +57,7 @@ def test_what_is_chosen_does_not_depend_on_the_held_out_readings() -> None:
         fit_session(r, parameters, Metrology(False, 2e-5))
         for r in (readings, replace(readings, value=value))
     )
-    np.testing.assert_array_equal(one.rest.values, other.rest.values)
+    np.testing.assert_array_equal(one.state.values, other.state.values)
     assert one.missing == other.missing
 
 

@@ -53,12 +53,12 @@ def test_what_is_left_is_separated_by_readings(parameters: Parameters) -> None:
 
 
 def test_rank_of_the_kept_is_full_and_of_all_is_not_more(model: Model) -> None:
-    from gapbridge.core.calibration.identifiability import _anywhere
+    from gapbridge.core.calibration.identifiability import _random_readings
 
     observable = make_observable("pose")
-    every = Parameters.every(model)
+    every = Parameters.of_effects(model)
     kept = identifiable_parameters(model, observable=observable)
-    readings, nuisance = _anywhere(model, observable, False, 5)
+    readings, nuisance = _random_readings(model, observable, False, 5)
     ranks = []
     for parameters in (every, kept):
         J, F = observable.columns(parameters, parameters.begin, readings, nuisance)

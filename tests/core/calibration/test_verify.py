@@ -15,8 +15,8 @@ from benchmarks.blind.mechanics import RealArm
 from benchmarks.calibration import laid_out
 from benchmarks.calibration.drawings import model_of, real_arm
 from gapbridge.bridge.calibration.format import verdict_text
-from gapbridge.core.calibration.accuracy_baseline import baseline_in, document_of
-from gapbridge.core.calibration.fit import fit_session, judged
+from gapbridge.core.calibration.accuracy_baseline import baseline_document, read_baseline
+from gapbridge.core.calibration.fit import evaluate_fit, fit_session
 from gapbridge.core.calibration.identifiability import identifiable_parameters
 from gapbridge.core.calibration.observables import make_observable
 from gapbridge.core.calibration.readings import Readings
@@ -40,8 +40,8 @@ def calibrated() -> Calibrated:
     real = laid_out.arm_with(KIND, laid_out.draw_values(KIND, parameters.names, rng))
     instrument = laid_out.instrument_for(KIND, LAYOUT, rng)
     readings = laid_out.readings_of(real, laid_out.lay_out(KIND, LAYOUT, rng), instrument, rng)
-    found = judged(model, fit_session(readings, parameters, METROLOGY), diagnose=False)
-    document = json.loads(json.dumps(document_of(found, METROLOGY.sigma)))
+    found = evaluate_fit(model, fit_session(readings, parameters, METROLOGY), diagnose=False)
+    document = json.loads(json.dumps(baseline_document(found, METROLOGY.sigma)))
     return found, document, real, instrument
 
 
@@ -90,7 +90,7 @@ def test_a_zero_that_the_calibration_left_open_may_be_off_by_as_much(
     calibrated: Calibrated,
 ) -> None:
     found, document, real, instrument = calibrated
-    baseline = baseline_in(document)
+    baseline = read_baseline(document)
     covariance = baseline.covariance.copy()
     at = baseline.names.index("joint_offset_3")
     covariance[at, at] += 4e-4**2
@@ -156,9 +156,9 @@ def test_too_few_readings_say_so(calibrated: Calibrated) -> None:
 def test_a_document_that_is_none_is_named(calibrated: Calibrated) -> None:
     document = calibrated[1]
     with pytest.raises(InputError, match="schema"):
-        baseline_in({"schema": "other"}, "calibration.json")
+        read_baseline({"schema": "other"}, "calibration.json")
     with pytest.raises(InputError, match="'noise'"):
-        baseline_in({k: v for k, v in document.items() if k != "noise"}, "calibration.json")
+        read_baseline({k: v for k, v in document.items() if k != "noise"}, "calibration.json")
 
 
 def test_effects_are_read_off_the_parameters_names() -> None:

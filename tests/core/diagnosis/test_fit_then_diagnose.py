@@ -51,11 +51,11 @@ def sigmas_off(found):
 )
 def test_no_further_cause_is_named(tool: bool, registered: bool, seed: int):
     log, metrology, found = fitted(moved(tool, zeros=False), registered, seed)
-    shift = found.written.tool_in_flange[:3, 3] - small.TOOL
+    shift = found.cell_model.tool_in_flange[:3, 3] - small.TOOL
     np.testing.assert_allclose(shift, SHIFT if tool else 0.0, atol=2e-5)
     assert sigmas_off(found).max() < 3.5
     assert found.remaining_rms < 1.15 * small.FLOOR
-    (channel,) = diagnose(found.written, log, metrology).channels
+    (channel,) = diagnose(found.cell_model, log, metrology).channels
     assert channel.verdict == "no_gap"
     assert not channel.causes
 
@@ -67,7 +67,7 @@ def test_no_further_cause_is_named(tool: bool, registered: bool, seed: int):
 def test_zeros_that_are_off_become_no_flexibilities(tool: bool, registered: bool, seed: int):
     log, metrology, found = fitted(moved(tool, zeros=True), registered, seed)
     assert sigmas_off(found).max() < 3.5
-    (channel,) = diagnose(found.written, log, metrology).channels
+    (channel,) = diagnose(found.cell_model, log, metrology).channels
     causes = {c.effect: c for c in channel.causes}
     assert "joint_offset" in causes
     assert not COMPLIANCE & set(causes)
@@ -106,7 +106,7 @@ def test_a_cause_has_the_uncertainty_of_the_flexibilities_it_depends_on():
 def test_an_arm_with_nominal_links_is_fitted_as_if_they_were_known(monkeypatch):
     """The links are let in where the poses are likelier with them, and cost nothing elsewhere."""
     _, _, found = fitted(SOFT, True, 11)
-    monkeypatch.setattr("gapbridge.core.estimation.geometry.SURE", np.inf)
+    monkeypatch.setattr("gapbridge.core.estimation.geometry.MIN_LIKELIHOOD_GAIN", np.inf)
     _, _, alone = fitted(SOFT, True, 11)
     np.testing.assert_array_equal(found.covariance, alone.covariance)
 
@@ -117,4 +117,4 @@ def test_a_tool_point_that_is_not_identifiable_is_the_cells():
     session = replace(session, q=np.tile(session.q[:1], (len(session.q), 1)))
     log = small.log_of(session, small.readings(SOFT, session, 3, registered=False))
     found = identify_compliance(small.model_of(), log, Metrology(False, small.SIGMA))
-    np.testing.assert_allclose(found.written.tool_in_flange[:3, 3], small.TOOL, atol=1e-12)
+    np.testing.assert_allclose(found.cell_model.tool_in_flange[:3, 3], small.TOOL, atol=1e-12)

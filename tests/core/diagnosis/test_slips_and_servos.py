@@ -160,7 +160,7 @@ def rests(terms: list[Term], q: np.ndarray, loads: Loads) -> dict[str, np.ndarra
     """Return targets and encoders of servos at rest, by hand: no code of the model's."""
     actual = q.copy()
     for _ in range(4):
-        held = MODEL.held_torque(actual, loads)
+        held = MODEL.holding_torque(actual, loads)
         actual = q.copy()
         for term in terms:
             j = term.site.joint - 1

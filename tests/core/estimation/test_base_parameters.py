@@ -4,8 +4,12 @@ import numpy as np
 import pytest
 
 from gapbridge.core.effects import flexibility_names
-from gapbridge.core.estimation.base_parameters import VISIBLE, choose, what_is_shown
-from gapbridge.core.estimation.compliance_fit import Linear
+from gapbridge.core.estimation.base_parameters import (
+    VISIBLE,
+    choose_identifiable,
+    identifiability_of,
+)
+from gapbridge.core.estimation.compliance_fit import ProjectedSystem
 from gapbridge.core.notes import Note, Reason
 
 SIGMA = 1e-4  # rad/Nm, the prior's
@@ -14,19 +18,19 @@ SIGMA = 1e-4  # rad/Nm, the prior's
 def problem(columns, values):
     """Return a problem whose columns (M, 4) are given in units of the noise per prior sigma."""
     columns = np.asarray(columns, dtype=float)
-    return Linear(columns / SIGMA, columns / SIGMA @ (np.asarray(values) * SIGMA))
+    return ProjectedSystem(columns / SIGMA, columns / SIGMA @ (np.asarray(values) * SIGMA))
 
 
 def chosen(linear):
-    kept = choose(linear, (np.zeros(4), SIGMA))
-    return kept, what_is_shown(linear, kept, SIGMA)
+    kept = choose_identifiable(linear, (np.zeros(4), SIGMA))
+    return kept, identifiability_of(linear, kept, SIGMA)
 
 
 def test_what_has_columns_of_its_own_is_kept_and_the_empty_ones_are_held():
     kept, shown = chosen(problem(np.diag([50.0, 20.0, 0.0, 1.0]), [1, 1, 0, 0]))
     assert kept.tolist() == [True, True, False, False]
     held = [Note(Reason.HELD, (f"radial_compliance_{i}",)) for i in (1, 2)]
-    assert list(shown.reported) == held
+    assert list(shown.notes) == held
     std = np.sqrt(np.diag(shown.covariance)) / SIGMA
     np.testing.assert_allclose(std[:2], [1 / 50, 1 / 20], rtol=2e-3)
     np.testing.assert_array_equal(std[2:], 1)
@@ -38,7 +42,7 @@ def test_two_that_act_alike_are_carried_by_one_and_both_are_named():
     kept, shown = chosen(problem(columns, [1, 0.5, 1, 0.5]))
     assert kept[[0, 2]].all()
     assert kept[1] != kept[3]
-    (note,) = shown.reported
+    (note,) = shown.notes
     assert note.reason is Reason.ACTS_LIKE
     ((share, carrier),) = note.values[1]
     assert share == pytest.approx(1.0)
@@ -60,7 +64,7 @@ def test_a_sum_that_shows_though_none_of_its_members_does_is_named():
     columns[0] = 0.7 * VISIBLE
     kept, shown = chosen(problem(columns, [1, 1, 1, 1]))
     assert not kept.any()
-    together = [note for note in shown.reported if note.reason is Reason.SHOWN_TOGETHER]
+    together = [note for note in shown.notes if note.reason is Reason.SHOWN_TOGETHER]
     assert len(together) == 1
     assert {part for _, part in together[0].values[0]} == set(flexibility_names(2))
     np.testing.assert_allclose([share for share, _ in together[0].values[0]], 0.5)
@@ -72,8 +76,8 @@ def test_two_kept_ones_whose_sum_is_much_better_known_are_named(sign):
     columns[0, 1], columns[1, 1], columns[2, 2] = sign * 500, 5, 50
     columns[0, 0] = 500
     _, shown = chosen(problem(columns, [1, 1, 1, 1]))
-    assert shown.reported[0].reason is (Reason.SUM_KNOWN if sign > 0 else Reason.DIFFERENCE_KNOWN)
-    assert shown.reported[0].values[:2] == ("axial_compliance_1", "axial_compliance_2")
+    assert shown.notes[0].reason is (Reason.SUM_KNOWN if sign > 0 else Reason.DIFFERENCE_KNOWN)
+    assert shown.notes[0].values[:2] == ("axial_compliance_1", "axial_compliance_2")
 
 
 def test_flexibilities_are_named_as_the_effects_are():

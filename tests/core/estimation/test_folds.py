@@ -7,12 +7,12 @@ import pytest
 from scipy.cluster.vq import kmeans2
 
 from gapbridge.core.estimation.held_out import (
+    held_out_residual,
     jackknife,
     joint_regions,
     k_means,
-    missed,
+    leave_one_out,
     random_folds,
-    without_each,
 )
 
 
@@ -45,7 +45,7 @@ def test_fits_that_left_a_part_out_are_those_of_the_other_rows() -> None:
     rng = np.random.default_rng(1)
     A = rng.normal(size=(40, 3)) * [1.0, 1e-4, 1e3]
     b, part = rng.normal(size=40), np.arange(30) % 4  # ten rows are in every fit
-    found = list(without_each(A, b, part))
+    found = list(leave_one_out(A, b, part))
     assert len(found) == 4
     for k, (out, x) in enumerate(found):
         assert out.tolist() == np.flatnonzero(part == k).tolist()
@@ -58,7 +58,7 @@ def test_what_holds_a_number_holds_it_in_every_fit() -> None:
     A, b = rng.normal(size=(30, 2)), rng.normal(size=30)
     A[:, 1] = 0.0
     part, hold = np.arange(30) % 5, np.array([4.0, 0.1])
-    left = missed(A, b, part, hold)
+    left = held_out_residual(A, b, part, hold)
     for k in range(5):
         rest, own = part != k, part == k
         x = A[rest, 0] @ b[rest] / (A[rest, 0] @ A[rest, 0] + 16.0)

@@ -212,7 +212,7 @@ def test_a_tool_point_that_nobody_registered_is_found_along_and_costs_no_flexibi
     assert found.remaining_rms < 1e-8
     assert Note(Reason.NOTHING_WRITTEN) in found.notes
     known = identify_compliance(model_of(6), log, KNOWN)
-    assert not known.tool_known  # 116 mm: a target that sits elsewhere, and no TCP to write
+    assert not known.tool_determined  # 116 mm: a target that sits elsewhere, and no TCP to write
     assert known.remaining_rms > 1e-2
 
 

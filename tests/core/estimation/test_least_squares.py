@@ -9,9 +9,9 @@ from gapbridge.core.estimation.least_squares import (
     basis_of,
     bounded,
     inverse,
+    inverse_lengths,
     projected_out,
     solve,
-    unit_of,
 )
 
 
@@ -45,7 +45,7 @@ def test_bounded_solutions_are_those_of_scipys_search() -> None:
     for _ in range(300):
         size = int(rng.integers(1, 13))
         A = rng.normal(size=(25, size)) * 10.0 ** rng.integers(-3, 3, size)
-        b, unit = rng.normal(size=25), unit_of(A)
+        b, unit = rng.normal(size=25), inverse_lengths(A)
         lower = np.where(rng.random(size) < 0.3, -np.inf, -0.2 * rng.random(size) * unit)
         upper = np.where(rng.random(size) < 0.3, np.inf, 0.2 * rng.random(size) * unit)
         found, stuck = bounded(A, b, lower, upper)

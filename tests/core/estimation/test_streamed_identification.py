@@ -15,7 +15,7 @@ from gapbridge.core.errors import ExcitationError, LogError
 from gapbridge.core.estimation import streamed
 from gapbridge.core.estimation.identification import data_of, identify_compliance
 from gapbridge.core.estimation.streamed import RowStore, identify_streamed
-from gapbridge.core.estimation.streamed_fit import stretches
+from gapbridge.core.estimation.streamed_fit import fold_slices
 from gapbridge.core.log.log import Log, read_log
 from gapbridge.core.log.pieces import LogPieces
 from gapbridge.core.metrology import Metrology
@@ -148,7 +148,7 @@ def test_a_cell_that_is_no_number_is_named_in_a_later_piece(tmp_path):
 def test_each_row_is_in_one_fold_and_folds_are_alike_in_size():
     counts, seen = np.zeros(5, dtype=int), []
     for number, rows in enumerate((1000, 1000, 3, 777)):
-        for fold, part in stretches(number, rows):
+        for fold, part in fold_slices(number, rows):
             counts[fold] += part.stop - part.start
             seen += [(number, row) for row in range(part.start, part.stop)]
     assert len(seen) == len(set(seen)) == counts.sum() == 2780
@@ -156,7 +156,7 @@ def test_each_row_is_in_one_fold_and_folds_are_alike_in_size():
 
 
 def test_more_rows_than_the_sample_give_what_all_of_them_give(monkeypatch):
-    monkeypatch.setattr(streamed, "SAMPLE", 300)
+    monkeypatch.setattr(streamed, "SAMPLE_ROWS", 300)
     log = measured_log(False, True, outlier=20)
     whole = identify_compliance(nominal(), log)
     found = identify_streamed(nominal(), pieces_of(log))
@@ -171,7 +171,7 @@ def test_more_rows_than_the_sample_give_what_all_of_them_give(monkeypatch):
 def test_rows_that_wait_in_a_file_are_those_that_came():
     log = measured_log(True, False)
     data, rows = data_of(log, Metrology(registered=True))
-    store = RowStore(kept=0)
+    store = RowStore(memory=0)
     store.append(data, rows)
     ((kept, numbers),) = store
     assert store.count == len(rows)

@@ -24,15 +24,15 @@ from gapbridge.core.errors import PlanError
 from gapbridge.core.model import Model
 from gapbridge.core.notes import Note, Reason
 from gapbridge.core.planning import design
-from gapbridge.core.planning.candidates import candidates_of
-from gapbridge.core.planning.design import reference_of
+from gapbridge.core.planning.candidates import sample_candidates
+from gapbridge.core.planning.design import draw_reference
 from gapbridge.core.planning.exchange import (
     Choice,
     backward_eliminated,
     exchanged,
     forward_selected,
 )
-from gapbridge.core.planning.information import blocks, information_of, inverse
+from gapbridge.core.planning.information import information_of, inverse, whitened_rows
 from gapbridge.core.planning.workspace import Place, Reflector, Workspace
 
 
@@ -92,7 +92,7 @@ def test_held_out_poses_are_poses_of_their_own(planned: Plan) -> None:
 def test_every_planned_pose_can_be_reached_and_seen(planned: Plan, space: Workspace) -> None:
     q = np.array([p.q for p in planned.poses])
     assert space.clear(q).all()
-    for missed in space.sees(space.frames(q), 0, 0).values():
+    for missed in space.not_visible(space.frames(q), 0, 0).values():
         assert not missed.any()
 
 
@@ -117,9 +117,9 @@ def test_more_poses_buy_less_uncertainty(planned: Plan) -> None:
 def test_planned_poses_beat_more_random_ones(
     planned: Plan, parameters: Parameters, space: Workspace
 ) -> None:
-    found = candidates_of(parameters, POSITION, LOADS, space, 11, 400)
-    rows = blocks(parameters, POSITION, found.readings, found.nuisance, SIGMA)
-    reference = reference_of(parameters, planned.loads, space, 3)
+    found = sample_candidates(parameters, POSITION, LOADS, space, 11, 400)
+    rows = whitened_rows(parameters, POSITION, found.readings, found.nuisance, SIGMA)
+    reference = draw_reference(parameters, planned.loads, space, 3)
     random = np.random.default_rng(0)
 
     def chance(count: int) -> list[np.ndarray]:
@@ -217,7 +217,7 @@ def test_where_nothing_is_seen_the_reason_is_reported(
     parameters: Parameters, space: Workspace
 ) -> None:
     blind = replace(space, places=(Place((9.0, 0.0, 0.5), farthest=1.0),))
-    with pytest.raises(PlanError, match=r"no pose can be reached and seen: .* out of range"):
+    with pytest.raises(PlanError, match=r"no pose is reachable and visible: .* out of range"):
         plan(parameters, POSITION, LOADS, blind)
 
 
@@ -274,6 +274,6 @@ def test_a_load_that_shows_nothing_is_named(parameters: Parameters, space: Works
 def test_too_few_poses_are_said_before_any_is_looked_for(
     parameters: Parameters, space: Workspace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("gapbridge.core.planning.design.candidates_of", None)
+    monkeypatch.setattr("gapbridge.core.planning.design.sample_candidates", None)
     with pytest.raises(PlanError, match="too few poses: found 3, expected at least"):
         plan(parameters, POSITION, LOADS, space, poses=3)

@@ -14,7 +14,7 @@ from gapbridge.core.calibration.observables.nuisance import Nuisance
 from gapbridge.core.calibration.parameters import Parameters
 from gapbridge.core.loads import Loads
 from gapbridge.core.planning.design import SessionDesign, plan
-from gapbridge.core.planning.information import Reference, blocks, expectation_of
+from gapbridge.core.planning.information import Reference, expected_accuracy, whitened_rows
 
 
 def expectation(parameters, observable, readings, nuisance, sigma, reference):
@@ -22,8 +22,8 @@ def expectation(parameters, observable, readings, nuisance, sigma, reference):
     fitted = readings[np.flatnonzero(~readings.held_out)]
     begin = parameters.model(parameters.begin)
     fitted = replace(fitted, value=observable.predict(begin, fitted, nuisance))
-    rows = blocks(parameters, observable, fitted, nuisance, sigma)
-    return expectation_of(parameters, rows, Reference.of(parameters, *reference))
+    rows = whitened_rows(parameters, observable, fitted, nuisance, sigma)
+    return expected_accuracy(parameters, rows, Reference.of(parameters, *reference))
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,13 @@ from gapbridge.core.arm import builtin_arm
 from gapbridge.core.errors import PlanError
 from gapbridge.core.model import Model
 from gapbridge.core.planning.capsules import Box, segment_distance
-from gapbridge.core.planning.workspace import Hindrance, Obstacle, Place, Reflector, Workspace
+from gapbridge.core.planning.workspace import (
+    Place,
+    Reflector,
+    Rejection,
+    RejectionReason,
+    Workspace,
+)
 
 UP = np.array([[0.0, -np.pi / 2, 0.0, -np.pi / 2, 0.0, 0.0]])  # a UR stretched upwards
 OUT = np.zeros((1, 6))  # a UR stretched out along -x
@@ -61,12 +67,12 @@ def test_the_floor_stops_the_forearm_and_not_the_foot(model: Model) -> None:
     space = Workspace.of(model, floor=0.0)
     assert space.clear(UP).all()
     down = np.array([[0.0, 0.6, 0.0, 0.0, 0.0, 0.0]])
-    assert space.hindrances(down)[Hindrance(Obstacle.FLOOR)].all()
+    assert space.rejections(down)[Rejection(RejectionReason.FLOOR)].all()
 
 
 def test_a_folded_arm_is_near_itself(model: Model) -> None:
     folded = np.array([[0.0, -np.pi / 2, np.pi - 0.15, 0.0, 0.5, 0.0]])
-    assert Workspace.of(model).hindrances(folded)[Hindrance(Obstacle.SELF)].all()
+    assert Workspace.of(model).rejections(folded)[Rejection(RejectionReason.SELF)].all()
 
 
 def test_the_load_is_part_of_the_arm(model: Model) -> None:
@@ -75,7 +81,7 @@ def test_the_load_is_part_of_the_arm(model: Model) -> None:
     box = Box(tuple(below - 0.03), tuple(below + 0.03))
     space = Workspace.of(model, keep_out=[box])
     assert space.clear(OUT).all()
-    assert not replace(space, hung=((0.0, 0.0, 0.55),)).clear(OUT).any()
+    assert not replace(space, loads_end=((0.0, 0.0, 0.55),)).clear(OUT).any()
 
 
 def test_a_straight_arm_is_nearly_singular(model: Model) -> None:
@@ -91,8 +97,8 @@ def test_the_tracker_sees_what_is_before_the_arm_and_not_what_is_behind_it(model
     behind = Place(tuple(tip + 3.0 * (wrist - tip)))
     space = Workspace.of(model, places=[before, behind])
     frames = space.frames(OUT)
-    assert not space.sees(frames, 0, 0)[Hindrance(Obstacle.HIDDEN, 1)].any()
-    assert space.sees(frames, 1, 0)[Hindrance(Obstacle.HIDDEN, 2)].any()
+    assert not space.not_visible(frames, 0, 0)[Rejection(RejectionReason.HIDDEN, 1)].any()
+    assert space.not_visible(frames, 1, 0)[Rejection(RejectionReason.HIDDEN, 2)].any()
 
 
 def test_a_reflector_is_seen_within_its_cone_and_the_instruments_range(model: Model) -> None:
@@ -102,12 +108,12 @@ def test_a_reflector_is_seen_within_its_cone_and_the_instruments_range(model: Mo
     space = Workspace.of(
         model, places=[place], reflector=Reflector(looks=[(0, 0, 1)], acceptance=np.radians(30))
     )
-    turned = Hindrance(Obstacle.TURNED, 1)
-    assert not space.sees(space.frames(OUT), 0, 0)[turned].any()
+    turned = Rejection(RejectionReason.TURNED, 1)
+    assert not space.not_visible(space.frames(OUT), 0, 0)[turned].any()
     away = replace(space, looks=-space.looks)
-    assert away.sees(away.frames(OUT), 0, 0)[turned].all()
+    assert away.not_visible(away.frames(OUT), 0, 0)[turned].all()
     near = replace(space, places=(replace(place, nearest=2.5),))
-    assert near.sees(near.frames(OUT), 0, 0)[Hindrance(Obstacle.RANGE, 1)].all()
+    assert near.not_visible(near.frames(OUT), 0, 0)[Rejection(RejectionReason.RANGE, 1)].all()
 
 
 @pytest.mark.parametrize(

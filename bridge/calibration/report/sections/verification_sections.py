@@ -23,7 +23,7 @@ from gapbridge.bridge.report.labels import (
     sentence,
 )
 from gapbridge.core.calibration.readings import Readings
-from gapbridge.core.calibration.verify import Suspect, Verification
+from gapbridge.core.calibration.verify import CandidateChange, Verification
 
 STEPS_VALID = (
     "Nothing: use the cell as it is. Verify it again after some months, and after every collision, "
@@ -126,8 +126,8 @@ def changes(data: VerificationData) -> list[blocks.Block]:
     shown: list[blocks.Block] = [blocks.Paragraph(f"Best explanation: {change_title(v.moved)}.")]
     if v.moved.estimates:
         shown.append(estimates_table(list(v.moved.estimates), planned=False))
-    if v.suspects:
-        rows = [[change_title(s), likelihood(s.chance)] for s in v.suspects]
+    if v.alternatives:
+        rows = [[change_title(s), likelihood(s.chance)] for s in v.alternatives]
         shown += [
             blocks.Heading("Explanations that fit nearly as well"),
             blocks.Table(("change", "chance of the residual"), rows, (3, 1), (1,)),
@@ -135,7 +135,7 @@ def changes(data: VerificationData) -> list[blocks.Block]:
     return shown
 
 
-def change_title(suspect: Suspect) -> str:
+def change_title(suspect: CandidateChange) -> str:
     """Return the name of a possible change."""
     if suspect.reading is not None:
         return f"reading {suspect.reading} alone is wrong"

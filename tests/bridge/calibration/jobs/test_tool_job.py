@@ -14,7 +14,7 @@ from gapbridge.core.arm import builtin_arm
 from gapbridge.core.calibration.observables import make_observable
 from gapbridge.core.calibration.observables.fixed_point import fixed_at
 from gapbridge.core.calibration.observables.nuisance import Nuisance
-from gapbridge.core.calibration.observables.predicted_readings import empty_readings
+from gapbridge.core.calibration.observables.predicted_readings import unmeasured_readings
 from gapbridge.core.loads import Loads
 from gapbridge.core.model import Model
 
@@ -37,9 +37,9 @@ def test_the_tip_of_a_new_tool_is_found_and_written_after_a_yes(tmp_path: Path) 
     true = replace(Model(builtin_arm("ur10e")), tool_in_flange=tool)
     q = np.array([p.q for p in plan.poses])
     observable = make_observable("point")
-    readings = empty_readings("point", q, Loads())
+    readings = unmeasured_readings("point", q, Loads())
     point = true.predict(BEGIN[None]).position[0]
-    touching = observable.brought(  # type: ignore[attr-defined]
+    touching = observable.solve_joints(  # type: ignore[attr-defined]
         true, q, readings, Nuisance((fixed_at(point),), np.zeros((1, 3)), np.zeros(1))
     )
     lines = [""]

@@ -6,7 +6,7 @@ import numpy as np
 
 from gapbridge.bridge.calibration.jobs.verify import VerifyJob
 from gapbridge.core.calibration.result import Errors, Estimate
-from gapbridge.core.calibration.verify import Suspect, Verification
+from gapbridge.core.calibration.verify import CandidateChange, Verification
 
 
 class Lines:
@@ -17,17 +17,17 @@ class Lines:
         self.lines.append(line)
 
 
-def suspect(joint: int, value: float) -> Suspect:
+def suspect(joint: int, value: float) -> CandidateChange:
     name = f"joint_offset_{joint}"
     found = (Estimate(name, value, 2e-4, "rad"),)
-    return Suspect(name, found, 0.4, 30.0, effect="joint_offset", joint=joint)
+    return CandidateChange(name, found, 0.4, 30.0, effect="joint_offset", joint=joint)
 
 
-def said(*others: Suspect) -> list[str]:
+def said(*others: CandidateChange) -> list[str]:
     found = Verification(
         holds=False, errors=Errors(np.full((5, 3), 1e-3), np.arange(5)),
         predicted=np.full(5, 1e-4), ratio=9.0,
-        chance=1e-9, moved=suspect(4, 0.01), suspects=others, stations=(), notes=(),
+        chance=1e-9, moved=suspect(4, 0.01), alternatives=others, stations=(), notes=(),
     )  # fmt: skip
     job = VerifyJob.__new__(VerifyJob)
     job.prompt = prompt = Lines()  # type: ignore[assignment]

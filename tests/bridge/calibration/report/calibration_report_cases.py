@@ -11,7 +11,7 @@ import numpy as np
 
 from gapbridge.bridge.calibration.report import InstrumentFacts, SessionFacts
 from gapbridge.core.arm import builtin_arm
-from gapbridge.core.calibration.fit import fit_session, judged
+from gapbridge.core.calibration.fit import evaluate_fit, fit_session
 from gapbridge.core.calibration.identifiability import identifiable_parameters
 from gapbridge.core.calibration.observables import make_observable
 from gapbridge.core.calibration.plan import Expectation, Payload, Plan, PlannedPose
@@ -91,7 +91,7 @@ def calibration(diagnose: bool = False) -> Calibration:
     )  # fmt: skip
     metrology = Metrology(sigma=SIGMA, repeatability=REPEATABILITY)
     readings = _readings(nominal, 3)
-    return judged(
+    return evaluate_fit(
         nominal, fit_session(readings, parameters, metrology), expected=expected, diagnose=diagnose
     )
 

@@ -8,13 +8,13 @@ from functools import cache
 import numpy as np
 
 from gapbridge.core.arm import builtin_arm
-from gapbridge.core.calibration.fit import fit_session, judged
+from gapbridge.core.calibration.fit import evaluate_fit, fit_session
 from gapbridge.core.calibration.identifiability import identifiable_parameters
 from gapbridge.core.calibration.observables import make_observable
 from gapbridge.core.calibration.observables.predicted_readings import (
-    empty_readings,
     predicted_readings,
-    usual_nuisance,
+    typical_nuisance,
+    unmeasured_readings,
 )
 from gapbridge.core.calibration.result import Calibration
 from gapbridge.core.effects import Site, Term
@@ -45,8 +45,8 @@ def calibration_of(kind: str) -> Calibration:
     pose[-6:], q[-6:], load[-6:], mass[-6:] = 0, q[0], 0, 1.0
     target = np.where(np.arange(COUNT) % 3 == 0, 2, 1) if kind == "relative" else 0 * pose
     loads = Loads(payload_mass=mass, payload_cog=np.zeros((COUNT, 3)))
-    empty = empty_readings(kind, q, loads, load=load, pose=pose, target=target)
-    nuisance = usual_nuisance(real, observable, empty)
+    empty = unmeasured_readings(kind, q, loads, load=load, pose=pose, target=target)
+    nuisance = typical_nuisance(real, observable, empty)
     readings = predicted_readings(observable, real, empty, nuisance)
     value = readings.value + rng.normal(0, SIGMA, readings.value.shape)
     hand = 0.0 if readings.value.shape[1] else 2e-5  # rad: what is touched is touched by hand
@@ -56,6 +56,6 @@ def calibration_of(kind: str) -> Calibration:
     )  # fmt: skip
     parameters = identifiable_parameters(nominal, EFFECTS, observable=observable)
     metrology = Metrology(sigma=SIGMA)
-    return judged(
+    return evaluate_fit(
         nominal, fit_session(readings, parameters, metrology, observable=observable), diagnose=False
     )

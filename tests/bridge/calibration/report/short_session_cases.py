@@ -9,7 +9,7 @@ import numpy as np
 from calibration_report_cases import JOINT, SIGMA, calibration
 
 from gapbridge.core.arm import builtin_arm
-from gapbridge.core.calibration.accuracy_baseline import document_of
+from gapbridge.core.calibration.accuracy_baseline import baseline_document
 from gapbridge.core.calibration.payload_session import PayloadCalibration, calibrate_payload
 from gapbridge.core.calibration.readings import Readings
 from gapbridge.core.calibration.tool_session import ToolCalibration, calibrate_tool
@@ -35,7 +35,7 @@ def verification(moved: bool) -> tuple[Verification, Readings]:
     frame = c.stations[0]
     readings = replace(taken, value=tip @ frame.rotation.T + frame.position)
     metrology = Metrology(sigma=SIGMA)
-    baseline = document_of(c, sigma=SIGMA)
+    baseline = baseline_document(c, sigma=SIGMA)
     return verify(c.model, readings, baseline, metrology), readings
 
 

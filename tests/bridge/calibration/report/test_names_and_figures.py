@@ -23,7 +23,7 @@ from gapbridge.core.notes import Note, Reason
 
 def test_every_parameter_that_a_session_can_find_has_a_title_of_its_own():
     effects = [e for e, effect in CATALOGUE.items() if effect.calibratable]
-    names = Parameters.every(Model(builtin_arm("ur10e")), effects).names
+    names = Parameters.of_effects(Model(builtin_arm("ur10e")), effects).names
     words = [parameter_title(name) for name in names]
     assert len(set(words)) == len(names)
     assert not [w for w in words if "_" in w or w.endswith((":", "("))]

@@ -15,9 +15,9 @@ from gapbridge.core.calibration.observables.fixed_point import fixed_at, point_o
 from gapbridge.core.calibration.observables.nuisance import Nuisance
 from gapbridge.core.calibration.observables.observable import Observable
 from gapbridge.core.calibration.observables.predicted_readings import (
-    empty_readings,
     predicted_readings,
-    usual_nuisance,
+    typical_nuisance,
+    unmeasured_readings,
 )
 from gapbridge.core.calibration.readings import Readings
 from gapbridge.core.errors import ExcitationError, InputError
@@ -45,11 +45,11 @@ def two_places(
     random = np.random.default_rng(seed)
     q = random.uniform(-2.5, 2.5, (count, 6))
     half = np.arange(count) % 2
-    readings = empty_readings(
+    readings = unmeasured_readings(
         observable.kind, q, Loads(payload_mass=random.choice([0.0, 4.0], count)),
         station=half, target=(np.arange(count) // 2) % 2,
     )  # fmt: skip
-    nuisance = usual_nuisance(model, observable, readings, seed)
+    nuisance = typical_nuisance(model, observable, readings, seed)
     if not observable.unknown and not observable.registered:
         frames = tuple(
             Registration(rotation_matrix(random.normal(size=3)), random.normal(size=3))
@@ -131,7 +131,9 @@ def test_a_sphere_is_touched_where_the_arm_is_brought(model) -> None:
     nuisance = replace(Nuisance.zero(), stations=(fixed_at(np.array([0.5, 0.2, 0.3])),))
     nuisance = replace(nuisance, lengths=np.array([0.04]))
     q = np.random.default_rng(3).uniform(-2.5, 2.5, (40, 6))
-    readings = predicted_readings(observable, model, empty_readings("sphere", q, Loads()), nuisance)
+    readings = predicted_readings(
+        observable, model, unmeasured_readings("sphere", q, Loads()), nuisance
+    )
     assert len(readings) > 20
     tip = model.predict(readings.q).position
     assert np.linalg.norm(tip - [0.5, 0.2, 0.3], axis=1) == pytest.approx(0.04, abs=1e-8)

@@ -167,7 +167,7 @@ def test_delays_that_differ_are_each_joints_own():
 def drooping(t, joint, droop):
     """Return where servos stand (N, n) of which one gives way to what it holds."""
     target = COURSE.at(t)
-    held = MODEL.held_torque(target, Loads())
+    held = MODEL.holding_torque(target, Loads())
     actual = target.copy()
     actual[:, joint - 1] -= droop * held[:, joint - 1]
     return actual
