@@ -147,12 +147,23 @@ def first_of(feed: PlannerSource, seconds: float = 1.0) -> np.ndarray | None:
     return found
 
 
-def turn(feed: PlannerSource, seconds: float = 0.05) -> None:
-    """Have the loop look a few times."""
-    until = time.monotonic() + seconds
+def closed_by(feed: PlannerSource, link: socket.socket) -> tuple[bytes, bool]:
+    """Look as the loop does until the feed closes; returns its answer, and if a setpoint came."""
+    received, setpoint_came = b"", False
+    link.settimeout(0.002)
+    until = time.monotonic() + 20.0
     while time.monotonic() < until:
-        feed.first(HERE)
-        time.sleep(0.002)
+        setpoint_came |= feed.first(HERE) is not None
+        try:
+            piece = link.recv(4096)
+        except TimeoutError:
+            continue
+        except ConnectionResetError:
+            return received, setpoint_came
+        if not piece:
+            return received, setpoint_came
+        received += piece
+    raise AssertionError(f"not closed within 20 s; received {received!r}")
 
 
 def answer(link: socket.socket) -> bytes:
@@ -218,8 +229,8 @@ def test_the_first_bad_line_ends_the_connection_and_nothing_after_it_counts(
 ) -> None:
     with planner(feed) as socket_:
         socket_.sendall(line.encode() + b"\n" + 5 * GOOD)
-        assert first_of(feed, 0.1) is None
-        reply = answer(socket_)
+        reply, setpoint_came = closed_by(feed, socket_)
+        assert not setpoint_came
         assert reply.startswith(b"error: ")
         assert reply.count(b"\n") == 1
     assert feed.refused == 1
@@ -231,9 +242,9 @@ def test_the_first_bad_line_ends_the_connection_and_nothing_after_it_counts(
 def test_a_line_without_end_does_not_fill_the_memory(feed: PlannerSource) -> None:
     with planner(feed) as socket_:
         socket_.sendall(b"1" * 20_000)
-        turn(feed)
-        assert b"a line without end" in answer(socket_)
-    assert first_of(feed, 0.02) is None
+        reply, setpoint_came = closed_by(feed, socket_)
+        assert b"a line without end" in reply
+        assert not setpoint_came
 
 
 def test_more_lines_than_the_robot_has_cycles_end_the_connection(feed: PlannerSource) -> None:
@@ -279,10 +290,11 @@ def test_a_second_planner_is_turned_away_and_the_next_one_is_not(feed: PlannerSo
                 assert feed.first(HERE) == pytest.approx(np.zeros(3))
                 time.sleep(0.01)
             assert answer(two) == b"error: another planner is connected\n"
-    turn(feed)
+    for _ in range(20):  # takes what the first one sent, and sees it leave
+        feed.first(HERE)
     with planner(feed) as three:
         three.sendall(b"0,0,0.1\n")
-        until = time.monotonic() + 1
+        until = time.monotonic() + 20
         while (found := feed.first(HERE)) is None or found[2] != 0.1:
             assert time.monotonic() < until
             time.sleep(0.002)
@@ -308,8 +320,7 @@ def test_one_that_fell_silent_gives_way_and_hears_of_it(feed: PlannerSource) -> 
         time.sleep(0.2)  # longer than the timeout: the feed is dry
         two.sendall(b"0,0,0.3\n")
         assert first_of(feed) == pytest.approx([0, 0, 0.3])
-        turn(feed)
-        assert b"another planner has taken the feed" in answer(one)
+        assert b"another planner has taken the feed" in closed_by(feed, one)[0]
 
 
 def test_the_socket_is_its_owners_and_goes_with_the_source(feed: PlannerSource) -> None:
@@ -340,8 +351,9 @@ def test_another_users_process_is_refused(
     monkeypatch.setattr("gapbridge.bridge.setpoint_source.planner.peer_of", lambda _: stranger)
     with planner(feed) as link:
         link.sendall(GOOD)
-        assert first_of(feed, 0.1) is None
-        assert b"another user" in answer(link)
+        reply, setpoint_came = closed_by(feed, link)
+        assert b"another user" in reply
+        assert not setpoint_came
 
 
 @pytest.mark.parametrize(
@@ -351,8 +363,8 @@ def test_another_users_process_is_refused(
 def test_over_tcp_nothing_counts_before_the_token(line: str, tcp: TcpSource) -> None:
     with planner(tcp) as link:
         link.sendall(line.encode() + b"\n" + GOOD)
-        assert first_of(tcp, 0.1) is None
-        reply = answer(link)
+        reply, setpoint_came = closed_by(tcp, link)
+        assert not setpoint_came
         assert b"expected the token in the first line" in reply
         assert TOKEN.encode() not in reply
 
@@ -368,8 +380,7 @@ def test_over_tcp_a_token_that_does_not_come_ends_the_connection(
 ) -> None:
     monkeypatch.setattr("gapbridge.bridge.setpoint_source.tcp.FIRST_LINE", 0.1)
     with planner(tcp) as link:
-        turn(tcp, 0.2)
-        assert b"no token within" in answer(link)
+        assert b"no token within" in closed_by(tcp, link)[0]
 
 
 def test_a_taken_address_is_one_line(tcp: TcpSource, tmp_path: Path) -> None:
