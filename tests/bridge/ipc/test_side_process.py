@@ -19,6 +19,7 @@ from gapbridge.bridge.cell.daemon_settings import DaemonSettings
 from gapbridge.bridge.ipc import side_process
 from gapbridge.bridge.ipc.shared_memory import SharedMemory
 from gapbridge.bridge.ipc.side_process import SideProcess
+from gapbridge.drivers.clock import SYSTEM, Clock
 
 ECHO = """
     import os
@@ -79,13 +80,13 @@ def start(
     start_data: dict[str, Any],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
-) -> Iterator[Callable[[str], SideProcess]]:
+) -> Iterator[Callable[..., SideProcess]]:
     monkeypatch.syspath_prepend(str(tmp_path))
     started: list[SideProcess] = []
 
-    def begin(text: str) -> SideProcess:
+    def begin(text: str, clock: Clock = SYSTEM) -> SideProcess:
         (tmp_path / "side_under_test.py").write_text(textwrap.dedent(text), encoding="utf-8")
-        started.append(SideProcess("side_under_test", start_data, memory, sys.stderr))
+        started.append(SideProcess("side_under_test", start_data, memory, sys.stderr, clock))
         return started[-1]
 
     yield begin
@@ -124,23 +125,34 @@ def test_it_gets_its_order_the_cycles_and_the_events_and_answers(
 
 
 def test_one_that_is_killed_comes_back_and_the_later_the_more_often(
-    start: Callable[[str], SideProcess],
+    start: Callable[..., SideProcess],
 ) -> None:
-    side = start(ECHO)
+    clock, now = Clock(), [1000.0]
+    clock.monotonic = lambda: now[0]
+    side = start(ECHO, clock)
     hear(side, "hello")
-    waits = []
-    for _ in range(3):
-        assert side.pid is not None
-        os.kill(side.pid, signal.SIGKILL)
-        assert "ended with -9" in wait_for(side.check)
-        gone = time.monotonic()
-        side.emit({"kind": "lost"})  # to nobody, and nobody waits
-        wait_for(lambda: side.check() or side.pid)
-        waits.append(time.monotonic() - gone)
+    for pause in (0.2, 0.4, 0.8):
+        restart(side, now, pause)
     hear(side, "hello")
     assert side.restarts == 3
     assert side.dropped == 3
-    assert waits[0] < waits[1] < waits[2]
+    now[0] += side_process.HEALTHY + 1.0  # it ran well for that long: the pause is short again
+    assert side.check() is None
+    restart(side, now, 0.2)
+
+
+def restart(side: SideProcess, now: list[float], pause: float) -> None:
+    """Kill a side process; it has to be restarted after ``pause`` s of the clock, not before."""
+    assert side.pid is not None
+    os.kill(side.pid, signal.SIGKILL)
+    assert "ended with -9" in wait_for(side.check)
+    side.emit({"kind": "lost"})  # to nobody, and nobody waits
+    now[0] += 0.99 * pause
+    assert side.check() is None
+    assert side.pid is None
+    now[0] += 0.02 * pause
+    assert side.check() is None
+    assert side.pid is not None
 
 
 def test_one_that_does_not_read_loses_events_holds_up_nothing_and_is_ended(
@@ -195,6 +207,7 @@ sys.path.insert(0, {str(tmp_path)!r})
 from gapbridge.bridge.ipc import side_main
 from gapbridge.bridge.ipc.shared_memory import SharedMemory
 from gapbridge.bridge.ipc.side_process import SideProcess
+from gapbridge.drivers.clock import SYSTEM, Clock
 side = SideProcess("side_under_test", json.loads({json.dumps(start_data)!r}), SharedMemory(2))
 while not side.events():
     time.sleep(0.02)
