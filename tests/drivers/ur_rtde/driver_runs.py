@@ -50,9 +50,17 @@ def until_error(seconds):
             return found, time.monotonic() - begun
     return "", seconds
 
+def read_state():
+    for _ in range(1000):  # a busy machine may read slower than samples come: that is refused
+        try:
+            return driver.read_state()
+        except InvalidStateError:
+            pass
+    raise AssertionError("no whole sample in 1000 readings")
+
 def read_for(cycles):
     for _ in range(cycles):
-        state = driver.read_state()
+        state = read_state()
     return state
 """
 

@@ -15,11 +15,11 @@ def test_a_state_is_the_plants(controller: SimulatedController) -> None:
         controller.host,
         """
         with driver:
-            states = [driver.read_state() for _ in range(200)]
+            states = [read_state() for _ in range(200)]
             free = np.mean([s.actual_TCP_force for s in states], axis=0)
             bench.do("wrench 30 -20 10 1 2 -3")
             read_for(50)
-            pulled = np.mean([driver.read_state().actual_TCP_force for _ in range(200)], axis=0)
+            pulled = np.mean([read_state().actual_TCP_force for _ in range(200)], axis=0)
             out["pull"] = (pulled - free).tolist()
             s = states[-1]
             out["q"] = s.actual_q.tolist()
@@ -33,7 +33,7 @@ def test_a_state_is_the_plants(controller: SimulatedController) -> None:
             out["scaling"] = s.speed_scaling
             out["tcp"] = driver.reader.joints_and_tcp()[1].tolist()
             out["age"] = min(
-                -driver.read_state().received + time.monotonic() for _ in range(50)
+                -read_state().received + time.monotonic() for _ in range(50)
             )
             from gapbridge.core.rotation import rotation_vector
             pose = model.rigid_pose(s.actual_q[None])
@@ -241,15 +241,18 @@ def test_torques_need_the_motors_constants(controller: SimulatedController) -> N
         controller.host,
         """
         driver.connect()
-        s = driver.read_state()
-        out["torque"] = s.actual_current_as_torque.tolist()
-        out["current"] = driver.reader._receive.getActualCurrent()
+        receive = driver.reader._receive
+        for _ in range(1000):  # until both are of one sample
+            s, current = read_state(), receive.getActualCurrent()
+            if receive.getTimestamp() == s.timestamp:
+                break
+        out["torque"], out["current"] = s.actual_current_as_torque.tolist(), current
         """,
         torque_constants=(10.0, 11.0, 12.0, 13.0, 14.0, 15.0),
     )
     assert len(out["torque"]) == 6
     for torque, current, constant in zip(out["torque"], out["current"], range(10, 16), strict=True):
-        assert torque == pytest.approx(current * constant, abs=0.1 + 0.5 * abs(torque))
+        assert torque == pytest.approx(current * constant, abs=1e-9)
     assert any(abs(t) > 1e-3 for t in out["torque"])
 
 
