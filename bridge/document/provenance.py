@@ -25,7 +25,7 @@ def provenance(
 ) -> dict[str, Any]:
     """Return the provenance of the running command's result, as JSON and cells hold it.
 
-    ``files`` are its inputs by role (``log``, ``cell``); a folder stands for all of its files.
+    ``files`` are its inputs by role (``log``, ``cell``); a folder means all of its files.
     Arguments are those of the command that differ from their defaults; called from Python, the
     command is ``command`` and its arguments are these files and ``options``.
     """

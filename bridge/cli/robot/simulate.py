@@ -19,7 +19,7 @@ def simulate(cell: Path, host: str | None, seed: int | None) -> None:
     """Run a simulated controller for a cell, on its real protocol, until stopped.
 
     The simulated arm bends with hidden flexibilities that are drawn from the seed. A control port
-    (30100) stands for the operator and the laser tracker: `measure`, `payload`, `wrench`,
+    (30100) acts as the operator and the laser tracker: `measure`, `payload`, `wrench`,
     `help`. Ends on SIGINT and SIGTERM.
 
     Example: gapbridge simulate cell.yaml
