@@ -11,12 +11,12 @@ import sys
 import textwrap
 import threading
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
+from patience import PATIENCE, wait_for
 from simulated_controller import SimulatedController
 
 from benchmarks.server_thread import OFFSET_SCRIPT
@@ -44,16 +44,6 @@ def plant(**changed: Any) -> ServerSettings:
     return simulated_cell("ur10e", own_address(), 11, **{**given, **changed})
 
 
-def wait_for(what: Callable[[], bool], limit: float, words: str) -> float:
-    """Wait until ``what`` holds; returns how long it took, s."""
-    begun = time.monotonic()
-    while not what():
-        waited = time.monotonic() - begun
-        assert waited < limit, f"{words}: not within {limit:g} s"
-        time.sleep(0.01)
-    return time.monotonic() - begun
-
-
 class Robot:
     """A simulated controller with its bench, and a cell file that knows its true compliance."""
 
@@ -71,7 +61,7 @@ class Robot:
         self.controller.stop()
 
     def bench(self, line: str) -> str:
-        with socket.create_connection((self.host, BENCH_PORT), timeout=5) as link:
+        with socket.create_connection((self.host, BENCH_PORT), timeout=PATIENCE) as link:
             link.sendall(line.encode() + b"\n")
             return link.makefile("r").readline().strip()
 
@@ -86,7 +76,7 @@ class Robot:
 
     def start_offset_program(self) -> socket.socket:
         """Start the program of the offset mode; it runs until the socket is closed."""
-        upload = socket.create_connection((self.host, self.settings.script_port), timeout=5)
+        upload = socket.create_connection((self.host, self.settings.script_port), timeout=PATIENCE)
         upload.sendall(OFFSET_SCRIPT.read_bytes())
         time.sleep(0.2)
         return upload
@@ -133,25 +123,25 @@ class Run:
 
     def __exit__(self, *_: object) -> None:
         self.daemon.stop()
-        self._thread.join(20)
+        self._thread.join(PATIENCE)
         assert not self._thread.is_alive()
 
-    def wait(self, state: State, limit: float = 120.0) -> float:
+    def wait(self, state: State) -> float:
         """Wait until the loop is in a state; returns how long it took, s."""
 
         def there() -> bool:
             assert self.error is None, self.error
             return self.daemon.state == state
 
-        return wait_for(there, limit, f"{state.name} ({self.output})")
+        return wait_for(there, f"{state.name} ({self.output})")
 
-    def compensate(self, limit: float = 120.0) -> None:
+    def compensate(self) -> None:
         """Arm, again as a person does where a busy machine ended the motion at once."""
-        until, asked = time.monotonic() + limit, 0.0
+        until, asked = time.monotonic() + PATIENCE, 0.0
         while self.daemon.state != State.COMPENSATING:
             now = time.monotonic()
             assert self.error is None, self.error
-            assert now < until, f"{self.daemon.state} ({self.output}): not within {limit:g} s"
+            assert now < until, f"{self.daemon.state} ({self.output}): not within {PATIENCE:g} s"
             if self.daemon.state == State.OBSERVING and now - asked > 3.0:
                 self.daemon.arm()
                 asked = now
@@ -162,9 +152,9 @@ class Run:
         self.daemon.stop()
         return self.join()
 
-    def join(self, limit: float = 30.0) -> RunSummary:
+    def join(self) -> RunSummary:
         """Wait for the run's own end."""
-        self._thread.join(limit)
+        self._thread.join(PATIENCE)
         assert not self._thread.is_alive(), self.output
         assert self.error is None, self.error
         assert self.summary is not None

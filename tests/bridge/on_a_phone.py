@@ -6,9 +6,10 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+from patience import PATIENCE
+
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 WIDTH = 390
-PATIENCE = 120_000  # ms: a busy machine draws slowly
 # What leaves the screen and cannot be scrolled to, what its own box cuts, text out of a drawing.
 CUT = """() => [...document.querySelectorAll('body *')].filter(e => {
   const r = e.getBoundingClientRect(), style = getComputedStyle(e);
@@ -40,7 +41,7 @@ def faults_on_a_phone(playwright: Any, path: Path) -> list[str]:
         browser = started.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
         for scheme in ("light", "dark"):
             page = browser.new_page(viewport={"width": WIDTH, "height": 844}, color_scheme=scheme)
-            page.set_default_timeout(PATIENCE)
+            page.set_default_timeout(1e3 * PATIENCE)
             page.goto(path.as_uri())
             page.wait_for_timeout(500)
             if page.evaluate("document.documentElement.scrollWidth") > WIDTH:

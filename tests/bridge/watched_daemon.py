@@ -12,7 +12,8 @@ from typing import Any
 import httpx
 import numpy as np
 import psutil
-from daemon_cell import Robot, wait_for
+from daemon_cell import Robot
+from patience import PATIENCE, wait_for
 from ports import free_port
 
 
@@ -50,24 +51,24 @@ class Watched:
 
     def status(self) -> dict[str, Any]:
         try:
-            found: dict[str, Any] = httpx.get(f"{self.url}status", timeout=5).json()
+            found: dict[str, Any] = httpx.get(f"{self.url}status", timeout=PATIENCE).json()
         except httpx.TransportError:
             return {}
         return found
 
-    def wait(self, state: str, limit: float = 60.0) -> None:
+    def wait(self, state: str) -> None:
         def there() -> bool:
             assert self.process.poll() is None, self.log.read_text()
             return bool(self.status().get("now", {}).get("state") == state)
 
-        wait_for(there, limit, f"{state} ({self.log.read_text()[-2000:]})")
+        wait_for(there, f"{state} ({self.log.read_text()[-2000:]})")
 
     def command(self, name: str) -> int:
         return subprocess.run([sys.executable, "-m", "gapbridge", name, self.cell]).returncode
 
     def arm(self) -> None:
         """Have a person at the machine arm; what a busy machine made of the link is cleared."""
-        until = time.monotonic() + 60
+        until = time.monotonic() + PATIENCE
         while self.status().get("now", {}).get("state") != "compensating":
             assert time.monotonic() < until, self.log.read_text()[-3000:]
             if self.command("arm"):
@@ -81,7 +82,7 @@ class Watched:
         if self.process.poll() is None:
             self.process.send_signal(signal.SIGTERM)
         try:
-            self.process.wait(20)
+            self.process.wait(PATIENCE)
         finally:
             self.process.kill()
 

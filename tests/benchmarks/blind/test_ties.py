@@ -24,7 +24,7 @@ def shown(left: dict[str, float], free: dict[str, float], gap: float = 1e6) -> S
 
 def test_each_tie_of_the_catalogue_is_shown_by_data_that_cannot_separate_it():
     said = {frozenset((name, other)): data for name, effect in CATALOGUE.items()
-            for other, data in effect.alike.items() if data != NO_MOMENT}  # fmt: skip
+            for other, data in effect.equivalents.items() if data != NO_MOMENT}  # fmt: skip
     drawn = {frozenset((data.effect, other)) for data in TABLE for other in data.alike}
     assert said.keys() - drawn == set()
 

@@ -5,6 +5,8 @@ import sys
 import threading
 import time
 
+from patience import PATIENCE
+
 from benchmarks.links.case import Cycles, nothing
 from benchmarks.links.measure import cpu_clock, measured
 from gapbridge.core.errors import StaleStateError
@@ -39,7 +41,7 @@ def test_another_threads_work_for_the_cycle_counts() -> None:
     assert thread.ident is not None
     clock = cpu_clock((thread.ident,))
     before = clock()
-    done.wait(10.0)
+    done.wait(PATIENCE)
     assert clock() - before > 0.02
     thread.join()
 

@@ -15,6 +15,7 @@ from typing import Self
 import numpy as np
 import pexpect
 from numpy.typing import NDArray
+from patience import PATIENCE
 
 from gapbridge.core.estimation.registration import Registration
 from gapbridge.core.rotation import rotation_matrix
@@ -35,14 +36,14 @@ class CellOperator:
     frame: Registration = FRAME  # of the tracker
 
     def bench(self, line: str) -> str:
-        with socket.create_connection((self.host, BENCH_PORT), timeout=10) as link:
+        with socket.create_connection((self.host, BENCH_PORT), timeout=PATIENCE) as link:
             link.sendall(line.encode() + b"\n")
             answer = link.makefile().readline().strip()
         assert not answer.startswith("error"), answer
         return answer
 
     def pendant(self, program: str) -> None:
-        with socket.create_connection((self.host, SCRIPT_PORT), timeout=10) as link:
+        with socket.create_connection((self.host, SCRIPT_PORT), timeout=PATIENCE) as link:
             link.sendall(program.encode())
             time.sleep(0.1)
 

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from patience import PATIENCE
 from scripted_session import (
     AXIAL,
     FRAME,
@@ -183,7 +184,7 @@ def feed() -> Iterator[tuple[int, list[np.ndarray]]]:
         thread.start()
         yield server.getsockname()[1], values
         server.shutdown(socket.SHUT_RDWR)
-    thread.join(10.0)
+    thread.join(PATIENCE)
 
 
 def _serve(server: socket.socket, values: list[np.ndarray]) -> None:

@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+from patience import PATIENCE
 
 from gapbridge.bridge.cell import load_cell
 from gapbridge.bridge.cli import main
@@ -401,12 +402,12 @@ def test_simulate_serves_until_it_is_asked_to_stop(desk: Desk) -> None:
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
         assert server.stdout is not None
         reported = [server.stdout.readline() for _ in range(2)]
-        with socket.create_connection((host, 30100), timeout=5) as bench:
+        with socket.create_connection((host, 30100), timeout=PATIENCE) as bench:
             bench.sendall(b"measure\n")
             assert len(bench.recv(4096).split(b",")) == 7
         start = time.monotonic()
         server.send_signal(signal.SIGTERM)
-        assert server.wait(10) == 0
+        assert server.wait(PATIENCE) == 0
     assert time.monotonic() - start < 3
     assert host in reported[0]
     assert reported[1] == f"ready {host}\n"

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 import yaml
 from cli_runs import gapbridge, refused
+from patience import PATIENCE
 from ports import free_port, own_host
 
 from gapbridge.bridge.cell import load_cell
@@ -48,7 +49,7 @@ def simulated(folder: Path, config: str, **link: object) -> Iterator[str]:
         yield host
     finally:
         served.terminate()
-        served.communicate(timeout=10)
+        served.communicate(timeout=PATIENCE)
 
 
 def init_check_and_observe(folder: Path, *arguments: object) -> Path:

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from daemon_cell import Robot, Run, offsets, wait_for
+from daemon_cell import Robot, Run, offsets
+from patience import wait_for
 
 from gapbridge.bridge.cell.run_settings import read_configuration
 from gapbridge.bridge.ipc.loop_state import State
@@ -28,10 +29,10 @@ def test_a_loop_that_is_started_anew_runs_the_cell_that_runs_not_the_edited_one(
         text = cell.read_text()
         with Run(cell) as run:
             run.wait(State.OBSERVING)
-            wait_for(lambda: granted(run), 10.0, "the grant of the first loop")
+            wait_for(lambda: granted(run), "the grant of the first loop")
             before = granted(run)
             run.compensate()
-            wait_for(lambda: run.daemon.tally.written > 400, 30.0, "a ramp")
+            wait_for(lambda: run.daemon.tally.written > 400, "a ramp")
             # an arm ten times as soft as the one that stands there: the model is what is read anew
             soft = [10.0 * c for c in robot.settings.plant.axial]
             axial = str(list(robot.settings.plant.axial))
@@ -44,13 +45,13 @@ def test_a_loop_that_is_started_anew_runs_the_cell_that_runs_not_the_edited_one(
             run.wait(State.OBSERVING)
             written = run.daemon.tally.written
             run.compensate()
-            wait_for(lambda: run.daemon.tally.written > written + 400, 30.0, "a ramp")
+            wait_for(lambda: run.daemon.tally.written > written + 400, "a ramp")
             assert run.daemon.configuration.text == text
             assert len(granted(run)) == 2
             assert granted(run)[-1] == before[-1] == run.daemon.configuration.hash
             run.daemon.reload()  # and a reload does take it
-            wait_for(lambda: run.daemon.configuration.text != text, 30.0, "the edited cell")
-            wait_for(lambda: len(granted(run)) >= 3, 90.0, "its loop")
+            wait_for(lambda: run.daemon.configuration.text != text, "the edited cell")
+            wait_for(lambda: len(granted(run)) >= 3, "its loop")
             assert granted(run)[-1] != before[-1]
             run.end()
         cycles = run.cycles()

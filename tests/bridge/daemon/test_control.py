@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from daemon_cell import Robot, Run, gapbridge, wait_for
+from daemon_cell import Robot, Run, gapbridge
+from patience import PATIENCE, wait_for
 
 from gapbridge.bridge.cell.runtime_folder import cell_key, runtime_folder
 from gapbridge.bridge.daemon import control
@@ -151,7 +152,7 @@ def test_a_person_arms_and_disarms_a_running_daemon(robot: Robot) -> None:
         def reported() -> list[dict[str, Any]]:
             return [e for e in run.daemon.events_since(0) if e["kind"] == "control"]
 
-        wait_for(lambda: len(reported()) == 4, 20.0, "the last request's event")
+        wait_for(lambda: len(reported()) == 4, "the last request's event")
         events = reported()
     assert [(e["command"], e["uid"], e["ok"]) for e in events] == [
         (command, os.getuid(), True) for command in ("disarm", "arm", "arm", "disarm")
@@ -171,7 +172,7 @@ def test_a_fault_waits_for_a_person_and_arming_is_refused_until_then(robot: Robo
         assert run.daemon.state == State.FAULT
         robot.bench("unlock")
         run.wait(State.OBSERVING)
-        wait_for(lambda: ask(cell, "status")["latched"] == "", 20.0, "no fault latched")
+        wait_for(lambda: ask(cell, "status")["latched"] == "", "no fault latched")
 
 
 @pytest.mark.slow
@@ -208,7 +209,7 @@ def test_the_commands_show_in_a_line_and_as_json(robot: Robot) -> None:
 
         def reported(*arguments: object) -> tuple[int, str, str]:
             done = gapbridge(*arguments, folder=robot.folder)
-            out, err = done.communicate(timeout=60)
+            out, err = done.communicate(timeout=PATIENCE)
             return done.returncode, out, err
 
         code, out, err = reported("status", cell)

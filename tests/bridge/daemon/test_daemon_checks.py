@@ -10,7 +10,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from daemon_cell import Robot, Run, offsets, wait_for
+from daemon_cell import Robot, Run, offsets
+from patience import PATIENCE, wait_for
 
 from gapbridge.bridge.daemon.status_document import lines
 from gapbridge.bridge.ipc.loop_state import State
@@ -31,7 +32,7 @@ def test_an_offset_that_stands_at_its_limit_ends_the_compensation(robot: Robot) 
                 run.daemon.arm()  # a busy machine was late, and the loop held before its second
             return "offset saturated" in " ".join(run.output)
 
-        wait_for(saturated, 30.0, "the saturation")
+        wait_for(saturated, "the saturation")
         run.wait(State.OBSERVING)
         assert run.daemon.status()["counts"]["saturated"] == 1
         run.end()
@@ -51,7 +52,7 @@ def test_a_loop_that_was_suspended_begins_anew_and_observes(robot: Robot) -> Non
         os.kill(pid, signal.SIGSTOP)
         time.sleep(0.4)
         os.kill(pid, signal.SIGCONT)
-        wait_for(lambda: not run.daemon.state.writes, 5.0, "no more writing")
+        wait_for(lambda: not run.daemon.state.writes, "no more writing")
         run.wait(State.OBSERVING)
         time.sleep(0.3)
         assert run.daemon.state == State.OBSERVING
@@ -68,7 +69,7 @@ def refusal(run: Run) -> str:
     """Arm and return why that was refused."""
     before = len(run.output)
     run.daemon.arm()
-    wait_for(lambda: len(run.output) > before, 10.0, "a word on arming")
+    wait_for(lambda: len(run.output) > before, "a word on arming")
     time.sleep(0.2)
     assert not run.daemon.state.writes, run.output
     return " ".join(run.output[before:])
@@ -137,7 +138,9 @@ def test_the_age_of_the_last_state_is_shown_in_the_unit_of_its_size(robot: Robot
 def script(robot: Robot, line: str) -> None:
     """Have the controller run a line beside its program, as a person at the pendant would."""
     text = f"sec person():\n  {line}\nend\n"
-    with socket.create_connection((robot.host, robot.settings.script_port), timeout=5) as upload:
+    with socket.create_connection(
+        (robot.host, robot.settings.script_port), timeout=PATIENCE
+    ) as upload:
         upload.sendall(text.encode())
         time.sleep(0.2)
 
@@ -160,7 +163,7 @@ def test_what_a_person_changes_in_the_controller_during_a_run_is_held_and_not_co
         run.compensate()
         time.sleep(0.8)
         script(robot, line)
-        wait_for(lambda: cause in " ".join(run.output), 20.0, f"{cause} ({run.output})")
+        wait_for(lambda: cause in " ".join(run.output), f"{cause} ({run.output})")
         run.wait(State.OBSERVING)
         assert cause.split(": ")[-1] in refusal(run)
         run.end()
@@ -177,7 +180,7 @@ def test_what_a_person_changes_in_the_controller_during_a_run_is_held_and_not_co
 @pytest.mark.slow
 def test_a_rate_above_the_controllers_is_refused_by_name(robot: Robot) -> None:
     with Run(robot.cell(", rate: 1000"), arm=True) as run:
-        wait_for(lambda: any("link.rate" in line for line in run.output), 30.0, "a refusal")
+        wait_for(lambda: any("link.rate" in line for line in run.output), "a refusal")
         output = " ".join(run.output)
         nothing_left(run)
     assert "link.rate: found 1000 Hz, expected at most 500 Hz" in output

@@ -13,7 +13,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from daemon_cell import Robot, Run, gapbridge, offsets, only_recording, read_cycles, wait_for
+from daemon_cell import Robot, Run, gapbridge, offsets, only_recording, read_cycles
+from patience import PATIENCE, wait_for
 
 from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.core.errors import CellError, InputError, LinkError
@@ -42,7 +43,7 @@ def test_a_loop_that_dies_comes_back_observing(robot: Robot, number: signal.Sign
         pid = run.daemon.loop_pid
         assert pid is not None
         os.kill(pid, number)
-        wait_for(lambda: run.daemon.loop_pid not in (None, pid), 10.0, "a new loop")
+        wait_for(lambda: run.daemon.loop_pid not in (None, pid), "a new loop")
         assert_came_back_observing(run, robot)
     assert run.summary is not None
     assert run.summary.restarts == 1
@@ -60,7 +61,7 @@ def test_a_loop_that_hangs_is_ended_and_comes_back_observing(robot: Robot) -> No
         pid = run.daemon.loop_pid
         assert pid is not None
         os.kill(pid, signal.SIGSTOP)
-        waited = wait_for(lambda: run.daemon.loop_pid != pid, 5.0, "the end of the hanging loop")
+        waited = wait_for(lambda: run.daemon.loop_pid != pid, "the end of the hanging loop")
         assert waited < 2.0
         assert_came_back_observing(run, robot)
     assert run.summary is not None
@@ -84,7 +85,7 @@ def test_a_clock_that_stands_still_is_seen_though_packets_flow(robot: Robot) -> 
     with Run(robot.cell()) as run:
         run.wait(State.OBSERVING)
         robot.bench("freeze")
-        wait_for(lambda: run.daemon.status()["counts"]["silence"] == 1, 20.0, "silence")
+        wait_for(lambda: run.daemon.status()["counts"]["silence"] == 1, "silence")
         robot.bench("thaw")
         run.wait(State.OBSERVING)
         assert run.daemon.latched == ""  # nothing was written, so nobody has to look
@@ -97,7 +98,7 @@ def test_a_clock_that_stands_still_ends_compensating(robot: Robot) -> None:
     with Run(robot.cell(), arm=True) as run:
         run.compensate()
         robot.bench("freeze")
-        wait_for(lambda: "holding" in " ".join(run.output), 20.0, "holding")
+        wait_for(lambda: "holding" in " ".join(run.output), "holding")
         assert "state stale" in " ".join(run.output)
         robot.bench("thaw")
         run.end()
@@ -122,7 +123,7 @@ def test_a_dropped_connection_is_replaced_by_a_new_process(robot: Robot) -> None
         run.compensate()
         time.sleep(0.3)
         robot.bench("drop")
-        wait_for(lambda: run.daemon.state != State.COMPENSATING, 20.0, "the fault")
+        wait_for(lambda: run.daemon.state != State.COMPENSATING, "the fault")
         assert_came_back_observing(run, robot)
 
 
@@ -132,7 +133,7 @@ def test_a_controller_that_is_started_anew_is_found_again(tmp_path: Path) -> Non
         run.compensate()
         time.sleep(0.3)
         os.kill(robot.controller.pid, signal.SIGKILL)
-        wait_for(lambda: run.daemon.state == State.DISCONNECTED, 5.0, "the loss of the link")
+        wait_for(lambda: run.daemon.state == State.DISCONNECTED, "the loss of the link")
         robot.controller.stop()
         robot.controller.start()
         assert_came_back_observing(run, robot)
@@ -186,7 +187,7 @@ def test_a_signal_ramps_out_and_ends_in_time(robot: Robot, number: signal.Signal
     time.sleep(1.0)
     begun = time.monotonic()
     run.send_signal(number)
-    out, err = run.communicate(timeout=10)
+    out, err = run.communicate(timeout=PATIENCE)
     assert time.monotonic() - begun < 5.0  # 1.1 s alone on its cores
     assert run.returncode == 0, err
     assert err == ""
@@ -210,7 +211,7 @@ def test_when_the_daemon_is_killed_its_loop_ramps_out_and_the_recording_is_whole
     killed = time.monotonic()
     run.kill()
     run.wait()
-    wait_for(lambda: "rtde_control ended" in robot.controller.log(), 20.0, "the end of the loop")
+    wait_for(lambda: "rtde_control ended" in robot.controller.log(), "the end of the loop")
     assert "watchdog" not in robot.controller.log()  # it ended by itself
     recording = only_recording(robot.folder / "recordings")
     time.sleep(1.5)  # the recorder outlives the loop by a moment
@@ -225,7 +226,7 @@ def test_when_the_daemon_is_killed_its_loop_ramps_out_and_the_recording_is_whole
 def test_a_robot_that_is_not_there_is_one_line(tmp_path: Path) -> None:
     robot = Robot(tmp_path)
     run = gapbridge("run", robot.cell(), folder=tmp_path)
-    out, err = run.communicate(timeout=30)
+    out, err = run.communicate(timeout=PATIENCE)
     assert run.returncode == 1
     assert err.count("\n") == 1
     assert robot.host in err
@@ -255,7 +256,7 @@ def mute_server(host: str) -> Iterator[None]:
 def test_a_controller_that_never_answers_does_not_hang_the_daemon(tmp_path: Path) -> None:
     robot = Robot(tmp_path)
     with mute_server(robot.host), Run(robot.cell(link=", connect_timeout: 1.0")) as run:
-        wait_for(lambda: run.error is not None, 20.0, "the end of the run")
+        wait_for(lambda: run.error is not None, "the end of the run")
     assert isinstance(run.error, LinkError)
 
 
@@ -277,6 +278,6 @@ def test_a_trajectory_that_is_not_there_is_unusable_input(tmp_path: Path) -> Non
     with Robot(tmp_path) as robot:
         cell = robot.cell(setpoints="{source: trajectory, file: nowhere.csv}")
         with Run(cell, arm=True) as run:
-            wait_for(lambda: run.error is not None, 20.0, "the end of the run")
+            wait_for(lambda: run.error is not None, "the end of the run")
     assert isinstance(run.error, InputError)
     assert "nowhere.csv: file not found" in str(run.error)

@@ -9,7 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from daemon_cell import Robot, Run, offsets, wait_for
+from daemon_cell import Robot, Run, offsets
+from patience import PATIENCE, wait_for
 from recorded_documents import read_documents
 
 from gapbridge.bridge.cell import load_cell
@@ -102,7 +103,7 @@ def test_a_person_arms_and_disarms_while_it_runs(robot: Robot) -> None:
 
 @pytest.mark.slow
 def test_a_robot_program_is_not_ended_to_arm(robot: Robot) -> None:
-    with socket.create_connection((robot.host, 30003), timeout=5) as upload:
+    with socket.create_connection((robot.host, 30003), timeout=PATIENCE) as upload:
         upload.sendall(b"def own_work():\n  sleep(30)\nend\n")
         time.sleep(0.2)
         with Run(robot.cell(), arm=True, duration=0.5) as run:
@@ -236,7 +237,7 @@ def test_a_planner_moves_the_arm_and_its_silence_is_a_smooth_hold(robot: Robot) 
             send(start + 0.002 * k * np.eye(6)[0])
         assert run.daemon.state == State.COMPENSATING
         planner.close()
-        wait_for(lambda: run.daemon.state == State.OBSERVING, 5.0, "hold and ramp out")
+        wait_for(lambda: run.daemon.state == State.OBSERVING, "hold and ramp out")
         summary = run.end()
     assert any("source dry" in line for line in summary.faults)
     cycles = run.cycles()

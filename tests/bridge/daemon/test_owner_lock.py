@@ -11,8 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from daemon_cell import Robot, Run, gapbridge, wait_for
+from daemon_cell import Robot, Run, gapbridge
 from link_settings import link_settings
+from patience import PATIENCE, wait_for
 
 from gapbridge.bridge.daemon.owner_lock import OwnerLock
 from gapbridge.bridge.ipc.control_client import ask
@@ -93,7 +94,7 @@ def test_two_daemons_on_one_robot_the_second_leaves_with_two(robot: Robot) -> No
         other = robot.folder / "other.yaml"
         other.write_text(cell.read_text())
         second = gapbridge("run", other, folder=robot.folder)
-        out, err = second.communicate(timeout=60)
+        out, err = second.communicate(timeout=PATIENCE)
         assert second.returncode == 2
         assert out == ""
         assert err.startswith("error: ")
@@ -117,14 +118,14 @@ def test_after_kill_nine_the_next_start_works_and_does_not_arm_by_itself(robot: 
     first.send_signal(signal.SIGKILL)
     first.wait()
     for pid in [loop, *sides]:
-        wait_for(lambda pid=pid: not alive(pid), 10.0, f"the end of {pid}")
+        wait_for(lambda pid=pid: not alive(pid), f"the end of {pid}")
     second = gapbridge("run", cell, "--duration", "2", folder=robot.folder)
-    out, err = second.communicate(timeout=60)
+    out, err = second.communicate(timeout=PATIENCE)
     assert err == ""
     assert "did not end in order: not arming by itself" in out
     assert "compensating" not in out
     third = gapbridge("run", cell, "--duration", "5", folder=robot.folder)
-    assert "compensating" in third.communicate(timeout=60)[0]  # the second ended in order
+    assert "compensating" in third.communicate(timeout=PATIENCE)[0]  # the second ended in order
 
 
 def alive(pid: int) -> bool:

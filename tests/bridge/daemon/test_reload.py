@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from daemon_cell import Robot, Run, offsets, wait_for
+from daemon_cell import Robot, Run, offsets
+from patience import wait_for
 
 from gapbridge.bridge.ipc.loop_state import State
 
@@ -18,7 +19,7 @@ PATIENT = ", state_timeout: 0.25"
 
 def configured(run: Run) -> dict[str, Any]:
     """Return the event of the last attempt."""
-    wait_for(lambda: bool(run.daemon.status()["configured"]), 10.0, "the cell read again")
+    wait_for(lambda: bool(run.daemon.status()["configured"]), "the cell read again")
     found: dict[str, Any] = run.daemon.status()["configured"]
     return found
 
@@ -68,7 +69,7 @@ def test_a_changed_cell_is_ramped_out_of_and_into(robot: Robot, arms: bool) -> N
         cell.write_text(cell.read_text() + "limits: {offset_rate: 0.02}\n")
         run.daemon.reload()
         assert configured(run)["ok"]
-        wait_for(lambda: run.daemon.loop_pid not in (None, first), 20.0, "the new loop")
+        wait_for(lambda: run.daemon.loop_pid not in (None, first), "the new loop")
         run.wait(State.COMPENSATING if arms else State.OBSERVING)
         time.sleep(1.0)
         assert run.daemon.state == (State.COMPENSATING if arms else State.OBSERVING)
@@ -94,6 +95,6 @@ def test_a_reload_while_observing_takes_effect_at_once(robot: Robot) -> None:
         cell.write_text(cell.read_text().replace("mass: 5.0", "mass: 4.0"))
         run.daemon.reload()
         assert configured(run)["ok"]
-        wait_for(lambda: run.daemon.loop_pid not in (None, first), 20.0, "the new loop")
+        wait_for(lambda: run.daemon.loop_pid not in (None, first), "the new loop")
         run.wait(State.OBSERVING)
         assert run.end().setpoints_written == 0

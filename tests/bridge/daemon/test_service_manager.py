@@ -13,7 +13,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from daemon_cell import Robot, gapbridge, wait_for
+from daemon_cell import Robot, gapbridge
+from patience import PATIENCE, wait_for
 
 from gapbridge.bridge.daemon.service_manager import ServiceManager
 
@@ -86,15 +87,15 @@ def test_the_daemon_reports_ready_alive_reloading_and_stopping_in_this_order(
     monkeypatch.delenv("WATCHDOG_PID", raising=False)
     with Robot(tmp_path) as robot:
         run = gapbridge("run", robot.cell(), folder=tmp_path)
-        wait_for(lambda: "READY=1" in listener.take(), 60.0, "ready")
+        wait_for(lambda: "READY=1" in listener.take(), "ready")
         alive = listener.lines.count("WATCHDOG=1")
-        wait_for(lambda: listener.take().count("WATCHDOG=1") > alive + 3, 10.0, "signs of life")
+        wait_for(lambda: listener.take().count("WATCHDOG=1") > alive + 3, "signs of life")
         run.send_signal(signal.SIGHUP)
-        wait_for(lambda: listener.take().count("READY=1") == 2, 60.0, "ready again")
+        wait_for(lambda: listener.take().count("READY=1") == 2, "ready again")
         assert "RELOADING=1" in listener.lines
         assert any(line.startswith("MONOTONIC_USEC=") for line in listener.lines)
         run.send_signal(signal.SIGTERM)
-        out, err = run.communicate(timeout=20)
+        out, err = run.communicate(timeout=PATIENCE)
     assert (run.returncode, err) == (0, "")
     reported = [
         line for line in listener.take() if line.split("=")[0] in ("READY", "RELOADING", "STOPPING")
@@ -112,7 +113,7 @@ def test_a_daemon_that_stands_still_gives_no_sign_of_life(
     monkeypatch.delenv("WATCHDOG_PID", raising=False)
     with Robot(tmp_path) as robot:
         run = gapbridge("run", robot.cell(), folder=tmp_path)
-        wait_for(lambda: "READY=1" in listener.take(), 60.0, "ready")
+        wait_for(lambda: "READY=1" in listener.take(), "ready")
         run.send_signal(signal.SIGSTOP)
         time.sleep(0.3)
         before = len(listener.take())
@@ -120,7 +121,7 @@ def test_a_daemon_that_stands_still_gives_no_sign_of_life(
         assert len(listener.take()) == before
         run.send_signal(signal.SIGCONT)
         run.send_signal(signal.SIGTERM)
-        run.communicate(timeout=20)
+        run.communicate(timeout=PATIENCE)
 
 
 def test_the_unit_is_sandboxed_and_not_root() -> None:

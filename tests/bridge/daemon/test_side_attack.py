@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from daemon_cell import Robot, Run, wait_for
+from daemon_cell import Robot, Run
+from patience import wait_for
 from ports import free_port
 
 from gapbridge.bridge.daemon import side_processes
@@ -43,7 +44,7 @@ def test_a_side_process_cannot_arm(
             def attacks() -> list[dict[str, Any]]:
                 return [e for e in run.daemon.events_since(0) if "attack" in e]
 
-            wait_for(lambda: len(attacks()) >= 3, 60.0, "three attacks")
+            wait_for(lambda: len(attacks()) >= 3, "three attacks")
             found = attacks()[-1]["attack"]
             assert found["loop"]
             # cycles of this loop and what is shown of them, requests, and a PLC's two

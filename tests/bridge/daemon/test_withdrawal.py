@@ -10,7 +10,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from daemon_cell import Robot, Run, offsets, wait_for
+from daemon_cell import Robot, Run, offsets
+from patience import wait_for
 
 from gapbridge.bridge.ipc.loop_state import State
 
@@ -34,7 +35,7 @@ def shift(robot: Robot, start: np.ndarray) -> float:
 def compensating(run: Run, robot: Robot, start: np.ndarray) -> float:
     """Wait until a fifth of a millimetre is in the arm; returns it."""
     run.compensate()
-    wait_for(lambda: shift(robot, start) > 2e-4, 5.0, "an offset")
+    wait_for(lambda: shift(robot, start) > 2e-4, "an offset")
     return shift(robot, start)
 
 
@@ -76,7 +77,7 @@ def test_a_stop_takes_the_time_that_the_cells_rate_needs(robot: Robot) -> None:
     start = np.array(robot.truth()["rigid_tcp"][:3])
     with Run(robot.cell(", mode: offset, rate: 125", limits=LIMITS), arm=True) as run:
         run.compensate()
-        wait_for(lambda: shift(robot, start) > 6e-4, 10.0, "an offset")  # over a second's worth
+        wait_for(lambda: shift(robot, start) > 6e-4, "an offset")  # over a second's worth
         run.daemon.stop()
         assert_no_faster(path_of(robot, start, 6.0))
         summary = run.join()
@@ -95,4 +96,4 @@ def test_a_fault_sends_no_zero_and_the_robots_program_withdraws(robot: Robot) ->
         robot.bench("stall 0.5")
         rows = path_of(robot, start, 6.0)
         assert_no_faster(rows)
-        wait_for(lambda: run.daemon.state != State.COMPENSATING, 5.0, "the end")
+        wait_for(lambda: run.daemon.state != State.COMPENSATING, "the end")

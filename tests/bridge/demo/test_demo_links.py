@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+from patience import PATIENCE
 
 from gapbridge.bridge.cell import load_cell
 from gapbridge.bridge.demo.links import LINKS, DemoLink
@@ -215,14 +216,14 @@ def test_a_demo_that_is_killed_leaves_no_controller_behind(tmp_path: Path) -> No
     )  # fmt: skip
     assert demo.stdout is not None
     host = demo.stdout.readline().strip()
-    with socket.create_connection((host, BENCH_PORT), timeout=5):
+    with socket.create_connection((host, BENCH_PORT), timeout=PATIENCE):
         demo.kill()
         demo.wait()
     demo.stdout.close()
     until = time.monotonic() + 10
     while time.monotonic() < until:
         try:
-            socket.create_connection((host, BENCH_PORT), timeout=5).close()
+            socket.create_connection((host, BENCH_PORT), timeout=PATIENCE).close()
         except OSError:
             return
         time.sleep(0.1)

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from patience import wait_for
 
 from gapbridge.bridge.cell.daemon_settings import DaemonSettings
 from gapbridge.bridge.ipc import side_process
@@ -48,14 +49,6 @@ DEAF = """
     start.emit({"kind": "hello"})
     time.sleep(1000)
 """
-
-
-def wait_for(what: Callable[[], Any], limit: float = 20.0) -> Any:
-    begun = time.monotonic()
-    while not (found := what()):
-        assert time.monotonic() - begun < limit
-        time.sleep(0.02)
-    return found
 
 
 @pytest.fixture
@@ -101,7 +94,7 @@ def hear(side: SideProcess, kind: str) -> dict[str, Any]:
         found.extend(event for event in side.events() if event["kind"] == kind)
         return bool(found)
 
-    wait_for(heard)
+    wait_for(heard, f"the event {kind}")
     return found[0]
 
 
@@ -145,7 +138,7 @@ def restart(side: SideProcess, now: list[float], pause: float) -> None:
     """Kill a side process; it has to be restarted after ``pause`` s of the clock, not before."""
     assert side.pid is not None
     os.kill(side.pid, signal.SIGKILL)
-    assert "ended with -9" in wait_for(side.check)
+    assert "ended with -9" in wait_for(side.check, "the end of a killed process")
     side.emit({"kind": "lost"})  # to nobody, and nobody waits
     now[0] += 0.99 * pause
     assert side.check() is None
@@ -167,9 +160,9 @@ def test_one_that_does_not_read_loses_events_holds_up_nothing_and_is_ended(
     assert side.dropped > 1000
     monkeypatch.setattr(side_process, "STALLED", 0.3)
     monkeypatch.setattr(side_process, "STARTING", 0.3)
-    assert "read nothing" in wait_for(side.check)
+    assert "read nothing" in wait_for(side.check, "the end of a stalled process")
     assert side.stalls == 1
-    wait_for(lambda: side.check() is None and side.restarts)
+    wait_for(lambda: side.check() is None and side.restarts, "another process")
 
 
 def test_a_line_is_never_torn_though_the_pipe_was_full(
@@ -191,7 +184,7 @@ def test_a_line_is_never_torn_though_the_pipe_was_full(
         heard.extend(e["of"]["number"] for e in side.events() if e["kind"] == "heard")
         return len([k for k in heard if k >= 0]) == 400 - dropped
 
-    wait_for(all_of_them)
+    wait_for(all_of_them, "all events that were not dropped")
     numbers = [k for k in heard if k >= 0]
     assert numbers == list(range(400 - dropped))
 
@@ -219,7 +212,7 @@ time.sleep(1000)
     pid = int(parent.stdout.readline())
     parent.kill()
     parent.wait()
-    wait_for(lambda: not alive(pid), 8.0)
+    wait_for(lambda: not alive(pid), "its end")
 
 
 def alive(pid: int) -> bool:

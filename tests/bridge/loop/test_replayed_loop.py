@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from daemon_cell import Robot, wait_for
+from daemon_cell import Robot
 from numpy.typing import NDArray
+from patience import wait_for
 
 from gapbridge.bridge.cell.run_settings import read_configuration
 from gapbridge.bridge.cell.settings.recording import RecordingSettings
@@ -61,12 +62,12 @@ class Loops:
         self.loop = LoopProcess(self.configuration, self.memory, self.commands, order, -3)
         self._number += 1
 
-    def until(self, what: Callable[[], bool], limit: float = 120.0) -> None:
+    def until(self, what: Callable[[], bool]) -> None:
         def holds() -> bool:
             self.recorder.step()
             return what()
 
-        wait_for(holds, limit, f"state {self.memory.state}")
+        wait_for(holds, f"state {self.memory.state}")
 
     def during(self, seconds: float) -> None:
         end = time.monotonic() + seconds

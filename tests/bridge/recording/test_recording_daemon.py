@@ -13,7 +13,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from daemon_cell import Robot, Run, gapbridge, only_recording, wait_for
+from daemon_cell import Robot, Run, gapbridge, only_recording
+from patience import wait_for
 from recorded_documents import read_documents
 
 from gapbridge.bridge.recording.export import export
@@ -35,12 +36,12 @@ def test_a_recorder_that_is_killed_amidst_a_run_loses_nothing(robot: Robot) -> N
     with Run(robot.cell(), arm=True) as run:
         run.compensate()
         for _ in range(2):
-            wait_for(lambda: recorder_pid(run) is not None, 20.0, "a recorder")
+            wait_for(lambda: recorder_pid(run) is not None, "a recorder")
             pid = recorder_pid(run)
             assert pid is not None
             time.sleep(0.7)
             os.kill(pid, signal.SIGKILL)
-            wait_for(lambda dead=pid: recorder_pid(run) != dead, 20.0, "its end")  # type: ignore[misc]
+            wait_for(lambda dead=pid: recorder_pid(run) != dead, "its end")  # type: ignore[misc]
         time.sleep(0.5)
         summary = run.end()
     assert summary.exit_code == 0
@@ -57,17 +58,17 @@ def test_a_recorder_that_is_killed_amidst_a_run_loses_nothing(robot: Robot) -> N
 def test_a_full_disk_pauses_the_recording_and_not_the_run(robot: Robot) -> None:
     with Run(robot.cell(), arm=True) as run:
         run.compensate()
-        wait_for(lambda: "recording into" in " ".join(run.output), 20.0, "a file")
+        wait_for(lambda: "recording into" in " ".join(run.output), "a file")
         pid = recorder_pid(run)
         assert pid is not None
         before = resource.prlimit(pid, resource.RLIMIT_FSIZE)
         resource.prlimit(pid, resource.RLIMIT_FSIZE, (50_000, before[1]))  # as a full disk refuses
-        wait_for(lambda: "recording paused: File too large" in run.output, 20.0, "a pause")
+        wait_for(lambda: "recording paused: File too large" in run.output, "a pause")
         written = run.daemon.tally.written
         time.sleep(0.5)
         assert run.daemon.tally.written > written
         resource.prlimit(pid, resource.RLIMIT_FSIZE, before)
-        wait_for(lambda: "-002.mcap" in run.output[-1], 20.0, "another file")
+        wait_for(lambda: "-002.mcap" in run.output[-1], "another file")
         summary = run.end()
     assert summary.exit_code == 0
     assert summary.restarts == summary.lost_rows == 0
@@ -103,7 +104,7 @@ def test_the_daemon_runs_on_a_recording_and_makes_the_same_offsets(robot: Robot)
     cell = robot.folder / "replay.yaml"
     cell.write_text(yaml.safe_dump(given))
     with Run(cell) as again:
-        summary = again.join(60.0)
+        summary = again.join()
     assert summary.exit_code == 0
     assert any("come to its end" in line for line in again.output)
     assert again.daemon.recording is not None
@@ -122,6 +123,7 @@ def says_it_is_over(session: Path) -> bool:
 def kill_daemons(robot: Robot, times: int) -> None:
     random = np.random.default_rng(7)
     cell = robot.cell()
+    log = robot.controller.log
     for k in range(times):
         folder = robot.folder / "recordings"
         before = {path.name.rsplit("-", 1)[0] for path in folder.glob("*.mcap")}
@@ -133,10 +135,9 @@ def kill_daemons(robot: Robot, times: int) -> None:
         killed = time.monotonic()
         run.kill()
         output, _ = run.communicate()
-        wait_for(lambda at=k: robot.controller.log().count("rtde_control ended") > at, 10.0,
-                 "the end of the loop")  # type: ignore[misc]  # fmt: skip
+        wait_for(lambda at=k: log().count("rtde_control ended") > at, "the loop's end")  # type: ignore[misc]
         (session,) = {p.name.rsplit("-", 1)[0] for p in folder.glob("*.mcap")} - before
-        wait_for(lambda at=folder / session: says_it_is_over(at), 20.0, "the recording's end")  # type: ignore[misc]
+        wait_for(lambda at=folder / session: says_it_is_over(at), "the recording's end")  # type: ignore[misc]
         columns = read_columns(folder / session)
         numbers = columns["number"]
         assert np.array_equal(numbers, np.arange(len(numbers)))

@@ -5,7 +5,8 @@ import shutil
 from contextlib import contextmanager
 
 import pytest
-from on_a_phone import CUT, PATIENCE
+from on_a_phone import CUT
+from patience import PATIENCE, wait_for
 from report_cases import CASES, diagnosed
 
 from gapbridge.bridge.report import write_report
@@ -31,7 +32,7 @@ def browser():
 def opened(browser, path, width=1200, height=900):
     """Give the page once all of its figures are drawn, and what it asked and complained about."""
     page = browser.new_page(viewport={"width": width, "height": height})
-    page.set_default_timeout(PATIENCE)
+    page.set_default_timeout(1e3 * PATIENCE)
     asked, complaints = [], []
     page.on("request", lambda request: asked.append(request.url))
     page.on("pageerror", lambda error: complaints.append(str(error)))
@@ -86,8 +87,7 @@ def test_the_arm_is_drawn_and_can_be_turned(browser, explained):
         page.mouse.down()
         page.mouse.move(box["x"] + 460, box["y"] + 290, steps=5)
         page.mouse.up()
-        page.wait_for_timeout(500)
-        assert scene.screenshot() != before
+        wait_for(lambda: scene.screenshot() != before, "another view")
         assert complaints == []
 
 
@@ -107,16 +107,14 @@ def test_the_wheel_scrolls_the_page_over_the_view_until_it_is_clicked(browser, e
         page.mouse.move(box["x"] + 300, box["y"] + 100)
         before, drawn = page.evaluate("scrollY"), scene.screenshot()
         page.mouse.wheel(0, 80)
-        page.wait_for_timeout(400)
-        assert page.evaluate("scrollY") == before + 80
+        page.wait_for_function(f"scrollY === {before + 80}")
         page.mouse.wheel(0, -80)
-        page.wait_for_timeout(400)
+        page.wait_for_function(f"scrollY === {before}")
         assert scene.screenshot() == drawn
         page.mouse.click(box["x"] + 300, box["y"] + 100)
         page.mouse.wheel(0, -80)
-        page.wait_for_timeout(400)
+        wait_for(lambda: scene.screenshot() != drawn, "the view from closer by")
         assert page.evaluate("scrollY") == before
-        assert scene.screenshot() != drawn
         assert complaints == []
 
 
@@ -134,7 +132,7 @@ def test_the_reader_chooses_what_the_gap_is_drawn_against(browser, explained):
 
 def test_a_dark_screen_shows_a_dark_page(browser, explained):
     page = browser.new_page(color_scheme="dark")
-    page.set_default_timeout(PATIENCE)
+    page.set_default_timeout(1e3 * PATIENCE)
     page.goto(explained.as_uri())
     ground = page.evaluate("getComputedStyle(document.querySelector('section')).backgroundColor")
     ink = page.evaluate("getComputedStyle(document.querySelector('svg text')).fill")

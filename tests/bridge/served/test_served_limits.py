@@ -8,6 +8,7 @@ import time
 
 import httpx
 import pytest
+from patience import PATIENCE
 
 from gapbridge.bridge.served.protocol import GuardedProtocol
 from gapbridge.bridge.served.server import listen, serve
@@ -52,7 +53,7 @@ def flood(monkeypatch):
             time.sleep(0.05)
     yield settings, sent
     over.set()
-    thread.join(10)
+    thread.join(PATIENCE)
     assert not thread.is_alive()
 
 
@@ -66,7 +67,7 @@ async def _disconnected(receive):
 
 def test_a_client_that_takes_nothing_is_cut_off_while_others_are_served(flood):
     settings, sent = flood
-    with socket.create_connection(("127.0.0.1", settings.port), timeout=5) as link:
+    with socket.create_connection(("127.0.0.1", settings.port), timeout=PATIENCE) as link:
         link.sendall(b"GET /flood HTTP/1.1\r\nHost: localhost\r\n\r\n")
         begun = time.monotonic()
         while not sent["ended"]:

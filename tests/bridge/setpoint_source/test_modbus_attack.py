@@ -8,6 +8,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+from patience import PATIENCE
+
 LOOP = """
 import sys
 from pathlib import Path
@@ -35,8 +37,9 @@ def test_the_server_of_a_plc_writes_to_no_memory_but_its_setpoint(tmp_path: Path
     here = Path(__file__).parents[1]
     path = os.pathsep.join([str(here), str(here.parents[1])])
     done = subprocess.run(
-        [sys.executable, "-c", LOOP, str(tmp_path)], capture_output=True, text=True, timeout=60,
-        env={**os.environ, "PYTHONPATH": path, "ATTACK_FOUND": str(found)}, check=False,
+        [sys.executable, "-c", LOOP, str(tmp_path)], capture_output=True, text=True,
+        timeout=PATIENCE, env={**os.environ, "PYTHONPATH": path, "ATTACK_FOUND": str(found)},
+        check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     attack = json.loads(found.read_text())

@@ -12,7 +12,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from daemon_cell import Robot, Run, wait_for
+from daemon_cell import Robot, Run
+from patience import wait_for
 
 from gapbridge.bridge.cell.sections import SetpointSettings
 from gapbridge.bridge.ipc.loop_state import State
@@ -66,7 +67,7 @@ def source() -> Iterator[ModbusSource]:
 
 
 def first_of(source: ModbusSource) -> np.ndarray:
-    wait_for(lambda: source.first(HERE) is not None, 20.0, "a setpoint")
+    wait_for(lambda: source.first(HERE) is not None, "a setpoint")
     found = source.first(HERE)
     assert found is not None
     return found
@@ -79,9 +80,7 @@ def test_what_a_plc_writes_is_the_setpoint(source: ModbusSource) -> None:
     assert first_of(source) == pytest.approx(HERE, abs=UNIT)
     source.begin(0.0, HERE)
     plc.put(HERE + 0.01)
-    wait_for(
-        lambda: bool(np.allclose(source.sample(0.0, HERE), HERE + 0.01, atol=UNIT)), 20.0, "it"
-    )
+    wait_for(lambda: bool(np.allclose(source.sample(0.0, HERE), HERE + 0.01, atol=UNIT)), "it")
 
 
 def test_joints_without_a_new_sequence_number_are_no_setpoint(source: ModbusSource) -> None:
@@ -92,7 +91,7 @@ def test_joints_without_a_new_sequence_number_are_no_setpoint(source: ModbusSour
     time.sleep(0.05)
     assert first_of(source) == pytest.approx(HERE, abs=UNIT)
     assert plc.client.write_single_register(0, 777)  # now they are
-    wait_for(lambda: first_of(source)[0] > 0.5, 20.0, "the joints")
+    wait_for(lambda: first_of(source)[0] > 0.5, "the joints")
 
 
 def test_a_plc_that_falls_silent_is_dry(source: ModbusSource) -> None:

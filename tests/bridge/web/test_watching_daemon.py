@@ -9,7 +9,8 @@ from collections.abc import Iterator
 import httpx
 import numpy as np
 import pytest
-from daemon_cell import Robot, wait_for
+from daemon_cell import Robot
+from patience import wait_for
 from watched_daemon import Watched, listening
 
 pytestmark = pytest.mark.slow
@@ -79,10 +80,10 @@ def test_page_and_metrics_die_and_come_back_and_the_loop_never_notices(daemon: W
         sides = status.get("sides", {})
         return bool(sides) and all(sides[n]["restarts"] == 1 for n in ("web", "metrics"))
 
-    wait_for(back, 30.0, "page and metrics")
+    wait_for(back, "page and metrics")
     after = daemon.status()
     assert after["status"]["loop"]["pid"] == loop
     assert after["status"]["loop"]["restarts"] == 0
     assert after["session"] == before["session"]
     expected = {("127.0.0.1", daemon.web), ("127.0.0.1", daemon.metrics)}
-    wait_for(lambda: listening(daemon.process.pid) == expected, 30.0, "both listening again")
+    wait_for(lambda: listening(daemon.process.pid) == expected, "both listening again")

@@ -6,7 +6,8 @@ import time
 from contextlib import contextmanager
 
 import pytest
-from on_a_phone import CUT, PATIENCE
+from on_a_phone import CUT
+from patience import PATIENCE
 from watched_feed import Feed
 
 from gapbridge.bridge.ipc.loop_state import State
@@ -32,7 +33,7 @@ def opened(browser, feed, viewport=None, **keys):
     """Give the page, live, and what it asked for and complained about."""
     context = browser.new_context(viewport=viewport or {"width": 1280, "height": 900}, **keys)
     page = context.new_page()
-    page.set_default_timeout(PATIENCE)
+    page.set_default_timeout(1e3 * PATIENCE)
     asked, complaints = [], []
     page.on("request", lambda request: asked.append(request.url))
     page.on("pageerror", lambda error: complaints.append(str(error)))
@@ -235,8 +236,7 @@ def test_the_wheel_scrolls_the_page_over_the_arm_until_it_is_clicked(browser, fe
         page.mouse.move(box["x"] + 100, box["y"] + 60)
         before = page.evaluate("scrollY")
         page.mouse.wheel(0, 80)
-        page.wait_for_timeout(500)
-        assert page.evaluate("scrollY") == before + 80
+        page.wait_for_function(f"scrollY === {before + 80}")
         page.mouse.click(box["x"] + 100, box["y"] + 60)
         page.mouse.wheel(0, 80)
         page.wait_for_timeout(500)

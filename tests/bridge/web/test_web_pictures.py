@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 from daemon_cell import Robot
-from on_a_phone import PATIENCE
+from patience import PATIENCE
 from watched_daemon import Watched
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
@@ -67,7 +67,7 @@ def _opened(browser, url, width, height, theme):
     """Return a live page of a size and theme, and what it complains of as long as it is open."""
     context = browser.new_context(viewport={"width": width, "height": height}, color_scheme=theme)
     page = context.new_page()
-    page.set_default_timeout(PATIENCE)
+    page.set_default_timeout(1e3 * PATIENCE)
     complaints = []
     page.on("pageerror", lambda e: complaints.append(str(e)))
     page.on("console", lambda m: complaints.append(m.text) if m.type == "error" else None)

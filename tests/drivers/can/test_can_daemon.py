@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from patience import PATIENCE, wait_for
 from ports import free_port, own_host
 
 from gapbridge.bridge.cell import load_cell
@@ -31,25 +32,18 @@ def gapbridge(*phrase):
             yield process
         finally:
             process.terminate()
-            process.communicate(timeout=60)
+            process.communicate(timeout=PATIENCE)
 
 
 def measured():
     """Return the tracker's mean of five positions (3,), m."""
     found = []
-    with socket.create_connection((HOST, BENCH), timeout=5) as bench:
+    with socket.create_connection((HOST, BENCH), timeout=PATIENCE) as bench:
         answers = bench.makefile()
         for _ in range(5):
             bench.sendall(b"measure\n")
             found.append([float(v) for v in answers.readline().split(",")[1:4]])
     return np.mean(found, axis=0)
-
-
-def wait_for(true, seconds):
-    until = time.monotonic() + seconds
-    while not true():
-        assert time.monotonic() < until
-        time.sleep(0.5)
 
 
 def serves():
@@ -77,11 +71,11 @@ def test_a_soft_piper_comes_to_where_it_was_meant_to_be(tmp_path):
         return float(np.linalg.norm(measured() - wanted))
 
     with gapbridge("simulate", cell):
-        wait_for(serves, 180)
+        wait_for(serves, "a reading")
         bare = error()
         assert bare > 3e-4
         with gapbridge("run", cell):
-            wait_for(lambda: error() < bare / 5, 180)
+            wait_for(lambda: error() < bare / 5, "the corrected arm")
             time.sleep(2.0)
             settled = error()
     assert settled < max(bare / 4, 1.2e-4)  # what is left is the arm's own repeatability

@@ -9,6 +9,7 @@ import can
 import numpy as np
 import pytest
 from can_arm import MODEL, next_state, setpoint_of
+from patience import PATIENCE
 
 from gapbridge.drivers.can.driver import CanDriver
 from gapbridge.drivers.can.settings import CanSettings
@@ -73,7 +74,7 @@ def firmware():
     found.start()
     yield found
     found.ended = True
-    found.join(2.0)
+    found.join(PATIENCE)
     found.bus.shutdown()
 
 

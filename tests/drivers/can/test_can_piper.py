@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from can_arm import next_state
+from patience import PATIENCE, wait_for
 from piper_sdk import C_PiperInterface_V2
 from piper_sdk.kinematics.piper_fk import C_PiperForwardKinematics
 from ports import free_port, own_host
@@ -63,16 +64,9 @@ def joints_of(sdk):
     return np.radians([getattr(reported, f"joint_{i}") * 1e-3 for i in range(1, 7)])
 
 
-def wait_for(true, seconds=5.0):
-    until = time.monotonic() + seconds
-    while not true():
-        assert time.monotonic() < until
-        time.sleep(0.02)
-
-
 def test_the_vendors_client_reads_and_commands_our_arm_and_we_notice_it(served, vendor):
     controller, link, model = served
-    wait_for(lambda: np.abs(joints_of(vendor) - controller.q).max() < 1e-5)
+    wait_for(lambda: np.abs(joints_of(vendor) - controller.q).max() < 1e-5, "its joints")
     with CanDriver(link, model) as driver:
         assert next_state(driver).actual_q == pytest.approx(controller.q, abs=1e-5)
         until = time.monotonic() + 5.0
@@ -88,7 +82,7 @@ def test_the_vendors_client_reads_and_commands_our_arm_and_we_notice_it(served, 
             next_state(driver)
             return np.abs(goal - controller.q).max() < 1e-4
 
-        wait_for(command)
+        wait_for(command, "the commanded joints")
         state = next_state(driver)
         assert state.target_q == pytest.approx(goal, abs=1e-5)  # another's, but heard
         assert vendor.GetArmStatus().arm_status.ctrl_mode == 1
@@ -115,4 +109,4 @@ def test_simulate_serves_the_cell_to_another_process(tmp_path):
             assert q == pytest.approx(found.file.simulation.start_q, abs=1e-4)
         finally:
             os.kill(server.pid, signal.SIGTERM)
-            server.wait(10)
+            server.wait(PATIENCE)

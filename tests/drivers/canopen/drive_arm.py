@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from typing import Any
 
@@ -103,11 +103,3 @@ def follow(
         state = settled(driver)
         share = min((time.monotonic() - begun) * 0.2 / way, 1.0)
         driver.write_setpoint(setpoint(start + share * (goal - start), state))
-
-
-def wait_for(true: Callable[[], bool], seconds: float, what: str) -> None:
-    """Wait until something is so; fail with its name where it does not come."""
-    until = time.monotonic() + seconds
-    while not true():
-        assert time.monotonic() < until, f"{what}: not within {seconds:g} s"
-        time.sleep(0.005)

@@ -9,7 +9,8 @@ from contextlib import suppress
 import can
 import numpy as np
 import pytest
-from drive_arm import DriveArm, follow, read_on, served, setpoint, settled, wait_for
+from drive_arm import DriveArm, follow, read_on, served, setpoint, settled
+from patience import wait_for
 from ports import free_port
 
 from gapbridge.core.errors import (
@@ -78,7 +79,7 @@ def test_connecting_reading_and_closing_enable_nothing_and_move_nothing(arm: Dri
     assert arm.controller.q == start
     wait_for(
         lambda: all(drive.nmt.state == "PRE-OPERATIONAL" for drive in arm.server.drives),
-        1.0, "the drives' answer to NMT",
+        "the drives' answer to NMT",
     )  # fmt: skip
 
 
@@ -118,7 +119,7 @@ def test_setpoints_take_effect_together_at_the_next_sync(
     time.sleep(0.05)
     assert np.abs(goal - generic.controller.q).min() > 0.009, "a setpoint counted without a SYNC"
     settled(driver)
-    wait_for(lambda: bool(np.abs(goal - generic.controller.q).max() < 1e-4), 20.0, "the setpoint")
+    wait_for(lambda: bool(np.abs(goal - generic.controller.q).max() < 1e-4), "the setpoint")
 
 
 class _Failing:
@@ -264,7 +265,7 @@ def test_an_emergency_is_a_fault_that_stops_writing_and_is_named(
 ) -> None:
     driver.arm(settled(driver))
     generic.server.fail(node_of(generic, 2), 0x2310)
-    wait_for(lambda: settled(driver).safety_mode == 9, 20.0, "safety_mode fault")
+    wait_for(lambda: settled(driver).safety_mode == 9, "safety_mode fault")
     state = settled(driver)
     with pytest.raises(WriteError, match=r"node 3: found FAULT.*EMCY 0x2310"):
         driver.write_setpoint(setpoint(state.actual_q, state))
@@ -277,7 +278,7 @@ def test_an_emergency_is_a_fault_that_stops_writing_and_is_named(
 def test_faults_are_reset_where_the_cell_says_so(generic: DriveArm) -> None:
     with generic.driver(clear_faults=True) as driver:
         generic.server.fail(node_of(generic, 2), 0x2310)
-        wait_for(lambda: settled(driver).safety_mode == 9, 20.0, "safety_mode fault")
+        wait_for(lambda: settled(driver).safety_mode == 9, "safety_mode fault")
         driver.arm(settled(driver))
         assert settled(driver).safety_mode == 1
         assert phases(generic) == {Phase.ENABLED}
@@ -337,7 +338,7 @@ def test_another_master_is_noticed_and_writing_refused(
     driver.arm(settled(driver))
     with generic.other_bus() as bus:
         bus.send(can.Message(arbitration_id=identifier, data=data, is_extended_id=False))
-        wait_for(lambda: driver.foreign is not None, 20.0, "the other master's frame")
+        wait_for(lambda: driver.foreign is not None, "the other master's frame")
     state = settled(driver)
     with pytest.raises(WriteError, match=f"another master sent {phrase}"):
         driver.write_setpoint(setpoint(state.actual_q, state))
@@ -348,7 +349,7 @@ def test_arming_waits_until_another_master_has_been_quiet(generic: DriveArm) -> 
     with generic.driver(foreign_quiet=0.4) as driver, generic.other_bus() as bus:
         time.sleep(0.4)
         bus.send(can.Message(arbitration_id=0x204, data=bytes(6), is_extended_id=False))
-        wait_for(lambda: driver.foreign is not None, 20.0, "the other master's frame")
+        wait_for(lambda: driver.foreign is not None, "the other master's frame")
         with pytest.raises(WriteError, match="found two masters"):
             driver.arm(settled(driver))
         assert Phase.ENABLED not in phases(generic)

@@ -10,7 +10,8 @@ from typing import Any
 import canopen
 import pytest
 from canopen.profiles.p402 import BaseNode402
-from drive_arm import DriveArm, served, wait_for
+from drive_arm import DriveArm, served
+from patience import wait_for
 
 from gapbridge.drivers.canopen.settings import CanopenSettings
 
@@ -59,13 +60,13 @@ def arm() -> Iterator[DriveArm]:
 def test_the_librarys_master_enables_moves_and_disables_a_drive(arm: DriveArm) -> None:
     with master(arm) as (_, node):
         axis = arm.server.drives[NODE - 1].axis
-        wait_for(lambda: node.state == "SWITCH ON DISABLED", 20.0, "a Statusword")
+        wait_for(lambda: node.state == "SWITCH ON DISABLED", "a Statusword")
         here = node.sdo[0x6064].raw
         node.rpdo[1]["Target position"].raw = here
         node.rpdo[2]["Modes of operation"].raw = 8
         for pdo in (node.rpdo[1], node.rpdo[2]):
             pdo.start(0.01)
-        wait_for(lambda: node.op_mode == "CYCLIC SYNCHRONOUS POSITION", 20.0, "the mode")
+        wait_for(lambda: node.op_mode == "CYCLIC SYNCHRONOUS POSITION", "the mode")
         for state in ("READY TO SWITCH ON", "SWITCHED ON", "OPERATION ENABLED"):
             node.state = state
             assert node.state == state
@@ -73,28 +74,26 @@ def test_the_librarys_master_enables_moves_and_disables_a_drive(arm: DriveArm) -
         for step in range(100):
             node.rpdo[1]["Target position"].raw = here + round(0.05 * counts * step / 99)
             time.sleep(0.01)
-        wait_for(
-            lambda: abs(arm.controller.q[NODE - 1] - start - 0.05) < 1e-5, 2.0, "the plant's joint"
-        )
+        wait_for(lambda: abs(arm.controller.q[NODE - 1] - start - 0.05) < 1e-5, "the plant's joint")
         assert all(not other.axis.holds for other in arm.server.drives if other.node != NODE)
         node.state = "SWITCHED ON"
         node.state = "SWITCH ON DISABLED"
-        wait_for(lambda: not axis.holds, 20.0, "the drive's end")
+        wait_for(lambda: not axis.holds, "the drive's end")
 
 
 def test_the_librarys_master_resets_a_fault_that_an_emcy_reported(arm: DriveArm) -> None:
     with master(arm) as (_, node):
         arm.server.fail(NODE, 0x8611)
-        wait_for(lambda: bool(node.emcy.active), 20.0, "an EMCY")
+        wait_for(lambda: bool(node.emcy.active), "an EMCY")
         assert node.emcy.active[0].code == 0x8611
-        wait_for(lambda: node.state == "FAULT", 20.0, "the state FAULT")
+        wait_for(lambda: node.state == "FAULT", "the state FAULT")
         assert node.sdo[0x603F].raw == 0x8611
         node.rpdo[1].start(0.01)
         node.controlword = 0x00
         time.sleep(0.05)
         node.controlword = 0x80
-        wait_for(lambda: node.state == "SWITCH ON DISABLED", 20.0, "the reset")
-        wait_for(lambda: not node.emcy.active, 20.0, "the EMCY's end")
+        wait_for(lambda: node.state == "SWITCH ON DISABLED", "the reset")
+        wait_for(lambda: not node.emcy.active, "the EMCY's end")
 
 
 def test_heartbeats_and_boot_up_are_the_standards(arm: DriveArm) -> None:

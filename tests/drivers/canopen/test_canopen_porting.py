@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import yaml
 from drive_arm import follow, served, settled
+from patience import PATIENCE
 
 from gapbridge.core.errors import InputError
 from gapbridge.core.log.mcap_reading import read_columns
@@ -88,7 +89,7 @@ def test_a_simulated_cell_is_run_from_end_to_end(tmp_path: Path) -> None:
         )  # fmt: skip
     finally:
         served_cell.terminate()
-        served_cell.wait(20)
+        served_cell.wait(PATIENCE)
     assert found.returncode == 0, found.stderr
     assert "Traceback" not in found.stderr + found.stdout
     cycles = int(re.search(r"cycles (\d+)", found.stdout + found.stderr)[1])

@@ -48,10 +48,11 @@ class CanCase(Case):
         self.settings = CanSettings(
             profile=profile, interface=interface, channel=channel, port=number, rate=rate,
             state_timeout=self.state_timeout, foreign_quiet=0.2, gear=gears,
-            send_timeout=0.25,  # both ends of the pty are in this busy process
         )  # fmt: skip
         super().__init__()
-        self.settings = self.settings.model_copy(update={"host": self.host})
+        # both ends of the pty are in this busy process: a frame may take longer than a cell allows
+        changes = {"host": self.host, "send_timeout": 10.0}
+        self.settings = self.settings.model_copy(update=changes)
 
     def make_servers(self) -> list[ProtocolServer]:
         """Return the arm's nodes."""

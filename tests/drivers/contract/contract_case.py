@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import itertools
 import os
-import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable
 from pathlib import Path
 from typing import Self
 
@@ -35,14 +33,6 @@ def model_of(n: int) -> Model:
     if n == 6:
         return Model(builtin_arm("ur10e"))
     return load_cell(CONFIG / "seven_axis_urdf.yaml").model
-
-
-def wait_for(true: Callable[[], bool], seconds: float, what: str) -> None:
-    """Wait until something is so; fail with its name where it does not come."""
-    until = time.monotonic() + seconds
-    while not true():
-        assert time.monotonic() < until, f"{what}: not within {seconds:g} s"
-        time.sleep(0.01)
 
 
 class Case(ABC):

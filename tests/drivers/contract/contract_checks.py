@@ -9,7 +9,8 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from contract_case import Case, wait_for
+from contract_case import Case
+from patience import wait_for
 
 from gapbridge.core.errors import (
     GateError,
@@ -121,7 +122,7 @@ def _fastest_on_the_way(case: Case, driver: Driver, goal: tuple[float, ...]) -> 
             fastest = max(fastest, float(np.abs(state.actual_qd).max()))
     wait_for(
         lambda: bool(np.abs(next_state(driver).actual_q - goal).max() <= case.resolution * 1.01),
-        20.0, "the joints that the plant has come to",
+        "the joints that the plant has come to",
     )  # fmt: skip
     return fastest
 
@@ -158,7 +159,7 @@ def check_offset(case: Case, driver: Driver) -> None:
     nominal = driver.nominal_q(next_state(driver))
     assert np.abs(nominal - controller.own_q).max() <= case.resolution + 2e-5
     driver.release()
-    wait_for(lambda: max(map(abs, moved())) < 2e-6, 20.0, "the offset's end")
+    wait_for(lambda: max(map(abs, moved())) < 2e-6, "the offset's end")
 
 
 def check_joints(case: Case, driver: Driver) -> None:

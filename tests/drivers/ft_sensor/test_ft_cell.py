@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from patience import PATIENCE
 
 from gapbridge.bridge.cell import load_cell
 from gapbridge.bridge.recording.export import export
@@ -71,13 +72,15 @@ def simulated(cell: Path) -> Iterator[subprocess.Popen[str]]:
         yield process
     finally:
         process.terminate()
-        assert process.wait(10) == 0
+        assert process.wait(PATIENCE) == 0
         process.stdout.close()
 
 
 def bench(cell: Path, line: str) -> str:
     link = load_cell(cell).link
-    with socket.create_connection((getattr(link, "host", ""), BENCH_PORT), timeout=5) as connection:
+    with socket.create_connection(
+        (getattr(link, "host", ""), BENCH_PORT), timeout=PATIENCE
+    ) as connection:
         connection.sendall(line.encode() + b"\n")
         return connection.makefile("r").readline().strip()
 
@@ -86,7 +89,7 @@ def run_python(code: str, *arguments: object) -> dict[str, Any]:
     """Run code in a process of its own, which ur_rtde may hang or crash; returns its JSON."""
     done = subprocess.run(
         [sys.executable, "-c", textwrap.dedent(code), *map(str, arguments)], env=environment(),
-        capture_output=True, text=True, timeout=60, check=False,
+        capture_output=True, text=True, timeout=PATIENCE, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr
     found: dict[str, Any] = json.loads(done.stdout.strip().splitlines()[-1])
@@ -155,7 +158,7 @@ def test_run_observes_and_records_the_sensors_wrench(tmp_path: Path, kind: str) 
         truth = json.loads(bench(cell, "truth"))
         done = subprocess.run(
             [sys.executable, "-m", "gapbridge", "run", str(cell), "--observe", "--duration", "2"],
-            env=environment(), capture_output=True, text=True, timeout=60, check=False,
+            env=environment(), capture_output=True, text=True, timeout=PATIENCE, check=False,
         )  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr
     rows = recorded(tmp_path)
@@ -179,7 +182,7 @@ def test_arm_and_sensor_share_one_can_bus(tmp_path: Path) -> None:
         bias = np.array(json.loads(bench(cell, "truth"))["sensor_bias"])
         done = subprocess.run(
             [sys.executable, "-m", "gapbridge", "run", str(cell), "--observe", "--duration", "2"],
-            env=environment(), capture_output=True, text=True, timeout=60, check=False,
+            env=environment(), capture_output=True, text=True, timeout=PATIENCE, check=False,
         )  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr
     rows = recorded(tmp_path)
@@ -199,7 +202,7 @@ def test_a_run_without_the_sensor_reports_which_and_ends(tmp_path: Path) -> None
         done = subprocess.run(
             [sys.executable, "-m", "gapbridge", "run", str(elsewhere), "--observe",
              "--duration", "5"],
-            env=environment(), capture_output=True, text=True, timeout=60, check=False,
+            env=environment(), capture_output=True, text=True, timeout=PATIENCE, check=False,
         )  # fmt: skip
     assert done.returncode == 1, done.stdout + done.stderr
     (line,) = done.stderr.strip().splitlines()
@@ -242,7 +245,7 @@ def test_a_sensor_that_no_other_process_can_reach_is_not_simulated(tmp_path: Pat
     cell.write_text(text, encoding="utf-8")
     done = subprocess.run(
         [sys.executable, "-m", "gapbridge", "simulate", str(cell)], env=environment(),
-        capture_output=True, text=True, timeout=60, check=False,
+        capture_output=True, text=True, timeout=PATIENCE, check=False,
     )  # fmt: skip
     assert done.returncode == 2
     assert "ft_sensor.interface: found 'virtual', expected socketcand" in done.stderr

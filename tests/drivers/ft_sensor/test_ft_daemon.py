@@ -13,7 +13,8 @@ import pytest
 BRIDGE = str(Path(__file__).resolve().parents[2] / "bridge")
 sys.path.insert(0, BRIDGE)
 
-from daemon_cell import Robot, Run, offsets, wait_for  # noqa: E402
+from daemon_cell import Robot, Run, offsets  # noqa: E402
+from patience import wait_for  # noqa: E402
 from sensor_wires import Reaction  # noqa: E402
 
 from gapbridge.bridge.ipc.loop_state import State  # noqa: E402
@@ -53,7 +54,7 @@ def test_a_silent_sensor_is_seen_and_its_return_is_observed(
         run.wait(State.OBSERVING)
         time.sleep(0.5)
         sensor.silent = True
-        wait_for(lambda: run.daemon.status()["counts"]["silence"] == 1, 20.0, "silence")
+        wait_for(lambda: run.daemon.status()["counts"]["silence"] == 1, "silence")
         sensor.silent = False
         run.wait(State.OBSERVING)
         assert run.daemon.latched == ""  # nothing was written, so nobody has to look
@@ -72,7 +73,7 @@ def test_a_sensor_lost_while_writing_ends_the_writing_until_a_person_arms_again(
         run.compensate()
         time.sleep(0.5)
         sensor.silent = True
-        wait_for(lambda: run.daemon.state != State.COMPENSATING, 20.0, "no longer compensating")
+        wait_for(lambda: run.daemon.state != State.COMPENSATING, "no longer compensating")
         time.sleep(1.0)
         sensor.silent = False
         run.wait(State.OBSERVING)
@@ -89,7 +90,7 @@ def test_overload_stops_the_writing(robot: Robot, sensor: RobotousNode) -> None:
     with Run(cell_of(robot, sensor), arm=True) as run:
         run.compensate()
         sensor.status = 0x10
-        wait_for(lambda: run.daemon.state != State.COMPENSATING, 20.0, "no longer compensating")
+        wait_for(lambda: run.daemon.state != State.COMPENSATING, "no longer compensating")
         run.end()
     assert any("overload" in line for line in run.output), run.output
 
@@ -102,10 +103,10 @@ def test_a_lost_sensor_drops_the_force_and_the_angles_stay_corrected(
         run.compensate()
         time.sleep(1.0)
         sensor.silent = True
-        wait_for(lambda: any("max_age" in line for line in run.output), 20.0, "the event")
+        wait_for(lambda: any("max_age" in line for line in run.output), "the event")
         time.sleep(0.5)
         sensor.silent = False
-        wait_for(lambda: "the sensor is back" in run.output, 5.0, "the sensor")
+        wait_for(lambda: "the sensor is back" in run.output, "the sensor")
         time.sleep(0.3)
         assert run.daemon.state == State.COMPENSATING
         status = run.daemon.status()

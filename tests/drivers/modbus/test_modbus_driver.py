@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from contract_case import wait_for
 from contract_checks import OFFSET, next_state, setpoint_of, stream
 from contract_modbus import INVENTED, ModbusCase
+from patience import wait_for
 
 from gapbridge.bridge.cell import load_cell
 from gapbridge.core.errors import LinkError, WriteError
@@ -44,7 +44,7 @@ def test_the_robot_takes_offsets_out_when_the_heartbeat_stops() -> None:
         stream(driver, lambda state, q: setpoint_of(state, q, q, OFFSET), 0.6)
         assert max(map(abs, program_of(ur).applied)) > 1e-4
         driver.transport.close()  # as if the process had died: nothing is released
-        wait_for(lambda: not any(program_of(ur).applied), 20.0, "the watchdog")
+        wait_for(lambda: not any(program_of(ur).applied), "the watchdog")
 
 
 def test_a_robot_without_its_program_is_not_armed(ur: ModbusCase) -> None:
@@ -158,14 +158,14 @@ def test_a_stopped_robot_is_not_armed_and_reports_why(ur: ModbusCase) -> None:
     with ur.driver() as driver:
         assert next_state(driver).safety_mode == 1
         ur.controller.protective_stop()
-        wait_for(lambda: next_state(driver).safety_mode == 3, 20.0, "the stop")
+        wait_for(lambda: next_state(driver).safety_mode == 3, "the stop")
         with pytest.raises(
             WriteError, match=r"security stopped \(holding 261\): found 1, expected"
         ):
             driver.arm(next_state(driver))
         ur.controller.unlock()
         ur.controller.emergency_stop()
-        wait_for(lambda: next_state(driver).safety_mode == 7, 20.0, "the button")
+        wait_for(lambda: next_state(driver).safety_mode == 7, "the button")
 
 
 def test_registers_too_coarse_for_the_offset_are_reported_before_arming(tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ import pytest
 from contract_case import own_address
 from contract_checks import check_reads, next_state
 from contract_modbus import ModbusCase
+from patience import PATIENCE
 
 from gapbridge.drivers.modbus.driver import ModbusDriver
 from gapbridge.drivers.simulated.modbus import image
@@ -41,7 +42,7 @@ def mbpoll(case: ModbusCase, table: str, first: int, count: int, *more: str) -> 
     found = subprocess.run(
         [tool, "-0", "-1", "-q", "-a", "1", "-p", str(case.settings.port), "-t", table, "-r",
          str(first), *(["-c", str(count)] if count else []), case.host, *more],
-        capture_output=True, text=True, check=False, timeout=10,
+        capture_output=True, text=True, check=False, timeout=PATIENCE,
     )  # fmt: skip
     assert found.returncode == 0, found.stdout + found.stderr
     return found.stdout
@@ -117,5 +118,5 @@ def test_our_driver_reads_a_server_that_is_not_pymodbus() -> None:
             assert np.abs(next_state(driver).actual_q - case.controller.q).max() <= case.resolution
     finally:
         ended.set()
-        thread.join(2.0)
+        thread.join(PATIENCE)
         other.stop()

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 from contract_checks import check_angles, check_offset, check_reads
 from contract_modbus import ModbusCase
+from patience import PATIENCE
 
 from gapbridge.core.errors import InputError
 from gapbridge.drivers.modbus import encode
@@ -84,7 +85,7 @@ def test_a_cell_with_a_map_of_the_users_is_served_and_run(profile: Path) -> None
         assert re.search(r"setpoints written [3-9]\d", run.stdout), run.stdout
     finally:
         served.terminate()
-        served.wait(10.0)
+        served.wait(PATIENCE)
 
 
 @pytest.mark.slow
@@ -112,7 +113,7 @@ def test_a_link_that_cannot_be_is_one_line(tmp_path: Path, link: str, words: str
     for command in (["run", "--observe", "--duration", "1"], ["simulate"]):
         found = subprocess.run(
             [sys.executable, "-m", "gapbridge", command[0], str(cell), *command[1:]],
-            capture_output=True, text=True, check=False, timeout=60,
+            capture_output=True, text=True, check=False, timeout=PATIENCE,
         )  # fmt: skip
         assert found.returncode == 2, (command, found.stdout, found.stderr)
         assert len(found.stderr.strip().splitlines()) == 1, found.stderr

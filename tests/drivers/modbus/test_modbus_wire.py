@@ -279,12 +279,13 @@ class Cable:
         self._cut.set()
 
 
+@pytest.mark.realtime  # an answer may take no longer than 2 s
 def test_the_contract_holds_over_a_serial_line() -> None:
     case, cable = ModbusCase("ur"), Cable()
     ours, theirs = cable.ports
     server = ModbusServer(case.robot_file, case.host, 502, serial=theirs, baudrate=115200)
     settings = ModbusSettings(
-        profile="ur", transport="rtu", serial=ours, baudrate=115200, rate=20.0, timeout=1.0
+        profile="ur", transport="rtu", serial=ours, baudrate=115200, rate=20.0, timeout=2.0
     )
     with (
         ServerThread(case.controller, [server], case.host),

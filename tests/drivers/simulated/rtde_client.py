@@ -6,6 +6,8 @@ import socket
 import struct
 from typing import Any
 
+from patience import PATIENCE
+
 FORMS = {
     "DOUBLE": "d", "VECTOR3D": "3d", "VECTOR6D": "6d", "INT32": "i", "UINT32": "I",
     "UINT64": "Q", "UINT8": "B", "BOOL": "?", "VECTOR6INT32": "6i", "VECTOR6UINT32": "6I",
@@ -14,7 +16,7 @@ FORMS = {
 
 class RtdeClient:
     def __init__(self, host: str, version: int = 2) -> None:
-        self.sock = socket.create_connection((host, 30004), timeout=5)
+        self.sock = socket.create_connection((host, 30004), timeout=PATIENCE)
         self.version = version
         self.names: list[str] = []
         self.form = ""

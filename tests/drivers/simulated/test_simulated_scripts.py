@@ -5,6 +5,7 @@ import time
 from collections.abc import Iterator
 
 import pytest
+from patience import PATIENCE
 from rtde_client import RtdeClient
 from simulated_cell import Bench, cell_settings
 from simulated_controller import SimulatedController
@@ -34,8 +35,8 @@ class Robot:
             + ",".join(f"input_double_register_{i}" for i in range(13))
         )
         self.state.start()
-        self._script = socket.create_connection((host, 30003), timeout=5)
-        self._dashboard = socket.create_connection((host, 29999), timeout=5)
+        self._script = socket.create_connection((host, 30003), timeout=PATIENCE)
+        self._dashboard = socket.create_connection((host, 29999), timeout=PATIENCE)
         self._lines = self._dashboard.makefile("r")
         self._lines.readline()
 
@@ -50,12 +51,12 @@ class Robot:
         values = [*numbers, *[0.0] * (13 - len(numbers))]
         self.state.write(self.recipe, "2i13d", code, integer, *values)
 
-    def until(self, name: str, value: object, cycles: int = 1500) -> dict[str, object]:
-        for _ in range(cycles):
-            sample = self.state.sample()
-            if sample[name] == value:
-                return sample
-        raise AssertionError(f"{name} stayed {sample[name]}, expected {value}")
+    def until(self, name: str, value: object) -> dict[str, object]:
+        begun = time.monotonic()
+        while (sample := self.state.sample())[name] != value:
+            waited = time.monotonic() - begun
+            assert waited < PATIENCE, f"{name} stayed {sample[name]}, expected {value}"
+        return sample
 
     def play(self, text: str) -> dict[str, object]:
         """Upload a program, see it run and end."""

@@ -4,7 +4,7 @@ import shutil
 
 import pytest
 from calibration_report_cases import calibration, plan, session
-from on_a_phone import PATIENCE
+from patience import PATIENCE
 from short_session_cases import payload, tool, verification
 
 from gapbridge.bridge.calibration.report import (
@@ -52,7 +52,7 @@ def browser():
 def test_a_page_fits_desk_and_phone_and_asks_for_nothing(kind, browser, tmp_path):
     path, _ = WRITERS[kind](tmp_path)
     page = browser.new_page(viewport={"width": 1200, "height": 900})
-    page.set_default_timeout(PATIENCE)
+    page.set_default_timeout(1e3 * PATIENCE)
     asked, complaints = [], []
     page.on("request", lambda request: asked.append(request.url))
     page.on("pageerror", lambda error: complaints.append(str(error)))
@@ -73,7 +73,7 @@ def test_a_page_fits_desk_and_phone_and_asks_for_nothing(kind, browser, tmp_path
 def test_the_long_list_opens_when_asked_to(browser, tmp_path):
     path, _ = WRITERS["calibration"](tmp_path)
     page = browser.new_page(viewport={"width": 1200, "height": 900})
-    page.set_default_timeout(PATIENCE)
+    page.set_default_timeout(1e3 * PATIENCE)
     page.goto(path.as_uri())
     rows = page.locator("#readings tbody tr")
     assert rows.count() == len(calibration().readings)

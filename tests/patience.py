@@ -1,0 +1,21 @@
+"""How long a test waits for what must come: long, for a busy machine says nothing about it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+PATIENCE = 120.0  # s
+
+
+def wait_for(what: Callable[[], Any], words: str, within: float = PATIENCE) -> Any:
+    """Wait until ``what`` returns something true, and return it; ``words`` say what was missed.
+
+    ``within`` (s) is for tests whose subject is time, which are marked ``realtime``.
+    """
+    begun = time.monotonic()
+    while not (found := what()):
+        assert time.monotonic() - begun < within, f"{words}: not within {within:g} s"
+        time.sleep(0.01)
+    return found
