@@ -173,7 +173,7 @@ def predict_torque(model: Model, motion: Motion, terms: Sequence[Term] = ()) -> 
     torque = torque + pieces.payload_mass[:, None] * pieces.payload_torque
     for term in terms_used:
         effect = CATALOGUE[term.effect]
-        if motion.load is None and not effect.carried:
+        if motion.load is None and not effect.loads_joints:
             motion = replace(motion, load=torque)
         torque = effect.drive(term, model.arm, torque, motion)
     return torque

@@ -96,7 +96,7 @@ def change_text(change: CandidateChange) -> str:
         return f"reading {change.reading} alone does not fit: measure it again"
     if change.effect:
         size = _size(change.estimates)
-        return CATALOGUE[change.effect].moved.format(joint=change.joint, size=size)
+        return CATALOGUE[change.effect].verification_message.format(joint=change.joint, size=size)
     return f"the instrument has moved by {_size(change.estimates)}: register it again"
 
 

@@ -132,7 +132,7 @@ def _unsupported(terms: Sequence[Term], model: Model) -> tuple[tuple[str, str], 
         effect = CATALOGUE[term.effect]
         in_chain = effect.of_the_arm and type(effect).shape is not Effect.shape
         if not in_chain and not effect.simulator(term, model.arm):
-            texts[effect.identifier] = effect.instead
+            texts[effect.identifier] = effect.simulator_advice
     return tuple(texts.items())
 
 

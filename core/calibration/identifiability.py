@@ -80,7 +80,7 @@ def _selection_order(parameters: Parameters) -> list[int]:
     named = [parameters.terms[t].effect for t, _ in parameters.place]
     order: list[int] = []
     for i, effect in enumerate(named):
-        parts = CATALOGUE[effect].sum_of
+        parts = CATALOGUE[effect].equals_sum_of
         order += [k for k, other in enumerate(named) if k not in order and other == parts]
         order += [] if i in order else [i]
     return order
@@ -92,8 +92,10 @@ def _columns(
     """Return J and F at the start of a fit; effects that need compliance, for a compliant arm."""
     J, F = observable.columns(parameters, parameters.begin, readings, nuisance)
     effects = [CATALOGUE[parameters.terms[t].effect] for t, _ in parameters.place]
-    only = np.array([effect.needs_softness for effect in effects], dtype=bool)
-    soft = np.array([effect.softens and not effect.curved for effect in effects], dtype=bool)
+    only = np.array([e.acts_through_deflection for e in effects], dtype=bool)
+    soft = np.array(
+        [effect.softens and not effect.has_nonlinearity for effect in effects], dtype=bool
+    )
     if only.any() and soft.any():
         deflected = np.where(soft, parameters.begin + 0.3 * parameters.scales, parameters.begin)
         J[:, only] = observable.columns(parameters, deflected, readings, nuisance)[0][:, only]

@@ -18,8 +18,8 @@ from gapbridge.core.notes import Note
 
 DEFAULT = tuple(  # effects of a calibration where none are named, in order of priority
     sorted(
-        (name for name, effect in CATALOGUE.items() if effect.calibrated),
-        key=lambda name: CATALOGUE[name].calibrated,
+        (name for name, effect in CATALOGUE.items() if effect.calibration_rank),
+        key=lambda name: CATALOGUE[name].calibration_rank,
     )
 )
 PERIODIC_ORDERS = (1.0, 2.0)  # cycles per turn of a transmission error
@@ -58,7 +58,7 @@ class Parameters:
                 units.append(parameter.unit)
                 low = 0.0 if effect.softens else parameter.lower
                 scale = parameter.scale * _lever_factor(model, term, k)
-                start = scale if effect.curved else 0.0
+                start = scale if effect.has_nonlinearity else 0.0
                 bounds = low - nominal[k], parameter.upper - nominal[k]
                 numbers.append((scale, *bounds, start))
         scales, lower, upper, begin = np.array(numbers).T
@@ -134,7 +134,7 @@ class Parameters:
 
     def approach_joints(self) -> tuple[int, ...]:
         """Return the joints (from 1) with an effect that depends on the direction of approach."""
-        effects = {term.effect for term in self.terms if CATALOGUE[term.effect].by_approach}
+        effects = {term.effect for term in self.terms if CATALOGUE[term.effect].depends_on_approach}
         return tuple(sorted({j for effect in effects for j in self.joints(effect)}))
 
     def joints(self, effect: str) -> tuple[int, ...]:
@@ -146,7 +146,7 @@ class Parameters:
 def _terms(model: Model, effects: Sequence[str]) -> Iterator[Term]:
     """Yield a term of zeros for each site of each effect."""
     contained = {
-        (CATALOGUE[effect].contains, site.joint)
+        (CATALOGUE[effect].replaces, site.joint)
         for name in effects
         for effect, site in _sites(model, name)
     }
@@ -186,7 +186,7 @@ def _lever_factor(model: Model, term: Term, value: int) -> float:
     The saturation moment of a stiffness curve scales with the moments at the joint: those of a
     wrist are much smaller than those of joint 1.
     """
-    if not CATALOGUE[term.effect].curved or term.site.joint is None:
+    if not CATALOGUE[term.effect].has_nonlinearity or term.site.joint is None:
         return 1.0
     arm, i = model.arm, term.site.joint - 1
     length = np.linalg.norm(arm.link_in_link[:, :3, 3], axis=1)

@@ -36,7 +36,9 @@ class Stages:
 def stages_of(parameters: Parameters, readings: Readings) -> Stages:
     """Return the stages that these readings allow."""
     effects = [CATALOGUE[parameters.terms[t].effect] for t, _ in parameters.place]
-    elastic = np.array([effect.softens or effect.needs_softness for effect in effects], dtype=bool)
+    elastic = np.array(
+        [effect.softens or effect.acts_through_deflection for effect in effects], dtype=bool
+    )
     group = readings.repeats()
     load = _load_numbers(readings)
     for one in np.unique(group):

@@ -207,7 +207,7 @@ def _candidate_changes(model: Model, readings: Readings) -> list[tuple[str, int 
     return [
         (identifier, site.joint)
         for identifier, effect in CATALOGUE.items()
-        if effect.moved and (loaded or not effect.adds_mass)
+        if effect.verification_message and (loaded or not effect.adds_mass)
         for site in effect.sites(model.arm)
     ]
 

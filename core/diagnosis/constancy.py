@@ -53,7 +53,12 @@ def _scales_a_quantity(candidate: Candidate) -> bool:
     Not so offsets (their mean is an offset whatever else is there), lines, curves and steps.
     """
     effect = candidate.effect
-    form = effect.beside_links or effect.together or effect.curved or effect.at_moment
+    form = (
+        effect.estimated_with_links
+        or effect.estimated_as_whole
+        or effect.has_nonlinearity
+        or effect.at_moment
+    )
     return not (form or candidate.periodic)
 
 

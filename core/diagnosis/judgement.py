@@ -122,7 +122,7 @@ def judge_geometry(
     """
     accused_before = [selection.term_index[p] for p in judgement.accused]
     suspected = [*accused_before, *(selection.term_index[p] for p, _ in judgement.withdrawn)]
-    single = any(selection.space.candidates[c].effect.together for c in suspected)
+    single = any(selection.space.candidates[c].effect.estimated_as_whole for c in suspected)
     if selection.block or not (single and judgement.structured):
         return selection, judgement
     try:
@@ -243,7 +243,7 @@ def _linear_with_unnamed(refit: Selection, judgement: Judgement) -> set[int]:
     """
     return {
         p for p in judgement.accused
-        if judgement.unnamed_part is not None and CATALOGUE[refit.terms[p].effect].curved
+        if judgement.unnamed_part is not None and CATALOGUE[refit.terms[p].effect].has_nonlinearity
         and refit.terms[p].values[1] ** 2 < CURVATURE_GAIN * refit.covariance[p][1, 1]
     }  # fmt: skip
 
@@ -262,12 +262,12 @@ def _confounded_with_load(selection: Selection) -> dict[int, str]:
     """
     space, loads_of = selection.working, {}
     for c in selection.term_index:
-        if not space.candidates[c].effect.any_constant:
+        if not space.candidates[c].effect.fits_any_constant:
             continue
         basis = basis_of(space.columns([c]))
         alike = []
         for other, candidate in enumerate(space.candidates):
-            if not candidate.effect.carried:
+            if not candidate.effect.loads_joints:
                 continue
             x = space.columns([other])
             whole = float(np.sum(x**2))
@@ -416,9 +416,9 @@ def ties_of(
             family = space.candidates[other].family
             if not space.candidates[other].named or family in (kind, *names):
                 continue
-            if delayed and space.candidates[other].effect.delays and family not in as_well:
+            if delayed and space.candidates[other].effect.is_delay and family not in as_well:
                 continue
-            if space.candidates[other].effect.contains != kind:  # a curve contains its line
+            if space.candidates[other].effect.replaces != kind:  # a curve contains its line
                 names.append(family)
         listed[c] = tuple(names)
     return listed
@@ -446,4 +446,6 @@ def covering_effects(space: SampleSpace, best: CandidateFit, c: int) -> list[int
 
 
 def _geometric(candidate: Candidate) -> bool:
-    return candidate.named and (candidate.effect.beside_links or candidate.effect.together)
+    return candidate.named and (
+        candidate.effect.estimated_with_links or candidate.effect.estimated_as_whole
+    )

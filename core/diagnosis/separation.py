@@ -179,7 +179,7 @@ def _best(moving: bool, trials: Trials, names: tuple[str, ...], gain: Array) -> 
         if gain[r] < MIN_SEPARATION or len(chosen) == PER_QUESTION:
             break
         if all(np.abs(q[r] - np.array(m.q)).max() > MIN_POSE_DISTANCE for m in chosen):
-            sided = any(CATALOGUE[name].by_approach for name in names)
+            sided = any(CATALOGUE[name].depends_on_approach for name in names)
             approach = tuple(int(v) for v in loads.approach[r]) if sided else None
             chosen.append(Measurement(
                 _floats(q[r]), float(loads.payload_mass[r]), names, float(gain[r]), approach,

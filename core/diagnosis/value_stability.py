@@ -97,7 +97,7 @@ def links_predict_new_regions(selection: Selection) -> bool:
 def _tool_point(selection: Selection, chosen: Sequence[int]) -> list[int]:
     """Return the tool point among candidates, where all links are a cause."""
     own = selection.space.candidates
-    return [c for c in chosen if selection.block and own[c].effect.beside_links]
+    return [c for c in chosen if selection.block and own[c].effect.estimated_with_links]
 
 
 def _tool_point_gains(
@@ -166,7 +166,7 @@ def links_close_gap(selection: Selection, accused: Sequence[int]) -> bool:
         return False
     count = np.bincount(part)
     candidates = selection.space.candidates
-    tool_point = [c for c in selection.best.chosen if candidates[c].effect.beside_links]
+    tool_point = [c for c in selection.best.chosen if candidates[c].effect.estimated_with_links]
     residual, before = (
         np.bincount(part, held_out.squares(c)) for c in ([*selection.block, *tool_point], accused)
     )  # fmt: skip
@@ -366,10 +366,11 @@ class _UnnamedFunctions:
         candidates = [self.space.candidates[c] for c in accused]
         begin = np.cumsum([0, *(len(k.parameters) for k in candidates)])
         late = np.array(
-            [b for b, k in zip(begin, candidates, strict=False) if k.effect.delays], dtype=np.int64
+            [b for b, k in zip(begin, candidates, strict=False) if k.effect.is_delay],
+            dtype=np.int64,
         )
         length = np.linalg.norm(self.space.columns([c for c, k in zip(
-            accused, candidates, strict=True) if k.effect.delays]), axis=0)  # fmt: skip
+            accused, candidates, strict=True) if k.effect.is_delay]), axis=0)  # fmt: skip
         known = np.where(identifiable[late], np.diag(spread)[late], np.inf)
         x, variance = shrunk_to_common_delay(value[late] / length, known / length**2)
         value[late], identifiable[late] = x * length, np.isfinite(variance)

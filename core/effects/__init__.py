@@ -91,10 +91,10 @@ CATALOGUE: dict[str, Effect] = {
 
 def ties_of(identifier: str) -> dict[str, str]:
     """Return the effects that look the same on some data as this one, and on which data."""
-    found = dict(CATALOGUE[identifier].alike)
+    found = dict(CATALOGUE[identifier].equivalents)
     for name, effect in CATALOGUE.items():
-        if identifier in effect.alike:
-            found[name] = effect.alike[identifier]
+        if identifier in effect.equivalents:
+            found[name] = effect.equivalents[identifier]
     return found
 
 
@@ -111,7 +111,7 @@ def flexibility_names(n: int) -> list[str]:
 
 def correcting(what: str) -> tuple[str, ...]:
     """Return the effects that correct one thing a cell declares: "payload", "tool", ..."""
-    return tuple(name for name, effect in CATALOGUE.items() if effect.corrects == what)
+    return tuple(name for name, effect in CATALOGUE.items() if effect.replaces_cell_value == what)
 
 
 def acting(terms: Iterable[Term], channel: str) -> list[Term]:
@@ -131,7 +131,7 @@ def settling(terms: Iterable[Term]) -> list[Term]:
 
 def by_approach(terms: Iterable[Term]) -> bool:
     """Return whether terms ask for the joints' last motions."""
-    return any(CATALOGUE[term.effect].by_approach for term in terms)
+    return any(CATALOGUE[term.effect].depends_on_approach for term in terms)
 
 
 def at_moment(terms: Iterable[Term]) -> bool:

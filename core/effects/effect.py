@@ -101,41 +101,41 @@ class Effect(ABC):
     channels: ClassVar[tuple[str, ...]]
     needs: ClassVar[tuple[str, ...]] = ()  # log columns beyond those of its channel
     motion: ClassVar[str] = ""  # what a log must contain for the effect to be identifiable
-    alike: ClassVar[Mapping[str, str]] = {}  # other effects: the data on which they are equivalent
-    instead: ClassVar[str] = ""  # the advice if a simulator's model cannot include it
+    equivalents: ClassVar[Mapping[str, str]] = {}  # effect: the data on which it equals this one
+    simulator_advice: ClassVar[str] = ""  # the advice if a simulator's model cannot include it
     simulated_as: ClassVar[Kind | None] = None  # the kind of its first value in a simulator's model
     of_the_arm: ClassVar[bool] = True  # False: an effect of the measurement, not of the arm
 
     # texts
     title: ClassVar[str] = ""  # in plain words; default: the identifier without underscores
     label_template: ClassVar[str] = ""  # of one parameter, with {joint} and {part}
-    moved: ClassVar[str] = ""  # message of a verification that finds it; '': not checked there
+    verification_message: ClassVar[str] = ""  # where one finds it; '': not checked
 
     # how it acts
     order: ClassVar[int] = 50  # order of application from load to reading, in its channel
     periodic: ClassVar[bool] = False  # True: sites have an order, and values are sine and cosine
-    delays: ClassVar[bool] = False  # True: its only value is a delay of the joint, s
+    is_delay: ClassVar[bool] = False  # True: its only value is a delay of the joint, s
     at_moment: ClassVar[bool] = False  # True: a step at one time, the last value
-    by_approach: ClassVar[bool] = False  # True: depends on the joint's direction of approach
+    depends_on_approach: ClassVar[bool] = False  # True: on the last motion of the joint
     softens: ClassVar[bool] = False  # True: a flexibility, 0 or more together with the model's
     flexibility: ClassVar[str] = ""  # which of a joint's linear flexibilities: axial, radial
-    needs_softness: ClassVar[bool] = False  # True: affects positions only through deflections
-    carried: ClassVar[bool] = False  # True: a load on the joints, on which friction may depend
+    acts_through_deflection: ClassVar[bool] = False  # True: shows by deflections only
+    loads_joints: ClassVar[bool] = False  # True: a load on the joints, on which friction may depend
     adds_mass: ClassVar[bool] = False  # True: kg in addition to the declared payload
     scales_reading: ClassVar[bool] = False  # True: does not change a zero reading of the sensor
-    any_constant: ClassVar[bool] = False  # True: can represent any constant reading
-    together: ClassVar[bool] = False  # True: small at all sites of a real arm, estimated as a whole
+    fits_any_constant: ClassVar[bool] = False  # True: can represent any constant reading
+    estimated_as_whole: ClassVar[bool] = False  # True: small at all sites of a real arm
     # True: estimated with the links: joint zeros and TCP with geometry, friction with masses
-    beside_links: ClassVar[bool] = False
-    shown_by: ClassVar[Term | None] = None  # the term that must be present to identify its values
+    estimated_with_links: ClassVar[bool] = False
+    identifiable_with: ClassVar[Term | None] = None  # the term that must be present
 
     # how it is estimated
-    shapes: ClassVar[tuple[float, ...]] = ()  # start values of its last parameter
-    curved: ClassVar[bool] = False  # True: first value a slope, second a nonlinearity
-    contains: ClassVar[str] = ""  # the effect of the same joint that it replaces
-    sum_of: ClassVar[str] = ""  # the effect whose parameters in sum are equivalent to this one
-    calibrated: ClassVar[int] = 0  # rank among the default effects of a calibration; 0: not one
-    corrects: ClassVar[str] = ""  # the value of the cell that a session measures instead
+    start_values: ClassVar[tuple[float, ...]] = ()  # start values of its last parameter
+    has_nonlinearity: ClassVar[bool] = False  # True: first value a slope, second a nonlinearity
+    replaces: ClassVar[str] = ""  # the effect of the same joint that it replaces
+    equals_sum_of: ClassVar[str] = ""  # the effect whose parameters in sum equal it
+    calibration_rank: ClassVar[int] = 0  # among a calibration's default effects; 0: none
+    replaces_cell_value: ClassVar[str] = ""  # the value of the cell that a session measures instead
 
     @property
     def calibratable(self) -> bool:

@@ -64,7 +64,7 @@ class Geometry:
         tool = model.tool_in_flange.copy()
         if not self.has_links:
             for term in model.terms[self.first : end]:
-                if CATALOGUE[term.effect].corrects == "tool":
+                if CATALOGUE[term.effect].replaces_cell_value == "tool":
                     tool[:3, 3] += term.values[:3]
         terms = (*model.terms[: self.first], *model.terms[end:])
         return replace(model, terms=terms, tool_in_flange=tool)
@@ -113,11 +113,11 @@ def with_geometry(model: Model, tool: bool) -> tuple[Model, Geometry]:
     terms: list[Term] = []
     values, sigma = [], []
     for identifier, effect in CATALOGUE.items():
-        is_tool = effect.corrects == "tool"
+        is_tool = effect.replaces_cell_value == "tool"
         if "position" not in effect.channels:
             continue
         for site in effect.sites(model.arm):
-            links = effect.together or (effect.beside_links and site.joint)
+            links = effect.estimated_as_whole or (effect.estimated_with_links and site.joint)
             if not (links or (is_tool and tool)):
                 continue
             parameters = effect.parameters(model.arm, site)

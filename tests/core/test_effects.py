@@ -134,7 +134,7 @@ def test_ties_are_mutual_declared_once_and_shown_in_a_common_channel(name):
     for other, data in ties_of(name).items():
         assert data
         assert ties_of(other)[name] == data
-        assert not (name in CATALOGUE[other].alike and other in CATALOGUE[name].alike)
+        assert not (name in CATALOGUE[other].equivalents and other in CATALOGUE[name].equivalents)
         assert {*CATALOGUE[name].channels} & {*CATALOGUE[other].channels}
 
 
@@ -158,7 +158,7 @@ def test_what_no_simulator_holds_says_what_to_do_instead(name):
     effect = CATALOGUE[name]
     in_chain = type(effect).shape is not Effect.shape
     asked = type(effect).simulator is not Effect.simulator
-    assert in_chain or asked or effect.simulated_as or effect.instead
+    assert in_chain or asked or effect.simulated_as or effect.simulator_advice
 
 
 def test_each_effect_stands_on_the_page_of_conventions_in_the_order_in_which_it_acts():

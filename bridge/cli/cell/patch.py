@@ -120,8 +120,8 @@ def tie_lines(causes: Sequence[CauseEntry], terms: Sequence[Term]) -> tuple[str,
             continue
         numbers = ", ".join(f"{p.name} = {p.value:.6g} {p.unit}".rstrip() for p in cause.parameters)
         others = " or ".join(
-            f"{name} ({CATALOGUE[name].instead})"
-            if name in CATALOGUE and CATALOGUE[name].instead
+            f"{name} ({CATALOGUE[name].simulator_advice})"
+            if name in CATALOGUE and CATALOGUE[name].simulator_advice
             else name
             for name in cause.indistinguishable_from
         )

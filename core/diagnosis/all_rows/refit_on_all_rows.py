@@ -100,7 +100,7 @@ def _scatter(observation: Observation, kept: Mask) -> UnnamedPart:
 
 def _shaped_as(candidate: Candidate, term: Term) -> Candidate:
     """Return the candidate with the shape of the term's last refit."""
-    if not candidate.effect.shapes:
+    if not candidate.effect.start_values:
         return candidate
     return replace(candidate, fixed=(*candidate.fixed[:-1], term.values[-1]))
 

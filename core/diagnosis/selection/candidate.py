@@ -133,17 +133,17 @@ def _variants(
             Candidate(identifier, Site(site.joint, order), parameters, free)
             for order in _orders(site, in_model, turns)
         ]
-    if effect.curved and not in_model:
+    if effect.has_nonlinearity and not in_model:
         linear = (replace(parameters[0], lower=-np.inf),) * 2
         return [
             Candidate(identifier, site, linear, free, curve=s * parameters[1].scale)
             for s in SOFTENING
         ]
-    if effect.shapes:
+    if effect.start_values:
         present = {t.values[-1] for t in in_model}
         return [
             Candidate(identifier, site, parameters[:-1], (*free[:-1], shape))
-            for shape in (*effect.shapes, *(present - {*effect.shapes}))
+            for shape in (*effect.start_values, *(present - {*effect.start_values}))
         ]
     if any(p.of_rotation for p in parameters) and not with_rotation:
         shown = tuple(p for p in parameters if not p.of_rotation)
@@ -174,7 +174,7 @@ def named_columns(observation: Observation, candidate: Candidate, base: Sequence
     if candidate.curve is not None:
         return _stiffness_curve_columns(observation, candidate)
     columns = _from_nominal(observation, candidate, base)
-    mass = candidate.effect.shown_by
+    mass = candidate.effect.identifiable_with
     if mass is not None and not columns.any():  # a load without mass has no centre of gravity
         columns = _from_nominal(observation, candidate, [*base, mass])
     return columns
@@ -187,7 +187,7 @@ def changes_prediction_alone(observation: Observation, candidate: Candidate) -> 
 
 def with_requirement(observation: Observation, candidate: Candidate) -> Candidate:
     """Return the candidate with the family that it requires (a centre of gravity, a load)."""
-    needed = candidate.effect.shown_by
+    needed = candidate.effect.identifiable_with
     if needed is None or changes_prediction_alone(observation, candidate):
         return candidate
     return replace(candidate, requires=needed.effect)

@@ -63,7 +63,7 @@ def _twin_columns(observation: Observation, candidate: Candidate, base: Sequence
 
 def _twins(term: Term, candidate: Candidate) -> bool:
     own = CATALOGUE[term.effect]
-    return candidate.family in own.alike or term.effect in candidate.effect.alike
+    return candidate.family in own.equivalents or term.effect in candidate.effect.equivalents
 
 
 def chord_value(observation: Observation, candidate: Candidate, base: Sequence[Term]) -> float:
@@ -103,7 +103,7 @@ def _of_joint(term: Term, candidate: Candidate) -> bool:
 
 def _alike(term: Term, candidate: Candidate) -> bool:
     """Return whether a term's value counts as the candidate's: delays add up."""
-    delays = CATALOGUE[term.effect].delays and candidate.effect.delays
+    delays = CATALOGUE[term.effect].is_delay and candidate.effect.is_delay
     return delays or term.effect == candidate.family
 
 
@@ -134,8 +134,10 @@ def one_delay(space: SampleSpace, best: CandidateFit) -> CandidateFit:
 
 def delayed_by(space: SampleSpace, best: CandidateFit) -> dict[str, CandidateFit]:
     """Return, by kind of delay, the set with it at all joints that have one; {} for one joint."""
-    site = {(k.family, k.site.joint): c for c, k in enumerate(space.candidates) if k.effect.delays}
-    late = [c for c in best.chosen if space.candidates[c].effect.delays]
+    site = {
+        (k.family, k.site.joint): c for c, k in enumerate(space.candidates) if k.effect.is_delay
+    }
+    late = [c for c in best.chosen if space.candidates[c].effect.is_delay]
     if len(late) < 2:
         return {}
     rest = [c for c in best.chosen if c not in late]

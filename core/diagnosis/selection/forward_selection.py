@@ -47,7 +47,7 @@ def exclusive(space: SampleSpace, chosen: Sequence[int], new: int) -> bool:
             apart = abs((a.site.order or 0) - (b.site.order or 0))
             if apart < MIN_ORDERS_APART or lines >= MAX_LINES:
                 return True
-        elif a.family in (b.family, b.effect.contains) or b.family == a.effect.contains:
+        elif a.family in (b.family, b.effect.replaces) or b.family == a.effect.replaces:
             return True
     return False
 

@@ -52,10 +52,10 @@ def link_candidates(space: SampleSpace, joints: bool = True) -> tuple[int, ...]:
     To the links' geometry belong the joints' zeros (the angle of a DH row); to the links' first
     moments friction and torque offsets.
     """
-    links = [c for c, k in enumerate(space.candidates) if k.effect.together]
+    links = [c for c, k in enumerate(space.candidates) if k.effect.estimated_as_whole]
     of_joints = [
         c for c, k in enumerate(space.candidates)
-        if joints and k.effect.beside_links and k.site.joint
+        if joints and k.effect.estimated_with_links and k.site.joint
     ]  # fmt: skip
     return (*links, *of_joints) if links else ()
 
@@ -86,7 +86,7 @@ def prior(
 
     def sized(links: float, joints: float) -> dict[int, Array]:
         return {
-            c: (links if space.candidates[c].effect.together else joints) * own
+            c: (links if space.candidates[c].effect.estimated_as_whole else joints) * own
             for c, own in size.items()
         }
 
@@ -237,14 +237,14 @@ def _few_joints(space: SampleSpace, best: CandidateFit, block: Sequence[int]) ->
 
 def _geometric(candidate: Candidate) -> bool:
     """Return whether this is a link's geometry or the zero of a joint."""
-    return candidate.effect.together or (
+    return candidate.effect.estimated_as_whole or (
         candidate.turns_joint_by_own_angle and not candidate.periodic
     )
 
 
 def _of_mass(candidate: Candidate) -> bool:
     """Return whether a link's parameters are first moments."""
-    return candidate.effect.carried
+    return candidate.effect.loads_joints
 
 
 def _score_with_links(space: SampleSpace, others: Sequence[int], links: Links) -> float:

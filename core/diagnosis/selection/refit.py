@@ -215,7 +215,7 @@ def _as_one_delay(
     fitted: list[Candidate], x: list[Array], covariance: list[Array]
 ) -> tuple[list[Array], list[Array]]:
     """Return values (d,) and covariances (d, d), delays shrunk to the common delay."""
-    late = [k for k, c in enumerate(fitted) if c.effect.delays]
+    late = [k for k, c in enumerate(fitted) if c.effect.is_delay]
     variances = np.array([covariance[k][0, 0] for k in late])
     values, variances = shrunk_to_common_delay(np.array([x[k][0] for k in late]), variances)
     x, covariance = list(x), list(covariance)
@@ -289,7 +289,7 @@ def worth(term: Term, spread: Array) -> float:
     if effect.periodic:
         single = float(value @ value) ** 2 / max(float(value @ spread @ value), 1e-300)
     else:
-        judged = slice(0, 1) if effect.curved or effect.shapes else slice(None)
+        judged = slice(0, 1) if effect.has_nonlinearity or effect.start_values else slice(None)
         single = float(np.max(value[judged] ** 2 / np.maximum(np.diag(spread)[judged], 1e-300)))
     return min(whole, single) / MIN_SIGMAS**2
 
@@ -379,7 +379,7 @@ def _step_share(
 
 def with_free_shape(arm: Arm, candidate: Candidate) -> Candidate:
     """Return the candidate with all parameters free, also those fixed in its columns."""
-    if not (candidate.effect.curved or candidate.effect.shapes):
+    if not (candidate.effect.has_nonlinearity or candidate.effect.start_values):
         return candidate
     parameters = candidate.effect.parameters(arm, candidate.site)
     return replace(candidate, parameters=parameters, fixed=(None,) * len(parameters), curve=None)

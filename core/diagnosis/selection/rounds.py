@@ -207,7 +207,7 @@ def _without_known_loads(
     loads = [
         own.reshape(-1, own.shape[-1])
         for c, own in zip(candidates, columns, strict=True)
-        if c.effect.carried and not c.site.joint and in_model_effects & {c.family, c.requires}
+        if c.effect.loads_joints and not c.site.joint and in_model_effects & {c.family, c.requires}
     ]
     if not loads:
         return smooth

@@ -70,7 +70,7 @@ class Selection:
 
     def is_link(self, position: int) -> bool:
         """Return whether a term is a link's geometry, where all links are a cause."""
-        together = self.space.candidates[self.term_index[position]].effect.together
+        together = self.space.candidates[self.term_index[position]].effect.estimated_as_whole
         return self._in_geometry(position) and together
 
     def _in_geometry(self, position: int) -> bool:

@@ -99,7 +99,7 @@ def sample_space(
 
 def chords_only(observation: Observation, base: Sequence[Term]) -> bool:
     """Return whether all columns are chords from zero: no term's part is added back."""
-    delays = all(CATALOGUE[term.effect].delays for term in base)
+    delays = all(CATALOGUE[term.effect].is_delay for term in base)
     return observation.channel == "tracking" and delays
 
 
@@ -113,9 +113,9 @@ def _tie_penalty(candidate: Candidate, observation: Observation) -> float:
     Without reversals, backlash ranks behind the offset. A sensor's constant ranks behind effects
     that are constant at these poses only, because further poses can tell these apart.
     """
-    if candidate.effect.any_constant:
+    if candidate.effect.fits_any_constant:
         return ANY_CONSTANT_PENALTY
-    if not candidate.effect.by_approach or candidate.site.joint is None:
+    if not candidate.effect.depends_on_approach or candidate.site.joint is None:
         return 0.0
     reversed_ = f"approach_{candidate.site.joint - 1}" in observation.quantities
     return 0.0 if reversed_ else NO_REVERSAL_PENALTY

@@ -38,9 +38,9 @@ def straight_curves(
         effect = CATALOGUE[term.effect]
         lines = [
             other for other, k in enumerate(space.candidates)
-            if k.family == effect.contains and k.site.joint == term.site.joint
+            if k.family == effect.replaces and k.site.joint == term.site.joint
         ]  # fmt: skip
-        if not (effect.curved and lines):
+        if not (effect.has_nonlinearity and lines):
             continue
         at_bound = term.values[1] <= float(np.sqrt(max(spread[1, 1], 0.0)))
         line = [lines[0] if other == c else other for other in index]

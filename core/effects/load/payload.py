@@ -26,15 +26,15 @@ class Payload(Effect):
     title = "load weighs more or less than declared"
     label_template = "mass of the load beyond the declared one"
     order = 10
-    needs_softness = True
+    acts_through_deflection = True
     adds_mass = True
-    carried = True
-    corrects = "payload"
-    moved = "the load differs from what was declared by {size}"
+    loads_joints = True
+    replaces_cell_value = "payload"
+    verification_message = "the load differs from what was declared by {size}"
     channels = ("position", "wrench", "torque")
     simulated_as = Kind.PAYLOAD
     motion = "poses that change how the load pulls"
-    instead = "change the load's mass where it is modelled"
+    simulator_advice = "change the load's mass where it is modelled"
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return the extra mass."""

@@ -30,16 +30,16 @@ class PayloadCog(Effect):
     title = "load's centre of gravity is elsewhere"
     label_template = "centre of gravity {part}"
     order = 12
-    needs_softness = True
-    carried = True
-    shown_by = Term("payload", Site(), (1.0,))  # values are then first moments, of 1 kg
-    corrects = "payload"
+    acts_through_deflection = True
+    loads_joints = True
+    identifiable_with = Term("payload", Site(), (1.0,))  # values are then first moments, of 1 kg
+    replaces_cell_value = "payload"
     channels = ("position", "wrench", "torque")
     motion = "a payload, and poses that turn the flange against gravity"
-    alike: ClassVar = {
+    equivalents: ClassVar = {
         "link_cog": "one constant load: the last link's first moment is the load's mass times it"
     }
-    instead = "move the centre of mass of the body that models the load"
+    simulator_advice = "move the centre of mass of the body that models the load"
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return the shift in flange axes."""

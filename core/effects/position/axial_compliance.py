@@ -23,12 +23,12 @@ class AxialCompliance(JointEffect):
     identifier = "axial_compliance"
     title = "joint twists under load"
     label_template = "twist of joint {joint} per torque"
-    calibrated = 4
+    calibration_rank = 4
     softens = True
     flexibility = "axial"
     channels = ("position",)
     motion = "payloads or pulls that change the torque about the joint's axis"
-    instead = "add a joint with the spring 1/c about the same axis"
+    simulator_advice = "add a joint with the spring 1/c about the same axis"
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return the flexibility beyond the model's."""

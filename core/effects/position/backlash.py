@@ -25,11 +25,11 @@ class Backlash(JointEffect):
     identifier = "backlash"
     title = "play in the joint"
     label_template = "play of joint {joint}"
-    by_approach = True
+    depends_on_approach = True
     channels = ("position",)
     simulated_as = Kind.PLAY
     motion = "poses reached from both sides of the joint"
-    instead = "add a joint about the same axis, limited to half the clearance on each side"
+    simulator_advice = "add a joint about the same axis, limited to half the clearance on each side"
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return the whole clearance."""

@@ -27,7 +27,7 @@ class BaseCompliance(Effect):
     softens = True
     channels = ("position",)
     motion = "poses and payloads that change the moment on the base, in all directions around it"
-    instead = "put the base on springs about x and y"
+    simulator_advice = "put the base on springs about x and y"
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return the flexibilities about x and y of base."""

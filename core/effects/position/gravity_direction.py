@@ -22,10 +22,10 @@ class GravityDirection(Effect):
     identifier = "gravity_direction"
     title = "base is not level"
     label_template = "tilt of the base about {part}"
-    needs_softness = True
+    acts_through_deflection = True
     channels = ("position",)
     motion = "a compliant model and poses all around the base"
-    instead = "turn the base, or gravity in the world"
+    simulator_advice = "turn the base, or gravity in the world"
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return the rotation vector's x and y, base axes."""

@@ -27,9 +27,9 @@ class JointOffset(JointEffect):
     identifier = "joint_offset"
     title = "joint zero is off"
     label_template = "zero of joint {joint}"
-    calibrated = 2
-    moved = "the zero of joint {joint} moved by {size}"
-    beside_links = True
+    calibration_rank = 2
+    verification_message = "the zero of joint {joint} moved by {size}"
+    estimated_with_links = True
     channels = ("position",)
     simulated_as = Kind.JOINT_ZERO
     motion = "poses that differ in the other joints"

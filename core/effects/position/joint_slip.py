@@ -32,7 +32,7 @@ class JointSlip(JointEffect):
     channels = ("position",)
     simulated_as = Kind.JOINT_ZERO  # the arm as it is since
     motion = "poses before and after the moment, that differ in the other joints"
-    alike: ClassVar = {"joint_offset": "no pose before the moment"}
+    equivalents: ClassVar = {"joint_offset": "no pose before the moment"}
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return the step, and when it happened."""

@@ -26,7 +26,9 @@ class LinkFlexibility(Effect):
     softens = True
     channels = ("position",)
     motion = "payloads or pulls in several directions, so that force and moment on the link differ"
-    instead = "add springs of 2 EI / L across the link at 21 % and 79 % of its length, a pair each"
+    simulator_advice = (
+        "add springs of 2 EI / L across the link at 21 % and 79 % of its length, a pair each"
+    )
 
     def sites(self, arm: Arm) -> tuple[Site, ...]:
         """Return the links between two joints that have a length."""

@@ -67,10 +67,10 @@ class LinkGeometry(Effect):
     """
 
     identifier = "link_geometry"
-    together = True
+    estimated_as_whole = True
     title = "link measures differ"
     label_template = "{part} of link {joint}"
-    calibrated = 3
+    calibration_rank = 3
     channels = ("position",)
     motion = "poses that differ in the joint before the link"
 

@@ -22,13 +22,13 @@ class RadialCompliance(JointEffect):
     identifier = "radial_compliance"
     title = "joint tilts under load"
     label_template = "tilt of joint {joint} per moment"
-    calibrated = 5
+    calibration_rank = 5
     softens = True
     flexibility = "radial"
-    sum_of = "base_compliance"
+    equals_sum_of = "base_compliance"
     channels = ("position",)
     motion = "payloads or pulls that change the moment across the joint's axis"
-    instead = "add two joints with the spring 1/c across the axis"
+    simulator_advice = "add two joints with the spring 1/c across the axis"
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return the flexibility beyond the model's."""

@@ -34,11 +34,11 @@ class StiffnessNonlinearity(JointEffect):
     title = "joint stiffens under load"
     label_template = "stiffening of joint {joint} ({part})"
     softens = True
-    curved = True
-    contains = "axial_compliance"
+    has_nonlinearity = True
+    replaces = "axial_compliance"
     channels = ("position",)
     motion = "at least three well separated torques about the joint's axis"
-    instead = "add a joint with the spring 1/c + theta^2 / (2 c^3 M0^2)"
+    simulator_advice = "add a joint with the spring 1/c + theta^2 / (2 c^3 M0^2)"
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return c and the softening 1/M0^2, in which the curve starts linear."""

@@ -31,12 +31,12 @@ class TargetSlip(Effect):
     at_moment = True
     channels = ("position",)
     motion = "poses before and after the moment, that differ in the orientation of the flange"
-    alike: ClassVar = {
+    equivalents: ClassVar = {
         "tool_frame": "no pose before the moment",
         "joint_slip": "no joint beyond the slipped one moves after the moment",
     }
     of_the_arm = False
-    instead = "none needed: a simulated target does not move"
+    simulator_advice = "none needed: a simulated target does not move"
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return the shift in flange axes, and when it happened."""

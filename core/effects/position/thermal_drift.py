@@ -27,7 +27,7 @@ class ThermalDrift(Effect):
     channels = ("position",)
     needs = ("joint_temperatures",)
     motion = "joint temperatures that change by several degrees"
-    instead = "scale the links' lengths for one temperature"
+    simulator_advice = "scale the links' lengths for one temperature"
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return the coefficient of expansion."""

@@ -22,10 +22,10 @@ class ToolFrame(Effect):
     identifier = "tool_frame"
     title = "tool (TCP) sits elsewhere"
     label_template = "tool {part}"
-    calibrated = 1
-    corrects = "tool"
-    moved = "the tool moved by {size}: run the short session for the tool"
-    beside_links = True
+    calibration_rank = 1
+    replaces_cell_value = "tool"
+    verification_message = "the tool moved by {size}: run the short session for the tool"
+    estimated_with_links = True
     channels = ("position",)
     motion = "poses that differ in the orientation of the flange"
 

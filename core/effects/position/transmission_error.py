@@ -30,7 +30,9 @@ class TransmissionError(JointEffect):
     periodic = True
     channels = ("position",)
     motion = "many different angles of the joint"
-    instead = "add amplitude sin(order q + phase) to the commanded angle in the control loop"
+    simulator_advice = (
+        "add amplitude sin(order q + phase) to the commanded angle in the control loop"
+    )
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return the coefficients of sine and cosine, in which the effect is linear."""

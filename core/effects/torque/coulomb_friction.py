@@ -28,7 +28,7 @@ class CoulombFriction(TorqueEffect):
     title = "constant friction"
     order = 52
     simulated_as = Kind.FRICTION
-    beside_links = True
+    estimated_with_links = True
     motion = "the joint moved both ways"
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:

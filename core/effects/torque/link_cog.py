@@ -28,12 +28,12 @@ class LinkCog(JointEffect):
     title = "link's centre of gravity is elsewhere"
     label_template = "first moment {part} of link {joint}"
     order = 22
-    carried = True
-    together = True
+    loads_joints = True
+    estimated_as_whole = True
     channels = ("torque",)
     motion = "poses that turn the link against gravity, or its accelerations"
-    alike: ClassVar = {"link_inertia": "poses at which the link pulls in one direction"}
-    instead = "move the link's centre of mass by the first moment over its mass"
+    equivalents: ClassVar = {"link_inertia": "poses at which the link pulls in one direction"}
+    simulator_advice = "move the link's centre of mass by the first moment over its mass"
 
     def sites(self, arm: Arm) -> tuple[Site, ...]:
         """Return the links that have a mass."""

@@ -26,7 +26,7 @@ class LinkInertia(JointEffect):
     identifier = "link_inertia"
     title = "link weighs more or less"
     order = 20
-    carried = True
+    loads_joints = True
     channels = ("torque",)
     simulated_as = Kind.LINK_SCALE
     motion = "many poses, and accelerations of all joints up to the link"

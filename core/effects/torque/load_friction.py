@@ -28,8 +28,8 @@ class LoadFriction(TorqueEffect):
     label_template = "load friction of joint {joint}"
     order = 53
     motion = "the joint moved both ways under loads that change"
-    alike: ClassVar = {"coulomb_friction": "motion under one load"}
-    instead = "friction by load in the control loop, or the simulator's actuator"
+    equivalents: ClassVar = {"coulomb_friction": "motion under one load"}
+    simulator_advice = "friction by load in the control loop, or the simulator's actuator"
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return the share of the load."""

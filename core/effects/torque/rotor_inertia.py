@@ -28,7 +28,7 @@ class RotorInertia(TorqueEffect):
     order = 30
     simulated_as = Kind.ARMATURE
     motion = "accelerations of the joint, at several poses of those beyond"
-    instead = "set the joint's armature where the simulator has it"
+    simulator_advice = "set the joint's armature where the simulator has it"
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return the inertia at the joint's side of the gear."""

@@ -29,9 +29,9 @@ class StribeckFriction(TorqueEffect):
     label_template = "breakaway friction of joint {joint} {part}"
     order = 54
     motion = "the joint moved both ways, slowly and fast"
-    alike: ClassVar = {"coulomb_friction": "motion at one low speed"}
-    instead = "friction by speed in the control loop, or the simulator's actuator"
-    shapes = tuple(4e-3 * 150 ** (i / 8) for i in range(9))  # rad/s
+    equivalents: ClassVar = {"coulomb_friction": "motion at one low speed"}
+    simulator_advice = "friction by speed in the control loop, or the simulator's actuator"
+    start_values = tuple(4e-3 * 150 ** (i / 8) for i in range(9))  # rad/s
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return the torque at standstill above Coulomb's, and the speed at which it is gone."""

@@ -25,8 +25,8 @@ class TorqueConstant(JointEffect):
     order = 90
     channels = ("torque",)
     motion = "a joint that carries torque, the more changing the better"
-    alike: ClassVar = {"torque_offset": "motion in which the joint's torque never changes"}
-    instead = "scale the measured torque by 1 / (1 + value) before it is compared"
+    equivalents: ClassVar = {"torque_offset": "motion in which the joint's torque never changes"}
+    simulator_advice = "scale the measured torque by 1 / (1 + value) before it is compared"
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return the relative increase."""

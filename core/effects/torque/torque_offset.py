@@ -26,13 +26,13 @@ class TorqueOffset(TorqueEffect):
     title = "torque reading's zero is off"
     label_template = "zero of the torque of joint {joint}"
     order = 95
-    beside_links = True
+    estimated_with_links = True
     motion = "the joint moved both ways, at poses that change its weight"
-    alike: ClassVar = {
+    equivalents: ClassVar = {
         "coulomb_friction": "motion of the joint one way only",
         "link_cog": "a joint whose weight never changes",
     }
-    instead = "subtract the offset from the measured torque before it is compared"
+    simulator_advice = "subtract the offset from the measured torque before it is compared"
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return the offset."""

@@ -26,9 +26,9 @@ class ViscousFriction(TorqueEffect):
     title = "friction grows with speed"
     order = 51
     simulated_as = Kind.DAMPING
-    beside_links = True
+    estimated_with_links = True
     motion = "the joint moved at several speeds"
-    alike: ClassVar = {"coulomb_friction": "motion at one speed"}
+    equivalents: ClassVar = {"coulomb_friction": "motion at one speed"}
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return the coefficient."""

@@ -27,13 +27,13 @@ class DeadBand(ServoEffect):
     title = "servo stops before its target"
     label_template = "dead band of servo {joint}"
     order = 70
-    by_approach = True
+    depends_on_approach = True
     motion = "the joint moved both ways, or poses reached from both sides"
-    alike: ClassVar = {
+    equivalents: ClassVar = {
         "latency": "motion one way at one speed",
         "tracking_lag": "motion one way at one speed",
     }
-    instead = "in the controller's settings, or a second, limited joint behind each servo"
+    simulator_advice = "in the controller's settings, or a second, limited joint behind each servo"
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return the half width w."""

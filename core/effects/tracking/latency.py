@@ -27,11 +27,11 @@ class Latency(ServoEffect):
     identifier = "latency"
     title = "joint reacts late"
     order = 20
-    delays = True
+    is_delay = True
     simulated_as = Kind.DELAY
     needs = ("timestamp",)
     motion = "a recording of changing speeds of the joint"
-    instead = "delay the command in the control loop"
+    simulator_advice = "delay the command in the control loop"
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return the delay."""

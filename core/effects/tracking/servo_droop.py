@@ -31,7 +31,7 @@ class ServoDroop(JointEffect):
     channels = ("tracking",)
     simulated_as = Kind.SERVO_COMPLIANCE
     motion = "poses, payloads or pulls that change the torque that the joint holds"
-    alike: ClassVar = {"dead_band": "one torque at each joint, reached from one side"}
+    equivalents: ClassVar = {"dead_band": "one torque at each joint, reached from one side"}
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return the droop per torque."""

@@ -25,11 +25,11 @@ class TrackingLag(ServoEffect):
     identifier = "tracking_lag"
     title = "joint lags behind"
     order = 30
-    delays = True
+    is_delay = True
     simulated_as = Kind.LAG
     needs = ("timestamp",)
     motion = "a recording of the joint with accelerations, the sharper the better"
-    instead = "filter the command in the control loop"
+    simulator_advice = "filter the command in the control loop"
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return the time constant."""

@@ -29,11 +29,11 @@ class FtBias(Effect):
     title = "force sensor zero is off"
     label_template = "sensor zero of {part}"
     order = 80
-    any_constant = True
-    corrects = "sensor zero"
+    fits_any_constant = True
+    replaces_cell_value = "sensor zero"
     channels = ("wrench",)
     motion = "poses that turn the flange by tens of degrees against gravity"
-    instead = "subtract the bias from the sensor's readings"
+    simulator_advice = "subtract the bias from the sensor's readings"
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return force (N) and torque (Nm) along the flange axes."""

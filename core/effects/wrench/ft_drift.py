@@ -30,7 +30,7 @@ class FtDrift(Effect):
     channels = ("wrench",)
     needs = ("timestamp",)
     motion = "a session long enough for the zero to move, with poses that come back"
-    instead = "subtract the drift from the sensor's readings"
+    simulator_advice = "subtract the drift from the sensor's readings"
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return the rates along the flange axes."""

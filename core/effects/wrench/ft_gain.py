@@ -29,10 +29,10 @@ class FtGain(Effect):
     title = "force sensor scale is off"
     order = 60
     scales_reading = True
-    shown_by = Term("payload", Site(), (1.0,))
+    identifiable_with = Term("payload", Site(), (1.0,))
     channels = ("wrench",)
     motion = "a load on every axis: the flange turned every way, with pulls or several payloads"
-    instead = "divide the sensor's readings by 1 + gain"
+    simulator_advice = "divide the sensor's readings by 1 + gain"
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return the relative errors along the flange axes."""

@@ -28,10 +28,10 @@ class FtMisalignment(Effect):
     title = "force sensor is turned"
     order = 55
     scales_reading = True
-    shown_by = Term("payload", Site(), (1.0,))
+    identifiable_with = Term("payload", Site(), (1.0,))
     channels = ("wrench",)
     motion = "loads along at least two directions of the flange"
-    instead = "turn the sensor's frame, or its readings"
+    simulator_advice = "turn the sensor's frame, or its readings"
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return the rotation vector of the sensor in the flange."""

@@ -289,8 +289,8 @@ def test_a_term_not_significant_with_unnamed_functions_is_withdrawn():
 
 def test_every_member_that_waits_for_another_names_one_of_its_channel():
     for effect in CATALOGUE.values():
-        if effect.shown_by is not None:
-            other = CATALOGUE[effect.shown_by.effect]
+        if effect.identifiable_with is not None:
+            other = CATALOGUE[effect.identifiable_with.effect]
             assert set(effect.channels) & set(other.channels)
 
 
