@@ -13,6 +13,7 @@ from typing import Any, Self
 import httpx
 import numpy as np
 from numpy.typing import NDArray
+from patience import PATIENCE
 from ports import free_port
 
 from gapbridge.bridge.cell import load_cell
@@ -85,12 +86,12 @@ class Feed:
         self.memory.close()
         self.log.close()
 
-    def wait(self, path: str = "", limit: float = 60.0, **keys: Any) -> httpx.Response:
+    def wait(self, path: str = "", **keys: Any) -> httpx.Response:
         """Return the first answer that the process gives."""
-        until = time.monotonic() + limit
+        until = time.monotonic() + PATIENCE
         while True:
             try:
-                return httpx.get(self.url + path, timeout=5, **keys)
+                return httpx.get(self.url + path, timeout=PATIENCE, **keys)
             except httpx.TransportError:
                 phrase = (self.folder / f"{self.section}.log").read_text()
                 assert time.monotonic() < until, f"{self.section} does not answer: {phrase}"

@@ -220,7 +220,7 @@ def test_a_demo_that_is_killed_leaves_no_controller_behind(tmp_path: Path) -> No
         demo.kill()
         demo.wait()
     demo.stdout.close()
-    until = time.monotonic() + 10
+    until = time.monotonic() + PATIENCE
     while time.monotonic() < until:
         try:
             socket.create_connection((host, BENCH_PORT), timeout=PATIENCE).close()

@@ -43,7 +43,7 @@ def flood(monkeypatch):
         target=serve, args=(app, settings, "web", over.is_set, lambda: None, 0.05)
     )
     thread.start()
-    until = time.monotonic() + 30
+    until = time.monotonic() + PATIENCE
     while True:
         try:
             httpx.get(settings.url)

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from patience import PATIENCE
 
 from gapbridge.bridge.cell import load_cell
 from gapbridge.bridge.cell.run_settings import settings_of
@@ -132,16 +133,16 @@ def tcp(tmp_path: Path) -> Iterator[TcpSource]:
 
 def planner(feed: PlannerSource) -> socket.socket:
     if isinstance(feed, TcpSource):
-        found = socket.create_connection(("127.0.0.1", feed.port), timeout=2)
+        found = socket.create_connection(("127.0.0.1", feed.port), timeout=PATIENCE)
     else:
         found = socket.socket(socket.AF_UNIX)
         found.connect(str(feed.settings.socket))
-    found.settimeout(2)
+    found.settimeout(PATIENCE)
     return found
 
 
-def first_of(feed: PlannerSource, seconds: float = 1.0) -> np.ndarray | None:
-    until = time.monotonic() + seconds
+def first_of(feed: PlannerSource) -> np.ndarray | None:
+    until = time.monotonic() + PATIENCE
     while (found := feed.first(HERE)) is None and time.monotonic() < until:
         time.sleep(0.002)
     return found
@@ -151,7 +152,7 @@ def closed_by(feed: PlannerSource, link: socket.socket) -> tuple[bytes, bool]:
     """Look as the loop does until the feed closes; returns its answer, and if a setpoint came."""
     received, setpoint_came = b"", False
     link.settimeout(0.002)
-    until = time.monotonic() + 20.0
+    until = time.monotonic() + PATIENCE
     while time.monotonic() < until:
         setpoint_came |= feed.first(HERE) is not None
         try:
@@ -187,6 +188,7 @@ def test_a_line_is_a_setpoint(line: str, feed: PlannerSource) -> None:
         assert feed.sample(0.002, HERE) == pytest.approx([0.1, 0.2, 0.3])
 
 
+@pytest.mark.realtime
 def test_joints_are_interpolated_between_lines(feed: PlannerSource) -> None:
     with planner(feed) as socket_:
         socket_.sendall(b"0,0,0\n")
@@ -294,7 +296,7 @@ def test_a_second_planner_is_turned_away_and_the_next_one_is_not(feed: PlannerSo
         feed.first(HERE)
     with planner(feed) as three:
         three.sendall(b"0,0,0.1\n")
-        until = time.monotonic() + 20
+        until = time.monotonic() + PATIENCE
         while (found := feed.first(HERE)) is None or found[2] != 0.1:
             assert time.monotonic() < until
             time.sleep(0.002)

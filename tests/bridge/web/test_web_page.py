@@ -199,7 +199,7 @@ def test_the_page_comes_back_when_its_own_process_was_killed(browser, tmp_path):
             live(page)
             os.kill(feed.side.pid, 9)
             page.wait_for_selector('body[data-connection="lost"]')
-            until = time.monotonic() + 60
+            until = time.monotonic() + PATIENCE
             while page.evaluate("document.body.dataset.connection") != "live":
                 feed.side.check()
                 assert time.monotonic() < until

@@ -5,16 +5,18 @@ from __future__ import annotations
 import itertools
 import math
 import struct
+import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from typing import NamedTuple
 
 import can
 import numpy as np
+from patience import PATIENCE
 
 from benchmarks.server_thread import ServerThread
 from gapbridge.core.arm import builtin_arm
-from gapbridge.core.errors import InvalidStateError
+from gapbridge.core.errors import InvalidStateError, StaleStateError
 from gapbridge.core.model import Model
 from gapbridge.core.state import RobotState, Setpoint
 from gapbridge.drivers.can.driver import CanDriver
@@ -53,11 +55,14 @@ def served_arm(profile: str = "piper", **keys: object) -> Iterator[Served]:
 
 
 def next_state(driver: CanDriver) -> RobotState:
-    """Return the next sample; a busy machine tears one now and then."""
-    for _ in range(20):
-        with suppress(InvalidStateError):
+    """Return the next sample; on a busy machine torn ones, and late ones, come before."""
+    until = time.monotonic() + PATIENCE
+    while True:
+        try:
             return driver.read_state()
-    return driver.read_state()
+        except (InvalidStateError, StaleStateError):
+            if time.monotonic() > until:
+                raise
 
 
 def joints_frame(first: int, a: float, b: float) -> tuple[int, bytes]:

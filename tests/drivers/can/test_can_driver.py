@@ -7,6 +7,7 @@ import can
 import numpy as np
 import pytest
 from can_arm import MODEL, UNIT, next_state, other_bus, served_arm, setpoint_of
+from patience import PATIENCE
 
 from gapbridge.core.errors import InvalidStateError, LinkError, StaleStateError, WriteError
 from gapbridge.drivers.can.driver import CanDriver
@@ -197,7 +198,7 @@ def test_everything_we_send_is_in_the_allow_list(served):
 def test_a_motor_that_loses_its_power_while_we_write_is_reported(served):
     armed(served)
     served.nodes.enabled[2] = False
-    until = time.monotonic() + 2.0
+    until = time.monotonic() + PATIENCE
     while next_state(served.driver).robot_mode == 7:
         assert time.monotonic() < until
 
@@ -224,7 +225,7 @@ def test_a_stop_that_comes_and_goes_while_frames_make_no_sample_is_reported_once
     driver, controller = served.driver, served.controller
 
     def read_until_stopped(stopped):
-        until = time.monotonic() + 5.0
+        until = time.monotonic() + PATIENCE
         while bool(driver.reader.stop_reason(writing=False)[0]) != stopped:
             assert time.monotonic() < until
             with suppress(InvalidStateError, StaleStateError):

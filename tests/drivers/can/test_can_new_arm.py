@@ -95,6 +95,6 @@ def test_an_arm_that_no_code_knows_is_read_armed_and_moved_from_data_alone(firmw
         assert firmware.q == pytest.approx(goal, abs=COUNT)
         assert state.actual_q == pytest.approx(goal, abs=COUNT)
         firmware.alarm = 2
-        until = time.monotonic() + 2.0
+        until = time.monotonic() + PATIENCE
         while next_state(driver).safety_mode != 7:
             assert time.monotonic() < until

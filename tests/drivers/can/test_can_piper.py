@@ -69,7 +69,7 @@ def test_the_vendors_client_reads_and_commands_our_arm_and_we_notice_it(served, 
     wait_for(lambda: np.abs(joints_of(vendor) - controller.q).max() < 1e-5, "its joints")
     with CanDriver(link, model) as driver:
         assert next_state(driver).actual_q == pytest.approx(controller.q, abs=1e-5)
-        until = time.monotonic() + 5.0
+        until = time.monotonic() + PATIENCE
         while not vendor.EnablePiper():
             assert time.monotonic() < until
             time.sleep(0.05)

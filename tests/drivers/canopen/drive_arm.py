@@ -10,6 +10,7 @@ from typing import Any
 
 import can
 import numpy as np
+from patience import PATIENCE
 
 from benchmarks.server_thread import ServerThread
 from gapbridge.core.arm import builtin_arm
@@ -64,7 +65,7 @@ def served(profile: str = "cia402", **keys: Any) -> Iterator[DriveArm]:
         yield arm
 
 
-def settled(driver: CanopenDriver, seconds: float = 10.0) -> RobotState:
+def settled(driver: CanopenDriver, seconds: float = PATIENCE) -> RobotState:
     """Return a state; a machine that is busy may tear a set or two."""
     until = time.monotonic() + seconds
     while True:
@@ -93,7 +94,7 @@ def follow(
     goal: np.ndarray,
     controller: ArmController,
     within: float = 1e-4,
-    seconds: float = 20.0,
+    seconds: float = PATIENCE,
 ) -> None:
     """Lead the arm to joints at 0.2 rad/s."""
     start, begun = np.array(controller.q), time.monotonic()

@@ -10,7 +10,7 @@ import can
 import numpy as np
 import pytest
 from drive_arm import DriveArm, follow, read_on, served, setpoint, settled
-from patience import wait_for
+from patience import PATIENCE, wait_for
 from ports import free_port
 
 from gapbridge.core.errors import (
@@ -205,7 +205,7 @@ def test_a_pdo_of_the_sync_before_is_never_taken_for_this_ones(
 
 def test_a_pdo_that_no_sync_asked_for_is_reported(generic: DriveArm, driver: CanopenDriver) -> None:
     settled(driver)
-    text, until = "", time.monotonic() + 10.0
+    text, until = "", time.monotonic() + PATIENCE
     with generic.other_bus() as bus:
         while "came without a SYNC" not in text and time.monotonic() < until:
             bus.send(can.Message(arbitration_id=0x181, data=bytes(6), is_extended_id=False))

@@ -80,7 +80,7 @@ def test_a_simulated_cell_is_run_from_end_to_end(tmp_path: Path) -> None:
     )
     try:
         assert served_cell.stdout is not None
-        until = time.monotonic() + 60.0
+        until = time.monotonic() + PATIENCE
         while "ready" not in served_cell.stdout.readline():
             assert time.monotonic() < until
         found = subprocess.run(

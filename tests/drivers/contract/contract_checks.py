@@ -10,7 +10,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from contract_case import Case
-from patience import wait_for
+from patience import PATIENCE, wait_for
 
 from gapbridge.core.errors import (
     GateError,
@@ -31,7 +31,7 @@ LATE = 0.05  # s that a sample may be older than the plant
 IN_TIME = 3  # states in a row that came within LATE: none of them has waited for this process
 
 
-def next_state(driver: Driver, seconds: float = 15.0) -> RobotState:
+def next_state(driver: Driver, seconds: float = PATIENCE) -> RobotState:
     """Return the next believable state; torn ones, and late ones, may come before."""
     until = time.monotonic() + seconds
     while True:
@@ -95,7 +95,7 @@ def check_angles(case: Case, driver: Driver) -> None:
             zip(start, controller.plant.arm.lower, controller.plant.arm.upper, strict=True)
         )
     )
-    until, fastest = time.monotonic() + 60.0, _fastest_on_the_way(case, driver, goal)
+    until, fastest = time.monotonic() + PATIENCE, _fastest_on_the_way(case, driver, goal)
     while case.speed_resolution is not None and fastest <= 0.1:  # a busy machine has missed it
         assert time.monotonic() < until, "no speed was ever reported"
         _fastest_on_the_way(case, driver, start)
@@ -106,7 +106,7 @@ def _fastest_on_the_way(case: Case, driver: Driver, goal: tuple[float, ...]) -> 
     """Have the plant go to joints, and compare where states come in time; returns rad/s."""
     controller = case.controller
     controller.move_own(goal)
-    fastest, in_time, until = 0.0, 0, time.monotonic() + 30.0
+    fastest, in_time, until = 0.0, 0, time.monotonic() + PATIENCE
     while max(map(abs, controller.qd)) > 1e-6 or not np.allclose(controller.q, goal, atol=1e-6):
         asked = time.monotonic()
         assert asked < until, "the plant never came there"
@@ -214,7 +214,7 @@ def check_gate(case: Case, driver: Driver) -> None:
 
 def _written(driver: Driver, setpoint: Callable[[RobotState, np.ndarray], Setpoint]) -> None:
     """Write one setpoint; a busy machine may be later than the robot's watchdog."""
-    until = time.monotonic() + 15.0
+    until = time.monotonic() + PATIENCE
     while True:
         state = next_state(driver)
         try:
@@ -307,7 +307,7 @@ def stream(
 
 
 def _recovers(driver: Driver) -> None:
-    until = time.monotonic() + 15.0
+    until = time.monotonic() + PATIENCE
     while True:
         try:
             driver.read_state()

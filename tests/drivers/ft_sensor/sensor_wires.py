@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from patience import PATIENCE
 from pydantic import TypeAdapter
 
 from gapbridge.core.arm import builtin_arm
@@ -79,7 +80,7 @@ def make_wire(kind: str, reaction: Callable[[], Any]) -> Wire:
     return Wire(node, keys)
 
 
-def next_reading(sensor: ForceTorqueSensor, limit: float = 15.0) -> Reading:
+def next_reading(sensor: ForceTorqueSensor, limit: float = PATIENCE) -> Reading:
     """Return the next sample; a busy machine may take a while."""
     until = time.monotonic() + limit
     while time.monotonic() < until:

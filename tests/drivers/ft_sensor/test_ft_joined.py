@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from patience import PATIENCE
 from sensor_wires import (
     COG,
     KINDS,
@@ -188,7 +189,7 @@ def read_for(driver: DriverWithSensor, seconds: float) -> None:
         driver.read_state()
 
 
-def heal(driver: DriverWithSensor, limit: float = 20.0) -> RobotState:
+def heal(driver: DriverWithSensor, limit: float = PATIENCE) -> RobotState:
     """Return the first state after a fault."""
     until = time.monotonic() + limit
     while True:

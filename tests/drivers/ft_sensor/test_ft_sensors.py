@@ -11,6 +11,7 @@ import can
 import numpy as np
 import pytest
 import serial
+from patience import PATIENCE, wait_for
 from pymodbus.framer import FramerRTU
 from sensor_wires import (
     COG,
@@ -54,7 +55,7 @@ def test_a_known_wrench_is_read_in_newtons_and_newton_metres(kind: str) -> None:
         assert reading.status == 0
         assert reading.timestamp <= reading.received <= time.monotonic()
         reaction.wrench = tuple(-v for v in reaction.wrench)
-        until = time.monotonic() + 15.0
+        until = time.monotonic() + PATIENCE
         while np.any(np.abs(reading.wrench - reaction.wrench) > tolerance(kind)):
             assert time.monotonic() < until, reading
             reading = next_reading(sensor)
@@ -153,10 +154,7 @@ def test_close_ends_the_stream(kind: str) -> None:
         with make_sensor(wire.settings()) as sensor:
             next_reading(sensor)
             assert device.streaming
-        until = time.monotonic() + 2.0
-        while device.streaming and time.monotonic() < until:
-            time.sleep(0.01)
-        assert not device.streaming
+        wait_for(lambda: not device.streaming, "the end of the stream")
 
 
 def test_a_stream_left_running_does_not_disturb_the_start() -> None:
@@ -210,7 +208,7 @@ def test_garbage_on_the_line_is_dropped_and_the_stream_goes_on() -> None:
             device.put(garbage)
             for _ in range(5):
                 assert np.allclose(next_reading(sensor).wrench, Reaction().wrench, atol=0.01)
-        until = time.monotonic() + 15.0
+        until = time.monotonic() + PATIENCE
         while sensor.dropped < 33:  # behind what a busy machine has not read yet
             next_reading(sensor)
             assert time.monotonic() < until

@@ -420,7 +420,8 @@ def test_two_arms_move_side_by_side_on_their_own_addresses() -> None:
                     assert c[k].servoJ([q[k][0] + sign * 0.05 * i / 199] + q[k][1:],
                                        0.5, 0.5, 0.002, 0.05, 300)
                 c[0].waitPeriod(t)
-            until(lambda: abs(r[1].getActualQ()[0] - q[1][0] + 0.05) < 1e-6)
+            until(lambda: abs(r[0].getActualQ()[0] - q[0][0] - 0.05) < 5e-7)
+            until(lambda: abs(r[1].getActualQ()[0] - q[1][0] + 0.05) < 5e-7)
             out["moved"] = [x.getActualQ()[0] - y[0] for x, y in zip(r, q)]
             out["poses"] = [x.getActualTCPPose() for x in r]
             """,
