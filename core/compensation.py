@@ -218,7 +218,7 @@ class Compensator:
             for part, values in zip(out, some, strict=True):
                 part[unsolved] = values
 
-    def forget(self) -> None:
+    def reset(self) -> None:
         """Start the next correction from zero, not from the last solution."""
         self._offset[:] = 0.0
         self._shape[:] = 0.0

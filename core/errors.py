@@ -7,6 +7,7 @@
     │   ├── ArmError          an arm table, URDF or DH list
     │   ├── CellError         a cell file
     │   ├── LogError          a log or a trajectory
+    │   │   └── LogOptionError   a source whose conversion needs another option
     │   ├── EquilibriumError  a load under which the model's arm would buckle
     │   ├── ExcitationError   the data do not determine what was requested
     │   └── PlanError         no poses can be planned for the request
@@ -50,6 +51,10 @@ class CellError(InputError):
 
 class LogError(InputError):
     """A log or a trajectory file cannot be used."""
+
+
+class LogOptionError(LogError):
+    """A source needs an option of its conversion, or another value of one."""
 
 
 class EquilibriumError(InputError):

@@ -11,7 +11,7 @@ import numpy as np
 from gapbridge.bridge.cell.cell import Cell
 from gapbridge.bridge.document.notes import note_texts
 from gapbridge.core.diagnosis.log_checks.units_and_clocks import check_units
-from gapbridge.core.errors import LogError
+from gapbridge.core.errors import LogError, LogOptionError
 from gapbridge.core.load_bounds import PAYLOAD_FACTOR
 from gapbridge.core.log.alignment import aligned
 from gapbridge.core.log.log import Log, read_log
@@ -30,9 +30,7 @@ def open_log(path: Path, cell: Cell) -> Log:
     else:
         try:
             converted = source.read(path, joint_names(cell), SourceOptions())
-        except LogError as error:
-            if "--" not in str(error):
-                raise
+        except LogOptionError as error:
             raise LogError(f"{error} (options of gapbridge convert)") from None
         for note in note_texts(converted.notes):
             click.echo(f"note: {path}: {note}", err=True)

@@ -101,7 +101,7 @@ class Daemon:
         self.control = Control(self, clock)
         self.loop: LoopProcess | None = None
         self._failure: Event = {}
-        self._faults: list[str] = []
+        self._faults: list[tuple[str, str]] = []  # cause, text
         self._lost_rows = 0
         self._refused = False  # arming was requested and refused
         self._has_state = False  # a state has been read in this run
@@ -452,7 +452,7 @@ class Daemon:
             self._say(text)
             self._refused |= event["cause"] == Cause.START_REFUSED
             if detail:
-                self._faults.append(text)
+                self._faults.append((event["cause"], text))
         elif detail and kind not in NOT_SHOWN:
             self._say(detail)
 
@@ -475,7 +475,7 @@ class Daemon:
         self._fault("loop", detail)
 
     def _fault(self, cause: str, detail: str) -> None:
-        self._faults.append(detail)
+        self._faults.append((cause, detail))
         self.event_log.add({"kind": EventKind.FAULT, "cause": cause, "detail": detail})
 
     def _summary(self) -> RunSummary:
@@ -486,10 +486,11 @@ class Daemon:
             **self.tally.figures(),
             restarts=self.restarts,
             lost_rows=self.lost_rows,
-            faults=tuple(self._faults),
+            faults=tuple(text for _, text in self._faults),
             state=state.name.lower(),
             exit_code=1 if failed else 0,
             recording=self.recording,
+            cause=self._faults[0][0] if self._faults else "",
         )
         self.event_log.add({"kind": EventKind.SUMMARY, "summary": summary.to_json()})
         return summary

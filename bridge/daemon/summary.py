@@ -58,6 +58,7 @@ class RunSummary:
     state: str  # at the end
     exit_code: int
     recording: Path | None = None
+    cause: str = ""  # of the first fault: a Cause, or "loop" where its process ended
 
     @property
     def missed_share(self) -> float:

@@ -18,8 +18,11 @@ MAX_STILL_SPEED = 0.003  # rad/s, fastest joint of an arm at rest
 SETTLING_TIME = 0.15  # s at rest before readings count
 DEPARTURE_TIME = 0.04  # s before the next move in which they no longer count
 MIN_READINGS = 8  # of the tracker, per pose
-FEW_READINGS = "readings of the tracker"
 MAX_POSE_ERROR = 0.05  # rad between the visited pose and the commanded one
+
+
+class TooFewReadingsError(RunError):
+    """The tracker measured less often at a pose than a mean needs."""
 
 
 @dataclass(frozen=True)
@@ -45,29 +48,30 @@ def measurements_at(
     poses: Array,
     load: Load | None = None,
     settling: float = SETTLING_TIME,
-) -> tuple[Measurements | None, str]:
-    """Return the measurements at the ``poses`` (M, n), up to the first missing one, and its reason.
+) -> tuple[Measurements | None, RunError | None]:
+    """Return the measurements at the ``poses`` (M, n), up to the first missing one, and its error.
 
     None where all are missing. ``recording`` holds columns by RTDE name, ``readings`` (K, 7) are
     the tracker's (time, position, rotation vector); ``load`` is the load of the arm where the
     controller does not report it; ``settling``: s at rest before readings count.
     """
     if "timestamp" not in recording:
-        return None, "the recording holds no state of the arm, expected one per cycle"
+        return None, RunError("the recording holds no state of the arm, expected one per cycle")
     if load is not None and "payload" not in recording:
         recording = {**recording, **_load_columns(load, len(recording["timestamp"]))}
     spans = _static_spans(recording, settling)
     rows: list[tuple[Array, ...]] = []
-    missing = ""
+    missing: RunError | None = None
     for number, pose in enumerate(poses):
         span = _next_span(recording, spans, pose)
         if span is None:
-            missing = f"visit {number + 1} of {len(poses)}: the arm was never at rest there"
+            text = f"visit {number + 1} of {len(poses)}: the arm was never at rest there"
+            missing = RunError(text)
             break
         try:
             rows.append(_measurement(recording, readings, span, pose, number, settling))
-        except RunError as error:
-            missing = str(error)
+        except TooFewReadingsError as error:
+            missing = error
             break
     if not rows:
         return None, missing
@@ -109,8 +113,8 @@ def _measurement(
     begin, end = t[0] + settling, t[-1] - DEPARTURE_TIME
     used = readings[(readings[:, 0] >= begin) & (readings[:, 0] <= end)]
     if len(used) < MIN_READINGS:
-        found = f"visit {number + 1}: found {len(used)} {FEW_READINGS}"
-        raise RunError(f"{found}, expected {MIN_READINGS}")
+        found = f"visit {number + 1}: found {len(used)} readings of the tracker"
+        raise TooFewReadingsError(f"{found}, expected {MIN_READINGS}")
     during = np.arange(span.start, span.stop)[(t >= begin) & (t <= end)]
     return (
         np.array(begin),

@@ -14,7 +14,12 @@ from gapbridge.bridge.daemon.daemon import Daemon, settings_of
 from gapbridge.bridge.daemon.summary import RunSummary
 from gapbridge.bridge.demo.bench import Tracker
 from gapbridge.bridge.demo.links.link import DemoLink
-from gapbridge.bridge.demo.measurements import FEW_READINGS, Measurements, joined, measurements_at
+from gapbridge.bridge.demo.measurements import (
+    Measurements,
+    TooFewReadingsError,
+    joined,
+    measurements_at,
+)
 from gapbridge.bridge.demo.poses import Load
 from gapbridge.bridge.demo.result import LoopFigures
 from gapbridge.bridge.ipc.loop_state import State
@@ -31,10 +36,9 @@ RETRY_PAUSE = 5.0  # s after a run without a completed visit
 MAX_TIMER_DELAY = 0.05  # s; a timer later than this means that the machine stalled
 STALL_CAUSES = (
     Cause.OVERRUN, Cause.STALE, Cause.RESYNC, Cause.SILENCE, Cause.LINK_LOST, Cause.INEFFECTIVE,
-    Cause.WRITE_FAILED, Cause.SOURCE_DRY, "limits.following",
-    FEW_READINGS,
+    Cause.WRITE_FAILED, Cause.SOURCE_DRY, Cause.SETPOINT_REFUSED,
 )  # fmt: skip
-"""Errors of a run that a stalled machine causes: missed deadlines, following errors."""
+"""What ends a run where a machine stalls; a setpoint is refused where the arm is far behind it."""
 MAX_RUNS_WITHOUT_VISIT = 4  # in a row and without a late timer: no stall, a failure
 
 
@@ -44,6 +48,8 @@ class RunOutcome(NamedTuple):
     measurements: Measurements | None
     error: str
     stalled: bool  # a timer came late during the run
+    cause: str = ""  # of the error: a Cause
+    few_readings: bool = False  # the tracker measured too rarely
 
 
 class TimerDelay(threading.Thread):
@@ -110,7 +116,7 @@ class Session:
                     self._emit(
                         f"  this machine stalled ({outcome.error}); "
                         f"{len(poses) - len(remaining)} of {len(poses)} visits done, "
-                        f"continuing{self._slow_down(outcome.error)}"
+                        f"continuing{self._slow_down(outcome.cause)}"
                     )
                     self._clock.sleep(0.0 if progress else RETRY_PAUSE)
                     bench.move_to(self._link.home)  # the next run begins there
@@ -122,16 +128,16 @@ class Session:
 
     def _check_outcome(self, outcome: RunOutcome, runs_without_visit: int, latest: float) -> None:
         """Raise RunError where no stall ended the run, or stalls last too long."""
-        retry = any(cause in outcome.error for cause in STALL_CAUSES)
+        retry = outcome.few_readings or outcome.cause in STALL_CAUSES
         retry = retry and runs_without_visit < MAX_RUNS_WITHOUT_VISIT
         if not (outcome.stalled or retry):
             raise RunError(outcome.error or "the run ended before its last visit")
         if self._clock.monotonic() > latest:
             raise RunError(f"stalled for more than {MAX_STALL_TIME:g} s: {outcome.error}")
 
-    def _slow_down(self, error: str) -> str:
+    def _slow_down(self, cause: str) -> str:
         """Halve the rate of later runs where deadlines were missed; return the message for it."""
-        if Cause.OVERRUN not in error or self._slower >= MAX_SLOWDOWN:
+        if cause != Cause.OVERRUN or self._slower >= MAX_SLOWDOWN:
             return ""
         self._slower *= 2
         return f" at {1 / self._slower:g} of the rate"
@@ -164,7 +170,10 @@ class Session:
             return RunOutcome(None, error or "nothing was recorded", stalled)
         recording = read_columns(summary.recording, reported_only=True)
         measured, missing = measurements_at(recording, readings, poses, load, self._link.settling)
-        return RunOutcome(measured, summary.faults[0] if summary.faults else missing, stalled)
+        if summary.faults:
+            return RunOutcome(measured, summary.faults[0], stalled, summary.cause)
+        few = isinstance(missing, TooFewReadingsError)
+        return RunOutcome(measured, str(missing or ""), stalled, few_readings=few)
 
     @property
     def written(self) -> int:

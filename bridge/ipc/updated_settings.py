@@ -7,6 +7,7 @@ from typing import Any
 
 from gapbridge.bridge.cell.daemon_settings import DaemonSettings
 from gapbridge.bridge.cell.run_settings import read_configuration
+from gapbridge.bridge.ipc.events import EventKind
 from gapbridge.core.errors import GapbridgeError
 
 FIXED_KEYS = ("web", "metrics", "recording", "model_source")  # until the daemon restarts
@@ -25,16 +26,16 @@ class UpdatedSettings:
 
     def on_event(self, event: dict[str, Any]) -> bool:
         """Handle an event of the daemon; returns whether the settings changed."""
-        if event.get("kind") == "configuration" and event.get("ok"):
+        if event.get("kind") == EventKind.CONFIGURATION and event.get("ok"):
             reported = event.get("hash")
-        elif event.get("kind") == "status":
+        elif event.get("kind") == EventKind.STATUS:
             reported = event.get("configuration_hash")
         else:
             return False
         if not reported or reported == self._hash:
             return False
         first, self._hash = self._hash is None, str(reported)
-        return not (first and event["kind"] == "status") and self._read(str(reported))
+        return not (first and event["kind"] == EventKind.STATUS) and self._read(str(reported))
 
     def _read(self, reported: str) -> bool:
         """Read the file; returns False if it is invalid or has changed again."""

@@ -251,7 +251,7 @@ class SetpointStream:
 
     def reset_solver(self) -> None:
         """Solve the next correction without a warm start, as after a refused setpoint."""
-        self._compensator.forget()
+        self._compensator.reset()
 
     @property
     def ramp_time(self) -> float:

@@ -30,12 +30,12 @@ from starlette.responses import Response
 from starlette.routing import Route
 
 from gapbridge.bridge.cell.daemon_settings import DaemonSettings
-from gapbridge.bridge.cell.updated_settings import UpdatedSettings
 from gapbridge.bridge.ipc.events import EventKind
 from gapbridge.bridge.ipc.loop_counters import DROPPED
 from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.ipc.shared_memory import SharedMemory
 from gapbridge.bridge.ipc.side_main import StartData, run_side
+from gapbridge.bridge.ipc.updated_settings import UpdatedSettings
 from gapbridge.bridge.served.credentials import read_token
 from gapbridge.bridge.served.guard import Guard
 from gapbridge.bridge.served.server import serve

@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 
 from gapbridge.bridge.cell.daemon_settings import DaemonSettings
-from gapbridge.bridge.cell.updated_settings import UpdatedSettings
 from gapbridge.bridge.ipc.events import EventKind
 from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.ipc.shared_memory import ROWS, SharedMemory
+from gapbridge.bridge.ipc.updated_settings import UpdatedSettings
 from gapbridge.bridge.web.prediction import Prediction
 from gapbridge.core.arrays import Array
 from gapbridge.core.limits import CLAMPS

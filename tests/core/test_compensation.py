@@ -179,7 +179,7 @@ def test_blocks_of_rows_reach_what_one_setpoint_after_the_other_reaches(n):
         live, together = Compensator(model), correct(model, q, loads)
         alone = []
         for r in range(count):
-            live.forget()
+            live.reset()
             alone.append(live.correct(q[r], loads[r : r + 1]))
         residual = np.array([one.residual for one in alone])
         reached = residual < TOLERANCE

@@ -7,7 +7,7 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
-from gapbridge.core.errors import LogError
+from gapbridge.core.errors import LogOptionError
 
 UR_JOINTS = (
     "shoulder_pan_joint", "shoulder_lift_joint", "elbow_joint",
@@ -26,7 +26,7 @@ def order_joints(
     ``found``: the names in the source (more than the arm's, where a gripper is among them);
     ``arm_joints``: those of the arm, () where unknown; ``chosen``: what the user says. Without
     either, names that are a UR's or an SO-101's, or one stem with numbers from 0 or 1 on, say their
-    order themselves. Raises LogError where the names do not.
+    order themselves. Raises LogOptionError where the names do not.
     """
     if chosen:
         return tuple(_one(path, name, found) for name in chosen)
@@ -36,7 +36,7 @@ def order_joints(
     if numbered := _numbered(found, len(arm_joints)):
         return numbered
     expected = f"those of the arm ({', '.join(arm_joints)})" if arm_joints else "a known order"
-    raise LogError(
+    raise LogOptionError(
         f"{path}: joints: found {', '.join(found)}, expected {expected}; "
         "name them in the order of the arm's joints with --joints"
     )
@@ -47,7 +47,9 @@ def _one(path: Path, name: str, found: Sequence[str]) -> str:
         return name
     near = difflib.get_close_matches(name, found, n=1)
     hint = f"; did you mean {near[0]}?" if near else ""
-    raise LogError(f"{path}: --joints: found {name}, expected one of {', '.join(found)}{hint}")
+    raise LogOptionError(
+        f"{path}: --joints: found {name}, expected one of {', '.join(found)}{hint}"
+    )
 
 
 def _matched(names: Sequence[str], found: Sequence[str]) -> tuple[str, ...]:

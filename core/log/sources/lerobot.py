@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from gapbridge.core.arrays import Array
-from gapbridge.core.errors import LogError
+from gapbridge.core.errors import LogError, LogOptionError
 from gapbridge.core.log.sources.joint_order import order_joints
 from gapbridge.core.log.sources.source import Converted, Source, SourceOptions
 from gapbridge.core.notes import Note, Reason
@@ -105,7 +105,7 @@ def _table(path: Path, episode: int | None) -> dict[str, Array]:
                 name: np.array(frame[name].to_pylist(), dtype=float) for name in wanted
             })  # fmt: skip
     if not parts:
-        raise LogError(f"{path}: --episode: found no episode {episode}, expected 0 to {last}")
+        raise LogOptionError(f"{path}: --episode: found no episode {episode}, expected 0 to {last}")
     return {name: np.concatenate([part[name] for part in parts]) for name in wanted}
 
 
@@ -126,7 +126,7 @@ def _scale(path: Path, order: Sequence[str], options: SourceOptions) -> Array:
     if options.units:
         return np.full(len(order), {"rad": 1.0, "degrees": np.pi / 180}[options.units])
     if options.calibration is None:
-        raise LogError(
+        raise LogOptionError(
             f"{path}: units: found none, expected --calibration FILE (the arm's calibration, in "
             "which numbers go from -100 to 100) or --units degrees or rad"
         )

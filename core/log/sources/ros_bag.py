@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from gapbridge.core.errors import LogError
+from gapbridge.core.errors import LogError, LogOptionError
 from gapbridge.core.log.sources.joint_order import order_joints
 from gapbridge.core.log.sources.resampling import Stream, joined
 from gapbridge.core.log.sources.source import Converted, Source, SourceOptions
@@ -147,7 +147,7 @@ def _topic(
     if asked is not None:
         if asked not in found:
             listed = ", ".join(found) or "none"
-            raise LogError(
+            raise LogOptionError(
                 f"{path}: --topic {role}: found {listed} of type {TYPES[role][0]}, expected {asked}"
             )
         return asked
@@ -158,7 +158,7 @@ def _topic(
         notes.append(Note(Reason.POSE_UNNAMED, (found,)))
         return None
     if len(found) > 1:
-        raise LogError(
+        raise LogOptionError(
             f"{path}: topics: found {len(found)} of type {TYPES[role][0]} ({', '.join(found)}), "
             f"expected one; name it with --topic {role}=TOPIC"
         )

@@ -15,6 +15,7 @@ from recorded_documents import read_documents
 
 from gapbridge.bridge.cell import load_cell
 from gapbridge.bridge.ipc.loop_state import State
+from gapbridge.bridge.loop.supervisor import Cause
 from gapbridge.bridge.recording.export import export
 from gapbridge.core.log.log import read_log
 from gapbridge.core.log.mcap_reading import read_configuration
@@ -240,6 +241,7 @@ def test_a_planner_moves_the_arm_and_its_silence_is_a_smooth_hold(robot: Robot) 
         wait_for(lambda: run.daemon.state == State.OBSERVING, "hold and ramp out")
         summary = run.end()
     assert any("source dry" in line for line in summary.faults)
+    assert summary.cause == Cause.SOURCE_DRY
     cycles = run.cycles()
     written = cycles["written"] > 0
     nominal = cycles["nominal_q_0"][written]

@@ -13,7 +13,13 @@ from rich.console import Console
 
 from gapbridge.bridge.cell import load_cell
 from gapbridge.bridge.demo.hidden import HiddenEffects, NamedCause
-from gapbridge.bridge.demo.measurements import Measurements, joined, measurements_at, write_log
+from gapbridge.bridge.demo.measurements import (
+    Measurements,
+    TooFewReadingsError,
+    joined,
+    measurements_at,
+    write_log,
+)
 from gapbridge.bridge.demo.page import page
 from gapbridge.bridge.demo.picture import picture
 from gapbridge.bridge.demo.poses import CALIBRATION_LOADS, TEST_LOADS, UR10E, candidates, plan
@@ -28,6 +34,7 @@ from gapbridge.bridge.demo.trajectory import (
     visit_trajectory,
 )
 from gapbridge.bridge.document.svg import svg_file
+from gapbridge.bridge.loop.supervisor import Cause
 from gapbridge.bridge.setpoint_source.quintic import write_trajectory
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.compensation import correct
@@ -150,7 +157,7 @@ def test_measurements_hold_only_readings_taken_after_settling() -> None:
     readings[:, 4:] = flips * [np.pi - 1e-9, 0, 0]
     found, missing = measurements_at(given, readings, poses)
     assert found is not None
-    assert not missing
+    assert missing is None
     np.testing.assert_allclose(found.actual_q, poses, atol=1e-7)
     np.testing.assert_allclose(found.position, poses[:, :3], atol=1e-7)
     np.testing.assert_allclose(np.abs(found.rotation), np.tile([np.pi, 0, 0], (3, 1)), atol=1e-6)
@@ -163,8 +170,11 @@ def test_a_visit_that_never_happened_is_reported() -> None:
         measurements_at(given, readings, HOME + np.array([shift]))
         for shift in ([0, 0.5, 0, 0, 0, 0], [0.3, 0, 0, 0, 0, 0])
     )
-    assert elsewhere == (None, "visit 1 of 1: the arm was never at rest there")
-    assert unseen == (None, "visit 1: found 0 readings of the tracker, expected 8")
+    assert elsewhere[0] is None
+    assert str(elsewhere[1]) == "visit 1 of 1: the arm was never at rest there"
+    assert unseen[0] is None
+    assert isinstance(unseen[1], TooFewReadingsError)
+    assert str(unseen[1]) == "visit 1: found 0 readings of the tracker, expected 8"
 
 
 def test_repeatability_is_that_of_the_scatter() -> None:
@@ -224,6 +234,7 @@ def test_bars_grow_with_their_share() -> None:
     assert bar(0.0, 10) != ""
 
 
+FEW = "too few readings"
 MISSED = "compensating -> holding (deadlines missed): 28 of 500 cycles missed"
 
 
@@ -252,14 +263,14 @@ class SlowMachine(Session):
         link = self._settings(cell).link
         self.rates.append(link.rate)
         return (
-            RunOutcome(None, MISSED, False)
+            RunOutcome(None, MISSED, False, Cause.OVERRUN)
             if link.rate > self.kept
             else RunOutcome(poses, "", False)
         )
 
 
 class Scripted(Session):
-    """A session whose runs end as scripted: visits done, error, stall."""
+    """A session whose runs end as scripted: visits done, cause, stall."""
 
     def __init__(self, *script: tuple[int, str, bool]) -> None:
         self.reported: list[str] = []
@@ -269,12 +280,12 @@ class Scripted(Session):
 
     def _run(self, cell, load, poses, longest):
         self.requested.append(len(poses))
-        done, error, stalled = self.script.pop(0)
+        done, cause, stalled = self.script.pop(0)
         zero = np.zeros((done, 6))
         found = Measurements(
             zero[:, 0], poses[:done], zero, zero[:, 0], zero[:, :3], zero, zero, zero
         )
-        return RunOutcome(found if done else None, error, stalled)
+        return RunOutcome(found if done else None, cause, stalled, cause, cause == FEW)
 
 
 class FakeLink:
@@ -330,9 +341,7 @@ def five_visits(session: Scripted) -> Measurements:
 
 
 def test_a_run_that_a_stall_ended_goes_on_with_the_visits_that_are_left():
-    session = Scripted(
-        (2, "state stale", False), (1, "?", True), (0, "silence", False), (2, "", False)
-    )
+    session = Scripted((2, "state stale", False), (1, "?", True), (0, FEW, False), (2, "", False))
     found = five_visits(session)
     assert session.requested == [5, 3, 2, 2]
     np.testing.assert_array_equal(found.nominal_q[:, 0], HOME[0] + np.arange(5) * 0.1)
@@ -351,9 +360,9 @@ def test_a_run_that_a_stall_ended_on_its_way_home_leaves_the_arm_there():
 
 
 def test_runs_that_come_no_farther_on_a_machine_that_keeps_time_are_a_failure():
-    behind = "setpoint refused: joint 4 is 0.0833 rad behind (limits.following)"
+    behind = Cause.SETPOINT_REFUSED
     session = Scripted((1, behind, False), *[(0, behind, False)] * 9)
-    with pytest.raises(RunError, match="behind"):
+    with pytest.raises(RunError, match="setpoint refused"):
         five_visits(session)
     assert session.requested == [5, 4, 4, 4, 4]
     session = Scripted((1, behind, False), *[(0, behind, True)] * 9, (4, "", False))
@@ -432,4 +441,4 @@ def test_nothing_of_the_report_is_cut_off_on_a_phone(result: Result, tmp_path: P
 def test_a_recording_without_states_is_a_run_to_be_repeated():
     found, missing = measurements_at({}, np.zeros((0, 7)), HOME[None])
     assert found is None
-    assert "holds no state of the arm" in missing
+    assert "holds no state of the arm" in str(missing)
