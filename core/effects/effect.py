@@ -101,7 +101,7 @@ class Effect(ABC):
     channels: ClassVar[tuple[str, ...]]
     needs: ClassVar[tuple[str, ...]] = ()  # log columns beyond those of its channel
     motion: ClassVar[str] = ""  # what a log must contain for the effect to be identifiable
-    equivalents: ClassVar[Mapping[str, str]] = {}  # effect: the data on which it equals this one
+    equivalents: ClassVar[Mapping[str, str]] = {}  # effect: on which data it is the same
     simulator_advice: ClassVar[str] = ""  # the advice if a simulator's model cannot include it
     simulated_as: ClassVar[Kind | None] = None  # the kind of its first value in a simulator's model
     of_the_arm: ClassVar[bool] = True  # False: an effect of the measurement, not of the arm
@@ -109,17 +109,17 @@ class Effect(ABC):
     # texts
     title: ClassVar[str] = ""  # in plain words; default: the identifier without underscores
     label_template: ClassVar[str] = ""  # of one parameter, with {joint} and {part}
-    verification_message: ClassVar[str] = ""  # where one finds it; '': not checked
+    verification_message: ClassVar[str] = ""  # of a verification that detects it; '': not checked
 
     # how it acts
     order: ClassVar[int] = 50  # order of application from load to reading, in its channel
     periodic: ClassVar[bool] = False  # True: sites have an order, and values are sine and cosine
     is_delay: ClassVar[bool] = False  # True: its only value is a delay of the joint, s
     at_moment: ClassVar[bool] = False  # True: a step at one time, the last value
-    depends_on_approach: ClassVar[bool] = False  # True: on the last motion of the joint
+    depends_on_approach: ClassVar[bool] = False  # True: on the joint's last motion
     softens: ClassVar[bool] = False  # True: a flexibility, 0 or more together with the model's
     flexibility: ClassVar[str] = ""  # which of a joint's linear flexibilities: axial, radial
-    acts_through_deflection: ClassVar[bool] = False  # True: shows by deflections only
+    acts_through_deflection: ClassVar[bool] = False  # True: not visible on a rigid arm
     loads_joints: ClassVar[bool] = False  # True: a load on the joints, on which friction may depend
     adds_mass: ClassVar[bool] = False  # True: kg in addition to the declared payload
     scales_reading: ClassVar[bool] = False  # True: does not change a zero reading of the sensor
@@ -127,7 +127,7 @@ class Effect(ABC):
     estimated_as_whole: ClassVar[bool] = False  # True: small at all sites of a real arm
     # True: estimated with the links: joint zeros and TCP with geometry, friction with masses
     estimated_with_links: ClassVar[bool] = False
-    identifiable_with: ClassVar[Term | None] = None  # the term that must be present
+    identifiable_with: ClassVar[Term | None] = None  # the term that it needs beside it
 
     # how it is estimated
     start_values: ClassVar[tuple[float, ...]] = ()  # start values of its last parameter

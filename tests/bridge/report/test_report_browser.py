@@ -107,9 +107,9 @@ def test_the_wheel_scrolls_the_page_over_the_view_until_it_is_clicked(browser, e
         page.mouse.move(box["x"] + 300, box["y"] + 100)
         before, drawn = page.evaluate("scrollY"), scene.screenshot()
         page.mouse.wheel(0, 80)
-        page.wait_for_function(f"scrollY === {before + 80}")
+        page.wait_for_function("y => scrollY === y", arg=before + 80)
         page.mouse.wheel(0, -80)
-        page.wait_for_function(f"scrollY === {before}")
+        page.wait_for_function("y => scrollY === y", arg=before)
         assert scene.screenshot() == drawn
         page.mouse.click(box["x"] + 300, box["y"] + 100)
         page.mouse.wheel(0, -80)

@@ -188,7 +188,6 @@ def test_a_line_is_a_setpoint(line: str, feed: PlannerSource) -> None:
         assert feed.sample(0.002, HERE) == pytest.approx([0.1, 0.2, 0.3])
 
 
-@pytest.mark.realtime
 def test_joints_are_interpolated_between_lines(feed: PlannerSource) -> None:
     with planner(feed) as socket_:
         socket_.sendall(b"0,0,0\n")
@@ -196,15 +195,17 @@ def test_joints_are_interpolated_between_lines(feed: PlannerSource) -> None:
         feed.begin(0.0, np.zeros(3))
         time.sleep(0.06)
         socket_.sendall(b"0.06,0,0\n")
-        seen, until = [0.0], time.monotonic() + 2.0
-        while seen[-1] < 0.06 and time.monotonic() < until:
+        seen, begun = [0.0], [time.monotonic()]
+        ended = begun.copy()
+        while seen[-1] < 0.06 and begun[-1] - begun[0] < PATIENCE:
+            begun.append(time.monotonic())
             seen.append(feed.sample(0.0, HERE)[0])
+            ended.append(time.monotonic())
             time.sleep(0.002)
-        seen.append(feed.sample(0.0, HERE)[0])
     assert seen[-1] == pytest.approx(0.06)
-    assert np.diff(seen).min() >= 0
-    assert np.diff(seen).max() < 0.03
-    assert any(0.01 < v < 0.05 for v in seen)
+    steps, most = np.diff(seen), np.array(ended[1:]) - begun[:-1]  # the lines ask for 1 rad/s
+    assert (steps >= 0).all()
+    assert (steps <= most + 1e-6).all()
 
 
 def test_a_feed_that_falls_silent_is_dry_and_may_come_back(feed: PlannerSource) -> None:

@@ -236,7 +236,7 @@ def test_the_wheel_scrolls_the_page_over_the_arm_until_it_is_clicked(browser, fe
         page.mouse.move(box["x"] + 100, box["y"] + 60)
         before = page.evaluate("scrollY")
         page.mouse.wheel(0, 80)
-        page.wait_for_function(f"scrollY === {before + 80}")
+        page.wait_for_function("y => scrollY === y", arg=before + 80)
         page.mouse.click(box["x"] + 100, box["y"] + 60)
         page.mouse.wheel(0, 80)
         page.wait_for_timeout(500)

@@ -104,14 +104,11 @@ def test_the_end_of_the_hub_is_reported_instead_of_spinning(hub):
     close_bus(bus)
 
 
-@pytest.mark.realtime
-def test_a_hub_that_nobody_serves_is_one_line_and_soon():
-    start = time.monotonic()
+def test_a_hub_that_nobody_serves_is_one_line():
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
     with pytest.raises(LinkError, match=rf"socketcand can0@127.0.0.1:{port}: cannot be reached"):
         open_bus(BusSettings(interface="socketcand", port=port))
-    assert time.monotonic() - start < 3.0
 
 
 def test_joining_a_busy_bus_takes_no_luck(hub):

@@ -11,6 +11,8 @@ import sys
 import textwrap
 from typing import Any
 
+from patience import PATIENCE
+
 from gapbridge.drivers.simulated.ur.settings import BENCH_PORT, ServerSettings, simulated_cell
 
 _numbers = itertools.count(2)
@@ -52,17 +54,17 @@ class Bench:
         self._socket.close()
 
 
-def run_client(host: str, body: str, timeout: float = 60.0) -> dict[str, Any]:
+def run_client(host: str, body: str, timeout: float = 2 * PATIENCE) -> dict[str, Any]:
     """Run ur_rtde code in a process of its own; returns what it puts into `out`.
 
     The library can hang, abort or crash its process, so it never shares one with a test.
-    `until(ready)` is for what comes a while after a command; it waits for 10 s at most.
+    `until(ready)` is for what comes a while after a command; it waits for PATIENCE at most.
     """
     code = (
         "import json, os, sys, time, math\n"
         f"host = {host!r}\nout = {{}}\n"
         "def until(ready):\n"
-        "    end = time.monotonic() + 10.0\n"
+        f"    end = time.monotonic() + {PATIENCE}\n"
         "    while not ready() and time.monotonic() < end:\n"
         "        time.sleep(0.01)\n"
         + textwrap.dedent(body)

@@ -327,6 +327,7 @@ b.sendall(b"protective_stop\\n")
 b.recv(10)
 until(r.isProtectiveStopped)
 out["bits"] = [r.isProtectiveStopped(), r.getSafetyMode(), r.getRuntimeState()]
+until(lambda: not c.servoJ(q, 0.5, 0.5, 0.002, 0.1, 300))  # it has a connection of its own
 out["servo"] = c.servoJ(q, 0.5, 0.5, 0.002, 0.1, 300)
 out["move"] = c.moveJ([q[0] + 0.1] + q[1:], 1.0, 2.0)
 try:

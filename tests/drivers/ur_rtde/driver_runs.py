@@ -7,9 +7,11 @@ import textwrap
 from pathlib import Path
 from typing import Any
 
-SIMULATED = str(Path(__file__).resolve().parents[1] / "simulated")
-sys.path.insert(0, SIMULATED)
+TESTS = Path(__file__).resolve().parents[2]
+PLACES = [str(TESTS / "drivers" / "simulated"), str(TESTS)]
+sys.path[:0] = PLACES
 
+from patience import PATIENCE  # noqa: E402
 from simulated_cell import Bench, cell_settings, run_client  # noqa: E402
 
 from benchmarks.server_thread import OFFSET_SCRIPT  # noqa: E402
@@ -18,7 +20,7 @@ __all__ = ["Bench", "cell_settings", "run_driver"]
 
 PREAMBLE = """
 import sys
-sys.path.insert(0, {simulated!r})
+sys.path[:0] = {places!r}
 import numpy as np
 from simulated_cell import Bench
 from gapbridge.core.arm import builtin_arm
@@ -65,10 +67,10 @@ def read_for(cycles):
 """
 
 
-def run_driver(host: str, body: str, timeout: float = 60.0, **link: Any) -> dict[str, Any]:
+def run_driver(host: str, body: str, timeout: float = 2 * PATIENCE, **link: Any) -> dict[str, Any]:
     """Run ``body`` with a driver, a bench and a few words; returns what it puts into ``out``."""
     link.setdefault("state_timeout", 1.0)  # a busy machine holds the simulated controller up
-    preamble = PREAMBLE.format(simulated=SIMULATED, link=link)
+    preamble = PREAMBLE.format(places=PLACES, link=link)
     return run_client(host, preamble + textwrap.dedent(body), timeout)
 
 
