@@ -24,21 +24,24 @@ from gapbridge.bridge.ipc.side_process import SideProcess
 from gapbridge.core.log.mcap_reading import read_columns, read_configuration
 from gapbridge.core.log.mcap_records import is_whole
 
-RATE = 500.0
+RATE = 125.0  # the ring then lasts for as long as a busy machine takes to start a process
 CELL = "robot: {model: ur10e}\nweb: {token: squeamish}\n"
 
 
 class Publisher:
-    """A loop's half of the shared memory, in a thread of the test: 500 cycles a second."""
+    """A loop's half of the shared memory, in a thread of the test."""
 
     def __init__(self) -> None:
         self.memory = SharedMemory(N)
-        self.stop = threading.Event()
+        self.stop, self._publishes = threading.Event(), threading.Event()
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
 
     def _run(self) -> None:
-        random, begun = np.random.default_rng(0), time.monotonic()
+        random = np.random.default_rng(0)
+        while not self._publishes.wait(0.005):
+            self.memory.beat()
+        begun = time.monotonic()
         while not self.stop.is_set():
             self.memory.beat()
             for _ in range(int((time.monotonic() - begun) * RATE) - self.memory.written):
@@ -50,9 +53,14 @@ class Publisher:
                 self.memory.publish()
             time.sleep(0.005)
 
+    def begin(self) -> None:
+        """Publish cycles from now on, if not before."""
+        self._publishes.set()
+
     def end(self) -> int:
         """Stop publishing; returns how many cycles there were."""
         self.stop.set()
+        self.begin()
         self._thread.join()
         return self.memory.written
 
@@ -70,6 +78,7 @@ class Recording:
         start = {"settings": settings.model_dump(mode="json"), "n": N, "session": SESSION,
                  "extra": {}}  # fmt: skip
         self.process = SideProcess("gapbridge.bridge.recording.main", start, publisher.memory)
+        self._publisher = publisher
         self._seen = 0  # files of former lives
 
     def wait_for_file(self) -> None:
@@ -82,6 +91,7 @@ class Recording:
 
         wait_for(writes, "a file")
         self._seen = self._files()
+        self._publisher.begin()
 
     def wait_for_cycle(self, number: int) -> None:
         """Wait until the files hold a cycle; an end in order takes what is then left to write."""

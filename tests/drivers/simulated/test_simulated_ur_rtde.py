@@ -141,6 +141,7 @@ out["declared"] = [r.getPayload(), *r.getPayloadCog()]
 out["target_payload"] = c.setTargetPayload(2.0, [0.0, 0.0, 0.04], [0.1, 0.1, 0.1, 0, 0, 0])
 c.setTcp([0, 0, 0.1, 0, 0, 0])
 out["tcp"] = c.getTCPOffset()
+until(lambda: apart(r.getActualTCPPose(), c.getForwardKinematics(q, [0, 0, 0.1, 0, 0, 0])) < 1e-6)
 pose = r.getActualTCPPose()
 out["inverse"] = c.getInverseKinematics(pose, q)
 out["default"] = c.getForwardKinematics()
