@@ -126,14 +126,14 @@ class Run:
         self._thread.join(PATIENCE)
         assert not self._thread.is_alive()
 
-    def wait(self, state: State) -> float:
-        """Wait until the loop is in a state; returns how long it took, s."""
+    def wait(self, state: State) -> None:
+        """Wait until the loop is in a state."""
 
         def there() -> bool:
             assert self.error is None, self.error
             return self.daemon.state == state
 
-        return wait_for(there, f"{state.name} ({self.output})")
+        wait_for(there, f"{state.name} ({self.output})")
 
     def compensate(self) -> None:
         """Arm, again as a person does where a busy machine ended the motion at once."""
