@@ -12,7 +12,9 @@ import numpy as np
 import yaml
 
 from gapbridge.core.arrays import Array
-from gapbridge.core.errors import ArmError
+from gapbridge.core.errors import ArmError, Keys
+
+DH_KEYS = ("robot", "dh")  # of the cell file
 
 
 @dataclass(frozen=True)
@@ -78,51 +80,51 @@ def arm_from_dh(
     ArmError where a row lacks a, alpha or d, or holds something that is not a finite number.
     """
     if not rows:
-        raise ArmError("robot.dh: found no rows, expected one row {a, alpha, d} per joint")
+        raise ArmError("found no rows, expected one row {a, alpha, d} per joint", DH_KEYS)
     n = len(rows)
     links = np.tile(np.eye(4), (n + 1, 1, 1))
     mass, cog, axes = np.zeros(n), np.zeros((n, 3)), np.empty((n, 3, 3))
     rotation = np.eye(4)
     for i, row in enumerate(rows):
-        where = f"robot.dh row {i + 1}"
-        a, alpha, d = (_read_number(row, key, where) for key in ("a", "alpha", "d"))
-        offset = _read_number(row, "offset", where, 0.0)
+        keys = (*DH_KEYS, i)
+        a, alpha, d = (_read_number(row, key, keys) for key in ("a", "alpha", "d"))
+        offset = _read_number(row, "offset", keys, 0.0)
         c, s = np.cos(offset), np.sin(offset)
         rotation[:2, :2] = [[c, -s], [s, c]]
         links[i] = links[i] @ rotation
         links[i + 1] = dh_transform(a, alpha, d)
-        mass[i] = _read_number(row, "mass", where, 0.0)
+        mass[i] = _read_number(row, "mass", keys, 0.0)
         if mass[i] < 0:
-            raise ArmError(f"{where}: mass: found {mass[i]:g}, expected 0 or more kg")
-        in_row, axes[i] = _read_cog(row, where), links[i + 1][:3, :3]
+            raise ArmError(f"found {mass[i]:g}, expected 0 or more kg", (*keys, "mass"))
+        in_row, axes[i] = _read_cog(row, keys), links[i + 1][:3, :3]
         cog[i] = axes[i] @ in_row + links[i + 1][:3, 3]
     inertia, limits = np.zeros((n, 3, 3)), limits or JointLimits.none(n)
     return Arm(name, links, mass, cog, inertia, limits, body_axes=axes)
 
 
-def _read_cog(row: Mapping[str, Any], where: str) -> Array:
+def _read_cog(row: Mapping[str, Any], keys: Keys) -> Array:
     value = row.get("cog")
     try:
         centre = np.zeros(3) if value is None else np.array(value, dtype=float)
     except (TypeError, ValueError):
         centre = np.full(3, np.nan)
     if centre.shape != (3,) or not np.isfinite(centre).all():
-        raise ArmError(f"{where}: cog: found {value}, expected three numbers (m)")
+        raise ArmError(f"found {value}, expected three numbers (m)", (*keys, "cog"))
     return centre
 
 
 def _read_number(
-    row: Mapping[str, Any], key: str, where: str, default: float | None = None
+    row: Mapping[str, Any], key: str, keys: Keys, default: float | None = None
 ) -> float:
     value = row.get(key, default)
     if value is None:
-        raise ArmError(f"{where}: {key}: found nothing, expected a number")
+        raise ArmError("found nothing, expected a number", (*keys, key))
     try:
         number = float(value)
     except (TypeError, ValueError):
-        raise ArmError(f"{where}: {key}: found {value!r}, expected a number") from None
+        raise ArmError(f"found {value!r}, expected a number", (*keys, key)) from None
     if not np.isfinite(number):
-        raise ArmError(f"{where}: {key}: found {value!r}, expected a finite number")
+        raise ArmError(f"found {value!r}, expected a finite number", (*keys, key))
     return number
 
 
@@ -141,7 +143,8 @@ def builtin_rows(name: str) -> dict[str, Any]:
     if name not in names:
         near = difflib.get_close_matches(str(name), names, n=1)
         hint = f"; did you mean {near[0]!r}?" if near else ""
-        raise ArmError(f"robot.model: found {name!r}, expected one of {', '.join(names)}{hint}")
+        text = f"found {name!r}, expected one of {', '.join(names)}{hint}"
+        raise ArmError(text, ("robot", "model"))
     text = (
         resources.files("gapbridge.core")
         .joinpath("arms", f"{name}.yaml")
@@ -167,7 +170,8 @@ def builtin_arm(name: str, calibration: Mapping[str, Sequence[float]] | None = N
             continue
         if len(values) != len(rows):
             raise ArmError(
-                f"robot.calibration.delta_{delta}: found {len(values)} values, expected {len(rows)}"
+                f"found {len(values)} values, expected {len(rows)}",
+                ("robot", "calibration", f"delta_{delta}"),
             )
         for row, value in zip(rows, values, strict=True):
             row[key] = row.get(key, 0.0) + float(value)

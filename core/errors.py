@@ -26,7 +26,10 @@
 from __future__ import annotations
 
 import errno
+from collections.abc import Sequence
 from enum import StrEnum
+
+Keys = Sequence[str | int]  # of a YAML file, from its top level; an index of a list from 0
 
 
 class GapbridgeError(Exception):
@@ -36,9 +39,18 @@ class GapbridgeError(Exception):
 
 
 class InputError(GapbridgeError):
-    """The user's input cannot be used; the message names file, key or row, found and expected."""
+    """The user's input cannot be used; the message names file, key or row, found and expected.
+
+    ``keys`` are those of the cell file that the error is of, and begin its message; the caller who
+    has the file adds its name and the line. None: the message names its place itself.
+    """
 
     exit_code = 2
+
+    def __init__(self, message: str, keys: Keys | None = None) -> None:
+        super().__init__(message if keys is None else f"{key_path(keys)}: {message}")
+        self.message = message
+        self.keys = keys
 
 
 class ArmError(InputError):
@@ -127,6 +139,17 @@ class GateError(WriteError):
 
 class LimitError(RunError):
     """A setpoint that is not sent: not finite, or outside its limits."""
+
+
+def key_path(keys: Keys) -> str:
+    """Return a key path for messages: ``robot.dh entry 2.a``, list entries from 1."""
+    text = ""
+    for key in keys:
+        if isinstance(key, int):
+            text += f" entry {key + 1}"
+        else:
+            text += f"{'.' if text else ''}{key}"
+    return text
 
 
 def first_line(error: BaseException) -> str:

@@ -13,7 +13,7 @@ import contextlib
 import errno
 import os
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextvars import ContextVar
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,9 +21,8 @@ from typing import Any, NamedTuple
 
 import yaml
 
-from gapbridge.core.errors import InputError
+from gapbridge.core.errors import InputError, Keys
 
-Keys = Sequence[str | int]
 MAX_QUOTED = 60  # characters of a value that a message quotes
 
 _FLOAT = re.compile(

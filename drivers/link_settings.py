@@ -59,7 +59,7 @@ class ProfileSettings(DriverSettings):
         if not self.profile_path.is_file():
             shipped = ", ".join(sorted(path.stem for path in self.shipped.glob("*.yaml")))
             raise InputError(
-                f"link.profile: found {self.profile!r}, expected one of {shipped}, or a path "
-                "ending in .yaml"
+                f"found {self.profile!r}, expected one of {shipped}, or a path ending in .yaml",
+                ("link", "profile"),
             )
         return settings

@@ -9,8 +9,8 @@ from typing import TypeVar
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
-from gapbridge.core.errors import InputError
-from gapbridge.core.files import Document, Keys, Kind, loaders, quoted, read_yaml
+from gapbridge.core.errors import InputError, Keys
+from gapbridge.core.files import Document, Kind, loaders, quoted, read_yaml
 
 
 class ProfileError(InputError):

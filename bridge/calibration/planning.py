@@ -21,7 +21,6 @@ from gapbridge.core.calibration.observables import make_observable
 from gapbridge.core.calibration.observables.observable import Observable
 from gapbridge.core.calibration.parameters import DEFAULT
 from gapbridge.core.calibration.plan import Payload, Plan
-from gapbridge.core.errors import CellError
 from gapbridge.core.metrology import Metrology
 from gapbridge.core.planning.capsules import Box
 from gapbridge.core.planning.design import SessionDesign, load_extent, plan
@@ -103,34 +102,37 @@ def workspace_of(cell: Cell, kind: str) -> Workspace:
 
 def _places(cell: Cell, kind: str) -> list[Place]:
     """Return the planned positions of the instrument, with its range. Raises CellError."""
-    settings, where = cell.calibration, f"{cell.path}: calibration"
+    settings, section = cell.calibration, "calibration"
     if settings.instrument_at is None:
         if kind in FIXTURES:
-            raise CellError(
-                f"{where}.instrument_at: found nothing, expected where the {FIXTURES[kind]} is, "
-                "m, in base, about"
+            raise cell.error(
+                (section, "instrument_at"),
+                f"found nothing, expected where the {FIXTURES[kind]} is, m, in base, about",
             )
         for key in ("further_places", "instrument_range", "reflector"):
             if getattr(settings, key):
-                raise CellError(
-                    f"{where}.instrument_at: found nothing beside {key}, expected where the "
-                    "instrument stands first, m, in base, about"
+                raise cell.error(
+                    (section, "instrument_at"),
+                    f"found nothing beside {key}, expected where the instrument stands first, m, "
+                    "in base, about",
                 )
         return []
     for key in ("instrument_range", "reflector") if kind in CONTACT_KINDS else ():
         if getattr(settings, key):
-            raise CellError(
-                f"{where}.{key}: found it with a {FIXTURES[kind]} that is touched, expected it "
-                "only where an instrument looks at the tool"
+            raise cell.error(
+                (section, key),
+                f"found it with a {FIXTURES[kind]} that is touched, expected it only where an "
+                "instrument looks at the tool",
             )
     if settings.reflector is not None and not any(settings.reflector.looks):
-        raise CellError(f"{where}.reflector.looks: found no length, expected a direction")
+        raise cell.error((section, "reflector", "looks"), "found no length, expected a direction")
     limits = settings.instrument_range or RangeEntry()
     farthest = np.inf if limits.farthest is None else limits.farthest
     if limits.nearest >= farthest:
-        raise CellError(
-            f"{where}.instrument_range: found nearest {limits.nearest:g} and farthest "
-            f"{farthest:g}, expected nearest below farthest"
+        raise cell.error(
+            (section, "instrument_range"),
+            f"found nearest {limits.nearest:g} and farthest {farthest:g}, expected nearest below "
+            "farthest",
         )
     return [
         Place(_vector3(position), limits.nearest, farthest)
@@ -147,9 +149,9 @@ def with_loads(workspace: Workspace, loads: Sequence[Payload]) -> Workspace:
 def _boxes(cell: Cell, settings: CalibrationSettings) -> list[BoxEntry]:
     for i, box in enumerate(settings.keep_out):
         if any(a >= b for a, b in zip(box.lower, box.upper, strict=True)):
-            raise CellError(
-                f"{cell.path}: calibration.keep_out entry {i + 1}: found lower {box.lower} and "
-                f"upper {box.upper}, expected lower below upper"
+            raise cell.error(
+                ("calibration", "keep_out", i),
+                f"found lower {box.lower} and upper {box.upper}, expected lower below upper",
             )
     return list(settings.keep_out)
 
@@ -162,9 +164,8 @@ def _range(
     n = cell.arm.n
     for name, values in (("lower", settings.lower), ("upper", settings.upper)):
         if len(values) != n:
-            raise CellError(
-                f"{cell.path}: calibration.joint_range.{name}: found {len(values)} values, "
-                f"expected {n}"
+            raise cell.error(
+                ("calibration", "joint_range", name), f"found {len(values)} values, expected {n}"
             )
     return settings.lower, settings.upper
 

@@ -39,7 +39,7 @@ from gapbridge.bridge.calibration.session.session import Session
 from gapbridge.bridge.cell import Cell
 from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.plan import PlannedPose
-from gapbridge.core.errors import CellError, LinkError
+from gapbridge.core.errors import LinkError
 
 JOBS: dict[str, tuple[str, type[Job]]] = {
     "whole": ("Calibration of", CalibrationJob),
@@ -175,14 +175,16 @@ def _report_resumed(prompt: Prompt, session: Session, folder: Path) -> None:
 def _measure(job: Job, joints: JointSource, instrument: AnyInstrument) -> None:
     prompt, settings, options = job.prompt, job.cell.calibration, job.options
     if instrument.contact and options.move:
-        raise CellError(
-            f"{job.cell.path}: calibration.instrument.kind: found {options.instrument.kind!r} with "
-            "--move, expected another: the tool is brought onto something by hand"
+        raise job.cell.error(
+            ("calibration", "instrument", "kind"),
+            f"found {options.instrument.kind!r} with --move, expected another: the tool is brought "
+            "onto something by hand",
         )
     if instrument.contact and isinstance(joints, PlannedJoints):
-        raise CellError(
-            f"{job.cell.path}: calibration.joints: found 'planned' with an instrument of kind "
-            f"{options.instrument.kind!r}, expected 'link' or 'typed': the joints are the reading"
+        raise job.cell.error(
+            ("calibration", "joints"),
+            f"found 'planned' with an instrument of kind {options.instrument.kind!r}, expected "
+            "'link' or 'typed': the joints are the reading",
         )
     prompt.say(f"instrument: {instrument.name}; joints: {_joints_text(joints, options)}")
     prompt.say("at every question: Enter continues, `undo`, `back`, `skip`, `quit`, `?`")
@@ -228,17 +230,18 @@ def make_joint_source(cell: Cell, options: SessionOptions, ask: Ask, folder: Pat
     source = settings.joints or ("link" if cell.link is not None else "typed")
     if source != "link":
         if options.move:
-            raise CellError(
-                f"{cell.path}: calibration.joints: found {source!r} with --move, expected 'link'"
+            raise cell.error(
+                ("calibration", "joints"), f"found {source!r} with --move, expected 'link'"
             )
         contact = options.kind == "tool" or options.instrument.measures in CONTACT_KINDS
         return TypedJoints(ask, contact) if source == "typed" else PlannedJoints()
     if cell.link is None:
-        raise CellError(f"{cell.path}: link: found nothing, expected the robot's address")
+        raise cell.error(("link",), "found nothing, expected the robot's address")
     if options.move and not cell.link.moves_arm:
-        raise CellError(
-            f"{cell.path}: link.driver: found {cell.link.driver!r}, which cannot move the arm; "
-            "expected another for --move, or jog it"
+        raise cell.error(
+            ("link", "driver"),
+            f"found {cell.link.driver!r}, which cannot move the arm; expected another for --move, "
+            "or jog it",
         )
     from gapbridge.bridge.calibration.joints.link import LinkedJoints
 

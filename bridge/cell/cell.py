@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from pydantic import ValidationError
 
 from gapbridge.bridge.cell.document import read_document
 from gapbridge.bridge.cell.effects import compliance_terms, term_from_entry
-from gapbridge.bridge.cell.message import error_lines, key_path
+from gapbridge.bridge.cell.message import error_lines
 from gapbridge.bridge.cell.plausibility import check_plausibility
 from gapbridge.bridge.cell.robot import build_arm
 from gapbridge.bridge.cell.schema import CauseEntry, CellFile, Simulation
@@ -27,7 +25,7 @@ from gapbridge.bridge.cell.settings.calibration import CalibrationSettings
 from gapbridge.bridge.cell.settings.web import MetricsSettings, WebSettings
 from gapbridge.core.arm import Arm
 from gapbridge.core.calibration.spread import Spread
-from gapbridge.core.errors import ArmError, CellError, InputError
+from gapbridge.core.errors import ArmError, CellError, InputError, Keys, key_path
 from gapbridge.core.files import Document
 from gapbridge.core.load_bounds import PAYLOAD_FACTOR
 from gapbridge.core.metrology import Metrology
@@ -54,6 +52,10 @@ class Cell:
         """Return the nominal arm."""
         return self.model.arm
 
+    def error(self, keys: Keys, message: str) -> CellError:
+        """Return an error about a key of the file."""
+        return CellError(message_at(self.document, keys, message))
+
     @property
     def link(self) -> LinkSettings | None:
         """Return section ``link``, its paths made absolute; None if the cell has none.
@@ -64,7 +66,7 @@ class Cell:
         try:
             return None if section is None else section.located(self.path.parent)
         except InputError as error:
-            raise type(error)(f"{self.path}: {error}") from None
+            raise located(self.document, error) from None
 
     @property
     def ft_sensor(self) -> FtSensorSettings | None:
@@ -175,7 +177,7 @@ def cell_errors(path: Path) -> list[str]:
         if not errors:
             build_cell(file, document)
     except (ArmError, CellError) as error:
-        errors = [located_message(document, str(error))]
+        errors = [located_message(document, error)]
     return errors
 
 
@@ -189,12 +191,12 @@ def build_cell(file: CellFile, document: Document) -> Cell:
             raise CellError(findings.errors[0])
         warnings = _check_payload(file, arm)
         if file.robot.tip is not None and file.robot.urdf is None:
-            warnings.append("robot.tip: has no effect without robot.urdf")
+            warnings.append((("robot", "tip"), "has no effect without robot.urdf"))
         terms = compliance_terms(file.compliance, arm) + tuple(
-            term_from_entry(e, arm, f"effects entry {i}") for i, e in enumerate(file.effects, 1)
+            term_from_entry(e, arm, ("effects", i)) for i, e in enumerate(file.effects)
         )
     except (ArmError, CellError) as error:
-        raise type(error)(located_message(document, str(error))) from None
+        raise located(document, error) from None
     tcp = file.tool.tcp
     model = Model(
         arm=arm,
@@ -213,41 +215,37 @@ def build_cell(file: CellFile, document: Document) -> Cell:
         document,
         model,
         metrology,
-        (*findings.warnings, *(located_message(document, w) for w in warnings)),
+        (*findings.warnings, *(message_at(document, *warning) for warning in warnings)),
     )
 
 
-def located_message(document: Document, text: str) -> str:
-    """Return a message prefixed with its file and the line of the key that it begins with."""
-    path = str(document.path)
-    if text.startswith(path):
-        return text
-    name = text.partition(":")[0]
-    # the key itself, or the nearest of its parents
-    named = [k for k in _paths((), document.data) if f"{name}.".startswith(f"{key_path(k)}.")]
-    line = document.line(max(named, key=len)) if named else None
-    return f"{path}: {text}" if line is None else f"{path}, line {line}: {text}"
+def located(document: Document, error: InputError) -> InputError:
+    """Return an error about a key of a cell as one that also names its file and line."""
+    return type(error)(located_message(document, error))
 
 
-def _paths(keys: tuple[str | int, ...], value: object) -> Iterator[tuple[str | int, ...]]:
-    """Yield the path of every key and entry."""
-    entries: Iterable[tuple[Any, object]] = ()
-    if isinstance(value, dict):
-        entries = value.items()
-    elif isinstance(value, list):
-        entries = enumerate(value)
-    for key, entry in entries:
-        yield (*keys, key)
-        yield from _paths((*keys, key), entry)
+def located_message(document: Document, error: InputError) -> str:
+    """Return an error's message with file and line; without a key it names its place itself."""
+    if error.keys is None:
+        return str(error)
+    return message_at(document, error.keys, error.message)
 
 
-def _check_payload(file: CellFile, arm: Arm) -> list[str]:
-    mass, rated = file.payload.mass, arm.payload
+def message_at(document: Document, keys: Keys, text: str) -> str:
+    """Return a message about a key: its file, its line where the file has its section, its path."""
+    line = f", line {document.line(keys)}" if keys[0] in document.data else ""
+    return f"{document.path}{line}: {key_path(keys)}: {text}"
+
+
+def _check_payload(file: CellFile, arm: Arm) -> list[tuple[Keys, str]]:
+    """Return the warnings about a payload, each with its keys. Raises CellError."""
+    keys, mass, rated = ("payload", "mass"), file.payload.mass, arm.payload
     if mass > PAYLOAD_FACTOR * rated:
         raise CellError(
-            f"payload.mass: found {mass:g} kg, out of range: expected 0 to {rated:g} kg, what "
-            f"{arm.name} is rated for"
+            f"found {mass:g} kg, out of range: expected 0 to {rated:g} kg, what {arm.name} is "
+            "rated for",
+            keys,
         )
     if mass > rated:
-        return [f"payload.mass: {mass:g} kg is more than {arm.name} is rated for ({rated:g} kg)"]
+        return [(keys, f"{mass:g} kg is more than {arm.name} is rated for ({rated:g} kg)")]
     return []

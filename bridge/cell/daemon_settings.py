@@ -13,6 +13,7 @@ from gapbridge.bridge.cell.sections import (
     SetpointSettings,
 )
 from gapbridge.bridge.cell.settings.web import MetricsSettings, WebSettings
+from gapbridge.core.errors import CellError
 from gapbridge.drivers.ft_sensor.settings import AnyFtSensor
 from gapbridge.drivers.section import Section
 from gapbridge.drivers.ur_rtde.settings import UrRtdeSettings
@@ -44,12 +45,13 @@ class DaemonSettings(Section):
 
     @model_validator(mode="after")
     def _source_fits_link(self) -> DaemonSettings:
-        """Refuse a setpoint source where the robot's own program moves the arm."""
+        """Refuse a setpoint source where the robot's own program moves the arm: CellError."""
         if not self.link.moves_arm and self.setpoints.source != "target":
-            raise ValueError(
-                f"setpoints.source: found {self.setpoints.source!r} with a link that sends "
-                "offsets only, expected 'target': there the robot's own program moves the arm"
+            raise CellError(
+                f"found {self.setpoints.source!r} with a link that sends offsets only, expected "
+                "'target': there the robot's own program moves the arm",
+                ("setpoints", "source"),
             )
         if self.setpoints.source == "trajectory" and self.setpoints.file is None:
-            raise ValueError("setpoints.file: found nothing, expected the trajectory's CSV")
+            raise CellError("found nothing, expected the trajectory's CSV", ("setpoints", "file"))
         return self

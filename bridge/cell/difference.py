@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from gapbridge.bridge.cell.cell import Cell
-from gapbridge.bridge.cell.message import key_path
 from gapbridge.core.arrays import Array
 from gapbridge.core.effects import Site, Term
+from gapbridge.core.errors import key_path
 from gapbridge.core.loads import Loads
 from gapbridge.core.model import Model
 from gapbridge.core.rotation import rotation_vector

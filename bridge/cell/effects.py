@@ -18,27 +18,28 @@ from gapbridge.core.effects import (
     effect_named,
     flexibility_effects,
 )
-from gapbridge.core.errors import CellError, InputError
+from gapbridge.core.errors import CellError, InputError, Keys
 
 VALUE = "value"  # key in the file of a parameter without a name
 
 
-def term_from_entry(entry: EffectEntry, arm: Arm, where: str) -> Term:
-    """Return the term of one entry of ``effects``; raises CellError that begins with ``where``."""
+def term_from_entry(entry: EffectEntry, arm: Arm, keys: Keys) -> Term:
+    """Return the term of the entry of ``effects`` at ``keys``. Raises CellError."""
     try:
         effect = effect_named(entry.effect)
     except InputError as error:
-        raise CellError(f"{where}.{error}") from None
+        raise CellError(error.message, (*keys, "effect")) from None
     sites = effect.sites(arm)
     joints = [site.joint for site in sites]
     if entry.joint not in joints:
         allowed = "no joint" if joints == [None] else f"a joint of {joints[0]} to {joints[-1]}"
         joint = "none" if entry.joint is None else entry.joint
-        raise CellError(f"{where}.joint: found {joint}, expected {allowed} for {entry.effect}")
+        raise CellError(f"found {joint}, expected {allowed} for {entry.effect}", (*keys, "joint"))
     if (entry.order is not None) != effect.periodic:
         raise CellError(
-            f"{where}.order: found {'none' if entry.order is None else entry.order}, expected "
-            f"{'cycles per turn' if entry.order is None else 'none'} for {entry.effect}"
+            f"found {'none' if entry.order is None else entry.order}, expected "
+            f"{'cycles per turn' if entry.order is None else 'none'} for {entry.effect}",
+            (*keys, "order"),
         )
     site = Site(entry.joint, entry.order)
     parameters = effect.parameters(arm, site)
@@ -46,21 +47,23 @@ def term_from_entry(entry: EffectEntry, arm: Arm, where: str) -> Term:
     for name in entry.parameters:
         if name not in names:
             raise CellError(
-                f"{where}.parameters.{name}: found an unknown parameter of {entry.effect}; "
-                f"{suggestion(name, names)}"
+                f"found an unknown parameter of {entry.effect}; {suggestion(name, names)}",
+                (*keys, "parameters", name),
             )
-    values = [_checked_value(entry, k, p, where) for k, p in zip(names, parameters, strict=True)]
+    values = [_checked_value(entry, k, p, keys) for k, p in zip(names, parameters, strict=True)]
     return Term(entry.effect, site, tuple(values), entry.stand_in)
 
 
-def _checked_value(entry: EffectEntry, name: str, parameter: Parameter, where: str) -> float:
+def _checked_value(entry: EffectEntry, name: str, parameter: Parameter, keys: Keys) -> float:
+    keys = (*keys, "parameters", name)
     if name not in entry.parameters:
-        raise CellError(f"{where}.parameters.{name}: found nothing, expected {parameter.unit}")
+        raise CellError(f"found nothing, expected {parameter.unit}", keys)
     value = entry.parameters[name]
     if not parameter.lower <= value <= parameter.upper:
         raise CellError(
-            f"{where}.parameters.{name}: found {value:g}, expected {parameter.lower:g} to "
-            f"{parameter.upper:g} {parameter.unit}"
+            f"found {value:g}, expected {parameter.lower:g} to {parameter.upper:g} "
+            f"{parameter.unit}",
+            keys,
         )
     return value
 
@@ -79,8 +82,9 @@ def compliance_terms(compliance: Compliance, arm: Arm) -> tuple[Term, ...]:
             continue
         if len(values) != arm.n:
             raise CellError(
-                f"compliance.{key}: found {len(values)} values, expected {arm.n}: "
-                f"the arm ({arm.name}) has {arm.n} joints"
+                f"found {len(values)} values, expected {arm.n}: the arm ({arm.name}) has "
+                f"{arm.n} joints",
+                ("compliance", key),
             )
         terms += [Term(effect, Site(i + 1), (v,)) for i, v in enumerate(values) if v]
     return tuple(terms)

@@ -6,7 +6,7 @@ import time
 
 from gapbridge.bridge.cell.cell import Cell
 from gapbridge.bridge.cell.plausibility import Findings
-from gapbridge.core.errors import CellError, InvalidStateError, StaleStateError
+from gapbridge.core.errors import InvalidStateError, StaleStateError
 from gapbridge.core.state import RobotState
 from gapbridge.drivers import make_driver
 from gapbridge.drivers.driver import Driver
@@ -25,7 +25,7 @@ def live_findings(cell: Cell) -> Findings:
     """
     link = cell.link
     if link is None:
-        raise CellError(f"{cell.path}: link: found nothing, expected the controller's address")
+        raise cell.error(("link",), "found nothing, expected the controller's address")
     if isinstance(link, UrRtdeSettings):
         require_listening(link.host)
     driver = make_driver(link, cell.model)

@@ -10,7 +10,8 @@ from typing import Any
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
-from gapbridge.core.files import Document, Keys, quoted
+from gapbridge.core.errors import Keys, key_path
+from gapbridge.core.files import Document, quoted
 
 _EXPECTED_TEXTS = {
     "float_type": "a number",
@@ -37,17 +38,6 @@ _EXPECTED_TEXTS = {
     "union_tag_not_found": "a key {discriminator}",
     "enum": "{expected}",
 }
-
-
-def key_path(keys: Keys) -> str:
-    """Return a key path for messages: ``robot.dh entry 2.a``, list entries from 1."""
-    text = ""
-    for key in keys:
-        if isinstance(key, int):
-            text += f" entry {key + 1}"
-        else:
-            text += f"{'.' if text else ''}{key}"
-    return text
 
 
 def error_lines(document: Document, schema: type[BaseModel], error: ValidationError) -> list[str]:

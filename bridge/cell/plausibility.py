@@ -11,10 +11,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gapbridge.bridge.cell.message import key_path
 from gapbridge.bridge.cell.schema import CellFile, Payload
 from gapbridge.bridge.cell.settings.calibration import CalibrationSettings, LoadEntry
 from gapbridge.core.arm import Arm, builtin_arm
+from gapbridge.core.errors import key_path
 from gapbridge.core.files import Document
 from gapbridge.core.load_bounds import LEVER, LoadBounds
 from gapbridge.core.model import Model

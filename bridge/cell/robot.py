@@ -14,37 +14,41 @@ from gapbridge.core.errors import ArmError, CellError
 from gapbridge.core.files import is_file, read_text
 from gapbridge.core.urdf import arm_from_urdf
 
+URDF, CALIBRATION = ("robot", "urdf"), ("robot", "calibration")  # keys of the cell file
 DELTAS = ("delta_theta", "delta_a", "delta_d", "delta_alpha")
 
 
 def build_arm(robot: Robot, folder: Path) -> Arm:
     """Return the arm that the robot section names; paths are relative to ``folder``.
 
-    Raises CellError (or ArmError, naming the URDF) if the section or one of its files cannot be
-    used; messages begin with the key.
+    Raises CellError (or ArmError) with the keys of what cannot be used.
     """
     kinds = [kind for kind in ("model", "urdf", "dh") if getattr(robot, kind) is not None]
     if len(kinds) > 1 and not robot.dh:
         kinds = [kind for kind in kinds if kind != "dh"]  # an empty list counts as left out
     if len(kinds) != 1:
         found = " and ".join(kinds) or "none of them"
-        raise CellError(f"robot: found {found}, expected one of model, urdf, dh")
+        raise CellError(f"found {found}, expected one of model, urdf, dh", ("robot",))
     if robot.calibration is not None and robot.model is None:
         raise CellError(
-            f"robot.calibration: found beside robot.{kinds[0]}, expected only beside robot.model"
+            f"found beside robot.{kinds[0]}, expected only beside robot.model", CALIBRATION
         )
     if robot.rated_payload is not None and robot.model is not None:
         raise CellError(
-            "robot.rated_payload: found beside robot.model, expected only beside robot.urdf or "
-            "robot.dh: that of a built-in arm is known"
+            "found beside robot.model, expected only beside robot.urdf or robot.dh: that of a "
+            "built-in arm is known",
+            ("robot", "rated_payload"),
         )
     if robot.model is not None:
         return builtin_arm(robot.model, calibration_of(robot.calibration, folder))
     if robot.urdf is not None:
         path = folder / robot.urdf
         if not is_file(path):
-            raise CellError(f"robot.urdf: file not found: {path}, expected a URDF")
-        arm = arm_from_urdf(path, robot.tip)
+            raise CellError(f"file not found: {path}, expected a URDF", URDF)
+        try:
+            arm = arm_from_urdf(path, robot.tip)
+        except ArmError as error:
+            raise ArmError(str(error), URDF) from None
     else:
         arm = arm_from_dh([row.model_dump() for row in robot.dh or []])
     rated = robot.rated_payload
@@ -75,18 +79,18 @@ def read_calibration(path: Path) -> dict[str, list[float]]:
         parser.read_string(read_text(path), source=str(path))
     except FileNotFoundError:
         raise ArmError(
-            f"robot.calibration: file not found: {path}, expected a calibration.conf"
+            f"file not found: {path}, expected a calibration.conf", CALIBRATION
         ) from None
     except (OSError, UnicodeDecodeError, configparser.Error) as error:
         what = " ".join(str(error).split())
-        raise ArmError(f"robot.calibration: {path} cannot be read: {what}") from None
+        raise ArmError(f"{path} cannot be read: {what}", CALIBRATION) from None
     deltas: dict[str, list[float]] = {}
     for section in parser.sections():
         for key in DELTAS:
             if parser.has_option(section, key):
                 deltas[key] = _numbers(path, key, parser.get(section, key))
     if not deltas:
-        raise ArmError(f"robot.calibration: {path}: found none of {', '.join(DELTAS)}")
+        raise ArmError(f"{path}: found none of {', '.join(DELTAS)}", CALIBRATION)
     return deltas
 
 
@@ -95,5 +99,5 @@ def _numbers(path: Path, key: str, text: str) -> list[float]:
         return [float(value) for value in json.loads(text)]
     except (ValueError, TypeError):
         raise ArmError(
-            f"robot.calibration: {path}: {key}: found {text!r}, expected a list of numbers"
+            f"{path}: {key}: found {text!r}, expected a list of numbers", CALIBRATION
         ) from None

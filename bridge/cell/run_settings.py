@@ -8,18 +8,18 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from pydantic import ValidationError
-
 from gapbridge.bridge.cell import Cell, load_cell
-from gapbridge.bridge.cell.cell import located_message
+from gapbridge.bridge.cell.cell import located
 from gapbridge.bridge.cell.daemon_settings import DaemonSettings
 from gapbridge.bridge.cell.runtime_folder import cell_key, runtime_folder
 from gapbridge.bridge.cell.sections import SetpointSettings
 from gapbridge.bridge.served.credentials import check_credentials, read_token
-from gapbridge.core.errors import CellError, InputError
+from gapbridge.core.errors import InputError
 from gapbridge.core.files import read_bytes, recorded
 from gapbridge.core.fitted_range import Range
 from gapbridge.core.model import Model
+
+TOKEN = ("setpoints", "token_file")  # keys of the cell file
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,10 @@ def _read(path: Path, settings: DaemonSettings | None) -> Configuration:
     with recorded() as files:
         cell = load_cell(path)
         settings = settings or settings_of(cell)
-        _read_referenced_files(settings)
+        try:
+            _read_referenced_files(settings)
+        except InputError as error:
+            raise located(cell.document, error) from None
     text, fitted = cell.document.text, cell.fitted_range
     return Configuration(settings, cell.arm.n, text, files, fitted, cell.model)
 
@@ -67,33 +70,28 @@ def _read_referenced_files(settings: DaemonSettings) -> None:
         with contextlib.suppress(OSError):  # the loop process reports the error
             read_bytes(setpoints.file)
     if setpoints.source == "tcp" and setpoints.token_file is not None:
-        read_token(setpoints.token_file, "setpoints.token_file")
+        read_token(setpoints.token_file, TOKEN)
 
 
 def settings_of(cell: Cell) -> DaemonSettings:
     """Return the daemon settings of a cell. Raises InputError if sections contradict each other."""
     if cell.link is None:
-        raise CellError(f"{cell.path}: link: found nothing, expected the robot's address for a run")
-    for section, served in (("web", cell.web), ("metrics", cell.metrics)):
-        if served is not None:
-            try:
-                check_credentials(served, section)
-            except InputError as error:
-                raise CellError(f"{cell.path}: {error}") from None
-    setpoints = _setpoint_settings(cell)
+        raise cell.error(("link",), "found nothing, expected the robot's address for a run")
     try:
+        for section, served in (("web", cell.web), ("metrics", cell.metrics)):
+            if served is not None:
+                check_credentials(served, section)
         return DaemonSettings(
-            cell=cell.path.resolve(), link=cell.link, limits=cell.limits, setpoints=setpoints,
-            recording=cell.recording, ft_sensor=cell.ft_sensor,
-            web=cell.web, metrics=cell.metrics,
+            cell=cell.path.resolve(), link=cell.link, limits=cell.limits,
+            setpoints=_setpoint_settings(cell), recording=cell.recording,
+            ft_sensor=cell.ft_sensor, web=cell.web, metrics=cell.metrics,
         )  # fmt: skip
-    except ValidationError as error:
-        message = str(error.errors()[0]["msg"]).removeprefix("Value error, ")
-        raise CellError(located_message(cell.document, message)) from None
+    except InputError as error:
+        raise located(cell.document, error) from None
 
 
 def _setpoint_settings(cell: Cell) -> SetpointSettings:
-    """Return section ``setpoints`` with absolute paths, its token checked. Raises CellError."""
+    """Return section ``setpoints`` with absolute paths, its token checked. Raises InputError."""
     section = cell.setpoints
     update = {
         name: path.resolve()
@@ -103,8 +101,5 @@ def _setpoint_settings(cell: Cell) -> SetpointSettings:
     if section.source == "planner" and section.socket is None:
         update["socket"] = runtime_folder() / f"{cell_key(cell.path)}.planner.sock"
     if section.source == "tcp" and section.token_file is not None:
-        try:
-            read_token(section.token_file, "setpoints.token_file")
-        except InputError as error:
-            raise CellError(f"{cell.path}: {error}") from None
+        read_token(section.token_file, TOKEN)
     return section.model_copy(update=update)

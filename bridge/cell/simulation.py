@@ -14,7 +14,6 @@ import numpy as np
 
 from gapbridge.bridge.cell.cell import Cell
 from gapbridge.bridge.cell.robot import calibration_of
-from gapbridge.core.errors import CellError
 from gapbridge.core.rotation import rotation_vector
 from gapbridge.drivers.addresses import is_loopback
 from gapbridge.drivers.link_settings import DriverSettings
@@ -104,9 +103,10 @@ def _address(cell: Cell, host: str | None) -> str:
     link = cell.file.link
     address = host or cell.file.simulation.host or str(getattr(link, "host", None) or HOST)
     if not is_loopback(address):
-        raise CellError(
-            f"{cell.path}: simulation.host: found {address!r}, expected a loopback address "
-            "(127.x.x.x): a simulated controller is never served to others"
+        raise cell.error(
+            ("simulation", "host"),
+            f"found {address!r}, expected a loopback address (127.x.x.x): a simulated controller "
+            "is never served to others",
         )
     return address
 
@@ -157,8 +157,9 @@ def _plant(cell: Cell) -> dict[str, Any]:
         if values is None:
             continue
         if len(values) != cell.arm.n:
-            raise CellError(
-                f"{cell.path}: simulation.{key}: found {len(values)} values, expected {cell.arm.n}"
+            raise cell.error(
+                ("simulation", *key.split(".")),
+                f"found {len(values)} values, expected {cell.arm.n}",
             )
         fields[key.rpartition(".")[2]] = tuple(values)
     return fields

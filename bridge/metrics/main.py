@@ -145,7 +145,7 @@ def run(start: StartData) -> None:
     settings = start.settings.metrics
     assert settings is not None
     path = settings.token_file
-    token = None if path is None else read_token(path, "metrics.token_file")
+    token = None if path is None else read_token(path, ("metrics", "token_file"))
     counts = Counts(start.memory, start.settings, start.extra.get("text"))
     registry = CollectorRegistry(auto_describe=False)
 

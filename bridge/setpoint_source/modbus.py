@@ -34,7 +34,7 @@ class ModbusSource(InterpolatedSource):
     ) -> None:
         super().__init__(settings, n, moves_arm, folder, rate)
         if n > MOST_JOINTS:
-            raise InputError(f"setpoints.source modbus: found {n} joints, expected {MOST_JOINTS}")
+            raise InputError(f"found {n} joints, expected {MOST_JOINTS}", ("setpoints", "source"))
         self._memory: PlcMemory | None = None
         self._server: subprocess.Popen[str] | None = None
         self._sequence: int | None = None

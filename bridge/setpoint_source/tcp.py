@@ -15,6 +15,7 @@ from gapbridge.bridge.setpoint_source.planner import Connection, PlannerSource
 from gapbridge.core.errors import InputError
 from gapbridge.drivers.clock import SYSTEM
 
+TOKEN = ("setpoints", "token_file")  # keys of the cell file
 FIRST_LINE = 2.0  # s within which the token must arrive
 
 
@@ -37,8 +38,8 @@ class TcpSource(PlannerSource):
         """Listen. Raises RunError where the address is taken, InputError without a token."""
         path = self.settings.token_file
         if path is None:
-            raise InputError("setpoints.token_file: found nothing, expected a file with a token")
-        self._token = read_token(path, "setpoints.token_file").encode()
+            raise InputError("found nothing, expected a file with a token", TOKEN)
+        self._token = read_token(path, TOKEN).encode()
         super().open()
 
     def _listen(self) -> socket.socket:

@@ -102,7 +102,7 @@ def run(start: StartData) -> None:
     settings = start.settings.web
     assert settings is not None
     path = settings.token_file
-    token = None if path is None else read_token(path, "web.token_file")
+    token = None if path is None else read_token(path, ("web", "token_file"))
     page = PageData(start.settings, start.n, start.session, start.memory, start.extra.get("text"))
     stream = Stream(settings.clients)
 

@@ -147,7 +147,7 @@ def effect_named(identifier: str) -> Effect:
 
     near = difflib.get_close_matches(identifier, CATALOGUE, n=1, cutoff=0.4)
     hint = f"; did you mean {near[0]!r}?" if near else f"; known: {', '.join(CATALOGUE)}"
-    raise InputError(f"effect: found {identifier!r}, expected one of the catalogue{hint}")
+    raise InputError(f"found {identifier!r}, expected one of the catalogue{hint}", ("effect",))
 
 
 def split_name(name: str, beside: Iterable[str] = ()) -> ParameterName | None:

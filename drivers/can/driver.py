@@ -43,8 +43,9 @@ class CanDriver(Driver):
         super().__init__(min(settings.rate, profile.rate), model, clock=clock)
         if model.arm.n != profile.n:
             raise ProfileError(
-                f"link.profile: found {profile.n} joints in {profile.name}, expected "
-                f"{model.arm.n}: the cell's arm has those"
+                f"found {profile.n} joints in {profile.name}, expected {model.arm.n}: the cell's "
+                "arm has those",
+                ("link", "profile"),
             )
         self.settings, self.profile = settings, profile
         self.reader = FrameReader(settings, profile, clock)

@@ -82,8 +82,9 @@ def interpolation_period(period: float) -> tuple[int, int]:
         if 1.0 <= round(value) <= 255 and abs(value - round(value)) < 1e-6 * value:
             return round(value), index
     raise InputError(
-        f"link.rate: found {1.0 / period:g} SYNCs per second, expected a period of whole ms or "
-        "tenths of it, as 100, 125, 200, 250, 500"
+        f"found {1.0 / period:g} SYNCs per second, expected a period of whole ms or tenths of it, "
+        "as 100, 125, 200, 250, 500",
+        ("link", "rate"),
     )
 
 

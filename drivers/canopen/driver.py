@@ -54,8 +54,9 @@ class CanopenDriver(Driver):
         fastest = 1.0 / self.profile.file.sync_period
         if settings.rate > fastest * (1.0 + 1e-9):
             raise InputError(
-                f"link.rate: found {settings.rate:g}, expected at most {fastest:g} SYNCs per "
-                f"second (sync_period of {self.profile.path.name})"
+                f"found {settings.rate:g}, expected at most {fastest:g} SYNCs per second "
+                f"(sync_period of {self.profile.path.name})",
+                ("link", "rate"),
             )
         interpolation_period(1.0 / settings.rate)  # raises InputError
         self.settings = settings

@@ -330,7 +330,8 @@ def checked_context(settings: ModbusSettings) -> ssl.SSLContext:
             context.load_cert_chain(settings.certificate, settings.key)
     except OSError as error:
         raise InputError(
-            f"link: authority, certificate, key: {error.strerror or error}, expected PEM files "
-            "that can be read"
+            f"authority, certificate, key: {error.strerror or error}, expected PEM files that can "
+            "be read",
+            ("link",),
         ) from None
     return context

@@ -31,5 +31,5 @@ class ReplaySettings(DriverSettings):
         try:
             files_of(path)
         except LogError as error:
-            raise LogError(f"link.file: {error}") from None
+            raise LogError(str(error), ("link", "file")) from None
         return self.model_copy(update={"file": path})

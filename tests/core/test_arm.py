@@ -207,15 +207,15 @@ def test_a_calibration_does_not_stick_to_the_built_in_arm():
     ("rows", "message"),
     [
         ([], "robot.dh: found no rows"),
-        ([{"a": 0, "d": 0}], "robot.dh row 1: alpha: found nothing, expected a number"),
-        ([{"a": 0, "d": 0, "alpha": "long"}], "row 1: alpha: found 'long', expected a number"),
+        ([{"a": 0, "d": 0}], "robot.dh entry 1.alpha: found nothing, expected a number"),
+        ([{"a": 0, "d": 0, "alpha": "long"}], "entry 1.alpha: found 'long', expected a number"),
         ([{"a": 0, "d": 0, "alpha": 0}, {"a": float("nan"), "d": 0, "alpha": 0}],
-         "row 2: a: found nan, expected a finite number"),
-        ([{"a": 0, "d": 0, "alpha": 0, "mass": -1}], "row 1: mass: found -1, expected 0 or more"),
-        ([{"a": 0, "d": 0, "alpha": 0, "mass": None}], "row 1: mass: found nothing"),
-        ([{"a": 0, "d": 0, "alpha": 0, "cog": [1, 2]}], r"row 1: cog: found \[1, 2\]"),
-        ([{"a": 0, "d": 0, "alpha": 0, "cog": ["x", 0, 0]}], "row 1: cog: found"),
-        ([{"a": 0, "d": 0, "alpha": 0, "cog": [[1], 0, 0]}], "row 1: cog: found"),
+         "entry 2.a: found nan, expected a finite number"),
+        ([{"a": 0, "d": 0, "alpha": 0, "mass": -1}], "entry 1.mass: found -1, expected 0 or more"),
+        ([{"a": 0, "d": 0, "alpha": 0, "mass": None}], "entry 1.mass: found nothing"),
+        ([{"a": 0, "d": 0, "alpha": 0, "cog": [1, 2]}], r"entry 1.cog: found \[1, 2\]"),
+        ([{"a": 0, "d": 0, "alpha": 0, "cog": ["x", 0, 0]}], "entry 1.cog: found"),
+        ([{"a": 0, "d": 0, "alpha": 0, "cog": [[1], 0, 0]}], "entry 1.cog: found"),
     ],
 )  # fmt: skip
 def test_a_mistake_in_dh_rows_is_reported_in_one_line(rows, message):

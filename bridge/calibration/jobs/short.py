@@ -25,7 +25,6 @@ from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.payload_session import calibrate_payload
 from gapbridge.core.calibration.plan import Expectation, Payload, Plan, PlannedPose
 from gapbridge.core.calibration.tool_session import calibrate_tool
-from gapbridge.core.errors import CellError
 from gapbridge.core.planning.payload_plan import plan_payload
 from gapbridge.core.planning.tool_plan import plan_tool
 from gapbridge.core.rotation import roll_pitch_yaw
@@ -57,9 +56,10 @@ class ToolJob(_ShortJob):
         self, cell: Cell, options: SessionOptions, prompt: Prompt, session: Session
     ) -> None:
         if cell.calibration.joints == "planned":
-            raise CellError(
-                f"{cell.path}: calibration.joints: found 'planned', expected 'link' or 'typed': "
-                "the tip is brought onto the point by hand"
+            raise cell.error(
+                ("calibration", "joints"),
+                "found 'planned', expected 'link' or 'typed': the tip is brought onto the point by "
+                "hand",
             )
         super().__init__(cell, options, prompt, session)
 
@@ -108,9 +108,10 @@ class PayloadJob(_ShortJob):
         self, cell: Cell, options: SessionOptions, prompt: Prompt, session: Session
     ) -> None:
         if cell.link is None or cell.calibration.joints not in (None, "link"):
-            raise CellError(
-                f"{cell.path}: link: found nothing to read ft_raw_wrench from, expected a "
-                "controller, and calibration.joints: link"
+            raise cell.error(
+                ("link",),
+                "found nothing to read ft_raw_wrench from, expected a controller, and "
+                "calibration.joints: link",
             )
         super().__init__(cell, options, prompt, session)
 

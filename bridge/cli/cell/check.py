@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from gapbridge.bridge.cell import Cell, load_cell
-from gapbridge.bridge.cell.cell import cell_errors, located_message
+from gapbridge.bridge.cell.cell import cell_errors, located_message, message_at
 from gapbridge.bridge.cell.live import live_findings
 from gapbridge.bridge.cell.log_consistency import log_findings
 from gapbridge.bridge.cell.run_settings import read_configuration
@@ -75,10 +75,9 @@ def _run_errors(cell: Cell) -> list[str]:
         if isinstance(settings.link, ProfileSettings):
             make_driver(settings.link, cell.model)  # checks the profile against the arm
     except InputError as error:
-        return [located_message(cell.document, str(error))]
+        return [located_message(cell.document, error)]
     try:
         make_source(settings.setpoints, cell.arm.n, True, cell.path.parent, settings.link.rate)
     except InputError as error:
-        line = cell.document.line(("setpoints", "file"))
-        return [f"{cell.path}, line {line}: setpoints: {error}"]
+        return [message_at(cell.document, error.keys or ("setpoints", "file"), error.message)]
     return []

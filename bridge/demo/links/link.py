@@ -25,7 +25,7 @@ from gapbridge.bridge.demo.processes import ServedCell
 from gapbridge.bridge.demo.result import Resolution
 from gapbridge.bridge.document.output_file import write_text
 from gapbridge.core.arrays import Array
-from gapbridge.core.errors import CellError, RunError
+from gapbridge.core.errors import RunError
 from gapbridge.drivers.simulated.ur.settings import BENCH_PORT
 
 PAYLOAD = re.compile(r"^payload:.*$", re.MULTILINE)
@@ -99,7 +99,7 @@ class DemoLink(ABC):
         text = cell.path.read_text(encoding="utf-8")
         declared, count = PAYLOAD.subn(f"payload: {{mass: {load.mass:g}, cog: [{cog}]}}", text)
         if count != 1:
-            raise CellError(f"{cell.path}: payload: found {count} lines, expected one")
+            raise cell.error(("payload",), f"found {count} lines, expected one")
         path = cell.path.with_name(f"{cell.path.stem}-{load.name.replace(' ', '-')}.yaml")
         write_text(path, declared)
         return load_cell(path)

@@ -66,8 +66,9 @@ class CanNodes(ProtocolServer):
             return
         if link.interface not in ("virtual", "socketcan"):
             raise InputError(
-                f"link.interface: found {link.interface!r}, which cannot be simulated, expected "
-                "socketcand, slcan, virtual or socketcan"
+                f"found {link.interface!r}, which cannot be simulated, expected socketcand, slcan, "
+                "virtual or socketcan",
+                ("link", "interface"),
             )
         self._bus = open_bus(link)
 
@@ -75,8 +76,9 @@ class CanNodes(ProtocolServer):
         assert self._hub is not None
         if (channel.exists() and not channel.is_symlink()) or not channel.parent.is_dir():
             raise InputError(
-                f"link.channel: found {channel}, expected a name that is free, as /tmp/arm, where "
-                "a link to the simulated serial line can be put"
+                f"found {channel}, expected a name that is free, as /tmp/arm, where a link to the "
+                "simulated serial line can be put",
+                ("link", "channel"),
             )
         channel.unlink(missing_ok=True)
         channel.symlink_to(self._hub.add_terminal())

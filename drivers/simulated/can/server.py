@@ -23,8 +23,8 @@ def make_servers(link: CanSettings, host: str, controller: ArmController) -> lis
     nodes = resolve_name(NODES.get(link.profile, MAPPED))
     if link.profile == "piper" and controller.n != 6:
         raise InputError(
-            f"link.profile: found 6 joints in piper, expected {controller.n}: the cell's arm has "
-            "those"
+            f"found 6 joints in piper, expected {controller.n}: the cell's arm has those",
+            ("link", "profile"),
         )
     server: ProtocolServer = nodes(link, host, controller)
     return [server]

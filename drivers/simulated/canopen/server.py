@@ -122,8 +122,9 @@ class CanopenServer(ProtocolServer):
             link = link.model_copy(update={"port": self._hub.port})
         elif link.interface not in ("virtual", "socketcan"):
             raise InputError(
-                f"link.interface: found {link.interface!r}, which cannot be simulated, expected "
-                "socketcand, virtual or socketcan"
+                f"found {link.interface!r}, which cannot be simulated, expected socketcand, "
+                "virtual or socketcan",
+                ("link", "interface"),
             )
         network: Any = _Network(open_bus(link))
         network.listeners[:] = [_Listener(self, network)]

@@ -63,7 +63,9 @@ def test_a_cell_that_is_wrong_ends_with_two_and_every_line(tmp_path: Path) -> No
 def test_a_trajectory_that_cannot_be_run_is_named(tmp_path: Path) -> None:
     path = cell(tmp_path, "127.0.0.1", more="setpoints: {source: trajectory, file: way.csv}\n")
     err = refused("check", path)
-    assert err.startswith(f"error: {path}, line 5: setpoints: {tmp_path}/way.csv: file not found")
+    assert err.startswith(
+        f"error: {path}, line 5: setpoints.file: {tmp_path}/way.csv: file not found"
+    )
     (tmp_path / "way.csv").write_text("timestamp,target_q_0\n0,0\n1,0\n")
     assert "target_q" in refused("check", path)
     joints = ",".join(f"target_q_{i}" for i in range(6))

@@ -135,7 +135,7 @@ def test_a_token_that_others_read_or_guess_is_refused_and_never_quoted(tmp_path,
     path.write_text(text)
     path.chmod(mode)
     with pytest.raises(InputError) as error:
-        read_token(path, "web.token_file")
+        read_token(path, ("web", "token_file"))
     assert says in str(error.value)
     assert TOKEN not in str(error.value)
 

@@ -104,11 +104,13 @@ def test_the_end_of_the_hub_is_reported_instead_of_spinning(hub):
     close_bus(bus)
 
 
-def test_a_hub_that_nobody_serves_is_one_line():
+def test_a_hub_that_nobody_serves_is_one_line_and_no_busy_loop():
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
+    before = time.process_time()  # the library alone would try for 10 s at full load
     with pytest.raises(LinkError, match=rf"socketcand can0@127.0.0.1:{port}: cannot be reached"):
         open_bus(BusSettings(interface="socketcand", port=port))
+    assert time.process_time() - before < 1.0
 
 
 def test_joining_a_busy_bus_takes_no_luck(hub):

@@ -24,7 +24,7 @@ from gapbridge.core.state import RobotState, Setpoint
 from gapbridge.drivers.driver import Driver
 from gapbridge.drivers.simulated.plant.kinematics import gap, tcp_in_base
 
-OFFSET = (4e-4, -3e-4, 5e-4, 1e-3, 0.0, -1e-3)  # m, rad: what a write of offsets moves the TCP by
+OFFSET = (4e-4, -3e-4, 5e-4, 2e-4, 0.0, -3e-4)  # m, rad: what a write of offsets moves the TCP by
 STEP = 0.02  # rad: what a write of joints moves each joint by
 PACE = 0.1  # rad/s
 LATE = 0.05  # s that a sample may be older than the plant

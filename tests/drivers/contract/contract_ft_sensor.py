@@ -28,7 +28,7 @@ class SensorCase(ModbusCase):
     def driver(self) -> Driver:
         """Return the Modbus driver joined with the sensor."""
         frame = {"xyz": XYZ, "rpy": RPY}
-        settings = self._wire.settings(sensor_in_flange=frame, max_age=1.0)
+        settings = self._wire.settings(sensor_in_flange=frame, max_age=1.0, connect_timeout=60.0)
         return DriverWithSensor(super().driver(), settings, self.model)
 
     def start(self) -> None:

@@ -23,10 +23,14 @@ from contract_checks import (
     next_state,
 )
 from contract_table import CASES
+from patience import PATIENCE
 
 from gapbridge.core.errors import WriteError
+from gapbridge.drivers.can import driver as can
 from gapbridge.drivers.can.driver import CanDriver
+from gapbridge.drivers.canopen import driver as canopen
 from gapbridge.drivers.driver import Driver
+from gapbridge.drivers.ft_sensor import robotiq_ft300
 
 
 @pytest.fixture(params=CASES)
@@ -36,7 +40,11 @@ def case(request: pytest.FixtureRequest) -> Iterator[Case]:
 
 
 @pytest.fixture
-def driver(case: Case) -> Iterator[Driver]:
+def driver(case: Case, monkeypatch: pytest.MonkeyPatch) -> Iterator[Driver]:
+    # controller and driver share this busy process: connecting may take longer than a cell allows
+    monkeypatch.setattr(can, "FIRST_SAMPLE", PATIENCE)
+    monkeypatch.setattr(canopen, "STARTING", PATIENCE)
+    monkeypatch.setattr(robotiq_ft300, "START", PATIENCE)
     with case.driver() as found:
         yield found
 
