@@ -78,7 +78,7 @@ def test_it_takes_as_long_as_it_took_divided_by_the_speed(desk: Desk) -> None:
 def test_a_cell_that_names_no_recording_is_one_line(tmp_path: Path) -> None:
     cell = tmp_path / "cell.yaml"
     cell.write_text("robot: {model: ur5e}\nlink: {driver: replay, file: run-1}\n")
-    with pytest.raises(LogError, match=r"cell\.yaml: link\.file: .*run-1: file not found"):
+    with pytest.raises(LogError, match=r"cell\.yaml, line 2: link\.file: .*run-1: file not found"):
         _ = load_cell(cell).link
 
 

@@ -209,22 +209,24 @@ def check_gate(case: Case, driver: Driver) -> None:
             driver.write_setpoint(setpoint_of(state, q, q, (length, *nothing[1:])))
     time.sleep(0.1)
     assert np.abs(before - case.controller.target_q).max() <= 2.0 * case.resolution + 1e-6
-    _written(driver, lambda state, q: setpoint_of(state, q, q, nothing))
+    write(driver, lambda state, q: setpoint_of(state, q, q, nothing))
 
 
-def _written(driver: Driver, setpoint: Callable[[RobotState, np.ndarray], Setpoint]) -> None:
-    """Write one setpoint; a busy machine may be later than the robot's watchdog."""
-    until = time.monotonic() + PATIENCE
-    while True:
+def write(driver: Driver, setpoint: Callable[[RobotState, np.ndarray], Setpoint]) -> None:
+    """Arm and write one setpoint; a busy machine may be later than the robot's watchdog."""
+
+    def written() -> bool:
         state = next_state(driver)
         try:
             driver.write_setpoint(setpoint(state, driver.nominal_q(state)))
         except WriteError:
-            assert time.monotonic() < until, "never written"
             driver.release()
-            driver.arm(next_state(driver))
-        else:
-            return
+            with contextlib.suppress(WriteError):
+                driver.arm(next_state(driver))
+            return False
+        return True
+
+    wait_for(written, "a setpoint that is written")
 
 
 def check_stall(case: Case, driver: Driver) -> None:

@@ -44,7 +44,7 @@ def driver(case: Case, monkeypatch: pytest.MonkeyPatch) -> Iterator[Driver]:
     # controller and driver share this busy process: connecting may take longer than a cell allows
     monkeypatch.setattr(can, "FIRST_SAMPLE", PATIENCE)
     monkeypatch.setattr(canopen, "STARTING", PATIENCE)
-    monkeypatch.setattr(robotiq_ft300, "START", PATIENCE)
+    monkeypatch.setattr(robotiq_ft300, "TRIES", int(PATIENCE))
     with case.driver() as found:
         yield found
 

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from contract_checks import OFFSET, check_reads, next_state, read_on, setpoint_of, stream
+from contract_checks import OFFSET, check_reads, next_state, read_on, setpoint_of, stream, write
 from contract_modbus import ModbusCase
 from evil_proxy import EvilProxy, Ruin
 from ports import free_port
@@ -294,8 +294,8 @@ def test_the_contract_holds_over_a_serial_line() -> None:
     ):
         check_reads(driver, case.model)
         assert np.abs(next_state(driver).actual_q - case.controller.q).max() <= case.resolution
-        driver.arm(next_state(driver))
-        stream(driver, lambda state, q: setpoint_of(state, q, q, OFFSET), 0.5)
+        for _ in range(10):
+            write(driver, lambda state, q: setpoint_of(state, q, q, OFFSET))
         driver.release()
         cable.cut()
         with pytest.raises(StaleStateError):
