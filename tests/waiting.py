@@ -59,7 +59,7 @@ COMPUTE = (
 )
 """Files in these folders whose tests compute."""
 WAITING = ("gw0", "gw1")  # processes of xdist that run them
-NICE = 5  # of its other processes, which compute with what is left of the cores
+NICE = 2  # of its other processes, which compute with what is left of the cores
 
 
 def waits(file: str) -> bool:
