@@ -93,7 +93,7 @@ def _row_rates(
         nothing = np.zeros(len(values) + 1, dtype=np.int64)
         return (nothing, np.zeros(0, dtype=np.int64), np.zeros((0, len(q)))), first_order_ok
     without_terms = model.without_terms().rows(q, loads)
-    starts, found_slots, found = [0], [], []
+    starts, slots, changes = [0], [], []
     for c, (t, k) in enumerate(values):
         if type(CATALOGUE[model.terms[t].effect]).condition is not base:
             ends = []
@@ -109,11 +109,11 @@ def _row_rates(
             )
             change = np.column_stack([a - b for a, b in zip(one[:3], other[:3], strict=True)])
             for j in np.flatnonzero(change.any(axis=0)):
-                found_slots.append(of_rows(n) + j)
-                found.append(change[:, j] / (2 * steps[c]))
-        starts.append(len(found))
-    rates = np.array(found) if found else np.zeros((0, len(q)))
-    return (np.array(starts), np.array(found_slots, dtype=np.int64), rates), first_order_ok
+                slots.append(of_rows(n) + j)
+                changes.append(change[:, j] / (2 * steps[c]))
+        starts.append(len(changes))
+    rates = np.array(changes) if changes else np.zeros((0, len(q)))
+    return (np.array(starts), np.array(slots, dtype=np.int64), rates), first_order_ok
 
 
 def _has_steps(model: Model, loads: Loads) -> bool:
@@ -130,14 +130,14 @@ def _sweep(
     if bool(chain.flexibility.any()) or bool(getattr(config, "DISABLE_JIT", 0)):
         return None
     count = len(rows.q)
-    found = np.empty((count, 3)), np.empty((count, 3, 3)), jacobian
+    results = np.empty((count, 3)), np.empty((count, 3, 3)), jacobian
 
     def work(first: int, last: int) -> int:
-        return int(jacobian_blocks(chain, rows, entries, first, last, found, converged))
+        return int(jacobian_blocks(chain, rows, entries, first, last, results, converged))
 
     if any(bad >= 0 for bad in in_ranges(work, count)):
         return None
-    return Poses(*found[:2])
+    return Poses(*results[:2])
 
 
 def _with_step(model: Model, t: int, k: int, step: float) -> Model:

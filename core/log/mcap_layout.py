@@ -41,16 +41,16 @@ class Layout:
 
     def encode(self, rows: Array, slices: Mapping[str, slice]) -> list[bytes]:
         """Return a message for each of the rows (k, width); ``slices``: where fields stand."""
-        found = np.tile(np.frombuffer(self.template, np.uint8), (len(rows), 1))
+        encoded = np.tile(np.frombuffer(self.template, np.uint8), (len(rows), 1))
         for place in self.places:
             part = rows[:, slices[place.name]]
             if place.is_enum:
-                found[:, place.start] = part[:, 0].astype(np.uint8)
+                encoded[:, place.start] = part[:, 0].astype(np.uint8)
             else:
                 stored = np.ascontiguousarray(part, "<f8").view(np.uint8)
-                found[:, place.start : place.start + 8 * place.count] = stored
-        data, width = found.tobytes(), len(self.template)
-        return [data[at : at + width] for at in range(0, len(data), width)]
+                encoded[:, place.start : place.start + 8 * place.count] = stored
+        data, width = encoded.tobytes(), len(self.template)
+        return [data[start : start + width] for start in range(0, len(data), width)]
 
     def decode(self, messages: Bytes) -> dict[str, Array]:
         """Return the fields of messages (k, length): (k,) or (k, count) each, in their own memory.
@@ -58,15 +58,15 @@ class Layout:
         Never the messages' own: theirs is read-only and at odd addresses, for which the loop's
         compiled functions would be compiled anew, amidst a cycle.
         """
-        found: dict[str, Array] = {}
+        columns: dict[str, Array] = {}
         for place in self.places:
             if place.is_enum:
-                found[place.name] = messages[:, place.start].astype(np.float64)
+                columns[place.name] = messages[:, place.start].astype(np.float64)
                 continue
             stored = messages[:, place.start : place.start + 8 * place.count]
             values = stored.copy().view("<f8").astype(np.float64, copy=False)
-            found[place.name] = values[:, 0] if place.is_single else values
-        return found
+            columns[place.name] = values[:, 0] if place.is_single else values
+        return columns
 
 
 def layout_of(channel: str, names: Sequence[str], sizes: Sizes) -> Layout:
@@ -93,50 +93,50 @@ def layout_in(message: DescriptorProto, sample: bytes) -> Layout:
     Raises ValueError where it is not of the kind that recordings are made of.
     """
     fields = {field.number: field for field in message.field}
-    at, places = 0, []
-    while at < len(sample):
-        tag, at = _read_varint(sample, at)
+    offset, places = 0, []
+    while offset < len(sample):
+        tag, offset = _read_varint(sample, offset)
         number, wire = tag >> 3, tag & 7
         if number not in fields:
             raise ValueError(f"found field {number}, which the schema does not have")
         field = fields[number]
         repeated = field.label == FieldDescriptorProto.LABEL_REPEATED
         if wire == _VARINT:
-            start = at
-            _, at = _read_varint(sample, at)
-            if at - start == 1:
+            start = offset
+            _, offset = _read_varint(sample, offset)
+            if offset - start == 1:
                 places.append(Place(field.name, start, 1, is_enum=True))
             continue
         size = 8
         if wire == _LENGTH:
-            size, at = _read_varint(sample, at)
+            size, offset = _read_varint(sample, offset)
         elif wire != _FIXED64:
             raise ValueError(f"found {field.name} with wire type {wire}, expected doubles")
-        if size % 8 or at + size > len(sample):
+        if size % 8 or offset + size > len(sample):
             raise ValueError(f"found {field.name} of {size} bytes, expected doubles")
-        places.append(Place(field.name, at, size // 8, is_single=not repeated))
-        at += size
+        places.append(Place(field.name, offset, size // 8, is_single=not repeated))
+        offset += size
     return Layout(sample, tuple(places))
 
 
 def _varint(value: int) -> bytes:
-    found = bytearray()
+    encoded = bytearray()
     while value > 0x7F:
-        found.append(value & 0x7F | 0x80)
+        encoded.append(value & 0x7F | 0x80)
         value >>= 7
-    found.append(value)
-    return bytes(found)
+    encoded.append(value)
+    return bytes(encoded)
 
 
-def _read_varint(data: bytes, at: int) -> tuple[int, int]:
+def _read_varint(data: bytes, offset: int) -> tuple[int, int]:
     """Return a number and where it ends. Raises ValueError where it does not."""
     value = 0
     for shift in range(0, 64, 7):
-        if at >= len(data):
+        if offset >= len(data):
             break
-        byte = data[at]
+        byte = data[offset]
         value |= (byte & 0x7F) << shift
-        at += 1
+        offset += 1
         if byte < 0x80:
-            return value, at
+            return value, offset
     raise ValueError("found a number without an end")

@@ -52,14 +52,14 @@ def files_of(path: Path) -> list[Path]:
     """
     if path.is_file():
         return [path]
-    name = re.compile(rf"{re.escape(path.name)}-(\d{{3,}}){re.escape(SUFFIX)}")
+    pattern = re.compile(rf"{re.escape(path.name)}-(\d{{3,}}){re.escape(SUFFIX)}")
     folder = path.parent
-    matches = [name.fullmatch(one.name) for one in folder.iterdir()] if folder.is_dir() else []
-    found = sorted((int(match[1]), match[0]) for match in matches if match)
-    if not found:
+    matches = [pattern.fullmatch(file.name) for file in folder.iterdir()] if folder.is_dir() else []
+    parts = sorted((int(match[1]), match[0]) for match in matches if match)
+    if not parts:
         what = "found a folder" if path.is_dir() else "file not found"
         raise LogError(f"{path}: {what}, expected a recording of the daemon (MCAP)")
-    return [folder / one for _, one in found]
+    return [folder / name for _, name in parts]
 
 
 def read_batches(path: Path) -> Iterator[Batch]:
@@ -87,10 +87,10 @@ def read_columns(path: Path, reported_only: bool = False) -> dict[str, Array]:
     """
     batches = [batch.columns for batch in read_batches(path) if len(batch)]
     names = list(batches[0]) if batches else []
-    found = {name: np.concatenate([columns[name] for columns in batches]) for name in names}
+    joined = {name: np.concatenate([columns[name] for columns in batches]) for name in names}
     return {
         name: values
-        for name, values in found.items()
+        for name, values in joined.items()
         if not (reported_only and np.isnan(values).all())
     }
 
@@ -102,8 +102,8 @@ def last_batch(path: Path) -> Batch | None:
         decoder = _Decoder(path)
         if chunks:  # schemas and channels stand in the first one
             decoder.take(records.read_chunk(file, *chunks[0]))
-        for at, length in reversed(chunks):
-            contents = records.read_chunk(file, at, length)
+        for offset, length in reversed(chunks):
+            contents = records.read_chunk(file, offset, length)
             batch = None if contents is None else decoder.take(contents)
             if batch is not None and len(batch):
                 return batch
@@ -113,8 +113,8 @@ def last_batch(path: Path) -> Batch | None:
 def _read_file(path: Path) -> Iterator[Batch]:
     with path.open("rb") as file:
         decoder = _Decoder(path)
-        for at, length in records.chunk_offsets(file, path):
-            contents = records.read_chunk(file, at, length)
+        for offset, length in records.chunk_offsets(file, path):
+            contents = records.read_chunk(file, offset, length)
             if contents is None:
                 return
             batch = decoder.take(contents)

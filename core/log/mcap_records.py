@@ -61,9 +61,9 @@ def chunk_offsets(file: IO[bytes], path: Path) -> Iterator[tuple[int, int]]:
 
     Raises LogError where the file is no MCAP file. A file of nothing has no chunks.
     """
-    for code, at, length in all_records(file, path):
+    for code, offset, length in all_records(file, path):
         if code == Opcode.CHUNK:
-            yield at, length
+            yield offset, length
 
 
 def all_records(file: IO[bytes], path: Path) -> Iterator[tuple[int, int, int]]:
@@ -75,15 +75,15 @@ def all_records(file: IO[bytes], path: Path) -> Iterator[tuple[int, int, int]]:
     magic = file.read(len(MCAP0_MAGIC))
     if magic != MCAP0_MAGIC[: len(magic)]:
         raise LogError(f"{path}: found no MCAP file, expected a recording of the daemon")
-    at = len(MCAP0_MAGIC)
-    while at + _HEAD.size <= size:
-        file.seek(at)
+    offset = len(MCAP0_MAGIC)
+    while offset + _HEAD.size <= size:
+        file.seek(offset)
         code, length = _HEAD.unpack(file.read(_HEAD.size))
-        at += _HEAD.size
-        if code not in _KNOWN or code in _ENDS or at + length > size:
+        offset += _HEAD.size
+        if code not in _KNOWN or code in _ENDS or offset + length > size:
             return
-        yield code, at, length
-        at += length
+        yield code, offset, length
+        offset += length
 
 
 def is_whole(path: Path) -> bool:
@@ -94,18 +94,18 @@ def is_whole(path: Path) -> bool:
         return size > 2 * len(MCAP0_MAGIC) and file.read() == MCAP0_MAGIC
 
 
-def read_chunk(file: IO[bytes], at: int, length: int) -> Contents | None:
+def read_chunk(file: IO[bytes], offset: int, length: int) -> Contents | None:
     """Return the content of a chunk; None where it is broken."""
-    found = unpacked(file, at, length)
+    chunk = unpacked(file, offset, length)
     try:
-        return None if found is None else _contents(found[1])
+        return None if chunk is None else _contents(chunk[1])
     except BROKEN:
         return None
 
 
-def unpacked(file: IO[bytes], at: int, length: int) -> tuple[Chunk, bytes] | None:
+def unpacked(file: IO[bytes], offset: int, length: int) -> tuple[Chunk, bytes] | None:
     """Return a chunk record and its data unpacked, None where it is broken or holds nothing."""
-    file.seek(at)
+    file.seek(offset)
     content = file.read(length)
     try:
         chunk = Chunk.read(ReadDataStream(BytesIO(content)))
@@ -119,11 +119,11 @@ def unpacked(file: IO[bytes], at: int, length: int) -> tuple[Chunk, bytes] | Non
 
 def inner_records(data: bytes) -> Iterator[tuple[int, int, int]]:
     """Yield opcode, where its data begins, and its length, of each record of an unpacked chunk."""
-    at, end = 0, len(data)
-    while at < end:
-        code, length = _HEAD.unpack_from(data, at)
-        yield code, at + HEAD_SIZE, length
-        at += HEAD_SIZE + length
+    offset, end = 0, len(data)
+    while offset < end:
+        code, length = _HEAD.unpack_from(data, offset)
+        yield code, offset + HEAD_SIZE, length
+        offset += HEAD_SIZE + length
 
 
 def message_head(data: bytes) -> tuple[int, int, int, int]:
@@ -132,19 +132,23 @@ def message_head(data: bytes) -> tuple[int, int, int, int]:
     return channel, sequence, log_time, publish_time
 
 
+def _stream(data: bytes, offset: int, length: int) -> ReadDataStream:
+    return ReadDataStream(BytesIO(data[offset : offset + length]))
+
+
 def _contents(data: bytes) -> Contents:
-    found = Contents([], [], [])
-    at, end, head, message = 0, len(data), _HEAD, _MESSAGE
-    add = found.messages.append
-    while at < end:
-        code, length = head.unpack_from(data, at)
-        at += 9
+    contents = Contents([], [], [])
+    offset, end, head, message = 0, len(data), _HEAD, _MESSAGE
+    add = contents.messages.append
+    while offset < end:
+        code, length = head.unpack_from(data, offset)
+        offset += 9
         if code == Opcode.MESSAGE:
-            channel, sequence, log_time, _ = message.unpack_from(data, at)
-            add(Message(channel, sequence, log_time, data[at + 22 : at + length]))
+            channel, sequence, log_time, _ = message.unpack_from(data, offset)
+            add(Message(channel, sequence, log_time, data[offset + 22 : offset + length]))
         elif code == Opcode.SCHEMA:
-            found.schemas.append(Schema.read(ReadDataStream(BytesIO(data[at : at + length]))))
+            contents.schemas.append(Schema.read(_stream(data, offset, length)))
         elif code == Opcode.CHANNEL:
-            found.channels.append(Channel.read(ReadDataStream(BytesIO(data[at : at + length]))))
-        at += length
-    return found
+            contents.channels.append(Channel.read(_stream(data, offset, length)))
+        offset += length
+    return contents

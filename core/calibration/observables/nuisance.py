@@ -49,17 +49,17 @@ class Nuisance:
     def moved(self, step: Array, layout: Layout) -> Nuisance:
         """Return the nuisance after a step (m,) of its unknown values."""
         stations, targets, lengths = list(self.stations), self.targets.copy(), self.lengths.copy()
-        at, frame = 0, list(layout.frame)
+        index, frame = 0, list(layout.frame)
         for s in range(layout.stations):
             if frame:
                 whole = np.zeros(6)
-                whole[frame] = step[at : at + len(frame)]
+                whole[frame] = step[index : index + len(frame)]
                 stations[s] = stations[s].moved(whole)
-                at += len(frame)
+                index += len(frame)
             if layout.length:
-                lengths[s] += step[at]
-                at += 1
+                lengths[s] += step[index]
+                index += 1
         for t in range(layout.first_target, layout.targets):
-            targets[t] += step[at : at + 3]
-            at += 3
+            targets[t] += step[index : index + 3]
+            index += 3
         return Nuisance(tuple(stations), targets, lengths)

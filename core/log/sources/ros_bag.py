@@ -142,27 +142,28 @@ def _topic(
     path: Path, bag: AnyReader, role: str, options: SourceOptions, notes: list[Note]
 ) -> str | None:
     """Return the topic of a role: the requested one, or the only one of its type."""
-    found = sorted({c.topic for c in bag.connections if _type(c.msgtype) in TYPES[role]})
-    asked = options.topics.get(role)
-    if asked is not None:
-        if asked not in found:
-            listed = ", ".join(found) or "none"
+    topics = sorted({c.topic for c in bag.connections if _type(c.msgtype) in TYPES[role]})
+    requested = options.topics.get(role)
+    if requested is not None:
+        if requested not in topics:
+            listed = ", ".join(topics) or "none"
             raise LogOptionError(
-                f"{path}: --topic {role}: found {listed} of type {TYPES[role][0]}, expected {asked}"
+                f"{path}: --topic {role}: found {listed} of type {TYPES[role][0]}, expected "
+                f"{requested}"
             )
-        return asked
-    if role == "wrench" and found and not options.wrench:
-        notes.append(Note(Reason.WRENCH_UNKNOWN, (found, WRENCHES)))
+        return requested
+    if role == "wrench" and topics and not options.wrench:
+        notes.append(Note(Reason.WRENCH_UNKNOWN, (topics, WRENCHES)))
         return None
-    if role == "pose" and found:
-        notes.append(Note(Reason.POSE_UNNAMED, (found,)))
+    if role == "pose" and topics:
+        notes.append(Note(Reason.POSE_UNNAMED, (topics,)))
         return None
-    if len(found) > 1:
+    if len(topics) > 1:
         raise LogOptionError(
-            f"{path}: topics: found {len(found)} of type {TYPES[role][0]} ({', '.join(found)}), "
+            f"{path}: topics: found {len(topics)} of type {TYPES[role][0]} ({', '.join(topics)}), "
             f"expected one; name it with --topic {role}=TOPIC"
         )
-    return found[0] if found else None
+    return topics[0] if topics else None
 
 
 def _type(name: str) -> str:
@@ -173,7 +174,7 @@ def _type(name: str) -> str:
 def _collect(path: Path, bag: AnyReader, topic: str) -> _Samples:
     from rosbags.highlevel import AnyReaderError
 
-    found = _Samples(topic)
+    samples = _Samples(topic)
     connections = [c for c in bag.connections if c.topic == topic]
     read: Callable[[bytes, str], Any] | None = None
     try:
@@ -182,15 +183,15 @@ def _collect(path: Path, bag: AnyReader, topic: str) -> _Samples:
             message: Any = read(data, connection.msgtype)
             stamp = message.header.stamp.sec + message.header.stamp.nanosec * 1e-9
             if stamp == 0:
-                stamp, found.received = received * 1e-9, found.received + 1
-            found.time.append(stamp)
-            found.rows.append(_values(_type(connection.msgtype), message))
-            found.frame = message.header.frame_id
+                stamp, samples.received = received * 1e-9, samples.received + 1
+            samples.time.append(stamp)
+            samples.rows.append(_values(_type(connection.msgtype), message))
+            samples.frame = message.header.frame_id
     except AnyReaderError as error:
         raise LogError(f"{path}: topic {topic}: cannot be read ({error})") from None
-    if not found.rows:
+    if not samples.rows:
         raise LogError(f"{path}: topic {topic}: found no messages, expected some")
-    return found
+    return samples
 
 
 def _reader(path: Path, bag: AnyReader, kind: str, data: bytes) -> Callable[[bytes, str], Any]:
@@ -241,21 +242,21 @@ def _values(kind: str, message: Any) -> dict[str, Any]:
         force, torque = message.wrench.force, message.wrench.torque
         return {"wrench": [force.x, force.y, force.z, torque.x, torque.y, torque.z]}
     pose = getattr(message, "pose", None) or message.transform
-    at = getattr(pose, "position", None) or pose.translation
+    position = getattr(pose, "position", None) or pose.translation
     turn = getattr(pose, "orientation", None) or pose.rotation
     return {
-        "measured_position": [at.x, at.y, at.z],
+        "measured_position": [position.x, position.y, position.z],
         "measured_rotation": [turn.x, turn.y, turn.z, turn.w],
     }
 
 
 def _names(samples: dict[str, _Samples]) -> tuple[str, ...]:
     """Return all joint names in the order in which they first came."""
-    found: dict[str, None] = {}
+    names: dict[str, None] = {}
     for role in ("controller", "joints"):
         for row in samples[role].rows if role in samples else ():
-            found.update(dict.fromkeys(row["names"]))
-    return tuple(found)
+            names.update(dict.fromkeys(row["names"]))
+    return tuple(names)
 
 
 def _streams(
