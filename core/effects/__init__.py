@@ -91,11 +91,11 @@ CATALOGUE: dict[str, Effect] = {
 
 def ties_of(identifier: str) -> dict[str, str]:
     """Return the effects that look the same on some data as this one, and on which data."""
-    found = dict(CATALOGUE[identifier].equivalents)
+    equivalents = dict(CATALOGUE[identifier].equivalents)
     for name, effect in CATALOGUE.items():
         if identifier in effect.equivalents:
-            found[name] = effect.equivalents[identifier]
-    return found
+            equivalents[name] = effect.equivalents[identifier]
+    return equivalents
 
 
 def flexibility_effects() -> dict[str, str]:

@@ -103,7 +103,7 @@ class Observable(ABC):
 
         By central differences; overridden where there is a closed form.
         """
-        found = np.empty((len(readings), self.equations, 6))
+        jacobian = np.empty((len(readings), self.equations, 6))
         for axis in range(3):
             shift = np.zeros(3)
             shift[axis] = STEP
@@ -120,8 +120,8 @@ class Observable(ABC):
             ]
             for k, (one, other) in enumerate(ends):
                 change = self.gap(one, readings, nuisance) - self.gap(other, readings, nuisance)
-                found[:, :, 3 * k + axis] = change / (2 * STEP)
-        return found
+                jacobian[:, :, 3 * k + axis] = change / (2 * STEP)
+        return jacobian
 
     def nuisance_columns(
         self, poses: Poses, readings: Readings, nuisance: Nuisance, layout: Layout | None = None
@@ -178,8 +178,8 @@ class Observable(ABC):
                 f"expected {self.width}"
             )
         layout = self.layout(readings)
-        found, needed = len(readings) * self.equations, layout.size
-        if not len(readings) or found < needed:
+        equations, needed = len(readings) * self.equations, layout.size
+        if not len(readings) or equations < needed:
             raise ExcitationError(
                 f"{self.kind} readings: found {len(readings)}, expected at least "
                 f"{max(-(-needed // self.equations), 1)} to know where the instrument stands"
