@@ -55,6 +55,9 @@ class Failing(Driver):
     def round_trip(self) -> float | None:
         return self.taken
 
+    def transit_time(self) -> float:
+        return self.taken or 0.0  # measured when arming, as a UR's
+
     def connect(self) -> None: ...
 
     def _read_state(self) -> RobotState:
@@ -307,6 +310,8 @@ def test_a_long_way_to_the_controller_is_refused_at_arming(
     bench.driver.taken = taken
     bench.writing.start(bench.state(), Q)
     assert bench.writing.ready == armed
+    # after a refusal it counts no more: states would never be fresh enough to arm again
+    assert bench.writing.transit_time == ((taken or 0.0) if armed else 0.0)
     assert (bench.supervisor.state == State.ARMED) == armed
     if not armed:
         assert bench.changes[-1][1].startswith("link: a question and its answer take 210 ms")
