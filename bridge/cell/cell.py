@@ -11,7 +11,7 @@ from pydantic import ValidationError
 
 from gapbridge.bridge.cell.document import read_document
 from gapbridge.bridge.cell.effects import compliance_terms, term_from_entry
-from gapbridge.bridge.cell.message import error_lines
+from gapbridge.bridge.cell.message import error_lines, located, located_message, message_at
 from gapbridge.bridge.cell.plausibility import check_plausibility
 from gapbridge.bridge.cell.robot import build_arm
 from gapbridge.bridge.cell.schema import CauseEntry, CellFile, Simulation
@@ -25,7 +25,7 @@ from gapbridge.bridge.cell.settings.calibration import CalibrationSettings
 from gapbridge.bridge.cell.settings.web import MetricsSettings, WebSettings
 from gapbridge.core.arm import Arm
 from gapbridge.core.calibration.spread import Spread
-from gapbridge.core.errors import ArmError, CellError, InputError, Keys, key_path
+from gapbridge.core.errors import ArmError, CellError, InputError, Keys
 from gapbridge.core.files import Document
 from gapbridge.core.load_bounds import PAYLOAD_FACTOR
 from gapbridge.core.metrology import Metrology
@@ -217,24 +217,6 @@ def build_cell(file: CellFile, document: Document) -> Cell:
         metrology,
         (*findings.warnings, *(message_at(document, *warning) for warning in warnings)),
     )
-
-
-def located(document: Document, error: InputError) -> InputError:
-    """Return an error about a key of a cell as one that also names its file and line."""
-    return type(error)(located_message(document, error))
-
-
-def located_message(document: Document, error: InputError) -> str:
-    """Return an error's message with file and line; without a key it names its place itself."""
-    if error.keys is None:
-        return str(error)
-    return message_at(document, error.keys, error.message)
-
-
-def message_at(document: Document, keys: Keys, text: str) -> str:
-    """Return a message about a key: its file, its line where the file has its section, its path."""
-    line = f", line {document.line(keys)}" if keys[0] in document.data else ""
-    return f"{document.path}{line}: {key_path(keys)}: {text}"
 
 
 def _check_payload(file: CellFile, arm: Arm) -> list[tuple[Keys, str]]:

@@ -10,7 +10,7 @@ from typing import Any
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
-from gapbridge.core.errors import Keys, key_path
+from gapbridge.core.errors import InputError, Keys, key_path
 from gapbridge.core.files import Document, quoted
 
 _EXPECTED_TEXTS = {
@@ -38,6 +38,24 @@ _EXPECTED_TEXTS = {
     "union_tag_not_found": "a key {discriminator}",
     "enum": "{expected}",
 }
+
+
+def located(document: Document, error: InputError) -> InputError:
+    """Return an error about a key of a cell as one that also names its file and line."""
+    return type(error)(located_message(document, error))
+
+
+def located_message(document: Document, error: InputError) -> str:
+    """Return an error's message with file and line; without a key it names its place itself."""
+    if error.keys is None:
+        return str(error)
+    return message_at(document, error.keys, error.message)
+
+
+def message_at(document: Document, keys: Keys, text: str) -> str:
+    """Return a message about a key: its file, its line where the file has its section, its path."""
+    line = f", line {document.line(keys)}" if keys[0] in document.data else ""
+    return f"{document.path}{line}: {key_path(keys)}: {text}"
 
 
 def error_lines(document: Document, schema: type[BaseModel], error: ValidationError) -> list[str]:

@@ -11,10 +11,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from gapbridge.bridge.cell.message import message_at
 from gapbridge.bridge.cell.schema import CellFile, Payload
 from gapbridge.bridge.cell.settings.calibration import CalibrationSettings, LoadEntry
 from gapbridge.core.arm import Arm, builtin_arm
-from gapbridge.core.errors import key_path
 from gapbridge.core.files import Document
 from gapbridge.core.load_bounds import LEVER, LoadBounds
 from gapbridge.core.model import Model
@@ -54,9 +54,9 @@ def check_plausibility(file: CellFile, document: Document, arm: Arm) -> Findings
     errors: list[str] = []
     warnings: list[str] = []
     for value in implausible_values(file, document, arm):
-        place = f"{document.path}, line {document.line(value.keys)}: {key_path(value.keys)}"
-        inside = f": {value.where}" if value.where else ""
-        line = f"{place}{inside}: found {value.found}, expected {value.expected}"
+        inside = f"{value.where}: " if value.where else ""
+        text = f"{inside}found {value.found}, expected {value.expected}"
+        line = message_at(document, value.keys, text)
         (errors if value.sure else warnings).append(line)
     return Findings(errors, warnings)
 

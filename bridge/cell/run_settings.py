@@ -9,17 +9,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from gapbridge.bridge.cell import Cell, load_cell
-from gapbridge.bridge.cell.cell import located
 from gapbridge.bridge.cell.daemon_settings import DaemonSettings
+from gapbridge.bridge.cell.message import located
 from gapbridge.bridge.cell.runtime_folder import cell_key, runtime_folder
 from gapbridge.bridge.cell.sections import SetpointSettings
-from gapbridge.bridge.served.credentials import check_credentials, read_token
+from gapbridge.bridge.served.credentials import SETPOINT_TOKEN, check_credentials, read_token
 from gapbridge.core.errors import InputError
 from gapbridge.core.files import read_bytes, recorded
 from gapbridge.core.fitted_range import Range
 from gapbridge.core.model import Model
-
-TOKEN = ("setpoints", "token_file")  # keys of the cell file
 
 
 @dataclass(frozen=True)
@@ -70,7 +68,7 @@ def _read_referenced_files(settings: DaemonSettings) -> None:
         with contextlib.suppress(OSError):  # the loop process reports the error
             read_bytes(setpoints.file)
     if setpoints.source == "tcp" and setpoints.token_file is not None:
-        read_token(setpoints.token_file, TOKEN)
+        read_token(setpoints.token_file, SETPOINT_TOKEN)
 
 
 def settings_of(cell: Cell) -> DaemonSettings:
@@ -101,5 +99,5 @@ def _setpoint_settings(cell: Cell) -> SetpointSettings:
     if section.source == "planner" and section.socket is None:
         update["socket"] = runtime_folder() / f"{cell_key(cell.path)}.planner.sock"
     if section.source == "tcp" and section.token_file is not None:
-        read_token(section.token_file, TOKEN)
+        read_token(section.token_file, SETPOINT_TOKEN)
     return section.model_copy(update=update)

@@ -12,6 +12,7 @@ from gapbridge.core.files import is_given, read_bytes
 
 SHORTEST_TOKEN = 32  # characters: too long to be guessed
 LONGEST_TOKEN = 1024
+SETPOINT_TOKEN = ("setpoints", "token_file")  # keys of the cell: a planner's over TCP
 
 
 def check_credentials(settings: ServedSettings, section: str) -> None:

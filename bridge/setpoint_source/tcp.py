@@ -10,12 +10,11 @@ import hmac
 import ipaddress
 import socket
 
-from gapbridge.bridge.served.credentials import read_token
+from gapbridge.bridge.served.credentials import SETPOINT_TOKEN, read_token
 from gapbridge.bridge.setpoint_source.planner import Connection, PlannerSource
 from gapbridge.core.errors import InputError
 from gapbridge.drivers.clock import SYSTEM
 
-TOKEN = ("setpoints", "token_file")  # keys of the cell file
 FIRST_LINE = 2.0  # s within which the token must arrive
 
 
@@ -38,8 +37,8 @@ class TcpSource(PlannerSource):
         """Listen. Raises RunError where the address is taken, InputError without a token."""
         path = self.settings.token_file
         if path is None:
-            raise InputError("found nothing, expected a file with a token", TOKEN)
-        self._token = read_token(path, TOKEN).encode()
+            raise InputError("found nothing, expected a file with a token", SETPOINT_TOKEN)
+        self._token = read_token(path, SETPOINT_TOKEN).encode()
         super().open()
 
     def _listen(self) -> socket.socket:

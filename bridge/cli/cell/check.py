@@ -7,9 +7,10 @@ from pathlib import Path
 import click
 
 from gapbridge.bridge.cell import Cell, load_cell
-from gapbridge.bridge.cell.cell import cell_errors, located_message, message_at
+from gapbridge.bridge.cell.cell import cell_errors
 from gapbridge.bridge.cell.live import live_findings
 from gapbridge.bridge.cell.log_consistency import log_findings
+from gapbridge.bridge.cell.message import located_message, message_at
 from gapbridge.bridge.cell.run_settings import read_configuration
 from gapbridge.bridge.cli.options import FILE, cell_argument
 from gapbridge.bridge.setpoint_source import make_source
