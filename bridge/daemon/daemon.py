@@ -440,6 +440,7 @@ class Daemon:
         """Act on an event, and print it on the terminal."""
         kind, detail = event["kind"], str(event.get("detail", ""))
         self._status.on_event(event)
+        self._reload.on_event(event)
         if kind == EventKind.FAILURE:
             self._failure = event
         if kind == EventKind.REFUSED:

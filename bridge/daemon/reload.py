@@ -1,7 +1,7 @@
 """Reloading a changed cell file while the daemon runs: applied completely, or not at all.
 
 The offset is ramped out, the loop ends, and one with the new cell starts: observing, unless the arm
-was compensating and the new cell has ``setpoints.arm``.
+was compensating, nothing but the reload ended that, and the new cell has ``setpoints.arm``.
 """
 
 from __future__ import annotations
@@ -14,14 +14,17 @@ from typing import NamedTuple
 from gapbridge.bridge.cell.cell import cell_errors
 from gapbridge.bridge.cell.run_settings import Configuration, read_configuration
 from gapbridge.bridge.daemon.service_manager import ServiceManager
-from gapbridge.bridge.ipc.events import EventKind, EventLog
+from gapbridge.bridge.ipc.events import Event, EventKind, EventLog
 from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.ipc.shared_memory import Phase
+from gapbridge.bridge.loop.supervisor import Cause
 from gapbridge.core.errors import GapbridgeError
 from gapbridge.drivers.controller_address import address_of
 
 KEPT_UNTIL_RESTART = ("recording", "web", "metrics")
 """Sections of side processes, which keep running; a change takes effect at the next start."""
+OWN_CAUSES = (Cause.ARM, Cause.WRITING, Cause.DISARM, Cause.RAMPED_OUT)
+"""Transitions of a loop that arms, compensates and ramps out for a reload."""
 
 
 class Swap(NamedTuple):
@@ -40,6 +43,7 @@ class Reload:
         self._requested = threading.Event()
         self._next: Configuration | None = None
         self._rearm = False  # it was compensating, and the new cell arms by itself
+        self._ended = False  # since it was armed last, something else ended the motion
         self.wants_end = False  # the loop is to be stopped: nothing is being written
 
     def ask(self) -> None:
@@ -55,8 +59,19 @@ class Reload:
             return False
         if state in (State.ARMED, State.COMPENSATING):
             return True
+        self._ended |= state in (State.FAULT, State.DISCONNECTED)
         self.wants_end = state != State.HOLDING
         return False
+
+    def on_event(self, event: Event) -> None:
+        """Note a person, a fault or a lost link that ends the motion: it stays ended."""
+        kind = event["kind"]
+        if kind == EventKind.REQUEST:
+            self._ended = event["command"] == "disarm"
+        elif kind == EventKind.TRANSITION:
+            self._ended |= event["cause"] not in OWN_CAUSES
+        elif kind in (EventKind.FAULT, EventKind.FAILURE, EventKind.SLIP):
+            self._ended = True
 
     def swap(self) -> Swap:
         """Return what the next loop starts with, also if the last one died meanwhile.
@@ -64,7 +79,7 @@ class Reload:
         The service manager is notified at the new loop's first cycle.
         """
         following, ended = self._next, self.wants_end
-        rearm = self._rearm and ended
+        rearm = self._rearm and ended and not self._ended
         self._next, self._rearm, self.wants_end = None, False, False
         if following is None:
             return Swap(None, rearms=False, in_order=False)

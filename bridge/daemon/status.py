@@ -43,9 +43,9 @@ class DaemonStatus:
         self._down = False  # the loop has ended and no other is connected
         self.armed_by = ""
         self._asked_by = ""  # of the last request to arm
-        self.latched = ""  # the fault that is not acknowledged yet
-        self._clears_with_link = False  # the fault ends with the link
-        self._slipped = False  # the fault is a joint's zero that moved
+        self._fault = ""  # of the loop, not acknowledged yet
+        self._clears_with_link = False  # that fault ends with the link
+        self._slip = ""  # a joint's zero that moved, not acknowledged yet: kept beside any fault
         self._batches: deque[tuple[float, int]] = deque()  # s, cycles
         self._last_state: float | None = None  # s, monotonic: when the last state was received
         self._received = slices["received"].start
@@ -54,6 +54,11 @@ class DaemonStatus:
         self._correction = (0, 0.0)  # flags and residual, m, of the last cycle
         self.configured: Event = {}  # the last attempt to reload
         self._compiling = ""  # what the loop's process compiles before its first cycle
+
+    @property
+    def latched(self) -> str:
+        """Return what is not acknowledged yet, a slip or a fault; empty: nothing."""
+        return self._slip or self._fault
 
     def take(self, rows: Array) -> None:
         """Update from cycles: rows (k, width)."""
@@ -72,9 +77,9 @@ class DaemonStatus:
         if event["kind"] == EventKind.REQUEST and event["command"] == "arm":
             self._asked_by = event["by"]
         if event["kind"] == EventKind.SLIP:
-            self.latched, self._clears_with_link, self._slipped = event["detail"], False, True
-        if event["kind"] == EventKind.REQUEST and event["acknowledges"] and self._slipped:
-            self.latched, self._slipped = "", False
+            self._slip = event["detail"]
+        if event["kind"] == EventKind.REQUEST and event["acknowledges"]:
+            self._slip = ""
         if event["kind"] == EventKind.COMPILING:
             self._compiling = event["detail"]
         if event["kind"] == EventKind.GRANTED:  # compiled, and about to connect
@@ -91,9 +96,9 @@ class DaemonStatus:
         self._why = f"{cause}: {detail}" if detail else cause
         if to == State.FAULT.name:
             if cause != Cause.LATCHED:  # else the fault is known
-                self.latched, self._clears_with_link = self._why, cause in CLEARED_BY_RECONNECTING
+                self._fault, self._clears_with_link = self._why, cause in CLEARED_BY_RECONNECTING
         elif event["from"] == State.FAULT.name and to == State.OBSERVING.name:
-            self.latched = ""
+            self._fault = ""
         if to == State.DISCONNECTED.name:
             self.lost_loop()
         if to == State.ARMED.name:
@@ -110,7 +115,7 @@ class DaemonStatus:
         """Record that link and loop have ended: faults of the link end with them."""
         self._compiling = ""
         if self._clears_with_link:
-            self.latched, self._clears_with_link = "", False
+            self._fault, self._clears_with_link = "", False
         self.armed_by = ""
 
     def history(self) -> dict[str, Any]:

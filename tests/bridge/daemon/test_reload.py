@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,9 +11,90 @@ import pytest
 from daemon_cell import Robot, Run, offsets
 from patience import wait_for
 
+from gapbridge.bridge.cell.run_settings import read_configuration
+from gapbridge.bridge.daemon.reload import Reload
+from gapbridge.bridge.daemon.service_manager import ServiceManager
+from gapbridge.bridge.ipc.events import EventKind, EventLog
 from gapbridge.bridge.ipc.loop_state import State
+from gapbridge.bridge.ipc.shared_memory import Phase
+from gapbridge.bridge.loop.supervisor import Cause
 
 pytestmark = pytest.mark.usefixtures("runtime")
+
+CELL = """robot: {model: ur10e}
+link: {driver: ur_rtde, host: 192.0.2.7}
+setpoints: {arm: true}
+"""
+
+
+class Taking:
+    """A reload of a cell that arms by itself, asked for while the arm compensates."""
+
+    def __init__(self, folder: Path) -> None:
+        cell = folder / "cell.yaml"
+        cell.write_text(CELL)
+        self.running = read_configuration(cell)
+        self.reload = Reload(ServiceManager(), EventLog())
+        self.request("arm")
+        self.reload.ask()
+
+    def step(self, state: State) -> bool:
+        return self.reload.step(state, Phase.RUNNING, self.running)
+
+    def request(self, command: str) -> None:
+        self.reload.on_event({"kind": EventKind.REQUEST, "command": command})
+
+    def transition(self, cause: Cause) -> None:
+        self.reload.on_event({"kind": EventKind.TRANSITION, "cause": cause})
+
+
+def test_a_reload_arms_again_what_it_has_ramped_out(tmp_path: Path) -> None:
+    taking = Taking(tmp_path)
+    assert taking.step(State.COMPENSATING)
+    taking.transition(Cause.DISARM)
+    assert not taking.step(State.HOLDING)
+    taking.transition(Cause.RAMPED_OUT)
+    assert not taking.step(State.OBSERVING)
+    assert taking.reload.wants_end
+    swap = taking.reload.swap()
+    assert (swap.rearms, swap.in_order) == (True, True)
+
+
+@pytest.mark.parametrize("cause", [Cause.LINK_LOST, Cause.WRITE_FAILED, Cause.FOREIGN])
+def test_a_reload_does_not_arm_what_a_fault_has_ended(cause: Cause, tmp_path: Path) -> None:
+    taking = Taking(tmp_path)
+    assert taking.step(State.COMPENSATING)
+    taking.transition(Cause.DISARM)
+    taking.step(State.HOLDING)
+    taking.transition(cause)
+    taking.step(State.DISCONNECTED if cause == Cause.LINK_LOST else State.OBSERVING)
+    assert not taking.reload.swap().rearms
+
+
+@pytest.mark.parametrize("state", [State.DISCONNECTED, State.FAULT])
+def test_a_reload_does_not_arm_what_has_died_without_a_word(state: State, tmp_path: Path) -> None:
+    taking = Taking(tmp_path)
+    taking.step(State.COMPENSATING)
+    taking.step(state)
+    assert taking.reload.wants_end
+    assert not taking.reload.swap().rearms
+
+
+@pytest.mark.parametrize("early", [False, True])
+def test_a_person_who_disarms_while_a_reload_ramps_out_is_obeyed(
+    early: bool, tmp_path: Path
+) -> None:
+    taking = Taking(tmp_path)
+    if early:  # the loop has not taken it yet
+        taking.request("disarm")
+    taking.step(State.COMPENSATING)
+    if not early:
+        taking.request("disarm")
+    taking.transition(Cause.DISARM)
+    taking.transition(Cause.RAMPED_OUT)
+    taking.step(State.OBSERVING)
+    assert not taking.reload.swap().rearms
+
 
 PATIENT = ", state_timeout: 0.25"
 

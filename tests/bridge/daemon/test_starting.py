@@ -1,4 +1,4 @@
-"""Before its first cycle a loop may compile: a state of its own, which ends with that."""
+"""The present status: compiling before the first cycle, and what stays latched."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from gapbridge.bridge.daemon.status import DaemonStatus
 from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.ipc.shared_memory import slices_of
 from gapbridge.bridge.loop.main import _report_compiling
+from gapbridge.bridge.loop.supervisor import Cause
 
 
 def test_compiling_is_a_state_until_the_loop_connects() -> None:
@@ -31,3 +32,19 @@ def test_a_loop_that_dies_while_compiling_is_starting_no_more() -> None:
     status.on_event({"kind": "compiling", "detail": "starting: x"})
     status.lost_loop()
     assert status.named(State.DISCONNECTED) == "disconnected"
+
+
+def transition(before: State, after: State, cause: Cause) -> dict[str, object]:
+    names = {"from": before.name, "to": after.name}
+    return {"kind": "transition", "time": 0.0, "cause": cause, "detail": "", **names}
+
+
+def test_a_slip_stays_latched_through_a_fault_that_ends_with_the_link() -> None:
+    status = DaemonStatus(slices_of(6))
+    status.on_event({"kind": "slip", "detail": "joint 3 slipped"})
+    status.on_event(transition(State.COMPENSATING, State.HOLDING, Cause.ZERO_MOVED))
+    status.on_event(transition(State.HOLDING, State.FAULT, Cause.WRITE_FAILED))
+    status.on_event(transition(State.FAULT, State.DISCONNECTED, Cause.LINK_LOST))
+    assert status.latched == "joint 3 slipped"
+    status.on_event({"kind": "request", "command": "disarm", "acknowledges": True, "by": "x"})
+    assert status.latched == ""
