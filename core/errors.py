@@ -125,6 +125,10 @@ class PartialWriteError(WriteError):
     """Only a part of a setpoint was sent, the link is up: the next one may be sent, whole."""
 
 
+class RobotBusyError(WriteError):
+    """The robot is still on its way to the last target: nothing of this setpoint was sent."""
+
+
 class IneffectiveWriteError(WriteError):
     """Setpoints were sent without effect, though the link is up."""
 

@@ -23,7 +23,7 @@ SLACK = 1.0 - 1e-12  # keeps rounding on the allowed side
 
 ENVELOPE, RATE, JOINT_OFFSET, JOINT_LIMIT, VELOCITY = range(5)
 CLAMPS = ("envelope", "rate", "joint_offset", "joint_limit", "velocity")
-_OK, _NOT_FINITE, _GAP_NOT_POSITIVE, _OUTSIDE_LIMITS, _JUMP, _TOO_FAR = range(6)
+_OK, _NOT_FINITE, _GAP_NOT_POSITIVE, _OUTSIDE_LIMITS, _JUMP, _TOO_FAR, _LAGS = range(7)
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,8 @@ class Limits:
     joint_offset: correction of any one joint, rad.
     lower, upper: joint limits (n,), rad.
     velocity: of each joint's command (n,), rad/s.
-    following: farthest a command may be from the actual joint, rad.
+    following: farthest a command may be from the actual joint, and the nominal setpoint from the
+    nominal joints reached, rad.
     cycle: duration of one cycle, s.
     """
 
@@ -92,8 +93,8 @@ class Limiter:
                    MAX_GAP_CYCLES * limits.cycle]  # fmt: skip
         bounds = (limits.lower, limits.upper, limits.velocity)
         # one block, to pass a single array to compiled code
-        self._block = np.concatenate([numbers, *bounds, np.zeros(3 * n + 6)])
-        self._q, self._nominal, self._delta, self._offset = _state_views(self._block)
+        self._block = np.concatenate([numbers, *bounds, np.zeros(4 * n + 6)])
+        self._q, self._nominal, self._reached, self._delta, self._offset = _state_views(self._block)
         self._out = _read_only(self._q), _read_only(self._offset)
         self._q[:] = self._nominal[:] = np.nan
 
@@ -128,8 +129,25 @@ class Limiter:
             raise LimitError(f"start: found an offset of {delta}, expected finite joints")
         self._q[:] = q
         self._delta[:] = 0.0 if delta is None else delta
-        self._nominal[:] = q - self._delta
+        self._nominal[:] = self._reached[:] = q - self._delta
         self._offset[:] = 0.0 if offset_in_base is None else offset_in_base
+
+    def settle(self) -> None:
+        """Take the nominal joints that the command has reached as the last nominal setpoint.
+
+        A command that lags behind its setpoints brakes from where it is.
+        """
+        self._nominal[:] = self._reached
+
+    @property
+    def reached(self) -> Array:
+        """Return the nominal joints that the command has reached (n,), rad: a read-only view."""
+        return _read_only(self._reached)
+
+    @property
+    def lag(self) -> float:
+        """Return how far the last command is from its goal, rad: the velocity limited it."""
+        return float(np.abs(self._nominal + self._delta - self._q).max())
 
     def reset(self) -> None:
         """End the stream; ``limit`` refuses until ``start``."""
@@ -151,7 +169,7 @@ class Limiter:
         zero. A command limited by the velocity continues towards its target in the next cycle.
         Raises LimitError, without any change of state, where a number is not finite, the nominal
         setpoint is outside the joint limits or has jumped, or the command would be too far from the
-        actual joints.
+        actual joints or from its goal.
         """
         code, clamped = _limit(
             self._block, nominal_q, corrected_q, offset_in_base, ramp, actual_q, dt
@@ -180,6 +198,12 @@ class Limiter:
                 f"{nominal_q[joint] - self._nominal[joint]:+.4f} rad in {dt:.4f} s, more than its "
                 f"velocity limit of {self.limits.velocity[joint]:.3g} rad/s allows"
             )
+        if code == _LAGS:
+            return (
+                f"setpoint: joint {joint + 1} would be more than {self.limits.following:g} rad "
+                "behind its nominal setpoint (limits.following): the setpoints are faster than its "
+                f"velocity limit of {self.limits.velocity[joint]:.3g} rad/s"
+            )
         if code == _TOO_FAR:
             behind = abs(self._q[joint] - actual_q[joint])
             return (
@@ -199,13 +223,16 @@ def _read_only(array: Array) -> Array:
     return view
 
 
-def _state_views(block: Array) -> tuple[Array, Array, Array, Array]:
-    """Return the last command, its nominal joints, joint offset (n,) and TCP offset (6,): views."""
-    n = (block.shape[0] - SCALARS - 6) // 6
+def _state_views(block: Array) -> tuple[Array, Array, Array, Array, Array]:
+    """Return views of the last command, nominal setpoint, nominal joints reached, offsets.
+
+    All (n,); the offsets are the joint offset (n,) and the TCP offset (6,).
+    """
+    n = (block.shape[0] - SCALARS - 6) // 7
     at = SCALARS + 3 * n
     return (
         block[at : at + n], block[at + n : at + 2 * n], block[at + 2 * n : at + 3 * n],
-        block[at + 3 * n :],
+        block[at + 3 * n : at + 4 * n], block[at + 4 * n :],
     )  # fmt: skip
 
 
@@ -274,9 +301,9 @@ def _correction_factor(numbers, bounds, nominal, corrected, offset, ramp):  # ty
 def _limit(block, nominal, corrected, offset, ramp, actual, dt):  # type: ignore[no-untyped-def]
     """Advance the state in the block by one setpoint; returns (reason, clamped bits).
 
-    With _TOO_FAR the second is the joint.
+    With _TOO_FAR and _LAGS the second is the joint.
     """
-    q, before, delta, applied = _compiled_views(block)
+    q, before, reached, delta, applied = _compiled_views(block)
     n = q.shape[0]
     numbers, bounds = block[:SCALARS], block[SCALARS : SCALARS + 3 * n].reshape((3, n))
     if not _finite(q, nominal, corrected, actual, offset, ramp, dt):
@@ -297,12 +324,24 @@ def _limit(block, nominal, corrected, offset, ramp, actual, dt):  # type: ignore
     if rate_factor < 1.0:
         clamped |= 1 << RATE
 
-    # velocity limits of the joint command
+    # velocity limits of the joint command: of its nominal part, then with the offset
+    pace = 1.0
+    for i in range(n):
+        distance = abs(nominal[i] - reached[i])
+        if distance > bounds[2, i] * gap:
+            pace = min(pace, bounds[2, i] * gap / distance * SLACK)
+            clamped |= 1 << VELOCITY
+    arrives = np.empty(n)
+    for i in range(n):
+        way = nominal[i] - reached[i]
+        arrives[i] = nominal[i] if pace == 1.0 else reached[i] + pace * way
+        if abs(nominal[i] - arrives[i]) > numbers[5]:
+            return _LAGS, i
     goal, speed_factor = np.empty(n), 1.0
     for i in range(n):
         joint_offset = delta[i] + rate_factor * (factor * (corrected[i] - nominal[i]) - delta[i])
-        goal[i] = min(max(nominal[i] + joint_offset, bounds[0, i]), bounds[1, i])
-        if goal[i] != nominal[i] + joint_offset:
+        goal[i] = min(max(arrives[i] + joint_offset, bounds[0, i]), bounds[1, i])
+        if goal[i] != arrives[i] + joint_offset:
             clamped |= 1 << JOINT_LIMIT
         distance = abs(goal[i] - q[i])
         if distance > bounds[2, i] * gap:
@@ -314,7 +353,7 @@ def _limit(block, nominal, corrected, offset, ramp, actual, dt):  # type: ignore
     for i in range(n):
         q[i] = goal[i] if speed_factor == 1.0 else q[i] + speed_factor * (goal[i] - q[i])
         delta[i] += rate_factor * (factor * (corrected[i] - nominal[i]) - delta[i])
-        before[i] = nominal[i]
+        before[i], reached[i] = nominal[i], arrives[i]
     for k in range(6):
         applied[k] += rate_factor * step[k]
     return _OK, clamped

@@ -13,7 +13,7 @@ from abc import ABC, abstractmethod
 from typing import Any, Self, final
 
 from gapbridge.core.arrays import Array
-from gapbridge.core.errors import WriteError
+from gapbridge.core.errors import RobotBusyError, WriteError
 from gapbridge.core.model import Model
 from gapbridge.core.state import RobotState, Setpoint
 from gapbridge.drivers.clock import SYSTEM, Clock
@@ -21,7 +21,7 @@ from gapbridge.drivers.controller_facts import ControllerFacts, Difference, diff
 from gapbridge.drivers.gate import Gate
 from gapbridge.drivers.state_check import FASTEST, SampleCheck
 
-GATED = ("read_state", "write_setpoint", "arm", "release")  # not to be overridden
+GATED = ("read_state", "write_setpoint", "arm", "release", "abandon")  # not to be overridden
 
 
 class Driver(ABC):
@@ -92,15 +92,20 @@ class Driver(ABC):
     def write_setpoint(self, setpoint: Setpoint) -> None:
         """Send one setpoint from the limiter; needs ``arm`` before.
 
-        Raises WriteError; GateError if the gate refuses it, and then nothing was sent.
+        Raises WriteError; GateError if the gate refuses it, and RobotBusyError from a robot that
+        moves from target to target and is still on its way: then nothing was sent.
         """
         self.gate.check(setpoint)
-        self._send(setpoint)
+        try:
+            self._send(setpoint)
+        except RobotBusyError:
+            self.gate.sent()  # the stream goes on: steps are judged between its setpoints
+            raise
         self.gate.sent()
 
     @abstractmethod
     def _send(self, setpoint: Setpoint) -> None:
-        """Send one setpoint that has passed the gate. Raises WriteError."""
+        """Send one setpoint that has passed the gate. Raises WriteError, RobotBusyError."""
 
     @abstractmethod
     def close(self) -> None:
@@ -157,6 +162,19 @@ class Driver(ABC):
 
     def _release(self) -> None:
         """Implement ``release``; see there."""
+
+    @final
+    def abandon(self) -> None:
+        """Stop writing in a fault: as ``release``, but no setpoint is sent any more.
+
+        Raises WriteError if the link is lost.
+        """
+        self.gate.end()
+        self._abandon()
+
+    def _abandon(self) -> None:
+        """Implement ``abandon``; a driver whose release sends setpoints has one of its own."""
+        self._release()
 
     def round_trip(self) -> float | None:
         """Return the round-trip time of a request now, s; None if the link has no requests.

@@ -215,7 +215,7 @@ def _source(run: Run) -> Source:
     )
     if isinstance(source, PlannedSource):
         assert run.planner is not None
-        source.listen(run.planner, run.clock)
+        source.attach(run.planner, run.clock)
     return source
 
 
@@ -247,7 +247,7 @@ class Planner:
 class PlannedSource(Source):
     """What a planner sends, by the product's own interpolator; its socket is not simulated."""
 
-    def listen(self, planner: Planner, clock: SimulatedClock) -> None:
+    def attach(self, planner: Planner, clock: SimulatedClock) -> None:
         """Take what the planner sends from now on."""
         self._interpolator = SetpointInterpolator(self.settings.timeout, "line", clock)
         planner.take = self._take
@@ -257,6 +257,10 @@ class PlannedSource(Source):
             return  # a line that is no setpoint never comes so far
         self._interpolator.take(q)
         self._interpolator.restart()
+
+    def discard(self) -> None:
+        """See Source.discard."""
+        self._interpolator.forget()
 
     def first(self, robot_q: Vector) -> Vector | None:
         """See Source.first."""

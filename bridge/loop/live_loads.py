@@ -64,7 +64,7 @@ class LiveLoads:
         problem = None
         if state.payload is not None and state.payload_cog is not None:
             problem = self._bounds.payload_problem(state.payload, state.payload_cog)
-        if problem is None and self._use_force and not state.sensor_lost:
+        if problem is None and self._use_force and not _has_no_force(state):
             problem = self._bounds.wrench_problem(state.actual_TCP_force)
         return problem
 
@@ -84,7 +84,7 @@ class LiveLoads:
 
         A lost sensor counts as zero force; the limiter makes the transition smooth.
         """
-        if state.sensor_lost and not np.isfinite(state.actual_TCP_force).all():
+        if _has_no_force(state):
             self._wrench[0], self._last = 0.0, -math.inf
             return
         gap = state.timestamp - self._last
@@ -105,3 +105,8 @@ class LiveLoads:
         if moved.any():
             self._approach[0, moved] = np.sign(step[moved])
             before[moved] = q[moved]
+
+
+def _has_no_force(state: RobotState) -> bool:
+    """Return whether the lost sensor was the only source of the TCP force."""
+    return bool(state.sensor_lost) and not np.isfinite(state.actual_TCP_force).all()

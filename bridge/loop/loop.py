@@ -212,7 +212,11 @@ class Loop:
             self._supervisor.take(Cause.DISARM)
 
     def _restart_checks(self) -> None:
-        """Restart clock, checks and link monitor after a time without reading states."""
+        """Restart clock, checks and link monitor after a time without reading states.
+
+        What the source received meanwhile is of unknown age.
+        """
+        self._source.discard()
         self._clock.skip()
         self._checks.reset()
         self._watch.reset()
@@ -272,8 +276,8 @@ class Loop:
             is_fresh = False  # how long it was queued only the next shows: clocks drift meanwhile
         self._acknowledge()
         supervisor, writing = self._supervisor, self._writing
-        if supervisor.state == State.FAULT:
-            writing.abandon()
+        if writing.ready and not (supervisor.state.writes or supervisor.state == State.ARMED):
+            self._release()  # a fault, or disarmed before the first setpoint
         loads = self._last_loads = self._loads.update(state)
         self._checks.check_loads(self._loads.problem)
         self._checks.check_settings(state, self._driver)
@@ -285,6 +289,8 @@ class Loop:
                 self._record(CycleInput(state, missed, nominal_q, loads, flags), None, since=start)
                 return
         holding = supervisor.state == State.HOLDING
+        if supervisor.state not in (State.ARMED, State.COMPENSATING):
+            self._source.listen()
         writes = supervisor.state.writes
         written = None
         if writes:
@@ -295,7 +301,7 @@ class Loop:
         setpoint = writing.unsent if writes and written is None else written
         cycle_input = CycleInput(state, missed, nominal_q, loads, flags)
         self._record(cycle_input, setpoint, writes, written is not None)
-        clamped = 0 if written is None else self._stream.clamped
+        clamped = 0 if setpoint is None else self._stream.clamped
         commanded = nominal_q if written is None else written.q
         self._checks.end(state, commanded, clamped, self._now() - state.received)
         if written is not None and holding and writing.at_rest(written, state):

@@ -26,6 +26,7 @@ DECELERATION = 8.0  # rad/s^2 of the fastest joint
 SMOOTHING = 0.02  # s: over which the velocity is averaged
 POSITION, RATE, LIMIT = range(3)  # rows of NominalStream's array
 PEAK_SLOPE = 1.5  # of a smooth step, in units of its mean slope
+ARRIVED = 1e-9  # rad from the goal at which a command has reached it
 LEAD_IN_SHARE = 0.5  # of the offset's rate limit for the lead-in: the offset changes meanwhile
 SOLVED = 1e-5  # m: corrections with a larger residual are not used
 DEFAULT_VELOCITY = np.pi  # rad/s: of joints whose limit is not known
@@ -80,7 +81,7 @@ def _track(motion, q, gap):  # type: ignore[no-untyped-def]
 
 
 class NominalStream:
-    """Tracks position and velocity of the nominal setpoint, so that it can brake smoothly.
+    """Tracks position and velocity of the nominal joints reached, so that it can brake smoothly.
 
     If a source runs dry in the middle of a motion, the joints brake along their path, the fastest
     with DECELERATION.
@@ -100,7 +101,7 @@ class NominalStream:
         self._rate[:] = 0.0
 
     def follow(self, q: Array, gap: float) -> None:
-        """Track the source's setpoint (n,) rad, ``gap`` s after the last one."""
+        """Track nominal joints (n,) rad, ``gap`` s after the last ones."""
         _track(self._motion, q, gap)
 
     def brake(self, gap: float) -> Array:
@@ -214,6 +215,8 @@ class SetpointStream:
         stream = self._nominal
         if source_q is not None:
             source_q = self._without_start_gap(source_q, usable)
+        if source_q is None:
+            self.limiter.settle()
         nominal = stream.brake(usable) if source_q is None else source_q
         correction = self.correct(nominal, loads)
         corrected, offset, n = correction.q, correction.offset_in_base, len(nominal)
@@ -227,7 +230,7 @@ class SetpointStream:
             raise StaleStateError("the state was too old before its setpoint could leave")
         limited = self.limiter.limit(nominal, corrected, offset, ramp, state.actual_q, gap)
         if source_q is not None:
-            stream.follow(source_q, gap)
+            stream.follow(self.limiter.reached, gap)
             self._since_start += usable
         self._ramp, self._resumes = ramp, False
         self._last, self.clamped = state.timestamp, limited.clamped
@@ -291,7 +294,12 @@ class SetpointStream:
     @property
     def at_rest(self) -> bool:
         """Return whether no offset is left and the motion has come to rest."""
-        return self.has_no_offset and self._nominal.at_rest
+        return self.has_no_offset and self._nominal.at_rest and self.arrived
+
+    @property
+    def arrived(self) -> bool:
+        """Return whether the command has reached its goal, which the velocity may delay."""
+        return self.limiter.lag < ARRIVED
 
     def shorten_ramp(self, ramp_time: float) -> None:
         """Ramp within ``ramp_time`` s from now on, if it would take longer."""

@@ -22,6 +22,7 @@ from gapbridge.core.errors import (
     IneffectiveWriteError,
     LimitError,
     PartialWriteError,
+    RobotBusyError,
     StaleStateError,
     WriteError,
 )
@@ -51,6 +52,7 @@ class Writing:
         self._stream, self._supervisor, self._reports = stream, supervisor, reports
         self._in_force = in_force or OffsetInForce(driver.n, None)
         self.ready = False  # the driver is armed
+        self._ready_since = 0.0  # s, monotonic
         self.has_armed = False  # the driver has been armed in this process
         self.unsent: Setpoint | None = None  # computed in the last cycle, not (completely) sent
         self.ramps_out = False  # the last setpoint's offset was ramping out
@@ -69,10 +71,6 @@ class Writing:
         """Return the bound of the last sample's transit time, s; see Driver.transit_time."""
         return self._driver.transit_time() if self.ready else 0.0
 
-    def abandon(self) -> None:
-        """Record that the driver is not armed any more: the robot has stopped by itself."""
-        self.ready = False
-
     def start(self, state: RobotState, nominal_q: Array) -> bool:
         """Start writing once the source has a first setpoint and the driver is ready.
 
@@ -81,7 +79,7 @@ class Writing:
         first = self._source.first(nominal_q)
         if first is None:
             if self.ready:
-                self._refuse_start("the source fell silent before the first setpoint")
+                self._await_first()
             return False
         away = np.abs(first - nominal_q)
         tolerance = self._settings.start_tolerance
@@ -108,6 +106,16 @@ class Writing:
         self._supervisor.take(Cause.WRITING)
         return False
 
+    def _await_first(self) -> None:
+        """Keep the driver armed until the source's timeout: what came before is not taken."""
+        if self._now() - self._ready_since > self._settings.timeout:
+            self._refuse_start("the source fell silent before the first setpoint")
+            return
+        try:
+            self._driver.keep_alive()
+        except WriteError as error:
+            self._refuse_start(str(error))
+
     def _arm_driver(self, state: RobotState) -> None:
         """Arm the driver; a fresh state is needed afterwards. Raises WriteError."""
         self._reports.memory.enter(Phase.ARMING)
@@ -117,7 +125,7 @@ class Writing:
             for warning in self._driver.arm(state):
                 detail = str(warning)
                 self._reports.emit({"kind": EventKind.WARNING, "what": "cell", "detail": detail})
-            self.ready = True
+            self.ready, self._ready_since = True, self._now()
         finally:
             self._reports.memory.enter(Phase.RUNNING)
             self._paused = True
@@ -182,6 +190,8 @@ class Writing:
                 self._check_solved()
                 self._check_late(expiry)
                 return setpoint
+        except RobotBusyError:  # neither sent nor in force; the newest one leaves when it is free
+            self.unsent = _copied(setpoint)
         except WriteError as error:
             self.unsent = _copied(setpoint)
             self._on_write_error(error)
@@ -259,21 +269,24 @@ class Writing:
             self._reports.count(LoopCounter.SOURCE_DRY)
             self._supervisor.take(Cause.SOURCE_DRY, str(error))
             return None if self._driver.moves_arm else nominal_q
-        if self._source.ended and not self._reports.memory.ended:
+        if self._source.ended and self._stream.arrived and not self._reports.memory.ended:
             self._reports.memory.note_ended()
             detail = "the source has come to its end; the arm stays there"
             self._reports.emit({"kind": EventKind.SOURCE, "what": "ended", "detail": detail})
         return source_q
 
     def release(self) -> None:
-        """Release the driver; the arm is at rest, or the robot's watchdog stops it."""
+        """Release the driver; the arm is at rest, or has stopped because of a fault."""
         self._stream.end()
         if not self.ready:
             return
         self.ready = False
         self._reports.memory.enter(Phase.ARMING)
         try:
-            self._driver.release()
+            if self._supervisor.state == State.FAULT:
+                self._driver.abandon()
+            else:
+                self._driver.release()
         except WriteError as error:
             self._reports.emit({"kind": EventKind.LINK, "what": "release", "detail": str(error)})
         self._reports.memory.enter(Phase.RUNNING)

@@ -43,6 +43,10 @@ class SetpointInterpolator:
             return None
         return self._newest
 
+    def forget(self) -> None:
+        """Wait for a new setpoint, as if none had come."""
+        self._newest = None
+
     def begin(self, robot_q: Array) -> None:
         """Start at the arm's joints ``robot_q`` (n,) rad."""
         self._present = robot_q.copy()
@@ -79,6 +83,15 @@ class InterpolatedSource(Source):
     @abstractmethod
     def _receive(self) -> bool:
         """Read what has arrived; returns whether there is a new setpoint."""
+
+    def listen(self) -> None:
+        """Read what has arrived; see Source.listen."""
+        self._receive()
+
+    def discard(self) -> None:
+        """Drop what has arrived; see Source.discard."""
+        self._receive()
+        self._interpolator.forget()
 
     def first(self, robot_q: Array) -> Array | None:
         """Return the newest setpoint (n,) rad, None if it is older than the timeout."""

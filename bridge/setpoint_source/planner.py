@@ -4,9 +4,10 @@ A line is JSON, ``{"q": [..n..]}``, or n comma-separated numbers, rad. The newes
 planner is slower than the loop, joints are interpolated over the time between two lines.
 
 Writing here moves the arm, so there is no second attempt: a line that is not a setpoint, or more
-lines than the robot has cycles, is answered with ``error: ...`` and ends the connection. From its
-first valid line on a connection is the only source, until it closes, or until it has been silent
-for the timeout and another planner sends a valid line.
+lines than the robot has cycles, is answered with ``error: ...`` and ends the connection. What
+arrives while the loop is busy arming is dropped unread. From its first valid line on a connection
+is the only source, until it closes, or until it has been silent for the timeout and another planner
+sends a valid line.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ import os
 import socket
 import stat
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 
@@ -31,6 +33,7 @@ LONGEST_LINE = 4096  # bytes
 MOST_BYTES = 16384  # read in one cycle
 MOST_LINES = 8  # read in one cycle; the rest is read in the next ones
 MOST_WAITING = 4  # connections without a valid line yet
+MOST_SKIPPED = 1 << 20  # bytes dropped at once, more than a socket stores
 SPAN = 2.0  # s over which lines are counted against the robot's cycles
 
 
@@ -74,6 +77,19 @@ class Connection:
             return []
         return lines
 
+    def skip(self) -> None:
+        """Drop the complete lines that have arrived, except the token; they are not counted."""
+        for _ in range(MOST_SKIPPED // MOST_BYTES):
+            before = len(self._buffer)
+            self._read()
+            if self.closed or len(self._buffer) == before:
+                break
+        *lines, remainder = self._buffer.split(b"\n")
+        kept = [] if self.admitted else lines[:1]
+        self._buffer = b"\n".join([*kept, remainder])
+        self._credit = SPAN * self._rate
+        self._credit_time = self.opened = self._now()
+
     def _read(self) -> None:
         try:
             data = self._link.recv(MOST_BYTES)
@@ -105,6 +121,7 @@ class PlannerSource(InterpolatedSource):
     """
 
     expected = "line"
+    needs_token: ClassVar[bool] = False
 
     def __init__(
         self, settings: SetpointSettings, n: int, moves_arm: bool, folder: Path, rate: float
@@ -157,7 +174,6 @@ class PlannerSource(InterpolatedSource):
 
     def _admit(self, connection: Connection, line: bytes) -> bool:
         """Admit a connection by its first line; returns whether the line was a token."""
-        connection.admit()
         return False
 
     def close(self) -> None:
@@ -187,6 +203,15 @@ class PlannerSource(InterpolatedSource):
         self._waiting = [c for c in self._waiting if not c.closed and c is not self._planner]
         return new
 
+    def discard(self) -> None:
+        """Drop the lines of all connections; see Source.discard."""
+        for _ in range(MOST_WAITING):
+            self._accept()
+        for connection in (self._planner, *self._waiting):
+            if connection is not None:
+                connection.skip()
+        self._interpolator.forget()
+
     @property
     def _is_held(self) -> bool:
         """Return whether a planner is active, which another one must not replace."""
@@ -203,6 +228,8 @@ class PlannerSource(InterpolatedSource):
         except OSError:
             return
         connection = Connection(link, self.rate)
+        if not self.needs_token:
+            connection.admit()
         if not self._may_connect(link):
             self._end(connection, "another user's process, expected one of the daemon's own user")
         elif self._is_held:

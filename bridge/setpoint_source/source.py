@@ -42,6 +42,15 @@ class Source(ABC):
     def open(self) -> None:
         """Open what the source listens on. Raises RunError."""
 
+    def listen(self) -> None:
+        """Read what has arrived; called in each cycle in which no setpoint is asked for.
+
+        So that what has arrived is never older than a cycle. Never blocks.
+        """
+
+    def discard(self) -> None:
+        """Drop what has arrived: the loop was not reading, so that nobody knows how old it is."""
+
     @abstractmethod
     def first(self, robot_q: Array) -> Array | None:
         """Return the first setpoint (n,), rad; None if there is none yet.

@@ -21,6 +21,7 @@ FIRST_LINE = 2.0  # s within which the token must arrive
 class TcpSource(PlannerSource):
     """Listens for one planner at a time; refuses connections without the token."""
 
+    needs_token = True
     _token = b""
 
     @property

@@ -287,6 +287,12 @@ class CanDriver(Driver):
             self.writer.reset()
             self._reset_reading()
 
+    def _abandon(self) -> None:
+        """Send nothing: a hold would be a setpoint for an arm that has stopped."""
+        self._armed_at = None
+        self.writer.reset()
+        self._reset_reading()
+
     def _run_release(self, hold: object) -> None:
         assert callable(hold)
         self.writer.run(self.profile.release, hold, self._listen, self._reached)

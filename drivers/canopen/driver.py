@@ -9,6 +9,7 @@ import numpy as np
 
 from gapbridge.core.arrays import Array
 from gapbridge.core.errors import (
+    ForeignCommandError,
     InputError,
     InvalidStateError,
     LinkError,
@@ -229,7 +230,7 @@ class CanopenDriver(Driver):
         while True:
             foreign, now = self.foreign, self._now()
             if foreign is not None and (foreign.seen > begun or now - foreign.seen < quiet):
-                raise WriteError(self._two_masters(foreign))
+                raise ForeignCommandError(self._two_masters(foreign))
             sample = self.sync_cycle.exchange()
             self._check_heartbeats()
             if sample is not None and now - self._connected_at >= quiet:
@@ -265,7 +266,7 @@ class CanopenDriver(Driver):
             raise WriteError(f"{self.master.where}: found a setpoint, expected arm() first")
         foreign = self.foreign
         if foreign is not None and foreign.seen > self._armed_at:
-            raise WriteError(self._two_masters(foreign))
+            raise ForeignCommandError(self._two_masters(foreign))
         joint = not_following(self.profile, sample)
         if joint is not None:
             node = self.profile.nodes[joint]

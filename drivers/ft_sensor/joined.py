@@ -127,17 +127,21 @@ class DriverWithSensor(Driver):
             self._reader.stop()
 
     def _make_ready(self, state: RobotState) -> None:
-        """Arm the arm's driver, and wait for a new sample of the sensor."""
-        self._arm.arm(state)
+        """Arm the arm's driver once the sensor has sent a new sample."""
         if not self._reader.wait(self.settings.connect_timeout):
             raise WriteError(
                 f"found no sample of the sensor within {self.settings.connect_timeout:g} s of "
                 "arming (ft_sensor.connect_timeout)"
             )
+        self._arm.arm(state)
 
     def _release(self) -> None:
         """Stop writing to the arm."""
         self._arm.release()
+
+    def _abandon(self) -> None:
+        """Stop writing to the arm in a fault."""
+        self._arm.abandon()
 
     def nominal_q(self, state: RobotState) -> Array:
         """See Driver.nominal_q."""

@@ -10,11 +10,13 @@ from collections.abc import Callable
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gapbridge.core.arrays import Array
 from gapbridge.core.errors import (
     ForeignCommandError,
     IneffectiveWriteError,
+    RobotBusyError,
     StaleStateError,
     WriteError,
 )
@@ -276,9 +278,9 @@ class TargetWriter:
         self._armed, self._sent, self._target = True, {}, None
 
     def write(self, setpoint: Setpoint, sample: Sample) -> None:
-        """Send one target and trigger it, unless the robot is busy with the one before.
+        """Send one target and trigger it. Raises WriteError.
 
-        The newest setpoint goes out when it is free again. Raises WriteError.
+        Raises RobotBusyError, and sends nothing, while the robot is on its way to the last target.
         """
         if not self._armed:
             raise WriteError(f"{self._transport.name}: found no permission, expected arm() first")
@@ -289,7 +291,9 @@ class TargetWriter:
         except ValueError as error:
             raise WriteError(f"{self._transport.name}: target: {error}") from None
         busy = any(text == "busy" for text, _ in sample.motion)
-        if registers == self._sent or busy:
+        if busy or (registers == self._sent and self._off_target(sample).any()):
+            raise RobotBusyError(f"{self._transport.name}: the robot moves to the last target")
+        if registers == self._sent:
             return
         for first, words in encode.runs(registers):
             self._transport.write(entry.table, first, words, single=self._entry.single)
@@ -305,14 +309,20 @@ class TargetWriter:
                 raise WriteError(f"{self._transport.name}: the last target failed: {words}")
         if self._target is None or self._now() - self._since < self._entry.following:
             return
-        away = np.abs(sample.vectors["position"] - self._target)
-        if (away > TARGET_TOLERANCE * abs(self._size) + 2e-3).any():
+        if self._off_target(sample).any():
+            away = np.abs(sample.vectors["position"] - self._target)
             joint = int(np.argmax(away))
             self._armed = False
             raise WriteError(
                 f"{self._transport.name}: targets have no effect: joint {joint + 1} is "
                 f"{away[joint]:.4f} rad from where it was sent {self._entry.following:g} s ago"
             )
+
+    def _off_target(self, sample: Sample) -> NDArray[np.bool_]:
+        """Return which joints (n,) have not reached the last target."""
+        assert self._target is not None
+        away = np.abs(sample.vectors["position"] - self._target)
+        return away > TARGET_TOLERANCE * abs(self._size) + 2e-3
 
     def _write_all(self, writes: list[RegisterWrite]) -> None:
         for write in writes:

@@ -273,7 +273,7 @@ def _forgets_faults(patch: Patch) -> None:
 
     def forgetting(self: Any) -> None:
         lost(self)
-        self.latched = ""
+        self._fault = ""
 
     patch.setattr(DaemonStatus, "lost_loop", forgetting)
 

@@ -266,7 +266,7 @@ def test_a_step_that_would_leave_the_arm_too_far_behind_names_its_joint() -> Non
 
 def test_a_long_gap_does_not_allow_a_long_step() -> None:
     limiter = started(np.zeros(N))
-    out = limiter.limit(np.full(N, 1.0), np.full(N, 1.0), np.zeros(6), 1.0, np.zeros(N), 2.0)
+    out = limiter.limit(np.full(N, 0.1), np.full(N, 0.1), np.zeros(6), 1.0, np.zeros(N), 2.0)
     assert out.q == pytest.approx(np.full(N, 5 * DT * 1.5))
 
 

@@ -69,6 +69,18 @@ def test_a_first_payload_that_cannot_be_leaves_the_models_own() -> None:
     assert loads.update(state(1.0, payload=40.0, payload_cog=Q * 0)).payload_mass is None
 
 
+def test_a_lost_sensor_beside_the_controllers_own_force_rejects_nothing_less() -> None:
+    loads = LiveLoads(3, True, 0.0, LoadBounds(5.0))
+    pull = np.array([0.0, 0, -30, 0, 0, 0])
+    loads.update(state(1.0, actual_TCP_force=pull))
+    found = loads.update(state(1.1, actual_TCP_force=300 * pull, sensor_lost="silent"))
+    assert found.wrench[0] == pytest.approx(pull)
+    assert "force: found 9000 N" in (loads.problem or "")
+    lost = loads.update(state(1.2, actual_TCP_force=np.full(6, np.nan), sensor_lost="silent"))
+    assert loads.problem is None
+    assert not lost.wrench.any()
+
+
 def test_a_force_that_does_not_count_is_not_rejected() -> None:
     loads = LiveLoads(3, False, 0.0, LoadBounds(5.0))
     loads.update(state(1.0, actual_TCP_force=np.full(6, 9e3)))

@@ -30,6 +30,7 @@ from gapbridge.core.errors import (
     IneffectiveWriteError,
     LinkError,
     PartialWriteError,
+    RobotBusyError,
     WriteError,
 )
 from gapbridge.core.loads import Loads
@@ -256,6 +257,26 @@ def test_a_setpoint_that_left_in_part_is_followed_by_a_whole_one(bench: Bench) -
     assert len(bench.driver.sent) == 20
     assert bench.count("write_partial") == PARTIAL_WRITE_LIMIT - 1
     assert bench.count("write_ineffective") == 0
+
+
+def test_a_setpoint_that_waits_for_a_busy_robot_is_neither_sent_nor_in_force(bench: Bench) -> None:
+    """Its offset would be taken off the next start, though the arm never had it."""
+    bench.cycles(700)
+    sent = bench.driver.sent[-1]
+    in_force = bench.writing._in_force.offset_at(sent)
+    bench.supervisor.take(Cause.DISARM)
+    bench.driver.error = RobotBusyError("on its way")
+    bench.cycles(700)
+    assert bench.supervisor.state == State.HOLDING
+    assert bench.stream.at_rest
+    assert bench.writing.unsent is not None
+    after = bench.writing._in_force.offset_at(sent)
+    assert in_force is not None and after is not None
+    assert (after.delta == in_force.delta).all()
+    assert (bench.count("write_failed"), bench.count("setpoint_refused")) == (0, 0)
+    bench.driver.error = None  # its way ends: the newest setpoint leaves
+    bench.cycles(1)
+    assert bench.driver.sent[-1] == pytest.approx(Q, abs=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -175,3 +175,44 @@ def test_braking_keeps_the_direction_and_ends_after_the_right_way() -> None:
     assert way[0] == pytest.approx(1.0 / (2 * DECELERATION), rel=0.03)
     assert way[1] == pytest.approx(-0.5 * way[0], rel=1e-6)
     assert stream.brake(CYCLE) == pytest.approx(stream.q)
+
+
+FAST = np.array([0.35, 0.0, 0.0, 0.0, 0.0, 0.0])  # rad/s
+
+
+def driven(run: Run, seconds: float) -> None:
+    """Move the source at FAST."""
+    for k in range(round(seconds / CYCLE)):
+        run.cycles(1, source=Q + FAST * CYCLE * (k + 1))
+
+
+def test_setpoints_faster_than_the_limit_are_refused_before_the_command_lags_far() -> None:
+    run = Run(joint_velocity=0.2)
+    with pytest.raises(LimitError, match=r"joint 1 would be more than 0\.1 rad behind its nominal"):
+        driven(run, 2.0)
+    assert run.sent[-1].nominal_q[0] - run.q[0] == pytest.approx(0.1, abs=2e-3)
+
+
+def test_a_command_that_lags_brakes_where_it_is() -> None:
+    run = Run(joint_velocity=0.2, following=0.5)
+    driven(run, 2.0)
+    assert not run.stream.arrived
+    lag, at = run.stream.limiter.lag, run.q[0]
+    assert lag == pytest.approx(0.3, rel=0.1)
+    run.cycles(40, source=None)
+    assert run.q[0] - at < 0.2**2 / (2 * DECELERATION) + 1e-3  # not on to the last nominal setpoint
+    speeds = run.steps()[-40:, 0] / CYCLE
+    assert np.abs(np.diff(speeds)).max() <= 1.5 * DECELERATION * CYCLE
+    assert speeds[-1] == pytest.approx(0.0, abs=1e-3)
+    run.cycles(400, source=None, goal=0.0)
+    assert run.stream.at_rest
+
+
+def test_a_command_that_lags_has_not_arrived_until_it_is_there() -> None:
+    run = Run(joint_velocity=0.2)
+    driven(run, 0.3)
+    end = Q + FAST * 0.3
+    run.cycles(5, source=end)
+    assert not run.stream.arrived
+    run.cycles(400, source=end)
+    assert run.stream.arrived

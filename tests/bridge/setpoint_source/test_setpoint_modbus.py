@@ -202,3 +202,12 @@ def test_the_arm_goes_where_the_plc_says_and_the_plc_hears_of_it(tmp_path: Path)
             assert np.linalg.norm(numbers_of(found[50:62])[:3]) > 1e-4
             run.wait(State.HOLDING)  # the PLC says no more
         assert {State.ARMED, State.COMPENSATING} & seen
+
+
+def test_what_a_plc_wrote_before_arming_starts_nothing(source: ModbusSource) -> None:
+    plc = Plc("127.0.0.1", source.port)
+    plc.put(HERE)
+    source.discard()
+    assert source.first(HERE) is None
+    plc.put(HERE + 0.1)
+    assert first_of(source) == pytest.approx(HERE + 0.1, abs=UNIT)

@@ -443,3 +443,31 @@ def test_a_planners_socket_is_in_the_runtime_folder_unless_the_cell_names_one(
     assert stat.S_IMODE(found.parent.stat().st_mode) == 0o700
     path.write_text(text.replace("planner}", "planner, socket: here.sock}"))
     assert settings_of(load_cell(path)).setpoints.socket == tmp_path / "here.sock"
+
+
+def test_what_came_while_nobody_read_is_no_setpoint(feed: PlannerSource) -> None:
+    """Arming takes a while: lines of that time are of unknown age, and not counted either."""
+    with planner(feed) as link:
+        link.sendall(b"0,0,0.1\n")
+        assert first_of(feed) == pytest.approx([0, 0, 0.1])
+        link.sendall(b"".join(b"0,0,%.4f\n" % (1e-4 * k) for k in range(3 * int(RATE))))
+        feed.discard()
+        assert feed.first(HERE) is None
+        link.sendall(b"0,0,0.7\n")
+        assert first_of(feed) == pytest.approx([0, 0, 0.7])
+
+
+def test_a_planner_that_died_before_arming_starts_nothing(feed: PlannerSource) -> None:
+    with planner(feed) as link:
+        link.sendall(60 * b"0,0,0.1\n")
+    feed.discard()
+    assert feed.first(HERE) is None
+
+
+def test_a_token_sent_while_nobody_read_still_counts(tcp: TcpSource) -> None:
+    with planner(tcp) as link:
+        link.sendall(b"token " + TOKEN.encode() + b"\n0,0,0.1\n0,0,0.2\n")
+        tcp.discard()
+        assert tcp.first(HERE) is None
+        link.sendall(b"0,0,0.7\n")
+        assert first_of(tcp) == pytest.approx([0, 0, 0.7])

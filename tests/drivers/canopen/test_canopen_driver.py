@@ -14,6 +14,7 @@ from patience import PATIENCE, wait_for
 from ports import free_port
 
 from gapbridge.core.errors import (
+    ForeignCommandError,
     InputError,
     InvalidStateError,
     LinkError,
@@ -340,7 +341,7 @@ def test_another_master_is_noticed_and_writing_refused(
         bus.send(can.Message(arbitration_id=identifier, data=data, is_extended_id=False))
         wait_for(lambda: driver.foreign is not None, "the other master's frame")
     state = settled(driver)
-    with pytest.raises(WriteError, match=f"another master sent {phrase}"):
+    with pytest.raises(ForeignCommandError, match=f"another master sent {phrase}"):
         driver.write_setpoint(setpoint(state.actual_q, state))
     driver.release()
 
@@ -350,7 +351,7 @@ def test_arming_waits_until_another_master_has_been_quiet(generic: DriveArm) -> 
         time.sleep(0.4)
         bus.send(can.Message(arbitration_id=0x204, data=bytes(6), is_extended_id=False))
         wait_for(lambda: driver.foreign is not None, "the other master's frame")
-        with pytest.raises(WriteError, match="found two masters"):
+        with pytest.raises(ForeignCommandError, match="found two masters"):
             driver.arm(settled(driver))
         assert Phase.ENABLED not in phases(generic)
         time.sleep(0.4)

@@ -16,6 +16,7 @@ from gapbridge.core.errors import (
     GateError,
     InvalidStateError,
     LinkError,
+    RobotBusyError,
     StaleStateError,
     WriteError,
 )
@@ -219,6 +220,8 @@ def write(driver: Driver, setpoint: Callable[[RobotState, np.ndarray], Setpoint]
         state = next_state(driver)
         try:
             driver.write_setpoint(setpoint(state, driver.nominal_q(state)))
+        except RobotBusyError:
+            return False
         except WriteError:
             driver.release()
             with contextlib.suppress(WriteError):
@@ -305,7 +308,8 @@ def stream(
     until = time.monotonic() + seconds
     while time.monotonic() < until and not done():
         state = next_state(driver)
-        driver.write_setpoint(setpoint(state, driver.nominal_q(state)))
+        with contextlib.suppress(RobotBusyError):  # from target to target
+            driver.write_setpoint(setpoint(state, driver.nominal_q(state)))
 
 
 def _recovers(driver: Driver) -> None:

@@ -27,7 +27,7 @@ from sensor_wires import (
 
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.effects import Site, Term
-from gapbridge.core.errors import InvalidStateError, LinkError, StaleStateError
+from gapbridge.core.errors import InvalidStateError, LinkError, StaleStateError, WriteError
 from gapbridge.core.model import Model
 from gapbridge.core.rotation import transform
 from gapbridge.core.state import RobotState, Setpoint
@@ -293,6 +293,18 @@ def test_each_state_gets_the_wrench_of_its_own_moment_whatever_the_arms_clock_sa
     # the sample before holds, so the wrench is half a sensor's period old on average
     assert -0.003 < np.median(gaps) < 0.006
     assert np.percentile(gaps, 95) < 0.02
+
+
+def test_an_arm_is_not_armed_before_its_sensor_speaks() -> None:
+    controller = resting_controller(TURNED)
+    wire = make_wire("robotous_rft", reaction_of(controller))
+    with wire.device, joined(wire, controller, connect_timeout=0.2) as driver:
+        state = driver.read_state()
+        wire.device.silent = True
+        time.sleep(0.1)  # what was on its way has arrived
+        with pytest.raises(WriteError, match=r"no sample of the sensor within 0\.2 s"):
+            driver.arm(state)
+        assert not driver._arm.gate._open
 
 
 def test_setpoints_and_the_arms_own_wishes_pass_through() -> None:
