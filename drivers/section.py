@@ -3,18 +3,31 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Self
+from typing import Annotated, Any, Self
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, GetCoreSchemaHandler
+from pydantic_core import CoreSchema, PydanticKnownError
+from pydantic_core.core_schema import no_info_before_validator_function as before
 
 Number = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[Number, Field(gt=0.0)]
 
 
 class Section(BaseModel):
-    """One mapping: unknown keys are refused, and instances are immutable."""
+    """One mapping: unknown keys are refused, and instances are immutable.
+
+    A number or a boolean is taken as it stands only: pydantic alone would read ``true`` as 1.0 and
+    the text ``'on'`` as true. Whole floats are whole numbers (``1e6``); paths and lists remain
+    pydantic's.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
+
+    @classmethod
+    def __get_pydantic_core_schema__(cls, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        """Return pydantic's schema, its numbers and booleans taken literally."""
+        schema: CoreSchema = _literal(handler(source), cls)
+        return schema
 
     def located(self, folder: Path) -> Self:
         """Return it with all paths in it, which are relative to ``folder``, made absolute."""
@@ -26,3 +39,26 @@ class Section(BaseModel):
             elif isinstance(value, Section):
                 placed[name] = value.located(folder)
         return self.model_copy(update=placed)
+
+
+def _literal(part: Any, section: type[Section]) -> Any:
+    """Return a part of a section's core schema with its numbers and booleans taken literally."""
+    if isinstance(part, list | tuple):
+        return type(part)(_literal(item, section) for item in part)
+    if not isinstance(part, dict) or part.get("cls", section) is not section:
+        return part  # another section's schema is literal already
+    kind = part.get("type")
+    if kind in ("float", "bool"):
+        return {"strict": True, **part}
+    if kind == "int":
+        return part if part.get("strict") else before(_refuse_bool_and_text, part)
+    return {
+        key: value if key in ("default", "metadata") else _literal(value, section)
+        for key, value in part.items()
+    }
+
+
+def _refuse_bool_and_text(value: Any) -> Any:
+    if isinstance(value, bool | str):
+        raise PydanticKnownError("int_type")
+    return value

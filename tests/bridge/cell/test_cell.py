@@ -189,6 +189,36 @@ def test_a_wrong_value_is_reported_with_what_was_expected(
 
 
 @pytest.mark.parametrize(
+    ("section", "keys", "found", "expected"),
+    [
+        ("limits", "offset_rate: true", "True", "a number"),
+        ("limits", "ramp_time: yes", "True", "a number"),
+        ("limits", "offset: '0.005'", "'0.005'", "a number"),
+        ("link", "rate: true", "True", "a number"),
+        ("setpoints", "arm: 'on'", "'on'", "true or false"),
+        ("setpoints", "arm: 1", "1", "true or false"),
+        ("recording", "every: true", "True", "a whole number"),
+        ("recording", "every: '2'", "'2'", "a whole number"),
+        ("web", "port: true", "True", "a whole number"),
+    ],
+)
+def test_numbers_and_booleans_of_every_section_are_taken_literally(
+    tmp_path: Path, section: str, keys: str, found: str, expected: str
+) -> None:
+    line = reported(tmp_path, f"{ARM}{section}: {{{keys}}}")
+    key = keys.split(":")[0]
+    assert f", line 2: {section}.{key}: found {found}, expected {expected} (" in line
+
+
+def test_a_whole_number_may_be_a_float_and_a_float_whole(tmp_path: Path) -> None:
+    text = "limits: {ramp_time: 1}\nlink: {driver: can, profile: piper, bitrate: 5e5}\n"
+    cell = load_cell(written(tmp_path, ARM + text))
+    assert cell.limits.ramp_time == 1.0
+    assert cell.link is not None
+    assert getattr(cell.link, "bitrate", None) == 500_000
+
+
+@pytest.mark.parametrize(
     ("text", "phrase"),
     [
         ("robot: [1, 2", "line 1"),
