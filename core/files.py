@@ -25,12 +25,18 @@ from gapbridge.core.errors import InputError, Keys
 
 MAX_QUOTED = 60  # characters of a value that a message quotes
 
+_INTEGER = re.compile(
+    r"^[-+]?(?:0b[0-1_]+|0x[0-9a-fA-F_]+|0|[1-9][0-9_]*)$"  # 010, 1:30: texts
+)
 _FLOAT = re.compile(
     r"^(?:[-+]?(?:[0-9][0-9_]*)(?:\.[0-9_]*)?(?:[eE][-+]?[0-9]+)"
-    r"|[-+]?\.[0-9][0-9_]*(?:[eE][-+]?[0-9]+)?)$"
+    r"|[-+]?[0-9][0-9_]*\.[0-9_]*"
+    r"|[-+]?\.[0-9][0-9_]*(?:[eE][-+]?[0-9]+)?"
+    r"|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN))$"
 )
 _BOOLEAN = re.compile(r"^(?:true|True|TRUE|false|False|FALSE)$")
 YAML_11_BOOLEAN = "tag:yaml.org,2002:bool"
+_NUMBERS = {"tag:yaml.org,2002:int": _INTEGER, "tag:yaml.org,2002:float": _FLOAT}
 # What PyYAML says of common slips, as found and expected.
 PROBLEMS = {
     r"'\t' that cannot start any token": "found a tab, expected spaces",
@@ -96,9 +102,10 @@ def read_only_given(files: Mapping[str, bytes]) -> None:
 
 
 def loaders(*, on_is_text: bool = False) -> tuple[Any, ...]:
-    """Return loaders of YAML 1.1 with the floats of YAML 1.2: PyYAML alone reads 2e-5 as a text.
+    """Return loaders of YAML 1.1 whose numbers mean the same in YAML 1.2.
 
-    ``on_is_text``: with the booleans of 1.2 too. The quickest loader (libyaml's, which saves a
+    PyYAML alone reads 2e-5 as a text, 010 as 8 and 1:30 as 90; 010 and 1:30 are texts here, which
+    no number accepts. ``on_is_text``: with the booleans of 1.2 too. The quickest loader (libyaml's, which saves a
     tenth of a second for a cell with a fit's covariance) comes first; the last one's messages are
     those that ``PROBLEMS`` knows.
     """
@@ -109,12 +116,13 @@ def loaders(*, on_is_text: bool = False) -> tuple[Any, ...]:
 def _loader(base: Any, on_is_text: bool) -> Any:
     resolvers = {
         first: [
-            (tag, content) for tag, content in all_of if not (on_is_text and tag == YAML_11_BOOLEAN)
+            (tag, _NUMBERS.get(tag, content))
+            for tag, content in all_of
+            if not (on_is_text and tag == YAML_11_BOOLEAN)
         ]
         for first, all_of in base.yaml_implicit_resolvers.items()
     }
     content: Any = type("_Loader", (base,), {"yaml_implicit_resolvers": resolvers})
-    content.add_implicit_resolver("tag:yaml.org,2002:float", _FLOAT, list("-+0123456789."))
     if on_is_text:
         content.add_implicit_resolver(YAML_11_BOOLEAN, _BOOLEAN, list("tTfF"))
     return content

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import re
 import typing
 from collections.abc import Iterable
 from typing import Any
@@ -13,14 +14,17 @@ from pydantic_core import ErrorDetails
 from gapbridge.core.errors import InputError, Keys, key_path
 from gapbridge.core.files import Document, quoted
 
+_OTHER_NOTATION = re.compile(r"[-+]?(0[0-9_]+|[0-9_]+(:[0-9.]+)+)")  # YAML 1.1: octal, base 60
 _EXPECTED_TEXTS = {
     "float_type": "a number",
     "float_parsing": "a number",
     "int_type": "a whole number",
     "int_parsing": "a whole number",
     "int_from_float": "a whole number",
+    "int_parsing_size": "a whole number of at most 18 digits",
     "finite_number": "a finite number",
     "string_type": "a text",
+    "path_type": "a path",
     "bool_type": "true or false",
     "bool_parsing": "true or false",
     "list_type": "a list",
@@ -130,15 +134,18 @@ def _file_keys(
     """
     keys: list[str | int] = []
     models, holder = [schema], None
+    names_entry = False  # whether the next part is a key of a dictionary
     for part in loc:
-        if isinstance(part, int):
+        if isinstance(part, int) or names_entry:
             keys.append(part)
+            names_entry = False
             continue
         owner = next((m for m in models if part in m.model_fields), None)
         if owner is not None:
             holder = owner
             keys.append(part)
             models = _models(owner.model_fields[part].annotation)
+            names_entry = typing.get_origin(owner.model_fields[part].annotation) is dict
         elif chosen := [m for m in models if _driver_tag(m) == part]:
             models = chosen
         elif part == loc[-1] and models and not _is_union_label(part, models):
@@ -190,4 +197,6 @@ def _expected_text(error: ErrorDetails, description: str) -> str:
     if template is None:
         return str(error["msg"]).removeprefix("Input should be ")
     text = template.format(**error.get("ctx", {}))
+    if error["type"] in ("float_type", "int_type") and isinstance(error["input"], str):
+        text += " without leading zeros or colons" * bool(_OTHER_NOTATION.fullmatch(error["input"]))
     return f"{text} ({description})" if description else text

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
-from pydantic import Field, model_validator
+from pydantic import Field, ValidationInfo, field_validator
 
 from gapbridge.bridge.cell.sections import (
     LimitSettings,
@@ -174,16 +174,22 @@ class Provenance(Section):
     )
     parameters: list[str] = Field(default=[], description="names of the fitted parameters")
     covariance: list[list[Number]] = Field(
-        default=[], description="of those parameters, SI: a row and a column each"
+        default=[],
+        validate_default=True,
+        description="of those parameters, SI: a row and a column each",
     )
     causes: list[CauseEntry] = Field(default=[], description="named by a diagnosis, with its ties")
 
-    @model_validator(mode="after")
-    def _covariance_is_square(self) -> Provenance:
-        size = len(self.parameters)
-        if [len(row) for row in self.covariance] != [size] * size:
+    @field_validator("covariance")
+    @classmethod
+    def _is_covariance(cls, rows: list[list[float]], info: ValidationInfo) -> list[list[float]]:
+        size = len(info.data.get("parameters", rows))
+        if [len(row) for row in rows] != [size] * size:
             raise ValueError(f"expected {size} rows of {size} numbers, one for each of parameters")
-        return self
+        for i, row in enumerate(rows):
+            if row[i] < 0.0:
+                raise ValueError(f"expected variances of 0 or more: that of entry {i + 1} is less")
+        return rows
 
 
 class CellFile(Section):

@@ -178,6 +178,27 @@ def test_an_unknown_key_is_named_with_the_nearest_known(
         ("robot: {model: ur10e, calibration: {delta_a: [1]}}", "1 values", "6"),
         ("robot: {model: ur10e, calibration: c.conf}", "file not found", "calibration.conf"),
         ("5: 6\nrobot: {model: ur10e}", "a key 5", "a word"),
+        (ARM + "payload: {mass: 010}", "line 2: payload.mass: found '010'", "leading zeros"),
+        (ARM + "recording: {every: 1:30}", "line 2: recording.every: found '1:30'", "or colons"),
+        (ARM + "recording: {folder: 5}", "recording.folder: found 5", "expected a path"),
+        (ARM + "recording: {every: 1e30}", "recording.every: found 1e+30", "expected a whole"),
+        (ARM + "provenance: {intervals: {x: [1]}}", "provenance.intervals.x entry 2", "95 %"),
+        (
+            ARM + "effects: [{effect: backlash, joint: 2, parameters: {value: x}}]",
+            "effects entry 1.parameters.value: found 'x'", "a number",
+        ),
+        (
+            ARM + "link: {driver: can, profile: piper, options: {a: [1]}}",
+            "link.options.a: found [1]", "expected",
+        ),
+        (
+            ARM + "provenance: {parameters: [payload], covariance: [[-1]]}",
+            "provenance.covariance: found [[-1]]", "variances of 0 or more: that of entry 1",
+        ),
+        (
+            ARM + "provenance: {parameters: [payload]}",
+            "provenance.covariance: found []", "1 rows of 1 numbers",
+        ),
     ],
 )  # fmt: skip
 def test_a_wrong_value_is_reported_with_what_was_expected(
