@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from gapbridge.bridge.cell.agreement import disagreeing_values
 from gapbridge.bridge.cell.message import message_at
 from gapbridge.bridge.cell.schema import CellFile, Payload
 from gapbridge.bridge.cell.settings.calibration import CalibrationSettings, LoadEntry
@@ -94,11 +95,7 @@ def implausible_values(file: CellFile, document: Document, arm: Arm) -> Iterator
         )
     if file.simulation.payload is not None:
         yield from _payload(("simulation", "payload"), file.simulation.payload, arm, arm_reach)
-    for i, angle in enumerate(file.simulation.start_q or []):
-        if abs(angle) > MAX_LIMIT:
-            yield Implausible(
-                ("simulation", "start_q", i), f"{angle:g}", "rad (it looks like degrees)"
-            )
+    yield from disagreeing_values(file, arm)
 
 
 def _session(section: CalibrationSettings, arm: Arm, arm_reach: float) -> Iterator[Implausible]:
@@ -123,13 +120,13 @@ def _session(section: CalibrationSettings, arm: Arm, arm_reach: float) -> Iterat
     for i, box in enumerate(section.keep_out):
         keys = (top, "keep_out", i)
         places += [((*keys, "lower"), box.lower), ((*keys, "upper"), box.upper)]
-        if np.any(np.array(box.lower) > box.upper):
-            yield Implausible((*keys, "lower"), f"{box.lower}", f"no more than upper, {box.upper}")
+        if np.any(np.array(box.lower) >= box.upper):
+            yield Implausible((*keys, "lower"), f"{box.lower}", f"less than upper, {box.upper}")
     for where, xyz in places:
         if (size := max(map(abs, xyz), default=0.0)) > MAX_DISTANCE:
             yield Implausible(where, f"{size:g}", "m (it looks like mm)")
     for end in ("lower", "upper") if section.joint_range is not None else ():
-        if (angle := max(map(abs, getattr(section.joint_range, end)))) > MAX_LIMIT:
+        if (angle := max(map(abs, getattr(section.joint_range, end)), default=0.0)) > MAX_LIMIT:
             yield Implausible(
                 (top, "joint_range", end), f"{angle:g}", "rad (it looks like degrees)"
             )

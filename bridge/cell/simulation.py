@@ -12,8 +12,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from gapbridge.bridge.cell.agreement import SIMULATED_PORTS
 from gapbridge.bridge.cell.cell import Cell
 from gapbridge.bridge.cell.robot import calibration_of
+from gapbridge.core.errors import InputError
 from gapbridge.core.rotation import rotation_vector
 from gapbridge.drivers.addresses import is_loopback
 from gapbridge.drivers.link_settings import DriverSettings
@@ -30,7 +32,6 @@ from gapbridge.drivers.simulated.ur.settings import (
 )
 
 HOST = "127.0.0.2"
-PORTS = ("rtde_port", "dashboard_port", "script_port", "bench_port", "primary_port")
 PERIOD = 0.004  # s, cycle of an ArmController
 
 SIMULATORS: dict[str, str] = {
@@ -99,16 +100,17 @@ def served_controller(
 
 
 def _address(cell: Cell, host: str | None) -> str:
-    """Return the loopback address that the controller is served at. Raises CellError."""
-    link = cell.file.link
-    address = host or cell.file.simulation.host or str(getattr(link, "host", None) or HOST)
-    if not is_loopback(address):
-        raise cell.error(
-            ("simulation", "host"),
-            f"found {address!r}, expected a loopback address (127.x.x.x): a simulated controller "
-            "is never served to others",
-        )
-    return address
+    """Return the loopback address that the controller is served at. Raises InputError."""
+    linked = getattr(cell.file.link, "host", None)
+    address = host or cell.file.simulation.host or str(linked or HOST)
+    if is_loopback(address):
+        return address
+    expected = "expected a loopback address (127.x.x.x): a simulated controller is never served to "
+    if host is not None:
+        raise InputError(f"--host: found {address!r}, {expected}others")
+    raise cell.error(
+        ("simulation", "host"), f"found nothing, and {address!r} at link.host, {expected}others"
+    )
 
 
 def server_settings(cell: Cell, host: str | None = None, seed: int | None = None) -> ServerSettings:
@@ -119,7 +121,7 @@ def server_settings(cell: Cell, host: str | None = None, seed: int | None = None
     estimates and not part of the plant. Raises CellError if the cell cannot be simulated.
     """
     simulation, address = cell.file.simulation, _address(cell, host)
-    ports = {name: getattr(simulation, name) for name in PORTS}
+    ports = {name: getattr(simulation, name) for name in SIMULATED_PORTS}
     settings = simulated_cell(
         cell.arm,
         address,
@@ -152,16 +154,8 @@ def _plant(cell: Cell) -> dict[str, Any]:
         fields["tool_shift"] = tuple(simulation.tool_shift)
     per_joint = {"droop": simulation.droop, "zero": simulation.zero}
     if (compliance := simulation.compliance) is not None:
-        per_joint |= {"compliance.axial": compliance.axial, "compliance.radial": compliance.radial}
-    for key, values in per_joint.items():
-        if values is None:
-            continue
-        if len(values) != cell.arm.n:
-            raise cell.error(
-                ("simulation", *key.split(".")),
-                f"found {len(values)} values, expected {cell.arm.n}",
-            )
-        fields[key.rpartition(".")[2]] = tuple(values)
+        per_joint |= {"axial": compliance.axial, "radial": compliance.radial}
+    fields |= {key: tuple(values) for key, values in per_joint.items() if values is not None}
     return fields
 
 

@@ -415,4 +415,7 @@ def test_simulate_serves_until_it_is_asked_to_stop(desk: Desk) -> None:
 
 def test_simulate_is_never_served_to_others(desk: Desk) -> None:
     desk.write("cell.yaml", CELL + "link: {host: 192.168.0.3}\n")
-    assert "loopback" in desk.refuses("simulate", "@cell.yaml")
+    line = desk.refuses("simulate", "@cell.yaml")
+    assert "simulation.host: found nothing, and '192.168.0.3' at link.host, expected a loop" in line
+    line = desk.refuses("simulate", "@cell.yaml", "--host", "8.8.8.8")
+    assert line.startswith("error: --host: found '8.8.8.8', expected a loopback address")
