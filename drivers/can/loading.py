@@ -49,13 +49,17 @@ UNITS: dict[str, dict[str, float]] = {
 
 
 class Names:
-    """One profile's keys and its DBC's messages."""
+    """One profile's keys, those that a cell's link replaces, and its DBC's messages."""
 
-    def __init__(self, document: ProfileDocument, file: ProfileFile, dbc: Dbc) -> None:
-        self.document, self.file, self.dbc = document, file, dbc
+    def __init__(
+        self, document: ProfileDocument, file: ProfileFile, dbc: Dbc, replaced: frozenset[str]
+    ) -> None:
+        self.document, self.file, self.dbc, self.replaced = document, file, dbc, replaced
 
     def error(self, keys: Sequence[str | int], text: str) -> ProfileError:
-        """Return an error with ``text`` about a key of the profile."""
+        """Return an error with ``text`` about a key of the profile, or of the cell's link."""
+        if keys[0] in self.replaced:
+            return ProfileError(text, ("link", *keys))
         return self.document.error(keys, text)
 
     def message(self, name: str, keys: Keys) -> tuple[Any, Key]:
@@ -199,11 +203,13 @@ class OutgoingLoading:
 def read_profile(path: Path, installation: Mapping[str, list[float]] | None = None) -> CanProfile:
     """Return the profile of a YAML file; raises ProfileError.
 
-    ``installation`` replaces its direction, zero and gear.
+    ``installation`` replaces its direction, zero and gear; errors in them have the link's keys.
     """
     document, file = read_profile_file(path, ProfileFile, _schema_error)
-    file = file.model_copy(update=dict(installation or {}))
-    return _Loading(document, file, read_dbc(path.parent / file.dbc)).profile()
+    replaced = dict(installation or {})
+    file = file.model_copy(update=replaced)
+    names = Names(document, file, read_dbc(path.parent / file.dbc), frozenset(replaced))
+    return _Loading(names).profile()
 
 
 def _schema_error(document: ProfileDocument, worst: ErrorDetails) -> ProfileError:
@@ -224,10 +230,11 @@ def _schema_error(document: ProfileDocument, worst: ErrorDetails) -> ProfileErro
 class _Loading:
     """Builds one profile."""
 
-    def __init__(self, document: ProfileDocument, file: ProfileFile, dbc: Dbc) -> None:
-        self.document, self.file, self.dbc = document, file, dbc
-        self.names = Names(document, file, dbc)
-        self.n = file.joints
+    def __init__(self, names: Names) -> None:
+        self.names, self.document, self.file, self.dbc = (
+            names, names.document, names.file, names.dbc,
+        )  # fmt: skip
+        self.n = names.file.joints
 
     def profile(self) -> CanProfile:
         file = self.file

@@ -9,6 +9,7 @@ from pydantic import Field
 
 from gapbridge.drivers.can_bus.bus import ArmBusSettings
 from gapbridge.drivers.link_settings import ProfileSettings
+from gapbridge.drivers.section import Number
 
 
 class CanSettings(ProfileSettings, ArmBusSettings):
@@ -23,10 +24,10 @@ class CanSettings(ProfileSettings, ArmBusSettings):
     direction: tuple[Literal[1, -1], ...] | None = Field(
         None, description="sign of each joint on the wire; left out: the profile's"
     )
-    zero: tuple[float, ...] | None = Field(
+    zero: tuple[Number, ...] | None = Field(
         None, description="rad of each joint at the wire's zero; left out: the profile's"
     )
-    gear: tuple[float, ...] | None = Field(
+    gear: tuple[Number, ...] | None = Field(
         None, description="wire turns per joint turn, per joint; left out: the profile's"
     )
     rate: float = Field(200.0, gt=0.0, le=1000.0, description="cycles per second asked for")

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import Field, field_validator
 
 from gapbridge.drivers.link_settings import DriverSettings
+from gapbridge.drivers.section import Positive
+
+Constants = Annotated[tuple[Positive, ...], Field(min_length=6, max_length=6)]
 
 
 class UrRtdeSettings(DriverSettings):
@@ -44,7 +47,7 @@ class UrRtdeSettings(DriverSettings):
     remote_control: bool = Field(
         True, description="servoj: refuse where the robot is not in remote control"
     )
-    torque_constants: tuple[float, ...] | None = Field(
+    torque_constants: Constants | None = Field(
         None,
         description="Nm/A of each joint motor current; without them there is no joint torque",
     )

@@ -187,6 +187,13 @@ def test_an_unknown_key_is_named_with_the_nearest_known(
             ARM + "effects: [{effect: backlash, joint: 2, parameters: {value: x}}]",
             "effects entry 1.parameters.value: found 'x'", "a number",
         ),
+        (ARM + "link: {torque_constants: [1, 1]}", "torque_constants: found 2 values", "6 values"),
+        (
+            ARM + "link: {torque_constants: [1, 1, 1, 1, 1, 0]}",
+            "link.torque_constants entry 6: found 0", "more than 0",
+        ),
+        (ARM + "link: {driver: can, profile: piper, gear: [.inf]}", "gear entry 1", "finite"),
+        (ARM + "link: {driver: can, profile: piper, zero: [.nan]}", "zero entry 1", "finite"),
         (
             ARM + "link: {driver: can, profile: piper, options: {a: [1]}}",
             "link.options.a: found [1]", "expected",

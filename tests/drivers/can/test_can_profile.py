@@ -145,9 +145,18 @@ def test_direction_zero_and_gear_of_the_installation_stand_before_the_profiles()
     assert turns == pytest.approx([-8.0] * 6)
 
 
-def test_an_installation_of_another_length_is_refused():
-    with pytest.raises(ProfileError, match="gear: found 2 values, expected 6"):
-        read_profile(CanSettings.shipped / "odrive.yaml", {"gear": [8.0, 8.0]})
+@pytest.mark.parametrize(
+    ("key", "values", "found"),
+    [
+        ("gear", [8.0, 8.0], "found 2 values, expected 6"),
+        ("gear", [8.0] * 5 + [0.0], "found 0, expected a ratio that is not zero"),
+        ("zero", [0.1], "found 1 values, expected 6"),
+    ],
+)
+def test_a_wrong_value_of_the_installation_is_reported_as_the_links(key, values, found):
+    with pytest.raises(ProfileError) as caught:
+        read_profile(CanSettings.shipped / "odrive.yaml", {key: values})
+    assert (caught.value.keys, caught.value.message) == (("link", key), found)
 
 
 def test_a_profile_that_is_not_shipped_is_refused_with_those_that_are():
