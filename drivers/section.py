@@ -5,12 +5,16 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any, Self
 
-from pydantic import BaseModel, ConfigDict, Field, GetCoreSchemaHandler
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, GetCoreSchemaHandler
 from pydantic_core import CoreSchema, PydanticKnownError
 from pydantic_core.core_schema import no_info_before_validator_function as before
 
+from gapbridge.drivers.addresses import host_name, plain_host
+
 Number = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[Number, Field(gt=0.0)]
+Host = Annotated[str, AfterValidator(host_name)]
+PlainHost = Annotated[str, AfterValidator(plain_host)]  # an IPv4 address or a name: no port, no IPv6
 
 
 class Section(BaseModel):

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from pydantic import BaseModel, Field, field_validator
 
 from gapbridge.core.errors import LinkError, first_line
+from gapbridge.drivers.section import Host
 
 if TYPE_CHECKING:
     import can
@@ -30,7 +31,7 @@ class BusSettings(BaseModel):
         description="python-can's name: socketcan, socketcand, slcan, virtual, pcan, kvaser, ...",
     )  # fmt: skip
     channel: str = Field("can0", min_length=1, description="can0, /dev/ttyACM0, ...")
-    host: str = Field("127.0.0.1", min_length=1, description="socketcand: where it is served")
+    host: Host = Field("127.0.0.1", min_length=1, description="socketcand: where it is served")
     port: int = Field(SOCKETCAND_PORT, ge=1, le=65535, description="socketcand: its TCP port")
     bitrate: int = Field(1_000_000, ge=10_000, le=8_000_000, description="bit/s")
     options: dict[str, bool | int | float | str] = Field(

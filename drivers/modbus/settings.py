@@ -8,6 +8,7 @@ from typing import Literal, Self
 from pydantic import Field, field_validator, model_validator
 
 from gapbridge.drivers.link_settings import ProfileSettings
+from gapbridge.drivers.section import PlainHost
 
 
 class ModbusSettings(ProfileSettings):
@@ -20,7 +21,7 @@ class ModbusSettings(ProfileSettings):
     shipped = Path(__file__).with_name("profiles")
     driver: Literal["modbus"] = "modbus"
     transport: Literal["tcp", "tls", "rtu"] = "tcp"
-    host: str = Field("127.0.0.2", min_length=1, description="tcp, tls: address or name")
+    host: PlainHost = Field("127.0.0.2", min_length=1, description="tcp, tls: address or name")
     port: int | None = Field(
         None, gt=0, lt=65536, description="tcp, tls: port; left out: the profile's"
     )
@@ -72,14 +73,6 @@ class ModbusSettings(ProfileSettings):
         if len(digits) != 64 or not set(digits) <= set("0123456789abcdef"):
             raise ValueError("expected 64 hexadecimal digits, the SHA-256 of a certificate")
         return digits
-
-    @field_validator("host")
-    @classmethod
-    def _plain_host(cls, value: str) -> str:
-        """Refuse a port in the host: it has a key of its own."""
-        if ":" in value or value.strip() != value:
-            raise ValueError("expected an IPv4 address or host name without a port")
-        return value
 
     @property
     def moves_arm(self) -> bool:

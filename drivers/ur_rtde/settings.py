@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import Field, field_validator
+from pydantic import Field
 
 from gapbridge.drivers.link_settings import DriverSettings
-from gapbridge.drivers.section import Positive
+from gapbridge.drivers.section import PlainHost, Positive
 
 Constants = Annotated[tuple[Positive, ...], Field(min_length=6, max_length=6)]
 
@@ -21,7 +21,7 @@ class UrRtdeSettings(DriverSettings):
     """
 
     driver: Literal["ur_rtde"] = "ur_rtde"
-    host: str = Field("127.0.0.2", description="the controller's IPv4 address or name")
+    host: PlainHost = Field("127.0.0.2", description="the controller's IPv4 address or name")
     mode: Literal["servoj", "offset"] = "servoj"
     lookahead: float = Field(0.1, ge=0.03, le=0.2, description="servoj: lookahead time, s")
     gain: float = Field(300.0, ge=100.0, le=2000.0, description="servoj: proportional gain")
@@ -56,11 +56,3 @@ class UrRtdeSettings(DriverSettings):
     def moves_arm(self) -> bool:
         """Return whether setpoints are the arm's motion."""
         return self.mode == "servoj"
-
-    @field_validator("host")
-    @classmethod
-    def _plain_host(cls, value: str) -> str:
-        """Refuse what ur_rtde cannot reach: ports and IPv6 addresses are not possible with it."""
-        if not value or ":" in value or value.strip() != value:
-            raise ValueError("expected an IPv4 address or host name without a port")
-        return value

@@ -10,7 +10,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field
 
-from gapbridge.drivers.section import Positive, Section
+from gapbridge.drivers.section import Host, Positive, Section
 
 LengthUnit = Literal["m", "mm", "um", "in"]
 AngleUnit = Literal["rad", "deg"]
@@ -98,7 +98,7 @@ class LineFeedSettings(Coordinates):
     """A TCP port of the tracker's software that sends one reading per line."""
 
     kind: Literal["line_feed"]
-    host: str = Field(default="127.0.0.1", description="address of the tracker's software")
+    host: Host = Field(default="127.0.0.1", description="address of the tracker's software")
     port: int = Field(gt=0, lt=65536, strict=True, description="of the tracker's software")
     trigger: str = Field(default="", description="line that asks for one reading; none: it streams")
     timeout: Positive = Field(default=10.0, description="s to wait for a line")
@@ -154,7 +154,7 @@ class SimulatedTrackerSettings(Base):
     """The simulated laser tracker of `gapbridge simulate`."""
 
     kind: Literal["simulated_tracker"]
-    host: str | None = Field(default=None, description="loopback address; default: link.host")
+    host: Host | None = Field(default=None, description="loopback address; default: link.host")
     port: int = Field(default=30100, gt=0, lt=65536, strict=True, description="the bench port")
     pose: bool = Field(default=False, strict=True, description="true: rotation as well")
 

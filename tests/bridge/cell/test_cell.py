@@ -174,6 +174,12 @@ def test_an_unknown_key_is_named_with_the_nearest_known(
         (ARM + "metrology: {registered: 1}", "found 1", "true or false"),
         (ARM + "metrology: {sigma: -1}", "found -1", "0 or more"),
         (ARM + "link: {host: '10.0.0.2:30004'}", "'10.0.0.2:30004'", "without a port"),
+        (ARM + "link: {host: 192.168.0..10}", "link.host: found '192.168.0..10'", "its labels"),
+        (
+            ARM + "link: {driver: modbus, profile: ur, host: 'a b'}", "link.host: found 'a b'",
+            "expected an IP address or host name",
+        ),
+        (ARM + f"link: {{host: {'a' * 64}.local}}", "link.host: found", "1 to 63 characters"),
         (ARM + "limits: {offset: 3}", "limits.offset: found 3", "0.1 or less"),
         ("robot: {model: ur10e, calibration: {delta_a: [1]}}", "1 values", "6"),
         ("robot: {model: ur10e, calibration: c.conf}", "file not found", "calibration.conf"),

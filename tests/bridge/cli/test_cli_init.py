@@ -132,6 +132,11 @@ def test_a_key_of_the_link_that_is_none_is_refused(
     assert phrase in refused("init", "127.9.9.9", *arguments, "--out", tmp_path / "new.yaml")
 
 
+def test_a_host_that_sockets_cannot_look_up_is_refused(tmp_path: Path) -> None:
+    line = refused("init", "192.168.0..10", "--out", tmp_path / "new.yaml")
+    assert line.startswith("error: link.host: found '192.168.0..10', expected an IP address")
+
+
 @pytest.mark.parametrize(
     ("host", "driver", "where"),
     [
