@@ -191,7 +191,7 @@ def parse_yaml(text: str, path: Path, kind: Kind) -> Document:
             where = path if root is None else f"{path}, line {root.start_mark.line + 1}"
             content = "an empty file" if root is None else "no keys"
             raise kind.error(f"{where}: found {content}, expected a {kind.name} ({kind.keys})")
-        _require_unique_keys(root, path, kind, set())
+        _require_plain(root, path, kind, set())
         data = loader.construct_document(root)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
@@ -235,13 +235,17 @@ def read_yaml(path: Path, kind: Kind) -> Document:
     return parse_yaml(text, path, kind)
 
 
-def _require_unique_keys(node: yaml.Node, path: Path, kind: Kind, seen: set[int]) -> None:
+def _require_plain(node: yaml.Node, path: Path, kind: Kind, seen: set[int]) -> None:
+    """Raise the kind's error for a key that comes twice, and for NUL, which no path may have."""
     if id(node) in seen:
         return
     seen.add(id(node))
+    if isinstance(node, yaml.ScalarNode) and "\0" in node.value:
+        line = node.start_mark.line + 1
+        raise kind.error(f"{path}, line {line}: found {quoted(node.value)}, expected no \\0 in it")
     if isinstance(node, yaml.SequenceNode):
         for item in node.value:
-            _require_unique_keys(item, path, kind, seen)
+            _require_plain(item, path, kind, seen)
     elif isinstance(node, yaml.MappingNode):
         keys: set[str] = set()
         for key, value in node.value:
@@ -252,4 +256,4 @@ def _require_unique_keys(node: yaml.Node, path: Path, kind: Kind, seen: set[int]
                         f"{path}, line {line}: {key.value}: found twice, expected once"
                     )
                 keys.add(key.value)
-            _require_unique_keys(value, path, kind, seen)
+            _require_plain(value, path, kind, seen)

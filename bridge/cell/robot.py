@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import configparser
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +12,7 @@ from pathlib import Path
 from gapbridge.bridge.cell.schema import Calibration, Robot
 from gapbridge.core.arm import Arm, arm_from_dh, builtin_arm
 from gapbridge.core.errors import ArmError, CellError
-from gapbridge.core.files import is_file, read_text
+from gapbridge.core.files import is_file, quoted, read_text
 from gapbridge.core.urdf import arm_from_urdf
 
 URDF, CALIBRATION = ("robot", "urdf"), ("robot", "calibration")  # keys of the cell file
@@ -40,7 +41,7 @@ def build_arm(robot: Robot, folder: Path) -> Arm:
             ("robot", "rated_payload"),
         )
     if robot.model is not None:
-        return builtin_arm(robot.model, calibration_of(robot.calibration, folder))
+        return _calibrated_arm(robot.model, robot.calibration, folder)
     if robot.urdf is not None:
         path = folder / robot.urdf
         if not is_file(path):
@@ -53,6 +54,17 @@ def build_arm(robot: Robot, folder: Path) -> Arm:
         arm = arm_from_dh([row.model_dump() for row in robot.dh or []])
     rated = robot.rated_payload
     return arm if rated is None else replace(arm, payload=rated)
+
+
+def _calibrated_arm(model: str, calibration: Calibration | str | None, folder: Path) -> Arm:
+    try:
+        return builtin_arm(model, calibration_of(calibration, folder))
+    except ArmError as error:
+        keys = tuple(error.keys or ())
+        if not isinstance(calibration, str) or keys[:2] != CALIBRATION or len(keys) == 2:
+            raise
+        message = f"{folder / calibration}: {keys[2]}: {error.message}"
+        raise ArmError(message, CALIBRATION) from None
 
 
 def calibration_of(
@@ -76,7 +88,7 @@ def read_calibration(path: Path) -> dict[str, list[float]]:
     """
     parser = configparser.ConfigParser(interpolation=None)
     try:
-        parser.read_string(read_text(path), source=str(path))
+        parser.read_string(read_text(path, "utf-8-sig"), source=str(path))
     except FileNotFoundError:
         raise ArmError(
             f"file not found: {path}, expected a calibration.conf", CALIBRATION
@@ -96,8 +108,11 @@ def read_calibration(path: Path) -> dict[str, list[float]]:
 
 def _numbers(path: Path, key: str, text: str) -> list[float]:
     try:
-        return [float(value) for value in json.loads(text)]
-    except (ValueError, TypeError):
+        values = [float(value) for value in json.loads(text)]
+    except (ValueError, TypeError, OverflowError):
+        values = [math.nan]
+    if not all(map(math.isfinite, values)):
         raise ArmError(
-            f"{path}: {key}: found {text!r}, expected a list of numbers", CALIBRATION
-        ) from None
+            f"{path}: {key}: found {quoted(text)}, expected a list of finite numbers", CALIBRATION
+        )
+    return values

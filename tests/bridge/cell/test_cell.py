@@ -262,6 +262,7 @@ def test_a_whole_number_may_be_a_float_and_a_float_whole(tmp_path: Path) -> None
         ("just words", "no keys"),
         ("robot: !!python/object:os.system []", "line 1"),
         ("robot: &a [*a]", "robot"),
+        (ARM + 'setpoints: {file: "a\\0b"}', "line 2: found 'a\\x00b', expected no \\0 in it"),
     ],
 )
 def test_broken_yaml_is_reported_with_its_line(tmp_path: Path, text: str, phrase: str) -> None:
@@ -322,10 +323,17 @@ def test_a_factory_calibration_moves_the_arm_as_its_deltas_say(tmp_path: Path) -
 
 @pytest.mark.parametrize(
     ("text", "phrase"),
-    [("no ini", "cannot be read"), ("[a]\nb = 1", "none of"), ("[a]\ndelta_a = x", "a list")],
+    [
+        ("no ini", "cannot be read"),
+        ("[a]\nb = 1", "none of"),
+        ("[a]\ndelta_a = x", "c.conf: delta_a: found 'x', expected a list of finite numbers"),
+        ("[a]\ndelta_a = [0, NaN]", "c.conf: delta_a: found '[0, NaN]', expected a list of fin"),
+        ("[a]\ndelta_a = [0, 0]", "robot.calibration: {}/c.conf: delta_a: found 2 values"),
+        ("\ufeff[a]\ndelta_a = [0, 0]", "delta_a: found 2 values"),
+    ],
 )
 def test_a_calibration_that_cannot_be_used_is_reported(
     tmp_path: Path, text: str, phrase: str
 ) -> None:
-    (tmp_path / "c.conf").write_text(text)
-    assert phrase in reported(tmp_path, "robot: {model: ur10e, calibration: c.conf}")
+    (tmp_path / "c.conf").write_text(text, encoding="utf-8")
+    assert phrase.format(tmp_path) in reported(tmp_path, "robot: {model: ur10e, calibration: c.conf}")
