@@ -105,9 +105,9 @@ def loaders(*, on_is_text: bool = False) -> tuple[Any, ...]:
     """Return loaders of YAML 1.1 whose numbers mean the same in YAML 1.2.
 
     PyYAML alone reads 2e-5 as a text, 010 as 8 and 1:30 as 90; 010 and 1:30 are texts here, which
-    no number accepts. ``on_is_text``: with the booleans of 1.2 too. The quickest loader (libyaml's, which saves a
-    tenth of a second for a cell with a fit's covariance) comes first; the last one's messages are
-    those that ``PROBLEMS`` knows.
+    no number accepts. ``on_is_text``: with the booleans of 1.2 too. The quickest loader (libyaml's,
+    which saves a tenth of a second for a cell with a fit's covariance) comes first; the last one's
+    messages are those that ``PROBLEMS`` knows.
     """
     fast = (yaml.CSafeLoader,) if hasattr(yaml, "CSafeLoader") else ()
     return tuple(_loader(base, on_is_text) for base in (*fast, yaml.SafeLoader))

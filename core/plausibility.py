@@ -131,8 +131,8 @@ def implausible_in_urdf(path: Path, arm: Arm) -> Iterator[Implausible]:
                 )
         i = arm.joint_names.index(name) if name in arm.joint_names else None
         if i is not None and (lower := arm.limits.lower[i]) > (upper := arm.limits.upper[i]):
-            found = f"limit lower {lower:g} and upper {upper:g}"
-            yield Implausible(URDF, found, "lower below upper", where=where)
+            both = f"limit lower {lower:g} and upper {upper:g}"
+            yield Implausible(URDF, both, "lower below upper", where=where)
 
 
 def _largest(element: ElementTree.Element | None, key: str) -> float:

@@ -14,7 +14,9 @@ from gapbridge.drivers.addresses import host_name, plain_host
 Number = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[Number, Field(gt=0.0)]
 Host = Annotated[str, AfterValidator(host_name)]
-PlainHost = Annotated[str, AfterValidator(plain_host)]  # an IPv4 address or a name: no port, no IPv6
+PlainHost = Annotated[
+    str, AfterValidator(plain_host)
+]  # an IPv4 address or a name: no port, no IPv6
 
 
 class Section(BaseModel):

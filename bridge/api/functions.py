@@ -14,6 +14,7 @@ import numpy as np
 
 from gapbridge.bridge.api.records import Corrected, Diagnosed, Fitted, Predicted
 from gapbridge.bridge.cell import Cell, load_cell
+from gapbridge.bridge.cell.message import located
 from gapbridge.bridge.cell.opened_log import at_joints_of, open_log
 from gapbridge.bridge.document.provenance import fitted, provenance
 from gapbridge.core.calibration.spread import Spread
@@ -54,6 +55,8 @@ def predict(cell: Cell, log: Log, *, channels: bool = False) -> Predicted:
             poses = cell.model.predict(q, loads)
     except EquilibriumError as error:
         raise InputError(f"{log.path}: row {log.line(error.row)}: {error.text}") from None
+    except InputError as error:
+        raise located(cell.document, error) from None
     further, needs = predicted_channels(cell.model, log) if channels else ({}, {})
     return Predicted(
         poses.position, poses.rotation_vector, std,

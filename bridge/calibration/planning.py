@@ -19,8 +19,9 @@ from gapbridge.bridge.cell.settings.instruments import Base
 from gapbridge.core.calibration.identifiability import identifiable_parameters
 from gapbridge.core.calibration.observables import make_observable
 from gapbridge.core.calibration.observables.observable import Observable
-from gapbridge.core.calibration.parameters import DEFAULT
+from gapbridge.core.calibration.parameters import DEFAULT, Parameters
 from gapbridge.core.calibration.plan import Payload, Plan
+from gapbridge.core.errors import InputError, PlanError
 from gapbridge.core.metrology import Metrology
 from gapbridge.core.planning.capsules import Box
 from gapbridge.core.planning.design import SessionDesign, load_extent, plan
@@ -33,8 +34,19 @@ CONTACT_KINDS = ("sphere", "point")  # kinds by contact: no instrument looks at 
 
 
 def effects_of(cell: Cell) -> tuple[str, ...]:
-    """Return the effects to fit."""
+    """Return the effects to fit. Raises CellError for one that a calibration cannot fit."""
+    for i, name in enumerate(cell.calibration.effects or ()):
+        try:
+            Parameters.of_effects(cell.model, (name,))
+        except InputError as error:
+            raise cell.error(("calibration", "effects", i), error.message) from None
     return tuple(cell.calibration.effects or DEFAULT)
+
+
+def check_session(cell: Cell) -> None:
+    """Raise CellError for what a session would refuse in section ``calibration``."""
+    effects_of(cell)
+    workspace_of(cell, cell.calibration.instrument.measures)
 
 
 def observable_of(cell: Cell, instrument: Base, places: int = 1) -> Observable:
@@ -91,13 +103,17 @@ def workspace_of(cell: Cell, kind: str) -> Workspace:
     settings, entry = cell.calibration, cell.calibration.reflector
     places = _places(cell, kind)
     lower, upper = _range(cell, settings.joint_range)
-    return Workspace.of(
-        cell.model, lower=lower, upper=upper, floor=settings.floor, places=places,
-        keep_out=[Box(_vector3(b.lower), _vector3(b.upper)) for b in _boxes(cell, settings)],
-        reflector=None if entry is None else Reflector(
-            looks=entry.looks, acceptance=entry.acceptance
-        ),
-    )  # fmt: skip
+    boxes = [Box(_vector3(b.lower), _vector3(b.upper)) for b in _boxes(cell, settings)]
+    optic = None
+    if entry is not None:
+        optic = Reflector(looks=entry.looks, acceptance=entry.acceptance)
+    try:
+        return Workspace.of(
+            cell.model, lower=lower, upper=upper, floor=settings.floor, places=places,
+            keep_out=boxes, reflector=optic,
+        )  # fmt: skip
+    except PlanError as error:
+        raise cell.error(("calibration", "joint_range"), str(error)) from None
 
 
 def _places(cell: Cell, kind: str) -> list[Place]:
@@ -166,6 +182,12 @@ def _range(
         if len(values) != n:
             raise cell.error(
                 ("calibration", "joint_range", name), f"found {len(values)} values, expected {n}"
+            )
+    for i, (lower, upper) in enumerate(zip(settings.lower, settings.upper, strict=True)):
+        if lower >= upper:
+            raise cell.error(
+                ("calibration", "joint_range", "lower", i),
+                f"found {lower:g}, expected less than upper, {upper:g}",
             )
     return settings.lower, settings.upper
 

@@ -14,7 +14,7 @@ from gapbridge.core.plausibility import MAX_LIMIT, Implausible
 from gapbridge.drivers.addresses import is_loopback
 from gapbridge.drivers.ur_rtde.settings import UrRtdeSettings
 
-ALL_ADDRESSES = ("0.0.0.0", "::")  # noqa: S104 - compared with, not listened on
+ALL_ADDRESSES = ("0.0.0.0", "::")
 SIMULATED_PORTS = ("rtde_port", "dashboard_port", "script_port", "bench_port", "primary_port")
 
 

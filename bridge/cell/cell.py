@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -24,10 +24,13 @@ from gapbridge.bridge.cell.sections import (
 from gapbridge.bridge.cell.settings.calibration import CalibrationSettings
 from gapbridge.bridge.cell.settings.web import MetricsSettings, WebSettings
 from gapbridge.core.arm import Arm
+from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.spread import Spread
-from gapbridge.core.errors import ArmError, CellError, InputError, Keys
+from gapbridge.core.effects import Term
+from gapbridge.core.errors import ArmError, CellError, EquilibriumError, InputError, Keys
 from gapbridge.core.files import Document
 from gapbridge.core.load_bounds import PAYLOAD_FACTOR
+from gapbridge.core.loads import Loads
 from gapbridge.core.metrology import Metrology
 from gapbridge.core.model import Model, Uncertain
 from gapbridge.core.rotation import rpy_matrix, transform
@@ -122,7 +125,15 @@ class Cell:
     @property
     def uncertain(self) -> Uncertain | None:
         """Return the model uncertainty as the diagnosis uses it; None if it is unknown."""
-        return partial(self.spread.sigma_columns, self.model) if self.spread.names else None
+        return self._sigma_columns if self.spread.names else None
+
+    def _sigma_columns(self, q: Array, loads: Loads | None, known: Sequence[Term]) -> Array:
+        try:
+            return self.spread.sigma_columns(self.model, q, loads, known)
+        except EquilibriumError:
+            raise
+        except InputError as error:
+            raise located(self.document, error) from None
 
     @property
     def causes(self) -> tuple[CauseEntry, ...]:

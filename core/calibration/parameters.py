@@ -167,13 +167,14 @@ def _sites(model: Model, name: str) -> list[tuple[str, Site]]:
     effect = effect_named(name if joint is None else stem)
     if not effect.calibratable:
         raise InputError(
-            f"effect: found {name!r}, expected one that measured positions show: "
-            + ", ".join(e for e, member in CATALOGUE.items() if member.calibratable)
+            f"found {name!r}, expected one that measured positions show: "
+            + ", ".join(e for e, member in CATALOGUE.items() if member.calibratable),
+            ("effect",),
         )
     sites = [s for s in effect.sites(model.arm) if joint is None or s.joint == joint]
     if not sites:
         raise InputError(
-            f"effect: found {name!r}, expected a joint of this arm of {model.arm.n} joints"
+            f"found {name!r}, expected a joint of this arm of {model.arm.n} joints", ("effect",)
         )
     if effect.periodic:
         sites = [replace(s, order=order) for s in sites for order in PERIODIC_ORDERS]

@@ -115,25 +115,31 @@ class Spread:
 def parameters_named(model: Model, names: Sequence[str], where: str) -> Parameters:
     """Return the parameters with these names, as corrections to ``model``.
 
-    Raises InputError, beginning with ``where``, for a name that its arm does not have.
+    Raises InputError with the keys of a name in ``where`` that its arm does not have.
     """
-    parameters = Parameters.of_effects(model, effects_of(names))
+    parameters = Parameters.of_effects(model, effects_of(names, where))
     index = {name: i for i, name in enumerate(parameters.names)}
-    missing = [name for name in names if name not in index]
-    if missing:
-        raise InputError(
-            f"{where}: found parameter {missing[0]!r}, expected one of this cell's arm"
-        )
+    for i, name in enumerate(names):
+        if name not in index:
+            raise InputError(
+                f"found {name!r}, expected a parameter of this cell's arm", (where, "parameters", i)
+            )
     return parameters.part([index[name] for name in names])
 
 
-def effects_of(names: Sequence[str]) -> tuple[str, ...]:
-    """Return the effects that parameters with these names belong to, each once."""
+def effects_of(names: Sequence[str], where: str = "calibration") -> tuple[str, ...]:
+    """Return the effects that parameters with these names belong to, each once.
+
+    Raises InputError with the keys of a name in ``where`` that belongs to none.
+    """
     effects = []
-    for name in names:
+    for i, name in enumerate(names):
         parts = split_name(name)
-        if parts is None:
-            raise InputError(f"calibration: found parameter {name!r}, expected one of an effect")
+        if parts is None or not CATALOGUE[parts.effect].calibratable:
+            raise InputError(
+                f"found {name!r}, expected a parameter of an effect that positions show",
+                (where, "parameters", i),
+            )
         effects.append(parts.effect)
     return tuple(dict.fromkeys(effects))
 

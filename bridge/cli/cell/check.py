@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import click
+import numpy as np
 
 from gapbridge.bridge.cell import Cell, load_cell
 from gapbridge.bridge.cell.cell import cell_errors
 from gapbridge.bridge.cell.live import live_findings
 from gapbridge.bridge.cell.log_consistency import log_findings
 from gapbridge.bridge.cell.message import located_message, message_at
+from gapbridge.bridge.cell.plausibility import Findings
 from gapbridge.bridge.cell.run_settings import read_configuration
 from gapbridge.bridge.cli.options import FILE, cell_argument
 from gapbridge.bridge.setpoint_source import make_source
+from gapbridge.core.calibration.spread import parameters_named
 from gapbridge.core.errors import InputError
 from gapbridge.drivers import make_driver
 from gapbridge.drivers.link_settings import ProfileSettings
@@ -47,8 +51,9 @@ def check(cell: Path, live: bool, logs: tuple[Path, ...]) -> None:
     if not errors:
         opened = load_cell(cell)
         warnings += opened.warnings
-        if opened.file.link is not None:
-            errors += _run_errors(opened)
+        for findings in _further_findings(opened):
+            errors += findings.errors
+            warnings += findings.warnings
         if live and not errors:
             findings = live_findings(opened)
             errors += findings.errors
@@ -69,16 +74,42 @@ def check(cell: Path, live: bool, logs: tuple[Path, ...]) -> None:
     click.echo(f"{cell}: fit to be used{text}{count}")
 
 
-def _run_errors(cell: Cell) -> list[str]:
-    """Return the errors of files that only a run reads: profiles, tokens, a trajectory."""
+def _further_findings(cell: Cell) -> Iterator[Findings]:
+    """Yield what only predict, calibrate or run would refuse: names, places, files."""
+    try:
+        if cell.spread.names:
+            parameters_named(cell.model, cell.spread.names, "provenance")
+        if "calibration" in cell.document.data:
+            from gapbridge.bridge.calibration.planning import check_session
+
+            check_session(cell)
+    except InputError as error:
+        yield Findings([located_message(cell.document, error)], [])
+    if cell.file.link is not None:
+        yield _run_findings(cell)
+
+
+def _run_findings(cell: Cell) -> Findings:
+    """Return the findings in what only a run reads: limits, profiles, tokens, a trajectory."""
+    limits = cell.arm.limits
+    for i in np.flatnonzero(limits.lower >= limits.upper):
+        text = f"joint {i + 1}: found limits {limits.lower[i]:g} to {limits.upper[i]:g} rad"
+        line = message_at(cell.document, ("robot",), f"{text}, expected lower below upper")
+        return Findings([line], [])
     try:
         settings = read_configuration(cell.path).settings
         if isinstance(settings.link, ProfileSettings):
             make_driver(settings.link, cell.model)  # checks the profile against the arm
     except InputError as error:
-        return [located_message(cell.document, error)]
+        return Findings([located_message(cell.document, error)], [])
+    setpoints, rate = settings.setpoints, settings.link.rate
     try:
-        make_source(settings.setpoints, cell.arm.n, True, cell.path.parent, settings.link.rate)
+        make_source(setpoints, cell.arm.n, True, cell.path.parent, rate)
     except InputError as error:
-        return [message_at(cell.document, error.keys or ("setpoints", "file"), error.message)]
-    return []
+        keys = error.keys or ("setpoints", "file")
+        return Findings([message_at(cell.document, keys, error.message)], [])
+    if setpoints.source != "trajectory":
+        return Findings([], [])
+    from gapbridge.bridge.cli.cell.trajectory_check import trajectory_findings
+
+    return trajectory_findings(cell, setpoints, rate)

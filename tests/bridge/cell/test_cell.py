@@ -336,4 +336,6 @@ def test_a_calibration_that_cannot_be_used_is_reported(
     tmp_path: Path, text: str, phrase: str
 ) -> None:
     (tmp_path / "c.conf").write_text(text, encoding="utf-8")
-    assert phrase.format(tmp_path) in reported(tmp_path, "robot: {model: ur10e, calibration: c.conf}")
+    assert phrase.format(tmp_path) in reported(
+        tmp_path, "robot: {model: ur10e, calibration: c.conf}"
+    )

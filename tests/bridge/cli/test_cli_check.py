@@ -211,6 +211,19 @@ def test_every_command_refuses_it_in_one_line(tmp_path: Path) -> None:
         ("link: {driver: can, profile: openarm}", "line 2: link.profile: found 7 joints in"),
         ("link: {host: 127.0.0.2}\nsetpoints: {source: trajectory}",
          "line 3: setpoints.file: found nothing"),
+        ("calibration: {joint_range: {lower: [0], upper: [1]}}",
+         "line 2: calibration.joint_range.lower: found 1 values, expected 6"),
+        ("calibration: {joint_range: {lower: [0, 2, 0, 0, 0, 0], upper: [1, 1, 1, 1, 1, 1]}}",
+         "line 2: calibration.joint_range.lower entry 2: found 2, expected less than upper, 1"),
+        ("calibration: {joint_range: {lower: [8, 0, 0, 0, 0, 0], upper: [9, 1, 1, 1, 1, 1]}}",
+         "line 2: calibration.joint_range: joint 1: found limits 8 to 6.283 rad"),
+        ("calibration:\n  effects: [backlash, foo]",
+         "line 3: calibration.effects entry 2: found 'foo', expected one of the catalogue"),
+        ("calibration: {effects: [latency]}", "line 2: calibration.effects entry 1: found 'lat"),
+        ("provenance: {parameters: [foo_9], covariance: [[1]]}",
+         "line 2: provenance.parameters entry 1: found 'foo_9', expected a parameter of an"),
+        ("provenance: {parameters: [backlash_9], covariance: [[1]]}",
+         "line 2: provenance.parameters entry 1: found 'backlash_9', expected a parameter of this"),
     ],
 )  # fmt: skip
 def test_what_only_a_run_would_refuse_is_named_with_its_line(
@@ -218,6 +231,57 @@ def test_what_only_a_run_would_refuse_is_named_with_its_line(
 ) -> None:
     path = cell_of(tmp_path, lines)
     assert f"error: {path}, {message}" in refused("check", path)
+
+
+@pytest.mark.parametrize(
+    ("lower", "upper", "message"),
+    [(0, 0, "line 1: robot: joint 1: found limits 0 to 0 rad, expected lower below upper")],
+)
+def test_a_joint_without_room_is_refused_where_a_run_would_fail(
+    tmp_path: Path, lower: float, upper: float, message: str
+) -> None:
+    (tmp_path / "arm.urdf").write_text(
+        '<robot name="r"><link name="a"/><link name="b"/><link name="c"/>'
+        '<joint name="j" type="revolute"><parent link="a"/><child link="b"/>'
+        f'<limit lower="{lower}" upper="{upper}" velocity="2" effort="9"/></joint>'
+        '<joint name="f" type="fixed"><parent link="b"/><child link="c"/><origin xyz="0 0 1"/>'
+        "</joint></robot>"
+    )
+    path = tmp_path / "cell.yaml"
+    path.write_text("robot: {urdf: arm.urdf}\n")
+    assert gapbridge("check", path).code == 0
+    path.write_text("robot: {urdf: arm.urdf}\nlink: {driver: replay, file: cell.yaml}\n")
+    assert f"error: {path}, {message}" in gapbridge("check", path).err
+
+
+TRAJECTORY = "link: {host: 127.0.0.2}\nsetpoints: {source: trajectory, file: t.csv}"
+
+
+@pytest.mark.parametrize(
+    ("joint_2", "code", "message"),
+    [
+        ((0.0, 0.1, 0.2), 0, ""),
+        ((0.0, 7.0, 7.1), 2, "row 3, column target_q_1: found 7.0000 rad, expected -6.2832 to"),
+        ((0.0, -90.0, 0.0), 2, "to 6.2832 (it looks like degrees)"),
+        ((0.0, 0.1, 0.4), 0, "row 4, column target_q_1: found 3 rad/s, expected at most 2.09: "
+         "`run` lags behind it"),
+        ((0.0, 0.5, 0.5), 2, "row 3, column target_q_1: found 5 rad/s, expected at most 2.09: "
+         "`run` refuses such a jump"),
+    ],
+)  # fmt: skip
+def test_a_trajectory_beyond_the_limits_is_named_with_row_and_joint(
+    tmp_path: Path, joint_2: tuple[float, ...], code: int, message: str
+) -> None:
+    path = cell_of(tmp_path, TRAJECTORY)
+    rows = [f"{0.1 * i},0,{q},0,0,0,0" for i, q in enumerate(joint_2)]
+    header = ",".join(["timestamp", *(f"target_q_{i}" for i in range(6))])
+    (tmp_path / "t.csv").write_text("\n".join([header, *rows]) + "\n")
+    answer = gapbridge("check", path)
+    assert answer.code == code
+    assert message in answer.err
+    if message:
+        kind = "error" if code else "warning"
+        assert f"{kind}: {path}, line 3: setpoints.file: {tmp_path}/t.csv: row " in answer.err
 
 
 def test_a_recording_that_is_none_is_refused_in_one_line(tmp_path: Path) -> None:
