@@ -78,7 +78,14 @@ def validation_errors(
 ) -> list[tuple[Keys | None, str]]:
     """Return the keys of each error (None: the key itself is invalid) and its text."""
     details = sorted(error.errors(), key=lambda d: d["type"] != "extra_forbidden")
-    return [_validation_error(schema, detail) for detail in details]
+    return [_validation_error(schema, detail) for detail in details if not _is_echo(detail)]
+
+
+def _is_echo(detail: ErrorDetails) -> bool:
+    """Return whether a length is reported only because wrong entries were not counted."""
+    if detail["type"] not in ("too_short", "too_long"):
+        return False
+    return bool(detail["ctx"]["actual_length"] != len(detail["input"]))
 
 
 def _validation_error(schema: type[BaseModel], detail: ErrorDetails) -> tuple[Keys | None, str]:

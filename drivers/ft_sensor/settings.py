@@ -58,8 +58,8 @@ class RobotousSettings(BusSettings, FtSensorSettings):
         (0x01, 0x02), description="ids of the first and second frame of a sample"
     )
     rate: float = Field(200.0, gt=0.0, le=1000.0, description="samples per second")
-    force_counts: float = Field(50.0, gt=0.0, description="counts per N")
-    torque_counts: float = Field(2000.0, gt=0.0, description="counts per Nm")
+    force_counts: Number = Field(50.0, gt=0.0, description="counts per N")
+    torque_counts: Number = Field(2000.0, gt=0.0, description="counts per Nm")
 
     @field_validator("reply_ids")
     @classmethod

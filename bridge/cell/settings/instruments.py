@@ -10,7 +10,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field
 
-from gapbridge.drivers.section import Host, Positive, Section
+from gapbridge.drivers.section import Host, Number, Positive, Section
 
 LengthUnit = Literal["m", "mm", "um", "in"]
 AngleUnit = Literal["rad", "deg"]
@@ -110,7 +110,7 @@ class DialGaugeSettings(Base):
     reads = "distance"
     kind: Literal["dial_gauge"]
     unit: LengthUnit = Field(description="of lengths: m, mm, um or in")
-    zero: float | None = Field(
+    zero: Number | None = Field(
         default=None, description="distance at which it reads 0, in its unit; default: estimated"
     )
 

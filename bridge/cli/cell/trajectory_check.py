@@ -36,13 +36,15 @@ def trajectory_findings(cell: Cell, setpoints: SetpointSettings, rate: float) ->
         )
         return Findings([message_at(cell.document, FILE, text)], [])
     time = log.require("timestamp")
-    cycles = np.arange(time[0], time[-1] + 1.0 / rate, 1.0 / rate)
-    steps = np.diff([np.interp(cycles, time, column) for column in q.T]).T * rate  # rad/s
-    share = np.abs(steps) / limits.velocity
-    if not share.size or (worst := float(share.max())) <= 1.0 + ROUNDING:
+    # of all windows of one cycle, the largest step begins or ends at a row
+    begins = np.concatenate([time, time - 1.0 / rate])
+    ends = np.concatenate([time + 1.0 / rate, time])
+    steps = [np.interp(ends, time, column) - np.interp(begins, time, column) for column in q.T]
+    share = np.abs(steps).T * rate / limits.velocity
+    if (worst := float(share.max())) <= 1.0 + ROUNDING:
         return Findings([], [])
-    cycle, joint = (int(i) for i in np.unravel_index(int(share.argmax()), share.shape))
-    row = log.line(int(np.searchsorted(time, cycles[cycle + 1]).clip(max=len(time) - 1)))
+    window, joint = (int(i) for i in np.unravel_index(int(share.argmax()), share.shape))
+    row = log.line(min(int(np.searchsorted(time, ends[window])), len(time) - 1))
     limit = limits.velocity[joint]
     text = message_at(
         cell.document, FILE,

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from gapbridge.bridge.cell import load_cell
+from gapbridge.bridge.cell.cell import cell_errors
 from gapbridge.core.errors import ArmError, CellError
 from gapbridge.core.rotation import rotation_matrix
 
@@ -198,6 +199,11 @@ def test_an_unknown_key_is_named_with_the_nearest_known(
             ARM + "link: {torque_constants: [1, 1, 1, 1, 1, 0]}",
             "link.torque_constants entry 6: found 0", "more than 0",
         ),
+        (ARM + "ft_sensor: {driver: robotous_rft, force_counts: .inf}", "_counts", "finite"),
+        (
+            ARM + "calibration: {instrument: {kind: dial_gauge, unit: mm, zero: .nan}}",
+            "instrument.zero: found nan", "finite",
+        ),
         (ARM + "link: {driver: can, profile: piper, gear: [.inf]}", "gear entry 1", "finite"),
         (ARM + "link: {driver: can, profile: piper, zero: [.nan]}", "zero entry 1", "finite"),
         (
@@ -242,6 +248,14 @@ def test_numbers_and_booleans_of_every_section_are_taken_literally(
     line = reported(tmp_path, f"{ARM}{section}: {{{keys}}}")
     key = keys.split(":")[0]
     assert f", line 2: {section}.{key}: found {found}, expected {expected} (" in line
+
+
+def test_a_list_of_the_right_length_is_not_reported_for_its_length(tmp_path: Path) -> None:
+    path = written(tmp_path, ARM + "link: {torque_constants: [1, 1, 1, 1, .nan, -1]}")
+    assert [line.split(": ")[1] for line in cell_errors(path)] == [
+        "link.torque_constants entry 5",
+        "link.torque_constants entry 6",
+    ]
 
 
 def test_a_whole_number_may_be_a_float_and_a_float_whole(tmp_path: Path) -> None:

@@ -284,6 +284,15 @@ def test_a_trajectory_beyond_the_limits_is_named_with_row_and_joint(
         assert f"{kind}: {path}, line 3: setpoints.file: {tmp_path}/t.csv: row " in answer.err
 
 
+def test_a_trajectory_of_any_length_is_checked(tmp_path: Path) -> None:
+    path = cell_of(tmp_path, TRAJECTORY)
+    rows = ["0,0,0,0,0,0,0", "0.0005,0.003,0,0,0,0,0", "1e300,0,0,0,0,0,0"]  # 6 rad/s, a quarter cycle
+    header = ",".join(["timestamp", *(f"target_q_{i}" for i in range(6))])
+    (tmp_path / "t.csv").write_text("\n".join([header, *rows]) + "\n")
+    answer = gapbridge("check", path)
+    assert (answer.code, answer.err) == (0, "")
+
+
 def test_a_recording_that_is_none_is_refused_in_one_line(tmp_path: Path) -> None:
     path, log = tmp_path / "cell.yaml", tmp_path / "log.mcap"
     path.write_text("robot: {model: ur10e}\n")
