@@ -79,9 +79,12 @@ def is_given() -> bool:
 
 def is_file(path: Path) -> bool:
     """Return whether there is a file to read."""
-    return (
-        path.is_file() if _given_files is None else any(key in _given_files for key in _keys(path))
-    )
+    if _given_files is not None:
+        return any(key in _given_files for key in _keys(path))
+    try:
+        return path.is_file()
+    except OSError:  # a name that is too long
+        return False
 
 
 @contextlib.contextmanager

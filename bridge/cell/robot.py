@@ -50,6 +50,8 @@ def build_arm(robot: Robot, folder: Path) -> Arm:
             arm = arm_from_urdf(path, robot.tip)
         except ArmError as error:
             raise ArmError(str(error), URDF) from None
+        except RecursionError:
+            raise ArmError(f"{path}: found links nested too deep, expected fewer", URDF) from None
     else:
         arm = arm_from_dh([row.model_dump() for row in robot.dh or []])
     rated = robot.rated_payload
@@ -108,11 +110,13 @@ def read_calibration(path: Path) -> dict[str, list[float]]:
 
 def _numbers(path: Path, key: str, text: str) -> list[float]:
     try:
-        values = [float(value) for value in json.loads(text)]
-    except (ValueError, TypeError, OverflowError):
-        values = [math.nan]
-    if not all(map(math.isfinite, values)):
-        raise ArmError(
-            f"{path}: {key}: found {quoted(text)}, expected a list of finite numbers", CALIBRATION
-        )
-    return values
+        values = json.loads(text)
+        if isinstance(values, list) and all(type(v) in (int, float) for v in values):
+            numbers = [float(value) for value in values]
+            if all(map(math.isfinite, numbers)):
+                return numbers
+    except (ValueError, OverflowError, RecursionError):
+        pass
+    raise ArmError(
+        f"{path}: {key}: found {quoted(text)}, expected a list of finite numbers", CALIBRATION
+    )

@@ -146,6 +146,7 @@ def test_an_unknown_key_is_named_with_the_nearest_known(
         ("robot: {dh: [{a: 1, alpha: 0}]}", "robot.dh entry 1.d: found nothing", "expected m"),
         ("robot: {dh: [{a: 1, alpha: 0, d: x}]}", "'x'", "a number"),
         ("robot: {urdf: none.urdf}", "none.urdf", "URDF"),
+        (f"robot: {{urdf: {'x' * 300}}}", "file not found", "URDF"),
         ("robot: ur10e", "'ur10e'", "keys with values"),
         ("tool: {}", "robot: found nothing", "model, urdf or dh"),
         (ARM + "payload: {mass: -1}", "payload.mass: found -1", "0 or more (kg)"),
@@ -316,6 +317,19 @@ def test_a_urdf_is_found_beside_the_cell(tmp_path: Path) -> None:
     assert np.allclose(cell.arm.link_in_link[7], np.eye(4))
 
 
+def test_a_urdf_of_links_that_are_nested_too_deep_is_refused(tmp_path: Path) -> None:
+    joint = '<joint name="{0}" type="{1}"><parent link="{2}"/><child link="{0}"/></joint>'
+    chain = [f'<link name="b{i}"/>{joint.format(f"b{i}", "fixed", f"b{i - 1}")}'
+             for i in range(1, 1500)]  # fmt: skip
+    (tmp_path / "arm.urdf").write_text(
+        f'<robot name="r"><link name="b0"/><link name="t"/>{joint.format("t", "revolute", "b0")}'
+        f"{''.join(chain)}</robot>"
+    )
+    assert "arm.urdf: found links nested too deep" in reported(
+        tmp_path, "robot: {urdf: arm.urdf, tip: t}"
+    )
+
+
 def test_a_factory_calibration_moves_the_arm_as_its_deltas_say(tmp_path: Path) -> None:
     (tmp_path / "calibration.conf").write_text(
         "[mounting]\n"
@@ -344,6 +358,9 @@ def test_a_factory_calibration_moves_the_arm_as_its_deltas_say(tmp_path: Path) -
         ("[a]\ndelta_a = [0, NaN]", "c.conf: delta_a: found '[0, NaN]', expected a list of fin"),
         ("[a]\ndelta_a = [0, 0]", "robot.calibration: {}/c.conf: delta_a: found 2 values"),
         ("\ufeff[a]\ndelta_a = [0, 0]", "delta_a: found 2 values"),
+        ("[a]\ndelta_a = [true, 0, 0, 0, 0, 0]", "delta_a: found '[true, 0, 0, 0, 0, 0]'"),
+        ('[a]\ndelta_a = "123456"', "a list of finite numbers"),
+        (f"[a]\ndelta_a = {'[' * 100_000}", "a list of finite numbers"),
     ],
 )
 def test_a_calibration_that_cannot_be_used_is_reported(

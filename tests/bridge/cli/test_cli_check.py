@@ -286,7 +286,11 @@ def test_a_trajectory_beyond_the_limits_is_named_with_row_and_joint(
 
 def test_a_trajectory_of_any_length_is_checked(tmp_path: Path) -> None:
     path = cell_of(tmp_path, TRAJECTORY)
-    rows = ["0,0,0,0,0,0,0", "0.0005,0.003,0,0,0,0,0", "1e300,0,0,0,0,0,0"]  # 6 rad/s, a quarter cycle
+    rows = [
+        "0,0,0,0,0,0,0",
+        "0.0005,0.003,0,0,0,0,0",
+        "1e300,0,0,0,0,0,0",
+    ]  # 6 rad/s, a quarter cycle
     header = ",".join(["timestamp", *(f"target_q_{i}" for i in range(6))])
     (tmp_path / "t.csv").write_text("\n".join([header, *rows]) + "\n")
     answer = gapbridge("check", path)

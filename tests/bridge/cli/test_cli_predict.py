@@ -100,6 +100,19 @@ def test_a_cell_of_which_nothing_was_fitted_says_so(
     assert "keeps no covariance of a fit" in capsys.readouterr().out
 
 
+def test_a_parameter_that_is_none_is_named_with_file_and_key(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cell = folder / "stale.yaml"
+    text = (folder / "cell.yaml").read_text()
+    cell.write_text(f"{text}\nprovenance: {{parameters: [foo_9], covariance: [[1.0]]}}\n")
+    arguments = ("predict", folder / "fit.csv", "--cell", cell, "--out", folder / "stale.csv")
+    assert run(*arguments) == 2
+    said = capsys.readouterr().err
+    assert said.startswith(f"error: {cell}, line ")
+    assert ": provenance.parameters entry 1: found 'foo_9', expected a parameter" in said
+
+
 def test_channels_are_predicted_beside_the_pose(folder: Path) -> None:
     out = folder / "channels.csv"
     arguments = ("predict", folder / "fit.csv", "--cell", folder / "new.yaml", "--out", out)
