@@ -37,6 +37,6 @@ def host_name(host: str) -> str:
 
 def plain_host(host: str) -> str:
     """Return an IPv4 address or host name. Raises ValueError for others, and for a port in it."""
-    if ":" in host:
+    if ":" in host or host.split() != [host]:
         raise ValueError("expected an IPv4 address or host name without a port")
     return host_name(host)

@@ -179,7 +179,7 @@ def test_an_unknown_key_is_named_with_the_nearest_known(
         (ARM + "link: {host: 192.168.0..10}", "link.host: found '192.168.0..10'", "its labels"),
         (
             ARM + "link: {driver: modbus, profile: ur, host: 'a b'}", "link.host: found 'a b'",
-            "expected an IP address or host name",
+            "expected an IPv4 address or host name without a port",
         ),
         (ARM + f"link: {{host: {'a' * 64}.local}}", "link.host: found", "1 to 63 characters"),
         (ARM + "limits: {offset: 3}", "limits.offset: found 3", "0.1 or less"),
