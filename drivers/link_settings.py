@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import ClassVar, Self
 
@@ -63,3 +64,9 @@ class ProfileSettings(DriverSettings):
                 ("link", "profile"),
             )
         return settings
+
+    def paths(self) -> Iterator[tuple[tuple[str | int, ...], Path]]:
+        """Yield the keys of each path, the profile's among them; see Section.paths."""
+        yield from super().paths()
+        if self.names_file:
+            yield ("profile",), Path(self.profile)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Self
 
@@ -46,6 +47,12 @@ class Section(BaseModel):
                 placed[name] = value.located(folder)
         return self.model_copy(update=placed)
 
+    def paths(self) -> Iterator[tuple[tuple[str | int, ...], Path]]:
+        """Yield the keys of each path that the file states, and the path as it is in the file."""
+        for name in type(self).model_fields:
+            if name in self.model_fields_set:
+                yield from _paths((name,), getattr(self, name))
+
 
 def _literal(part: Any, section: type[Section]) -> Any:
     """Return a part of a section's core schema with its numbers and booleans taken literally."""
@@ -68,3 +75,16 @@ def _refuse_bool_and_text(value: Any) -> Any:
     if isinstance(value, bool | str):
         raise PydanticKnownError("int_type")
     return value
+
+
+def _paths(
+    keys: tuple[str | int, ...], value: object
+) -> Iterator[tuple[tuple[str | int, ...], Path]]:
+    """Yield the paths in the value at ``keys``; see Section.paths."""
+    if isinstance(value, Path):
+        yield keys, value
+    elif isinstance(value, Section):
+        yield from (((*keys, *inner), path) for inner, path in value.paths())
+    elif isinstance(value, list | tuple):
+        for index, item in enumerate(value):
+            yield from _paths((*keys, index), item)

@@ -169,7 +169,7 @@ def _driver_tag(model: type[BaseModel]) -> str | None:
 
 def _is_union_label(part: str, models: list[type[BaseModel]]) -> bool:
     names = {m.__name__ for m in models}
-    return part in names or part in ("str", "float", "int", "bool") or "[" in part
+    return part in names or part in ("str", "float", "int", "bool", "path") or "[" in part
 
 
 def _description(schema: type[BaseModel], keys: Keys) -> str:

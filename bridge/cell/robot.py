@@ -70,7 +70,7 @@ def _calibrated_arm(model: str, calibration: Calibration | str | None, folder: P
 
 
 def calibration_of(
-    calibration: Calibration | str | None, folder: Path
+    calibration: Calibration | Path | None, folder: Path
 ) -> Mapping[str, Sequence[float]] | None:
     """Return the DH deltas (rad, m, per joint) of ``robot.calibration`` or of the file it names.
 

@@ -6,6 +6,7 @@ import copy
 import json
 import os
 import re
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -21,12 +22,6 @@ from gapbridge.core.files import Document
 from gapbridge.core.model import Model
 
 PLAIN = re.compile(r"(?!(?:y|n|yes|no|on|off|true|false|null|nan|inf)$)[a-z][a-z_]*", re.IGNORECASE)
-PATHS: tuple[tuple[str, ...], ...] = (
-    ("robot", "urdf"),
-    ("robot", "calibration"),
-    ("setpoints", "file"),
-    ("recording", "folder"),
-)
 
 
 class _Dumper(yaml.SafeDumper):
@@ -54,7 +49,7 @@ def save_cell(
     """
     path = Path(path)
     model = model or cell.model
-    text = cell_text(cell.document, path, model, _changed_tool(cell, model) | (sections or {}))
+    text = cell_text(cell, path, model, _changed_tool(cell, model) | (sections or {}))
     write_text(path, text)
 
 
@@ -68,19 +63,19 @@ def _changed_tool(cell: Cell, model: Model) -> dict[str, Any]:
     return {"tool": tool}
 
 
-def cell_text(
-    document: Document, path: Path, model: Model, sections: dict[str, Any] | None = None
-) -> str:
+def cell_text(cell: Cell, path: Path, model: Model, sections: dict[str, Any] | None = None) -> str:
     """Return the text of the cell file at ``path`` for ``model``; see save_cell."""
+    document = cell.document
     changes: dict[str, Any] = {**(sections or {})}
     changes["compliance"] = compliance_entry(model.terms, model.arm.n)
     entries = effect_entries(model.terms, model.arm)
     if entries or "effects" in document.data:
         changes["effects"] = entries
     expected = copy.deepcopy(document.data)
-    for keys in PATHS:
-        _rebase(expected, keys, document.path.parent, path.parent)
-    edited = _edited(document, expected, changes)
+    paths = _moved_paths(cell, path.parent)
+    for (*parents, last), moved in paths.items():
+        _value(expected, parents)[last] = moved
+    edited = _edited(document, paths, changes)
     expected.update(changes)
     if edited is not None and _reads_as(edited, path, expected):
         return edited
@@ -88,27 +83,28 @@ def cell_text(
                      default_flow_style=None, width=100)  # fmt: skip
 
 
-def _rebase(data: dict[str, Any], keys: tuple[str, ...], old: Path, new: Path) -> None:
-    *parents, last = keys
-    section: Any = data
-    for key in parents:
-        section = section.get(key) if isinstance(section, dict) else None
-    if isinstance(section, dict) and isinstance(section.get(last), str):
-        path = Path(section[last])
-        if not path.is_absolute():
-            section[last] = os.path.relpath(old.resolve() / path, new.resolve())
+def _moved_paths(cell: Cell, folder: Path) -> dict[tuple[str | int, ...], str]:
+    """Return the relative paths of a cell, by their keys, as they are from ``folder``."""
+    old, new = cell.document.path.parent.resolve(), folder.resolve()
+    return {
+        keys: os.path.relpath(old / path, new)
+        for keys, path in cell.file.paths()
+        if old != new and not path.is_absolute()
+    }
 
 
-def _edited(document: Document, expected: dict[str, Any], changes: dict[str, Any]) -> str | None:
+def _edited(
+    document: Document, paths: Mapping[tuple[str | int, ...], str], changes: dict[str, Any]
+) -> str | None:
     """Return the user's text with values replaced, or None for a top level in flow style."""
     if document.root.flow_style:
         return None
-    edits: list[tuple[int, int, str]] = []
-    for keys in PATHS:
-        node, value = document.node(keys), _value(expected, keys)
-        if isinstance(node, yaml.ScalarNode) and isinstance(value, str) and value != node.value:
-            scalar = yaml.safe_dump(value, width=10**6).split("\n")[0]
-            edits.append((node.start_mark.index, node.end_mark.index, scalar))
+    edits: set[tuple[int, int, str]] = set()  # of an alias and its anchor: once
+    for keys, moved in paths.items():
+        node = document.node(keys)
+        if isinstance(node, yaml.ScalarNode):
+            scalar = yaml.safe_dump(moved, width=10**6).split("\n")[0]
+            edits.add((node.start_mark.index, node.end_mark.index, scalar))
     appended = ""
     for key, value in changes.items():
         pair = next(((k, v) for k, v in document.root.value if k.value == key), None)
@@ -116,18 +112,18 @@ def _edited(document: Document, expected: dict[str, Any], changes: dict[str, Any
         if pair is None:
             appended += block
         else:
-            edits.append((pair[0].start_mark.index, _end(pair[1]), block.rstrip("\n")))
+            edits.add((pair[0].start_mark.index, _end(pair[1]), block.rstrip("\n")))
     text = document.text
     for start, end, new in sorted(edits, reverse=True):
         text = text[:start] + new + text[end:]
     return text + ("" if text.endswith("\n") else "\n") + appended
 
 
-def _value(data: dict[str, Any], keys: tuple[str, ...]) -> Any:
-    value: Any = data
+def _value(data: Any, keys: Iterable[str | int]) -> Any:
+    """Return the value at a key path that the data have."""
     for key in keys:
-        value = value.get(key) if isinstance(value, dict) else None
-    return value
+        data = data[key]
+    return data
 
 
 def _end(node: yaml.Node) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import Field, ValidationInfo, field_validator
@@ -46,13 +47,13 @@ class Robot(Section):
     """The arm: a built-in one, a URDF or DH rows."""
 
     model: str | None = Field(default=None, description="a built-in arm")
-    urdf: str | None = Field(default=None, description="a file, relative to the cell's folder")
+    urdf: Path | None = Field(default=None, description="a file, relative to the cell's folder")
     dh: list[DhRow] | None = Field(default=None, description="standard DH rows")
     tip: str | None = Field(default=None, description="the URDF link that is the flange")
     rated_payload: Annotated[Number, Field(gt=0)] | None = Field(
         default=None, description="kg, for urdf and dh; known for model"
     )
-    calibration: Calibration | str | None = Field(
+    calibration: Calibration | Path | None = Field(
         default=None, description="UR's delta_* values, or its calibration.conf"
     )
 

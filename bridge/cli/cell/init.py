@@ -88,9 +88,9 @@ def init(
         raise InputError("--tip: found without --urdf, expected the URDF whose link it is")
     link = _link(host, driver, profile, port) | _link_keys(keys)
     settings = _settings(link)
-    facts = enquire(host) if driver == "ur_rtde" else _read_facts(settings, arm_options)
-    if str(link.get("profile")).endswith(".yaml"):
-        link["profile"] = _path_from_cell(Path(link["profile"]), out)
+    located = settings.located(Path.cwd())
+    facts = enquire(host) if driver == "ur_rtde" else _read_facts(located, arm_options)
+    link |= {str(keys[-1]): _path_from_cell(path, out) for keys, path in settings.paths()}
     urdf = None if arm_options.urdf is None else _path_from_cell(arm_options.urdf, out)
     options = InitOptions(link, arm_options.model, urdf, arm_options.tip)
     text = first_cell_text(facts, options)
@@ -136,13 +136,13 @@ def _link_keys(keys: Sequence[str]) -> dict[str, Any]:
 
 
 def _settings(link: dict[str, Any]) -> LinkSettings:
-    """Return the settings of a link, paths from the working folder. Raises InputError."""
+    """Return the settings of a link. Raises InputError."""
     try:
         settings = CellFile.model_validate({"robot": {"model": "ur10e"}, "link": link}).link
     except ValidationError as error:
         raise InputError(validation_errors(CellFile, error)[0][1]) from None
     assert settings is not None
-    return settings.located(Path.cwd())
+    return settings
 
 
 def _read_facts(link: LinkSettings, arm_options: ArmOptions) -> ControllerFacts:

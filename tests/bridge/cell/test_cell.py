@@ -144,6 +144,7 @@ def test_an_unknown_key_is_named_with_the_nearest_known(
         ("robot: {}", "none of them", "one of model, urdf, dh"),
         ("robot: {dh: []}", "no rows", "one row"),
         ("robot: {dh: [{a: 1, alpha: 0}]}", "robot.dh entry 1.d: found nothing", "expected m"),
+        (ARM + "setpoints: {file: 5}", "setpoints.file: found 5", "expected a path"),
         ("robot: {dh: [{a: 1, alpha: 0, d: x}]}", "'x'", "a number"),
         ("robot: {urdf: none.urdf}", "none.urdf", "URDF"),
         (f"robot: {{urdf: {'x' * 300}}}", "file not found", "URDF"),

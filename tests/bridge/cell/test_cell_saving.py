@@ -13,7 +13,7 @@ from gapbridge.bridge.cell import load_cell, save_cell
 from gapbridge.bridge.cell.document import number_text, parse
 from gapbridge.core.arm import Arm, builtin_arm
 from gapbridge.core.effects import CATALOGUE, Site, Term
-from gapbridge.core.errors import RunError
+from gapbridge.core.errors import RunError, key_path
 
 CONFIG = Path(__file__).parents[3] / "config"
 TEXT = """\
@@ -89,8 +89,74 @@ def test_relative_paths_hold_from_the_new_folder(tmp_path: Path) -> None:
     (tmp_path / "c").mkdir()
     save_cell(cell, tmp_path / "c" / "new.yaml")
     again = load_cell(tmp_path / "c" / "new.yaml")
-    assert again.file.robot.urdf == "../a/b/arm.urdf"
+    assert again.file.robot.urdf == Path("../a/b/arm.urdf")
     np.testing.assert_array_equal(again.arm.link_in_link, cell.arm.link_in_link)
+
+
+WITH_PATHS = """\
+robot: {model: ur10e, calibration: calibration.conf}
+link:
+  {driver: modbus, profile: mine.yaml, transport: tls, authority: ca.pem, certificate: c.pem,
+   key: k.pem}
+setpoints: {source: tcp, file: track.csv, socket: s.sock, token_file: t}  # by the planner
+recording: {folder: runs}
+web: &served {certificate: w.pem, key: w.key, token_file: w.token}
+metrics: *served
+calibration: {folder: sessions, instrument: {kind: folder, unit: mm, folder: tracker}}
+"""
+KEYS_OF_PATHS = {
+    "robot": ["calibration"],
+    "link": ["authority", "certificate", "key", "profile"],
+    "setpoints": ["file", "socket", "token_file"],
+    "recording": ["folder"],
+    "web": ["certificate", "key", "token_file"],
+    "metrics": ["certificate", "key", "token_file"],
+    "calibration": ["instrument.folder", "folder"],
+}
+
+
+def files_of(path: Path) -> dict[str, Path]:
+    """The absolute paths that a cell states, by their keys."""
+    paths = load_cell(path).file.paths()
+    return {key_path(keys): (path.parent / stated).resolve() for keys, stated in paths}
+
+
+def test_every_path_of_a_cell_holds_from_the_new_folder(tmp_path: Path) -> None:
+    source = cell_in(tmp_path / "a" / "b", WITH_PATHS)
+    (source.parent / "calibration.conf").write_text("[mounting]\ndelta_a = [0, 0, 0, 0, 0, 1e-4]\n")
+    (tmp_path / "c").mkdir()
+    written = tmp_path / "c" / "new.yaml"
+    save_cell(load_cell(source), written)
+    named = [f"{section}.{key}" for section, keys in KEYS_OF_PATHS.items() for key in keys]
+    assert sorted(files_of(source)) == sorted(named)
+    assert files_of(written) == files_of(source)
+    text = written.read_text()
+    assert "profile: ../a/b/mine.yaml" in text
+    assert "# by the planner" in text
+
+
+@pytest.mark.parametrize(
+    ("text", "stated"),
+    [
+        ("link: {driver: replay, file: run.mcap}", "file: ../a/run.mcap"),
+        ("link: {driver: can, profile: mine.yml}", "profile: ../a/mine.yml"),
+        ("link: {driver: can, profile: piper}", "profile: piper}"),
+        ("calibration: {instrument: {kind: file, unit: mm, file: m.csv}}", "file: ../a/m.csv"),
+    ],
+)
+def test_a_path_is_moved_whatever_kind_of_section_states_it(
+    tmp_path: Path, text: str, stated: str
+) -> None:
+    source = cell_in(tmp_path / "a", f"robot: {{model: ur10e}}\n{text}\n")
+    (tmp_path / "c").mkdir()
+    save_cell(load_cell(source), tmp_path / "c" / "new.yaml")
+    assert stated in (tmp_path / "c" / "new.yaml").read_text()
+
+
+def test_beside_the_old_cell_paths_stay_as_they_are_written(tmp_path: Path) -> None:
+    source = cell_in(tmp_path, TEXT.replace("arm.urdf", "./arm.urdf"))
+    save_cell(load_cell(source), tmp_path / "new.yaml")
+    assert "urdf: ./arm.urdf  # as delivered" in (tmp_path / "new.yaml").read_text()
 
 
 def test_an_absolute_path_stays_as_it_is(tmp_path: Path) -> None:
@@ -99,7 +165,7 @@ def test_an_absolute_path_stays_as_it_is(tmp_path: Path) -> None:
     source.write_text(TEXT.replace("arm.urdf", absolute))
     (tmp_path / "c").mkdir()
     save_cell(load_cell(source), tmp_path / "c" / "new.yaml")
-    assert load_cell(tmp_path / "c" / "new.yaml").file.robot.urdf == absolute
+    assert load_cell(tmp_path / "c" / "new.yaml").file.robot.urdf == Path(absolute)
 
 
 @pytest.mark.parametrize(

@@ -88,10 +88,14 @@ def test_cia_402_drives(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_modbus_controller(tmp_path: Path) -> None:
-    port = free_port()
+def test_a_modbus_controller(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    port, work = free_port(), tmp_path / "work"
+    work.mkdir()
+    monkeypatch.chdir(work)
     with simulated(tmp_path, "ur10e_modbus_simulated.yaml", port=port) as host:
-        init_check_and_observe(tmp_path, host, *MODBUS, "--port", port)
+        keys = ("--port", port, "--link", "authority=ca.pem")
+        path = init_check_and_observe(tmp_path, host, *MODBUS, *keys)
+    assert load_cell(path).file.link.authority == Path("work/ca.pem")  # from the cell's folder
 
 
 @pytest.mark.slow
