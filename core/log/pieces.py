@@ -102,22 +102,51 @@ def _tables(path: Path, rows: int) -> Iterator[Table]:
         return ((columns.names, table, None) for table in columns.tables(rows))
     if path.suffix.lower() == RECORDING:
         return _recording(path)
+    return _csv(path, rows, _encoding(path))
+
+
+def column_names(path: Path) -> list[str]:
+    """Return the names of all columns of a CSV or Parquet file.
+
+    Raises LogError where they cannot be read, or where a CSV is packed.
+    """
+    if path.suffix.lower() in PARQUET:
+        return ParquetColumns(path).names
+    with path.open(encoding=_encoding(path)) as file:
+        return _header(_rows(path, file))[0]
+
+
+def _encoding(path: Path) -> str:
+    """Return the text encoding of a CSV. Raises LogError where it is packed."""
     with path.open("rb") as file:
         head = file.read(8)
-        if head[:2] == GZIP:
-            raise LogError(
-                f"{path}: found gzip of a log that is too long to be read as a whole, expected it "
-                "unpacked (gunzip)"
-            )
-    return _csv(path, rows, encoding_of(path, head))
+    if head[:2] == GZIP:
+        raise LogError(
+            f"{path}: found gzip of a log that is too long to be read as a whole, expected it "
+            "unpacked (gunzip)"
+        )
+    return encoding_of(path, head)
+
+
+def _rows(path: Path, file: Iterable[str]) -> Iterator[tuple[int, str]]:
+    """Yield the header and the rows of a CSV with their lines. Raises LogError if it is no text."""
+    try:
+        yield from dropwhile(lambda one: not one[1].strip(), _lines(file))
+    except UnicodeDecodeError:
+        raise LogError(f"{path}: found bytes that are no text, expected CSV (UTF-8)") from None
+
+
+def _header(rows: Iterator[tuple[int, str]]) -> tuple[list[str], str]:
+    """Return the names of all columns, and the delimiter, of the first of the rows."""
+    header = next(rows, (1, ""))[1]
+    delimiter = delimiter_of(header)
+    return [name.strip().strip('"') for name in header.strip().split(delimiter)], delimiter
 
 
 def _csv(path: Path, rows: int, encoding: str) -> Iterator[Table]:
     with path.open(encoding=encoding) as file:
-        kept = dropwhile(lambda one: not one[1].strip(), _lines(file))
-        header = next(kept, (1, ""))[1]
-        delimiter = delimiter_of(header)
-        names = [name.strip().strip('"') for name in header.strip().split(delimiter)]
+        kept = _rows(path, file)
+        names, delimiter = _header(kept)
         while taken := list(islice(kept, rows)):
             numbers, lines = zip(*taken, strict=True)
             table = csv_table(

@@ -88,7 +88,7 @@ def _identified(
     if (
         len(paths) == 1
         and is_large(paths[0])
-        and not (has_sessions(paths[0]) or metrology.remounted)
+        and not (metrology.remounted or has_sessions(paths[0]))
     ):
         ranges: list[dict[str, tuple[float, float]]] = []
         warnings: list[str] = []

@@ -12,7 +12,7 @@ from gapbridge.core.effects import by_approach
 from gapbridge.core.errors import LogError
 from gapbridge.core.log.columns import PARQUET
 from gapbridge.core.log.log import Log
-from gapbridge.core.log.pieces import ROWS, LogPieces
+from gapbridge.core.log.pieces import ROWS, LogPieces, column_names
 from gapbridge.core.log.sources import source_of
 from gapbridge.core.log.sources.recording import Recording
 
@@ -71,13 +71,10 @@ def is_large(path: Path) -> bool:
 
 
 def has_sessions(path: Path) -> bool:
-    """Return whether a log's rows belong to several sessions (a column ``session``)."""
+    """Return whether a log's rows belong to several sessions (a column ``session``).
+
+    Raises LogError if its columns cannot be read.
+    """
     if source_of(path) is not None or not path.is_file():
         return False
-    if path.suffix.lower() in PARQUET:
-        from pyarrow import parquet
-
-        return "session" in parquet.read_schema(path).names
-    with path.open(encoding="utf-8-sig", errors="replace") as file:
-        header = file.readline().replace(";", ",").strip().split(",")
-    return "session" in [name.strip().strip('"') for name in header]
+    return "session" in column_names(path)

@@ -106,6 +106,39 @@ def test_a_fault_far_down_a_large_log_names_its_row(tmp_path, monkeypatch):
     assert "row 779, column payload: found 500 kg" in text
 
 
+@pytest.mark.parametrize(
+    ("before", "encoding"), [("", "utf-8"), ("# by the tracker\n\n", "utf-8"), ("#\n", "utf-16")]
+)
+def test_sessions_of_a_large_log_are_fitted_apart_whatever_stands_before_its_header(
+    tmp_path, monkeypatch, before, encoding
+):
+    """The instrument's frame differs between the sessions: together they cannot be fitted."""
+    columns, cell = session(60), cell_in(tmp_path)
+    late = np.arange(60) >= 30
+    columns["measured_position_0"] = columns["measured_position_0"] + 0.1 * late
+    columns["session"] = late.astype(float)
+    lines = [",".join(columns)] + [",".join(map(repr, row)) for row in zip(*(
+        values.tolist() for values in columns.values()), strict=True)]  # fmt: skip
+    log = tmp_path / "log.csv"
+    log.write_text(before + "\n".join(lines) + "\n", encoding=encoding)
+    monkeypatch.setattr(large_log, "LARGE_BYTES", 1000)
+    assert large_log.has_sessions(log)
+    answer = gapbridge("fit", log, "--cell", cell, "--out", tmp_path / "new.yaml")
+    assert answer.code == 0, answer.err
+    found, true = (
+        m.compliance()[0] for m in (load_cell(tmp_path / "new.yaml").model, bent_model())
+    )
+    np.testing.assert_allclose(found[1:3], true[1:3], rtol=0.05)
+
+
+def test_a_large_log_with_bytes_that_are_no_text_is_refused(tmp_path, monkeypatch):
+    log = tmp_path / "log.csv"
+    log.write_bytes(b"# \xe9\nactual_q_0\n")
+    monkeypatch.setattr(large_log, "LARGE_BYTES", 5)
+    line = refused("fit", log, "--cell", cell_in(tmp_path), "--out", tmp_path / "new.yaml")
+    assert "log.csv: found bytes that are no text" in line
+
+
 @pytest.mark.parametrize(("rows", "large"), [(20_000, False), (20_001, True)])
 def test_a_log_is_large_from_its_number_of_rows_on(tmp_path, rows, large):
     log = parquet_in(tmp_path, {"payload": np.zeros(rows)})
