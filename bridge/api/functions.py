@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from gapbridge.bridge.api.envelope import require_envelope
 from gapbridge.bridge.api.records import Corrected, Diagnosed, Fitted, Predicted
 from gapbridge.bridge.cell import Cell, load_cell
 from gapbridge.bridge.cell.message import located
@@ -68,13 +69,14 @@ def predict(cell: Cell, log: Log, *, channels: bool = False) -> Predicted:
 def compensate(cell: Cell, log: Log) -> Corrected:
     """Return each row's corrected setpoint: its predicted pose is the rigid arm's at the row's q.
 
-    Raises InputError where a row has no equilibrium.
+    Raises InputError where a row has no equilibrium, or exceeds the envelope of the cell's limits.
     """
     loads = log.loads(by_approach(cell.model.terms))
     corrected = correct(cell.model, log.require("target_q", "actual_q"), loads)
     failed = np.flatnonzero(~np.isfinite(corrected.residual))
     if len(failed):
         raise InputError(f"{log.path}: row {log.line(failed[0])}: {EquilibriumError.text}")
+    require_envelope(cell, log, corrected)
     return Corrected(corrected.q, corrected.residual, _sources(cell, log))  # type: ignore[arg-type]  # of N
 
 

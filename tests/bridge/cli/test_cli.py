@@ -263,6 +263,41 @@ def test_a_pose_out_of_reach_is_reported_and_the_rest_written(desk: Desk) -> Non
     assert np.isfinite(np.loadtxt(desk.folder / "o.csv", delimiter=",", skiprows=1)).all()
 
 
+@pytest.mark.parametrize(
+    ("limits", "scale", "phrase"),
+    [
+        ("", 30, "row 2: the correction moves the TCP by"),
+        ("", 250, "row 2: the corrected setpoint misses the wanted pose by"),
+        ("limits: {joint_offset: 1e-5}", 1, "expected at most 1e-05 rad (limits.joint_offset of"),
+        ("limits: {offset: 1e-5}", 1, "expected at most 0.01 mm (limits.offset of"),
+        (
+            "limits: {offset_rotation: 1e-5}",
+            1,
+            "expected at most 1e-05 rad (limits.offset_rotation",
+        ),
+    ],
+)
+def test_a_correction_beyond_the_limits_of_its_cell_is_refused(
+    desk: Desk, limits: str, scale: float, phrase: str
+) -> None:
+    values = ", ".join(f"{scale * 1e-5:g}" for _ in range(6))
+    axial = f"compliance: {{axial: [{values}]}}"
+    desk.write("soft.yaml", f"robot: {{model: ur10e}}\n{axial}\n{limits}\n")
+    desk.write("log.csv", csv(target_q=poses(3), payload=np.full(3, 5.0)))
+    line = desk.refuses("compensate", "@log.csv", "--cell", "@soft.yaml", "--out", "@o.csv")
+    assert phrase in line
+    assert not (desk.folder / "o.csv").exists()
+
+
+def test_near_a_singular_pose_a_large_joint_offset_is_reported(desk: Desk) -> None:
+    q = np.vstack([poses(2), [[0.3, -1.2, 1.4, -0.9, 0.002, 0.4]]])  # the wrist is almost straight
+    desk.write("log.csv", csv(target_q=q, payload=np.full(3, 12.0)))
+    ran = desk.run("compensate", "@log.csv", "--cell", "@cell.yaml", "--out", "@o.csv")
+    assert ran.code == 0
+    assert "1 row(s) near a singular pose need more than limits.joint_offset (0.05 rad)" in ran.err
+    assert "row 4 needs most" in ran.err
+
+
 # -- what a user can get wrong ------------------------------------------------------------------
 
 TRACKER = ",".join(f"measured_position_{i}" for i in range(3))
