@@ -35,7 +35,7 @@ def provenance(
     return {
         "version": installed_version(),
         "time": datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z"),
-        "command": command if context is None else str(context.info_name),
+        "command": command if context is None else _command(context),
         "arguments": called if context is None else _arguments(context),
         "files": [
             {"role": role, "name": path.name, "sha256": digest(path)}
@@ -130,6 +130,15 @@ def digest(path: Path) -> str | None:
     except OSError:
         return None
     return result.hexdigest()
+
+
+def _command(context: click.Context) -> str:
+    """Return the name of the running command, with those of its groups: ``fleet fit``."""
+    name = str(context.info_name)
+    group = context.parent
+    while group is not None and group.parent is not None:
+        name, group = f"{group.info_name} {name}", group.parent
+    return name
 
 
 def _arguments(context: click.Context) -> dict[str, Any]:

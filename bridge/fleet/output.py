@@ -13,6 +13,7 @@ import numpy as np
 
 from gapbridge.bridge.cell import load_cell, save_cell
 from gapbridge.bridge.document.output_file import replacing_bytes, write_text
+from gapbridge.bridge.document.provenance import fitted, intervals_of, provenance
 from gapbridge.bridge.fleet.diagnosis_summary import FleetDiagnosis, summarise
 from gapbridge.bridge.fleet.fit_summary import (
     FittedArm,
@@ -28,7 +29,9 @@ from gapbridge.bridge.fleet.runner import FleetRun
 from gapbridge.bridge.fleet.session import Fleet
 from gapbridge.bridge.fleet.task import Outcome
 from gapbridge.bridge.report.labels import counted, effect_title, joint_list, with_unit
+from gapbridge.core.calibration.spread import Spread
 from gapbridge.core.estimation.compliance_fit import flexibilities
+from gapbridge.core.fitted_range import merged
 
 SHOWN = 8  # lines of each kind on the terminal
 CELL_TABLE = "cells.csv"
@@ -167,10 +170,19 @@ def write_cells(fit: FleetFit, folder: Path) -> list[Path]:
 
 
 def _write_cell(kind: FittedType, arm: FittedArm, path: Path) -> None:
-    cell = load_cell(Path(arm.sessions[-1].outcome.cell))
-    values = np.where(kind.scatter.identifiable, arm.fit.flexibility, flexibilities(cell.model))
+    last, known = arm.sessions[-1].outcome, kind.scatter.identifiable
+    cell = load_cell(Path(last.cell))
+    values = np.where(known, arm.fit.flexibility, flexibilities(cell.model))
     n = cell.arm.n
-    save_cell(cell, path, cell.model.with_compliance(values[:n], values[n:]))
+    logs = [Path(s.outcome.log) for s in arm.sessions]
+    ranges = merged(s.outcome.result.get("range", {}) for s in arm.sessions)
+    spread = Spread.of_fit(known, arm.fit.covariance).beside(cell.spread)
+    estimates = zip(kind.parameters, values, arm.fit.std, known, strict=True)
+    intervals = intervals_of((name, float(v), float(std)) for name, v, std, k in estimates if k)
+    origin = provenance({"log": logs, "cell": [Path(last.cell)]})
+    origin = fitted(origin, ranges, spread, cell.intervals | intervals)
+    model = cell.model.with_compliance(values[:n], values[n:])
+    save_cell(cell, path, model, {"provenance": origin})
 
 
 def _file_name(arm: str, used: set[str]) -> str:

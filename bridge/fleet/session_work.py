@@ -14,6 +14,7 @@ from gapbridge.bridge.document.diagnosis_json import document
 from gapbridge.core.diagnosis.diagnosis import channels_of, diagnose
 from gapbridge.core.estimation.compliance_fit import flexibilities, typical_flexibility
 from gapbridge.core.estimation.hierarchical_evidence import evidence
+from gapbridge.core.fitted_range import range_of
 from gapbridge.core.log.log import Log
 
 EPOCH = 1.0e9  # s: larger timestamps are Unix times, smaller ones relative
@@ -89,7 +90,7 @@ def _rows(channel: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 
 def fit_session(cell: Cell, log: Log, options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the session's equations of the flexibilities, and those of the cell, rad/Nm."""
+    """Return a session's equations, its columns' ranges, the flexibilities of the cell, rad/Nm."""
     equations = evidence(cell.model, log, cell.metrology)
     arrays = {"matrix": equations.matrix.tolist(), "right": equations.right.tolist()}
     return {
@@ -97,4 +98,5 @@ def fit_session(cell: Cell, log: Log, options: Mapping[str, Any]) -> dict[str, A
         "nominal": flexibilities(cell.model).tolist(),
         "usual": typical_flexibility(cell.model),
         "evidence": asdict(equations) | arrays,
+        "range": range_of(log),
     }

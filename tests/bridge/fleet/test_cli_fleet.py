@@ -19,6 +19,7 @@ from pyarrow import parquet
 
 from gapbridge.bridge.cell import load_cell
 from gapbridge.core.arm import builtin_arm
+from gapbridge.core.log.log import read_log
 from gapbridge.core.model import Model
 from tests.bridge.cli_runs import (
     AXIAL,
@@ -98,6 +99,27 @@ def test_the_new_cells_carry_what_was_found_and_their_table_is_one_for_the_next_
     for name in table.values():
         found = load_cell(folder / "cells" / name).model.predict(q, loads).position
         assert np.abs(found - truth).max() < 0.1 * np.abs(rigid - truth).max()
+
+
+def test_the_new_cells_state_where_they_come_from(fitted: Any) -> None:
+    folder, _ = fitted
+    cell = load_cell(folder / "cells" / "arm1.yaml")
+    origin = cell.file.provenance
+    assert origin.command == "fleet fit"
+    assert origin.arguments["apply"] == str(folder / "cells")
+    assert [(f.role, f.name) for f in origin.files] == [
+        ("log", "s0.csv"), ("log", "s1.csv"), ("log", "s2.csv"), ("cell", "cell.yaml"),
+    ]  # fmt: skip
+    own = [read_log(folder / "logs" / "arm1" / f"s{k}.csv", 6) for k in range(3)]
+    low = min(float(log.get("actual_q")[:, 2].min()) for log in own)
+    assert cell.fitted_range["actual_q_2"][0] == low
+    [row] = [
+        r for r in rows_of(folder / "out" / "results.parquet")
+        if (r["level"], r["arm"], r["parameter"]) == ("arm", "arm1", "axial_compliance_2")
+    ]  # fmt: skip
+    index = cell.spread.names.index("axial_compliance_2")
+    assert np.sqrt(cell.spread.covariance[index, index]) == pytest.approx(row["std"])
+    assert cell.intervals["axial_compliance_2"][1] == pytest.approx(row["high"])
 
 
 def test_a_second_run_does_nothing_anew_and_comes_to_the_same(fitted: Any) -> None:
