@@ -25,12 +25,15 @@ from benchmarks.blind.run import (
 )
 
 
-@click.command()
-@click.option("--seeds", default=20, show_default=True, help="Cases of each kind.")
+@click.command(context_settings={"help_option_names": ["-h", "--help"]})
+@click.option("--seeds", type=click.IntRange(1), default=20, show_default=True,
+              help="Cases of each kind.")  # fmt: skip
 @click.option("--kinds", "names", default=None, help="Kinds or groups, by commas; see --list.")
 @click.option("--quick", is_flag=True, help="Two cases of each kind.")
-@click.option("--workers", default=1, show_default=True, help="Processes side by side.")
-@click.option("--seed", "first", type=int, default=None, help="First seed, to repeat a run.")
+@click.option("--workers", type=click.IntRange(1), default=1, show_default=True,
+              help="Processes side by side.")  # fmt: skip
+@click.option("--seed", "first", type=click.IntRange(0), default=None,
+              help="First seed, to repeat a run.")  # fmt: skip
 @click.option("--out", type=click.Path(path_type=Path), default=None,
               help="Folder for blind.html and the diagnoses.")  # fmt: skip
 @click.option("--command", default="gapbridge diagnose", show_default=True,
@@ -44,19 +47,22 @@ def main(
     seeds: int, names: str | None, quick: bool, workers: int, first: int | None,
     out: Path | None, command: str, inside: str | None, small: bool, listing: bool,
 ) -> None:  # fmt: skip
-    """Draw cases whose effect is withheld, have them diagnosed, and score the answers."""
+    """Draw cases whose effect is withheld, have them diagnosed, and score the answers.
+
+    Example: gapbridge blind --quick --out out/blind
+    """
     console = Console(emoji=False)
     if listing:
         for group, own in cases.kinds().items():
             console.print(f"[bold]{group}[/]: {' '.join(own)}")
         return
+    how: Diagnose = _function(inside) if inside else _program(command)
     wanted = names.split(",") if names else None
     count = 2 if quick else seeds
     first = fresh_seed() if first is None else first
     console.print(f"first seed {first} (repeat with --seed {first})")
     if not has_pinocchio():
         console.print("the torque channel is left out: its truth needs Pinocchio (the test extra)")
-    how: Diagnose = _function(inside) if inside else Command.parse(command)
     total = len(jobs_of(chosen_kinds(wanted), count, first))
     try:
         run = run_blind(count, wanted, workers, out, how, first)
@@ -78,9 +84,25 @@ def main(
         console.print(f"written: {page}")
 
 
+def _program(line: str) -> Command:
+    """Return the program of a command line. Raises click.UsageError if it names none."""
+    try:
+        return Command.parse(line)
+    except ValueError:
+        raise click.UsageError(f"--command: found {line!r}, expected a program") from None
+
+
 def _function(name: str) -> Diagnose:
+    """Return the function ``module:function``. Raises click.UsageError where there is none."""
     module, _, function = name.partition(":")
-    found: Diagnose = getattr(importlib.import_module(module), function)
+    try:
+        found: Diagnose = getattr(importlib.import_module(module), function)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise click.UsageError(
+            f"--in-process: found {name!r}, expected module:function ({error})"
+        ) from None
+    if not callable(found):
+        raise click.UsageError(f"--in-process: found {name!r}, expected a function")
     return found
 
 

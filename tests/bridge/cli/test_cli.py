@@ -153,7 +153,8 @@ def test_a_command_waits_for_no_solver_before_it_has_work(desk: Desk, name: str)
 def test_every_command_has_help_with_an_example(desk: Desk, name: str) -> None:
     ran = desk.run(name, "--help")
     assert ran.code == 0
-    assert "Example" in ran.out or name == "blind"  # its help is the benchmark's own
+    assert "Example" in ran.out
+    assert desk.run(name, "-h").out == ran.out
     assert "config/" not in ran.out  # which a wheel has not
 
 

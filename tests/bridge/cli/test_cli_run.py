@@ -136,3 +136,21 @@ def test_where_there_is_no_checkout_the_help_says_that_one_is_needed(
     assert "Example: gapbridge blind" in answer.out
     assert "needs a checkout" in " ".join(answer.out.split())
     assert gapbridge("blind").code == 1
+
+
+@pytest.mark.parametrize(
+    ("given", "phrase"),
+    [
+        (("--in-process", "nothere:f"), "found 'nothere:f', expected module:function"),
+        (("--in-process", "json:f"), "module 'json' has no attribute 'f'"),
+        (("--in-process", "json:__name__"), "found 'json:__name__', expected a function"),
+        (("--command", ""), "--command: found '', expected a program"),
+        (("--command", "'a"), "expected a program"),
+        (("--seeds", 0), "'--seeds'"),
+        (("--workers", 0), "'--workers'"),
+    ],
+)
+def test_an_option_of_the_blind_benchmark_that_cannot_be_used_is_refused(
+    given: tuple[object, ...], phrase: str
+) -> None:
+    assert phrase in refused("blind", *given, "--quick", "--kinds", "backlash")
