@@ -109,10 +109,14 @@ def _discriminator_key(reported: str) -> str:
 
 
 def suggestion(name: str, known: Iterable[str]) -> str:
-    """Return a hint that names the most similar known name, or all of them."""
+    """Return a hint that names the most similar known name; all of them if it is unlike it."""
     names = list(known)
     near = difflib.get_close_matches(name.lower(), names, n=1, cutoff=0.5)
-    return f"did you mean {near[0]!r}?" if near else f"known here: {', '.join(names)}"
+    if near:
+        return f"did you mean {near[0]!r}?"
+    nearest = difflib.get_close_matches(name.lower(), names, n=1, cutoff=0.0)
+    listed = f"known here: {', '.join(names)}"
+    return f"nearest {nearest[0]!r}; {listed}" if nearest else listed
 
 
 def _unknown_key(keys: Keys, model: type[BaseModel] | None) -> tuple[str, str]:

@@ -125,6 +125,8 @@ def test_text_that_is_no_plain_yaml_is_reported(tmp_path: Path, text: str, phras
         (ARM + "recording: {foldr: x}", "recording.foldr 'folder'"),
         ("robot: {dh: [{a: 1, alpha: 0, d: 0, of: 1}]}", "'of' 'offset'"),
         ("robot: {model: ur10e, calibration: {delta_thet: [1]}}", "delta_thet 'delta_theta'"),
+        (ARM + "limits: {speed: 1}", "limits.speed nearest 'offset_rate'; known joint_margin"),
+        (ARM + "qqq: 1", "qqq nearest 'web'; known"),
     ],
 )
 def test_an_unknown_key_is_named_with_the_nearest_known(
