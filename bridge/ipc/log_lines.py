@@ -22,7 +22,10 @@ HIDDEN = re.compile(
 )
 LEFT_OUT = ("text", "monotonic", "kind", "time", "detail")  # text: the whole cell file
 LONGEST = 2000  # characters of one value
-_ERRORS = (EventKind.FAULT, EventKind.REFUSED)
+_ERRORS = (EventKind.FAULT, EventKind.REFUSED, EventKind.FAILURE, EventKind.SLIP)
+_WARNINGS = (
+    EventKind.SIDE, EventKind.WARNING, EventKind.DEGRADED, EventKind.DROPPED, EventKind.LINK,
+)  # fmt: skip
 
 
 def log_line(event: Mapping[str, Any]) -> str:
@@ -58,7 +61,9 @@ def _level(event: Mapping[str, Any]) -> str:
         return "error"
     if str(event.get("to", "")).upper() == State.FAULT.name:
         return "error"
-    if event.get("kind") == EventKind.SIDE or "paused" in event or "lost" in event:
+    if event.get("kind") == EventKind.DEGRADED and event.get("what") == "":  # it has ended
+        return "info"
+    if event.get("kind") in _WARNINGS or "paused" in event or "lost" in event:
         return "warning"
     return "info"
 

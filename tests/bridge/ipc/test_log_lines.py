@@ -35,6 +35,13 @@ def test_a_transition_reports_what_led_where():
         ({"kind": "refused", "detail": "no"}, "error"),
         ({"kind": "recorder", "paused": "disk full", "detail": "d"}, "warning"),
         ({"kind": "side", "side": "web", "detail": "ended with 1"}, "warning"),
+        ({"kind": "failure", "detail": "the link is lost"}, "error"),
+        ({"kind": "slip", "joints": [3], "size": 0.01, "detail": "joint 3"}, "error"),
+        ({"kind": "warning", "what": "unexpected_force", "detail": "d"}, "warning"),
+        ({"kind": "degraded", "what": "ft_sensor", "detail": "silent"}, "warning"),
+        ({"kind": "degraded", "what": "", "detail": "the sensor is back"}, "info"),
+        ({"kind": "dropped", "what": "nan", "detail": "d"}, "warning"),
+        ({"kind": "link", "what": "stale", "detail": "d"}, "warning"),
         ({"kind": "control", "detail": "armed"}, "info"),
     ],
 )
