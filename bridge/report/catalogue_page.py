@@ -9,6 +9,7 @@ import inspect
 import sys
 from pathlib import Path
 
+from gapbridge.bridge.document.effect_parameters import parameter_texts
 from gapbridge.bridge.report.labels import CHANNELS as CHANNEL_TITLES
 from gapbridge.bridge.report.labels import effect_title
 from gapbridge.core.arm import builtin_arm
@@ -48,7 +49,6 @@ def _place(effect: Effect) -> str:
 
 
 def _effect(effect: Effect) -> str:
-    arm = builtin_arm("ur10e")
     lines = [f"### {effect.identifier}", "", inspect.getdoc(effect) or "", ""]
     lines.append(f"- shows in: {', '.join(effect.channels)}; sits at: {_place(effect)}")
     if effect.motion:
@@ -57,10 +57,7 @@ def _effect(effect: Effect) -> str:
         lines.append(f"- looks the same as `{other}` on: {data}")
     if effect.needs:
         lines.append(f"- columns beyond the channel's own: {', '.join(effect.needs)}")
-    names = [
-        f"`{parameter.name or 'value'}` ({parameter.unit or 'no unit'})"
-        for parameter in effect.parameters(arm, effect.sites(arm)[0])
-    ]
+    names = [f"`{name}` ({unit})" for name, unit in parameter_texts(effect)]
     return "\n".join([*lines, f"- parameters: {', '.join(names)}", ""])
 
 

@@ -32,10 +32,11 @@ def explain(effect: str | None) -> None:
 
 def explanation_text(effect: Effect) -> str:
     """Return the description, needed data and parameters of an effect."""
-    from gapbridge.core.arm import builtin_arm  # slow to import, not needed by the list
+    # slow to import, not needed by the list
+    from gapbridge.bridge.document.effect_parameters import ARM, parameter_texts
+    from gapbridge.core.arm import builtin_arm
 
-    arm = builtin_arm("ur10e")
-    sites = effect.sites(arm)
+    sites = effect.sites(builtin_arm(ARM))
     channels = ", ".join(f"{name} ({CHANNELS[name]})" for name in effect.channels)
     lines = [effect.identifier, "", _text(effect), "", f"shows in: {channels}"]
     if effect.motion:
@@ -46,10 +47,7 @@ def explanation_text(effect: Effect) -> str:
         lines.append(f"needs columns: {', '.join(effect.needs)}")
     lines.append("sits at: " + ("one joint each" if sites[0].joint else "the whole arm"))
     lines.append("parameters in a cell file:")
-    lines += [
-        f"  {parameter.name or 'value'} ({parameter.unit or 'no unit'})"
-        for parameter in effect.parameters(arm, sites[0])
-    ]
+    lines += [f"  {name} ({unit})" for name, unit in parameter_texts(effect)]
     return "\n".join(lines)
 
 

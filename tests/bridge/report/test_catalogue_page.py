@@ -2,6 +2,7 @@
 
 import inspect
 
+from gapbridge.bridge.cli.cell.explain import explanation_text
 from gapbridge.bridge.report.catalogue_page import PAGE, catalogue_page, main
 from gapbridge.core.effects import CATALOGUE
 
@@ -21,3 +22,9 @@ def test_every_effect_stands_on_the_page_with_its_docstring():
 def test_the_page_is_written_where_it_is_asked_for(tmp_path):
     assert main([str(tmp_path / "page.md")]) == 0
     assert (tmp_path / "page.md").read_text(encoding="utf-8") == catalogue_page()
+
+
+def test_parameters_that_only_some_joints_have_are_listed():
+    line = "`a` (m), `d` (m), `alpha` (rad), `beta` (rad, not of every joint)"
+    assert f"- parameters: {line}\n" in catalogue_page()
+    assert "beta (rad, not of every joint)" in explanation_text(CATALOGUE["link_geometry"])
