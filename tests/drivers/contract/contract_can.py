@@ -7,6 +7,7 @@ import math
 import os
 import tempfile
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -24,30 +25,37 @@ _ports = itertools.count(29600)
 THOUSANDTH = math.radians(0.001)
 
 
-class CanCase(Case):
-    """An arm on a bus: its profile, its wire, half a count of its joints, two sample frames."""
+@dataclass(frozen=True)
+class CanArm:
+    """An arm on a bus: its profile, half a count of its joints (rad), the ids of two frames."""
 
-    def __init__(
-        self,
-        profile: str,
-        interface: str,
-        resolution: float,
-        frames: tuple[int, int],
-        n: int = 6,
-        speed: float | None = 1e-3,
-        rate: float = 100.0,
-        gear: float | None = None,
-    ) -> None:
+    profile: str
+    resolution: float  # rad
+    frames: tuple[int, int]
+    n: int = 6  # joints
+    speed: float | None = 1e-3  # rad/s, half a count; None: it reports none
+    gear: float | None = None  # wire turns per joint turn; None: the profile's
+
+    @property
+    def gears(self) -> tuple[float, ...] | None:
+        """Return the gear of each joint, every other one with the opposite sign."""
+        gear = self.gear
+        return None if gear is None else tuple(gear * (-1) ** i for i in range(self.n))
+
+
+class CanCase(Case):
+    """An arm on a bus of one of python-can's interfaces."""
+
+    def __init__(self, arm: CanArm, interface: str, rate: float = 100.0) -> None:
         number = next(_ports)
         channel = f"bus{number}"
         if interface == "slcan":
             channel = f"{tempfile.gettempdir()}/gapbridge-{os.getpid()}-{number}"
-        self.n, self.resolution, self.speed_resolution = n, resolution + 1e-9, speed
-        self._frames = frames
-        gears = None if gear is None else tuple(gear * (-1) ** i for i in range(n))
+        self.n, self.resolution, self.speed_resolution = arm.n, arm.resolution + 1e-9, arm.speed
+        self._frames = arm.frames
         self.settings = CanSettings(
-            profile=profile, interface=interface, channel=channel, port=number, rate=rate,
-            state_timeout=self.state_timeout, foreign_quiet=0.2, gear=gears,
+            profile=arm.profile, interface=interface, channel=channel, port=number, rate=rate,
+            state_timeout=self.state_timeout, foreign_quiet=0.2, gear=arm.gears,
         )  # fmt: skip
         super().__init__()
         # both ends of the pty are in this busy process: a frame may take longer than a cell allows
@@ -71,21 +79,15 @@ class CanCase(Case):
 
 def can_cases() -> dict[str, Callable[[], Case]]:
     """Return a maker of each case by its name."""
-    half = 0.5 * THOUSANDTH
-    piper = (0x2A5, 0x2A6)
-    turn = 2.0 * math.pi
+    piper = CanArm("piper", 0.5 * THOUSANDTH, (0x2A5, 0x2A6))
+    openarm = CanArm("openarm", 12.5 / 65535, (0x11, 0x12), n=7, speed=0.012)
+    odrive = CanArm("odrive", 2.0 * math.pi * 2e-7, (0x09, 0x29), gear=9.0)
+    invented = CanArm(str(INVENTED), 0.25 * THOUSANDTH, (0x18FF5010, 0x18FF5011), speed=None)
     return {
-        "can piper, virtual": partial(CanCase, "piper", "virtual", half, piper),
-        "can piper, socketcand": partial(CanCase, "piper", "socketcand", half, piper, rate=200.0),
-        "can piper, slcan": partial(CanCase, "piper", "slcan", half, piper),
-        "can openarm, socketcand": partial(
-            CanCase, "openarm", "socketcand", 12.5 / 65535, (0x11, 0x12), n=7, speed=0.012
-        ),
-        "can odrive, virtual": partial(
-            CanCase, "odrive", "virtual", turn * 2e-7, (0x09, 0x29), gear=9.0
-        ),
-        "can, a map that no code knows": partial(
-            CanCase, str(INVENTED), "socketcand", 0.25 * THOUSANDTH, (0x18FF5010, 0x18FF5011),
-            speed=None,
-        ),
-    }  # fmt: skip
+        "can piper, virtual": partial(CanCase, piper, "virtual"),
+        "can piper, socketcand": partial(CanCase, piper, "socketcand", rate=200.0),
+        "can piper, slcan": partial(CanCase, piper, "slcan"),
+        "can openarm, socketcand": partial(CanCase, openarm, "socketcand"),
+        "can odrive, virtual": partial(CanCase, odrive, "virtual"),
+        "can, a map that no code knows": partial(CanCase, invented, "socketcand"),
+    }
