@@ -58,12 +58,12 @@ def build_arm(robot: Robot, folder: Path) -> Arm:
     return arm if rated is None else replace(arm, payload=rated)
 
 
-def _calibrated_arm(model: str, calibration: Calibration | str | None, folder: Path) -> Arm:
+def _calibrated_arm(model: str, calibration: Calibration | Path | None, folder: Path) -> Arm:
     try:
         return builtin_arm(model, calibration_of(calibration, folder))
     except ArmError as error:
         keys = tuple(error.keys or ())
-        if not isinstance(calibration, str) or keys[:2] != CALIBRATION or len(keys) == 2:
+        if not isinstance(calibration, Path) or keys[:2] != CALIBRATION or len(keys) == 2:
             raise
         message = f"{folder / calibration}: {keys[2]}: {error.message}"
         raise ArmError(message, CALIBRATION) from None
