@@ -48,8 +48,10 @@ def estimate_noise(
     """
     block = blocks(observation)
     count = int(block.max()) + 1
-    # in a large log joint noise would absorb causes that are not found yet
-    J = observation.joint_columns if len(kept) < MAX_JOINT_NOISE_SAMPLES else None
+    # in a large log joint noise would absorb causes that are not found yet; where each joint is a
+    # coordinate, its own noise already includes it
+    separable = observation.channel == "position" and len(kept) < MAX_JOINT_NOISE_SAMPLES
+    J = observation.joint_columns if separable else None
     use = np.flatnonzero(kept)
     if len(use) > MAX_SAMPLES:
         use = use[:: len(use) // MAX_SAMPLES + 1]

@@ -9,6 +9,7 @@ import pytest
 import small_arm as small
 
 from gapbridge.core.diagnosis.channels.position import observe
+from gapbridge.core.diagnosis.channels.recording import own_joints
 from gapbridge.core.diagnosis.selection.noise import estimate_noise
 from gapbridge.core.metrology import Metrology
 
@@ -61,3 +62,13 @@ def test_readings_set_aside_do_not_count():
     kept[5] = False
     noise = estimate_noise(SEEN, gap, kept)
     assert noise.block_sigma[0] == pytest.approx(2e-5, rel=0.3)
+
+
+@pytest.mark.parametrize("channel", ["torque", "tracking"])
+def test_where_joints_are_coordinates_each_has_one_noise_of_its_own(channel):
+    """A noise common to the joints beside one of each is a number too many for the data."""
+    rng, size = np.random.default_rng(1), np.array([0.5, 0.2, 0.1])
+    joints = replace(SEEN, channel=channel, sigma=0.0, joint_columns=own_joints(120, 3))
+    noise = estimate_noise(joints, rng.normal(0, size, (120, 3)), KEPT)
+    assert noise.block_sigma == pytest.approx(size, rel=0.2)
+    assert noise.joint_sigma == 0
