@@ -39,6 +39,12 @@ def blocks(observation: Observation) -> NDArray[np.int64]:
     return np.arange(k)
 
 
+def _in_unit(observation: Observation) -> NDArray[np.bool_]:
+    """Return which coordinates (k,) have the channel's unit, that of its known sigma."""
+    block = blocks(observation)
+    return block == 0 if observation.channel in ("position", "wrench") else block >= 0
+
+
 def estimate_noise(
     observation: Observation, residual: Array, kept: NDArray[np.bool_], shrink: float = 1.0
 ) -> Noise:
@@ -60,7 +66,8 @@ def estimate_noise(
     spread = np.array([scale_of(r[:, block == b]) for b in range(count)])
     if J is None:
         scale = np.array([max(float(np.mean(r[:, block == b] ** 2)), 1e-30) for b in range(count)])
-        scale[0] = max(scale[0], known)
+        own = np.unique(block[_in_unit(observation)])
+        scale[own] = np.maximum(scale[own], known)
         return _noise(observation, block, scale, 0.0)
     lever = J[use] @ np.swapaxes(J[use], 1, 2)
     size = np.sqrt(np.mean(np.einsum("nii->ni", lever)[:, block == 0]))
@@ -98,8 +105,7 @@ def _noise(
     J = observation.joint_columns
     if J is not None and joint > 0:
         V = V + joint * (J @ np.swapaxes(J, 1, 2))
-    first = block == 0
-    whole = float(np.mean(np.einsum("nii->ni", V)[:, first]))
+    whole = float(np.mean(np.einsum("nii->ni", V)[:, _in_unit(observation)]))
     known = observation.sigma**2
     if observation.sigma_is_whole and known > 0:
         factor = known / whole

@@ -72,3 +72,11 @@ def test_where_joints_are_coordinates_each_has_one_noise_of_its_own(channel):
     noise = estimate_noise(joints, rng.normal(0, size, (120, 3)), KEPT)
     assert noise.block_sigma == pytest.approx(size, rel=0.2)
     assert noise.joint_sigma == 0
+
+
+def test_the_step_of_the_encoders_is_the_least_noise_of_every_joint():
+    size = np.array([3e-5, 1e-6, 4e-6])
+    joints = replace(SEEN, channel="tracking", sigma=1e-5, joint_columns=own_joints(120, 3))
+    noise = estimate_noise(joints, np.random.default_rng(2).normal(0, size, (120, 3)), KEPT)
+    assert noise.block_sigma == pytest.approx([3e-5, 1e-5, 1e-5], rel=0.2)
+    assert noise.block_sigma[1:] == pytest.approx(1e-5, rel=1e-9)
