@@ -44,13 +44,15 @@ def term_from_entry(entry: EffectEntry, arm: Arm, keys: Keys) -> Term:
     site = Site(entry.joint, entry.order)
     parameters = effect.parameters(arm, site)
     names = [file_key(parameter) for parameter in parameters]
+    if parameters[-1].optional and names[-1] not in entry.parameters:
+        parameters = parameters[:-1]
     for name in entry.parameters:
         if name not in names:
             raise CellError(
                 f"found an unknown parameter of {entry.effect}; {suggestion(name, names)}",
                 (*keys, "parameters", name),
             )
-    values = [_checked_value(entry, k, p, keys) for k, p in zip(names, parameters, strict=True)]
+    values = [_checked_value(entry, file_key(p), p, keys) for p in parameters]
     return Term(entry.effect, site, tuple(values), entry.stand_in)
 
 
@@ -127,7 +129,7 @@ def effect_entries(terms: Sequence[Term], arm: Arm) -> list[dict[str, Any]]:
         if term.site.order is not None:
             entry["order"] = float(term.site.order)
         parameters = effect_named(term.effect).parameters(arm, term.site)
-        names = [file_key(parameter) for parameter in parameters]
+        names = [file_key(parameter) for parameter in parameters[: len(term.values)]]
         entry["parameters"] = dict(zip(names, map(float, term.values), strict=True))
         if term.stand_in:
             entry["stand_in"] = True

@@ -107,7 +107,7 @@ def _numbers(cell: Cell) -> Iterator[_Parameter]:
     for (effect, site), indices in sites.items():
         for k, parameter in enumerate(CATALOGUE[effect].parameters(model.arm, site)):
             name = CATALOGUE[effect].label(site, parameter)
-            value = sum(model.terms[i].values[k] for i in indices)
+            value = sum(sum(model.terms[i].values[k : k + 1]) for i in indices)
             std = sigma.get(name)
             half_width = 0.0 if std is None else SIGMAS * std
             lower = max(value - half_width, parameter.lower)

@@ -39,6 +39,7 @@ class Parameter:
     lower: float = -math.inf
     upper: float = math.inf
     of_rotation: bool = False  # True: shows only where the instrument measures rotations too
+    optional: bool = False  # True: a term may end before it, as in cells that are older than it
 
 
 @dataclass(frozen=True)
@@ -209,7 +210,7 @@ class Effect(ABC):
     def reported(self, arm: Arm, term: Term, covariance: Array | None) -> tuple[Reported, ...]:
         """Return the term's parameters as they are reported; ``covariance`` is (k, k) or None."""
         lines = []
-        for k, parameter in enumerate(self.parameters(arm, term.site)):
+        for k, parameter in enumerate(self.parameters(arm, term.site)[: len(term.values)]):
             std = None
             if covariance is not None and k < len(covariance):  # the rest was not fitted
                 std = math.sqrt(max(covariance[k, k], 0.0)) or None

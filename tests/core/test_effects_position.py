@@ -7,7 +7,7 @@ from scipy.optimize import brentq, root
 from scipy.spatial.transform import Rotation
 from test_equilibrium import SEVEN
 
-from gapbridge.core.arm import arm_from_dh, builtin_rows
+from gapbridge.core.arm import arm_from_dh, builtin_arm, builtin_rows
 from gapbridge.core.effects import CATALOGUE, Site, Term
 from gapbridge.core.loads import Loads
 from gapbridge.core.model import Model
@@ -131,6 +131,50 @@ def test_the_second_twist_turns_about_y_behind_the_link(joint):
         twist = Rotation.from_rotvec(beta * turns[joint - 1][:, 1])
         expected = origins[joint] + twist.apply(tcp - origins[joint])
         np.testing.assert_allclose(poses.position[r], expected, atol=1e-12)
+
+
+CALIBRATED = {
+    "delta_theta": [0.0, 0.35, -0.3501, 2e-4, 0.0, 0.0],
+    "delta_a": [1e-5, 0.02, 0.03, 2e-5, 0.0, 0.0],
+    "delta_d": [1e-5, 180.0, -179.9, -0.1, 0.0, 0.0],
+    "delta_alpha": [2e-4, 1.3e-3, -1.2e-3, 1e-4, 0.0, 0.0],
+}  # as factory calibrations are: axes of the drawing's parallel ones are 1 mrad apart
+
+
+@pytest.mark.parametrize("joint", [2, 3])
+@pytest.mark.parametrize("calibration", [CALIBRATED, {"delta_alpha": [0, 4e-6, -4e-6, 0, 0, 0]}])
+def test_nearly_parallel_axes_have_the_twists_of_parallel_ones(joint, calibration):
+    """Their common normal is metres away: a turn about it would throw the arm as far."""
+    arm, drawing = builtin_arm("ur10e", calibration), builtin_arm("ur10e")
+    member, site = CATALOGUE["link_geometry"], Site(joint)
+    parameters = member.parameters(arm, site)
+    assert [p.name for p in parameters] == ["a", "d", "alpha", "beta"]
+    q, loads = scene(6)
+    for k, parameter in enumerate(parameters):
+        values = tuple(parameter.scale * (i == k) for i in range(4))
+        moved = [
+            Model(one).with_terms([Term("link_geometry", site, values)]).predict(q, loads).position
+            - Model(one).predict(q, loads).position
+            for one in (arm, drawing)
+        ]
+        turned = 0.4  # rad that the calibration's frames are turned by, and slightly displaced
+        np.testing.assert_allclose(*(np.linalg.norm(m, axis=1) for m in moved), atol=2e-3 * turned)
+        assert np.linalg.norm(moved[0], axis=1).max() < 3e-3
+
+
+def test_a_term_without_its_second_twist_keeps_the_sense_of_a_dh_row():
+    """Cells hold such terms of nearly parallel axes, found before these had a second twist."""
+    rows = [dict(row) for row in DH["ur10e"]]
+    rows[1]["alpha"] = 2e-3
+    q, loads = scene(6)
+    term = Term("link_geometry", Site(2), (1e-3, -2e-3, 3e-3))
+    poses = Model(arm_from_dh(rows)).with_terms([term]).predict(q, loads)
+    for key, more in (("a", 1e-3), ("d", -2e-3), ("alpha", 3e-3)):
+        rows[1][key] += more
+    changed = Model(arm_from_dh(rows)).predict(q, loads)
+    np.testing.assert_allclose(poses.position, changed.position, atol=1e-10)
+    member = CATALOGUE["link_geometry"]
+    assert len(member.reported(Model(arm_from_dh(rows)).arm, term, None)) == 3
 
 
 @ARMS

@@ -13,7 +13,11 @@ if TYPE_CHECKING:
     from gapbridge.core.kernels.rates import ChainRate
     from gapbridge.core.kernels.reference import Chain
 
-PARALLEL = 1e-6  # sine of the angle below which two axes count as parallel
+# Sines of the angle below which two axes count as parallel. Factory calibrations and rounded angles
+# leave 1e-6 to a few 1e-3 where the drawing has parallel axes, whose common normal is then up to
+# hundreds of metres away; drawings have 0 or far more
+PARALLEL = 1e-2
+EXACTLY_PARALLEL = 1e-6  # the same of terms without beta
 
 
 class LinkForm(NamedTuple):
@@ -27,26 +31,40 @@ class LinkForm(NamedTuple):
     parallel: bool
 
 
-def link_form(arm: Arm, joint: int) -> LinkForm:
-    """Return the common normal of link ``joint`` (from 1), in the frame of that link."""
-    return _form(arm.link_in_link[joint].tobytes())
+def link_form(arm: Arm, joint: int, least: float = PARALLEL) -> LinkForm:
+    """Return the common normal of link ``joint`` (from 1), in the frame of that link.
+
+    Axes count as parallel if the sine of their angle is below ``least``.
+    """
+    return _form(arm.link_in_link[joint].tobytes(), least)
+
+
+def _form_of(term: Term, arm: Arm) -> LinkForm:
+    """Return the form that a term's values are of.
+
+    Terms of nearly parallel axes without beta are of the far common normal, as older cells hold.
+    """
+    assert term.site.joint is not None
+    least = PARALLEL if len(term.values) > 3 else EXACTLY_PARALLEL
+    return link_form(arm, term.site.joint, least)
 
 
 @lru_cache(maxsize=256)  # a fit asks for the few links of one arm thousands of times
-def _form(link: bytes) -> LinkForm:
+def _form(link: bytes, least: float) -> LinkForm:
     """Return the form of a link from the bytes of its transform (4, 4)."""
     import numpy as np
 
     step = np.frombuffer(link).reshape(4, 4)
     z, next_z, p = np.array([0, 0, 1.0]), step[:3, 2], step[:3, 3]
     sine = float(np.hypot(next_z[0], next_z[1]))
-    parallel = sine < PARALLEL
-    if parallel:
+    if sine < least:
         across = np.array([p[0], p[1], 0.0])
         length = float(np.linalg.norm(across))
         # standard DH rows have x along the frame's own x, whatever the sign of a
         along_x = length < 1e-9 or abs(p[1]) < 1e-9
         x = np.array([1.0, 0, 0]) if along_x else across / length
+        if sine >= EXACTLY_PARALLEL and x[0] < 0:  # the origin is not quite on the row's x
+            x = -x
         return LinkForm(z, x, next_z, np.cross(next_z, x), 0.0, True)
     x = np.cross(z, next_z) / sine
     if abs(next_z[0]) < 1e-9:
@@ -86,8 +104,10 @@ class LinkGeometry(Effect):
             Parameter("d", "m", 1e-3, -0.1, 0.1),
             Parameter("alpha", "rad", 1e-3, -0.1, 0.1),
         )
-        beta = (Parameter("beta", "rad", 1e-3, -0.1, 0.1),)
-        return own + (beta if link_form(arm, site.joint).parallel else ())
+        if not link_form(arm, site.joint).parallel:
+            return own
+        nearly = not link_form(arm, site.joint, EXACTLY_PARALLEL).parallel
+        return (*own, Parameter("beta", "rad", 1e-3, -0.1, 0.1, optional=nearly))
 
     def shape(self, term: Term, arm: Arm, chain: Chain) -> None:
         """Move and twist the next joint's frame."""
@@ -95,7 +115,7 @@ class LinkGeometry(Effect):
 
         joint = term.site.joint
         assert joint is not None
-        form = link_form(arm, joint)
+        form = _form_of(term, arm)
         a, d, alpha = term.values[:3]
         twist = one_rotation_matrix(form.x * alpha)
         turned = twist @ chain.rotation[joint]
@@ -112,7 +132,7 @@ class LinkGeometry(Effect):
         from gapbridge.core.rotation import one_rotation_matrix
 
         assert term.site.joint is not None
-        form, link = link_form(arm, term.site.joint), rate.link[term.site.joint]
+        form, link = _form_of(term, arm), rate.link[term.site.joint]
         if value == 0:
             link[:3] = form.x
         elif value == 1:

@@ -13,7 +13,7 @@ from gapbridge.bridge.cell import load_cell, save_cell
 from gapbridge.bridge.cell.document import number_text, parse
 from gapbridge.core.arm import Arm, builtin_arm
 from gapbridge.core.effects import CATALOGUE, Site, Term
-from gapbridge.core.errors import RunError, key_path
+from gapbridge.core.errors import CellError, RunError, key_path
 
 CONFIG = Path(__file__).parents[3] / "config"
 TEXT = """\
@@ -234,3 +234,20 @@ def test_a_stand_in_keeps_its_mark(tmp_path: Path) -> None:
     again = tmp_path / "again.yaml"
     save_cell(load_cell(new), again)
     assert again.read_text().count("stand_in: true") == 2
+
+
+def test_links_of_nearly_parallel_axes_may_be_without_the_second_twist(tmp_path: Path) -> None:
+    """Cells written before such links had one load, and are written back as they were."""
+    robot = "robot: {model: ur10e, calibration: {delta_alpha: [0, 1e-3, 0, 0, 0, 0]}}\n"
+    entry = (
+        "effects:\n  - {effect: link_geometry, joint: %d, parameters: {a: 1e-4, d: 0, alpha: 0}}"
+    )
+    old = tmp_path / "old.yaml"
+    old.write_text(robot + entry % 2)
+    cell = load_cell(old)
+    assert cell.model.terms == (Term("link_geometry", Site(2), (1e-4, 0.0, 0.0)),)
+    save_cell(cell, tmp_path / "new.yaml")
+    assert load_cell(tmp_path / "new.yaml").model.terms == cell.model.terms
+    old.write_text(robot + entry % 3)  # exactly parallel
+    with pytest.raises(CellError, match="beta"):
+        load_cell(old)
