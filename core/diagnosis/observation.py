@@ -51,6 +51,7 @@ class Observation:
     tool_axes: Array | None = None  # (N, 3, 3) axes of the TCP in base, as columns
     axial_moment: Array | None = None  # (N, n) Nm about each joint's axis
     times: Array | None = None  # (N,) s or row numbers, for steps
+    payload_mass: Array | None = None  # (N,) kg, declared in the log; None: the cell's
     order_in_time: bool = False  # True: a recording of motion, correlated in time
     # nuisance step (p,), terms -> the observation with moved frames and columns at these terms
     rebase: Callable[[Array, Sequence[Term]], Observation] | None = None
@@ -103,6 +104,7 @@ def thinned(observation: Observation, most: int) -> Observation:
         unnamed=lambda: tuple((target, columns[take]) for target, columns in unnamed()),
         friction=some(observation.friction),
         times=some(observation.times),
+        payload_mass=some(observation.payload_mass),
         tool_axes=some(observation.tool_axes),
         axial_moment=some(observation.axial_moment),
         session=None if observation.session is None else observation.session[take],
@@ -161,6 +163,7 @@ def stacked(parts: Sequence[Observation], quantities: Mapping[str, Array]) -> Ob
         tool_axes=together("tool_axes"),
         axial_moment=together("axial_moment"),
         times=together("times"),
+        payload_mass=together("payload_mass"),
         rebase=rebase if columns[-1] else None,
         session=np.repeat(session, size),
         nuisance_session=tuple(int(s) for s in np.repeat(session, width)),

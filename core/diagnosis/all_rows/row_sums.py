@@ -222,7 +222,8 @@ class Streamed:
             groups=np.repeat(np.minimum(stretch, STRETCHES - 1), each),
             rows=np.repeat(self.row, each),
             session=None if whole.session is None else np.repeat(self.session, each),
-            joint_columns=None, friction=None, times=None, subset=None, unnamed=tuple,
+            joint_columns=None, friction=None, times=None, payload_mass=None, subset=None,
+            unnamed=tuple,
         )  # fmt: skip
         whitener = np.broadcast_to(np.diag(self.inverse_sigma), (samples, k, k))
         return observation, replace(self.excerpt.noise, whitener=whitener)

@@ -163,6 +163,7 @@ def _observed(
         unnamed=lambda: unnamed_causes(model, q, loads, k),
         tool_axes=poses.rotation,
         times=loads.time,
+        payload_mass=loads.payload_mass,
         rebase=rebase if nuisance.shape[2] else None,
     )
 

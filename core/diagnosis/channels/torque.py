@@ -78,6 +78,7 @@ def _observed(
         rows=motion.rows,
         axes=joint_axes(n),
         joint_columns=own_joints(len(motion), n),
+        payload_mass=motion.loads.payload_mass,
         order_in_time=motion.moving,
         friction=motion.direction if motion.moving else None,
         unnamed=lambda: unnamed_loads(model, motion, "torque"),

@@ -77,6 +77,7 @@ def _observed(
         groups=conditions(motion),
         rows=motion.rows,
         axes=AXES,
+        payload_mass=motion.loads.payload_mass,
         order_in_time=motion.moving,
         unnamed=lambda: unnamed_loads(model, motion, "wrench"),
         instrument=lambda: instrument_noise(measured[whole.rows], whole),

@@ -317,10 +317,12 @@ def _bounded(candidate: Candidate, model: Model, observation: Observation) -> Ca
 
 
 def _payload_bounds(model: Model, observation: Observation) -> tuple[float, float]:
-    """Return bounds of a payload's error: the true mass is from 0 to the largest plausible."""
-    declared = observation.quantities.get("payload", np.array([model.payload_mass]))
-    most = MAX_PAYLOAD_FACTOR * max(float(declared.max()), LoadBounds.of(model).rated)
-    return -float(declared.min()), most
+    """Return bounds of a payload's error: every true mass is from 0 to the largest plausible."""
+    declared = observation.payload_mass
+    if declared is None:
+        declared = np.array([model.payload_mass])
+    least, most = float(declared.min()), float(declared.max())
+    return -least, MAX_PAYLOAD_FACTOR * max(most, LoadBounds.of(model).rated) - most
 
 
 def _observable(candidate: Candidate, observation: Observation) -> bool:

@@ -6,10 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import small_arm as small
 
 from gapbridge.core.arm import builtin_arm
+from gapbridge.core.diagnosis.channels import position, torque, wrench
 from gapbridge.core.diagnosis.selection.candidate import named_candidates
 from gapbridge.core.diagnosis.selection.refit import _step
+from gapbridge.core.diagnosis.selection.rounds import _payload_bounds
+from gapbridge.core.metrology import Metrology
 
 ARM = builtin_arm("ur5")
 
@@ -34,3 +38,27 @@ def test_a_parameter_on_its_bound_is_fixed_and_the_others_are_solved(flexible):
     assert step[1:] == pytest.approx(alone)
     free = _step(A, b, np.ones(3), flexible, [np.ones(1), np.ones(1)])
     assert free == pytest.approx([-1.0, 2.0, 0.5])
+
+
+@pytest.mark.parametrize(
+    ("declared", "cell", "bounds"),
+    [
+        (5.0, 0.0, (-5.0, 25.0)),  # the log's, also where it never changes
+        (2.0, 8.0, (-2.0, 28.0)),
+        (None, 8.0, (-8.0, 22.0)),
+        ((2.0, 6.0), 0.0, (-2.0, 24.0)),  # no row's mass is negative
+    ],
+)
+@pytest.mark.parametrize("channel", [position, torque, wrench])
+def test_the_true_payload_is_from_nothing_to_three_times_the_rated(channel, declared, cell, bounds):
+    session = small.session_of(0)
+    rows = len(session.q)
+    mass = None if declared is None else np.resize(declared, rows)
+    log = small.log_of(
+        session, np.zeros((rows, 3)) + session.q, payload=mass, payload_cog=None,
+        actual_current_as_torque=np.random.default_rng(0).normal(size=(rows, 3)),
+        ft_raw_wrench=np.zeros((rows, 6)),
+    )  # fmt: skip
+    model = replace(small.model_of(), payload_mass=cell)  # rated for 10 kg
+    seen = channel.observe(model, log, Metrology(registered=True))
+    assert _payload_bounds(model, seen) == pytest.approx(bounds)

@@ -43,6 +43,20 @@ def test_an_undeclared_load_is_found_with_its_centre_and_the_zero(plant, pull):
     assert np.allclose(found["ft_bias"], BIAS, atol=0.1)
 
 
+def test_a_load_lighter_than_the_log_declares_is_no_gain_of_the_sensor(plant):
+    """The log's payload counts, also where it never changes and the cell holds another."""
+    q, ones = truth.poses(N, ROWS, 5), np.ones(ROWS)
+    wrench = plant.dynamics(q, 0 * q, 0 * q, payload=4.0)[1]
+    wrench += np.random.default_rng(3).normal(0, 1, wrench.shape) * NOISE
+    log = truth.log_of(
+        N, timestamp=np.arange(ROWS) * 20.0, actual_q=q, ft_raw_wrench=wrench, payload=5.0 * ones,
+        payload_cog=ones[:, None] * truth.COG,
+    )  # fmt: skip
+    found = next(c for c in diagnose(plant.model(0.0), log).channels if c.channel == "wrench")
+    assert [c.effect for c in found.causes] == ["payload"]
+    assert found.causes[0].terms[0].values[0] == pytest.approx(-1.0, abs=0.02)
+
+
 @pytest.mark.parametrize("seed", [0, 2, 5])
 def test_an_undeclared_load_is_found_by_a_sensor_whose_gains_differ(plant, seed):
     """Beside the load found, a mass anywhere at the tool explains the gains no better than it."""
