@@ -171,7 +171,8 @@ def _diagnose(
             searched = _search_and_refit(*samples, model, withhold, progress)
             channels.append(_channel_diagnosis(searched, model, None))
         else:
-            searched = _search_and_refit(*samples, model, withhold, progress).without_columns()
+            searched = _search_and_refit(*samples, model, withhold, progress, True)
+            searched = searched.without_columns()
             streamed = partial(_observed_in, observe, model, metrology)
             streaming.append((searched, searched.row_sums(streamed, model)))
     if long is not None and streaming:
@@ -362,9 +363,12 @@ def _search(
 
 def _search_and_refit(
     observation: Observation, whole: Observation, model: Model, withhold: tuple[str, ...],
-    progress: Callable[[str], None] | None,
+    progress: Callable[[str], None] | None, streamed: bool = False,
 ) -> _SearchResult:  # fmt: skip
-    """Return the result of a search in ``observation``, refitted on all samples of ``whole``."""
+    """Return the result of a search in ``observation``, refitted on all samples of ``whole``.
+
+    ``streamed``: further rows follow block by block, which only the named terms are refitted on.
+    """
     searched, judgement, withdrawn = _search(observation, model, withhold, progress)
     held_out = HeldOut(searched)
     judgement = with_stand_ins(searched, judgement)
@@ -375,7 +379,7 @@ def _search_and_refit(
     chosen = [searched.term_index[p] for p in judgement.accused]
     where = locate(searched, gaps(searched, chosen)[0][searched.kept], chosen)
     selection = searched
-    if len(whole.rows) > len(observation.rows):
+    if streamed or len(whole.rows) > len(observation.rows):
         if progress:
             progress(f"{observation.channel}: all {len(whole.rows)} rows")
         judgement = with_undecided_terms(judgement)

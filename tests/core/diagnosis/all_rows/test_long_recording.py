@@ -106,3 +106,18 @@ def test_rows_from_sums_have_the_same_sums():
     A = rng.normal(size=(50, 4)) @ np.diag([1.0, 1e-3, 1e3, 0.0])
     R = rows_of(A.T @ A)
     np.testing.assert_allclose(R.T @ R, A.T @ A, rtol=1e-9, atol=1e-12)
+
+
+def test_a_channel_with_few_rows_of_a_long_recording_is_judged_on_all(recording, monkeypatch):
+    """The excerpt's rows are few enough to be searched at once, with unnamed functions."""
+    monkeypatch.setattr(blocks, "WHOLE", 8000)
+    monkeypatch.setattr(blocks, "EXCERPT", 6000)
+    model, log = recording
+    torque = log.columns["actual_current_as_torque"].copy()
+    torque[:, 3] += 2.0 * np.sin(3 * log.columns["actual_q"][:, 3] ** 2)  # in no catalogue
+    torque[np.arange(COUNT) % 25 > 0] = np.nan
+    few = Log("few.csv", log.columns | {"actual_current_as_torque": torque}, 6)
+    found = next(c for c in diagnose(model, few).channels if c.channel == "torque")
+    assert 300 < found.samples <= COUNT / 25  # without those where a joint reverses
+    assert [c.effect for c in found.causes][:1] == ["coulomb_friction"]
+    assert found.structured
