@@ -48,12 +48,13 @@ from gapbridge.core.diagnosis.judgement import (
 from gapbridge.core.diagnosis.log_checks.missing_flexibility import flexibility_findings
 from gapbridge.core.diagnosis.log_checks.units_and_clocks import check_units, findings
 from gapbridge.core.diagnosis.noise_floor import Floor, noise_floor, whiteness
-from gapbridge.core.diagnosis.observation import NotObservable, Observation, thinned
+from gapbridge.core.diagnosis.observation import NotObservable, Observation
 from gapbridge.core.diagnosis.residual_structure import dependence
 from gapbridge.core.diagnosis.selection.rounds import select
 from gapbridge.core.diagnosis.selection.selection import Selection, refitted_alone
 from gapbridge.core.diagnosis.selection.step_times import slips
 from gapbridge.core.diagnosis.separation import Measurement, next_measurements
+from gapbridge.core.diagnosis.thinning import thinned, thinned_poses
 from gapbridge.core.diagnosis.value_stability import closes_gap
 from gapbridge.core.effects import CATALOGUE, Term, correcting, flexibility_effects
 from gapbridge.core.errors import LogError
@@ -215,8 +216,12 @@ def _samples(
     if isinstance(whole, NotObservable):
         return whole
     fewer = whole
-    if len(whole.rows) > MAX_SAMPLES[whole.channel]:
-        fewer = _thinned(whole, model, excerpt, metrology, observe)
+    most = MAX_SAMPLES[whole.channel]
+    if len(whole.rows) > most and whole.channel == "position":
+        observed = partial(_observed_in, observe, model, metrology)
+        fewer = thinned_poses(whole, excerpt, observed, most)
+    elif len(whole.rows) > most:
+        fewer = thinned(whole, most)
     if long is None:
         return fewer, whole
     return replace(fewer, rows=long.rows[fewer.rows]), replace(whole, rows=long.rows[whole.rows])
@@ -274,21 +279,6 @@ def _log_findings(model: Model, log: Log, metrology: Metrology) -> list[LogFindi
     if not log.one_clock:
         log_findings.append(LogFinding(LogCheck.CLOCKS_OVERLAP))
     return log_findings + outside_findings(log)
-
-
-def _thinned(
-    observation: Observation, model: Model, log: Log, metrology: Metrology, observe: Observe
-) -> Observation:
-    """Return the channel with fewer samples; poses are observed again, with free frames."""
-    if observation.channel != "position":
-        return thinned(observation, MAX_SAMPLES[observation.channel])
-    take = np.unique(np.linspace(0, len(observation.rows) - 1, MAX_SAMPLES["position"]).astype(int))
-    # approach directions come from neighbouring rows: derived before rows are left out
-    approach = log.approach()
-    columns = dict(log.columns) | ({} if approach is None else {"approach": approach})
-    part = observe(model, replace(log, columns=columns).select(observation.rows[take]), metrology)
-    assert isinstance(part, Observation)
-    return replace(part, rows=observation.rows[take])
 
 
 def _model_terms(channels: Sequence[ChannelDiagnosis]) -> list[Term]:

@@ -76,42 +76,6 @@ class Observation:
         return self.joint_columns * self.axial_moment[:, None, :]
 
 
-def thinned(observation: Observation, most: int) -> Observation:
-    """Return the observation with at most ``most`` samples, evenly spaced.
-
-    Predictions are still made on the full log, for delays and derivatives.
-    """
-    count = len(observation.rows)
-    if count <= most:
-        return observation
-    take = np.unique(np.linspace(0, count - 1, most).astype(int))
-    if observation.subset is not None:
-        return observation.subset(take)
-    whole, unnamed = observation.predict, observation.unnamed
-
-    def some(columns: Array | None) -> Array | None:
-        return None if columns is None else columns[take]
-
-    return replace(
-        observation,
-        measured=observation.measured[take],
-        predict=lambda terms: whole(terms)[take],
-        nuisance=observation.nuisance[take],
-        quantities={name: z[take] for name, z in observation.quantities.items()},
-        groups=observation.groups[take],
-        rows=observation.rows[take],
-        joint_columns=some(observation.joint_columns),
-        unnamed=lambda: tuple((target, columns[take]) for target, columns in unnamed()),
-        friction=some(observation.friction),
-        times=some(observation.times),
-        payload_mass=some(observation.payload_mass),
-        tool_axes=some(observation.tool_axes),
-        axial_moment=some(observation.axial_moment),
-        session=None if observation.session is None else observation.session[take],
-        rebase=None,
-    )
-
-
 def stacked(parts: Sequence[Observation], quantities: Mapping[str, Array]) -> Observation:
     """Return the observations of several sessions as one, with a nuisance for each.
 

@@ -11,23 +11,23 @@ from gapbridge.core.arrays import Array, Index
 from gapbridge.core.derivatives import signal_noise
 from gapbridge.core.diagnosis.criteria import MIN_TORQUE_CHANGE, STEPPED_SHARE
 from gapbridge.core.diagnosis.observation import HELD_TORQUE
+from gapbridge.core.diagnosis.thinning import drawn
 from gapbridge.core.estimation.held_out import pose_groups
 from gapbridge.core.log.log import Log
 from gapbridge.core.motion import Motion
+from gapbridge.core.sessions import session_of
 
-MAX_POSES = 30_000  # poses at rest, evenly spaced: limited by memory
+MAX_POSES = 30_000  # poses at rest: limited by memory
 STRETCHES = 24  # conditions of a recording: even stretches of time
 MIN_CONDITIONS = 5
 MIN_TORQUE = 1e-3  # Nm
 CONSTANT_SPREAD = 1e-9  # spread below which a quantity counts as constant
 
 
-def subsampled(usable: NDArray[np.bool_], most: int = MAX_POSES) -> Index:
-    """Return at most ``most`` of the usable rows, evenly spread."""
+def subsampled(log: Log, usable: NDArray[np.bool_], motion: Motion) -> Index:
+    """Return at most MAX_POSES of the ``usable`` rows (N,) of a log's motion, as indices to it."""
     rows = np.flatnonzero(usable)
-    if len(rows) <= most:
-        return rows
-    return rows[np.round(np.linspace(0, len(rows) - 1, most)).astype(np.int64)]
+    return rows[drawn(session_of(log)[motion.rows[rows]], MAX_POSES)]
 
 
 def conditions(motion: Motion) -> Index:

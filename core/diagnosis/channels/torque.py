@@ -36,7 +36,7 @@ def observe(model: Model, log: Log, metrology: Metrology) -> Observation | NotOb
 
     Rows without derivatives (edges, gaps), with a torque that is not finite, or with a joint that
     reverses (unknown sign of friction) are left out. Of more than 30,000 poses at rest 30,000 are
-    taken, evenly spaced. Not observable if the links have no mass or the torques are constant.
+    taken. Not observable if the links have no mass or the torques are constant.
     Raises LogError if the log holds something unusable.
     """
     measured = log.get("actual_current_as_torque")
@@ -45,7 +45,7 @@ def observe(model: Model, log: Log, metrology: Metrology) -> Observation | NotOb
         return NotObservable("torque", needs)
     whole = motion_of(log)
     finite = np.isfinite(measured[whole.rows]).all(axis=1)
-    rows = subsampled(whole.valid & finite & _steady(whole))
+    rows = subsampled(log, whole.valid & finite & _steady(whole), whole)
     if not len(rows):
         return NotObservable("torque", ("actual_current_as_torque",))
     known = measured[np.isfinite(measured).all(axis=1)]

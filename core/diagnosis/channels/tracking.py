@@ -44,7 +44,7 @@ def observe(model: Model, log: Log, metrology: Metrology) -> Observation | NotOb
     if needs:
         return NotObservable("tracking", needs)
     motion = with_holding_torque(model, motion_of(log))
-    return _observed(model, log, motion, subsampled(_known_past(motion)))
+    return _observed(model, log, motion, subsampled(log, _known_past(motion), motion))
 
 
 def _observed(model: Model, log: Log, motion: Motion, rows: Index) -> Observation:

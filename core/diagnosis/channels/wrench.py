@@ -37,7 +37,7 @@ def observe(model: Model, log: Log, metrology: Metrology) -> Observation | NotOb
 
     Torques are weighted by the ratio of the noise of forces to that of torques. Rows without
     derivatives and rows whose wrench is not finite are left out. Of more than 30,000 poses at rest
-    30,000 are taken, evenly spaced. Raises LogError if the log holds something unusable.
+    30,000 are taken. Raises LogError if the log holds something unusable.
     """
     measured = log.get("ft_raw_wrench")
     needs = [] if measured is not None else ["ft_raw_wrench"]
@@ -46,7 +46,7 @@ def observe(model: Model, log: Log, metrology: Metrology) -> Observation | NotOb
     if measured is None or needs:
         return NotObservable("wrench", tuple(needs))
     whole = motion_of(log)
-    rows = subsampled(whole.valid & np.isfinite(measured[whole.rows]).all(axis=1))
+    rows = subsampled(log, whole.valid & np.isfinite(measured[whole.rows]).all(axis=1), whole)
     if not len(rows):
         return NotObservable("wrench", ("ft_raw_wrench",))
     return _observed(model, log, measured, whole, rows)

@@ -9,6 +9,7 @@ import pytest
 import small_arm as small
 
 import gapbridge.core.diagnosis.diagnosis as whole
+from gapbridge.core.diagnosis import thinning
 from gapbridge.core.diagnosis.channels.recording import instrument_noise, signal_step
 from gapbridge.core.diagnosis.diagnosis import diagnose
 from gapbridge.core.diagnosis.finding import Check
@@ -103,7 +104,7 @@ def test_every_row_is_fitted_and_judged(monkeypatch: pytest.MonkeyPatch) -> None
     metrology = Metrology(registered=True, sigma=small.SIGMA)
     log = small.log_of(drawn, small.readings(small.REAL["axial_compliance"], drawn, 1))
     (channel,) = diagnose(small.model_of(), log, metrology).channels
-    few = log.select(np.unique(np.linspace(0, 399, 60).astype(int)))
+    few = log.select(thinning.drawn(np.zeros(400), 60))
     (searched,) = diagnose(small.model_of(), few, metrology).channels
     assert channel.samples == len(channel.gap) == 400
     (cause,), (before,) = channel.causes, searched.causes
@@ -122,7 +123,7 @@ def test_a_cause_that_few_rows_suggest_falls_by_all_of_them(
     drawn = small.session_of(1, small.Plan(poses=200))
     position = small.readings(small.NOMINAL, drawn, 1)
     off = small.readings(small.REAL["joint_offset"], drawn, 1)
-    taken = np.unique(np.linspace(0, 199, 60).astype(int))
+    taken = thinning.drawn(np.zeros(200), 60)
     position[taken] = off[taken]
     position[np.setdiff1d(np.arange(200), taken)[:60]] -= (off - small.readings(
         small.NOMINAL, drawn, 1))[np.setdiff1d(np.arange(200), taken)[:60]]  # fmt: skip

@@ -11,7 +11,8 @@ import pytest
 
 from gapbridge.core.diagnosis.channels.torque import observe
 from gapbridge.core.diagnosis.diagnosis import diagnose
-from gapbridge.core.diagnosis.observation import NotObservable, Observation, thinned
+from gapbridge.core.diagnosis.observation import NotObservable, Observation
+from gapbridge.core.diagnosis.thinning import thinned
 from gapbridge.core.effects import Site, Term
 from gapbridge.core.metrology import Metrology
 

@@ -1,0 +1,69 @@
+"""Fewer samples of a channel, for the search: one of each even stretch of every session.
+
+Samples at even distances would all be of one phase of what alternates from row to row, as two
+loads do that are measured in turn; each is drawn at random from its stretch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from gapbridge.core.arrays import Index
+from gapbridge.core.diagnosis.observation import NotObservable, Observation
+from gapbridge.core.log.log import Log
+
+SEED = 0
+
+
+def drawn(session: Index, most: int) -> Index:
+    """Return at most ``most`` of the rows of sessions (N,), in order; all of a small session.
+
+    Sessions that have to be thinned get the same number of rows, one of each even stretch.
+    """
+    if len(session) <= most:
+        return np.arange(len(session))
+    rng = np.random.default_rng(SEED)
+    rows = [np.flatnonzero(session == s) for s in np.unique(session)]
+    taken, left = [], most
+    for i, own in enumerate(sorted(rows, key=len)):
+        count = min(len(own), left // (len(rows) - i))
+        ends = np.linspace(0, len(own), count + 1).astype(np.int64)
+        taken.append(own[rng.integers(ends[:-1], ends[1:])])
+        left -= count
+    return np.sort(np.concatenate(taken))
+
+
+def thinned(observation: Observation, most: int) -> Observation:
+    """Return a channel of a recording with at most ``most`` samples.
+
+    Predictions are still made on the full log, for delays and derivatives.
+    """
+    assert observation.subset is not None
+    return observation.subset(drawn(_sessions(observation), most))
+
+
+def thinned_poses(
+    observation: Observation, log: Log, observe: Callable[[Log], Observation | NotObservable],
+    most: int,
+) -> Observation:  # fmt: skip
+    """Return the position channel of ``log`` with at most ``most`` poses, observed again.
+
+    Their frames are then free.
+    """
+    rows = observation.rows[drawn(_sessions(observation), most)]
+    # approach directions come from neighbouring rows: derived before rows are left out
+    approach = log.approach()
+    columns = dict(log.columns) | ({} if approach is None else {"approach": approach})
+    part = observe(replace(log, columns=columns).select(rows))
+    assert isinstance(part, Observation)
+    return replace(part, rows=rows)
+
+
+def _sessions(observation: Observation) -> Index:
+    """Return the session (N,) of each sample; zeros where there is one."""
+    if observation.session is None:
+        return np.zeros(len(observation.rows), dtype=np.int64)
+    return observation.session
