@@ -44,6 +44,7 @@ from gapbridge.core.diagnosis.judgement import (
     judge_geometry,
     significant_alone,
     with_stand_ins,
+    with_structure_left,
 )
 from gapbridge.core.diagnosis.log_checks.missing_flexibility import flexibility_findings
 from gapbridge.core.diagnosis.log_checks.units_and_clocks import check_units, findings
@@ -363,7 +364,10 @@ def _search_and_refit(
     held_out = HeldOut(searched)
     judgement = with_stand_ins(searched, judgement)
     stand_ins = _stand_ins(searched, judgement, held_out, model)
+    before = judgement
     searched, judgement = significant_alone(searched, judgement, model.arm)
+    if judgement.accused != before.accused:
+        judgement = with_structure_left(searched, judgement)
     without = (*withhold, *(c.effect for c in withdrawn))
     considered = (*considered_of(searched, judgement, held_out, without), *withdrawn)
     chosen = [searched.term_index[p] for p in judgement.accused]

@@ -39,6 +39,7 @@ from gapbridge.core.diagnosis.residual_structure import dependence, structure_p_
 from gapbridge.core.diagnosis.selection.candidate import Candidate
 from gapbridge.core.diagnosis.selection.delay_columns import delayed_by
 from gapbridge.core.diagnosis.selection.local_search import forward_selected, rivals
+from gapbridge.core.diagnosis.selection.outliers import inliers
 from gapbridge.core.diagnosis.selection.refit import UnnamedPart, worth
 from gapbridge.core.diagnosis.selection.sample_space import CandidateFit, SampleSpace, fit
 from gapbridge.core.diagnosis.selection.selection import Selection, refitted_alone
@@ -142,26 +143,74 @@ def _verdict(
 ) -> Judgement:  # fmt: skip
     """Return the judgement with the ``accused`` candidates, and whether structure is left."""
     position_of = {c: p for p, c in enumerate(whole.term_index)}
-    space, nuisance = selection.working, selection.nuisance_basis
+    nuisance = selection.nuisance_basis
     single = [c for c in accused if c not in selection.block]
+    space = _space_left_by(selection, single)
     p_value = structure_p_value(space, nuisance, single)
     p_value = min(p_value, _excess_residual_p(whole))
-    if np.mean(~whole.kept) > MAX_OUTLIER_SHARE:
+    if _outlier_share(whole, accused) > MAX_OUTLIER_SHARE:
         p_value = 0.0
     unnamed = any(not space.candidates[c].named for c in selection.best.chosen)
     if unnamed:
-        p_value = min(p_value, _unnamed_unnecessary_p(space, selection.best))
+        p_value = min(p_value, _unnamed_unnecessary_p(selection.working, selection.best))
     hint = unnamed or withdrawn_any
     structured = p_value < (MAX_STRUCTURE_P_WITH_HINT if hint else MAX_STRUCTURE_P)
     depends: tuple[tuple[str, float], ...] = ()
     if structured or not accused:
         depends = tuple(dependence(space, nuisance, single, selection.groups))
-    ties = ties_of(space, selection.best, single)
+    ties = ties_of(selection.working, selection.best, single)
     return Judgement(
         tuple(position_of[c] for c in accused), structured, p_value, depends,
         {position_of[c]: names for c, names in ties.items()},
         tuple((position_of[c], why) for c, why in withdrawn.items()),
     )  # fmt: skip
+
+
+def _predicted(selection: Selection, accused: Sequence[int]) -> Array:
+    """Return the observation's prediction (N, k) with the terms of the accused candidates."""
+    pairs = zip(selection.term_index, selection.terms, strict=True)
+    return selection.observation.predict([term for c, term in pairs if c in accused])
+
+
+def _space_left_by(selection: Selection, accused: Sequence[int]) -> SampleSpace:
+    """Return the working space with the residual of the accused terms as its target.
+
+    The space's own target is of the model that it is linearised at, which may hold other terms.
+    Where all links are a cause they are a part of its noise, and its target is kept.
+    """
+    if selection.block:
+        return selection.working
+    residual = selection.observation.measured - _predicted(selection, accused)
+    return replace(selection.space, y=selection.plain_rows_of(residual[..., None])[:, 0])
+
+
+def _outlier_share(selection: Selection, accused: Sequence[int]) -> float:
+    """Return the share of the samples that are outliers and that the accused terms do not fit."""
+    left_out, observation = ~selection.kept, selection.observation
+    if np.mean(left_out) > MAX_OUTLIER_SHARE:
+        residual = observation.measured - _predicted(selection, accused)
+        left_out &= ~inliers(observation, selection.noise, residual)
+    return float(np.mean(left_out))
+
+
+def with_structure_left(selection: Selection, judgement: Judgement) -> Judgement:
+    """Return the judgement with the structure that its accused terms leave.
+
+    For a judgement of more terms, some of which have been withdrawn since.
+    """
+    accused = [selection.term_index[p] for p in judgement.accused]
+    if not set(accused) & set(selection.block):
+        selection = selection.without_links()
+    single = [c for c in accused if c not in selection.block]
+    space, nuisance = _space_left_by(selection, single), selection.nuisance_basis
+    p_value = structure_p_value(space, nuisance, single)
+    if judgement.p_value is not None:
+        p_value = min(p_value, judgement.p_value)
+    structured = judgement.structured or p_value < MAX_STRUCTURE_P_WITH_HINT
+    depends = judgement.depends_on
+    if structured or not accused:
+        depends = tuple(dependence(space, nuisance, single, selection.groups))
+    return replace(judgement, p_value=p_value, structured=structured, depends_on=depends)
 
 
 def _unnamed_unnecessary_p(space: SampleSpace, best: CandidateFit) -> float:
@@ -226,12 +275,9 @@ def significant_alone(
         inside = refit.term_index[weakest[0]] in refit.block
         # friction that belongs to the links may be significant on more rows
         reason = NOT_SIGNIFICANT if inside else NOT_STABLE
-        # a joint's zero that is not significant leaves no structure behind
-        structured = not inside or refit.is_link(weakest[0])
         judgement = replace(
             judgement, accused=tuple(p for p in judgement.accused if p not in weakest),
             withdrawn=(*judgement.withdrawn, *((p, reason) for p in weakest)),
-            structured=judgement.structured or structured,
             ties={p: names for p, names in judgement.ties.items() if p not in weakest},
         )  # fmt: skip
 

@@ -74,7 +74,7 @@ def fitted_on_all_rows(
     state = SelectionState(
         placed, model.arm, candidates, noise, np.ones(len(placed.rows), dtype=bool)
     )
-    state = replace(state, kept=inliers(state, placed.measured - placed.predict(terms)))
+    state = replace(state, kept=inliers(placed, noise, placed.measured - placed.predict(terms)))
     columns = [exact_columns(placed, c, terms) for c in candidates]
     space, unprojected = sample_space(state, columns, terms, [])
     links = {p: selection.prior[c] for p, c in enumerate(selection.term_index)

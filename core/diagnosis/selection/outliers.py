@@ -14,9 +14,10 @@ from gapbridge.core.diagnosis.criteria import (
     MAX_OUTLIER_SHARE,
     MAX_UNPREDICTED_SHARE,
 )
+from gapbridge.core.diagnosis.observation import Observation
 from gapbridge.core.diagnosis.selection.candidate import Candidate
 from gapbridge.core.diagnosis.selection.forward_selection import joining
-from gapbridge.core.diagnosis.selection.noise import estimate_noise
+from gapbridge.core.diagnosis.selection.noise import Noise, estimate_noise
 from gapbridge.core.diagnosis.selection.sample_space import CandidateFit, SampleSpace, fit
 from gapbridge.core.diagnosis.selection.state import SelectionState, UnprojectedRows, sample_space
 from gapbridge.core.effects import Term
@@ -58,42 +59,42 @@ def mark_outliers(
         inverse = np.linalg.pinv(G + np.diag(prior**2), rcond=1e-14, hermitian=True)
         r = gap - A @ (inverse @ (M.T @ rhs))
         used = float(np.trace(inverse @ G))
-        state = replace(state, kept=_keep(state, r))
+        state = replace(state, kept=_keep(observation, state.noise, r))
         if step in (2, 5, STEPS - 1):
             noise = estimate_noise(observation, r, state.kept, 1 - used / (N * k))
             state = replace(state, noise=noise)
-        white = whitened(state, r)
+        white = whitened(state.noise, r)
         distance = distance_of(white, scale_of(white))
         weight = start_weights_of(distance) if step < STARTING else weights_of(distance)
-    return replace(state, kept=_keep(state, r))
+    return replace(state, kept=_keep(observation, state.noise, r))
 
 
-def inliers(state: SelectionState, residual: Array) -> NDArray[np.bool_]:
+def inliers(observation: Observation, noise: Noise, residual: Array) -> NDArray[np.bool_]:
     """Return the inliers (N,) of a residual (N, k), with the nuisance refitted."""
-    nuisance = state.observation.nuisance
+    nuisance = observation.nuisance
     if nuisance.shape[2]:
-        W = state.noise.whitener
+        W = noise.whitener
         A, b = (W @ nuisance).reshape(-1, nuisance.shape[2]), (W @ residual[..., None]).ravel()
-        white = whitened(state, residual)
+        white = whitened(noise, residual)
         row = np.repeat(distance_of(white, scale_of(white)) < OUTLIER, residual.shape[1])
         residual = residual - nuisance @ solve(A[row], b[row])
-    return _keep(state, residual)
+    return _keep(observation, noise, residual)
 
 
-def whitened(state: SelectionState, residual: Array) -> Array:
+def whitened(noise: Noise, residual: Array) -> Array:
     """Return a residual (N, k) in units of the noise."""
-    return np.asarray((state.noise.whitener @ residual[..., None])[..., 0])
+    return np.asarray((noise.whitener @ residual[..., None])[..., 0])
 
 
-def _keep(state: SelectionState, residual: Array) -> NDArray[np.bool_]:
+def _keep(observation: Observation, noise: Noise, residual: Array) -> NDArray[np.bool_]:
     """Return the inliers (N,): without the farthest outliers, of which a share is the limit.
 
     In recordings few are excluded: there they are friction at rest or delay, not bad readings.
     """
-    white = whitened(state, residual)
+    white = whitened(noise, residual)
     distance = distance_of(white, scale_of(white))
     outliers = np.flatnonzero(distance >= OUTLIER)
-    moving = state.observation.channel in ("torque", "tracking")
+    moving = observation.channel in ("torque", "tracking")
     share = MAX_OUTLIER_SHARE if moving else MAX_EXCLUDED_SHARE
     limit = int(np.ceil(share * len(residual)))
     kept = np.ones(len(residual), dtype=bool)
@@ -155,6 +156,6 @@ def revise_noise_and_outliers(
     state: SelectionState, residual: Array, free: float
 ) -> SelectionState:
     """Return the state with noise and outliers of the best explanation's residual."""
-    kept = _keep(state, residual)
+    kept = _keep(state.observation, state.noise, residual)
     noise = estimate_noise(state.observation, residual, kept, free)
     return replace(state, kept=kept, noise=noise)

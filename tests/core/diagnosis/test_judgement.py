@@ -33,6 +33,7 @@ from gapbridge.core.diagnosis.judgement import (
     pure_error,
     significant_alone,
     ties_of,
+    with_structure_left,
 )
 from gapbridge.core.diagnosis.selection.sample_space import fit
 from gapbridge.core.diagnosis.selection.selection import Selection
@@ -110,6 +111,31 @@ def test_a_term_without_held_out_gain_is_withdrawn():
     judged = judge(selection, HeldOut(noise))
     assert judged.accused == ()
     assert [why for _, why in judged.withdrawn] == [Withdrawal(Check.HELD_OUT_GAIN)]
+
+
+def test_structure_is_what_the_remaining_accused_terms_leave():
+    """Terms withdrawn later leave their part; it has a p-value and quantities."""
+    channel = channel_of("backlash")
+    given = replace(channel.judgement, structured=False, p_value=0.55, depends_on=())
+    assert with_structure_left(channel.selection, given) == given
+    fewer = with_structure_left(channel.selection, replace(given, accused=()))
+    assert fewer.structured
+    assert fewer.p_value is not None
+    assert fewer.p_value < 1e-3
+    assert fewer.depends_on[0][0] == "approach_1"
+
+
+def test_outliers_that_the_accused_terms_fit_are_no_structure():
+    channel = channel_of("joint_offset")
+    kept = channel.selection.kept.copy()
+    kept[::5] = False
+    fewer = replace(channel.selection, kept=kept)
+    accused = [fewer.term_index[p] for p in channel.judgement.accused]
+    assert accused
+    assert judging._outlier_share(fewer, accused) == 0
+    off = fewer.observation.measured + 1e-2 * ~kept[:, None]
+    bad = replace(fewer, observation=replace(fewer.observation, measured=off))
+    assert judging._outlier_share(bad, accused) == pytest.approx(0.2)
 
 
 def test_a_value_on_its_bound_is_no_accusation():
@@ -259,7 +285,6 @@ def test_all_links_are_accused_only_if_one_of_them_is_significant(monkeypatch, t
     assert selection is found
     assert judgement.accused == stays
     assert {p for p, _ in judgement.withdrawn} == {0, 1, 2} - {*stays}
-    assert judgement.structured == (stays == (0,))
 
 
 @pytest.mark.parametrize(("offset", "stays"), [(2.9e-4, (0, 1)), (3.1e-4, (0, 1, 2))])
@@ -282,7 +307,6 @@ def test_each_joint_zero_of_the_links_has_to_be_significant(monkeypatch, offset,
     monkeypatch.setattr(judging, "refitted_alone", lambda *_: found)
     _, judgement = significant_alone(found, Judgement((0, 1, 2), False, None, (), {}, ()), None)
     assert judgement.accused == stays
-    assert not judgement.structured
 
 
 @pytest.mark.parametrize(("spread", "held"), [(9e-3, True), (5e-3, False)])

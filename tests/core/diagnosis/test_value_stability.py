@@ -17,7 +17,13 @@ from gapbridge.core.diagnosis.criteria import NEGLIGIBLE_SIZE
 from gapbridge.core.diagnosis.diagnosis import diagnose
 from gapbridge.core.diagnosis.finding import Check, Withdrawal
 from gapbridge.core.diagnosis.held_out import HeldOut
-from gapbridge.core.diagnosis.judgement import Judgement, judge, judge_geometry, significant_alone
+from gapbridge.core.diagnosis.judgement import (
+    Judgement,
+    judge,
+    judge_geometry,
+    significant_alone,
+    with_structure_left,
+)
 from gapbridge.core.diagnosis.selection import rounds
 from gapbridge.core.diagnosis.selection.candidate import named_candidates, with_requirement
 from gapbridge.core.diagnosis.selection.refit import UnnamedPart, _cluster_covariance, worth
@@ -283,7 +289,7 @@ def test_a_term_not_significant_with_unnamed_functions_is_withdrawn():
     unknown = UnnamedPart(twin, np.full(twin.shape[1], np.inf), np.arange(rows) // 3 % 20)
     _, judged = significant_alone(found, replace(judgement, unnamed_part=unknown), arm)
     assert judged.accused == ()
-    assert judged.structured
+    assert with_structure_left(found, judged).structured
     assert [p for p, _ in judged.withdrawn] == [0]
 
 
