@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from gapbridge.core.arrays import Array
 from gapbridge.core.diagnosis.across_sessions import session_transfer
 from gapbridge.core.diagnosis.all_rows.gap_sizes import gaps, sizes_of, streamed_sizes
 from gapbridge.core.diagnosis.all_rows.long_recording import LongRecording, long_recording
@@ -19,6 +18,11 @@ from gapbridge.core.diagnosis.all_rows.refit_on_all_rows import (
     fitted_on_all_rows,
     refitted,
     with_undecided_terms,
+)
+from gapbridge.core.diagnosis.all_rows.remaining_structure import (
+    Depends,
+    with_excess,
+    with_whiteness,
 )
 from gapbridge.core.diagnosis.all_rows.row_sums import RowSums, Streamed
 from gapbridge.core.diagnosis.causes import Cause, Considered, causes_of, considered_of
@@ -48,7 +52,6 @@ from gapbridge.core.diagnosis.judgement import (
 )
 from gapbridge.core.diagnosis.log_checks.missing_flexibility import flexibility_findings
 from gapbridge.core.diagnosis.log_checks.units_and_clocks import check_units, findings
-from gapbridge.core.diagnosis.noise_floor import Floor, noise_floor, whiteness
 from gapbridge.core.diagnosis.observation import NotObservable, Observation
 from gapbridge.core.diagnosis.residual_structure import dependence
 from gapbridge.core.diagnosis.selection.rounds import select
@@ -67,7 +70,6 @@ from gapbridge.core.metrology import Metrology
 from gapbridge.core.model import Model, Uncertain
 from gapbridge.core.sessions import session_of, sessions_in, with_sessions
 
-Depends = tuple[tuple[str, float], ...]  # quantity, share
 Observe = Callable[[Model, Log, Metrology], Observation | NotObservable]
 
 CHANNELS: Mapping[str, Observe] = {
@@ -413,7 +415,9 @@ def _channel_diagnosis(
     else:
         sizes = streamed_sizes(streamed, decided, judgement.accused)
     causes = causes_of(decided, judgement, held_out, model.arm)
-    judgement, floor = _with_whiteness(judgement, final, sizes.means, searched.depends)
+    if searched.more and streamed is None:
+        judgement = with_excess(judgement, final, remaining, searched.depends)
+    judgement, floor = with_whiteness(judgement, final, sizes.means, searched.depends)
     held_out_rms = held_out.rms(chosen) if held_out.possible else None
     if not causes:  # only the frame was fitted
         held_out_rms = sizes.gap_rms
@@ -438,25 +442,6 @@ def _channel_diagnosis(
         noise_floor_source=floor.source, stand_ins=searched.stand_ins,
         fitted_together=searched.fitted_together,
     )  # fmt: skip
-
-
-def _with_whiteness(
-    judgement: Judgement, selection: Selection, means: Array | None,
-    depends: Callable[[Sequence[int]], Depends],
-) -> tuple[Judgement, Floor]:  # fmt: skip
-    """Return the judgement with the whiteness test of a recording's residual, and the floor."""
-    floor = noise_floor(selection, judgement.structured)
-    test = whiteness(means, floor.rms)
-    if test is None or test.white:
-        return judgement, floor
-    p_value = test.p_value if judgement.p_value is None else min(judgement.p_value, test.p_value)
-    judgement = replace(
-        judgement,
-        structured=True,
-        p_value=p_value,
-        depends_on=judgement.depends_on or depends(judgement.accused),
-    )
-    return judgement, noise_floor(selection, True)
 
 
 def _stand_ins(
