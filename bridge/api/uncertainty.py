@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
+from gapbridge.bridge.document.parameter_entries import parameter_entries
 from gapbridge.bridge.document.provenance import intervals_of
 from gapbridge.core.calibration.spread import Spread
 from gapbridge.core.diagnosis.diagnosis import Diagnosis
@@ -35,10 +35,7 @@ def cause_entries(diagnosis: Diagnosis, earlier: Sequence[Any] = ()) -> list[dic
     entries: list[dict[str, Any]] = [
         {
             "effect": cause.effect, "joints": list(cause.joints), "channel": channel.channel,
-            "parameters": [
-                {"name": p.name, "value": float(p.value), "std": _finite(p.std), "unit": p.unit}
-                for p in cause.parameters
-            ],
+            "parameters": parameter_entries(cause.parameters),
             "indistinguishable_from": list(cause.indistinguishable_from),
         }
         for channel in diagnosis.channels
@@ -47,10 +44,6 @@ def cause_entries(diagnosis: Diagnosis, earlier: Sequence[Any] = ()) -> list[dic
     new = {p["name"] for entry in entries for p in entry["parameters"]}
     kept = [old.model_dump() for old in earlier if not new & {p.name for p in old.parameters}]
     return [*entries, *kept]
-
-
-def _finite(std: float | None) -> float | None:
-    return None if std is None or not math.isfinite(std) else float(std)
 
 
 def intervals_applied(

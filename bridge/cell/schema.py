@@ -144,7 +144,9 @@ class CauseParameter(Section):
     """A parameter of a cause, as the diagnosis estimated it."""
 
     name: str
-    value: Number
+    value: Number | str | None = Field(
+        default=None, description="of a session its name; null: no time, because clocks overlap"
+    )
     std: NotNegative | None = Field(default=None, description="1 sigma")
     unit: str = ""
 

@@ -6,6 +6,7 @@ import math
 from typing import Any
 
 from gapbridge.bridge.document.findings import considered_text, finding_text
+from gapbridge.bridge.document.parameter_entries import parameter_entries
 from gapbridge.core.diagnosis.across_sessions import SessionTransfer
 from gapbridge.core.diagnosis.causes import Cause
 from gapbridge.core.diagnosis.channel_diagnosis import ChannelDiagnosis
@@ -97,7 +98,7 @@ def _cause(cause: Cause, channel: ChannelDiagnosis, diagnosis: Diagnosis) -> dic
     return {
         "effect": cause.effect,
         "joints": list(cause.joints),
-        "parameters": _parameters(cause, channel, diagnosis),
+        "parameters": parameter_entries(cause.parameters),
         "gap_without": shrink.gap_without if shrink else None,
         "gap_with": shrink.gap_with if shrink else None,
         "shrink": shrink.shrink if shrink else None,
@@ -109,35 +110,6 @@ def _cause(cause: Cause, channel: ChannelDiagnosis, diagnosis: Diagnosis) -> dic
     }
 
 
-def _parameters(
-    cause: Cause, channel: ChannelDiagnosis, diagnosis: Diagnosis
-) -> list[dict[str, Any]]:
-    """Return a cause's parameters; where clocks overlap, a time as the first session after it.
-
-    A time of the joined clock would not be one of any session's clock.
-    """
-    entries: list[dict[str, Any]] = []
-    for p in cause.parameters:
-        entry = {"name": p.name, "value": p.value, "std": p.std, "unit": p.unit}
-        if p.is_time and not diagnosis.one_clock:
-            first = diagnosis.sessions[_first_session(channel, p.value)]
-            entries.append({**entry, "value": None, "std": None})
-            name = p.name.removesuffix("_time") + "_session"
-            entries.append({"name": name, "value": first, "std": None, "unit": ""})
-        else:
-            entries.append(entry)
-    return entries
-
-
-def _first_session(channel: ChannelDiagnosis, moment: float) -> int:
-    """Return the first session with rows after ``moment``, s of the joined clock."""
-    observation = channel.selection.observation
-    assert observation.times is not None
-    assert observation.session is not None
-    after = observation.times > moment
-    return int(observation.session[after].min() if after.any() else observation.session.max())
-
-
 def _across(transfer: SessionTransfer, sessions: tuple[str, ...]) -> dict[str, Any]:
     return {
         "carries": transfer.transfers,
@@ -145,10 +117,7 @@ def _across(transfer: SessionTransfer, sessions: tuple[str, ...]) -> dict[str, A
         "values": [
             {
                 "session": sessions[s],
-                "parameters": [
-                    {"name": p.name, "value": p.value, "std": p.std, "unit": p.unit}
-                    for p in parameters
-                ],
+                "parameters": parameter_entries(parameters),
             }
             for s, parameters in transfer.values
         ],

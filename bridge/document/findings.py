@@ -74,7 +74,7 @@ def _fact(fact: Fact, rows: bool, title: Callable[[str], str]) -> str:
             return f"{fact.rows} usable row(s) are too few for a diagnosis"
         case Thinned():
             return (
-                f"causes were searched on {fact.searched} of {fact.rows} rows, evenly spaced; "
+                f"causes were searched on {fact.searched} of {fact.rows} rows, drawn evenly; "
                 "fitted and judged on all of them"
             )
         case Outliers():
@@ -111,11 +111,13 @@ def _slip(slip: Slip) -> str:
         distance = f"{1e3 * float(np.linalg.norm(term.values[:-1])):.3g} mm"
     else:
         distance = f"{1e3 * term.values[0]:.3g} mrad ({np.degrees(term.values[0]):.3g} deg)"
+    more = "; before and after it nothing else changed" if slip.alone else ""
+    if slip.session:
+        return f"{moved} moved by {distance}; {slip.session} is the first session that has it{more}"
     when = f"rows {slip.before:g} and {slip.after:g} of the log"
     if slip.timed:
         dated = slip.before // DAY != slip.after // DAY
         when = f"{clock(slip.before, dated)} and {clock(slip.after, dated)}"
-    more = "; before and after it nothing else changed" if slip.alone else ""
     return f"{moved} moved by {distance} between {when}{more}"
 
 

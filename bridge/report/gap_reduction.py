@@ -80,7 +80,10 @@ def _sessions(channel: ChannelDiagnosis, sessions: tuple[str, ...]) -> list[Bloc
         heads = ("changed between sessions", *(sessions[s] for s, _ in across.values))
         values = [parameters for _, parameters in across.values]
         lines: list[list[Cell]] = [
-            [same[0].name, *(f"{p.value:.4g} ± {p.std or 0.0:.2g} {p.unit}" for p in same)]
+            [
+                same[0].name,
+                *(p.session or f"{p.value:.4g} ± {p.std or 0.0:.2g} {p.unit}" for p in same),
+            ]
             for same in zip(*values, strict=True)
         ]
         blocks.append(Table(heads, lines))

@@ -54,6 +54,8 @@ def _parameters(causes: list[Cause]) -> list[blocks.Block]:
 
 
 def _value(p: Reported) -> tuple[str, str, str]:
+    if p.session:
+        return f"first in session {p.session}", "no common clock", ""
     if p.is_time:
         return clock(p.value, dated=True), "between two rows of the log", ""
     name, factor = parameter_unit(p)

@@ -52,15 +52,17 @@ from gapbridge.core.diagnosis.judgement import (
 )
 from gapbridge.core.diagnosis.log_checks.missing_flexibility import flexibility_findings
 from gapbridge.core.diagnosis.log_checks.units_and_clocks import check_units, findings
+from gapbridge.core.diagnosis.model_terms import model_terms, terms_with_stand_ins
 from gapbridge.core.diagnosis.observation import NotObservable, Observation
 from gapbridge.core.diagnosis.residual_structure import dependence
 from gapbridge.core.diagnosis.selection.rounds import select
 from gapbridge.core.diagnosis.selection.selection import Selection, refitted_alone
 from gapbridge.core.diagnosis.selection.step_times import slips
 from gapbridge.core.diagnosis.separation import Measurement, next_measurements
+from gapbridge.core.diagnosis.session_clocks import first_session, on_own_clocks
 from gapbridge.core.diagnosis.thinning import thinned, thinned_poses
 from gapbridge.core.diagnosis.value_stability import closes_gap
-from gapbridge.core.effects import CATALOGUE, Term, correcting, flexibility_effects
+from gapbridge.core.effects import Term, correcting, flexibility_effects
 from gapbridge.core.errors import LogError
 from gapbridge.core.fitted_range import outside_findings
 from gapbridge.core.log.columns import COLUMNS, did_you_mean
@@ -199,13 +201,11 @@ def _diagnose(
         reported += [ChannelFinding(channel.channel, fact) for fact in _facts(channel, log)]
         if simulated is None and len(flexibilities) == 2 and _gap_unexplained(channel):
             reported += flexibility_findings(model, log, metrology)
-    terms = _model_terms(channels)
-    if not log.one_clock:
-        terms = [_slip_applied(term, log) for term in terms]
     return Diagnosis(
-        _overall(channels), tuple(channels), tuple(not_observable),
-        next_measurements(model, log, channels), tuple(reported), model.with_terms(terms),
-        model.with_terms(_terms_with_stand_ins(channels, terms)),
+        _overall(channels), tuple(on_own_clocks(channel, log) for channel in channels),
+        tuple(not_observable), next_measurements(model, log, channels), tuple(reported),
+        model.with_terms(model_terms(channels, log)),
+        model.with_terms(terms_with_stand_ins(channels, log)),
         log.session_names, log.one_clock,
     )  # fmt: skip
 
@@ -282,35 +282,6 @@ def _log_findings(model: Model, log: Log, metrology: Metrology) -> list[LogFindi
     if not log.one_clock:
         log_findings.append(LogFinding(LogCheck.CLOCKS_OVERLAP))
     return log_findings + outside_findings(log)
-
-
-def _model_terms(channels: Sequence[ChannelDiagnosis]) -> list[Term]:
-    """Return the causes' terms; of several channels (a payload) the most certain value."""
-    best: dict[tuple[str, object], tuple[float, Term]] = {}
-    for channel in channels:
-        for cause in channel.causes:
-            for term, deviation in zip(cause.terms, cause.relative_deviation, strict=True):
-                key = (term.effect, term.site)
-                if key not in best or deviation < best[key][0]:
-                    best[key] = (deviation, term)
-    return [term for _, term in best.values()]
-
-
-def _terms_with_stand_ins(
-    channels: Sequence[ChannelDiagnosis], accused: Sequence[Term]
-) -> list[Term]:
-    """Return the accused terms and the stand-ins, with the values of their common fit."""
-    terms = {(t.effect, t.site): t for t in accused}
-    for channel in channels:
-        terms |= {(t.effect, t.site): t for t in channel.fitted_together}
-    return list(terms.values())
-
-
-def _slip_applied(term: Term, log: Log) -> Term:
-    """Return a step as applied to all rows: overlapping clocks have no common time of it."""
-    if not CATALOGUE[term.effect].at_moment:
-        return term
-    return replace(term, values=(*term.values[:-1], float(log.times()[0]) - 1.0))
 
 
 def _gap_unexplained(channel: ChannelDiagnosis) -> bool:
@@ -502,5 +473,6 @@ def _facts(channel: ChannelDiagnosis, log: Log) -> list[Fact]:
     observation, alone = selection.observation, channel.verdict is Verdict.EXPLAINED
     timed = "timestamp" in observation.quantities
     for term, before, after in slips(terms, observation.times):
-        facts.append(Slip(term, before, after, timed, alone))
+        session = "" if log.one_clock else first_session(term.values[-1], log)
+        facts.append(Slip(term, before, after, timed, alone, session))
     return facts + [note for cause in channel.causes for note in cause.notes]

@@ -92,6 +92,7 @@ class Slip:
     after: float
     timed: bool
     alone: bool  # no structure remains: the model holds before and after
+    session: str = ""  # the first session that has it, where the sessions' clocks overlap
 
 
 Fact = TooFewRows | Thinned | Outliers | NotAccused | Slip | ParameterNote

@@ -80,6 +80,7 @@ class Reported:
     unit: str
     part: str = ""  # which of its effect's numbers it is, as in the name's end
     is_time: bool = False  # True: a moment on the clock of the log
+    session: str = ""  # the first session after a moment, where the sessions' clocks overlap
 
 
 @dataclass(frozen=True)

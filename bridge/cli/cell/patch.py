@@ -118,7 +118,11 @@ def tie_lines(causes: Sequence[CauseEntry], terms: Sequence[Term]) -> tuple[str,
         applied = any((cause.effect, joint) in in_model for joint in joints)
         if not (cause.indistinguishable_from and applied):
             continue
-        numbers = ", ".join(f"{p.name} = {p.value:.6g} {p.unit}".rstrip() for p in cause.parameters)
+        numbers = ", ".join(
+            f"{p.name} = {p.value:.6g} {p.unit}".rstrip()
+            for p in cause.parameters
+            if isinstance(p.value, float)
+        )
         others = " or ".join(
             f"{name} ({CATALOGUE[name].simulator_advice})"
             if name in CATALOGUE and CATALOGUE[name].simulator_advice

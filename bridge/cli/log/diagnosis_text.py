@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from gapbridge.bridge.document.findings import clock, finding_text
+from gapbridge.bridge.document.parameter_entries import session_parameter
 from gapbridge.bridge.report.labels import parameter_unit, unit_of
 from gapbridge.core.diagnosis.causes import Cause
 from gapbridge.core.diagnosis.channel_diagnosis import ChannelDiagnosis, Verdict
@@ -139,7 +140,7 @@ def _most_changed(values: Sequence[Sequence[Reported]]) -> list[int]:
     """Return the indices of the parameters that differ most, in sigmas, most first."""
     sigmas = []
     for same in zip(*values, strict=True):
-        numbers = [p.value for p in same]
+        numbers = [0.0 if p.is_time else p.value for p in same]
         spread = max((p.std or 0.0) for p in same)
         sigmas.append((max(numbers) - min(numbers)) / max(spread, 1e-300))
     order = sorted(range(len(sigmas)), key=lambda k: -sigmas[k])
@@ -177,6 +178,8 @@ def _shrink_text(cause: Cause) -> str:
 
 
 def _parameter_text(parameter: Reported) -> str:
+    if parameter.session:
+        return f"{session_parameter(parameter)} = {parameter.session}"
     if parameter.is_time:
         return f"{parameter.name} = {clock(parameter.value, dated=True)}"
     unit, factor = parameter_unit(parameter)

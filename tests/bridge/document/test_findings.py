@@ -43,7 +43,7 @@ def test_a_value_that_is_not_constant_names_the_quantity() -> None:
     ("fact", "text"),
     [
         (TooFewRows(3), "3 usable row(s) are too few for a diagnosis"),
-        (Thinned(60, 200), "causes were searched on 60 of 200 rows, evenly spaced; fitted and "
+        (Thinned(60, 200), "causes were searched on 60 of 200 rows, drawn evenly; fitted and "
                            "judged on all of them"),
         (Outliers(((13, ""), (42, ""))), "2 outlier(s) excluded (row 13, 42 of the file)"),
         (Outliers(tuple((row, "b.csv") for row in range(2, 11))),

@@ -13,9 +13,13 @@ import pytest
 import small_arm as small
 
 from benchmarks.blind.mechanics import turn
+from gapbridge.bridge.api.uncertainty import cause_entries
+from gapbridge.bridge.cli.log.diagnosis_text import diagnosis_text
 from gapbridge.bridge.document.diagnosis_json import document
 from gapbridge.core.diagnosis.across_sessions import session_transfer
 from gapbridge.core.diagnosis.diagnosis import diagnose
+from gapbridge.core.diagnosis.model_terms import terms_with_stand_ins
+from gapbridge.core.effects import Site, Term
 from gapbridge.core.errors import LogError
 from gapbridge.core.estimation.identification import identify_compliance
 from gapbridge.core.metrology import Metrology
@@ -186,3 +190,41 @@ def test_a_parameter_that_one_session_does_not_show_is_not_compared() -> None:
     reported = session_transfer(changed, (own, other), MODEL.arm)
     assert all(np.isfinite(c.p_value) for c in reported)
     assert "axial_compliance" in {c.effect for c in reported}
+
+
+@pytest.fixture(scope="module")
+def slipped():
+    """Return the diagnosis of three sessions, each from time 0; joint 2 slips before the second."""
+    off = small.turned(2, lambda s, q: np.full(len(q), 3e-3))
+    logs = [session(real, seed) for seed, real in ((34, small.NOMINAL), (35, off), (36, off))]
+    return diagnose(MODEL, join_sessions(logs, MODEL), Metrology(sigma=small.SIGMA))
+
+
+def test_where_clocks_overlap_a_step_is_told_by_the_first_session_that_has_it(slipped) -> None:
+    """A time of the joined clock would be none of any session's."""
+    (channel,) = slipped.channels
+    (cause,) = channel.causes
+    assert cause.effect == "joint_slip"
+    expected = [("joint_slip_2_time", None, "s"), ("joint_slip_2_session", "35.csv", "")]
+    (in_json,) = document(slipped)["channels"][0]["causes"]
+    (in_cell,) = cause_entries(slipped)
+    assert in_json["parameters"] == in_cell["parameters"]
+    assert [(p["name"], p["value"], p["unit"]) for p in in_json["parameters"][1:]] == expected
+    text = diagnosis_text(slipped)
+    assert "joint_slip_2_session = 35.csv" in text
+    assert "35.csv is the first session that has it" in text
+    assert "joint_slip_2_time" not in text
+    (term,) = slipped.model.terms
+    assert term.values[-1] < session(small.NOMINAL, 34).times()[0]  # all rows have it
+
+
+def test_the_model_with_stand_ins_has_the_final_causes_and_applies_steps_everywhere(slipped):
+    """The common fit is made before all rows withdraw some of its terms."""
+    (channel,) = slipped.channels
+    log = join_sessions([session(small.NOMINAL, s) for s in (34, 35)], MODEL)
+    (slip,) = channel.causes[0].terms
+    gone = Term("backlash", Site(1), (1e-4,))
+    fitted = replace(channel, fitted_together=(slip, gone))
+    (kept,) = terms_with_stand_ins([fitted], log)
+    assert kept.effect == "joint_slip"
+    assert kept.values[-1] < log.times()[0]
