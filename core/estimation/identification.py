@@ -49,6 +49,7 @@ MAX_TOOL_SHIFT = 3 * TOOL_STD  # m from the cell's; farther off it is another po
 REFIT_CONVERGED = 1e-4  # relative step, in cross-validation
 REFIT_FRAME_CONVERGED = 1e-6  # m, rad, in cross-validation
 FIRST_ROUNDS = 3  # of the fit of all flexibilities, before the choice
+ROUNDING = 1e-9  # m
 NOT_AVAILABLE = float("nan")
 
 
@@ -209,6 +210,8 @@ def require_excitation(model: Model, data: Data, metrology: Metrology, usual: fl
         raise ExcitationError(
             f"{found}, expected at least {-(-unknown // 3)} to fit the compliance"
         )
+    if data.frames and data.rotation is None:
+        _require_frames(model, data, metrology)
     zeros, ones = np.zeros((len(data.q), 3)), np.ones((len(data.q), 3))
     R = weighted_factor(model, IDENTITY, replace(data, rotation=None), (zeros, ones))[:, :-1]
     form = projected_out(basis_of(R[:, : -2 * n], RANK), R[:, -2 * n :])
@@ -231,6 +234,26 @@ def require_excitation(model: Model, data: Data, metrology: Metrology, usual: fl
             raise ExcitationError(
                 f"{found} for {determined} flexibilities that they bend: nothing is left by which "
                 "a fit could be judged; expected more poses"
+            )
+
+
+def _require_frames(model: Model, data: Data, metrology: Metrology) -> None:
+    """Raise ExcitationError where a session's positions lie on a line: its frame may turn about it.
+
+    The poses may bear different loads: deflections do not determine a frame.
+    """
+    position = model.rigid_pose(data.q).position
+    session = np.zeros(len(data.q)) if data.session is None else data.session
+    for s in np.unique(session):
+        own = position[session == s]
+        across = np.linalg.svd(own - own.mean(axis=0), compute_uv=False)[1:2].sum()
+        if across <= max(3 * metrology.sigma, ROUNDING):
+            poses = len(np.unique(np.round(data.q[session == s], 3), axis=0))
+            of_session = f" in session {int(s) + 1}" if data.sessions > 1 else ""
+            raise ExcitationError(
+                f"found measured positions of {poses} different pose(s) on one line{of_session}, "
+                "expected at least three poses not on a line to fit the instrument's frame, or "
+                "metrology.registered: true in the cell where the instrument measures in base"
             )
 
 

@@ -303,6 +303,21 @@ def test_a_fit_that_leaves_nothing_to_judge_it_by_is_declined():
             identify_compliance(model_of(6), log_of(6, few), KNOWN)
 
 
+@pytest.mark.parametrize(("poses", "fits"), [(1, False), (2, False), (3, True)])
+def test_a_frame_that_nobody_registered_takes_three_poses(poses, fits):
+    """Under other loads too: a fit to fewer poses ended with a tool point metres away."""
+    places = np.random.default_rng(3).uniform(-2, 2, (poses, 6))[np.arange(24) % poses]
+    _, columns = truth(6, 24, 7, rotation=False, places=places)
+    if fits:
+        found = identify_compliance(model_of(6), log_of(6, columns), Metrology(sigma=NOISE))
+        assert found.remaining_rms < 2 * NOISE
+        return
+    match = rf"{poses} different pose\(s\) on one line.*metrology\.registered: true"
+    with pytest.raises(ExcitationError, match=match):
+        identify_compliance(model_of(6), log_of(6, columns), Metrology(sigma=NOISE))
+    identify_compliance(model_of(6), log_of(6, columns), KNOWN)
+
+
 @pytest.mark.parametrize(("rows", "registered"), [(1, True), (2, True), (1, False), (3, False)])
 def test_rows_that_are_copies_of_each_other_are_no_poses_more(rows, registered):
     _, columns = truth(6, 4, 10)
