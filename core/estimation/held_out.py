@@ -15,6 +15,7 @@ from gapbridge.core.estimation.least_squares import SUMS_RANK, inverse_lengths
 
 FOLDS = 5
 SAME_POSE = 1e-3  # rad, of every joint
+MAX_COMPARED = 3000  # rows that are compared with each other
 
 
 def random_folds(groups: Index, count: int = FOLDS, seed: int = 0) -> Index:
@@ -61,7 +62,14 @@ def jackknife(without: Array) -> Array:
 
 
 def pose_groups(q: Array) -> Index:
-    """Return a number per row (N,): rows within SAME_POSE of each other share one."""
+    """Return a number per row (N,): rows within SAME_POSE of each other share one.
+
+    Of many rows those that round to the same pose share one, for speed; equal poses on either side
+    of a rounding limit then have two.
+    """
+    if len(q) > MAX_COMPARED:
+        rounded = np.round(q / SAME_POSE)
+        return np.asarray(np.unique(rounded, axis=0, return_inverse=True)[1].reshape(-1))
     groups = np.full(len(q), -1)
     count = 0
     for row in range(len(q)):

@@ -278,7 +278,7 @@ def _held_out_rms(
     data: Data, settings: _FitSettings, whole: tuple[Fit, Fit], inlier: Mask
 ) -> tuple[float, float]:
     """Return the rms before and after over inlier rows of poses left out; nan: too few poses."""
-    groups = pose_groups(data.q[:2000]) if len(data.q) <= 2000 else np.arange(len(data.q))
+    groups = pose_groups(data.q)
     if int(groups.max()) + 1 < 2 * FOLDS:
         return NOT_AVAILABLE, NOT_AVAILABLE
     fold = random_folds(groups)

@@ -155,7 +155,7 @@ def _observed(
         sigma=float(np.hypot(metrology.sigma, metrology.repeatability or 0.0)),
         sigma_is_whole=metrology.repeatability is not None,
         quantities=quantities(log, rows) | approaches(loads.approach),
-        groups=pose_groups(q) if len(q) <= 3000 else rounded_groups(q),
+        groups=pose_groups(q),
         rows=rows,
         axes=("x", "y", "z", "rx", "ry", "rz")[:k],
         joint_columns=form.jacobian[:, :k],
@@ -166,15 +166,6 @@ def _observed(
         payload_mass=loads.payload_mass,
         rebase=rebase if nuisance.shape[2] else None,
     )
-
-
-def rounded_groups(q: Array, tolerance: float = 1e-3) -> NDArray[np.int64]:
-    """Return a group number per row (N,), equal for rows equal within ``tolerance`` (rad).
-
-    Fast for many rows, but equal poses on either side of a rounding limit get two numbers.
-    """
-    rounded = np.round(q / tolerance)
-    return np.asarray(np.unique(rounded, axis=0, return_inverse=True)[1].reshape(-1))
 
 
 def session_model(model: Model, log: Log, metrology: Metrology) -> Model:

@@ -10,6 +10,9 @@ from benchmarks.evidence.finite_elements import STIFF
 from gapbridge.core.arm import arm_from_dh, builtin_rows
 from gapbridge.core.effects import flexibility_names
 from gapbridge.core.errors import ExcitationError, LogError
+from gapbridge.core.estimation import identification
+from gapbridge.core.estimation.compliance_fit import fit_nuisances, prior_of
+from gapbridge.core.estimation.held_out import random_folds
 from gapbridge.core.estimation.identification import identify_compliance
 from gapbridge.core.loads import Loads
 from gapbridge.core.log.log import Log
@@ -246,6 +249,25 @@ def test_one_pose_shows_too_little_for_a_held_out_figure():
     found = identify_compliance(model_of(6), log_of(6, columns), KNOWN)
     assert np.isnan(found.remaining_rms_held_out)
     assert found.remaining_rms < 2 * NOISE
+
+
+@pytest.mark.parametrize("repeats", [40, 110])
+def test_repeats_of_a_pose_leave_together_also_in_a_long_log(monkeypatch, repeats):
+    """A fit that saw a repeat of the judged pose would foretell its noise."""
+    seen = []
+
+    def drawn(groups):
+        seen.append(len(np.unique(groups)))
+        return random_folds(groups)
+
+    monkeypatch.setattr(identification, "random_folds", drawn)
+    _, columns = truth(6, 30, 8, rotation=False)
+    many = {k: np.repeat(v, repeats, axis=0) for k, v in columns.items()}
+    data, _ = identification.data_of(log_of(6, many), KNOWN)
+    settings = identification._FitSettings(prior_of(model_of(6)), rounds=1)
+    fit = fit_nuisances(model_of(6), data)
+    identification._held_out_rms(data, settings, (fit, fit), np.ones(len(data.q), dtype=bool))
+    assert seen == [30]
 
 
 def test_flexibilities_stay_at_or_above_zero():
