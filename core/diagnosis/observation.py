@@ -63,6 +63,7 @@ class Observation:
     # terms -> (N, k, r) 1-sigma changes of the prediction by the cell's fitted parameters
     uncertain: Callable[[Sequence[Term]], Array] | None = None
     session: NDArray[np.int64] | None = None  # (N,) session of each sample; None: there is one
+    free_frame: bool = False  # True: the first six nuisance columns are an instrument's frame
     nuisance_session: tuple[int, ...] = ()  # (p,) session of each nuisance column, where several
 
     def rebased(self, step: Array, terms: Sequence[Term]) -> Observation:

@@ -152,7 +152,7 @@ def _difference(
     observation = channel.selection.observation
     try:
         apart = predict(question.first) - predict(question.second)
-        if observation.nuisance.shape[2] >= 6:
+        if observation.free_frame:
             on_log = observation.predict(question.first) - observation.predict(question.second)
             position = predict(question.second)
             apart = apart - _frame_correction(observation.nuisance, on_log, position)

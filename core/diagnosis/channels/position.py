@@ -165,6 +165,7 @@ def _observed(
         times=loads.time,
         payload_mass=loads.payload_mass,
         rebase=rebase if nuisance.shape[2] else None,
+        free_frame=not metrology.registered,
     )
 
 

@@ -14,11 +14,13 @@ from scipy.spatial.transform import Rotation
 from benchmarks.blind.mechanics import Session, stand, turn
 from benchmarks.blind.session import Plan
 from gapbridge.core.arm import JointLimits
+from gapbridge.core.diagnosis import separation
 from gapbridge.core.diagnosis.diagnosis import diagnose
 from gapbridge.core.diagnosis.separation import next_measurements
 from gapbridge.core.effects import CATALOGUE, Site
 from gapbridge.core.log.log import Log
 from gapbridge.core.metrology import Metrology
+from gapbridge.core.sessions import join_sessions
 
 PLAY = 9e-4  # rad
 OFFSET = small.turned(2, lambda s, q: np.full(len(q), -PLAY / 2))  # all come from below
@@ -89,6 +91,24 @@ def test_a_difference_that_a_frame_absorbs_is_never_proposed():
     found = small.diagnosed("none", 0, False)
     requested = {e for m in found.next_measurements for e in m.separates}
     assert "joint_offset" not in requested
+
+
+@pytest.mark.parametrize("registered", [True, False])
+def test_a_frame_is_fitted_only_where_it_is_free(monkeypatch, registered):
+    """A target that is remounted in two registered sessions has as many free numbers as a frame."""
+    logs = []
+    for seed in (0, 1):
+        session = small.session_of(seed)
+        log = small.log_of(session, small.readings(small.NOMINAL, session, seed))
+        logs.append(small.replace(log, path=f"{seed}.csv"))
+    model, fitted = small.model_of(), []
+    monkeypatch.setattr(
+        separation, "_frame_correction", lambda _, __, p: fitted.append(1) or np.zeros_like(p)
+    )
+    metrology = Metrology(registered=registered, sigma=small.SIGMA, remounted=True)
+    found = diagnose(model, join_sessions(logs, model), metrology)
+    assert found.channels[0].selection.observation.nuisance.shape[2] >= 6
+    assert bool(fitted) is not registered
 
 
 def test_the_same_question_gets_the_same_answer(tied):
