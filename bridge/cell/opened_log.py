@@ -16,6 +16,7 @@ from gapbridge.core.load_bounds import PAYLOAD_FACTOR
 from gapbridge.core.log.alignment import aligned
 from gapbridge.core.log.log import Log, read_log
 from gapbridge.core.log.sources import SourceOptions, source_of
+from gapbridge.core.rotation import rotation_matrix, rotation_vector
 
 
 def open_log(path: Path, cell: Cell) -> Log:
@@ -58,8 +59,13 @@ def at_joints_of(log: Log, simulated: Log, cell: Cell) -> Log:
     position = simulated.get("measured_position")
     if simulated_q is None or measured_q is None or position is None:
         return simulated
-    shift = cell.model.predict(measured_q).position - cell.model.predict(simulated_q).position
-    return replace(simulated, columns={**simulated.columns, "measured_position": position + shift})
+    real, own = cell.model.predict(measured_q), cell.model.predict(simulated_q)
+    moved = {"measured_position": position + real.position - own.position}
+    rotation = simulated.get("measured_rotation")
+    if rotation is not None:
+        turn = real.rotation @ np.swapaxes(own.rotation, 1, 2)
+        moved["measured_rotation"] = rotation_vector(turn @ rotation_matrix(rotation))
+    return replace(simulated, columns={**simulated.columns, **moved})
 
 
 def joint_names(cell: Cell) -> tuple[str, ...]:

@@ -21,10 +21,10 @@ APART = {"target_q": 0.01, "actual_q": 0.1}  # rad that a joint may be off: arms
 def aligned(simulated: Log, log: Log) -> Log:
     """Return the simulator's rows at the rows of ``log``; its TCP is ``measured_position``.
 
-    If both have a ``timestamp``, each row gets the simulator's values at its time, interpolated
-    between rows that are close in time; clocks with a constant difference over all rows count as
-    equal. Otherwise rows correspond by number. Raises LogError where a row has no counterpart, or
-    another pose.
+    Its rotation, where it has one, is ``measured_rotation``. If both have a ``timestamp``, each row
+    gets the simulator's values at its time, interpolated between rows that are close in time;
+    clocks with a constant difference over all rows count as equal. Otherwise rows correspond by
+    number. Raises LogError where a row has no counterpart, or another pose.
     """
     simulated = _with_position(simulated)
     clocks = log.has("timestamp") and simulated.has("timestamp") and log.one_clock
@@ -36,14 +36,13 @@ def aligned(simulated: Log, log: Log) -> Log:
 
 
 def _with_position(simulated: Log) -> Log:
-    """Return the log with the TCP that a UR's recording has, where it has no measured one."""
+    """Return the log with the TCP's pose that a UR's recording has, where none was measured."""
     pose = simulated.get(POSE)
     if pose is None or simulated.has("measured_position"):
         return simulated
-    return replace(
-        simulated,
-        columns={**simulated.columns, "measured_position": simulated.require(POSE)[:, :3]},
-    )
+    pose = simulated.require(POSE)
+    own = {"measured_position": pose[:, :3], "measured_rotation": pose[:, 3:]}
+    return replace(simulated, columns={**simulated.columns, **own})
 
 
 def _by_row(simulated: Log, log: Log) -> Log:

@@ -20,6 +20,7 @@ from gapbridge.core.log.log import Log
 from gapbridge.core.metrology import Metrology
 from gapbridge.core.model import Model
 from gapbridge.core.motion import motion_of, with_motion
+from gapbridge.core.rotation import rotation_matrix, rotation_vector
 
 Observe = Callable[[Model, Log, Metrology], Observation | NotObservable]
 COLUMN_OF_CHANNEL = {
@@ -28,6 +29,7 @@ COLUMN_OF_CHANNEL = {
     "tracking": "actual_q",
     "torque": "actual_current_as_torque",
 }
+ROTATION = "measured_rotation"
 PREFIX = "simulated "
 
 
@@ -40,7 +42,7 @@ def joined(log: Log, simulated: Log) -> Log:
     simulated = aligned(simulated, log)
     predictions = {
         PREFIX + name: simulated.require(name)
-        for name in COLUMN_OF_CHANNEL.values()
+        for name in (*COLUMN_OF_CHANNEL.values(), ROTATION)
         if simulated.has(name)
     }
     if not predictions:
@@ -50,7 +52,10 @@ def joined(log: Log, simulated: Log) -> Log:
 
 
 def predicted_by(channel: str, observe: Observe) -> Observe:
-    """Return an observer with the simulator's prediction; a channel it lacks is not observable."""
+    """Return an observer with the simulator's prediction; a channel it lacks is not observable.
+
+    Rotations are compared only if the simulator has them.
+    """
 
     def simulated(model: Model, log: Log, metrology: Metrology) -> Observation | NotObservable:
         values = log.get(PREFIX + COLUMN_OF_CHANNEL[channel])
@@ -60,7 +65,7 @@ def predicted_by(channel: str, observe: Observe) -> Observe:
         if values is None:
             needs = f"{COLUMN_OF_CHANNEL[channel]} (in the simulator's log)"
             return NotObservable(channel, (needs,))
-        return _with_prediction(observation, values)
+        return _with_prediction(observation, values, log.get(PREFIX + ROTATION))
 
     return simulated
 
@@ -68,9 +73,12 @@ def predicted_by(channel: str, observe: Observe) -> Observe:
 def _behind(log: Log, channel: str, values: Array | None) -> Log:
     """Return the log of a tracking channel with the simulator's encoders as its command.
 
+    That of a position channel is without rotations that the simulator lacks.
     A delay or lag to be found is then in series with the simulated servo's own. The motion remains
     that of the log, because a block of a long log cannot derive it from its own rows.
     """
+    if channel == "position" and not log.has(PREFIX + ROTATION):
+        return replace(log, columns={n: c for n, c in log.columns.items() if n != ROTATION})
     if channel != "tracking" or values is None or not log.has("target_q"):
         return log
     motion = motion_of(log)
@@ -78,12 +86,26 @@ def _behind(log: Log, channel: str, values: Array | None) -> Log:
     return with_motion(behind, replace(motion, target_q=values[motion.rows]))
 
 
-def _with_prediction(observation: Observation, values: Array) -> Observation:
+def _with_prediction(
+    observation: Observation, values: Array, rotation: Array | None, terms: Sequence[Term] = ()
+) -> Observation:
+    """Return the observation with the simulator's ``values`` and, of poses, ``rotation`` (N, 3).
+
+    ``terms`` are those that the observation's columns were made at.
+    """
     channel_rows, rebase, subset = observation.predict, observation.rebase, observation.subset
     nominal = channel_rows(())
     base = nominal.copy()
     part = values[observation.rows]
-    base[:, : part.shape[1]] = part  # rotations, where measured, stay the model's
+    base[:, : part.shape[1]] = part
+    if observation.channel == "position" and base.shape[1] > 3:
+        assert rotation is not None and observation.tool_axes is not None
+        # rotations are relative to the measured one: known from the model's TCP beside it
+        to_measured = rotation_matrix(channel_rows(terms)[:, 3:])
+        from_model = rotation_matrix(rotation[observation.rows]) @ np.swapaxes(
+            observation.tool_axes, 1, 2
+        )
+        base[:, 3:] = rotation_vector(from_model @ to_measured)
 
     def predict(terms: Sequence[Term]) -> Array:
         return np.asarray(base + (channel_rows(terms) - nominal)) if terms else base
@@ -91,7 +113,9 @@ def _with_prediction(observation: Observation, values: Array) -> Observation:
     moved = (
         None
         if rebase is None
-        else lambda step, terms: _with_prediction(rebase(step, terms), values)
+        else lambda step, terms: _with_prediction(rebase(step, terms), values, rotation, terms)
     )
-    thinned = None if subset is None else lambda take: _with_prediction(subset(take), values)
+    thinned = (
+        None if subset is None else lambda take: _with_prediction(subset(take), values, rotation)
+    )
     return replace(observation, predict=predict, rebase=moved, subset=thinned, uncertain=None)

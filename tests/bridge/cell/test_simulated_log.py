@@ -9,6 +9,7 @@ import numpy as np
 from gapbridge.bridge.cell import load_cell
 from gapbridge.bridge.cell.opened_log import at_joints_of
 from gapbridge.core.log.log import Log
+from gapbridge.core.rotation import rotation_matrix, rotation_vector
 
 
 def test_a_simulated_servo_that_rests_elsewhere_is_no_gap_of_the_position(tmp_path: Path) -> None:
@@ -18,10 +19,15 @@ def test_a_simulated_servo_that_rests_elsewhere_is_no_gap_of_the_position(tmp_pa
     rests = q + 3e-4
     log = Log("log.csv", {"actual_q": q}, 6)
     given = np.add(cell.model.predict(rests).position, [0, 0, 1e-3])
-    simulated = Log("sim.csv", {"actual_q": rests, "measured_position": given}, 6)
+    turn = rotation_matrix(np.array([[1e-3, 0, 2e-3]]))
+    turned = {k: rotation_vector(turn @ cell.model.predict(v).rotation)
+              for k, v in (("rests", rests), ("q", q))}  # fmt: skip
+    columns = {"measured_position": given, "measured_rotation": turned["rests"]}
+    simulated = Log("sim.csv", {"actual_q": rests, **columns}, 6)
     found = at_joints_of(log, simulated, cell)
     expected = np.add(cell.model.predict(q).position, [0, 0, 1e-3])
     assert np.allclose(found.require("measured_position"), expected, rtol=0, atol=1e-12)
+    assert np.allclose(found.require("measured_rotation"), turned["q"], rtol=0, atol=1e-5)
     assert np.array_equal(found.require("actual_q"), rests)
 
 

@@ -71,4 +71,6 @@ def test_a_urs_own_pose_is_the_simulated_position() -> None:
         aligned(simulated, log).columns["measured_position"], log.columns["measured_position"]
     )
     del simulated.columns["measured_position"]  # type: ignore[attr-defined]
-    np.testing.assert_array_equal(aligned(simulated, log).columns["measured_position"], pose[:, :3])
+    found = aligned(simulated, log).columns
+    np.testing.assert_array_equal(found["measured_position"], pose[:, :3])
+    np.testing.assert_array_equal(found["measured_rotation"], pose[:, 3:])

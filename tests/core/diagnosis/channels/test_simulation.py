@@ -22,6 +22,7 @@ from gapbridge.core.effects import Site, Term
 from gapbridge.core.errors import LogError
 from gapbridge.core.log.log import Log
 from gapbridge.core.metrology import Metrology
+from gapbridge.core.rotation import rotation_matrix, rotation_vector
 
 METROLOGY = Metrology(registered=True, sigma=small.SIGMA)
 SESSION = small.session_of(0)
@@ -76,6 +77,32 @@ def test_an_effect_changes_the_simulators_values_as_it_changes_the_models():
     change = observation.predict([term]) - observation.predict(())
     assert np.allclose(change, own.predict([term]) - own.predict(()))
     assert np.abs(change).max() > 1e-3
+
+
+TURN = (0.0, 0.0, 0.0, 2e-3, -1e-3, 3e-3)  # rad, of a tool that the model does not know
+
+
+@pytest.mark.parametrize("registered", [True, False])
+@pytest.mark.parametrize("has_rotation", [True, False])
+def test_rotations_are_compared_with_the_simulators(registered, has_rotation):
+    """The simulator knows how the tool is turned; if it has no rotations none are compared."""
+    model, rng = small.model_of(), np.random.default_rng(5)
+    turned = model.with_terms([Term("tool_frame", Site(), TURN)])
+    pose = turned.predict(SESSION.q, log_of(small.NOMINAL).loads())
+    measured = {"measured_position": pose.position, "measured_rotation": rotation_vector(
+        pose.rotation)}  # fmt: skip
+    simulator = dict(measured) if has_rotation else {"measured_position": pose.position}
+    if not registered:
+        frame = rotation_matrix(np.array([[0.3, -0.8, 1.2]]))[0]
+        measured["measured_position"] = pose.position @ frame.T + [2.0, -1.0, 0.0]
+        measured["measured_rotation"] = rotation_vector(frame @ pose.rotation)
+    noisy = {k: v + rng.normal(0, 2e-5, v.shape) for k, v in measured.items()}
+    log = small.log_of(SESSION, noisy.pop("measured_position"), **noisy)
+    metrology = Metrology(registered=registered, sigma=2e-5)
+    found = diagnose(model, log, metrology, simulated=Log("sim.csv", simulator, 3))
+    assert found.verdict == "no_gap"
+    assert found.channels[0].gap.shape[1] == (6 if has_rotation else 3)
+    assert np.abs(found.channels[0].gap).max() < 2e-4
 
 
 def test_rows_stay_together_where_some_have_no_reading():
