@@ -20,7 +20,12 @@ from gapbridge.core.diagnosis.selection.delay_columns import exact_columns
 from gapbridge.core.diagnosis.selection.selection import Selection
 from gapbridge.core.diagnosis.selection.smooth import spline_basis
 from gapbridge.core.effects import Term
-from gapbridge.core.estimation.least_squares import basis_of, projected_out, solve
+from gapbridge.core.estimation.least_squares import (
+    basis_of,
+    projected_out,
+    solve,
+    unit_columns,
+)
 
 
 def not_constant(
@@ -73,7 +78,7 @@ def _variation(
     jacobian = exact_columns(observation, space.candidates[c], _others(selection, c))
     constant = selection.rows_of(_by_session(jacobian, observation.quantities.get("session")))
     others = np.hstack([space.columns([o for o in accused if o != c]), unnamed])
-    basis = basis_of(_unit(np.hstack([constant, others])))
+    basis = basis_of(unit_columns(np.hstack([constant, others])))
     residual = projected_out(basis, space.y)
     freedom = max(space.freedom - basis.shape[1], 1.0)
     variance = max(float(residual @ residual) / freedom, space.floor)
@@ -81,7 +86,7 @@ def _variation(
     best, name, varying = 0.0, "", constant[:, :0]
     for quantity, shape in shapes.items():
         columns = jacobian[:, :, :, None] * shape[:, None, None, :]
-        rows = _unit(selection.rows_of(columns.reshape(*jacobian.shape[:2], -1)))
+        rows = unit_columns(selection.rows_of(columns.reshape(*jacobian.shape[:2], -1)))
         further = basis_of(projected_out(basis, rows))
         gain = float(np.sum((further.T @ residual) ** 2)) / variance
         gain -= further.shape[1] * np.log(space.freedom) + 2 * np.log(len(shapes))
@@ -141,7 +146,3 @@ def _quantities(selection: Selection, candidate: Candidate) -> dict[str, Array]:
     if observation.axial_moment is not None and joint is not None:
         quantities["load"] = np.abs(observation.axial_moment[:, joint - 1])
     return {name: z for name, z in quantities.items() if len(np.unique(z)) > 2}
-
-
-def _unit(columns: Array) -> Array:
-    return np.asarray(columns / (np.linalg.norm(columns, axis=0) + 1e-300))

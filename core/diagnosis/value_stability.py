@@ -40,7 +40,13 @@ from gapbridge.core.diagnosis.selection.sample_space import gains
 from gapbridge.core.diagnosis.selection.selection import Selection
 from gapbridge.core.diagnosis.selection.smooth import targets
 from gapbridge.core.estimation.held_out import jackknife
-from gapbridge.core.estimation.least_squares import basis_of, projected_out, solve, squared_sigmas
+from gapbridge.core.estimation.least_squares import (
+    basis_of,
+    projected_out,
+    solve,
+    squared_sigmas,
+    unit_columns,
+)
 
 
 def stable_effects(
@@ -209,7 +215,7 @@ class _UnnamedFunctions:
             accused, *self._beyond_accused(accused, chosen)
         )
         together = [
-            self._unit(accused),
+            unit_columns(self.space.columns(accused)),
             self.space.columns(self._first),
             self._free_constants(accused),
         ]
@@ -262,7 +268,7 @@ class _UnnamedFunctions:
         if not self._is_sensor:
             return np.zeros((len(self.space.y), 0))
         C = np.hstack(list(self._constant.values()))
-        V = basis_of(self._unit(accused))
+        V = basis_of(unit_columns(self.space.columns(accused)))
         residual = np.linalg.norm(projected_out(V, C), axis=0) / np.linalg.norm(C, axis=0)
         return np.asarray(C[:, residual > 1e-6])
 
@@ -288,7 +294,7 @@ class _UnnamedFunctions:
             width = sum(self._constant[t].shape[1] for t in targets_)
             return np.full(width, np.inf)
         columns = self._columns(chosen)
-        A = np.hstack([self._unit(accused), columns])
+        A = np.hstack([unit_columns(self.space.columns(accused)), columns])
         solution = solve(A, space.y)
         rss = float(np.sum((space.y - A @ solution) ** 2))
         scatter = np.sqrt(max(rss / max(space.freedom - A.shape[1], 1.0), space.floor))
@@ -310,7 +316,11 @@ class _UnnamedFunctions:
         contains every weight, and one that points nearly down is a weight. A function of a joint's
         own speed contains its delay, and one that is nearly linear is a delay.
         """
-        space, X, columns = self.space, self._unit(accused), self._columns(chosen)
+        space, X, columns = (
+            self.space,
+            unit_columns(self.space.columns(accused)),
+            self._columns(chosen),
+        )
         constants = self._constant_sigma(accused, chosen)
         for c in chosen:
             if not (space.candidates[c].without_quantity or _of_own_speed(space.candidates[c])):
@@ -329,10 +339,6 @@ class _UnnamedFunctions:
         free = np.full(columns.shape[1] - len(constants), np.inf)
         return columns, np.concatenate([free, constants])
 
-    def _unit(self, accused: Sequence[int]) -> Array:
-        X = self.space.columns(accused)
-        return np.asarray(X / (np.sqrt(np.einsum("ij,ij->j", X, X)) + 1e-300))
-
     def _stable_values(
         self, accused: list[int], columns: Array, sigma: Array
     ) -> tuple[Array, Array, NDArray[np.bool_]]:
@@ -343,7 +349,7 @@ class _UnnamedFunctions:
         """
         known = np.isfinite(sigma)
         prior = np.diag(1 / np.maximum(sigma, 1e-300))[known]  # rows added to every part
-        X, y = self._unit(accused), self.space.y
+        X, y = unit_columns(self.space.columns(accused)), self.space.y
         X = np.vstack([X, np.zeros((len(prior), X.shape[1]))])
         y = np.append(y, np.zeros(len(prior)))
         columns = np.vstack([columns, prior])

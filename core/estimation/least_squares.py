@@ -23,6 +23,11 @@ def inverse_lengths(columns: Array, ridge: Array | None = None) -> Array:
     return _inverted(size)
 
 
+def unit_columns(columns: Array) -> Array:
+    """Return columns (m, p) of unit length; zero ones stay zero."""
+    return np.asarray(columns / (np.sqrt(np.einsum("ij,ij->j", columns, columns)) + 1e-300))
+
+
 def _inverted(size: Array) -> Array:
     """Return one over sizes (p,), 0 of a zero."""
     return np.where(size > 1e-150, 1 / np.maximum(size, 1e-150), 0.0)

@@ -22,6 +22,7 @@ from gapbridge.core.estimation.held_out import jackknife, leave_one_out
 from gapbridge.core.estimation.least_squares import (
     basis_of,
     inverse,
+    inverse_lengths,
     projected_out,
     solve,
     squared_sigmas,
@@ -74,7 +75,8 @@ def refit(
     x = _start_values(state, fitted, _linear_values(space, linear_fit, fitted))
     for _ in range(REFITS):
         rows = _linearised(state, fitted, x, extra, prior_sigma, unnamed_part)
-        step = _step(*rows.with_prior(), rows.unit(), fitted, x)
+        whole, target = rows.with_prior()
+        step = _step(whole, target, inverse_lengths(whole), fitted, x)
         parts = np.split(step, np.cumsum([len(v) for v in x]))[: len(x)]
         share = _step_share(state, fitted, x, parts, sigma, rows.A)
         x = [_within(c, v + share * part) for c, v, part in zip(fitted, x, parts, strict=True)]
@@ -137,12 +139,6 @@ class _Linearised:
         """Return all rows (m + f, p) and their right-hand side (m + f,)."""
         return np.vstack([self.A, self.prior]), np.concatenate([self.b, self.prior_target])
 
-    def unit(self) -> Array:
-        """Return one over each column's norm (p,), prior included; 0 of a zero column."""
-        squares = [np.einsum("ij,ij->j", rows, rows) for rows in (self.A, self.prior)]
-        size = np.sqrt(squares[0] + squares[1])
-        return np.where(size > 1e-150, 1 / np.maximum(size, 1e-150), 0.0)
-
     def variance(self, step: Array, floor: float) -> float:
         """Return the residual variance of a row after a step (p,), at least ``floor``."""
         residual_ss = float(np.sum((self.b - self.A @ step) ** 2))
@@ -198,8 +194,7 @@ def single_step(
     prior_sigma = [PRIOR_REACH * c.scales for c in fitted]
     prior, prior_target = _prior_rows(prior_sigma, x, rows.A.shape[1], None, 0)
     whole, target = np.vstack([rows.A, prior]), np.concatenate([rows.b, prior_target])
-    unit = 1 / np.sqrt(np.einsum("ij,ij->j", whole, whole))
-    step = _step(whole, target, unit, fitted, x)
+    step = _step(whole, target, inverse_lengths(whole), fitted, x)
     sizes = [len(v) for v in x]
     values = [
         _within(c, v + part)

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from gapbridge.core.diagnosis.criteria import LARGE_SAMPLE
 from gapbridge.core.diagnosis.selection.candidate import Candidate
 from gapbridge.core.diagnosis.selection.forward_selection import (
-    DEPTH,
     beam_search,
     joining,
     projected,
@@ -43,7 +42,7 @@ MAX_TERMS_OF_LARGE_LOG = 40
 
 
 def screened_search(
-    space: SampleSpace, depth: int = DEPTH, base: Sequence[int] = (),
+    space: SampleSpace, base: Sequence[int] = (),
     transform: Callable[[SampleSpace], SampleSpace] = lambda space: space,
 ) -> CandidateFit:  # fmt: skip
     """Return the best set among the candidates worth a search, in the indices of ``space``.
@@ -53,11 +52,11 @@ def screened_search(
     keep = screened(space, base)
     place = {int(c): i for i, c in enumerate(keep)}
     part_space = transform(part(space, keep))
-    best = with_fewest_families(part_space, search(part_space, depth, [place[c] for c in base]))
+    best = with_fewest_families(part_space, search(part_space, [place[c] for c in base]))
     return replace(best, chosen=tuple(int(keep[c]) for c in best.chosen))
 
 
-def search(space: SampleSpace, depth: int = DEPTH, base: Sequence[int] = ()) -> CandidateFit:
+def search(space: SampleSpace, base: Sequence[int] = ()) -> CandidateFit:
     """Return the best set: named causes alone, unless adding an unnamed function improves it.
 
     ``base`` is a set already found (named causes), used as a further start.
@@ -67,14 +66,14 @@ def search(space: SampleSpace, depth: int = DEPTH, base: Sequence[int] = ()) -> 
     """
     if len(space.y) >= LARGE_SAMPLE:
         return _deep_search(space, base)
-    named = improve(space, beam_search(space, depth, named_only=True)[0], named_only=True)
+    named = improve(space, beam_search(space, named_only=True)[0], named_only=True)
     if base:
         again = improve(space, fit(space, tuple(base)), named_only=True)
         named = min([named, again], key=lambda f: f.score)
     simplest = min([named, *joined_sets(space, named)], key=lambda f: f.score)
     if simplest is named:
         return named
-    whole, better = (improve(space, f) for f in (beam_search(space, depth)[0], simplest))
+    whole, better = (improve(space, f) for f in (beam_search(space)[0], simplest))
     return min([named, whole, better], key=lambda f: f.score)
 
 
