@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import gc
 import os
 import signal
@@ -20,6 +21,7 @@ from gapbridge.core.kernels import compiling
 
 INTERRUPT_RETRY = 0.02  # s until an interrupt inside LLVM is tried again
 SUCCESS, FAILURE, UNUSABLE_INPUT = 0, 1, 2
+UNUSABLE_PATH = (errno.EACCES, errno.ENAMETOOLONG, errno.ENOTDIR, errno.ELOOP)
 
 
 class CommandTable(click.Group):
@@ -125,7 +127,11 @@ def _run(arguments: list[str]) -> int:
         return _fail("interrupted", FAILURE)
     except GapbridgeError as error:
         return _fail(str(error), error.exit_code)
-    except BrokenPipeError:
+    except OSError as error:
+        if error.errno in UNUSABLE_PATH and error.filename is not None:
+            return _fail(f"{error.filename}: {error.strerror}", UNUSABLE_INPUT)
+        if not isinstance(error, BrokenPipeError):
+            return _crash(error)
         # the reader of stdout is gone; flushing stdout at exit must not fail either
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return FAILURE

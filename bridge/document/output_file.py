@@ -91,7 +91,7 @@ def replacing(path: Path) -> Iterator[IO[str]]:
 def replacing_bytes(path: Path) -> Iterator[IO[bytes]]:
     """Open a binary file that replaces ``path`` when the block ends without an error.
 
-    Raises RunError where it cannot be written.
+    Raises RunError where it cannot be written; what the block raises of another file stays.
     """
     place = Path(os.path.realpath(path))
     part = place.with_name(f".{place.name}.{os.getpid()}.part")
@@ -104,6 +104,8 @@ def replacing_bytes(path: Path) -> Iterator[IO[bytes]]:
         os.replace(part, place)
         sync_folder(place.parent)  # else a power cut can lose the new file's name
     except OSError as error:
+        if error.filename not in (None, str(part)):
+            raise
         raise RunError(f"{path}: cannot be written: {error.strerror or error}") from error
     finally:
         with contextlib.suppress(OSError):

@@ -1,7 +1,8 @@
 """Finishing a recording that was cut off: writing the summary of its complete records.
 
 A recorder that was killed leaves complete chunks and no summary; readers that seek cannot open such
-a file. Data after the last complete record is removed. Format: the MCAP specification.
+a file. Data after the last complete record is removed. A file in which readable chunks follow a
+damaged one is left as it is. Format: the MCAP specification.
 """
 
 from __future__ import annotations
@@ -51,12 +52,13 @@ class _Whole:
     end: int = 0  # bytes of the file that are kept
     last: dict[int, MessageIndex] = field(default_factory=dict)  # of the last chunk
     torn: bool = False  # the last chunk's indexes must be written again
+    damaged: bool = False  # behind a chunk that cannot be read are others that can
     _chunk: ChunkIndex | None = None  # the last one, its indexes not read yet
     _indexed: dict[int, int] = field(default_factory=dict)  # channel -> offset of its index
     _index_length: int = 0
 
     def take(self, file: IO[bytes], code: int, offset: int, length: int) -> bool:
-        """Add a record; returns False for a broken chunk, after which nothing can be read."""
+        """Add a record; returns False for a broken chunk."""
         if code == Opcode.CHUNK:
             unpacked = records.unpacked(file, offset, length)
             if unpacked is None:
@@ -122,7 +124,7 @@ def finish(path: Path) -> bool:
         if records.is_whole(path):
             return False
         whole = _scan(file, path)
-        if not whole.end:
+        if whole.damaged or not whole.end:
             return False
         tail = _tail(whole)
         file.truncate(whole.end)
@@ -160,10 +162,14 @@ def _finished(path: Path) -> bool:
 
 def _scan(file: IO[bytes], path: Path) -> _Whole:
     """Return the complete records, up to the first incomplete one."""
-    whole = _Whole()
-    for code, offset, length in records.all_records(file, path):
+    whole, rest = _Whole(), records.all_records(file, path)
+    for code, offset, length in rest:
         if not whole.take(file, code, offset, length):
             break
+    whole.damaged = any(
+        code == Opcode.CHUNK and records.unpacked(file, offset, length) is not None
+        for code, offset, length in rest
+    )
     whole.finish()
     return whole
 

@@ -65,7 +65,8 @@ def files_of(path: Path) -> list[Path]:
 def read_batches(path: Path) -> Iterator[Batch]:
     """Yield what a recording holds, chunk by chunk; see ``files_of``.
 
-    Ends where the file is broken off. Raises LogError where it is no recording.
+    Ends where the file is broken off; a damaged chunk with others behind it is left out, so that
+    its cycles are missing. Raises LogError where it is no recording.
     """
     for file in files_of(path):
         yield from _read_file(file)
@@ -114,10 +115,7 @@ def _read_file(path: Path) -> Iterator[Batch]:
     with path.open("rb") as file:
         decoder = _Decoder(path)
         for offset, length in records.chunk_offsets(file, path):
-            contents = records.read_chunk(file, offset, length)
-            if contents is None:
-                return
-            batch = decoder.take(contents)
+            batch = decoder.take(records.read_chunk(file, offset, length))
             if batch is not None:
                 yield batch
 

@@ -1,7 +1,7 @@
 """Whole records of an MCAP file that may end anywhere: killed, cut, or with garbage behind it.
 
-A record counts when it is there to its last byte and, being a chunk, its checksum is right; what
-comes after the first that does not is not read. Format: the MCAP specification.
+A record counts when it is there to its last byte and, being a chunk, its checksum is right. Format:
+the MCAP specification.
 """
 
 from __future__ import annotations

@@ -109,10 +109,11 @@ def diagnose(
         diagnosis = _diagnose(opened, rows, metrology, withhold, simulated, emit)
     for finding in wrong_arm_findings(diagnosis):
         click.echo(f"warning: {rows.path}: {log_finding_text(finding)}", err=True)
-    click.echo(diagnosis_text(diagnosis))
     origin = provenance({"log": logs, "cell": [cell], "sim": [sim] if sim else []})
     whole = Diagnosed(opened, rows, diagnosis, document(diagnosis) | {"provenance": origin})
-    for file in output.write(whole):
+    written = output.write(whole)  # before the text: its reader may leave early
+    click.echo(diagnosis_text(diagnosis))
+    for file in written:
         click.echo(f"{file}: written")
 
 

@@ -19,6 +19,7 @@ from patience import PATIENCE
 from gapbridge.bridge.cell import load_cell
 from gapbridge.bridge.cli import main
 from gapbridge.bridge.cli.table import COMMANDS
+from gapbridge.bridge.document.output_file import replacing_bytes
 from gapbridge.core.compensation import correct
 from gapbridge.core.effects import CATALOGUE
 from gapbridge.core.loads import Loads
@@ -352,6 +353,31 @@ def test_unusable_paths_are_refused_in_one_line(desk: Desk, command: str) -> Non
     ):
         assert reported in desk.refuses(command, *given)
     assert (desk.folder / "pipe").is_fifo()
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        ("predict", f"@{'x' * 300}.csv", "--cell", "@cell.yaml", "--out", "@p.csv"),
+        ("fit", "@log.csv", "--cell", "@cell.yaml", "--out", f"@{'x' * 300}.yaml"),
+        ("check", "@cell.yaml", "--log", f"@{'x' * 300}.csv"),
+        ("predict", "@log.csv/log.csv", "--cell", "@cell.yaml", "--out", "@p.csv"),
+        ("status", f"@{'x' * 300}.yaml"),
+    ],
+)
+def test_a_path_that_the_system_refuses_is_named_in_one_line(
+    desk: Desk, given: tuple[str, ...]
+) -> None:
+    desk.write("log.csv", csv(actual_q=poses(3)))
+    line = desk.refuses(*given)
+    assert next(word for word in given if "xxx" in word or "/" in word)[1:] in line
+    assert "details" not in line
+
+
+def test_what_a_block_cannot_read_is_not_told_of_its_output(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match=r"other\.csv"), replacing_bytes(tmp_path / "o.csv"):
+        (tmp_path / "other.csv").read_bytes()
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_an_unknown_key_of_a_cell_is_reported_by_the_real_command(desk: Desk) -> None:

@@ -65,6 +65,18 @@ def test_what_is_found_is_reported_written_and_predicts(tmp_path: Path) -> None:
     assert np.abs(table[:, :3] - truth).max() < 0.05 * np.abs(rigid - truth).max()
 
 
+def test_a_reader_who_leaves_early_costs_no_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def leave(_: object) -> str:
+        raise KeyboardInterrupt  # or a pipe that is broken
+
+    monkeypatch.setattr(command, "diagnosis_text", leave)
+    file = tmp_path / "d.json"
+    gapbridge("diagnose", soft_log(tmp_path), "--cell", cell_in(tmp_path), "--json", file)
+    assert json.loads(file.read_text(encoding="utf-8"))["schema"] == "gapbridge.diagnosis/1"
+
+
 def test_a_withheld_effect_is_never_named(tmp_path: Path) -> None:
     file = tmp_path / "d.json"
     answer = gapbridge(

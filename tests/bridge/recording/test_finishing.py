@@ -166,3 +166,24 @@ def test_a_file_with_nothing_but_its_head_is_finished_too(desk: Desk) -> None:
     segment.abandon()
     assert finish(path)
     assert messages(path, seeking=True) == []
+
+
+def test_a_damaged_chunk_costs_its_own_cycles_only(desk: Desk) -> None:
+    """Cut there, the readable ones behind it would be lost for good."""
+    path = cut_off(desk)
+    whole = read_columns(path)["timestamp"]
+    with path.open("rb") as file:
+        chunks = list(chunk_offsets(file, path))
+    offset, length = chunks[len(chunks) // 2]
+    content = bytearray(path.read_bytes())
+    content[offset + length // 2] ^= 0x40
+    path.write_bytes(content)
+    assert not finish(path)
+    assert path.read_bytes() == content
+    left = read_columns(path)["timestamp"]
+    assert 0 < len(left) < len(whole)
+    assert left[0] == whole[0]
+    assert left[-1] == whole[-1]
+    exported = export(path, path.with_suffix(".csv"))
+    assert exported.rows == len(left)
+    assert exported.gaps == len(whole) - len(left)
