@@ -82,7 +82,7 @@ def _run(cell: Cell, options: SessionOptions, prompt: Prompt, session: Session) 
     title, kind = JOBS[options.kind]
     prompt.say(f"{title} {cell.path}: {cell.arm.name}", "bold")
     job = kind(cell, options, prompt, session)
-    if session.start_entry:
+    if session.start_entry and session.has_begun:
         check_start(session.start_entry, cell, options, folder)
         _report_resumed(prompt, session, folder)
     else:

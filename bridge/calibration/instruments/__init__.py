@@ -33,6 +33,14 @@ INSTRUMENTS: dict[str, type[AnyInstrument]] = {
 _SETTINGS: TypeAdapter[InstrumentSettings] = TypeAdapter(InstrumentSettings)
 
 
+def _plain(pair: str, value: str) -> Any:
+    """Return a value of the command line. Raises InputError."""
+    try:
+        return yaml.safe_load(value)
+    except yaml.YAMLError:
+        raise InputError(f"--instrument: found {pair!r}, expected KEY=VALUE") from None
+
+
 def instrument_settings(cell: Cell, argument: str | None) -> InstrumentSettings:
     """Return the settings of an instrument given as ``KIND[,KEY=VALUE...]``; None: the cell's.
 
@@ -47,11 +55,15 @@ def instrument_settings(cell: Cell, argument: str | None) -> InstrumentSettings:
         raise InputError(f"--instrument: found {kind!r}, expected one of {', '.join(INSTRUMENTS)}")
     keys: dict[str, Any] = settings.model_dump() if settings.kind == kind else {}
     keys["kind"] = kind
+    given: dict[str, Any] = {}
     for pair in pairs:
         name, equals, value = pair.partition("=")
         if not equals:
             raise InputError(f"--instrument: found {pair!r}, expected KEY=VALUE")
-        keys[name.strip()] = yaml.safe_load(value)
+        if name.strip() in given:
+            raise InputError(f"--instrument: found {name.strip()} twice, expected it once")
+        given[name.strip()] = _plain(pair, value)
+    keys |= given
     try:
         return _SETTINGS.validate_python(keys)
     except ValidationError as error:

@@ -38,9 +38,10 @@ def _is_unfinished(journal: Path, cell: Cell, kind: str) -> bool:
         entries = read_entries(journal)
     except InputError:
         return False
-    if not entries or entries[0]["kind"] != "begun":
+    begun = next((entry for entry in reversed(entries) if entry["kind"] == "begun"), None)
+    if begun is None:
         return False
-    same = entries[0].get("cell") == str(cell.path.resolve()) and entries[0].get("job") == kind
+    same = begun.get("cell") == str(cell.path.resolve()) and begun.get("job") == kind
     return same and not any(e["kind"] == "ended" for e in entries)
 
 

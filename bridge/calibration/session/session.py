@@ -63,7 +63,7 @@ class Session:
     """State of a session; every change is written to the journal first."""
 
     journal: Journal
-    start_entry: Entry = field(default_factory=dict)  # kind "begun"; empty: a new session
+    start_entry: Entry = field(default_factory=dict)  # the last of kind "begun"; empty: none
     plan: Plan | None = None
     accepted: list[Reading] = field(default_factory=list)
     undone: int = 0  # number of readings discarded with `undo`
@@ -83,6 +83,11 @@ class Session:
         for entry in journal.entries:
             session.apply(entry)
         return session
+
+    @property
+    def has_begun(self) -> bool:
+        """Return whether it has a plan or readings; a start that was refused left none."""
+        return self.plan is not None or bool(self.used_sources) or bool(self.accepted)
 
     def add(self, kind: str, **fields: Any) -> None:
         """Write an entry to the journal, then apply it."""

@@ -86,7 +86,11 @@ def init(
         raise InputError("--model: found beside --urdf, expected one of them")
     if arm_options.tip is not None and arm_options.urdf is None:
         raise InputError("--tip: found without --urdf, expected the URDF whose link it is")
-    link = _link(host, driver, profile, port) | _link_keys(keys)
+    link = _link(host, driver, profile, port)
+    for key, value in _link_keys(keys).items():
+        if key in link:
+            raise InputError(f"--link: found {key}, expected it once: HOST and options give it")
+        link[key] = value
     settings = _settings(link)
     located = settings.located(Path.cwd())
     facts = enquire(host) if driver == "ur_rtde" else _read_facts(located, arm_options)
@@ -112,6 +116,8 @@ def _link(host: str, driver: str, profile: str | None, port: int | None) -> dict
     if driver == "ur_rtde":
         if port is not None:
             raise InputError("--port: found with --driver ur_rtde, expected none: it is 30004")
+        if profile is not None:
+            raise InputError("--profile: found with --driver ur_rtde, expected none")
         return {"driver": driver, "host": host}
     link: dict[str, Any] = {"driver": driver, "profile": profile}
     if driver == "modbus":

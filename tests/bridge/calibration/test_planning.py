@@ -147,6 +147,19 @@ def test_contradicting_settings_are_refused_in_one_line(
     assert re.fullmatch(r"error: .*/cell\.yaml, line \d+: calibration\..*\n", result.err)
 
 
+def test_a_refused_start_does_not_block_the_corrected_cell(tmp_path: Path) -> None:
+    refused = run_calibrate(
+        cell_with(tmp_path, "floor: 3"), "--plan-only", "--session", tmp_path / "s"
+    )
+    assert (refused.code, "pose" in refused.err) == (2, True)
+    corrected = cell_with(tmp_path)
+    corrected.write_text(corrected.read_text().replace("0.18", "0.19"))
+    result = run_calibrate(corrected, "--plan-only", "--session", tmp_path / "s")
+    assert result.code == 0, result.err
+    begun = [e for e in read_entries(tmp_path / "s" / FILE) if e["kind"] == "begun"]
+    assert len(begun) == 2
+
+
 def test_loads_count_in_collision_checks(tmp_path: Path) -> None:
     from gapbridge.bridge.calibration.planning import loads_of, with_loads
 

@@ -195,6 +195,8 @@ def test_end_of_input_and_quit_show_how_to_resume(tmp_path: Path) -> None:
     [
         (["--instrument", "typd"], {}, "--instrument: found 'typd', expected one of typed"),
         (["--instrument", "typed,unit=km"], {}, "--instrument typed: unit"),
+        (["--instrument", "typed,unit=["], {}, "--instrument: found 'unit=[', expected KEY=VALUE"),
+        (["--instrument", "typed,unit=mm,unit=m"], {}, "--instrument: found unit twice"),
         (["--move"], {}, "calibration.joints: found 'planned' with --move, expected 'link'"),
         (["--verify"], {}, "expected the accuracy baseline that `gapbridge calibrate` writes"),
         (["--payload-only"], {}, "link: found nothing"),

@@ -127,6 +127,9 @@ def test_a_profile_beside_the_cell_is_found_from_its_folder(tmp_path: Path) -> N
         ((*ODRIVE, "--link", "gear"), "--link: found 'gear', expected KEY=VALUE"),
         ((*ODRIVE, "--link", "gear=[50"), "--link, line 1: found broken YAML"),
         (("--port", "30004"), "--port: found with --driver ur_rtde"),
+        (("--profile", "ur"), "--profile: found with --driver ur_rtde"),
+        (("--link", "host=10.1.2.3"), "--link: found host, expected it once"),
+        ((*ODRIVE, "--link", "profile=piper"), "--link: found profile, expected it once"),
         (("--tip", "tool0"), "--tip: found without --urdf"),
     ],
 )
