@@ -27,10 +27,11 @@ MODE = 0o640  # of a new file
 FOLDER_MODE = 0o750  # of a new folder of recordings, sessions and the like
 
 
-def require_writable(path: Path, *inputs: Path) -> Path:
+def require_writable(path: Path, *others: Path) -> Path:
     """Return the path if a file can be written there; called before the work is done.
 
-    Raises InputError where its folder is missing, it is a folder or a device, or it is an input.
+    ``others``: inputs, and outputs named before. Raises InputError where its folder is missing, it
+    is a folder or a device, or it is one of the others.
     """
     if path.is_dir():
         raise InputError(f"{path}: found a folder, expected a file to write")
@@ -39,9 +40,11 @@ def require_writable(path: Path, *inputs: Path) -> Path:
     folder = path.parent
     if not folder.is_dir():
         raise InputError(f"{path}: found no folder {folder}, expected an existing one")
-    for file in inputs:
+    for file in others:
         if path.exists() and file.exists() and path.samefile(file):
             raise InputError(f"{path}: found the output to be the input {file}, expected another")
+        if os.path.realpath(path) == os.path.realpath(file):
+            raise InputError(f"{path}: found for two outputs, expected two files")
     if not os.access(folder, os.W_OK):
         raise InputError(f"{path}: found a folder {folder} that cannot be written to")
     return path

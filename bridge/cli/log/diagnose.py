@@ -117,6 +117,9 @@ def diagnose(
         click.echo(f"{file}: written")
 
 
+REPORT_FILES = ("diagnosis.json", "report.html")  # in the folder of --out
+
+
 @dataclass(frozen=True)
 class _Output:
     """The output files of the command; None: not written."""
@@ -128,11 +131,10 @@ class _Output:
 
     def require_writable(self, *inputs: Path) -> None:
         """Create the folder; raise InputError if a file is not writable, or is an input."""
+        named = [] if self.out is None else [self.out / name for name in REPORT_FILES]
         for file in (self.json_file, self.new_cell):
             if file is not None:
-                require_writable(file, *inputs)
-        if self.json_file is not None and self.json_file == self.new_cell:
-            raise InputError(f"{self.new_cell}: found for --json and --apply, expected two files")
+                named.append(require_writable(file, *inputs, *named))
         if self.out is not None:
             require_folder(self.out, "--out", above=False)
 

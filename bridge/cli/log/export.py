@@ -43,9 +43,10 @@ def export_recording(
     require_table(out, *files)
     span = Span(_moment("--from", start), _moment("--to", stop))
     if cell_out is not None:
-        require_writable(cell_out, *files)
-        write_text(cell_out, str(read_configuration(recording).get("text", "")))
+        require_writable(cell_out, *files, out)
     _emit(out, export(recording, out, span))
+    if cell_out is not None:
+        write_text(cell_out, str(read_configuration(recording).get("text", "")))
 
 
 def _moment(option: str, text: str | None) -> float | datetime | None:

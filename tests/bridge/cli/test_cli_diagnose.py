@@ -77,6 +77,16 @@ def test_a_reader_who_leaves_early_costs_no_file(
     assert json.loads(file.read_text(encoding="utf-8"))["schema"] == "gapbridge.diagnosis/1"
 
 
+@pytest.mark.parametrize(
+    "outputs",
+    [("--json", "same", "--apply", "same"), ("--out", ".", "--apply", "report.html")],
+)
+def test_two_outputs_are_two_files(tmp_path: Path, outputs: tuple[str, ...]) -> None:
+    given = [tmp_path / word if k % 2 else word for k, word in enumerate(outputs)]
+    line = refused("diagnose", soft_log(tmp_path), "--cell", cell_in(tmp_path), *given)
+    assert "found for two outputs, expected two files" in line
+
+
 def test_a_withheld_effect_is_never_named(tmp_path: Path) -> None:
     file = tmp_path / "d.json"
     answer = gapbridge(
@@ -131,7 +141,7 @@ def test_stand_ins_go_into_the_cell_only_when_asked_for(
         (("--json", "{}/none/d.json"), ["found no folder"]),
         (("--apply", "{}/cell.yaml"), ["output to be the input"]),
         (("--apply", "{}"), ["found a folder"]),
-        (("--json", "{}/both", "--apply", "{}/both"), ["--json and --apply", "two files"]),
+        (("--json", "{}/both", "--apply", "{}/both"), ["two outputs", "two files"]),
         (("--sim", "{}/none.csv"), ["none.csv: file not found"]),
         (("--sim", "{}/short.csv"), ["short.csv", "found 3 rows, expected 40"]),
     ],

@@ -101,6 +101,8 @@ def test_the_command_writes_beside_the_recording_and_gives_the_cell_back(
     desk.record(3)
     recorder = desk.recorder()
     recorder.configuration["text"] = "robot: {model: ur10e}\n"
+    publish(desk.memory, 3)
+    recorder.step(flush=True)
     recorder.close()
     runner = CliRunner()
     done = runner.invoke(gapbridge, ["export", str(desk.files[0])])
@@ -110,6 +112,14 @@ def test_the_command_writes_beside_the_recording_and_gives_the_cell_back(
     cell = tmp_path / "cell.yaml"
     done = runner.invoke(gapbridge, ["export", str(desk.files[1]), "--cell-out", str(cell)])
     assert cell.read_text() == "robot: {model: ur10e}\n"
+    same = str(tmp_path / "same.csv")
+    done = runner.invoke(
+        gapbridge, ["export", str(desk.files[1]), "--out", same, "--cell-out", same]
+    )
+    assert "found for two outputs" in str(done.exception)
+    beyond = [str(desk.files[1]), "--from", "100", "--cell-out", str(tmp_path / "no.yaml")]
+    assert runner.invoke(gapbridge, ["export", *beyond]).exit_code != 0
+    assert not (tmp_path / "no.yaml").exists()
 
 
 @pytest.mark.parametrize(
