@@ -26,7 +26,7 @@ from gapbridge.bridge.fleet.fit_summary import (
 from gapbridge.bridge.fleet.report.page import write_diagnosis_report, write_fit_report
 from gapbridge.bridge.fleet.report.shared_sections import quantity_title, type_title
 from gapbridge.bridge.fleet.runner import FleetRun
-from gapbridge.bridge.fleet.session import Fleet
+from gapbridge.bridge.fleet.session import CELL_TABLE, RESULTS_FILE, SESSIONS_FILE, Fleet
 from gapbridge.bridge.fleet.task import Outcome
 from gapbridge.bridge.report.labels import counted, effect_title, joint_list, with_unit
 from gapbridge.core.calibration.spread import Spread
@@ -34,8 +34,6 @@ from gapbridge.core.estimation.compliance_fit import flexibilities
 from gapbridge.core.fitted_range import merged
 
 SHOWN = 8  # lines of each kind on the terminal
-CELL_TABLE = "cells.csv"
-RESULTS_FILE, SESSIONS_FILE = "results.parquet", "sessions.parquet"
 CHANNELS = ("position", "wrench", "tracking", "torque")
 FIGURE_COLUMNS = {"gap_rms": "float64", "gap_max": "float64", "noise_floor_rms": "float64",
            "remaining_rms": "float64", "remaining_rms_held_out": "float64"}  # fmt: skip

@@ -13,6 +13,8 @@ from gapbridge.core.errors import InputError
 from gapbridge.core.log.columns import PARQUET
 
 LOGS = (".csv", *PARQUET)
+RESULTS_FILE, SESSIONS_FILE, CELL_TABLE = "results.parquet", "sessions.parquet", "cells.csv"
+OUTPUTS = (RESULTS_FILE, SESSIONS_FILE, CELL_TABLE)  # tables that a run writes
 WILDCARDS = re.compile(r"[*?\[]")
 
 
@@ -47,13 +49,13 @@ def find_sessions(
     A log's arm is the first folder below the folder of the fleet; for a log in that folder itself,
     the file's name up to its first underscore. ``pattern`` is a regular expression that matches
     the arm in the path below the folder of the fleet instead (first group, or the whole match).
-    Files below ``without``, the output folder, are ignored.
+    The tables of a run in ``without``, the output folder, are ignored.
     Raises InputError if there is no log, or ``pattern`` does not match one.
     """
     found = {log for text in where for log in _logs(text)}
     output = None if without is None else without.absolute()
     logs = sorted(
-        (log for log in found if output is None or output not in log.absolute().parents),
+        (log for log in found if log.absolute().parent != output or log.name not in OUTPUTS),
         key=lambda p: natural_key(str(p)),
     )
     if not logs:
@@ -116,7 +118,10 @@ def _arm(below: Path, expression: re.Pattern[str] | None, pattern: str | None) -
     match = expression.search(below.as_posix())
     if match is None:
         raise InputError(f"--arm: {pattern!r} does not fit {below.as_posix()}")
-    return match.group(1) if expression.groups else match.group()
+    name = match.group(1) if expression.groups else match.group()
+    if not name:
+        raise InputError(f"--arm: {pattern!r} matches nothing of {below.as_posix()}")
+    return name
 
 
 def _require_unique(sessions: Sequence[Session]) -> None:

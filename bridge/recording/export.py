@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from datetime import datetime
@@ -23,6 +22,7 @@ if TYPE_CHECKING:
     import pyarrow
 
 ADDED = ("nominal_q", "corrected_q", "offset", "written", "age", "residual", "clamped", "number")
+LONGEST = 1e9  # s that a bound of a span may be from an end
 GROUP = 20_000  # rows of a Parquet row group at least
 
 
@@ -73,7 +73,7 @@ def moment(text: str) -> float | datetime:
     Raises InputError if it is neither.
     """
     with contextlib.suppress(ValueError):
-        if math.isfinite(seconds := float(text)):
+        if abs(seconds := float(text)) < LONGEST:
             return seconds
     try:
         return datetime.fromisoformat(text).astimezone()

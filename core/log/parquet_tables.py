@@ -75,7 +75,10 @@ def _numbers(part: pyarrow.Table | pyarrow.RecordBatch, name: str) -> Array:
 
     column = part.column(name)
     if column.type != pyarrow.float64():
-        column = column.cast(pyarrow.float64())  # imports what costs 40 ms
+        try:
+            column = column.cast(pyarrow.float64())  # imports what costs 40 ms
+        except pyarrow.ArrowInvalid as error:
+            raise pyarrow.ArrowInvalid(f"column {name}: {error}") from None
     return np.asarray(column.to_numpy(zero_copy_only=False))
 
 
@@ -93,6 +96,8 @@ def _check_types(path: Path, schema: pyarrow.Schema, wanted: list[str]) -> None:
     from pyarrow import types
 
     for name in wanted:
+        if len(schema.get_all_field_indices(name)) > 1:
+            raise LogError(f"{path}: column {name}: found twice, expected it once")
         kind = schema.field(name).type
         if not (types.is_floating(kind) or types.is_integer(kind) or types.is_decimal(kind)):
             what = "text" if types.is_string(kind) else str(kind)

@@ -171,6 +171,20 @@ def test_parquet_that_is_none_and_text_in_it_are_reported(tmp_path):
         read_log(path, 6)
 
 
+def test_parquet_columns_that_come_twice_or_do_not_fit_are_named(tmp_path):
+    path = tmp_path / "log.parquet"
+    numbers = pyarrow.array([0.1, 0.2])
+    names = ["timestamp", *(f"actual_q_{i}" for i in range(6)), "actual_q_0"]
+    parquet.write_table(pyarrow.Table.from_arrays([numbers] * 8, names=names), path)
+    with pytest.raises(LogError, match="column actual_q_0: found twice, expected it once"):
+        read_log(path, 6)
+    stamps = pyarrow.array([2**60 + 1, 2**60 + 3])
+    table = pyarrow.Table.from_arrays([stamps, *[numbers] * 6], names=names[:7])
+    parquet.write_table(table, path)
+    with pytest.raises(LogError, match="column timestamp: "):
+        read_log(path, 6)
+
+
 def test_parquet_with_empty_cells_names_the_cell_when_it_is_needed(tmp_path):
     path = tmp_path / "log.parquet"
     parquet.write_table(pyarrow.table({"payload": [1.0, None, 3.0]}), path)

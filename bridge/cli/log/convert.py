@@ -94,5 +94,7 @@ def _by_role(topics: tuple[str, ...]) -> dict[str, str]:
             raise InputError(
                 f"--topic: found {option!r}, expected ROLE=TOPIC, ROLE one of {', '.join(ROLES)}"
             )
+        if role in roles:
+            raise InputError(f"--topic: found {role} twice, expected it once")
         roles[role] = topic
     return roles

@@ -96,7 +96,10 @@ def diagnose(withhold: tuple[str, ...], **values: Any) -> None:
     Example: gapbridge fleet diagnose 'logs/*/2026-*.csv' --cell arms.csv --workers 8
     """
     for name in withhold:
-        effect_named(name)
+        try:
+            effect_named(name)
+        except InputError as error:
+            raise InputError(f"--withhold: {error}") from None
     options = FleetOptions(**values)
     done, sessions = _run("diagnose", diagnose_session, {"withhold": list(withhold)}, options)
     from gapbridge.bridge.fleet.output import write_diagnosis

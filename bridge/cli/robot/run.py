@@ -39,6 +39,8 @@ def run(cell: Path, observe: bool, arm: bool, duration: float | None, log: str) 
     """
     if observe and arm:
         raise InputError("--observe: found beside --arm, expected one of them")
+    if duration is not None and not duration < float("inf"):
+        raise InputError(f"--duration: found {duration:g}, expected a number of seconds")
     opened = open_cell(cell)
     from gapbridge.bridge.daemon.run import run_cell  # imports the numerical libraries
 

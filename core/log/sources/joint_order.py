@@ -29,6 +29,9 @@ def order_joints(
     order themselves. Raises LogOptionError where the names do not.
     """
     if chosen:
+        for name in chosen:
+            if chosen.count(name) > 1:
+                raise LogOptionError(f"{path}: --joints: found {name} twice, expected it once")
         return tuple(_one(path, name, found) for name in chosen)
     for names in (tuple(arm_joints), UR_JOINTS, SO_JOINTS):
         if matched := _matched(names, found):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -14,6 +14,9 @@ from gapbridge.core.errors import LogError, LogOptionError
 from gapbridge.core.log.sources.joint_order import order_joints
 from gapbridge.core.log.sources.source import Converted, Source, SourceOptions
 from gapbridge.core.notes import Note, Reason
+
+if TYPE_CHECKING:
+    import pyarrow
 
 INFO = Path("meta") / "info.json"
 STEPS = 4095  # of an encoder turn, as LeRobot counts its servos' 4096 positions
@@ -41,14 +44,15 @@ class LeRobot(Source):
                 raise LogError(
                     f"{path}: action: found {', '.join(commanded)}, expected {name} among them"
                 )
-        table = _table(path, options.episode)
+        widths = {"action": len(commanded), "observation.state": len(names)}
+        table = _table(path, options.episode, widths)
         scale = _scale(path, order, options)
         columns = {"timestamp": _running_time(table["timestamp"], table["episode_index"])}
         for column, key, found in (
             ("target_q", "action", commanded), ("actual_q", "observation.state", names),
         ):  # fmt: skip
             columns[column] = table[key][:, [found.index(name) for name in order]] * scale
-        fps = float(info.get("fps", 0)) or 30.0
+        fps = _fps(path, info)
         episodes = len(np.unique(table["episode_index"]))
         notes = [Note(Reason.FRAME_TIMES, (fps, 1e3 / fps))]
         if episodes > 1:
@@ -81,8 +85,20 @@ def _names(path: Path, info: dict[str, Any], feature: str) -> list[str]:
     return [str(name) for name in names]
 
 
-def _table(path: Path, episode: int | None) -> dict[str, Array]:
-    """Return action, observation.state, timestamp and episode_index of all frames in order."""
+def _fps(path: Path, info: dict[str, Any]) -> float:
+    """Return the frames per second; 30 if the dataset does not state it."""
+    try:
+        return float(info.get("fps", 0)) or 30.0
+    except (ValueError, TypeError):
+        found = f"found {info['fps']!r}, expected a number"
+        raise LogError(f"{path / INFO}: fps: {found} (Hz)") from None
+
+
+def _table(path: Path, episode: int | None, widths: dict[str, int]) -> dict[str, Array]:
+    """Return action, observation.state, timestamp and episode_index of all frames in order.
+
+    ``widths``: how many numbers a vector has.
+    """
     import pyarrow
     from pyarrow import parquet
 
@@ -101,12 +117,23 @@ def _table(path: Path, episode: int | None) -> dict[str, Array]:
             last = max(last, *frame["episode_index"].to_pylist())
             frame = frame.filter(pyarrow.compute.equal(frame["episode_index"], episode))
         if frame.num_rows:
-            parts.append({
-                name: np.array(frame[name].to_pylist(), dtype=float) for name in wanted
-            })  # fmt: skip
+            parts.append({name: _numbers(file, frame, name, widths.get(name)) for name in wanted})
     if not parts:
         raise LogOptionError(f"{path}: --episode: found no episode {episode}, expected 0 to {last}")
     return {name: np.concatenate([part[name] for part in parts]) for name in wanted}
+
+
+def _numbers(file: Path, frame: pyarrow.Table, name: str, width: int | None) -> Array:
+    """Return a column: (N,), or vectors (N, width). Raises LogError."""
+    try:
+        found = np.array(frame[name].to_pylist(), dtype=float)
+    except (ValueError, TypeError):
+        found = np.empty(0)
+    shape = (frame.num_rows,) if width is None else (frame.num_rows, width)
+    if found.shape != shape or (width is None and not np.isfinite(found).all()):
+        what = "a number" if width is None else f"{width} numbers"
+        raise LogError(f"{file}: column {name}: expected {what} in each of {shape[0]} rows")
+    return found
 
 
 def _running_time(time: Array, episode: Array) -> Array:
@@ -123,6 +150,8 @@ def _scale(path: Path, order: Sequence[str], options: SourceOptions) -> Array:
 
     By the calibration file a joint's numbers go from -100 to 100 over its range of servo steps.
     """
+    if options.units and options.calibration is not None:
+        raise LogOptionError(f"{path}: --units: found with --calibration, expected one of them")
     if options.units:
         return np.full(len(order), {"rad": 1.0, "degrees": np.pi / 180}[options.units])
     if options.calibration is None:
@@ -133,7 +162,8 @@ def _scale(path: Path, order: Sequence[str], options: SourceOptions) -> Array:
     file = options.calibration
     try:
         given = json.loads(file.read_text(encoding="utf-8"))
-        span = [float(given[name]["range_max"]) - float(given[name]["range_min"]) for name in order]
+        ends = {name: (given[name]["range_min"], given[name]["range_max"]) for name in order}
+        span = [float(most) - float(least) for least, most in ends.values()]
     except OSError as error:
         raise LogError(f"{file}: cannot be read ({error.strerror})") from None
     except (ValueError, TypeError):
@@ -142,4 +172,10 @@ def _scale(path: Path, order: Sequence[str], options: SourceOptions) -> Array:
     except KeyError as error:
         raise LogError(f"{file}: {error.args[0]}: not found, expected {', '.join(order)} with "
                        "range_min and range_max") from None  # fmt: skip
+    for (name, (least, most)), steps in zip(ends.items(), span, strict=True):
+        if not 0.0 < steps < np.inf:
+            raise LogError(
+                f"{file}: {name}: found range_min {least} and range_max {most}, expected a "
+                "range of more than 0 steps"
+            )
     return np.asarray(np.array(span) / 2 / 100 * 2 * np.pi / STEPS)

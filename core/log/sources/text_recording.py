@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -106,10 +107,15 @@ def _numbers(path: Path, delimiter: str | None, places: list[int]) -> Array:
 def _loaded(
     path: Path, delimiter: str | None, places: list[int], convert: Callable[[str], float] | None
 ) -> Array:
-    return np.loadtxt(
-        path, delimiter=delimiter, skiprows=1, usecols=places, ndmin=2, comments=None,
-        encoding="utf-8-sig", converters=convert,
-    )  # fmt: skip
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # of no rows, which is an error here
+        found = np.loadtxt(
+            path, delimiter=delimiter, skiprows=1, usecols=places, ndmin=2, comments=None,
+            encoding="utf-8-sig", converters=convert,
+        )  # fmt: skip
+    if not len(found):
+        raise LogError(f"{path}: found no rows below the header, expected rows of numbers")
+    return found
 
 
 def _comma_number(text: str) -> float:

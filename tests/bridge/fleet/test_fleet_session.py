@@ -50,6 +50,9 @@ def test_a_pattern_finds_the_arm(tmp_path: Path) -> None:
     assert set(arms_of(found).values()) == {"hall1", "hall2"}
     with pytest.raises(InputError, match="--arm: 'x9' does not fit"):
         find_sessions([str(tmp_path)], "x9")
+    for empty in ("", r"(zz)?"):
+        with pytest.raises(InputError, match=r"--arm: .* matches nothing of"):
+            find_sessions([str(tmp_path)], empty)
     with pytest.raises(InputError, match="no regular expression"):
         find_sessions([str(tmp_path)], "(")
 
@@ -57,6 +60,9 @@ def test_a_pattern_finds_the_arm(tmp_path: Path) -> None:
 def test_results_are_no_logs(tmp_path: Path) -> None:
     files_in(tmp_path, "a/s.csv", "out/results.parquet")
     assert list(arms_of(find_sessions([str(tmp_path)], without=tmp_path / "out"))) == ["a/s"]
+    files_in(tmp_path, "out/s.csv")  # a folder of logs as the output folder loses none
+    found = arms_of(find_sessions([str(tmp_path)], without=tmp_path / "out"))
+    assert list(found) == ["a/s", "out/s"]
 
 
 @pytest.mark.parametrize(

@@ -109,3 +109,46 @@ def test_a_dataset_without_names_is_refused(dataset: Path) -> None:
     info.write_text(json.dumps(given))
     with pytest.raises(LogError, match=r"features.action.names: found None"):
         source_of(dataset).read(dataset, JOINTS, SourceOptions(units="rad"))
+
+
+@pytest.mark.parametrize(
+    ("least", "most"), [(0, 0), (3000, 1000), (float("nan"), 3000), (1000, float("inf"))]
+)
+def test_a_calibration_without_a_range_is_refused(
+    dataset: Path, calibration: Path, least: float, most: float
+) -> None:
+    """All angles would be zero, or turned round."""
+    given = json.loads(calibration.read_text())
+    given["elbow_flex"] |= {"range_min": least, "range_max": most}
+    calibration.write_text(json.dumps(given))
+    with pytest.raises(LogError, match=r"arm\.json: elbow_flex: found range_min"):
+        source_of(dataset).read(dataset, JOINTS, SourceOptions(calibration=calibration))
+
+
+def test_contradicting_options_are_refused(dataset: Path, calibration: Path) -> None:
+    both = SourceOptions(units="rad", calibration=calibration)
+    with pytest.raises(LogError, match="--units: found with --calibration"):
+        source_of(dataset).read(dataset, JOINTS, both)
+    twice = SourceOptions(("elbow_flex",) * 5, units="rad")
+    with pytest.raises(LogError, match="--joints: found elbow_flex twice"):
+        source_of(dataset).read(dataset, JOINTS, twice)
+
+
+def test_frames_and_rates_that_are_no_numbers_are_refused(dataset: Path) -> None:
+    file = dataset / "data" / "chunk-000" / "file-000.parquet"
+    whole = parquet.read_table(file)
+    for name, values, phrase in (
+        ("action", [[1.0, 2.0]] * (2 * FRAMES), "column action: expected 6 numbers in each of 60"),
+        ("action", ["x"] * (2 * FRAMES), "column action: expected 6 numbers"),
+        ("action", [[1.0]] + [[1.0, 2.0]] * (2 * FRAMES - 1), "column action: expected 6 numbers"),
+        ("timestamp", [None] * (2 * FRAMES), "column timestamp: expected a number in each of 60"),
+    ):
+        changed = whole.set_column(whole.column_names.index(name), name, pyarrow.array(values))
+        parquet.write_table(changed, file)
+        with pytest.raises(LogError, match=phrase):
+            source_of(dataset).read(dataset, JOINTS, SourceOptions(units="rad"))
+    parquet.write_table(whole, file)
+    info = dataset / "meta" / "info.json"
+    info.write_text(json.dumps(json.loads(info.read_text()) | {"fps": "x"}))
+    with pytest.raises(LogError, match="fps: found 'x', expected a number"):
+        source_of(dataset).read(dataset, JOINTS, SourceOptions(units="rad"))

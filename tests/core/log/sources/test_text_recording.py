@@ -61,3 +61,10 @@ def test_text_among_the_numbers_is_one_clear_line(tmp_path: Path) -> None:
         file.write("5,1,what\n")
     with pytest.raises(LogError, match=r"log.csv: found .*expected rows of numbers"):
         source_of(tmp_path / "log.csv").read(tmp_path / "log.csv", (), SourceOptions())
+
+
+def test_a_header_alone_is_refused(tmp_path: Path, recwarn: pytest.WarningsRecorder) -> None:
+    franka(tmp_path / "log.csv", rows=0)
+    with pytest.raises(LogError, match=r"log\.csv: found no rows below the header"):
+        source_of(tmp_path / "log.csv").read(tmp_path / "log.csv", (), SourceOptions())
+    assert not recwarn.list
