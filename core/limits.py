@@ -327,14 +327,14 @@ def _limit(block, nominal, corrected, offset, ramp, actual, dt):  # type: ignore
     # velocity limits of the joint command: of its nominal part, then with the offset
     pace = 1.0
     for i in range(n):
-        distance = abs(nominal[i] - reached[i])
-        if distance > bounds[2, i] * gap:
-            pace = min(pace, bounds[2, i] * gap / distance * SLACK)
+        way = abs(nominal[i] - reached[i])
+        if way > bounds[2, i] * gap:
+            pace = min(pace, bounds[2, i] * gap / way * SLACK)
             clamped |= 1 << VELOCITY
     arrives = np.empty(n)
     for i in range(n):
-        way = nominal[i] - reached[i]
-        arrives[i] = nominal[i] if pace == 1.0 else reached[i] + pace * way
+        step_to = pace * (nominal[i] - reached[i])
+        arrives[i] = nominal[i] if pace == 1.0 else reached[i] + step_to
         if abs(nominal[i] - arrives[i]) > numbers[5]:
             return _LAGS, i
     goal, speed_factor = np.empty(n), 1.0

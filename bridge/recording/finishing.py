@@ -12,6 +12,7 @@ import fcntl
 import os
 import struct
 import zlib
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from io import BytesIO
 from pathlib import Path
@@ -75,6 +76,13 @@ class _Whole:
             return True
         self.end = offset + length
         return True
+
+    def look_behind(self, file: IO[bytes], rest: Iterable[tuple[int, int, int]]) -> None:
+        """Note whether chunks that can be read are among the records not taken."""
+        self.damaged = any(
+            code == Opcode.CHUNK and records.unpacked(file, offset, length) is not None
+            for code, offset, length in rest
+        )
 
     def finish(self) -> None:
         """End with the last chunk; incomplete indexes are dropped."""
@@ -166,10 +174,7 @@ def _scan(file: IO[bytes], path: Path) -> _Whole:
     for code, offset, length in rest:
         if not whole.take(file, code, offset, length):
             break
-    whole.damaged = any(
-        code == Opcode.CHUNK and records.unpacked(file, offset, length) is not None
-        for code, offset, length in rest
-    )
+    whole.look_behind(file, rest)
     whole.finish()
     return whole
 

@@ -72,6 +72,10 @@ class Waiting(Source):
     """A source whose first setpoint comes when it is told so."""
 
     ready = True
+    discarded = 0
+
+    def discard(self) -> None:
+        self.discarded += 1
 
     def first(self, robot_q: np.ndarray) -> np.ndarray | None:
         return Q if self.ready else None
@@ -164,6 +168,16 @@ def test_a_fault_releases_the_driver_once_and_ends_when_it_is_acknowledged(bench
     bench.run({10: Command.ARM, 40: stops, 60: is_fine, 70: Command.DISARM})
     assert bench.driver.noted == ["armed", "released"]
     assert bench.causes()[-2:] == [Cause.UNSAFE, Cause.ACKNOWLEDGED]
+
+
+def test_what_came_before_the_driver_was_armed_is_dropped(bench: Bench) -> None:
+    found = []
+
+    def note() -> None:
+        found.append(bench.source.discarded)
+
+    bench.run({9: note, 10: Command.ARM, 12: note})
+    assert found[1] == found[0] + 2  # armed by a person; then the driver, which takes its time
 
 
 def test_a_release_that_fails_in_a_fault_is_reported(bench: Bench) -> None:
