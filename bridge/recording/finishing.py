@@ -1,8 +1,8 @@
 """Finishing a recording that was cut off: writing the summary of its complete records.
 
 A recorder that was killed leaves complete chunks and no summary; readers that seek cannot open such
-a file. Data after the last complete record is removed. A file in which readable chunks follow a
-damaged one is left as it is. Format: the MCAP specification.
+a file. Data after the last complete record is removed; a file that is damaged before its end stays
+as it is. Format: the MCAP specification.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ import fcntl
 import os
 import struct
 import zlib
-from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from io import BytesIO
 from pathlib import Path
@@ -53,13 +52,12 @@ class _Whole:
     end: int = 0  # bytes of the file that are kept
     last: dict[int, MessageIndex] = field(default_factory=dict)  # of the last chunk
     torn: bool = False  # the last chunk's indexes must be written again
-    damaged: bool = False  # behind a chunk that cannot be read are others that can
     _chunk: ChunkIndex | None = None  # the last one, its indexes not read yet
     _indexed: dict[int, int] = field(default_factory=dict)  # channel -> offset of its index
     _index_length: int = 0
 
     def take(self, file: IO[bytes], code: int, offset: int, length: int) -> bool:
-        """Add a record; returns False for a broken chunk."""
+        """Add a record; returns False for a broken chunk, after which nothing can be read."""
         if code == Opcode.CHUNK:
             unpacked = records.unpacked(file, offset, length)
             if unpacked is None:
@@ -76,13 +74,6 @@ class _Whole:
             return True
         self.end = offset + length
         return True
-
-    def look_behind(self, file: IO[bytes], rest: Iterable[tuple[int, int, int]]) -> None:
-        """Note whether chunks that can be read are among the records not taken."""
-        self.damaged = any(
-            code == Opcode.CHUNK and records.unpacked(file, offset, length) is not None
-            for code, offset, length in rest
-        )
 
     def finish(self) -> None:
         """End with the last chunk; incomplete indexes are dropped."""
@@ -119,7 +110,8 @@ class _Whole:
 def finish(path: Path) -> bool:
     """Write the summary of a file that has none; returns whether it lacked one and got it.
 
-    A file that is being written is left unchanged. Raises OSError if it cannot be written, LogError
+    A file that is being written is left unchanged, and one with a readable chunk behind a damaged
+    stretch, which truncating would lose. Raises OSError if it cannot be written, LogError
     if it is not an MCAP file.
     """
     if records.is_whole(path):
@@ -129,10 +121,10 @@ def finish(path: Path) -> bool:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
             return False
-        if records.is_whole(path):
+        if records.is_whole(path) or records.damages(path):
             return False
         whole = _scan(file, path)
-        if whole.damaged or not whole.end:
+        if not whole.end:
             return False
         tail = _tail(whole)
         file.truncate(whole.end)
@@ -170,11 +162,10 @@ def _finished(path: Path) -> bool:
 
 def _scan(file: IO[bytes], path: Path) -> _Whole:
     """Return the complete records, up to the first incomplete one."""
-    whole, rest = _Whole(), records.all_records(file, path)
-    for code, offset, length in rest:
+    whole = _Whole()
+    for code, offset, length in records.all_records(file, path):
         if not whole.take(file, code, offset, length):
             break
-    whole.look_behind(file, rest)
     whole.finish()
     return whole
 

@@ -1,4 +1,4 @@
-"""Reading recordings: rows in batches, events, configuration; also of files that were cut."""
+"""Reading recordings: rows in batches, events, configuration; also of cut and damaged files."""
 
 from __future__ import annotations
 
@@ -26,6 +26,7 @@ from gapbridge.core.log.mcap_schema import (
     STATE,
     message_of,
 )
+from gapbridge.core.notes import Note, Reason
 
 SUFFIX = ".mcap"
 Document = dict[str, Any]
@@ -65,11 +66,19 @@ def files_of(path: Path) -> list[Path]:
 def read_batches(path: Path) -> Iterator[Batch]:
     """Yield what a recording holds, chunk by chunk; see ``files_of``.
 
-    Ends where the file is broken off; a damaged chunk with others behind it is left out, so that
-    its cycles are missing. Raises LogError where it is no recording.
+    Leaves out what is damaged (``damages``). Raises LogError where it is no recording.
     """
     for file in files_of(path):
         yield from _read_file(file)
+
+
+def damages(path: Path) -> tuple[Note, ...]:
+    """Return a note for each stretch of a recording that cannot be read; see ``files_of``."""
+    return tuple(
+        Note(Reason.DAMAGED, (file.name, *stretch))
+        for file in files_of(path)
+        for stretch in records.damages(file)
+    )
 
 
 def read_configuration(path: Path) -> Document:

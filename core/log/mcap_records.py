@@ -1,12 +1,13 @@
-"""Whole records of an MCAP file that may end anywhere: killed, cut, or with garbage behind it.
+"""Whole records of an MCAP file that may end anywhere, or be damaged: killed, cut, flipped bytes.
 
-A record counts when it is there to its last byte and, being a chunk, its checksum is right. Format:
-the MCAP specification.
+A record counts when it is there to its last byte and, being a chunk, its checksum is right. Behind
+a damaged stretch reading goes on with the next chunk that counts. Format: the MCAP specification.
 """
 
 from __future__ import annotations
 
 import os
+import re
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -29,7 +30,9 @@ _HEAD = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<HIQQ")
 HEAD_SIZE = _HEAD.size  # bytes before a record's data: opcode and length
 _KNOWN = frozenset(int(code) for code in Opcode)
-_ENDS = (Opcode.DATA_END, Opcode.FOOTER)
+_ENDS = {Opcode.DATA_END: 4, Opcode.FOOTER: 20}  # and their lengths
+_CHUNK = re.compile(rb"(?=\x06.{4}\0{4})", re.DOTALL)  # its head: opcode, a length below 4 GiB
+_BLOCK = 1 << 20  # bytes that are searched for it at a time
 # what the libraries raise where bytes are not what they should be
 BROKEN = (
     McapError, struct.error, ValueError, EOFError, RuntimeError, OverflowError, MemoryError,
@@ -57,7 +60,7 @@ class Contents:
 
 
 def chunk_offsets(file: IO[bytes], path: Path) -> Iterator[tuple[int, int]]:
-    """Yield where the data of each chunk record begins, and its length, up to the end or a break.
+    """Yield where the data of each chunk record begins, and its length, up to the end.
 
     Raises LogError where the file is no MCAP file. A file of nothing has no chunks.
     """
@@ -69,21 +72,68 @@ def chunk_offsets(file: IO[bytes], path: Path) -> Iterator[tuple[int, int]]:
 def all_records(file: IO[bytes], path: Path) -> Iterator[tuple[int, int, int]]:
     """Yield opcode, where its data begins, and its length, of each record of the data section.
 
-    Ends where a record is not there to its last byte. Raises LogError where it is no MCAP file.
+    Where a record is not there to its last byte, the next chunk that can be read comes next; ends
+    where there is none. Raises LogError where it is no MCAP file.
     """
     size = os.fstat(file.fileno()).st_size
     magic = file.read(len(MCAP0_MAGIC))
     if magic != MCAP0_MAGIC[: len(magic)]:
         raise LogError(f"{path}: found no MCAP file, expected a recording of the daemon")
-    offset = len(MCAP0_MAGIC)
-    while offset + _HEAD.size <= size:
+    offset = before = len(MCAP0_MAGIC)
+    while offset + HEAD_SIZE <= size:
         file.seek(offset)
-        code, length = _HEAD.unpack(file.read(_HEAD.size))
-        offset += _HEAD.size
-        if code not in _KNOWN or code in _ENDS or offset + length > size:
+        code, length = _HEAD.unpack(file.read(HEAD_SIZE))
+        if _ENDS.get(code) == length:
             return
-        yield code, offset, length
-        offset += length
+        if code not in _KNOWN or code in _ENDS or offset + HEAD_SIZE + length > size:
+            # the length of the record before may be what is wrong
+            before = offset = _next_chunk(file, before + 1, size)
+            continue
+        yield code, offset + HEAD_SIZE, length
+        before, offset = offset, offset + HEAD_SIZE + length
+
+
+def _next_chunk(file: IO[bytes], start: int, size: int) -> int:
+    """Return where the next chunk record that can be read begins, ``size`` if there is none."""
+    while start + HEAD_SIZE <= size:
+        file.seek(start)
+        block = file.read(_BLOCK)
+        for match in _CHUNK.finditer(block):
+            offset = start + match.start()
+            _, length = _HEAD.unpack_from(block, match.start())
+            if offset + HEAD_SIZE + length <= size and unpacked(file, offset + HEAD_SIZE, length):
+                return offset
+        start += max(len(block) - HEAD_SIZE + 1, 1)
+    return size
+
+
+def damages(path: Path) -> list[tuple[int, int]]:
+    """Return first byte and length of the stretches of a file that cannot be read.
+
+    What is behind the last readable chunk of an unfinished file is none: it was being written.
+    Raises OSError, LogError where it is no MCAP file.
+    """
+    found: list[tuple[int, int]] = []
+    behind: list[tuple[int, int]] = []  # since the last readable chunk
+    end = len(MCAP0_MAGIC)
+    with path.open("rb") as file:
+        for code, offset, length in all_records(file, path):
+            start = offset - HEAD_SIZE
+            if start > end:
+                behind.append((end, start - end))
+            end = offset + length
+            if code == Opcode.CHUNK and unpacked(file, offset, length) is None:
+                behind.append((start, end - start))
+            elif code == Opcode.CHUNK:
+                found += behind
+                behind = []
+        if not is_whole(path):
+            return found
+        file.seek(end)
+        head = file.read(HEAD_SIZE)
+        if len(head) < HEAD_SIZE or _HEAD.unpack(head)[0] not in _ENDS:
+            behind.append((end, os.fstat(file.fileno()).st_size - end))
+    return found + behind
 
 
 def is_whole(path: Path) -> bool:

@@ -31,7 +31,7 @@ class Recording(Source):
 
     def read(self, path: Path, arm_joints: Sequence[str], options: SourceOptions) -> Converted:
         """Return the log; see ``Source.read``."""
-        from gapbridge.core.log.mcap_reading import files_of
+        from gapbridge.core.log.mcap_reading import damages, files_of
 
         n = len(arm_joints) or _joints(path)
         pieces = [piece for file in files_of(path) for piece in LogPieces(file, n)]
@@ -42,7 +42,7 @@ class Recording(Source):
             )
         names = set.intersection(*(set(piece.columns) for piece in pieces)) - {"approach"}
         columns = {name: np.concatenate([p.columns[name] for p in pieces]) for name in names}
-        return Converted(columns, tuple(f"joint_{i + 1}" for i in range(n)))
+        return Converted(columns, tuple(f"joint_{i + 1}" for i in range(n)), damages(path))
 
 
 def _joints(path: Path) -> int:

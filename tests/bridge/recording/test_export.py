@@ -17,6 +17,7 @@ from gapbridge.bridge.recording.export import Span, export, moment
 from gapbridge.core.errors import InputError, LogError
 from gapbridge.core.log.log import read_log
 from gapbridge.core.log.mcap_reading import read_batches
+from gapbridge.core.log.mcap_records import chunk_offsets
 
 
 @pytest.fixture
@@ -93,6 +94,26 @@ def test_gaps_and_a_clock_that_goes_back_are_reported(desk: Desk, tmp_path: Path
     assert done.exit_code == 0, done.output
     assert "5 cycles in between were not recorded" in done.output
     assert "row 12: the controller's clock goes back" in done.output
+
+
+@pytest.mark.parametrize("place", [-9, -8, -7, 60])
+@pytest.mark.parametrize("whole", [True, False])
+def test_behind_a_damaged_chunk_reading_goes_on_and_the_file_stays_as_it_is(
+    desk: Desk, tmp_path: Path, place: int, whole: bool
+) -> None:
+    desk.record(20, 20, 20)
+    (path,) = desk.files
+    with path.open("rb") as file:
+        start = list(chunk_offsets(file, path))[2][0]
+    raw = bytearray(path.read_bytes())
+    raw[start + place] ^= 0x10  # in the chunk's opcode, its length, its data
+    path.write_bytes(raw if whole else raw[:-8])
+    before = path.read_bytes()
+    done = CliRunner().invoke(gapbridge, ["export", str(path), "--out", str(tmp_path / "l.csv")])
+    assert "l.csv: 40 cycles over" in done.output, done.output
+    assert f"warning: {path.name}: chunk at byte {start - 9} is damaged: " in done.output
+    assert " bytes were left out\n" in done.output
+    assert path.read_bytes() == before
 
 
 def test_the_command_writes_beside_the_recording_and_gives_the_cell_back(

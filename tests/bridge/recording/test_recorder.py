@@ -186,8 +186,9 @@ def test_a_byte_that_changed_on_the_disk_hides_cycles_and_never_alters_one(
     flipped = desk.folder / "flipped.bin"
     flipped.write_bytes(raw)
     found = read_columns(flipped)["actual_q"]
-    assert len(found) in (20, 60)
-    expected = rows[: len(found), desk.memory.slices["actual_q"]]
+    assert len(found) in (40, 60)
+    left = rows if len(found) == 60 else np.delete(rows, range(20, 40), axis=0)
+    expected = left[:, desk.memory.slices["actual_q"]]
     assert same_bits(found, np.ascontiguousarray(expected))
 
 
