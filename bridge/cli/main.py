@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import gc
+import io
 import os
 import signal
 import sys
 import threading
+from collections.abc import Iterator
 from pkgutil import resolve_name
 from types import FrameType
 from typing import NoReturn
@@ -103,9 +106,25 @@ def gapbridge() -> None:
 def main(arguments: list[str] | None = None) -> NoReturn:
     """Run the command line and exit with its code; never shows a traceback."""
     install_interrupt_handler()
-    code = _run(sys.argv[1:] if arguments is None else arguments)
+    with _usable_streams():
+        code = _run(sys.argv[1:] if arguments is None else arguments)
     gc.freeze()  # saves the final garbage collection, 0.1 s
     sys.exit(code)
+
+
+@contextlib.contextmanager
+def _usable_streams() -> Iterator[None]:
+    """Let text for a closed stream go nowhere, and replace what stdout's encoding lacks."""
+    with contextlib.ExitStack() as stack:
+        for stream, redirect in (
+            (sys.stdout, contextlib.redirect_stdout), (sys.stderr, contextlib.redirect_stderr),
+        ):  # fmt: skip
+            if stream is None:
+                nowhere = stack.enter_context(open(os.devnull, "w", encoding="utf-8"))
+                stack.enter_context(redirect(nowhere))
+        if isinstance(sys.stdout, io.TextIOWrapper):
+            sys.stdout.reconfigure(errors="replace")
+        yield
 
 
 def _run(arguments: list[str]) -> int:
@@ -130,14 +149,27 @@ def _run(arguments: list[str]) -> int:
     except OSError as error:
         if error.errno in UNUSABLE_PATH and error.filename is not None:
             return _fail(f"{error.filename}: {error.strerror}", UNUSABLE_INPUT)
-        if not isinstance(error, BrokenPipeError):
+        if not _is_of_stdout(error):
             return _crash(error)
-        # the reader of stdout is gone; flushing stdout at exit must not fail either
+        # flushing stdout at exit must not fail either
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return FAILURE
+        if isinstance(error, BrokenPipeError):  # its reader has left
+            return FAILURE
+        return _fail(f"stdout: cannot be written: {error.strerror}", FAILURE)
     except Exception as error:
         return _crash(error)
     return int(result) if isinstance(result, int) else SUCCESS
+
+
+def _is_of_stdout(error: OSError) -> bool:
+    """Return whether an error came from printing: then an empty line fails, too."""
+    if isinstance(error, BrokenPipeError):
+        return True
+    try:
+        click.echo()
+    except OSError:
+        return True
+    return False
 
 
 def _fail(text: str, code: int) -> int:
