@@ -194,8 +194,10 @@ def read_log(path: Path | str, n: int) -> Log:
 
 
 def no_file(path: Path) -> LogError:
-    """Return the error for a log that does not exist, or is a folder."""
-    what = "found a folder that is no data source" if path.is_dir() else "file not found"
+    """Return the error for a log that does not exist, or is a folder, a device or a pipe."""
+    what = "found a device or pipe" if path.exists() else "file not found"
+    if path.is_dir():
+        what = "found a folder that is no data source"
     return LogError(f"{path}: {what}, expected a CSV or Parquet log")
 
 

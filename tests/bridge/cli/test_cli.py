@@ -345,6 +345,7 @@ def test_unusable_paths_are_refused_in_one_line(desk: Desk, command: str) -> Non
     for given, reported in (
         (("@none.csv", "--cell", "@cell.yaml", "--out", "@o.csv"), "none.csv: file not found"),
         (("@log.csv", "--cell", "@none.yaml", "--out", "@o.csv"), "none.yaml: file not found"),
+        (("@pipe", "--cell", "@cell.yaml", "--out", "@o.csv"), "pipe: found a device or pipe"),
         (("@log.csv", "--cell", "@cell.yaml", "--out", "@none/o.csv"), "found no folder"),
         (("@log.csv", "--cell", "@cell.yaml", "--out", "@log.csv"), "output to be the input"),
         (("@log.csv", "--cell", "@cell.yaml", "--out", "@cell.yaml"), "output to be the input"),
