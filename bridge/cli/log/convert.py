@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +14,14 @@ from gapbridge.bridge.document.notes import note_texts
 from gapbridge.bridge.document.output_file import require_table, write_table
 from gapbridge.core.errors import InputError, LogError
 from gapbridge.core.log.columns import PARQUET
-from gapbridge.core.log.sources import SOURCES, SourceOptions, source_of
+from gapbridge.core.log.sources import SOURCES, Source, SourceOptions, source_of
 from gapbridge.core.log.sources.ros_bag import TYPES, WRENCHES
 
 ROLES = tuple(TYPES)
+OPTIONS = {  # by the field of SourceOptions
+    one.name: "--topic" if one.name == "topics" else f"--{one.name.replace('_', '-')}"
+    for one in fields(SourceOptions)
+}
 
 
 @click.command()
@@ -67,6 +72,7 @@ def convert(source: Path, out: Path, cell: Path | None, **options: Any) -> None:
         )
     require_table(out, *([source] if source.is_file() else []), *([cell] if cell else []))
     source_options = _options(**options)
+    _require_read(kind, source_options)
     opened = open_cell(cell) if cell else None
     converted = kind.read(source, joint_names(opened) if opened else (), source_options)
     if opened is not None:
@@ -84,6 +90,15 @@ def _options(
 ) -> SourceOptions:
     names = tuple(name.strip() for name in joints.split(",")) if joints else ()
     return SourceOptions(names, _by_role(topics), wrench or "", units=units or "", **same)
+
+
+def _require_read(kind: Source, options: SourceOptions) -> None:
+    """Raise InputError for an option that this kind of source does not read."""
+    read = [OPTIONS[name] for name in kind.options]
+    for name, option in OPTIONS.items():
+        if getattr(options, name) != getattr(SourceOptions(), name) and option not in read:
+            expected = f"one of {', '.join(read)}" if read else "none of the kind"
+            raise InputError(f"{option}: found with a {kind.title}, expected {expected}")
 
 
 def _by_role(topics: tuple[str, ...]) -> dict[str, str]:

@@ -28,6 +28,7 @@ class LeRobot(Source):
 
     identifier = "lerobot"
     title = "LeRobot dataset (folder with meta/info.json)"
+    options = ("joints", "calibration", "units", "episode")
 
     def holds(self, path: Path) -> bool:
         """Return whether this is a dataset."""

@@ -60,6 +60,7 @@ class RosBag(Source):
 
     identifier = "ros_bag"
     title = "ROS 1 or ROS 2 bag, MCAP with ROS 2 messages"
+    options = ("joints", "topics", "wrench", "effort_is_torque")
 
     def holds(self, path: Path) -> bool:
         """Return whether this is a bag."""

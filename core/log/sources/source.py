@@ -67,6 +67,7 @@ class Source(ABC):
 
     identifier: ClassVar[str]
     title: ClassVar[str]
+    options: ClassVar[tuple[str, ...]] = ()  # the fields of SourceOptions that it reads
 
     @abstractmethod
     def holds(self, path: Path) -> bool:

@@ -67,12 +67,23 @@ def test_predictions_under_a_parquet_name_are_parquet(recording: Path) -> None:
         (["plain.csv", "--out", "log.csv"], "actual_q_0 is a log as it stands"),
         (["robot.csv", "--out", "log.txt"], "expected .csv or .parquet"),
         (["robot.csv", "--out", "log.csv", "--topic", "joint=x"], "--topic: found 'joint=x'"),
+        (["robot.csv", "--out", "log.csv", "--topic", "joints=/x"], "--topic: found with a record"),
+        (["robot.csv", "--out", "log.csv", "--joints", "a,b"], "expected none of the kind"),
+        (["robot.csv", "--out", "log.csv", "--episode", "0"], "--episode: found with a recording"),
+        (["robot.csv", "--out", "log.csv", "--effort-is-torque"], "--effort-is-torque: found with"),
+        (
+            ["data", "--out", "log.csv", "--wrench", "ft_raw_wrench"],
+            "expected one of --joints, --calibration, --units, --episode",
+        ),
         (["robot.csv", "--out", "robot.csv"], "found the output to be the input"),
     ],
 )
 def test_what_cannot_be_converted_is_one_line(
     recording: Path, arguments: list[str], output: str
 ) -> None:
+    dataset = recording.parent / "data" / "meta" / "info.json"
+    dataset.parent.mkdir(parents=True)
+    dataset.write_text("{}")
     with contextlib.chdir(recording.parent):
         done = gapbridge("convert", *arguments)
     assert done.code == 2
