@@ -39,6 +39,7 @@ class Mjcf(ModelFormat):
     """MuJoCo's XML."""
 
     suffixes = (".xml", ".mjcf")
+    holds_load = True
 
     def patch(self, path: Path, changes: ModelChanges, options: PatchOptions,
               notes: Sequence[str]) -> Patched:  # fmt: skip
@@ -276,14 +277,15 @@ class _Patch:
 
     def tool(self) -> None:
         """Move the TCP's site."""
+        sites = [site.name for site in self.scene.spec.sites]
+        tcp = known_name(self.scene.path, "--tcp", self.options.tcp, sites)
         if np.allclose(self.changes.tcp_shift, np.eye(4), rtol=0, atol=TOLERANCE):
             return
-        sites = [site.name for site in self.scene.spec.sites]
-        if not self.options.tcp:
+        if not tcp:
             listed = ", ".join(sites) or "none"
             self.missing.append(f"tool: name the site of the TCP with --tcp ({listed})")
             return
-        site = self.scene.spec.site(known_name(self.scene.path, "--tcp", self.options.tcp, sites))
+        site = self.scene.spec.site(tcp)
         frame = self.world @ self.changes.tcp_in_base
         motion = frame @ self.changes.tcp_shift @ np.linalg.inv(frame)
         self._place_site(site, motion @ self._site_in_world(site))
@@ -323,24 +325,23 @@ class _Patch:
 
     def load(self) -> None:
         """Change the body that models the load; where ``--load`` names none, add a mass."""
+        named = [body.name for body in self.scene.spec.bodies if body.name]
+        load = known_name(self.scene.path, "--load", self.options.load, named)
         extra = sum(s.value for s in self.changes.settings if s.kind is Kind.PAYLOAD)
         shift = self.changes.vector(Kind.PAYLOAD_COG)
         if not extra and not shift.any():
             return
-        if self.options.load:
-            self._change_load(extra, shift)
+        if load:
+            self._change_load(self.scene.spec.body(load), extra, shift)
         elif extra > 0 and not shift.any():
             self._add_load(extra)
         else:
-            bodies = ", ".join(b.name for b in self.scene.spec.bodies if b.name)
             self.missing.append(
                 f"load: {extra:+.6g} kg, centre {1e3 * np.linalg.norm(shift):.4g} mm off: name "
-                f"the body that models it with --load ({bodies})"
+                f"the body that models it with --load ({', '.join(named)})"
             )
 
-    def _change_load(self, extra: float, shift: Array) -> None:
-        named = [b.name for b in self.scene.spec.bodies if b.name]
-        body = self.scene.spec.body(known_name(self.scene.path, "--load", self.options.load, named))
+    def _change_load(self, body: Any, extra: float, shift: Array) -> None:
         element = self.scene.inertial(body)
         if element.mass + extra <= 0:
             raise InputError(

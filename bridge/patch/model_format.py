@@ -38,6 +38,7 @@ class ModelFormat(ABC):
     """One format of models."""
 
     suffixes: ClassVar[tuple[str, ...]]
+    holds_load: ClassVar[bool] = False  # whether a body of it can be named as the payload
 
     @abstractmethod
     def patch(self, path: Path, changes: ModelChanges, options: PatchOptions,
@@ -65,8 +66,8 @@ def pick_joints(
 
 
 def known_name(path: Path, option: str, name: str, names: Sequence[str]) -> str:
-    """Return ``name`` if the model has it. Raises InputError with the nearest name."""
-    if name in names:
+    """Return ``name`` if the model has it or it is ''; raises InputError with the nearest name."""
+    if not name or name in names:
         return name
     matches = difflib.get_close_matches(name, names, n=1)
     hint = f"; did you mean {matches[0]}?" if matches else f": {', '.join(names) or 'none'}"

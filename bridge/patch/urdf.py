@@ -238,11 +238,11 @@ def _tool(
     frames: dict[str, Array], changed: list[str],
 ) -> list[str]:  # fmt: skip
     """Move the TCP's link; returns what the URDF cannot represent."""
+    link = known_name(path, "--tcp", options.tcp, list(document.links))
     if np.allclose(changes.tcp_shift, np.eye(4), rtol=0, atol=TOLERANCE):
         return []
-    if not options.tcp:
+    if not link:
         return ["tool: name the fixed link of the TCP with --tcp"]
-    link = known_name(path, "--tcp", options.tcp, list(document.links))
     joint = next((j for j in document.joints if document.end(j, "child") == link), None)
     if joint is None or document.joints[joint].get("type") != "fixed":
         raise InputError(f"{path}: --tcp: found {link}, expected a link behind a fixed joint")

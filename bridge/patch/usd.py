@@ -396,17 +396,17 @@ class _Layer:
 
     def tool(self) -> None:
         """Move the Xform of the TCP, given by path or name."""
-        if np.allclose(self.changes.tcp_shift, np.eye(4), rtol=0, atol=TOLERANCE):
-            return
-        if not self.options.tcp:
-            self.missing.append("tool: name the Xform of the TCP with --tcp")
-            return
         stage = self.stage.stage
         paths = {p.GetName(): str(p.GetPath()) for p in stage.Traverse()
                  if p.IsA(self.stage.UsdGeom.Xformable)}  # fmt: skip
         tcp = self.options.tcp
-        if tcp not in paths.values():
+        if tcp and tcp not in paths.values():
             tcp = paths[known_name(self.stage.path, "--tcp", tcp, list(paths))]
+        if np.allclose(self.changes.tcp_shift, np.eye(4), rtol=0, atol=TOLERANCE):
+            return
+        if not tcp:
+            self.missing.append("tool: name the Xform of the TCP with --tcp")
+            return
         frame = self.world @ self.changes.tcp_in_base
         motion = frame @ self.changes.tcp_shift @ np.linalg.inv(frame)
         last = self.stage.last_body(self.names[-1])

@@ -22,7 +22,7 @@ from gapbridge.core.errors import InputError
 @click.option("--out", required=True, type=FILE, help="The patched model to write.")
 @click.option("--joints", metavar="A,B,...", help="The model's joints, in the order of the arm's.")
 @click.option("--tcp", metavar="NAME", help="The model's TCP: a site (MJCF) or a link (URDF).")
-@click.option("--load", metavar="NAME", help="The model's body that is the declared payload.")
+@click.option("--load", metavar="NAME", help="An MJCF's body that is the declared payload.")
 @click.option(
     "--parameters",
     type=FILE,
@@ -56,6 +56,8 @@ def patch(
     kind = format_of(model)
     if not model.is_file():
         raise InputError(f"{model}: file not found, expected a model")
+    if load and not kind.holds_load:
+        raise InputError(f"--load: found with {model}, expected an MJCF (.xml)")
     opened = open_cell(cell)
     require_writable(out, model, cell)
     options = _options(opened, out, joints, tcp, load)

@@ -154,9 +154,14 @@ def test_mujocos_own_sysid_reads_the_bounds(folder: Path) -> None:
         (["arm.urdf", "--out", "out.urdf", "--parameters", "bounds.py"], "expected an MJCF"),
         (["arm.xml", "--out", "out.xml", "--parameters", "bounds.txt"], "expected .py or"),
         (["arm.xml", "--out", "out.xml", "--parameters", "arm.xml"], "expected .py or"),
+        (["arm.xml", "--out", "out.yaml", "--parameters", "out.yaml"], "found for two outputs"),
+        (["arm.xml", "--out", "out.xml", "--tcp", "tpc"], "--tcp: found tpc"),  # it stays nominal
+        (["arm.urdf", "--out", "out.urdf", "--tcp", "tpc"], "--tcp: found tpc"),
+        (["arm.xml", "--out", "out.xml", "--load", "nope"], "--load: found nope"),
+        (["arm.urdf", "--out", "out.urdf", "--load", "link"], "--load: found with arm.urdf"),
     ],
 )
-def test_bounds_that_cannot_be_written_are_one_line(
+def test_options_that_cannot_be_used_are_one_line(
     folder: Path, arguments: list[str], output: str
 ) -> None:
     done = patch(folder, *arguments)

@@ -146,6 +146,13 @@ def test_bodies_stand_where_the_joints_have_them(tmp_path: Path, nested: bool) -
     assert np.allclose(BASE_TURN.inv().apply(at - BASE_AT), expected, rtol=0, atol=1e-5)
 
 
+def test_a_tcp_that_the_stage_lacks_is_refused_also_where_it_stays(tmp_path: Path) -> None:
+    write_stage(tmp_path / "a.usda", ARM, 1.0, nested=False)
+    kind, options = format_of(tmp_path / "a.usda"), PatchOptions(tcp="tpc")
+    with pytest.raises(InputError, match="--tcp: found tpc"):
+        kind.patch(tmp_path / "a.usda", changes_of(NOMINAL), options, [])
+
+
 def test_the_layer_holds_overs_alone_where_nothing_is_added(tmp_path: Path) -> None:
     model = NOMINAL.with_terms([*GEOMETRY, Term("coulomb_friction", Site(2), (4.0,))])
     _, found = patched(tmp_path, model)
