@@ -14,7 +14,6 @@ from gapbridge.core.log.columns import PARQUET
 
 LOGS = (".csv", *PARQUET)
 RESULTS_FILE, SESSIONS_FILE, CELL_TABLE = "results.parquet", "sessions.parquet", "cells.csv"
-OUTPUTS = (RESULTS_FILE, SESSIONS_FILE, CELL_TABLE)  # tables that a run writes
 WILDCARDS = re.compile(r"[*?\[]")
 
 
@@ -42,24 +41,24 @@ class Fleet:
 
 
 def find_sessions(
-    where: Sequence[str], pattern: str | None = None, without: Path | None = None
+    where: Sequence[str], pattern: str | None = None, without: Sequence[Path] = ()
 ) -> Fleet:
     """Return the sessions of folders, glob patterns and files.
 
     A log's arm is the first folder below the folder of the fleet; for a log in that folder itself,
     the file's name up to its first underscore. ``pattern`` is a regular expression that matches
     the arm in the path below the folder of the fleet instead (first group, or the whole match).
-    The tables of a run in ``without``, the output folder, are ignored.
+    The files ``without``, tables that a run reads or writes, are ignored.
     Raises InputError if there is no log, or ``pattern`` does not match one.
     """
     found = {log for text in where for log in _logs(text)}
-    output = None if without is None else without.absolute()
+    tables = {os.path.realpath(table) for table in without}
     logs = sorted(
-        (log for log in found if log.absolute().parent != output or log.name not in OUTPUTS),
+        (log for log in found if os.path.realpath(log) not in tables),
         key=lambda p: natural_key(str(p)),
     )
     if not logs:
-        raise InputError(f"{' '.join(where)}: found no log beside those in {without}")
+        raise InputError(f"{' '.join(where)}: found only tables of a run, expected logs")
     folder = _folder(where, logs)
     expression = _compiled(pattern)
     sessions = []

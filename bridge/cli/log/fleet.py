@@ -16,7 +16,13 @@ from gapbridge.bridge.document.output_file import require_folder
 from gapbridge.bridge.fleet.cell_source import cell_source
 from gapbridge.bridge.fleet.journal import Journal
 from gapbridge.bridge.fleet.runner import FleetRun, make_tasks, run, summary_lines
-from gapbridge.bridge.fleet.session import Fleet, find_sessions
+from gapbridge.bridge.fleet.session import (
+    CELL_TABLE,
+    RESULTS_FILE,
+    SESSIONS_FILE,
+    Fleet,
+    find_sessions,
+)
 from gapbridge.bridge.fleet.session_work import diagnose_session, fit_session
 from gapbridge.bridge.fleet.task import BAD, DONE, Outcome, SessionJob
 from gapbridge.bridge.fleet.workers.dask_workers import DaskWorkers
@@ -79,6 +85,12 @@ class FleetOptions:
     fresh: bool
     workers: int | None
     scheduler: str | None
+    cells: Path | None = None  # folder of the new cells
+
+    def tables(self) -> list[Path]:
+        """Return the tables that a run reads or writes, which may be in a folder of its logs."""
+        written = [self.out / RESULTS_FILE, self.out / SESSIONS_FILE, Path(self.cell)]
+        return written if self.cells is None else [*written, self.cells / CELL_TABLE]
 
 
 @fleet.command()
@@ -123,7 +135,7 @@ def fit(cells: Path | None, **values: Any) -> None:
     """
     if cells is not None:
         require_folder(cells, "--apply")
-    options = FleetOptions(**values)
+    options = FleetOptions(**values, cells=cells)
     done, sessions = _run("fit", fit_session, {}, options)
     from gapbridge.bridge.fleet.output import write_fit
 
@@ -137,7 +149,7 @@ def _run(
     workers, scheduler = options.workers, options.scheduler
     if workers is not None and scheduler is not None:
         raise InputError("--workers: found beside --scheduler, expected one of them")
-    sessions = find_sessions(options.logs, options.pattern, without=options.out)
+    sessions = find_sessions(options.logs, options.pattern, without=options.tables())
     cells = cell_source(options.cell, sessions.folder)
     for warning in cells.warnings():
         click.echo(f"warning: {warning}", err=True)

@@ -234,3 +234,13 @@ def test_without_the_extra_a_scheduler_is_refused_in_one_line(
     assert answer.code == 1
     assert "expected the extra 'fleet': pip install 'gapbridge[fleet]'" in answer.err
     assert answer.err.count("\n") == 1
+
+
+def test_the_tables_of_a_run_are_no_sessions_of_it(tmp_path: Path) -> None:
+    (tmp_path / "arms.csv").write_text("arm,cell\na1,a1.yaml\n")
+    new_cells = tmp_path / "new"
+    new_cells.mkdir()
+    (new_cells / "cells.csv").write_text("arm,cell\na1,a1.yaml\n")
+    line = refused("fleet", "fit", tmp_path, "--cell", tmp_path / "arms.csv", "--apply", new_cells,
+                   "--out", tmp_path / "out")  # fmt: skip
+    assert "found only tables of a run, expected logs" in line

@@ -57,12 +57,15 @@ def test_a_pattern_finds_the_arm(tmp_path: Path) -> None:
         find_sessions([str(tmp_path)], "(")
 
 
-def test_results_are_no_logs(tmp_path: Path) -> None:
-    files_in(tmp_path, "a/s.csv", "out/results.parquet")
-    assert list(arms_of(find_sessions([str(tmp_path)], without=tmp_path / "out"))) == ["a/s"]
+def test_a_runs_tables_are_no_logs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    files_in(tmp_path, "a/s.csv", "out/results.parquet", "cells.csv")
+    monkeypatch.chdir(tmp_path)
+    tables = [tmp_path / "out" / "results.parquet", Path("a/../cells.csv")]
+    assert list(arms_of(find_sessions(["."], without=tables))) == ["a/s"]
     files_in(tmp_path, "out/s.csv")  # a folder of logs as the output folder loses none
-    found = arms_of(find_sessions([str(tmp_path)], without=tmp_path / "out"))
-    assert list(found) == ["a/s", "out/s"]
+    assert list(arms_of(find_sessions(["."], without=tables))) == ["a/s", "out/s"]
+    with pytest.raises(InputError, match="found only tables of a run, expected logs"):
+        find_sessions(["cells.csv"], without=tables)
 
 
 @pytest.mark.parametrize(
