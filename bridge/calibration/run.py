@@ -153,9 +153,13 @@ def _make_plan(job: Job, joints: JointSource) -> None:
 
 
 def _report_existing_plan(job: Job) -> None:
-    """Print the plan of an earlier call with --plan-only, and warn that --poses is ignored."""
-    if job.options.poses is not None:
-        job.prompt.warn("this session already has a plan: --poses has no effect")
+    """Print the plan of an earlier call with --plan-only; warn of options that it ignores."""
+    options, seed = job.options, job.session.start_entry.get("seed")
+    for option, ignored in (
+        ("--poses", options.poses is not None), ("--seed", options.seed not in (0, seed)),
+    ):  # fmt: skip
+        if ignored:
+            job.prompt.warn(f"this session already has a plan: {option} has no effect")
     if job.options.plan_only and job.session.plan is not None:
         job.report_plan(job.session.plan)
 

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import re
 from typing import TYPE_CHECKING, Any
 
 import yaml
-from pydantic import TypeAdapter, ValidationError
+from pydantic import ValidationError
 
 from gapbridge.bridge.calibration.instruments.files import ReadingsFile, WatchedFolder
 from gapbridge.bridge.calibration.instruments.instrument import AnyInstrument
 from gapbridge.bridge.calibration.instruments.joint_only import PointContact, SphereContact
 from gapbridge.bridge.calibration.instruments.network import LineFeed, SimulatedTracker
 from gapbridge.bridge.calibration.instruments.typed import DialGauge, TwoBalls, TypedCoordinates
+from gapbridge.bridge.cell.message import validation_errors
+from gapbridge.bridge.cell.schema import CellFile
 from gapbridge.bridge.cell.settings.instruments import InstrumentSettings
 from gapbridge.core.errors import InputError
 
@@ -30,7 +33,7 @@ INSTRUMENTS: dict[str, type[AnyInstrument]] = {
     "simulated_tracker": SimulatedTracker,
 }
 """calibration.instrument.kind in a cell file -> class."""
-_SETTINGS: TypeAdapter[InstrumentSettings] = TypeAdapter(InstrumentSettings)
+SECTION = "calibration"
 
 
 def _plain(pair: str, value: str) -> Any:
@@ -50,12 +53,10 @@ def instrument_settings(cell: Cell, argument: str | None) -> InstrumentSettings:
     settings = cell.calibration.instrument
     if argument is None:
         return settings
-    kind, *pairs = (part.strip() for part in argument.split(","))
+    kind, *pairs = (part.strip() for part in re.split(r",(?![^\[]*\])", argument))
     if kind not in INSTRUMENTS:
         raise InputError(f"--instrument: found {kind!r}, expected one of {', '.join(INSTRUMENTS)}")
-    keys: dict[str, Any] = settings.model_dump() if settings.kind == kind else {}
-    keys["kind"] = kind
-    given: dict[str, Any] = {}
+    given: dict[str, Any] = {"kind": kind}
     for pair in pairs:
         name, equals, value = pair.partition("=")
         if not equals:
@@ -63,13 +64,12 @@ def instrument_settings(cell: Cell, argument: str | None) -> InstrumentSettings:
         if name.strip() in given:
             raise InputError(f"--instrument: found {name.strip()} twice, expected it once")
         given[name.strip()] = _plain(pair, value)
-    keys |= given
+    keys = settings.model_dump() | given if settings.kind == kind else given
+    sections = {"robot": {"model": "ur10e"}, SECTION: {"instrument": keys}}
     try:
-        return _SETTINGS.validate_python(keys)
+        return CellFile.model_validate(sections).calibration.instrument
     except ValidationError as error:
-        first = error.errors()[0]
-        name = ".".join(str(part) for part in first["loc"][1:])
-        message = str(first["msg"]).removeprefix("Value error, ")
+        text = validation_errors(CellFile, error)[0][1]
         raise InputError(
-            f"--instrument {kind}: {name}: {message[:1].lower()}{message[1:]}"
+            f"--instrument {kind}: {text.removeprefix(f'{SECTION}.instrument.')}"
         ) from None

@@ -194,7 +194,10 @@ def test_end_of_input_and_quit_show_how_to_resume(tmp_path: Path) -> None:
     ("arguments", "changed", "phrase"),
     [
         (["--instrument", "typd"], {}, "--instrument: found 'typd', expected one of typed"),
-        (["--instrument", "typed,unit=km"], {}, "--instrument typed: unit"),
+        (["--instrument", "typed,unit=km"], {}, "--instrument typed: unit: found 'km', expected"),
+        (["--instrument", "typed,unit=mm,sigma=true"], {}, "typed: sigma: found True, expected a"),
+        (["--instrument", "typed,kind=file"], {}, "--instrument: found kind twice"),
+        (["--instrument", "file,unit=mm,columns=[x,y],file=none/x.csv"], {}, "no such file"),
         (["--instrument", "typed,unit=["], {}, "--instrument: found 'unit=[', expected KEY=VALUE"),
         (["--instrument", "typed,unit=mm,unit=m"], {}, "--instrument: found unit twice"),
         (["--move"], {}, "calibration.joints: found 'planned' with --move, expected 'link'"),
@@ -217,6 +220,14 @@ def test_unusable_input_is_refused_in_one_line(
     assert phrase in result.err
     assert result.err.count("\n") == 1
     assert "Traceback" not in result.err
+
+
+def test_what_a_planned_session_ignores_is_told(clean: tuple[Path, CommandResult]) -> None:
+    folder = clean[0]
+    result = run_calibrate(folder / "cell.yaml", "--plan-only", "--session", folder / "s",
+                           "--seed", "3", "--poses", "20")  # fmt: skip
+    for option in ("--seed", "--poses"):
+        assert f"this session already has a plan: {option} has no effect" in result.out
 
 
 def test_a_session_resumes_only_with_its_own_cell(
