@@ -41,7 +41,8 @@ def _plain(pair: str, value: str) -> Any:
     try:
         return yaml.safe_load(value)
     except yaml.YAMLError:
-        raise InputError(f"--instrument: found {pair!r}, expected KEY=VALUE") from None
+        expected = "expected KEY=VALUE in YAML (signs in quotes)"
+        raise InputError(f"--instrument: found {pair!r}, {expected}") from None
 
 
 def instrument_settings(cell: Cell, argument: str | None) -> InstrumentSettings:
