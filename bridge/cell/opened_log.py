@@ -75,6 +75,7 @@ def joint_names(cell: Cell) -> tuple[str, ...]:
 
 def check_log(log: Log, cell: Cell) -> None:
     """Raise LogError if joint angles, units or payloads of a log are impossible for the arm."""
+    log.check_size()
     for name in ("actual_q", "target_q"):
         if np.isinf(log.columns.get(name, np.zeros(0))).any():
             log.require(name)  # names the cell

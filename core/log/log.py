@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gapbridge.core.arrays import Array, Index
+from gapbridge.core.arrays import Array, Index, Mask
 from gapbridge.core.errors import LogError
 from gapbridge.core.files import is_file, read_bytes
 from gapbridge.core.loads import Loads
@@ -45,6 +45,7 @@ PACKED: dict[bytes, str] = {  # first bytes -> what it is, and what to do
     b"\xd0\xcf\x11\xe0": "an Excel workbook: save the sheet as CSV",
 }
 UTF_16 = (b"\xff\xfe", b"\xfe\xff")
+LARGEST = 1e20  # of a number in a log: more than any clock's, and its square is finite
 STILL = 1e-6  # rad: a smaller change between rows is no motion
 
 
@@ -97,15 +98,24 @@ class Log:
         )
 
     def _check_finite(self, name: str) -> None:
-        values = self.columns[name]
-        if np.isfinite(values).all():
+        self._refuse(name, ~np.isfinite(self.columns[name]), "a finite number")
+
+    def check_size(self) -> None:
+        """Raise LogError, naming row and column, for a number too large to calculate with."""
+        for name, values in self.columns.items():
+            wrong = (np.abs(values) > LARGEST) & np.isfinite(values)
+            self._refuse(name, wrong, f"at most {LARGEST:g}")
+
+    def _refuse(self, name: str, wrong: Mask, expected: str) -> None:
+        """Raise LogError for the first cell of a column (group) that is ``wrong``."""
+        if not wrong.any():
             return
-        flat = values.reshape(len(values), -1)
-        row, column = (int(v) for v in np.argwhere(~np.isfinite(flat))[0])
-        label = name if values.ndim == 1 else f"{name}_{column}"
+        flat = self.columns[name].reshape(len(self), -1)
+        row, column = (int(v) for v in np.argwhere(wrong.reshape(flat.shape))[0])
+        label = name if wrong.ndim == 1 else f"{name}_{column}"
         raise LogError(
             f"{self.path}: row {self.line(row)}, column {label}: found "
-            f"{flat[row, column]}, expected a finite number"
+            f"{flat[row, column]}, expected {expected}"
         )
 
     def loads(self, motions: bool = True) -> Loads:

@@ -321,6 +321,7 @@ BAD_Q2 = "0,0,0,0.1,0.1,{},0.1,0.1,0.1"
         (f"{Q1}\n{ROW}\n{BAD_Q2.format('nan')}\n", ["row 3", "actual_q_2", "nan"]),
         (f"{Q1}\n{ROW}\n{BAD_Q2.format('x')}\n", ["row 3", "actual_q_2", "'x'"]),
         (f"{Q1}\n{BAD_Q2.format('inf')}\n", ["row 2", "actual_q_2", "inf"]),
+        (f"{Q1}\n{ROW}\n1e300,{ROW[4:]}\n", ["row 3", "measured_position_0", "1e+300"]),
         (f"{Q1},payload\n{ROW},-1\n", ["row 2", "payload", "-1"]),
         (f"{Q1},payload\n{ROW},1\n{ROW},400\n", ["row 3", "400 kg", "out of range", "12.5 kg"]),
         (f"{Q1},payload\n{ROW},nan\n", ["row 2", "payload", "nan"]),
