@@ -333,8 +333,7 @@ def _limit(block, nominal, corrected, offset, ramp, actual, dt):  # type: ignore
             clamped |= 1 << VELOCITY
     arrives = np.empty(n)
     for i in range(n):
-        step_to = pace * (nominal[i] - reached[i])
-        arrives[i] = nominal[i] if pace == 1.0 else reached[i] + step_to
+        arrives[i] = nominal[i] if pace == 1.0 else reached[i] + pace * (nominal[i] - reached[i])
         if abs(nominal[i] - arrives[i]) > numbers[5]:
             return _LAGS, i
     goal, speed_factor = np.empty(n), 1.0

@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING
 
 import click
 
+from gapbridge.core.errors import InputError
+
 if TYPE_CHECKING:
     from gapbridge.bridge.cell import Cell
     from gapbridge.core.log.log import Log
@@ -31,6 +33,17 @@ csv_option = click.option(
     type=FILE,
     help="The file to write: CSV, or Parquet if it ends in .parquet.",
 )
+
+
+def require_effects(names: Iterable[str]) -> None:
+    """Raise InputError for a name of --withhold that is no effect's."""
+    from gapbridge.core.effects import effect_named
+
+    for name in names:
+        try:
+            effect_named(name)
+        except InputError as error:
+            raise InputError(f"--withhold: {error}") from None
 
 
 def open_cell(path: Path) -> Cell:

@@ -213,11 +213,11 @@ class SetpointStream:
             gap = self.limiter.limits.cycle
         usable = min(max(gap, 0.0), self._longest_gap)
         stream = self._nominal
-        if source_q is not None:
-            source_q = self._without_start_gap(source_q, usable)
         if source_q is None:
             self.limiter.settle()
-        nominal = stream.brake(usable) if source_q is None else source_q
+            nominal = stream.brake(usable)
+        else:
+            nominal = self._without_start_gap(source_q, usable)
         correction = self.correct(nominal, loads)
         corrected, offset, n = correction.q, correction.offset_in_base, len(nominal)
         if self.residual < SOLVED:

@@ -10,7 +10,6 @@ from collections.abc import Callable
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gapbridge.core.arrays import Array
 from gapbridge.core.errors import (
@@ -309,8 +308,8 @@ class TargetWriter:
                 raise WriteError(f"{self._transport.name}: the last target failed: {words}")
         if self._target is None or self._now() - self._since < self._entry.following:
             return
-        if self._off_target(sample).any():
-            away = np.abs(sample.vectors["position"] - self._target)
+        away = self._off_target(sample)
+        if away.any():
             joint = int(np.argmax(away))
             self._armed = False
             raise WriteError(
@@ -318,11 +317,11 @@ class TargetWriter:
                 f"{away[joint]:.4f} rad from where it was sent {self._entry.following:g} s ago"
             )
 
-    def _off_target(self, sample: Sample) -> NDArray[np.bool_]:
-        """Return which joints (n,) have not reached the last target."""
+    def _off_target(self, sample: Sample) -> Array:
+        """Return how far each joint is from the last target (n,), rad; 0: it has reached it."""
         assert self._target is not None
         away = np.abs(sample.vectors["position"] - self._target)
-        return away > TARGET_TOLERANCE * abs(self._size) + 2e-3
+        return np.where(away > TARGET_TOLERANCE * abs(self._size) + 2e-3, away, 0.0)
 
     def _write_all(self, writes: list[RegisterWrite]) -> None:
         for write in writes:

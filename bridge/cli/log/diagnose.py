@@ -19,6 +19,7 @@ from gapbridge.bridge.cli.options import (
     open_cell,
     open_logs,
     remounted_option,
+    require_effects,
     warn_outside,
 )
 from gapbridge.bridge.cli.progress import status
@@ -28,7 +29,6 @@ from gapbridge.bridge.document.output_file import require_folder, require_writab
 from gapbridge.bridge.document.provenance import provenance
 from gapbridge.core.diagnosis.diagnosis import Diagnosis, channels_of
 from gapbridge.core.diagnosis.diagnosis import diagnose as diagnose_log
-from gapbridge.core.effects import effect_named
 from gapbridge.core.errors import InputError, LogError
 from gapbridge.core.log.log import Log
 from gapbridge.core.metrology import Metrology
@@ -101,7 +101,7 @@ def diagnose(
     opened = open_cell(cell)
     rows = open_logs(logs, opened)
     warn_outside(rows, opened)
-    _check_effects(withhold)
+    require_effects(withhold)
     simulated = None if sim is None else open_simulated(sim, opened, rows)
     output.require_writable(*logs, cell, *([sim] if sim else []))
     with status("diagnosing") as emit:
@@ -161,11 +161,3 @@ def _diagnose(
     except InputError as error:
         text = str(error)
         raise LogError(text if text.startswith(log.path) else f"{log.path}: {text}") from None
-
-
-def _check_effects(names: tuple[str, ...]) -> None:
-    for name in names:
-        try:
-            effect_named(name)
-        except InputError as error:
-            raise InputError(f"--withhold: {error}") from None

@@ -10,7 +10,7 @@ from typing import Any
 
 import click
 
-from gapbridge.bridge.cli.options import FILE
+from gapbridge.bridge.cli.options import FILE, require_effects
 from gapbridge.bridge.cli.progress import progress
 from gapbridge.bridge.document.output_file import require_folder
 from gapbridge.bridge.fleet.cell_source import cell_source
@@ -28,7 +28,6 @@ from gapbridge.bridge.fleet.task import BAD, DONE, Outcome, SessionJob
 from gapbridge.bridge.fleet.workers.dask_workers import DaskWorkers
 from gapbridge.bridge.fleet.workers.local_workers import LocalWorkers
 from gapbridge.bridge.fleet.workers.workers import Workers
-from gapbridge.core.effects import effect_named
 from gapbridge.core.errors import InputError, RunError
 
 OUT = Path("out/fleet")
@@ -107,11 +106,7 @@ def diagnose(withhold: tuple[str, ...], **values: Any) -> None:
 
     Example: gapbridge fleet diagnose 'logs/*/2026-*.csv' --cell arms.csv --workers 8
     """
-    for name in withhold:
-        try:
-            effect_named(name)
-        except InputError as error:
-            raise InputError(f"--withhold: {error}") from None
+    require_effects(withhold)
     options = FleetOptions(**values)
     done, sessions = _run("diagnose", diagnose_session, {"withhold": list(withhold)}, options)
     from gapbridge.bridge.fleet.output import write_diagnosis

@@ -1,4 +1,4 @@
-"""The samples that are searched stand for all: of every session, and of what alternates."""
+"""The samples that are searched represent all: every session, and what alternates."""
 
 from __future__ import annotations
 

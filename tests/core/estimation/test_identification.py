@@ -253,7 +253,7 @@ def test_one_pose_shows_too_little_for_a_held_out_figure():
 
 @pytest.mark.parametrize("repeats", [40, 110])
 def test_repeats_of_a_pose_leave_together_also_in_a_long_log(monkeypatch, repeats):
-    """A fit that saw a repeat of the judged pose would foretell its noise."""
+    """A fit that saw a repeat of the judged pose would have fitted its noise."""
     seen = []
 
     def drawn(groups):
