@@ -12,6 +12,7 @@ Algorithms" (2008), ch. 5.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
@@ -26,6 +27,7 @@ from gapbridge.core.model import Model
 from gapbridge.core.motion import Contributions, Motion
 
 MIN_MASS = 1e-6  # kg, of a link, to divide a first moment by
+MOMENTS = 16  # whose torques are kept: one of each link, and the steps of a Jacobian
 
 
 class Frames(NamedTuple):
@@ -96,8 +98,10 @@ def contributions_of(model: Model, motion: Motion) -> Contributions:
             _at_flange(sensor, point_at_sensor, -force, zeros),
         )
 
-    def link_from(i: int, moment: Array) -> Array:
-        shift = moment / max(float(chain.mass[i]), MIN_MASS)
+    # a fit varies one term at a time, the others keep their moments
+    @functools.lru_cache(maxsize=MOMENTS)
+    def link_from(i: int, moment: tuple[float, ...]) -> Array:
+        shift = np.array(moment) / max(float(chain.mass[i]), MIN_MASS)
         return link_at(i, chain.cog[i] + shift) - link_torque[:, i]
 
     payload_torque, payload_wrench = payload_from(np.zeros(3))

@@ -52,7 +52,7 @@ class Contributions:
     # torques (N, n) and wrench (N, 6) per kg of payload, its centre shifted by (3,) m, flange axes
     payload_from: Callable[[Array], tuple[Array, Array]]
     # torques (N, n) that a first moment (3,) kg m of a link (from 0) takes more, link axes
-    link_from: Callable[[int, Array], Array]
+    link_from: Callable[[int, tuple[float, ...]], Array]
 
 
 @dataclass(frozen=True)
@@ -105,6 +105,10 @@ class Motion:
     def direction(self) -> Array:
         """Return the sign of motion (N, n), smooth within the speeds at which it is unsure."""
         return np.asarray(np.tanh(4.0 * self.qd / self.still))
+
+    def direction_of(self, joint: int) -> Array:
+        """Return the direction (N,) of one joint (from 0)."""
+        return np.asarray(np.tanh(4.0 * self.qd[:, joint] / self.still[joint]))
 
     @property
     def turning(self) -> Mask:

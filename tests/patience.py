@@ -9,13 +9,16 @@ from typing import Any
 PATIENCE = 120.0  # s
 
 
-def wait_for(what: Callable[[], Any], words: str, within: float = PATIENCE) -> Any:
+def wait_for(
+    what: Callable[[], Any], words: str | Callable[[], str], within: float = PATIENCE
+) -> Any:
     """Wait until ``what`` returns something true, and return it; ``words`` say what was missed.
 
     ``within`` (s) is for tests whose subject is time, which are marked ``realtime``.
     """
     begun = time.monotonic()
     while not (found := what()):
-        assert time.monotonic() - begun < within, f"{words}: not within {within:g} s"
+        late = time.monotonic() - begun >= within
+        assert not late, f"{words() if callable(words) else words}: not within {within:g} s"
         time.sleep(0.01)
     return found

@@ -128,7 +128,9 @@ def main(log_level: str) -> int:
     settings = pickle.load(sys.stdin.buffer)
 
     def wait_for_parent() -> None:
-        os.read(sys.stdin.fileno(), 1)  # a daemon thread in a buffered read ends Python badly
+        # unbuffered: a daemon thread in a buffered read ends Python badly
+        while os.read(sys.stdin.fileno(), 4096):
+            pass  # what an attack on the pipes of a run has written
         stopped.append(0)
 
     threading.Thread(target=wait_for_parent, daemon=True).start()

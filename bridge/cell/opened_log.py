@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from gapbridge.core.load_bounds import PAYLOAD_FACTOR
 from gapbridge.core.log.alignment import aligned
 from gapbridge.core.log.log import Log, read_log
 from gapbridge.core.log.sources import SourceOptions, source_of
+from gapbridge.core.notes import Note
 from gapbridge.core.rotation import rotation_matrix, rotation_vector
 
 
@@ -33,11 +35,16 @@ def open_log(path: Path, cell: Cell) -> Log:
             converted = source.read(path, joint_names(cell), SourceOptions())
         except LogOptionError as error:
             raise LogError(f"{error} (options of gapbridge convert)") from None
-        for note in note_texts(converted.notes):
-            click.echo(f"note: {path}: {note}", err=True)
+        show_notes(path, converted.notes)
         log = converted.log(path, cell.arm.n)
     check_log(log, cell)
     return log
+
+
+def show_notes(path: Path, notes: Iterable[Note]) -> None:
+    """Print what reading a log has noted."""
+    for note in note_texts(notes):
+        click.echo(f"note: {path}: {note}", err=True)
 
 
 def open_simulated(path: Path, cell: Cell, log: Log) -> Log:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,10 +15,12 @@ from gapbridge.bridge.cell.message import located
 from gapbridge.bridge.cell.runtime_folder import cell_key, runtime_folder
 from gapbridge.bridge.cell.sections import SetpointSettings
 from gapbridge.bridge.served.credentials import SETPOINT_TOKEN, check_credentials, read_token
-from gapbridge.core.errors import InputError
+from gapbridge.core.errors import CellError, InputError
 from gapbridge.core.files import read_bytes, recorded
 from gapbridge.core.fitted_range import Range
 from gapbridge.core.model import Model
+
+LONGEST_SOCKET = 107  # bytes of its path, as Linux limits it: unix(7)
 
 
 @dataclass(frozen=True)
@@ -89,7 +92,10 @@ def settings_of(cell: Cell) -> DaemonSettings:
 
 
 def _setpoint_settings(cell: Cell) -> SetpointSettings:
-    """Return section ``setpoints`` with absolute paths, its token checked. Raises InputError."""
+    """Return section ``setpoints`` with absolute paths. Raises InputError.
+
+    Its token and its socket's path are checked.
+    """
     section = cell.setpoints
     update = {
         name: path.resolve()
@@ -98,6 +104,22 @@ def _setpoint_settings(cell: Cell) -> SetpointSettings:
     }
     if section.source == "planner" and section.socket is None:
         update["socket"] = runtime_folder() / f"{cell_key(cell.path)}.planner.sock"
+    elif section.source == "planner":
+        _require_socket_path(update["socket"])
     if section.source == "tcp" and section.token_file is not None:
         read_token(section.token_file, SETPOINT_TOKEN)
     return section.model_copy(update=update)
+
+
+def _require_socket_path(path: Path) -> None:
+    """Raise CellError unless a Unix socket can be made at ``path``."""
+    found = ""
+    if not path.parent.is_dir():
+        found = f"found no folder {path.parent}"
+    elif path.exists() and not path.is_socket():
+        found = f"found a {'folder' if path.is_dir() else 'file'}"
+    elif (length := len(os.fsencode(path))) > LONGEST_SOCKET:
+        found = f"found {length} bytes"
+    if found:
+        expected = f"a path for a Unix socket, of at most {LONGEST_SOCKET} bytes"
+        raise CellError(f"{path}: {found}, expected {expected}", ("setpoints", "socket"))

@@ -83,6 +83,8 @@ def natural_key(text: str) -> list[tuple[int, int, str]]:
 def _logs(text: str) -> list[Path]:
     path = Path(text)
     if path.is_dir():
+        if not os.access(path, os.R_OK | os.X_OK):
+            raise InputError(f"{text}: this user may not read the folder, expected logs")
         found = [p for p in path.rglob("*") if p.suffix.lower() in LOGS and p.is_file()]
         if not found:
             raise InputError(f"{text}: found no log in this folder, expected CSV or Parquet files")

@@ -108,9 +108,10 @@ def read_columns(path: Path, reported_only: bool = False) -> dict[str, Array]:
 def last_batch(path: Path) -> Batch | None:
     """Return the last batch of one file that holds cycles, without reading the whole file."""
     with path.open("rb") as file:
-        chunks = list(records.chunk_offsets(file, path))
         decoder = _Decoder(path)
-        if chunks:  # schemas and channels stand in the first one
+        decoder.take(records.definitions(file))
+        chunks = list(records.chunk_offsets(file, path))
+        if chunks:  # of a file that was not finished, schemas and channels stand in the first one
             decoder.take(records.read_chunk(file, *chunks[0]))
         for offset, length in reversed(chunks):
             contents = records.read_chunk(file, offset, length)
@@ -123,6 +124,7 @@ def last_batch(path: Path) -> Batch | None:
 def _read_file(path: Path) -> Iterator[Batch]:
     with path.open("rb") as file:
         decoder = _Decoder(path)
+        decoder.take(records.definitions(file))  # its first chunk, which has them, may be damaged
         for offset, length in records.chunk_offsets(file, path):
             batch = decoder.take(records.read_chunk(file, offset, length))
             if batch is not None:

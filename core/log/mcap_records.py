@@ -19,6 +19,7 @@ import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
+from mcap.reader import SeekingReader
 from mcap.records import Channel, Chunk, Schema
 from mcap.stream_reader import get_chunk_data_stream
 from mcap.writer import MCAP0_MAGIC
@@ -76,6 +77,7 @@ def all_records(file: IO[bytes], path: Path) -> Iterator[tuple[int, int, int]]:
     where there is none. Raises LogError where it is no MCAP file.
     """
     size = os.fstat(file.fileno()).st_size
+    file.seek(0)
     magic = file.read(len(MCAP0_MAGIC))
     if magic != MCAP0_MAGIC[: len(magic)]:
         raise LogError(f"{path}: found no MCAP file, expected a recording of the daemon")
@@ -151,6 +153,17 @@ def read_chunk(file: IO[bytes], offset: int, length: int) -> Contents | None:
         return None if chunk is None else _contents(chunk[1])
     except BROKEN:
         return None
+
+
+def definitions(file: IO[bytes]) -> Contents | None:
+    """Return the schemas and channels that a finished file repeats at its end, None without."""
+    try:
+        summary = SeekingReader(file).get_summary()
+    except (*BROKEN, OSError):
+        return None
+    if summary is None:
+        return None
+    return Contents(list(summary.schemas.values()), list(summary.channels.values()), [])
 
 
 def unpacked(file: IO[bytes], offset: int, length: int) -> tuple[Chunk, bytes] | None:

@@ -89,10 +89,15 @@ class _CheckedSocket(ssl.SSLSocket):
 
 
 class Transport:
-    """Requests to one device; ``allow`` is the list of what may be written."""
+    """Requests to one device; ``allow`` is the list of what may be written.
+
+    Raises InputError where a file of the encryption cannot be used.
+    """
 
     def __init__(self, settings: ModbusSettings, port: int, device_id: int) -> None:
         self._settings, self._port, self._device = settings, port, device_id
+        if settings.transport == "tls":
+            checked_context(settings)  # files that cannot be used are no reason to try again
         self._writable: frozenset[tuple[Table, int]] = frozenset()
         self._allowed: set[tuple[Table, int, int]] = set()  # runs that were looked up before
         self._client: Any = None
@@ -315,6 +320,10 @@ def checked_context(settings: ModbusSettings) -> ssl.SSLContext:
     ``fingerprint`` it must be that very one, whatever name it has. Raises InputError where a file
     cannot be used.
     """
+    for name in ("authority", "certificate", "key"):
+        path = getattr(settings, name)
+        if path is not None and not path.is_file():
+            raise InputError(f"{path}: found no file, expected PEM", ("link", name))
     context = CheckedContext(ssl.PROTOCOL_TLS_CLIENT)
     context.sslsocket_class = _CheckedSocket
     context.minimum_version = ssl.TLSVersion.TLSv1_2

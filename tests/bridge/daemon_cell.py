@@ -133,7 +133,7 @@ class Run:
             assert self.error is None, self.error
             return self.daemon.state == state
 
-        wait_for(there, f"{state.name} ({self.output})")
+        wait_for(there, lambda: f"{state.name} ({self.output})")
 
     def compensate(self) -> None:
         """Arm, again as a person does where a busy machine ended the motion at once."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from gapbridge.bridge.cell import Cell
-from gapbridge.bridge.cell.opened_log import check_log, open_log
+from gapbridge.bridge.cell.opened_log import check_log, open_log, show_notes
 from gapbridge.core.effects import by_approach
 from gapbridge.core.errors import LogError
 from gapbridge.core.log.columns import PARQUET
@@ -33,10 +33,11 @@ class LargeLog:
     def __iter__(self) -> Iterator[Log]:
         """Yield the pieces. Raises LogError, as ``open_log`` does."""
         files = [self.path]
-        if not self.path.is_file():
-            from gapbridge.core.log.mcap_reading import files_of  # imports protobuf
+        if source_of(self.path) is not None:
+            from gapbridge.core.log.mcap_reading import damages, files_of  # imports protobuf
 
             files = files_of(self.path)
+            show_notes(self.path, damages(self.path))
         for file in files:
             for piece in LogPieces(file, self.cell.arm.n, self.rows, self.motions):
                 check_log(piece, self.cell)

@@ -37,4 +37,4 @@ class CoulombFriction(TorqueEffect):
 
     def added(self, term: Term, i: int, motion: Motion) -> Array:
         """Return the friction that the motor overcomes."""
-        return term.values[0] * motion.direction[:, i]
+        return term.values[0] * motion.direction_of(i)

@@ -60,4 +60,4 @@ class LinkCog(JointEffect):
         assert motion.pieces is not None
         i, moment = term.site.index, np.array(term.values)
         in_link = moment if arm.body_axes is None else arm.body_axes[i] @ moment
-        return torque + motion.pieces.link_from(i, in_link)
+        return torque + motion.pieces.link_from(i, tuple(in_link.tolist()))

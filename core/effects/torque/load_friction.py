@@ -40,4 +40,4 @@ class LoadFriction(TorqueEffect):
         import numpy as np
 
         assert motion.load is not None
-        return term.values[0] * np.abs(motion.load[:, i]) * motion.direction[:, i]
+        return term.values[0] * np.abs(motion.load[:, i]) * motion.direction_of(i)

@@ -46,4 +46,4 @@ class StribeckFriction(TorqueEffect):
 
         speed = max(abs(term.values[1]), SLOWEST)
         fading = np.exp(-((motion.qd[:, i] / speed) ** 2))
-        return term.values[0] * fading * motion.direction[:, i]
+        return term.values[0] * fading * motion.direction_of(i)

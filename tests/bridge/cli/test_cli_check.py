@@ -297,6 +297,23 @@ def test_a_trajectory_of_any_length_is_checked(tmp_path: Path) -> None:
     assert (answer.code, answer.err) == (0, "")
 
 
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [("none.pem", None, "link.authority: {folder}/none.pem: found no file, expected PEM"),
+     ("ca.pem", "no PEM", "link: authority, certificate, key: ")],
+)  # fmt: skip
+def test_files_of_an_encrypted_link_are_found_unusable(
+    name: str, text: str | None, message: str, tmp_path: Path
+) -> None:
+    if text is not None:
+        (tmp_path / name).write_text(text)
+    link = f"{{driver: modbus, profile: ur, host: 127.0.0.1, transport: tls, authority: {name}}}"
+    answer = gapbridge("check", cell_of(tmp_path, f"link: {link}"))
+    assert answer.code == 2
+    assert message.format(folder=tmp_path) in answer.err
+    assert "line 2" in answer.err
+
+
 def test_a_recording_that_is_none_is_refused_in_one_line(tmp_path: Path) -> None:
     path, log = tmp_path / "cell.yaml", tmp_path / "log.mcap"
     path.write_text("robot: {model: ur10e}\n")

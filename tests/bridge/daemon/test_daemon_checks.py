@@ -163,7 +163,7 @@ def test_what_a_person_changes_in_the_controller_during_a_run_is_held_and_not_co
         run.compensate()
         time.sleep(0.8)
         script(robot, line)
-        wait_for(lambda: cause in " ".join(run.output), f"{cause} ({run.output})")
+        wait_for(lambda: cause in " ".join(run.output), lambda: f"{cause} ({run.output})")
         run.wait(State.OBSERVING)
         assert cause.split(": ")[-1] in refusal(run)
         run.end()

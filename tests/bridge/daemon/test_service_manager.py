@@ -135,7 +135,8 @@ def test_the_unit_is_sandboxed_and_not_root() -> None:
     assert service["CapabilityBoundingSet"] == ""
     assert service["ProtectSystem"] == "strict"
     assert service["KillMode"] == "mixed"
-    assert "AF_CAN" in service["RestrictAddressFamilies"]
+    assert {"AF_CAN", "AF_INET", "AF_INET6"} <= {*service["RestrictAddressFamilies"].split()}
+    assert service["Restart"] == "on-failure"  # a trajectory's end is none
     assert float(service["WatchdogSec"]) > 3
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 from datetime import UTC, datetime
 from pathlib import Path
@@ -12,11 +13,13 @@ from click.testing import CliRunner
 from pyarrow import parquet
 from recorded import Desk, N, publish, same_bits
 
+from gapbridge.bridge.cell import load_cell
+from gapbridge.bridge.cli.log.large_log import LargeLog
 from gapbridge.bridge.cli.main import gapbridge
 from gapbridge.bridge.recording.export import Span, export, moment
 from gapbridge.core.errors import InputError, LogError
 from gapbridge.core.log.log import read_log
-from gapbridge.core.log.mcap_reading import read_batches
+from gapbridge.core.log.mcap_reading import last_batch, read_batches
 from gapbridge.core.log.mcap_records import chunk_offsets
 
 
@@ -114,6 +117,43 @@ def test_behind_a_damaged_chunk_reading_goes_on_and_the_file_stays_as_it_is(
     assert f"warning: {path.name}: chunk at byte {start - 9} is damaged: " in done.output
     assert " bytes were left out\n" in done.output
     assert path.read_bytes() == before
+
+
+def test_a_finished_file_is_read_where_its_first_chunk_is_damaged(
+    desk: Desk, tmp_path: Path
+) -> None:
+    rows = desk.record(20, 20)
+    (path,) = desk.files
+    with path.open("rb") as file:
+        start = next(chunk_offsets(file, path))[0]
+    raw = bytearray(path.read_bytes())
+    raw[start + 60] ^= 0x10
+    path.write_bytes(raw)
+    out = tmp_path / "l.csv"
+    done = CliRunner().invoke(gapbridge, ["export", str(path), "--out", str(out)])
+    assert done.exit_code == 0, done.output
+    assert f"warning: {path.name}: chunk at byte {start - 9} is damaged: " in done.output
+    kept = read_log(out, N).require("timestamp")  # that chunk held the file's definitions only
+    assert same_bits(kept, rows[:, desk.memory.slices["timestamp"]].ravel().copy())
+    batch = last_batch(path)
+    assert batch is not None and len(batch)
+
+
+def test_a_recording_read_in_pieces_tells_what_is_damaged(
+    desk: Desk, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    desk.record(20, 20, 20)
+    (path,) = desk.files
+    with path.open("rb") as file:
+        start = list(chunk_offsets(file, path))[1][0]
+    raw = bytearray(path.read_bytes())
+    raw[start + 60] ^= 0x10
+    path.write_bytes(raw)
+    cell = tmp_path / "cell.yaml"
+    cell.write_text("robot: {model: ur10e}\n")
+    with contextlib.suppress(LogError):  # its numbers are no arm's
+        next(iter(LargeLog(path, load_cell(cell))))
+    assert re.search(rf"note: {re.escape(str(path))}: .*is damaged: ", capsys.readouterr().err)
 
 
 def test_the_command_writes_beside_the_recording_and_gives_the_cell_back(

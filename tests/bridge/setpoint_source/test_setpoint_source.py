@@ -445,6 +445,24 @@ def test_a_planners_socket_is_in_the_runtime_folder_unless_the_cell_names_one(
     assert settings_of(load_cell(path)).setpoints.socket == tmp_path / "here.sock"
 
 
+@pytest.mark.parametrize(
+    ("name", "found"),
+    [("folder", "found a folder"), ("cell.yaml", "found a file"), ("no/s", "found no folder "),
+     ("s" * 108, "bytes, expected a path for a Unix socket, of at most 107 bytes")],
+)  # fmt: skip
+def test_a_path_that_no_socket_can_have_is_found_before_a_run(
+    name: str, found: str, tmp_path: Path
+) -> None:
+    (tmp_path / "folder").mkdir()
+    path = tmp_path / "cell.yaml"
+    path.write_text(
+        "robot: {model: ur10e}\nlink: {host: 127.0.0.1}\n"
+        f"setpoints: {{source: planner, socket: {name}}}\n"
+    )
+    with pytest.raises(CellError, match=rf"line 3: .*{found}"):
+        settings_of(load_cell(path))
+
+
 def test_what_came_while_nobody_read_is_no_setpoint(feed: PlannerSource) -> None:
     """Arming takes a while: lines of that time are of unknown age, and not counted either."""
     with planner(feed) as link:

@@ -51,8 +51,10 @@ def read_on(driver: Driver, count: int = 1000) -> None:
 
 def check_reads(driver: Driver, model: Model, count: int = 8) -> list[RobotState]:
     """States are complete, finite, recent, and time goes on."""
-    states = [next_state(driver) for _ in range(count)]
-    n = model.arm.n
+    states, n = [], model.arm.n
+    for _ in range(count):
+        states.append(next_state(driver))
+        assert time.monotonic() - states[-1].received < 5.0
     for state in states:
         assert state.actual_q.shape == state.actual_qd.shape == state.target_q.shape == (n,)
         assert state.actual_TCP_force.shape == (6,)
@@ -61,7 +63,6 @@ def check_reads(driver: Driver, model: Model, count: int = 8) -> list[RobotState
         for name in ("joint_temperatures", "actual_current_as_torque"):
             found = getattr(state, name)
             assert found is None or (found.shape == (n,) and np.isfinite(found).all()), name
-        assert time.monotonic() - state.received < 5.0
     times = np.diff([s.timestamp for s in states])
     assert (times > 0.0).all()
     assert (np.diff([s.received for s in states]) > 0.0).all()

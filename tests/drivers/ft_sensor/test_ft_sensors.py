@@ -31,7 +31,7 @@ from sensor_wires import (
 )
 
 from gapbridge.core.errors import LinkError
-from gapbridge.drivers.ft_sensor import FT_SENSORS, make_sensor, robotiq_ft300
+from gapbridge.drivers.ft_sensor import FT_SENSORS, make_sensor
 from gapbridge.drivers.ft_sensor.joined import sensor_to_flange
 from gapbridge.drivers.simulated.ft_sensor.ati_node import AtiNode, RobotousNode
 from gapbridge.drivers.simulated.ft_sensor.ft300_device import Ft300Device
@@ -182,7 +182,6 @@ def test_a_request_read_together_with_what_ends_the_stream_is_answered() -> None
 def test_a_stream_that_is_slow_to_start_is_waited_for(
     late: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(robotiq_ft300, "TRIES", int(PATIENCE))  # of a second each
     device = Ft300Device(Reaction())
     wire, pass_bytes, begun = Wire(device, {"driver": "robotiq_ft300"}), device._pass_bytes, []
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import os
 import select
@@ -18,6 +19,7 @@ import pytest
 from contract_checks import OFFSET, check_reads, next_state, read_on, setpoint_of, stream, write
 from contract_modbus import ModbusCase
 from evil_proxy import EvilProxy, Ruin
+from patience import wait_for
 from ports import free_port
 
 from benchmarks.server_thread import ServerThread
@@ -27,6 +29,8 @@ from gapbridge.drivers.modbus.settings import ModbusSettings
 from gapbridge.drivers.simulated.modbus.server import ModbusServer
 
 QUICK = {"timeout": 0.25, "state_timeout": 0.5}
+# both ends are in this busy process: an answer may take longer than a cell allows
+PATIENT = {"timeout": 5.0}
 
 
 @pytest.fixture
@@ -42,8 +46,23 @@ def proxy(case: ModbusCase) -> Iterator[EvilProxy]:
         yield found
 
 
-def driver_through(case: ModbusCase, proxy: EvilProxy) -> ModbusDriver:
-    return ModbusDriver(case.settings.model_copy(update={"port": proxy.port, **QUICK}), case.model)
+@contextlib.contextmanager
+def driver_through(case: ModbusCase, proxy: EvilProxy) -> Iterator[ModbusDriver]:
+    driver = ModbusDriver(
+        case.settings.model_copy(update={"port": proxy.port, **QUICK}), case.model
+    )
+
+    def is_connected() -> bool:
+        with contextlib.suppress(StaleStateError):  # both ends are in this busy process
+            driver.connect()
+            return True
+        return False
+
+    wait_for(is_connected, "a link")
+    try:
+        yield driver
+    finally:
+        driver.close()
 
 
 def other_function(answer: bytes) -> bytes:
@@ -105,7 +124,7 @@ def test_a_late_answer_is_never_taken_for_the_next_ones(case: ModbusCase, proxy:
         proxy.wait = 0.0
         goal = (case.controller.q[0] + 0.2, *case.controller.q[1:])
         case.controller.move_own(goal)
-        time.sleep(1.5)
+        wait_for(lambda: np.abs(np.subtract(case.controller.q, goal)).max() < 1e-9, "the pose")
         assert np.abs(next_state(driver).actual_q - goal).max() <= case.resolution
 
 
@@ -131,6 +150,7 @@ def test_a_readings_time_is_the_longest_way_of_its_state(
         assert 0.02 <= driver.transit_time() <= (driver.round_trip() or 0.0)
 
 
+@pytest.mark.realtime
 def test_an_offset_whose_answer_is_lost_once_is_sent_once_more(
     case: ModbusCase, proxy: EvilProxy
 ) -> None:
@@ -206,7 +226,7 @@ def test_the_contract_holds_over_mutual_tls(keys: Path) -> None:
     settings = ModbusSettings(
         profile="ur", host=case.host, port=port, transport="tls", rate=50.0,
         authority=keys / "ca.pem", certificate=keys / "client.pem", key=keys / "client.key",
-    )  # fmt: skip
+    ).model_copy(update=PATIENT)  # fmt: skip
     with ServerThread(case.controller, [server], case.host):
         with ModbusDriver(settings, case.model) as driver:
             check_reads(driver, case.model)
@@ -230,11 +250,11 @@ def test_over_tls_only_the_named_or_the_pinned_controller_is_let_in(keys: Path) 
     server = ModbusServer(case.robot_file, case.host, port, tls=context)
     base = {"profile": "ur", "host": case.host, "port": port, "transport": "tls", "rate": 50.0}
     with ServerThread(case.controller, [server], case.host):
-        named = ModbusSettings(**base, authority=keys / "ca.pem")
+        named = ModbusSettings(**base, authority=keys / "ca.pem").model_copy(update=PATIENT)
         with pytest.raises(LinkError, match="certificate is refused: IP address mismatch"):
             ModbusDriver(named, case.model).connect()
         for more in ({}, {"authority": keys / "ca.pem"}):
-            pinned = ModbusSettings(**base, fingerprint=own, **more)
+            pinned = ModbusSettings(**base, fingerprint=own, **more).model_copy(update=PATIENT)
             with ModbusDriver(pinned, case.model) as driver:
                 check_reads(driver, case.model)
             changed = pinned.model_copy(update={"fingerprint": "0" * 64})
@@ -286,8 +306,7 @@ def test_the_contract_holds_over_a_serial_line() -> None:
     settings = ModbusSettings(
         profile="ur", transport="rtu", serial=ours, baudrate=115200, rate=20.0
     )
-    # both ends of the line are in this busy process: an answer may take longer than a cell allows
-    settings = settings.model_copy(update={"timeout": 5.0})
+    settings = settings.model_copy(update=PATIENT)
     with (
         ServerThread(case.controller, [server], case.host),
         ModbusDriver(settings, case.model) as driver,
