@@ -129,3 +129,12 @@ def test_a_table_that_cannot_be_used_is_reported(text: str, reported: str, tmp_p
 
 def test_any_other_word_is_one_cell_for_all(tmp_path: Path) -> None:
     assert cell_source("cell.yaml", tmp_path) == OneCell(Path("cell.yaml"))
+
+
+def test_a_folder_that_may_not_be_read_is_told_as_such(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    files_in(tmp_path, "a/s1.csv")
+    monkeypatch.setattr("os.access", lambda *_: False)  # root may read everything
+    with pytest.raises(InputError, match="this user may not read the folder"):
+        find_sessions([str(tmp_path)])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import re
 from datetime import UTC, datetime
 from pathlib import Path
@@ -99,6 +100,16 @@ def test_gaps_and_a_clock_that_goes_back_are_reported(desk: Desk, tmp_path: Path
     assert "row 12: the controller's clock goes back" in done.output
 
 
+def damage(path: Path, chunk: int, place: int = 60) -> int:
+    """Flip a bit ``place`` bytes behind where the data of a chunk begins; returns where that is."""
+    with path.open("rb") as file:
+        start = list(chunk_offsets(file, path))[chunk][0]
+    raw = bytearray(path.read_bytes())
+    raw[start + place] ^= 0x10
+    path.write_bytes(raw)
+    return start
+
+
 @pytest.mark.parametrize("place", [-9, -8, -7, 60])
 @pytest.mark.parametrize("whole", [True, False])
 def test_behind_a_damaged_chunk_reading_goes_on_and_the_file_stays_as_it_is(
@@ -106,11 +117,9 @@ def test_behind_a_damaged_chunk_reading_goes_on_and_the_file_stays_as_it_is(
 ) -> None:
     desk.record(20, 20, 20)
     (path,) = desk.files
-    with path.open("rb") as file:
-        start = list(chunk_offsets(file, path))[2][0]
-    raw = bytearray(path.read_bytes())
-    raw[start + place] ^= 0x10  # in the chunk's opcode, its length, its data
-    path.write_bytes(raw if whole else raw[:-8])
+    start = damage(path, 2, place)  # in the chunk's opcode, its length, its data
+    if not whole:
+        os.truncate(path, path.stat().st_size - 8)
     before = path.read_bytes()
     done = CliRunner().invoke(gapbridge, ["export", str(path), "--out", str(tmp_path / "l.csv")])
     assert "l.csv: 40 cycles over" in done.output, done.output
@@ -124,11 +133,7 @@ def test_a_finished_file_is_read_where_its_first_chunk_is_damaged(
 ) -> None:
     rows = desk.record(20, 20)
     (path,) = desk.files
-    with path.open("rb") as file:
-        start = next(chunk_offsets(file, path))[0]
-    raw = bytearray(path.read_bytes())
-    raw[start + 60] ^= 0x10
-    path.write_bytes(raw)
+    start = damage(path, 0)
     out = tmp_path / "l.csv"
     done = CliRunner().invoke(gapbridge, ["export", str(path), "--out", str(out)])
     assert done.exit_code == 0, done.output
@@ -144,11 +149,7 @@ def test_a_recording_read_in_pieces_tells_what_is_damaged(
 ) -> None:
     desk.record(20, 20, 20)
     (path,) = desk.files
-    with path.open("rb") as file:
-        start = list(chunk_offsets(file, path))[1][0]
-    raw = bytearray(path.read_bytes())
-    raw[start + 60] ^= 0x10
-    path.write_bytes(raw)
+    damage(path, 1)
     cell = tmp_path / "cell.yaml"
     cell.write_text("robot: {model: ur10e}\n")
     with contextlib.suppress(LogError):  # its numbers are no arm's
