@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 import threading
-import time
 from collections import deque
 
 import numpy as np
@@ -21,6 +20,7 @@ from gapbridge.core.model import Model
 from gapbridge.core.motion import Motion
 from gapbridge.core.rotation import rpy_matrix, skew
 from gapbridge.core.state import RobotState, Setpoint
+from gapbridge.drivers.clock import Clock
 from gapbridge.drivers.controller_facts import ControllerFacts, Difference
 from gapbridge.drivers.driver import Driver
 from gapbridge.drivers.ft_sensor import make_sensor
@@ -45,7 +45,7 @@ class DriverWithSensor(Driver):
         self.gate = arm.gate
         self.settings = settings
         self._arm = arm
-        self._reader = SensorReader(make_sensor(settings), settings)
+        self._reader = SensorReader(make_sensor(settings), settings, arm.clock)
         self._clock = ClockOffset()
         self._to_flange = sensor_to_flange(settings.sensor_in_flange)
         self._tcp_force = TcpForce(model) if settings.tcp_force == "sensor" else None
@@ -233,8 +233,9 @@ def _motion_at_rest(model: Model) -> Motion:
 class SensorReader:
     """Stores the last samples of a sensor. A broken link is reopened until it works."""
 
-    def __init__(self, sensor: ForceTorqueSensor, settings: FtSensorSettings) -> None:
+    def __init__(self, sensor: ForceTorqueSensor, settings: FtSensorSettings, clock: Clock) -> None:
         self._sensor, self._settings = sensor, settings
+        self._now = clock.monotonic  # the age of samples is measured by it
         self._readings: deque[Reading] = deque(maxlen=KEPT)
         self._broken = ""  # why the link is broken
         self._stopping = threading.Event()
@@ -246,9 +247,10 @@ class SensorReader:
         self._stopping.clear()
         self._readings.clear()
         self._sensor.connect()
+        self._new_sample.clear()
         self._thread = threading.Thread(target=self._run, name="ft-sensor", daemon=True)
         self._thread.start()
-        if not self.wait(self._settings.connect_timeout):
+        if not self._new_sample.wait(self._settings.connect_timeout):
             self.stop()
             raise LinkError(
                 f"{self._sensor.name}: found no sample within {self._settings.connect_timeout:g} s"
@@ -309,7 +311,7 @@ class SensorReader:
 
     def _require_fresh(self, readings: list[Reading]) -> None:
         limit = self._settings.max_age
-        age = time.monotonic() - readings[-1].timestamp if readings else float("inf")
+        age = self._now() - readings[-1].timestamp if readings else float("inf")
         if age > limit:
             raise StaleStateError(
                 f"{self._sensor.name}: found the last sample {age:.3f} s old{self._why()}, "

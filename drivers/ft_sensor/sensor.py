@@ -32,7 +32,8 @@ class ClockOffset:
         self._last = sensor_time
         if self._offset is None or gap < 0.0 or lead - self._offset > JUMP:
             self._offset = lead
-        self._offset = min(lead, self._offset + DRIFT * gap)
+        else:
+            self._offset = min(lead, self._offset + DRIFT * gap)
         return min(sensor_time + self._offset, received)
 
 
