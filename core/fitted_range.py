@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 
 from gapbridge.core.arrays import Array, Mask
+from gapbridge.core.log.columns import scalars
 from gapbridge.core.log.log import Log
 from gapbridge.core.log.log_finding import LogCheck, LogFinding
 from gapbridge.core.sessions import sessions_in
@@ -122,12 +123,4 @@ def _columns(log: Log) -> dict[str, Array]:
         "joint_temperatures": log.get("joint_temperatures"),
         "actual_TCP_force": log.get("actual_TCP_force"),
     }
-    result: dict[str, Array] = {}
-    for name, column in columns.items():
-        if column is None:
-            continue
-        if column.ndim == 1:
-            result[name] = column
-        else:
-            result |= {f"{name}_{i}": column[:, i] for i in range(column.shape[1])}
-    return result
+    return scalars(columns)

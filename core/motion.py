@@ -75,6 +75,17 @@ class Motion:
     load: Array | None = None  # (N, n) Nm of the rigid arm with payload and pull, no friction
     held: Array | None = None  # (N, n) Nm that each joint holds at rest: gravity, payload, pull
 
+    @classmethod
+    def at_rest(cls, q: Array, loads: Loads) -> Motion:
+        """Return N rows of an arm that rests at ``q`` (N, n), rad; without times."""
+        count, n = q.shape
+        return cls(
+            t=np.zeros(count), q=q, qd=np.zeros_like(q), qdd=np.zeros_like(q), target_q=None,
+            loads=loads, rows=np.arange(count), valid=np.ones(count, dtype=bool),
+            stretch=np.zeros(count, dtype=np.int64), start=0.0, moving=False,
+            still=np.full(n, SMALLEST_MOTION),
+        )  # fmt: skip
+
     def __len__(self) -> int:
         return len(self.t)
 
@@ -153,15 +164,14 @@ def _motion_of(log: Log) -> Motion:
                     f"{log.path}: row {line}, column timestamp: found {first:g} again (as in "
                     f"{repeated} of {count} rows), expected a time of its own per row"
                 )
-    still = np.full(q.shape[1], SMALLEST_MOTION)
     measured_qd = log.require("actual_qd")[rows] if log.has("actual_qd") else None
     target = log.require("target_q")[rows] if log.has("target_q") else None
-    motion = Motion(
-        t=t, q=q[rows], qd=np.zeros_like(q[rows]) if measured_qd is None else measured_qd,
-        qdd=np.zeros_like(q[rows]), target_q=target, loads=log.loads()[rows], rows=rows,
-        valid=np.ones(len(rows), dtype=bool), stretch=np.zeros(len(rows), dtype=np.int64),
-        start=float(t[0]), moving=moving, still=still,
+    motion = replace(
+        Motion.at_rest(q[rows], log.loads()[rows]),
+        t=t, target_q=target, rows=rows, start=float(t[0]), moving=moving,
     )  # fmt: skip
+    if measured_qd is not None:
+        motion = replace(motion, qd=measured_qd)
     session = log.columns["session"][rows] if log.session_names else np.zeros(len(rows))
     return _with_derivatives(motion, measured_qd, np.diff(session) != 0) if moving else motion
 

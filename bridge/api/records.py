@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import json
-import math
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from gapbridge.bridge.cell import Cell, save_cell
+from gapbridge.bridge.document.json_text import finite
 from gapbridge.bridge.document.output_file import (
     require_folder,
     require_table,
@@ -22,6 +19,7 @@ from gapbridge.bridge.document.output_file import (
 from gapbridge.bridge.document.provenance import fitted, provenance
 from gapbridge.core.arrays import Array, Mask
 from gapbridge.core.fitted_range import range_of
+from gapbridge.core.log.columns import as_table
 from gapbridge.core.log.log import Log
 from gapbridge.core.model import Model
 
@@ -61,9 +59,8 @@ class Predicted:
 
         Key ``provenance`` holds version, time, arguments, SHA-256 of log and cell.
         """
-        columns: dict[str, Any] = {name: _plain(values) for name, values in self.columns.items()}
         origin = provenance(self.sources, "predict", channels=bool(self.channels or self.needs))
-        return {**columns, "provenance": origin}
+        return {**finite(self.columns), "provenance": origin}
 
 
 @dataclass(frozen=True)
@@ -112,7 +109,7 @@ class Fitted:
         """Return the figures as lists and numbers."""
         return {
             "axial": self.axial.tolist(), "radial": self.radial.tolist(),
-            "std_axial": _finite(self.std_axial), "std_radial": _finite(self.std_radial),
+            "std_axial": finite(self.std_axial), "std_radial": finite(self.std_radial),
             "shown": self.shown.tolist(), "samples": self.samples, "gap_rms": self.gap_rms,
             "remaining_rms": self.remaining_rms,
             "remaining_rms_held_out": self.remaining_rms_held_out, "notes": list(self.notes),
@@ -189,25 +186,6 @@ class Diagnosed:
         return tuple(dict.fromkeys(effects))
 
 
-def as_table(columns: Mapping[str, Array]) -> tuple[list[str], Array]:
-    """Return the names (k) and values (N, k) of columns by the names of their vectors."""
-    names: list[str] = []
-    for name, values in columns.items():
-        names += [name] if values.ndim == 1 else [f"{name}_{i}" for i in range(values.shape[1])]
-    return names, np.column_stack(list(columns.values()))
-
-
 def _save(cell: Cell, path: Path | str, model: Model, origin: dict[str, Any]) -> None:
     """Write a cell. Raises InputError where it cannot be written, or is the one it came from."""
     save_cell(cell, require_writable(Path(path), cell.path), model, {"provenance": origin})
-
-
-def _finite(values: Array) -> list[float | None]:
-    return [float(v) if math.isfinite(v) else None for v in values]
-
-
-def _plain(values: Array) -> list[Any]:
-    """Return numbers as lists, None where there is none."""
-    plain = values.astype(object)
-    plain[~np.isfinite(values)] = None
-    return list(plain.tolist())

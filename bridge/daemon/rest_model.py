@@ -82,13 +82,7 @@ class RestModel:
 
     def _predicted(self, q: Array, mass: float, cog: Array) -> Array:
         """Return the rigid arm's readings (N, 6 + n) at rest."""
-        count, still = len(q), np.zeros(q.shape)
-        motion = Motion(
-            t=np.zeros(count), q=q, qd=still, qdd=still, target_q=None,
-            loads=Loads(np.full(count, mass), np.tile(cog, (count, 1))), rows=np.arange(count),
-            valid=np.ones(count, dtype=bool), stretch=np.zeros(count, dtype=np.int64), start=0.0,
-            moving=False, still=np.ones(self._n),
-        )  # fmt: skip
-        motion = with_pieces(self._model, motion)
+        loads = Loads(np.full(len(q), mass), np.tile(cog, (len(q), 1)))
+        motion = with_pieces(self._model, Motion.at_rest(q, loads))
         wrench, torque = predict_wrench(self._model, motion), predict_torque(self._model, motion)
         return np.hstack([wrench, torque])

@@ -12,6 +12,7 @@ from gapbridge.bridge.demo.poses import Load
 from gapbridge.bridge.document.output_file import write_table
 from gapbridge.core.arrays import Array
 from gapbridge.core.errors import RunError
+from gapbridge.core.log.columns import as_table
 from gapbridge.core.rotation import mean_rotation
 
 MAX_STILL_SPEED = 0.003  # rad/s, fastest joint of an arm at rest
@@ -150,7 +151,4 @@ def write_log(path: Path, measurements: Measurements, joints: bool = True) -> No
     }
     if not joints:
         del columns["actual_q"]
-    names: list[str] = []
-    for name, values in columns.items():
-        names += [name] if values.ndim == 1 else [f"{name}_{i}" for i in range(values.shape[1])]
-    write_table(path, names, np.hstack([v.reshape(len(v), -1) for v in columns.values()]))
+    write_table(path, *as_table(columns))

@@ -10,7 +10,7 @@ from gapbridge.core.arrays import Array
 from gapbridge.core.kernels.single import LEVER
 from gapbridge.core.loads import Loads
 from gapbridge.core.model import Model
-from gapbridge.core.planning.travel import shortest_order
+from gapbridge.core.planning.travel import ordered_poses
 
 CANDIDATES = 400
 
@@ -111,17 +111,6 @@ def informative(model: Model, q: Array, load: Load, count: int, information: Arr
     return np.array(chosen)
 
 
-def visit_order(q: Array, start: Array) -> Array:
-    """Return the order of the poses (N, n) on a short path from ``start`` (n,)."""
-    between, first = _joint_distance(q, q), _joint_distance(start[None], q)[0]
-    return np.array(shortest_order(between, first), dtype=int)
-
-
-def _joint_distance(q: Array, to: Array) -> Array:
-    """Return the largest joint motion (A, B), rad, from ``q`` (A, n) to ``to`` (B, n)."""
-    return np.asarray(np.abs(q[:, None] - to[None]).max(axis=2))
-
-
 @dataclass(frozen=True)
 class Plan:
     """Poses of the whole demo, in the order of the visits."""
@@ -140,13 +129,12 @@ def plan(model: Model, home: Array, seed: int, experiment: Experiment = UR10E) -
     for load in experiment.calibration_loads:
         chosen = informative(model, free, load, experiment.calibration_poses, information)
         used |= set(chosen.tolist())
-        calibration.append(free[chosen][visit_order(free[chosen], home)])
+        calibration.append(ordered_poses(free[chosen], home))
     position = model.rigid_pose(free).position
     far = np.flatnonzero(np.hypot(position[:, 0], position[:, 1]) > experiment.workspace.far)
     unused = free[[i for i in far if i not in used]]
     tests = []
     for k in range(len(experiment.test_loads)):
         chosen_poses = unused[k * experiment.test_poses : (k + 1) * experiment.test_poses]
-        chosen_poses = chosen_poses[visit_order(chosen_poses, home)]
-        tests.append(np.tile(chosen_poses, (experiment.visits[k], 1)))
+        tests.append(np.tile(ordered_poses(chosen_poses, home), (experiment.visits[k], 1)))
     return Plan(tuple(calibration), tuple(tests))

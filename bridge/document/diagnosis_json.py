@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 from gapbridge.bridge.document.findings import considered_text, finding_text
+from gapbridge.bridge.document.json_text import finite
 from gapbridge.bridge.document.parameter_entries import parameter_entries
 from gapbridge.core.diagnosis.across_sessions import SessionTransfer
 from gapbridge.core.diagnosis.causes import Cause
@@ -39,7 +39,7 @@ def document(diagnosis: Diagnosis) -> dict[str, Any]:
         "findings": [finding_text(f) for f in diagnosis.findings],
         "sessions": list(diagnosis.sessions),
     }
-    cleaned: dict[str, Any] = _finite(values)
+    cleaned: dict[str, Any] = finite(values)
     return cleaned
 
 
@@ -122,15 +122,3 @@ def _across(transfer: SessionTransfer, sessions: tuple[str, ...]) -> dict[str, A
             for s, parameters in transfer.values
         ],
     }
-
-
-def _finite(value: Any) -> Any:
-    """Return the value with numbers that JSON does not have (NaN, infinity) as None."""
-    if isinstance(value, dict):
-        return {k: _finite(v) for k, v in value.items()}
-    if isinstance(value, list):
-        return [_finite(v) for v in value]
-    if isinstance(value, bool) or value is None or isinstance(value, str | int):
-        return value
-    number = float(value)
-    return number if math.isfinite(number) else None

@@ -7,18 +7,23 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
+
 
 def json_text(document: Mapping[str, Any], separators: tuple[str, str] | None = None) -> str:
     """Return a document as JSON; values of other types are written as text."""
     try:
         return json.dumps(document, default=str, allow_nan=False, separators=separators)
     except ValueError:
-        return json.dumps(_finite(document), default=str, separators=separators)
+        return json.dumps(finite(document), default=str, separators=separators)
 
 
-def _finite(value: Any) -> Any:
+def finite(value: Any) -> Any:
+    """Return a value as JSON has it: NaN and infinity as None, arrays and tuples as lists."""
+    if isinstance(value, np.ndarray | np.generic):
+        value = value.tolist()
     if isinstance(value, Mapping):
-        return {key: _finite(item) for key, item in value.items()}
+        return {key: finite(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_finite(item) for item in value]
+        return [finite(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value

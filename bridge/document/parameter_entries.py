@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable
 from typing import Any
 
+from gapbridge.bridge.document.json_text import finite
 from gapbridge.core.effects import Reported
 
 
@@ -18,7 +18,7 @@ def parameter_entries(parameters: Iterable[Reported]) -> list[dict[str, Any]]:
     entries: list[dict[str, Any]] = []
     for p in parameters:
         entries.append(
-            {"name": p.name, "value": _finite(p.value), "std": _finite(p.std), "unit": p.unit}
+            {"name": p.name, "value": finite(p.value), "std": finite(p.std), "unit": p.unit}
         )
         if p.session:
             name = session_parameter(p)
@@ -29,7 +29,3 @@ def parameter_entries(parameters: Iterable[Reported]) -> list[dict[str, Any]]:
 def session_parameter(moment: Reported) -> str:
     """Return the name under which the first session after a moment is listed."""
     return moment.name.removesuffix("_time") + "_session"
-
-
-def _finite(value: float | None) -> float | None:
-    return None if value is None or not math.isfinite(value) else float(value)

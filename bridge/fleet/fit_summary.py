@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import norm
 
+from gapbridge.bridge.document.json_text import finite
 from gapbridge.bridge.fleet.drift import ChannelFigure, Drift, Figure, Outlier, significant
 from gapbridge.bridge.fleet.task import Outcome, by_arm
 from gapbridge.core.arrays import Array
@@ -168,7 +169,7 @@ def flexibility_rows(fleet: FleetFit) -> Iterator[dict[str, Any]]:
                 yield shared | {
                     "level": "arm", "arm": arm.name, "own_share": float(arm.fit.own_share[j]),
                     "scatter": float(kind.scatter.between_sessions[j]),
-                    "drift": _finite(arm.fit.drift[j]), "drift_std": _finite(arm.fit.drift_std[j]),
+                    "drift": finite(arm.fit.drift[j]), "drift_std": finite(arm.fit.drift_std[j]),
                     "drift_per": "session",
                 } | _interval(arm.fit.flexibility[j], arm.fit.std[j])  # fmt: skip
                 for session in arm.sessions:
@@ -194,7 +195,3 @@ def _interval(value: float, std: float) -> dict[str, float]:
     return {"value": float(value), "std": float(std),
             "low": max(float(value - 1.96 * std), 0.0),
             "high": float(value + 1.96 * std)}  # fmt: skip
-
-
-def _finite(value: float) -> float | None:
-    return float(value) if math.isfinite(value) else None

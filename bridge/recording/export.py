@@ -14,7 +14,7 @@ import numpy as np
 from gapbridge.bridge.document.output_file import replacing_bytes
 from gapbridge.bridge.recording.finishing import finish_recording
 from gapbridge.core.errors import InputError, LogError
-from gapbridge.core.log.columns import COLUMNS, PARQUET
+from gapbridge.core.log.columns import COLUMNS, PARQUET, scalars
 from gapbridge.core.log.mcap_reading import Batch, read_batches
 from gapbridge.core.log.mcap_schema import ENUM_FIELD
 
@@ -158,13 +158,10 @@ def _columns_of(recording: Path, first: int, last: int) -> list[str]:
 def _table(batch: Batch, columns: list[str]) -> pyarrow.Table:
     import pyarrow
 
-    arrays: dict[str, Any] = {}
-    for name in columns:
-        values = batch.columns[name]
-        if values.ndim == 1:
-            arrays[name] = values
-        else:
-            arrays.update((f"{name}_{i}", values[:, i].copy()) for i in range(values.shape[1]))
+    arrays: dict[str, Any] = {
+        name: values.copy()
+        for name, values in scalars({name: batch.columns[name] for name in columns}).items()
+    }
     arrays[ENUM_FIELD] = [_state(batch, value) for value in batch.columns[ENUM_FIELD]]
     return pyarrow.table(arrays)
 

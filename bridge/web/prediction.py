@@ -41,7 +41,7 @@ class Prediction:
             model = resolve_name(self._settings.model_source)(self._settings.cell).model
             # compiles before the first use
             q = np.zeros(model.arm.n)
-            self._predict(model, q[None], Loads())
+            predict_wrench(model, Motion.at_rest(q[None], Loads()))
             bend = np.linalg.norm(skeleton(model, q)[-1] - skeleton(model.without_terms(), q)[-1])
         except (GapbridgeError, ValueError, AttributeError, ImportError):
             return
@@ -103,7 +103,7 @@ class Prediction:
         if not np.isfinite(q).all():
             return nothing
         try:
-            return self._predict(model, q, loads)
+            return predict_wrench(model, Motion.at_rest(q, loads))
         except GapbridgeError:  # no equilibrium under this load
             return nothing
 
@@ -118,14 +118,3 @@ class Prediction:
             wrench=force if np.isfinite(force).all() else None,
             temperature=temperature if np.isfinite(temperature).all() else None,
         )
-
-    @staticmethod
-    def _predict(model: Model, q: Array, loads: Loads) -> Array:
-        count, n = q.shape
-        still = np.zeros((count, n))
-        motion = Motion(
-            t=np.zeros(count), q=q, qd=still, qdd=still, target_q=None, loads=loads,
-            rows=np.arange(count), valid=np.ones(count, dtype=bool),
-            stretch=np.zeros(count, dtype=np.int64), start=0.0, moving=False, still=np.zeros(n),
-        )  # fmt: skip
-        return predict_wrench(model, motion)

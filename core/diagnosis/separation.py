@@ -267,12 +267,9 @@ def _loads_of_motion(
 
 
 def _motion(model: Model, trials: Trials) -> Motion:
-    count = len(trials.q)
-    return Motion(
-        t=np.full(count, trials.time), q=trials.q, qd=trials.qd, qdd=trials.qdd, target_q=None,
-        loads=trials.loads, rows=np.arange(count), valid=np.ones(count, dtype=bool),
-        stretch=np.zeros(count, dtype=np.int64), start=trials.start,
-        moving=bool(trials.qd.any()),
+    return replace(
+        Motion.at_rest(trials.q, trials.loads), t=np.full(len(trials.q), trials.time),
+        qd=trials.qd, qdd=trials.qdd, start=trials.start, moving=bool(trials.qd.any()),
         still=STILL * max_speed(model),
     )  # fmt: skip
 
@@ -288,13 +285,11 @@ def _encoder_angles(model: Model, trials: Trials) -> Predict:
     )
     speed = (trials.qd[:, None] + trials.qdd[:, None] * t).reshape(-1, n)
     offset = np.arange(count)[:, None] * 10.0 * LEAD  # trials in sequence
-    motion = Motion(
-        t=(trials.time + offset + before[None]).ravel(), q=q, qd=speed,
-        qdd=np.repeat(trials.qdd, k, axis=0), target_q=q,
-        loads=trials.loads[np.repeat(np.arange(count), k)],
-        rows=np.arange(count * k), valid=np.ones(count * k, dtype=bool),
-        stretch=np.repeat(np.arange(count), k), start=trials.start, moving=True,
-        still=STILL * max_speed(model),
+    trial = np.repeat(np.arange(count), k)
+    motion = replace(
+        Motion.at_rest(q, trials.loads[trial]), t=(trials.time + offset + before[None]).ravel(),
+        qd=speed, qdd=trials.qdd[trial], target_q=q, stretch=trial, start=trials.start,
+        moving=True, still=STILL * max_speed(model),
     )  # fmt: skip
     motion = with_holding_torque(model, motion)
     return lambda terms: predict_tracking(model, motion, terms)[k - 1 :: k]

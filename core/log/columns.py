@@ -7,7 +7,11 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from gapbridge.core.arrays import Array
 
 PARQUET = (".parquet", ".pq")  # endings of a name
 # name -> number of columns: 0 = one column without index, None = one per joint
@@ -53,6 +57,25 @@ def indices(name: str, n: int) -> list[str]:
     """Return the suffixes of ``name`` in the columns of an arm of n joints: '_0', ... or ''."""
     count = COLUMNS[name]
     return [""] if count == 0 else [f"_{i}" for i in range(n if count is None else count)]
+
+
+def scalars(columns: Mapping[str, Array | None]) -> dict[str, Array]:
+    """Return each scalar (N,) of columns (N,) or (N, k) by its name in a log; None is left out."""
+    result: dict[str, Array] = {}
+    for name, values in columns.items():
+        if values is None:
+            continue
+        if values.ndim == 1:
+            result[name] = values
+        else:
+            result |= {f"{name}_{i}": values[:, i] for i in range(values.shape[1])}
+    return result
+
+
+def as_table(columns: Mapping[str, Array | None]) -> tuple[list[str], Array]:
+    """Return the names (k) and values (N, k) of the scalars of columns (N,) or (N, m)."""
+    named = scalars(columns)
+    return list(named), np.column_stack(list(named.values()))
 
 
 def written(name: str, n: int) -> str:

@@ -215,19 +215,10 @@ def _sensor_correction(model: Model) -> tuple[Array, Array]:
         effect = CATALOGUE[term.effect]
         # errors of the sensor; a drift needs the time of its log
         if effect.channels == ("wrench",) and "timestamp" not in effect.needs:
-            probes = effect.sense(term, model.arm, probes, _motion_at_rest(model))
+            at_rest = Motion.at_rest(np.zeros((len(probes), model.arm.n)), Loads())
+            probes = effect.sense(term, model.arm, probes, at_rest)
     bias = probes[0]
     return np.linalg.inv((probes[1:] - bias).T), bias
-
-
-def _motion_at_rest(model: Model) -> Motion:
-    """Return seven rows of an arm at rest, for the probes."""
-    zeros, rows = np.zeros((7, model.arm.n)), np.arange(7)
-    return Motion(
-        t=np.zeros(7), q=zeros, qd=zeros, qdd=zeros, target_q=None, loads=Loads(), rows=rows,
-        valid=np.ones(7, dtype=bool), stretch=np.zeros(7, dtype=np.int64), start=0.0,
-        moving=False, still=np.zeros(model.arm.n),
-    )  # fmt: skip
 
 
 class SensorReader:

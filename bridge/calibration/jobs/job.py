@@ -27,6 +27,7 @@ from gapbridge.core.calibration.payload_session import PayloadCalibration
 from gapbridge.core.calibration.plan import Expectation, Payload, Plan, PlannedPose
 from gapbridge.core.calibration.readings import Readings
 from gapbridge.core.calibration.tool_session import ToolCalibration
+from gapbridge.core.log.columns import as_table
 from gapbridge.core.model import Model
 
 NO_EXPECTATION = Expectation((), (), np.zeros(0), np.zeros(0), float("nan"), float("nan"))
@@ -151,20 +152,16 @@ def write_log(readings: Readings, registered: bool, path: Path) -> None:
     rows = readings if registered else readings[readings.station == 0]
     if rows.kind in ("position", "pose"):
         rows = rows[rows.target == 0]
-    n, loads = rows.q.shape[1], rows.loads
-    columns: dict[str, np.ndarray[tuple[int, ...], np.dtype[np.float64]]] = {
+    loads = rows.loads
+    placed = rows.kind in ("position", "pose")
+    columns = {
         "timestamp": np.arange(len(rows), dtype=float),
-        **{f"actual_q_{i}": rows.q[:, i] for i in range(n)},
+        "actual_q": rows.q,
+        "payload": loads.payload_mass,
+        "payload_cog": loads.payload_cog,
+        "approach": loads.approach,
+        "joint_temperatures": loads.temperature,
+        "measured_position": rows.value[:, :3] if placed else None,
+        "measured_rotation": rows.value[:, 3:] if rows.kind == "pose" else None,
     }
-    if loads.payload_mass is not None and loads.payload_cog is not None:
-        columns["payload"] = loads.payload_mass
-        columns |= {f"payload_cog_{i}": loads.payload_cog[:, i] for i in range(3)}
-    if loads.approach is not None:
-        columns |= {f"approach_{i}": loads.approach[:, i] for i in range(n)}
-    if loads.temperature is not None:
-        columns |= {f"joint_temperatures_{i}": loads.temperature[:, i] for i in range(n)}
-    if rows.kind in ("position", "pose"):
-        columns |= {f"measured_position_{i}": rows.value[:, i] for i in range(3)}
-    if rows.kind == "pose":
-        columns |= {f"measured_rotation_{i}": rows.value[:, 3 + i] for i in range(3)}
-    write_table(path, list(columns), np.column_stack(list(columns.values())))
+    write_table(path, *as_table(columns))

@@ -11,7 +11,7 @@ import click
 import numpy as np
 
 from gapbridge.bridge.api.functions import predict as predict_log
-from gapbridge.bridge.api.records import Predicted, as_table
+from gapbridge.bridge.api.records import Predicted
 from gapbridge.bridge.cell import Cell
 from gapbridge.bridge.cli.log.large_log import pieces_of
 from gapbridge.bridge.cli.options import (
@@ -24,6 +24,7 @@ from gapbridge.bridge.cli.options import (
 from gapbridge.bridge.cli.progress import progress
 from gapbridge.bridge.document.output_file import require_table, writing_table
 from gapbridge.core.arrays import Array
+from gapbridge.core.log.columns import as_table
 from gapbridge.core.log.log import Log
 from gapbridge.core.predicted_channels import predicted_channels, with_neighbours
 

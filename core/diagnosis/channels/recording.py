@@ -13,6 +13,7 @@ from gapbridge.core.diagnosis.criteria import MIN_TORQUE_CHANGE, STEPPED_SHARE
 from gapbridge.core.diagnosis.observation import HELD_TORQUE
 from gapbridge.core.diagnosis.thinning import drawn
 from gapbridge.core.estimation.held_out import pose_groups
+from gapbridge.core.log.columns import scalars
 from gapbridge.core.log.log import Log
 from gapbridge.core.motion import Motion
 from gapbridge.core.sessions import session_of
@@ -67,15 +68,11 @@ def quantities(log: Log, motion: Motion) -> dict[str, Array]:
 
 def varying(columns: Mapping[str, Array | None]) -> dict[str, Array]:
     """Return each scalar (N,) of columns (N,) or (N, k) that varies, by its name in the log."""
-    varied: dict[str, Array] = {}
-    for name, values in columns.items():
-        if values is None:
-            continue
-        table = values.reshape(len(values), -1)
-        for i in range(table.shape[1]):
-            if np.isfinite(table[:, i]).all() and np.ptp(table[:, i]) > CONSTANT_SPREAD:
-                varied[name if values.ndim == 1 else f"{name}_{i}"] = table[:, i]
-    return varied
+    return {
+        name: values
+        for name, values in scalars(columns).items()
+        if np.isfinite(values).all() and np.ptp(values) > CONSTANT_SPREAD
+    }
 
 
 def held_torques(motion: Motion) -> dict[str, Array]:

@@ -133,14 +133,8 @@ def _predicted(
     model: Model, log: Log, q: Array, name: str, pull: Array | None, rows: Index
 ) -> Array:
     """Return the prediction of a channel at rest; accelerations matter little to a sign."""
-    count, n = len(rows), model.arm.n
-    nothing = np.zeros((count, n))
-    motion = Motion(
-        t=np.zeros(count), q=q[rows], qd=nothing, qdd=nothing, target_q=None,
-        loads=_loads(log, rows, pull), rows=rows, valid=np.ones(count, dtype=bool),
-        stretch=np.zeros(count, dtype=np.int64), start=0.0, moving=False, still=np.ones(n),
-    )  # fmt: skip
     predictor = predict_wrench if name == "ft_raw_wrench" else predict_torque
+    motion = Motion.at_rest(q[rows], _loads(log, rows, pull))
     return predictor(replace(model, terms=()), motion)
 
 

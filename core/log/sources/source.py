@@ -8,11 +8,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import ClassVar
 
-import numpy as np
-
 from gapbridge.core.arrays import Array
 from gapbridge.core.errors import LogError
-from gapbridge.core.log.columns import COLUMNS
+from gapbridge.core.log.columns import COLUMNS, as_table
 from gapbridge.core.log.log import Log
 from gapbridge.core.notes import Note
 
@@ -43,14 +41,7 @@ class Converted:
 
     def table(self) -> tuple[list[str], Array]:
         """Return names and values (N, k) of the log's columns, indices written out."""
-        names: list[str] = []
-        parts: list[Array] = []
-        for name in (name for name in COLUMNS if name in self.columns):
-            values = self.columns[name].reshape(len(self), -1)
-            single = COLUMNS[name] == 0
-            names += [name] if single else [f"{name}_{i}" for i in range(values.shape[1])]
-            parts.append(values)
-        return names, np.hstack(parts)
+        return as_table({name: self.columns[name] for name in COLUMNS if name in self.columns})
 
     def log(self, path: Path, n: int) -> Log:
         """Return the log of an arm of n joints. Raises LogError where the source has not n."""
