@@ -51,10 +51,25 @@ class Stream:
         )
 
     def hold(self, offset: tuple[float, ...], cycles: int) -> dict[str, Any]:
+        """Send an offset for so many cycles, and on until it is applied and echoed.
+
+        A busy machine that lets the heartbeat rest begins the ramp anew.
+        """
         for _ in range(cycles):
-            self.send(offset)
-            sample = self.client.sample()
+            sample = self._cycle(offset)
+        begun = time.monotonic()
+        while not (
+            sample["output_int_register_12"] >= self.sequence - 2
+            and sample["output_int_register_13"] == 1
+            and applied(sample) == pytest.approx(offset, abs=1e-12)
+        ):
+            assert time.monotonic() - begun < PATIENCE, sample
+            sample = self._cycle(offset)
         return sample
+
+    def _cycle(self, offset: tuple[float, ...]) -> dict[str, Any]:
+        self.send(offset)
+        return self.client.sample()
 
     def wait(self, cycles: int) -> dict[str, Any]:
         for _ in range(cycles):
@@ -92,9 +107,6 @@ def stream(controller: SimulatedController) -> Iterator[Stream]:
 def test_an_offset_is_applied_in_base_axes_and_echoed(stream: Stream) -> None:
     before = stream.client.sample()
     after = stream.hold(OFFSET, 200)
-    assert after["output_int_register_13"] == 1
-    assert after["output_int_register_12"] >= stream.sequence - 2
-    assert applied(after) == pytest.approx(OFFSET, abs=1e-12)
     moved = shift(before, after)
     assert moved == pytest.approx(OFFSET[:3], abs=1e-8)
     assert after["target_q"] != before["target_q"]
@@ -102,13 +114,14 @@ def test_an_offset_is_applied_in_base_axes_and_echoed(stream: Stream) -> None:
 
 
 def test_offsets_are_ramped_never_jumped(stream: Stream) -> None:
-    lengths = []
-    for _ in range(40):
+    lengths = [0.0]
+    begun = time.monotonic()
+    while lengths[-1] < 5.0e-3 - 1e-12:
         stream.send((5.0e-3, 0.0, 0.0, 0.0, 0.0, 0.0))
         lengths.append(applied(stream.client.sample())[0])
+        assert time.monotonic() - begun < PATIENCE, lengths
     steps = [b - a for a, b in pairwise(lengths)]
     assert max(steps) <= 2.0e-4 + 1e-12
-    assert lengths[-1] > 2.0e-3
 
 
 def test_a_wrong_checksum_is_rejected_until_a_good_one_comes(stream: Stream) -> None:
@@ -134,7 +147,7 @@ def test_without_a_heartbeat_the_offset_goes_to_zero(stream: Stream) -> None:
     stream.hold(OFFSET, 100)
     stream.until(2)
     assert applied(stream.wait(60)) == [0.0] * 6
-    assert stream.hold(OFFSET, 100)["output_int_register_13"] == 1
+    stream.hold(OFFSET, 100)
 
 
 def test_the_robots_own_motion_goes_on_under_the_offset(
