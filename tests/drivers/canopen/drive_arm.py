@@ -34,6 +34,7 @@ class DriveArm:
         chosen = {
             "interface": "virtual", "channel": f"drives{next(_numbers)}", "rate": 100.0,
             "state_timeout": 0.3, "listen": 0.05, "foreign_quiet": 0.1,
+            "sdo_timeout": 5.0,  # of a busy machine
         }  # fmt: skip
         self.settings = CanopenSettings(profile=profile, **{**chosen, **keys})
         self.model = Model(builtin_arm("ur10e"))

@@ -34,6 +34,7 @@ class CanopenCase(Case):
         self.settings = CanopenSettings(
             profile=profile, interface=interface, channel=f"drives{number}", port=number,
             rate=100.0, state_timeout=self.state_timeout, listen=0.05, foreign_quiet=0.2,
+            sdo_timeout=5.0,  # of a busy machine
         )  # fmt: skip
         super().__init__()
         self.settings = self.settings.model_copy(update={"host": self.host})
