@@ -150,7 +150,8 @@ def _significant(
     """Return selection and judgement with significant terms only; undecided ones need six sigmas.
 
     Of the links, accused as a whole, one term at least has to be significant, and no parameter
-    implausible without being so. The weakest term is removed first.
+    implausible without being so. The weakest term is removed first; terms that came to zero, on
+    their bound, are removed together, since the others' values do not depend on them.
     """
     accused, withdrawn = list(judgement.accused), list(judgement.withdrawn)
     link_terms = {p for p in accused if p in selection.prior}  # three sigmas suffice
@@ -165,11 +166,12 @@ def _significant(
             kind for kind in selection.judged_together(accused)
             if max(strength[p] / least.get(p, 1.0) for p in kind) < 1
         ]  # fmt: skip
-        weakest = min(weak, key=lambda kind: max(strength[p] for p in kind), default=())
-        if not weakest:
+        if not weak:
             return selection, replace(judgement, accused=tuple(accused), withdrawn=tuple(withdrawn))
-        accused = [p for p in accused if p not in weakest]
-        withdrawn += [(p, NOT_SIGNIFICANT) for p in weakest]
+        at_zero = [kind for kind in weak if not any(strength[p] for p in kind)]
+        removed = at_zero or [min(weak, key=lambda kind: max(strength[p] for p in kind))]
+        withdrawn += [(p, NOT_SIGNIFICANT) for kind in removed for p in kind]
+        accused = [p for p in accused if not any(p in kind for kind in removed)]
         selection = alone(selection, accused)
 
 

@@ -143,3 +143,25 @@ def test_an_undecided_joint_zero_of_the_links_needs_three_sigmas(zero, stays):
     requested = Judgement((0, 1), True, 0.0, (), {}, (), undecided=(1,))
     _, decided = all_rows._significant(found, requested, lambda selection, accused: selection)
     assert decided.accused == stays
+
+
+def test_terms_that_came_to_zero_are_removed_together():
+    """Each would cost a refit of all rows; the others' values do not depend on them."""
+    found = OnAllRows((1e-3, 1e-3, 1e-3), (0.0,))
+    size = 5e-3  # Nm, a tenth of its deviation
+    frictions = [Term("coulomb_friction", Site(j), (0.0,)) for j in (1, 2, 3)]
+    found.terms = (Term("coulomb_friction", Site(4), (size,)), *frictions)
+    found.covariance = [np.eye(1) * (10 * size) ** 2] * 4
+    found.term_index, found.prior = (0, 1, 2, 3), {}
+    own = [SimpleNamespace(effect=effect_named(t.effect)) for t in found.terms]
+    found.space = SimpleNamespace(candidates=own)
+    refitted_with = []
+
+    def alone(selection, accused):
+        refitted_with.append(tuple(accused))
+        return selection
+
+    requested = Judgement((0, 1, 2, 3), True, 0.0, (), {}, ())
+    _, decided = all_rows._significant(found, requested, alone)
+    assert refitted_with == [(0,), ()]
+    assert decided.withdrawn == tuple((p, NOT_SIGNIFICANT) for p in (1, 2, 3, 0))
