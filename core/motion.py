@@ -115,10 +115,10 @@ class Motion:
     @property
     def direction(self) -> Array:
         """Return the sign of motion (N, n), smooth within the speeds at which it is unsure."""
-        return np.asarray(np.tanh(4.0 * self.qd / self.still))
+        return np.column_stack([self.direction_of(j) for j in range(self.qd.shape[1])])
 
     def direction_of(self, joint: int) -> Array:
-        """Return the direction (N,) of one joint (from 0)."""
+        """Return the ``direction`` (N,) of one joint (from 0)."""
         return np.asarray(np.tanh(4.0 * self.qd[:, joint] / self.still[joint]))
 
     @property

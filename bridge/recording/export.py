@@ -159,7 +159,7 @@ def _table(batch: Batch, columns: list[str]) -> pyarrow.Table:
     import pyarrow
 
     arrays: dict[str, Any] = {
-        name: values.copy()
+        name: np.ascontiguousarray(values)
         for name, values in scalars({name: batch.columns[name] for name in columns}).items()
     }
     arrays[ENUM_FIELD] = [_state(batch, value) for value in batch.columns[ENUM_FIELD]]

@@ -15,7 +15,7 @@ import numpy as np
 
 from gapbridge.core.arrays import Array, Index
 from gapbridge.core.errors import LogError
-from gapbridge.core.log.columns import PARQUET, is_known
+from gapbridge.core.log.columns import PARQUET, as_table, is_known, scalars
 from gapbridge.core.log.log import (
     GZIP,
     Log,
@@ -171,13 +171,11 @@ def _recording(path: Path) -> Iterator[Table]:
     from gapbridge.core.log.mcap_reading import read_batches
 
     for batch in read_batches(path):
-        names, parts = [], []
-        for name, values in batch.columns.items():
-            flat = values.reshape(len(values), -1)
-            ends = [""] if values.ndim == 1 else [f"_{k}" for k in range(flat.shape[1])]
-            # what the controller never reported is no column
-            if len(values) and is_known(name + ends[0]) and not np.isnan(flat).all():
-                names += [name + end for end in ends]
-                parts.append(flat)
-        if parts:
-            yield names, np.hstack(parts), None
+        # what the controller never reported is no column
+        reported = {
+            name: values
+            for name, values in batch.columns.items()
+            if is_known(next(iter(scalars({name: values})))) and not np.isnan(values).all()
+        }
+        if reported:
+            yield *as_table(reported), None

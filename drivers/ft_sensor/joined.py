@@ -238,7 +238,7 @@ class SensorReader:
         self._stopping.clear()
         self._readings.clear()
         self._sensor.connect()
-        self._new_sample.clear()
+        self._new_sample.clear()  # before the thread: its first sample may be the only one for now
         self._thread = threading.Thread(target=self._run, name="ft-sensor", daemon=True)
         self._thread.start()
         if not self._new_sample.wait(self._settings.connect_timeout):

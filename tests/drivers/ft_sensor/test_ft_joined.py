@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from patience import PATIENCE
+from patience import PATIENCE, wait_for
 from sensor_wires import (
     COG,
     KINDS,
@@ -49,10 +49,9 @@ PERIOD = 0.002  # s
 class ControllerDriver(Driver):
     """An arm without a wire of its own: reads a simulated controller's plant, at 500 Hz."""
 
-    def __init__(self, controller: ArmController, lead: float = 0.0, clock: Clock = SYSTEM) -> None:
+    def __init__(self, controller: ArmController, clock: Clock = SYSTEM) -> None:
         super().__init__(1.0 / PERIOD, Model(builtin_arm("ur10e")), clock=clock)
         self.controller = controller
-        self.lead = lead  # s of the arm's clock on this machine's
         self.written: list[Setpoint] = []
         self.open = False
         self._due = 0.0
@@ -65,7 +64,7 @@ class ControllerDriver(Driver):
         self._due = max(self._due + PERIOD, time.monotonic())
         now = time.monotonic()
         q, still = np.array(self.controller.q), np.zeros(self.n)
-        return RobotState(now + self.lead, now, q, still, q, np.full(6, 99.0))
+        return RobotState(now, now, q, still, q, np.full(6, 99.0))
 
     def _send(self, setpoint: Setpoint) -> None:
         self.written.append(setpoint)
@@ -345,8 +344,7 @@ def test_an_arm_is_not_armed_before_its_sensor_speaks() -> None:
     with wire.device, joined(wire, controller, connect_timeout=0.2) as driver:
         state = driver.read_state()
         wire.device.silent = True
-        while driver._reader.wait(0.2):
-            pass  # what was on its way arrives
+        wait_for(lambda: not driver._reader.wait(0.2), "the end of what was on its way")
         with pytest.raises(WriteError, match=r"no sample of the sensor within 0\.2 s"):
             driver.arm(state)
         assert not driver._arm.gate._open

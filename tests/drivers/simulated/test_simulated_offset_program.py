@@ -121,7 +121,7 @@ def test_offsets_are_ramped_never_jumped(stream: Stream) -> None:
         lengths.append(applied(stream.client.sample())[0])
         assert time.monotonic() - begun < PATIENCE, lengths
     steps = [b - a for a, b in pairwise(lengths)]
-    assert max(steps) <= 2.0e-4 + 1e-12
+    assert 1.0e-4 - 1e-12 <= max(steps) <= 2.0e-4 + 1e-12  # at full rate, however often begun anew
 
 
 def test_a_wrong_checksum_is_rejected_until_a_good_one_comes(stream: Stream) -> None:
@@ -140,7 +140,7 @@ def test_an_offset_that_is_no_number_is_rejected(stream: Stream) -> None:
     stream.client.write(
         stream.recipe, "5d5i", math.nan, 0, 0, 0, 0, 0, stream.sequence, 0, 5, RATES
     )
-    stream.until(3)
+    assert applied(stream.until(3)) == [0.0] * 6
 
 
 def test_without_a_heartbeat_the_offset_goes_to_zero(stream: Stream) -> None:
@@ -169,5 +169,5 @@ def test_stopping_the_program_leaves_no_state_behind(
     stream.hold(OFFSET, 50)
     dashboard = socket.create_connection((controller.host, 29999), timeout=PATIENCE)
     dashboard.sendall(b"stop\n")
-    stream.until(0)
+    assert applied(stream.until(0)) == [0.0] * 6
     dashboard.close()
