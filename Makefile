@@ -45,6 +45,7 @@ KERNEL_TESTS := $(addprefix tests/core/test_,kinematics.py statics.py equilibriu
 	compensation.py limits.py effects_position.py effects_moving.py)
 
 coverage: warm
+	$(PIP) install --quiet --editable '.[coverage]'
 	NUMBA_DISABLE_JIT=1 $(BIN)/python -m pytest --cov --cov-report= $(KERNEL_TESTS)
 	$(BIN)/python -m pytest --cov --cov-append --cov-report=term-missing:skip-covered
 

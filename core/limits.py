@@ -15,14 +15,13 @@ from numba import njit
 from gapbridge.core.arrays import Array
 from gapbridge.core.errors import LimitError
 from gapbridge.core.kernels.reference import JIT
+from gapbridge.core.state import CLAMPS, ENVELOPE, JOINT_LIMIT, JOINT_OFFSET, RATE, VELOCITY
 
 MAX_GAP_CYCLES = 5.0  # of the time between setpoints that counts for the rate limits
 MAX_MAGNITUDE = 1e6  # rad, m, of any number of a setpoint
 SCALARS = 7  # scalar limits, first in the limiter's block
 SLACK = 1.0 - 1e-12  # keeps rounding on the allowed side
 
-ENVELOPE, RATE, JOINT_OFFSET, JOINT_LIMIT, VELOCITY = range(5)
-CLAMPS = ("envelope", "rate", "joint_offset", "joint_limit", "velocity")
 _OK, _NOT_FINITE, _GAP_NOT_POSITIVE, _OUTSIDE_LIMITS, _JUMP, _TOO_FAR, _LAGS = range(7)
 
 

@@ -6,6 +6,10 @@ from typing import NamedTuple
 
 from gapbridge.core.arrays import Array
 
+ENVELOPE, RATE, JOINT_OFFSET, JOINT_LIMIT, VELOCITY = range(5)
+CLAMPS = ("envelope", "rate", "joint_offset", "joint_limit", "velocity")
+"""What the limiter may clamp: the name of each bit of a setpoint's ``clamped``."""
+
 
 class RobotState(NamedTuple):
     """One sample of a controller's state, all fields of the same cycle.

@@ -116,11 +116,10 @@ class Witness:
         finally:
             os.close(shared)
         assert self._process.stdout is not None
-        watching = 0
-        while watching < watchers:  # those that watch already may have noted something
-            data = os.read(self._process.stdout.fileno(), 65536)
+        while not all(due for (due,) in struct.iter_unpack("d", self._due)):
+            data = os.read(self._process.stdout.fileno(), 65536)  # each writes once it is due
             assert data, "a watcher has ended"
-            watching += self._take(data)
+            self._take(data)
         os.set_blocking(self._process.stdout.fileno(), False)
 
     def worst(self, since: float, until: float) -> float:
@@ -155,15 +154,14 @@ class Witness:
             while data := os.read(self._process.stdout.fileno(), 65536):
                 self._take(data)
 
-    def _take(self, data: bytes) -> int:
-        """Keep what the watchers wrote; return how many began to watch: an empty line each."""
+    def _take(self, data: bytes) -> None:
+        """Keep what the watchers wrote: an empty line when one begins, then when each was late."""
         *lines, self._rest = (self._rest + data).split(b"\n")
         for line in lines:
             with contextlib.suppress(ValueError):  # an attacker writes into every pipe it finds
                 due, late = map(float, line.split())
                 self._late.append((due, late))
         del self._late[:-10_000]
-        return lines.count(b"")
 
     def stop(self) -> None:
         """End it."""

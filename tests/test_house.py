@@ -172,8 +172,9 @@ def test_a_part_that_sets_attributes_of_another_is_noticed() -> None:
     assert not _attributes_set(ast.parse(code.format("self.x = 1")))
 
 
-def test_the_recorder_loads_nothing_that_compiles() -> None:
-    code = "import sys, gapbridge.bridge.recording.main; print('numba' in sys.modules)"
+@pytest.mark.parametrize("side", ["recording", "metrics"])  # the page predicts poses
+def test_a_side_process_that_predicts_nothing_loads_nothing_that_compiles(side: str) -> None:
+    code = f"import sys, gapbridge.bridge.{side}.main; print('numba' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
     assert done.stdout == "False\n", done.stderr
 

@@ -11,6 +11,7 @@ import threading
 import time
 from pathlib import Path
 
+import lateness
 import pytest
 from lateness import LIMIT, NOTED, Witness, core_time, core_times
 
@@ -181,6 +182,23 @@ def test_a_core_that_stands_still_is_noticed_while_others_run() -> None:
     finally:
         witness.stop()
     assert NOTED < LIMIT
+
+
+def test_lines_of_a_stranger_do_not_pass_for_those_of_watchers(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """An attacker of another test writes into every pipe; one that began at 0 s would be late."""
+    strange = "os.write(1, 9 * b'\\n')\ntime.sleep(0.05)\ndue = time.time()"
+    monkeypatch.setattr(
+        lateness, "_WATCH", lateness._WATCH.replace("due = time.time()", strange, 1)
+    )
+    witness = Witness()
+    begun = time.time()
+    witness.start()
+    try:
+        assert witness.worst(begun, time.time()) < time.time() - begun
+    finally:
+        witness.stop()
 
 
 def test_a_witness_that_has_ended_excuses_nothing() -> None:

@@ -10,7 +10,7 @@ import numpy as np
 
 from gapbridge.bridge.ipc.shared_memory import slices_of
 from gapbridge.core.arrays import Array
-from gapbridge.core.limits import CLAMPS
+from gapbridge.core.state import CLAMPS
 
 UNIT = 1e-6  # s: bin of a histogram
 BATCH = 50  # batches of rows that are counted together

@@ -6,7 +6,6 @@ import hashlib
 from typing import Any
 
 from gapbridge.bridge.cell.daemon_settings import DaemonSettings
-from gapbridge.bridge.cell.run_settings import read_configuration
 from gapbridge.bridge.ipc.events import EventKind
 from gapbridge.core.errors import GapbridgeError
 
@@ -39,6 +38,8 @@ class UpdatedSettings:
 
     def _read(self, reported: str) -> bool:
         """Read the file; returns False if it is invalid or has changed again."""
+        from gapbridge.bridge.cell.run_settings import read_configuration  # brings numba
+
         try:
             configuration = read_configuration(self.settings.cell)
         except GapbridgeError:

@@ -15,8 +15,7 @@ from gapbridge.bridge.loop.link_monitor import hold_time
 from gapbridge.bridge.loop.reports import Reports
 from gapbridge.bridge.loop.supervisor import Cause, Supervisor
 from gapbridge.core.arrays import Array
-from gapbridge.core.limits import ENVELOPE, JOINT_LIMIT, JOINT_OFFSET
-from gapbridge.core.state import RobotState
+from gapbridge.core.state import ENVELOPE, JOINT_LIMIT, JOINT_OFFSET, RobotState
 from gapbridge.drivers.driver import Driver
 from gapbridge.drivers.robot_modes import PLAYING, why_not_ready
 

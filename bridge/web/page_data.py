@@ -19,7 +19,7 @@ from gapbridge.bridge.ipc.shared_memory import ROWS, SharedMemory
 from gapbridge.bridge.ipc.updated_settings import UpdatedSettings
 from gapbridge.bridge.web.prediction import Prediction
 from gapbridge.core.arrays import Array
-from gapbridge.core.limits import CLAMPS
+from gapbridge.core.state import CLAMPS
 
 Message = tuple[str, dict[str, Any]]  # kind, data
 ENDS = (EventKind.FAULT, EventKind.FAILURE)  # events with which a process of the loop ends

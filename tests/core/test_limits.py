@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from gapbridge.core.errors import LimitError
-from gapbridge.core.limits import CLAMPS, ENVELOPE, JOINT_LIMIT, JOINT_OFFSET, RATE, Limiter, Limits
+from gapbridge.core.limits import Limiter, Limits
+from gapbridge.core.state import CLAMPS, ENVELOPE, JOINT_LIMIT, JOINT_OFFSET, RATE
 
 Array = NDArray[np.float64]
 N = 6

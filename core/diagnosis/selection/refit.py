@@ -80,8 +80,9 @@ def refit(
         parts = np.split(step, np.cumsum([len(v) for v in x]))[: len(x)]
         share = _step_share(state, fitted, x, parts, sigma, rows.A)
         x = [_within(c, v + share * part) for c, v, part in zip(fitted, x, parts, strict=True)]
-        state = _frame_moved(state, extra, _terms(fitted, x))
-        if _largest_step(fitted, parts) < CONVERGED:
+        before, state = state, _frame_moved(state, extra, _terms(fitted, x))
+        stuck = share == 0 and state is before  # another round would be the same
+        if stuck or _largest_step(fitted, parts) < CONVERGED:
             break
     covariance = _covariances(
         *rows.with_prior(), rows.variance(step, space.floor), [len(v) for v in x],

@@ -132,6 +132,7 @@ def test_what_a_withheld_effect_depends_on_is_found_by_shuffling(case):
     assert score(label, reported).depends_right is True
 
 
+@pytest.mark.slow
 def test_a_twin_may_be_named_for_a_withheld_effect(tmp_path):
     for seed in range(60):
         label = make_case("withheld:base_compliance", seed, tmp_path)
@@ -142,6 +143,7 @@ def test_a_twin_may_be_named_for_a_withheld_effect(tmp_path):
     assert got.outcome == "right_tie"
 
 
+@pytest.mark.slow
 def test_the_first_order_of_a_withheld_effect_may_be_named_with_the_rest_admitted(tmp_path):
     label = make_case("withheld:torque:load_friction", 3, tmp_path)
     own = [cause("coulomb_friction", [j]) for j in label.causes[0].joints]
@@ -175,6 +177,7 @@ def test_other_channels_are_scored_alike(case, kind):
         assert blamed.outcome == "wrong"
 
 
+@pytest.mark.slow
 def test_a_delay_of_the_whole_arm_may_be_reported_joint_by_joint_or_of_the_arm(tmp_path):
     for seed in range(10):
         label = make_case("tracking:latency", seed, tmp_path)

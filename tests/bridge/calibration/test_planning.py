@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from further import further
 from scripted_session import (
     FRAME,
     plan_in,
@@ -39,6 +40,7 @@ def plan_with(folder: Path, *lines: str, **changed: object) -> tuple[Plan, Model
     return make_plan(cell, options, lambda text, share: None), cell.model
 
 
+@pytest.mark.slow
 def test_poses_that_turn_the_reflector_away_are_not_planned(tmp_path: Path) -> None:
     plan, model = plan_with(
         tmp_path,
@@ -60,7 +62,7 @@ def _angle(plan: Plan, model: Model) -> np.ndarray:
 
 @pytest.mark.parametrize(
     ("kind", "near", "far"),
-    [("{kind: typed, unit: m}", 2.0, 2.6), ("{kind: dial_gauge, unit: mm}", 1.9, 2.7)],
+    [("{kind: typed, unit: m}", 2.0, 2.6), *further(("{kind: dial_gauge, unit: mm}", 1.9, 2.7))],
 )
 def test_poses_out_of_the_instruments_range_are_not_planned(
     tmp_path: Path, kind: str, near: float, far: float
@@ -75,6 +77,7 @@ def test_poses_out_of_the_instruments_range_are_not_planned(
     assert apart.max() - 1e-9 <= far
 
 
+@pytest.mark.slow
 def test_an_instrument_is_moved_through_its_planned_places(tmp_path: Path) -> None:
     cell = cell_with(
         tmp_path, f"instrument_at: {list(INSTRUMENT_AT)}", "further_places: [[-2.0, 1.0, 0.5]]",
@@ -106,6 +109,7 @@ def test_an_instrument_is_moved_through_its_planned_places(tmp_path: Path) -> No
     assert [e["station"] for e in readings] == stations
 
 
+@pytest.mark.slow
 def test_a_tip_on_one_point_is_planned_and_needs_its_place(tmp_path: Path) -> None:
     plan, model = plan_with(
         tmp_path, "instrument_at: [0.7, 0.2, 0.4]", instrument="{kind: point}", poses=16

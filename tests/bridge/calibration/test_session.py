@@ -81,6 +81,7 @@ def test_nothing_is_applied_without_a_yes(
     assert not (tmp_path / "no.yaml").exists()
 
 
+@pytest.mark.slow
 def test_corrected_mistakes_leave_the_same_calibration(
     clean: tuple[Path, CommandResult], tmp_path: Path
 ) -> None:

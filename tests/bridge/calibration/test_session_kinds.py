@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from further import further
 from patience import PATIENCE
 from scripted_session import (
     AXIAL,
@@ -125,12 +126,14 @@ def in_degrees(q: np.ndarray) -> str:
     return " ".join(f"{v:.6f}" for v in np.degrees(q))
 
 
+@pytest.mark.slow
 def test_a_dial_gauge_of_unknown_zero(tmp_path: Path) -> None:
     session = planned_session(tmp_path, "{kind: dial_gauge, unit: mm}", 26, fixed_point_frame(0.2))
     dial = [f"{1e3 * v:.3f}" for v in session.readings.value[:, 0]]
     check_identified(session, session.run(session.lines(lambda i: dial[i])))
 
 
+@pytest.mark.slow
 def test_two_balls_measured_in_an_unknown_frame(tmp_path: Path) -> None:
     balls = Nuisance((FRAME,), np.array([[0.0, 0.0, 0.0], [0.21, 0.02, 0.0]]), np.zeros(1))
     session = planned_session(tmp_path, "{kind: two_balls, unit: in}", 16, balls)
@@ -145,7 +148,7 @@ def test_two_balls_measured_in_an_unknown_frame(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("instrument", "poses", "radius"),
-    [("{kind: sphere, radius: 0.03}", 28, 0.03), ("{kind: point}", 16, 0.0)],
+    [*further(("{kind: sphere, radius: 0.03}", 28, 0.03)), ("{kind: point}", 16, 0.0)],
 )
 def test_contact_with_joint_angles_alone(
     tmp_path: Path, instrument: str, poses: int, radius: float
@@ -157,6 +160,7 @@ def test_contact_with_joint_angles_alone(
     check_identified(session, session.run(session.lines(lambda i: "", lambda i: in_degrees(q[i]))))
 
 
+@pytest.mark.slow
 def test_files_that_the_trackers_software_exports(tmp_path: Path) -> None:
     out = tmp_path / "out"
     out.mkdir()
@@ -203,6 +207,7 @@ def _serve(server: socket.socket, values: list[np.ndarray]) -> None:
             number += asked
 
 
+@pytest.mark.slow
 def test_lines_that_the_trackers_software_sends_on_demand(
     tmp_path: Path, feed: tuple[int, list[np.ndarray]]
 ) -> None:

@@ -309,6 +309,7 @@ def test_odd_rows_and_names_are_reported_where_work_is_still_possible(tmp_path: 
         assert words in answer.out
 
 
+@pytest.mark.slow
 def test_a_log_of_another_arm_is_diagnosed_and_reported_as_such(tmp_path: Path) -> None:
     q, loads = poses_and_loads(60)
     columns = {f"actual_q_{i}": q[:, i] for i in range(6)}

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from further import further
 
 from gapbridge.bridge.cli.main import main
 
@@ -33,7 +34,7 @@ def left() -> None:
     os.dup2(writer, 1)
 
 
-@pytest.mark.parametrize("unbuffered", ["", "1"])
+@pytest.mark.parametrize("unbuffered", ["", *further("1")])
 @pytest.mark.parametrize(
     ("arguments", "stdout", "code", "err"),
     [

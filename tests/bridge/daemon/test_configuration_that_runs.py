@@ -21,6 +21,7 @@ def granted(run: Run) -> list[str]:
     return [e["hash"] for e in run.daemon.events_since(0) if e["kind"] == "granted"]
 
 
+@pytest.mark.slow
 def test_a_loop_that_is_started_anew_runs_the_cell_that_runs_not_the_edited_one(
     tmp_path: Path,
 ) -> None:

@@ -123,6 +123,7 @@ def test_arming_warns_of_what_differs_from_the_controller_and_is_no_reason_to_re
     assert warned == ["payload.mass: found 4.5 kg, expected 5 kg, as the controller has it"]
 
 
+@pytest.mark.slow
 def test_the_age_of_the_last_state_is_shown_in_the_unit_of_its_size(robot: Robot) -> None:
     with Run(robot.cell(PATIENT)) as run:
         run.wait(State.OBSERVING)

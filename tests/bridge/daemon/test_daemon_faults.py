@@ -68,6 +68,7 @@ def test_a_loop_that_hangs_is_ended_and_comes_back_observing(robot: Robot) -> No
     assert any("no heartbeat" in line for line in run.summary.faults)
 
 
+@pytest.mark.slow
 def test_a_controller_that_stands_still_is_a_fault(robot: Robot) -> None:
     with Run(robot.cell(), arm=True) as run:
         run.compensate()
@@ -81,6 +82,7 @@ def test_a_controller_that_stands_still_is_a_fault(robot: Robot) -> None:
     assert any("clock has stopped" in line for line in run.output)
 
 
+@pytest.mark.slow
 def test_a_clock_that_stands_still_is_seen_though_packets_flow(robot: Robot) -> None:
     with Run(robot.cell()) as run:
         run.wait(State.OBSERVING)
@@ -141,6 +143,7 @@ def test_a_controller_that_is_started_anew_is_found_again(tmp_path: Path) -> Non
     assert run.summary.restarts >= 1
 
 
+@pytest.mark.slow
 def test_a_run_of_given_length_ends_also_where_its_controller_has_gone(tmp_path: Path) -> None:
     with Robot(tmp_path) as robot:
         cell = robot.cell(", connect_timeout: 1.0")

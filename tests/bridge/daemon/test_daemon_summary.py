@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from gapbridge.bridge.daemon.summary import Histogram, RunSummary, Tally
 from gapbridge.bridge.ipc.shared_memory import slices_of
-from gapbridge.core.limits import CLAMPS, RATE, VELOCITY
+from gapbridge.core.state import CLAMPS, RATE, VELOCITY
 
 N, RATE_HZ = 6, 500.0
 

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from daemon_cell import Robot, Run, offsets
+from further import further
 from patience import wait_for
 
 from gapbridge.bridge.ipc.loop_state import State
@@ -57,7 +58,7 @@ def assert_no_faster(rows: np.ndarray) -> None:
 
 
 @pytest.mark.realtime
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSEGV])
+@pytest.mark.parametrize("number", [signal.SIGKILL, *further(signal.SIGSEGV)])
 def test_after_a_killed_loop_the_robots_program_withdraws_at_the_cells_rate(
     robot: Robot, number: signal.Signals
 ) -> None:

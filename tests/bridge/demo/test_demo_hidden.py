@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from further import further
 
 from gapbridge.bridge.cell import Cell, load_cell, save_cell
 from gapbridge.bridge.cell.simulation import _plant
@@ -84,14 +85,17 @@ def errors(link: DemoLink, plant: Plant, cell: Cell) -> np.ndarray:
 
 @pytest.mark.parametrize(
     ("name", "seed"),
-    [("ur_rtde", 5), ("can", 3), ("modbus", 3)]
-    + [pytest.param(n, s, marks=pytest.mark.slow) for n in sorted(LINKS) for s in range(4, 10)],
+    [
+        ("ur_rtde", 5),
+        *further(("can", 3), ("modbus", 3)),
+        *further(*((name, seed) for name in sorted(LINKS) for seed in range(4, 10))),
+    ],
 )
 def test_what_is_hidden_is_named_on_every_link(tmp_path: Path, name: str, seed: int) -> None:
     is_named(LINKS[name](tmp_path, seed), tmp_path)
 
 
-@pytest.mark.parametrize(("seed", "value"), [(2, -3.195e-3), (5, -2.380e-3)])
+@pytest.mark.parametrize(("seed", "value"), [*further((2, -3.195e-3)), (5, -2.380e-3)])
 def test_a_zero_against_which_flexibilities_were_fitted_is_named(
     tmp_path: Path, seed: int, value: float
 ) -> None:

@@ -426,6 +426,7 @@ def test_three_rounds_of_visits_and_the_truth_are_shown(
     assert whole.summary()["hidden"]["tool_frame_x"] == 1e-3
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(CHROMIUM is None, reason="no chromium on this machine")
 def test_nothing_of_the_report_is_cut_off_on_a_phone(result: Result, tmp_path: Path) -> None:
     playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")

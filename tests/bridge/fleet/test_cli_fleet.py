@@ -135,6 +135,7 @@ def test_a_second_run_does_nothing_anew_and_comes_to_the_same(fitted: Any) -> No
     assert rows_of(folder / "out" / "results.parquet") == before
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(CHROMIUM is None, reason="no chromium on this machine")
 def test_nothing_of_the_report_is_cut_off_on_a_phone(fitted: Any) -> None:
     playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
@@ -175,6 +176,7 @@ def test_diagnose_shows_the_effect_that_recurs(tmp_path: Path) -> None:
     assert len(rows_of(tmp_path / "out" / "sessions.parquet")) == 3
 
 
+@pytest.mark.slow
 def test_a_run_that_is_killed_loses_nothing(tmp_path: Path) -> None:
     logs = logs_in(tmp_path, NAMES)
     cell_in(tmp_path)

@@ -43,6 +43,7 @@ def test_a_cluster_does_every_session_and_one_of_its_workers_may_die(
     assert len({o.result["process"] for o in outcomes}) >= 2
 
 
+@pytest.mark.slow
 def test_a_session_that_kills_workers_is_begun_twice_and_harms_no_other(
     address: str, tmp_path: Path
 ) -> None:
@@ -66,6 +67,7 @@ def test_a_bad_log_is_one_outcome_among_others(address: str, tmp_path: Path) -> 
     assert outcomes["b/s"].state == DONE
 
 
+@pytest.mark.slow
 def test_an_address_without_a_scheduler_is_reported_in_one_line() -> None:
     with pytest.raises(RunError, match="found no Dask scheduler there") as error:
         DaskWorkers("tcp://127.0.0.1:9", timeout=1.0).start()

@@ -7,12 +7,15 @@ import signal
 from collections import Counter
 from pathlib import Path
 
+import pytest
+
 from gapbridge.bridge.fleet.task import CRASHED, DIED, DONE, Outcome
 from gapbridge.bridge.fleet.workers.local_workers import LocalWorkers
 from tests.bridge.fleet.fleet_in import tasks_in
 from tests.bridge.fleet.jobs import count_rows, fail, kill_itself
 
 
+@pytest.mark.slow
 def test_every_session_is_done_once_by_both_processes(tmp_path: Path) -> None:
     names = [f"arm{i}/s" for i in range(12)]
     present = tmp_path / "present"
@@ -51,6 +54,7 @@ def test_a_killed_worker_loses_nothing(tmp_path: Path) -> None:
     assert len({o.result["process"] for o in outcomes}) == 4
 
 
+@pytest.mark.slow
 def test_a_session_that_kills_twice_is_reported_and_the_others_are_done(tmp_path: Path) -> None:
     book = tmp_path / "book"
     names = ["a/killer", "b/once", *(f"c/s{i}" for i in range(6))]

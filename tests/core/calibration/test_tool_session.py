@@ -41,6 +41,7 @@ def model() -> Model:
     return model_of(real_arm(KIND))
 
 
+@pytest.mark.slow
 def test_intervals_hold_the_tip_in_95_of_100_sessions(model: Model) -> None:
     q = np.array(plan_tool(model, BEGIN, poses=7).poses)
     held, rng = [], np.random.default_rng(0)

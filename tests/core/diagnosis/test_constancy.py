@@ -113,6 +113,7 @@ def test_less_than_a_period_is_no_line_with_an_unknown(beside):
     assert line_in(selection) not in not_periodic(selection)
 
 
+@pytest.mark.slow
 def test_only_numbers_of_poses_are_judged():
     """An offset is the mean of whatever turns its joint, and a link's numbers have their forms."""
     selection = diagnosed(1.0).selection

@@ -8,6 +8,7 @@ from functools import partial
 import numpy as np
 import pytest
 import small_arm as small
+from further import further
 
 from gapbridge.core.calibration.spread import Spread
 from gapbridge.core.diagnosis.diagnosis import channels_of, diagnose
@@ -45,7 +46,7 @@ def sigmas_off(found):
     return np.abs(apart) / np.concatenate([found.std_axial, found.std_radial])
 
 
-@pytest.mark.parametrize("seed", [11, 12])
+@pytest.mark.parametrize("seed", [11, *further(12)])
 @pytest.mark.parametrize(
     ("tool", "registered"), [(False, True), (False, False), (True, True), (True, False)]
 )
@@ -60,7 +61,7 @@ def test_no_further_cause_is_named(tool: bool, registered: bool, seed: int):
     assert not channel.causes
 
 
-@pytest.mark.parametrize("seed", [11, 12])
+@pytest.mark.parametrize("seed", [11, *further(12)])
 @pytest.mark.parametrize(
     ("tool", "registered"), [(False, True), (False, False), (True, True), (True, False)]
 )

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import small_arm as small
+from further import further
 
 import gapbridge.core.diagnosis.diagnosis as whole
 from gapbridge.core.diagnosis import thinning
@@ -19,7 +20,7 @@ from gapbridge.core.metrology import Metrology
 from gapbridge.core.motion import motion_of
 
 
-@pytest.mark.parametrize("effect", ["none", "cross_coupling"])
+@pytest.mark.parametrize("effect", ["none", *further("cross_coupling")])
 def test_without_a_cause_the_held_out_gap_is_the_gap(effect: str) -> None:
     """Nothing is fitted but the frame, before as well as after, over the same samples."""
     for registered in (True, False):

@@ -97,6 +97,7 @@ def test_what_is_reported_of_a_new_session_holds_for_further_ones(compliant) -> 
     assert [s for s, _ in found.by_session] == [0, 1]
 
 
+@pytest.mark.slow
 def test_figures_of_an_unknown_hold_in_a_new_session_too() -> None:
     real = small.REAL["cross_coupling"]
     found = diagnose(MODEL, together(real, (1, 2)), Metrology(sigma=small.SIGMA))

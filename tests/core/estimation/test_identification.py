@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from further import further
 from oracle import equilibrium as oracle
 from test_equilibrium import SEVEN
 
@@ -84,6 +85,7 @@ def test_with_noise_the_residual_is_the_noise_and_held_out_poses_are_met(n, rota
     assert found.samples == 80
 
 
+@pytest.mark.slow
 def test_errors_of_the_flexibilities_are_as_large_as_their_intervals_say():
     z = []
     for seed in range(8):
@@ -96,7 +98,7 @@ def test_errors_of_the_flexibilities_are_as_large_as_their_intervals_say():
     assert np.abs(z).max() < 4
 
 
-@pytest.mark.parametrize("repeats", [1, 3])
+@pytest.mark.parametrize("repeats", [1, *further(3)])
 def test_intervals_hold_where_joints_are_off_at_all_repeats_of_a_pose(repeats):
     """Rounded or imprecise joints move whole poses, the farther the longer the lever."""
     z = []
@@ -370,6 +372,7 @@ def test_the_linear_form_predicts_finite_elements_from_the_true_flexibilities(na
         np.testing.assert_allclose(linear[:, part], case.deflection[:, part], atol=1e-4 * scale)
 
 
+@pytest.mark.slow
 def test_fifty_noisy_poses_foretell_fifty_others_of_finite_elements_to_the_noise():
     columns = poses.measured(paper.frame_arm("ur10e", np.random.default_rng(1)),
                              np.random.default_rng(1), "ur10e")  # fmt: skip

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from further import further
 
 from gapbridge.core.kernels import machine_code
 from gapbridge.core.kernels.machine_code import CORE, FOLDERS, MARK
@@ -73,12 +74,14 @@ def test_what_was_compiled_in_changes_and_the_caller_is_compiled_anew(package: P
     assert package.run() == "6.0 1"
 
 
+@pytest.mark.slow
 def test_a_file_without_compiled_functions_costs_nothing(package: Package) -> None:
     package.run()
     (package.core / "words.py").write_text("TEXT = 1\n")
     assert package.run() == "3.0 1"
 
 
+@pytest.mark.slow
 def test_machine_code_from_before_a_module_was_renamed_is_not_read(package: Package) -> None:
     """Numba's index pickles the classes of arguments by the module that they are defined in."""
     kernels = package.core / "kernels"
@@ -98,6 +101,7 @@ def test_machine_code_from_before_a_module_was_renamed_is_not_read(package: Pack
     assert package.run() == "3.0 0"
 
 
+@pytest.mark.slow
 def test_other_places_for_machine_code_look_at_all_sources_too(
     package: Package, tmp_path: Path
 ) -> None:
@@ -130,6 +134,7 @@ def test_functions_of_other_libraries_are_left_alone() -> None:
     assert machine_code.InTree.from_function(Package.run, machine_code.__file__) is not None
 
 
+@pytest.mark.slow
 def test_what_is_loaded_does_not_make_numba_ready_to_compile(package: Package) -> None:
     """Numba would import scipy.linalg for that: 0.3 s in each process."""
     path = package.core / "correction.py"
@@ -138,6 +143,7 @@ def test_what_is_loaded_does_not_make_numba_ready_to_compile(package: Package) -
     assert package.run().split() == ["3.0", "1", "False"]
 
 
+@pytest.mark.slow
 def test_what_is_loaded_compiles_nothing_of_numbas_own(package: Package) -> None:
     """Nor reads bitcode, of our functions or of those that count references."""
     path = package.core / "correction.py"
@@ -155,6 +161,7 @@ for place, name in ((nrtdynmod, "create_nrt_module"), (binding, "parse_bitcode")
     assert package.run().split() == ["3.0", "1"]
 
 
+@pytest.mark.slow
 def test_what_was_loaded_goes_into_what_is_compiled_then(package: Package) -> None:
     path = package.core / "correction.py"
     more = "from gapbridge.core.kernels.reference import statics\nprint(statics(2.0))\n"
@@ -176,6 +183,7 @@ print(sorted({name for name in ("scipy.linalg", "numba.np.arraymath", "numba.np.
 """
 
 
+@pytest.mark.slow
 def test_a_prediction_needs_no_linear_algebra_of_scipy() -> None:
     """Each function of numpy's that a kernel calls may bring what takes long to import.
 
@@ -191,7 +199,10 @@ def test_a_prediction_needs_no_linear_algebra_of_scipy() -> None:
 
 @pytest.mark.parametrize(
     "missing",
-    ["environment._rebuild_env", "caching.CodeLibraryCacheImpl", "config.CACHE_LOCATOR_CLASSES"],
+    [
+        "environment._rebuild_env",
+        *further("caching.CodeLibraryCacheImpl", "config.CACHE_LOCATOR_CLASSES"),
+    ],
 )
 def test_another_numba_keeps_no_machine_code_but_computes(missing: str) -> None:
     # what is kept without these parts would not notice that a source has changed

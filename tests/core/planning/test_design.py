@@ -132,6 +132,7 @@ def test_planned_poses_beat_more_random_ones(
     assert planned.expected.tcp_std_worst < np.median([std.max() for std in twice])
 
 
+@pytest.mark.slow
 def test_travel_counts(parameters: Parameters, space: Workspace) -> None:
     far, near = (
         plan(parameters, POSITION, LOADS, space, poses=12, held_out=0, repeats=0, travel_weight=w)
@@ -249,6 +250,7 @@ def test_gains_are_what_adding_a_candidate_brings() -> None:
     assert np.isinf(gains[:4]).all()
 
 
+@pytest.mark.slow
 def test_two_places_and_two_balls_are_visited_one_place_after_the_other(
     parameters: Parameters, model: Model
 ) -> None:

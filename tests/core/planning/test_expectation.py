@@ -38,6 +38,7 @@ def planned(parameters: Parameters):
     return plan(parameters, POSITION, LOADS, space, asked)
 
 
+@pytest.mark.slow
 def test_scatter_over_sessions_is_what_was_expected(parameters, planned) -> None:
     scatter = repeated_sessions(
         parameters, POSITION, readings_of(planned), Nuisance.zero(), sigma=SIGMA, sessions=600,

@@ -23,6 +23,7 @@ from contract_checks import (
     next_state,
 )
 from contract_table import CASES
+from further import further
 from patience import PATIENCE
 
 from gapbridge.core.errors import WriteError
@@ -32,8 +33,11 @@ from gapbridge.drivers.canopen import driver as canopen
 from gapbridge.drivers.driver import Driver
 from gapbridge.drivers.ft_sensor import robotiq_ft300
 
+TWICE = "canopen lwa4p, virtual"  # the same drives as over socketcand
+PARAMS = [*(name for name in CASES if name != TWICE), *further(TWICE)]
 
-@pytest.fixture(params=CASES)
+
+@pytest.fixture(params=PARAMS)
 def case(request: pytest.FixtureRequest) -> Iterator[Case]:
     with CASES[request.param]() as found:
         yield found

@@ -47,6 +47,7 @@ def cell_of(robot: Robot, sensor: RobotousNode, when_lost: str = "stop") -> Path
     )
 
 
+@pytest.mark.slow
 def test_a_silent_sensor_is_seen_and_its_return_is_observed(
     robot: Robot, sensor: RobotousNode
 ) -> None:

@@ -77,6 +77,7 @@ def test_a_short_recording_is_looked_at_as_a_whole(recording):
     assert blocks.long_recording(recording[1]) is None
 
 
+@pytest.mark.slow
 def test_blocks_find_what_the_whole_shows(both):
     for one, other in zip(*(found.channels for found in both), strict=True):
         assert one.channel == other.channel

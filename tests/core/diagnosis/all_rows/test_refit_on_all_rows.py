@@ -31,6 +31,7 @@ def searched():
     return selection, judge(selection, HeldOut(selection))
 
 
+@pytest.mark.slow
 def test_covariances_with_an_unknown_effect_include_the_scatter_among_regions():
     """One accusation falls: the others' intervals were those of white noise from then on."""
     selection = small.diagnosed("cross_coupling").channels[0].selection

@@ -59,12 +59,14 @@ def test_nothing_is_reported_where_no_fit_can_be_made(rigid: Model) -> None:
     assert flexibility_findings(rigid, few, FREE) == []
 
 
+@pytest.mark.slow
 def test_what_is_withheld_is_not_offered(rigid: Model) -> None:
     found = diagnose(rigid, log_of(TYPE), FREE, withhold=("axial_compliance", "radial_compliance"))
     assert found.verdict != "no_gap"
     assert not any("gapbridge fit" in finding_text(f) for f in found.findings)
 
 
+@pytest.mark.slow
 def test_fit_and_diagnosis_exclude_the_same_outliers_and_do_not_undo_each_other(
     rigid: Model,
 ) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+from further import further
 
 from benchmarks.blind.cases import make_case
 from gapbridge.bridge.cell import load_cell
@@ -12,7 +13,7 @@ from gapbridge.core.log.log import read_log
 
 @pytest.mark.parametrize(
     ("kind", "seed", "cause"),
-    [("mixed:3", 1060004, ("stiffness_nonlinearity", (2,))),
+    [*further(("mixed:3", 1060004, ("stiffness_nonlinearity", (2,)))),
      ("axial_compliance", 1090000, None)],
 )  # fmt: skip
 def test_a_curve_with_a_sigma_of_a_third_is_accused_and_a_line_is_kept_linear(
