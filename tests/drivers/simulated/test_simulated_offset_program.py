@@ -51,21 +51,21 @@ class Stream:
         )
 
     def hold(self, offset: tuple[float, ...], cycles: int) -> dict[str, Any]:
-        """Send an offset for so many cycles, and on until it is applied and echoed.
+        """Send an offset for so many cycles, and on until it is applied, echoed and reached.
 
-        A busy machine that lets the heartbeat rest begins the ramp anew.
+        A busy machine that lets the heartbeat rest begins the ramp anew, and the arm follows late.
         """
-        for _ in range(cycles):
-            sample = self._cycle(offset)
+        samples = [self._cycle(offset) for _ in range(cycles)]
         begun = time.monotonic()
         while not (
-            sample["output_int_register_12"] >= self.sequence - 2
-            and sample["output_int_register_13"] == 1
-            and applied(sample) == pytest.approx(offset, abs=1e-12)
+            samples[-1]["output_int_register_12"] >= self.sequence - 2
+            and samples[-1]["output_int_register_13"] == 1
+            and applied(samples[-1]) == pytest.approx(offset, abs=1e-12)
+            and samples[-1]["actual_q"] == pytest.approx(samples[-2]["actual_q"], abs=1e-10)
         ):
-            assert time.monotonic() - begun < PATIENCE, sample
-            sample = self._cycle(offset)
-        return sample
+            assert time.monotonic() - begun < PATIENCE, samples[-1]
+            samples.append(self._cycle(offset))
+        return samples[-1]
 
     def _cycle(self, offset: tuple[float, ...]) -> dict[str, Any]:
         self.send(offset)
