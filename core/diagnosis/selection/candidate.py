@@ -201,7 +201,6 @@ def jacobian(
     Zeros where the arm has no equilibrium: there only the prior determines the step.
     """
     columns = []
-    others = _interacting(candidate.effect, others)
     for k, parameter in enumerate(candidate.parameters):
         h = np.zeros(len(x))
         h[k] = STEP * parameter.scale
@@ -212,19 +211,6 @@ def jacobian(
             ahead = behind = observation.measured
         columns.append((ahead - behind) / (2 * h[k]))
     return np.stack(columns, axis=-1)
-
-
-def _interacting(effect: Effect, others: Sequence[Term]) -> list[Term]:
-    """Return the terms without which an effect's derivatives would differ.
-
-    Torques that add up cancel in a difference, except for loads and the friction that they cause.
-    """
-    by_load = effect.loads_joints or effect.depends_on_load
-
-    def cancels(other: Effect) -> bool:
-        return other.adds_torque and not (by_load and (other.loads_joints or other.depends_on_load))
-
-    return [t for t in others if not (effect.adds_torque and cancels(CATALOGUE[t.effect]))]
 
 
 def _from_nominal(observation: Observation, candidate: Candidate, base: Sequence[Term]) -> Array:

@@ -29,7 +29,6 @@ class LinkCog(JointEffect):
     label_template = "first moment {part} of link {joint}"
     order = 22
     loads_joints = True
-    adds_torque = True
     estimated_as_whole = True
     channels = ("torque",)
     motion = "poses that turn the link against gravity, or its accelerations"
