@@ -1,22 +1,15 @@
-"""How files are shared out over the processes of xdist."""
+"""How whole files are shared out over the processes of xdist."""
 
 from __future__ import annotations
 
 from typing import Any
 
-from waiting import APART, WAITING, waits
+from waiting import WAITING, waits
 from xdist.scheduler import LoadFileScheduling  # type: ignore[import-untyped]
 
 
 class Scheduling(LoadFileScheduling):  # type: ignore[misc]
-    """Files that wait go to ``WAITING``, which take others last; the rest never take them.
-
-    The cases of a test in ``APART`` are shared out one by one, after whole files.
-    """
-
-    def _split_scope(self, nodeid: str) -> str:
-        apart = any(test in nodeid for test in APART)
-        return nodeid if apart else str(super()._split_scope(nodeid))
+    """Files that wait go to ``WAITING``, which take others last; the rest never take them."""
 
     def _assign_work_unit(self, node: Any) -> None:
         waiting = node.gateway.id in WAITING

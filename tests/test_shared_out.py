@@ -8,7 +8,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from waiting import APART, COMPUTE, WAIT, WAITING, waits
+from waiting import COMPUTE, WAIT, WAITING, waits
 
 pytest.importorskip("xdist")
 
@@ -70,16 +70,5 @@ def test_files_stay_whole_and_those_that_wait_go_to_two_processes(processes: int
         assert kinds == sorted(kinds, reverse=True) if name in WAITING else not any(kinds)
 
 
-def test_cases_that_share_nothing_are_shared_out_one_by_one_after_whole_files() -> None:
-    apart = [f"tests/{APART[0]}{k}]" for k in range(12)]
-    tests = [*apart, *(f"tests/core/test_{i}.py::test_{j}" for i in range(4) for j in range(3))]
-    found = shared_out(tests, 4)
-    assert sorted(test for ran in found.values() for test in ran) == sorted(tests)
-    assert all(ran[-1] in apart and ran[0] not in apart for ran in found.values())
-
-
 def test_every_file_that_waits_is_there() -> None:
     assert [place for place in (*WAIT, *COMPUTE) if not (HERE / place).exists()] == []
-    for test in APART:
-        file, name = test.rstrip("[").split("::")
-        assert f"def {name}(" in (HERE / file).read_text(encoding="utf-8")

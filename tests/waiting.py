@@ -58,8 +58,6 @@ COMPUTE = (
     "drivers/ur_rtde/test_ur_nominal.py",
 )
 """Files in these folders whose tests compute."""
-APART = ("benchmarks/test_simulated_runs.py::test_what_must_hold_holds_whatever_goes_wrong[",)
-"""Tests whose cases run in any process: in one they would take longer than all others together."""
 WAITING = ("gw0", "gw1")  # processes of xdist that run them
 NICE = 2  # of its other processes, which compute with what is left of the cores
 

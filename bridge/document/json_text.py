@@ -20,12 +20,12 @@ def json_text(document: Mapping[str, Any], separators: tuple[str, str] | None = 
 
 def finite(value: Any) -> Any:
     """Return a value as JSON has it: NaN and infinity as None, arrays and tuples as lists."""
-    if isinstance(value, np.ndarray):  # a long column, without a call for each number
+    if isinstance(value, np.ndarray) and value.dtype.kind == "f":  # no call for each number
         plain = value.astype(object)
         plain[~np.isfinite(value)] = None
         return plain.tolist()
-    if isinstance(value, np.generic):
-        value = value.item()
+    if isinstance(value, np.ndarray | np.generic):
+        value = value.tolist()
     if isinstance(value, Mapping):
         return {key: finite(item) for key, item in value.items()}
     if isinstance(value, list | tuple):

@@ -33,7 +33,6 @@ def structure_p_value(space: SampleSpace, nuisance: Array, chosen: Sequence[int]
     residuals[0] = space.y
     np.random.default_rng(SEED).standard_normal(out=residuals[1:])
     residuals -= (residuals @ fitted) @ fitted.T
-    residuals = residuals.astype(np.float32)  # ranks among draws need no more
     whole = np.einsum("ij,ij->i", residuals, residuals)
     if not whole[0]:
         return 1.0
@@ -51,7 +50,7 @@ def _squares_along(X: Array, columns: NDArray[np.int64], sizes: Array, residuals
     """Return the sum of squares of every residual (D, m) along the columns, a few at once."""
     total = np.zeros(len(residuals))
     for few in np.array_split(np.arange(len(columns)), 1 + len(columns) // AT_ONCE):
-        along = residuals @ (X[:, columns[few]] / sizes[few]).astype(residuals.dtype)
+        along = residuals @ (X[:, columns[few]] / sizes[few])
         total += np.einsum("ij,ij->i", along, along)
     return total
 

@@ -79,11 +79,9 @@ def refit(
         step = _step(whole, target, inverse_lengths(whole), fitted, x)
         parts = np.split(step, np.cumsum([len(v) for v in x]))[: len(x)]
         share = _step_share(state, fitted, x, parts, sigma, rows.A)
-        last = x, state
         x = [_within(c, v + share * part) for c, v, part in zip(fitted, x, parts, strict=True)]
         state = _frame_moved(state, extra, _terms(fitted, x))
-        stays = state is last[1] and all(map(np.array_equal, x, last[0]))  # in all further rounds
-        if stays or _largest_step(fitted, parts) < CONVERGED:
+        if _largest_step(fitted, parts) < CONVERGED:
             break
     covariance = _covariances(
         *rows.with_prior(), rows.variance(step, space.floor), [len(v) for v in x],
