@@ -105,11 +105,8 @@ class ServoWriter:
         elif not self._control.isProgramRunning():
             self._control.reuploadScript()
             self._wait_running()
-        control = self._control
-        if not control.setWatchdog(self._settings.watchdog):
+        if not self._control.setWatchdog(self._settings.watchdog):
             raise WriteError(f"{host}: the controller refused the watchdog")
-        # returns when the script accepts commands: otherwise the first servoJ would block
-        control.kickWatchdog()
         self._count, self._kicked = 0, 0.0
 
     def _open(self) -> Any:
