@@ -27,7 +27,9 @@ from gapbridge.core.model import Model
 from gapbridge.core.motion import Contributions, Motion
 
 MIN_MASS = 1e-6  # kg, of a link, to divide a first moment by
-MOMENTS = 16  # whose torques are kept: one of each link, and the steps of a Jacobian
+PAIRS = ((0, 1), (0, 2), (1, 2))  # of a link's axes
+OWN_SHIFT = 0.15  # m that a link's own mass may lie elsewhere: what shifts its centre of gravity
+# farther (a counterweight) adds no inertia beyond that, which would grow with the square
 
 
 class Frames(NamedTuple):
@@ -98,11 +100,25 @@ def contributions_of(model: Model, motion: Motion) -> Contributions:
             _at_flange(sensor, point_at_sensor, -force, zeros),
         )
 
-    # a fit varies one term at a time, the others keep their moments
-    @functools.lru_cache(maxsize=MOMENTS)
-    def link_from(i: int, moment: tuple[float, ...]) -> Array:
-        shift = np.array(moment) / max(float(chain.mass[i]), MIN_MASS)
-        return link_at(i, chain.cog[i] + shift) - link_torque[:, i]
+    @functools.cache
+    def shift_torque(i: int) -> Array:
+        """Return the torques (9, N * n) per m along each axis of link i, and per product of two."""
+
+        def more(shift: Array) -> Array:
+            return (link_at(i, chain.cog[i] + shift) - link_torque[:, i]).ravel()
+
+        axes = np.eye(3)
+        ahead, behind = [more(axis) for axis in axes], [more(-axis) for axis in axes]
+        linear = [(f - b) / 2 for f, b in zip(ahead, behind, strict=True)]
+        square = [(f + b) / 2 for f, b in zip(ahead, behind, strict=True)]
+        mixed = [more(axes[j] + axes[k]) - ahead[j] - ahead[k] for j, k in PAIRS]
+        return np.stack([*linear, *square, *mixed])
+
+    def link_from(i: int, moment: Array) -> Array:
+        shift = moment / max(float(chain.mass[i]), MIN_MASS)
+        near = shift * min(1.0, OWN_SHIFT / max(float(np.linalg.norm(shift)), OWN_SHIFT))
+        products = [*(near**2), *(near[j] * near[k] for j, k in PAIRS)]
+        return np.asarray((np.array([*shift, *products]) @ shift_torque(i)).reshape(count, n))
 
     payload_torque, payload_wrench = payload_from(np.zeros(3))
     return Contributions(

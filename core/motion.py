@@ -52,7 +52,7 @@ class Contributions:
     # torques (N, n) and wrench (N, 6) per kg of payload, its centre shifted by (3,) m, flange axes
     payload_from: Callable[[Array], tuple[Array, Array]]
     # torques (N, n) that a first moment (3,) kg m of a link (from 0) takes more, link axes
-    link_from: Callable[[int, tuple[float, ...]], Array]
+    link_from: Callable[[int, Array], Array]
 
 
 @dataclass(frozen=True)

@@ -14,9 +14,9 @@ from gapbridge.core.diagnosis.across_sessions import session_transfer
 from gapbridge.core.diagnosis.all_rows.gap_sizes import gaps, sizes_of, streamed_sizes
 from gapbridge.core.diagnosis.all_rows.long_recording import LongRecording, long_recording
 from gapbridge.core.diagnosis.all_rows.refit_on_all_rows import (
+    RefitsAtOnce,
     accused_on_all_rows,
     fitted_on_all_rows,
-    refitted,
     with_undecided_terms,
 )
 from gapbridge.core.diagnosis.all_rows.remaining_structure import (
@@ -373,8 +373,8 @@ def _channel_diagnosis(
     held_out = HeldOut(decided)
     if searched.more or streamed is not None:
         unknown = judgement.unnamed_part is not None
-        alone = partial(refitted, model, unknown) if streamed is None else streamed.alone
-        decided, judgement = accused_on_all_rows(decided, judgement, held_out, alone)
+        refits = RefitsAtOnce(model, unknown) if streamed is None else streamed
+        decided, judgement = accused_on_all_rows(decided, judgement, held_out, refits)
     if streamed is None:
         final = decided
     else:

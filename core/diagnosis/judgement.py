@@ -256,8 +256,9 @@ def significant_alone(
     significant than before, and a stiffness curve linear. If all links are accused as a whole, at
     least one of their terms must be significant, and no parameter implausible without being so.
     """
+    start = selection.terms
     while True:
-        refit = refitted_alone(selection, arm, judgement.accused, judgement.unnamed_part)
+        refit = refitted_alone(selection, arm, judgement.accused, judgement.unnamed_part, start)
         if implausible := refit.implausible_parameters(judgement.accused):
             selection = selection.with_nominal(implausible)
             continue
@@ -280,6 +281,7 @@ def significant_alone(
             withdrawn=(*judgement.withdrawn, *((p, reason) for p in weakest)),
             ties={p: names for p, names in judgement.ties.items() if p not in weakest},
         )  # fmt: skip
+        start = refit.terms
 
 
 def _linear_with_unnamed(refit: Selection, judgement: Judgement) -> set[int]:

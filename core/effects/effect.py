@@ -123,6 +123,8 @@ class Effect(ABC):
     flexibility: ClassVar[str] = ""  # which of a joint's linear flexibilities: axial, radial
     acts_through_deflection: ClassVar[bool] = False  # True: not visible on a rigid arm
     loads_joints: ClassVar[bool] = False  # True: a load on the joints, on which friction may depend
+    adds_torque: ClassVar[bool] = False  # True: to that of the other terms, whatever it is
+    depends_on_load: ClassVar[bool] = False  # True: ``added`` depends on the load of the joint
     adds_mass: ClassVar[bool] = False  # True: kg in addition to the declared payload
     scales_reading: ClassVar[bool] = False  # True: does not change a zero reading of the sensor
     fits_any_constant: ClassVar[bool] = False  # True: can represent any constant reading
@@ -240,6 +242,7 @@ class TorqueEffect(JointEffect):
     """What a joint's motor delivers more."""
 
     channels = ("torque",)
+    adds_torque = True
 
     def drive(self, term: Term, arm: Arm, torque: Array, motion: Motion) -> Array:
         """Add it at the joint."""

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import moving_truth as truth
 import numpy as np
+import pinocchio as pin
 import pytest
 
-from gapbridge.core.dynamics import predict_torque, predict_wrench
+from gapbridge.core.dynamics import OWN_SHIFT, predict_torque, predict_wrench
+from gapbridge.core.effects import Site, Term
 from gapbridge.core.loads import Loads
 from gapbridge.core.motion import Motion
 
@@ -63,3 +65,46 @@ def test_a_pull_at_the_tcp_reads_as_it_is_and_eases_the_motors(case):
     bare = predict_torque(plant.model(), free)
     saved = np.abs(predict_torque(model, held) - bare).mean()
     assert saved < 0.5 * np.abs(predict_torque(model, free) - bare).mean()
+
+
+def shifted_link(plant, monkeypatch, link, shift):
+    """Have Pinocchio's link (from 1) with its centre of gravity moved by (3,) m, link axes."""
+    nominal = type(plant).pinocchio
+
+    def moved(self, *arguments, **more):
+        model = nominal(self, *arguments, **more)
+        old = model.inertias[link]
+        model.inertias[link] = pin.Inertia(old.mass, old.lever + shift, old.inertia)
+        return model
+
+    monkeypatch.setattr(type(plant), "pinocchio", moved)
+
+
+def first_moment(plant, link, shift):
+    return Term("link_cog", Site(link), tuple(plant.arm.mass[link - 1] * shift))
+
+
+@pytest.mark.parametrize("link", [2, 5])
+def test_a_links_mass_that_lies_elsewhere_takes_the_torques_of_pinocchio(case, link, monkeypatch):
+    plant, q, qd, qdd, *_ = case
+    shift = 0.99 * OWN_SHIFT * np.array([2, -1, 2]) / 3
+    shifted_link(plant, monkeypatch, link, shift)
+    motion = motion_at(q, qd, qdd, Loads())
+    found = predict_torque(plant.model(), motion, [first_moment(plant, link, shift)])
+    assert np.abs(found - plant.dynamics(q, qd, qdd)[0]).max() < 1e-9
+
+
+def test_a_counterweight_takes_its_weight_and_no_more_inertia_than_the_links_own_mass(
+    case, monkeypatch
+):
+    plant, q, qd, qdd, *_ = case
+    shift, zero, model = np.array([-1.2, 0.3, 0.4]), np.zeros_like(q), plant.model()
+    at_rest, moving = motion_at(q, zero, zero, Loads()), motion_at(q, qd, qdd, Loads())
+    once, twice, thrice = (
+        predict_torque(model, moving, [first_moment(plant, 2, times * shift)])
+        for times in (1, 2, 3)
+    )
+    assert np.abs((thrice - twice) - (twice - once)).max() < 1e-9
+    shifted_link(plant, monkeypatch, 2, shift)
+    held = predict_torque(model, at_rest, [first_moment(plant, 2, shift)])
+    assert np.abs(held - plant.dynamics(q, zero, zero)[0]).max() < 1e-9

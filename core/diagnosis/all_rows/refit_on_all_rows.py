@@ -6,8 +6,9 @@ their rivals fit into memory for all rows, which decide values, ties and held-ou
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 
@@ -31,7 +32,13 @@ from gapbridge.core.diagnosis.selection.geometry import links_of
 from gapbridge.core.diagnosis.selection.local_search import rivals
 from gapbridge.core.diagnosis.selection.noise import carried_to
 from gapbridge.core.diagnosis.selection.outliers import inliers
-from gapbridge.core.diagnosis.selection.refit import UnnamedPart, refit, worth
+from gapbridge.core.diagnosis.selection.refit import (
+    LinearisedTerms,
+    UnnamedPart,
+    linearised_terms,
+    refit,
+    worth,
+)
 from gapbridge.core.diagnosis.selection.sample_space import fit
 from gapbridge.core.diagnosis.selection.selection import Selection, refitted_alone
 from gapbridge.core.diagnosis.selection.state import SelectionState, sample_space
@@ -40,7 +47,17 @@ from gapbridge.core.estimation.least_squares import solve
 from gapbridge.core.estimation.robust import start_weights
 from gapbridge.core.model import Model
 
-Alone = Callable[[Selection, Sequence[int]], Selection]
+
+class Refits(Protocol):
+    """How the selection's terms are refitted on all rows."""
+
+    def alone(self, selection: Selection, accused: Sequence[int]) -> Selection:
+        """Return the selection with some of its terms (positions), refitted without the others."""
+
+    def linearised(self, selection: Selection, accused: Sequence[int]) -> LinearisedTerms | None:
+        """Return the regression about the accused terms' values; None: each set is refitted."""
+
+
 MAX_RIVALS = 12  # of all causes together
 NO_GAIN = Withdrawal(Check.ALL_ROWS_GAIN)
 
@@ -106,30 +123,30 @@ def _shaped_as(candidate: Candidate, term: Term) -> Candidate:
 
 
 def accused_on_all_rows(
-    selection: Selection, judgement: Judgement, held_out: HeldOut, alone: Alone
+    selection: Selection, judgement: Judgement, held_out: HeldOut, refits: Refits
 ) -> tuple[Selection, Judgement]:
     """Return selection and judgement of the effects that are validated on all rows.
 
     Values have to be significant, lines constant over the quarters of the joint's range, and each
-    effect has to reduce the held-out gap. Ties are evaluated again. ``alone`` refits some of the
+    effect has to reduce the held-out gap. Ties are evaluated again. ``refits`` refits some of the
     selection's terms.
     """
-    selection, judgement = _significant(selection, judgement, alone)
+    selection, judgement = _significant(selection, judgement, refits)
     varying = {
         p: Withdrawal(Check.CONSTANT, by)
         for p, by in not_constant(selection, judgement.accused).items()
     }
-    selection, judgement = _without(varying, selection, judgement, alone)
+    selection, judgement = _without(varying, selection, judgement, refits)
     # in the space of all rows a term's position is its candidate
     failed = without_gain(selection, judgement.accused, held_out) if held_out.possible else []
-    selection, judgement = _without(dict.fromkeys(failed, NO_GAIN), selection, judgement, alone)
+    selection, judgement = _without(dict.fromkeys(failed, NO_GAIN), selection, judgement, refits)
     single = [p for p in judgement.accused if p not in selection.prior]
     ties = ties_of(selection.working, selection.best, single)
     return selection, replace(judgement, ties=ties)
 
 
 def _without(
-    reasons: Mapping[int, Withdrawal], selection: Selection, judgement: Judgement, alone: Alone
+    reasons: Mapping[int, Withdrawal], selection: Selection, judgement: Judgement, refits: Refits
 ) -> tuple[Selection, Judgement]:
     """Return selection and judgement without some positions, the others refitted and significant.
 
@@ -141,53 +158,101 @@ def _without(
     judgement = replace(
         judgement, accused=accused, withdrawn=(*judgement.withdrawn, *reasons.items())
     )
-    return _significant(alone(selection, accused), judgement, alone)
+    return _significant(refits.alone(selection, accused), judgement, refits)
 
 
 def _significant(
-    selection: Selection, judgement: Judgement, alone: Alone
+    selection: Selection, judgement: Judgement, refits: Refits
 ) -> tuple[Selection, Judgement]:
     """Return selection and judgement with significant terms only; undecided ones need six sigmas.
 
     Of the links, accused as a whole, one term at least has to be significant, and no parameter
-    implausible without being so. The weakest term is removed first; terms that came to zero, on
-    their bound, are removed together, since the others' values do not depend on them.
+    implausible without being so.
     """
-    accused, withdrawn = list(judgement.accused), list(judgement.withdrawn)
-    link_terms = {p for p in accused if p in selection.prior}  # three sigmas suffice
+    link_terms = {p for p in judgement.accused if p in selection.prior}  # three sigmas suffice
     square = (MIN_SIGMAS_WITH_UNNAMED / MIN_SIGMAS) ** 2
     least = dict.fromkeys(set(judgement.undecided) - link_terms, square)
     while True:
+        accused = judgement.accused
         if far := selection.implausible_parameters(accused):
-            selection = alone(selection.with_nominal(far), accused)
+            selection = refits.alone(selection.with_nominal(far), accused)
             continue
-        strength = {p: worth(selection.terms[p], selection.covariance[p]) for p in accused}
+        removed = _insignificant(selection, accused, least, refits)
+        if not removed:
+            return selection, judgement
+        judgement = replace(
+            judgement, accused=tuple(p for p in accused if p not in removed),
+            withdrawn=(*judgement.withdrawn, *((p, NOT_SIGNIFICANT) for p in removed)),
+        )  # fmt: skip
+        selection = refits.alone(selection, judgement.accused)
+
+
+def _insignificant(
+    selection: Selection, accused: Sequence[int], least: Mapping[int, float], refits: Refits
+) -> list[int]:
+    """Return the positions of terms to remove, the weakest first; ``least`` is 1 of others.
+
+    Terms that came to zero, on their bound, are removed together, since the others' values do not
+    depend on them. What the removal changes is followed to first order.
+    """
+    strength = {p: worth(selection.terms[p], selection.covariance[p]) for p in accused}
+    removed: list[int] = []
+    linearised = None
+    while True:
+        left = [p for p in accused if p not in removed]
         weak = [
-            kind for kind in selection.judged_together(accused)
+            kind for kind in selection.judged_together(left)
             if max(strength[p] / least.get(p, 1.0) for p in kind) < 1
         ]  # fmt: skip
         if not weak:
-            return selection, replace(judgement, accused=tuple(accused), withdrawn=tuple(withdrawn))
+            return removed
         at_zero = [kind for kind in weak if not any(strength[p] for p in kind)]
-        removed = at_zero or [min(weak, key=lambda kind: max(strength[p] for p in kind))]
-        withdrawn += [(p, NOT_SIGNIFICANT) for kind in removed for p in kind]
-        accused = [p for p in accused if not any(p in kind for kind in removed)]
-        selection = alone(selection, accused)
+        weakest = at_zero or [min(weak, key=lambda kind: max(strength[p] for p in kind))]
+        removed += [p for kind in weakest for p in kind]
+        left = [p for p in left if p not in removed]
+        linearised = linearised or refits.linearised(selection, accused)
+        if linearised is None or not left:
+            return removed
+        fits = linearised.alone([accused.index(p) for p in left])
+        strength = {
+            p: worth(selection.terms[p].with_values(value), spread)
+            for p, value, spread in zip(left, *fits, strict=True)
+        }
 
 
-def refitted(
-    model: Model, unknown: bool, selection: Selection, accused: Sequence[int]
-) -> Selection:
-    """Return the selection on all rows with only some of its terms, refitted.
+@dataclass(frozen=True)
+class RefitsAtOnce:
+    """Refits on all rows at once. If something is unknown, covariances include regions' scatter."""
 
-    If something is ``unknown``, covariances include the scatter among regions.
-    """
-    unnamed_part = _scatter(selection.observation, selection.kept) if unknown else None
-    whole = refitted_alone(selection, model.arm, accused, unnamed_part)
-    links = {p: own for p, own in whole.prior.items() if p in accused}
-    whole = replace(whole, prior=links)
-    single = tuple(p for p in accused if p not in links)
-    return replace(whole, best=fit(whole.working, single))
+    model: Model
+    unknown: bool
+
+    def alone(self, selection: Selection, accused: Sequence[int]) -> Selection:
+        """Return the selection with some of its terms (positions), refitted without the others."""
+        whole = refitted_alone(selection, self.model.arm, accused, self._scatter(selection))
+        links = {p: own for p, own in whole.prior.items() if p in accused}
+        whole = replace(whole, prior=links)
+        single = tuple(p for p in accused if p not in links)
+        return replace(whole, best=fit(whole.working, single))
+
+    def linearised(self, selection: Selection, accused: Sequence[int]) -> LinearisedTerms | None:
+        """Return the regression about the accused terms' values.
+
+        Links keep the prior that they have with all of them. None for a cell whose own parameters
+        are uncertain.
+        """
+        observation, scatter = selection.observation, self._scatter(selection)
+        if observation.uncertain is not None:
+            return None
+        state = SelectionState(observation, self.model.arm, [], selection.noise, selection.kept)
+        return linearised_terms(
+            state, [selection.space.candidates[p] for p in accused],
+            [selection.terms[p] for p in accused], [selection.prior.get(p) for p in accused],
+            None if scatter is None else scatter.region, selection.space.floor,
+        )  # fmt: skip
+
+    def _scatter(self, selection: Selection) -> UnnamedPart | None:
+        return _scatter(selection.observation, selection.kept) if self.unknown else None
 
 
 def _rivals(selection: Selection, accused: Sequence[int]) -> list[Candidate]:

@@ -16,14 +16,14 @@ from gapbridge.core.arm import Arm
 from gapbridge.core.arrays import Array, Index
 from gapbridge.core.diagnosis.all_rows.long_recording import Block, LongRecording
 from gapbridge.core.diagnosis.channels.recording import STRETCHES
-from gapbridge.core.diagnosis.criteria import MAX_OUTLIER_SHARE
+from gapbridge.core.diagnosis.criteria import MAX_OUTLIER_SHARE, PRIOR_REACH
 from gapbridge.core.diagnosis.noise_floor import BLOCK, own_coordinates
 from gapbridge.core.diagnosis.observation import NotObservable, Observation
 from gapbridge.core.diagnosis.regions import REGIONS
 from gapbridge.core.diagnosis.selection.candidate import Candidate, jacobian, named_columns
 from gapbridge.core.diagnosis.selection.delay_columns import chord_columns, chord_value
 from gapbridge.core.diagnosis.selection.noise import Noise
-from gapbridge.core.diagnosis.selection.refit import ReducedRows, single_step, with_free_shape
+from gapbridge.core.diagnosis.selection.refit import LinearisedTerms, with_free_shape
 from gapbridge.core.diagnosis.selection.sample_space import SampleSpace, fit, penalties
 from gapbridge.core.diagnosis.selection.selection import Selection
 from gapbridge.core.diagnosis.selection.state import UnprojectedRows, candidate_of, chords_only
@@ -136,6 +136,9 @@ class Streamed:
         """Return the selection of some of the terms; another selection's space is the same."""
         return self.selection(accused)
 
+    def linearised(self, selection: Selection, accused: Sequence[int]) -> None:
+        """Return None: ``alone`` is fast, and of first order itself."""
+
     def remaining(self, selection: Selection, accused: Sequence[int]) -> tuple[Array, Array]:
         """Return the residual's squares (k,) summed over rows, and means (bins, k) over time."""
         selector = self._selector(accused)
@@ -170,25 +173,21 @@ class Streamed:
     def _fitted(self, accused: Sequence[int]) -> tuple[list[Array], list[Array]]:
         if not accused:
             return [], []
-        selector, used = self._selector(accused), [*self.columns.jacobian, self.columns.width - 1]
+        used = [*self.columns.jacobian, self.columns.width - 1]
         span = max(float(np.ptp(self.time)), 1e-9)
         part = ((self.time - self.time.min()) / span * REGIONS).astype(np.int64)
         part = np.minimum(part, REGIONS - 1) if self.by_region else np.zeros_like(part)
         names = np.unique(part)
         sums = np.stack([self.sums[part == name].sum(axis=(0, 1)) for name in names])
-        rows = rows_of(selector.T @ sums[:, used][:, :, used] @ selector)
+        rows = rows_of(sums[:, used][:, :, used])
         flat = rows.reshape(-1, rows.shape[2])
-        known = dict(zip(self.columns.accused, range(len(self.columns.accused)), strict=True))
-        return single_step(
-            ReducedRows(
-                flat[:, :-1], flat[:, -1],
-                np.repeat(names, rows.shape[1]) if self.by_region else None,
-                float(self.gap.kept * len(self.inverse_sigma)),
-            ),
-            [self.columns.freed[known[p]] for p in accused],
-            [self.columns.x[known[p]] for p in accused],
-            self.excerpt.space.floor,
+        terms = LinearisedTerms(
+            self.columns.freed, self.columns.x,
+            [PRIOR_REACH * c.scales for c in self.columns.freed], flat[:, :-1], flat[:, -1],
+            np.repeat(names, rows.shape[1]) if self.by_region else None,
+            float(self.gap.kept * len(self.inverse_sigma)), self.excerpt.space.floor,
         )  # fmt: skip
+        return terms.alone([self.columns.accused.index(p) for p in accused])
 
     def _space(self) -> tuple[SampleSpace, UnprojectedRows]:
         """Return the sample space of all rows, as rows with the same sums."""

@@ -201,6 +201,7 @@ def jacobian(
     Zeros where the arm has no equilibrium: there only the prior determines the step.
     """
     columns = []
+    others = _interacting(candidate.effect, others)
     for k, parameter in enumerate(candidate.parameters):
         h = np.zeros(len(x))
         h[k] = STEP * parameter.scale
@@ -211,6 +212,24 @@ def jacobian(
             ahead = behind = observation.measured
         columns.append((ahead - behind) / (2 * h[k]))
     return np.stack(columns, axis=-1)
+
+
+def _interacting(effect: Effect, others: Sequence[Term]) -> Sequence[Term]:
+    """Return the terms without which an effect's derivatives would differ.
+
+    Torques that add up cancel in a difference, except for loads where friction depends on them.
+    """
+    if not effect.adds_torque:
+        return others
+    kinds = {t.effect: CATALOGUE[t.effect] for t in others}
+    rubbing = effect.depends_on_load or (
+        effect.loads_joints and any(kind.depends_on_load for kind in kinds.values())
+    )
+
+    def cancels(other: Effect) -> bool:
+        return other.adds_torque and not (rubbing and (other.loads_joints or other.depends_on_load))
+
+    return [t for t in others if not cancels(kinds[t.effect])]
 
 
 def _from_nominal(observation: Observation, candidate: Candidate, base: Sequence[Term]) -> Array:

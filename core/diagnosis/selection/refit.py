@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -29,9 +29,11 @@ from gapbridge.core.estimation.least_squares import (
 )
 
 REFITS = 8
-CONVERGED = 1e-6  # largest change of the last step, in usual sizes
+DAMPINGS = (0.0, 1e-6, 1e-4, 1e-2, 1.0)  # of the strongest column, in usual sizes, squared
+CONVERGED = 1e-3  # squared length of the last step, in its standard deviations
 ROUNDING = 1e-13  # of the largest eigenvalue of a covariance
 NO_PRIOR: Mapping[int, Array] = {}
+NO_START: Mapping[int, Term] = {}
 
 
 @dataclass(frozen=True)
@@ -58,30 +60,37 @@ def refit(
     linear_fit: CandidateFit,
     links: Mapping[int, Array] = NO_PRIOR,
     unnamed_part: UnnamedPart | None = None,
+    start: Mapping[int, Term] = NO_START,
 ) -> tuple[SelectionState, tuple[Term, ...], tuple[int, ...], tuple[Array, ...], Array]:
     """Refit the named terms on the full prediction; smooth ones stay linear, frames are refitted.
 
-    ``links`` are further candidates with a prior 1 sigma of each parameter. With an
-    ``unnamed_part`` covariances are those of regions held out in turn (jackknife) where these are
+    ``links`` are further candidates with a prior 1 sigma of each parameter. ``start``: terms of
+    candidates to start from, instead of the linear fit's values. With an ``unnamed_part``
+    covariances are those of regions held out in turn (jackknife) where these are
     wider than those of white noise, because an unknown effect differs among regions.
     """
     index = (*(c for c in linear_fit.chosen if space.candidates[c].named), *links)
     fitted = [with_free_shape(state.arm, space.candidates[c]) for c in index]
     prior_sigma = [links.get(c, PRIOR_REACH * k.scales) for c, k in zip(index, fitted, strict=True)]
-    sigma = [links.get(c, np.inf) for c in index]
     extra = space.columns([c for c in linear_fit.chosen if not space.candidates[c].named])
     if unnamed_part is not None:
         extra = np.hstack([extra, unnamed_part.columns])
-    x = _start_values(state, fitted, _linear_values(space, linear_fit, fitted))
+    linear = _linear_values(space, linear_fit, fitted)
+    x = [
+        np.array(start[c].values[: len(v)]) if c in start else v
+        for c, v in zip(index, linear, strict=True)
+    ]
+    x = _start_values(state, fitted, x)
     for _ in range(REFITS):
         rows = _linearised(state, fitted, x, extra, prior_sigma, unnamed_part)
-        whole, target = rows.with_prior()
-        step = _step(whole, target, inverse_lengths(whole), fitted, x)
-        parts = np.split(step, np.cumsum([len(v) for v in x]))[: len(x)]
-        share = _step_share(state, fitted, x, parts, sigma, rows.A)
-        x = [_within(c, v + share * part) for c, v, part in zip(fitted, x, parts, strict=True)]
+        step, trial = _descended(state, fitted, x, rows, prior_sigma)
+        if trial is None:
+            break
+        change = np.concatenate([*trial, np.zeros(0)]) - np.concatenate([*x, np.zeros(0)])
+        moved = rows.A[:, : len(change)] @ change
+        x = trial
         state = _frame_moved(state, extra, _terms(fitted, x))
-        if _largest_step(fitted, parts) < CONVERGED:
+        if moved @ moved < CONVERGED * rows.variance(step, space.floor):
             break
     covariance = _covariances(
         *rows.with_prior(), rows.variance(step, space.floor), [len(v) for v in x],
@@ -119,6 +128,7 @@ def _start_values(state: SelectionState, fitted: list[Candidate], x: list[Array]
 
     With the linear values of flexibilities the arm might buckle under its load.
     """
+    x = [_within(c, v) for c, v in zip(fitted, x, strict=True)]
     try:
         state.observation.predict(_terms(fitted, x))
     except EquilibriumError:
@@ -171,39 +181,69 @@ def _frame_moved(state: SelectionState, extra: Array, terms: tuple[Term, ...]) -
     return replace(state, observation=observation.rebased(_nuisance_step(extra, gap, state), terms))
 
 
-def _largest_step(fitted: list[Candidate], parts: list[Array]) -> float:
-    """Return the largest component of a step, in usual sizes of the parameters."""
-    each = (float(np.abs(part / c.scales).max()) for c, part in zip(fitted, parts, strict=True))
-    return max(each, default=0.0)
-
-
 @dataclass(frozen=True)
-class ReducedRows:
-    """Few whitened rows of a regression with the sums of products of many."""
+class LinearisedTerms:
+    """The regression of some terms about their values: fits without some of them, to first order.
 
-    A: Array  # (m, p) Jacobian at the current values
+    The rows may be few, with the sums of products of many.
+    """
+
+    fitted: list[Candidate]
+    x: list[Array]  # (d,) of each term, about which the rows are linearised
+    prior_sigma: list[Array]  # (d,) of each term, about nominal
+    A: Array  # (m, p) whitened Jacobian: terms, nuisance
     b: Array  # (m,) gap
     region: NDArray[np.int64] | None  # (m,) region of each row; None: no scatter among regions
     count: float  # number of the original rows
+    floor: float  # least variance of a row
+
+    def alone(self, kept: Sequence[int]) -> tuple[list[Array], list[Array]]:
+        """Return values (d,) and covariances (d, d) of some of the terms, without the others."""
+        begin = np.cumsum([0, *(len(v) for v in self.x)])
+        own = [np.arange(begin[k], begin[k + 1]) for k in kept]
+        removed = np.setdiff1d(np.arange(begin[-1]), np.concatenate([*own, np.zeros(0)]))
+        columns = np.concatenate([*own, np.arange(begin[-1], self.A.shape[1])]).astype(int)
+        A = self.A[:, columns]
+        b = self.b + self.A[:, removed] @ np.concatenate([*self.x, np.zeros(0)])[removed]
+        fitted, x = [self.fitted[k] for k in kept], [self.x[k] for k in kept]
+        prior_sigma = [self.prior_sigma[k] for k in kept]
+        prior, prior_target = _prior_rows(prior_sigma, x, A.shape[1], None, 0)
+        whole, target = np.vstack([A, prior]), np.concatenate([b, prior_target])
+        step = _step(whole, target, inverse_lengths(whole), fitted, x)
+        sizes = [len(v) for v in x]
+        parts = np.split(step, np.cumsum(sizes))[: len(x)]
+        values = [_within(c, v + part) for c, v, part in zip(fitted, x, parts, strict=True)]
+        residual_ss = float(np.sum((b - A @ step) ** 2))
+        variance = max(residual_ss / max(self.count - A.shape[1], 1), self.floor)
+        return _as_one_delay(
+            fitted, values, _covariances(whole, target, variance, sizes, self.region)
+        )
 
 
-def single_step(
-    rows: ReducedRows, fitted: list[Candidate], x: list[Array], floor: float
-) -> tuple[list[Array], list[Array]]:
-    """Return values (d,) and covariances (d, d) of terms after one Gauss-Newton step from ``x``."""
-    prior_sigma = [PRIOR_REACH * c.scales for c in fitted]
-    prior, prior_target = _prior_rows(prior_sigma, x, rows.A.shape[1], None, 0)
-    whole, target = np.vstack([rows.A, prior]), np.concatenate([rows.b, prior_target])
-    step = _step(whole, target, inverse_lengths(whole), fitted, x)
-    sizes = [len(v) for v in x]
-    values = [
-        _within(c, v + part)
-        for c, v, part in zip(fitted, x, np.split(step, np.cumsum(sizes)[:-1]), strict=True)
+def linearised_terms(
+    state: SelectionState, candidates: list[Candidate], terms: Sequence[Term],
+    links: Sequence[Array | None], region: NDArray[np.int64] | None, floor: float,
+) -> LinearisedTerms:  # fmt: skip
+    """Return the regression of terms about their values, as few rows of each region (m,).
+
+    ``links`` are prior 1 sigma (d,) of each term's parameters, None of what is no link.
+    """
+    fitted = [with_free_shape(state.arm, c) for c in candidates]
+    x = [np.array(t.values[: len(c.scales)]) for c, t in zip(fitted, terms, strict=True)]
+    no_functions = np.zeros((int(state.kept.sum()) * state.observation.measured.shape[1], 0))
+    prior_sigma = [
+        PRIOR_REACH * c.scales if own is None else own for c, own in zip(fitted, links, strict=True)
     ]
-    residual_ss = float(np.sum((rows.b - rows.A @ step) ** 2))
-    variance = max(residual_ss / max(rows.count - rows.A.shape[1], 1), floor)
-    spread = _covariances(whole, target, variance, sizes, rows.region)
-    return _as_one_delay(fitted, values, spread)
+    rows = _linearised(state, fitted, x, no_functions, prior_sigma, None)
+    whole = np.column_stack([rows.A, rows.b])
+    part = np.zeros(len(whole), dtype=np.int64) if region is None else region
+    names = np.unique(part)
+    few = [np.asarray(np.linalg.qr(whole[part == name], mode="r")) for name in names]
+    named = None if region is None else np.repeat(names, [len(r) for r in few])
+    short = np.vstack(few)
+    return LinearisedTerms(
+        fitted, x, prior_sigma, short[:, :-1], short[:, -1], named, float(len(whole)), floor
+    )
 
 
 def _as_one_delay(
@@ -342,34 +382,51 @@ def _prior_rows(
     return np.vstack([rows, more]), np.concatenate([prior_target, np.zeros(len(known))])
 
 
-def _step_share(
-    state: SelectionState, fitted: list[Candidate], x: list[Array], parts: list[Array],
-    sigma: list[Array | float], A: Array,
-) -> float:  # fmt: skip
-    """Return the share of a Gauss-Newton step that does not increase the objective.
+def _descended(
+    state: SelectionState, fitted: list[Candidate], x: list[Array], rows: _Linearised,
+    prior_sigma: list[Array],
+) -> tuple[Array, list[Array] | None]:  # fmt: skip
+    """Return the Gauss-Newton step (p,), and each term's values (d,) after the least damped step.
 
-    ``sigma`` is the prior 1 sigma of each term's parameters; inf: none.
+    The least damped that does not increase the residual (Levenberg-Marquardt; None: there is none).
+    A direction that the rows hardly determine takes a step too long for the linearisation, and
+    would hold up all others if the whole step was shortened.
     """
-    if not fitted:
-        return 1.0
-    linear = A[:, sum(len(v) for v in x) :]  # smooth terms and nuisance, refitted for each trial
-    Q = basis_of(linear)
+    whole, target = rows.with_prior()
+    count = sum(len(v) for v in x)
+    Q = basis_of(whole[:, count:])  # unnamed functions and nuisance, refitted for each trial
 
-    def objective(share: float) -> float:
-        trial = [_within(c, v + share * part) for c, v, part in zip(fitted, x, parts, strict=True)]
+    def objective(trial: list[Array]) -> float:
         try:
             gap = state.observation.measured - state.observation.predict(_terms(fitted, trial))
         except InputError:
             return float("inf")
-        r = projected_out(Q, flat(gap[..., None], state)[:, 0])
-        from_nominal = np.concatenate([v / size for v, size in zip(trial, sigma, strict=True)])
-        return float(r @ r + from_nominal @ from_nominal)
+        from_nominal = -np.concatenate([v / s for v, s in zip(trial, prior_sigma, strict=True)])
+        unnamed = np.zeros(len(target) - len(rows.b) - count)
+        r = np.concatenate([flat(gap[..., None], state)[:, 0], from_nominal, unnamed])
+        r = projected_out(Q, r)
+        return float(r @ r)
 
-    now = objective(0.0)
-    for share in (1.0, 0.5, 0.25, 0.1, 0.03):
-        if objective(share) <= now:
-            return share
-    return 0.0
+    R = np.asarray(np.linalg.qr(np.column_stack([whole, target]), mode="r"))
+    A, b = R[:, :-1], R[:, -1]
+    unit, size = inverse_lengths(A), np.concatenate([*prior_sigma, np.zeros(0)])
+    strongest = float((np.sqrt(np.sum(A[:, :count] ** 2, axis=0)) * size).max(initial=0.0))
+
+    def step(damping: float) -> Array:
+        damped = np.vstack([A, np.zeros((count, A.shape[1]))])
+        damped[len(A) :, :count] = np.diag(np.sqrt(damping) * strongest / size)
+        return _step(damped, np.concatenate([b, np.zeros(count)]), unit, fitted, x)
+
+    plain = step(0.0)
+    if not fitted:
+        return plain, x
+    now = objective(x)
+    for damping in DAMPINGS:
+        parts = np.split(step(damping) if damping else plain, np.cumsum([len(v) for v in x]))
+        trial = [_within(c, v + part) for c, v, part in zip(fitted, x, parts, strict=False)]
+        if objective(trial) <= now:
+            return plain, trial
+    return plain, None
 
 
 def with_free_shape(arm: Arm, candidate: Candidate) -> Candidate:

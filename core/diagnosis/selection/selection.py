@@ -188,12 +188,14 @@ class Selection:
 
 
 def refitted_alone(
-    selection: Selection, arm: Arm, accused: Sequence[int], unnamed_part: UnnamedPart | None = None
-) -> Selection:
+    selection: Selection, arm: Arm, accused: Sequence[int], unnamed_part: UnnamedPart | None = None,
+    start: Sequence[Term] | None = None,
+) -> Selection:  # fmt: skip
     """Return the selection with the ``accused`` terms (positions) refitted without the others.
 
-    In a short log the ``unnamed_part`` is fitted too, because the residual structure would bias the
-    values. A long log averages over it, and the functions would absorb the links' part.
+    It begins from the terms ``start``, by default the selection's. In a short log the
+    ``unnamed_part`` is fitted too, because the residual structure would bias the values. A long log
+    averages over it, and the functions would absorb the links' part.
     """
     whole = len(accused) == len(selection.terms) and unnamed_part is None
     if not accused or (whole and not selection.nominal):
@@ -206,8 +208,10 @@ def refitted_alone(
     state = SelectionState(selection.observation, arm, [], selection.noise, selection.kept)
     space = selection.working if links else selection.space
     alone = fit(space, [c for c in chosen if c not in links])
+    terms = selection.terms if start is None else start
+    begin = {c: terms[p] for p, c in zip(accused, chosen, strict=True)}
     state, fitted, index, spread, residual = refit(
-        state, selection.space, alone, links, unnamed_part
+        state, selection.space, alone, links, unnamed_part, begin
     )
     terms, covariance = list(selection.terms), list(selection.covariance)
     for c, term, term_covariance in zip(index, fitted, spread, strict=True):

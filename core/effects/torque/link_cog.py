@@ -18,9 +18,11 @@ class LinkCog(JointEffect):
 
     Axes of the URDF link (with ``dh`` those of the row's frame). Comes from cables, covers, and
     drawings without motors. Shows in the weight that the joint and those before it hold; the mass
-    stays, which ``link_inertia`` changes. Part of it loads no joint, or cannot be distinguished
-    from the next link's: only some combinations are found, the rest stays open. Under one constant
-    load the last link's is the same as ``payload_cog``.
+    stays, which ``link_inertia`` changes. The link's inertia about its joint grows with the shift
+    up to 0.15 m: more than that is a counterweight's, not the link's own mass. Part of the moment
+    loads no joint, or cannot be distinguished from the next link's: only some combinations are
+    found, the rest stays open. Under one constant load the last link's is the same as
+    ``payload_cog``.
     Source: Gautier, Khalil, IEEE Trans. Robotics and Automation 6 (1990) 368, on base parameters.
     """
 
@@ -29,6 +31,7 @@ class LinkCog(JointEffect):
     label_template = "first moment {part} of link {joint}"
     order = 22
     loads_joints = True
+    adds_torque = True
     estimated_as_whole = True
     channels = ("torque",)
     motion = "poses that turn the link against gravity, or its accelerations"
@@ -60,4 +63,4 @@ class LinkCog(JointEffect):
         assert motion.pieces is not None
         i, moment = term.site.index, np.array(term.values)
         in_link = moment if arm.body_axes is None else arm.body_axes[i] @ moment
-        return torque + motion.pieces.link_from(i, tuple(in_link.tolist()))
+        return torque + motion.pieces.link_from(i, in_link)

@@ -27,6 +27,7 @@ class LinkInertia(JointEffect):
     title = "link weighs more or less"
     order = 20
     loads_joints = True
+    adds_torque = True
     channels = ("torque",)
     simulated_as = Kind.LINK_SCALE
     motion = "many poses, and accelerations of all joints up to the link"

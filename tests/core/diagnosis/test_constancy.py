@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import pytest
@@ -12,9 +11,9 @@ import small_arm as small
 from benchmarks.blind.measuring import axial_moments
 from benchmarks.blind.session import play
 from gapbridge.core.diagnosis.all_rows.refit_on_all_rows import (
+    RefitsAtOnce,
     accused_on_all_rows,
     fitted_on_all_rows,
-    refitted,
 )
 from gapbridge.core.diagnosis.constancy import not_constant
 from gapbridge.core.diagnosis.diagnosis import diagnose
@@ -140,8 +139,6 @@ def test_all_rows_judge_whether_a_line_is_one(fades, kept):
     )  # fmt: skip
     accused = Judgement((0,), True, 0.0, (), {}, ())
     whole = fitted_on_all_rows(selection, accused, selection.observation, model)
-    _, decided = accused_on_all_rows(
-        whole, accused, HeldOut(whole), partial(refitted, model, False)
-    )
+    _, decided = accused_on_all_rows(whole, accused, HeldOut(whole), RefitsAtOnce(model, False))
     assert decided.accused == ((0,) if kept else ())
     assert kept or dict(decided.withdrawn)[0].failed is Check.CONSTANT

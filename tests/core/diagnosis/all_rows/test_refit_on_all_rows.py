@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,9 +11,9 @@ import small_arm as small
 
 from gapbridge.core.diagnosis.all_rows import refit_on_all_rows as all_rows
 from gapbridge.core.diagnosis.all_rows.refit_on_all_rows import (
+    RefitsAtOnce,
     accused_on_all_rows,
     fitted_on_all_rows,
-    refitted,
     with_undecided_terms,
 )
 from gapbridge.core.diagnosis.held_out import HeldOut
@@ -22,7 +21,7 @@ from gapbridge.core.diagnosis.judgement import NOT_SIGNIFICANT, Judgement, judge
 from gapbridge.core.diagnosis.selection.selection import Selection
 from gapbridge.core.effects import Site, Term, effect_named
 
-ALONE = partial(refitted, small.model_of(), False)
+REFITS = RefitsAtOnce(small.model_of(), False)
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +36,7 @@ def test_covariances_with_an_unknown_effect_include_the_scatter_among_regions():
     selection = small.diagnosed("cross_coupling").channels[0].selection
     everything = tuple(range(len(selection.terms)))
     white, _ = on_all(selection, Judgement(everything, True, 0.0, (), {}, ()))
-    beside = refitted(small.model_of(), True, white, everything)
+    beside = RefitsAtOnce(small.model_of(), True).alone(white, everything)
     for p in everything:
         assert beside.covariance[p].item() > 1.5 * white.covariance[p].item()
 
@@ -61,7 +60,7 @@ def test_a_term_not_significant_on_some_rows_is_accused_if_significant_on_all(se
     requested = with_undecided_terms(withdrawn_as_vague(judgement, position))
     assert requested.undecided == (position,)
     whole, held = on_all(selection, requested)
-    _, decided = accused_on_all_rows(whole, requested, held, ALONE)
+    _, decided = accused_on_all_rows(whole, requested, held, REFITS)
     assert position in decided.accused
     assert position not in dict(decided.withdrawn)
 
@@ -75,11 +74,16 @@ def test_a_term_not_significant_on_all_rows_is_withdrawn(searched):
     value = np.array(whole.terms[position].values[: len(covariance[position])])
     covariance[position] = np.diag((value / 4.0) ** 2)  # enough for a word, not for an accusation
     unsure = replace(whole, covariance=tuple(covariance))
-    _, decided = accused_on_all_rows(unsure, requested, held, ALONE)
+    _, decided = accused_on_all_rows(unsure, requested, held, REFITS)
     assert position not in decided.accused
     assert dict(decided.withdrawn)[position] == NOT_SIGNIFICANT
-    _, kept = accused_on_all_rows(unsure, judgement, held, ALONE)
+    _, kept = accused_on_all_rows(unsure, judgement, held, REFITS)
     assert position in kept.accused  # what some rows were sure of is not asked again
+
+
+def each_by_itself(alone):
+    """Return refits that follow nothing to first order."""
+    return SimpleNamespace(alone=alone, linearised=lambda *_: None)
 
 
 class OnAllRows:
@@ -111,7 +115,7 @@ def test_a_length_not_identifiable_on_all_rows_is_kept_nominal():
     found = OnAllRows((1e-3, 0.071, 1e-3), (5e-4,))
     requested = Judgement((0, 1), True, 0.0, (), {}, ())
     selection, decided = all_rows._significant(
-        found, requested, lambda selection, accused: selection
+        found, requested, each_by_itself(lambda selection, _: selection)
     )
     assert selection.terms[0].values == (1e-3, 0.0, 1e-3)
     assert decided.accused == (0, 1)
@@ -131,7 +135,7 @@ def test_remaining_terms_are_tested_again_after_a_withdrawal(monkeypatch):
 
     requested = Judgement((0, 1), True, 0.0, (), {}, ())
     selection, decided = accused_on_all_rows(
-        found, requested, SimpleNamespace(possible=False), alone
+        found, requested, SimpleNamespace(possible=False), each_by_itself(alone)
     )
     assert decided.accused == (0,)
     assert selection.terms[0].values == (1e-3, 0.0, 1e-3)
@@ -142,7 +146,9 @@ def test_an_undecided_joint_zero_of_the_links_needs_three_sigmas(zero, stays):
     """It has a prior: without it the links of a UR10 stood for 0.57 mrad +- 0.13 mrad."""
     found = OnAllRows((1e-3, 1e-3, 1e-3), (zero,))
     requested = Judgement((0, 1), True, 0.0, (), {}, (), undecided=(1,))
-    _, decided = all_rows._significant(found, requested, lambda selection, accused: selection)
+    _, decided = all_rows._significant(
+        found, requested, each_by_itself(lambda selection, _: selection)
+    )
     assert decided.accused == stays
 
 
@@ -163,6 +169,38 @@ def test_terms_that_came_to_zero_are_removed_together():
         return selection
 
     requested = Judgement((0, 1, 2, 3), True, 0.0, (), {}, ())
-    _, decided = all_rows._significant(found, requested, alone)
+    _, decided = all_rows._significant(found, requested, each_by_itself(alone))
     assert refitted_with == [(0,), ()]
     assert decided.withdrawn == tuple((p, NOT_SIGNIFICANT) for p in (1, 2, 3, 0))
+
+
+def test_what_a_removal_makes_insignificant_is_removed_before_the_next_refit():
+    """Followed to first order, one refit in place of one for each term; the refit decides."""
+    terms = [Term("coulomb_friction", Site(j), (1.0,)) for j in (1, 2, 3, 4)]
+    refitted_with = []
+
+    def selection_of(sizes):
+        found = OnAllRows((0.0, 0.0, 0.0), (0.0,))
+        found.terms = tuple(t.with_values([v]) for t, v in zip(terms, sizes, strict=True))
+        found.covariance, found.term_index = [np.eye(1) * 1e-2] * 4, (0, 1, 2, 3)
+        found.prior = {}
+        own = [SimpleNamespace(effect=effect_named(t.effect)) for t in terms]
+        found.space = SimpleNamespace(candidates=own)
+        return found
+
+    def alone(selection, accused):
+        refitted_with.append(tuple(accused))
+        return selection_of([1.0, 0.0, 0.0, 0.1] if len(refitted_with) == 1 else [1.0] * 4)
+
+    def to_first_order(kept):  # without joint 3 joint 2's is gone, and then joint 4's is sure
+        sizes = {(0, 1, 3): [1.0, 0.1, 0.2], (0, 3): [1.0, 1.0], (0,): [1.0]}[tuple(kept)]
+        return [np.array([v]) for v in sizes], [np.eye(1) * 1e-2] * len(kept)
+
+    refits = SimpleNamespace(
+        alone=alone, linearised=lambda *_: SimpleNamespace(alone=to_first_order)
+    )
+    requested = Judgement((0, 1, 2, 3), True, 0.0, (), {}, ())
+    found = selection_of([1.0, 0.5, 0.1, 0.5])
+    _, decided = all_rows._significant(found, requested, refits)
+    assert refitted_with == [(0, 3), (0,)]
+    assert [p for p, _ in decided.withdrawn] == [2, 1, 3]

@@ -15,7 +15,7 @@ from gapbridge.core.diagnosis.channels.position import observe
 from gapbridge.core.diagnosis.observation import Observation
 from gapbridge.core.diagnosis.selection.candidate import named_candidates, named_columns
 from gapbridge.core.diagnosis.selection.noise import estimate_noise
-from gapbridge.core.diagnosis.selection.refit import refit
+from gapbridge.core.diagnosis.selection.refit import UnnamedPart, linearised_terms, refit
 from gapbridge.core.diagnosis.selection.sample_space import fit
 from gapbridge.core.diagnosis.selection.state import SelectionState, sample_space
 from gapbridge.core.metrology import Metrology
@@ -153,3 +153,64 @@ def test_a_number_that_moves_nothing_hides_no_other():
     _, terms, _, covariance, _ = refit(state, space, fit(space, (0, 1)))
     assert terms[alone].values[0] == pytest.approx(0.01, abs=1e-6)
     assert covariance[alone][0, 0] == pytest.approx(expected[0, 0], rel=0.05)
+
+
+def test_a_direction_that_the_rows_hardly_determine_does_not_hold_up_the_others():
+    """Its step is too long for the linearisation: it is shortened, not the whole step."""
+    rng = np.random.default_rng(4)
+    real = offset(2, LARGE_SAMPLE)
+    metrology = Metrology(registered=True, sigma=small.SIGMA)
+    position = exact(real) + rng.normal(0, small.SIGMA, exact(real).shape)
+    seen = observe(MODEL, small.log_of(SESSION, position), metrology)
+    assert isinstance(seen, Observation)
+    vague = rng.normal(size=seen.measured.shape)
+
+    def predict(terms):
+        size = sum(t.values[0] for t in terms if t.effect == "axial_compliance") / 1e-5
+        shape = 1e-3 * size + max(abs(size) - 5.0, 0.0) ** 2
+        others = [t for t in terms if t.effect != "axial_compliance"]
+        return seen.predict(others) + small.SIGMA * vague * shape
+
+    bent = replace(seen, predict=predict)
+    wanted = [("joint_offset", 2), ("axial_compliance", 3)]
+    candidates = [c for c in named_candidates(MODEL.arm, "position", turns=[1.0] * 3)
+                  if (c.family, c.site.joint) in wanted]  # fmt: skip
+    kept = np.ones(len(seen.rows), dtype=bool)
+    noise = estimate_noise(bent, np.full(bent.measured.shape, small.FLOOR), kept)
+    found = []
+    for own in (candidates, [c for c in candidates if c.family == "joint_offset"]):
+        state = SelectionState(bent, MODEL.arm, own, noise, kept)
+        space, *_ = sample_space(state, [named_columns(bent, c, ()) for c in own], (), [])
+        linear = fit(space, tuple(range(len(own))))
+        start = tuple(np.full(1, 0.0599 if c.family == "joint_offset" else 0.0) for c in own)
+        _, terms, _, _, _ = refit(state, space, replace(linear, values=start))
+        found.append(next(t.values[0] for t in terms if t.effect == "joint_offset"))
+    assert found[0] == pytest.approx(found[1], abs=1e-6)
+
+
+@pytest.mark.parametrize("regions", [None, 5])
+def test_a_fit_without_a_term_to_first_order_is_the_refit_without_it(regions):
+    metrology = Metrology(registered=True, sigma=small.SIGMA)
+    position = exact(offset(2, 1e-3))
+    position = position + np.random.default_rng(5).normal(0, small.SIGMA, position.shape)
+    seen = observe(MODEL, small.log_of(SESSION, position), metrology)
+    assert isinstance(seen, Observation)
+    wanted = [("joint_offset", 2), ("joint_offset", 3), ("axial_compliance", 3)]
+    candidates = [c for c in named_candidates(MODEL.arm, "position", turns=[1.0] * 3)
+                  if (c.family, c.site.joint) in wanted]  # fmt: skip
+    kept = np.ones(len(seen.rows), dtype=bool)
+    noise = estimate_noise(seen, np.full(seen.measured.shape, small.FLOOR), kept)
+    state = SelectionState(seen, MODEL.arm, candidates, noise, kept)
+    space, *_ = sample_space(state, [named_columns(seen, c, ()) for c in candidates], (), [])
+    region = None
+    if regions is not None:
+        region = np.arange(seen.measured.size) * regions // seen.measured.size
+    part = None if region is None else UnnamedPart(np.zeros((len(region), 0)), np.zeros(0), region)
+    _, terms, _, _, _ = refit(state, space, fit(space, (0, 1, 2)), unnamed_part=part)
+    found = linearised_terms(state, candidates, terms, [None] * 3, region, space.floor)
+    for left in ((0, 2), (1,), (0, 1, 2)):
+        _, exact_terms, _, covariance, _ = refit(state, space, fit(space, left), unnamed_part=part)
+        values, spread = found.alone(left)
+        for value, own, term, exactly in zip(values, spread, exact_terms, covariance, strict=True):
+            assert abs(value[0] - term.values[0]) < 0.1 * np.sqrt(exactly[0, 0])
+            assert own[0, 0] == pytest.approx(exactly[0, 0], rel=0.02)
