@@ -1,4 +1,4 @@
-"""The nonlinear refit: Gauss-Newton on the full prediction, frames included."""
+"""The nonlinear refit: Levenberg-Marquardt steps on the full prediction, frames included."""
 
 from __future__ import annotations
 
