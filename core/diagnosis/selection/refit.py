@@ -151,8 +151,12 @@ class _Linearised:
 
     def variance(self, step: Array, floor: float) -> float:
         """Return the residual variance of a row after a step (p,), at least ``floor``."""
-        residual_ss = float(np.sum((self.b - self.A @ step) ** 2))
-        return float(max(residual_ss / max(len(self.b) - self.A.shape[1], 1), floor))
+        return _variance(self.b - self.A @ step, len(self.b) - self.A.shape[1], floor)
+
+
+def _variance(residual: Array, freedom: float, floor: float) -> float:
+    """Return the variance of a residual (m,) with so many degrees of freedom, at least floor."""
+    return float(max(float(residual @ residual) / max(freedom, 1.0), floor))
 
 
 def _linearised(
@@ -213,8 +217,7 @@ class LinearisedTerms:
         sizes = [len(v) for v in x]
         parts = np.split(step, np.cumsum(sizes))[: len(x)]
         values = [_within(c, v + part) for c, v, part in zip(fitted, x, parts, strict=True)]
-        residual_ss = float(np.sum((b - A @ step) ** 2))
-        variance = max(residual_ss / max(self.count - A.shape[1], 1), self.floor)
+        variance = _variance(b - A @ step, self.count - A.shape[1], self.floor)
         return _as_one_delay(
             fitted, values, _covariances(whole, target, variance, sizes, self.region)
         )
