@@ -12,7 +12,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from Pynite import FEModel3D
 from scipy.linalg import lu_factor, lu_solve
 from scipy.spatial.transform import Rotation
 
@@ -62,6 +61,8 @@ class Frame:
     """One pose of an arm as a finite-element model."""
 
     def __init__(self, arm: FrameArm, q: np.ndarray, payload_cog: np.ndarray | None = None) -> None:
+        from Pynite import FEModel3D  # takes most of a second to import
+
         self.arm, self.model = arm, FEModel3D()
         self._places: dict[str, str] = {}
         self.model.add_material("unit", 1.0, 1.0, 0.3, 0.0)

@@ -8,6 +8,7 @@ from pathlib import Path
 import yaml
 
 from gapbridge.core.errors import InputError
+from gapbridge.core.files import loaders
 
 LISTS = Path(__file__).parent / "lists"
 
@@ -43,9 +44,9 @@ class Mutant:
 
 def read_mutants(folder: Path = LISTS) -> list[Mutant]:
     """Return the mutants of all lists. Raises InputError for one that is not whole."""
-    found = []
+    found, fastest = [], loaders()[0]
     for path in sorted(folder.glob("*.yaml")):
-        for number, given in enumerate(yaml.safe_load(path.read_text(encoding="utf-8")), 1):
+        for number, given in enumerate(yaml.load(path.read_text(encoding="utf-8"), fastest), 1):
             try:
                 found.append(Mutant(**{**given, "tests": tuple(given["tests"])}))
             except (KeyError, TypeError) as error:

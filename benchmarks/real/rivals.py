@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import savgol_filter
 
 from benchmarks.real import arms
 from benchmarks.real.geometry import fit_geometry, points, registered
@@ -176,6 +175,8 @@ def derivatives(table: Table) -> tuple[Array, Array, Array, int]:
     time, q = table.time, table.joints()
     even = np.linspace(time[0], time[-1], len(time))
     dt = float(even[1] - even[0])
+    from scipy.signal import savgol_filter  # takes most of a second to import
+
     window = max(5, int(SMOOTH / dt) // 2 * 2 + 1)
     speed = table.get("actual_qd")
     if speed is None:

@@ -48,6 +48,10 @@ def structure_p_value(space: SampleSpace, nuisance: Array, chosen: Sequence[int]
 
 def _squares_along(X: Array, columns: NDArray[np.int64], sizes: Array, residuals: Array) -> Array:
     """Return the sum of squares of every residual (D, m) along the columns, a few at once."""
+    m, count = len(X), len(columns)
+    if m * (count + len(residuals)) < len(residuals) * count:  # fewer products by squares of rows
+        unit = X[:, columns] / sizes
+        return np.asarray(np.einsum("ij,ij->i", residuals @ (unit @ unit.T), residuals))
     total = np.zeros(len(residuals))
     for few in np.array_split(np.arange(len(columns)), 1 + len(columns) // AT_ONCE):
         along = residuals @ (X[:, columns[few]] / sizes[few])

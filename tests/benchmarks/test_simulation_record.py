@@ -52,6 +52,7 @@ print(before == many.sources())
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("changed", "counts"), [("writing.py", False), *further(("judgement.py", True))], ids=str
 )

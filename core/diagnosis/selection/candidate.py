@@ -43,7 +43,7 @@ class Candidate:
     target: str = ""  # the joint, axis or frame that it moves
     requires: str = ""  # family without which it changes no prediction
 
-    @cached_property
+    @property
     def named(self) -> bool:
         """Return whether this is a member of the catalogue."""
         return self.family != "smooth"
@@ -53,23 +53,23 @@ class Candidate:
         """Return the usual size (d,) of each parameter."""
         return np.array([p.scale for p in self.parameters])
 
-    @cached_property
+    @property
     def effect(self) -> Effect:
         """Return the member of the catalogue; of what is in none, an effect without attributes."""
         return CATALOGUE.get(self.family, UNNAMED)
 
-    @cached_property
+    @property
     def turns_joint_by_own_angle(self) -> bool:
         """Return whether this is an angle error of a joint as a function of its own angle."""
         own = Effect.angle_columns
         return type(self.effect).angle_columns is not own
 
-    @cached_property
+    @property
     def periodic(self) -> bool:
         """Return whether this is one line of a periodic effect."""
         return self.effect.periodic
 
-    @cached_property
+    @property
     def without_quantity(self) -> bool:
         """Return whether this is an unnamed cause that is no function of a quantity."""
         return not self.named and not self.quantity

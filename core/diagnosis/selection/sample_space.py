@@ -100,22 +100,21 @@ class CandidateFit:
 
 def penalties(candidates: Sequence[Candidate], freedom: float) -> Array:
     """Return the penalty of each candidate: d log m + 2 log(number of its kind) + a margin."""
-    families = {c.family for c in candidates if c.named} or {""}
-    count: dict[str, int] = {}
-    for c in candidates:
-        count[_kind(c)] = count.get(_kind(c), 0) + c.tried
-    paid = []
-    for c in candidates:
-        tried = count[_kind(c)] * (len(families) if c.named else 1)
-        d = len(c.parameters)
-        extra = ACCUSATION_PENALTY if c.named else SMOOTH_PENALTY
-        paid.append(d * np.log(max(freedom, 2.0)) + 2 * np.log(tried) + extra)
-    return np.array(paid)
+    kinds = [_kind(c) for c in candidates]
+    tried = dict.fromkeys(kinds, 0)
+    for kind, c in zip(kinds, candidates, strict=True):
+        tried[kind] += c.tried
+    named = np.array([c.named for c in candidates], dtype=bool)
+    families = len({c.family for c in candidates if c.named}) or 1
+    alike = np.array([tried[kind] for kind in kinds]) * np.where(named, families, 1)
+    d = np.array([len(c.parameters) for c in candidates])
+    extra = np.where(named, ACCUSATION_PENALTY, SMOOTH_PENALTY)
+    return np.asarray(d * np.log(max(freedom, 2.0)) + 2 * np.log(alike) + extra)
 
 
 def _kind(candidate: Candidate) -> str:
     """Return the kind among which a candidate counts as one of many hypotheses."""
-    if candidate.periodic and (candidate.site.order or 0) in USUAL_ORDERS:
+    if (candidate.site.order or 0) in USUAL_ORDERS and candidate.periodic:
         return "usual lines"
     if candidate.without_quantity:
         return "rivals"

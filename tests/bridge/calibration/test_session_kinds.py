@@ -146,6 +146,7 @@ def test_two_balls_measured_in_an_unknown_frame(tmp_path: Path) -> None:
     check_identified(session, result, of="axial_compliance")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("instrument", "poses", "radius"),
     [*further(("{kind: sphere, radius: 0.03}", 28, 0.03)), ("{kind: point}", 16, 0.0)],

@@ -179,6 +179,7 @@ def test_a_log_that_no_command_can_use_does_not_pass(
     assert phrase in refused("check", path, "--log", log)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("order", "phrase"),
     [((2, 1, 0, 3, 4, 5), "joints 1 and 3 look swapped (a UR's"),

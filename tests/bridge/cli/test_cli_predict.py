@@ -150,6 +150,7 @@ def test_a_covariance_of_another_size_is_refused_in_one_line(
     assert "Traceback" not in error
 
 
+@pytest.mark.slow
 def test_a_diagnosis_that_is_applied_keeps_the_covariance_of_its_causes(folder: Path) -> None:
     write_log(folder, "d.csv", 60, 4)
     applied = folder / "applied.yaml"

@@ -256,6 +256,7 @@ def mute_server(host: str) -> Iterator[None]:
         connection.close()
 
 
+@pytest.mark.slow
 def test_a_controller_that_never_answers_does_not_hang_the_daemon(tmp_path: Path) -> None:
     robot = Robot(tmp_path)
     with mute_server(robot.host), Run(robot.cell(link=", connect_timeout: 1.0")) as run:
@@ -277,6 +278,7 @@ def test_motion_of_two_masters_is_refused(tmp_path: Path) -> None:
         Run(cell)
 
 
+@pytest.mark.slow
 def test_a_trajectory_that_is_not_there_is_unusable_input(tmp_path: Path) -> None:
     with Robot(tmp_path) as robot:
         cell = robot.cell(setpoints="{source: trajectory, file: nowhere.csv}")

@@ -152,6 +152,7 @@ def test_the_report_needs_nothing_else_and_names_the_skipped_log(fitted: Any) ->
     assert "http" not in page.replace("http://www.w3.org/2000/svg", "")
 
 
+@pytest.mark.slow
 def test_diagnose_shows_the_effect_that_recurs(tmp_path: Path) -> None:
     for seed in range(3):
         q, loads = poses_and_loads(14, seed)

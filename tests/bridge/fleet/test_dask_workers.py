@@ -27,6 +27,7 @@ def address() -> Iterator[str]:
         yield cluster.scheduler_address
 
 
+@pytest.mark.slow
 def test_a_cluster_does_every_session_and_one_of_its_workers_may_die(
     address: str, tmp_path: Path
 ) -> None:

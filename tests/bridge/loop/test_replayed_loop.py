@@ -139,6 +139,7 @@ def test_a_run_with_writing_and_two_loops_is_replayed_bit_for_bit(robot: Robot) 
     assert_same_bits(again, then, count)
 
 
+@pytest.mark.slow
 def test_another_model_makes_other_offsets_of_the_same_states(robot: Robot) -> None:
     loops = Loops(robot.cell(), "run-then")
     loops.until(lambda: loops.memory.written > 300)

@@ -201,6 +201,7 @@ def test_what_cannot_be_exported_is_one_line(desk: Desk, arguments: list[str], p
     assert phrase in str(done.exception)
 
 
+@pytest.mark.slow
 def test_a_long_recording_is_exported_in_pieces(desk: Desk, tmp_path: Path) -> None:
     recorder = desk.recorder()
     for _ in range(6):

@@ -25,8 +25,8 @@ from gapbridge.bridge.setpoint_source import make_source
 
 TOKEN = "0d9b7a63c1f24e58b6a7d3c2e1f09485"
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
-LINES = 3000
-WAY = 0.3  # rad that joint 1 would be moved by
+LINES = 1000
+WAY = 0.1  # rad that joint 1 would be moved by
 
 
 class Target:

@@ -88,6 +88,7 @@ def line_of(fades):
     return not_constant(selection, [own], np.zeros((len(selection.space.y), 0)))
 
 
+@pytest.mark.slow
 def test_a_gears_line_is_the_same_in_every_part_of_the_range():
     assert line_of(0.0) == {}
     assert [*line_of(1.0).values()] == ["actual_q_1"]

@@ -77,6 +77,7 @@ def test_zeros_that_are_off_become_no_flexibilities(tool: bool, registered: bool
     assert channel.remaining_rms < 1.15 * small.FLOOR
 
 
+@pytest.mark.slow
 def test_a_cause_has_the_uncertainty_of_the_flexibilities_it_depends_on():
     """By how far it moves with them; a flexibility that is accused itself makes nothing unsure."""
     session = small.session_of(11)

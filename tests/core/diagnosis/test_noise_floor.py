@@ -37,6 +37,7 @@ def repeated(effect: str, times: int = 3):
     return small.log_of(session, small.readings(small.REAL[effect], session, 3))
 
 
+@pytest.mark.slow
 def test_repeats_measure_the_floor_under_an_unknown_thirty_times_as_large() -> None:
     metrology = Metrology(registered=True, sigma=small.SIGMA)
     (channel,) = diagnose(small.model_of(), repeated("cross_coupling"), metrology).channels

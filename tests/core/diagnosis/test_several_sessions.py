@@ -129,6 +129,7 @@ def test_a_value_that_changed_is_named_as_changed() -> None:
     assert [v["session"] for v in cause["across_sessions"]["values"]] == ["34.csv", "35.csv"]
 
 
+@pytest.mark.slow
 def test_what_holds_in_one_session_only_depends_on_the_session() -> None:
     """Nothing of the catalogue: two sessions of three bend by the square of another joint."""
     real = small.REAL["cross_coupling"]

@@ -98,6 +98,7 @@ def test_errors_of_the_flexibilities_are_as_large_as_their_intervals_say():
     assert np.abs(z).max() < 4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("repeats", [1, *further(3)])
 def test_intervals_hold_where_joints_are_off_at_all_repeats_of_a_pose(repeats):
     """Rounded or imprecise joints move whole poses, the farther the longer the lever."""

@@ -51,6 +51,7 @@ def test_scatter_over_sessions_is_what_was_expected(parameters, planned) -> None
     assert np.abs(ratio - 1).max() < 0.13  # 600 sessions determine a deviation to 3 %, 25 of them
 
 
+@pytest.mark.slow
 def test_expectation_of_a_plans_readings_is_the_plans(parameters, planned) -> None:
     q = np.random.default_rng(0).uniform(-2, 2, (50, 6))
     reference = (q, Loads(payload_mass=np.full(50, 4.0)))

@@ -66,6 +66,7 @@ def test_fewer_than_eight_poses_decide_nothing(tmp_path: Path) -> None:
     assert "7 such poses were measured, expected 8 or more" in text
 
 
+@pytest.mark.slow
 def test_the_residual_is_described_alike_in_every_section(tmp_path: Path) -> None:
     c = calibration(True)
     left = Note(Reason.EFFECTS_MISSING, ((("transmission_error_2", 0.9),),))

@@ -95,6 +95,7 @@ def test_blocks_find_what_the_whole_shows(both):
                 assert b.std == pytest.approx(a.std, rel=0.2)
 
 
+@pytest.mark.slow
 def test_an_outlier_outside_the_excerpt_is_excluded_and_named(both):
     _, found = both
     torque = next(c for c in found.channels if c.channel == "torque")

@@ -30,6 +30,7 @@ def log_of(arm: TrueArm, poses: int = 70, seed: int = 3) -> Log:
     return Log("log.csv", columns(arm, poses, Habits(), np.random.default_rng(seed)), 6)
 
 
+@pytest.mark.slow
 def test_a_soft_arm_behind_a_rigid_cell_is_sent_to_the_fit(rigid: Model) -> None:
     found = diagnose(rigid, log_of(TYPE), FREE)
     assert found.verdict in ("explained", "partly_explained")  # a dozen flexibilities, one by one

@@ -102,6 +102,7 @@ def test_the_instruments_pose_changes_nothing(seed):
     assert np.abs(residual).max() < 1e-7
 
 
+@pytest.mark.slow
 def test_the_reported_deviation_is_the_scatter_over_sessions():
     real = replace(offset(2, 0.01), axial=np.array([0.0, 5e-6, 0.0]))
     effects = [("joint_offset", 2), ("axial_compliance", 2)]
