@@ -27,6 +27,7 @@ LABELS = {
         "servo_droop",
     },
 }
+BEGINNINGS = tuple(f"{e}_" for e in CATALOGUE if e not in SHARED)
 ASKED = {"effect", "family", "identifier"}  # attributes whose text is an identifier
 PARTS = {"startswith", "endswith", "removeprefix", "removesuffix", "partition", "find", "count"}
 TAKING = {"Term", "effect_named", "joints"}  # calls whose first argument is one
@@ -38,6 +39,8 @@ def _named(text: object) -> str | None:
         return None
     if text in CATALOGUE:
         return text
+    if not text.startswith(BEGINNINGS):
+        return None
     return next((e for e in CATALOGUE if e not in SHARED and text.startswith(f"{e}_")), None)
 
 
@@ -56,9 +59,9 @@ def _texts(node: ast.AST) -> Iterator[str]:
             yield part.value
 
 
-def _asked(tree: ast.AST) -> Iterator[str]:
+def _asked(nodes: list[ast.AST]) -> Iterator[str]:
     """Yield effects that are compared with, or asked for, by name: shared names count here."""
-    for node in ast.walk(tree):
+    for node in nodes:
         if isinstance(node, ast.Compare):
             sides = [node.left, *node.comparators]
             if any(isinstance(s, ast.Attribute) and s.attr in ASKED for s in sides):
@@ -71,9 +74,9 @@ def _asked(tree: ast.AST) -> Iterator[str]:
             yield from (t for t in _texts(node.slice) if t in CATALOGUE)
 
 
-def _asked_in_part(tree: ast.AST) -> Iterator[str]:
+def _asked_in_part(nodes: list[ast.AST]) -> Iterator[str]:
     """Yield pieces of text that an identifier is searched for: ``"compliance" in term.effect``."""
-    for node in ast.walk(tree):
+    for node in nodes:
         if isinstance(node, ast.Compare):
             sides = zip([node.left, *node.comparators], node.ops, node.comparators, strict=False)
             for left, op, right in sides:
@@ -87,16 +90,16 @@ def _asked_in_part(tree: ast.AST) -> Iterator[str]:
 
 def _found(source: str) -> list[str]:
     """Return the effects that a source names, docstrings left aside."""
-    tree = ast.parse(source)
+    nodes = list(ast.walk(ast.parse(source)))
     prose = {
         id(node.body[0].value)
-        for node in ast.walk(tree)
+        for node in nodes
         if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef)
         and node.body
         and isinstance(node.body[0], ast.Expr)
     }
-    found = [*_asked(tree), *_asked_in_part(tree)]
-    for node in ast.walk(tree):
+    found = [*_asked(nodes), *_asked_in_part(nodes)]
+    for node in nodes:
         if isinstance(node, ast.Constant) and id(node) not in prose:
             name = _named(node.value)
             if name and name not in SHARED:

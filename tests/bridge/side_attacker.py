@@ -94,6 +94,7 @@ def main() -> None:
             if event.get("kind") == "status" and event["state"] != "disconnected":
                 found = {
                     **attack(os.getppid()),
+                    "pid": os.getpid(),
                     "loop": event["loop"]["pid"] in family(os.getppid()),
                 }
                 for event_ in FORGED:

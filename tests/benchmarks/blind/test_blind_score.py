@@ -110,6 +110,7 @@ def test_an_effect_outside_the_catalogue_must_be_reported_as_unexplained(case):
     assert (blamed.outcome, blamed.false) == ("wrong", ("payload",))
 
 
+@pytest.mark.slow
 def test_what_it_depends_on_counts_among_the_first_three_only(case):
     label = case("outside:tool_plate")
     reported = ["actual_q_0", "actual_q_1", "actual_q_2", "payload"]

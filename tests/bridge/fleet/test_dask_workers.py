@@ -59,6 +59,7 @@ def test_a_session_that_kills_workers_is_begun_twice_and_harms_no_other(
     assert Counter(book.read_text().split())["killer"] == 2
 
 
+@pytest.mark.slow
 def test_a_bad_log_is_one_outcome_among_others(address: str, tmp_path: Path) -> None:
     tasks = tasks_in(tmp_path, ["a/s", "b/s"], count_rows)
     tasks[0].log.write_text("nonsense\n1\n")

@@ -106,6 +106,30 @@ def post(port: int, body: bytes, limit: float = 2.0) -> bytes:
     return found
 
 
+def test_a_posted_body_is_no_plc(tmp_path: Path) -> None:
+    """A whole Modbus request as the body of an HTTP POST is not taken from behind the head."""
+    settings = SetpointSettings(source="modbus", port=0, timeout=0.5)
+    source = make_source(settings, 3, True, tmp_path)
+    source.open()
+    try:
+        counts = [0, 7, *(0, 100) * 3]
+        write = struct.pack(">BHHB", 16, 0, len(counts), 2 * len(counts))
+        write += struct.pack(f">{len(counts)}H", *counts)
+        frame = struct.pack(">HHHB", 1, 0, len(write) + 1, 1) + write
+        port = source.port  # type: ignore[attr-defined]
+        for pad in range(8):
+            post(port, pad * b"\0" + 40 * frame, limit=0.5)
+        time.sleep(0.2)
+        assert source.first(np.zeros(3)) is None
+        with socket.create_connection(
+            ("127.0.0.1", port), timeout=PATIENCE
+        ) as plc:  # it does listen
+            plc.sendall(frame)
+            assert plc.recv(100)
+    finally:
+        source.close()
+
+
 @pytest.mark.realtime
 def test_a_posted_body_is_no_plan(target: Target) -> None:
     target.arm()
@@ -168,27 +192,3 @@ def test_the_target_was_open_all_the_while(target: Target) -> None:
     """After the attacks a planner that knows the token is heard: they were refused, not lost."""
     target.arm()
     assert target.is_open_to_a_planner()
-
-
-def test_a_posted_body_is_no_plc(tmp_path: Path) -> None:
-    """A whole Modbus request as the body of an HTTP POST is not taken from behind the head."""
-    settings = SetpointSettings(source="modbus", port=0, timeout=0.5)
-    source = make_source(settings, 3, True, tmp_path)
-    source.open()
-    try:
-        counts = [0, 7, *(0, 100) * 3]
-        write = struct.pack(">BHHB", 16, 0, len(counts), 2 * len(counts))
-        write += struct.pack(f">{len(counts)}H", *counts)
-        frame = struct.pack(">HHHB", 1, 0, len(write) + 1, 1) + write
-        port = source.port  # type: ignore[attr-defined]
-        for pad in range(8):
-            post(port, pad * b"\0" + 40 * frame, limit=0.5)
-        time.sleep(0.2)
-        assert source.first(np.zeros(3)) is None
-        with socket.create_connection(
-            ("127.0.0.1", port), timeout=PATIENCE
-        ) as plc:  # it does listen
-            plc.sendall(frame)
-            assert plc.recv(100)
-    finally:
-        source.close()

@@ -21,9 +21,9 @@ SMALLEST, LARGEST = 1e-3, 2e-2  # m, how far a bad row is off
 
 @pytest.mark.parametrize(
     ("seed", "poses", "bad", "registered"),
-    [(1, 33, 5, True), (3, 40, 10, False),
-     *further((0, 33, 1, True), (2, 33, 10, True), (4, 60, 3, False), (5, 60, 10, False),
-              (6, 70, 20, True))],
+    [(3, 40, 10, False),
+     *further((0, 33, 1, True), (1, 33, 5, True), (2, 33, 10, True), (4, 60, 3, False),
+              (5, 60, 10, False), (6, 70, 20, True))],
 )  # fmt: skip
 def test_fit_and_diagnose_agree_on_bad_rows(seed, poses, bad, registered):
     rng = np.random.default_rng(seed)

@@ -8,6 +8,7 @@ import moving_truth as truth
 import numpy as np
 import pinocchio as pin
 import pytest
+from further import further
 
 from gapbridge.core import dynamics
 from gapbridge.core.diagnosis.channels.torque import observe
@@ -234,7 +235,7 @@ def test_friction_that_fades_is_reported_as_unexplained_and_depends_on_time(plan
 @pytest.mark.parametrize(
     "effect",
     [
-        "link_inertia",
+        *further("link_inertia"),
         pytest.param(
             "torque_constant",
             marks=pytest.mark.xfail(
