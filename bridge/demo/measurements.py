@@ -23,7 +23,7 @@ MAX_POSE_ERROR = 0.05  # rad between the visited pose and the commanded one
 
 
 class TooFewReadingsError(RunError):
-    """The tracker measured less often at a pose than a mean needs."""
+    """At a pose the tracker measured less often than a mean needs, or no cycle was recorded."""
 
 
 @dataclass(frozen=True)
@@ -117,6 +117,9 @@ def _measurement(
         found = f"visit {number + 1}: found {len(used)} readings of the tracker"
         raise TooFewReadingsError(f"{found}, expected {MIN_READINGS}")
     during = np.arange(span.start, span.stop)[(t >= begin) & (t <= end)]
+    if not len(during):  # this machine stalled for as long as the arm rested
+        found = f"visit {number + 1}: found no recorded cycle between {begin:.3f} and {end:.3f} s"
+        raise TooFewReadingsError(f"{found} of rest, expected some")
     return (
         np.array(begin),
         pose,

@@ -177,6 +177,22 @@ def test_a_visit_that_never_happened_is_reported() -> None:
     assert str(unseen[1]) == "visit 1: found 0 readings of the tracker, expected 8"
 
 
+def test_a_rest_that_was_not_recorded_is_measured_again() -> None:
+    """A stalled machine records the beginning and the end of a rest, and nothing between them."""
+    poses = HOME + np.array([[0.3, 0, 0, 0, 0, 0]])
+    given = recording(visit_trajectory(HOME, poses, TOP_SPEED))
+    there = np.flatnonzero(np.abs(given["actual_q"] - poses[0]).max(axis=1) < 1e-6)
+    kept = np.setdiff1d(np.arange(len(given["timestamp"])), there[1:-1])
+    times = given["timestamp"][there[1:-1]]
+    readings = np.column_stack([times, np.zeros((len(times), 6))])
+    assert measurements_at(given, readings, poses)[1] is None
+    gap = {name: values[kept] for name, values in given.items()}
+    found, missing = measurements_at(gap, readings, poses)
+    assert found is None
+    assert isinstance(missing, TooFewReadingsError)
+    assert "visit 1: found no recorded cycle between" in str(missing)
+
+
 def test_repeatability_is_that_of_the_scatter() -> None:
     random = np.random.default_rng(3)
     q = np.repeat(random.uniform(-1, 1, (200, 6)), 2, axis=0)
