@@ -172,11 +172,11 @@ def derivatives(table: Table) -> tuple[Array, Array, Array, int]:
 
     Speeds are the measured ones where the log has them. Rows are put on an even clock.
     """
+    from scipy.signal import savgol_filter  # takes most of a second to import
+
     time, q = table.time, table.joints()
     even = np.linspace(time[0], time[-1], len(time))
     dt = float(even[1] - even[0])
-    from scipy.signal import savgol_filter  # takes most of a second to import
-
     window = max(5, int(SMOOTH / dt) // 2 * 2 + 1)
     speed = table.get("actual_qd")
     if speed is None:

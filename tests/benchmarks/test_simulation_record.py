@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from further import further
 
 from benchmarks.simulation import __main__ as many
 from benchmarks.simulation.invariants import Violation
@@ -54,7 +53,7 @@ print(before == many.sources())
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("changed", "counts"), [("writing.py", False), *further(("judgement.py", True))], ids=str
+    ("changed", "counts"), [("writing.py", False), ("judgement.py", True)], ids=str
 )
 def test_what_has_run_counts_until_a_source_that_runs_changes(changed: str, counts: bool) -> None:
     ran = subprocess.run(

@@ -100,7 +100,6 @@ def test_clean_data_is_right_only_without_accusation_and_structure(case):
     assert (got.outcome, got.false) == ("wrong", ("joint_offset",))
 
 
-@pytest.mark.slow
 def test_an_effect_outside_the_catalogue_must_be_reported_as_unexplained(case):
     label = case("outside:tool_plate")
     reported = score(label, answer(label, structured=True, depends=["actual_q_0", "payload"]))

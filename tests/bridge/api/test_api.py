@@ -76,7 +76,6 @@ def test_a_cell_written_from_python_holds_what_was_done_with_which_files(desk: P
     assert "from log.csv, more.csv" in shown
 
 
-@pytest.mark.slow
 def test_a_diagnosis_writes_what_the_command_writes(desk: Path) -> None:
     paths = desk / "log.csv", "--cell", desk / "cell.yaml", "--out", desk / "command"
     new = "--apply", desk / "command.yaml", "--stand-ins"

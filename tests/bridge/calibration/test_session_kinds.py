@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from further import further
 from patience import PATIENCE
 from scripted_session import (
     AXIAL,
@@ -149,7 +148,7 @@ def test_two_balls_measured_in_an_unknown_frame(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("instrument", "poses", "radius"),
-    [*further(("{kind: sphere, radius: 0.03}", 28, 0.03)), ("{kind: point}", 16, 0.0)],
+    [("{kind: sphere, radius: 0.03}", 28, 0.03), ("{kind: point}", 16, 0.0)],
 )
 def test_contact_with_joint_angles_alone(
     tmp_path: Path, instrument: str, poses: int, radius: float

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from cli_runs import gapbridge, refused
 from daemon_cell import plant
-from further import further
 from simulated_controller import SimulatedController
 
 from gapbridge.bridge.cell import load_cell
@@ -183,7 +182,7 @@ def test_a_log_that_no_command_can_use_does_not_pass(
 @pytest.mark.parametrize(
     ("order", "phrase"),
     [((2, 1, 0, 3, 4, 5), "joints 1 and 3 look swapped (a UR's"),
-     *further(((0, 1, 2, 4, 3, 5), "joints 4 and 5 look swapped"))],
+     ((0, 1, 2, 4, 3, 5), "joints 4 and 5 look swapped")],
 )  # fmt: skip
 def test_fit_and_diagnose_of_another_arm_warn_with_the_mistake(
     tmp_path: Path, order: tuple[int, ...], phrase: str

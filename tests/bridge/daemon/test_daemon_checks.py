@@ -111,7 +111,6 @@ def test_a_model_that_is_no_use_is_reported_and_does_not_arm(robot: Robot, times
         assert "the model corrects nothing" in "\n".join(lines(status))
 
 
-@pytest.mark.slow
 def test_arming_warns_of_what_differs_from_the_controller_and_is_no_reason_to_refuse(
     robot: Robot,
 ) -> None:

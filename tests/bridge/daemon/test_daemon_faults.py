@@ -256,7 +256,6 @@ def mute_server(host: str) -> Iterator[None]:
         connection.close()
 
 
-@pytest.mark.slow
 def test_a_controller_that_never_answers_does_not_hang_the_daemon(tmp_path: Path) -> None:
     robot = Robot(tmp_path)
     with mute_server(robot.host), Run(robot.cell(link=", connect_timeout: 1.0")) as run:

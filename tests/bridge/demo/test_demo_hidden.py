@@ -99,7 +99,7 @@ def test_what_is_hidden_is_named_on_every_link(tmp_path: Path, name: str, seed: 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("seed", "value"), [*further((2, -3.195e-3)), (5, -2.380e-3)])
+@pytest.mark.parametrize(("seed", "value"), [(2, -3.195e-3), (5, -2.380e-3)])
 def test_a_zero_against_which_flexibilities_were_fitted_is_named(
     tmp_path: Path, seed: int, value: float
 ) -> None:

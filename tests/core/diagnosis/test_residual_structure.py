@@ -10,6 +10,7 @@ import toy_candidates as toy
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from gapbridge.core.diagnosis import residual_structure
 from gapbridge.core.diagnosis.residual_structure import dependence, structure_p_value
 from gapbridge.core.estimation.least_squares import basis_of
 
@@ -109,3 +110,13 @@ def test_a_basis_is_orthonormal_and_spans_what_it_was_made_of():
     assert basis.shape == (20, 3)
     assert np.allclose(basis.T @ basis, np.eye(3))
     assert np.allclose(basis @ (basis.T @ twice), twice)
+
+
+@pytest.mark.parametrize("columns", [20, 400])
+def test_squares_along_few_and_many_columns_are_those_of_their_products(columns):
+    rng = np.random.default_rng(columns)
+    X, residuals = rng.normal(size=(30, columns)), rng.normal(size=(500, 30))
+    used, sizes = rng.permutation(columns)[: columns - 7], rng.uniform(1, 2, columns - 7)
+    found = residual_structure._squares_along(X, used, sizes, residuals)
+    expected = np.sum((residuals @ (X[:, used] / sizes)) ** 2, axis=1)
+    assert found == pytest.approx(expected, rel=1e-12)

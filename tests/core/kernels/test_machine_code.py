@@ -66,7 +66,6 @@ def package(tmp_path: Path) -> Package:
     return Package(tmp_path)
 
 
-@pytest.mark.slow
 def test_what_was_compiled_in_changes_and_the_caller_is_compiled_anew(package: Package) -> None:
     assert package.run() == "3.0 0"
     assert package.run() == "3.0 1"

@@ -22,6 +22,18 @@ def copy(tmp_path: Path) -> Path:
     return Path(shutil.copy(CanopenSettings.shipped / "cia402.yaml", tmp_path / "mine.yaml"))
 
 
+def test_each_nodes_dictionary_is_its_own_and_follows_the_file(copy: Path) -> None:
+    path = copy.with_name("cia402.eds")
+    eds = read_profile(copy, 6).eds
+    first, second, other = eds.dictionary(3), eds.dictionary(3), eds.dictionary(4)
+    assert other[0x1800][1].default == first[0x1800][1].default + 1  # $NODEID+0x180
+    first[0x6041].default = 7
+    assert second[0x6041].default != 7
+    assert eds.dictionary(3)[0x6041].default != 7
+    path.write_text(path.read_text().replace("Statusword", "Another name"))
+    assert eds.dictionary(3)[0x6041].name == "Another name"
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_a_shipped_profile_has_six_drives_and_puts_counts_back_where_they_came_from(
     name: str,
