@@ -98,11 +98,10 @@ class RobotiqFt300(ForceTorqueSensor):
 
     def _begin(self, tries: int) -> None:
         """End a running stream and start a new one, in up to ``tries`` attempts."""
-        self._stop_stream()
-        if self.settings.mode != "stream":
-            return
         try:
-            self._start_stream()
+            self._stop_stream()
+            if self.settings.mode == "stream":
+                self._start_stream()
         except LinkError:
             if tries == 1:
                 raise

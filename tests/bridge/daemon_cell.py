@@ -77,9 +77,14 @@ class Robot:
     def start_offset_program(self) -> socket.socket:
         """Start the program of the offset mode; it runs until the socket is closed."""
         upload = socket.create_connection((self.host, self.settings.script_port), timeout=PATIENCE)
-        upload.sendall(OFFSET_SCRIPT.read_bytes())
-        time.sleep(0.2)
+        self.upload(upload, OFFSET_SCRIPT.read_text(encoding="utf-8"))
         return upload
+
+    def upload(self, link: socket.socket, program: str) -> None:
+        """Send a program, and wait until it has begun."""
+        before = self.controller.log().count(" starts\n")
+        link.sendall(program.encode())
+        wait_for(lambda: self.controller.log().count(" starts\n") > before, "the program")
 
     def cell(self, link: str = "", **sections: str) -> Path:
         """Write the cell file; ``link`` adds to its link, the others are whole sections."""
@@ -146,6 +151,26 @@ class Run:
                 self.daemon.arm()
                 asked = now
             time.sleep(0.002)
+
+    def write(self, count: int) -> None:
+        """Compensate until so many more setpoints have been written."""
+        before = self._written
+
+        def there() -> bool:
+            self.compensate()
+            return self._written >= before + count
+
+        wait_for(there, lambda: f"{count} setpoints ({self.output})")
+
+    def latest(self, column: str) -> Array:
+        """Return a column's values in the newest cycle."""
+        memory = self.daemon.memory
+        rows, _ = memory.rows(max(memory.written - 1, 0), memory.written)
+        return np.array(rows[-1][memory.slices[column]])
+
+    @property
+    def _written(self) -> int:
+        return int(self.daemon.status()["link"]["written"])
 
     def end(self) -> RunSummary:
         """Stop the run and return how it went."""

@@ -46,7 +46,7 @@ def test_an_offset_that_stands_at_its_limit_ends_the_compensation(robot: Robot) 
 def test_a_loop_that_was_suspended_begins_anew_and_observes(robot: Robot) -> None:
     with Run(robot.cell(PATIENT), arm=True) as run:
         run.compensate()
-        time.sleep(0.5)
+        run.write(60)
         pid = run.daemon.loop_pid
         assert pid is not None
         os.kill(pid, signal.SIGSTOP)
@@ -162,7 +162,7 @@ def test_what_a_person_changes_in_the_controller_during_a_run_is_held_and_not_co
     program = robot.start_offset_program()
     with Run(robot.cell(f"{PATIENT}, mode: offset"), arm=True) as run:
         run.compensate()
-        time.sleep(0.8)
+        run.write(60)
         script(robot, line)
         wait_for(lambda: cause in " ".join(run.output), lambda: f"{cause} ({run.output})")
         run.wait(State.OBSERVING)

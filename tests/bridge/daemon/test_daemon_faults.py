@@ -39,7 +39,7 @@ def assert_came_back_observing(run: Run, robot: Robot) -> None:
 def test_a_loop_that_dies_comes_back_observing(robot: Robot, number: signal.Signals) -> None:
     with Run(robot.cell(), arm=True) as run:
         run.compensate()
-        time.sleep(0.3)
+        run.write(60)
         pid = run.daemon.loop_pid
         assert pid is not None
         os.kill(pid, number)
@@ -58,7 +58,7 @@ def test_a_loop_that_dies_comes_back_observing(robot: Robot, number: signal.Sign
 def test_a_loop_that_hangs_is_ended_and_comes_back_observing(robot: Robot) -> None:
     with Run(robot.cell(), arm=True) as run:
         run.compensate()
-        time.sleep(0.3)
+        run.write(60)
         pid = run.daemon.loop_pid
         assert pid is not None
         os.kill(pid, signal.SIGSTOP)
@@ -72,7 +72,7 @@ def test_a_loop_that_hangs_is_ended_and_comes_back_observing(robot: Robot) -> No
 def test_a_controller_that_stands_still_is_a_fault(robot: Robot) -> None:
     with Run(robot.cell(), arm=True) as run:
         run.compensate()
-        time.sleep(0.3)
+        run.write(60)
         os.kill(robot.controller.pid, signal.SIGSTOP)
         try:
             run.wait(State.DISCONNECTED)
@@ -110,7 +110,7 @@ def test_a_clock_that_stands_still_ends_compensating(robot: Robot) -> None:
 def test_a_short_stall_ramps_out_and_does_not_ramp_in_again(robot: Robot) -> None:
     with Run(robot.cell(), arm=True) as run:
         run.compensate()
-        time.sleep(0.8)
+        run.write(300)
         robot.bench("stall 0.08")
         run.wait(State.OBSERVING)
         assert_came_back_observing(run, robot)
@@ -123,7 +123,7 @@ def test_a_short_stall_ramps_out_and_does_not_ramp_in_again(robot: Robot) -> Non
 def test_a_dropped_connection_is_replaced_by_a_new_process(robot: Robot) -> None:
     with Run(robot.cell(), arm=True) as run:
         run.compensate()
-        time.sleep(0.3)
+        run.write(60)
         robot.bench("drop")
         wait_for(lambda: run.daemon.state != State.COMPENSATING, "the fault")
         assert_came_back_observing(run, robot)
@@ -133,7 +133,7 @@ def test_a_dropped_connection_is_replaced_by_a_new_process(robot: Robot) -> None
 def test_a_controller_that_is_started_anew_is_found_again(tmp_path: Path) -> None:
     with Robot(tmp_path) as robot, Run(robot.cell(), arm=True) as run:
         run.compensate()
-        time.sleep(0.3)
+        run.write(60)
         os.kill(robot.controller.pid, signal.SIGKILL)
         wait_for(lambda: run.daemon.state == State.DISCONNECTED, "the loss of the link")
         robot.controller.stop()
@@ -158,7 +158,7 @@ def test_a_run_of_given_length_ends_also_where_its_controller_has_gone(tmp_path:
 def test_a_protective_stop_is_a_fault_and_nobody_writes_after_it(robot: Robot) -> None:
     with Run(robot.cell(), arm=True) as run:
         run.compensate()
-        time.sleep(0.3)
+        run.write(60)
         robot.bench("protective_stop")
         run.wait(State.FAULT)
         time.sleep(0.5)

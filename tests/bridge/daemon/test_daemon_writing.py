@@ -59,8 +59,8 @@ def test_compensation_brings_the_tcp_to_where_it_was_wanted_without_a_jump(robot
     without = np.linalg.norm(robot.tcp() - wanted)
     with Run(cell, arm=True) as run:
         run.compensate()
-        time.sleep(1.5)
-        with_compensation = np.linalg.norm(robot.tcp() - wanted)
+        with_compensation = settled_error(robot, wanted)
+        run.write(500)
         summary = run.end()
     assert without > 4e-4
     assert with_compensation < 1e-4
@@ -80,7 +80,7 @@ def test_compensation_brings_the_tcp_to_where_it_was_wanted_without_a_jump(robot
 def test_after_a_run_the_arm_is_where_it_was_and_no_program_is_left(robot: Robot) -> None:
     with Run(robot.cell(), arm=True) as run:
         run.compensate()
-        time.sleep(0.7)
+        run.write(300)
         run.end()
     truth = robot.truth()
     rigid = load_cell(robot.cell()).model.rigid_pose(np.array([robot.settings.start_q]))
@@ -93,7 +93,7 @@ def test_a_person_arms_and_disarms_while_it_runs(robot: Robot) -> None:
     with Run(robot.cell()) as run:
         run.wait(State.OBSERVING)
         run.compensate()
-        time.sleep(0.3)
+        run.write(60)
         run.daemon.disarm()
         run.wait(State.OBSERVING)
         run.compensate()
@@ -105,8 +105,7 @@ def test_a_person_arms_and_disarms_while_it_runs(robot: Robot) -> None:
 @pytest.mark.slow
 def test_a_robot_program_is_not_ended_to_arm(robot: Robot) -> None:
     with socket.create_connection((robot.host, 30003), timeout=PATIENCE) as upload:
-        upload.sendall(b"def own_work():\n  sleep(30)\nend\n")
-        time.sleep(0.2)
+        robot.upload(upload, "def own_work():\n  sleep(30)\nend\n")
         with Run(robot.cell(), arm=True, duration=0.5) as run:
             summary = run.join()
     assert summary.setpoints_written == 0
@@ -160,7 +159,7 @@ def test_offset_mode_corrects_under_the_robots_own_program(robot: Robot) -> None
         with_compensation = settled_error(robot, wanted)
         start = robot.settings.start_q
         robot.bench("move 0.2 " + " ".join(map(str, start[1:])))
-        time.sleep(1.5)
+        wait_for(lambda: abs(run.latest("nominal_q")[0] - 0.2) < 1e-7, "the end of the motion")
         summary = run.end()
     assert without > 4e-4
     assert with_compensation < 1e-4
@@ -171,9 +170,11 @@ def test_offset_mode_corrects_under_the_robots_own_program(robot: Robot) -> None
     assert np.abs(cycles["nominal_q_1"] - start[1]).max() < 1e-6
     assert np.abs(cycles["target_q_1"] - start[1])[written].max() > 1e-4
     assert cycles["nominal_q_0"][-1] == pytest.approx(0.2, abs=1e-6)
-    time.sleep(0.2)
     rigid = load_cell(cell).model.rigid_pose(np.array([(0.2, *start[1:])])).position[0]
-    assert robot.truth()["rigid_tcp"][:3] == pytest.approx(rigid, abs=1e-6)
+    wait_for(
+        lambda: np.abs(robot.truth()["rigid_tcp"][:3] - rigid).max() < 1e-6,
+        lambda: f"the arm without offset ({robot.truth()})",
+    )
     program.close()
 
 

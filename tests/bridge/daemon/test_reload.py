@@ -146,7 +146,7 @@ def test_a_changed_cell_is_ramped_out_of_and_into(robot: Robot, arms: bool) -> N
     cell = robot.cell(PATIENT, setpoints=section)
     with Run(cell, arm=True) as run:
         run.compensate()
-        time.sleep(0.8)
+        run.write(60)
         first, before = run.daemon.loop_pid, run.daemon.status()["configuration_hash"]
         cell.write_text(cell.read_text() + "limits: {offset_rate: 0.02}\n")
         run.daemon.reload()

@@ -7,7 +7,7 @@ import can
 import numpy as np
 import pytest
 from can_arm import MODEL, UNIT, next_state, other_bus, served_arm, setpoint_of
-from patience import PATIENCE
+from patience import PATIENCE, wait_for
 
 from gapbridge.core.errors import InvalidStateError, LinkError, StaleStateError, WriteError
 from gapbridge.drivers.can.driver import CanDriver
@@ -25,6 +25,14 @@ def served():
 def armed(served):
     served.driver.arm(next_state(served.driver))
     return next_state(served.driver)
+
+
+def state_when(served, condition):
+    """Return the first sample of which the condition holds."""
+    latest = time.monotonic() + PATIENCE
+    while not condition(state := next_state(served.driver)):
+        assert time.monotonic() < latest, state
+    return state
 
 
 def for_three_samples(driver):
@@ -110,8 +118,7 @@ def test_another_commander_while_we_write_ends_our_writing(served):
     served.driver.write_setpoint(setpoint_of(state.actual_q))
     bus = other_bus(served.settings)
     bus.send(can.Message(arbitration_id=0x152, data=bytes(8), is_extended_id=False))
-    time.sleep(0.05)
-    state = next_state(served.driver)
+    state = state_when(served, lambda _: served.driver.reader.foreign is not None)
     with pytest.raises(WriteError, match="another commander sent 0x152"):
         served.driver.write_setpoint(setpoint_of(state.actual_q))
     bus.shutdown()
@@ -138,8 +145,9 @@ def test_half_a_setpoint_is_taken_back(served, at):
         (key[0], data) for key, data in first
     ]  # whole, and last on the wire
     assert served.driver.writer.reverted == 1
-    time.sleep(0.1)
-    assert served.controller.target_q == pytest.approx(q, abs=UNIT)
+    wait_for(
+        lambda: served.controller.target_q == pytest.approx(q, abs=UNIT), "the setpoint before"
+    )
 
 
 def test_where_the_setpoint_before_does_not_go_out_either_the_arm_is_stopped(served):
@@ -154,8 +162,7 @@ def test_where_the_setpoint_before_does_not_go_out_either_the_arm_is_stopped(ser
     with pytest.raises(WriteError, match="the stop sequence was sent"):
         served.driver.write_setpoint(setpoint_of(q + 0.001))
     assert breaking.sent[-1] == (0x150, b"\x01" + bytes(7))
-    time.sleep(0.1)
-    assert next_state(served.driver).safety_mode == 7
+    state_when(served, lambda state: state.safety_mode == 7)
 
 
 def test_a_first_frame_that_fails_leaves_nothing_to_take_back(served):
@@ -200,24 +207,19 @@ def test_everything_we_send_is_in_the_allow_list(served):
 def test_a_motor_that_loses_its_power_while_we_write_is_reported(served):
     armed(served)
     served.nodes.enabled[2] = False
-    until = time.monotonic() + PATIENCE
-    while next_state(served.driver).robot_mode == 7:
-        assert time.monotonic() < until
+    state_when(served, lambda state: state.robot_mode != 7)
 
 
 def test_a_mode_taken_away_at_the_arm_is_reported_only_while_we_write(served):
     assert next_state(served.driver).robot_mode == 7  # standby, but we only read
     armed(served)
     served.nodes.control_mode = 2  # somebody drags the arm
-    time.sleep(0.05)
-    assert next_state(served.driver).robot_mode == 5
+    state_when(served, lambda state: state.robot_mode == 5)
 
 
 def test_the_stop_button_is_an_emergency_stop_and_keeps_us_from_arming(served):
     served.controller.emergency_stop()
-    time.sleep(0.05)
-    state = next_state(served.driver)
-    assert state.safety_mode == 7
+    state = state_when(served, lambda state: state.safety_mode == 7)
     assert state.safety_status_bits != 1
     with pytest.raises(WriteError, match=r"emergency_stop: ArmStatus.arm_status is 1"):
         served.driver.arm(state)

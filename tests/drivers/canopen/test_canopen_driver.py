@@ -300,9 +300,9 @@ def test_drives_stop_by_themselves_when_we_fall_silent(
     driver.arm(settled(driver))
     state = settled(driver)
     driver.write_setpoint(setpoint(state.actual_q + 0.001, state))
-    settled(driver)
-    time.sleep(0.6)  # as a process that hangs, or was killed
-    assert Phase.ENABLED not in phases(generic)
+    settled(driver)  # from here on silent, as a process that hangs, or was killed
+    wait_for(lambda: Phase.ENABLED not in phases(generic), "the drives' own stop")
+    wait_for(lambda: not any(generic.controller.qd), "the end of the motion")
     rest = generic.controller.q
     time.sleep(0.1)
     assert generic.controller.q == rest

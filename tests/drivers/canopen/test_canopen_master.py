@@ -90,7 +90,8 @@ def test_the_librarys_master_resets_a_fault_that_an_emcy_reported(arm: DriveArm)
         assert node.sdo[0x603F].raw == 0x8611
         node.rpdo[1].start(0.01)
         node.controlword = 0x00
-        time.sleep(0.05)
+        machine = arm.server.drives[NODE - 1].axis.machine
+        wait_for(lambda: machine.word == 0x00, "the Controlword")  # a reset is its edge
         node.controlword = 0x80
         wait_for(lambda: node.state == "SWITCH ON DISABLED", "the reset")
         wait_for(lambda: not node.emcy.active, "the EMCY's end")
@@ -109,8 +110,7 @@ def test_an_nmt_reset_restarts_a_drive_with_the_eds_defaults(arm: DriveArm) -> N
     with master(arm) as (_, node):
         assert node.sdo[0x1A00][0].raw == 2
         node.nmt.state = "RESET"
-        time.sleep(0.1)
-        assert node.sdo[0x1A00][0].raw == 1
+        wait_for(lambda: node.sdo[0x1A00][0].raw == 1, "the EDS defaults")
 
 
 @pytest.mark.parametrize(

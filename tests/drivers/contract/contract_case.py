@@ -8,6 +8,8 @@ from abc import ABC, abstractmethod
 from pathlib import Path
 from typing import Self
 
+from patience import wait_for
+
 from benchmarks.server_thread import ServerThread
 from gapbridge.bridge.cell import load_cell
 from gapbridge.core.arm import builtin_arm
@@ -69,6 +71,11 @@ class Case(ABC):
     @abstractmethod
     def driver(self) -> Driver:
         """Return a driver, not connected."""
+
+    def run_cycles(self, count: int = 5) -> None:
+        """Wait until the controller has run so many more cycles."""
+        until = self.controller.clock + (count - 0.5) * PERIOD
+        wait_for(lambda: self.controller.clock > until, f"{count} cycles of the controller")
 
     def tear(self) -> None:
         """Have at least one sample that is read next mixed of two moments."""

@@ -178,6 +178,21 @@ def test_a_request_read_together_with_what_ends_the_stream_is_answered() -> None
         assert line.read(8)[:6] == request[:6]
 
 
+def test_a_write_that_times_out_is_one_attempt(monkeypatch: pytest.MonkeyPatch) -> None:
+    wire, write = make_wire("robotiq_ft300", Reaction()), serial.Serial.write
+    late = [serial.SerialTimeoutException("Write timeout")]
+
+    def timed_out_once(line: serial.Serial, data: bytes) -> int | None:
+        if late:
+            raise late.pop()
+        return write(line, data)
+
+    monkeypatch.setattr(serial.Serial, "write", timed_out_once)
+    with wire.device, make_sensor(wire.settings()) as sensor:
+        assert next_reading(sensor).wrench[2] == pytest.approx(12.25, abs=0.02)
+    assert not late
+
+
 @pytest.mark.parametrize("late", [0.6, 1.3])
 def test_a_stream_that_is_slow_to_start_is_waited_for(
     late: float, monkeypatch: pytest.MonkeyPatch

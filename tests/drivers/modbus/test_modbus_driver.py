@@ -49,7 +49,7 @@ def test_the_robot_takes_offsets_out_when_the_heartbeat_stops() -> None:
 
 def test_a_robot_without_its_program_is_not_armed(ur: ModbusCase) -> None:
     program_of(ur).running = False
-    time.sleep(0.05)
+    ur.run_cycles()
     with ur.driver() as driver, pytest.raises(WriteError, match="expected a running mailbox progr"):
         driver.arm(next_state(driver))
 
@@ -68,14 +68,14 @@ def test_a_mailbox_whose_checksum_is_wrong_is_not_applied(ur: ModbusCase) -> Non
         next_state(driver)
         words = encode.mailbox_words(5, [400] * 6, 9, [2500, 1000])
         driver.transport.write("holding", 234, [*words[:-1], words[-1] ^ 1])
-        time.sleep(0.1)
+        ur.run_cycles(25)
         assert not any(program_of(ur).applied)
         # a silence of half a second, since the program's start too, outranks a wrong checksum
         assert driver._look().answer[1] in (encode.REJECTED, encode.EXPIRED)
         for beat in (9, 10):
             words = encode.mailbox_words(5, [400] * 6, beat, [2500, 1000])
             driver.transport.write("holding", 234, words)
-            time.sleep(0.1)
+            ur.run_cycles(25)
         assert any(program_of(ur).applied)
 
 
@@ -210,7 +210,7 @@ def test_the_wrong_controller_is_reported_when_connecting() -> None:
         assert isinstance(server, ModbusServer)
         other = server.profile.identity[0].model_copy(update={"good": [2]})
         server.profile = server.profile.model_copy(update={"identity": [other]})
-        time.sleep(0.05)
+        case.run_cycles()
         with pytest.raises(LinkError, match=r"map version \(holding 4\): found 2, expected 3: not"):
             case.driver().connect()
 

@@ -25,7 +25,7 @@ pyModbusTCP = pytest.importorskip("pyModbusTCP", reason="pyModbusTCP is not inst
 @pytest.fixture
 def case() -> Iterator[ModbusCase]:
     with ModbusCase("ur") as found:
-        time.sleep(0.05)
+        found.run_cycles()
         yield found
 
 
@@ -62,7 +62,7 @@ def test_mbpoll_reads_the_joints_of_our_server(case: ModbusCase) -> None:
 
 def test_mbpoll_writes_and_reads_back_a_general_register(case: ModbusCase) -> None:
     mbpoll(case, "4", 236, 0, "1234")
-    time.sleep(0.05)
+    case.run_cycles()
     assert read_by_mbpoll(case, "4", 236, 1) == [1234]
 
 
@@ -70,7 +70,7 @@ def test_pymodbustcp_reads_registers_and_coils_of_our_server() -> None:
     from pyModbusTCP.client import ModbusClient
 
     with ModbusCase("igus") as case:
-        time.sleep(0.05)
+        case.run_cycles()
         client = ModbusClient(case.host, case.settings.port, unit_id=1, timeout=2.0)
         words = client.read_input_registers(142, 12)
         assert words is not None

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -75,7 +74,6 @@ def test_a_cell_with_a_map_of_the_users_is_served_and_run(profile: Path) -> None
         assert served.stdout is not None
         assert "Modbus 15822" in served.stdout.readline()
         assert served.stdout.readline().startswith("ready")
-        time.sleep(0.2)
         run = subprocess.run(
             [*command, "run", str(cell), "--arm", "--duration", "3"],
             capture_output=True, text=True, check=False, timeout=120,

@@ -6,6 +6,7 @@ import time
 from itertools import pairwise
 
 import pytest
+from patience import wait_for
 from rtde_client import RtdeClient
 from simulated_cell import cell_settings
 from simulated_controller import SimulatedController
@@ -89,8 +90,12 @@ def test_an_input_of_another_connection_is_in_use_until_that_closes(
     assert owner.inputs("input_int_register_5") == (2, ["INT32"])
     assert other.inputs("input_int_register_4,input_int_register_6") == (0, ["INT32", "IN_USE"])
     owner.close()
-    time.sleep(0.05)
-    assert other.inputs("input_int_register_4,input_int_register_6") == (1, ["INT32", "INT32"])
+    wait_for(
+        lambda: (
+            other.inputs("input_int_register_4,input_int_register_6") == (1, ["INT32", "INT32"])
+        ),
+        "the inputs",
+    )
 
 
 def test_inputs_are_taken_without_start_and_keep_their_last_value(
@@ -102,12 +107,11 @@ def test_inputs_are_taken_without_start_and_keep_their_last_value(
     reader = RtdeClient(controller.host)
     reader.outputs("input_int_register_30,input_double_register_31")
     reader.start()
-    time.sleep(0.02)
+    written = {"input_int_register_30": -5, "input_double_register_31": 2.5}
+    wait_for(lambda: reader.sample() == written, "the values")
     writer.close()
-    time.sleep(0.05)
-    for _ in range(40):
-        sample = reader.sample()
-    assert sample == {"input_int_register_30": -5, "input_double_register_31": 2.5}
+    for _ in range(65):
+        assert reader.sample() == written
 
 
 def test_of_a_short_input_packet_what_fits_is_taken_and_the_length_is_logged(

@@ -1,11 +1,11 @@
 from __future__ import annotations
 
 import socket
-import time
 from collections.abc import Iterator
 
 import pytest
 from driver_runs import Bench, cell_settings, offset_program
+from patience import wait_for
 from simulated_controller import SimulatedController
 
 from gapbridge.drivers.simulated.ur.settings import SCRIPT_PORT
@@ -29,5 +29,5 @@ def offset_robot(controller: SimulatedController) -> SimulatedController:
     """A robot whose own program, with ours in it, runs."""
     with socket.create_connection((controller.host, SCRIPT_PORT), timeout=5) as pendant:
         pendant.sendall(offset_program().encode())
-        time.sleep(0.3)
+        wait_for(lambda: " starts\n" in controller.log(), "the program")
     return controller
