@@ -7,8 +7,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from gapbridge.core.arm import Arm
 from gapbridge.core.arrays import Array
 from gapbridge.core.effects import CATALOGUE, Site, Term, effect_named
+from gapbridge.core.effects.effect import typical_moment
 from gapbridge.core.errors import InputError
 from gapbridge.core.estimation.pose_jacobian import PoseColumns, pose_columns
 from gapbridge.core.kernels.adjoint import CONVERGED
@@ -25,7 +27,6 @@ DEFAULT = tuple(  # effects of a calibration where none are named, in order of p
 PERIODIC_ORDERS = (1.0, 2.0)  # cycles per turn of a transmission error
 PRIOR = 10.0  # usual sizes
 STEP_SHARE = 0.01  # of a usual size: step of numerical derivatives
-MIN_LEVER = 0.05  # of the arm's reach, beyond a joint
 
 
 @dataclass(frozen=True)
@@ -57,7 +58,9 @@ class Parameters:
                 names.append(_name(term, effect.label(term.site, parameter), parameter.name))
                 units.append(parameter.unit)
                 low = 0.0 if effect.softens else parameter.lower
-                scale = parameter.scale * _lever_factor(model, term, k)
+                scale = parameter.scale
+                if effect.has_nonlinearity and k == 0:
+                    scale *= _lever_factor(model.arm, term.site)
                 start = scale if effect.has_nonlinearity else 0.0
                 bounds = low - nominal[k], parameter.upper - nominal[k]
                 numbers.append((scale, *bounds, start))
@@ -145,14 +148,18 @@ class Parameters:
 
 def _terms(model: Model, effects: Sequence[str]) -> Iterator[Term]:
     """Yield a term of zeros for each site of each effect."""
+    sites = {name: effect_sites(model, name) for name in effects}
+    for name, own in sites.items():
+        if not own:
+            raise InputError(
+                f"found {name!r}, expected a joint of this arm of {model.arm.n} joints", ("effect",)
+            )
     contained = {
-        (CATALOGUE[effect].replaces, site.joint)
-        for name in effects
-        for effect, site in _sites(model, name)
+        (CATALOGUE[effect].replaces, site.joint) for own in sites.values() for effect, site in own
     }
     seen = set()
-    for name in effects:
-        for effect, site in _sites(model, name):
+    for own in sites.values():
+        for effect, site in own:
             if (effect, site.joint) in contained or (effect, site) in seen:
                 continue
             seen.add((effect, site))
@@ -160,8 +167,11 @@ def _terms(model: Model, effects: Sequence[str]) -> Iterator[Term]:
             yield Term(effect, site, (0.0,) * count)
 
 
-def _sites(model: Model, name: str) -> list[tuple[str, Site]]:
-    """Return effect and sites of ``effect`` or ``effect_JOINT``."""
+def effect_sites(model: Model, name: str) -> list[tuple[str, Site]]:
+    """Return effect and sites of ``effect`` or ``effect_JOINT``; none at a joint without it.
+
+    Raises InputError where it is no effect, or one that positions do not show.
+    """
     stem, _, number = name.rpartition("_")
     joint = int(number) if number.isdigit() and stem in CATALOGUE else None
     effect = effect_named(name if joint is None else stem)
@@ -172,28 +182,14 @@ def _sites(model: Model, name: str) -> list[tuple[str, Site]]:
             ("effect",),
         )
     sites = [s for s in effect.sites(model.arm) if joint is None or s.joint == joint]
-    if not sites:
-        raise InputError(
-            f"found {name!r}, expected a joint of this arm of {model.arm.n} joints", ("effect",)
-        )
     if effect.periodic:
         sites = [replace(s, order=order) for s in sites for order in PERIODIC_ORDERS]
     return [(effect.identifier, site) for site in sites]
 
 
-def _lever_factor(model: Model, term: Term, value: int) -> float:
-    """Return the factor on a usual size for a joint with less lever than the first one.
-
-    The saturation moment of a stiffness curve scales with the moments at the joint: those of a
-    wrist are much smaller than those of joint 1.
-    """
-    if not CATALOGUE[term.effect].has_nonlinearity or term.site.joint is None:
-        return 1.0
-    arm, i = model.arm, term.site.joint - 1
-    length = np.linalg.norm(arm.link_in_link[:, :3, 3], axis=1)
-    tool = float(np.linalg.norm(model.tool_in_flange[:3, 3]))
-    share = (float(length[i + 1 :].sum()) + tool) / (float(length.sum()) + tool)
-    return max(share, MIN_LEVER) ** -(1 + value)
+def _lever_factor(arm: Arm, site: Site) -> float:
+    """Return the whole arm's usual moment over a joint's own: a wrist bends under less."""
+    return typical_moment(arm) / typical_moment(arm, site.joint or 0)
 
 
 def _nominal_values(model: Model, term: Term) -> Array:

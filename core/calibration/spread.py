@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gapbridge.core.arrays import Array
-from gapbridge.core.calibration.parameters import Parameters
+from gapbridge.core.calibration.parameters import Parameters, effect_sites
 from gapbridge.core.effects import CATALOGUE, Term, flexibility_names, split_name
 from gapbridge.core.errors import EquilibriumError, InputError
 from gapbridge.core.loads import Loads
@@ -117,18 +117,21 @@ def parameters_named(model: Model, names: Sequence[str], where: str) -> Paramete
 
     Raises InputError with the keys of a name in ``where`` that its arm does not have.
     """
-    parameters = Parameters.of_effects(model, effects_of(names, where))
-    index = {name: i for i, name in enumerate(parameters.names)}
+    # each at its own joint: a stiffness curve stands instead of that joint's flexibility only
+    effects = [e for e in effects_of(names, where) if effect_sites(model, e)]
+    parameters = Parameters.of_effects(model, effects) if effects else None
+    known = parameters.names if parameters is not None else ()
     for i, name in enumerate(names):
-        if name not in index:
+        if name not in known:
             raise InputError(
                 f"found {name!r}, expected a parameter of this cell's arm", (where, "parameters", i)
             )
-    return parameters.part([index[name] for name in names])
+    assert parameters is not None
+    return parameters.part([known.index(name) for name in names])
 
 
 def effects_of(names: Sequence[str], where: str = "calibration") -> tuple[str, ...]:
-    """Return the effects that parameters with these names belong to, each once.
+    """Return the effects, with their joint, that parameters with these names belong to, each once.
 
     Raises InputError with the keys of a name in ``where`` that belongs to none.
     """
@@ -140,7 +143,7 @@ def effects_of(names: Sequence[str], where: str = "calibration") -> tuple[str, .
                 f"found {name!r}, expected a parameter of an effect that positions show",
                 (where, "parameters", i),
             )
-        effects.append(parts.effect)
+        effects.append(parts.effect if parts.joint is None else f"{parts.effect}_{parts.joint}")
     return tuple(dict.fromkeys(effects))
 
 

@@ -80,17 +80,15 @@ NO_REVERSAL_PENALTY = 3.0  # of backlash in a log without reversals: an offset r
 ANY_CONSTANT_PENALTY = 1e-3  # of a sensor's constant: breaks exact ties, else rounding would
 MAX_LINES = 4  # periodic lines of a joint: more are the Fourier series of something else
 MIN_ORDERS_APART = 0.75  # cycles per turn between two lines of a joint
-MIN_PERIODS = (
-    0.75  # of a line in the joint's range if there is an unknown: less than two extremes of
-)
-# a sine fit any curve. False lines had 0.26 to 0.54, true ones at least 0.89
+MIN_PERIODS = 0.75  # of a line in the joint's range if there is an unknown, or the joint's own
+# offset: less than two extremes of a sine fit any curve. False lines had 0.26 to 0.6, true ones
+# beside an unknown at least 0.89
 MIN_DELAYS = 3  # joints with a known delay: with fewer no joint can be called the outlier
 NEGLIGIBLE_WORTH = 1e-4  # of a term, below which it is removed at once: a thirtieth of its sigma
 MAX_SMOOTH_TERMS = 2  # unnamed functions of a set: more add nothing
 LARGE_SAMPLE = 450  # rows of the sample space from which terms are searched one by one
 # Sizes of an arm's parameters, in multiples of the usual size that Effect.parameters gives
 MAX_TIMES_USUAL = 200.0  # larger values are not plausible
-MAX_SOFTENING = 6000.0  # the same of the softening of a stiffness curve
 TOO_LARGE_SIGMAS = 3.0  # by which a linear value has to exceed these sizes to be refused
 OUT_OF_BOUNDS_SIGMAS = 2.5  # by which it has to be below its lower bound
 PRIOR_REACH = 100.0  # 1 sigma of the weak prior of a fitted parameter

@@ -1,6 +1,7 @@
 """Periodic lines of a joint that are not periodic: one local bump in its angle fits equally well.
 
-With an unnamed function in the set, a line also needs most of a period in the joint's range.
+With an unnamed function in the set, or with the joint's own offset, a line also needs most of a
+period in the joint's range: less of it and an offset are the arc of any curve.
 """
 
 from __future__ import annotations
@@ -18,23 +19,24 @@ CENTRES, WIDTHS = 13, (0.05, 0.1, 0.2)  # start values of a bump, as shares of t
 
 
 def not_periodic(selection: Selection) -> set[int]:
-    """Return the candidates (a joint's lines and offset) that one bump in its angle replaces.
+    """Return the candidates (a joint's lines and offset) that no period proves.
 
-    Centre and width of the bump are free; it wins ties.
+    One bump in the joint's angle replaces them; its centre and width are free, and it wins ties.
     """
     space, observation = selection.working, selection.observation
     if observation.channel != "position" or observation.joint_columns is None:
         return set()
     chosen = [c for c in selection.best.chosen if space.candidates[c].named]
-    bump_like: set[int] = set()
-    if len(chosen) < len(selection.best.chosen):
-        bump_like = {c for c in chosen if _periods(selection, c) < MIN_PERIODS}
+    few = {c for c in chosen if _periods(selection, c) < MIN_PERIODS}
+    bump_like = set(few) if len(chosen) < len(selection.best.chosen) else set()
     for i in range(observation.joint_columns.shape[2]):
         of_joint = [c for c in chosen if space.candidates[c].site.joint == i + 1]
         lines = [c for c in of_joint if space.candidates[c].periodic]
+        group = [c for c in of_joint if space.candidates[c].turns_joint_by_own_angle]
+        if len(group) > len(lines):
+            bump_like |= few & set(lines)
         if len(lines) < 2:
             continue
-        group = [c for c in of_joint if space.candidates[c].turns_joint_by_own_angle]
         others = basis_of(space.columns([c for c in chosen if c not in group]))
         y = projected_out(others, space.y)
         basis = basis_of(projected_out(others, space.columns(group)))

@@ -23,8 +23,8 @@ from gapbridge.core.errors import InputError
 STEP = 1e-2  # of a parameter's usual scale, for central differences
 WHOLE_ORDERS = 128  # cycles per turn: periodic lines up to this order are candidates
 HALF_ORDERS = 40  # up to here also at half orders
-# (typical moment / M0)^2, the softening values of the candidates of a stiffness curve
-SOFTENING = tuple(float(v) for v in np.geomspace(0.1, 3000, 13))
+# (joint's typical moment / M0)^2, the softening values of the candidates of a stiffness curve
+SOFTENING = tuple(float(v) for v in np.geomspace(0.02, 100, 13))
 
 UNNAMED = Effect()
 

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from gapbridge.core.arrays import Array
 from gapbridge.core.diagnosis.criteria import (
     ACCUSATION_PENALTY,
-    MAX_SOFTENING,
     MAX_TIMES_USUAL,
     OUT_OF_BOUNDS_SIGMAS,
     SMOOTH_PENALTY,
@@ -190,9 +189,7 @@ def _plausible(candidate: Candidate, x: Array, s: Array) -> bool:
         lower = -np.inf if candidate.curve is not None else parameter.lower
         if value < lower - OUT_OF_BOUNDS_SIGMAS * deviation or value > parameter.upper:
             return False
-        limit = (
-            MAX_SOFTENING if parameter.name == "softening" else MAX_TIMES_USUAL
-        ) * parameter.scale
+        limit = MAX_TIMES_USUAL * parameter.scale
         if parameter.unit not in SENSOR_UNITS and abs(value) - TOO_LARGE_SIGMAS * deviation > limit:
             return False
     return True

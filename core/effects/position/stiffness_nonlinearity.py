@@ -42,10 +42,10 @@ class StiffnessNonlinearity(JointEffect):
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
         """Return c and the softening 1/M0^2, in which the curve starts linear."""
-        moment = typical_moment(arm)
+        own = typical_moment(arm, site.joint or 0)  # a wrist's curve bends at far less
         return (
-            Parameter("compliance", "rad/Nm", 1e-3 / moment, 0.0),
-            Parameter("softening", "1/(Nm)2", 1 / moment**2, 0.0),
+            Parameter("compliance", "rad/Nm", 1e-3 / typical_moment(arm), 0.0),
+            Parameter("softening", "1/(Nm)2", 1 / own**2, 0.0),
         )
 
     def shape(self, term: Term, arm: Arm, chain: Chain) -> None:

@@ -21,7 +21,7 @@ from gapbridge.core.calibration.identifiability import identifiable_parameters
 from gapbridge.core.calibration.observables import make_observable
 from gapbridge.core.calibration.readings import Readings
 from gapbridge.core.calibration.result import Calibration
-from gapbridge.core.calibration.spread import effects_of
+from gapbridge.core.calibration.spread import effects_of, parameters_named
 from gapbridge.core.calibration.verify import verify
 from gapbridge.core.errors import ExcitationError, InputError
 from gapbridge.core.metrology import Metrology
@@ -161,10 +161,21 @@ def test_a_document_that_is_none_is_named(calibrated: Calibrated) -> None:
         read_baseline({k: v for k, v in document.items() if k != "noise"}, "calibration.json")
 
 
+def test_a_curve_at_one_joint_leaves_another_its_flexibility() -> None:
+    """Else no command reads a cell with both that `diagnose --apply` wrote."""
+    model = model_of(real_arm(ARMS["cobot5"]))
+    curve = ("stiffness_nonlinearity_2_compliance", "stiffness_nonlinearity_2_softening")
+    for names in (("axial_compliance_4", *curve), (*curve, "axial_compliance_4")):
+        assert parameters_named(model, names, "provenance").names == names
+    with pytest.raises(InputError, match="found 'axial_compliance_9', expected a parameter of"):
+        parameters_named(model, ("axial_compliance_9",), "provenance")
+
+
 def test_effects_are_read_off_the_parameters_names() -> None:
     assert effects_of(("joint_offset_2", "link_geometry_1_a", "joint_offset_3")) == (
-        "joint_offset",
-        "link_geometry",
+        "joint_offset_2",
+        "link_geometry_1",
+        "joint_offset_3",
     )
     with pytest.raises(InputError, match="nonsense"):
         effects_of(("nonsense_1",))

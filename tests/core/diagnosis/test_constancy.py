@@ -143,3 +143,19 @@ def test_all_rows_judge_whether_a_line_is_one(fades, kept):
     _, decided = accused_on_all_rows(whole, accused, HeldOut(whole), RefitsAtOnce(model, False))
     assert decided.accused == ((0,) if kept else ())
     assert kept or dict(decided.withdrawn)[0].failed is Check.CONSTANT
+
+
+@pytest.mark.parametrize(("slope", "place"), [(1e-3, 0.5), (2e-3, 0.3)])
+def test_a_kink_in_a_joints_angle_is_no_line_of_half_a_period(slope, place):
+    """An offset and a line of order 1 fit it to the noise: the log shows 0.6 of a period."""
+
+    def kink(session, q):
+        return slope * np.maximum(q - np.quantile(q, place), 0.0)
+
+    session = small.session_of(0)
+    log = small.log_of(session, small.readings(small.turned(2, kink), session))
+    metrology = Metrology(registered=True, sigma=small.SIGMA)
+    channel = diagnose(small.model_of(), log, metrology).channels[0]
+    assert not channel.causes
+    assert channel.structured
+    assert channel.depends_on[0][0] == "actual_q_1"

@@ -51,9 +51,12 @@ class Package:
         (self.core / "kernels" / "reference.py").write_text(KERNEL.format(factor=factor))
 
     def run(self, **environment: str) -> str:
-        """Return what a process of its own computes, and how often it took what was compiled."""
+        """Return what a process of its own computes, and how often it took what was compiled.
+
+        Without bytecode: a source that is written twice in a second is taken for unchanged there.
+        """
         done = subprocess.run(
-            [sys.executable, "-c", "import gapbridge.core.correction"], cwd=self.folder, text=True,
+            [sys.executable, "-Bc", "import gapbridge.core.correction"], cwd=self.folder, text=True,
             env={**os.environ, "PYTHONPATH": str(self.folder), **environment},
             capture_output=True,
         )  # fmt: skip

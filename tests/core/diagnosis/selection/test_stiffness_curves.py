@@ -26,3 +26,14 @@ def test_a_curve_with_a_sigma_of_a_third_is_accused_and_a_line_is_kept_linear(
     (channel,) = [c for c in found.channels if c.channel == "position"]
     curves = [(c.effect, c.joints) for c in channel.causes if c.effect == "stiffness_nonlinearity"]
     assert curves == ([cause] if cause else [])
+
+
+def test_the_curve_of_a_wrist_is_not_pulled_to_that_of_a_shoulder(tmp_path) -> None:
+    """Joint 4 of a large arm bends at a fiftieth of what its shoulder holds."""
+    truth = make_case("hard:stiffness_nonlinearity", 1320008, tmp_path).causes[0].parameters
+    cell = load_cell(tmp_path / "cell.yaml")
+    found = diagnose(cell.model, read_log(tmp_path / "log.csv", cell.arm.n), cell.metrology)
+    (cause,) = next(c.causes for c in found.channels if c.channel == "position")
+    assert {p.name for p in cause.parameters} == set(truth)
+    for parameter in cause.parameters:
+        assert abs(parameter.value - truth[parameter.name]) < 3 * parameter.std
