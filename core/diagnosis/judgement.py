@@ -48,6 +48,7 @@ from gapbridge.core.diagnosis.selection.stiffness_curves import straight_curves
 from gapbridge.core.diagnosis.value_stability import (
     links_close_gap,
     links_predict_new_regions,
+    shifts_alike,
     stable_effects,
 )
 from gapbridge.core.effects import CATALOGUE
@@ -123,6 +124,7 @@ def judge_geometry(
     """
     accused_before = [selection.term_index[p] for p in judgement.accused]
     suspected = [*accused_before, *(selection.term_index[p] for p, _ in judgement.withdrawn)]
+    suspected = [c for c in suspected if c not in shifts_alike(selection)]
     single = any(selection.space.candidates[c].effect.estimated_as_whole for c in suspected)
     if selection.block or not (single and judgement.structured):
         return selection, judgement

@@ -122,7 +122,8 @@ class _GapClosure:
 
     Causes that only together explain the gap (a tool and what bends under it) are not significant
     one by one with unnamed functions. Effects that imitate an unknown one close the gap in some
-    parts only. Periodic lines are never needed, because their phase fits any shape.
+    parts only. Periodic lines are never needed, because their phase fits any shape, nor is what
+    shifts all measured positions alike (the height of the base), which is the mean of any error.
     """
 
     def __init__(self, selection: Selection) -> None:
@@ -132,13 +133,15 @@ class _GapClosure:
         self._held_out = HeldOut(selection, parts=self._part)
         # only of poses: a weight and a gain at one attitude look the same in every part
         self._possible = selection.observation.channel == "position" and self._held_out.possible
+        self._shifts = shifts_alike(selection)
 
     def needs_any(self, accused: Sequence[int], weakest: Iterable[int]) -> bool:
         """Return whether closing the gap needs one of ``weakest``, which is then in ``needed``."""
         self._possible = self.closed(accused)
         for c in weakest if self._possible else ():
             others = [o for o in accused if o != c]
-            if not (self._candidates[c].periodic or self.closed(others)):
+            own = self._candidates[c]
+            if not (own.periodic or c in self._shifts or self.closed(others)):
                 self.needed.add(c)
                 return True
         return False
@@ -154,6 +157,24 @@ class _GapClosure:
         worst = float(np.max(residual[before > 0] / before[before > 0], initial=0.0))
         closed = residual.sum() <= CLOSED_SHARE**2 * before.sum()
         return bool(closed and worst <= CLOSED_SHARE_IN_WORST_PART**2)
+
+
+def shifts_alike(selection: Selection) -> set[int]:
+    """Return the candidates whose terms shift all measured positions by the same vector.
+
+    It is the mean of whatever error the positions have.
+    """
+    alike: set[int] = set()
+    if selection.observation.channel != "position":
+        return alike
+    space, shift = selection.working, targets(selection.observation)["position"]
+    constant = basis_of(selection.rows_of(shift))
+    for c, term in zip(selection.term_index, selection.terms, strict=True):
+        columns = space.columns([c])
+        moved = columns @ np.array(term.values[: columns.shape[1]])
+        if np.sum((constant.T @ moved) ** 2) > CONTAINED_SHARE * np.sum(moved**2):
+            alike.add(c)
+    return alike
 
 
 def closes_gap(selection: Selection, accused: Sequence[int]) -> bool:

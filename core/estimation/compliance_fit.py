@@ -25,7 +25,7 @@ from gapbridge.core.estimation.registration import (
     frame_columns,
     register_robustly,
 )
-from gapbridge.core.estimation.robust import distance_of, scale_of, weights_of
+from gapbridge.core.estimation.robust import FULL_WEIGHT, distance_of, scale_of, weights_of
 from gapbridge.core.kernels.factor import factor_blocks
 from gapbridge.core.kernels.threads import in_ranges
 from gapbridge.core.loads import Loads
@@ -510,8 +510,14 @@ def robust_weights(gap: Array) -> tuple[Array, Array]:
 
 
 def noise_of(gap: Array) -> Array:
-    """Return the noise (2,), m and rad, of gaps (N, 3 or 6)."""
-    return np.array([scale_of(gap[:, :3]), scale_of(gap[:, 3:]) if gap.shape[1] > 3 else 1.0])
+    """Return the noise (2,), m and rad, of gaps (N, 3 or 6).
+
+    At least a third of the rows are inliers with it: of a gap in one direction only (a base whose
+    height is wrong) the median coordinate shows nothing.
+    """
+    scale = np.array([scale_of(gap[:, :3]), scale_of(gap[:, 3:]) if gap.shape[1] > 3 else 1.0])
+    distance = distance_of(gap, np.repeat(scale, 3)[: gap.shape[1]])
+    return np.asarray(scale * max(float(np.quantile(distance, 1 / 3)) / FULL_WEIGHT, 1.0))
 
 
 def weights_at(gap: Array, scale: Array) -> Array:

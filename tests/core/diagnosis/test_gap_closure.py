@@ -4,12 +4,15 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import small_arm as small
 
 from gapbridge.core.diagnosis import diagnosis, value_stability
 from gapbridge.core.diagnosis.causes import Considered, Outcome
+from gapbridge.core.diagnosis.diagnosis import diagnose
 from gapbridge.core.diagnosis.finding import Check, Withdrawal
 from gapbridge.core.diagnosis.judgement import Judgement
 from gapbridge.core.effects import Site, Term
+from gapbridge.core.metrology import Metrology
 
 PARTS = np.repeat(np.arange(4), 5)
 
@@ -18,13 +21,14 @@ PARTS = np.repeat(np.arange(4), 5)
 def closing(monkeypatch):
     """Return a maker of a closing by the share (4,) of the gap that sets of candidates leave."""
 
-    def made(shares, periodic=(), channel="position"):
+    def made(shares, periodic=(), channel="position", shifts=frozenset()):
         def squares(chosen):
             return np.asarray(shares.get(frozenset(chosen), np.ones(4)))[PARTS] ** 2
 
         held = SimpleNamespace(possible=True, squares=squares)
         monkeypatch.setattr(value_stability, "HeldOut", lambda selection, parts: held)
         monkeypatch.setattr(value_stability, "parts", lambda observation, kept: PARTS)
+        monkeypatch.setattr(value_stability, "shifts_alike", lambda selection: shifts)
         candidates = [SimpleNamespace(periodic=c in periodic) for c in range(4)]
         space = SimpleNamespace(candidates=candidates)
         selection = SimpleNamespace(
@@ -126,3 +130,23 @@ def test_only_poses_are_searched_a_second_time(two_searches):
     made, requested = two_searches
     assert made(closes=True, channel="torque") == ("transmission_error", (), [])
     assert requested == [()]
+
+
+def test_a_shift_of_all_positions_alike_is_never_needed(closing):
+    """It is the mean of whatever error there is."""
+    alone = {frozenset({0}): np.full(4, 0.25)}
+    assert closing(alone).needs_any([0], [0])
+    assert not closing(alone, shifts={0}).needs_any([0], [0])
+
+
+@pytest.mark.parametrize("strength", [2e-4, 5e-4])
+def test_a_height_error_that_grows_with_distance_is_no_longer_link(strength):
+    """Light that bends: its mean is what a longer link 1 does, and nearly all of the gap."""
+    session = small.session_of(0)
+    read = small.readings(small.NOMINAL, session)
+    station = np.array([3.0, -2.0, 0.4])
+    read[:, 2] += strength * np.sum((read - station) ** 2, axis=1)
+    metrology = Metrology(registered=True, sigma=small.SIGMA)
+    channel = diagnose(small.model_of(), small.log_of(session, read), metrology).channels[0]
+    assert not channel.causes
+    assert channel.structured
