@@ -124,8 +124,12 @@ def judge_geometry(
     """
     accused_before = [selection.term_index[p] for p in judgement.accused]
     suspected = [*accused_before, *(selection.term_index[p] for p, _ in judgement.withdrawn)]
-    suspected = [c for c in suspected if c not in shifts_alike(selection)]
-    single = any(selection.space.candidates[c].effect.estimated_as_whole for c in suspected)
+    shifts = shifts_alike(selection)
+    single = any(
+        selection.space.candidates[c].effect.estimated_as_whole
+        for c in suspected
+        if c not in shifts
+    )
     if selection.block or not (single and judgement.structured):
         return selection, judgement
     try:

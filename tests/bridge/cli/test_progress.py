@@ -51,6 +51,13 @@ def test_names_of_effects_are_no_pictures(
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
     monkeypatch.setenv("FORCE_COLOR", "1")
     monkeypatch.setenv("TERM", "xterm")
+    shown = [""]
+
+    def drawn() -> bool:
+        shown.append(capsys.readouterr().err)
+        return "ft_bias" in "".join(shown)
+
     with status("diagnosing") as emit:
         emit("withheld:wrench:ft_bias")
-        wait_for(lambda: "withheld:wrench:ft_bias" in capsys.readouterr().err, "the name")
+        wait_for(drawn, "the name")
+    assert "withheld:wrench:ft_bias" in "".join(shown)

@@ -162,7 +162,7 @@ def test_where_the_setpoint_before_does_not_go_out_either_the_arm_is_stopped(ser
     with pytest.raises(WriteError, match="the stop sequence was sent"):
         served.driver.write_setpoint(setpoint_of(q + 0.001))
     assert breaking.sent[-1] == (0x150, b"\x01" + bytes(7))
-    state_when(served, lambda state: state.safety_mode == 7)
+    assert state_when(served, lambda state: state.safety_mode != 1).safety_mode == 7
 
 
 def test_a_first_frame_that_fails_leaves_nothing_to_take_back(served):
@@ -207,19 +207,21 @@ def test_everything_we_send_is_in_the_allow_list(served):
 def test_a_motor_that_loses_its_power_while_we_write_is_reported(served):
     armed(served)
     served.nodes.enabled[2] = False
-    state_when(served, lambda state: state.robot_mode != 7)
+    state = state_when(served, lambda state: state.robot_mode != 7)
+    assert state.robot_mode == 5  # as a mode that is taken away
 
 
 def test_a_mode_taken_away_at_the_arm_is_reported_only_while_we_write(served):
     assert next_state(served.driver).robot_mode == 7  # standby, but we only read
     armed(served)
     served.nodes.control_mode = 2  # somebody drags the arm
-    state_when(served, lambda state: state.robot_mode == 5)
+    assert state_when(served, lambda state: state.robot_mode != 7).robot_mode == 5
 
 
 def test_the_stop_button_is_an_emergency_stop_and_keeps_us_from_arming(served):
     served.controller.emergency_stop()
-    state = state_when(served, lambda state: state.safety_mode == 7)
+    state = state_when(served, lambda state: state.safety_mode != 1)
+    assert state.safety_mode == 7
     assert state.safety_status_bits != 1
     with pytest.raises(WriteError, match=r"emergency_stop: ArmStatus.arm_status is 1"):
         served.driver.arm(state)
