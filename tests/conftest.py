@@ -28,6 +28,10 @@ settings.register_profile(
 )
 settings.load_profile("any machine")
 
+# texts have local times of day
+os.environ["TZ"] = "UTC"
+time.tzset()
+
 # Two processes share the cores: threads of linear algebra within each only wait for each other.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -28,12 +29,31 @@ WIDTH, HEIGHT = 340.0, 230.0
 LEFT, RIGHT, TOP, BOTTOM = 44.0, 10.0, 30.0, 38.0
 TITLE = 20.0  # px of the y axis' title and its margin
 DIGIT, MINUS = 6.4, 8.4  # px, width of a digit and a minus sign of 10 px in the widest usual font
+MARGIN = 0.04  # of the values, beyond them on a tight axis
+DIGITS = 4  # significant, of a number
+MOST_DIGITS = 17  # that distinguish all numbers
+WRITTEN_OUT = (1e6, 1e12)  # smaller numbers have no exponent: with DIGITS, and with more digits
 
 
-def plain(value: float) -> str:
+def plain(value: float, digits: int = DIGITS) -> str:
     """Return a number without trailing zeros and without leading zeros in its exponent."""
-    digits, e, exponent = f"{value:.4g}".partition("e")
-    return f"{digits}{e}{int(exponent) if e else ''}".replace("-", "−")
+    text = f"{value:.{digits}g}"
+    if "e+" in text and abs(value) < WRITTEN_OUT[digits > DIGITS]:
+        text = f"{float(text):.0f}"
+    mantissa, e, exponent = text.partition("e")
+    return f"{mantissa}{e}{int(exponent) if e else ''}".replace("-", "−")
+
+
+def tick_labels(ticks: Sequence[float]) -> tuple[str, ...]:
+    """Return the ticks as numbers with as many digits as their distance needs."""
+    gaps = [abs(b - a) for a, b in pairwise(ticks)]
+    exact = 1e-3 * min(gaps, default=math.inf)
+    digits = DIGITS
+    while digits < MOST_DIGITS and any(
+        abs(float(f"{tick:.{digits}g}") - tick) > exact for tick in ticks
+    ):
+        digits += 1
+    return tuple(plain(tick, digits) for tick in ticks)
 
 
 def _width(text: str) -> float:
@@ -51,6 +71,12 @@ class Scale:
     ticks: tuple[float, ...] = ()  # none: no grid
     labels: tuple[str, ...] = ()  # of the ticks, instead of their numbers
     log: bool = False
+    grid: bool = True
+
+    @property
+    def texts(self) -> tuple[str, ...]:
+        """Return the text of each tick."""
+        return self.labels or tick_labels(self.ticks)
 
     def share(self, value: float) -> float:
         """Return the position of a value on the axis, 0 to 1."""
@@ -72,13 +98,14 @@ def scale(
     low, high = min(finite), max(finite)
     if zero:
         low, high = min(low, 0.0), max(high, 0.0)
-    if high - low < 1e-12:
-        high = low + 1.0
+    size = max(abs(low), abs(high))
+    if high - low < 1e-12 * max(size, 1.0):
+        high = low + max(1.0, 1e-6 * size)
     step = _round_step((high - low) / ticks)
     first, last = math.floor(low / step + 1e-9), math.ceil(high / step - 1e-9)
     places = tuple(k * step for k in range(first, last + 1))
     if tight:
-        low, high = low - 0.04 * (high - low), high + 0.04 * (high - low)
+        low, high = low - MARGIN * (high - low), high + MARGIN * (high - low)
         return Scale(title, low, high, tuple(v for v in places if low <= v <= high))
     return Scale(title, places[0], places[-1], places)
 
@@ -107,7 +134,8 @@ def visible(values: Sequence[float]) -> list[float]:
 def named(title: str, labels: Sequence[str]) -> Scale:
     """Return a scale of categories at 0, 1, 2, ..."""
     count = len(labels)
-    return Scale(title, -0.5, count - 0.5, tuple(float(i) for i in range(count)), tuple(labels))
+    return Scale(title, -0.5, count - 0.5, tuple(float(i) for i in range(count)), tuple(labels),
+                 grid=False)  # fmt: skip
 
 
 def _round_step(rough: float) -> float:
@@ -123,7 +151,7 @@ class Chart:
         width: float = WIDTH, equal: bool = False,
     ) -> None:  # fmt: skip
         self.x, self.y = x, y
-        widest = max(map(_width, [] if y.labels else map(plain, y.ticks)), default=0.0)
+        widest = max(map(_width, [] if y.labels else y.texts), default=0.0)
         self.left, self.top = max(left, TITLE + widest), TOP
         self.right, self.bottom = width - RIGHT, height - BOTTOM
         if equal:
@@ -180,11 +208,16 @@ class Chart:
         right, bottom = self.at(x, y - width / 2)
         self.drawing.add(Rectangle(left, top, max(right - left, 0.5), bottom - top, colour, hint))
 
-    def upright(self, x: float, text: str, colour: str) -> None:
-        """Draw a dashed vertical line with a text at its top."""
+    def upright(self, x: float, text: str, colour: str, *, line: int = 0) -> None:
+        """Draw a dashed vertical line with a text beside it, ``line`` lines below its top.
+
+        The text is on the left where there is no room for it on the right.
+        """
         self.line([x, x], [self.y.low, self.y.high], colour, width=1.2, dashed=True)
         place = self.at(x, self.y.high)
-        self.drawing.add(Text(place[0] + 3, place[1] + 8, text, 10, colour))
+        left = place[0] + 3 + DIGIT * len(text) > self.drawing.width
+        beside, anchor = (place[0] - 3, "end") if left else (place[0] + 3, "start")
+        self.drawing.add(Text(beside, place[1] + 8 + 12 * line, text, 10, colour, anchor))
 
     def level(self, y: float, text: str, colour: str) -> None:
         """Draw a dashed horizontal line with a text at its right end."""
@@ -216,17 +249,15 @@ class Chart:
         self.x, self.y = _widened(self.x, unit * wide), _widened(self.y, unit * high)
 
     def _axes(self) -> None:
-        for k, tick in enumerate(self.x.ticks):
+        for tick, label in zip(self.x.ticks, self.x.texts, strict=True):
             x, y = self.at(tick, self.y.low)
-            label = self.x.labels[k] if self.x.labels else plain(tick)
-            if not self.x.labels:
+            if self.x.grid:
                 self.drawing.line([(x, self.top), (x, y)], Stroke(GRID, 0.8))
             inside = min(x, self.drawing.width - _width(label) / 2)
             self.drawing.add(Text(inside, y + 14, label, 10, SOFT, "middle"))
-        for k, tick in enumerate(self.y.ticks):
+        for tick, label in zip(self.y.ticks, self.y.texts, strict=True):
             x, y = self.at(self.x.low, tick)
-            label = self.y.labels[k] if self.y.labels else plain(tick)
-            if not self.y.labels:
+            if self.y.grid:
                 self.drawing.line([(x, y), (self.right, y)], Stroke(GRID, 0.8))
             self.drawing.add(Text(x - 5, y + 3.5, label, 10, SOFT, "end"))
         corners = ((self.left, self.top), (self.left, self.bottom), (self.right, self.bottom))
@@ -240,7 +271,8 @@ class Chart:
 
 def _widened(axis: Scale, span: float) -> Scale:
     middle = (axis.low + axis.high) / 2
-    return Scale(axis.title, middle - span / 2, middle + span / 2, axis.ticks, axis.labels)
+    return Scale(axis.title, middle - span / 2, middle + span / 2, axis.ticks, axis.labels,
+                 grid=axis.grid)  # fmt: skip
 
 
 def distribution(title: str, quantity: str, series: Sequence[tuple[str, Array, str]]) -> Chart:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from datetime import UTC, datetime
 
 import numpy as np
 
+from gapbridge.bridge.document.local_time import clock, day, is_date
 from gapbridge.bridge.document.log_findings import log_finding_text
 from gapbridge.core.diagnosis.causes import Considered, Outcome
 from gapbridge.core.diagnosis.finding import (
@@ -24,8 +24,6 @@ from gapbridge.core.diagnosis.finding import (
 )
 from gapbridge.core.log.log_finding import LogFinding
 
-SINCE_1970 = 1e9  # s: from here on a timestamp is a date
-DAY = 86400.0  # s
 SHOWN = 8  # rows of outliers
 WITHDRAWN = {
     Check.CURVED: "its curve cannot be distinguished from a straight line",
@@ -82,7 +80,7 @@ def _fact(fact: Fact, rows: bool, title: Callable[[str], str]) -> str:
         case NotAccused():
             return _not_named(fact, title(fact.term.effect))
         case Slip():
-            return f"{title(fact.term.effect)}: {_slip(fact)}"
+            return f"{title(fact.term.effect)}: {slip_text(fact)}"
         case ParameterNote():
             return f"{title(fact.name)} {_parameter(fact)}"
 
@@ -103,31 +101,38 @@ def _not_named(fact: NotAccused, effect: str) -> str:
     return f"{effect}{joint} is not named as a cause: {withdrawal_text(fact.reason)}{more}"
 
 
-def _slip(slip: Slip) -> str:
-    """Return what moved, how far, and between which rows."""
+def slip_text(slip: Slip) -> str:
+    """Return what moved, how far, between which rows, and whether anything else changed."""
     term, joint = slip.term, slip.term.site.joint
     moved = "the target on the tool" if joint is None else f"the zero of joint {joint}"
     if joint is None:
         distance = f"{1e3 * float(np.linalg.norm(term.values[:-1])):.3g} mm"
     else:
         distance = f"{1e3 * term.values[0]:.3g} mrad ({np.degrees(term.values[0]):.3g} deg)"
-    more = "; before and after it nothing else changed" if slip.alone else ""
+    besides = "besides the slips" if slip.others else "before and after it"
+    more = f"; {besides} nothing else changed" if slip.alone else (
+        "; something else may have changed too"
+    )  # fmt: skip
     if slip.session:
         return f"{moved} moved by {distance}; {slip.session} is the first session that has it{more}"
-    when = f"rows {slip.before:g} and {slip.after:g} of the log"
-    if slip.timed:
-        dated = slip.before // DAY != slip.after // DAY
-        when = f"{clock(slip.before, dated)} and {clock(slip.after, dated)}"
-    return f"{moved} moved by {distance} between {when}{more}"
+    return f"{moved} moved by {distance} between {between_text(slip)}{more}"
 
 
-def clock(time: float, dated: bool = False) -> str:
-    """Return seconds since 1970 as time of day (UTC), ``dated`` with its date; else seconds."""
-    if time < SINCE_1970:
-        return f"{time:.7g} s"
-    return datetime.fromtimestamp(time, tz=UTC).strftime(
-        "%Y-%m-%d %H:%M:%S" if dated else "%H:%M:%S"
-    )
+def between_text(slip: Slip) -> str:
+    """Return the last row before a slip and the first row after it."""
+    if not slip.timed:
+        return f"rows {slip.before:g} and {slip.after:g} of the log"
+    start = "" if is_date(slip.first) else " from the start"
+    return f"{moment_text(slip, slip.before)} and {moment_text(slip, slip.after)}{start}"
+
+
+def moment_text(slip: Slip, time: float) -> str:
+    """Return a time of the slip's log: of day (with the date if the log has several), s, row."""
+    if not slip.timed:
+        return f"row {time:g}"
+    if is_date(slip.first):
+        return clock(time, dated=day(slip.first) != day(slip.last))
+    return clock(time - slip.first)
 
 
 def _parameter(note: ParameterNote) -> str:

@@ -28,6 +28,7 @@ from gapbridge.bridge.report.labels import (
     with_unit,
 )  # fmt: skip
 from gapbridge.bridge.report.material import Material, after, chosen_channel, shares, unexplained
+from gapbridge.bridge.report.slips import advice, answered, slips_of
 from gapbridge.core.diagnosis.causes import Cause
 from gapbridge.core.diagnosis.channel_diagnosis import ChannelDiagnosis, Verdict
 from gapbridge.core.diagnosis.diagnosis import Diagnosis
@@ -58,7 +59,7 @@ def answer(material: Material) -> list[blocks.Block]:
         if c is not main
     ]
     return [
-        blocks.Verdict(verdict, " ".join(sentences(main))), *others,
+        blocks.Verdict(verdict, " ".join(sentences(main))), *others, *answered(diagnosis),
         blocks.Heading("What to do now"), blocks.Bullets(tuple(next_steps(diagnosis))),
         blocks.Pictures(tuple(picture(c) for c in diagnosis.channels), CAPTION),
     ]  # fmt: skip
@@ -68,11 +69,14 @@ def next_steps(diagnosis: Diagnosis) -> list[str]:
     """Return recommended next steps, most urgent first."""
     causes = [cause for c in diagnosis.channels for cause in c.causes]
     steps = []
-    if diagnosis.findings:
+    slipped = [slip for c in diagnosis.channels for slip in slips_of(diagnosis, c)]
+    if len(diagnosis.findings) > len(slipped):
         steps.append(
             "Read the findings under Data quality first: where one is a mistake in the log or the "
             "cell, correct it and diagnose again."
         )
+    if slipped:
+        steps.append(advice(slipped))
     if causes:
         steps.append(
             "Write the causes into a new cell with --apply NEW_CELL, then diagnose a log of other "

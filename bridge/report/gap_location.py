@@ -5,11 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from gapbridge.bridge.document import blocks
-from gapbridge.bridge.document.axes import Chart, scale
+from gapbridge.bridge.document.axes import Chart, Scale, scale
 from gapbridge.bridge.document.drawing import EDGE, SOFT, Drawing
 from gapbridge.bridge.document.findings import considered_text
 from gapbridge.bridge.document.scene import Arrows, Path, Scene, base
 from gapbridge.bridge.document.skeleton import reach, round_factor, skeleton
+from gapbridge.bridge.document.time_scale import time_scale
 from gapbridge.bridge.report.labels import (
     effect_title,
     joint_list,
@@ -27,13 +28,17 @@ from gapbridge.bridge.report.material import (
     per_sample,
     thinned,
 )
+from gapbridge.bridge.report.slips import mark, slips_of
 from gapbridge.core.arrays import Array, Index
 from gapbridge.core.diagnosis.causes import Cause, Considered, Outcome
 from gapbridge.core.diagnosis.channel_diagnosis import ChannelDiagnosis
+from gapbridge.core.diagnosis.finding import Slip
 from gapbridge.core.diagnosis.noise_floor import own_coordinates
+from gapbridge.core.log.log import Log
 from gapbridge.core.planning.travel import spread_rows
 
 MOST_QUANTITIES = 14
+TIME = quantity_title("timestamp")
 MIN_SHARE = 0.02  # smallest dependence that is listed
 POINTS = 600  # most points of a scatter plot
 ARROWS = 250  # most error arrows
@@ -53,7 +58,7 @@ def gap_location(material: Material) -> list[blocks.Block]:
     for channel in material.diagnosis.channels:
         shown += channel_heading(material.diagnosis, channel)
         shown += [blocks.TableRow((_joints(channel), _axes(channel), _depends(channel)))]
-        shown.append(_against(channel))
+        shown.append(_against(channel, slips_of(material.diagnosis, channel), material.log))
         if channel.channel == "position":
             shown.append(arm_view(channel, material))
     return shown
@@ -99,18 +104,18 @@ def _quantities(channel: ChannelDiagnosis) -> list[str]:
     return [n for n in names if n in available][:MOST_QUANTITIES]
 
 
-def _against(channel: ChannelDiagnosis) -> blocks.Gallery:
+def _against(channel: ChannelDiagnosis, slips: list[Slip], log: Log) -> blocks.Gallery:
     """Return scatter plots of the gap against each quantity; menus choose the plot."""
     kept = channel.selection.kept
     gap, after = channel.gap[kept], channel.remaining[kept]
     count = own_coordinates(channel.selection.observation)
     keep = thinned(per_sample(gap, count), POINTS)
     series = before_and_after(channel, gap[keep], after[keep])
-    across, upwards = _abscissas(channel, keep), _ordinates(channel, series, count)
+    across, upwards = _abscissas(channel, keep, log), _ordinates(channel, series, count)
     drawings = [
-        _scatter((x_title, x), (y_title, series))
+        _scatter((axis, x), (y_title, series), slips if label == TIME else [])
         for _, y_title, series in upwards
-        for _, x_title, x in across
+        for label, axis, x in across
     ]
     menus = (
         ("Show", tuple(label for label, _, _ in upwards)),
@@ -126,20 +131,22 @@ def _against(channel: ChannelDiagnosis) -> blocks.Gallery:
 Series = list[tuple[str, Array, str]]  # name, values, colour
 
 
-def _scatter(across: tuple[str, Array], upwards: tuple[str, Series]) -> Drawing:
-    x_title, x = across
+def _scatter(
+    across: tuple[Scale, Array], upwards: tuple[str, Series], slips: list[Slip]
+) -> Drawing:
+    axis, x = across
     y_title, series = upwards
     every = np.concatenate([values for _, values, _ in series])
-    chart = Chart("", scale(x_title, [*x], tight=True, zero=False),
-                  scale(y_title, [*every], tight=True), width=430, height=270)  # fmt: skip
+    chart = Chart("", axis, scale(y_title, [*every], tight=True), width=430, height=270)
     for _, values, colour in series:
         chart.points([*x], [*values], colour, radius=2.0, opacity=0.7)
+    mark(chart, slips)
     chart.legend([(name, colour) for name, _, colour in series])
     return chart.drawing
 
 
-def _abscissas(channel: ChannelDiagnosis, keep: Index) -> list[tuple[str, str, Array]]:
-    """Return label, axis title and values of each quantity to plot against."""
+def _abscissas(channel: ChannelDiagnosis, keep: Index, log: Log) -> list[tuple[str, Scale, Array]]:
+    """Return label, axis and values of each quantity to plot against."""
     observation, kept = channel.selection.observation, channel.selection.kept
     jitter = np.random.default_rng(0).uniform(-0.08, 0.08, len(keep))
     choices = []
@@ -149,11 +156,18 @@ def _abscissas(channel: ChannelDiagnosis, keep: Index) -> list[tuple[str, str, A
         if name.startswith("approach_"):
             values = values + jitter  # points at -1 and +1 would overlap
         title = quantity_title(name)
-        choices.append((title, f"{title} ({unit})" if unit else title, values))
+        axis = time_scale([*values], float(log.times()[0]), calendar=log.one_clock) if (
+            title == TIME
+        ) else _tight(f"{title} ({unit})" if unit else title, values)  # fmt: skip
+        choices.append((title, axis, values))
     if not choices:
         rows: Array = np.asarray(observation.rows[kept][keep] + 1, dtype=np.float64)
-        choices.append(("row of the log", "row of the log", rows))
+        choices.append(("row of the log", _tight("row of the log", rows), rows))
     return choices
+
+
+def _tight(title: str, values: Array) -> Scale:
+    return scale(title, [*values], tight=True, zero=False)
 
 
 def _ordinates(

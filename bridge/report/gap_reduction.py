@@ -6,7 +6,7 @@ import numpy as np
 
 from gapbridge.bridge.document.axes import Chart, distribution, scale
 from gapbridge.bridge.document.blocks import Bar, Block, Cell, Paragraph, Pictures, Table
-from gapbridge.bridge.document.drawing import BAD_DOT, EDGE, LIMIT, Drawing
+from gapbridge.bridge.document.drawing import BAD_DOT, EDGE, LIMIT
 from gapbridge.bridge.report.labels import CHANNELS, effect_title, percent, unit_of, with_unit
 from gapbridge.bridge.report.material import (
     Material,
@@ -16,8 +16,10 @@ from gapbridge.bridge.report.material import (
     shares,
     thinned,
 )
+from gapbridge.bridge.report.slips import mark_rows, slips_of
 from gapbridge.core.arrays import Array, Index
 from gapbridge.core.diagnosis.channel_diagnosis import ChannelDiagnosis
+from gapbridge.core.diagnosis.finding import Slip
 
 
 def gap_reduction(material: Material) -> list[Block]:
@@ -26,7 +28,8 @@ def gap_reduction(material: Material) -> list[Block]:
     blocks: list[Block] = [_shares(diagnosis.channels)]
     for channel in diagnosis.channels:
         blocks += channel_heading(diagnosis, channel)
-        blocks += _channel(channel) + _sessions(channel, diagnosis.sessions)
+        blocks += _channel(channel, slips_of(diagnosis, channel))
+        blocks += _sessions(channel, diagnosis.sessions)
     return blocks
 
 
@@ -49,7 +52,7 @@ def _shares(channels: tuple[ChannelDiagnosis, ...]) -> Table:
     return Table(heads, rows)
 
 
-def _channel(channel: ChannelDiagnosis) -> list[Block]:
+def _channel(channel: ChannelDiagnosis, slips: list[Slip]) -> list[Block]:
     pair = held_out_pair(channel)
     blocks: list[Block] = [_causes(channel)] if any(c.shrink for c in channel.causes) else []
     if pair is None:
@@ -58,7 +61,7 @@ def _channel(channel: ChannelDiagnosis) -> list[Block]:
     if not channel.causes:
         text = "No cause was added to the model, so before and after are the same."
         blocks.append(Paragraph(text, "note"))
-    blocks.append(_pictures(channel, before, after))
+    blocks.append(_pictures(channel, before, after, slips))
     if channel.causes:
         better = float(np.mean(after < before))
         blocks.append(Paragraph(f"{percent(better)} of the held-out samples have a smaller gap."))
@@ -106,7 +109,9 @@ def _causes(channel: ChannelDiagnosis) -> Table:
     return Table(heads, rows, (2.4, 1, 1, 2))
 
 
-def _pictures(channel: ChannelDiagnosis, before: Array, after: Array) -> Pictures:
+def _pictures(
+    channel: ChannelDiagnosis, before: Array, after: Array, slips: list[Slip]
+) -> Pictures:
     name, factor = unit_of(channel.unit)
     series = [
         (label, values * factor, colour)
@@ -121,8 +126,9 @@ def _pictures(channel: ChannelDiagnosis, before: Array, after: Array) -> Picture
     note = f" {len(keep)} of {len(before)} samples are drawn." if len(keep) < len(before) else ""
     rows = channel.selection.observation.rows[channel.selection.kept][keep] + 1
     by_sample = _by_sample(rows, [(n, v[keep], c) for n, v, c in series], name, level)
+    mark_rows(by_sample, channel, slips)
     return Pictures(
-        (share.drawing, by_sample),
+        (share.drawing, by_sample.drawing),
         "Held-out samples. Left: cumulative distribution of the gap, logarithmic. Right: every "
         f"sample. Dashed: the noise.{note}",
     )
@@ -130,7 +136,7 @@ def _pictures(channel: ChannelDiagnosis, before: Array, after: Array) -> Picture
 
 def _by_sample(
     rows: Index, series: list[tuple[str, Array, str]], unit: str, level: float | None
-) -> Drawing:
+) -> Chart:
     highest = [level or 0.0, *(float(values.max()) for _, values, _ in series)]
     chart = Chart("Every sample", scale("row of the log", [*rows], tight=True),
                   scale(f"gap per coordinate, {unit}", highest))  # fmt: skip
@@ -139,4 +145,4 @@ def _by_sample(
     if level is not None:
         chart.level(level, "noise", EDGE)
     chart.legend([(label, colour) for label, _, colour in series])
-    return chart.drawing
+    return chart

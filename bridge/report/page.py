@@ -19,6 +19,7 @@ from gapbridge.bridge.report.gap_reduction import gap_reduction
 from gapbridge.bridge.report.labels import CHANNELS, with_unit
 from gapbridge.bridge.report.material import Material, per_sample
 from gapbridge.bridge.report.parameters import parameters
+from gapbridge.bridge.report.slips import slip_section
 from gapbridge.core.diagnosis.channel_diagnosis import ChannelDiagnosis
 from gapbridge.core.diagnosis.diagnosis import Diagnosis
 from gapbridge.core.diagnosis.noise_floor import own_coordinates
@@ -115,6 +116,8 @@ def _outliers(channel: ChannelDiagnosis, log: Log) -> list[blocks.Block]:
 
 SECTIONS: tuple[blocks.Section[Material], ...] = (
     blocks.Section("answer", "The answer", answer),
+    blocks.Section("slips", "Before and after each slip", slip_section,
+            "The gap of each part of the log between the slips."),
     blocks.Section("where", "Where the gap lies", gap_location,
             "Which joints and axes it comes from, and what it depends on."),
     blocks.Section("which", "Which effect causes it", effect_tables,

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from gapbridge.bridge.document import blocks
-from gapbridge.bridge.document.findings import clock
 from gapbridge.bridge.document.provenance import HALF_WIDTH
 from gapbridge.bridge.report.labels import (
     decimals_of,
@@ -17,7 +16,9 @@ from gapbridge.bridge.report.labels import (
     parameter_unit,
 )
 from gapbridge.bridge.report.material import Material
+from gapbridge.bridge.report.slips import moment_of
 from gapbridge.core.diagnosis.causes import Cause
+from gapbridge.core.diagnosis.diagnosis import Diagnosis
 from gapbridge.core.diagnosis.separation import Measurement
 from gapbridge.core.effects import Reported
 
@@ -28,12 +29,13 @@ def parameters(material: Material) -> list[blocks.Block]:
     """Return the parameters, the ties and the next measurements."""
     causes = [c for channel in material.diagnosis.channels for c in channel.causes]
     return [
-        *_parameters(causes), *_ties(causes), blocks.Heading("What to measure next"),
+        *_parameters(causes, material.diagnosis), *_ties(causes),
+        blocks.Heading("What to measure next"),
         *_next(material.diagnosis.next_measurements),
     ]  # fmt: skip
 
 
-def _parameters(causes: list[Cause]) -> list[blocks.Block]:
+def _parameters(causes: list[Cause], diagnosis: Diagnosis) -> list[blocks.Block]:
     if not causes:
         return [
             blocks.Paragraph("No cause was named, so there are no parameters to add to the model.")
@@ -43,7 +45,7 @@ def _parameters(causes: list[Cause]) -> list[blocks.Block]:
         where = f", {joint_list(cause.joints)}" if cause.joints else ""
         first: blocks.Cell = blocks.Named(effect_title(cause.effect), where)
         for p in cause.parameters:
-            rows.append([first, blocks.Named("", code=p.name), *_value(p)])
+            rows.append([first, blocks.Named("", code=p.name), *_value(p, diagnosis)])
             first = ""
     note = (
         "Each value is what the real arm has more than the model; the interval contains the true "
@@ -53,11 +55,11 @@ def _parameters(causes: list[Cause]) -> list[blocks.Block]:
     return [blocks.Table(heads, rows, (2.2, 2.2, 1, 1.6, 0.8)), blocks.Paragraph(note, "note")]
 
 
-def _value(p: Reported) -> tuple[str, str, str]:
+def _value(p: Reported, diagnosis: Diagnosis) -> tuple[str, str, str]:
     if p.session:
         return f"first in session {p.session}", "no common clock", ""
     if p.is_time:
-        return clock(p.value, dated=True), "between two rows of the log", ""
+        return moment_of(p, diagnosis), "between two rows of the log", ""
     name, factor = parameter_unit(p)
     value = p.value * factor
     if p.std is None or not np.isfinite(p.std):

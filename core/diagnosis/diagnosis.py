@@ -470,9 +470,22 @@ def _facts(channel: ChannelDiagnosis, log: Log) -> list[Fact]:
         stand_in = position_ in judgement.stand_ins
         facts.append(NotAccused(selection.terms[position_], reason, stand_in))
     terms = [term for cause in channel.causes for term in cause.terms]
-    observation, alone = selection.observation, channel.verdict is Verdict.EXPLAINED
-    timed = "timestamp" in observation.quantities
-    for term, before, after in slips(terms, observation.times):
-        session = "" if log.one_clock else first_session(term.values[-1], log)
-        facts.append(Slip(term, before, after, timed, alone, session))
+    facts += _slips(channel, terms, log)
     return facts + [note for cause in channel.causes for note in cause.notes]
+
+
+def _slips(channel: ChannelDiagnosis, terms: Sequence[Term], log: Log) -> list[Slip]:
+    """Return the slips among the terms of the causes."""
+    observation, times = channel.selection.observation, log.times()
+    found = slips(terms, observation.times)
+    carried = all(transfer.transfers for transfer in channel.session_transfer)
+    return [
+        Slip(
+            term, before, after, float(times[0]), float(times[-1]),
+            timed="timestamp" in observation.quantities,
+            alone=channel.verdict is Verdict.EXPLAINED and carried,
+            session="" if log.one_clock else first_session(term.values[-1], log),
+            others=len(found) - 1,
+        )
+        for term, before, after in found
+    ]  # fmt: skip

@@ -90,9 +90,12 @@ class Slip:
     term: Term
     before: float  # s, or the row where the log has no time
     after: float
+    first: float  # of the log, as ``before``
+    last: float
     timed: bool
-    alone: bool  # no structure remains: the model holds before and after
+    alone: bool  # no structure remains and nothing differs between sessions: the model holds
     session: str = ""  # the first session that has it, where the sessions' clocks overlap
+    others: int = 0  # slips besides it
 
 
 Fact = TooFewRows | Thinned | Outliers | NotAccused | Slip | ParameterNote

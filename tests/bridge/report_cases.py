@@ -14,7 +14,7 @@ from gapbridge.core.log.log import Log
 from gapbridge.core.metrology import Metrology
 from gapbridge.core.model import Model
 
-CASES = ("no gap", "explained", "unexplained", "partly explained", "rotations and forces")
+CASES = ("no gap", "explained", "unexplained", "partly explained", "rotations and forces", "slip")
 METROLOGY = Metrology(registered=False, sigma=2e-5, repeatability=2e-5)
 
 
@@ -32,6 +32,8 @@ def diagnosed(name: str) -> Case:
         return _case((), rows=24)
     if name == "explained":
         return _case((Term("axial_compliance", Site(2), (2e-5,)),), rows=60)
+    if name == "slip":
+        return _case((Term("joint_slip", Site(3), (5e-3, 730.0)),), rows=60)
     if name == "unexplained":
         return _case((Term("axial_compliance", Site(2), (2e-5,)),), 60, withhold=COMPLIANT)
     if name == "partly explained":

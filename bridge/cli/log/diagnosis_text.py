@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from gapbridge.bridge.document.findings import clock, finding_text
+from gapbridge.bridge.document.findings import finding_text
 from gapbridge.bridge.document.parameter_entries import session_parameter
 from gapbridge.bridge.report.labels import parameter_unit, unit_of
+from gapbridge.bridge.report.slips import moment_of, slip_findings, slip_texts
 from gapbridge.core.diagnosis.causes import Cause
 from gapbridge.core.diagnosis.channel_diagnosis import ChannelDiagnosis, Verdict
 from gapbridge.core.diagnosis.diagnosis import Diagnosis
@@ -31,12 +32,15 @@ def diagnosis_text(diagnosis: Diagnosis) -> str:
     several = len(diagnosis.channels) > 1
     for channel in diagnosis.channels:
         verdict = f": {VERDICTS[channel.verdict]}" if several else ""
-        lines += ["", f"{channel.channel}{verdict}", *_channel_lines(channel, diagnosis.sessions)]
+        lines += ["", f"{channel.channel}{verdict}", *_channel_lines(channel, diagnosis)]
+        for slip, gap in slip_texts(diagnosis, channel):
+            lines += [f"  slip: {slip}", f"    {gap}"]
     if diagnosis.not_observable:
         lines.append("")
     for missing in diagnosis.not_observable:
         lines.append(f"{missing.channel}: not observable here; needs {', '.join(missing.needs)}")
-    notes = [finding_text(f) for f in diagnosis.findings if f not in wrong_arm_findings(diagnosis)]
+    elsewhere = [*wrong_arm_findings(diagnosis), *slip_findings(diagnosis)]
+    notes = [finding_text(f) for f in diagnosis.findings if f not in elsewhere]
     if notes:
         lines += ["", *(f"note: {note}" for note in notes)]
     if diagnosis.next_measurements:
@@ -69,7 +73,7 @@ def _rms_text(channel: ChannelDiagnosis, rms: float | None) -> str:
     return f"{gap_text(rms, channel.unit)} rms per coordinate ({in_space} in space)"
 
 
-def _channel_lines(channel: ChannelDiagnosis, sessions: tuple[str, ...]) -> list[str]:
+def _channel_lines(channel: ChannelDiagnosis, diagnosis: Diagnosis) -> list[str]:
     unit = channel.unit
     most = "at most" if channel.channel != "position" else "at most in space"
     lines = [
@@ -78,15 +82,15 @@ def _channel_lines(channel: ChannelDiagnosis, sessions: tuple[str, ...]) -> list
         "coordinate",
     ]
     for cause in channel.causes:
-        lines += [f"  {line}" for line in _cause_lines(cause, unit)]
-        lines += [f"    {line}" for line in _session_changes(channel, cause, sessions)]
+        lines += [f"  {line}" for line in _cause_lines(cause, unit, diagnosis)]
+        lines += [f"    {line}" for line in _session_changes(channel, cause, diagnosis)]
     if channel.causes:
         lines.append(f"  remaining with these values {_rms_text(channel, channel.remaining_rms)}")
         lines.append(
             f"  on samples held out {_rms_text(channel, channel.remaining_rms_held_out)}, "
             "these causes alone fitted to the others"
         )
-    lines += [f"  {line}" for line in _expected_elsewhere(channel, sessions)]
+    lines += [f"  {line}" for line in _expected_elsewhere(channel, diagnosis.sessions)]
     for stand_in in channel.stand_ins:
         lines.append(
             f"  stand-in: {_cause_title(stand_in)}: not proved, but the gap shrinks by it in "
@@ -117,9 +121,7 @@ def _expected_elsewhere(channel: ChannelDiagnosis, sessions: tuple[str, ...]) ->
     return lines
 
 
-def _session_changes(
-    channel: ChannelDiagnosis, cause: Cause, sessions: tuple[str, ...]
-) -> list[str]:
+def _session_changes(channel: ChannelDiagnosis, cause: Cause, diagnosis: Diagnosis) -> list[str]:
     """Return whether a cause is the same in all sessions; if not, its values per session."""
     across = next((c for c in channel.session_transfer if c.effect == cause.effect), None)
     if across is None:
@@ -129,8 +131,8 @@ def _session_changes(
     lines = [f"changed between sessions (p = {across.p_value:.2g} if it had not):"]
     most = _most_changed([parameters for _, parameters in across.values])
     for s, parameters in across.values:
-        each = "; ".join(_parameter_text(parameters[k]) for k in most)
-        lines.append(f"  {sessions[s]}: {each}")
+        each = "; ".join(_parameter_text(parameters[k], diagnosis) for k in most)
+        lines.append(f"  {diagnosis.sessions[s]}: {each}")
     if len(most) < len(across.values[0][1]):
         lines.append("  (those that changed most; all are in the JSON)")
     return lines
@@ -147,7 +149,7 @@ def _most_changed(values: Sequence[Sequence[Reported]]) -> list[int]:
     return order[:MAX_CHANGED]
 
 
-def _cause_lines(cause: Cause, unit: str) -> list[str]:
+def _cause_lines(cause: Cause, unit: str, diagnosis: Diagnosis) -> list[str]:
     lines = [
         f"cause: {_cause_title(cause)} (probability {cause.probability:.3g}){_shrink_text(cause)}"
     ]
@@ -156,7 +158,7 @@ def _cause_lines(cause: Cause, unit: str) -> list[str]:
             f"  held-out gap {gap_text(cause.shrink.gap_without, unit)} without it, "
             f"{gap_text(cause.shrink.gap_with, unit)} with it"
         )
-    lines += [f"  {_parameter_text(parameter)}" for parameter in cause.parameters]
+    lines += [f"  {_parameter_text(parameter, diagnosis)}" for parameter in cause.parameters]
     if cause.indistinguishable_from:
         ties = ", ".join(cause.indistinguishable_from)
         lines.append(f"  these data cannot separate it from {ties}")
@@ -177,11 +179,11 @@ def _shrink_text(cause: Cause) -> str:
     return f": shrinks the gap by {cause.shrink.shrink:.1%} ({low:.1%} to {high:.1%})"
 
 
-def _parameter_text(parameter: Reported) -> str:
+def _parameter_text(parameter: Reported, diagnosis: Diagnosis) -> str:
     if parameter.session:
         return f"{session_parameter(parameter)} = {parameter.session}"
     if parameter.is_time:
-        return f"{parameter.name} = {clock(parameter.value, dated=True)}"
+        return f"{parameter.name} = {moment_of(parameter, diagnosis)}"
     unit, factor = parameter_unit(parameter)
     spread = "" if parameter.std is None else f" ± {factor * parameter.std:.2g}"
     return f"{parameter.name} = {factor * parameter.value:.5g}{spread} {unit}".rstrip()

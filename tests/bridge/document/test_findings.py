@@ -27,6 +27,16 @@ from gapbridge.core.effects import Site, Term
 
 PLAY = Term("backlash", Site(2), (9e-4,))
 BOUND = Withdrawal(Check.INSIDE_BOUNDS)
+EVENING = 1.7e9  # 2023-11-14 22:13:20 UTC
+
+
+def slipped(
+    before: float, after: float, last: float | None = None, timed: bool = True, alone: bool = True,
+    **more,
+) -> Slip:  # fmt: skip
+    """Return a slip of joint 3 between two rows of a log that begins with the first of them."""
+    term = Term("joint_slip", Site(3), (2e-3, (before + after) / 2))
+    return Slip(term, before, after, before, last or after, timed, alone, **more)
 
 
 def test_every_check_has_a_sentence_of_its_own() -> None:
@@ -54,17 +64,25 @@ def test_a_value_that_is_not_constant_names_the_quantity() -> None:
         (NotAccused(Term("tool_frame", Site(), (1e-3,)), BOUND, stand_in=True),
          "tool_frame is not named as a cause: its value is at its bound; it improves held-out "
          "poses: a stand-in"),
-        (Slip(Term("joint_slip", Site(3), (2e-3, 1.7e9)), 1.7e9, 1.7e9 + 40, True, True),
+        (slipped(EVENING, EVENING + 40),
          "joint_slip: the zero of joint 3 moved by 2 mrad (0.115 deg) between 22:13:20 and "
          "22:14:00; before and after it nothing else changed"),
-        (Slip(Term("joint_slip", Site(3), (2e-3, 1.7e9)), 1.7e9, 1.7e9 + 86400, True, False),
+        (slipped(EVENING, EVENING + 86400, alone=False),
          "joint_slip: the zero of joint 3 moved by 2 mrad (0.115 deg) between 2023-11-14 22:13:20 "
-         "and 2023-11-15 22:13:20"),
-        (Slip(Term("joint_slip", Site(3), (2e-3, 42.5)), 42, 43, False, False),
+         "and 2023-11-15 22:13:20; something else may have changed too"),
+        (slipped(EVENING, EVENING + 40, last=EVENING + 9e4),
+         "joint_slip: the zero of joint 3 moved by 2 mrad (0.115 deg) between 2023-11-14 22:13:20 "
+         "and 2023-11-14 22:14:00; before and after it nothing else changed"),
+        (slipped(42, 43, timed=False, alone=False),
          "joint_slip: the zero of joint 3 moved by 2 mrad (0.115 deg) between rows 42 and 43 of "
-         "the log"),
-        (Slip(Term("target_slip", Site(), (3e-4, 4e-4, 0.0, 7.5)), 7, 8, True, False),
-         "target_slip: the target on the tool moved by 0.5 mm between 7 s and 8 s"),
+         "the log; something else may have changed too"),
+        (slipped(42, 43, others=1, session="b.csv"),
+         "joint_slip: the zero of joint 3 moved by 2 mrad (0.115 deg); b.csv is the first session "
+         "that has it; besides the slips nothing else changed"),
+        (Slip(Term("target_slip", Site(), (3e-4, 4e-4, 0.0, 107.5)), 107, 108, 100, 120, True,
+              alone=True),
+         "target_slip: the target on the tool moved by 0.5 mm between 7 s and 8 s from the start; "
+         "before and after it nothing else changed"),
         (ParameterNote(ParameterState.ON_BOUND, "backlash_2", 0.0, "rad"),
          "backlash_2 is at its bound (0 rad)"),
         (ParameterNote(ParameterState.NOMINAL, "link_geometry_5_alpha", 0.0, "rad"),
