@@ -111,7 +111,7 @@ def slip_text(slip: Slip) -> str:
         distance = f"{1e3 * term.values[0]:.3g} mrad ({np.degrees(term.values[0]):.3g} deg)"
     besides = "besides the slips" if slip.others else "before and after it"
     more = f"; {besides} nothing else changed" if slip.alone else (
-        "; something else may have changed too"
+        "; whether anything else changed is open"
     )  # fmt: skip
     if slip.session:
         return f"{moved} moved by {distance}; {slip.session} is the first session that has it{more}"

@@ -30,6 +30,8 @@ from gapbridge.core.diagnosis.finding import ChannelFinding, Slip
 from gapbridge.core.diagnosis.noise_floor import own_coordinates
 from gapbridge.core.effects import Reported
 
+LABEL_LINES = 6  # of labels of slips, one below the other
+
 
 @dataclass(frozen=True)
 class Moment:
@@ -261,7 +263,7 @@ def log_scale(slip: Slip, times: Array) -> Scale:
 def mark(chart: Chart, slips: list[Slip]) -> None:
     """Draw a labelled vertical line at each moment of a chart over time."""
     for k, moment in enumerate(moments(slips)):
-        chart.upright(moment.time, f"slip: {moment.label}", VIOLET, line=k)
+        chart.upright(moment.time, f"slip: {moment.label}", VIOLET, line=k % LABEL_LINES)
 
 
 def mark_rows(chart: Chart, channel: ChannelDiagnosis, slips: list[Slip]) -> None:
@@ -272,4 +274,4 @@ def mark_rows(chart: Chart, channel: ChannelDiagnosis, slips: list[Slip]) -> Non
     for k, moment in enumerate(moments(slips)):
         after = int(np.searchsorted(times, moment.time, side="right"))
         row = 1.0 + 0.5 * float(rows[max(after - 1, 0)] + rows[min(after, len(rows) - 1)])
-        chart.upright(row, f"slip: {moment.label}", VIOLET, line=k)
+        chart.upright(row, f"slip: {moment.label}", VIOLET, line=k % LABEL_LINES)

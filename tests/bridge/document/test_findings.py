@@ -69,13 +69,13 @@ def test_a_value_that_is_not_constant_names_the_quantity() -> None:
          "22:14:00; before and after it nothing else changed"),
         (slipped(EVENING, EVENING + 86400, alone=False),
          "joint_slip: the zero of joint 3 moved by 2 mrad (0.115 deg) between 2023-11-14 22:13:20 "
-         "and 2023-11-15 22:13:20; something else may have changed too"),
+         "and 2023-11-15 22:13:20; whether anything else changed is open"),
         (slipped(EVENING, EVENING + 40, last=EVENING + 9e4),
          "joint_slip: the zero of joint 3 moved by 2 mrad (0.115 deg) between 2023-11-14 22:13:20 "
          "and 2023-11-14 22:14:00; before and after it nothing else changed"),
         (slipped(42, 43, timed=False, alone=False),
          "joint_slip: the zero of joint 3 moved by 2 mrad (0.115 deg) between rows 42 and 43 of "
-         "the log; something else may have changed too"),
+         "the log; whether anything else changed is open"),
         (slipped(42, 43, others=1, session="b.csv"),
          "joint_slip: the zero of joint 3 moved by 2 mrad (0.115 deg); b.csv is the first session "
          "that has it; besides the slips nothing else changed"),

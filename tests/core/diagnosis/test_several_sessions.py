@@ -16,12 +16,13 @@ from benchmarks.blind.mechanics import turn
 from gapbridge.bridge.api.uncertainty import cause_entries
 from gapbridge.bridge.cli.log.diagnosis_text import diagnosis_text
 from gapbridge.bridge.document.diagnosis_json import document
-from gapbridge.core.diagnosis.across_sessions import session_transfer
-from gapbridge.core.diagnosis.diagnosis import diagnose
+from gapbridge.core.diagnosis.across_sessions import SessionTransfer, session_transfer
+from gapbridge.core.diagnosis.diagnosis import _slips, diagnose
 from gapbridge.core.diagnosis.model_terms import terms_with_stand_ins
 from gapbridge.core.effects import Site, Term
 from gapbridge.core.errors import LogError
 from gapbridge.core.estimation.identification import identify_compliance
+from gapbridge.core.log.log import Log
 from gapbridge.core.metrology import Metrology
 from gapbridge.core.sessions import join_sessions
 
@@ -194,12 +195,27 @@ def test_a_parameter_that_one_session_does_not_show_is_not_compared() -> None:
     assert "axial_compliance" in {c.effect for c in reported}
 
 
-@pytest.fixture(scope="module")
-def slipped():
-    """Return the diagnosis of three sessions, each from time 0; joint 2 slips before the second."""
+def sessions_with_slip() -> Log:
+    """Return three sessions, each from time 0; joint 2 slips before the second."""
     off = small.turned(2, lambda s, q: np.full(len(q), 3e-3))
     logs = [session(real, seed) for seed, real in ((34, small.NOMINAL), (35, off), (36, off))]
-    return diagnose(MODEL, join_sessions(logs, MODEL), Metrology(sigma=small.SIGMA))
+    return join_sessions(logs, MODEL)
+
+
+@pytest.fixture(scope="module")
+def slipped():
+    """Return the diagnosis of sessions with a slip."""
+    return diagnose(MODEL, sessions_with_slip(), Metrology(sigma=small.SIGMA))
+
+
+@pytest.mark.parametrize("carried", [True, False])
+def test_a_slip_is_not_all_that_changed_where_a_cause_differs_between_sessions(slipped, carried):
+    (channel,) = slipped.channels
+    other = SessionTransfer("axial_compliance", carried, 1e-9, ())
+    changed = replace(channel, session_transfer=(*channel.session_transfer, other))
+    (slip,) = _slips(changed, channel.causes[0].terms, sessions_with_slip())
+    assert slip.alone is carried
+    assert (slip.others, slip.session) == (0, "35.csv")
 
 
 def test_where_clocks_overlap_a_step_is_told_by_the_first_session_that_has_it(slipped) -> None:
