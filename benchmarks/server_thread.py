@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Self
 
 from gapbridge.drivers import ur_rtde
+from gapbridge.drivers.clock import SYSTEM
 from gapbridge.drivers.simulated.server.arm_controller import ArmController
 from gapbridge.drivers.simulated.server.protocol_server import ProtocolServer, ServerLoop
 
@@ -25,7 +26,7 @@ class ServerThread:
         bench_port: int = 0,
     ) -> None:
         self.controller = controller
-        self.loop = ServerLoop(controller, servers, host, bench_port)
+        self.loop = ServerLoop(controller, servers, host, bench_port, SYSTEM)
         self._ended = threading.Event()
         self._thread: threading.Thread | None = None
 

@@ -6,6 +6,7 @@ from pkgutil import resolve_name
 from typing import TYPE_CHECKING, cast
 
 from gapbridge.core.errors import LinkError
+from gapbridge.drivers.clock import SYSTEM, Clock
 
 if TYPE_CHECKING:
     from gapbridge.core.model import Model
@@ -23,11 +24,13 @@ DRIVERS: dict[str, str] = {
 """Driver name in a cell file -> ``module:Class``, imported when it is used."""
 
 
-def make_driver(settings: DriverSettings, model: Model, bounds: GateBounds | None = None) -> Driver:
+def make_driver(
+    settings: DriverSettings, model: Model, bounds: GateBounds | None = None, clock: Clock = SYSTEM
+) -> Driver:
     """Return the driver that the settings name, not yet connected.
 
     ``model`` gives it the arm and the tool, ``bounds`` the limits of its gate (None: the defaults
-    of a cell file). Raises LinkError if the driver's library is missing.
+    of a cell file), ``clock`` the time. Raises LinkError if the driver's library is missing.
     """
     name = str(getattr(settings, "driver", ""))
     if name not in DRIVERS:
@@ -36,7 +39,7 @@ def make_driver(settings: DriverSettings, model: Model, bounds: GateBounds | Non
         driver_class = resolve_name(DRIVERS[name])
     except ImportError as error:
         raise LinkError(f"link.driver {name}: its library cannot be imported: {error}") from None
-    driver = cast("Driver", driver_class(settings, model))
+    driver = cast("Driver", driver_class(settings, model, clock))
     if bounds is not None:
         driver.gate.set_bounds(bounds)
     return driver

@@ -1,8 +1,8 @@
 """The clock that loop, daemon and drivers read and wait by.
 
 Modules of the bridge and of the drivers get a clock as an argument, so that a simulation can run a
-loop, a daemon and a controller in simulated time. Modules that wait for real processes and sockets
-use the system's time (see the list in pyproject.toml).
+loop, a daemon and a controller in simulated time. Entry points name the system's and hand it on;
+what waits for real processes and sockets uses the system's time (see the list in pyproject.toml).
 """
 
 from __future__ import annotations

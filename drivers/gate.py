@@ -19,7 +19,6 @@ from gapbridge.core.errors import GateError
 from gapbridge.core.kernels.reference import JIT
 from gapbridge.core.model import Model
 from gapbridge.core.state import Setpoint
-from gapbridge.drivers.clock import SYSTEM
 
 MAX_STEP_CYCLES = 5.0  # no step is larger than the rates allow in this many cycles
 MAX_WIRE_DELAY = 0.04  # s for which a link may delay setpoints and then send them in a burst
@@ -188,7 +187,7 @@ class Gate:
 
     def __init__(
         self, rate: float, model: Model, moves_arm: bool,
-        clock: Callable[[], float] = SYSTEM.monotonic,
+        clock: Callable[[], float],
     ) -> None:  # fmt: skip
         arm = model.arm
         n = arm.n

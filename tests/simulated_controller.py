@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from typing import IO, Self
 
 from gapbridge.core.errors import GapbridgeError, LinkError
+from gapbridge.drivers.clock import SYSTEM
 from gapbridge.drivers.simulated.ur.server import serve
 from gapbridge.drivers.simulated.ur.settings import ServerSettings
 
@@ -135,7 +136,7 @@ def main(log_level: str) -> int:
 
     threading.Thread(target=wait_for_parent, daemon=True).start()
     try:
-        serve(settings, lambda: bool(stopped))
+        serve(settings, SYSTEM, lambda: bool(stopped))
     except GapbridgeError as error:
         sys.stderr.write(f"error: {error}\n")
         return error.exit_code

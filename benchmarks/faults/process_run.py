@@ -19,6 +19,7 @@ from benchmarks.faults.running import Event, SourceStatus
 from gapbridge.bridge.cell import load_cell
 from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.ipc.shared_memory import NAME, SharedMemory
+from gapbridge.drivers.clock import SYSTEM
 
 CODE = """
 import ctypes, json, signal, sys
@@ -71,7 +72,7 @@ class ProcessRun(SourceStatus):
         while time.monotonic() < until:
             found = self._newest()
             if found is not None:
-                return SharedMemory(self._n, found, writable=False)
+                return SharedMemory(self._n, found, writable=False, clock=SYSTEM)
             if not self.alive:
                 break
             time.sleep(0.02)
@@ -96,7 +97,7 @@ class ProcessRun(SourceStatus):
         if now - self._looked > LOOK_EVERY:
             self._looked = now
             if (fd := self._newest()) is not None:
-                self._memory = SharedMemory(self._n, fd, writable=False)
+                self._memory = SharedMemory(self._n, fd, writable=False, clock=SYSTEM)
         return self._memory
 
     @property

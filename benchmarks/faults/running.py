@@ -12,6 +12,7 @@ from gapbridge.bridge.cell import load_cell
 from gapbridge.bridge.daemon.daemon import Daemon, settings_of
 from gapbridge.bridge.daemon.summary import RunSummary
 from gapbridge.bridge.ipc.loop_state import State
+from gapbridge.drivers.clock import SYSTEM
 
 BACKOFF = (0.1, 0.5)  # s before a restart: not to wait long between faults
 WRITES = tuple(state.name for state in State if state.writes)
@@ -54,7 +55,7 @@ class Running(SourceStatus):
         given = {"backoff": BACKOFF, **changed}
         settings = settings_of(load_cell(cell)).model_copy(update=given)
         self.events: list[Event] = []
-        self.daemon = Daemon(settings, may_write=not observe, log=self.events.append)
+        self.daemon = Daemon(settings, may_write=not observe, log=self.events.append, clock=SYSTEM)
         self.memory = self.daemon.memory
         self.summary: RunSummary | None = None
         self.error: BaseException | None = None

@@ -28,6 +28,7 @@ from gapbridge.bridge.fleet.task import DONE, Outcome, Task, run_task
 from gapbridge.bridge.fleet.workers.dask_workers import DaskWorkers
 from gapbridge.bridge.fleet.workers.local_workers import LocalWorkers
 from gapbridge.bridge.fleet.workers.workers import Workers
+from gapbridge.drivers.clock import SYSTEM
 
 WORKERS = 2
 POSES = 10
@@ -138,7 +139,7 @@ def _loop(tasks: Sequence[Task]) -> None:
 
 def _pool(workers: Workers, journal: Path) -> Way:
     def way(tasks: Sequence[Task]) -> None:
-        with Journal(journal, fresh=True) as book:
+        with Journal(journal, SYSTEM, fresh=True) as book:
             done = run(tasks, [], workers, book, lambda outcome: None)
         assert all(o.state == DONE for o in done.outcomes)
 
@@ -164,7 +165,7 @@ def whole(folder: Path, sessions: int, seed: int) -> float:
     begin = time.perf_counter()
     found = find_sessions([str(folder / "logs")])
     tasks, _ = make_tasks(found.sessions, OneCell(cell), fit_session, {})
-    with Journal(folder / "journal", fresh=True) as book:
+    with Journal(folder / "journal", SYSTEM, fresh=True) as book:
         run(tasks, [], LocalWorkers(WORKERS), book, lambda outcome: None)
     return time.perf_counter() - begin
 

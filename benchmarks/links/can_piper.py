@@ -24,6 +24,7 @@ from gapbridge.bridge.cell.cell import Cell
 from gapbridge.bridge.cell.simulation import served_controller
 from gapbridge.drivers.can.driver import CanDriver
 from gapbridge.drivers.can.settings import CanSettings
+from gapbridge.drivers.clock import SYSTEM
 
 HOST, PORT = "127.77.0.4", 29921
 BURST = 0.0015  # s in which all frames of one sample have come
@@ -66,7 +67,7 @@ class PiperVirtualCase(LinkCase):
 @contextmanager
 def _armed(cell: Cell, pause: Pause) -> Iterator[Cycles]:
     assert isinstance(cell.link, CanSettings)
-    with CanDriver(cell.link, cell.model) as driver:
+    with CanDriver(cell.link, cell.model, SYSTEM) as driver:
         ours = OurCycle(driver, cell.model)
         driver.arm(driver.read_state())
         ours.hold = driver.writer.target

@@ -23,6 +23,7 @@ from gapbridge.bridge.cell.cell import Cell
 from gapbridge.bridge.cell.simulation import served_controller
 from gapbridge.drivers.canopen.driver import CanopenDriver
 from gapbridge.drivers.canopen.settings import CanopenSettings
+from gapbridge.drivers.clock import SYSTEM
 
 HOST, PORT = "127.77.0.3", 29920
 PACE = 0.010  # s from one SYNC to the next, as the drives are configured
@@ -68,7 +69,7 @@ class DrivesVirtualCase(LinkCase):
 @contextmanager
 def _armed(cell: Cell, pause: Pause) -> Iterator[Cycles]:
     assert isinstance(cell.link, CanopenSettings)
-    with CanopenDriver(cell.link, cell.model) as driver:
+    with CanopenDriver(cell.link, cell.model, SYSTEM) as driver:
         ours = OurCycle(driver, cell.model)
         driver.arm(driver.read_state())
         ours.hold = driver.writer.target

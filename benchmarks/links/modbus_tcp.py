@@ -14,6 +14,7 @@ from pymodbus.client import ModbusTcpClient
 
 from benchmarks.links.case import Cycles, LinkCase, OurCycle, Pause
 from benchmarks.links.serving import served_cell
+from gapbridge.drivers.clock import SYSTEM
 from gapbridge.drivers.modbus.driver import ModbusDriver
 from gapbridge.drivers.modbus.settings import ModbusSettings
 from gapbridge.drivers.modbus.write import MailboxWriter
@@ -37,7 +38,7 @@ class ModbusTcpCase(LinkCase):
         with served_cell(LINK) as cell:
             assert isinstance(cell.link, ModbusSettings)
             bare: Any = ModbusTcpClient(HOST, port=PORT, timeout=0.5, retries=0)
-            with ModbusDriver(cell.link, cell.model) as driver:
+            with ModbusDriver(cell.link, cell.model, SYSTEM) as driver:
                 bare.connect()
                 ours = OurCycle(driver, cell.model)
                 driver.arm(driver.read_state())

@@ -16,6 +16,7 @@ from benchmarks.links.case import Cycles, LinkCase, OurCycle, Pause
 from benchmarks.links.serving import served_cell
 from benchmarks.server_thread import OFFSET_SCRIPT
 from gapbridge.bridge.cell.cell import Cell
+from gapbridge.drivers.clock import SYSTEM
 from gapbridge.drivers.simulated.ur.settings import SCRIPT_PORT
 from gapbridge.drivers.ur_rtde import registers
 from gapbridge.drivers.ur_rtde.driver import UrRtdeDriver
@@ -66,7 +67,7 @@ class UrServoCase(LinkCase):
 @contextmanager
 def _armed(cell: Cell) -> Iterator[tuple[UrRtdeDriver, OurCycle]]:
     assert isinstance(cell.link, UrRtdeSettings)
-    with UrRtdeDriver(cell.link, cell.model) as driver:
+    with UrRtdeDriver(cell.link, cell.model, SYSTEM) as driver:
         ours = OurCycle(driver, cell.model)
         state = driver.read_state()
         driver.arm(state)

@@ -22,6 +22,7 @@ from gapbridge.core.compensation import Compensator
 from gapbridge.core.kernels import single
 from gapbridge.core.kernels.packed import pack
 from gapbridge.core.loads import Loads
+from gapbridge.drivers.clock import SYSTEM
 
 OURS, EXACT, EXACT_CALL = (
     "ours, first order",
@@ -148,7 +149,7 @@ def _stream(rounds: int) -> dict[str, Any]:
     from gapbridge.bridge.loop.setpoint_stream import SetpointStream
     from gapbridge.core.state import RobotState
 
-    made = SetpointStream(task.deflected(), LimitSettings(), 500.0)
+    made = SetpointStream(task.deflected(), LimitSettings(), 500.0, clock=SYSTEM)
     there, (_, loads) = task.path(500 * rounds), task.rows(1)
     made.start(there[0], 0.0, led=True)
     taken: dict[str, list[float]] = {"wall": [], "cpu": []}

@@ -40,6 +40,7 @@ from gapbridge.bridge.cell import Cell
 from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.plan import PlannedPose
 from gapbridge.core.errors import LinkError
+from gapbridge.drivers.clock import SYSTEM
 
 JOBS: dict[str, tuple[str, type[Job]]] = {
     "whole": ("Calibration of", CalibrationJob),
@@ -249,4 +250,4 @@ def make_joint_source(cell: Cell, options: SessionOptions, ask: Ask, folder: Pat
         )
     from gapbridge.bridge.calibration.joints.link import LinkedJoints
 
-    return LinkedJoints(cell, settings.settle, settings.speed, folder, options.move)
+    return LinkedJoints(cell, settings.settle, settings.speed, folder, options.move, SYSTEM)

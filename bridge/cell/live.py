@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import time
-
 from gapbridge.bridge.cell.cell import Cell
 from gapbridge.bridge.cell.plausibility import Findings
 from gapbridge.core.errors import InvalidStateError, StaleStateError
 from gapbridge.core.state import RobotState
 from gapbridge.drivers import make_driver
+from gapbridge.drivers.clock import Clock
 from gapbridge.drivers.driver import Driver
 from gapbridge.drivers.ur_rtde.enquiry import require_listening
 from gapbridge.drivers.ur_rtde.settings import UrRtdeSettings
@@ -18,7 +17,7 @@ RATE_KEY = ("link", "rate")
 MIN_RATE_SHARE = 0.8  # measured state rate / configured rate
 
 
-def live_findings(cell: Cell) -> Findings:
+def live_findings(cell: Cell, clock: Clock) -> Findings:
     """Return the differences of a cell from its controller; reads only, never moves the arm.
 
     Raises CellError for a cell without a link, LinkError if the controller cannot be read.
@@ -28,7 +27,7 @@ def live_findings(cell: Cell) -> Findings:
         raise cell.error(("link",), "found nothing, expected the controller's address")
     if isinstance(link, UrRtdeSettings):
         require_listening(link.host)
-    driver = make_driver(link, cell.model)
+    driver = make_driver(link, cell.model, clock=clock)
     errors: list[str] = []
     warnings: list[str] = []
     with driver:
@@ -54,20 +53,22 @@ def read_valid_state(driver: Driver) -> RobotState:
 
     Raises LinkError.
     """
-    start = time.monotonic()
+    now = driver.clock.monotonic
+    start = now()
     while True:
         try:
             return driver.read_state()
         except (InvalidStateError, StaleStateError):
-            if time.monotonic() - start > READ_TIMEOUT:
+            if now() - start > READ_TIMEOUT:
                 raise
 
 
 def _measured_rate(driver: Driver) -> float:
     """Return the measured rate of states, Hz."""
-    start = time.monotonic()
+    now = driver.clock.monotonic
+    start = now()
     count = 0
-    while count < RATE_SAMPLES and time.monotonic() - start < READ_TIMEOUT:
+    while count < RATE_SAMPLES and now() - start < READ_TIMEOUT:
         read_valid_state(driver)
         count += 1
-    return count / max(time.monotonic() - start, 1e-6)
+    return count / max(now() - start, 1e-6)

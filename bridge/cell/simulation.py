@@ -18,6 +18,7 @@ from gapbridge.bridge.cell.robot import calibration_of
 from gapbridge.core.errors import InputError
 from gapbridge.core.rotation import rotation_vector
 from gapbridge.drivers.addresses import is_loopback
+from gapbridge.drivers.clock import Clock
 from gapbridge.drivers.link_settings import DriverSettings
 from gapbridge.drivers.simulated.ft_sensor.serving import served_sensor
 from gapbridge.drivers.simulated.server.arm_controller import ArmController, make_controller
@@ -57,6 +58,7 @@ def serve_cell(
     seed: int | None,
     stop: Callable[[], bool],
     emit: Callable[[str], None],
+    clock: Clock,
 ) -> None:
     """Serve the simulated controller of a cell until ``stop()`` is true.
 
@@ -68,9 +70,9 @@ def serve_cell(
         served = served_controller(cell, link, host, seed)
         names = ", ".join(server.name for server in served.servers)
         emit(f"{cell.arm.name} at {served.host}: {names}, bench {served.bench_port}")
-        with served_sensor(cell.ft_sensor, lambda: served.controller.raw_wrench, link):
+        with served_sensor(cell.ft_sensor, lambda: served.controller.raw_wrench, clock, link):
             serve_controller(
-                served.controller, served.servers, served.host, served.bench_port, stop
+                served.controller, served.servers, served.host, served.bench_port, clock, stop
             )
         return
     settings = server_settings(cell, host, seed)
@@ -79,7 +81,10 @@ def serve_cell(
         f"{settings.dashboard_port}, primary {settings.primary_port}, scripts "
         f"{settings.script_port}, bench {settings.bench_port}"
     )
-    serve(settings, stop, lambda in_flange: served_sensor(cell.ft_sensor, in_flange))
+    serve(
+        settings, clock, stop,
+        lambda in_flange: served_sensor(cell.ft_sensor, in_flange, clock),
+    )  # fmt: skip
 
 
 def served_controller(

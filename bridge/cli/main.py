@@ -21,6 +21,7 @@ from gapbridge.bridge.cli.progress import CompileProgress
 from gapbridge.bridge.cli.table import COMMANDS
 from gapbridge.core.errors import GapbridgeError
 from gapbridge.core.kernels import compiling
+from gapbridge.drivers.clock import SYSTEM
 
 INTERRUPT_RETRY = 0.02  # s until an interrupt inside LLVM is tried again
 SUCCESS, FAILURE, UNUSABLE_INPUT = 0, 1, 2
@@ -128,7 +129,7 @@ def _usable_streams() -> Iterator[None]:
 
 
 def _run(arguments: list[str]) -> int:
-    compiling.listeners[:] = [CompileProgress()]
+    compiling.listeners[:] = [CompileProgress(SYSTEM.monotonic)]
     try:
         result = gapbridge.main(args=arguments, prog_name="gapbridge", standalone_mode=False)
         sys.stdout.flush()

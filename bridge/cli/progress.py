@@ -7,7 +7,6 @@ import sys
 from collections.abc import Callable, Iterator
 
 from gapbridge.core.kernels.compiling import ABOUT
-from gapbridge.drivers.clock import SYSTEM
 
 REPORT_PERIOD = 10.0  # s between two lines on compiling
 
@@ -42,7 +41,7 @@ def status(label: str) -> Iterator[Callable[[str], None]]:
 class CompileProgress:
     """Reports on stderr that functions are compiled, at once and every REPORT_PERIOD."""
 
-    def __init__(self, clock: Callable[[], float] = SYSTEM.monotonic) -> None:
+    def __init__(self, clock: Callable[[], float]) -> None:
         self._clock = clock
         self._start: float | None = None  # s
         self._next = 0.0  # s: time of the next line

@@ -10,7 +10,7 @@ from gapbridge.bridge.ipc.events import Event, EventKind
 from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.ipc.shared_memory import Phase
 from gapbridge.bridge.loop.supervisor import Cause
-from gapbridge.drivers.clock import SYSTEM, Clock
+from gapbridge.drivers.clock import Clock
 
 LONGEST_ARMING = 25.0  # s: uploads a program to the robot
 LONGEST_RAMP = 20.0  # s
@@ -66,7 +66,7 @@ class Controlled(Protocol):
 class Control:
     """Answers requests; ``answer`` may take as long as arming or ramping out."""
 
-    def __init__(self, daemon: Controlled, clock: Clock = SYSTEM) -> None:
+    def __init__(self, daemon: Controlled, clock: Clock) -> None:
         self._daemon, self._clock = daemon, clock
 
     def answer(self, command: str, peer: Peer) -> dict[str, Any]:

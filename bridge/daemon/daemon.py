@@ -42,7 +42,7 @@ from gapbridge.bridge.loop.setpoint_stream import longest_ramp_out
 from gapbridge.bridge.loop.supervisor import Cause
 from gapbridge.bridge.recording.folder import LOOP_LOG, new_session
 from gapbridge.core.errors import InputError, LinkError
-from gapbridge.drivers.clock import SYSTEM, Clock
+from gapbridge.drivers.clock import Clock
 from gapbridge.drivers.controller_address import address_of
 
 __all__ = ["Daemon", "Say", "settings_of"]
@@ -68,9 +68,9 @@ class Daemon:
         self,
         configuration: DaemonSettings | Configuration,
         may_write: bool,
+        clock: Clock,
         say: Say = lambda _: None,
         log: Callable[[Event], None] | None = None,
-        clock: Clock = SYSTEM,
     ) -> None:
         self._clock = clock
         if not isinstance(configuration, Configuration):
@@ -295,7 +295,7 @@ class Daemon:
         folder = settings.recording.folder
         if folder is not None:
             require_folder(folder, "recording.folder")
-        self.session = new_session(folder)
+        self.session = new_session(folder, self._clock.time())
         if folder is not None:
             log = folder / f"{self.session}{LOOP_LOG}"
             self._output = stack.enter_context(open(log, "ab", opener=private))  # noqa: SIM115

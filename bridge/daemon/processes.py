@@ -18,7 +18,7 @@ from gapbridge.bridge.ipc.sealed_memory import sealed_bytes
 from gapbridge.bridge.ipc.shared_memory import Phase, RunMemory
 from gapbridge.bridge.ipc.side_process import environment
 from gapbridge.bridge.loop.loop import Exit
-from gapbridge.drivers.clock import SYSTEM, Clock
+from gapbridge.drivers.clock import Clock
 
 STARTING_LIMIT = 180.0  # s: imports and, the first time, compilation
 ENDING_LIMIT = 2.0  # s
@@ -35,7 +35,7 @@ class LoopProcess:
 
     def __init__(
         self, configuration: Configuration, memory: RunMemory, commands: CommandMemory,
-        order: dict[str, Any], log: IO[Any] | int, clock: Clock = SYSTEM,
+        order: dict[str, Any], log: IO[Any] | int, clock: Clock,
     ) -> None:  # fmt: skip
         self._now = clock.monotonic
         memory.renew()

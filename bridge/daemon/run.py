@@ -18,6 +18,7 @@ from gapbridge.bridge.cell.run_settings import Configuration, read_configuration
 from gapbridge.bridge.daemon.daemon import Daemon, Say
 from gapbridge.bridge.daemon.summary import RunSummary
 from gapbridge.bridge.ipc.events import Event
+from gapbridge.drivers.clock import SYSTEM
 
 
 def run_cell(
@@ -42,7 +43,7 @@ def run_cell(
 
 def _say(text: str) -> None:
     """Print what happened, with the time of day."""
-    now = datetime.now()
+    now = datetime.fromtimestamp(SYSTEM.time())
     click.echo(f"{now:%H:%M:%S}.{now.microsecond // 1000:03d} {text}")
 
 
@@ -58,7 +59,7 @@ def run_daemon(
 
     Stops on SIGINT and SIGTERM, reads the cell file again on SIGHUP.
     """
-    daemon = Daemon(configuration, may_write=not observe, say=say, log=log)
+    daemon = Daemon(configuration, not observe, SYSTEM, say, log)
     by = "--arm" if arm else "the cell file"
     wanted = not observe and (arm or configuration.settings.setpoints.arm)
     with _signals(daemon):

@@ -9,13 +9,13 @@ import contextlib
 import os
 import socket
 
-from gapbridge.drivers.clock import SYSTEM, Clock
+from gapbridge.drivers.clock import Clock
 
 
 class ServiceManager:
     """Speaks to the service manager where there is one; silent where there is none."""
 
-    def __init__(self, clock: Clock = SYSTEM) -> None:
+    def __init__(self, clock: Clock) -> None:
         self._now = clock.monotonic
         self._address = os.environ.get("NOTIFY_SOCKET", "")
         if self._address.startswith("@"):

@@ -9,7 +9,7 @@ from gapbridge.bridge.cell.daemon_settings import DaemonSettings
 from gapbridge.bridge.ipc.events import EventKind
 from gapbridge.bridge.ipc.shared_memory import SharedMemory
 from gapbridge.bridge.ipc.side_process import SideProcess
-from gapbridge.drivers.clock import SYSTEM, Clock
+from gapbridge.drivers.clock import Clock
 
 SIDE_PROCESSES: dict[str, tuple[str, Callable[[DaemonSettings], bool]]] = {
     "recorder": ("gapbridge.bridge.recording.main", lambda s: s.recording.folder is not None),
@@ -25,7 +25,7 @@ DEFAULT_END_TIMEOUT = 0.3  # s, of the others
 class SideProcesses:
     """All side processes of a run."""
 
-    def __init__(self, clock: Clock = SYSTEM) -> None:
+    def __init__(self, clock: Clock) -> None:
         self._clock = clock
         self._running: dict[str, SideProcess] = {}
 
@@ -39,7 +39,7 @@ class SideProcesses:
         """Start those that the settings enable."""
         for name, (module, is_enabled) in SIDE_PROCESSES.items():
             if is_enabled(settings):
-                self._running[name] = SideProcess(module, start_data, memory, log, self._clock)
+                self._running[name] = SideProcess(module, start_data, memory, self._clock, log)
 
     def show(self, memory: SharedMemory) -> None:
         """Switch all of them to another memory."""

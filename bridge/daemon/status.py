@@ -11,7 +11,7 @@ from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.loop.checks import NOTHING, UNSOLVED
 from gapbridge.bridge.loop.supervisor import CLEARED_BY_RECONNECTING, Cause
 from gapbridge.core.arrays import Array
-from gapbridge.drivers.clock import SYSTEM, Clock
+from gapbridge.drivers.clock import Clock
 
 RATE_SPAN = 2.0  # s over which the rate is averaged
 
@@ -36,7 +36,7 @@ def correction(flags: int, residual: float) -> dict[str, Any]:
 class DaemonStatus:
     """Keeps what the status document reports; ``slices``: where fields are in a cycle's row."""
 
-    def __init__(self, slices: dict[str, slice], clock: Clock = SYSTEM) -> None:
+    def __init__(self, slices: dict[str, slice], clock: Clock) -> None:
         self._now = clock.monotonic
         self.started = self._since = clock.time()
         self._why = ""

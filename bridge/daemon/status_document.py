@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import time
+from datetime import datetime
 from typing import Any
 
 SCHEMA = "gapbridge.status/1"
@@ -13,7 +13,7 @@ AGES = (("ms", 1e-3, 1.0), ("s", 1.0, 120.0), ("min", 60.0, 7200.0), ("h", 3600.
 def lines(status: dict[str, Any]) -> list[str]:
     """Return a status document as a person reads it."""
     link, loop = status["link"], status["loop"]
-    since = time.strftime("%H:%M:%S", time.localtime(status["since"]))
+    since = f"{datetime.fromtimestamp(status['since']):%H:%M:%S}"
     why = f" ({status['why']})" if status["why"] else ""
     report = [
         f"{status['cell']}: {status['state']} since {since}{why}",

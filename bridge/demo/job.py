@@ -31,6 +31,7 @@ from gapbridge.core.calibration.spread import Spread
 from gapbridge.core.errors import RunError
 from gapbridge.core.estimation.identification import identify_compliance
 from gapbridge.core.log.log import read_log
+from gapbridge.drivers.clock import SYSTEM
 
 
 @dataclass
@@ -69,7 +70,7 @@ def _job(
     link: DemoLink, seed: int, out: Path, console: Console, begun: float
 ) -> tuple[Result, str]:
     cell, experiment = link.cell, link.experiment
-    session = Session(link, out, console.print)
+    session = Session(link, out, console.print, SYSTEM)
     planned = plan(cell.model, link.home, seed, experiment)
     log = _calibrate(link, session, planned, out, console)
     fit = identify_compliance(cell.model, read_log(log, cell.arm.n), cell.metrology)

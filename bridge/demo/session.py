@@ -27,7 +27,7 @@ from gapbridge.bridge.loop.supervisor import Cause
 from gapbridge.core.arrays import Array
 from gapbridge.core.errors import LinkError, RunError
 from gapbridge.core.log.mcap_reading import read_columns
-from gapbridge.drivers.clock import SYSTEM, Clock
+from gapbridge.drivers.clock import Clock
 
 MAX_SLOWDOWN = 4  # where deadlines are missed the rate is halved, down to this fraction
 MARGIN = 60.0  # s to connect, arm and end, in addition to the trajectory
@@ -80,7 +80,7 @@ class Session:
     """Successive runs of the daemon on one simulated cell."""
 
     def __init__(
-        self, link: DemoLink, folder: Path, emit: Callable[[str], None], clock: Clock = SYSTEM
+        self, link: DemoLink, folder: Path, emit: Callable[[str], None], clock: Clock
     ) -> None:
         self._link = link
         self._folder = folder
@@ -149,7 +149,7 @@ class Session:
 
     def _run(self, cell: Cell, load: Load, poses: Array, longest: float) -> RunOutcome:
         """Run the daemon through the poses until the end or the first error."""
-        daemon = Daemon(self._settings(cell), may_write=True)
+        daemon = Daemon(self._settings(cell), True, self._clock)
         over = threading.Event()
         watch = threading.Thread(target=_watch, args=(daemon, over, longest + MARGIN), daemon=True)
         watch.start()

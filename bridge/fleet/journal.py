@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import fcntl
 import os
-import time
 from pathlib import Path
 from typing import Any, Self
 
@@ -13,6 +12,7 @@ from pydantic_core import from_json, to_json
 from gapbridge.bridge.document.output_file import private, sync_folder
 from gapbridge.bridge.fleet.task import Outcome
 from gapbridge.core.errors import InputError, RunError
+from gapbridge.drivers.clock import Clock
 
 SYNC_PERIOD = 1.0  # s of outcomes that a power failure may lose
 
@@ -20,7 +20,8 @@ SYNC_PERIOD = 1.0  # s of outcomes that a power failure may lose
 class Journal:
     """An append-only file of JSON lines with one writer at a time."""
 
-    def __init__(self, path: Path, *, fresh: bool = False) -> None:
+    def __init__(self, path: Path, clock: Clock, *, fresh: bool = False) -> None:
+        self._now = clock.monotonic
         self.path = path
         self._synced = 0.0
         try:
@@ -56,9 +57,9 @@ class Journal:
         try:
             self._file.write(line + b"\n")
             self._file.flush()
-            if time.monotonic() - self._synced > SYNC_PERIOD:
+            if self._now() - self._synced > SYNC_PERIOD:
                 os.fsync(self._file.fileno())
-                self._synced = time.monotonic()
+                self._synced = self._now()
         except OSError as error:
             raise RunError(f"{self.path}: cannot be written: {error.strerror}") from None
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from enum import StrEnum
 from typing import Any
 
-from gapbridge.drivers.clock import SYSTEM, Clock
+from gapbridge.drivers.clock import Clock
 
 KEPT = 500
 Event = dict[str, Any]
@@ -42,7 +42,7 @@ class EventKind(StrEnum):
 class EventLog:
     """Numbers events and passes them on; ``listeners`` get each one, in order."""
 
-    def __init__(self, *listeners: Callable[[Event], None], clock: Clock = SYSTEM) -> None:
+    def __init__(self, *listeners: Callable[[Event], None], clock: Clock) -> None:
         self._clock = clock
         self._listeners = listeners
         self.sequence = 0

@@ -31,7 +31,7 @@ from gapbridge.bridge.ipc.sealed_memory import (
 )
 from gapbridge.core.arrays import Array
 from gapbridge.core.state import RobotState
-from gapbridge.drivers.clock import SYSTEM, Clock
+from gapbridge.drivers.clock import Clock
 
 WORDS = 128
 ROWS = 8192  # cycles kept: 16 s at 500 Hz
@@ -112,7 +112,7 @@ class SharedMemory:
     """
 
     def __init__(
-        self, n: int, fd: int | None = None, writable: bool = True, clock: Clock = SYSTEM
+        self, n: int, fd: int | None = None, writable: bool = True, *, clock: Clock
     ) -> None:
         self._now = clock.monotonic
         self.n = n
@@ -247,7 +247,7 @@ class SharedMemory:
 class RunMemory(SharedMemory):
     """The daemon's read-only view of one loop after the other; cycles and counts continue."""
 
-    def __init__(self, n: int, clock: Clock = SYSTEM) -> None:
+    def __init__(self, n: int, clock: Clock) -> None:
         super().__init__(n, writable=False, clock=clock)
         seal(self.fd)  # initial memory, before the first loop
         self._shown = os.dup(self.fd)  # the newest one that is sealed
@@ -288,8 +288,8 @@ class RunMemory(SharedMemory):
 class FollowedMemory(SharedMemory):
     """A side process's view: it switches to each memory that the daemon sends."""
 
-    def __init__(self, n: int, fd: int, successors: socket.socket) -> None:
-        super().__init__(n, fd, writable=False)
+    def __init__(self, n: int, fd: int, successors: socket.socket, clock: Clock) -> None:
+        super().__init__(n, fd, writable=False, clock=clock)
         self._successors = successors
         successors.setblocking(False)
 

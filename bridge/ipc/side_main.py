@@ -21,7 +21,7 @@ from typing import Any
 from gapbridge.bridge.cell.daemon_settings import DaemonSettings
 from gapbridge.bridge.ipc.shared_memory import FollowedMemory, SharedMemory
 from gapbridge.core.errors import GapbridgeError
-from gapbridge.drivers.clock import SYSTEM
+from gapbridge.drivers.clock import SYSTEM, Clock
 
 END_TIMEOUT = 5.0  # s that a side process may take to end after the daemon
 NICENESS = 5  # the loop comes first
@@ -109,10 +109,12 @@ class StartData:
     events: EventLines
     up: EventWriter
     extra: dict[str, Any]
+    clock: Clock
 
     def emit(self, event: dict[str, Any]) -> None:
         """Send the daemon an event (a dict with "kind"), which it distributes; never blocks."""
-        self.up.emit({"time": SYSTEM.time(), "monotonic": SYSTEM.monotonic(), **event})
+        now = {"time": self.clock.time(), "monotonic": self.clock.monotonic()}
+        self.up.emit({**now, **event})
 
 
 def read_start_data() -> StartData:
@@ -121,17 +123,21 @@ def read_start_data() -> StartData:
     with contextlib.suppress(OSError):
         os.nice(NICENESS)
     events = EventLines(start_data["events"])
-    threading.Thread(target=_end_after_daemon, args=(events.fd,), daemon=True).start()
+    threading.Thread(target=_end_after_daemon, args=(events.fd, SYSTEM), daemon=True).start()
     return StartData(
         settings=DaemonSettings.model_validate(start_data["settings"]),
         n=start_data["n"],
         session=start_data["session"],
         memory=FollowedMemory(
-            start_data["n"], start_data["memory"], socket.socket(fileno=start_data["successors"])
+            start_data["n"],
+            start_data["memory"],
+            socket.socket(fileno=start_data["successors"]),
+            SYSTEM,
         ),
         events=events,
         up=EventWriter(start_data["up"]),
         extra=start_data.get("extra", {}),
+        clock=SYSTEM,
     )
 
 
@@ -156,10 +162,10 @@ def read_event(line: bytes) -> dict[str, Any] | None:
     return event if isinstance(event, dict) else None
 
 
-def _end_after_daemon(fd: int) -> None:
+def _end_after_daemon(fd: int, clock: Clock) -> None:
     """End this process END_TIMEOUT s after the daemon has closed the pipe, even if it hangs."""
     watch = select.poll()
     watch.register(fd, 0)  # hang-ups only, which are always reported
     watch.poll()
-    SYSTEM.sleep(END_TIMEOUT)
+    clock.sleep(END_TIMEOUT)
     os._exit(1)

@@ -17,7 +17,7 @@ from typing import IO, Any
 
 from gapbridge.bridge.ipc.shared_memory import SharedMemory
 from gapbridge.bridge.ipc.side_main import EventLines, EventWriter
-from gapbridge.drivers.clock import SYSTEM, Clock
+from gapbridge.drivers.clock import Clock
 
 BACKOFF = (0.2, 10.0)  # s before a restart: first, most
 HEALTHY = 10.0  # s of running after which the backoff is reset
@@ -35,7 +35,7 @@ class SideProcess:
 
     def __init__(
         self, module: str, start_data: dict[str, Any], memory: SharedMemory,
-        log: IO[Any] | int = -3, clock: Clock = SYSTEM,
+        clock: Clock, log: IO[Any] | int = -3,
     ) -> None:  # fmt: skip
         self._now = clock.monotonic
         self.module, self.start_data = module, start_data

@@ -10,7 +10,7 @@ from gapbridge.bridge.loop.reports import Reports
 from gapbridge.bridge.loop.supervisor import Cause, Supervisor
 from gapbridge.core.errors import Implausible, InvalidStateError, LinkError, StaleStateError
 from gapbridge.core.state import RobotState
-from gapbridge.drivers.clock import SYSTEM, Clock
+from gapbridge.drivers.clock import Clock
 from gapbridge.drivers.driver import Driver
 
 DRIFT = 5e-3  # s per s: how fast the clock offset may grow
@@ -47,7 +47,7 @@ class ControllerClock:
     agree with the offset from before.
     """
 
-    def __init__(self, rate: float, hold: float = 1.0, clock: Clock = SYSTEM) -> None:
+    def __init__(self, rate: float, clock: Clock, hold: float = 1.0) -> None:
         self._now = clock.monotonic
         self._rate, self._hold = rate, hold
         self._offset: float | None = None  # s: monotonic minus controller time

@@ -91,7 +91,7 @@ class Loop:
         )  # fmt: skip
         self._last_loads = Loads()  # of the last cycle
         self._model_check = ModelCheck(model, settings.setpoints.use_force)
-        self._clock = ControllerClock(driver.rate, hold_time(driver.rate), clock)
+        self._clock = ControllerClock(driver.rate, clock, hold_time(driver.rate))
         reports = Reports(memory, emit)
         self._supervisor = Supervisor(reports.transition)
         read_timeout = settings.link.state_timeout

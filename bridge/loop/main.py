@@ -41,7 +41,7 @@ from gapbridge.core.kernels import compiling
 from gapbridge.core.loads import Loads
 from gapbridge.core.model import Model
 from gapbridge.drivers import make_driver
-from gapbridge.drivers.clock import SYSTEM
+from gapbridge.drivers.clock import SYSTEM, Clock
 from gapbridge.drivers.driver import Driver
 from gapbridge.drivers.ft_sensor.joined import DriverWithSensor
 from gapbridge.drivers.replay.driver import ReplayDriver
@@ -62,11 +62,11 @@ def main() -> None:
     """Run the loop; never returns."""
     order = json.loads(sys.stdin.readline())
     os.set_blocking(order["events"], False)
-    emit = _emitter(order["events"])
+    emit = _emitter(order["events"], SYSTEM)
     compiling.listeners.append(_report_compiling(emit))
     code: int = Exit.CRASH
     try:
-        code = _run(order, emit)
+        code = _run(order, emit, SYSTEM)
     except InputError as error:
         emit({"kind": EventKind.FAILURE, "detail": str(error), "input": True})
         code = Exit.INPUT
@@ -82,20 +82,20 @@ def main() -> None:
     os._exit(code)
 
 
-def _run(order: dict[str, Any], emit: Callable[[dict[str, Any]], None]) -> Exit:
-    memory = SharedMemory(order["n"], order["memory"])
+def _run(order: dict[str, Any], emit: Callable[[dict[str, Any]], None], clock: Clock) -> Exit:
+    memory = SharedMemory(order["n"], order["memory"], clock=clock)
     memory.enter(Phase.STARTING)
     files = pickle.loads(all_bytes(order["files"]))  # by the daemon, which started this process
     read_only_given(files)  # only the daemon reads the disk, at start and reload
     settings = DaemonSettings.model_validate(order["settings"])
     model = _read_model(settings)
-    driver = make_driver(settings.link, model, gate_bounds(settings.limits))
+    driver = make_driver(settings.link, model, gate_bounds(settings.limits), clock)
     source = _make_source(settings, model, driver)
     loop = _make_loop(settings, model, driver, source, memory, emit, order["number"])
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: loop.request_stop())
     _end_with_parent(order["parent"])
-    _compile(settings, model)
+    _compile(settings, model, clock)
     if order["may_write"]:
         source.open()
     granted = ", ".join(become_realtime(1.0 / driver.rate))
@@ -108,7 +108,9 @@ def _make_source(settings: DaemonSettings, model: Model, driver: Driver) -> Sour
     """Return the setpoint source; a recording needs none."""
     is_replay = isinstance(driver, ReplayDriver)
     setpoints = SetpointSettings() if is_replay else settings.setpoints
-    return make_source(setpoints, model.arm.n, driver.moves_arm, settings.cell.parent, driver.rate)
+    return make_source(
+        setpoints, model.arm.n, driver.moves_arm, settings.cell.parent, driver.clock, driver.rate
+    )
 
 
 def _make_loop(
@@ -122,13 +124,13 @@ def _make_loop(
     return Loop(settings, model, driver, source, *arguments)
 
 
-def _emitter(events: int) -> Callable[[dict[str, Any]], None]:
+def _emitter(events: int, clock: Clock) -> Callable[[dict[str, Any]], None]:
     """Return a function that notifies the daemon of an event and never blocks."""
 
     def emit(event: dict[str, Any]) -> None:
         if len(event.get("detail", "")) > LONGEST_DETAIL:
             event = {**event, "detail": event["detail"][:LONGEST_DETAIL]}
-        now = {"time": SYSTEM.time(), "monotonic": SYSTEM.monotonic()}
+        now = {"time": clock.time(), "monotonic": clock.monotonic()}
         with contextlib.suppress(OSError):  # one datagram: sent completely or not at all
             os.write(events, json.dumps({**now, **event}).encode())
 
@@ -153,10 +155,10 @@ def _read_model(settings: DaemonSettings) -> Model:
     return model
 
 
-def _compile(settings: DaemonSettings, model: Model) -> None:
+def _compile(settings: DaemonSettings, model: Model, clock: Clock) -> None:
     """Compile or load all kernels before the first cycle; may take seconds."""
     arm = model.arm
-    stream = SetpointStream(model, settings.limits, settings.link.rate)
+    stream = SetpointStream(model, settings.limits, settings.link.rate, clock)
     q = np.clip(np.zeros(arm.n), arm.limits.lower, arm.limits.upper)
     loads = Loads(
         np.zeros(1), np.zeros((1, 3)), np.zeros((1, 6)), np.full((1, arm.n), 25.0),

@@ -75,7 +75,9 @@ class ReplayedLoop(Loop):
         if first:
             return
         settings = self._settings
-        self._stream = SetpointStream(self._model, settings.limits, self._recording.rate)
+        self._stream = SetpointStream(
+            self._model, settings.limits, self._recording.rate, self._recording.clock
+        )
         self._loads = LiveLoads(
             self._model.arm.n, settings.setpoints.use_force, settings.setpoints.force_filter,
             LoadBounds.of(self._model),

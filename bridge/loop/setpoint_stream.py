@@ -19,7 +19,7 @@ from gapbridge.core.loads import Loads
 from gapbridge.core.model import Model
 from gapbridge.core.rotation import rotation_vector
 from gapbridge.core.state import RobotState, Setpoint
-from gapbridge.drivers.clock import SYSTEM, Clock
+from gapbridge.drivers.clock import Clock
 from gapbridge.drivers.gate import GateBounds
 
 DECELERATION = 8.0  # rad/s^2 of the fastest joint
@@ -123,9 +123,7 @@ class NominalStream:
 class SetpointStream:
     """One stream of setpoints from ``start`` until it is at rest."""
 
-    def __init__(
-        self, model: Model, settings: LimitSettings, rate: float, clock: Clock = SYSTEM
-    ) -> None:
+    def __init__(self, model: Model, settings: LimitSettings, rate: float, clock: Clock) -> None:
         self._now = clock.monotonic
         limits = limits_of(settings, model.arm, rate)
         self.limiter = Limiter(limits, model.arm.n)

@@ -48,7 +48,7 @@ def _setpoints() -> None:
     """Call the kernels of the live loop, and of signals in time."""
     model = _model()
     corrected = Compensator(model).correct(Q[0])
-    Gate(500.0, model, True)
+    Gate(500.0, model, True, lambda: 0.0)
     Nominal(model)
     NominalStream(np.ones(N))
     limits = Limits(np.full(N, -7.0), np.full(N, 7.0), np.full(N, 3.0))

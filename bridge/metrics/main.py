@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 import sys
-import time
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -41,6 +40,7 @@ from gapbridge.bridge.served.guard import Guard
 from gapbridge.bridge.served.server import serve
 from gapbridge.core.arrays import Array
 from gapbridge.core.state import CLAMPS
+from gapbridge.drivers.clock import Clock
 
 AGE_BOUNDS = (0.00025, 0.0005, 0.001, 0.002, 0.004, 0.008, 0.016, 0.032, 0.064, 0.128)  # s
 WORK_BOUNDS = (0.00005, 0.0001, 0.0002, 0.0004, 0.0008, 0.0016, 0.0032, 0.0064, 0.0128)  # s
@@ -74,8 +74,13 @@ class Counts:
     """Counts since this process started, and the latest values."""
 
     def __init__(
-        self, memory: SharedMemory, settings: DaemonSettings, text: str | None = None
+        self,
+        memory: SharedMemory,
+        settings: DaemonSettings,
+        clock: Clock,
+        text: str | None = None,
     ) -> None:
+        self.clock = clock
         self.memory, self._slices = memory, memory.slices
         self._updated = UpdatedSettings(settings, text)  # text: the cell file's
         self.reader = memory.reader()
@@ -99,7 +104,7 @@ class Counts:
     @property
     def silence(self) -> float:
         """Return s since the last state of the robot; infinite before the first."""
-        return time.monotonic() - self.received if self.received else float("inf")
+        return self.clock.monotonic() - self.received if self.received else float("inf")
 
     def update(self, events: list[dict[str, Any]]) -> None:
         """Process new events and cycles."""
@@ -146,7 +151,7 @@ def run(start: StartData) -> None:
     assert settings is not None
     path = settings.token_file
     token = None if path is None else read_token(path, ("metrics", "token_file"))
-    counts = Counts(start.memory, start.settings, start.extra.get("text"))
+    counts = Counts(start.memory, start.settings, start.clock, start.extra.get("text"))
     registry = CollectorRegistry(auto_describe=False)
 
     async def metrics(request: Request) -> Response:
@@ -305,7 +310,7 @@ class Families(Collector):
             "1 while nothing can be recorded (disk full, ...).",
             float(self._counts.recorder_paused),
         )
-        lag = _lag(self._counts.status.get("recording"))
+        lag = _lag(self._counts.status.get("recording"), self._counts.clock.time())
         if lag is not None:
             yield GaugeMetricFamily(
                 "gapbridge_recorder_lag_seconds",
@@ -338,8 +343,11 @@ def _numbers(part: Any) -> dict[str, float]:
     }
 
 
-def _lag(recording: Any) -> float | None:
-    """Return s since the newest file of a recording (its stem) changed; None without any."""
+def _lag(recording: Any, now: float) -> float | None:
+    """Return s until ``now`` since the newest file of a recording (its stem) changed.
+
+    None without any.
+    """
     if not recording:
         return None
     stem = Path(str(recording))
@@ -347,7 +355,7 @@ def _lag(recording: Any) -> float | None:
         newest = max(p.stat().st_mtime for p in stem.parent.glob(f"{stem.name}-*.mcap"))
     except (OSError, ValueError):
         return None
-    return max(time.time() - newest, 0.0)
+    return max(now - newest, 0.0)
 
 
 if __name__ == "__main__":

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import re
-import time
+from datetime import datetime
 from pathlib import Path
 
 from gapbridge.core.log.mcap_reading import SUFFIX, last_batch
@@ -14,9 +14,12 @@ LOOP_LOG = ".loop.log"
 MB = 1e6
 
 
-def new_session(folder: Path | None) -> str:
-    """Return an unused name for a run that begins now, run-YYYYmmdd-HHMMSS."""
-    stem, number = time.strftime("run-%Y%m%d-%H%M%S"), 1
+def new_session(folder: Path | None, begin: float) -> str:
+    """Return an unused name for a run that begins at ``begin`` (s since 1970).
+
+    run-YYYYmmdd-HHMMSS in local time, with a number after it where that is taken.
+    """
+    stem, number = f"{datetime.fromtimestamp(begin):run-%Y%m%d-%H%M%S}", 1
     name = stem
     while folder is not None and _is_taken(folder, name):
         number += 1

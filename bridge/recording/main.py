@@ -18,7 +18,6 @@ import yaml
 from gapbridge.bridge.ipc.events import EventKind
 from gapbridge.bridge.ipc.side_main import StartData, read_start_data
 from gapbridge.bridge.recording.recorder import Recorder
-from gapbridge.drivers.clock import SYSTEM
 
 LOOK_EVERY = 0.1  # s
 HEARTBEAT_TIMEOUT = 0.6  # s without a heartbeat of the loop: the run of a lost daemon is over
@@ -34,7 +33,12 @@ def main() -> None:
         signal.signal(number, signal.SIG_IGN)
     start = read_start_data()
     recorder = Recorder(
-        start.settings.recording, start.session, start.memory, _configuration(start), start.emit
+        start.settings.recording,
+        start.session,
+        start.memory,
+        _configuration(start),
+        start.emit,
+        start.clock,
     )
     ended = _follow(start, recorder)
     if not ended:
@@ -47,7 +51,7 @@ def _follow(start: StartData, recorder: Recorder) -> bool:
     ended = False
     while not start.events.closed:
         start.events.wait(LOOK_EVERY)
-        SYSTEM.sleep(LOOK_EVERY / 2)  # events come in bursts; cycles wait in the ring
+        start.clock.sleep(LOOK_EVERY / 2)  # events come in bursts; cycles wait in the ring
         for event in start.events.poll():
             recorder.take(event)
             ended |= event.get("kind") == EventKind.ENDED
@@ -59,12 +63,12 @@ def _follow(start: StartData, recorder: Recorder) -> bool:
 
 def _record_remaining(start: StartData, recorder: Recorder) -> None:
     """Go on recording until the loop, which has lost its daemon, has stopped too."""
-    until = SYSTEM.monotonic() + LONGEST_REMAINDER
+    until = start.clock.monotonic() + LONGEST_REMAINDER
     detail = "the daemon is gone without an end"
-    recorder.take({"time": SYSTEM.time(), "kind": EventKind.RECORDER, "detail": detail})
-    while start.memory.silence < HEARTBEAT_TIMEOUT and SYSTEM.monotonic() < until:
+    recorder.take({"time": start.clock.time(), "kind": EventKind.RECORDER, "detail": detail})
+    while start.memory.silence < HEARTBEAT_TIMEOUT and start.clock.monotonic() < until:
         recorder.step()
-        SYSTEM.sleep(LOOK_EVERY)
+        start.clock.sleep(LOOK_EVERY)
 
 
 def _configuration(start: StartData, event: dict[str, Any] | None = None) -> dict[str, Any]:

@@ -25,7 +25,7 @@ from gapbridge.bridge.recording.folder import next_path, number_after, prune, se
 from gapbridge.bridge.recording.segment import Segment
 from gapbridge.core.errors import LogError
 from gapbridge.core.log.mcap_schema import CONFIGURATION, EVENTS, LOG, STATUS
-from gapbridge.drivers.clock import SYSTEM, Clock
+from gapbridge.drivers.clock import Clock
 
 FLUSH_EVERY = 0.4  # s
 RETRY_EVERY = 2.0  # s between attempts while the disk cannot be written to
@@ -52,7 +52,7 @@ class Recorder:
         memory: SharedMemory,
         configuration: Mapping[str, Any],
         emit: Emit,
-        clock: Clock = SYSTEM,
+        clock: Clock,
     ) -> None:
         self._clock = clock
         assert settings.folder is not None

@@ -29,7 +29,7 @@ from gapbridge.core.log.mcap_schema import (
     json_name,
     json_schema,
 )
-from gapbridge.drivers.clock import SYSTEM, Clock
+from gapbridge.drivers.clock import Clock
 
 LARGEST_CHUNK = 1 << 26  # bytes: chunks end by flush, long before this
 SYNC_SHARE = 0.1  # largest share of the time spent waiting for the disk
@@ -74,7 +74,7 @@ class Segment:
     """One file of a run, from its first byte to its summary."""
 
     def __init__(
-        self, path: Path, slices: Mapping[str, slice], states: Sequence[str], clock: Clock = SYSTEM
+        self, path: Path, slices: Mapping[str, slice], states: Sequence[str], clock: Clock
     ) -> None:
         """Open a new file. Raises OSError, FileExistsError where the name is taken."""
         self.path, self._clock = path, clock

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, cast
 if TYPE_CHECKING:
     from gapbridge.bridge.cell.sections import SetpointSettings
     from gapbridge.bridge.setpoint_source.source import Source
+    from gapbridge.drivers.clock import Clock
 
 SOURCES: dict[str, str] = {
     "target": "gapbridge.bridge.setpoint_source.target:TargetSource",
@@ -21,13 +22,16 @@ SOURCES: dict[str, str] = {
 
 
 def make_source(
-    settings: SetpointSettings, n: int, moves_arm: bool, folder: Path, rate: float = 500.0
-) -> Source:
+    settings: SetpointSettings, n: int, moves_arm: bool, folder: Path, clock: Clock,
+    rate: float = 500.0,
+) -> Source:  # fmt: skip
     """Return the source that the settings name, not yet open.
 
     ``n``: joints; ``moves_arm``: whether setpoints are the arm's only motion; ``folder``: where
-    relative paths start; ``rate``: of the robot's cycles, Hz. Raises InputError if it cannot be
+    relative paths start; ``clock``: for sources whose setpoints come at their own times, the others
+    follow the controller's; ``rate``: of the robot's cycles, Hz. Raises InputError if it cannot be
     used.
     """
     source_class = resolve_name(SOURCES[settings.source])
-    return cast("Source", source_class(settings, n, moves_arm, folder, rate))
+    timed = (clock,) if source_class.takes_clock else ()
+    return cast("Source", source_class(settings, n, moves_arm, folder, rate, *timed))

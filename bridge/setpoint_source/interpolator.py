@@ -9,7 +9,7 @@ from typing import ClassVar
 from gapbridge.bridge.cell.sections import SetpointSettings
 from gapbridge.bridge.setpoint_source.source import Source, SourceDryError
 from gapbridge.core.arrays import Array
-from gapbridge.drivers.clock import SYSTEM, Clock
+from gapbridge.drivers.clock import Clock
 
 MAX_INTERVAL = 0.1  # s: longest time over which one setpoint is approached
 
@@ -21,7 +21,7 @@ class SetpointInterpolator:
     for messages.
     """
 
-    def __init__(self, timeout: float, expected: str, clock: Clock = SYSTEM) -> None:
+    def __init__(self, timeout: float, expected: str, clock: Clock) -> None:
         self._now = clock.monotonic
         self._timeout, self._expected = timeout, expected
         self._newest: Array | None = None
@@ -72,13 +72,16 @@ class SetpointInterpolator:
 class InterpolatedSource(Source):
     """A source whose setpoints arrive at irregular times and are interpolated."""
 
+    takes_clock = True
     expected: ClassVar[str]  # what the sender should send, for messages
 
     def __init__(
-        self, settings: SetpointSettings, n: int, moves_arm: bool, folder: Path, rate: float
-    ) -> None:
+        self, settings: SetpointSettings, n: int, moves_arm: bool, folder: Path, rate: float,
+        clock: Clock,
+    ) -> None:  # fmt: skip
         super().__init__(settings, n, moves_arm, folder, rate)
-        self._interpolator = SetpointInterpolator(settings.timeout, self.expected)
+        self._clock = clock
+        self._interpolator = SetpointInterpolator(settings.timeout, self.expected, clock)
 
     @abstractmethod
     def _receive(self) -> bool:

@@ -15,6 +15,7 @@ from gapbridge.bridge.setpoint_source.interpolator import InterpolatedSource
 from gapbridge.bridge.setpoint_source.plc_memory import MOST_JOINTS, PlcMemory
 from gapbridge.bridge.setpoint_source.source import SourceStatus
 from gapbridge.core.errors import InputError, RunError
+from gapbridge.drivers.clock import Clock
 
 WRITTEN, LIMITED = 1, 2  # flags
 
@@ -30,9 +31,10 @@ class ModbusSource(InterpolatedSource):
     expected = "new sequence number"
 
     def __init__(
-        self, settings: SetpointSettings, n: int, moves_arm: bool, folder: Path, rate: float
-    ) -> None:
-        super().__init__(settings, n, moves_arm, folder, rate)
+        self, settings: SetpointSettings, n: int, moves_arm: bool, folder: Path, rate: float,
+        clock: Clock,
+    ) -> None:  # fmt: skip
+        super().__init__(settings, n, moves_arm, folder, rate, clock)
         if n > MOST_JOINTS:
             raise InputError(f"found {n} joints, expected {MOST_JOINTS}", ("setpoints", "source"))
         self._memory: PlcMemory | None = None

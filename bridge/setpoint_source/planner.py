@@ -27,7 +27,7 @@ from gapbridge.bridge.cell.sections import SetpointSettings
 from gapbridge.bridge.ipc.control_socket import peer_of
 from gapbridge.bridge.setpoint_source.interpolator import InterpolatedSource
 from gapbridge.core.errors import RunError
-from gapbridge.drivers.clock import SYSTEM
+from gapbridge.drivers.clock import Clock
 
 LONGEST_LINE = 4096  # bytes
 MOST_BYTES = 16384  # read in one cycle
@@ -40,8 +40,8 @@ SPAN = 2.0  # s over which lines are counted against the robot's cycles
 class Connection:
     """One planner's connection: its unread bytes and how many lines it may still send."""
 
-    def __init__(self, link: socket.socket, rate: float) -> None:
-        self._now = SYSTEM.monotonic
+    def __init__(self, link: socket.socket, rate: float, clock: Clock) -> None:
+        self._now = clock.monotonic
         link.setblocking(False)
         self._link, self._rate = link, rate
         self._buffer = b""
@@ -124,9 +124,10 @@ class PlannerSource(InterpolatedSource):
     needs_token: ClassVar[bool] = False
 
     def __init__(
-        self, settings: SetpointSettings, n: int, moves_arm: bool, folder: Path, rate: float
-    ) -> None:
-        super().__init__(settings, n, moves_arm, folder, rate)
+        self, settings: SetpointSettings, n: int, moves_arm: bool, folder: Path, rate: float,
+        clock: Clock,
+    ) -> None:  # fmt: skip
+        super().__init__(settings, n, moves_arm, folder, rate, clock)
         self._listener: socket.socket | None = None
         self._planner: Connection | None = None
         self._waiting: list[Connection] = []
@@ -218,7 +219,7 @@ class PlannerSource(InterpolatedSource):
         planner = self._planner
         if planner is None or planner.closed:
             return False
-        return SYSTEM.monotonic() - planner.received <= self.settings.timeout
+        return self._clock.monotonic() - planner.received <= self.settings.timeout
 
     def _accept(self) -> None:
         if self._listener is None:
@@ -227,7 +228,7 @@ class PlannerSource(InterpolatedSource):
             link, _ = self._listener.accept()
         except OSError:
             return
-        connection = Connection(link, self.rate)
+        connection = Connection(link, self.rate, self._clock)
         if not self.needs_token:
             connection.admit()
         if not self._may_connect(link):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from pathlib import Path
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 from gapbridge.bridge.cell.sections import SetpointSettings
 from gapbridge.core.arrays import Array
@@ -31,6 +31,10 @@ class Source(ABC):
 
     Constructors read what they need and open nothing. ``sample`` never blocks.
     """
+
+    takes_clock: ClassVar[bool] = (
+        False  # its constructor takes a Clock last: senders have their own
+    )
 
     def __init__(
         self, settings: SetpointSettings, n: int, moves_arm: bool, folder: Path, rate: float

@@ -13,7 +13,6 @@ import socket
 from gapbridge.bridge.served.credentials import SETPOINT_TOKEN, read_token
 from gapbridge.bridge.setpoint_source.planner import Connection, PlannerSource
 from gapbridge.core.errors import InputError
-from gapbridge.drivers.clock import SYSTEM
 
 FIRST_LINE = 2.0  # s within which the token must arrive
 
@@ -68,7 +67,7 @@ class TcpSource(PlannerSource):
         return True
 
     def _receive(self) -> bool:
-        late = SYSTEM.monotonic() - FIRST_LINE
+        late = self._clock.monotonic() - FIRST_LINE
         for connection in self._waiting:
             if not connection.admitted and not connection.closed and connection.opened < late:
                 self._end(connection, f"no token within {FIRST_LINE:g} s")

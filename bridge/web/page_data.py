@@ -6,7 +6,6 @@ Time series are thinned to a few points a second.
 from __future__ import annotations
 
 import math
-import time
 from collections import deque
 from typing import Any
 
@@ -20,6 +19,7 @@ from gapbridge.bridge.ipc.updated_settings import UpdatedSettings
 from gapbridge.bridge.web.prediction import Prediction
 from gapbridge.core.arrays import Array
 from gapbridge.core.state import CLAMPS
+from gapbridge.drivers.clock import Clock
 
 Message = tuple[str, dict[str, Any]]  # kind, data
 ENDS = (EventKind.FAULT, EventKind.FAILURE)  # events with which a process of the loop ends
@@ -52,10 +52,12 @@ class PageData:
         n: int,
         session: str,
         memory: SharedMemory,
+        clock: Clock,
         text: str | None = None,
     ) -> None:
         assert settings.web is not None
         self._updated = UpdatedSettings(settings, text)  # text: the cell file's
+        self._clock = clock
         self._session, self._memory = session, memory
         self._slices, self._n = memory.slices, n
         # a page opened late shows what the ring holds
@@ -90,11 +92,12 @@ class PageData:
             messages.append(("hello", self.snapshot()))  # limits and rate may have changed
         points = self._take(self._reader.drain())
         messages.append(("tick", {**self.now(), "points": plain(points)}))
-        if time.monotonic() >= self._timing_at:
-            self._timing_at = time.monotonic() + TIMING_EVERY
+        now = self._clock.monotonic()
+        if now >= self._timing_at:
+            self._timing_at = now + TIMING_EVERY
             messages.append(("timing", self._timing.figures()))
-        if time.monotonic() >= self._arm_at and self._row is not None:
-            self._arm_at = time.monotonic() + ARM_EVERY
+        if now >= self._arm_at and self._row is not None:
+            self._arm_at = now + ARM_EVERY
             arm = self._prediction.arm(self._row)
             messages += [] if arm is None else [("arm", arm)]
         return messages
@@ -115,8 +118,8 @@ class PageData:
         return [("event", event)]
 
     def _take(self, rows: Array) -> Array:
-        s, now = self._slices, time.monotonic()
-        wall = time.time() - now
+        s, now = self._slices, self._clock.monotonic()
+        wall = self._clock.time() - now
         cycles = np.full((len(rows), len(COLUMNS)), np.nan)
         if len(rows):
             received, age = rows[:, s["received"].start], rows[:, s["age"].start]
@@ -147,12 +150,12 @@ class PageData:
 
     def now(self) -> dict[str, Any]:
         """Return the present state, rate and counts."""
-        times, now = self._times, time.monotonic()
+        times, now = self._times, self._clock.monotonic()
         silence = now - self._last if self._last else None
         alive = len(times) > 1 and silence is not None and silence < RATE_SPAN
         rate = (len(times) - 1) / (times[-1] - times[0]) if alive else 0.0
         return {
-            "time": time.time(),
+            "time": self._clock.time(),
             "state": (State.DISCONNECTED if self._down else State(self._memory.state)).name.lower(),
             "phase": self._memory.phase.name.lower(),
             "why": {k: v for k, v in self._why.items() if k in ("cause", "detail", "time")},

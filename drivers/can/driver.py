@@ -22,7 +22,7 @@ from gapbridge.drivers.can.reader import FrameReader
 from gapbridge.drivers.can.settings import CanSettings
 from gapbridge.drivers.can.state import StateBuilder
 from gapbridge.drivers.can.writer import FrameWriter
-from gapbridge.drivers.clock import SYSTEM, Clock
+from gapbridge.drivers.clock import Clock
 from gapbridge.drivers.driver import Driver
 from gapbridge.drivers.profile_file import ProfileError
 
@@ -38,7 +38,7 @@ class CanDriver(Driver):
     and an armed driver stops writing.
     """
 
-    def __init__(self, settings: CanSettings, model: Model, clock: Clock = SYSTEM) -> None:
+    def __init__(self, settings: CanSettings, model: Model, clock: Clock) -> None:
         profile = read_profile(settings.profile_path, settings.installation)
         super().__init__(min(settings.rate, profile.rate), model, clock=clock)
         if model.arm.n != profile.n:

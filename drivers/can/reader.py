@@ -13,7 +13,7 @@ from gapbridge.drivers.can.assembler import Assembler, Sample
 from gapbridge.drivers.can.profile import CanProfile, Key, Status
 from gapbridge.drivers.can.settings import CanSettings
 from gapbridge.drivers.can_bus.bus import close_bus, open_bus
-from gapbridge.drivers.clock import SYSTEM, Clock
+from gapbridge.drivers.clock import Clock
 from gapbridge.drivers.robot_modes import StopReason
 
 QUEUED_CYCLES, QUEUED_TIME = 4.0, 0.03  # cycles, s: a sample queued for longer is not fresh
@@ -31,7 +31,7 @@ class ForeignCommand:
 class FrameReader:
     """Reads one bus for one profile. Opens and closes it; independent of writing."""
 
-    def __init__(self, settings: CanSettings, profile: CanProfile, clock: Clock = SYSTEM) -> None:
+    def __init__(self, settings: CanSettings, profile: CanProfile, clock: Clock) -> None:
         self._now = clock.monotonic
         self._settings, self._profile = settings, profile
         self.bus: Any = None

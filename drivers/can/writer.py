@@ -11,7 +11,7 @@ from gapbridge.core.arrays import Array
 from gapbridge.core.errors import PartialWriteError, WriteError, first_line
 from gapbridge.drivers.can.profile import Action, CanProfile, Key, Outgoing
 from gapbridge.drivers.can.settings import CanSettings
-from gapbridge.drivers.clock import SYSTEM, Clock
+from gapbridge.drivers.clock import Clock
 
 Frames = list[tuple[Key, bytes]]
 
@@ -19,7 +19,7 @@ Frames = list[tuple[Key, bytes]]
 class FrameWriter:
     """Sends setpoints and sequences over a bus that is open."""
 
-    def __init__(self, settings: CanSettings, profile: CanProfile, clock: Clock = SYSTEM) -> None:
+    def __init__(self, settings: CanSettings, profile: CanProfile, clock: Clock) -> None:
         self._now = clock.monotonic
         self._settings, self._profile = settings, profile
         self._bus: Any = None

@@ -33,7 +33,7 @@ from gapbridge.drivers.canopen.profile import WINDOW, read_profile
 from gapbridge.drivers.canopen.settings import CanopenSettings
 from gapbridge.drivers.canopen.state import StateBuilder, not_following, positions, states
 from gapbridge.drivers.canopen.sync_set import SyncSet
-from gapbridge.drivers.clock import SYSTEM, Clock
+from gapbridge.drivers.clock import Clock
 from gapbridge.drivers.driver import Driver
 
 log = logging.getLogger("drivers.canopen")
@@ -49,7 +49,7 @@ class CanopenDriver(Driver):
     before ``arm``.
     """
 
-    def __init__(self, settings: CanopenSettings, model: Model, clock: Clock = SYSTEM) -> None:
+    def __init__(self, settings: CanopenSettings, model: Model, clock: Clock) -> None:
         self.profile = read_profile(settings.profile_path, model.arm.n)
         super().__init__(settings.rate, model, clock=clock)
         fastest = 1.0 / self.profile.file.sync_period
@@ -61,7 +61,7 @@ class CanopenDriver(Driver):
             )
         interpolation_period(1.0 / settings.rate)  # raises InputError
         self.settings = settings
-        self.master = Master(settings, self.profile)
+        self.master = Master(settings, self.profile, clock)
         self.writer = RpdoWriter(self.master, self.profile)
         self._period = 1.0 / self.rate
         window = self.profile.file.sync_window or WINDOW * self._period

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import threading
-import time
 from collections import Counter
 from enum import StrEnum
 from typing import NamedTuple
 
 from gapbridge.drivers.canopen.pdo import PdoLayout
 from gapbridge.drivers.canopen.profile import CanopenProfile
+from gapbridge.drivers.clock import Clock
 
 
 class DropReason(StrEnum):
@@ -33,14 +33,16 @@ class SyncSet(NamedTuple):
 class SyncCollector:
     """Collects the TPDOs of one SYNC at a time. One thread may feed it while another waits."""
 
-    def __init__(self, profile: CanopenProfile) -> None:
+    def __init__(self, profile: CanopenProfile, clock: Clock) -> None:
+        self._clock = clock
         self._members: dict[int, tuple[int, PdoLayout]] = {
             layout.cob_id(node): (joint, layout)
             for joint, node in enumerate(profile.nodes)
             for layout in profile.tpdo
         }
         self._nodes = profile.nodes
-        self._changed = threading.Condition()
+        self._lock = threading.Lock()
+        self._over = threading.Event()  # the set is whole, or rejected
         self._frames: dict[int, dict[str, int]] = {}
         self._open = False
         self._rejected: tuple[DropReason, str, str] | None = None  # why, which TPDO, detail
@@ -55,14 +57,15 @@ class SyncCollector:
 
     def begin(self, now: float) -> None:
         """Start a new set: a SYNC leaves at ``now`` (s, monotonic)."""
-        with self._changed:
+        with self._lock:
             self._frames, self._rejected, self._open = {}, None, True
             self._missing.clear()
+            self._over.clear()
             self._synced = self._received = now
 
     def end(self) -> None:
         """Accept nothing until the next SYNC."""
-        with self._changed:
+        with self._lock:
             self._open = False
 
     def take(self, cob_id: int, data: bytes, now: float) -> None:
@@ -72,7 +75,7 @@ class SyncCollector:
             return
         joint, layout = member
         who = f"{layout.name} of node {self._nodes[joint]}"
-        with self._changed:
+        with self._lock:
             if not self._open:
                 self._take_late(cob_id, who)
                 return
@@ -87,7 +90,7 @@ class SyncCollector:
             self._received = now
             if len(self._frames) == len(self._members):
                 self._open = False
-                self._changed.notify_all()
+                self._over.set()
 
     def _take_late(self, cob_id: int, who: str) -> None:
         if cob_id in self._missing:
@@ -105,12 +108,12 @@ class SyncCollector:
     def _reject(self, reason: DropReason, who: str, detail: str = "") -> None:
         self.dropped[reason] += 1
         self._rejected = self._rejected or (reason, who, detail)
-        self._changed.notify_all()
+        self._over.set()
 
     def wait(self, until: float) -> SyncSet | None:
         """Return the set, None where it is incomplete or rejected by ``until``."""
-        with self._changed:
-            self._changed.wait_for(self._over, max(until - time.monotonic(), 0.0))
+        self._clock.wait(self._over, max(until - self._clock.monotonic(), 0.0))
+        with self._lock:
             self._open = False
             if self._rejected or len(self._frames) < len(self._members):
                 self.dropped[DropReason.TORN] += 1
@@ -120,9 +123,6 @@ class SyncCollector:
             for cob_id, objects in self._frames.items():
                 counts[self._members[cob_id][0]].update(objects)
             return SyncSet(tuple(counts), self._synced, self._received)
-
-    def _over(self) -> bool:
-        return bool(self._rejected) or len(self._frames) == len(self._members)
 
     @property
     def empty(self) -> bool:

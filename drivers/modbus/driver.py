@@ -13,7 +13,7 @@ from gapbridge.core.compensation import wanted_pose
 from gapbridge.core.errors import InvalidStateError, LinkError, StaleStateError, WriteError
 from gapbridge.core.model import Model
 from gapbridge.core.state import RobotState, Setpoint
-from gapbridge.drivers.clock import SYSTEM, Clock
+from gapbridge.drivers.clock import Clock
 from gapbridge.drivers.driver import Driver
 from gapbridge.drivers.modbus.decode import Decoder, Sample, check_identity
 from gapbridge.drivers.modbus.freshness import Freshness
@@ -33,7 +33,7 @@ ANSWER_CYCLES, ANSWER_TIME = 4.0, 0.03  # cycles, s: an older answer is not fres
 class ModbusDriver(Driver):
     """One arm on Modbus. The profile gives the register map and the way to write setpoints."""
 
-    def __init__(self, settings: ModbusSettings, model: Model, clock: Clock = SYSTEM) -> None:
+    def __init__(self, settings: ModbusSettings, model: Model, clock: Clock) -> None:
         self.profile = profile = read_profile(settings.profile_path, model.arm.n)
         reads_targets = profile.write.mode == "mailbox"
         super().__init__(settings.rate, model, not reads_targets, clock, profile.fastest)

@@ -20,7 +20,7 @@ from gapbridge.core.errors import (
     WriteError,
 )
 from gapbridge.core.state import RobotState, Setpoint
-from gapbridge.drivers.clock import SYSTEM, Clock
+from gapbridge.drivers.clock import Clock
 from gapbridge.drivers.modbus import encode
 from gapbridge.drivers.modbus.decode import Sample
 from gapbridge.drivers.modbus.registers import UNITS, Table
@@ -59,7 +59,7 @@ class Writer(Protocol):
 
 def make_writer(
     profile: ProfileFile, transport: Transport, rates: Rates, zero_timeout: float,
-    clock: Clock = SYSTEM,
+    clock: Clock,
 ) -> Writer:  # fmt: skip
     """Return the writer of a profile.
 
@@ -110,7 +110,7 @@ class MailboxWriter:
 
     def __init__(
         self, box: Mailbox, transport: Transport, together: bool, rates: Rates, zero_timeout: float,
-        clock: Clock = SYSTEM,
+        clock: Clock,
     ) -> None:  # fmt: skip
         self._clock, self._now = clock, clock.monotonic
         self._box, self._transport, self._together = box, transport, together
@@ -262,7 +262,7 @@ class MailboxWriter:
 class TargetWriter:
     """Joint targets in registers, and a trigger that starts the motion there."""
 
-    def __init__(self, entry: TargetTrigger, transport: Transport, clock: Clock = SYSTEM) -> None:
+    def __init__(self, entry: TargetTrigger, transport: Transport, clock: Clock) -> None:
         self._now = clock.monotonic
         self._entry, self._transport = entry, transport
         self._size = entry.target.scale * UNITS[entry.target.unit][1]

@@ -15,7 +15,7 @@ import numpy as np
 from gapbridge.core.arrays import Array
 from gapbridge.core.errors import LinkError, LogError
 from gapbridge.core.state import RobotState, Setpoint
-from gapbridge.drivers.clock import SYSTEM, Clock
+from gapbridge.drivers.clock import Clock
 from gapbridge.drivers.driver import Driver
 from gapbridge.drivers.replay.settings import ReplaySettings
 
@@ -56,7 +56,7 @@ class ReplayDriver(Driver):
     the recording has none, or is of another arm.
     """
 
-    def __init__(self, settings: ReplaySettings, model: Model, clock: Clock = SYSTEM) -> None:
+    def __init__(self, settings: ReplaySettings, model: Model, clock: Clock) -> None:
         self.settings = settings
         first = next(self._rows(), None)
         if first is None:

@@ -20,7 +20,7 @@ import numpy as np
 
 from gapbridge.core.errors import WriteError, first_line
 from gapbridge.core.state import RobotState, Setpoint
-from gapbridge.drivers.clock import SYSTEM, Clock
+from gapbridge.drivers.clock import Clock
 from gapbridge.drivers.robot_modes import PLAYING, why_not_ready
 from gapbridge.drivers.ur_rtde import registers
 from gapbridge.drivers.ur_rtde.registers import Program
@@ -81,7 +81,7 @@ def check_ready(host: str, state: RobotState) -> None:
 class ServoWriter:
     """Joint setpoints by servoJ, through the control script that the library uploads."""
 
-    def __init__(self, settings: UrRtdeSettings, clock: Clock = SYSTEM) -> None:
+    def __init__(self, settings: UrRtdeSettings, clock: Clock) -> None:
         self._clock, self._now = clock, clock.monotonic
         self._settings = settings
         self._control: Any = None
@@ -221,7 +221,7 @@ class OffsetWriter:
         self,
         settings: UrRtdeSettings,
         rates: Callable[[], tuple[float, float]],
-        clock: Clock = SYSTEM,
+        clock: Clock,
     ) -> None:
         self._now = clock.monotonic
         self._settings, self._cell_rates = settings, rates

@@ -12,7 +12,7 @@ from gapbridge.core.errors import InvalidStateError, LinkError, WriteError
 from gapbridge.core.model import Model
 from gapbridge.core.rotation import one_rotation_matrix
 from gapbridge.core.state import RobotState, Setpoint
-from gapbridge.drivers.clock import SYSTEM, Clock
+from gapbridge.drivers.clock import Clock
 from gapbridge.drivers.controller_facts import TCP_TURNED, ControllerFacts, Difference, differences
 from gapbridge.drivers.driver import Driver
 from gapbridge.drivers.offset_inverse import Nominal
@@ -29,7 +29,7 @@ class UrRtdeDriver(Driver):
     breaks. After a LinkError the object cannot be used again: start a new process.
     """
 
-    def __init__(self, settings: UrRtdeSettings, model: Model, clock: Clock = SYSTEM) -> None:
+    def __init__(self, settings: UrRtdeSettings, model: Model, clock: Clock) -> None:
         super().__init__(settings.rate, model, settings.mode == "servoj", clock)
         if model.arm.n != 6:
             raise LinkError(f"link: found an arm of {model.arm.n} joints, a UR has 6")
@@ -87,7 +87,7 @@ class UrRtdeDriver(Driver):
 
     def round_trip(self) -> float | None:
         """Return the round-trip time of an RTDE request, s; see Driver.round_trip."""
-        self._round_trip = duration = round_trip(self.settings.host)
+        self._round_trip = duration = round_trip(self.settings.host, self.clock)
         return duration
 
     def transit_time(self) -> float:
@@ -126,7 +126,7 @@ class UrRtdeDriver(Driver):
 
     def facts(self, state: RobotState) -> ControllerFacts:
         """Return what RTDE and the primary interface report; see Driver.facts."""
-        return enquire(self.settings.host)
+        return enquire(self.settings.host, self.clock)
 
     def differences(self, state: RobotState) -> list[Difference]:
         """Return where the cell differs; see Driver.differences. Raises WriteError."""

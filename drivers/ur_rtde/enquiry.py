@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import socket
 import struct
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -24,6 +23,7 @@ from gapbridge.core.arm import builtin_arm, builtin_names, builtin_rows
 from gapbridge.core.arrays import Array
 from gapbridge.core.errors import LinkError, WriteError
 from gapbridge.core.rotation import rotation_matrix, transform
+from gapbridge.drivers.clock import Clock
 from gapbridge.drivers.controller_facts import ControllerFacts
 
 RTDE, PRIMARY = 30004, 30001
@@ -49,7 +49,7 @@ class PrimaryFacts:
     limits: Array | None = None  # (6, 3): lower, upper (rad), velocity (rad/s)
 
 
-def enquire(host: str) -> ControllerFacts:
+def enquire(host: str, clock: Clock) -> ControllerFacts:
     """Return what a UR controller reports about its arm.
 
     Where its primary interface cannot be read, model, calibration and limits stay None. Raises
@@ -61,7 +61,7 @@ def enquire(host: str) -> ControllerFacts:
         message = getattr(error, "strerror", None) or str(error) or type(error).__name__
         raise LinkError(f"{host}: found no answer on RTDE's port {RTDE}: {message}") from None
     try:
-        primary = read_primary(host)
+        primary = read_primary(host, clock)
     except (OSError, EOFError, struct.error):
         primary = PrimaryFacts()
     model = None if primary.nominal is None else model_of(primary.nominal)
@@ -101,7 +101,7 @@ def require_listening(host: str) -> None:
         ) from None
 
 
-def round_trip(host: str) -> float:
+def round_trip(host: str, clock: Clock) -> float:
     """Return the median round-trip time of some requests, s: a bound of a sample's transit time.
 
     Raises WriteError where none comes.
@@ -113,10 +113,10 @@ def round_trip(host: str) -> float:
             link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             with link.makefile("rb") as answers:
                 for _ in range(TRIES):
-                    begun = time.monotonic()
+                    begun = clock.monotonic()
                     link.sendall(question)
                     _answer(answers, "V")
-                    times.append(time.monotonic() - begun)
+                    times.append(clock.monotonic() - begun)
     except (OSError, EOFError) as error:
         message = getattr(error, "strerror", None) or str(error)
         raise WriteError(f"{host}: found no answer on RTDE's port {RTDE}: {message}") from None
@@ -189,14 +189,14 @@ def _exactly(stream: Any, count: int) -> bytes:
 # -- the primary interface ----------------------------------------------------------------------
 
 
-def read_primary(host: str) -> PrimaryFacts:
+def read_primary(host: str, clock: Clock) -> PrimaryFacts:
     """Return geometry and limits from the primary interface.
 
     Raises OSError, EOFError where it cannot be read, struct.error where it is another thing.
     """
-    until, facts = time.monotonic() + TIMEOUT, PrimaryFacts()
+    until, facts = clock.monotonic() + TIMEOUT, PrimaryFacts()
     with socket.create_connection((host, PRIMARY), TIMEOUT) as link, link.makefile("rb") as stream:
-        while time.monotonic() < until:
+        while clock.monotonic() < until:
             size, kind = struct.unpack(">ib", _exactly(stream, 5))
             if not 5 <= size <= LARGEST:
                 raise EOFError(f"found a package of {size} bytes")

@@ -17,7 +17,7 @@ import numpy as np
 from gapbridge.core.arrays import Array
 from gapbridge.core.errors import InvalidStateError, LinkError, StaleStateError, first_line
 from gapbridge.core.state import RobotState
-from gapbridge.drivers.clock import SYSTEM, Clock
+from gapbridge.drivers.clock import Clock
 from gapbridge.drivers.ur_rtde.registers import APPLIED, ECHO, PROGRAM
 from gapbridge.drivers.ur_rtde.settings import UrRtdeSettings
 
@@ -48,7 +48,7 @@ _NAMES = (
 class StateReader:
     """The reading half of a link to one controller."""
 
-    def __init__(self, settings: UrRtdeSettings, clock: Clock = SYSTEM) -> None:
+    def __init__(self, settings: UrRtdeSettings, clock: Clock) -> None:
         self._now, self._sleep = clock.monotonic, clock.sleep
         self._settings = settings
         self._receive: Any = None

@@ -25,6 +25,7 @@ from gapbridge.bridge.daemon.daemon import Daemon, settings_of
 from gapbridge.bridge.daemon.summary import RunSummary
 from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.core.log.mcap_reading import read_columns
+from gapbridge.drivers.clock import SYSTEM
 from gapbridge.drivers.simulated.ur.settings import BENCH_PORT, ServerSettings, simulated_cell
 
 Array = NDArray[np.float64]
@@ -111,7 +112,7 @@ class Run:
                  duration: float | None = None) -> None:  # fmt: skip
         self.output: list[str] = []
         settings = settings_of(load_cell(cell))
-        self.daemon = Daemon(settings, may_write=not observe, say=self.output.append)
+        self.daemon = Daemon(settings, may_write=not observe, say=self.output.append, clock=SYSTEM)
         self.summary: RunSummary | None = None
         self.error: Exception | None = None
         self._thread = threading.Thread(target=self._run, args=(arm, duration))

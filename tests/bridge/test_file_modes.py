@@ -17,6 +17,7 @@ from gapbridge.bridge.fleet.journal import Journal as FleetJournal
 from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.ipc.shared_memory import slices_of
 from gapbridge.bridge.recording.segment import Segment
+from gapbridge.drivers.clock import SYSTEM
 
 CELL = "robot: {model: ur10e}\npayload: {mass: 5.0}\n"
 
@@ -34,7 +35,7 @@ def mode(path: Path) -> int:
 
 
 def recording(path: Path) -> None:
-    Segment(path, slices_of(6), [state.name for state in State]).close()
+    Segment(path, slices_of(6), [state.name for state in State], clock=SYSTEM).close()
 
 
 def session_journal(path: Path) -> None:
@@ -43,7 +44,7 @@ def session_journal(path: Path) -> None:
 
 
 def fleet_journal(path: Path) -> None:
-    with FleetJournal(path):
+    with FleetJournal(path, SYSTEM):
         pass
 
 

@@ -22,7 +22,7 @@ from gapbridge.bridge.recording.segment import Segment
 from gapbridge.core.errors import GapbridgeError
 from gapbridge.core.log.mcap_reading import read_columns
 from gapbridge.core.log.mcap_schema import EVENTS
-from gapbridge.drivers.clock import Clock
+from gapbridge.drivers.clock import SYSTEM, Clock
 
 Scenario = Callable[[Path, Callable[[], Path]], None]
 N = 6
@@ -63,10 +63,10 @@ def fleet(folder: Path, cut: Callable[[], Path]) -> None:
         return Outcome(key, "a", "s", "l", "c", DONE, 1.0)
 
     def left() -> list[str]:
-        with FleetJournal(cut() / "journal.jsonl") as journal:
+        with FleetJournal(cut() / "journal.jsonl", SYSTEM) as journal:
             return [key for key in ("one", "two") if journal.known(key) is not None]
 
-    with FleetJournal(path) as journal:
+    with FleetJournal(path, SYSTEM) as journal:
         journal.add(outcome("one"))
         assert left() == ["one"]
         journal.add(outcome("two"))  # within a second: synced at the end

@@ -21,6 +21,7 @@ from gapbridge.bridge.cell.daemon_settings import DaemonSettings
 from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.ipc.shared_memory import Phase, SharedMemory
 from gapbridge.bridge.ipc.side_process import SideProcess
+from gapbridge.drivers.clock import SYSTEM
 
 Array = NDArray[np.float64]
 N, RATE = 6, 125.0
@@ -53,7 +54,7 @@ class Feed:
         self.folder = folder
         scheme = "https" if keys.get("certificate") else "http"
         self.url = f"{scheme}://127.0.0.1:{self.port}/"
-        self.memory = SharedMemory(N)
+        self.memory = SharedMemory(N, clock=SYSTEM)
         self.state = State.OBSERVING
         self.restarts = 0
         self.counts: dict[str, int] = {"late": 1, "stale": 2, "overrun": 0}
@@ -71,7 +72,7 @@ class Feed:
             "settings": self.settings.model_dump(mode="json"), "n": N, "session": self.session,
             "extra": {"text": CELL},
         }  # fmt: skip
-        self.side = SideProcess(f"bridge.{self.section}.main", order, self.memory, self.log)
+        self.side = SideProcess(f"bridge.{self.section}.main", order, self.memory, SYSTEM, self.log)
         self.memory.enter(Phase.RUNNING)
         self.memory.note_state(self.state)
         self._thread = threading.Thread(target=self._run)

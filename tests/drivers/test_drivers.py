@@ -13,6 +13,7 @@ from gapbridge.core.arm import Arm, builtin_arm
 from gapbridge.core.errors import LinkError
 from gapbridge.core.model import Model
 from gapbridge.drivers import DRIVERS, make_driver
+from gapbridge.drivers.clock import Clock
 from gapbridge.drivers.driver import Driver
 from gapbridge.drivers.link_settings import DriverSettings
 
@@ -48,6 +49,12 @@ def test_a_driver_is_made_without_touching_hardware(name: str, model: Model) -> 
     assert driver.rate == settings.rate
     driver.close()  # also without connect, and again
     driver.close()
+
+
+@pytest.mark.parametrize("name", WIRED)
+def test_a_driver_goes_by_the_clock_that_it_is_given(name: str, model: Model) -> None:
+    clock = Clock()
+    assert make_driver(link(name), model, clock=clock).clock is clock
 
 
 @pytest.mark.parametrize("name", WIRED)

@@ -37,8 +37,8 @@ class Clock:
 
 
 def opened(moves_arm: bool, bounds: GateBounds | None = None) -> tuple[Gate, Clock]:
-    found, clock = Gate(RATE, MODEL, moves_arm), Clock()
-    found.set_clock(clock)
+    clock = Clock()
+    found = Gate(RATE, MODEL, moves_arm, clock)
     found.set_bounds(bounds or GateBounds())
     found.begin(Q, Q)
     return found, clock

@@ -21,6 +21,7 @@ from benchmarks.faults.rig import Rig
 from benchmarks.faults.row import Row, cycles, seconds
 from gapbridge.bridge.cell import load_cell
 from gapbridge.drivers.can_bus.bus import BusSettings
+from gapbridge.drivers.clock import SYSTEM
 from gapbridge.drivers.simulated.can.hub import Hub
 from gapbridge.drivers.simulated.ft_sensor.ati_node import RobotousNode
 
@@ -109,10 +110,10 @@ class SensedRig(Rig):
     """A rig with a force-torque sensor on a bus of its own."""
 
     def __init__(self, link: Link, folder: Path, when_lost: str) -> None:
-        self._hub = Hub(own_address())
+        self._hub = Hub(SYSTEM, own_address())
         self._hub.__enter__()
         bus = BusSettings(interface="socketcand", host=self._hub.host, port=self._hub.port)
-        self.sensor = RobotousNode(lambda: WEIGHT, bus)
+        self.sensor = RobotousNode(lambda: WEIGHT, bus, SYSTEM)
         super().__init__(link, folder, (
             f"{LIMITS}ft_sensor: {{driver: robotous_rft, interface: socketcand, "
             f"host: {self._hub.host}, port: {self._hub.port}, max_age: 0.1, "

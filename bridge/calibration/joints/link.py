@@ -7,7 +7,6 @@ through the limiter, without corrections; once the arm rests there the daemon on
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
@@ -28,6 +27,7 @@ from gapbridge.bridge.setpoint_source.quintic import quintic, quintic_time, writ
 from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.plan import PlannedPose
 from gapbridge.core.errors import GapbridgeError, LinkError, RunError
+from gapbridge.drivers.clock import Clock
 
 MAX_REST_SPEED = 0.003  # rad/s, of any joint of an arm at rest
 ARRIVAL_TOLERANCE = 0.05  # rad, of any joint
@@ -56,7 +56,10 @@ class LinkedJoints(JointSource):
 
     detects_rest = True
 
-    def __init__(self, cell: Cell, settle: float, speed: float, folder: Path, move: bool) -> None:
+    def __init__(
+        self, cell: Cell, settle: float, speed: float, folder: Path, move: bool, clock: Clock
+    ) -> None:
+        self._clock = clock
         self._settle, self._speed, self._folder = settle, speed, folder
         self.can_move = move
         self._settings = settings_of(cell).model_copy(
@@ -93,11 +96,11 @@ class LinkedJoints(JointSource):
 
     def sample_at_rest(self, pose: PlannedPose) -> JointSample:
         """Return a sample. Raises ReadingError if the arm moves or its force is not steady."""
-        until = time.monotonic() + max(5.0, 4.0 * self._settle)
-        while time.monotonic() < until:
+        until = self._clock.monotonic() + max(5.0, 4.0 * self._settle)
+        while self._clock.monotonic() < until:
             if self._at_rest() and self._force_steady():
                 return self._sample()
-            time.sleep(0.02)
+            self._clock.sleep(0.02)
         why = "the force at the tool is not steady" if self._at_rest() else "the arm moves"
         raise ReadingError(f"{why}, expected it at rest for {self._settle:g} s")
 
@@ -126,7 +129,7 @@ class LinkedJoints(JointSource):
         """Wait until the arm rests at the pose, then disarm the daemon. Raises RunError."""
         run = self._active_run()
         limit = MAX_SLOWDOWN * duration + LINK_MARGIN
-        until = time.monotonic() + limit
+        until = self._clock.monotonic() + limit
         writing, message_count = False, 0
         while True:
             state = run.daemon.state
@@ -139,27 +142,28 @@ class LinkedJoints(JointSource):
             at_pose = q is not None and np.abs(q - pose.q).max() < ARRIVAL_TOLERANCE / 10
             if writing and at_pose and run.daemon.memory.ended and self._at_rest():
                 break
-            if time.monotonic() > until:
+            if self._clock.monotonic() > until:
                 run.stop()
                 raise RunError(f"the arm did not arrive within {limit:.0f} s")
-            time.sleep(0.02)
+            self._clock.sleep(0.02)
         run.daemon.disarm()
-        while run.daemon.state.writes and time.monotonic() < until:
-            time.sleep(0.02)
+        while run.daemon.state.writes and self._clock.monotonic() < until:
+            self._clock.sleep(0.02)
 
     # -- cycles of the daemon ----------------------------------------------------------------------
 
     def _start(self, settings: DaemonSettings, write: bool) -> None:
-        self._run = run = DaemonRun(settings, write)
-        started = time.monotonic()
+        self._run = run = DaemonRun(settings, write, self._clock)
+        started = self._clock.monotonic()
         limit = settings.link.connect_timeout + LINK_MARGIN
         until = started + limit
         while not len(self._recent_cycles(1.0)):
-            if run.daemon.phase == Phase.STARTING and time.monotonic() < started + START_TIMEOUT:
-                until = time.monotonic() + limit  # slow imports on a busy machine
-            if time.monotonic() > until:
+            now = self._clock.monotonic()
+            if run.daemon.phase == Phase.STARTING and now < started + START_TIMEOUT:
+                until = now + limit  # slow imports on a busy machine
+            if now > until:
                 raise LinkError("the arm reports nothing, expected its joints")
-            time.sleep(0.02)
+            self._clock.sleep(0.02)
 
     def _active_run(self) -> DaemonRun:
         if self._run is None:
@@ -233,8 +237,8 @@ def write_move(path: Path, stops: Sequence[Array], speed: float) -> float:
 class DaemonRun:
     """One run of the daemon in a thread, with a buffer of its last cycles."""
 
-    def __init__(self, settings: DaemonSettings, write: bool) -> None:
-        self.daemon = Daemon(settings, may_write=write, say=self._say)
+    def __init__(self, settings: DaemonSettings, write: bool, clock: Clock) -> None:
+        self.daemon = Daemon(settings, write, clock, self._say)
         self.slices = self.daemon.memory.slices
         self.rows = np.empty((0, self.daemon.memory.width))
         self.approach = np.zeros(self.daemon.memory.n)

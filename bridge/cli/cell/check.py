@@ -20,6 +20,7 @@ from gapbridge.bridge.setpoint_source import make_source
 from gapbridge.core.calibration.spread import parameters_named
 from gapbridge.core.errors import InputError
 from gapbridge.drivers import make_driver
+from gapbridge.drivers.clock import SYSTEM
 from gapbridge.drivers.link_settings import ProfileSettings
 
 
@@ -55,7 +56,7 @@ def check(cell: Path, live: bool, logs: tuple[Path, ...]) -> None:
             errors += findings.errors
             warnings += findings.warnings
         if live and not errors:
-            findings = live_findings(opened)
+            findings = live_findings(opened, SYSTEM)
             errors += findings.errors
             warnings += findings.warnings
         for log in logs if not errors else ():
@@ -99,12 +100,14 @@ def _run_findings(cell: Cell) -> Findings:
     try:
         settings = read_configuration(cell.path).settings
         if isinstance(settings.link, ProfileSettings):
-            make_driver(settings.link, cell.model)  # checks the profile against the arm
+            make_driver(
+                settings.link, cell.model, clock=SYSTEM
+            )  # checks the profile against the arm
     except InputError as error:
         return Findings([located_message(cell.document, error)], [])
     setpoints, rate = settings.setpoints, settings.link.rate
     try:
-        make_source(setpoints, cell.arm.n, True, cell.path.parent, rate)
+        make_source(setpoints, cell.arm.n, True, cell.path.parent, SYSTEM, rate)
     except InputError as error:
         keys = error.keys or ("setpoints", "file")
         return Findings([message_at(cell.document, keys, error.message)], [])

@@ -27,6 +27,7 @@ from gapbridge.core.errors import GapbridgeError, Implausible, InputError, Inval
 from gapbridge.core.model import Model
 from gapbridge.core.urdf import arm_from_urdf
 from gapbridge.drivers import make_driver
+from gapbridge.drivers.clock import SYSTEM
 from gapbridge.drivers.controller_facts import ControllerFacts
 from gapbridge.drivers.ur_rtde.enquiry import enquire
 
@@ -93,7 +94,7 @@ def init(
         link[key] = value
     settings = _settings(link)
     located = settings.located(Path.cwd())
-    facts = enquire(host) if driver == "ur_rtde" else _read_facts(located, arm_options)
+    facts = enquire(host, SYSTEM) if driver == "ur_rtde" else _read_facts(located, arm_options)
     link |= {str(keys[-1]): _path_from_cell(path, out) for keys, path in settings.paths()}
     urdf = None if arm_options.urdf is None else _path_from_cell(arm_options.urdf, out)
     options = InitOptions(link, arm_options.model, urdf, arm_options.tip)
@@ -160,7 +161,7 @@ def _read_facts(link: LinkSettings, arm_options: ArmOptions) -> ControllerFacts:
             "FILE: its controller does not report which arm it moves"
         )
     arm = arm_from_urdf(urdf, tip) if urdf is not None else builtin_arm(str(model))
-    with make_driver(link, Model(arm=arm)) as driver:
+    with make_driver(link, Model(arm=arm), clock=SYSTEM) as driver:
         try:
             return driver.facts(read_valid_state(driver))
         except InvalidStateError as error:

@@ -29,6 +29,7 @@ from gapbridge.bridge.fleet.workers.dask_workers import DaskWorkers
 from gapbridge.bridge.fleet.workers.local_workers import LocalWorkers
 from gapbridge.bridge.fleet.workers.workers import Workers
 from gapbridge.core.errors import InputError, RunError
+from gapbridge.drivers.clock import SYSTEM
 
 OUT = Path("out/fleet")
 
@@ -155,7 +156,7 @@ def _run(
     for outcome in bad:
         _print_skipped(outcome)
     with (
-        Journal(options.out / f"{name}.jsonl", fresh=options.fresh) as journal,
+        Journal(options.out / f"{name}.jsonl", SYSTEM, fresh=options.fresh) as journal,
         progress(f"{name}: sessions", len(tasks)) as advance,
     ):
 

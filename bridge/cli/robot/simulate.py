@@ -9,6 +9,7 @@ import click
 
 from gapbridge.bridge.cell.simulation import serve_cell
 from gapbridge.bridge.cli.options import cell_argument, open_cell
+from gapbridge.drivers.clock import SYSTEM
 
 
 @click.command()
@@ -27,4 +28,4 @@ def simulate(cell: Path, host: str | None, seed: int | None) -> None:
     stopped: list[int] = []
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda n, _: stopped.append(n))
-    serve_cell(open_cell(cell), host, seed, lambda: bool(stopped), click.echo)
+    serve_cell(open_cell(cell), host, seed, lambda: bool(stopped), click.echo, SYSTEM)

@@ -11,10 +11,10 @@ import os
 import selectors
 import socket
 import threading
-import time
 from typing import Self
 
 from gapbridge.drivers.addresses import is_loopback
+from gapbridge.drivers.clock import Clock
 from gapbridge.drivers.simulated.can.frame import Frame
 from gapbridge.drivers.simulated.can.port import Port, SerialPort, SocketcandPort
 
@@ -24,7 +24,8 @@ MOST_PORTS = 64
 class Hub:
     """One simulated bus, served by a thread between ``start`` and ``close``."""
 
-    def __init__(self, host: str = "127.0.0.1", port: int = 0) -> None:
+    def __init__(self, clock: Clock, host: str = "127.0.0.1", port: int = 0) -> None:
+        self._clock = clock
         if not is_loopback(host):
             raise ValueError(f"host: found {host!r}, expected a loopback address (127.x.x.x)")
         self.host = host
@@ -129,7 +130,7 @@ class Hub:
             return
         link.setblocking(False)
         link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self._add(SocketcandPort(link))
+        self._add(SocketcandPort(link, self._clock))
 
     def _add(self, port: Port) -> None:
         with self._lock:
@@ -149,7 +150,7 @@ class Hub:
 
     def _broadcast(self, frame: Frame, source: Port | None) -> None:
         self.frames += 1
-        stamp = time.time()
+        stamp = self._clock.time()
         for port in list(self._ports.values()):
             if port is source:
                 continue

@@ -14,6 +14,7 @@ import can
 from gapbridge.core.errors import InputError, LinkError
 from gapbridge.drivers.can.settings import CanSettings
 from gapbridge.drivers.can_bus.bus import BusSettings, close_bus, open_bus
+from gapbridge.drivers.clock import Clock
 from gapbridge.drivers.simulated.can.frame import Frame
 from gapbridge.drivers.simulated.can.hub import Hub
 from gapbridge.drivers.simulated.can.port import InnerPort
@@ -52,12 +53,13 @@ class CanNodes(ProtocolServer):
 
     # -- the bus ----------------------------------------------------------------------------------
 
-    def open(self, controller: ArmController) -> None:
+    def open(self, controller: ArmController, clock: Clock) -> None:
         """Serve or join the bus. Raises LinkError, OSError, InputError."""
         link: BusSettings = self._link
         if link.interface in ("socketcand", "slcan"):
             port = link.port if link.interface == "socketcand" else 0
-            self._hub = Hub(link.host if link.interface == "socketcand" else "127.0.0.1", port)
+            host = link.host if link.interface == "socketcand" else "127.0.0.1"
+            self._hub = Hub(clock, host, port)
             self._hub.start()
             if link.interface == "slcan":
                 self._put_terminal(Path(link.channel))

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 import struct
-import time
 
 from gapbridge.drivers.can.settings import CanSettings
+from gapbridge.drivers.clock import Clock
 from gapbridge.drivers.simulated.can.nodes import CanNodes
 from gapbridge.drivers.simulated.server.arm_controller import ArmController
 
@@ -29,6 +29,11 @@ class OdriveNodes(CanNodes):
         self._target = list(controller.target_q)
         self._count = 0
         self._due = 0.0  # s, monotonic: when the next encoder estimate is sent
+
+    def open(self, controller: ArmController, clock: Clock) -> None:
+        """Serve or join the bus; see CanNodes.open."""
+        self._now = clock.monotonic
+        super().open(controller, clock)
 
     def take(self, identifier: int, data: bytes, controller: ArmController) -> None:
         """Execute state, mode, position, e-stop and clear."""
@@ -67,12 +72,12 @@ class OdriveNodes(CanNodes):
         A late estimate puts off the next: the firmware (CANSimple::service_stack) counts its period
         from when the last one left, and never sends two at once to catch up.
         """
-        if time.monotonic() >= self._due:
+        if self._now() >= self._due:
             self.begin_sample()
             rows = zip(self.wire(TURN), self.speeds(controller, TURN), strict=True)
             for node, (turns, speed) in enumerate(rows):
                 self.send(node << 5 | ENCODER, struct.pack("<ff", turns, speed))
-            self._due = time.monotonic() + ENCODER_PERIOD
+            self._due = self._now() + ENCODER_PERIOD
         if self._count % HEARTBEAT_EVERY == 0:
             error = 0 if controller.can_move else ESTOP_REQUESTED
             for node, state in enumerate(self.state):

@@ -8,10 +8,10 @@ import math
 import os
 import socket
 import termios
-import time
 from abc import ABC, abstractmethod
 from collections import deque
 
+from gapbridge.drivers.clock import Clock
 from gapbridge.drivers.simulated.can.frame import Frame
 
 BACKLOG = 1 << 20  # unread bytes after which a client is disconnected
@@ -73,8 +73,9 @@ class SocketcandPort(Port):
     at once, as python-can expects.
     """
 
-    def __init__(self, link: socket.socket) -> None:
+    def __init__(self, link: socket.socket, clock: Clock) -> None:
         super().__init__(link.fileno())
+        self._now = clock.monotonic
         self._link = link
         self._frames_from = math.inf  # s, monotonic
         self._write(b"< hi >")
@@ -96,7 +97,7 @@ class SocketcandPort(Port):
             case ["open", _]:
                 self._write(b"< ok >")
             case ["rawmode"]:
-                self._frames_from = time.monotonic() + QUIET
+                self._frames_from = self._now() + QUIET
                 self._write(b"< ok >")
             case ["echo"]:
                 self._write(b"< echo >")
@@ -111,7 +112,7 @@ class SocketcandPort(Port):
 
     def deliver(self, frame: Frame, stamp: float) -> None:
         """Send ``< frame id seconds.microseconds data >``."""
-        if time.monotonic() >= self._frames_from:
+        if self._now() >= self._frames_from:
             name = f"{frame.id:08X}" if frame.extended else f"{frame.id:03X}"
             self._write(f"< frame {name} {stamp:.6f} {frame.data.hex().upper()} >".encode())
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import threading
-import time
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -15,6 +14,7 @@ from gapbridge.core.errors import InputError, LinkError
 from gapbridge.drivers.can_bus.bus import BusSettings, close_bus, open_bus
 from gapbridge.drivers.canopen.profile import CanopenProfile, read_profile
 from gapbridge.drivers.canopen.settings import CanopenSettings
+from gapbridge.drivers.clock import Clock
 from gapbridge.drivers.simulated.can.hub import Hub
 from gapbridge.drivers.simulated.canopen.drive import COMMUNICATION, Drive, Units
 from gapbridge.drivers.simulated.canopen.machine import Phase
@@ -63,9 +63,9 @@ class _Network(canopen.Network):
 class _Listener(MessageListener):
     """Passes frames to the server, one at a time."""
 
-    def __init__(self, server: CanopenServer, network: Any) -> None:
+    def __init__(self, server: CanopenServer, network: Any, clock: Clock) -> None:
         super().__init__(network)
-        self._server = server
+        self._server, self._clock = server, clock
 
     def on_message_received(self, msg: Any) -> None:
         if msg.is_error_frame or msg.is_remote_frame or msg.is_extended_id:
@@ -75,7 +75,7 @@ class _Listener(MessageListener):
             self._server.take_frame(int(msg.arbitration_id), bytes(msg.data))
 
     def on_error(self, exc: Exception) -> None:
-        time.sleep(PAUSE)  # the bus is lost: the server's cycle detects it
+        self._clock.sleep(PAUSE)  # the bus is lost: the server's cycle detects it
 
 
 class CanopenServer(ProtocolServer):
@@ -113,11 +113,11 @@ class CanopenServer(ProtocolServer):
 
     # -- the bus ----------------------------------------------------------------------------------
 
-    def open(self, controller: ArmController) -> None:
+    def open(self, controller: ArmController, clock: Clock) -> None:
         """Serve or join the bus, and start the drives. Raises LinkError, OSError, InputError."""
-        link = self._link
+        link, self._now = self._link, clock.monotonic
         if link.interface == "socketcand":
-            self._hub = Hub(link.host, link.port)
+            self._hub = Hub(clock, link.host, link.port)
             self._hub.start()
             link = link.model_copy(update={"port": self._hub.port})
         elif link.interface not in ("virtual", "socketcan"):
@@ -127,7 +127,7 @@ class CanopenServer(ProtocolServer):
                 ("link", "interface"),
             )
         network: Any = _Network(open_bus(link))
-        network.listeners[:] = [_Listener(self, network)]
+        network.listeners[:] = [_Listener(self, network, clock)]
         with self.lock:
             self._network = network
             for drive in self.drives:
@@ -202,7 +202,7 @@ class CanopenServer(ProtocolServer):
         count, delay = self._late.pop(drive.node)
         if count > 1:
             self._late[drive.node] = (count - 1, delay)
-        due, right = time.monotonic() + delay, drive.samples()
+        due, right = self._now() + delay, drive.samples()
         wrong = drive.samples_off_by(OFF_BY)
         self._delayed += [
             DelayedPdo(due, self._syncs, cob_id, data, off)
@@ -230,7 +230,7 @@ class CanopenServer(ProtocolServer):
                 return
             self._network.set_mute(controller.stalled)
             self._follow_stops(controller)
-            self._send_delayed(time.monotonic())
+            self._send_delayed(self._now())
             self._watch_heartbeats(controller)
             self._move(controller)
             if not controller.frozen:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import struct
-import time
 from typing import Any
 
 import can
 import numpy as np
 
 from gapbridge.drivers.can_bus.bus import BusSettings, close_bus, open_bus
+from gapbridge.drivers.clock import Clock
 from gapbridge.drivers.simulated.ft_sensor.node import Reaction, SimulatedSensor
 
 RANGE = np.array((600.0, 600.0, 600.0, 60.0, 60.0, 60.0))  # N, Nm at about full gauges
@@ -101,12 +101,13 @@ class RobotousNode(SimulatedSensor):
         self,
         reaction: Reaction,
         bus: BusSettings,
+        clock: Clock,
         command_id: int = 0x64,
         reply_ids: tuple[int, int] = (0x01, 0x02),
         rate: float = 200.0,
     ) -> None:
         super().__init__(reaction)
-        self._settings = bus
+        self._settings, self._now = bus, clock.monotonic
         self._command_id, self._reply_ids, self._period = command_id, reply_ids, 1.0 / rate
         self._bus: Any = None
         self.streaming = False
@@ -121,16 +122,16 @@ class RobotousNode(SimulatedSensor):
 
     def serve(self) -> None:
         """Obey commands and stream."""
-        due = time.monotonic()
+        due = self._now()
         try:
             while not self._ended.is_set():
-                command = self._bus.recv(max(due - time.monotonic(), 0.0))
+                command = self._bus.recv(max(due - self._now(), 0.0))
                 if command is not None and len(command.data) == 8 and not self.silent:
                     self.streaming = (self.streaming or command.data[0] == 0x0B) and (
                         command.data[0] != 0x0C
                     )
-                if time.monotonic() >= due:
-                    due = max(due + self._period, time.monotonic() - 0.1)
+                if self._now() >= due:
+                    due = max(due + self._period, self._now() - 0.1)
                     if self.streaming and not self.silent:
                         self._send_sample()
         except (can.CanError, OSError):

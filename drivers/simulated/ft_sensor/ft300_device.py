@@ -7,7 +7,6 @@ import contextlib
 import os
 import select
 import struct
-import time
 import tty
 from pathlib import Path
 
@@ -17,6 +16,7 @@ from pymodbus.server import ModbusSerialServer
 from pymodbus.simulator import DataType, SimData, SimDevice
 
 from gapbridge.core.errors import LinkError
+from gapbridge.drivers.clock import Clock
 from gapbridge.drivers.simulated.ft_sensor.node import Reaction, SimulatedSensor
 
 REGISTERS, STREAM_REGISTER, STREAM = 180, 410, 0x0200
@@ -32,8 +32,11 @@ class Ft300Device(SimulatedSensor):
     and puts the stream on the line, so that the wire carries what the device's would.
     """
 
-    def __init__(self, reaction: Reaction, link: Path | None = None, device_id: int = 9) -> None:
+    def __init__(
+        self, reaction: Reaction, clock: Clock, link: Path | None = None, device_id: int = 9
+    ) -> None:
         super().__init__(reaction)
+        self._now = clock.monotonic
         self.path = ""
         self.streaming = False
         self.sent = 0  # samples streamed
@@ -83,11 +86,11 @@ class Ft300Device(SimulatedSensor):
         )
         server = ModbusSerialServer(device, port=self._server_path, baudrate=19200)
         await server.serve_forever(background=True)
-        self._due = time.monotonic()
+        self._due = self._now()
         while not self._ended.is_set():
             self._pass_bytes()
-            if self.streaming and not self.silent and time.monotonic() >= self._due:
-                self._due = max(self._due + PERIOD, time.monotonic() - 0.1)
+            if self.streaming and not self.silent and self._now() >= self._due:
+                self._due = max(self._due + PERIOD, self._now() - 0.1)
                 self.put(self.frame())
                 self.sent += 1
             await asyncio.sleep(0.001)
@@ -109,7 +112,7 @@ class Ft300Device(SimulatedSensor):
             current_registers[first : first + 6] = values
         elif set_values is not None and address == STREAM_REGISTER:
             self.streaming = list(set_values)[:1] == [STREAM]
-            self._due = time.monotonic() + LINGER
+            self._due = self._now() + LINGER
         return None
 
     def frame(self) -> bytes:

@@ -10,6 +10,7 @@ from pathlib import Path
 from gapbridge.core.errors import InputError, LinkError
 from gapbridge.drivers.addresses import is_loopback
 from gapbridge.drivers.can_bus.bus import BusSettings
+from gapbridge.drivers.clock import Clock
 from gapbridge.drivers.ft_sensor.settings import (
     AtiSettings,
     FtSensorSettings,
@@ -27,8 +28,9 @@ BETWEEN_PROCESSES = ("socketcand", "socketcan")
 
 @contextlib.contextmanager
 def served_sensor(
-    settings: FtSensorSettings | None, in_flange: Callable[[], Sequence[float]], link: object = None
-) -> Iterator[None]:
+    settings: FtSensorSettings | None, in_flange: Callable[[], Sequence[float]], clock: Clock,
+    link: object = None,
+) -> Iterator[None]:  # fmt: skip
     """Serve the sensor of a cell while the ``with`` block lasts; None: nothing to serve.
 
     ``in_flange`` returns the plant's wrench on the flange (6,). A CAN bus over socketcand is served
@@ -39,19 +41,20 @@ def served_sensor(
         yield
         return
     frame = settings.sensor_in_flange
-    sensor = _device(settings, reaction_at(in_flange, frame.xyz, frame.rpy, settings.sign))
+    reaction = reaction_at(in_flange, frame.xyz, frame.rpy, settings.sign)
+    sensor = _device(settings, reaction, clock)
     with contextlib.ExitStack() as stack:
         if isinstance(settings, BusSettings) and settings.interface == "socketcand":
             if _same_bus(settings, link):
-                stack.enter_context(_started_later(sensor))
+                stack.enter_context(_started_later(sensor, clock))
                 yield
                 return
-            stack.enter_context(contextlib.closing(_hub(settings)))
+            stack.enter_context(contextlib.closing(_hub(settings, clock)))
         stack.enter_context(sensor)
         yield
 
 
-def _device(settings: FtSensorSettings, reaction: Reaction) -> SimulatedSensor:
+def _device(settings: FtSensorSettings, reaction: Reaction, clock: Clock) -> SimulatedSensor:
     if isinstance(settings, RobotiqSettings):
         port = Path(settings.port)
         if (port.exists() and not port.is_symlink()) or not port.parent.is_dir():
@@ -59,7 +62,7 @@ def _device(settings: FtSensorSettings, reaction: Reaction) -> SimulatedSensor:
                 f"ft_sensor.port: found {settings.port}, expected a name that is free, as "
                 "/tmp/ft300, where a link to the simulated line can be put"
             )
-        return Ft300Device(reaction, port, settings.device_id)
+        return Ft300Device(reaction, clock, port, settings.device_id)
     if isinstance(settings, BusSettings) and settings.interface not in BETWEEN_PROCESSES:
         raise InputError(
             f"ft_sensor.interface: found {settings.interface!r}, expected socketcand or socketcan: "
@@ -67,7 +70,7 @@ def _device(settings: FtSensorSettings, reaction: Reaction) -> SimulatedSensor:
         )
     if isinstance(settings, RobotousSettings):
         return RobotousNode(
-            reaction, settings, settings.command_id, settings.reply_ids, settings.rate
+            reaction, settings, clock, settings.command_id, settings.reply_ids, settings.rate
         )
     if isinstance(settings, AtiSettings):
         return AtiNode(reaction, settings, settings.base_id)
@@ -79,25 +82,25 @@ def _same_bus(settings: BusSettings, link: object) -> bool:
     return all(getattr(link, key, None) == getattr(settings, key) for key in keys)
 
 
-def _hub(settings: BusSettings) -> Hub:
+def _hub(settings: BusSettings, clock: Clock) -> Hub:
     if not is_loopback(settings.host):
         raise InputError(
             f"ft_sensor.host: found {settings.host!r}, expected a loopback address (127.x.x.x): "
             "a simulated sensor is never served to others"
         )
     try:
-        return Hub(settings.host, settings.port).start()
+        return Hub(clock, settings.host, settings.port).start()
     except OSError as error:
         raise LinkError(f"{settings.where()}: cannot be served: {error.strerror}") from None
 
 
 @contextlib.contextmanager
-def _started_later(sensor: SimulatedSensor) -> Iterator[None]:
+def _started_later(sensor: SimulatedSensor, clock: Clock) -> Iterator[None]:
     """Start the sensor as soon as its bus is served."""
     ended = threading.Event()
 
     def wait_for_bus() -> None:
-        while not ended.wait(RETRY):
+        while not clock.wait(ended, RETRY):
             with contextlib.suppress(LinkError):
                 sensor.start()
                 return

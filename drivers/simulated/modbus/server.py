@@ -19,6 +19,7 @@ from pymodbus.server import ModbusSerialServer, ModbusTcpServer, ModbusTlsServer
 from pymodbus.simulator import DataType, SimData, SimDevice
 
 from gapbridge.core.errors import LinkError
+from gapbridge.drivers.clock import Clock
 from gapbridge.drivers.modbus.map import compile_map
 from gapbridge.drivers.modbus.profile import read_profile
 from gapbridge.drivers.modbus.registers import BIT_TABLES, Table
@@ -73,7 +74,7 @@ class ModbusServer(ProtocolServer):
 
     # -- the thread -------------------------------------------------------------------------------
 
-    def open(self, controller: ArmController) -> None:
+    def open(self, controller: ArmController, clock: Clock) -> None:
         """Start serving. Raises LinkError if the port is taken."""
         self._controller, self._failure = controller, None
         self._publish(controller)
@@ -82,7 +83,7 @@ class ModbusServer(ProtocolServer):
             target=self._run, args=(listening,), daemon=True, name="simulated Modbus"
         )
         self._thread.start()
-        if not listening.wait(START_LIMIT) or self._failure is not None:
+        if not clock.wait(listening, START_LIMIT) or self._failure is not None:
             raise LinkError(
                 f"simulated controller: {self._serial or f'{self._host}:{self._port}'}: "
                 f"cannot listen: {self._failure or 'no answer'}"

@@ -9,11 +9,11 @@ import os
 import select
 import socket
 import sys
-import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Protocol
 
 from gapbridge.core.errors import LinkError
+from gapbridge.drivers.clock import Clock
 from gapbridge.drivers.simulated.server.arm_controller import ArmController
 from gapbridge.drivers.simulated.server.bench import BenchServer, Command
 from gapbridge.drivers.simulated.server.connection import Connection, listen
@@ -38,8 +38,8 @@ class ProtocolServer:
 
     name = "server"
 
-    def open(self, controller: ArmController) -> None:
-        """Open ports. Raises OSError or LinkError if that fails."""
+    def open(self, controller: ArmController, clock: Clock) -> None:
+        """Open ports; ``clock`` is for what does not go by cycles. Raises OSError or LinkError."""
 
     def cycle(self, controller: ArmController) -> None:
         """Read what clients have sent, command the arm, publish its state; after each cycle."""
@@ -71,7 +71,9 @@ class ServerLoop:
         servers: Sequence[ProtocolServer],
         host: str,
         bench_port: int,
+        clock: Clock,
     ) -> None:
+        self._clock = clock
         self.controller, self.servers, self.host = controller, servers, host
         self._port = bench_port
         self._listener: socket.socket | None = None
@@ -91,7 +93,7 @@ class ServerLoop:
         try:
             self._listener = listen(self.host, self._port)
             for server in self.servers:
-                server.open(self.controller)
+                server.open(self.controller, self._clock)
         except OSError as error:
             self.close()
             raise LinkError(
@@ -103,12 +105,12 @@ class ServerLoop:
 
     def run(self, stop: Callable[[], bool]) -> None:
         """Serve until `stop()` is true; it is asked once per cycle."""
-        controller = self.controller
-        deadline = time.monotonic()
+        controller, clock = self.controller, self._clock
+        deadline = clock.monotonic()
         while not stop():
             deadline += controller.period
             self._serve_until(deadline)
-            now = time.monotonic()
+            now = clock.monotonic()
             if now - deadline > LATE:
                 deadline = now
             controller.cycle()
@@ -118,7 +120,7 @@ class ServerLoop:
 
     def _serve_until(self, deadline: float) -> None:
         while True:
-            remaining = deadline - time.monotonic()
+            remaining = deadline - self._clock.monotonic()
             owners = {s.fileno(): (server, s) for server in self.servers for s in server.sockets()}
             clients = {c.fileno(): c for c in self._clients}
             listener = [self._listener.fileno()] if self._listener else []
@@ -161,21 +163,22 @@ def serve_controller(
     servers: Sequence[ProtocolServer],
     host: str,
     bench_port: int,
+    clock: Clock,
     stop: Callable[[], bool] | None = None,
 ) -> None:
     """Serve a controller in this process until `stop()` is true (never, if it is None).
 
     Prints ``ready <host>`` to stdout when every port listens. Raises LinkError where one is taken.
     """
-    loop = ServerLoop(controller, servers, host, bench_port)
+    loop = ServerLoop(controller, servers, host, bench_port, clock)
     loop.open()
     become_punctual()  # from here on nothing is collected by itself
-    collected = time.monotonic()
+    collected = clock.monotonic()
 
     def over() -> bool:
         nonlocal collected
-        if time.monotonic() - collected > COLLECT_EVERY:
-            collected = time.monotonic()
+        if (now := clock.monotonic()) - collected > COLLECT_EVERY:
+            collected = now
             gc.collect(1)
         return stop is not None and stop()
 

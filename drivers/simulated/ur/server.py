@@ -7,13 +7,13 @@ import logging
 import select
 import socket
 import sys
-import time
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import partial
 
 from gapbridge.core.errors import LinkError
+from gapbridge.drivers.clock import Clock
 from gapbridge.drivers.simulated.server.bench import BenchServer
 from gapbridge.drivers.simulated.server.connection import Connection, listen
 from gapbridge.drivers.simulated.server.protocol_server import become_punctual
@@ -44,7 +44,8 @@ class Listener:
 class Server:
     """All ports of one controller on one loopback address."""
 
-    def __init__(self, settings: ServerSettings) -> None:
+    def __init__(self, settings: ServerSettings, clock: Clock) -> None:
+        self._now = clock.monotonic
         self.controller: Controller = make_controller(settings)
         version = ".".join(str(v) for v in (*settings.version, 0))
         self.rtde = RtdeServer(self.controller, (*settings.version, 0))
@@ -94,7 +95,7 @@ class Server:
     def run(self, stop: Callable[[], bool]) -> None:
         """Serve until `stop()` is true; it is asked once per cycle."""
         controller, rtde = self.controller, self.rtde
-        deadline = time.monotonic()
+        deadline = self._now()
         cycles = 0
         while not stop():
             self._serve_until(deadline + 0.5 * CYCLE)
@@ -106,7 +107,7 @@ class Server:
             self._serve_until(deadline - LEAD)
             controller.cycle()
             self._serve_until(deadline)
-            now = time.monotonic()
+            now = self._now()
             if now - deadline > LATE:
                 deadline = now
             rtde.publish(CYCLE)
@@ -115,7 +116,7 @@ class Server:
     def _serve_until(self, deadline: float) -> None:
         """Answer clients until the next cycle is due."""
         while True:
-            remaining = deadline - time.monotonic()
+            remaining = deadline - self._now()
             watched = [*self._listeners, *self._clients]
             try:
                 ready, _, _ = select.select(watched, [], [], max(remaining, 0.0))
@@ -166,6 +167,7 @@ Beside = Callable[[Callable[[], Sequence[float]]], AbstractContextManager[None]]
 
 def serve(
     settings: ServerSettings,
+    clock: Clock,
     stop: Callable[[], bool] | None = None,
     beside: Beside = lambda _: nullcontext(),
 ) -> None:
@@ -175,7 +177,7 @@ def serve(
     listens. Raises LinkError where a port is taken. Must run in a process of its own: ur_rtde's
     constructors hold the interpreter lock.
     """
-    server = Server(settings)
+    server = Server(settings, clock)
     memory = server.controller.memory
     try:
         with beside(lambda: memory["ft_raw_wrench"]):

@@ -8,10 +8,13 @@ import pytest
 
 from gapbridge.bridge.cell import live
 from gapbridge.core.errors import InvalidStateError, LinkError, StaleStateError
+from gapbridge.drivers.clock import SYSTEM
 
 
 class Bus:
     """Raises the given errors, then returns a state."""
+
+    clock = SYSTEM
 
     def __init__(self, *errors: Exception) -> None:
         self.errors = list(errors)

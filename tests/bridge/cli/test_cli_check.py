@@ -16,6 +16,7 @@ from gapbridge.bridge.cell import load_cell
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.model import Model
 from gapbridge.core.plausibility import flange_in_first
+from gapbridge.drivers.clock import SYSTEM
 from gapbridge.drivers.controller_facts import ControllerFacts, differences
 from gapbridge.drivers.simulated.ur.settings import announced_rows
 from gapbridge.drivers.ur_rtde.enquiry import enquire
@@ -323,7 +324,7 @@ def test_a_recording_that_is_none_is_refused_in_one_line(tmp_path: Path) -> None
 
 
 def test_the_controller_reports_what_it_is(host: str) -> None:
-    facts = enquire(host)
+    facts = enquire(host, SYSTEM)
     assert (facts.n, facts.model, facts.version, facts.rate) == (6, "ur10e", "5.15.0", 500.0)
     assert facts.payload == 5.0
     assert facts.payload_cog is not None

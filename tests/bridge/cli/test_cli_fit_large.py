@@ -13,6 +13,7 @@ from pyarrow import parquet
 from gapbridge.bridge.cell import load_cell
 from gapbridge.bridge.cli.log import large_log
 from gapbridge.core.log.pieces import LogPieces
+from gapbridge.drivers.clock import SYSTEM
 
 Columns = dict[str, np.ndarray]
 
@@ -150,9 +151,11 @@ def test_a_recording_that_holds_no_measured_poses_says_so(tmp_path):
     from gapbridge.bridge.ipc.shared_memory import SharedMemory
     from gapbridge.bridge.recording.recorder import Recorder
 
-    page = SharedMemory(6)
+    page = SharedMemory(6, clock=SYSTEM)
     settings = RecordingSettings(folder=tmp_path, keep_free=0.0)
-    recorder = Recorder(settings, "run-20260101-000000", page, {"joints": 6}, lambda reported: None)
+    recorder = Recorder(
+        settings, "run-20260101-000000", page, {"joints": 6}, lambda reported: None, clock=SYSTEM
+    )
     for number in range(40):
         row = page.next_row()
         row[1:] = 0.1

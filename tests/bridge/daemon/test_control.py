@@ -24,6 +24,7 @@ from gapbridge.bridge.ipc.control_socket import ControlSocket, Peer
 from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.ipc.shared_memory import Phase
 from gapbridge.core.errors import InputError, RunError
+from gapbridge.drivers.clock import SYSTEM
 
 PATIENT = ", state_timeout: 0.25"  # a busy machine holds the simulated controller up
 
@@ -277,7 +278,7 @@ def test_a_disarming_that_no_loop_has_taken_is_not_called_done(
 ) -> None:
     monkeypatch.setattr(control, "LONGEST_PICKUP", 0.1)
     daemon = NoLoop()
-    reply = control.Control(daemon).answer("disarm", Peer(1, 2))  # type: ignore[arg-type]
+    reply = control.Control(daemon, clock=SYSTEM).answer("disarm", Peer(1, 2))  # type: ignore[arg-type]
     assert not reply["ok"]
     assert "no loop has taken it" in reply["error"]
     assert "kept for the next one" in reply["error"]
@@ -288,7 +289,7 @@ def test_a_disarming_is_asked_for_though_the_arm_seems_to_observe() -> None:
     """A person's arming may be on its way: what is asked for after it stands."""
     daemon = NoLoop()
     daemon.state, daemon.latched, daemon.last_taken = State.OBSERVING, "", 9
-    reply = control.Control(daemon).answer("disarm", Peer(1, 2))  # type: ignore[arg-type]
+    reply = control.Control(daemon, clock=SYSTEM).answer("disarm", Peer(1, 2))  # type: ignore[arg-type]
     assert reply == {"ok": True, "answer": "is observing already"}
     assert daemon.asked == 4
 
@@ -311,5 +312,5 @@ class GivesUp(NoLoop):
 
 
 def test_an_arming_that_the_loop_gives_up_is_answered_at_once_and_says_why() -> None:
-    reply = control.Control(GivesUp()).answer("arm", Peer(1, 2))  # type: ignore[arg-type]
+    reply = control.Control(GivesUp(), clock=SYSTEM).answer("arm", Peer(1, 2))  # type: ignore[arg-type]
     assert reply == {"ok": False, "error": "gap in time: found a gap of 0.408 s"}

@@ -18,6 +18,7 @@ from gapbridge.bridge.ipc.events import EventKind, EventLog
 from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.ipc.shared_memory import Phase
 from gapbridge.bridge.loop.supervisor import Cause
+from gapbridge.drivers.clock import SYSTEM
 
 pytestmark = pytest.mark.usefixtures("runtime")
 
@@ -34,7 +35,7 @@ class Taking:
         cell = folder / "cell.yaml"
         cell.write_text(CELL)
         self.running = read_configuration(cell)
-        self.reload = Reload(ServiceManager(), EventLog())
+        self.reload = Reload(ServiceManager(clock=SYSTEM), EventLog(clock=SYSTEM))
         self.request("arm")
         self.reload.ask()
 

@@ -17,6 +17,7 @@ from daemon_cell import Robot, gapbridge
 from patience import PATIENCE, wait_for
 
 from gapbridge.bridge.daemon.service_manager import ServiceManager
+from gapbridge.drivers.clock import SYSTEM
 
 UNIT = Path(__file__).parents[3] / "config" / "gapbridge@.service"
 
@@ -51,7 +52,7 @@ def test_signs_of_life_come_thrice_in_the_time_allowed(
     listener: Listener, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("WATCHDOG_USEC", "300000")
-    manager = ServiceManager()
+    manager = ServiceManager(clock=SYSTEM)
     begun = time.monotonic()
     while time.monotonic() - begun < 1.0:
         manager.kick()
@@ -63,17 +64,17 @@ def test_without_a_service_manager_or_with_a_dead_one_nothing_happens(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.delenv("NOTIFY_SOCKET", raising=False)
-    assert not ServiceManager().present
-    ServiceManager().ready()
+    assert not ServiceManager(clock=SYSTEM).present
+    ServiceManager(clock=SYSTEM).ready()
     monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "nobody"))
-    ServiceManager().ready()
+    ServiceManager(clock=SYSTEM).ready()
 
 
 def test_an_abstract_socket_is_reached_too(monkeypatch: pytest.MonkeyPatch) -> None:
     name = f"gapbridge-test-{os.getpid()}"
     listener = Listener(f"\0{name}")
     monkeypatch.setenv("NOTIFY_SOCKET", f"@{name}")
-    ServiceManager().stopping()
+    ServiceManager(clock=SYSTEM).stopping()
     assert listener.take() == ["STOPPING=1"]
     listener.socket.close()
 

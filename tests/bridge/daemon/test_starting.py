@@ -7,6 +7,7 @@ from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.ipc.shared_memory import slices_of
 from gapbridge.bridge.loop.main import _report_compiling
 from gapbridge.bridge.loop.supervisor import Cause
+from gapbridge.drivers.clock import SYSTEM
 
 
 def test_compiling_is_a_state_until_the_loop_connects() -> None:
@@ -18,7 +19,7 @@ def test_compiling_is_a_state_until_the_loop_connects() -> None:
         "starting: compiling for this machine, once",
         "starting: compiling for this machine, once (11 functions)",
     ]
-    status = DaemonStatus(slices_of(6))
+    status = DaemonStatus(slices_of(6), clock=SYSTEM)
     assert status.named(State.DISCONNECTED) == "disconnected"
     for event in events:
         status.on_event(event)
@@ -28,7 +29,7 @@ def test_compiling_is_a_state_until_the_loop_connects() -> None:
 
 
 def test_a_loop_that_dies_while_compiling_is_starting_no_more() -> None:
-    status = DaemonStatus(slices_of(6))
+    status = DaemonStatus(slices_of(6), clock=SYSTEM)
     status.on_event({"kind": "compiling", "detail": "starting: x"})
     status.lost_loop()
     assert status.named(State.DISCONNECTED) == "disconnected"
@@ -40,7 +41,7 @@ def transition(before: State, after: State, cause: Cause) -> dict[str, object]:
 
 
 def test_a_slip_stays_latched_through_a_fault_that_ends_with_the_link() -> None:
-    status = DaemonStatus(slices_of(6))
+    status = DaemonStatus(slices_of(6), clock=SYSTEM)
     status.on_event({"kind": "slip", "detail": "joint 3 slipped"})
     status.on_event(transition(State.COMPENSATING, State.HOLDING, Cause.ZERO_MOVED))
     status.on_event(transition(State.HOLDING, State.FAULT, Cause.WRITE_FAILED))

@@ -14,6 +14,7 @@ from gapbridge.bridge.fleet.session import find_sessions
 from gapbridge.bridge.fleet.task import BAD, DIED, DONE, Outcome, Task, run_task
 from gapbridge.bridge.fleet.workers.workers import Workers
 from gapbridge.core.errors import RunError
+from gapbridge.drivers.clock import SYSTEM
 from tests.bridge.fleet.fleet_in import tasks_in
 from tests.bridge.fleet.jobs import count_rows
 
@@ -24,21 +25,21 @@ def outcome(key: str, state: str = DONE) -> Outcome:
 
 def test_what_was_added_is_known_to_the_next_run(tmp_path: Path) -> None:
     path = tmp_path / "j.jsonl"
-    with Journal(path) as journal:
+    with Journal(path, clock=SYSTEM) as journal:
         journal.add(outcome("a"))
-    with Journal(path) as journal:
+    with Journal(path, clock=SYSTEM) as journal:
         assert journal.known("a") == outcome("a")
         assert journal.known("b") is None
 
 
 def test_a_line_that_was_cut_off_is_taken_away_and_the_rest_kept(tmp_path: Path) -> None:
     path = tmp_path / "j.jsonl"
-    with Journal(path) as journal:
+    with Journal(path, clock=SYSTEM) as journal:
         journal.add(outcome("a"))
         journal.add(outcome("b"))
     whole = path.read_bytes()
     path.write_bytes(whole[:-7])
-    with Journal(path) as journal:
+    with Journal(path, clock=SYSTEM) as journal:
         assert journal.known("a") is not None
         assert journal.known("b") is None
         journal.add(outcome("b"))
@@ -47,15 +48,15 @@ def test_a_line_that_was_cut_off_is_taken_away_and_the_rest_kept(tmp_path: Path)
 
 def test_two_runs_do_not_write_one_journal(tmp_path: Path) -> None:
     path = tmp_path / "j.jsonl"
-    with Journal(path), pytest.raises(RunError, match="another run writes it"):
-        Journal(path)
+    with Journal(path, clock=SYSTEM), pytest.raises(RunError, match="another run writes it"):
+        Journal(path, clock=SYSTEM)
 
 
 def test_fresh_forgets(tmp_path: Path) -> None:
     path = tmp_path / "j.jsonl"
-    with Journal(path) as journal:
+    with Journal(path, clock=SYSTEM) as journal:
         journal.add(outcome("a"))
-    with Journal(path, fresh=True) as journal:
+    with Journal(path, fresh=True, clock=SYSTEM) as journal:
         assert journal.known("a") is None
 
 
@@ -81,7 +82,7 @@ class InProcess(Workers):
 def resumed(tasks: list[Task], path: Path) -> list[str]:
     """Run the tasks and return the sessions that were not resumed."""
     workers = InProcess()
-    with Journal(path) as journal:
+    with Journal(path, clock=SYSTEM) as journal:
         run(tasks, [], workers, journal, lambda outcome: None)
     return workers.given
 
@@ -90,7 +91,7 @@ def test_a_run_goes_on_where_it_was_broken_off_and_redoes_what_has_changed(tmp_p
     names = ["a/s1", "a/s2", "b/s1"]
     tasks = tasks_in(tmp_path, names, count_rows)
     path = tmp_path / "j.jsonl"
-    with Journal(path) as journal:
+    with Journal(path, clock=SYSTEM) as journal:
         # as if broken off: one done, one bad, one whose workers died
         for task, state in zip(tasks, (DONE, BAD, DIED), strict=True):
             journal.add(Outcome(task.key, task.arm, task.session, "", "", state, 0.1))

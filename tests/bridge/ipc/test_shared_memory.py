@@ -13,11 +13,12 @@ import pytest
 
 from gapbridge.bridge.ipc.loop_counters import LoopCounter
 from gapbridge.bridge.ipc.shared_memory import ROWS, FollowedMemory, Phase, RunMemory, SharedMemory
+from gapbridge.drivers.clock import SYSTEM
 
 
 @pytest.fixture
 def memory() -> Iterator[SharedMemory]:
-    found = SharedMemory(2)
+    found = SharedMemory(2, clock=SYSTEM)
     yield found
     found.close()
 
@@ -41,12 +42,12 @@ def test_each_reader_has_its_own_place(memory: SharedMemory) -> None:
 def loop_of(run: RunMemory) -> SharedMemory:
     """Return the memory as the next process of the loop joins it."""
     run.renew()
-    return SharedMemory(2, os.dup(run.fd))
+    return SharedMemory(2, os.dup(run.fd), clock=SYSTEM)
 
 
 @pytest.fixture
 def run() -> Iterator[RunMemory]:
-    found = RunMemory(2)
+    found = RunMemory(2, clock=SYSTEM)
     yield found
     found.close()
 
@@ -80,18 +81,18 @@ def test_memory_is_shown_once_its_loop_alone_can_write_to_it(run: RunMemory) -> 
     run.renew()
     assert not run.promote()  # its loop is still starting
     assert os.path.sameopenfile(first, run.open_for_reading())
-    loop = SharedMemory(2, os.dup(run.fd))
+    loop = SharedMemory(2, os.dup(run.fd), clock=SYSTEM)
     assert run.promote()
     assert not run.promote()
     assert os.path.sameopenfile(run.fd, run.open_for_reading())
     with pytest.raises(PermissionError):
-        SharedMemory(2, os.dup(run.fd))
+        SharedMemory(2, os.dup(run.fd), clock=SYSTEM)
     loop.close()
 
 
 def test_who_reads_along_changes_over_and_misses_nothing(run: RunMemory) -> None:
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    side = FollowedMemory(2, run.open_for_reading(), theirs)
+    side = FollowedMemory(2, run.open_for_reading(), theirs, clock=SYSTEM)
     reader = side.reader()
     for k in range(3):
         loop = loop_of(run)
@@ -128,12 +129,13 @@ def test_who_only_reads_cannot_write(memory: SharedMemory) -> None:
     code = f"""
 import mmap, os
 from gapbridge.bridge.ipc.shared_memory import SharedMemory
-memory = SharedMemory(2, {fd}, writable=False)
+from gapbridge.drivers.clock import SYSTEM
+memory = SharedMemory(2, {fd}, writable=False, clock=SYSTEM)
 assert memory.reader().drain()[:, 1].tolist() == [7.0]
 again = os.open("/proc/self/fd/{fd}", os.O_RDWR)
 ways = (lambda: memory.note_state(3), lambda: os.write({fd}, b"x"), lambda: mmap.mmap({fd}, 64),
         lambda: os.pwrite(again, b"x", 0), lambda: mmap.mmap(again, 64),
-        lambda: os.ftruncate(again, 0), lambda: SharedMemory(2, again))
+        lambda: os.ftruncate(again, 0), lambda: SharedMemory(2, again, clock=SYSTEM))
 for way in ways:
     try:
         way()

@@ -53,7 +53,7 @@ DEAF = """
 
 @pytest.fixture
 def memory() -> Iterator[SharedMemory]:
-    found = SharedMemory(2)
+    found = SharedMemory(2, clock=SYSTEM)
     yield found
     found.close()
 
@@ -79,7 +79,7 @@ def start(
 
     def begin(text: str, clock: Clock = SYSTEM) -> SideProcess:
         (tmp_path / "side_under_test.py").write_text(textwrap.dedent(text), encoding="utf-8")
-        started.append(SideProcess("side_under_test", start_data, memory, sys.stderr, clock))
+        started.append(SideProcess("side_under_test", start_data, memory, clock, sys.stderr))
         return started[-1]
 
     yield begin
@@ -201,7 +201,8 @@ from gapbridge.bridge.ipc import side_main
 from gapbridge.bridge.ipc.shared_memory import SharedMemory
 from gapbridge.bridge.ipc.side_process import SideProcess
 from gapbridge.drivers.clock import SYSTEM, Clock
-side = SideProcess("side_under_test", json.loads({json.dumps(start_data)!r}), SharedMemory(2))
+side = SideProcess("side_under_test", json.loads({json.dumps(start_data)!r}),
+    SharedMemory(2, clock=SYSTEM), SYSTEM)
 while not side.events():
     time.sleep(0.02)
 print(side.pid, flush=True)

@@ -163,7 +163,7 @@ class Bench:
 
 @pytest.fixture
 def memory() -> Iterator[SharedMemory]:
-    found = SharedMemory(6)
+    found = SharedMemory(6, clock=SYSTEM)
     yield found
     found.close()
 

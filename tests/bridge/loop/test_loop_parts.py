@@ -15,6 +15,7 @@ from gapbridge.bridge.loop.link_monitor import DRIFT, ControllerClock
 from gapbridge.bridge.loop.live_loads import LiveLoads
 from gapbridge.core.load_bounds import LoadBounds
 from gapbridge.core.state import RobotState
+from gapbridge.drivers.clock import SYSTEM
 
 Q = np.array([0.0, -1.5, 1.8])
 
@@ -110,7 +111,7 @@ def test_temperatures_are_passed_on() -> None:
 
 
 def test_missed_cycles_are_counted_by_the_controllers_clock() -> None:
-    clock = ControllerClock(500.0)
+    clock = ControllerClock(500.0, clock=SYSTEM)
     missed = [clock.take(state(t)) for t in (1.0, 1.002, 1.004, 1.010, 1.012)]
     assert missed == [0, 0, 0, 2, 0]
     clock.skip()
@@ -119,7 +120,7 @@ def test_missed_cycles_are_counted_by_the_controllers_clock() -> None:
 
 
 def test_age_counts_from_when_the_sample_could_have_been_here() -> None:
-    clock = ControllerClock(500.0)
+    clock = ControllerClock(500.0, clock=SYSTEM)
     now = time.monotonic()
     clock.take(state(1.0, now))
     clock.take(state(1.002, now + 0.002))
@@ -131,7 +132,7 @@ def test_age_counts_from_when_the_sample_could_have_been_here() -> None:
 
 
 def test_a_clock_that_drifts_is_followed() -> None:
-    clock = ControllerClock(500.0)
+    clock = ControllerClock(500.0, clock=SYSTEM)
     for k in range(100_000):
         clock.take(state(0.002 * k, 0.002 * k * (1 + 5e-5)))
     last = state(0.002 * 99_999, 0.002 * 99_999 * (1 + 5e-5))
@@ -141,7 +142,7 @@ def test_a_clock_that_drifts_is_followed() -> None:
 
 
 def test_a_break_does_not_make_the_state_after_it_younger() -> None:
-    clock = ControllerClock(500.0, hold=0.04)
+    clock = ControllerClock(500.0, hold=0.04, clock=SYSTEM)
     clock.take(state(1.0, 10.0), transit_known=True)
     after = state(1.6, 10.6 + 0.041)  # 41 ms old when it came to be read
     clock.take(after, transit_known=True)
@@ -151,7 +152,7 @@ def test_a_break_does_not_make_the_state_after_it_younger() -> None:
 
 
 def test_a_clock_that_stood_still_is_tied_anew_once_nothing_younger_comes() -> None:
-    clock = ControllerClock(500.0, hold=0.04)
+    clock = ControllerClock(500.0, hold=0.04, clock=SYSTEM)
     now = time.monotonic()
     clock.take(state(1.0, now - 0.3))
     for k in range(25):  # its clock stood still for 0.25 s, as it seems
@@ -162,7 +163,7 @@ def test_a_clock_that_stood_still_is_tied_anew_once_nothing_younger_comes() -> N
 
 
 def test_once_armed_samples_that_come_later_for_good_stay_old() -> None:
-    clock = ControllerClock(500.0, hold=0.04)
+    clock = ControllerClock(500.0, hold=0.04, clock=SYSTEM)
     now = time.monotonic()
     clock.take(state(1.0, now - 3.0), transit_known=True)
     for k in range(1, 1000):  # from then on 0.21 s later than before
@@ -176,7 +177,7 @@ def test_once_armed_samples_that_come_later_for_good_stay_old() -> None:
 
 
 def test_a_clock_that_is_set_forward_behind_late_samples_makes_none_of_them_younger() -> None:
-    clock = ControllerClock(500.0, hold=0.04)
+    clock = ControllerClock(500.0, hold=0.04, clock=SYSTEM)
     for k in range(50):
         clock.take(state(1.0 + 0.002 * k, 10.0 + 0.002 * k), transit_known=True)
     for k in range(50, 500):  # 45 to 60 ms late; meanwhile it is set forward by 50 ms
@@ -191,7 +192,7 @@ def test_a_clock_that_is_set_forward_behind_late_samples_makes_none_of_them_youn
 
 
 def test_the_newest_of_what_a_link_held_back_counts_once_others_come_as_quickly() -> None:
-    clock = ControllerClock(500.0, hold=0.04)
+    clock = ControllerClock(500.0, hold=0.04, clock=SYSTEM)
     for k in range(50):
         clock.take(state(1.0 + 0.002 * k, 10.0 + 0.002 * k), transit_known=True)
     clock.take(state(1.1, 10.16), transit_known=True)  # 60 ms late; the next one read is in time
@@ -204,7 +205,7 @@ def test_the_newest_of_what_a_link_held_back_counts_once_others_come_as_quickly(
 
 
 def test_what_a_stalled_link_hands_on_at_once_is_old_until_the_newest_has_come() -> None:
-    clock = ControllerClock(500.0, hold=0.04)
+    clock = ControllerClock(500.0, hold=0.04, clock=SYSTEM)
     now = time.monotonic()
     clock.take(state(1.0, now - 0.1))
     fresh = []
@@ -218,7 +219,7 @@ def test_what_a_stalled_link_hands_on_at_once_is_old_until_the_newest_has_come()
 
 @pytest.fixture
 def memory():
-    found = SharedMemory(3)
+    found = SharedMemory(3, clock=SYSTEM)
     yield found
     found.close()
 
@@ -263,12 +264,13 @@ def test_a_row_that_was_not_finished_is_not_read(memory: SharedMemory) -> None:
 
 
 def test_another_process_sees_the_same_memory_and_its_death_leaves_it_whole() -> None:
-    memory = RunMemory(3)
+    memory = RunMemory(3, clock=SYSTEM)
     memory.renew()
     code = f"""
 import os, time
 from gapbridge.bridge.ipc.shared_memory import SharedMemory, Phase
-memory = SharedMemory(3, {memory.fd})
+from gapbridge.drivers.clock import SYSTEM
+memory = SharedMemory(3, {memory.fd}, clock=SYSTEM)
 memory.enter(Phase.RUNNING)
 memory.note_state(3)
 memory.note_state_read()

@@ -18,7 +18,7 @@ from gapbridge.bridge.loop.supervisor import Cause
 from gapbridge.bridge.setpoint_source.source import Source
 from gapbridge.core.errors import WriteError
 from gapbridge.core.state import RobotState, Setpoint
-from gapbridge.drivers.clock import Clock
+from gapbridge.drivers.clock import SYSTEM, Clock
 from gapbridge.drivers.driver import Driver
 
 Q = np.array([0.0, -1.5, 1.8, -1.87, -1.57, 0.0])
@@ -129,7 +129,7 @@ class Bench:
 @pytest.fixture
 def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Bench]:
     monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path))
-    memory = SharedMemory(6)
+    memory = SharedMemory(6, clock=SYSTEM)
     yield Bench(tmp_path, memory)
     memory.close()
 

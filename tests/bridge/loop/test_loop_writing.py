@@ -36,6 +36,7 @@ from gapbridge.core.errors import (
 from gapbridge.core.loads import Loads
 from gapbridge.core.model import Model
 from gapbridge.core.state import RobotState, Setpoint
+from gapbridge.drivers.clock import SYSTEM
 from gapbridge.drivers.driver import Driver
 
 Q = np.array([0.0, -1.5, 1.8, -1.87, -1.57, 0.0])
@@ -97,10 +98,10 @@ class Bench:
         self.changes: list[tuple[str, str]] = []  # cause and detail
         self.supervisor = Supervisor(lambda *change: self.changes.append(change[2:]))
         self.supervisor.state = State.ARMED
-        self.stream = Stream(MODEL, LimitSettings(), 500.0)
+        self.stream = Stream(MODEL, LimitSettings(), 500.0, clock=SYSTEM)
         self.loads = LiveLoads(6, True, 0.0)
         settings = SetpointSettings()
-        source = make_source(settings, 6, True, Path())
+        source = make_source(settings, 6, True, Path(), clock=SYSTEM)
         reports = Reports(memory, lambda _: None)
         self.writing = Writing(settings, self.driver, source, self.stream, self.supervisor, reports)
         self.at, self.q = 1.0, Q
@@ -132,7 +133,7 @@ class Bench:
 
 @pytest.fixture
 def bench() -> Iterator[Bench]:
-    memory = SharedMemory(6)
+    memory = SharedMemory(6, clock=SYSTEM)
     yield Bench(memory)
     memory.close()
 

@@ -22,6 +22,7 @@ from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.ipc.shared_memory import RunMemory
 from gapbridge.bridge.recording.recorder import Recorder
 from gapbridge.core.log.mcap_reading import read_columns
+from gapbridge.drivers.clock import SYSTEM
 
 COMPARED = (
     "timestamp", "state", "written", "attempted", "nominal_q", "corrected_q", "offset", "residual",
@@ -41,7 +42,7 @@ class Loops:
 
     def __init__(self, cell: Path, session: str, arm: bool = False) -> None:
         self.configuration = read_configuration(cell)
-        self.memory, self.commands = RunMemory(6), CommandMemory()
+        self.memory, self.commands = RunMemory(6, clock=SYSTEM), CommandMemory()
         folder = cell.parent / "recordings"
         self.stem = folder / session
         self.recorder = Recorder(
@@ -50,6 +51,7 @@ class Loops:
             self.memory,
             {},
             lambda _: None,
+            clock=SYSTEM,
         )
         self._number = 0
         self.start(arm)
@@ -59,7 +61,9 @@ class Loops:
                  "after": self.commands.number()}  # fmt: skip
         if arm:
             self.commands.ask(Command.ARM)
-        self.loop = LoopProcess(self.configuration, self.memory, self.commands, order, -3)
+        self.loop = LoopProcess(
+            self.configuration, self.memory, self.commands, order, -3, clock=SYSTEM
+        )
         self._number += 1
 
     def until(self, what: Callable[[], bool]) -> None:

@@ -25,6 +25,7 @@ from gapbridge.core.errors import LinkError, PartialWriteError
 from gapbridge.core.log.mcap_reading import read_columns
 from gapbridge.core.model import Model
 from gapbridge.core.state import RobotState, Setpoint
+from gapbridge.drivers.clock import SYSTEM
 from gapbridge.drivers.driver import Driver
 from gapbridge.drivers.replay.driver import ReplayDriver
 from gapbridge.drivers.replay.settings import ReplaySettings
@@ -83,7 +84,7 @@ def run(
     loop: Loop, memory: SharedMemory, commands: CommandMemory, folder: Path, name: str
 ) -> dict[str, Any]:
     settings = RecordingSettings(folder=folder, keep_free=0.0)
-    recorder = Recorder(settings, name, memory, {}, lambda _: None)
+    recorder = Recorder(settings, name, memory, {}, lambda _: None, clock=SYSTEM)
     assert loop.run(Commands(commands.fd), True) in (Exit.LINK, Exit.DONE)
     recorder.close()
     return read_columns(folder / name)
@@ -94,10 +95,10 @@ def test_refused_and_half_sent_setpoints_gaps_and_lost_sensors_are_replayed(tmp_
     cell.write_text(CELL)
     model = load_cell(cell).model
     settings = DaemonSettings(cell=cell)
-    memory, commands, events = SharedMemory(N), CommandMemory(), []
+    memory, commands, events = SharedMemory(N, clock=SYSTEM), CommandMemory(), []
     source = TargetSource(SetpointSettings(), N, False, tmp_path, 20.0)
     loop = Loop(settings, model, Scripted(1800, commands, model), source, memory, events.append)
-    _compile(settings, model)  # else the first cycles are late
+    _compile(settings, model, clock=SYSTEM)  # else the first cycles are late
     then = run(loop, memory, commands, tmp_path, "then")
     flags = then["flags"].astype(int)
     assert {0.0, 1.0, 2.0} == set(then["attempted"])
@@ -108,7 +109,7 @@ def test_refused_and_half_sent_setpoints_gaps_and_lost_sensors_are_replayed(tmp_
     assert (flags & 8).any()  # ramping out
     assert then["written"].sum() > 500
 
-    memory, commands = SharedMemory(N), CommandMemory()
-    driver = ReplayDriver(ReplaySettings(file=tmp_path / "then", speed=100.0), model)
+    memory, commands = SharedMemory(N, clock=SYSTEM), CommandMemory()
+    driver = ReplayDriver(ReplaySettings(file=tmp_path / "then", speed=100.0), model, clock=SYSTEM)
     again = ReplayedLoop(settings, model, driver, source, memory, lambda _: None)
     assert_same_bits(run(again, memory, commands, tmp_path, "again"), then, len(then["number"]))

@@ -18,6 +18,7 @@ from gapbridge.core.errors import LimitError
 from gapbridge.core.loads import Loads
 from gapbridge.core.model import Model
 from gapbridge.core.state import RobotState, Setpoint
+from gapbridge.drivers.clock import SYSTEM
 
 Q = np.array([0.0, -1.5, 1.8, -1.87, -1.57, 0.0])
 CYCLE = 0.002
@@ -37,7 +38,7 @@ class Run:
     """Drives a stream as the loop does, with an arm that follows at once."""
 
     def __init__(self, soft: float = 5e-6, **limits: float) -> None:
-        self.stream = SetpointStream(model(soft), LimitSettings(**limits), 500.0)
+        self.stream = SetpointStream(model(soft), LimitSettings(**limits), 500.0, clock=SYSTEM)
         self.at, self.q = 100.0, Q.copy()
         self.sent: list[Setpoint] = []
         self.stream.start(Q, self.at)

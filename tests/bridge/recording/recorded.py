@@ -12,6 +12,7 @@ from gapbridge.bridge.cell.settings.recording import RecordingSettings
 from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.ipc.shared_memory import SharedMemory
 from gapbridge.bridge.recording.recorder import Recorder
+from gapbridge.drivers.clock import SYSTEM
 
 N = 6
 SESSION = "run-20260101-000000"
@@ -41,12 +42,14 @@ class Desk:
 
     def __init__(self, folder: Path, **settings: Any) -> None:
         self.folder = folder
-        self.memory = SharedMemory(N)
+        self.memory = SharedMemory(N, clock=SYSTEM)
         self.events: list[dict[str, Any]] = []
         self.settings = RecordingSettings(folder=folder, **{"keep_free": 0.0, **settings})
 
     def recorder(self) -> Recorder:
-        return Recorder(self.settings, SESSION, self.memory, CONFIGURATION, self.events.append)
+        return Recorder(
+            self.settings, SESSION, self.memory, CONFIGURATION, self.events.append, clock=SYSTEM
+        )
 
     def record(self, *counts: int) -> Array:
         """Record so many cycles, a flush after each; returns the rows."""

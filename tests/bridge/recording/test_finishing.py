@@ -20,6 +20,7 @@ from gapbridge.bridge.recording.folder import segments
 from gapbridge.bridge.recording.segment import Segment
 from gapbridge.core.log.mcap_reading import read_columns
 from gapbridge.core.log.mcap_records import all_records, chunk_offsets, is_whole
+from gapbridge.drivers.clock import SYSTEM
 
 
 @pytest.fixture
@@ -161,7 +162,7 @@ def test_a_process_that_was_killed_holds_no_lock(tmp_path: Path) -> None:
 def test_a_file_with_nothing_but_its_head_is_finished_too(desk: Desk) -> None:
     path = desk.folder / "run-20200101-000000-001.mcap"
     path.parent.mkdir(parents=True, exist_ok=True)
-    segment = Segment(path, desk.memory.slices, [state.name for state in State])
+    segment = Segment(path, desk.memory.slices, [state.name for state in State], clock=SYSTEM)
     segment._file.flush()
     segment.abandon()
     assert finish(path)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from datetime import datetime
 from pathlib import Path
 
 import numpy as np
@@ -254,13 +255,13 @@ def test_the_oldest_files_make_room(tmp_path: Path) -> None:
 
 
 def test_a_session_is_named_anew_while_its_name_is_taken(tmp_path: Path) -> None:
-    names = set()
+    names, begin = set(), datetime(2026, 3, 1, 12, 30, 5).timestamp()
     for _ in range(3):
-        name = new_session(tmp_path)
+        name = new_session(tmp_path, begin)
         names.add(name)
         (tmp_path / f"{name}-001.mcap").touch()
     assert len(names) == 3
-    assert new_session(None).startswith("run-")
+    assert new_session(None, begin) == "run-20260301-123005"
 
 
 def test_every_so_manieth_cycle_is_counted_over_files(tmp_path: Path) -> None:

@@ -23,6 +23,7 @@ from gapbridge.bridge.ipc.shared_memory import SharedMemory
 from gapbridge.bridge.ipc.side_process import SideProcess
 from gapbridge.core.log.mcap_reading import read_columns, read_configuration
 from gapbridge.core.log.mcap_records import is_whole
+from gapbridge.drivers.clock import SYSTEM
 
 RATE = 125.0  # the ring then lasts for as long as a busy machine takes to start a process
 CELL = "robot: {model: ur10e}\nweb: {token: squeamish}\n"
@@ -32,7 +33,7 @@ class Publisher:
     """A loop's half of the shared memory, in a thread of the test."""
 
     def __init__(self) -> None:
-        self.memory = SharedMemory(N)
+        self.memory = SharedMemory(N, clock=SYSTEM)
         self.stop, self._publishes = threading.Event(), threading.Event()
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
@@ -77,7 +78,9 @@ class Recording:
         )
         start = {"settings": settings.model_dump(mode="json"), "n": N, "session": SESSION,
                  "extra": {}}  # fmt: skip
-        self.process = SideProcess("gapbridge.bridge.recording.main", start, publisher.memory)
+        self.process = SideProcess(
+            "gapbridge.bridge.recording.main", start, publisher.memory, clock=SYSTEM
+        )
         self._publisher = publisher
         self._seen = 0  # files of former lives
 

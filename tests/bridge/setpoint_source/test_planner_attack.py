@@ -22,6 +22,7 @@ from ports import free_port
 from gapbridge.bridge.cell.sections import SetpointSettings
 from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.setpoint_source import make_source
+from gapbridge.drivers.clock import SYSTEM
 
 TOKEN = "0d9b7a63c1f24e58b6a7d3c2e1f09485"
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
@@ -109,7 +110,7 @@ def post(port: int, body: bytes, limit: float = 2.0) -> bytes:
 def test_a_posted_body_is_no_plc(tmp_path: Path) -> None:
     """A whole Modbus request as the body of an HTTP POST is not taken from behind the head."""
     settings = SetpointSettings(source="modbus", port=0, timeout=0.5)
-    source = make_source(settings, 3, True, tmp_path)
+    source = make_source(settings, 3, True, tmp_path, clock=SYSTEM)
     source.open()
     try:
         counts = [0, 7, *(0, 100) * 3]

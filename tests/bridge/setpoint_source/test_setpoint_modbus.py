@@ -22,6 +22,7 @@ from gapbridge.bridge.setpoint_source.modbus import ModbusSource
 from gapbridge.bridge.setpoint_source.plc_memory import PlcMemory
 from gapbridge.bridge.setpoint_source.source import SourceDryError, SourceStatus
 from gapbridge.core.errors import InputError, RunError
+from gapbridge.drivers.clock import SYSTEM
 
 client_library = pytest.importorskip("pyModbusTCP.client", reason="pyModbusTCP is not installed")
 HERE = np.array([0.1, -0.2, 0.3])
@@ -58,7 +59,7 @@ class Plc:
 @pytest.fixture
 def source() -> Iterator[ModbusSource]:
     settings = SetpointSettings(source="modbus", port=0, timeout=0.3)
-    made = make_source(settings, 3, True, Path())
+    made = make_source(settings, 3, True, Path(), clock=SYSTEM)
     assert isinstance(made, ModbusSource)
     made.open()
     yield made
@@ -141,12 +142,12 @@ def test_registers_that_are_not_there_are_refused(source: ModbusSource) -> None:
 def test_a_taken_port_is_one_line(source: ModbusSource) -> None:
     settings = SetpointSettings(source="modbus", port=source.port)
     with pytest.raises(RunError, match="cannot listen on"):
-        make_source(settings, 3, True, Path()).open()
+        make_source(settings, 3, True, Path(), clock=SYSTEM).open()
 
 
 def test_an_arm_of_too_many_joints_is_refused() -> None:
     with pytest.raises(InputError, match="found 11 joints, expected"):
-        make_source(SetpointSettings(source="modbus"), 11, True, Path())
+        make_source(SetpointSettings(source="modbus"), 11, True, Path(), clock=SYSTEM)
 
 
 def test_a_record_that_is_half_written_is_not_seen() -> None:

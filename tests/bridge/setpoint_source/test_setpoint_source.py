@@ -26,6 +26,7 @@ from gapbridge.bridge.setpoint_source.target import TargetSource
 from gapbridge.bridge.setpoint_source.tcp import TcpSource
 from gapbridge.bridge.setpoint_source.trajectory import TrajectorySource
 from gapbridge.core.errors import CellError, InputError, LogError, RunError
+from gapbridge.drivers.clock import SYSTEM
 
 HERE = np.array([0.1, 0.2, 0.3])
 
@@ -33,7 +34,7 @@ HERE = np.array([0.1, 0.2, 0.3])
 def trajectory(tmp_path: Path, text: str) -> Source:
     (tmp_path / "way.csv").write_text(text, encoding="utf-8")
     settings = SetpointSettings(source="trajectory", file=Path("way.csv"))
-    return make_source(settings, 3, True, tmp_path)
+    return make_source(settings, 3, True, tmp_path, clock=SYSTEM)
 
 
 WAY = """timestamp,target_q_0,target_q_1,target_q_2
@@ -45,11 +46,11 @@ WAY = """timestamp,target_q_0,target_q_1,target_q_2
 
 def test_each_name_gives_its_source(tmp_path: Path) -> None:
     assert isinstance(trajectory(tmp_path, WAY), TrajectorySource)
-    made = make_source(SetpointSettings(source="target"), 3, True, tmp_path)
+    made = make_source(SetpointSettings(source="target"), 3, True, tmp_path, clock=SYSTEM)
     assert isinstance(made, TargetSource)
     for name, kind in (("planner", PlannerSource), ("tcp", TcpSource)):
         settings = SetpointSettings(source=name, token_file=tmp_path / "token")
-        assert type(make_source(settings, 3, True, tmp_path)) is kind
+        assert type(make_source(settings, 3, True, tmp_path, clock=SYSTEM)) is kind
 
 
 def test_a_trajectory_is_replayed_at_the_controllers_clock_and_held_at_its_end(
@@ -94,14 +95,14 @@ def test_a_bad_trajectory_is_one_line(old: str, new: str, phrase: str, tmp_path:
 def test_a_missing_trajectory_is_named(tmp_path: Path) -> None:
     settings = SetpointSettings(source="trajectory", file=Path("nowhere.csv"))
     with pytest.raises(InputError, match=r"nowhere\.csv"):
-        make_source(settings, 3, True, tmp_path)
+        make_source(settings, 3, True, tmp_path, clock=SYSTEM)
 
 
 def test_the_own_target_is_where_the_arm_stood_or_what_its_program_wants(tmp_path: Path) -> None:
-    standing = make_source(SetpointSettings(), 3, True, tmp_path)
+    standing = make_source(SetpointSettings(), 3, True, tmp_path, clock=SYSTEM)
     standing.begin(0.0, HERE)
     assert standing.sample(1.0, HERE + 0.1) == pytest.approx(HERE)
-    riding = make_source(SetpointSettings(), 3, False, tmp_path)
+    riding = make_source(SetpointSettings(), 3, False, tmp_path, clock=SYSTEM)
     riding.begin(0.0, HERE)
     assert riding.sample(1.0, HERE + 0.1) == pytest.approx(HERE + 0.1)
 
@@ -113,7 +114,7 @@ RATE = 500.0  # Hz
 @pytest.fixture
 def feed(tmp_path: Path) -> Iterator[PlannerSource]:
     settings = SetpointSettings(source="planner", socket=tmp_path / "p.sock", timeout=0.15)
-    source = PlannerSource(settings, 3, True, Path(), RATE)
+    source = PlannerSource(settings, 3, True, Path(), RATE, clock=SYSTEM)
     source.open()
     yield source
     source.close()
@@ -125,7 +126,7 @@ def tcp(tmp_path: Path) -> Iterator[TcpSource]:
     token.write_text(TOKEN + "\n")
     token.chmod(0o600)
     settings = SetpointSettings(source="tcp", token_file=token, port=0, timeout=0.15)
-    source = TcpSource(settings, 3, True, Path(), RATE)
+    source = TcpSource(settings, 3, True, Path(), RATE, clock=SYSTEM)
     source.open()
     yield source
     source.close()
@@ -339,7 +340,7 @@ def test_the_socket_of_a_loop_that_was_killed_is_replaced(tmp_path: Path) -> Non
     with socket.socket(socket.AF_UNIX) as left:
         left.bind(str(path))
     settings = SetpointSettings(source="planner", socket=path)
-    source = PlannerSource(settings, 3, True, Path(), RATE)
+    source = PlannerSource(settings, 3, True, Path(), RATE, clock=SYSTEM)
     source.open()
     with planner(source) as link:
         link.sendall(GOOD)
@@ -389,10 +390,10 @@ def test_over_tcp_a_token_that_does_not_come_ends_the_connection(
 def test_a_taken_address_is_one_line(tcp: TcpSource, tmp_path: Path) -> None:
     settings = tcp.settings.model_copy(update={"port": tcp.port})
     with pytest.raises(RunError, match="cannot listen on"):
-        TcpSource(settings, 3, True, Path(), RATE).open()
+        TcpSource(settings, 3, True, Path(), RATE, clock=SYSTEM).open()
     settings = SetpointSettings(source="planner", socket=tmp_path / "no" / "p.sock")
     with pytest.raises(RunError, match="cannot listen on"):
-        PlannerSource(settings, 3, True, Path(), RATE).open()
+        PlannerSource(settings, 3, True, Path(), RATE, clock=SYSTEM).open()
 
 
 @pytest.mark.parametrize(

@@ -21,6 +21,7 @@ from gapbridge.core.model import Model
 from gapbridge.core.state import RobotState, Setpoint
 from gapbridge.drivers.can.driver import CanDriver
 from gapbridge.drivers.can.settings import CanSettings
+from gapbridge.drivers.clock import SYSTEM
 from gapbridge.drivers.simulated.can.nodes import CanNodes
 from gapbridge.drivers.simulated.can.server import make_servers
 from gapbridge.drivers.simulated.server.arm_controller import ArmController, make_controller
@@ -47,7 +48,7 @@ def served_arm(profile: str = "piper", **keys: object) -> Iterator[Served]:
     controller = make_controller(*simulated_arm(MODEL.arm, seed=5), period=0.004)
     (nodes,) = make_servers(settings, "127.0.0.2", controller)
     with ServerThread(controller, [nodes], "127.0.0.2"):
-        driver = CanDriver(settings, MODEL)
+        driver = CanDriver(settings, MODEL, clock=SYSTEM)
         try:
             yield Served(controller, nodes, settings, driver)
         finally:

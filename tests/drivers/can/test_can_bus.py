@@ -10,13 +10,14 @@ from pydantic import ValidationError
 
 from gapbridge.core.errors import LinkError
 from gapbridge.drivers.can_bus.bus import BusSettings, close_bus, open_bus
+from gapbridge.drivers.clock import SYSTEM
 from gapbridge.drivers.simulated.can.frame import Frame
 from gapbridge.drivers.simulated.can.hub import Hub
 
 
 @pytest.fixture
 def hub():
-    with Hub() as served:
+    with Hub(SYSTEM) as served:
         yield served
 
 

@@ -12,6 +12,7 @@ from patience import PATIENCE, wait_for
 from gapbridge.core.errors import InvalidStateError, LinkError, StaleStateError, WriteError
 from gapbridge.drivers.can.driver import CanDriver
 from gapbridge.drivers.can.settings import CanSettings
+from gapbridge.drivers.clock import SYSTEM
 from gapbridge.drivers.profile_file import ProfileError
 
 
@@ -277,7 +278,7 @@ def test_a_lost_frame_costs_its_sample_and_is_reported(served):
 
 def test_an_arm_that_is_not_on_the_bus_is_one_line_with_what_was_missed():
     settings = CanSettings(profile="piper", interface="virtual", channel="nobody")
-    driver = CanDriver(settings, MODEL)
+    driver = CanDriver(settings, MODEL, clock=SYSTEM)
     with pytest.raises(LinkError, match=r"virtual nobody: AgileX PiPER: never heard JointFeedback"):
         driver.connect()
 
@@ -285,7 +286,7 @@ def test_an_arm_that_is_not_on_the_bus_is_one_line_with_what_was_missed():
 def test_an_arm_of_another_number_of_joints_is_refused_before_the_bus_is_opened():
     settings = CanSettings(profile="openarm", interface="virtual", channel="nobody")
     with pytest.raises(ProfileError, match=r"found 7 joints in OpenArm .*, expected 6"):
-        CanDriver(settings, MODEL)
+        CanDriver(settings, MODEL, clock=SYSTEM)
 
 
 @pytest.mark.realtime

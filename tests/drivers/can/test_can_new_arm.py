@@ -13,6 +13,7 @@ from patience import PATIENCE
 
 from gapbridge.drivers.can.driver import CanDriver
 from gapbridge.drivers.can.settings import CanSettings
+from gapbridge.drivers.clock import SYSTEM
 
 INVENTED = Path(__file__).with_name("invented.yaml")
 COUNT = math.radians(0.0005)
@@ -82,7 +83,7 @@ def test_an_arm_that_no_code_knows_is_read_armed_and_moved_from_data_alone(firmw
     settings = CanSettings(
         profile=str(INVENTED), interface="virtual", channel="invented", foreign_quiet=0.1
     )
-    with CanDriver(settings, MODEL) as driver:
+    with CanDriver(settings, MODEL, clock=SYSTEM) as driver:
         state = next_state(driver)
         assert state.actual_q == pytest.approx(firmware.q, abs=COUNT)
         assert not firmware.powered

@@ -18,6 +18,7 @@ from benchmarks.server_thread import ServerThread
 from gapbridge.bridge.cell import load_cell
 from gapbridge.drivers.can.driver import CanDriver
 from gapbridge.drivers.can.settings import CanSettings
+from gapbridge.drivers.clock import SYSTEM
 from gapbridge.drivers.simulated.can.server import make_servers
 from gapbridge.drivers.simulated.plant.plant_arm import plant_arm
 from gapbridge.drivers.simulated.server.arm_controller import make_controller
@@ -67,7 +68,7 @@ def joints_of(sdk):
 def test_the_vendors_client_reads_and_commands_our_arm_and_we_notice_it(served, vendor):
     controller, link, model = served
     wait_for(lambda: np.abs(joints_of(vendor) - controller.q).max() < 1e-5, "its joints")
-    with CanDriver(link, model) as driver:
+    with CanDriver(link, model, clock=SYSTEM) as driver:
         assert next_state(driver).actual_q == pytest.approx(controller.q, abs=1e-5)
         until = time.monotonic() + PATIENCE
         while not vendor.EnablePiper():
@@ -104,7 +105,7 @@ def test_simulate_serves_the_cell_to_another_process(tmp_path):
             assert "CAN (piper)" in lines[0]
             assert lines[1] == f"ready {HOST}\n"
             found = load_cell(cell)
-            with CanDriver(found.link, found.model) as driver:
+            with CanDriver(found.link, found.model, clock=SYSTEM) as driver:
                 q = [next_state(driver).actual_q for _ in range(50)][-1]
             assert q == pytest.approx(found.file.simulation.start_q, abs=1e-4)
         finally:

@@ -11,6 +11,7 @@ from ports import free_port, own_host
 from benchmarks.server_thread import ServerThread
 from gapbridge.drivers.can.driver import CanDriver
 from gapbridge.drivers.can.settings import CanSettings
+from gapbridge.drivers.clock import SYSTEM
 from gapbridge.drivers.link_settings import DriverSettings
 from gapbridge.drivers.simulated.can.server import make_servers
 from gapbridge.drivers.simulated.server.arm_controller import make_controller
@@ -38,7 +39,10 @@ def test_the_page_s_arm_is_read_armed_and_moved(folder):
     ).located(folder)  # fmt: skip
     controller = make_controller(*simulated_arm(MODEL.arm, seed=2), period=0.004)
     servers = make_servers(settings, HOST, controller)
-    with ServerThread(controller, servers, HOST), CanDriver(settings, MODEL) as driver:
+    with (
+        ServerThread(controller, servers, HOST),
+        CanDriver(settings, MODEL, clock=SYSTEM) as driver,
+    ):
         assert driver.rate == 100.0
         state = next_state(driver)
         assert state.actual_q == pytest.approx(controller.q, abs=HALF * 1.01)

@@ -19,6 +19,7 @@ from gapbridge.core.model import Model
 from gapbridge.core.state import RobotState, Setpoint
 from gapbridge.drivers.canopen.driver import CanopenDriver
 from gapbridge.drivers.canopen.settings import CanopenSettings
+from gapbridge.drivers.clock import SYSTEM
 from gapbridge.drivers.simulated.canopen.server import CanopenServer
 from gapbridge.drivers.simulated.server.arm_controller import ArmController, make_controller
 from gapbridge.drivers.simulated.ur.settings import simulated_arm
@@ -46,7 +47,7 @@ class DriveArm:
 
     def driver(self, **keys: Any) -> CanopenDriver:
         """Return a driver, not connected."""
-        return CanopenDriver(self.settings.model_copy(update=keys), self.model)
+        return CanopenDriver(self.settings.model_copy(update=keys), self.model, clock=SYSTEM)
 
     @contextmanager
     def other_bus(self) -> Iterator[can.BusABC]:

@@ -16,6 +16,7 @@ from gapbridge.drivers.canopen.profile import CanopenProfile, read_profile
 from gapbridge.drivers.canopen.settings import CanopenSettings
 from gapbridge.drivers.canopen.state import StateBuilder
 from gapbridge.drivers.canopen.sync_set import SyncCollector
+from gapbridge.drivers.clock import SYSTEM
 from gapbridge.drivers.state_check import SampleCheck
 
 TOTAL = 1_000_000
@@ -68,13 +69,13 @@ def ruined(
 @pytest.mark.slow
 def test_a_million_frames_give_no_exception_and_no_wrong_sample() -> None:
     profile = read_profile(CanopenSettings.shipped / "cia402.yaml")
-    collector = SyncCollector(profile)
+    collector = SyncCollector(profile, SYSTEM)
     builder, check = StateBuilder(profile), SampleCheck(builtin_arm("ur10e"))
     network = Network()
     for node in profile.nodes:
         network.add_node(node, profile.eds.dictionary(node))
-    heartbeats = HeartbeatMonitor(network, profile)
-    listener = BusListener(network, profile, collector)
+    heartbeats = HeartbeatMonitor(network, profile, SYSTEM)
+    listener = BusListener(network, profile, collector, SYSTEM)
     random, good = np.random.default_rng(4), good_frames(profile)
     count = taken = refused = 0
     begun = time.monotonic()
@@ -114,7 +115,7 @@ def test_a_million_frames_give_no_exception_and_no_wrong_sample() -> None:
 @pytest.mark.slow
 def test_random_payloads_are_refused_or_are_what_their_bytes_say() -> None:
     profile = read_profile(CanopenSettings.shipped / "cia402.yaml")
-    collector = SyncCollector(profile)
+    collector = SyncCollector(profile, SYSTEM)
     arm = builtin_arm("ur10e")
     builder, check = StateBuilder(profile), SampleCheck(arm)
     random = np.random.default_rng(5)

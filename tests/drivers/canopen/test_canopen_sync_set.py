@@ -16,6 +16,7 @@ from gapbridge.drivers.canopen.profile import read_profile
 from gapbridge.drivers.canopen.settings import CanopenSettings
 from gapbridge.drivers.canopen.state import StateBuilder, positions
 from gapbridge.drivers.canopen.sync_set import SyncCollector, SyncSet
+from gapbridge.drivers.clock import SYSTEM
 
 PROFILE = read_profile(CanopenSettings.shipped / "cia402.yaml")
 COB_IDS = [layout.cob_id(node) for node in PROFILE.nodes for layout in PROFILE.tpdo]
@@ -32,7 +33,7 @@ def frame_of(cob_id: int, value: int) -> bytes:
 def test_a_set_is_given_only_when_each_pdo_came_once_and_whole(
     frames: list[tuple[int, int]],
 ) -> None:
-    collector = SyncCollector(PROFILE)
+    collector = SyncCollector(PROFILE, SYSTEM)
     collector.begin(0.0)
     for cob_id, more in frames:
         collector.take(cob_id, bytes(LENGTHS.get(cob_id, 3) + more), 0.0)
@@ -49,7 +50,7 @@ def test_a_set_is_given_only_when_each_pdo_came_once_and_whole(
 
 @given(st.permutations(COB_IDS))
 def test_the_order_of_a_sets_frames_does_not_matter(order: list[int]) -> None:
-    collector = SyncCollector(PROFILE)
+    collector = SyncCollector(PROFILE, SYSTEM)
     collector.begin(0.0)
     for cob_id in order:
         collector.take(cob_id, frame_of(cob_id, cob_id & 7), 1.0)
@@ -61,7 +62,7 @@ def test_the_order_of_a_sets_frames_does_not_matter(order: list[int]) -> None:
 
 
 def test_a_frame_before_any_sync_or_after_the_set_is_a_stray() -> None:
-    collector = SyncCollector(PROFILE)
+    collector = SyncCollector(PROFILE, SYSTEM)
     collector.take(COB_IDS[0], frame_of(COB_IDS[0], 0), 0.0)
     assert collector.stray == "TPDO1 of node 1"
     collector.clear_stray()
@@ -74,7 +75,7 @@ def test_a_frame_before_any_sync_or_after_the_set_is_a_stray() -> None:
 
 
 def test_what_a_torn_set_lacked_may_come_late_once() -> None:
-    collector = SyncCollector(PROFILE)
+    collector = SyncCollector(PROFILE, SYSTEM)
     collector.begin(0.0)
     for cob_id in COB_IDS[1:]:
         collector.take(cob_id, frame_of(cob_id, 0), 0.0)

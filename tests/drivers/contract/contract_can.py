@@ -15,6 +15,7 @@ from contract_case import Case
 
 from gapbridge.drivers.can.driver import CanDriver
 from gapbridge.drivers.can.settings import CanSettings
+from gapbridge.drivers.clock import SYSTEM
 from gapbridge.drivers.driver import Driver
 from gapbridge.drivers.simulated.can.nodes import CanNodes
 from gapbridge.drivers.simulated.can.server import make_servers
@@ -68,7 +69,7 @@ class CanCase(Case):
 
     def driver(self) -> Driver:
         """Return a CAN driver."""
-        return CanDriver(self.settings, self.model)
+        return CanDriver(self.settings, self.model, clock=SYSTEM)
 
     def tear(self) -> None:
         """Have two samples lose a frame each, so that what is left looks like one."""

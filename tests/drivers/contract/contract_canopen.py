@@ -11,6 +11,7 @@ from contract_case import Case
 
 from gapbridge.drivers.canopen.driver import CanopenDriver
 from gapbridge.drivers.canopen.settings import CanopenSettings
+from gapbridge.drivers.clock import SYSTEM
 from gapbridge.drivers.driver import Driver
 from gapbridge.drivers.simulated.canopen.server import CanopenServer, make_servers
 from gapbridge.drivers.simulated.server.protocol_server import ProtocolServer
@@ -45,7 +46,7 @@ class CanopenCase(Case):
 
     def driver(self) -> Driver:
         """Return a CANopen driver."""
-        return CanopenDriver(self.settings, self.model)
+        return CanopenDriver(self.settings, self.model, clock=SYSTEM)
 
     def tear(self) -> None:
         """Have one drive's PDOs, off by 0.05 rad, come so late that they meet the next SYNC's."""

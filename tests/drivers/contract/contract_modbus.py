@@ -10,6 +10,7 @@ from pathlib import Path
 
 from contract_case import Case
 
+from gapbridge.drivers.clock import SYSTEM
 from gapbridge.drivers.driver import Driver
 from gapbridge.drivers.modbus.driver import ModbusDriver
 from gapbridge.drivers.modbus.profile import read_profile
@@ -60,7 +61,7 @@ class ModbusCase(Case):
 
     def driver(self) -> Driver:
         """Return a Modbus driver."""
-        return ModbusDriver(self.settings, self.model)
+        return ModbusDriver(self.settings, self.model, clock=SYSTEM)
 
     def tear(self) -> None:
         """Have images mixed of two for as long as one reading comes after the other."""

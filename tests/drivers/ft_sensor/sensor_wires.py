@@ -17,6 +17,7 @@ from pydantic import TypeAdapter
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.rotation import rpy_matrix
 from gapbridge.drivers.can_bus.bus import BusSettings
+from gapbridge.drivers.clock import SYSTEM
 from gapbridge.drivers.ft_sensor.sensor import ForceTorqueSensor, Reading
 from gapbridge.drivers.ft_sensor.settings import AnyFtSensor, FtSensorSettings
 from gapbridge.drivers.simulated.ft_sensor.ati_node import AtiNode, RobotousNode
@@ -72,11 +73,15 @@ def make_wire(kind: str, reaction: Callable[[], Any]) -> Wire:
     name, *mode = kind.split()
     if name == "robotiq_ft300":
         keys: dict[str, Any] = {"driver": name, "mode": (mode or ["stream"])[0], "max_age": 1.0}
-        return Wire(Ft300Device(reaction), keys)
+        return Wire(Ft300Device(reaction, SYSTEM), keys)
     channel = f"ft-{os.getpid()}-{next(_channels)}"
     bus = BusSettings(interface="virtual", channel=channel)
     keys = {"driver": name, "interface": "virtual", "channel": channel, "max_age": 1.0}
-    node = RobotousNode(reaction, bus) if name == "robotous_rft" else AtiNode(reaction, bus, seed=5)
+    node = (
+        RobotousNode(reaction, bus, SYSTEM)
+        if name == "robotous_rft"
+        else AtiNode(reaction, bus, seed=5)
+    )
     return Wire(node, keys)
 
 

@@ -10,6 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from gapbridge.drivers.clock import SYSTEM
+
 BRIDGE = str(Path(__file__).resolve().parents[2] / "bridge")
 sys.path.insert(0, BRIDGE)
 
@@ -33,9 +35,9 @@ def robot(tmp_path: Path) -> Iterator[Robot]:
 
 @pytest.fixture
 def sensor(robot: Robot) -> Iterator[RobotousNode]:
-    with Hub(robot.host) as hub:
+    with Hub(SYSTEM, robot.host) as hub:
         bus = BusSettings(interface="socketcand", host=robot.host, port=hub.port)
-        with RobotousNode(Reaction(WEIGHT), bus) as node:
+        with RobotousNode(Reaction(WEIGHT), bus, SYSTEM) as node:
             yield node
 
 

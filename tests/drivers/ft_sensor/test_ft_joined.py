@@ -85,7 +85,7 @@ class ListedSensor(ForceTorqueSensor):
     """Gives the samples of a list, then waits: no wire, no time of its own."""
 
     def __init__(self, readings: list[Reading]) -> None:
-        super().__init__()
+        super().__init__(SYSTEM)
         self.left = deque(readings)
         self.emptied = threading.Event()
 
@@ -114,8 +114,10 @@ def joined(
 ) -> DriverWithSensor:
     """Join an arm and a sensor; ``max_age`` counts only where a test names it."""
     settings = wire.settings(**{**MOUNTED, **keys})
-    clock = SYSTEM if "max_age" in keys else Standing()
-    return DriverWithSensor(ControllerDriver(controller, clock=clock), settings, m or model())
+    found = DriverWithSensor(ControllerDriver(controller), settings, m or model())
+    if "max_age" not in keys:
+        found._reader._clock = Standing()  # only its ages: arm and sensor go on
+    return found
 
 
 def bounds(kind: str, lever: float = 0.3) -> np.ndarray[Any, Any]:
@@ -245,7 +247,7 @@ def test_a_cut_serial_line_is_reported_and_opened_anew(tmp_path: Any) -> None:
     from gapbridge.drivers.simulated.ft_sensor.ft300_device import Ft300Device
 
     controller, link = resting_controller(TURNED), tmp_path / "ft300"
-    device, arm = Ft300Device(reaction_of(controller), link), ControllerDriver(controller)
+    device, arm = Ft300Device(reaction_of(controller), SYSTEM, link), ControllerDriver(controller)
     settings = settings_of(
         driver="robotiq_ft300", port=str(link), max_age=1.0, when_lost="stop", **MOUNTED
     )
@@ -307,7 +309,7 @@ def test_each_state_gets_the_wrench_of_its_own_moment_whatever_the_arms_clock_sa
     sensor = ListedSensor(
         [Reading(t, t + delay, np.array((0.0, 0.0, slope * t, 0.0, 0.0, 0.0))) for t in taken]
     )
-    monkeypatch.setattr(joined_module, "make_sensor", lambda _: sensor)
+    monkeypatch.setattr(joined_module, "make_sensor", lambda *_: sensor)
     arm = ControllerDriver(resting_controller(TURNED), clock=Standing())
     settings = settings_of(driver="ati_netcanoem", interface="virtual", channel="none")
     moments = np.arange(0.011, taken[-1], PERIOD)

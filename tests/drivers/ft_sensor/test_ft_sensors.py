@@ -31,6 +31,7 @@ from sensor_wires import (
 )
 
 from gapbridge.core.errors import LinkError
+from gapbridge.drivers.clock import SYSTEM
 from gapbridge.drivers.ft_sensor import FT_SENSORS, make_sensor
 from gapbridge.drivers.ft_sensor.joined import sensor_to_flange
 from gapbridge.drivers.simulated.ft_sensor.ati_node import AtiNode, RobotousNode
@@ -49,7 +50,7 @@ def tolerance(kind: str) -> np.ndarray[Any, Any]:
 def test_a_known_wrench_is_read_in_newtons_and_newton_metres(kind: str) -> None:
     reaction = Reaction()
     wire = make_wire(kind, reaction)
-    with wire.device, make_sensor(wire.settings()) as sensor:
+    with wire.device, make_sensor(wire.settings(), SYSTEM) as sensor:
         reading = next_reading(sensor)
         assert np.all(np.abs(reading.wrench - reaction.wrench) <= tolerance(kind))
         assert reading.status == 0
@@ -67,7 +68,7 @@ def test_a_mass_at_rest_reads_its_weight_pointing_down(kind: str, sign: int) -> 
     controller = resting_controller(TURNED)
     wire = make_wire(kind, reaction_of(controller, sign))
     wire.keys |= {"sensor_in_flange": {"xyz": XYZ, "rpy": RPY}, "sign": sign}
-    with wire.device, make_sensor(wire.settings()) as sensor:
+    with wire.device, make_sensor(wire.settings(), SYSTEM) as sensor:
         reading = next_reading(sensor)
     in_flange = sensor_to_flange(wire.settings().sensor_in_flange) @ reading.wrench
     rotation = flange_rotation(TURNED)
@@ -85,7 +86,7 @@ def test_the_constructor_touches_no_wire_and_the_table_is_whole() -> None:
     }
     assert set(keys) == set(FT_SENSORS)
     for name, more in keys.items():
-        sensor = make_sensor(settings_of(driver=name, **more))
+        sensor = make_sensor(settings_of(driver=name, **more), SYSTEM)
         with pytest.raises(LinkError, match=name):
             sensor.read(0.01)
         with pytest.raises(LinkError):
@@ -98,7 +99,7 @@ def test_the_constructor_touches_no_wire_and_the_table_is_whole() -> None:
 def test_overload_bits_are_reported(kind: str) -> None:
     wire = make_wire(kind, Reaction())
     wire.device.status = 0x2000 if kind == "ati_netcanoem" else 0x04
-    with wire.device, make_sensor(wire.settings()) as sensor:
+    with wire.device, make_sensor(wire.settings(), SYSTEM) as sensor:
         reading = next_reading(sensor)
         assert reading.status == wire.device.status
         phrase = sensor.describe(reading.status)
@@ -107,7 +108,7 @@ def test_overload_bits_are_reported(kind: str) -> None:
 
 def test_a_saturated_gauge_is_overload() -> None:
     wire = make_wire("ati_netcanoem", Reaction((900.0, 0.0, 0.0, 0.0, 0.0, 0.0)))
-    with wire.device, make_sensor(wire.settings()) as sensor:
+    with wire.device, make_sensor(wire.settings(), SYSTEM) as sensor:
         reading = next_reading(sensor)
         assert "saturated" in sensor.describe(reading.status)
 
@@ -119,7 +120,7 @@ def test_a_sensor_calibrated_in_pounds_is_read_in_newtons() -> None:
     pounds = AtiNode(
         reaction, wire.device._settings, seed=9, units=((1, 4.4482216), (2, 1.3558179))
     )
-    with pounds, make_sensor(wire.settings()) as sensor:
+    with pounds, make_sensor(wire.settings(), SYSTEM) as sensor:
         assert np.all(
             np.abs(next_reading(sensor).wrench - reaction.wrench) <= tolerance("ati_netcanoem")
         )
@@ -128,7 +129,7 @@ def test_a_sensor_calibrated_in_pounds_is_read_in_newtons() -> None:
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_silent_sensor_gives_no_reading_and_its_return_does(kind: str) -> None:
     wire = make_wire(kind, Reaction())
-    with wire.device, make_sensor(wire.settings()) as sensor:
+    with wire.device, make_sensor(wire.settings(), SYSTEM) as sensor:
         next_reading(sensor)
         wire.device.silent = True
         before_the_silence = 1000  # readings at most, in the buffers of wire and system
@@ -143,7 +144,7 @@ def test_a_sensor_that_does_not_answer_is_no_sensor() -> None:
     wire = make_wire("ati_netcanoem", Reaction())
     wire.device.silent = True
     with wire.device, pytest.raises(LinkError, match="base id 0x20"):
-        make_sensor(wire.settings()).connect()
+        make_sensor(wire.settings(), SYSTEM).connect()
 
 
 @pytest.mark.parametrize("kind", ["robotous_rft", "robotiq_ft300"])
@@ -151,7 +152,7 @@ def test_close_ends_the_stream(kind: str) -> None:
     wire = make_wire(kind, Reaction())
     device: Any = wire.device
     with device:
-        with make_sensor(wire.settings()) as sensor:
+        with make_sensor(wire.settings(), SYSTEM) as sensor:
             next_reading(sensor)
             assert device.streaming
         wait_for(lambda: not device.streaming, "the end of the stream")
@@ -165,12 +166,12 @@ def test_a_stream_left_running_does_not_disturb_the_start() -> None:
         device.streaming = True
         device._due = time.monotonic()
         time.sleep(0.05)
-        with make_sensor(wire.settings()) as sensor:
+        with make_sensor(wire.settings(), SYSTEM) as sensor:
             assert next_reading(sensor).wrench[2] == pytest.approx(12.25, abs=0.02)
 
 
 def test_a_request_read_together_with_what_ends_the_stream_is_answered() -> None:
-    device = Ft300Device(Reaction())
+    device = Ft300Device(Reaction(), SYSTEM)
     request = struct.pack(">BBHHBH", 9, 16, 410, 1, 2, 0x0200)
     request += FramerRTU.compute_CRC(request).to_bytes(2, "big")
     with device, serial.Serial(device.path, timeout=10.0) as line:
@@ -188,7 +189,7 @@ def test_a_write_that_times_out_is_one_attempt(monkeypatch: pytest.MonkeyPatch) 
         return write(line, data)
 
     monkeypatch.setattr(serial.Serial, "write", timed_out_once)
-    with wire.device, make_sensor(wire.settings()) as sensor:
+    with wire.device, make_sensor(wire.settings(), SYSTEM) as sensor:
         assert next_reading(sensor).wrench[2] == pytest.approx(12.25, abs=0.02)
     assert not late
 
@@ -197,7 +198,7 @@ def test_a_write_that_times_out_is_one_attempt(monkeypatch: pytest.MonkeyPatch) 
 def test_a_stream_that_is_slow_to_start_is_waited_for(
     late: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    device = Ft300Device(Reaction())
+    device = Ft300Device(Reaction(), SYSTEM)
     wire, pass_bytes, begun = Wire(device, {"driver": "robotiq_ft300"}), device._pass_bytes, []
 
     def answer_late() -> None:
@@ -207,7 +208,7 @@ def test_a_stream_that_is_slow_to_start_is_waited_for(
     monkeypatch.setattr(device, "_pass_bytes", answer_late)
     with device:
         begun.append(time.monotonic())
-        with make_sensor(wire.settings()) as sensor:
+        with make_sensor(wire.settings(), SYSTEM) as sensor:
             assert next_reading(sensor).wrench[2] == pytest.approx(12.25, abs=0.02)
 
 
@@ -215,7 +216,7 @@ def test_garbage_on_the_line_is_dropped_and_the_stream_goes_on() -> None:
     wire = make_wire("robotiq_ft300", Reaction())
     device = wire.device
     assert isinstance(device, Ft300Device)
-    with device, make_sensor(wire.settings()) as sensor:
+    with device, make_sensor(wire.settings(), SYSTEM) as sensor:
         next_reading(sensor)
         half, broken = device.frame()[:9], bytearray(device.frame())
         broken[5] ^= 0x40
@@ -243,7 +244,7 @@ def flood(wire: Wire, stop: threading.Event, rng: np.random.Generator) -> None:
 def test_foreign_and_broken_frames_on_the_bus_never_make_a_sample(kind: str) -> None:
     wire, stop = make_wire(kind, Reaction()), threading.Event()
     noise = threading.Thread(target=flood, args=(wire, stop, np.random.default_rng(1)))
-    with wire.device, make_sensor(wire.settings()) as sensor:
+    with wire.device, make_sensor(wire.settings(), SYSTEM) as sensor:
         noise.start()
         try:
             for _ in range(60):
@@ -258,9 +259,14 @@ def test_foreign_and_broken_frames_on_the_bus_never_make_a_sample(kind: str) -> 
 def test_a_second_robotous_on_the_bus_is_another_pair_of_ids() -> None:
     wire = make_wire("robotous_rft", Reaction())
     assert isinstance(wire.device, RobotousNode)
-    other = RobotousNode(Reaction((0.0,) * 6), wire.device._settings, 0x65, (0x11, 0x12))
+    other = RobotousNode(Reaction((0.0,) * 6), wire.device._settings, SYSTEM, 0x65, (0x11, 0x12))
     second = wire.settings(command_id=0x65, reply_ids=(0x11, 0x12))
-    with wire.device, other, make_sensor(wire.settings()) as a, make_sensor(second) as b:
+    with (
+        wire.device,
+        other,
+        make_sensor(wire.settings(), SYSTEM) as a,
+        make_sensor(second, SYSTEM) as b,
+    ):
         assert next_reading(a).wrench[2] == pytest.approx(12.25, abs=0.02)
         assert next_reading(b).wrench == pytest.approx(0.0)
 

@@ -16,6 +16,7 @@ from patience import wait_for
 from gapbridge.bridge.cell import load_cell
 from gapbridge.core.errors import LinkError, WriteError
 from gapbridge.core.state import RobotState, Setpoint
+from gapbridge.drivers.clock import SYSTEM
 from gapbridge.drivers.gate import GateBounds
 from gapbridge.drivers.modbus import encode
 from gapbridge.drivers.modbus.driver import ModbusDriver
@@ -175,7 +176,7 @@ def test_registers_too_coarse_for_the_offset_are_reported_before_arming(tmp_path
         f"compliance: {{axial: [{', '.join(['1.0e-6'] * 6)}]}}\n"
     )
     with ModbusCase("niryo") as case:
-        driver = ModbusDriver(case.settings, load_cell(path).model)
+        driver = ModbusDriver(case.settings, load_cell(path).model, clock=SYSTEM)
         with driver:
             before = np.array(case.controller.q)
             with pytest.raises(
@@ -186,7 +187,7 @@ def test_registers_too_coarse_for_the_offset_are_reported_before_arming(tmp_path
                 driver.arm(next_state(driver))
             assert np.abs(before - case.controller.q).max() < 1e-9
         coarse = case.settings.model_copy(update={"coarsest": 0.005})
-        with ModbusDriver(coarse, load_cell(path).model) as driver:
+        with ModbusDriver(coarse, load_cell(path).model, clock=SYSTEM) as driver:
             driver.arm(next_state(driver))
 
 
@@ -222,12 +223,12 @@ def test_a_map_with_the_wrong_word_order_is_reported_when_connecting(tmp_path: P
     with ModbusCase("igus") as case:
         wrong = case.settings.model_copy(update={"profile": str(path)})
         with pytest.raises(LinkError, match=r"actual_q_\d: found -?\d+"):
-            ModbusDriver(wrong, case.model).connect()
+            ModbusDriver(wrong, case.model, clock=SYSTEM).connect()
 
 
 def test_a_register_that_is_not_there_is_reported_when_connecting() -> None:
     with ModbusCase("xarm") as case:
-        wide = ModbusDriver(case.settings, case.model)
+        wide = ModbusDriver(case.settings, case.model, clock=SYSTEM)
         wide._first_block = dataclasses.replace(wide._first_block, count=12)
         with pytest.raises(LinkError, match="the controller refuses: illegal address"):
             wide.connect()

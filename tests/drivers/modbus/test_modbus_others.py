@@ -15,6 +15,7 @@ from contract_checks import check_reads, next_state
 from contract_modbus import ModbusCase
 from patience import PATIENCE
 
+from gapbridge.drivers.clock import SYSTEM
 from gapbridge.drivers.modbus.driver import ModbusDriver
 from gapbridge.drivers.simulated.modbus import image
 from gapbridge.drivers.simulated.modbus.server import ModbusServer
@@ -111,7 +112,7 @@ def test_our_driver_reads_a_server_that_is_not_pymodbus() -> None:
     thread.start()
     try:
         settings = case.settings.model_copy(update={"host": host, "port": 15503})
-        with ModbusDriver(settings, case.model) as driver:
+        with ModbusDriver(settings, case.model, clock=SYSTEM) as driver:
             check_reads(driver, case.model)
             driver.arm(next_state(driver))
             driver.release()

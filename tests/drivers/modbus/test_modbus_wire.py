@@ -24,6 +24,7 @@ from ports import free_port
 
 from benchmarks.server_thread import ServerThread
 from gapbridge.core.errors import InvalidStateError, LinkError, StaleStateError
+from gapbridge.drivers.clock import SYSTEM
 from gapbridge.drivers.modbus.driver import ModbusDriver
 from gapbridge.drivers.modbus.settings import ModbusSettings
 from gapbridge.drivers.simulated.modbus.server import ModbusServer
@@ -49,7 +50,9 @@ def proxy(case: ModbusCase) -> Iterator[EvilProxy]:
 @contextlib.contextmanager
 def driver_through(case: ModbusCase, proxy: EvilProxy) -> Iterator[ModbusDriver]:
     driver = ModbusDriver(
-        case.settings.model_copy(update={"port": proxy.port, **QUICK}), case.model
+        case.settings.model_copy(update={"port": proxy.port, **QUICK}),
+        case.model,
+        clock=SYSTEM,
     )
 
     def is_connected() -> bool:
@@ -131,7 +134,7 @@ def test_an_answer_that_was_long_under_way_is_not_fresh(case: ModbusCase, proxy:
     settings = case.settings.model_copy(
         update={"port": proxy.port, "timeout": 0.4, "state_timeout": 0.3}
     )
-    with ModbusDriver(settings, case.model) as driver:
+    with ModbusDriver(settings, case.model, clock=SYSTEM) as driver:
         next_state(driver)
         proxy.wait = 4.0 / driver.rate + 0.05  # as if this process had stood still meanwhile
         with pytest.raises(StaleStateError, match="no new sample for"):
@@ -227,17 +230,17 @@ def test_the_contract_holds_over_mutual_tls(keys: Path) -> None:
         authority=keys / "ca.pem", certificate=keys / "client.pem", key=keys / "client.key",
     ).model_copy(update=PATIENT)  # fmt: skip
     with ServerThread(case.controller, [server], case.host):
-        with ModbusDriver(settings, case.model) as driver:
+        with ModbusDriver(settings, case.model, clock=SYSTEM) as driver:
             check_reads(driver, case.model)
             driver.arm(next_state(driver))
             stream(driver, lambda state, q: setpoint_of(state, q, q, OFFSET), 0.5)
             driver.release()
         nobody = settings.model_copy(update={"certificate": None, "key": None})
         with pytest.raises(LinkError):
-            ModbusDriver(nobody, case.model).connect()
+            ModbusDriver(nobody, case.model, clock=SYSTEM).connect()
         stranger = settings.model_copy(update={"authority": keys / "client.pem"})
         with pytest.raises(LinkError, match="cannot be reached"):
-            ModbusDriver(stranger, case.model).connect()
+            ModbusDriver(stranger, case.model, clock=SYSTEM).connect()
 
 
 def test_over_tls_only_the_named_or_the_pinned_controller_is_let_in(keys: Path) -> None:
@@ -251,14 +254,14 @@ def test_over_tls_only_the_named_or_the_pinned_controller_is_let_in(keys: Path) 
     with ServerThread(case.controller, [server], case.host):
         named = ModbusSettings(**base, authority=keys / "ca.pem").model_copy(update=PATIENT)
         with pytest.raises(LinkError, match="certificate is refused: IP address mismatch"):
-            ModbusDriver(named, case.model).connect()
+            ModbusDriver(named, case.model, clock=SYSTEM).connect()
         for more in ({}, {"authority": keys / "ca.pem"}):
             pinned = ModbusSettings(**base, fingerprint=own, **more).model_copy(update=PATIENT)
-            with ModbusDriver(pinned, case.model) as driver:
+            with ModbusDriver(pinned, case.model, clock=SYSTEM) as driver:
                 check_reads(driver, case.model)
             changed = pinned.model_copy(update={"fingerprint": "0" * 64})
             with pytest.raises(LinkError, match=rf"SHA-256 {own}, expected 0+ \(link"):
-                ModbusDriver(changed, case.model).connect()
+                ModbusDriver(changed, case.model, clock=SYSTEM).connect()
 
 
 def test_a_fingerprint_is_taken_as_tools_print_it() -> None:
@@ -308,7 +311,7 @@ def test_the_contract_holds_over_a_serial_line() -> None:
     settings = settings.model_copy(update=PATIENT)
     with (
         ServerThread(case.controller, [server], case.host),
-        ModbusDriver(settings, case.model) as driver,
+        ModbusDriver(settings, case.model, clock=SYSTEM) as driver,
     ):
         check_reads(driver, case.model)
         assert np.abs(next_state(driver).actual_q - case.controller.q).max() <= case.resolution
@@ -323,4 +326,4 @@ def test_the_contract_holds_over_a_serial_line() -> None:
 def test_a_serial_port_that_is_not_there_is_a_link_error() -> None:
     settings = ModbusSettings(profile="ur", transport="rtu", serial="/dev/ttyNowhere")
     with pytest.raises(LinkError, match=r"/dev/ttyNowhere device 1: cannot be reached"):
-        ModbusDriver(settings, ModbusCase("ur").model).connect()
+        ModbusDriver(settings, ModbusCase("ur").model, clock=SYSTEM).connect()

@@ -10,6 +10,7 @@ import pytest
 from simulated_controller import SimulatedController
 
 from gapbridge.core.errors import WriteError
+from gapbridge.drivers.clock import SYSTEM
 from gapbridge.drivers.ur_rtde import enquiry
 from gapbridge.drivers.ur_rtde.enquiry import round_trip
 
@@ -17,7 +18,7 @@ DELAY = 0.06  # s
 
 
 def test_a_server_beside_us_answers_within_milliseconds(controller: SimulatedController) -> None:
-    assert 0.0 < round_trip(controller.host) < 0.02
+    assert 0.0 < round_trip(controller.host, SYSTEM) < 0.02
 
 
 def slow_server(delay: float, answers: int) -> int:
@@ -38,11 +39,11 @@ def slow_server(delay: float, answers: int) -> int:
 
 def test_a_long_way_counts_whole(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(enquiry, "RTDE", slow_server(DELAY, enquiry.TRIES))
-    assert DELAY <= round_trip("127.0.0.1") < DELAY + 0.05
+    assert DELAY <= round_trip("127.0.0.1", SYSTEM) < DELAY + 0.05
 
 
 @pytest.mark.parametrize("answers", [0, 1])
 def test_no_answer_is_one_line(monkeypatch: pytest.MonkeyPatch, answers: int) -> None:
     monkeypatch.setattr(enquiry, "RTDE", slow_server(0.0, answers))
     with pytest.raises(WriteError, match=r"127.0.0.1: found no answer on RTDE's port"):
-        round_trip("127.0.0.1")
+        round_trip("127.0.0.1", SYSTEM)

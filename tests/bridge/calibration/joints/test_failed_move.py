@@ -11,6 +11,7 @@ from gapbridge.bridge.calibration.joints.link import LinkedJoints
 from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.core.calibration.plan import PlannedPose
 from gapbridge.core.errors import RunError
+from gapbridge.drivers.clock import SYSTEM
 
 LINES = [
     "armed -> compensating (writing)",
@@ -45,6 +46,7 @@ class BrokenRun:
 
 def test_the_reason_of_a_failed_move_is_shown(monkeypatch: pytest.MonkeyPatch) -> None:
     joints = object.__new__(LinkedJoints)
+    joints._clock = SYSTEM
     joints._run = BrokenRun()  # type: ignore[assignment]
     monkeypatch.setattr(joints, "current_q", lambda: None)
     pose = PlannedPose(0, np.zeros(6), 0, np.zeros(6))
