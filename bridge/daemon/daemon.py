@@ -30,6 +30,7 @@ from gapbridge.bridge.daemon.slip_watch import Slip, SlipWatch
 from gapbridge.bridge.daemon.status import DaemonStatus
 from gapbridge.bridge.daemon.status_document import SCHEMA
 from gapbridge.bridge.daemon.summary import RunSummary, Tally
+from gapbridge.bridge.daemon.verification_watch import VerificationWatch
 from gapbridge.bridge.document.output_file import private, require_folder
 from gapbridge.bridge.ipc.command_memory import Command, CommandMemory
 from gapbridge.bridge.ipc.control_socket import ControlSocket
@@ -96,6 +97,7 @@ class Daemon:
         self._status = DaemonStatus(self.memory.slices, clock)
         self._fitted = FittedWatch(configuration.fitted, self.memory.slices)
         self._slips = self._slip_watch()
+        self._verification = VerificationWatch(None if settings.uncorrected else settings.cell)
         self._status_at = 0.0
         self._reload = Reload(self.manager, self.event_log)
         self.control = Control(self, clock)
@@ -133,6 +135,11 @@ class Daemon:
     def latched(self) -> str:
         """Return the latched fault, not acknowledged yet; empty: none."""
         return self._status.latched
+
+    @property
+    def mark_problem(self) -> str:
+        """Return why an acknowledged mark of a failed verification is still there; empty: no."""
+        return self._verification.problem
 
     @property
     def sequence(self) -> int:
@@ -257,7 +264,26 @@ class Daemon:
                 {"kind": EventKind.REQUEST, "command": name, "number": number, "by": by,
                  "acknowledges": command == Command.DISARM, "detail": detail}
             )  # fmt: skip
+            if command == Command.DISARM:
+                self._verification.acknowledge()
+            if command == Command.DISARM or not self._status.zero_moved:
+                self._check_verification()
+            if command == Command.ARM and (why := self._status.zero_moved):
+                detail = f"{why}; acknowledge it first: gapbridge disarm"
+                self.event_log.add({"kind": EventKind.REFUSED, "what": "arm", "detail": detail})
+                continue
             self._commands.ask(command, number)
+
+    def _check_verification(self) -> None:
+        """Hold if a verification has failed; end that once its mark is removed."""
+        event = self._verification.look()
+        if event is None:
+            return
+        self.event_log.add(event)
+        if not event["holds"]:
+            self._commands.ask(Command.ZERO_MOVED)  # after the event that says why
+        elif not self.latched:
+            self._commands.ask(Command.DISARM)  # else a person's, who sees what else is latched
 
     # -- the run ----------------------------------------------------------------------------------
 
@@ -348,6 +374,7 @@ class Daemon:
             self.event_log.add(self._posted.get())
         if self._clock.monotonic() >= self._status_at:
             self._status_at = self._clock.monotonic() + STATUS_EVERY
+            self._check_verification()
             self.side_processes.emit({"kind": EventKind.STATUS, **self.status()})
         loop = self.loop
         if loop is None or not loop.hangs:
@@ -394,7 +421,7 @@ class Daemon:
     def _start_loop(self, armed_by: str) -> LoopProcess:
         """Start a process of the loop, which receives only requests made from now on.
 
-        In addition, a disarm request that no loop has received is repeated.
+        In addition, requests other than to arm that no loop has received are repeated.
         """
         with self._request_lock:  # no request is numbered and not yet written
             self._forward_requests()
@@ -403,7 +430,8 @@ class Daemon:
             "may_write": self.may_write, "number": self._loops, "latched": self._status.latched,
             "after": after,
         }  # fmt: skip
-        for command in (Command.DISARM, Command.RAMP_OUT):
+        kept = (Command.DISARM, Command.RAMP_OUT, Command.ZERO_MOVED)
+        for command in sorted(kept, key=self._commands.last_of):
             if self._commands.last_of(command) > self.memory.last_taken:
                 self._commands.ask(command)
         if armed_by and self.may_write:
