@@ -103,13 +103,13 @@ def test_a_mark_found_between_two_loops_is_counted_by_the_next(cell: Path) -> No
         run.loops[-1].kill()
         until(world, lambda: run.daemon.loop is None, 3.0)
         write_mark(cell, REASON, cell.parent)
-        run.daemon._check_verification()
+        run.daemon._check_zeros()
         assert counted(run) == 0
         until(world, lambda: counted(run) == 1, 10.0)
         assert not ask(run, "arm")["ok"]
 
 
-@pytest.mark.parametrize("data", [b"", b"{}", b"\xff" * 100])
+@pytest.mark.parametrize("data", [b"", b"{}", b"\xff\xfe"], ids=repr)
 def test_a_mark_of_garbage_refuses_in_one_line_and_can_be_acknowledged(
     cell: Path, data: bytes
 ) -> None:
