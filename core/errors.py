@@ -20,6 +20,7 @@
         │       ├── IneffectiveWriteError   it was sent and had no effect
         │       ├── ForeignCommandError     somebody else commands the arm
         │       └── GateError               the gate before the wire refused it: nothing was sent
+        ├── VerificationError a verification that did not pass
         └── LimitError        a setpoint outside the limits, not sent
 """
 
@@ -89,6 +90,10 @@ class PlanError(InputError):
 
 class RunError(GapbridgeError):
     """Something failed at run time."""
+
+
+class VerificationError(RunError):
+    """The readings of a verification do not fit the calibration."""
 
 
 class LinkError(RunError):

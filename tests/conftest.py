@@ -47,6 +47,13 @@ HAD = pytest.StashKey[dict[str, tuple[float, float]]]()  # s that threads had, b
 MADE: dict[pytest.FixtureDef[Any], tuple[float, float]] = {}  # s since 1970: begun, ended
 
 
+@pytest.fixture(scope="session", autouse=True)
+def state(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """Keep what daemons learn out of the user's own folder."""
+    os.environ.pop("STATE_DIRECTORY", None)
+    os.environ["XDG_STATE_HOME"] = str(tmp_path_factory.mktemp("state"))
+
+
 def pytest_configure(config: pytest.Config) -> None:
     """Have a process that only computes leave the cores to those that are due."""
     worker = getattr(config, "workerinput", {}).get("workerid", WAITING[0])

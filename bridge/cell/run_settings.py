@@ -39,6 +39,12 @@ class Configuration:
         """Return the SHA-256 of the file."""
         return hashlib.sha256(self.text.encode()).hexdigest()
 
+    @property
+    def fingerprint(self) -> str:
+        """Return the SHA-256 of the file and of all files that it refers to."""
+        digests = [hashlib.sha256(self.files[name]).digest() for name in sorted(self.files)]
+        return hashlib.sha256(self.text.encode() + b"".join(digests)).hexdigest()
+
 
 def configuration_for(settings: DaemonSettings) -> Configuration:
     """Return the configuration of given settings; reads their cell file. Raises InputError."""

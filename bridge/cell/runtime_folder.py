@@ -1,4 +1,4 @@
-"""The folder of the daemon's sockets and locks: temporary, accessible to its owner only."""
+"""The daemon's folders: of its sockets and locks (temporary, private), and of what it keeps."""
 
 from __future__ import annotations
 
@@ -39,6 +39,27 @@ def runtime_folder() -> Path:
             path.chmod(0o700)
         return path
     raise InputError(f"{problem}, expected a folder for the daemon's socket (XDG_RUNTIME_DIR)")
+
+
+def state_folder() -> Path:
+    """Return the folder of what outlives a power cycle, created if missing.
+
+    systemd's ``$STATE_DIRECTORY``, else ``gapbridge`` in the user's own. Raises InputError if it
+    cannot be used.
+    """
+    if folder := os.environ.get("STATE_DIRECTORY"):  # colon-separated
+        path = Path(folder.split(":")[0])
+    else:
+        home = os.environ.get("XDG_STATE_HOME") or os.path.expanduser("~/.local/state")
+        path = Path(home) / "gapbridge"
+    try:
+        path.mkdir(mode=0o700, parents=True, exist_ok=True)
+        status = path.stat()
+    except OSError as error:
+        raise InputError(f"{path}: {error.strerror}, expected a folder to keep state in") from None
+    if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.geteuid():
+        raise InputError(f"{path}: found no folder of this user, expected one to keep state in")
+    return path
 
 
 def cell_key(cell: Path) -> str:

@@ -36,6 +36,10 @@ class Controlled(Protocol):
         """Return the latched fault, not acknowledged yet; empty: none."""
 
     @property
+    def mark_problem(self) -> str:
+        """Return why an acknowledged mark of a failed verification is still there; empty: no."""
+
+    @property
     def may_write(self) -> bool:
         """Return whether arming is possible at all."""
 
@@ -130,6 +134,9 @@ class Control:
                 f"no loop has taken it within {LONGEST_PICKUP:g} s (the state is "
                 f"{daemon.state.name.lower()}); it is kept for the next one"
             )
+
+        if problem := daemon.mark_problem:
+            return refusal(problem)
 
         def observes() -> bool:
             return daemon.state == State.OBSERVING and not daemon.latched

@@ -18,9 +18,10 @@ from typing import IO, Any
 
 from gapbridge.bridge.cell.daemon_settings import DaemonSettings
 from gapbridge.bridge.cell.run_settings import Configuration, configuration_for, settings_of
-from gapbridge.bridge.cell.runtime_folder import cell_key, runtime_folder
+from gapbridge.bridge.cell.runtime_folder import cell_key, runtime_folder, state_folder
 from gapbridge.bridge.daemon.control import Control
 from gapbridge.bridge.daemon.fitted_watch import FittedWatch
+from gapbridge.bridge.daemon.kept_rests import KeptRests
 from gapbridge.bridge.daemon.owner_lock import OwnerLock
 from gapbridge.bridge.daemon.processes import LoopProcess
 from gapbridge.bridge.daemon.reload import Reload
@@ -30,6 +31,7 @@ from gapbridge.bridge.daemon.slip_watch import Slip, SlipWatch
 from gapbridge.bridge.daemon.status import DaemonStatus
 from gapbridge.bridge.daemon.status_document import SCHEMA
 from gapbridge.bridge.daemon.summary import RunSummary, Tally
+from gapbridge.bridge.daemon.verification_watch import VerificationWatch
 from gapbridge.bridge.document.output_file import private, require_folder
 from gapbridge.bridge.ipc.command_memory import Command, CommandMemory
 from gapbridge.bridge.ipc.control_socket import ControlSocket
@@ -96,6 +98,8 @@ class Daemon:
         self._status = DaemonStatus(self.memory.slices, clock)
         self._fitted = FittedWatch(configuration.fitted, self.memory.slices)
         self._slips = self._slip_watch()
+        self._kept = KeptRests(clock)
+        self._verification = VerificationWatch(None if settings.uncorrected else settings.cell)
         self._status_at = 0.0
         self._reload = Reload(self.manager, self.event_log)
         self.control = Control(self, clock)
@@ -133,6 +137,11 @@ class Daemon:
     def latched(self) -> str:
         """Return the latched fault, not acknowledged yet; empty: none."""
         return self._status.latched
+
+    @property
+    def mark_problem(self) -> str:
+        """Return why an acknowledged mark of a failed verification is still there; empty: no."""
+        return self._verification.problem
 
     @property
     def sequence(self) -> int:
@@ -207,6 +216,36 @@ class Daemon:
         smallest = self.settings.limits.zero_slip
         return SlipWatch(self.configuration.model, self.memory.slices, smallest)
 
+    def _take_configuration(self, new: Configuration) -> None:
+        """Take what the next loop runs with; what was learned stays while it is the same."""
+        same = new.fingerprint == self.configuration.fingerprint
+        self.configuration = new
+        self._fitted = FittedWatch(new.fitted, self.memory.slices)
+        if same:
+            self._slips.interrupt()
+        else:
+            self._slips = self._slip_watch()
+        self._keep_rests(at_once=True)
+
+    def _open_kept_rests(self) -> None:
+        """Continue with what the run before has learned of the joints' zeros."""
+        settings = self.settings
+        if settings.uncorrected or settings.link.driver == "replay" or not self._slips.watches:
+            return
+        try:
+            path = state_folder() / f"{cell_key(settings.cell)}.rests.json"
+            detail = self._kept.open(path, self._slips, self.configuration)
+        except InputError as error:
+            detail = f"{error}; what is learned of joints' zeros is lost at the end"
+        if detail:
+            self.event_log.add({"kind": EventKind.NOTE, "detail": detail})
+
+    def _keep_rests(self, at_once: bool = False) -> None:
+        if detail := self._kept.step(self._slips, self.configuration, at_once):
+            self.event_log.add(
+                {"kind": EventKind.WARNING, "what": "rests_not_kept", "detail": detail}
+            )
+
     def note(self, event: Event) -> None:
         """Queue an event, which the daemon's thread emits."""
         self._posted.put(event)
@@ -253,11 +292,38 @@ class Daemon:
             number, command, by = self._requests.get()
             name = "arm" if command == Command.ARM else "disarm"
             detail = f"{name} requested by {by}"
+            moved = self._status.zero_moved
             self.event_log.add(
                 {"kind": EventKind.REQUEST, "command": name, "number": number, "by": by,
                  "acknowledges": command == Command.DISARM, "detail": detail}
             )  # fmt: skip
+            if command == Command.DISARM:
+                self._verification.acknowledge()
+            if command == Command.DISARM or not moved:
+                self._check_zeros()
+            if command == Command.DISARM and moved:
+                self._slips.reset()
+                self._keep_rests(at_once=True)
+            if command == Command.ARM and (why := self._status.zero_moved):
+                detail = f"{why}; acknowledge it first: gapbridge disarm"
+                self.event_log.add({"kind": EventKind.REFUSED, "what": "arm", "detail": detail})
+                continue
             self._commands.ask(command, number)
+
+    def _check_zeros(self) -> None:
+        """Hold if a verification has failed, until its mark is removed, or for an earlier slip."""
+        slip = self._kept.slip_of_earlier_run()
+        if slip is not None:
+            self.event_log.add(slip)
+            self._commands.ask(Command.ZERO_MOVED)
+        event = self._verification.look()
+        if event is None:
+            return
+        self.event_log.add(event)
+        if not event["holds"]:
+            self._commands.ask(Command.ZERO_MOVED)  # after the event that says why
+        elif not self.latched:
+            self._commands.ask(Command.DISARM)  # else a person's, who sees what else is latched
 
     # -- the run ----------------------------------------------------------------------------------
 
@@ -271,9 +337,7 @@ class Daemon:
             while not self._stopping.is_set():
                 self._run_loop((by or PROGRAM) if arm else "", duration)
                 swap = self._reload.swap()
-                self.configuration = swap.configuration or self.configuration
-                self._fitted = FittedWatch(self.configuration.fitted, self.memory.slices)
-                self._slips = self._slip_watch()
+                self._take_configuration(swap.configuration or self.configuration)
                 arm = swap.rearms  # otherwise only a person can arm again
                 by = "the cell file" if arm else ""
                 if not self._stopping.is_set() and not swap.in_order:
@@ -306,6 +370,9 @@ class Daemon:
         stack.callback(self.side_processes.close)
         self.side_processes.start(settings, start_data, self.memory, self._output)
         stack.callback(lambda: self.event_log.add({"kind": EventKind.ENDED}))
+        self._open_kept_rests()
+        stack.callback(self._kept.close)
+        stack.callback(self._keep_rests, at_once=True)
         path = runtime_folder() / f"{cell_key(settings.cell)}.sock"
         try:
             stack.enter_context(ControlSocket(path, self.control.answer))
@@ -348,6 +415,8 @@ class Daemon:
             self.event_log.add(self._posted.get())
         if self._clock.monotonic() >= self._status_at:
             self._status_at = self._clock.monotonic() + STATUS_EVERY
+            self._check_zeros()
+            self._keep_rests()
             self.side_processes.emit({"kind": EventKind.STATUS, **self.status()})
         loop = self.loop
         if loop is None or not loop.hangs:
@@ -394,7 +463,7 @@ class Daemon:
     def _start_loop(self, armed_by: str) -> LoopProcess:
         """Start a process of the loop, which receives only requests made from now on.
 
-        In addition, a disarm request that no loop has received is repeated.
+        In addition, requests other than to arm that no loop has received are repeated.
         """
         with self._request_lock:  # no request is numbered and not yet written
             self._forward_requests()
@@ -403,7 +472,8 @@ class Daemon:
             "may_write": self.may_write, "number": self._loops, "latched": self._status.latched,
             "after": after,
         }  # fmt: skip
-        for command in (Command.DISARM, Command.RAMP_OUT):
+        kept = (Command.DISARM, Command.RAMP_OUT, Command.ZERO_MOVED)
+        for command in sorted(kept, key=self._commands.last_of):
             if self._commands.last_of(command) > self.memory.last_taken:
                 self._commands.ask(command)
         if armed_by and self.may_write:
@@ -435,11 +505,13 @@ class Daemon:
             self.event_log.add(finding.event)
             if isinstance(finding, Slip):
                 self._commands.ask(Command.ZERO_MOVED)  # after the event that says why
+                self._keep_rests(at_once=True)
 
     def _on_event(self, event: Event) -> None:
         """Act on an event, and print it on the terminal."""
         kind, detail = event["kind"], str(event.get("detail", ""))
         self._status.on_event(event)
+        self._kept.on_event(event)
         self._reload.on_event(event)
         if kind == EventKind.FAILURE:
             self._failure = event

@@ -70,7 +70,7 @@ class Reload:
             self._ended = event["command"] == "disarm"
         elif kind == EventKind.TRANSITION:
             self._ended |= event["cause"] not in OWN_CAUSES
-        elif kind in (EventKind.FAULT, EventKind.FAILURE, EventKind.SLIP):
+        elif kind in (EventKind.FAULT, EventKind.FAILURE, EventKind.SLIP, EventKind.VERIFICATION):
             self._ended = True
 
     def swap(self) -> Swap:

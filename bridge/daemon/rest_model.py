@@ -22,6 +22,7 @@ class Place:
 
     q: Array  # (n,) rad
     mass: float  # kg, declared
+    cog: Array  # (3,) m, declared
     side: bytes  # direction of approach of each joint
     predicted: Array  # (m,) readings of the rigid arm
     slip: Array  # (m, n) change of the readings per rad of each joint's zero
@@ -64,17 +65,19 @@ class RestModel:
         force, torque = flange_in_base.T @ at_tcp[:3], flange_in_base.T @ at_tcp[3:]
         return np.concatenate([force, torque + np.cross(tool[:3, 3], force)])
 
-    def columns(self, mean: Array) -> tuple[Array, Array, Array]:
+    def place(self, q: Array, mass: float, cog: Array, side: bytes) -> Place:
+        """Return a place with what the model predicts there."""
+        return Place(q, mass, cog, side, *self._columns(q, mass, cog))
+
+    def _columns(self, q: Array, mass: float, cog: Array) -> tuple[Array, Array, Array]:
         """Return readings (m,), their changes by joint zeros (m, n) and by other steps (m, f)."""
         n = self._n
-        mass, cog = self.payload(mean)
         steps = STEP * np.vstack([np.eye(n), -np.eye(n), np.zeros(n)])
-        turned = self._predicted(mean[:n] + steps, mass, cog)
+        turned = self._predicted(q + steps, mass, cog)
         slip, here = (turned[:n] - turned[n:-1]).T / (2.0 * STEP), turned[-1]
         moment = mass * cog
         payload = [
-            (self._predicted(mean[None, :n], mass + STEP, (moment + m) / (mass + STEP))[0] - here)
-            / STEP
+            (self._predicted(q[None], mass + STEP, (moment + m) / (mass + STEP))[0] - here) / STEP
             for m in STEP * np.vstack([np.zeros(3), np.eye(3)])
         ]
         payload[1:] = [column - payload[0] for column in payload[1:]]  # the moment's own

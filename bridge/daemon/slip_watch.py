@@ -16,7 +16,7 @@ poses in the shares of a joint. It is reported as a force, and excluded from the
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -89,10 +89,13 @@ class Force:
 
 
 @dataclass(frozen=True)
-class _Rest:
+class Rest:
+    """One rest of the arm."""
+
     place: int
     time: float  # s
     readings: Array  # (m,) less the model's; NaN where there is no such sensor
+    stretch: int = -1  # of cycles without interruption; -1: in an earlier run
 
 
 class _Change(NamedTuple):
@@ -140,6 +143,7 @@ class SlipWatch:
         if model is not None and smallest > 0.0:
             self._model = RestModel(model.without_terms())
         self._smallest = smallest
+        self._stretch = 0
         names = (
             "actual_q", "ft_raw_wrench", "actual_TCP_force", "actual_current_as_torque", "payload",
             "payload_cog",
@@ -155,12 +159,43 @@ class SlipWatch:
     def reset(self) -> None:
         """Start learning again: the arm has changed."""
         self._places: list[Place] = []
-        self._rests: deque[_Rest] = deque(maxlen=MAX_RESTS)
+        self._rests: deque[Rest] = deque(maxlen=MAX_RESTS)
         self._standstill: _Standstill | None = None
         self._touched = False  # a force has come or gone during this rest
         self._previous_q: Array | None = None  # (n,) rad: the rest before this one
-        self._under_force: list[_Rest] = []  # rests in a row under a force
+        self._under_force: list[Rest] = []  # rests in a row under a force
         self._sigma: Array | None = None  # (m,) of one rest
+
+    def interrupt(self) -> None:
+        """Forget the rest under way: cycles are missing, and the arm may have moved meanwhile."""
+        self._standstill, self._touched = None, False
+        self._previous_q, self._under_force = None, []
+        self._stretch += 1
+
+    @property
+    def places(self) -> tuple[Place, ...]:
+        """Return the poses to which the program has returned."""
+        return tuple(self._places)
+
+    @property
+    def rests(self) -> tuple[Rest, ...]:
+        """Return the rests that are compared, in their order."""
+        return tuple(self._rests)
+
+    def resume(
+        self, poses: Sequence[tuple[Array, float, Array, bytes]], rests: Iterable[Rest]
+    ) -> None:
+        """Continue with the rests of an earlier run; ``poses``: arguments of RestModel.place."""
+        self.reset()
+        if self._model is not None:
+            self._places = [self._model.place(*pose) for pose in poses]
+            self._rests.extend(rests)
+            self._sigma = self._noise()
+
+    @property
+    def watches(self) -> bool:
+        """Return whether anything is compared."""
+        return self._model is not None
 
     @property
     def learned(self) -> bool:
@@ -221,7 +256,8 @@ class SlipWatch:
         # the median window: a touch shorter than half of the rest has no effect
         mean = _median(standing.windows)
         place = self._place_of(mean)
-        rest = _Rest(place, standing.since, self._model.readings(mean, self._places[place]))
+        readings = self._model.readings(mean, self._places[place])
+        rest = Rest(place, standing.since, readings, self._stretch)
         self._previous_q = mean[: self._n]
         findings = self._forces(rest)
         if self._under_force:
@@ -234,7 +270,7 @@ class SlipWatch:
             self.reset()
         return findings
 
-    def _forces(self, rest: _Rest) -> list[Slip | Force]:
+    def _forces(self, rest: Rest) -> list[Slip | Force]:
         """Exclude rests under a force, up to LASTING_RESTS in a row."""
         excess = self._excess(rest)
         if excess is None:
@@ -248,9 +284,13 @@ class SlipWatch:
             self._under_force = []
         return []
 
-    def _excess(self, rest: _Rest) -> float | None:
+    def _excess(self, rest: Rest) -> float | None:
         """Return the change of force, N, at a pose if it is too large for a slip, or None."""
-        former = [r.readings for r in self._rests if r.place == rest.place]
+        former = [
+            r.readings
+            for r in self._rests
+            if r.place == rest.place and r.stretch == rest.stretch  # a sensor may be zeroed between
+        ]
         if self._sigma is None or len(former) < 2:
             return None
         size = float(np.linalg.norm((rest.readings - _median(former))[:3]))
@@ -261,7 +301,7 @@ class SlipWatch:
         """Return the number of the pose, a new one if it was not seen yet."""
         assert self._model is not None
         n = self._n
-        q, mass = mean[:n], self._model.payload(mean)[0]
+        q, (mass, cog) = mean[:n], self._model.payload(mean)
         step = np.zeros(n) if self._previous_q is None else q - self._previous_q
         side = np.where(np.abs(step) > APPROACH_STEP, np.sign(step), 0).astype(np.int8).tobytes()
         for number, place in enumerate(self._places):
@@ -270,7 +310,7 @@ class SlipWatch:
                 return number
         if len(self._places) >= MAX_POSES:
             self._drop_oldest()
-        self._places.append(Place(q, mass, side, *self._model.columns(mean)))
+        self._places.append(self._model.place(q, mass, cog, side))
         return len(self._places) - 1
 
     def _drop_oldest(self) -> None:
@@ -446,7 +486,7 @@ def _median(values: Array | list[Array]) -> Array:
     return np.asarray(np.where(np.isnan(ordered[-1]), np.nan, half))
 
 
-def _by_place(rests: list[_Rest]) -> dict[int, list[Array]]:
+def _by_place(rests: list[Rest]) -> dict[int, list[Array]]:
     readings: dict[int, list[Array]] = {}
     for rest in rests:
         readings.setdefault(rest.place, []).append(rest.readings)

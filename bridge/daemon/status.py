@@ -46,6 +46,7 @@ class DaemonStatus:
         self._fault = ""  # of the loop, not acknowledged yet
         self._clears_with_link = False  # that fault ends with the link
         self._slip = ""  # a joint's zero that moved, not acknowledged yet: kept beside any fault
+        self._unverified = ""  # why the last verification failed, until its mark is removed
         self._batches: deque[tuple[float, int]] = deque()  # s, cycles
         self._last_state: float | None = None  # s, monotonic: when the last state was received
         self._received = slices["received"].start
@@ -57,8 +58,13 @@ class DaemonStatus:
 
     @property
     def latched(self) -> str:
-        """Return what is not acknowledged yet, a slip or a fault; empty: nothing."""
-        return self._slip or self._fault
+        """Return what is not acknowledged yet, a moved zero or a fault; empty: nothing."""
+        return self.zero_moved or self._fault
+
+    @property
+    def zero_moved(self) -> str:
+        """Return why the joints' zeros are not trusted: slip, failed verification; empty: are."""
+        return self._unverified or self._slip
 
     def take(self, rows: Array) -> None:
         """Update from cycles: rows (k, width)."""
@@ -78,6 +84,8 @@ class DaemonStatus:
             self._asked_by = event["by"]
         if event["kind"] == EventKind.SLIP:
             self._slip = event["detail"]
+        if event["kind"] == EventKind.VERIFICATION:
+            self._unverified = "" if event["holds"] else event["detail"]
         if event["kind"] == EventKind.REQUEST and event["acknowledges"]:
             self._slip = ""
         if event["kind"] == EventKind.COMPILING:

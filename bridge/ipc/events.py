@@ -33,6 +33,7 @@ class EventKind(StrEnum):
     COMPILING = "compiling"  # what the loop compiles
     CONFIGURATION = "configuration"  # the cell file was read again
     SLIP = "slip"  # a joint's zero has moved
+    VERIFICATION = "verification"  # the mark of a failed verification has come or gone
     RECORDER = "recorder"  # the recorder's own
     SIDE = "side"  # a side process ended, stalled or emitted a foreign kind of event
     SUMMARY = "summary"  # of the run

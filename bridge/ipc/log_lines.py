@@ -57,7 +57,7 @@ class JsonLines:
 
 
 def _level(event: Mapping[str, Any]) -> str:
-    if event.get("kind") in _ERRORS or "failure" in event:
+    if event.get("kind") in _ERRORS or "failure" in event or event.get("holds") is False:
         return "error"
     if str(event.get("to", "")).upper() == State.FAULT.name:
         return "error"

@@ -70,6 +70,12 @@ class Verification:
     stations: tuple[Registration, ...]
     notes: tuple[Note, ...]
 
+    @property
+    def cell_differs(self) -> bool:
+        """Return whether the arm may differ from its cell, not only instrument or one reading."""
+        changes = () if self.moved is None else (self.moved, *self.alternatives)
+        return not self.holds and (not changes or any(change.effect for change in changes))
+
 
 @dataclass(frozen=True)
 class _WhitenedSystem:

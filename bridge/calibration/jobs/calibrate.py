@@ -22,6 +22,7 @@ from gapbridge.bridge.calibration.planning import effects_of, make_plan, metrolo
 from gapbridge.bridge.calibration.session.prompt import Prompt
 from gapbridge.bridge.calibration.session.session import Session, seconds_left
 from gapbridge.bridge.cell import Cell
+from gapbridge.bridge.cell.verification_mark import remove_mark
 from gapbridge.bridge.document.notes import calibration_text, note_text
 from gapbridge.bridge.document.provenance import fitted as fit_provenance
 from gapbridge.bridge.document.provenance import provenance
@@ -174,6 +175,7 @@ class CalibrationJob(Job):
         target = self.write_new_cell(result.model, "the calibrated cell", sections)
         if target is not None:
             write_document(baseline_path(target), baseline)
+            remove_mark(target)  # of the calibration that was replaced
             prompt.say(f"  months later: gapbridge calibrate {target} --verify")
 
 

@@ -26,12 +26,13 @@ from gapbridge.bridge.calibration.planning import (
     workspace_of,
 )
 from gapbridge.bridge.calibration.session.session import seconds_left
+from gapbridge.bridge.cell.verification_mark import mark_path, remove_mark, write_mark
 from gapbridge.bridge.document.notes import note_texts
 from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.accuracy_baseline import read_baseline
 from gapbridge.core.calibration.plan import Plan, PlannedPose
 from gapbridge.core.calibration.verify import Verification, verify
-from gapbridge.core.errors import InputError
+from gapbridge.core.errors import InputError, VerificationError
 from gapbridge.core.planning.candidates import sample_candidates
 from gapbridge.core.planning.travel import joint_speed, move_times, shortest_order, spread_rows
 
@@ -94,7 +95,11 @@ class VerifyJob(Job):
         self.prompt.say(f"plan: {len(plan.poses)} poses, {duration(time)}")
 
     def finish(self) -> None:
-        """Report whether the calibration is still valid, and what has changed if it is not."""
+        """Report whether the calibration is still valid, and what has changed if it is not.
+
+        Raises VerificationError if it is not. New readings set or remove the mark beside
+        the cell; a session that is only evaluated once more does not.
+        """
         prompt, options, folder = self.prompt, self.options, self.folder
         places = self.session.station_count
         metrology = metrology_of(self.cell, options.instrument, places)
@@ -115,7 +120,23 @@ class VerifyJob(Job):
             prompt.say(f"{file}: written")
         moved = None if verification.moved is None else verification.moved.name
         others = [other.name for other in verification.alternatives]
+        if not self.session.has_ended:
+            self._mark(verification)  # first: a session that could not mark has not ended
         self.session.add("ended", holds=verification.holds, moved=moved, or_else=others)
+        if not verification.holds:
+            raise VerificationError(f"{self.cell.path}: {verdict_text(verification)}")
+
+    def _mark(self, verification: Verification) -> None:
+        """Mark the cell, so that its daemon does not arm, or remove the mark. Raises RunError."""
+        path, prompt = self.cell.path, self.prompt
+        if verification.cell_differs:
+            mark = write_mark(path, verdict_text(verification), self.folder)
+            prompt.warn(
+                f"{mark}: written; `gapbridge run {path}` does not arm until a "
+                f"verification passes, or a person has acknowledged it: gapbridge disarm {path}"
+            )
+        elif verification.holds and remove_mark(path):
+            prompt.say(f"{mark_path(path)}: removed")
 
     def _report(self, verification: Verification) -> None:
         prompt = self.prompt

@@ -72,6 +72,7 @@ class Session:
     station: int = 0  # of the instrument, as in Reading: also counts unplanned moves
     place: int = 0  # planned position of the instrument, as PlannedPose.station
     target: int = 0  # added to PlannedPose.target: counts slips of the target
+    has_ended: bool = False  # its readings were evaluated
     notes: list[str] = field(default_factory=list)
     used_sources: set[str] = field(default_factory=set)
     intervals: list[float] = field(default_factory=list)  # s between consecutive readings
@@ -102,10 +103,14 @@ class Session:
                 self.plan = plan_of(entry["plan"])
             case "reading":
                 self._accept(Reading.of(entry))
+                self.has_ended = False
+            case "ended":
+                self.has_ended = True
             case "rejected":
                 self.used_sources.add(entry.get("source", ""))
             case "undo":
                 self.undone += 1
+                self.has_ended = False
                 self.accepted.pop()
             case "skip":
                 self.skipped.add(int(entry["stop"]))

@@ -15,6 +15,7 @@ from gapbridge.bridge.cell.log_consistency import log_findings
 from gapbridge.bridge.cell.message import located_message, message_at
 from gapbridge.bridge.cell.plausibility import Findings
 from gapbridge.bridge.cell.run_settings import read_configuration
+from gapbridge.bridge.cell.verification_mark import read_mark
 from gapbridge.bridge.cli.options import FILE, cell_argument
 from gapbridge.bridge.setpoint_source import make_source
 from gapbridge.core.calibration.spread import parameters_named
@@ -88,6 +89,9 @@ def _further_findings(cell: Cell) -> Iterator[Findings]:
         yield Findings([located_message(cell.document, error)], [])
     if cell.file.link is not None:
         yield _run_findings(cell)
+    if reason := read_mark(cell.path):
+        way_out = f"expected a verification that passes, or gapbridge disarm {cell.path}"
+        yield Findings([f"{reason}; {way_out}"], [])
 
 
 def _run_findings(cell: Cell) -> Findings:

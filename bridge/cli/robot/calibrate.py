@@ -50,7 +50,8 @@ EPILOG = "\b\nAt every question:\n" + "\n".join(
 @click.option(
     "--verify",
     is_flag=True,
-    help="Measure a few poses to verify that the calibration is still valid.",
+    help="Measure a few poses to verify that the calibration is still valid; if not, exit with 1, "
+    "and the daemon does not arm.",
 )
 @click.option(
     "--payload-only",

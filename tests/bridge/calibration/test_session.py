@@ -23,6 +23,7 @@ from scripted_session import (
 
 from gapbridge.bridge.calibration.session.journal import FILE, read_entries
 from gapbridge.bridge.cell import load_cell
+from gapbridge.bridge.cell.verification_mark import read_mark
 
 
 @pytest.fixture(scope="module")
@@ -251,19 +252,24 @@ def test_a_verification_accepts_the_arm_and_detects_a_bent_tool(
     clean: tuple[Path, CommandResult], tmp_path: Path
 ) -> None:
     cell = clean[0] / "new.yaml"
-    for bend, phrase in ((0.0, "holds"), (0.004, "tool")):
-        session = tmp_path / f"v{bend:g}"
+    for name, bend, phrase in (("a", 0.0, "holds"), ("b", 0.004, "tool"), ("c", 0.0, "holds")):
+        session = tmp_path / name
         assert run_calibrate(cell, "--verify", "--plan-only", "--session", session).code == 0
         plan = plan_in(session)
         value = _verified(plan, bend)
         lines = session_lines(plan, [reading_line(v) for v in value])
         lines = [part for line in lines for part in ([line, "keep"] if bend and line else [line])]
         result = run_calibrate(cell, "--verify", "--session", session, lines=lines)
-        assert result.code == 0, result.err + result.out[-1500:]
+        assert result.code == (1 if bend else 0), result.err + result.out[-1500:]
         assert (session / "verification.html").exists()
+        assert bool(read_mark(cell)) is bool(bend)
+        assert result.err.count("\n") == (1 if bend else 0)
         assert phrase in result.out.lower()
         holds = next(e for e in read_entries(session / FILE) if e["kind"] == "ended")["holds"]
         assert holds is (bend == 0.0)
+        if bend:  # an old session that is evaluated again says nothing of the arm today
+            assert run_calibrate(cell, "--verify", "--session", tmp_path / "a").code == 0
+            assert "the tool moved by" in read_mark(cell)
 
 
 def _verified(plan: object, bend: float) -> np.ndarray:

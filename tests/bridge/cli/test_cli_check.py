@@ -13,6 +13,7 @@ from daemon_cell import plant
 from simulated_controller import SimulatedController
 
 from gapbridge.bridge.cell import load_cell
+from gapbridge.bridge.cell.verification_mark import write_mark
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.model import Model
 from gapbridge.core.plausibility import flange_in_first
@@ -59,6 +60,14 @@ def test_a_cell_that_is_wrong_ends_with_two_and_every_line(tmp_path: Path) -> No
     lines = answer.err.splitlines()
     assert [line.split(": ")[2] for line in lines] == ["gravity", "reference_temperature"]
     assert all(line.startswith(f"error: {path}, line ") for line in lines)
+
+
+def test_a_cell_whose_verification_failed_is_not_fit(tmp_path: Path) -> None:
+    path = cell_of(tmp_path, "")
+    mark = write_mark(path, "the zero of joint 5 moved by 10 mrad", tmp_path)
+    assert refused("check", path).startswith(f"error: {mark}: the zero of joint 5 moved by 10 mrad")
+    mark.unlink()
+    assert gapbridge("check", path).code == 0
 
 
 def test_a_trajectory_that_cannot_be_run_is_named(tmp_path: Path) -> None:

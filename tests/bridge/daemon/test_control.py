@@ -17,6 +17,7 @@ from daemon_cell import Robot, Run, gapbridge
 from patience import PATIENCE, wait_for
 
 from gapbridge.bridge.cell.runtime_folder import cell_key, runtime_folder
+from gapbridge.bridge.cell.verification_mark import write_mark
 from gapbridge.bridge.daemon import control
 from gapbridge.bridge.ipc import control_socket
 from gapbridge.bridge.ipc.control_client import ask, ask_socket, running
@@ -256,11 +257,27 @@ def test_a_disarming_between_two_loops_is_kept_and_answered_by_the_next(robot: R
         assert run.daemon.latched == ""
 
 
+def test_a_cell_whose_verification_failed_does_not_arm_before_a_person_has_seen_it(
+    robot: Robot,
+) -> None:
+    cell = robot.cell(PATIENT)
+    mark = write_mark(cell, "the zero of joint 5 moved by 10 mrad", robot.folder)
+    with Run(cell, arm=True) as run:
+        run.wait(State.OBSERVING)
+        wait_for(lambda: run.daemon.status()["counts"]["zero_moved"] == 1, "the count")
+        assert any("acknowledge it first" in line for line in run.output)
+        with pytest.raises(RunError, match="the zero of joint 5 moved by 10 mrad"):
+            ask(cell, "arm")
+        assert "observing" in ask(cell, "disarm")
+        assert not mark.exists()
+        assert "compensating" in ask(cell, "arm")
+
+
 class NoLoop:
     """A daemon between two processes of the loop, of which no next one comes."""
 
     state, phase, latched, may_write, sequence = State.DISCONNECTED, Phase.STARTING, "x", True, 0
-    last_taken, asked = 3, 3
+    last_taken, asked, mark_problem = 3, 3, ""
 
     def disarm(self, by: str) -> int:
         self.asked += 1

@@ -2,22 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from typing import Any
-
 import numpy as np
 import pytest
+from simulated_daemon import ask, causes, rides_on_a_program, until
 
-from benchmarks.simulation.links import setting_of
-from benchmarks.simulation.processes import Run as SimulatedRun
-from benchmarks.simulation.sequence import LINKS
-from benchmarks.simulation.ur import UrLink, library
-from benchmarks.simulation.world import Process, SimulatedClock, World
 from benchmarks.zero_slips import COUNTS, SETUPS, SLICES, Program, Setup, found_in
 from gapbridge.bridge.daemon.slip_watch import Slip, SlipWatch
 from gapbridge.bridge.daemon.status_document import lines
-from gapbridge.bridge.ipc.control_socket import Peer
+from gapbridge.bridge.ipc.command_memory import Command
 from gapbridge.bridge.ipc.loop_state import State
 
 LEARNING = 6 * COUNTS  # rests
@@ -117,43 +109,6 @@ def test_without_poses_that_come_back_nothing_is_compared() -> None:
     assert "learning" in watch.detail
 
 
-@contextmanager
-def rides_on_a_program(seed: int = 3) -> Iterator[tuple[SimulatedRun, World]]:
-    """A whole daemon and its loop on a UR's own program, in simulated time; it compensates."""
-    world = World(seed)
-    link = LINKS["ur_offset"](world, SimulatedClock(world), setting_of("ur_offset"), lambda _: None)
-    assert isinstance(link, UrLink)
-    with library(link.modules()):
-        run = SimulatedRun(world, link.clock, link, planned=False)
-        try:
-            until(world, lambda: run.daemon.state == State.OBSERVING)
-            ask(run, "arm")
-            assert run.daemon.state == State.COMPENSATING
-            yield run, world
-        finally:
-            world.end()
-            run.daemon._commands.close()
-            run.daemon.memory.close()
-
-
-def until(world: World, over: Callable[[], bool], limit: float = 30.0) -> None:
-    world.run(world.now + limit, over)
-    assert over()
-
-
-def ask(run: SimulatedRun, command: str) -> dict[str, Any]:
-    """Return what the control socket answers."""
-    world, before = run.world, run.world.now
-    person = Process(world, "person", lambda: run.daemon.control.answer(command, Peer(1, 1000)))
-    until(world, lambda: person.over, 60.0)
-    assert person.error == "", (before, person.error)
-    return dict(person.result)
-
-
-def causes(run: SimulatedRun) -> list[str]:
-    return [e["cause"] for e in run.daemon.event_log.recent if e["kind"] == "transition"]
-
-
 def test_a_slip_holds_the_run_until_a_person_has_seen_it() -> None:
     with rides_on_a_program() as (run, world):
         daemon = run.daemon
@@ -171,8 +126,10 @@ def test_a_slip_holds_the_run_until_a_person_has_seen_it() -> None:
         refused = ask(run, "arm")
         assert not refused["ok"]
         assert "a fault is latched: the zero of joint 4" in refused["error"]
-        daemon.arm()  # past the daemon's refusal: the loop has one of its own
-        until(world, lambda: daemon.event_log.counts["refused"] > 0, 3.0)
+        daemon.arm()  # past the answer: the daemon has another refusal
+        until(world, lambda: daemon.event_log.counts["refused"] == 1, 3.0)
+        daemon._commands.ask(Command.ARM)  # past the daemon: the loop has one of its own
+        until(world, lambda: daemon.event_log.counts["refused"] == 2, 3.0)
         assert daemon.state == State.OBSERVING
         assert ask(run, "disarm")["ok"]
         assert daemon.status()["latched"] == ""

@@ -1,0 +1,187 @@
+"""What the watch over the joints' zeros has learned, kept in a file for the next run.
+
+A collision that ends a run, or a power cycle, must not become the new normal. The file holds poses
+and rests while the cell and its files are the same, and a slip until it is acknowledged.
+"""
+
+from __future__ import annotations
+
+import json
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gapbridge.bridge.cell.run_settings import Configuration
+from gapbridge.bridge.daemon.slip_watch import MAX_POSES, MAX_RESTS, Rest, SlipWatch
+from gapbridge.bridge.document.output_file import write_text
+from gapbridge.bridge.document.provenance import installed_version
+from gapbridge.bridge.ipc.events import Event, EventKind
+from gapbridge.core.arrays import Array
+from gapbridge.core.errors import GapbridgeError
+from gapbridge.drivers.clock import SYSTEM, Clock
+
+SCHEMA = "gapbridge.rests/1"
+EVERY = 60.0  # s between two writes
+LONGEST = 4_000_000  # bytes
+LARGEST = 1e6  # of any number
+SLIP = ("joints", "size", "std", "since", "detail")  # fields of the event
+
+
+class KeptRests:
+    """Reads the file at the start of a run and writes it, in a thread: disks can be slow."""
+
+    def __init__(self, clock: Clock = SYSTEM) -> None:
+        self._now = clock.monotonic
+        self._path: Path | None = None  # None: nothing is kept
+        self._text = ""  # written last
+        self._due = 0.0  # s, monotonic
+        self._slip: Event | None = None  # not acknowledged
+        self._is_new = False  # that slip is of an earlier run, and not reported in this one
+        self._failed = False  # reported
+        self._writer = ThreadPoolExecutor(1)  # starts no thread before the first write
+        self._writing: Future[None] | None = None
+
+    def open(self, path: Path, watch: SlipWatch, configuration: Configuration) -> str:
+        """Have ``watch`` continue with what the file holds; returns why not, if it does not."""
+        self._path, self._due = path, self._now() + EVERY
+        self._text = self._document(watch, configuration)  # nothing worth a file yet
+        try:
+            with open(path, "rb") as file:
+                data = file.read(LONGEST)
+        except FileNotFoundError:
+            return ""
+        except OSError as error:
+            return f"{path}: cannot be read: {error.strerror}; joints' zeros are learned anew"
+        self._text = ""
+        try:
+            document = json.loads(data)
+            if document["schema"] != SCHEMA:
+                raise ValueError
+            slip, owner = _slip_of(document["slip"]), document["of"]
+            poses, rests = _poses(document, configuration.n), _rests(document, configuration.n)
+        except (ValueError, TypeError, KeyError, AttributeError, RecursionError, OverflowError):
+            return f"{path}: found no rests of an arm, ignored; joints' zeros are learned anew"
+        self._slip, self._is_new = slip, slip is not None
+        if owner != _identity(configuration):
+            return f"{path}: found rests with another cell; joints' zeros are learned anew"
+        watch.resume(poses, rests)
+        self._text = self._document(watch, configuration)
+        return ""
+
+    def slip_of_earlier_run(self) -> Event | None:
+        """Return the event of a slip that nobody has acknowledged in an earlier run, once."""
+        slip, self._is_new = self._slip if self._is_new else None, False
+        return slip
+
+    def on_event(self, event: Event) -> None:
+        """Note a slip, and that it is acknowledged."""
+        if event["kind"] == EventKind.SLIP:
+            self._slip = {"kind": EventKind.SLIP, **{key: event[key] for key in SLIP}}
+        if event["kind"] == EventKind.REQUEST and event["acknowledges"]:
+            self._slip = None
+
+    def step(self, watch: SlipWatch, configuration: Configuration, at_once: bool = False) -> str:
+        """Write what is new, once a minute or ``at_once``; returns why it failed, once."""
+        if self._path is None or (self._now() < self._due and not at_once):
+            return ""
+        self._due = self._now() + EVERY
+        text = self._document(watch, configuration)
+        if text != self._text:
+            self._text = text
+            self._writing = self._writer.submit(write_text, self._path, text)
+        return self._problem()
+
+    def close(self) -> None:
+        """Wait until the last write is done."""
+        self._writer.shutdown()
+
+    def _problem(self) -> str:
+        if self._writing is None or not self._writing.done():
+            return ""
+        error, self._writing = self._writing.exception(), None
+        if error is None:
+            return ""
+        self._text = ""  # tried again
+        if self._failed:
+            return ""
+        self._failed = True
+        what = str(error) if isinstance(error, GapbridgeError) else type(error).__name__
+        return f"what was learned of the joints' zeros is lost at the end: {what}"
+
+    def _document(self, watch: SlipWatch, configuration: Configuration) -> str:
+        """Return the file's text; before enough is learned there are no rests in it."""
+        places, rests = (watch.places, watch.rests) if watch.learned else ((), ())
+        document = {
+            "schema": SCHEMA,
+            "of": _identity(configuration),
+            "slip": self._slip,
+            "poses": [
+                {"q": place.q.tolist(), "mass": place.mass, "cog": place.cog.tolist(),
+                 "side": np.frombuffer(place.side, np.int8).tolist()}
+                for place in places
+            ],
+            "rests": [
+                [rest.place, rest.time, [_number(reading) for reading in rest.readings]]
+                for rest in rests
+            ],
+        }  # fmt: skip
+        return json.dumps(document, separators=(",", ":")) + "\n"
+
+
+def _number(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
+def _identity(configuration: Configuration) -> str:
+    """Return what rests belong to: the cell, its files, and the program that predicts readings."""
+    return f"{installed_version()} {configuration.fingerprint}"
+
+
+def _slip_of(kept: Any) -> Event | None:
+    if kept is None:
+        return None
+    event = {"kind": EventKind.SLIP, **{key: kept[key] for key in SLIP}}
+    if not isinstance(event["detail"], str):
+        raise ValueError
+    return event
+
+
+def _numbers(values: Any, count: int) -> Array:
+    """Return (count,) finite numbers, None as NaN. Raises ValueError, TypeError."""
+    numbers = np.array([np.nan if value is None else float(value) for value in values])
+    if numbers.shape != (count,) or np.any(np.abs(numbers) > LARGEST):
+        raise ValueError
+    return numbers
+
+
+def _finite(values: Any, count: int) -> Array:
+    numbers = _numbers(values, count)
+    if not np.isfinite(numbers).all():
+        raise ValueError
+    return numbers
+
+
+def _poses(document: dict[str, Any], n: int) -> list[tuple[Array, float, Array, bytes]]:
+    poses = [
+        (
+            _finite(pose["q"], n), float(_finite([pose["mass"]], 1)[0]), _finite(pose["cog"], 3),
+            np.sign(_finite(pose["side"], n)).astype(np.int8).tobytes(),
+        )
+        for pose in document["poses"]
+    ]  # fmt: skip
+    if len(poses) > MAX_POSES:
+        raise ValueError
+    return poses
+
+
+def _rests(document: dict[str, Any], n: int) -> list[Rest]:
+    count = len(document["poses"])
+    rests = [
+        Rest(int(place), float(time), _numbers(readings, 6 + n))
+        for place, time, readings in document["rests"]
+    ]
+    if len(rests) > MAX_RESTS or not all(0 <= rest.place < count for rest in rests):
+        raise ValueError
+    return rests
