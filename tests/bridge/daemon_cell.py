@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 import os
 import socket
@@ -17,6 +16,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 from patience import PATIENCE, wait_for
+from ports import own_host
 from simulated_controller import SimulatedController
 
 from benchmarks.server_thread import OFFSET_SCRIPT
@@ -30,18 +30,11 @@ from gapbridge.drivers.simulated.ur.settings import BENCH_PORT, ServerSettings, 
 Array = NDArray[np.float64]
 TCP = (0.0, 0.0, 0.18, 0.0, 0.0, 0.0)
 PAYLOAD, COG = 5.0, (0.0, 0.0, 0.06)
-_hosts = itertools.count(2)
-
-
-def own_address() -> str:
-    """Return a loopback address that no other test uses."""
-    pid = os.getpid()
-    return f"127.{1 + (pid >> 8) % 250}.{pid % 256}.{next(_hosts) + 100}"
 
 
 def plant(**changed: Any) -> ServerSettings:
     given: dict[str, Any] = {"tcp": TCP, "payload_mass": PAYLOAD, "payload_cog": COG}
-    return simulated_cell("ur10e", own_address(), 11, **{**given, **changed})
+    return simulated_cell("ur10e", own_host(), 11, **{**given, **changed})
 
 
 class Robot:
