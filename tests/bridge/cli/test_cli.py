@@ -460,7 +460,7 @@ def test_explain_lists_the_catalogue_and_names_the_nearest(desk: Desk) -> None:
     assert "'backlash'" in desk.refuses("explain", "backlsh")
 
 
-@pytest.mark.realtime
+@pytest.mark.realtime(limit=0.5)
 def test_simulate_serves_until_it_is_asked_to_stop(desk: Desk) -> None:
     host = own_host()
     desk.write("cell.yaml", SOFT + f"simulation: {{host: {host}, seed: 3}}\n")

@@ -42,7 +42,7 @@ def test_an_offset_that_stands_at_its_limit_ends_the_compensation(robot: Robot) 
 
 
 @pytest.mark.slow
-@pytest.mark.realtime
+@pytest.mark.realtime(limit=0.1)
 def test_a_loop_that_was_suspended_begins_anew_and_observes(robot: Robot) -> None:
     with Run(robot.cell(PATIENT), arm=True) as run:
         run.compensate()

@@ -54,7 +54,7 @@ def test_a_loop_that_dies_comes_back_observing(robot: Robot, number: signal.Sign
 
 
 @pytest.mark.slow
-@pytest.mark.realtime
+@pytest.mark.realtime(limit=0.3)
 def test_a_loop_that_hangs_is_ended_and_comes_back_observing(robot: Robot) -> None:
     with Run(robot.cell(), arm=True) as run:
         run.compensate()

@@ -130,7 +130,7 @@ def test_a_posted_body_is_no_plc(tmp_path: Path) -> None:
         source.close()
 
 
-@pytest.mark.realtime
+@pytest.mark.realtime(limit=0.1)
 def test_a_posted_body_is_no_plan(target: Target) -> None:
     target.arm()
     for _ in range(3):
@@ -162,7 +162,7 @@ Promise.all(ways).then(found => {{ document.title = found.join(); }});
         pass
 
 
-@pytest.mark.realtime
+@pytest.mark.realtime(limit=0.1)
 @pytest.mark.skipif(CHROMIUM is None, reason="no chromium on this machine")
 def test_a_strangers_page_in_a_browser_is_no_planner(target: Target) -> None:
     playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
