@@ -62,6 +62,15 @@ class Robot:
         found: dict[str, Any] = json.loads(self.bench("truth"))
         return found
 
+    def clock(self) -> float:
+        """Return the controller's own time, s."""
+        return float(self.bench("measure").split(",")[0])
+
+    def elapse(self, seconds: float) -> None:
+        """Wait until the controller has run for so long by its own clock."""
+        until = self.clock() + seconds
+        wait_for(lambda: self.clock() >= until, f"{seconds:g} s of the controller")
+
     def tcp(self, readings: int = 20) -> Array:
         """Return the true TCP's position (3,) as the tracker sees it, m."""
         rows = [self.bench("measure").split(",") for _ in range(readings)]
@@ -154,6 +163,17 @@ class Run:
             return self._written >= before + count
 
         wait_for(there, lambda: f"{count} setpoints ({self.output})")
+
+    def cycle(self, count: int) -> None:
+        """Wait until the loop has run so many more cycles, writing or not."""
+        memory = self.daemon.memory
+        until = memory.written + count
+
+        def there() -> bool:
+            assert self.error is None, self.error
+            return memory.written >= until
+
+        wait_for(there, lambda: f"{count} cycles ({self.output})")
 
     def latest(self, column: str) -> Array:
         """Return a column's values in the newest cycle."""

@@ -50,11 +50,11 @@ def test_a_loop_that_was_suspended_begins_anew_and_observes(robot: Robot) -> Non
         pid = run.daemon.loop_pid
         assert pid is not None
         os.kill(pid, signal.SIGSTOP)
-        time.sleep(0.4)
+        robot.elapse(0.4)
         os.kill(pid, signal.SIGCONT)
         wait_for(lambda: not run.daemon.state.writes, "no more writing")
         run.wait(State.OBSERVING)
-        time.sleep(0.3)
+        run.cycle(150)
         assert run.daemon.state == State.OBSERVING
         assert run.daemon.latched == ""
         run.end()
@@ -70,7 +70,7 @@ def refusal(run: Run) -> str:
     before = len(run.output)
     run.daemon.arm()
     wait_for(lambda: len(run.output) > before, "a word on arming")
-    time.sleep(0.2)
+    run.cycle(100)
     assert not run.daemon.state.writes, run.output
     return " ".join(run.output[before:])
 
@@ -98,7 +98,7 @@ def test_a_model_that_is_no_use_is_reported_and_does_not_arm(robot: Robot, times
     changed(cell, line, f"compliance: {{axial: {axial}, radial: {radial}}}")
     with Run(cell) as run:
         run.wait(State.OBSERVING)
-        time.sleep(0.5)
+        run.cycle(250)
         output = refusal(run)
         status = run.daemon.status()
         nothing_left(run)
@@ -191,9 +191,11 @@ def test_a_rate_above_the_controllers_is_refused_by_name(robot: Robot) -> None:
 def test_a_hiccup_while_observing_leaves_no_fault_and_arming_works(robot: Robot) -> None:
     with Run(robot.cell()) as run:
         run.wait(State.OBSERVING)
-        time.sleep(0.5)
+        run.cycle(250)
         robot.bench("stall 0.5")
-        time.sleep(1.5)
+        wait_for(lambda: run.daemon.status()["counts"]["silence"] == 1, "silence")
+        run.wait(State.OBSERVING)
+        run.cycle(250)
         assert run.daemon.latched == ""
         assert run.daemon.state == State.OBSERVING, run.output
         assert run.daemon.status()["counts"]["silence"] == 1
