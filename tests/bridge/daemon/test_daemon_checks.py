@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import signal
 import socket
-import time
 from pathlib import Path
 
 import numpy as np
@@ -138,12 +137,14 @@ def test_the_age_of_the_last_state_is_shown_in_the_unit_of_its_size(robot: Robot
 
 def script(robot: Robot, line: str) -> None:
     """Have the controller run a line beside its program, as a person at the pendant would."""
-    text = f"sec person():\n  {line}\nend\n"
+    before = robot.controller.log().count("program person uploaded")
     with socket.create_connection(
         (robot.host, robot.settings.script_port), timeout=PATIENCE
     ) as upload:
-        upload.sendall(text.encode())
-        time.sleep(0.2)
+        upload.sendall(f"sec person():\n  {line}\nend\n".encode())
+        wait_for(
+            lambda: robot.controller.log().count("program person uploaded") > before, "the line"
+        )
 
 
 @pytest.mark.slow

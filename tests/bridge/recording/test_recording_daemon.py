@@ -39,10 +39,10 @@ def test_a_recorder_that_is_killed_amidst_a_run_loses_nothing(robot: Robot) -> N
             wait_for(lambda: recorder_pid(run) is not None, "a recorder")
             pid = recorder_pid(run)
             assert pid is not None
-            time.sleep(0.7)
+            run.cycle(350)
             os.kill(pid, signal.SIGKILL)
             wait_for(lambda dead=pid: recorder_pid(run) != dead, "its end")  # type: ignore[misc]
-        time.sleep(0.5)
+        run.cycle(250)
         summary = run.end()
     assert summary.exit_code == 0
     assert summary.lost_rows == 0
