@@ -4,10 +4,12 @@ Tests over wires mostly wait: two processes run them, and more, if there are any
 with what is left of the cores (``make test`` has four).
 
 Every test has one chance, and is patient about time. The few whose subject is time itself are
-marked ``realtime``: such a test says nothing where the machine was late. It is skipped where the
-machine cannot keep any time before it begins, and where it failed while a process beside it on any
-core, which only sleeps, was woken later than a state may be old, or while its own process waited
-for a core for longer than it had one. How late, or how long, is in the skip's reason.
+marked ``realtime(limit=...)``: such a test says nothing where the machine is later than its subject
+bears (s; left out: as old as a state may be). Processes that only sleep, one on each core, measure
+that. It is skipped where one is woken later than the limit just before it begins, and where it
+failed and one was woken later than the limit meanwhile, or one of its own threads could run but had
+no core for more than half of its time. How late, or how long, is in the skip's reason. What a test
+says by ``pytest.fail`` is no matter of time, and always counts.
 """
 
 from __future__ import annotations
@@ -39,11 +41,11 @@ HERE = Path(__file__).parent
 if str(HERE) not in sys.path:
     sys.path.insert(0, str(HERE))
 
-from lateness import HOPELESS, LIMIT, Witness, core_time, core_times  # noqa: E402
+from lateness import CASES, LIMIT, STARVED, Witness, core_waits, longest_wait  # noqa: E402
 from waiting import NICE, WAITING  # noqa: E402
 
 WITNESS = Witness()
-HAD = pytest.StashKey[dict[str, tuple[float, float]]]()  # s that threads had, before a test
+BEGUN = pytest.StashKey[tuple[float, dict[str, float]]]()  # s since 1970; s that threads had waited
 MADE: dict[pytest.FixtureDef[Any], tuple[float, float]] = {}  # s since 1970: begun, ended
 
 
@@ -69,6 +71,12 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
     return Scheduling(config, log)
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Note which tests are in real time, before any is deselected."""
+    CASES[:] = [i.nodeid for i in items if i.get_closest_marker("realtime")]
+
+
 @pytest.hookimpl(hookwrapper=True)
 def pytest_fixture_setup(fixturedef: pytest.FixtureDef[Any]) -> Iterator[None]:
     """Note when a fixture was made: what several tests judge may have run in it."""
@@ -79,8 +87,8 @@ def pytest_fixture_setup(fixturedef: pytest.FixtureDef[Any]) -> Iterator[None]:
 
 @pytest.hookimpl(hookwrapper=True, tryfirst=True)
 def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
-    """Note what this process has had of the cores before a test."""
-    item.stash[HAD] = core_times()
+    """Note when a test begins, and how long the threads of this process had waited for a core."""
+    item.stash[BEGUN] = time.time(), core_waits()
     yield
 
 
@@ -92,14 +100,23 @@ def worst_of(item: pytest.Item, begun: float, ended: float) -> float:
     return max(WITNESS.worst(*span) for span in spans)
 
 
+def limit_of(item: pytest.Item) -> float | None:
+    """Return how late the machine may be for a test, s; None where time is not its subject."""
+    mark = item.get_closest_marker("realtime")
+    return None if mark is None else float(mark.kwargs.get("limit", LIMIT))
+
+
 def pytest_runtest_setup(item: pytest.Item) -> None:
     """Judge the machine before a test in real time."""
-    if item.get_closest_marker("realtime") is None:
+    limit = limit_of(item)
+    if limit is None:
         return
     WITNESS.start()
-    late = WITNESS.worst(time.time() - 1.0, time.time())
-    if late > HOPELESS and (late := WITNESS.probe()) > HOPELESS:
-        pytest.skip(f"this machine keeps no time: it woke a process {1e3 * late:.0f} ms late")
+    if (late := WITNESS.probe()) > limit:
+        pytest.skip(
+            f"this machine woke a process {1e3 * late:.0f} ms late just before, at most "
+            f"{1e3 * limit:.0f} ms are judged by"
+        )
 
 
 @pytest.hookimpl(hookwrapper=True)
@@ -107,19 +124,23 @@ def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) ->
     """Judge the machine where a test in real time has failed."""
     outcome = yield
     report = outcome.get_result()  # type: ignore[attr-defined]
-    if not report.failed or item.get_closest_marker("realtime") is None:
+    limit = limit_of(item)
+    if not report.failed or limit is None:
+        return
+    if call.excinfo is not None and call.excinfo.errisinstance(pytest.fail.Exception):
         return
     late = worst_of(item, call.start, call.stop)
-    ran, waited = core_time(item.stash[HAD])
-    if late > LIMIT:
+    begun, waits = item.stash[BEGUN]
+    waited, lasted = longest_wait(waits), time.time() - begun
+    if late > limit:
         why = (
             f"this machine woke a process {1e3 * late:.0f} ms late meanwhile, at most "
-            f"{1e3 * LIMIT:.0f} ms are judged by"
+            f"{1e3 * limit:.0f} ms are judged by"
         )
-    elif waited > max(ran, LIMIT):
+    elif waited > STARVED * lasted:
         why = (
-            f"this process waited {1e3 * waited:.0f} ms for a core meanwhile and had one for "
-            f"{1e3 * ran:.0f} ms, at most as long is judged by"
+            f"this test had no core for {1e3 * waited:.0f} ms of its {1e3 * lasted:.0f} ms though "
+            "it could run, at most half is judged by"
         )
     else:
         return

@@ -12,9 +12,10 @@ import time
 
 EVERY = 0.005  # s between two looks
 NOTED = 0.010  # s: what is later is noted
-LIMIT = 0.040  # s: what a state may be old (docs/reliability.md); a machine so late judges nothing
-PROBE = 0.1  # s that it is watched before a test
-HOPELESS = 0.2  # s: so late within the probe, a test need not begin
+LIMIT = 0.040  # s: what a state may be old (docs/reliability.md); what a test bears that names none
+STARVED = 0.5  # share of a test's time for which one of its threads wanted a core and had none
+CASES: list[str] = []  # the tests in real time that were collected
+PROBE = 0.3  # s that the machine is watched before a test
 _WATCH = f"""
 import mmap, os, select, signal, struct, sys, time, tty
 parent = os.getppid()
@@ -64,26 +65,21 @@ os._exit(0)
 """
 
 
-def core_times() -> dict[str, tuple[float, float]]:
-    """Return how long each thread of this process has run and has waited for a core, s."""
+def core_waits() -> dict[str, float]:
+    """Return how long each thread of this process has waited for a core while it could run, s.
+
+    Source: proc(5), /proc/PID/schedstat, second figure. A thread that sleeps waits for none.
+    """
     found = {}
     for thread in os.listdir("/proc/self/task"):
         with contextlib.suppress(OSError), open(f"/proc/self/task/{thread}/schedstat") as file:
-            ran, waited, _ = file.read().split()
-            found[thread] = (1e-9 * int(ran), 1e-9 * int(waited))
+            found[thread] = 1e-9 * int(file.read().split()[1])
     return found
 
 
-def core_time(since: dict[str, tuple[float, float]]) -> tuple[float, float]:
-    """Return how long the threads that there are have run and waited since then, s.
-
-    What has ended meanwhile has taken its counts with it.
-    """
-    ran, waited = 0.0, 0.0
-    for thread, now in core_times().items():
-        before = since.get(thread, (0.0, 0.0))
-        ran, waited = ran + now[0] - before[0], waited + now[1] - before[1]
-    return ran, waited
+def longest_wait(since: dict[str, float]) -> float:
+    """Return how long the thread that waited longest for a core since then has done so, s."""
+    return max(waited - since.get(thread, 0.0) for thread, waited in core_waits().items())
 
 
 class Witness:

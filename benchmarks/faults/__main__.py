@@ -13,7 +13,7 @@ from benchmarks.faults import matrix as matrix_module
 from benchmarks.faults import sequences as sequences_module
 from benchmarks.faults.links import LINKS
 from benchmarks.faults.matrix import read_results, run_matrix
-from benchmarks.faults.report import PAGE, fill, fill_matrix
+from benchmarks.faults.report import PAGE, counted, fill, fill_matrix
 from benchmarks.faults.sequences import Tally, read_tally, run_sequences
 from benchmarks.faults.table import ROWS
 
@@ -48,8 +48,8 @@ def main(
     wrong = 0
     if repeat:
         results = run_matrix(chosen, keys, repeat, folder, rate, click.echo, 60.0 * minutes)
-        wrong += sum(bool(result.wrong) for result in results)
-        click.echo(f"{len(results)} faults, {wrong} not as expected")
+        wrong += sum(bool(result.wrong and result.judged) for result in results)
+        click.echo(counted(results))
         if page:
             fill_matrix(ROWS, results)
     if sequences:

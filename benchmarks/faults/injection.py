@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 
-from benchmarks.faults.punctual import Witness
+from benchmarks.faults.punctual import LATE, Witness
 from benchmarks.faults.rig import Rig
 from benchmarks.faults.row import Result, Row
 from gapbridge.bridge.ipc.loop_state import State
@@ -15,7 +15,6 @@ AFTERWARDS = 0.25  # s for which the end state must stay
 RESTING, AT_REST = (State.OBSERVING, State.COMPENSATING, State.FAULT), 3.0  # s: stays for good
 END_LIMIT = 90.0  # s: a new process takes its time on a busy machine
 PATIENCE = 10.0  # s on top of what is allowed, to distinguish what is late from what never comes
-LATE = 0.03  # s behind its time: the proxies of this process made faults of their own
 BUSY = (Cause.OVERRUN.value, Cause.RESYNC.value)
 
 
@@ -50,20 +49,20 @@ def _make(rig: Rig, row: Row, witness: Witness) -> Result:
     return Result(
         row.key, rig.link.name, rig.link.cycle, detected, end, found.largest_step,
         bounds.offset_rate * bounds.cycle, tuple(wrong), found.violated > before,
-        not found.violated > before and (missed > 0 or _disturbed(rig, row, moment, witness)),
+        _late(rig, row, moment, missed, witness),
     )  # fmt: skip
 
 
-def _disturbed(rig: Rig, row: Row, moment: float, witness: Witness) -> bool:
-    """Return whether the machine was too busy meanwhile.
+def _late(rig: Rig, row: Row, moment: float, missed: int, witness: Witness) -> float:
+    """Return how late the machine was meanwhile, s; 0 where the fault bears that.
 
-    This process slept for longer than a state may be old, or the loop missed deadlines by itself.
+    Where the loop reports that it missed states or deadlines, half a cycle is enough for it; a loop
+    that misses them on a machine that was on time is to blame itself.
     """
-    if witness.latest > LATE:
-        return True
-    if "overrun" in row.sign:
-        return False
-    return any(event.get("cause") in BUSY for event in rig.run.since(moment))
+    of_the_loop = "overrun" not in row.sign and any(
+        event.get("cause") in BUSY for event in rig.run.since(moment)
+    )
+    return witness.late(min(LATE, 0.5 * rig.link.cycle) if missed or of_the_loop else LATE)
 
 
 def _await(rig: Rig, row: Row, moment: float, before: dict[str, int]) -> float | None:

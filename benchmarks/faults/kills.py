@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import random
 import signal
-import socket
 import sys
 import tempfile
 import time
@@ -20,9 +19,10 @@ import click
 import psutil
 
 from benchmarks.faults.controller_process import ControllerProcess
-from benchmarks.faults.links import LIMITS, LINKS, own_address
+from benchmarks.faults.links import LIMITS, LINKS
 from benchmarks.faults.process_run import END_LIMIT, ProcessRun
 from benchmarks.faults.report import PAGE, fill
+from benchmarks.ports import free_port, own_host
 from gapbridge.bridge.ipc.control_client import ask
 from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.core.errors import GapbridgeError
@@ -59,13 +59,9 @@ class Scene:
 
     def __init__(self, folder: Path, link: str) -> None:
         self.link = LINKS[link]()
-        self.host = own_address()
-        ports = []
-        for _ in range(2):
-            with socket.create_server(("127.0.0.1", 0)) as free:
-                ports.append(int(free.getsockname()[1]))
+        self.host = own_host()
         more = LIMITS.replace("folder: null", "folder: recordings")
-        more += f"web: {{port: {ports[0]}}}\nmetrics: {{port: {ports[1]}}}\n"
+        more += f"web: {{port: {free_port()}}}\nmetrics: {{port: {free_port()}}}\n"
         self.cell, controller_cell = self.link.write_cells(folder, self.host, self.host, more)
         self.controller = ControllerProcess(
             controller_cell, self.host, 30100, folder / "controller.log"

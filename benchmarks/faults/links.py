@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import itertools
 import math
-import os
 import shutil
 import socket
 import time
@@ -55,13 +53,6 @@ compliance: &soft
   radial: [5.0e-6, 8.0e-6, 1.0e-5, 1.0e-5, 2.0e-5, 2.0e-5]
 simulation: {seed: 1, start_q: [0.0, 1.5, -1.2, 0.0, 0.6, 0.0], compliance: *soft}
 """
-_hosts = itertools.count(1)
-
-
-def own_address() -> str:
-    """Return a loopback address that nobody else uses."""
-    pid = os.getpid()
-    return f"127.{1 + (pid >> 8) % 250}.{pid % 256}.{next(_hosts)}"
 
 
 class Link(ABC):

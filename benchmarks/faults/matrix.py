@@ -7,7 +7,7 @@ import sys
 import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 
 from benchmarks.faults.injection import make_fault
@@ -18,7 +18,6 @@ from benchmarks.faults.table import rows_of
 
 Say = Callable[[str], None]
 KEPT = "results.jsonl"
-ATTEMPTS = 6  # of one fault on a machine that misses deadlines by itself
 
 
 def run_matrix(
@@ -54,7 +53,7 @@ def run_alone(row: Row, link: Link, folder: Path) -> Result:
             return row.apart(row, link, folder)
         assert row.own is not None
         with row.own(link, folder) as rig:
-            return _patiently(rig, row)
+            return _made(rig, row)
     except Exception as error:  # it did not come up
         traceback.print_exc(file=sys.stderr)
         return Result(
@@ -72,23 +71,19 @@ def _on_one_rig(
         with Rig(link, folder) as rig:
             while left and time.monotonic() < until:
                 row = left.pop(0)
-                result = _patiently(rig, row)
+                result = _made(rig, row)
                 say(line(result))
                 yield result
                 if rig.run.error is not None or not rig.run.alive:
                     break
 
 
-def _patiently(rig: Rig, row: Row) -> Result:
-    """Make a fault, again where the machine disturbed it; never again after a violation."""
-    for again in range(ATTEMPTS):
-        try:
-            result = replace(make_fault(rig, row), again=again)
-        except Exception as error:
-            return _failed(rig, row, error)
-        if not (result.wrong and result.disturbed) or not rig.run.alive:
-            break
-    return result
+def _made(rig: Rig, row: Row) -> Result:
+    """Make a fault, once."""
+    try:
+        return make_fault(rig, row)
+    except Exception as error:
+        return _failed(rig, row, error)
 
 
 def _failed(rig: Rig, row: Row, error: Exception) -> Result:
@@ -121,7 +116,8 @@ def line(result: Result) -> str:
     if result.detected is not None:
         after = f"after {result.cycles:.1f} cycles ({1e3 * result.detected:.0f} ms)"
     step = f"largest step {1e6 * result.largest_step:.0f} um"
-    if result.again:
-        after += f", attempt {result.again + 1}"
     message = f"{result.link:15} {result.row:24} {after:34} {step:24} end {result.end}"
-    return message + "".join(f"\n    NOT AS EXPECTED: {wrong}" for wrong in result.wrong)
+    verdict = "NOT AS EXPECTED"
+    if not result.judged:
+        verdict = f"MACHINE LATE BY {1e3 * result.late:.0f} MS, NOT JUDGED"
+    return message + "".join(f"\n    {verdict}: {wrong}" for wrong in result.wrong)

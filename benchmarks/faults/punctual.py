@@ -13,6 +13,7 @@ from types import TracebackType
 from typing import Self
 
 FIRST = 2  # SCHED_FIFO: before all that has no real-time priority
+LATE = 0.03  # s that the machine may be late
 PRIORITY = 20  # SCHED_FIFO; below the loop's and the simulated controller's
 
 
@@ -39,17 +40,25 @@ def go_first(pid: int | None = None) -> None:
 
 
 class Witness:
-    """Measures how late this process wakes: what disturbs it is the machine's, and no fault."""
+    """Measures how late threads of this process wake, one on each core.
+
+    What disturbs them is the machine's, and no fault. A host may stop one core and not the others.
+    They go before others no more than the least of a rig's processes does.
+    """
 
     TICK = 0.002  # s
 
     def __init__(self) -> None:
         self.latest = 0.0  # s behind a tick, the worst
         self._over = threading.Event()
-        self._thread = threading.Thread(target=self._watch, daemon=True, name="witness")
+        self._threads = [
+            threading.Thread(target=self._watch, args=(core,), daemon=True, name=f"witness {core}")
+            for core in os.sched_getaffinity(0)
+        ]
 
     def __enter__(self) -> Self:
-        self._thread.start()
+        for thread in self._threads:
+            thread.start()
         return self
 
     def __exit__(
@@ -57,10 +66,16 @@ class Witness:
         trace: TracebackType | None,
     ) -> None:  # fmt: skip
         self._over.set()
-        self._thread.join()
+        for thread in self._threads:
+            thread.join()
 
-    def _watch(self) -> None:
-        be_punctual()
+    def late(self, limit: float = LATE) -> float:
+        """Return how late the machine was up to now, s; 0 where that is within ``limit``."""
+        return self.latest if self.latest > limit else 0.0
+
+    def _watch(self, core: int) -> None:
+        os.sched_setaffinity(0, {core})  # of this thread
+        go_first()
         before = time.monotonic()
         while not self._over.wait(self.TICK):
             now = time.monotonic()

@@ -44,20 +44,19 @@ def matrix(rows: Iterable[Row], results: Sequence[Result]) -> str:
         found = [r for r in results if r.row == row.key]
         if found:
             lines.append(_worst_line(row, found))
-    return "\n".join([*lines, "", _counted(results)])
+    return "\n".join([*lines, "", counted(results)])
 
 
 def _worst_line(row: Row, found: Sequence[Result]) -> str:
-    seen = [r for r in found if r.cycles is not None and row.sign != "none"]
+    seen = [r for r in found if r.judged and r.cycles is not None and row.sign != "none"]
     detected = NOTHING if row.sign == "none" else "-"
     if seen:
         cycles = max(r.cycles or 0.0 for r in seen)
         detected = f"{cycles:.1f} ({1e3 * max(r.detected or 0.0 for r in seen):.0f})"
     step = max(r.largest_step / r.step_allowed for r in found if r.step_allowed)
-    wrong = sum(bool(r.wrong) for r in found)
     return (
         f"| {row.fault}: {row.how} | {len({r.link for r in found})} | {len(found)} | {detected} | "
-        f"{step:.1f} | {wrong or 'none'} |"
+        f"{step:.1f} | {_verdict(found)} |"
     )
 
 
@@ -75,32 +74,46 @@ def matrix_by_link(rows: Iterable[Row], results: Sequence[Result]) -> str:
         for (key, link), found in by_case.items():
             if key == row.key:
                 lines.append(_line(row, link, found))
-    return "\n".join([*lines, "", _counted(results)])
+    return "\n".join([*lines, "", counted(results)])
 
 
-def _counted(results: Sequence[Result]) -> str:
-    again, wrong = sum(r.again for r in results), sum(bool(r.wrong) for r in results)
+def counted(results: Sequence[Result]) -> str:
+    """Return in a sentence how many faults were made, and how many were not as expected."""
     broken = sum(r.violated for r in results)
-    return (
-        f"{len(results)} faults made, {wrong} not as expected, {broken} with an invariant broken; "
-        f"{again} made again because the machine missed deadlines by itself."
+    found = (
+        f"{len(results)} faults made, each once, {_wrong(results)} not as expected, {broken} with "
+        "an invariant broken"
     )
+    if unjudged := [r.late for r in results if not r.judged]:
+        late = f"up to {1e3 * max(unjudged):.0f} ms"
+        found += f"; {len(unjudged)} not judged, because the machine itself was late by {late}"
+    return f"{found}."
+
+
+def _wrong(results: Sequence[Result]) -> int:
+    return sum(bool(r.wrong and r.judged) for r in results)
+
+
+def _verdict(found: Sequence[Result]) -> str:
+    """Return how many were not as expected, and how many were not judged where some were not."""
+    unjudged = sum(not r.judged for r in found)
+    return f"{_wrong(found) or 'none'}" + (f", {unjudged} not judged" if unjudged else "")
 
 
 def _line(row: Row, link: str, found: Sequence[Result]) -> str:
-    cycles = [r.cycles for r in found if r.cycles is not None and row.sign != "none"]
+    judged = [r for r in found if r.judged]
+    cycles = [r.cycles for r in judged if r.cycles is not None and row.sign != "none"]
     detected = NOTHING if row.sign == "none" else "-"
     if cycles:
-        worst = max(r.detected or 0.0 for r in found)
+        worst = max(r.detected or 0.0 for r in judged)
         detected = f"{statistics.median(cycles):.1f}, {max(cycles):.1f} ({1e3 * worst:.0f})"
     step = 1e6 * max(r.largest_step for r in found)
     ends = ", ".join(
-        f"{end} {count}" if len({r.end for r in found}) > 1 else end
-        for end, count in Counter(r.end for r in found).most_common()
+        f"{end} {count}" if len({r.end for r in judged}) > 1 else end
+        for end, count in Counter(r.end for r in judged).most_common()
     )
-    wrong = sum(bool(r.wrong) for r in found)
     allowed = 1e6 * found[0].step_allowed
     return (
         f"| {row.fault} | {row.how} | {link} | {len(found)} | {detected} | "
-        f"{step:.0f} ({allowed:.0f}) | {ends} | {wrong or 'none'} |"
+        f"{step:.0f} ({allowed:.0f}) | {ends or '-'} | {_verdict(found)} |"
     )

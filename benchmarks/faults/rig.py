@@ -10,11 +10,12 @@ from typing import Any, Self
 
 from benchmarks.faults.controller_process import ControllerProcess
 from benchmarks.faults.invariants import Checker, Found
-from benchmarks.faults.links import Link, own_address
+from benchmarks.faults.links import Link
 from benchmarks.faults.proxy import Proxy
 from benchmarks.faults.punctual import be_ordinary, be_punctual
 from benchmarks.faults.running import Running
 from benchmarks.faults.tap import Tap
+from benchmarks.ports import own_host
 from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.core.errors import LinkError
 
@@ -30,7 +31,7 @@ class Rig:
 
     def __init__(self, link: Link, folder: Path, more: str = "", **changed: Any) -> None:
         self.link, self._changed = link, changed
-        self.front, self.back = own_address(), own_address()
+        self.front, self.back = own_host(), own_host()
         self.cell, controller_cell = link.write_cells(folder, self.front, self.back, more)
         self.controller = ControllerProcess(
             controller_cell, self.back, 30100, folder / "controller.log"

@@ -27,15 +27,20 @@ class Result:
     step_allowed: float  # m, in one cycle
     wrong: tuple[str, ...] = ()  # what is not as it must be
     violated: bool = False  # an invariant did not hold on the wire
-    disturbed: bool = (
-        False  # the machine itself was late: to be made again, if it is not as it must
-    )
-    again: int = 0  # times that it was made before, on a disturbed machine
+    late: float = 0.0  # s that the machine itself was late, 0: not more than the fault bears
 
     @property
     def cycles(self) -> float | None:
         """Return the time of the detection in cycles of the link."""
         return None if self.detected is None else self.detected / self.cycle
+
+    @property
+    def judged(self) -> bool:
+        """Return whether it says something: not where it went wrong on a machine that was late.
+
+        A violated invariant always does.
+        """
+        return self.violated or not self.wrong or self.late == 0.0
 
 
 Own = Callable[[Link, Path], Rig]

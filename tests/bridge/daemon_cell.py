@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 import os
 import socket
@@ -17,6 +16,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 from patience import PATIENCE, wait_for
+from ports import own_host
 from simulated_controller import SimulatedController
 
 from benchmarks.server_thread import OFFSET_SCRIPT
@@ -31,18 +31,11 @@ from gapbridge.drivers.simulated.ur.settings import BENCH_PORT, ServerSettings, 
 Array = NDArray[np.float64]
 TCP = (0.0, 0.0, 0.18, 0.0, 0.0, 0.0)
 PAYLOAD, COG = 5.0, (0.0, 0.0, 0.06)
-_hosts = itertools.count(2)
-
-
-def own_address() -> str:
-    """Return a loopback address that no other test uses."""
-    pid = os.getpid()
-    return f"127.{1 + (pid >> 8) % 250}.{pid % 256}.{next(_hosts) + 100}"
 
 
 def plant(**changed: Any) -> ServerSettings:
     given: dict[str, Any] = {"tcp": TCP, "payload_mass": PAYLOAD, "payload_cog": COG}
-    return simulated_cell("ur10e", own_address(), 11, **{**given, **changed})
+    return simulated_cell("ur10e", own_host(), 11, **{**given, **changed})
 
 
 class Robot:
@@ -69,6 +62,15 @@ class Robot:
     def truth(self) -> dict[str, Any]:
         found: dict[str, Any] = json.loads(self.bench("truth"))
         return found
+
+    def clock(self) -> float:
+        """Return the controller's own time, s."""
+        return float(self.bench("measure").split(",")[0])
+
+    def elapse(self, seconds: float) -> None:
+        """Wait until the controller has run for so long by its own clock."""
+        until = self.clock() + seconds
+        wait_for(lambda: self.clock() >= until, f"{seconds:g} s of the controller")
 
     def tcp(self, readings: int = 20) -> Array:
         """Return the true TCP's position (3,) as the tracker sees it, m."""
@@ -162,6 +164,17 @@ class Run:
             return self._written >= before + count
 
         wait_for(there, lambda: f"{count} setpoints ({self.output})")
+
+    def cycle(self, count: int) -> None:
+        """Wait until the loop has run so many more cycles, writing or not."""
+        memory = self.daemon.memory
+        until = memory.written + count
+
+        def there() -> bool:
+            assert self.error is None, self.error
+            return memory.written >= until
+
+        wait_for(there, lambda: f"{count} cycles ({self.output})")
 
     def latest(self, column: str) -> Array:
         """Return a column's values in the newest cycle."""

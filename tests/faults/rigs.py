@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
+
+import pytest
 
 from benchmarks.faults.links import LINKS, Link
 from benchmarks.faults.rig import Rig
+from benchmarks.faults.row import Result
 
 INLIER = 125.0  # Hz of the UR links: what a busy machine still keeps up with
 
@@ -13,6 +17,19 @@ INLIER = 125.0  # Hz of the UR links: what a busy machine still keeps up with
 def quiet_link(name: str) -> Link:
     """Return a link at a rate that a small machine keeps up with."""
     return LINKS[name](INLIER if name.startswith("ur_") else None)
+
+
+def judge(result: Result, wrong: Sequence[str] | None = None) -> None:
+    """Fail where a fault did not end as the table says; skip where the machine itself was late.
+
+    ``wrong``: what counts of what is not as it must be; none: all. A violation always fails.
+    """
+    wrong = result.wrong if wrong is None else wrong
+    if result.violated:
+        pytest.fail(f"an invariant is broken: {result.wrong}")
+    if wrong and not result.judged:
+        pytest.skip(f"the machine was {1e3 * result.late:.0f} ms late: not judged: {wrong}")
+    assert not wrong, wrong
 
 
 class Rigs:

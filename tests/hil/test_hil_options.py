@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from ports import own_host
 
 HERE = Path(__file__).parent
 CELL = """\
@@ -28,7 +29,7 @@ def run_hil(*options: str) -> tuple[int, str]:
 @pytest.mark.slow
 def test_it_only_reads_unless_motion_is_allowed(tmp_path: Path) -> None:
     cell = tmp_path / "cell.yaml"
-    cell.write_text(CELL % {"host": "127.9.8.7"})
+    cell.write_text(CELL % {"host": own_host()})
     served = subprocess.Popen(
         [sys.executable, "-m", "gapbridge", "simulate", str(cell)],
         stdout=subprocess.PIPE, text=True,

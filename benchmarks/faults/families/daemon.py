@@ -11,6 +11,7 @@ import psutil
 
 from benchmarks.faults.links import Link
 from benchmarks.faults.process_run import END_LIMIT, ProcessRun
+from benchmarks.faults.punctual import Witness
 from benchmarks.faults.rig import RECOVERY_LIMIT, START_LIMIT, Rig
 from benchmarks.faults.row import Apart, Result, Row, seconds
 from benchmarks.faults.running import Running
@@ -42,7 +43,7 @@ def ended_by(number: signal.Signals) -> Apart:
     """Return a way to end the daemon: its offset must go, it must be gone and start anew."""
 
     def run(row: Row, link: Link, folder: Path) -> Result:
-        with ProcessRig(link, folder) as rig:
+        with ProcessRig(link, folder) as rig, Witness() as witness:
             rig.pass_time(AFTER)
             found, run, wrong = rig.found, rig.ended, list[str]()
             found.largest_step = 0.0
@@ -64,7 +65,7 @@ def ended_by(number: signal.Signals) -> Apart:
             if left > 5.0 * rig.checker.bounds.grain and not link.moves_arm:
                 words = f"an offset of {1e6 * left:.1f} um was left behind"
                 wrong.append(f"{words}: {run.output[-900:]}")
-            step = found.largest_step
+            step, late = found.largest_step, witness.late()
             rig.link.prepare(rig.controller, rig.back)
             rig.start_daemon()  # with what the former has left behind: nothing is cleaned
             rig.pass_time(AFTER)
@@ -72,7 +73,7 @@ def ended_by(number: signal.Signals) -> Apart:
             bounds = rig.checker.bounds
             return Result(
                 row.key, link.name, link.cycle, detected, "ended", step,
-                bounds.offset_rate * bounds.cycle, tuple(wrong), bool(rig.found.violated),
+                bounds.offset_rate * bounds.cycle, tuple(wrong), bool(rig.found.violated), late,
             )  # fmt: skip
 
     return run

@@ -16,9 +16,10 @@ from typing import Any, Self
 import numpy as np
 
 from benchmarks.faults.bad_model import FLAG
-from benchmarks.faults.links import LIMITS, Link, own_address
+from benchmarks.faults.links import LIMITS, Link
 from benchmarks.faults.rig import Rig
 from benchmarks.faults.row import Row, cycles, seconds
+from benchmarks.ports import own_host
 from gapbridge.bridge.cell import load_cell
 from gapbridge.drivers.can_bus.bus import BusSettings
 from gapbridge.drivers.clock import SYSTEM
@@ -110,7 +111,7 @@ class SensedRig(Rig):
     """A rig with a force-torque sensor on a bus of its own."""
 
     def __init__(self, link: Link, folder: Path, when_lost: str) -> None:
-        self._hub = Hub(SYSTEM, own_address())
+        self._hub = Hub(SYSTEM, own_host())
         self._hub.__enter__()
         bus = BusSettings(interface="socketcand", host=self._hub.host, port=self._hub.port)
         self.sensor = RobotousNode(lambda: WEIGHT, bus, SYSTEM)

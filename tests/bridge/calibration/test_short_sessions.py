@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
-import os
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,11 +9,11 @@ import numpy as np
 import pytest
 from cell_operator import CellOperator, Terminal, last_pose
 from jogging_operator import JoggingOperator, answer_questions
+from ports import own_host
 
 from gapbridge.bridge.cell import load_cell
 from gapbridge.bridge.demo.processes import ServedCell
 
-_hosts = itertools.count(2)
 BEGIN = np.array([0.2, -1.4, 1.6, -1.8, -1.5, 0.3])
 LOAD = (4.0, (0.01, -0.02, 0.06))
 CELL = """\
@@ -39,8 +37,7 @@ def write_cell(folder: Path, name: str, host: str, tcp: tuple[float, ...]) -> Pa
 @pytest.fixture(scope="module")
 def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[JoggingOperator]:
     """Serve an arm; return an operator that jogs it."""
-    folder, pid = tmp_path_factory.mktemp("served"), os.getpid()
-    host = f"127.{1 + (pid >> 8) % 250}.{pid % 256}.{next(_hosts) + 200}"
+    folder, host = tmp_path_factory.mktemp("served"), own_host()
     cell = write_cell(folder, "served.yaml", host, TRUE_TCP)
     with ServedCell(cell, 3):
         yield JoggingOperator(CellOperator(host), load_cell(cell).model)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import itertools
 import json
-import os
 import signal
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from cell_operator import FRAME, CellOperator, Terminal, last_pose
+from ports import own_host
 
 from benchmarks.calibration.kills import run as run_kills
 from gapbridge.bridge.calibration.session.journal import FILE, read_entries
@@ -20,7 +19,6 @@ from gapbridge.bridge.demo.processes import ServedCell
 from gapbridge.core.estimation.registration import Registration
 from gapbridge.core.rotation import rotation_matrix
 
-_hosts = itertools.count(2)
 LOADS = ((1.5, (0.0, 0.0, 0.05)), (9.5, (0.0, 0.0, 0.09)))
 CELL = """\
 robot: {{model: ur10e}}
@@ -45,8 +43,7 @@ simulation: {{seed: 3}}
 
 
 def write_cell(folder: Path, instrument: str, poses: int) -> tuple[Path, str]:
-    pid = os.getpid()
-    host = f"127.{1 + (pid >> 8) % 250}.{pid % 256}.{next(_hosts) + 150}"
+    host = own_host()
     path = folder / "cell.yaml"
     path.write_text(CELL.format(host=host, instrument=instrument, poses=poses), encoding="utf-8")
     return path, host

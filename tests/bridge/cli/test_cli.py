@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from further import further
 from patience import PATIENCE
+from ports import own_host
 
 from gapbridge.bridge.cell import load_cell
 from gapbridge.bridge.cli import main
@@ -459,9 +460,9 @@ def test_explain_lists_the_catalogue_and_names_the_nearest(desk: Desk) -> None:
     assert "'backlash'" in desk.refuses("explain", "backlsh")
 
 
-@pytest.mark.realtime
+@pytest.mark.realtime(limit=0.5)
 def test_simulate_serves_until_it_is_asked_to_stop(desk: Desk) -> None:
-    host = f"127.{1 + os.getpid() // 250 % 250}.{os.getpid() % 250}.77"
+    host = own_host()
     desk.write("cell.yaml", SOFT + f"simulation: {{host: {host}, seed: 3}}\n")
     command = [sys.executable, "-m", "gapbridge", "simulate", str(desk.folder / "cell.yaml")]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import signal
 import socket
-import time
 from pathlib import Path
 
 import numpy as np
@@ -42,7 +41,7 @@ def test_an_offset_that_stands_at_its_limit_ends_the_compensation(robot: Robot) 
 
 
 @pytest.mark.slow
-@pytest.mark.realtime
+@pytest.mark.realtime(limit=0.1)
 def test_a_loop_that_was_suspended_begins_anew_and_observes(robot: Robot) -> None:
     with Run(robot.cell(PATIENT), arm=True) as run:
         run.compensate()
@@ -50,11 +49,11 @@ def test_a_loop_that_was_suspended_begins_anew_and_observes(robot: Robot) -> Non
         pid = run.daemon.loop_pid
         assert pid is not None
         os.kill(pid, signal.SIGSTOP)
-        time.sleep(0.4)
+        robot.elapse(0.4)
         os.kill(pid, signal.SIGCONT)
         wait_for(lambda: not run.daemon.state.writes, "no more writing")
         run.wait(State.OBSERVING)
-        time.sleep(0.3)
+        run.cycle(150)
         assert run.daemon.state == State.OBSERVING
         assert run.daemon.latched == ""
         run.end()
@@ -70,7 +69,7 @@ def refusal(run: Run) -> str:
     before = len(run.output)
     run.daemon.arm()
     wait_for(lambda: len(run.output) > before, "a word on arming")
-    time.sleep(0.2)
+    run.cycle(100)
     assert not run.daemon.state.writes, run.output
     return " ".join(run.output[before:])
 
@@ -98,7 +97,7 @@ def test_a_model_that_is_no_use_is_reported_and_does_not_arm(robot: Robot, times
     changed(cell, line, f"compliance: {{axial: {axial}, radial: {radial}}}")
     with Run(cell) as run:
         run.wait(State.OBSERVING)
-        time.sleep(0.5)
+        run.cycle(250)
         output = refusal(run)
         status = run.daemon.status()
         nothing_left(run)
@@ -138,12 +137,14 @@ def test_the_age_of_the_last_state_is_shown_in_the_unit_of_its_size(robot: Robot
 
 def script(robot: Robot, line: str) -> None:
     """Have the controller run a line beside its program, as a person at the pendant would."""
-    text = f"sec person():\n  {line}\nend\n"
+    before = robot.controller.log().count("program person uploaded")
     with socket.create_connection(
         (robot.host, robot.settings.script_port), timeout=PATIENCE
     ) as upload:
-        upload.sendall(text.encode())
-        time.sleep(0.2)
+        upload.sendall(f"sec person():\n  {line}\nend\n".encode())
+        wait_for(
+            lambda: robot.controller.log().count("program person uploaded") > before, "the line"
+        )
 
 
 @pytest.mark.slow
@@ -191,9 +192,11 @@ def test_a_rate_above_the_controllers_is_refused_by_name(robot: Robot) -> None:
 def test_a_hiccup_while_observing_leaves_no_fault_and_arming_works(robot: Robot) -> None:
     with Run(robot.cell()) as run:
         run.wait(State.OBSERVING)
-        time.sleep(0.5)
+        run.cycle(250)
         robot.bench("stall 0.5")
-        time.sleep(1.5)
+        wait_for(lambda: run.daemon.status()["counts"]["silence"] == 1, "silence")
+        run.wait(State.OBSERVING)
+        run.cycle(250)
         assert run.daemon.latched == ""
         assert run.daemon.state == State.OBSERVING, run.output
         assert run.daemon.status()["counts"]["silence"] == 1

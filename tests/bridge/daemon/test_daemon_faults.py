@@ -6,12 +6,12 @@ import os
 import signal
 import socket
 import threading
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 from daemon_cell import Robot, Run, gapbridge, offsets, only_recording, read_cycles
 from patience import PATIENCE, wait_for
@@ -23,7 +23,7 @@ from gapbridge.core.errors import CellError, InputError, LinkError
 def assert_came_back_observing(run: Run, robot: Robot) -> None:
     """The last words for every fault: observing again, and not a setpoint since."""
     run.wait(State.OBSERVING)
-    time.sleep(0.5)
+    run.cycle(250)
     assert run.daemon.state == State.OBSERVING
     summary = run.end()
     cycles = run.cycles()
@@ -54,7 +54,7 @@ def test_a_loop_that_dies_comes_back_observing(robot: Robot, number: signal.Sign
 
 
 @pytest.mark.slow
-@pytest.mark.realtime
+@pytest.mark.realtime(limit=0.3)
 def test_a_loop_that_hangs_is_ended_and_comes_back_observing(robot: Robot) -> None:
     with Run(robot.cell(), arm=True) as run:
         run.compensate()
@@ -161,13 +161,14 @@ def test_a_protective_stop_is_a_fault_and_nobody_writes_after_it(robot: Robot) -
         run.write(60)
         robot.bench("protective_stop")
         run.wait(State.FAULT)
-        time.sleep(0.5)
+        run.cycle(250)
         assert run.daemon.state == State.FAULT
         summary = run.end()
     assert summary.exit_code == 1
     assert any("safety_mode 3" in line for line in summary.faults)
     cycles = run.cycles()
     fault = cycles["state"].index("fault")
+    assert len(cycles["state"]) - fault > 200
     assert not cycles["written"][fault:].any()
 
 
@@ -183,23 +184,34 @@ def test_a_stopped_robot_cannot_be_armed(robot: Robot) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_a_signal_ramps_out_and_ends_in_time(robot: Robot, number: signal.Signals) -> None:
+    start = np.array(robot.truth()["rigid_tcp"][:3])
     run = gapbridge("run", robot.cell(), "--arm", folder=robot.folder)
     assert run.stdout is not None
     while "compensating" not in run.stdout.readline():
         assert run.poll() is None
-    time.sleep(1.0)
-    begun = time.monotonic()
+    wait_for(
+        lambda: np.linalg.norm(np.array(robot.truth()["rigid_tcp"][:3]) - start) > 4.2e-4,
+        "an offset",
+    )
+    asked = robot.clock()
     run.send_signal(number)
     out, err = run.communicate(timeout=PATIENCE)
-    assert time.monotonic() - begun < 5.0  # 1.1 s alone on its cores
     assert run.returncode == 0, err
     assert err == ""
     assert "setpoints written" in out
-    recording = only_recording(robot.folder / "recordings")
-    moved = np.linalg.norm(offsets(read_cycles(recording))[:, :3], axis=1)
+    cycles = read_cycles(only_recording(robot.folder / "recordings"))
+    assert (cycles["timestamp"] > asked).sum() < 1000  # 2 s; without any other work half of it
+    moved = np.linalg.norm(offsets(cycles)[:, :3], axis=1)
     assert moved.max() > 4e-4
     assert moved[-1] == 0.0
     assert np.abs(np.diff(moved)).max() <= 0.05 * 0.002 * 5.001
+
+
+def lives(process: psutil.Process) -> bool:
+    try:
+        return str(process.status()) != psutil.STATUS_ZOMBIE
+    except psutil.NoSuchProcess:
+        return False
 
 
 @pytest.mark.slow
@@ -210,19 +222,19 @@ def test_when_the_daemon_is_killed_its_loop_ramps_out_and_the_recording_is_whole
     assert run.stdout is not None
     while "compensating" not in run.stdout.readline():
         assert run.poll() is None
-    time.sleep(0.7)
-    killed = time.monotonic()
+    robot.elapse(0.7)
+    family = psutil.Process(run.pid).children(recursive=True)
+    killed = robot.clock()
     run.kill()
     run.wait()
     wait_for(lambda: "rtde_control ended" in robot.controller.log(), "the end of the loop")
     assert "watchdog" not in robot.controller.log()  # it ended by itself
     recording = only_recording(robot.folder / "recordings")
-    time.sleep(1.5)  # the recorder outlives the loop by a moment
+    wait_for(lambda: not any(map(lives, family)), "the end of the recorder")
     cycles = read_cycles(recording)
     span = cycles["timestamp"][-1] - cycles["timestamp"][0]
     assert span > 0.7
-    now = float(robot.bench("measure").split(",")[0])  # s, controller clock
-    assert now - cycles["timestamp"][-1] < time.monotonic() - killed + 0.1
+    assert cycles["timestamp"][-1] > killed
 
 
 @pytest.mark.slow

@@ -48,7 +48,7 @@ def test_an_observer_cannot_be_armed(robot: Robot) -> None:
     with Run(robot.cell(), observe=True) as run:
         run.wait(State.OBSERVING)
         run.daemon.arm()
-        time.sleep(0.3)
+        run.cycle(150)
         assert run.daemon.state == State.OBSERVING
     assert "program" not in robot.controller.log()
 

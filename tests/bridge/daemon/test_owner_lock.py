@@ -6,7 +6,6 @@ import json
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
@@ -101,7 +100,7 @@ def test_two_daemons_on_one_robot_the_second_leaves_with_two(robot: Robot) -> No
         assert err.count("\n") == 1
         assert "in use by another daemon" in err
         assert str(cell) in err
-        time.sleep(0.2)
+        run.cycle(100)
         assert run.daemon.state == State.OBSERVING
         assert run.end().restarts == 0
 

@@ -8,16 +8,16 @@ import shutil
 import signal
 import socket
 import subprocess
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import psutil
 import pytest
 from daemon_cell import Robot, gapbridge
 from patience import PATIENCE, wait_for
 
 from gapbridge.bridge.daemon.service_manager import ServiceManager
-from gapbridge.drivers.clock import SYSTEM
+from gapbridge.drivers.clock import Clock
 
 UNIT = Path(__file__).parents[3] / "config" / "gapbridge@.service"
 
@@ -52,12 +52,12 @@ def test_signs_of_life_come_thrice_in_the_time_allowed(
     listener: Listener, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("WATCHDOG_USEC", "300000")
-    manager = ServiceManager(clock=SYSTEM)
-    begun = time.monotonic()
-    while time.monotonic() - begun < 1.0:
+    clock, ticks = Clock(), (1000.0 + 0.001 * k for k in range(900))
+    clock.monotonic = lambda: next(ticks)
+    manager = ServiceManager(clock)
+    for _ in range(900):
         manager.kick()
-        time.sleep(0.01)
-    assert 6 <= listener.take().count("WATCHDOG=1") <= 11
+    assert listener.take().count("WATCHDOG=1") == 9
 
 
 def test_without_a_service_manager_or_with_a_dead_one_nothing_happens(
@@ -116,9 +116,17 @@ def test_a_daemon_that_stands_still_gives_no_sign_of_life(
         run = gapbridge("run", robot.cell(), folder=tmp_path)
         wait_for(lambda: "READY=1" in listener.take(), "ready")
         run.send_signal(signal.SIGSTOP)
-        time.sleep(0.3)
+        wait_for(lambda: psutil.Process(run.pid).status() == psutil.STATUS_STOPPED, "the stop")
         before = len(listener.take())
-        time.sleep(1.0)
+        monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "alive"))
+        alive, other = ServiceManager(), Listener(str(tmp_path / "alive"))
+
+        def lived() -> bool:
+            alive.kick()
+            return len(other.take()) >= 10
+
+        wait_for(lived, "ten signs of a process that does not stand still")
+        other.socket.close()
         assert len(listener.take()) == before
         run.send_signal(signal.SIGCONT)
         run.send_signal(signal.SIGTERM)

@@ -57,7 +57,7 @@ def assert_no_faster(rows: np.ndarray) -> None:
         assert (fallen <= RATE * (times[first:] - times[first] + 0.03) + 1e-6).all()
 
 
-@pytest.mark.realtime
+@pytest.mark.realtime(limit=0.03)
 @pytest.mark.parametrize("number", [signal.SIGKILL, *further(signal.SIGSEGV)])
 def test_after_a_killed_loop_the_robots_program_withdraws_at_the_cells_rate(
     robot: Robot, number: signal.Signals
@@ -89,7 +89,7 @@ def test_a_stop_takes_the_time_that_the_cells_rate_needs(robot: Robot) -> None:
     assert np.linalg.norm(moved[-1]) == 0.0
 
 
-@pytest.mark.realtime
+@pytest.mark.realtime(limit=0.03)
 def test_a_fault_sends_no_zero_and_the_robots_program_withdraws(robot: Robot) -> None:
     start = np.array(robot.truth()["rigid_tcp"][:3])
     with Run(robot.cell(", mode: offset, rate: 125", limits=LIMITS), arm=True) as run:

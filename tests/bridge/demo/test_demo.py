@@ -57,7 +57,10 @@ def test_the_demo_shows_what_it_states(tmp_path: Path) -> None:
         assert summary["accused"][name]["value"] == pytest.approx(true, abs=6e-5)
     assert 0.01 < repeatability < 0.1
     slower = 2 ** " ".join(ran.stdout.split()).count(" of the rate")
-    assert 0.9 * 500 / slower < summary["loop"]["rate_hz"] < 1.01 * 500
+    loop = summary["loop"]
+    # of the controller's clock; a busy machine misses cycles, and none goes without being counted
+    assert 0.9 * 500 / slower < loop["rate_hz"] * loop["cycles"] / (loop["cycles"] - loop["missed"])
+    assert loop["rate_hz"] < 1.01 * 500
     assert "<script src" not in (out / "report.html").read_text()
     rigid, calibrated = load_cell(out / "cell.yaml"), load_cell(out / "calibrated.yaml")
     assert rigid.model.terms == ()

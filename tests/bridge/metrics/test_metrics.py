@@ -132,7 +132,8 @@ def test_a_cell_that_was_read_again_gives_its_limits(feed):
         time.sleep(0.1)
     # a file that the daemon did not take changes nothing
     feed.change_cell("limits: {offset: 0.007}\n", ok=False)
-    time.sleep(0.5)
+    feed.change(State.OBSERVING, "afterwards")
+    wait_for(lambda: "afterwards" in feed.wait("metrics").text, "the event after it")
     assert value(families(feed), "gapbridge_offset_limit_meters") == 0.004
 
 

@@ -58,6 +58,11 @@ class Publisher:
         """Publish cycles from now on, if not before."""
         self._publishes.set()
 
+    def publish(self, count: int) -> None:
+        """Wait until so many more cycles have been published."""
+        until = self.memory.written + count
+        wait_for(lambda: self.memory.written >= until, f"{count} cycles")
+
     def end(self) -> int:
         """Stop publishing; returns how many cycles there were."""
         self.stop.set()
@@ -184,7 +189,7 @@ def test_stalled_for_a_while_it_loses_nothing(recording: Recording, publisher: P
     pid = recording.process.pid
     assert pid is not None
     os.kill(pid, signal.SIGSTOP)
-    time.sleep(2.0)
+    publisher.publish(250)
     os.kill(pid, signal.SIGCONT)
     count = publisher.end()
     recording.wait_for_cycle(count - 1)
@@ -200,7 +205,7 @@ def test_a_daemon_that_is_gone_without_an_end_is_outlived_until_the_loop_has_sto
     assert recording.process.pid is not None
     os.kill(recording.process.pid, signal.SIGTERM)  # as a service manager ends all at once
     recording.process.begin_close()  # as the system does when the daemon is killed
-    time.sleep(1.0)
+    publisher.publish(125)
     count = publisher.end()
     recording.process.close(10.0)
     assert recording.numbers() == list(range(count))

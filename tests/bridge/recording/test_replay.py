@@ -64,7 +64,7 @@ def test_arrays_are_of_the_kind_that_the_loop_was_compiled_for(desk: Desk) -> No
                 assert array.flags.carray  # in one piece, aligned, writable
 
 
-@pytest.mark.realtime
+@pytest.mark.realtime(limit=0.2)
 def test_it_takes_as_long_as_it_took_divided_by_the_speed(desk: Desk) -> None:
     desk.record(200)  # 0.398 s
     for speed, longest in ((1.0, 0.398), (4.0, 0.0995)):

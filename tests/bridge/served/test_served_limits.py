@@ -9,6 +9,7 @@ import time
 import httpx
 import pytest
 from patience import PATIENCE
+from ports import free_port
 
 from gapbridge.bridge.served.protocol import GuardedProtocol
 from gapbridge.bridge.served.server import listen, serve
@@ -21,9 +22,7 @@ from gapbridge.core.errors import LinkError
 def flood(monkeypatch):
     """Serve an endless answer, with little patience."""
     monkeypatch.setattr(GuardedProtocol, "stall_time", 0.5)
-    with socket.socket() as s:
-        s.bind(("127.0.0.1", 0))
-        port = s.getsockname()[1]
+    port = free_port()
     sent = {"ended": 0}
 
     async def app(scope, receive, send):

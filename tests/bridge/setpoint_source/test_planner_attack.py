@@ -131,13 +131,13 @@ def test_a_posted_body_is_no_plc(tmp_path: Path) -> None:
         source.close()
 
 
-@pytest.mark.realtime
+@pytest.mark.realtime(limit=0.1)
 def test_a_posted_body_is_no_plan(target: Target) -> None:
     target.arm()
     for _ in range(3):
         reply = post(target.port, target.lines())
         assert reply == b"" or reply.startswith(b"error: ")  # reset, or refused in one line
-    time.sleep(0.3)
+    target.run.cycle(150)
     target.assert_untouched()
 
 
@@ -163,7 +163,7 @@ Promise.all(ways).then(found => {{ document.title = found.join(); }});
         pass
 
 
-@pytest.mark.realtime
+@pytest.mark.realtime(limit=0.1)
 @pytest.mark.skipif(CHROMIUM is None, reason="no chromium on this machine")
 def test_a_strangers_page_in_a_browser_is_no_planner(target: Target) -> None:
     playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
@@ -185,7 +185,7 @@ def test_a_strangers_page_in_a_browser_is_no_planner(target: Target) -> None:
         server.shutdown()
         server.server_close()
     assert sent.count("POST") == 6  # the browser did send them
-    time.sleep(0.3)
+    target.run.cycle(150)
     target.assert_untouched()
 
 

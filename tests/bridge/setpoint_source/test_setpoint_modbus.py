@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from daemon_cell import Robot, Run
 from patience import wait_for
+from ports import free_port
 
 from gapbridge.bridge.cell.sections import SetpointSettings
 from gapbridge.bridge.ipc.loop_state import State
@@ -183,10 +184,11 @@ def test_neither_side_can_write_what_is_the_others() -> None:
 def test_the_arm_goes_where_the_plc_says_and_the_plc_hears_of_it(tmp_path: Path) -> None:
     with Robot(tmp_path) as robot:
         start = np.array(robot.settings.start_q)
-        cell = robot.cell(setpoints="{source: modbus, port: 15811, timeout: 0.5}")
+        port = free_port()
+        cell = robot.cell(setpoints=f"{{source: modbus, port: {port}, timeout: 0.5}}")
         with Run(cell, arm=True) as run:
             run.wait(State.ARMED)
-            plc = Plc("127.0.0.1", 15811)
+            plc = Plc("127.0.0.1", port)
             begun = time.monotonic()
             seen: set[int] = set()
             while time.monotonic() - begun < 3.0:

@@ -60,7 +60,7 @@ def feed(tmp_path_factory):
         yield feed
 
 
-@pytest.mark.realtime
+@pytest.mark.realtime(limit=0.3)
 def test_a_change_of_state_shows_within_a_second_with_its_reason(browser, feed):
     with opened(browser, feed) as (page, asked, complaints):
         live(page)

@@ -78,10 +78,9 @@ def settled(driver: CanopenDriver, seconds: float = PATIENCE) -> RobotState:
                 raise
 
 
-def read_on(driver: CanopenDriver, seconds: float = 2.0) -> None:
-    """Read for a while, past torn samples; raises what the driver raises otherwise."""
-    until = time.monotonic() + seconds
-    while time.monotonic() < until:
+def read_on(driver: CanopenDriver, cycles: int = 200) -> None:
+    """Read so many cycles, past torn samples; raises what the driver raises otherwise."""
+    for _ in range(cycles):
         with suppress(InvalidStateError):
             driver.read_state()
 

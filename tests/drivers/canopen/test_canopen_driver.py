@@ -185,7 +185,7 @@ def test_a_set_without_one_drives_pdo_is_torn(generic: DriveArm, driver: Canopen
     settled(driver)
 
 
-@pytest.mark.realtime
+@pytest.mark.realtime(limit=0.02)
 @pytest.mark.parametrize(("delay", "count"), [(0.009, 4), (0.016, 4), (0.024, 4), (0.045, 1)])
 def test_a_pdo_of_the_sync_before_is_never_taken_for_this_ones(
     generic: DriveArm, driver: CanopenDriver, delay: float, count: int
@@ -237,10 +237,8 @@ def test_frames_of_others_are_no_samples(
 def test_a_lost_node_is_stale_and_named(generic: DriveArm, driver: CanopenDriver) -> None:
     settled(driver)
     generic.server.mute(node_of(generic, 4))
-    begun = time.monotonic()
     with pytest.raises(StaleStateError, match="node 5"):
         read_on(driver)
-    assert time.monotonic() - begun < 5.0
 
 
 def test_a_missing_heartbeat_is_stale_though_pdos_come(

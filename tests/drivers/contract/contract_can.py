@@ -22,7 +22,8 @@ from gapbridge.drivers.simulated.can.server import make_servers
 from gapbridge.drivers.simulated.server.protocol_server import ProtocolServer
 
 INVENTED = Path(__file__).parents[1] / "can" / "invented.yaml"
-_ports = itertools.count(29600)
+PORT = 29600  # each case has an address of its own
+_channels = itertools.count()
 THOUSANDTH = math.radians(0.001)
 
 
@@ -48,14 +49,14 @@ class CanCase(Case):
     """An arm on a bus of one of python-can's interfaces."""
 
     def __init__(self, arm: CanArm, interface: str, rate: float = 100.0) -> None:
-        number = next(_ports)
+        number = next(_channels)
         channel = f"bus{number}"
         if interface == "slcan":
             channel = f"{tempfile.gettempdir()}/gapbridge-{os.getpid()}-{number}"
         self.n, self.resolution, self.speed_resolution = arm.n, arm.resolution + 1e-9, arm.speed
         self._frames = arm.frames
         self.settings = CanSettings(
-            profile=arm.profile, interface=interface, channel=channel, port=number, rate=rate,
+            profile=arm.profile, interface=interface, channel=channel, port=PORT, rate=rate,
             state_timeout=self.state_timeout, foreign_quiet=0.2, gear=arm.gears,
         )  # fmt: skip
         super().__init__()

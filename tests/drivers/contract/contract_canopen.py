@@ -16,8 +16,9 @@ from gapbridge.drivers.driver import Driver
 from gapbridge.drivers.simulated.canopen.server import CanopenServer, make_servers
 from gapbridge.drivers.simulated.server.protocol_server import ProtocolServer
 
+PORT = 29900  # each case has an address of its own
 LATE = 0.012  # s that a torn sample's PDO is late: it comes after the next SYNC's slot
-_ports = itertools.count(29900)
+_channels = itertools.count()
 
 
 class CanopenCase(Case):
@@ -30,10 +31,9 @@ class CanopenCase(Case):
     def __init__(
         self, profile: str, interface: str, resolution: float, speed: float | None
     ) -> None:
-        number = next(_ports)
         self.resolution, self.speed_resolution = resolution + 1e-9, speed
         self.settings = CanopenSettings(
-            profile=profile, interface=interface, channel=f"drives{number}", port=number,
+            profile=profile, interface=interface, channel=f"contract{next(_channels)}", port=PORT,
             rate=100.0, state_timeout=self.state_timeout, listen=0.05, foreign_quiet=0.2,
             sdo_timeout=5.0,  # of a busy machine
         )  # fmt: skip

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import itertools
-import os
 from abc import ABC, abstractmethod
 from pathlib import Path
 from typing import Self
 
 from patience import wait_for
+from ports import own_host
 
 from benchmarks.server_thread import ServerThread
 from gapbridge.bridge.cell import load_cell
@@ -21,13 +20,6 @@ from gapbridge.drivers.simulated.ur.settings import simulated_arm
 
 PERIOD = 0.004  # s
 CONFIG = Path(__file__).parents[3] / "config"
-_numbers = itertools.count(2)
-
-
-def own_address() -> str:
-    """Return a loopback address that no other test process uses."""
-    pid = os.getpid()
-    return f"127.{1 + (pid >> 8) % 250}.{pid % 256}.{next(_numbers) % 250 + 2}"
 
 
 def model_of(n: int) -> Model:
@@ -56,7 +48,7 @@ class Case(ABC):
     n = 6
 
     def __init__(self) -> None:
-        self.host = own_address()
+        self.host = own_host()
         self.model = model_of(self.n)
         self.controller: ArmController = make_controller(
             *simulated_arm(self.model.arm, seed=11), period=PERIOD

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Callable
 from functools import partial
@@ -21,7 +20,7 @@ from gapbridge.drivers.simulated.modbus.server import ModbusServer
 from gapbridge.drivers.simulated.server.protocol_server import ProtocolServer
 
 INVENTED = Path(__file__).parents[1] / "modbus" / "invented.yaml"
-_ports = itertools.count(15100)
+PORT = 15100  # each case has an address of its own
 
 
 def _half_a_count(entry: Vector | None) -> float | None:
@@ -39,7 +38,7 @@ class ModbusCase(Case):
     """
 
     def __init__(self, profile: str, watchdog: float | None = 10.0) -> None:
-        self.settings = ModbusSettings(profile=profile, port=next(_ports), rate=50.0, timeout=1.0)
+        self.settings = ModbusSettings(profile=profile, port=PORT, rate=50.0, timeout=1.0)
         self.file = file = read_profile(self.settings.profile_path)
         self.robot_file = file
         if watchdog is not None and isinstance(file.write, Mailbox):

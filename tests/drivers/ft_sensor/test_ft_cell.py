@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import itertools
 import json
 import os
 import socket
@@ -18,6 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 from patience import PATIENCE
+from ports import own_host
 
 from gapbridge.bridge.cell import load_cell
 from gapbridge.bridge.recording.export import export
@@ -25,7 +25,6 @@ from gapbridge.core.errors import InputError
 from gapbridge.drivers.simulated.ur.settings import BENCH_PORT
 
 ROOT = Path(__file__).resolve().parents[3]
-_numbers = itertools.count(2)
 MASS, COG = 5.0, (0.0, 0.0, 0.06)
 SECTIONS = {
     "robotous_rft": "driver: robotous_rft, interface: socketcand, host: {host}",
@@ -35,7 +34,7 @@ SECTIONS = {
 
 
 def cell_in(folder: Path, kind: str, more: str = "") -> Path:
-    host = f"127.{1 + (os.getpid() >> 8) % 250}.{os.getpid() % 256}.{next(_numbers) + 50}"
+    host = own_host()
     section = SECTIONS[kind].format(host=host, folder=folder)
     text = f"""\
         robot: {{model: ur10e}}

@@ -97,7 +97,7 @@ def test_registers_that_a_dead_client_left_move_nothing(ur: ModbusCase) -> None:
         assert driver._look().answer == (0, encode.EXPIRED)
 
 
-@pytest.mark.realtime
+@pytest.mark.realtime(limit=0.02)
 def test_a_client_that_dies_is_withdrawn_at_the_rates_of_its_cell(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

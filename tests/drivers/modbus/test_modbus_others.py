@@ -10,10 +10,10 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from contract_case import own_address
 from contract_checks import check_reads, next_state
 from contract_modbus import ModbusCase
 from patience import PATIENCE
+from ports import own_host
 
 from gapbridge.drivers.clock import SYSTEM
 from gapbridge.drivers.modbus.driver import ModbusDriver
@@ -87,7 +87,7 @@ def test_our_driver_reads_a_server_that_is_not_pymodbus() -> None:
     """pyModbusTCP's own server, filled as a UR's, with a mailbox written to it."""
     from pyModbusTCP.server import ModbusServer as OtherServer
 
-    case, host = ModbusCase("ur"), own_address()
+    case, host = ModbusCase("ur"), own_host()
     server = case.servers[0]
     assert isinstance(server, ModbusServer)
     other = OtherServer(host, 15503, no_block=True)

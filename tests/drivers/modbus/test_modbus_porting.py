@@ -11,6 +11,7 @@ import pytest
 from contract_checks import check_angles, check_offset, check_reads
 from contract_modbus import ModbusCase
 from patience import PATIENCE
+from ports import own_host
 
 from gapbridge.core.errors import InputError
 from gapbridge.drivers.modbus import encode
@@ -66,7 +67,7 @@ def test_a_cell_with_a_map_of_the_users_is_served_and_run(profile: Path) -> None
     cell.write_text(
         "robot: {model: ur5e}\npayload: {mass: 2.0}\ncompliance: {axial: [2.0e-6, 4.0e-6, 4.0e-6, "
         "8.0e-6, 8.0e-6, 8.0e-6]}\nrecording: {folder: null}\n"
-        "link: {driver: modbus, profile: my_arm.yaml, host: 127.8.7.6, port: 15822}\n"
+        f"link: {{driver: modbus, profile: my_arm.yaml, host: {own_host()}, port: 15822}}\n"
     )
     command = [sys.executable, "-m", "gapbridge"]
     served = subprocess.Popen([*command, "simulate", str(cell)], stdout=subprocess.PIPE, text=True)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import itertools
 import json
-import os
 import socket
 import subprocess
 import sys
@@ -12,20 +10,13 @@ import textwrap
 from typing import Any
 
 from patience import PATIENCE
+from ports import own_host
 
 from gapbridge.drivers.simulated.ur.settings import BENCH_PORT, ServerSettings, simulated_cell
 
-_numbers = itertools.count(2)
-
-
-def own_address() -> str:
-    """Return a loopback address that no other test process uses."""
-    pid = os.getpid()
-    return f"127.{1 + (pid >> 8) % 250}.{pid % 256}.{next(_numbers)}"
-
 
 def cell_settings(seed: int = 7, arm: str = "ur10e", **plant: Any) -> ServerSettings:
-    return simulated_cell(arm, own_address(), seed, **plant)
+    return simulated_cell(arm, own_host(), seed, **plant)
 
 
 class Bench:

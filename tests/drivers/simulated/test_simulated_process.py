@@ -11,8 +11,9 @@ from pathlib import Path
 
 import pytest
 from patience import PATIENCE
+from ports import own_host
 from rtde_client import RtdeClient
-from simulated_cell import cell_settings, own_address
+from simulated_cell import cell_settings
 from simulated_controller import SimulatedController
 
 from gapbridge.core.errors import LinkError
@@ -30,7 +31,7 @@ def test_a_taken_port_is_reported_and_nothing_is_left_running() -> None:
 
 def test_the_server_listens_on_its_own_address_only() -> None:
     settings = cell_settings()
-    other = own_address()
+    other = own_host()
     with SimulatedController(settings):
         for port in (30004, 29999, 30003, 30100):
             with socket.create_connection((settings.host, port), timeout=5):

@@ -178,9 +178,9 @@ def test_a_long_log_is_used_whole_and_held_out_by_stretches_of_time(plant):
     log = truth.log_of(N, timestamp=t, actual_q=COURSE.at(t),
                        actual_current_as_torque=COURSE.at(t),
                        joint_temperatures=np.tile(t[:, None], N) + 20)  # fmt: skip
-    begin = time.perf_counter()
+    begin = time.process_time()  # what the machine does beside it costs no time of this process
     seen = observe(plant.model(2.0), log, METROLOGY)
-    assert time.perf_counter() - begin < 3
+    assert time.process_time() - begin < 3
     assert isinstance(seen, Observation)
     assert len(seen.measured) == len(seen.rows) == len(seen.groups) > 12000
     assert np.all(np.diff(seen.groups) >= 0)
