@@ -9,7 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gapbridge.drivers.modbus import encode
+from gapbridge.drivers.modbus.profile import read_profile
 from gapbridge.drivers.modbus.registers import CODES, Coding
+from gapbridge.drivers.modbus.schema import Mailbox
+from gapbridge.drivers.modbus.settings import ModbusSettings
 
 TYPES = sorted(CODES)
 
@@ -67,3 +70,22 @@ def test_sequence_numbers_never_come_to_zero() -> None:
         seen.add(number)
     assert 0 not in seen
     assert max(seen) == 0x7FFF
+
+
+@given(st.lists(st.integers(0, 0x7FFF), min_size=10, max_size=10, unique=True), st.data())
+def test_two_registers_exchanged_spoil_the_checksum(words: list[int], data: st.DataObject) -> None:
+    i, j = data.draw(st.lists(st.integers(0, 9), min_size=2, max_size=2, unique=True))
+    changed = words.copy()
+    changed[i], changed[j] = words[j], words[i]
+    difference = (i - j) * (words[i] - words[j])
+    assert (encode.checksum(changed) != encode.checksum(words)) == bool(difference % 65521)
+
+
+def test_lengths_and_angles_of_a_mailbox_have_their_own_counts() -> None:
+    box = read_profile(ModbusSettings.shipped / "ur.yaml").write
+    assert isinstance(box, Mailbox)
+    box = box.model_copy(update={"length_count": 1e-6, "angle_count": 2e-6})
+    offset = [1e-3, -2e-3, 3e-3, 4e-3, -5e-3, 6e-3]
+    counts = encode.offset_counts(encode.units_of(box), offset)
+    assert counts == [1000, -2000, 3000, 2000, -2500, 3000]
+    assert encode.offset_of(box, [c % 0x10000 for c in counts]) == pytest.approx(offset)
