@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import importlib
 from pathlib import Path
 
@@ -46,5 +47,37 @@ def test_a_listed_mistake_can_be_made_and_names_tests_that_are_there(mutant: Mut
     assert text != (ROOT / mutant.file).read_text(encoding="utf-8")
     for test in mutant.tests:
         path, _, name = test.partition("::")
-        assert (ROOT / path).exists(), test
-        assert not name or f"def {name}" in (ROOT / path).read_text(encoding="utf-8"), test
+        files = [ROOT / path] if path.endswith(".py") else (ROOT / path).rglob("test_*.py")
+        found = set().union(*(quick_tests(file) for file in files))
+        assert name in found if name else found, test
+
+
+@functools.cache
+def quick_tests(file: Path) -> frozenset[str]:
+    """Return the names of a file's tests that ``make test`` runs."""
+    body = ast.parse(file.read_text(encoding="utf-8")).body
+    marks = [node for node in body if isinstance(node, ast.Assign) and is_slow(node)]
+    names = [
+        node.name
+        for node in body
+        if isinstance(node, ast.FunctionDef) and node.name.startswith("test_")
+        if not any(is_slow(decorator) for decorator in node.decorator_list)
+    ]
+    return frozenset() if marks else frozenset(names)
+
+
+def is_slow(node: ast.AST) -> bool:
+    """Return whether a decorator, or the marks of a file, say slow."""
+    if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) != "pytestmark":
+        return False
+    return any(ast.unparse(n) == "pytest.mark.slow" for n in ast.walk(node))
+
+
+def test_a_test_is_quick_where_neither_it_nor_its_file_is_marked(tmp_path: Path) -> None:
+    slow = "@pytest.mark.slow\ndef test_a(): ...\ndef test_b(): ...\ndef other(): ...\n"
+    for name, text, expected in (
+        ("one.py", slow, {"test_b"}),
+        ("other.py", "pytestmark = [pytest.mark.slow]\n" + slow, set()),
+    ):
+        (tmp_path / name).write_text(text)
+        assert quick_tests(tmp_path / name) == expected

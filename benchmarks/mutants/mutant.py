@@ -28,8 +28,8 @@ class Mutant:
 
     @property
     def folder(self) -> str:
-        """Return the folder that the table counts it in."""
-        return str(Path(self.file).parent)
+        """Return the folder that the table counts it in: at most one below the layer's."""
+        return "/".join(Path(self.file).parent.parts[:2])
 
     def text(self, root: Path) -> str:
         """Return the file with the mistake. Raises InputError where its text is not there once."""

@@ -14,6 +14,7 @@ from benchmarks.mutants.mutant import Mutant
 ROOT = Path(__file__).resolve().parents[2]
 LIMIT = 600.0  # s for the tests of one mutant; one that hangs them is noticed
 COPIED = ("benchmarks", "bridge", "config", "core", "docs", "drivers", "gapbridge", "tests")
+MARKERS = "not slow"  # of make test
 PASSED, FAILED = 0, 1  # pytest's exit codes
 
 
@@ -27,7 +28,10 @@ class Verdict:
 
 
 class Trial:
-    """The copy. Compiled code is taken along: only what a mistake touches is compiled anew."""
+    """The copy. Compiled code is taken along: only what a mistake touches is compiled anew.
+
+    Only tests that ``make test`` runs count: slow ones would notice a mistake too late.
+    """
 
     def __init__(self, folder: Path) -> None:
         self.root = folder / "checkout"
@@ -44,7 +48,7 @@ class Trial:
         """Run tests in the copy; returns pytest's exit code and the first failure, or its end."""
         command = [
             sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider",
-            "-o", "addopts=--strict-markers --timeout=300 --tb=line", *tests,
+            "-o", "addopts=--strict-markers --timeout=300 --tb=line", "-m", MARKERS, *tests,
         ]  # fmt: skip
         environment = {**os.environ, "PYTHONPATH": str(self.root)}
         try:

@@ -428,6 +428,7 @@ class Daemon:
         self._failure = {}
         loop = self.loop = self._start_loop(armed_by)
         stop_by = first_cycle = None
+        needed = 0.0  # s from a request to stop until the loop is killed
         try:
             while loop.exit_code is None:
                 self._clock.sleep(TICK)
@@ -443,13 +444,17 @@ class Daemon:
                 if self._reload.step(self.state, self.phase, self.configuration):
                     self._commands.ask(Command.RAMP_OUT)  # not a person's request
                 if (self._stopping.is_set() or self._reload.wants_end) and stop_by is None:
-                    needed = STOP_TIMEOUT + longest_ramp_out(self.settings.limits)
-                    stop_by = self._clock.monotonic() + needed + STOP_MARGIN
+                    needed = STOP_TIMEOUT + longest_ramp_out(self.settings.limits) + STOP_MARGIN
+                    stop_by = self._clock.monotonic() + needed
                     if self._stopping.is_set():
                         self.manager.stopping()
                     loop.ask_to_stop()
-                if loop.hangs or (stop_by is not None and self._clock.monotonic() > stop_by):
+                detail = ""
+                if loop.hangs:
                     detail = f"no heartbeat of the loop for {self.memory.silence:.2f} s: killed"
+                elif stop_by is not None and self._clock.monotonic() > stop_by:
+                    detail = f"the loop has not stopped within {needed:.1f} s: killed"
+                if detail:
                     loop.kill()  # reported after its end: nothing is written any more
                     self._fault("hang", detail)
             self._read_loop()

@@ -29,10 +29,15 @@ def test_a_text_that_is_not_there_once_is_refused(tmp_path: Path) -> None:
 
 
 def test_the_table_counts_by_folder() -> None:
-    one, other = (Mutant("m", f"{name}/a.py", "x", "y", ("tests",)) for name in ("core", "bridge"))
-    lines = table([Verdict(one, True, ""), Verdict(one, False, ""), Verdict(other, True, "")])
-    assert "| core | 2 | 1 (50 %) |" in lines
-    assert lines[-1] == "| all | 3 | 2 (67 %) |"
+    files = ("core/a.py", "core/effects/load/a.py", "core/effects/a.py", "bridge/loop/a.py")
+    mutants = [Mutant("m", file, "x", "y", ("tests",)) for file in files]
+    lines = table([Verdict(m, m is not mutants[1], "") for m in mutants])
+    assert lines[2:] == [
+        "| bridge/loop | 1 | 1 (100 %) |",
+        "| core | 1 | 1 (100 %) |",
+        "| core/effects | 2 | 1 (50 %) |",
+        "| all | 4 | 3 (75 %) |",
+    ]
 
 
 def test_a_run_goes_on_with_what_was_noticed_before(tmp_path: Path) -> None:

@@ -203,9 +203,11 @@ BAD = {
 }
 
 
+@pytest.mark.parametrize("terms", [(), (Term("joint_offset", Site(2), (0.0,)),)])
 @pytest.mark.parametrize("what", BAD)
-def test_what_cannot_be_solved_says_so_and_spoils_no_later_setpoint(what):
-    live, good = Compensator(SIX), np.array([0.3, -1.2, 1.4, -0.5, 0.8, 0.2])
+def test_what_cannot_be_solved_says_so_and_spoils_no_later_setpoint(what, terms):
+    live = Compensator(SIX.with_terms(terms))  # with terms row by row
+    good = np.array([0.3, -1.2, 1.4, -0.5, 0.8, 0.2])
     before = live.correct(good)
     assert live.correct(*BAD[what]).residual == np.inf
     after = live.correct(good)
@@ -317,6 +319,26 @@ def test_effects_that_look_at_the_joint_angles_are_corrected():
     assert found.residual[0] < 1e-8
     assert distance(model, found.q, q, loads)[0] < 1e-8
     assert abs(found.q[0, 1] - q[0, 1]) > 1e-3
+
+
+@pytest.mark.parametrize("terms", [(), (Term("joint_offset", Site(2), (0.0,)),)])
+def test_loads_count_for_their_own_setpoint_alone(terms):
+    model, q = SIX.with_terms(terms), np.array([0.3, -1.2, 1.4, -0.5, 0.8, 0.2])
+    live = Compensator(model)
+    before = live.correct(q)
+    loads = Loads(np.array([1.0]), np.array([[0.1, 0.0, 0.2]]), np.full((1, 6), 20.0))
+    pulled = live.correct(q, loads)
+    assert np.abs(pulled.q - before.q).max() > 1e-5
+    np.testing.assert_allclose(pulled.q, Compensator(model).correct(q, loads).q, atol=1e-9)
+    np.testing.assert_allclose(live.correct(q).q, before.q, atol=1e-9)
+
+
+def test_an_effect_is_corrected_where_the_arm_goes_and_not_where_it_was_to_be():
+    wave = Term("transmission_error", Site(2, 40), (2e-3, 1e-3))
+    model, q = SIX.with_terms([wave]), np.array([[0.3, -1.2, 1.4, -0.5, 0.8, 0.2]])
+    found = correct(model, q)
+    assert found.residual[0] < 1e-8
+    assert distance(model, found.q, q)[0] < 1e-8
 
 
 def test_a_correction_stays_what_it_was_when_the_next_one_is_made():

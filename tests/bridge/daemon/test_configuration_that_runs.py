@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,11 @@ from daemon_cell import Robot, Run, offsets
 from patience import wait_for
 
 from gapbridge.bridge.cell.run_settings import read_configuration
+from gapbridge.bridge.daemon.processes import LoopProcess
+from gapbridge.bridge.ipc.command_memory import CommandMemory
 from gapbridge.bridge.ipc.loop_state import State
+from gapbridge.bridge.ipc.shared_memory import RunMemory
+from gapbridge.bridge.loop.loop import Exit
 
 PATIENT = ", state_timeout: 0.25"
 
@@ -82,6 +87,24 @@ def test_a_loop_reads_none_of_the_files_that_a_cell_names_from_the_disk(tmp_path
             run.wait(State.DISCONNECTED)
             run.wait(State.OBSERVING)
             run.compensate()
+
+
+def test_a_loop_starts_without_its_cells_files_on_the_disk(tmp_path: Path) -> None:
+    cell = tmp_path / "cell.yaml"
+    cell.write_text(
+        "robot: {model: ur10e}\nlink: {driver: modbus, profile: ur, host: 127.0.0.1, port: 1}\n"
+    )
+    configuration = read_configuration(cell)
+    cell.unlink()
+    memory, commands = RunMemory(6), CommandMemory()
+    order = {"may_write": False, "number": 0, "latched": "", "after": 0}
+    loop = LoopProcess(configuration, memory, commands, order, subprocess.DEVNULL)
+    wait_for(lambda: loop.exit_code is not None, "its end")
+    details = [event.get("detail", "") for event in loop.events()]
+    loop.close()
+    commands.close()
+    memory.close()
+    assert loop.exit_code == Exit.LINK, details  # nothing listens there
 
 
 def test_every_file_that_a_cell_names_belongs_to_its_configuration(tmp_path: Path) -> None:

@@ -194,6 +194,45 @@ def test_a_latched_fault_outlives_the_loop_that_found_it(robot: Robot) -> None:
         run.wait(State.OBSERVING)
 
 
+class Standing:
+    """A daemon in one state, that notes what it is asked for."""
+
+    state, phase, latched, may_write = State.OBSERVING, Phase.RUNNING, "", True
+    sequence = last_taken = 0
+
+    def __init__(self, **differs: Any) -> None:
+        self.asked: list[str] = []
+        self.noted: list[dict[str, Any]] = []
+        for name, value in differs.items():
+            setattr(self, name, value)
+
+    def events_since(self, sequence: int) -> list[dict[str, Any]]:
+        return [{"kind": "transition", "from": "ARMED", "to": "COMPENSATING"}]
+
+    def arm(self, by: str) -> int:
+        self.asked.append(by)
+        return 1
+
+    def note(self, event: dict[str, Any]) -> None:
+        self.noted.append(event)
+
+
+@pytest.mark.parametrize(
+    ("differs", "words"),
+    [({"may_write": False}, "only observes (--observe)"), ({"latched": "a stop"}, "a stop;"),
+     ({"state": State.HOLDING}, "found state holding"), ({}, "")],
+)  # fmt: skip
+def test_only_a_daemon_that_may_write_observes_and_has_no_fault_is_armed(
+    differs: dict[str, Any], words: str
+) -> None:
+    daemon: Any = Standing(**differs)
+    reply = control.Control(daemon).answer("arm", Peer(4, 7))
+    assert reply["ok"] == (not words)
+    assert words in reply.get("error", "")
+    assert daemon.asked == ([] if words else ["uid 7, pid 4"])
+    assert daemon.noted[-1]["ok"] == reply["ok"]
+
+
 @pytest.mark.slow
 def test_a_daemon_that_only_observes_cannot_be_armed(robot: Robot) -> None:
     cell = robot.cell(PATIENT)

@@ -13,16 +13,18 @@ from gapbridge.bridge.cell.run_settings import read_configuration
 from gapbridge.bridge.ipc.command_memory import Command
 from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.ipc.shared_memory import SharedMemory
-from gapbridge.bridge.loop.loop import Loop
+from gapbridge.bridge.loop.loop import STOP_TIMEOUT, Exit, Loop
+from gapbridge.bridge.loop.setpoint_stream import longest_ramp_out
 from gapbridge.bridge.loop.supervisor import Cause
 from gapbridge.bridge.setpoint_source.source import Source
-from gapbridge.core.errors import WriteError
+from gapbridge.core.errors import RobotBusyError, WriteError
 from gapbridge.core.state import RobotState, Setpoint
 from gapbridge.drivers.clock import SYSTEM, Clock
 from gapbridge.drivers.driver import Driver
 
 Q = np.array([0.0, -1.5, 1.8, -1.87, -1.57, 0.0])
 RATE = 500.0
+LONGEST_STOP = 2000  # cycles from a request to stop until a test gives up
 CELL = """robot: {model: ur10e}
 compliance: {axial: [1.0e-6, 1.0e-6, 1.0e-6, 1.0e-6, 1.0e-6, 1.0e-6]}
 payload: {mass: 5.0, cog: [0, 0, 0.06]}
@@ -97,6 +99,7 @@ class Asked:
     def take(self) -> list[Command]:
         self._cycle += 1
         self.stop = self._cycle > self._cycles
+        assert self._cycle < self._cycles + LONGEST_STOP, "the loop does not end"
         found = self._script.get(self._cycle)
         if callable(found):
             found()
@@ -118,9 +121,10 @@ class Bench:
         emit = self.events.append
         self.loop = Loop(settings, configuration.model, self.driver, self.source, memory, emit)
 
-    def run(self, script: dict[int, Any], cycles: int = 120) -> None:
+    def run(self, script: dict[int, Any], cycles: int = 120) -> Exit:
         """Run for ``cycles`` with requests, or calls, before the cycles that ``script`` names."""
-        self.loop.run(Asked(self.loop, script, cycles), may_write=True)  # type: ignore[arg-type]
+        asked: Any = Asked(self.loop, script, cycles)
+        return self.loop.run(asked, may_write=True)
 
     def causes(self) -> list[str]:
         return [event["cause"] for event in self.events if event["kind"] == "transition"]
@@ -190,3 +194,38 @@ def test_a_release_that_fails_in_a_fault_is_reported(bench: Bench) -> None:
     bench.driver._release = fail  # type: ignore[method-assign]
     bench.run({10: Command.ARM, 40: stops})
     assert bench.loop._supervisor.state == State.FAULT
+
+
+@pytest.mark.parametrize("fault", ["busy", "unanswered"])
+def test_a_stop_whose_ramp_cannot_end_ends_at_its_deadline(bench: Bench, fault: str) -> None:
+    """Else a robot that takes no more setpoints keeps the process for ever."""
+    driver, stopped = bench.driver, []
+
+    def busy(setpoint: Setpoint) -> None:
+        raise RobotBusyError("busy")
+
+    def takes_no_more() -> None:
+        stopped.append(driver.clock.monotonic())
+        if fault == "busy":
+            driver._send = busy  # type: ignore[method-assign]
+        else:
+            since = driver.clock.monotonic() - 10.0
+            driver.unanswered_since = lambda: since  # type: ignore[method-assign]
+
+    assert bench.run({10: Command.ARM, 120: takes_no_more}) == Exit.DONE
+    taken = driver.clock.monotonic() - stopped[0]
+    longest = STOP_TIMEOUT + longest_ramp_out(bench.loop._settings.limits)
+    assert longest <= taken < longest + 0.05  # not before the ramp could have ended
+    assert driver.noted == ["armed", "released"]
+    assert bench.events[-1]["detail"] == "not at rest in time"
+
+
+def test_a_first_setpoint_far_from_the_arm_is_refused_before_the_driver_is_armed(
+    bench: Bench,
+) -> None:
+    bench.source.first = lambda robot_q: Q + 0.2  # type: ignore[method-assign]
+    bench.run({10: Command.ARM})
+    assert bench.causes() == ["connected", "arm", "start refused"]
+    assert bench.driver.noted == []
+    detail = bench.events[-1]["detail"]
+    assert detail.startswith("joint 1: found the first setpoint 0.2000 rad from the arm")

@@ -50,18 +50,27 @@ class Wire:
     def write(self, table: str, address: int, words: list[int], single: bool = False) -> None:
         self.written.append((table, address, list(words)))
 
-    def sample(self, says: int = encode.RUNNING, *, busy: bool = False, q: Any = NOTHING) -> Sample:
+    def sample(
+        self, says: int = encode.RUNNING, *, busy: bool = False, q: Any = NOTHING,
+        applied: Any = NOTHING,
+    ) -> Sample:  # fmt: skip
         motion = (("busy", "moving"),) if busy else ()
-        return Sample({"echo": NOTHING, "position": q}, None, (), motion, (self.number, says))
+        return Sample({"echo": applied, "position": q}, None, (), motion, (self.number, says))
 
 
-def opened(name: str) -> tuple[Any, Wire, ByHand]:
-    """Return the armed writer of a shipped profile, its wire and its clock."""
+def made(name: str) -> tuple[Any, Wire, ByHand]:
+    """Return the writer of a shipped profile, its wire and its clock."""
     wire, clock = Wire(), ByHand()
     profile = read_profile(ModbusSettings.shipped / f"{name}.yaml")
     if profile.function_23:
         profile = profile.model_copy(update={"function_23": False})
     writer = make_writer(profile, wire, lambda: (0.01, 0.02), 1.0, clock)  # type: ignore[arg-type]
+    return writer, wire, clock
+
+
+def opened(name: str) -> tuple[Any, Wire, ByHand]:
+    """Return the armed writer of a shipped profile, its wire and its clock."""
+    writer, wire, clock = made(name)
 
     def look() -> Sample:
         if isinstance(writer, MailboxWriter) and wire.written:
@@ -144,3 +153,105 @@ def test_a_target_waits_while_the_robot_is_busy_and_the_newest_goes_out_after() 
         writer.write(Setpoint(q, q, NOTHING), wire.sample(q=q))
         assert len(wire.written) == after
         np.testing.assert_allclose(writer.target(), q, atol=abs(writer._size))
+
+
+def test_an_offset_goes_out_in_counts_with_the_cells_rates() -> None:
+    writer, wire, _ = opened("ur")
+    length, angle = writer._box.length_count, writer._box.angle_count
+    counts = [1, -2, 300, 4, -5, 6]
+    in_base = np.array(counts) * np.repeat([length, angle], 3)
+    writer.write(Setpoint(NOTHING, NOTHING, in_base), wire.sample())
+    table, address, words = wire.written[-1]
+    assert (table, address) == ("holding", writer._box.address)
+    assert words[0] == writer._sequence
+    assert words[1:7] == [c % 0x10000 for c in counts]
+    assert words[8:10] == [500, 200]  # 0.01 m/s and 0.02 rad/s
+    assert words[10] == encode.checksum(words[:10])
+
+
+def test_every_writing_has_another_heartbeat_and_the_same_offset_the_same_number() -> None:
+    """Else the robot's program takes a constant offset for a dead client, and ramps it out."""
+    writer, wire, _ = opened("ur")
+    for _ in range(5):
+        writer.write(offset(1e-4), wire.sample())
+    words = [words for _, _, words in wire.written[-5:]]
+    assert len({w[7] for w in words}) == 5
+    assert len({w[0] for w in words}) == 1
+
+
+def test_letting_go_of_an_offset_writes_nothing() -> None:
+    """The robot's program ramps it out by itself; a zero would be a step."""
+    writer, wire, _ = opened("ur")
+    writer.write(offset(1e-4), wire.sample())
+    before = len(wire.written)
+    writer.release()
+    assert len(wire.written) == before
+
+
+@pytest.mark.parametrize("ends", [True, False])
+def test_arming_waits_for_a_former_offset_to_ramp_out(ends: bool) -> None:
+    writer, wire, clock = made("ur")
+    applied = np.array([0.0, 0.0, 1e-3, 0.0, 0.0, 0.0])
+
+    def look() -> Sample:
+        if wire.written:
+            assert not applied.any()
+            wire.number = writer._sequence
+        if ends:
+            applied[2] = max(applied[2] - 1e-4, 0.0)
+        return wire.sample(applied=applied)
+
+    if ends:
+        writer.arm(types.SimpleNamespace(), look)
+        return
+    with pytest.raises(WriteError, match=r"still applies an offset of 1\.000 mm"):
+        writer.arm(types.SimpleNamespace(), look)
+    assert not wire.written
+    assert 1.0 < clock.now - 100.0 < 1.1
+
+
+def test_the_echo_of_a_former_session_does_not_arm() -> None:
+    writer, wire, clock = made("ur")
+    with pytest.raises(WriteError, match="offsets do not arrive"):
+        writer.arm(types.SimpleNamespace(), wire.sample)
+    assert writer._box.echo < clock.now - 100.0 < writer._box.echo + 0.1
+
+
+def target_writer() -> tuple[TargetWriter, Wire, ByHand]:
+    for path in sorted(ModbusSettings.shipped.glob("*.yaml")):
+        if read_profile(path).write.mode == "target_trigger":
+            return opened(path.stem)
+    raise AssertionError("no profile sends targets")
+
+
+def test_a_target_is_there_before_it_is_triggered() -> None:
+    writer, wire, _ = target_writer()
+    wire.written.clear()
+    q = np.full(6, 0.1)
+    writer.write(Setpoint(q, q, NOTHING), wire.sample())
+    trigger = [(write.table, write.address) for write in writer._entry.trigger]
+    assert [(table, at) for table, at, _ in wire.written][-len(trigger) :] == trigger
+    assert len(wire.written) > len(trigger)
+
+
+def test_a_target_that_is_not_reached_in_time_ends_the_writing() -> None:
+    writer, wire, clock = target_writer()
+    q = np.full(6, 0.1)
+    writer.write(Setpoint(q, q, NOTHING), wire.sample())
+    begun, following = clock.now, writer._entry.following
+    while clock.now - begun < following - 0.05:
+        clock.now += 0.02
+        with pytest.raises(RobotBusyError):
+            writer.write(Setpoint(q, q, NOTHING), wire.sample(q=0.5 * q))
+    clock.now += 0.1
+    with pytest.raises(WriteError, match="targets have no effect: joint 1 is 0\\.05"):
+        writer.write(Setpoint(q, q, NOTHING), wire.sample(q=0.5 * q))
+
+
+def test_a_target_that_the_robot_refused_ends_the_writing() -> None:
+    writer, wire, _ = target_writer()
+    q = np.full(6, 0.1)
+    writer.write(Setpoint(q, q, NOTHING), wire.sample())
+    refused = wire.sample(q=q)._replace(motion=(("result", "out of reach"),))
+    with pytest.raises(WriteError, match="the last target failed: out of reach"):
+        writer.write(Setpoint(q, q, NOTHING), refused)

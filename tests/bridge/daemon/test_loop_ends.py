@@ -1,0 +1,182 @@
+"""What the daemon does where a process of its loop ends, hangs or does not stop; no time passes."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from contextlib import ExitStack
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from gapbridge.bridge.cell.run_settings import read_configuration
+from gapbridge.bridge.daemon.daemon import STOP_MARGIN, TICK, Daemon
+from gapbridge.bridge.daemon.processes import LoopProcess
+from gapbridge.bridge.daemon.summary import RunSummary
+from gapbridge.bridge.ipc.command_memory import Command, CommandMemory
+from gapbridge.bridge.ipc.shared_memory import Phase, RunMemory, SharedMemory
+from gapbridge.bridge.loop.loop import STOP_TIMEOUT, Exit
+from gapbridge.bridge.loop.setpoint_stream import longest_ramp_out
+from gapbridge.drivers.clock import Clock
+
+CELL = """robot: {model: ur10e}
+link: {driver: ur_rtde, host: 192.0.2.7}
+"""
+LONGEST = 60.0  # s after which a test gives up
+
+
+class ByHand(Clock):
+    """A clock that begins at 0 s and goes on where somebody waits; calls ``acts`` at their time."""
+
+    def __init__(self) -> None:
+        self.now = 0.0
+        self.acts: dict[float, Callable[[], object]] = {}
+        self.monotonic = self.time = lambda: 100.0 + self.now
+        self.sleep = self._pass
+
+    def _pass(self, seconds: float) -> None:
+        before, self.now = self.now, self.now + seconds
+        for at, act in self.acts.items():
+            if before < at <= self.now:
+                act()
+        assert self.now < LONGEST, "the daemon does not end"
+
+    def wait(self, event: threading.Event, seconds: float) -> bool:
+        self._pass(seconds)
+        return event.is_set()
+
+
+class Played(LoopProcess):
+    """A loop that reads states and ends when it is to stop, unless it is ``deaf``.
+
+    ``silent``: its heart stands still. ``dies``: the exit code with which it dies at 0.5 s.
+    """
+
+    pid = 1
+
+    def __init__(
+        self, how: dict[str, Any], configuration: Any, memory: RunMemory, commands: CommandMemory,
+        order: dict[str, Any], log: Any, clock: ByHand,
+    ) -> None:  # fmt: skip
+        memory.renew()
+        self.memory, self._commands, self._settings = memory, commands, configuration.settings
+        self.how, self.order, self._clock = how, order, clock
+        self._now, self.started = clock.monotonic, clock.monotonic()
+        self.killed_at: float | None = None
+        self.own = SharedMemory(memory.n, memory.fd, clock=clock)
+        self.own.enter(Phase.RUNNING)
+        self.own.note_state_read()
+
+    @property
+    def exit_code(self) -> int | None:
+        if "silent" not in self.how:
+            self.own.beat()
+        if self.killed_at is not None:
+            return -9
+        if "dies" in self.how and self._clock.now > 0.5:
+            return int(self.how["dies"])
+        stops = self._commands.last_of(Command.STOP) and "deaf" not in self.how
+        return Exit.DONE if stops else None
+
+    def events(self) -> list[dict[str, Any]]:
+        return []
+
+    def kill(self) -> None:
+        self.killed_at = self._clock.now
+
+    def close(self) -> None: ...
+
+
+class Bench(Daemon):
+    """A daemon without locks, sockets and side processes; each loop of it does as it is told."""
+
+    def __init__(self, folder: Path, *how: dict[str, Any], may_write: bool = True) -> None:
+        cell = folder / "cell.yaml"
+        cell.write_text(CELL)
+        self.clock, self.loops = ByHand(), list[Played]()
+        super().__init__(read_configuration(cell), may_write, clock=self.clock)
+        todo = iter(how)
+
+        def make(*given: Any) -> Played:
+            self.loops.append(Played(next(todo, {}), *given))
+            return self.loops[-1]
+
+        self.loop_process = make  # type: ignore[assignment]
+
+    def _open(self, stack: ExitStack, arm: bool, by: str) -> bool:
+        return arm
+
+    def run_until(self, seconds: float, arm: bool = False) -> RunSummary:
+        """Run, and ask to stop after so many seconds."""
+        self.clock.acts[seconds] = self.stop
+        try:
+            return self.run(arm=arm, by="--arm")
+        finally:
+            self.asked = {command: self._commands.last_of(command) for command in Command}
+            self._commands.close()
+            self.memory.close()
+
+
+def test_a_loop_that_does_not_stop_is_killed_at_the_deadline(tmp_path: Path) -> None:
+    daemon = Bench(tmp_path, {"deaf": True})
+    summary = daemon.run_until(1.0)
+    own = STOP_TIMEOUT + longest_ramp_out(daemon.settings.limits)  # the loop's deadline
+    assert own + STOP_MARGIN < daemon.clock.now - 1.0 < own + STOP_MARGIN + 5 * TICK
+    assert daemon.asked[Command.STOP]
+    assert summary.exit_code == 1
+    assert summary.faults == (f"the loop has not stopped within {own + STOP_MARGIN:.1f} s: killed",)
+
+
+def test_a_loop_that_stops_is_not_killed(tmp_path: Path) -> None:
+    daemon = Bench(tmp_path)
+    summary = daemon.run_until(1.0)
+    assert daemon.loops[0].killed_at is None
+    assert daemon.clock.now < 1.0 + 3 * TICK
+    assert not summary.faults
+
+
+def test_a_loop_without_a_heartbeat_is_killed_and_another_one_observes(tmp_path: Path) -> None:
+    daemon = Bench(tmp_path, {"silent": True})
+    summary = daemon.run_until(5.0, arm=True)
+    first, second = daemon.loops
+    assert first.killed_at == pytest.approx(daemon.settings.hang_timeout, abs=3 * TICK)
+    assert summary.restarts == 1
+    assert summary.faults[0].startswith("no heartbeat of the loop for")
+    assert second.order["after"] >= daemon.asked[Command.ARM]
+
+
+def test_a_loop_that_takes_the_place_of_a_dead_one_is_not_armed(tmp_path: Path) -> None:
+    daemon = Bench(tmp_path, {"dies": Exit.CRASH})
+    daemon.run_until(5.0, arm=True)
+    first, second = daemon.loops
+    assert first.order["after"] < daemon.asked[Command.ARM]
+    assert second.order["after"] >= daemon.asked[Command.ARM]
+
+
+def test_a_daemon_that_only_observes_never_asks_to_arm(tmp_path: Path) -> None:
+    daemon = Bench(tmp_path, may_write=False)
+    daemon.run_until(1.0, arm=True)
+    assert daemon.asked[Command.ARM] == 0
+    assert not daemon.loops[0].order["may_write"]
+
+
+@pytest.mark.parametrize("at", [0.2, 0.6])  # of the first loop, which takes nothing; between both
+def test_a_disarming_that_no_loop_has_taken_is_for_the_next(tmp_path: Path, at: float) -> None:
+    daemon = Bench(tmp_path, {"dies": Exit.CRASH})
+    daemon.clock.acts[at] = daemon.disarm
+    daemon.run_until(5.0)
+    asked = max(daemon.asked[Command.DISARM], daemon.asked[Command.RAMP_OUT])
+    assert daemon.loops[1].order["after"] < asked
+
+
+def test_loops_that_die_are_started_again_more_and_more_slowly(tmp_path: Path) -> None:
+    daemon = Bench(tmp_path, *[{"dies": Exit.CRASH}] * 6)
+    daemon.run_until(5.0)
+    begun = [loop.started for loop in daemon.loops][1:]  # behind the first pause
+    first, most = daemon.settings.backoff
+    waits = [b - a for a, b in pairwise(begun)]
+    expected = [min(2.0**k * first, most) for k in range(1, len(begun))]
+    assert waits == pytest.approx(expected, abs=4 * TICK)
+    assert len(waits) > 2
