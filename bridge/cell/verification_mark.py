@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import os
 import stat
-from datetime import UTC, datetime
 from pathlib import Path
 
 from gapbridge.bridge.document.output_file import sync_folder, write_text
@@ -29,8 +28,7 @@ def mark_path(cell: Path) -> Path:
 def write_mark(cell: Path, reason: str, session: Path) -> Path:
     """Write the mark of a failed verification; returns its path. Raises RunError."""
     path = mark_path(cell)
-    now = datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z")
-    document = {"schema": SCHEMA, "time": now, "reason": reason, "session": str(session.resolve())}
+    document = {"schema": SCHEMA, "reason": reason, "session": str(session.resolve())}
     write_text(path, json.dumps(document, indent=1) + "\n")
     return path
 

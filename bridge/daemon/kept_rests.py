@@ -20,7 +20,7 @@ from gapbridge.bridge.document.provenance import installed_version
 from gapbridge.bridge.ipc.events import Event, EventKind
 from gapbridge.core.arrays import Array
 from gapbridge.core.errors import GapbridgeError
-from gapbridge.drivers.clock import SYSTEM, Clock
+from gapbridge.drivers.clock import Clock
 
 SCHEMA = "gapbridge.rests/1"
 EVERY = 60.0  # s between two writes
@@ -32,7 +32,7 @@ SLIP = ("joints", "size", "std", "since", "detail")  # fields of the event
 class KeptRests:
     """Reads the file at the start of a run and writes it, in a thread: disks can be slow."""
 
-    def __init__(self, clock: Clock = SYSTEM) -> None:
+    def __init__(self, clock: Clock) -> None:
         self._now = clock.monotonic
         self._path: Path | None = None  # None: nothing is kept
         self._text = ""  # written last

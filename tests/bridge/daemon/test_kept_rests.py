@@ -22,6 +22,7 @@ from gapbridge.bridge.daemon.kept_rests import EVERY, KeptRests
 from gapbridge.bridge.daemon.slip_watch import Slip, SlipWatch
 from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.core.errors import InputError, RunError
+from gapbridge.drivers.clock import SYSTEM
 
 LEARNING, ROUNDS = 6 * COUNTS, 2 * COUNTS + 1  # rests
 FOUND = Slip((4, 3), 0.0098, 0.0007, 12.0, "the zero of joint 4 or 3 has moved by 9.8 mrad")
@@ -44,7 +45,7 @@ def watch_of(program: Program) -> SlipWatch:
 
 def a_run(path: Path, cell: Configuration, watch: SlipWatch, *events: dict[str, Any]) -> str:
     """Have a run of the daemon begin with the file and end with what ``watch`` holds then."""
-    kept = KeptRests()
+    kept = KeptRests(SYSTEM)
     told = kept.open(path, watch, cell)
     for event in events:
         kept.on_event(event)
@@ -57,7 +58,7 @@ def a_run(path: Path, cell: Configuration, watch: SlipWatch, *events: dict[str, 
 def learned(path: Path, cell: Configuration) -> Program:
     """Return a program whose rests an earlier run has kept."""
     program = Program(SETUPS[0], 21)
-    watch, kept = watch_of(program), KeptRests()
+    watch, kept = watch_of(program), KeptRests(SYSTEM)
     assert kept.open(path, watch, cell) == ""
     assert found_in(watch, program, LEARNING)[:2] == ([], [])
     kept.step(watch, cell, at_once=True)
@@ -80,7 +81,7 @@ def test_a_slip_between_two_runs_is_found_in_the_second(
     learned: Program, path: Path, cell: Configuration
 ) -> None:
     watch = watch_of(learned)
-    assert KeptRests().open(path, watch, cell) == ""
+    assert KeptRests(SYSTEM).open(path, watch, cell) == ""
     assert watch.learned
     learned.slip(4, 0.010)
     learned.time = 0.0  # the controller was off, too
@@ -90,7 +91,7 @@ def test_a_slip_between_two_runs_is_found_in_the_second(
 
 def test_a_night_without_a_slip_is_none(learned: Program, path: Path, cell: Configuration) -> None:
     watch = watch_of(learned)
-    KeptRests().open(path, watch, cell)
+    KeptRests(SYSTEM).open(path, watch, cell)
     learned._drift += np.repeat((3.0, 0.1, 4.0), (3, 3, 6))  # N, Nm, Nm: zeros, over a night
     learned.time = 0.0
     assert found_in(watch, learned, 4 * COUNTS)[:2] == ([], [])
@@ -181,13 +182,13 @@ def test_a_slip_is_kept_until_it_is_acknowledged_whatever_the_cell(
     a_run(path, cell, watch_of(program), FOUND.event)
     other = replace(cell, text=cell.text + "\n")
     for _ in range(2):
-        kept = KeptRests()
+        kept = KeptRests(SYSTEM)
         kept.open(path, watch_of(program), other)
         assert kept.slip_of_earlier_run() == FOUND.event
         assert kept.slip_of_earlier_run() is None
         a_run(path, other, watch_of(program))
     a_run(path, other, watch_of(program), ACKNOWLEDGED)
-    kept = KeptRests()
+    kept = KeptRests(SYSTEM)
     kept.open(path, watch_of(program), other)
     assert kept.slip_of_earlier_run() is None
 
@@ -220,7 +221,7 @@ def test_the_file_is_written_once_a_minute_and_only_if_something_is_new(
 def test_a_disk_that_cannot_be_written_is_told_once(
     learned: Program, tmp_path: Path, cell: Configuration
 ) -> None:
-    watch, kept = watch_of(learned), KeptRests()
+    watch, kept = watch_of(learned), KeptRests(SYSTEM)
     kept.open(tmp_path / "none" / "x.json", watch, cell)
     kept.on_event(FOUND.event)
     told = []
