@@ -52,8 +52,9 @@ def make_fault(rig: Rig, row: Row) -> Result:
 def _late(rig: Rig, row: Row, moment: float, missed: int) -> float:
     """Return how late the machine was meanwhile, s; 0 where the fault bears that.
 
-    Also shortly before: the loop counts what it missed within a span. Where the loop reports that it missed states or deadlines, half a cycle is enough for that; a
-    loop that misses them on a machine that was on time is to blame itself.
+    Also shortly before: the loop counts what it missed within a span. Where it reports that it
+    missed states or deadlines, half a cycle is enough for that; a loop that misses them on a
+    machine that was on time is to blame itself.
     """
     of_the_loop = "overrun" not in row.sign and any(
         event.get("cause") in BUSY for event in rig.run.since(moment)
