@@ -45,24 +45,25 @@ def make_fault(rig: Rig, row: Row) -> Result:
     return Result(
         row.key, rig.link.name, rig.link.cycle, detected, end, found.largest_step,
         bounds.offset_rate * bounds.cycle, tuple(wrong), found.violated > before,
-        _late(rig, row, moment, missed),
+        _late(rig, row, moment, detected),
     )  # fmt: skip
 
 
-def _late(rig: Rig, row: Row, moment: float, missed: int) -> float:
+def _late(rig: Rig, row: Row, moment: float, detected: float | None) -> float:
     """Return how late the machine was meanwhile, s; 0 where the fault bears that.
 
     Also shortly before: the loop counts what it missed within a span. Where it reports that it
-    missed states or deadlines, half a cycle is enough for that; a loop that misses them on a
-    machine that was on time is to blame itself.
+    missed deadlines, half a cycle is enough for that; a loop that misses them on a machine that was
+    on time is to blame itself. Half a cycle is also enough for a proxy to make the fault too late.
     """
     of_the_loop = "overrun" not in row.sign and any(
         event.get("cause") in BUSY for event in rig.run.since(moment)
     )
-    since = time.monotonic() - (time.time() - moment) - OVERRUN_SPAN
-    return rig.witness.late(
-        since, min(LATE, 0.5 * rig.link.cycle) if missed or of_the_loop else LATE
-    )
+    made, half = time.monotonic() - (time.time() - moment), min(LATE, 0.5 * rig.link.cycle)
+    late = rig.witness.late(made - OVERRUN_SPAN, half if of_the_loop else LATE)
+    if not late and detected is None:
+        late = rig.witness.late(made - OVERRUN_SPAN, half, until=made + row.within(rig.link))
+    return late
 
 
 def _await(rig: Rig, row: Row, moment: float, before: dict[str, int]) -> float | None:

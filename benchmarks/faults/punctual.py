@@ -6,6 +6,7 @@ Who measures must not be what is measured: a proxy that sleeps makes faults of i
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import threading
 import time
@@ -70,9 +71,10 @@ class Witness:
         for thread in self._threads:
             thread.join()
 
-    def late(self, since: float, limit: float = LATE) -> float:
-        """Return how late the machine was since then (s monotonic), s; 0 if within ``limit``."""
-        worst = max((late for woke, late in list(self._late) if woke > since), default=0.0)
+    def late(self, since: float, limit: float = LATE, until: float = math.inf) -> float:
+        """Return how late the machine was in a span (s monotonic), s; 0 if within ``limit``."""
+        span = [late for woke, late in list(self._late) if woke > since and woke - late < until]
+        worst = max(span, default=0.0)
         return worst if worst > limit else 0.0
 
     def _watch(self, core: int) -> None:
