@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import time
 
-from benchmarks.faults.punctual import LATE, Witness
+from benchmarks.faults.punctual import LATE
 from benchmarks.faults.rig import Rig
 from benchmarks.faults.row import Result, Row
 from gapbridge.bridge.ipc.loop_state import State
+from gapbridge.bridge.loop.checks import OVERRUN_SPAN
 from gapbridge.bridge.loop.supervisor import Cause
 
 POLL = 0.001  # s
@@ -21,11 +22,6 @@ BUSY = (Cause.OVERRUN.value, Cause.RESYNC.value)
 def make_fault(rig: Rig, row: Row) -> Result:
     """Make a row's fault while the daemon compensates; returns what became of it."""
     rig.compensate()
-    with Witness() as witness:
-        return _make(rig, row, witness)
-
-
-def _make(rig: Rig, row: Row, witness: Witness) -> Result:
     assert row.inject is not None
     found = rig.found
     found.largest_step, before = 0.0, found.violated
@@ -49,20 +45,25 @@ def _make(rig: Rig, row: Row, witness: Witness) -> Result:
     return Result(
         row.key, rig.link.name, rig.link.cycle, detected, end, found.largest_step,
         bounds.offset_rate * bounds.cycle, tuple(wrong), found.violated > before,
-        _late(rig, row, moment, missed, witness),
+        _late(rig, row, moment, detected),
     )  # fmt: skip
 
 
-def _late(rig: Rig, row: Row, moment: float, missed: int, witness: Witness) -> float:
+def _late(rig: Rig, row: Row, moment: float, detected: float | None) -> float:
     """Return how late the machine was meanwhile, s; 0 where the fault bears that.
 
-    Where the loop reports that it missed states or deadlines, half a cycle is enough for it; a loop
-    that misses them on a machine that was on time is to blame itself.
+    Also shortly before: the loop counts what it missed within a span. Where it reports that it
+    missed deadlines, half a cycle is enough for that; a loop that misses them on a machine that was
+    on time is to blame itself. Half a cycle is also enough for a proxy to make the fault too late.
     """
     of_the_loop = "overrun" not in row.sign and any(
         event.get("cause") in BUSY for event in rig.run.since(moment)
     )
-    return witness.late(min(LATE, 0.5 * rig.link.cycle) if missed or of_the_loop else LATE)
+    made, half = time.monotonic() - (time.time() - moment), min(LATE, 0.5 * rig.link.cycle)
+    late = rig.witness.late(made - OVERRUN_SPAN, half if of_the_loop else LATE)
+    if not late and detected is None:
+        late = rig.witness.late(made - OVERRUN_SPAN, half, until=made + row.within(rig.link))
+    return late
 
 
 def _await(rig: Rig, row: Row, moment: float, before: dict[str, int]) -> float | None:

@@ -6,6 +6,7 @@ Who measures must not be what is measured: a proxy that sleeps makes faults of i
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import threading
 import time
@@ -14,6 +15,7 @@ from typing import Self
 
 FIRST = 2  # SCHED_FIFO: before all that has no real-time priority
 LATE = 0.03  # s that the machine may be late
+KEPT = 10_000  # late wakings that are remembered: more than those of a fault
 PRIORITY = 20  # SCHED_FIFO; below the loop's and the simulated controller's
 
 
@@ -43,13 +45,13 @@ class Witness:
     """Measures how late threads of this process wake, one on each core.
 
     What disturbs them is the machine's, and no fault. A host may stop one core and not the others.
-    They go before others no more than the least of a rig's processes does.
+    They have no priority: neither have some threads of a rig, such as those of libraries.
     """
 
     TICK = 0.002  # s
 
     def __init__(self) -> None:
-        self.latest = 0.0  # s behind a tick, the worst
+        self._late: list[tuple[float, float]] = []  # s monotonic: when it woke; s: how late
         self._over = threading.Event()
         self._threads = [
             threading.Thread(target=self._watch, args=(core,), daemon=True, name=f"witness {core}")
@@ -69,14 +71,19 @@ class Witness:
         for thread in self._threads:
             thread.join()
 
-    def late(self, limit: float = LATE) -> float:
-        """Return how late the machine was up to now, s; 0 where that is within ``limit``."""
-        return self.latest if self.latest > limit else 0.0
+    def late(self, since: float, limit: float = LATE, until: float = math.inf) -> float:
+        """Return how late the machine was in a span (s monotonic), s; 0 if within ``limit``."""
+        span = [late for woke, late in list(self._late) if woke > since and woke - late < until]
+        worst = max(span, default=0.0)
+        return worst if worst > limit else 0.0
 
     def _watch(self, core: int) -> None:
         os.sched_setaffinity(0, {core})  # of this thread
-        go_first()
+        be_ordinary()
         before = time.monotonic()
         while not self._over.wait(self.TICK):
             now = time.monotonic()
-            self.latest, before = max(self.latest, now - before - self.TICK), now
+            if now - before > 2.0 * self.TICK:
+                self._late.append((now, now - before - self.TICK))
+                del self._late[:-KEPT]
+            before = now

@@ -12,7 +12,7 @@ from benchmarks.faults.controller_process import ControllerProcess
 from benchmarks.faults.invariants import Checker, Found
 from benchmarks.faults.links import Link
 from benchmarks.faults.proxy import Proxy
-from benchmarks.faults.punctual import be_ordinary, be_punctual
+from benchmarks.faults.punctual import Witness, be_ordinary, be_punctual
 from benchmarks.faults.running import Running
 from benchmarks.faults.tap import Tap
 from benchmarks.ports import own_host
@@ -37,6 +37,7 @@ class Rig:
             controller_cell, self.back, 30100, folder / "controller.log"
         )
         self.checker = Checker(link.bounds(self.cell))
+        self.witness = Witness()
         self._runs: list[Running] = []
         self.decoder = link.decoder()
         self.tap = Tap(self.decoder, link.ports(), self._state_word)
@@ -70,12 +71,14 @@ class Rig:
         sys.setswitchinterval(1e-4)  # the proxy's thread must not wait for others
         be_punctual()  # nor for this one, which may hold the interpreter
         try:
+            self.witness.__enter__()
             self.controller.start()
             self.link.prepare(self.controller, self.back)
             self.proxy.__enter__()
             self.start_daemon()
         except BaseException:
             self.controller.stop()
+            self.witness.__exit__(None, None, None)
             be_ordinary()
             raise
         return self
@@ -89,6 +92,7 @@ class Rig:
         finally:
             self.proxy.__exit__(None, None, None)
             self.controller.stop()
+            self.witness.__exit__(None, None, None)
             be_ordinary()
 
     def start_daemon(self) -> None:

@@ -11,7 +11,6 @@ import psutil
 
 from benchmarks.faults.links import Link
 from benchmarks.faults.process_run import END_LIMIT, ProcessRun
-from benchmarks.faults.punctual import Witness
 from benchmarks.faults.rig import RECOVERY_LIMIT, START_LIMIT, Rig
 from benchmarks.faults.row import Apart, Result, Row, seconds
 from benchmarks.faults.running import Running
@@ -43,7 +42,7 @@ def ended_by(number: signal.Signals) -> Apart:
     """Return a way to end the daemon: its offset must go, it must be gone and start anew."""
 
     def run(row: Row, link: Link, folder: Path) -> Result:
-        with ProcessRig(link, folder) as rig, Witness() as witness:
+        with ProcessRig(link, folder) as rig:
             rig.pass_time(AFTER)
             found, run, wrong = rig.found, rig.ended, list[str]()
             found.largest_step = 0.0
@@ -65,7 +64,7 @@ def ended_by(number: signal.Signals) -> Apart:
             if left > 5.0 * rig.checker.bounds.grain and not link.moves_arm:
                 words = f"an offset of {1e6 * left:.1f} um was left behind"
                 wrong.append(f"{words}: {run.output[-900:]}")
-            step, late = found.largest_step, witness.late()
+            step, late = found.largest_step, rig.witness.late(moment)
             rig.link.prepare(rig.controller, rig.back)
             rig.start_daemon()  # with what the former has left behind: nothing is cleaned
             rig.pass_time(AFTER)
