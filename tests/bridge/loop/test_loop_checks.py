@@ -265,6 +265,20 @@ def test_two_bad_samples_are_dropped_and_three_in_a_row_hold(memory: SharedMemor
     assert [event["what"] for event in events] == ["dropped_torn"]  # not five times
 
 
+@pytest.mark.parametrize(("armed", "longest"), [(False, 3.0), (True, 0.5)])
+def test_a_silent_link_is_lost_and_sooner_once_it_was_armed(
+    memory: SharedMemory, armed: bool, longest: float
+) -> None:
+    """The library of a UR cannot write after a break."""
+    clock = [100.0]
+    driver, _, watch, _ = watched(memory, clock)
+    driver.next = StaleStateError("the clock stands still")
+    while not watch.lost and clock[0] < 110.0:
+        clock[0] += 0.01
+        assert watch.next(armed) is None
+    assert longest < clock[0] - 100.0 < longest + 0.02
+
+
 def test_a_state_that_is_late_is_counted_and_only_a_stale_one_holds(memory: SharedMemory) -> None:
     clock = [100.0]
     driver, supervisor, watch, _ = watched(memory, clock)

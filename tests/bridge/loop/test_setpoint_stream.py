@@ -13,7 +13,7 @@ from gapbridge.bridge.loop.setpoint_stream import (
     limits_of,
 )
 from gapbridge.core.arm import builtin_arm
-from gapbridge.core.compensation import correct
+from gapbridge.core.compensation import Correction, correct
 from gapbridge.core.errors import LimitError
 from gapbridge.core.loads import Loads
 from gapbridge.core.model import Model
@@ -73,6 +73,30 @@ def test_the_offset_ramps_in_to_the_whole_correction_and_out_to_none() -> None:
     assert end.q == pytest.approx(Q, abs=1e-15)
     assert run.stream.at_rest
     assert np.abs(run.steps()).max() < 1e-4
+
+
+def test_a_correction_that_misses_is_not_sent_and_the_last_solved_one_ramps_out(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    run = Run()
+    last = run.cycles(400).offset_in_base
+    missing = Correction(Q + 0.02, np.full(6, 0.005), 1e-3, 3)
+    monkeypatch.setattr(run.stream._compensator, "correct", lambda q, loads: missing)
+    run.cycles(400, goal=0.0)
+    assert "1 mm from the wanted pose" in run.stream.unsolved
+    sent = np.array([s.offset_in_base for s in run.sent[400:]])
+    share = sent @ last / (last @ last)
+    assert sent == pytest.approx(np.outer(share, last), abs=1e-12)
+    assert (np.diff(share) <= 1e-12).all()
+    assert share[0] > 0.98
+    assert run.stream.at_rest
+
+
+@pytest.mark.parametrize(("ramp_time", "after"), [(2.0, 0.5), (0.3, 0.3)])
+def test_a_stop_shortens_a_long_ramp_and_lengthens_none(ramp_time: float, after: float) -> None:
+    run = Run(ramp_time=ramp_time)
+    run.stream.shorten_ramp(0.5)
+    assert run.stream.ramp_time == after
 
 
 def test_a_first_setpoint_beside_the_arm_is_led_over_to_without_a_jump() -> None:
