@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections import deque
 from dataclasses import dataclass
 from typing import Any
@@ -20,6 +19,7 @@ from gapbridge.drivers.canopen.objects import (
 )
 from gapbridge.drivers.canopen.profile import CanopenProfile
 from gapbridge.drivers.canopen.sync_set import SyncCollector
+from gapbridge.drivers.clock import SYSTEM, Clock
 
 KEPT = 64  # emergencies stored
 PAUSE = 0.02  # s between two readings of a lost bus
@@ -50,9 +50,15 @@ class Emergency:
 class BusListener(MessageListener):
     """Passes frames to the collector and the canopen library; our own are not received."""
 
-    def __init__(self, network: Network, profile: CanopenProfile, collector: SyncCollector) -> None:
+    def __init__(
+        self,
+        network: Network,
+        profile: CanopenProfile,
+        collector: SyncCollector,
+        clock: Clock = SYSTEM,
+    ) -> None:
         super().__init__(network)
-        self._collector = collector
+        self._collector, self._clock = collector, clock
         self._commands = _commands(profile)
         self.foreign: ForeignCommand | None = None
         self.error_frames = 0
@@ -64,7 +70,7 @@ class BusListener(MessageListener):
             return
         if msg.is_remote_frame or msg.is_extended_id or msg.is_fd or not msg.is_rx:
             return
-        now, cob_id = time.monotonic(), int(msg.arbitration_id)
+        now, cob_id = self._clock.monotonic(), int(msg.arbitration_id)
         what = self._commands.get(cob_id)
         if what is not None:
             self.foreign = ForeignCommand(what, now)
@@ -77,7 +83,7 @@ class BusListener(MessageListener):
 
         The thread runs until it is stopped, so it must pause.
         """
-        time.sleep(PAUSE)
+        self._clock.sleep(PAUSE)
 
 
 def _commands(profile: CanopenProfile) -> dict[int, str]:
@@ -94,8 +100,8 @@ def _commands(profile: CanopenProfile) -> dict[int, str]:
 class HeartbeatMonitor:
     """The last heartbeat, NMT state and emergencies of each drive."""
 
-    def __init__(self, network: Network, profile: CanopenProfile) -> None:
-        self._profile = profile
+    def __init__(self, network: Network, profile: CanopenProfile, clock: Clock = SYSTEM) -> None:
+        self._profile, self._now = profile, clock.monotonic
         self.received_at: dict[int, float] = {}  # node -> s, monotonic
         self.nmt: dict[int, int] = {}  # node -> NMT state that it reported last
         self.restarted: set[int] = set()
@@ -108,7 +114,7 @@ class HeartbeatMonitor:
 
     def _heartbeat_of(self, node: int) -> Any:
         def note(state: int) -> None:
-            self.received_at[node] = time.monotonic()
+            self.received_at[node] = self._now()
             if state == 0:
                 self.restarted.add(node)
             self.nmt[node] = state
@@ -117,7 +123,7 @@ class HeartbeatMonitor:
 
     def _emergency_of(self, node: int, consumer: Any) -> Any:
         def note(error: Any) -> None:
-            emergency = Emergency(node, error.code, error.register, time.monotonic())
+            emergency = Emergency(node, error.code, error.register, self._now())
             self.log.append(emergency)
             if error.code & 0xFF00:
                 self.active[node] = emergency
@@ -132,7 +138,7 @@ class HeartbeatMonitor:
         """Reset states and restarts: the drives have just been configured."""
         self.restarted.clear()
         self.nmt.clear()
-        now = time.monotonic()
+        now = self._now()
         self.received_at = dict.fromkeys(self._profile.nodes, now)
 
     @property
@@ -142,7 +148,7 @@ class HeartbeatMonitor:
 
     def lost(self) -> int | None:
         """Return a node whose heartbeats have ceased; None: none."""
-        now = time.monotonic()
+        now = self._now()
         for node in self._profile.nodes:
             if now - self.received_at.get(node, 0.0) > self._profile.heartbeat.lost_after:
                 return node

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import time
 from collections.abc import Callable
 from typing import Any
 
@@ -28,6 +27,7 @@ from gapbridge.drivers.canopen.objects import (
 from gapbridge.drivers.canopen.profile import CanopenProfile
 from gapbridge.drivers.canopen.settings import CanopenSettings
 from gapbridge.drivers.canopen.sync_set import SyncCollector
+from gapbridge.drivers.clock import SYSTEM, Clock
 
 logging.getLogger("canopen").setLevel(logging.CRITICAL)  # reported by our own errors instead
 ABSENT = (0x06020000, 0x06090011)  # SDO aborts: no such object, no such subindex
@@ -64,9 +64,11 @@ class _Network(canopen.Network):
 class Master:
     """The only master of one profile's drives, on one bus."""
 
-    def __init__(self, settings: CanopenSettings, profile: CanopenProfile) -> None:
-        self._settings, self._profile = settings, profile
-        self.collector = SyncCollector(profile)
+    def __init__(
+        self, settings: CanopenSettings, profile: CanopenProfile, clock: Clock = SYSTEM
+    ) -> None:
+        self._settings, self._profile, self.clock = settings, profile, clock
+        self.collector = SyncCollector(profile, clock)
         self.network: Any = None
         self.listener: BusListener | None = None
         self.heartbeats: HeartbeatMonitor | None = None
@@ -79,14 +81,15 @@ class Master:
 
     def open(self) -> None:
         """Open the bus and listen; sends nothing. Raises LinkError."""
-        bus = open_bus(self._settings)
-        network: Any = _Network(bus, AllowedFrames(self._profile))
-        self.listener = BusListener(network, self._profile, self.collector)
+        self._listen(_Network(open_bus(self._settings), AllowedFrames(self._profile)))
+
+    def _listen(self, network: Any) -> None:
+        self.listener = BusListener(network, self._profile, self.collector, self.clock)
         network.listeners[:] = [self.listener]
         for node in self._profile.nodes:
             remote = network.add_node(node, self._profile.eds.dictionary(node))
             remote.sdo.RESPONSE_TIMEOUT = self._settings.sdo_timeout
-        self.heartbeats = HeartbeatMonitor(network, self._profile)
+        self.heartbeats = HeartbeatMonitor(network, self._profile, self.clock)
         self._beat_at = 0.0
         network.connect()
         self.network = network
@@ -125,14 +128,14 @@ class Master:
     def sync(self) -> float:
         """Send one SYNC, and our heartbeat if due; returns when it was sent (s, monotonic)."""
         self.beat()
-        now = time.monotonic()
+        now = self.clock.monotonic()
         self.collector.begin(now)
         self.send(SYNC, b"", "SYNC")
         return now
 
     def beat(self) -> None:
         """Send our heartbeat if due. Called by the loop, so that it stops if the loop hangs."""
-        now = time.monotonic()
+        now = self.clock.monotonic()
         if now < self._beat_at:
             return
         self._beat_at = now + 0.5 * self._profile.heartbeat.ours

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 
 from gapbridge.core.arrays import Array
@@ -44,7 +43,7 @@ class Power:
         exchange: Callable[[], SyncSet | None],
     ) -> None:
         self._master, self._profile, self._writer = master, profile, writer
-        self._exchange = exchange
+        self._exchange, self._now = exchange, master.clock.monotonic
         self._modes: dict[int, int] = {}  # node -> Modes of operation before
         self._watched: list[int] = []  # nodes that watch our heartbeat
 
@@ -89,7 +88,7 @@ class Power:
         """
         hold: Array | None = None
         resetting = False
-        end = time.monotonic() + within
+        end = self._now() + within
         while True:
             reported = states(sample)
             enabled = all(state == "OPERATION ENABLED" for state in reported)
@@ -97,7 +96,7 @@ class Power:
                 hold = positions(self._profile, sample)
             if hold is not None and enabled and not_following(self._profile, sample) is None:
                 return hold
-            if time.monotonic() > end:
+            if self._now() > end:
                 raise self._not_enabled(sample)
             resetting = not resetting and clear_faults
             commands = [self._towards(state, enabled, resetting) for state in reported]
@@ -133,12 +132,12 @@ class Power:
 
         Drives that do not answer are sent the commands too.
         """
-        profile, end = self._profile, time.monotonic() + STOPPING
+        profile, end = self._profile, self._now() + STOPPING
         reported: list[State] = ["OPERATION ENABLED"] * profile.n
         q, still = self._writer.target, 0
         while True:
             if q is not None:
-                late = time.monotonic() > end - 0.5 * STOPPING
+                late = self._now() > end - 0.5 * STOPPING
                 word = DISABLE_VOLTAGE if still >= STILL_SYNCS or late else QUICK_STOP
                 moving = "OPERATION ENABLED"
                 commands = [QUICK_STOP if s == moving and not late else word for s in reported]
@@ -151,7 +150,7 @@ class Power:
                 if all(state in OFF for state in reported):
                     self._writer.reset()
                     return
-            if time.monotonic() > end:
+            if self._now() > end:
                 raise WriteError(
                     f"{self._master.where}: not all drives have reported that they are off "
                     f"{STOPPING:g} s after the quick stop"

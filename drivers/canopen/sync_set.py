@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import threading
-import time
 from collections import Counter
 from enum import StrEnum
 from typing import NamedTuple
 
 from gapbridge.drivers.canopen.pdo import PdoLayout
 from gapbridge.drivers.canopen.profile import CanopenProfile
+from gapbridge.drivers.clock import SYSTEM, Clock
 
 
 class DropReason(StrEnum):
@@ -26,14 +26,15 @@ class SyncSet(NamedTuple):
     """The reports of all drives at one SYNC. A tuple, because one is created in every cycle."""
 
     counts: tuple[dict[str, int], ...]  # per joint: object name -> counts
-    synced: float  # s, time.monotonic() when the SYNC was sent
-    received: float  # s, time.monotonic() of the last TPDO
+    synced: float  # s, monotonic, when the SYNC was sent
+    received: float  # s, monotonic, of the last TPDO
 
 
 class SyncCollector:
     """Collects the TPDOs of one SYNC at a time. One thread may feed it while another waits."""
 
-    def __init__(self, profile: CanopenProfile) -> None:
+    def __init__(self, profile: CanopenProfile, clock: Clock = SYSTEM) -> None:
+        self._now = clock.monotonic
         self._members: dict[int, tuple[int, PdoLayout]] = {
             layout.cob_id(node): (joint, layout)
             for joint, node in enumerate(profile.nodes)
@@ -110,7 +111,7 @@ class SyncCollector:
     def wait(self, until: float) -> SyncSet | None:
         """Return the set, None where it is incomplete or rejected by ``until``."""
         with self._changed:
-            self._changed.wait_for(self._over, max(until - time.monotonic(), 0.0))
+            self._changed.wait_for(self._over, max(until - self._now(), 0.0))
             self._open = False
             if self._rejected or len(self._frames) < len(self._members):
                 self.dropped[DropReason.TORN] += 1
