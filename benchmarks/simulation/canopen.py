@@ -39,11 +39,21 @@ class BusFrame(NamedTuple):
     sampled: float
 
 
+class _Received(NamedTuple):
+    """A frame as python-can gives it, without what making one of its own costs."""
+
+    arbitration_id: int
+    data: bytes
+    timestamp: float
+    is_rx = True
+    is_error_frame = is_remote_frame = is_extended_id = is_fd = False
+
+
 class _Network(canopen_master._Network):
     """The product's, whose bus is the link's wires and whose thread is the world."""
 
     def __init__(self, link: CanopenLink, allowed: AllowedFrames) -> None:
-        super().__init__(_Bus(link), allowed)
+        super().__init__(cast(Any, _Bus(link)), allowed)
         self._link = link
 
     def connect(self, *_: Any, **__: Any) -> Any:
@@ -53,6 +63,12 @@ class _Network(canopen_master._Network):
             cast(Any, remote).sdo.responses = _Responses(self._link)
         self._link.network = self
         return self
+
+    def send_message(self, can_id: int, data: Any, remote: bool = False) -> None:
+        """Send a frame that the profile allows."""
+        self._allowed.check(can_id, data)
+        cast(_Bus, self.bus).send(can_id, bytes(data))
+        self.check()
 
     def disconnect(self) -> None:
         """Receive nothing any more."""
@@ -66,13 +82,12 @@ class _Bus:
     def __init__(self, link: CanopenLink) -> None:
         self._link, self._generation = link, link.generation
 
-    def send(self, frame: Any) -> None:
+    def send(self, cob_id: int, data: bytes) -> None:
         link = self._link
         if self._generation != link.generation:
             raise python_can.CanOperationError("Connection reset by peer")
         if link.refuses_frames and link.world.random.random() < 0.5:
             raise python_can.CanOperationError("No buffer space available")
-        cob_id, data = int(frame.arbitration_id), bytes(frame.data)
         link.note(cob_id, data)
         link.up.send((cob_id, data))
 
@@ -152,6 +167,10 @@ class CanopenLink(SimulatedLink):
         driver = self.setting.make_driver(canopen_driver, CanopenDriver, self.clock)
         self.profile: CanopenProfile = driver.profile
         self._share_dictionaries()
+        units = zip(
+            self.profile.counts_per_radian.tolist(), self.profile.zero.tolist(), strict=True
+        )
+        self._units = dict(zip(self.profile.nodes, units, strict=True))  # counts a radian, rad
         self.drives = SimulatedDrives(self.profile, self.controller, self._send)
 
     def _share_dictionaries(self) -> None:
@@ -213,17 +232,19 @@ class CanopenLink(SimulatedLink):
                 if not (late and q == last):  # that is said again, in a late setpoint's place
                     self.wrote("joints", q, "RPDOs")
                     return
-        elif base == RPDO_BASE and node in profile.nodes and len(data) == 6:
+        elif base == RPDO_BASE and node in self._units and len(data) == 6:
             word, counts = struct.unpack("<Hi", data)
-            joint = profile.nodes.index(node)
-            angle = counts / profile.counts_per_radian[joint] + profile.zero[joint]
-            self._sent[node] = (word, float(angle))
+            self._sent[node] = (word, self._angle(node, counts))
         elif cob_id == 0:
             self._sent.clear()
         elif base not in (0x600, 0x700) or node == 0:
             self.wrote("forbidden", (), f"{cob_id:#x}")
             return
         self.wrote("other", (), f"{cob_id:#x}")
+
+    def _angle(self, node: int, counts: int) -> float:
+        per_radian, zero = self._units[node]
+        return counts / per_radian + zero
 
     def _on_up(self, message: tuple[int, bytes]) -> None:
         if self.world.now < self.rebooting_until or self.controller.stalled:
@@ -245,24 +266,18 @@ class CanopenLink(SimulatedLink):
         if cob_id & 0x780 == TPDO_BASE:
             self._look(cob_id & 0x7F, data)
             self._sampled_at[cob_id] = sampled
-        network.listeners[0].on_message_received(
-            python_can.Message(
-                timestamp=self.world.now, arbitration_id=cob_id, is_extended_id=False, data=data,
-                check=False,
-            )
-        )  # fmt: skip
+        received = cast(Any, _Received(cob_id, data, self.world.now))
+        network.listeners[0].on_message_received(received)
 
     def _look(self, node: int, data: bytes) -> None:
         """See what a checker sees of a TPDO: the joint, and whether its drive follows."""
-        profile = self.profile
-        if node not in profile.nodes or len(data) != 7:
+        if node not in self._units or len(data) != 7:
             return
         word, counts, mode = struct.unpack("<Hib", data)
-        joint = profile.nodes.index(node)
-        angle = counts / profile.counts_per_radian[joint] + profile.zero[joint]
-        self._seen[node] = (word & STATE_BITS == FOLLOWS and mode == CYCLIC, float(angle))
-        if len(self._seen) == profile.n:
-            q = [self._seen[n][1] for n in profile.nodes]
+        follows = word & STATE_BITS == FOLLOWS and mode == CYCLIC
+        self._seen[node] = (follows, self._angle(node, counts))
+        if len(self._seen) == len(self._units):
+            q = [self._seen[n][1] for n in self._units]
             self.see((math.nan, q, q, all(follows for follows, _ in self._seen.values())))
             self._seen.clear()
             self._seen_at = self.world.now

@@ -7,7 +7,7 @@ from pathlib import Path
 import yaml
 
 from benchmarks.faults.links import LINKS as WIRED
-from benchmarks.faults.links import UR, Link
+from benchmarks.faults.links import UR, Link, UrServo
 from benchmarks.faults.proxy import Port
 from benchmarks.faults.wire.seen import Decoder
 
@@ -55,5 +55,16 @@ class CanopenDrives(SimulatedOnly):
         return super().write_cells(folder, front, back, more)
 
 
-CELLS: dict[str, type[Link]] = {**WIRED, "canopen": CanopenDrives}
+class UrWithSensor(UrServo):
+    """UR by servoJ, forces by a sensor on the flange."""
+
+    def section(self, host: str) -> str:
+        """See Link.section."""
+        return (
+            f"{super().section(host)}"
+            "ft_sensor: {driver: robotous_rft, interface: virtual, rate: 50, when_lost: stop}\n"
+        )
+
+
+CELLS: dict[str, type[Link]] = {**WIRED, "canopen": CanopenDrives, "ur_sensor": UrWithSensor}
 """Link -> its cell, and what it promises."""

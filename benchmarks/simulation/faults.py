@@ -9,11 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.simulation import can, canopen, modbus, ur
+from benchmarks.simulation import can, canopen, modbus, sensor, ur
 from benchmarks.simulation.can import CanLink
 from benchmarks.simulation.canopen import CanopenLink
 from benchmarks.simulation.modbus import ModbusLink
 from benchmarks.simulation.processes import PLANNED_JOINT, Run
+from benchmarks.simulation.sensor import SensorLink
 from benchmarks.simulation.ur import UrLink
 from benchmarks.simulation.wires import WAY
 
@@ -27,7 +28,9 @@ class Fault:
 
     name: str
     make: Callable[[Run, Draw], str]
-    links: tuple[str, ...] = ("ur_servoj", "ur_offset", "modbus", "can", "canopen")
+    links: tuple[str, ...] = (
+        "ur_servoj", "ur_offset", "modbus", "can", "canopen", "ur_sensor",
+    )  # fmt: skip
     weight: float = 1.0
 
 
@@ -72,7 +75,7 @@ def _double(run: Run, draw: Draw) -> str:
 def _spoil(run: Run, draw: Draw) -> str:
     spoiled: Any = {
         UrLink: ur.spoiled, ModbusLink: modbus.spoiled, CanLink: can.spoiled,
-        CanopenLink: canopen.spoiled,
+        CanopenLink: canopen.spoiled, SensorLink: ur.spoiled,
     }[type(run.link)]  # fmt: skip
     run.link.down.change = lambda message: spoiled(message, draw)
     run.link.down.changed = draw.choice((1, 1, 2, 3, 10, 40))
@@ -183,12 +186,8 @@ def _refuse(run: Run, draw: Draw) -> str:
     return ""
 
 
-def _of_canopen(make: Callable[[CanopenLink, Draw], str]) -> Callable[[Run, Draw], str]:
-    def made(run: Run, draw: Draw) -> str:
-        assert isinstance(run.link, CanopenLink)
-        return make(run.link, draw)
-
-    return made
+def _of_link(make: Callable[[Any, Draw], str]) -> Callable[[Run, Draw], str]:
+    return lambda run, draw: make(run.link, draw)
 
 
 def _withhold(run: Run, draw: Draw) -> str:
@@ -288,13 +287,14 @@ def _stop(run: Run, draw: Draw) -> str:
     return ""
 
 
-_UR = ("ur_servoj", "ur_offset")
+_SERVOJ = ("ur_servoj", "ur_sensor")
+_UR = (*_SERVOJ, "ur_offset")
 FAULTS = (
     Fault("delay step", _delay, weight=2.0),
     Fault("jitter", _jitter),
     Fault("held back", _hold, weight=2.0),
     Fault("lost messages", _lose, ("modbus", "can", "canopen")),
-    Fault("doubled messages", _double, ("ur_servoj", "ur_offset", "can", "canopen")),
+    Fault("doubled messages", _double, (*_UR, "can", "canopen")),
     Fault("corruption", _spoil, weight=2.0),
     Fault("reordering", _reorder, ("can", "canopen")),
     Fault("connection cut", _cut),
@@ -311,19 +311,20 @@ FAULTS = (
     Fault("speed slider", _speed, _UR),
     Fault("robot's program ends", _program, (*_UR, "modbus")),
     Fault("another commander", _foreign),
-    Fault("writes refused", _refuse, ("ur_servoj", "can", "canopen")),
+    Fault("writes refused", _refuse, (*_SERVOJ, "can", "canopen")),
     Fault("frame withheld", _withhold, ("can",)),
     Fault("model no number", _model),
     Fault("loop stalls", _stall, weight=3.0),
     Fault("loop dies", _death, weight=2.0),
     Fault("daemon stalls", _daemon_stall),
     Fault("machine stalls", _machine),
-    Fault("planner silent", _planner_silent, ("ur_servoj", "can", "canopen")),
-    Fault("planner's nonsense", _planner_nonsense, ("ur_servoj", "can", "canopen")),
+    Fault("planner silent", _planner_silent, (*_SERVOJ, "can", "canopen")),
+    Fault("planner's nonsense", _planner_nonsense, (*_SERVOJ, "can", "canopen")),
     Fault("arm", _arm, weight=2.0),
     Fault("disarm", _disarm, weight=2.0),
     Fault("stop", _stop, weight=0.3),
-    *(Fault(name, _of_canopen(make), ("canopen",)) for name, make in canopen.FAMILIES),
+    *(Fault(name, _of_link(make), ("canopen",)) for name, make in canopen.FAMILIES),
+    *(Fault(name, _of_link(make), ("ur_sensor",)) for name, make in sensor.FAMILIES),
 )
 
 

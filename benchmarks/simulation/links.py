@@ -31,6 +31,7 @@ PAYLOAD: dict[str, tuple[float, tuple[float, float, float]]] = {
 UR_PAYLOAD = (5.0, (0.0, 0.0, 0.06))
 SIMULATED_RATE = {
     "ur_servoj": 125.0, "ur_offset": 125.0, "modbus": 50.0, "can": 100.0, "canopen": 100.0,
+    "ur_sensor": 125.0,
 }  # Hz  # fmt: skip
 SENSED_EVERY = 4  # cycles
 RESTARTS = (0.05, 0.4)  # s: the daemon's backoff

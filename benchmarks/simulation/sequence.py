@@ -15,6 +15,7 @@ from benchmarks.simulation.invariants import Judge, Violation
 from benchmarks.simulation.links import SimulatedLink, setting_of
 from benchmarks.simulation.modbus import ModbusLink
 from benchmarks.simulation.processes import PLANNED_JOINT, Run
+from benchmarks.simulation.sensor import SensorLink
 from benchmarks.simulation.ur import UrLink, library
 from benchmarks.simulation.world import BEGIN, Process, SimulatedClock, World
 from gapbridge.bridge.ipc.control_socket import Peer
@@ -23,7 +24,7 @@ from gapbridge.core.state import Setpoint
 
 LINKS: dict[str, type[SimulatedLink]] = {
     "ur_servoj": UrLink, "ur_offset": UrLink, "modbus": ModbusLink, "can": CanLink,
-    "canopen": CanopenLink,
+    "canopen": CanopenLink, "ur_sensor": SensorLink,
 }  # fmt: skip
 MOST_FAULTS = 4
 QUIET, SPAN, REST = 0.3, 0.8, 0.3  # s: until faults begin; over what time they are spread; after

@@ -6,6 +6,7 @@ from pkgutil import resolve_name
 from typing import TYPE_CHECKING, cast
 
 from gapbridge.core.errors import LinkError
+from gapbridge.drivers.clock import SYSTEM, Clock
 
 if TYPE_CHECKING:
     from gapbridge.drivers.ft_sensor.sensor import ForceTorqueSensor
@@ -19,7 +20,7 @@ FT_SENSORS: dict[str, str] = {
 """Sensor name in a cell file -> ``module:Class``, imported when it is used."""
 
 
-def make_sensor(settings: FtSensorSettings) -> ForceTorqueSensor:
+def make_sensor(settings: FtSensorSettings, clock: Clock = SYSTEM) -> ForceTorqueSensor:
     """Return the sensor that the settings name, not yet connected.
 
     Raises LinkError if it is unknown or its library is missing.
@@ -33,4 +34,4 @@ def make_sensor(settings: FtSensorSettings) -> ForceTorqueSensor:
         sensor_class = resolve_name(FT_SENSORS[name])
     except ImportError as error:
         raise LinkError(f"ft_sensor.driver {name}: cannot be imported: {error}") from None
-    return cast("ForceTorqueSensor", sensor_class(settings))
+    return cast("ForceTorqueSensor", sensor_class(settings, clock))

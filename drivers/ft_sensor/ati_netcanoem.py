@@ -10,7 +10,6 @@ Sources: KITrobotics/ati_force_torque ForceTorqueCtrl, ati_netcanoem_ft_driver, 
 from __future__ import annotations
 
 import struct
-import time
 from typing import Any
 
 import numpy as np
@@ -18,6 +17,7 @@ import numpy as np
 from gapbridge.core.arrays import Array
 from gapbridge.core.errors import LinkError
 from gapbridge.drivers.can_bus.bus import open_bus
+from gapbridge.drivers.clock import SYSTEM, Clock
 from gapbridge.drivers.ft_sensor.can_sensor import CanSensor
 from gapbridge.drivers.ft_sensor.sensor import Reading
 from gapbridge.drivers.ft_sensor.settings import AtiSettings
@@ -87,8 +87,8 @@ class AnswerDecoder:
 class AtiNetCanOem(CanSensor):
     """Driver of the sensor."""
 
-    def __init__(self, settings: AtiSettings) -> None:
-        super().__init__()
+    def __init__(self, settings: AtiSettings, clock: Clock = SYSTEM) -> None:
+        super().__init__(clock)
         self.settings = settings
         self.name = f"ati_netcanoem at {settings.where()}"
         self._base = settings.base_id << 4
@@ -104,7 +104,7 @@ class AtiNetCanOem(CanSensor):
         except LinkError:
             self.close()
             raise
-        self._due = time.monotonic()
+        self._due = self.clock.monotonic()
 
     def _calibration(self) -> Array:
         (units,) = self._ask(UNITS, b"", (2,))
@@ -130,7 +130,7 @@ class AtiNetCanOem(CanSensor):
         for _ in range(ATTEMPTS):
             self._drain()
             self._send(self._base | operation, data)
-            answer = self._answer(operation, len(lengths), time.monotonic() + ANSWER)
+            answer = self._answer(operation, len(lengths), self.clock.monotonic() + ANSWER)
             if answer is not None and tuple(map(len, answer)) == lengths:
                 return answer
         raise LinkError(
@@ -143,7 +143,7 @@ class AtiNetCanOem(CanSensor):
     ) -> list[bytes] | None:
         """Return the data of an answer's frames; None if it has not come in time."""
         decoder = AnswerDecoder(self._base | operation, frames, window)
-        while (remaining := until - time.monotonic()) > 0.0:
+        while (remaining := until - self.clock.monotonic()) > 0.0:
             frame = self._receive(remaining)
             if frame is None:
                 break
@@ -159,16 +159,16 @@ class AtiNetCanOem(CanSensor):
     def read(self, timeout: float) -> Reading | None:
         """Request a sample when it is due and return it; see ForceTorqueSensor.read."""
         self._connected()
-        until = time.monotonic() + timeout
-        time.sleep(max(min(self._due, until) - time.monotonic(), 0.0))
+        until = self.clock.monotonic() + timeout
+        self.clock.sleep(max(min(self._due, until) - self.clock.monotonic(), 0.0))
         if self._due > until:
             return None
         self._drain()
-        requested_at = time.monotonic()
+        requested_at = self.clock.monotonic()
         self._due = max(self._due + 1.0 / self.settings.rate, requested_at)
         self._send(self._base | GAUGES, b"")
         answer = self._answer(GAUGES, 2, requested_at + SAMPLE, FRAME_WINDOW)
-        received = time.monotonic()
+        received = self.clock.monotonic()
         if answer is None:
             return None
         decoded = decode_gauges(*answer)

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-import time
 from typing import Any
 
 from gapbridge.core.errors import LinkError, first_line
 from gapbridge.drivers.can_bus.bus import close_bus
+from gapbridge.drivers.clock import SYSTEM, Clock
 from gapbridge.drivers.ft_sensor.sensor import ForceTorqueSensor
 
 
 class CanSensor(ForceTorqueSensor):
     """A sensor with standard CAN frames; ``connect`` opens ``_bus``."""
 
-    def __init__(self) -> None:
-        super().__init__()
+    def __init__(self, clock: Clock = SYSTEM) -> None:
+        super().__init__(clock)
         self._bus: Any = None
 
     def _connected(self) -> Any:
@@ -40,10 +40,11 @@ class CanSensor(ForceTorqueSensor):
         """
         import can
 
-        bus, until = self._connected(), time.monotonic() + timeout
+        now = self.clock.monotonic
+        bus, until = self._connected(), now() + timeout
         while True:
             try:
-                frame = bus.recv(max(until - time.monotonic(), 0.0))
+                frame = bus.recv(max(until - now(), 0.0))
             except (can.CanError, OSError, ValueError) as error:
                 raise LinkError(f"{self.name}: {first_line(error)}") from None
             if frame is None:

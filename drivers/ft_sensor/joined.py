@@ -45,7 +45,7 @@ class DriverWithSensor(Driver):
         self.gate = arm.gate
         self.settings = settings
         self._arm = arm
-        self._reader = SensorReader(make_sensor(settings), settings, arm.clock)
+        self._reader = SensorReader(make_sensor(settings, arm.clock), settings, arm.clock)
         self._clock = ClockOffset()
         self._to_flange = sensor_to_flange(settings.sensor_in_flange)
         self._tcp_force = TcpForce(model) if settings.tcp_force == "sensor" else None
@@ -226,7 +226,7 @@ class SensorReader:
 
     def __init__(self, sensor: ForceTorqueSensor, settings: FtSensorSettings, clock: Clock) -> None:
         self._sensor, self._settings = sensor, settings
-        self._now = clock.monotonic  # the age of samples is measured by it
+        self._clock = clock  # the age of samples is measured by it
         self._readings: deque[Reading] = deque(maxlen=KEPT)
         self._broken = ""  # why the link is broken
         self._stopping = threading.Event()
@@ -239,19 +239,23 @@ class SensorReader:
         self._readings.clear()
         self._sensor.connect()
         self._new_sample.clear()  # before the thread: its first sample may be the only one for now
-        self._thread = threading.Thread(target=self._run, name="ft-sensor", daemon=True)
-        self._thread.start()
-        if not self._new_sample.wait(self._settings.connect_timeout):
+        self._thread = self._begin_thread()
+        if not self._clock.wait(self._new_sample, self._settings.connect_timeout):
             self.stop()
             raise LinkError(
                 f"{self._sensor.name}: found no sample within {self._settings.connect_timeout:g} s"
                 f"{self._why()}, expected a stream of them (ft_sensor.connect_timeout)"
             )
 
+    def _begin_thread(self) -> threading.Thread:
+        thread = threading.Thread(target=self._run, name="ft-sensor", daemon=True)
+        thread.start()
+        return thread
+
     def wait(self, timeout: float) -> bool:
         """Wait for the next sample up to ``timeout`` s; returns whether one has come."""
         self._new_sample.clear()
-        return self._new_sample.wait(timeout)
+        return self._clock.wait(self._new_sample, timeout)
 
     def _why(self) -> str:
         """Return why there may be no sample, for messages."""
@@ -271,7 +275,7 @@ class SensorReader:
             except LinkError as error:
                 self._sensor.close()
                 self._broken = str(error)
-                self._stopping.wait(pause)
+                self._clock.wait(self._stopping, pause)
                 pause = min(2.0 * pause, BACKOFF[1])
                 continue
             if reading is not None:
@@ -302,7 +306,7 @@ class SensorReader:
 
     def _require_fresh(self, readings: list[Reading]) -> None:
         limit = self._settings.max_age
-        age = self._now() - readings[-1].timestamp if readings else float("inf")
+        age = self._clock.monotonic() - readings[-1].timestamp if readings else float("inf")
         if age > limit:
             raise StaleStateError(
                 f"{self._sensor.name}: found the last sample {age:.3f} s old{self._why()}, "

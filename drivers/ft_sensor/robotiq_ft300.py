@@ -10,12 +10,12 @@ from __future__ import annotations
 
 import contextlib
 import struct
-import time
 from typing import Any
 
 import numpy as np
 
 from gapbridge.core.errors import LinkError
+from gapbridge.drivers.clock import SYSTEM, Clock
 from gapbridge.drivers.ft_sensor.sensor import ForceTorqueSensor, Reading
 from gapbridge.drivers.ft_sensor.settings import RobotiqSettings
 
@@ -68,8 +68,8 @@ class StreamDecoder:
 class RobotiqFt300(ForceTorqueSensor):
     """Driver of the sensor."""
 
-    def __init__(self, settings: RobotiqSettings) -> None:
-        super().__init__()
+    def __init__(self, settings: RobotiqSettings, clock: Clock = SYSTEM) -> None:
+        super().__init__(clock)
         self.settings = settings
         self.name = f"robotiq_ft300 at {settings.port}"
         self._client: Any = None
@@ -113,7 +113,7 @@ class RobotiqFt300(ForceTorqueSensor):
         try:
             line.write(QUIET)
             line.flush()
-            time.sleep(len(QUIET) * BITS / self.settings.baudrate + TURN)
+            self.clock.sleep(len(QUIET) * BITS / self.settings.baudrate + TURN)
             line.reset_input_buffer()
         except OSError as error:  # pyserial's errors are OSErrors
             raise self._broken(error) from None
@@ -129,7 +129,7 @@ class RobotiqFt300(ForceTorqueSensor):
             raise self._broken(error) from None
         if answer.isError() or answer.function_code != 16:
             raise LinkError(f"{self.name}: the sensor refused to start its stream ({answer})")
-        self._decoder, self._last_received = StreamDecoder(), time.monotonic()
+        self._decoder, self._last_received = StreamDecoder(), self.clock.monotonic()
 
     def _line(self) -> Any:
         line = self._client and self._client.socket
@@ -145,11 +145,11 @@ class RobotiqFt300(ForceTorqueSensor):
         """Return the next sample; see ForceTorqueSensor.read."""
         if self.settings.mode == "registers":
             return self._ask()
-        until = time.monotonic() + timeout
+        until = self.clock.monotonic() + timeout
         while not self._waiting:
-            remaining = until - time.monotonic()
+            remaining = until - self.clock.monotonic()
             if remaining <= 0.0:
-                if time.monotonic() - self._last_received > SILENCE:
+                if self.clock.monotonic() - self._last_received > SILENCE:
                     self._start_stream()  # the sensor may have been switched off
                 return None
             self._take_bytes(remaining)
@@ -164,7 +164,7 @@ class RobotiqFt300(ForceTorqueSensor):
             data += line.read(min(line.in_waiting, LONGEST)) if data else b""
         except (OSError, TypeError) as error:  # TypeError: closed while reading
             raise self._broken(error) from None
-        received = time.monotonic()
+        received = self.clock.monotonic()
         samples = self._decoder.take(data)
         self.dropped = self._decoder.dropped
         transfer_time = FRAME.size * BITS / self.settings.baudrate
@@ -179,7 +179,7 @@ class RobotiqFt300(ForceTorqueSensor):
         from pymodbus.exceptions import ConnectionException, ModbusException
 
         line = self._line()
-        requested_at = time.monotonic()
+        requested_at = self.clock.monotonic()
         try:
             answer = self._client.read_holding_registers(
                 REGISTER, count=6, device_id=self.settings.device_id
@@ -191,7 +191,7 @@ class RobotiqFt300(ForceTorqueSensor):
             with contextlib.suppress(OSError):
                 line.reset_input_buffer()
             return None
-        received = time.monotonic()
+        received = self.clock.monotonic()
         if answer.isError() or answer.function_code != 3 or len(answer.registers) != 6:
             self.dropped += 1
             return None

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import contextlib
 import struct
-import time
 from typing import Any
 
 import numpy as np
 
 from gapbridge.drivers.can_bus.bus import open_bus
+from gapbridge.drivers.clock import SYSTEM, Clock
 from gapbridge.drivers.ft_sensor.can_sensor import CanSensor
 from gapbridge.drivers.ft_sensor.sensor import ClockOffset, Reading
 from gapbridge.drivers.ft_sensor.settings import RobotousSettings
@@ -56,8 +56,8 @@ class PairDecoder:
 class RobotousRft(CanSensor):
     """Driver of the sensor."""
 
-    def __init__(self, settings: RobotousSettings) -> None:
-        super().__init__()
+    def __init__(self, settings: RobotousSettings, clock: Clock = SYSTEM) -> None:
+        super().__init__(clock)
         self.settings = settings
         self.name = f"robotous_rft at {settings.where()}"
         counts = 3 * (settings.force_counts,) + 3 * (settings.torque_counts,)
@@ -77,17 +77,17 @@ class RobotousRft(CanSensor):
         self._command(START)
 
     def _command(self, code: int) -> None:
-        self._last_received = time.monotonic()
+        self._last_received = self.clock.monotonic()
         self._send(self.settings.command_id, bytes([code]) + bytes(7))
 
     def read(self, timeout: float) -> Reading | None:
         """Return the next sample; see ForceTorqueSensor.read."""
-        until = time.monotonic() + timeout
-        while (remaining := until - time.monotonic()) > 0.0:
+        until = self.clock.monotonic() + timeout
+        while (remaining := until - self.clock.monotonic()) > 0.0:
             frame = self._receive(remaining)
             if frame is None:
                 break
-            received = time.monotonic()
+            received = self.clock.monotonic()
             stamp = frame.timestamp or received
             counts = self._decoder.take(frame.arbitration_id, bytes(frame.data), stamp)
             self.dropped = self._decoder.dropped
@@ -95,7 +95,7 @@ class RobotousRft(CanSensor):
                 self._last_received = received
                 wrench = np.array(counts[:6]) * self._unit
                 return Reading(self._clock.take(stamp, received), received, wrench, counts[6])
-        if time.monotonic() - self._last_received > SILENCE:
+        if self.clock.monotonic() - self._last_received > SILENCE:
             self._command(START)  # the sensor may have been switched off
         return None
 

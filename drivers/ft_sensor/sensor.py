@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Self
 
 from gapbridge.core.arrays import Array
+from gapbridge.drivers.clock import SYSTEM, Clock
 
 DRIFT = 1e-4  # s per s: largest drift between two clocks
 JUMP = 0.5  # s: a clock that is off by more was set
@@ -56,7 +57,8 @@ class ForceTorqueSensor(ABC):
 
     name = "force-torque sensor"  # in messages
 
-    def __init__(self) -> None:
+    def __init__(self, clock: Clock = SYSTEM) -> None:
+        self.clock = clock  # of this machine; the sensor's own is estimated
         self.dropped = 0  # invalid frames or pairs
 
     @abstractmethod

@@ -30,7 +30,9 @@ from gapbridge.bridge.loop.loop import Loop
 from gapbridge.bridge.loop.supervisor import Cause, Supervisor
 from gapbridge.core.errors import StaleStateError
 from gapbridge.core.state import Setpoint
+from gapbridge.drivers.canopen import driver as canopen_driver
 from gapbridge.drivers.driver import Driver
+from gapbridge.drivers.ft_sensor.joined import SensorReader
 from gapbridge.drivers.modbus import encode
 from gapbridge.drivers.modbus.driver import ModbusDriver
 from gapbridge.drivers.ur_rtde.command import OffsetWriter, ServoWriter
@@ -39,7 +41,7 @@ from gapbridge.drivers.ur_rtde.state import StateReader
 
 DOCS = Path(__file__).parents[2] / "docs" / "evidence" / "fault-method.md"
 SEEDS, PART = 2000, 50  # of all tests together, of one
-SERVOJ, OFFSET, MODBUS, CAN, CANOPEN = range(5)  # seeds of each link
+SERVOJ, OFFSET, MODBUS, CAN, CANOPEN, SENSOR = range(6)  # seeds of each link
 Patch = pytest.MonkeyPatch
 Break = Callable[[Patch], None]
 
@@ -177,7 +179,7 @@ def test_a_way_that_was_long_when_arming_was_refused_is_measured_anew() -> None:
     plan = [(0.1, "disarm"), (0.2, "delay step"), (0.6, "arm")]
     found = [
         when_four(5026389),
-        *(run(seed, plan=plan) for seed in range(OFFSET, OFFSET + 50, len(LINKS))),
+        *(run(seed, plan=plan) for seed in range(OFFSET, OFFSET + 60, len(LINKS))),
     ]
     assert not [str(outcome) for outcome in found if outcome.violations]
 
@@ -385,3 +387,46 @@ def test_the_first_state_after_the_loop_stood_still_writes_nothing() -> None:
 def test_a_way_that_grows_while_the_driver_is_armed_makes_states_old() -> None:
     """Arming takes 0.3 s on a UR, and the round trip is measured at its begin."""
     assert not when_four(11053496).violations
+
+
+@pytest.mark.parametrize("more", range(0, 8 * len(LINKS), len(LINKS)))
+def test_a_canopen_setpoint_whose_sync_comes_late_never_takes_effect(more: int) -> None:
+    """Seeds 46 and 48: the process stood still between a setpoint's frames and its SYNC."""
+    plan = [(0.1, "machine stalls"), (0.4, "loop stalls"), (0.7, "machine stalls")]
+    assert not run(CANOPEN + more, plan=plan).violations
+
+
+def test_a_canopen_setpoint_that_may_wait_for_ever_is_found(monkeypatch: Patch) -> None:
+    monkeypatch.setattr(canopen_driver, "LONGEST_WAIT", math.inf)
+    plan = [(0.1, "machine stalls"), (0.4, "machine stalls"), (0.7, "machine stalls")]
+    seeds = range(CANOPEN, 40 * len(LINKS), len(LINKS))  # until a stall is of the right length
+    outcomes = (run(seed, plan=plan) for seed in seeds)
+    assert any(v.invariant == "fresh" for outcome in outcomes for v in outcome.violations)
+
+
+def test_a_drives_fault_is_reset_by_arming_where_the_cell_says_so() -> None:
+    """Seed 3: the loop refused to arm a robot in fault before the driver could reset it."""
+    plan = [(0.1, "drive fault"), (0.3, "loop dies")]
+    assert not [
+        str(o)
+        for more in range(0, 4 * len(LINKS), len(LINKS))
+        if (o := run(CANOPEN + more, plan=plan)).violations
+    ]
+
+
+def test_without_the_sensor_nothing_is_written_where_its_loss_stops() -> None:
+    plan = [(0.1, "FT sensor lost"), (0.5, "FT sensor's bus lost"), (0.7, "FT sensor overloaded")]
+    seeds = range(SENSOR, 20 * len(LINKS), len(LINKS))
+    found = [run(seed, plan=plan) for seed in seeds]
+    assert not [str(outcome) for outcome in found if outcome.violations]
+    words = " ".join(fault for outcome in found for fault in outcome.faults)
+    assert "(stop" in words
+    assert "(degrade" in words
+
+
+def test_a_lost_sensor_that_nobody_misses_is_found(monkeypatch: Patch) -> None:
+    monkeypatch.setattr(SensorReader, "_require_fresh", lambda *_: None)
+    monkeypatch.setattr(SensorReader, "_require_valid", lambda *_: None)
+    plan = [(0.1, "FT sensor lost"), (0.5, "FT sensor overloaded")]
+    outcomes = [run(seed, plan=plan) for seed in range(SENSOR, 20 * len(LINKS), len(LINKS))]
+    assert any(v.invariant == "allowed" for outcome in outcomes for v in outcome.violations)

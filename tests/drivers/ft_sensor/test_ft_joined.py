@@ -307,7 +307,7 @@ def test_each_state_gets_the_wrench_of_its_own_moment_whatever_the_arms_clock_sa
     sensor = ListedSensor(
         [Reading(t, t + delay, np.array((0.0, 0.0, slope * t, 0.0, 0.0, 0.0))) for t in taken]
     )
-    monkeypatch.setattr(joined_module, "make_sensor", lambda _: sensor)
+    monkeypatch.setattr(joined_module, "make_sensor", lambda *_: sensor)
     arm = ControllerDriver(resting_controller(TURNED), clock=Standing())
     settings = settings_of(driver="ati_netcanoem", interface="virtual", channel="none")
     moments = np.arange(0.011, taken[-1], PERIOD)
