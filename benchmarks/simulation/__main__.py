@@ -10,6 +10,7 @@ import argparse
 import gc
 import hashlib
 import json
+import logging
 import multiprocessing
 import sys
 import time
@@ -38,6 +39,7 @@ def main() -> int:
     parser.add_argument("--processes", type=int, help="side by side; left out: one a core")
     parser.add_argument("--out", type=Path, default=RECORD, help="the record (%(default)s)")
     given = parser.parse_args()
+    logging.disable(logging.WARNING)  # what drivers say of thousands of faults
     if given.seed is not None:
         outcome = run(given.seed, print)
         print(outcome)

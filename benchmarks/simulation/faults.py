@@ -9,14 +9,17 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.simulation import can, modbus, ur
+from benchmarks.simulation import can, canopen, modbus, sensor, ur
 from benchmarks.simulation.can import CanLink
+from benchmarks.simulation.canopen import CanopenLink
 from benchmarks.simulation.modbus import ModbusLink
 from benchmarks.simulation.processes import PLANNED_JOINT, Run
+from benchmarks.simulation.sensor import SensorLink
 from benchmarks.simulation.ur import UrLink
 from benchmarks.simulation.wires import WAY
 
 Draw = random.Random
+BUSES = (CanLink, CanopenLink)
 
 
 @dataclass(frozen=True)
@@ -25,13 +28,15 @@ class Fault:
 
     name: str
     make: Callable[[Run, Draw], str]
-    links: tuple[str, ...] = ("ur_servoj", "ur_offset", "modbus", "can")
+    links: tuple[str, ...] = (
+        "ur_servoj", "ur_offset", "modbus", "can", "canopen", "ur_sensor",
+    )  # fmt: skip
     weight: float = 1.0
 
 
 def _delay(run: Run, draw: Draw) -> str:
     """Have the way be longer for good: what no clock at one end shows."""
-    most = 0.3 if not isinstance(run.link, CanLink) else 0.003  # a bus has no such queue
+    most = 0.3 if not isinstance(run.link, BUSES) else 0.003  # a bus has no such queue
     run.link.down.delay = WAY + draw.uniform(0.0, most) ** 1.5
     if draw.random() < 0.5:
         run.link.up.delay = WAY + draw.uniform(0.0, most) ** 1.5
@@ -39,7 +44,7 @@ def _delay(run: Run, draw: Draw) -> str:
 
 
 def _jitter(run: Run, draw: Draw) -> str:
-    most = 0.002 if isinstance(run.link, CanLink) else 0.1
+    most = 0.002 if isinstance(run.link, BUSES) else 0.1
     run.link.down.jitter = draw.uniform(0.0, most)
     return f"{run.link.down.jitter:.4f} s"
 
@@ -47,7 +52,7 @@ def _jitter(run: Run, draw: Draw) -> str:
 def _hold(run: Run, draw: Draw) -> str:
     seconds = draw.choice((0.02, 0.05, 0.1, 0.3, 0.8, 4.0)) * draw.uniform(0.5, 1.5)
     wires = draw.choice(([run.link.down], [run.link.up], [run.link.down, run.link.up]))
-    if isinstance(run.link, CanLink):
+    if isinstance(run.link, BUSES):
         run.link.controller.stall(seconds)
         return f"arm silent for {seconds:.3f} s"
     for wire in wires:
@@ -68,9 +73,10 @@ def _double(run: Run, draw: Draw) -> str:
 
 
 def _spoil(run: Run, draw: Draw) -> str:
-    spoiled: Any = {UrLink: ur.spoiled, ModbusLink: modbus.spoiled, CanLink: can.spoiled}[
-        type(run.link)
-    ]
+    spoiled: Any = {
+        UrLink: ur.spoiled, ModbusLink: modbus.spoiled, CanLink: can.spoiled,
+        CanopenLink: canopen.spoiled, SensorLink: ur.spoiled,
+    }[type(run.link)]  # fmt: skip
     run.link.down.change = lambda message: spoiled(message, draw)
     run.link.down.changed = draw.choice((1, 1, 2, 3, 10, 40))
     return f"{run.link.down.changed} messages"
@@ -174,10 +180,14 @@ def _refuse(run: Run, draw: Draw) -> str:
     link = run.link
     if isinstance(link, UrLink):
         link.refuses_servo = True
-    elif isinstance(link, CanLink):
+    elif isinstance(link, BUSES):
         link.refuses_frames = True
         run.world.after(draw.uniform(0.01, 0.3), lambda: setattr(link, "refuses_frames", False))
     return ""
+
+
+def _of_link(make: Callable[[Any, Draw], str]) -> Callable[[Run, Draw], str]:
+    return lambda run, draw: make(run.link, draw)
 
 
 def _withhold(run: Run, draw: Draw) -> str:
@@ -277,19 +287,20 @@ def _stop(run: Run, draw: Draw) -> str:
     return ""
 
 
-_UR = ("ur_servoj", "ur_offset")
+_SERVOJ = ("ur_servoj", "ur_sensor")
+_UR = (*_SERVOJ, "ur_offset")
 FAULTS = (
     Fault("delay step", _delay, weight=2.0),
     Fault("jitter", _jitter),
     Fault("held back", _hold, weight=2.0),
-    Fault("lost messages", _lose, ("modbus", "can")),
-    Fault("doubled messages", _double, ("ur_servoj", "ur_offset", "can")),
+    Fault("lost messages", _lose, ("modbus", "can", "canopen")),
+    Fault("doubled messages", _double, (*_UR, "can", "canopen")),
     Fault("corruption", _spoil, weight=2.0),
-    Fault("reordering", _reorder, ("can",)),
+    Fault("reordering", _reorder, ("can", "canopen")),
     Fault("connection cut", _cut),
     Fault("controller restart", _restart),
     Fault("controller's clock stands", _freeze_clock, (*_UR, "modbus")),
-    Fault("values stand", _freeze_values, (*_UR, "can")),
+    Fault("values stand", _freeze_values, (*_UR, "can", "canopen")),
     Fault("drift of the controller's clock", _pace, _UR),
     Fault("jump of the controller's clock", _jump, _UR),
     Fault("protective stop", _protective),
@@ -300,18 +311,20 @@ FAULTS = (
     Fault("speed slider", _speed, _UR),
     Fault("robot's program ends", _program, (*_UR, "modbus")),
     Fault("another commander", _foreign),
-    Fault("writes refused", _refuse, ("ur_servoj", "can")),
+    Fault("writes refused", _refuse, (*_SERVOJ, "can", "canopen")),
     Fault("frame withheld", _withhold, ("can",)),
     Fault("model no number", _model),
     Fault("loop stalls", _stall, weight=3.0),
     Fault("loop dies", _death, weight=2.0),
     Fault("daemon stalls", _daemon_stall),
     Fault("machine stalls", _machine),
-    Fault("planner silent", _planner_silent, ("ur_servoj", "can")),
-    Fault("planner's nonsense", _planner_nonsense, ("ur_servoj", "can")),
+    Fault("planner silent", _planner_silent, (*_SERVOJ, "can", "canopen")),
+    Fault("planner's nonsense", _planner_nonsense, (*_SERVOJ, "can", "canopen")),
     Fault("arm", _arm, weight=2.0),
     Fault("disarm", _disarm, weight=2.0),
     Fault("stop", _stop, weight=0.3),
+    *(Fault(name, _of_link(make), ("canopen",)) for name, make in canopen.FAMILIES),
+    *(Fault(name, _of_link(make), ("ur_sensor",)) for name, make in sensor.FAMILIES),
 )
 
 

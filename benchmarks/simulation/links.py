@@ -1,4 +1,4 @@
-"""The four links, with a controller and wires in memory; the drivers are the product's own."""
+"""The links, with a controller and wires in memory; the drivers are the product's own."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from benchmarks.faults.invariants import Bounds
-from benchmarks.faults.links import LINKS as WIRED
 from benchmarks.faults.wire.seen import Fresh, Numbers, Write
+from benchmarks.simulation.cells import CELLS
 from benchmarks.simulation.wires import Wire
 from benchmarks.simulation.world import SimulatedClock, World
 from gapbridge.bridge.cell import Cell, load_cell
@@ -29,7 +29,10 @@ PAYLOAD: dict[str, tuple[float, tuple[float, float, float]]] = {
     "can": (1.0, (0.0, 0.0, 0.06)),
 }
 UR_PAYLOAD = (5.0, (0.0, 0.0, 0.06))
-SIMULATED_RATE = {"ur_servoj": 125.0, "ur_offset": 125.0, "modbus": 50.0, "can": 100.0}  # Hz
+SIMULATED_RATE = {
+    "ur_servoj": 125.0, "ur_offset": 125.0, "modbus": 50.0, "can": 100.0, "canopen": 100.0,
+    "ur_sensor": 125.0,
+}  # Hz  # fmt: skip
 SENSED_EVERY = 4  # cycles
 RESTARTS = (0.05, 0.4)  # s: the daemon's backoff
 Saw = Callable[[Fresh | Write], None]
@@ -42,7 +45,7 @@ class Setting:
     def __init__(self, name: str) -> None:
         self.name = name
         self._profile: Any = None
-        self.wired = WIRED[name](SIMULATED_RATE[name])
+        self.wired = CELLS[name](SIMULATED_RATE[name])
         self._folder = tempfile.TemporaryDirectory(prefix="simulation-")
         path, _ = self.wired.write_cells(Path(self._folder.name), "127.0.0.9", "127.0.0.9", "")
         shutil.copymode(path, path)

@@ -9,11 +9,13 @@ from typing import Any
 
 from benchmarks.faults.invariants import Checker
 from benchmarks.simulation.can import CanLink
+from benchmarks.simulation.canopen import CanopenLink
 from benchmarks.simulation.faults import FAULTS, Fault, drawn
 from benchmarks.simulation.invariants import Judge, Violation
 from benchmarks.simulation.links import SimulatedLink, setting_of
 from benchmarks.simulation.modbus import ModbusLink
 from benchmarks.simulation.processes import PLANNED_JOINT, Run
+from benchmarks.simulation.sensor import SensorLink
 from benchmarks.simulation.ur import UrLink, library
 from benchmarks.simulation.world import BEGIN, Process, SimulatedClock, World
 from gapbridge.bridge.ipc.control_socket import Peer
@@ -22,6 +24,7 @@ from gapbridge.core.state import Setpoint
 
 LINKS: dict[str, type[SimulatedLink]] = {
     "ur_servoj": UrLink, "ur_offset": UrLink, "modbus": ModbusLink, "can": CanLink,
+    "canopen": CanopenLink, "ur_sensor": SensorLink,
 }  # fmt: skip
 MOST_FAULTS = 4
 QUIET, SPAN, REST = 0.3, 0.8, 0.3  # s: until faults begin; over what time they are spread; after
@@ -55,14 +58,19 @@ class Outcome:
         return "\n".join(lines)
 
 
-def run(seed: int, say: Any = None, plan: Sequence[tuple[float, str]] | None = None) -> Outcome:
+def run(
+    seed: int,
+    say: Any = None,
+    plan: Sequence[tuple[float, str]] | None = None,
+    on: str | None = None,
+) -> Outcome:
     """Run one seed; ``say`` gets every event.
 
     ``plan``: faults by name, each with its moment (s after the first could be), in place of those
-    that the seed draws.
+    that the seed draws; ``on``: the link, in place of the seed's.
     """
     draw = random.Random(f"faults {seed}")
-    name = list(LINKS)[seed % len(LINKS)]
+    name = on or list(LINKS)[seed % len(LINKS)]
     world = World(seed)
     clock = SimulatedClock(world)
     setting = setting_of(name)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -19,13 +20,16 @@ class RpdoWriter:
     """Sends RPDOs of transmission type 1: drives act on them at the next SYNC, all at once.
 
     After a set that was sent in part the previous set is sent again; if that fails too, no SYNC is
-    sent, so that the partial set never takes effect.
+    sent, so that the partial set never takes effect. A set whose SYNC comes too late (the process
+    stood still in between) is replaced by the one in force in the same way.
     """
 
     def __init__(self, master: Master, profile: CanopenProfile) -> None:
         self._master, self._profile = master, profile
         self._image: list[dict[str, int]] = [{} for _ in profile.nodes]
         self._last: Frames = []
+        self._in_force: tuple[Frames, Array | None] = [], None  # frames, target at the last SYNC
+        self._expires = math.inf  # s, monotonic: after it, ``_last`` must not take effect any more
         self.partial = False  # the drives hold a part of a set, until a SYNC
         self.reverted = 0  # sets that were sent in part and reverted
         self.target: Array | None = None  # (n,) rad, of the last whole set
@@ -43,11 +47,13 @@ class RpdoWriter:
     def reset(self) -> None:
         """Drop the last set: the drives' own state is valid now."""
         self._last, self.partial, self.target = [], False, None
+        self._in_force, self._expires = ([], None), math.inf
 
-    def send(self, controlwords: Sequence[int], q: Array) -> None:
+    def send(self, controlwords: Sequence[int], q: Array, expires: float = math.inf) -> None:
         """Send Controlwords and joint targets (n,), rad; they count at the next SYNC.
 
-        Raises WriteError if not all were sent; then none of them takes effect.
+        If that SYNC is not sent before ``expires`` (s, monotonic), they never do. Raises WriteError
+        if not all were sent; then none of them takes effect.
         """
         frames = self._encode(controlwords, q)
         for sent, (cob_id, data, name) in enumerate(frames):
@@ -58,6 +64,7 @@ class RpdoWriter:
                 done = "" if not sent else f" ({sent} of {len(frames)} out; {self._revert()})"
                 raise WriteError(f"{error}{done}") from None
         self._last, self.partial, self.target = frames, False, q.copy()
+        self._expires = expires
 
     def _encode(self, controlwords: Sequence[int], q: Array) -> Frames:
         """Return all frames before any is sent. Raises WriteError."""
@@ -90,8 +97,14 @@ class RpdoWriter:
         self.partial = False
         return "the set before was sent again"
 
-    def complete_set(self) -> None:
-        """Make sure that a SYNC may be sent. Raises LinkError if a set is still partial."""
+    def complete_set(self, now: float) -> None:
+        """Make sure that a SYNC may be sent at ``now`` (s, monotonic).
+
+        Raises LinkError if a set is still partial.
+        """
+        if now > self._expires:
+            self._expires, self.partial = math.inf, True
+            self._last, self.target = self._in_force
         if self.partial:
             done = self._revert()
             if self.partial:
@@ -99,3 +112,7 @@ class RpdoWriter:
                     f"{self._master.where}: a setpoint is out in part: {done}; the drives stop "
                     "when our heartbeat ends"
                 )
+
+    def synced(self) -> None:
+        """Note that a SYNC was sent: the last set is in force."""
+        self._in_force, self._expires = (self._last, self.target), math.inf

@@ -39,6 +39,7 @@ from gapbridge.drivers.driver import Driver
 log = logging.getLogger("drivers.canopen")
 
 MAX_SKIPPED_SYNCS = 3  # SYNCs after a torn set
+LONGEST_WAIT, LONGEST_WAIT_CYCLES = 0.04, 5.0  # s, cycles: from a state to its setpoint's SYNC
 STARTING = 2.0  # s in which drives must be OPERATIONAL and answer a SYNC
 
 
@@ -67,7 +68,8 @@ class CanopenDriver(Driver):
         window = self.profile.file.sync_window or WINDOW * self._period
         self.sync_cycle = SyncCycle(self.master, self.writer, self._period, window, clock)
         self.power = Power(self.master, self.profile, self.writer, self.sync_cycle.exchange)
-        self._arm, self._builder = model.arm, StateBuilder(self.profile)
+        self._arm = model.arm
+        self._builder = StateBuilder(self.profile, settings.clear_faults)
         self._fresh_at = 0.0  # s, monotonic: of the last whole sample
         self._connected_at = 0.0
         self._armed_at: float | None = None  # s, monotonic
@@ -274,7 +276,8 @@ class CanopenDriver(Driver):
                 f"{self.master.where}: node {node}: found {states(sample)[joint]}, expected "
                 f"a drive that follows setpoints{self.power.emergency(node)}"
             )
-        self.writer.send([self.power.following] * self.n, setpoint.q)
+        expires = sample.received + max(LONGEST_WAIT, LONGEST_WAIT_CYCLES * self._period)
+        self.writer.send([self.power.following] * self.n, setpoint.q, expires)
 
     def _release(self) -> None:
         """Quick stop, then switch the drives off and give them back their mode."""
@@ -322,10 +325,12 @@ class SyncCycle:
         if self._torn:
             self._skip_syncs()
         self._wait_for_slot()
-        self._writer.complete_set()
+        self._writer.complete_set(self._clock.monotonic())
         collector = self._master.collector
         collector.clear_stray()
-        sample = collector.wait(self._master.sync() + self._window)
+        synced = self._master.sync()
+        self._writer.synced()
+        sample = collector.wait(synced + self._window)
         self._torn = sample is None
         if sample is not None:
             self.sample = sample

@@ -80,8 +80,9 @@ class Master:
 
     def open(self) -> None:
         """Open the bus and listen; sends nothing. Raises LinkError."""
-        bus = open_bus(self._settings)
-        network: Any = _Network(bus, AllowedFrames(self._profile))
+        self._listen(_Network(open_bus(self._settings), AllowedFrames(self._profile)))
+
+    def _listen(self, network: Any) -> None:
         self.listener = BusListener(network, self._profile, self.collector, self.clock)
         network.listeners[:] = [self.listener]
         for node in self._profile.nodes:

@@ -51,26 +51,29 @@ class PdoLayout:
         base = TPDO_BASE if self.transmitted else RPDO_BASE
         return base + PDO_STEP * (self.number - 1) + node
 
+    @cached_property
+    def _fields(self) -> tuple[tuple[str, int, int, int], ...]:
+        """Return name, bits, smallest and largest count of each object; used in each cycle."""
+        return tuple((entry.name, entry.bits, entry.low, entry.high) for entry in self.entries)
+
     def decode(self, data: bytes) -> dict[str, int]:
         """Return the counts by object name. Raises ValueError where the length is another."""
         if len(data) != self.length:
             raise ValueError(f"{self.name}: found {len(data)} bytes, expected {self.length}")
         whole, counts = int.from_bytes(data, "little"), {}
-        for entry in self.entries:
-            value = whole & ((1 << entry.bits) - 1)
-            counts[entry.name] = value - (1 << entry.bits) if value > entry.high else value
-            whole >>= entry.bits
+        for name, bits, _, high in self._fields:
+            value = whole & ((1 << bits) - 1)
+            counts[name] = value - (1 << bits) if value > high else value
+            whole >>= bits
         return counts
 
     def encode(self, counts: dict[str, int]) -> bytes:
         """Return the bytes. Raises ValueError where a count does not fit."""
         whole, start = 0, 0
-        for entry in self.entries:
-            value = counts[entry.name]
-            if not entry.low <= value <= entry.high:
-                raise ValueError(
-                    f"{entry.name}: found {value}, expected {entry.low} to {entry.high}"
-                )
-            whole |= (value & ((1 << entry.bits) - 1)) << start
-            start += entry.bits
+        for name, bits, low, high in self._fields:
+            value = counts[name]
+            if not low <= value <= high:
+                raise ValueError(f"{name}: found {value}, expected {low} to {high}")
+            whole |= (value & ((1 << bits) - 1)) << start
+            start += bits
         return whole.to_bytes(self.length, "little")

@@ -8,7 +8,7 @@ import numpy as np
 
 from gapbridge.core.arrays import Array
 from gapbridge.core.state import RobotState
-from gapbridge.drivers.canopen.objects import MODE_ACTIVE, State, state_of
+from gapbridge.drivers.canopen.objects import FAULTS, MODE_ACTIVE, State, state_of
 from gapbridge.drivers.canopen.profile import CanopenProfile
 from gapbridge.drivers.canopen.sync_set import SyncSet
 from gapbridge.drivers.robot_modes import StopReason, modes_of
@@ -39,8 +39,8 @@ def not_following(profile: CanopenProfile, sample: SyncSet) -> int | None:
 class StateBuilder:
     """Makes states; keeps the previous samples, for velocities."""
 
-    def __init__(self, profile: CanopenProfile) -> None:
-        self._profile = profile
+    def __init__(self, profile: CanopenProfile, clears_faults: bool = False) -> None:
+        self._profile, self._clears_faults = profile, clears_faults
         self._rated = profile.rated_torque
         self._last: deque[tuple[float, Array]] = deque(maxlen=SPAN)  # s of the SYNC, rad
 
@@ -80,8 +80,8 @@ class StateBuilder:
 
     def _stop_reason(self, sample: SyncSet, armed: bool) -> StopReason | None:
         reported = states(sample)
-        if "FAULT" in reported or "FAULT REACTION ACTIVE" in reported:
-            return StopReason.FAULT
+        if any(state in FAULTS for state in reported) and (armed or not self._clears_faults):
+            return StopReason.FAULT  # else arming resets it, as it leads out of every other state
         if not armed:
             return None
         if "QUICK STOP ACTIVE" in reported:

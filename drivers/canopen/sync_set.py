@@ -26,8 +26,8 @@ class SyncSet(NamedTuple):
     """The reports of all drives at one SYNC. A tuple, because one is created in every cycle."""
 
     counts: tuple[dict[str, int], ...]  # per joint: object name -> counts
-    synced: float  # s, time.monotonic() when the SYNC was sent
-    received: float  # s, time.monotonic() of the last TPDO
+    synced: float  # s, monotonic, when the SYNC was sent
+    received: float  # s, monotonic, of the last TPDO
 
 
 class SyncCollector:

@@ -239,14 +239,18 @@ class SensorReader:
         self._readings.clear()
         self._sensor.connect()
         self._new_sample.clear()  # before the thread: its first sample may be the only one for now
-        self._thread = threading.Thread(target=self._run, name="ft-sensor", daemon=True)
-        self._thread.start()
+        self._thread = self._begin_thread()
         if not self._clock.wait(self._new_sample, self._settings.connect_timeout):
             self.stop()
             raise LinkError(
                 f"{self._sensor.name}: found no sample within {self._settings.connect_timeout:g} s"
                 f"{self._why()}, expected a stream of them (ft_sensor.connect_timeout)"
             )
+
+    def _begin_thread(self) -> threading.Thread:
+        thread = threading.Thread(target=self._run, name="ft-sensor", daemon=True)
+        thread.start()
+        return thread
 
     def wait(self, timeout: float) -> bool:
         """Wait for the next sample up to ``timeout`` s; returns whether one has come."""

@@ -17,7 +17,7 @@ import pytest
 
 from benchmarks.simulation.faults import FAULTS
 from benchmarks.simulation.invariants import INVARIANTS, as_markdown
-from benchmarks.simulation.sequence import LINKS, run
+from benchmarks.simulation.sequence import LINKS, Outcome, run
 from gapbridge.bridge.daemon import daemon as daemon_module
 from gapbridge.bridge.daemon.control import Control
 from gapbridge.bridge.daemon.processes import LoopProcess
@@ -30,7 +30,9 @@ from gapbridge.bridge.loop.loop import Loop
 from gapbridge.bridge.loop.supervisor import Cause, Supervisor
 from gapbridge.core.errors import StaleStateError
 from gapbridge.core.state import Setpoint
+from gapbridge.drivers.canopen import driver as canopen_driver
 from gapbridge.drivers.driver import Driver
+from gapbridge.drivers.ft_sensor.joined import SensorReader
 from gapbridge.drivers.modbus import encode
 from gapbridge.drivers.modbus.driver import ModbusDriver
 from gapbridge.drivers.ur_rtde.command import OffsetWriter, ServoWriter
@@ -39,9 +41,14 @@ from gapbridge.drivers.ur_rtde.state import StateReader
 
 DOCS = Path(__file__).parents[2] / "docs" / "evidence" / "fault-method.md"
 SEEDS, PART = 2000, 50  # of all tests together, of one
-SERVOJ, OFFSET, MODBUS, CAN = range(4)  # seeds of each link
+SERVOJ, OFFSET, MODBUS, CAN, CANOPEN, SENSOR = range(6)  # seeds of each link
 Patch = pytest.MonkeyPatch
 Break = Callable[[Patch], None]
+
+
+def when_four(seed: int) -> Outcome:
+    """Return the run that a seed was when there were the first four links only."""
+    return run(seed, on=list(LINKS)[seed % 4])
 
 
 @pytest.mark.parametrize("first", range(0, SEEDS, PART))
@@ -89,7 +96,7 @@ def test_the_page_has_the_list() -> None:
 
 def test_a_disarm_from_before_a_fault_does_not_acknowledge_it() -> None:
     """Seed 98: the loop stood still, somebody asked for disarming, and then the robot stopped."""
-    assert not run(98).violations
+    assert not when_four(98).violations
     plan = [(0.1, "machine stalls"), (0.11, "disarm"), (0.12, "protective stop")]
     assert not [str(o) for seed in range(12) if (o := run(seed, plan=plan)).violations]
 
@@ -104,13 +111,16 @@ def test_a_program_that_applies_nothing_after_a_stop_may_be_armed_at_once() -> N
 def test_the_first_state_after_a_standstill_is_judged_by_the_clock_before_it() -> None:
     """Seed 3385: a state 42 ms old was written by, as if the clocks had drifted apart meanwhile."""
     plan = [(0.1, "machine stalls"), (0.5, "held back"), (0.7, "loop stalls")]
-    found = [run(3385), *(run(seed, plan=plan) for seed in range(OFFSET, OFFSET + 24, len(LINKS)))]
+    found = [
+        when_four(3385),
+        *(run(seed, plan=plan) for seed in range(OFFSET, OFFSET + 24, len(LINKS))),
+    ]
     assert not [str(outcome) for outcome in found if outcome.violations]
 
 
 def test_an_arm_released_in_silence_is_sent_where_it_was_sent_before() -> None:
     """Seed 3243: stopped while the arm was silent; enabling frames say the last joints again."""
-    assert not run(3243).violations
+    assert not when_four(3243).violations
 
 
 @pytest.mark.parametrize(("driver", "seed"), [(UrRtdeDriver, SERVOJ), (ModbusDriver, MODBUS)])
@@ -124,47 +134,53 @@ def test_a_way_longer_than_a_state_may_be_old_lets_no_setpoint_leave(
 
 def test_an_arming_that_a_gap_in_the_states_ends_is_answered() -> None:
     """Seed 2007469: who had asked waited for 25 s, and then read that nobody had answered."""
-    assert not run(2007469).violations
+    assert not when_four(2007469).violations
 
 
 def test_the_answer_to_a_closed_connection_is_nobodys() -> None:
     """Seed 3000286: a new Modbus connection numbers from one again, and took the old one's."""
-    assert not run(3000286).violations
+    assert not when_four(3000286).violations
 
 
 @pytest.mark.parametrize("seed", [5005572, 5025157])
 def test_a_clock_that_is_set_forward_behind_jitter_makes_no_state_younger(seed: int) -> None:
-    assert not run(seed).violations
+    assert not when_four(seed).violations
 
 
 def test_a_clock_set_forward_as_the_next_packet_comes_late_is_no_violation_but_reported() -> None:
     """Seed 5024965: timestamps and arrivals are those of a clock that nobody touched."""
-    found = run(5024965)
+    found = when_four(5024965)
     assert not found.violations
     assert found.hidden > 0.05
     assert "undetectable: a setpoint of a state sampled 0.066 s before" in str(found)
 
 
 def test_a_planner_that_begins_where_an_offset_was_left_is_led_over_no_faster_than_it() -> None:
-    assert not run(8022740).violations
+    assert not when_four(8022740).violations
 
 
 def test_an_answer_of_zeros_does_not_say_that_no_offset_is_applied() -> None:
     """Seed 7061098: over Modbus, after a loop that died; arming announced a zero into an offset."""
-    assert not run(7061098).violations
+    assert not when_four(7061098).violations
 
 
 def test_the_first_setpoint_of_a_stream_is_within_the_envelope_whatever_the_model_says() -> None:
     """Seed 5019099: joints 0.5 rad off beside a small offset; the arm went 0.03 rad at once."""
     plan = [(0.1, "disarm"), (0.5, "model no number"), (0.51, "arm")]
-    found = [run(5019099), *(run(seed, plan=plan) for seed in range(CAN, CAN + 80, len(LINKS)))]
+    found = [
+        when_four(5019099),
+        *(run(seed, plan=plan) for seed in range(CAN, CAN + 80, len(LINKS))),
+    ]
     assert not [str(outcome) for outcome in found if outcome.violations]
 
 
 def test_a_way_that_was_long_when_arming_was_refused_is_measured_anew() -> None:
     """Seed 5026389: it went on counting, so that no state was ever fresh again."""
     plan = [(0.1, "disarm"), (0.2, "delay step"), (0.6, "arm")]
-    found = [run(5026389), *(run(seed, plan=plan) for seed in range(OFFSET, OFFSET + 40, 4))]
+    found = [
+        when_four(5026389),
+        *(run(seed, plan=plan) for seed in range(OFFSET, OFFSET + 60, len(LINKS))),
+    ]
     assert not [str(outcome) for outcome in found if outcome.violations]
 
 
@@ -359,15 +375,58 @@ def test_every_invariant_has_a_break() -> None:
 
 
 def test_a_stop_that_comes_and_goes_while_frames_are_out_of_order_is_a_fault() -> None:
-    found = run(8072455)
+    found = when_four(8072455)
     assert not found.violations
 
 
 def test_the_first_state_after_the_loop_stood_still_writes_nothing() -> None:
     """A controller's clock that runs fast meanwhile makes it look younger than it is."""
-    assert not run(11029317).violations
+    assert not when_four(11029317).violations
 
 
 def test_a_way_that_grows_while_the_driver_is_armed_makes_states_old() -> None:
     """Arming takes 0.3 s on a UR, and the round trip is measured at its begin."""
-    assert not run(11053496).violations
+    assert not when_four(11053496).violations
+
+
+@pytest.mark.parametrize("more", range(0, 8 * len(LINKS), len(LINKS)))
+def test_a_canopen_setpoint_whose_sync_comes_late_never_takes_effect(more: int) -> None:
+    """Seeds 46 and 48: the process stood still between a setpoint's frames and its SYNC."""
+    plan = [(0.1, "machine stalls"), (0.4, "loop stalls"), (0.7, "machine stalls")]
+    assert not run(CANOPEN + more, plan=plan).violations
+
+
+def test_a_canopen_setpoint_that_may_wait_for_ever_is_found(monkeypatch: Patch) -> None:
+    monkeypatch.setattr(canopen_driver, "LONGEST_WAIT", math.inf)
+    plan = [(0.1, "machine stalls"), (0.4, "machine stalls"), (0.7, "machine stalls")]
+    seeds = range(CANOPEN, 40 * len(LINKS), len(LINKS))  # until a stall is of the right length
+    outcomes = (run(seed, plan=plan) for seed in seeds)
+    assert any(v.invariant == "fresh" for outcome in outcomes for v in outcome.violations)
+
+
+def test_a_drives_fault_is_reset_by_arming_where_the_cell_says_so() -> None:
+    """Seed 3: the loop refused to arm a robot in fault before the driver could reset it."""
+    plan = [(0.1, "drive fault"), (0.3, "loop dies")]
+    assert not [
+        str(o)
+        for more in range(0, 4 * len(LINKS), len(LINKS))
+        if (o := run(CANOPEN + more, plan=plan)).violations
+    ]
+
+
+def test_without_the_sensor_nothing_is_written_where_its_loss_stops() -> None:
+    plan = [(0.1, "FT sensor lost"), (0.5, "FT sensor's bus lost"), (0.7, "FT sensor overloaded")]
+    seeds = range(SENSOR, 20 * len(LINKS), len(LINKS))
+    found = [run(seed, plan=plan) for seed in seeds]
+    assert not [str(outcome) for outcome in found if outcome.violations]
+    words = " ".join(fault for outcome in found for fault in outcome.faults)
+    assert "(stop" in words
+    assert "(degrade" in words
+
+
+def test_a_lost_sensor_that_nobody_misses_is_found(monkeypatch: Patch) -> None:
+    monkeypatch.setattr(SensorReader, "_require_fresh", lambda *_: None)
+    monkeypatch.setattr(SensorReader, "_require_valid", lambda *_: None)
+    plan = [(0.1, "FT sensor lost"), (0.5, "FT sensor overloaded")]
+    outcomes = [run(seed, plan=plan) for seed in range(SENSOR, 20 * len(LINKS), len(LINKS))]
+    assert any(v.invariant == "allowed" for outcome in outcomes for v in outcome.violations)
