@@ -59,7 +59,9 @@ def _late(rig: Rig, row: Row, moment: float, detected: float | None) -> float:
     of_the_loop = "overrun" not in row.sign and any(
         event.get("cause") in BUSY for event in rig.run.since(moment)
     )
-    made, half = time.monotonic() - (time.time() - moment), min(LATE, 0.5 * rig.link.cycle)
+    # where the loop has to ask, a cycle waits for it, the proxy, the controller, the proxy again
+    half = min(LATE, 0.5 * rig.link.cycle / (1 if rig.link.behind else 4))
+    made = time.monotonic() - (time.time() - moment)
     late = rig.witness.late(made - OVERRUN_SPAN, half if of_the_loop else LATE)
     if not late and detected is None:
         late = rig.witness.late(made - OVERRUN_SPAN, half, until=made + row.within(rig.link))
