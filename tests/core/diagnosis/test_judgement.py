@@ -138,6 +138,21 @@ def test_outliers_that_the_accused_terms_fit_are_no_structure():
     assert judging._outlier_share(bad, accused) == pytest.approx(0.2)
 
 
+@pytest.mark.parametrize(("share", "structured"), [(0.1, False), (0.11, True)])
+def test_more_than_a_tenth_of_outliers_is_structure(monkeypatch, share, structured):
+    monkeypatch.setattr(judging, "_outlier_share", lambda *_: share)
+    selection = channel_of("joint_offset").selection
+    assert judge(selection, HeldOut(selection)).structured == structured
+
+
+def test_a_term_is_accused_only_beside_the_effect_that_it_needs():
+    candidates = [SimpleNamespace(family=name, requires=needs)
+                  for name, needs in (("friction", ""), ("fading", "friction"))]  # fmt: skip
+    selection = SimpleNamespace(space=SimpleNamespace(candidates=candidates))
+    assert judging._missing_requirement(selection, [1]) == [1]
+    assert judging._missing_requirement(selection, [0, 1]) == []
+
+
 def test_a_value_on_its_bound_is_no_accusation():
     selection = channel_of("backlash").selection
     (term,), (c,) = selection.terms, selection.term_index
