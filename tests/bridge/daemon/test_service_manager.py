@@ -17,7 +17,7 @@ from daemon_cell import Robot, gapbridge
 from patience import PATIENCE, wait_for
 
 from gapbridge.bridge.daemon.service_manager import ServiceManager
-from gapbridge.drivers.clock import Clock
+from gapbridge.drivers.clock import SYSTEM, Clock
 
 UNIT = Path(__file__).parents[3] / "config" / "gapbridge@.service"
 
@@ -64,17 +64,17 @@ def test_without_a_service_manager_or_with_a_dead_one_nothing_happens(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.delenv("NOTIFY_SOCKET", raising=False)
-    assert not ServiceManager(clock=SYSTEM).present
-    ServiceManager(clock=SYSTEM).ready()
+    assert not ServiceManager(SYSTEM).present
+    ServiceManager(SYSTEM).ready()
     monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "nobody"))
-    ServiceManager(clock=SYSTEM).ready()
+    ServiceManager(SYSTEM).ready()
 
 
 def test_an_abstract_socket_is_reached_too(monkeypatch: pytest.MonkeyPatch) -> None:
     name = f"gapbridge-test-{os.getpid()}"
     listener = Listener(f"\0{name}")
     monkeypatch.setenv("NOTIFY_SOCKET", f"@{name}")
-    ServiceManager(clock=SYSTEM).stopping()
+    ServiceManager(SYSTEM).stopping()
     assert listener.take() == ["STOPPING=1"]
     listener.socket.close()
 
