@@ -275,7 +275,7 @@ def finished(folder: Path, cut: Callable[[], Path], expect: Callable[[Check], No
 
 def recorder(folder: Path, cut: Callable[[], Path], expect: Callable[[Check], None]) -> None:
     """A run's recorder; the next run's finishes what was cut off."""
-    clock, memory = _Later(), SharedMemory(N)
+    clock, memory = _Later(), SharedMemory(N, clock=SYSTEM)
     settings = RecordingSettings(folder=folder / "recordings", keep_free=0.0)
     running = Recorder(settings, SESSION, memory, {}, lambda _: None, clock)
 
@@ -291,7 +291,7 @@ def recorder(folder: Path, cut: Callable[[], Path], expect: Callable[[Check], No
             assert before == list(range(len(before)))
             assert len(before) in allowed
             settings = RecordingSettings(folder=place, keep_free=0.0)
-            memory = SharedMemory(N)
+            memory = SharedMemory(N, clock=SYSTEM)
             following = Recorder(settings, "run-20260102-000000", memory, {}, lambda _: None)
             publish(memory, 5)
             for _ in range(3):

@@ -226,7 +226,7 @@ def test_only_a_daemon_that_may_write_observes_and_has_no_fault_is_armed(
     differs: dict[str, Any], words: str
 ) -> None:
     daemon: Any = Standing(**differs)
-    reply = control.Control(daemon).answer("arm", Peer(4, 7))
+    reply = control.Control(daemon, clock=SYSTEM).answer("arm", Peer(4, 7))
     assert reply["ok"] == (not words)
     assert words in reply.get("error", "")
     assert daemon.asked == ([] if words else ["uid 7, pid 4"])

@@ -10,6 +10,7 @@ from gapbridge.core.errors import PartialWriteError
 from gapbridge.drivers.can.loading import read_profile
 from gapbridge.drivers.can.settings import CanSettings
 from gapbridge.drivers.can.writer import FrameWriter
+from gapbridge.drivers.clock import SYSTEM
 
 
 class Bus:
@@ -34,7 +35,7 @@ class Bus:
 @pytest.fixture
 def opened() -> tuple[FrameWriter, Bus]:
     profile, bus = read_profile(CanSettings.shipped / "piper.yaml"), Bus()
-    writer = FrameWriter(CanSettings(profile="piper"), profile)
+    writer = FrameWriter(CanSettings(profile="piper"), profile, SYSTEM)
     writer.use(bus)
     return writer, bus
 
