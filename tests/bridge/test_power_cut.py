@@ -292,7 +292,9 @@ def recorder(folder: Path, cut: Callable[[], Path], expect: Callable[[Check], No
             assert len(before) in allowed
             settings = RecordingSettings(folder=place, keep_free=0.0)
             memory = SharedMemory(N, clock=SYSTEM)
-            following = Recorder(settings, "run-20260102-000000", memory, {}, lambda _: None)
+            following = Recorder(
+                settings, "run-20260102-000000", memory, {}, lambda _: None, SYSTEM
+            )
             publish(memory, 5)
             for _ in range(3):
                 following.step(flush=True)

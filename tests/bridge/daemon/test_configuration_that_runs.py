@@ -99,7 +99,7 @@ def test_a_loop_starts_without_its_cells_files_on_the_disk(tmp_path: Path) -> No
     cell.unlink()
     memory, commands = RunMemory(6, SYSTEM), CommandMemory()
     order = {"may_write": False, "number": 0, "latched": "", "after": 0}
-    loop = LoopProcess(configuration, memory, commands, order, subprocess.DEVNULL)
+    loop = LoopProcess(configuration, memory, commands, order, subprocess.DEVNULL, SYSTEM)
     wait_for(lambda: loop.exit_code is not None, "its end")
     details = [event.get("detail", "") for event in loop.events()]
     loop.close()
