@@ -34,6 +34,7 @@ class PayloadCog(Effect):
     loads_joints = True
     identifiable_with = Term("payload", Site(), (1.0,))  # values are then first moments, of 1 kg
     replaces_cell_value = "payload"
+    equal_of_last_link = "link_cog"
     channels = ("position", "wrench", "torque")
     motion = "a payload, and poses that turn the flange against gravity"
     equivalents: ClassVar = {
