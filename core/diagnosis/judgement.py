@@ -161,7 +161,11 @@ def _verdict(
     structured = p_value < (MAX_STRUCTURE_P_WITH_HINT if hint else MAX_STRUCTURE_P)
     depends: tuple[tuple[str, float], ...] = ()
     if structured or not accused:
-        depends = tuple(dependence(space, nuisance, single, selection.groups))
+        # a constant that is not separated from a load depends on nothing, whatever predicts it
+        constant = [c for c, why in withdrawn.items() if why.failed is Check.SEPARATED]
+        known = [*single, *constant]
+        if not constant or structure_p_value(space, nuisance, known) < MAX_STRUCTURE_P:
+            depends = tuple(dependence(space, nuisance, known, selection.groups))
     ties = ties_of(selection, accused)
     return Judgement(
         tuple(position_of[c] for c in accused), structured, p_value, depends,
