@@ -239,10 +239,9 @@ def _moving(case: ChannelCase, rng: Generator) -> dict[str, Array]:
         "actual_qd": qd + rng.normal(0, 5e-4, qd.shape),
         "actual_current_as_torque": torque if case.error is None else torque + case.error,
     }
-    if rng.random() < 0.5:
-        count = len(cell.time)
-        columns["payload"] = np.full(count, cell.bench.session.payload_mass[0])
-        columns["payload_cog"] = np.tile(cell.bench.session.payload_cog[0], (count, 1))
+    if rng.random() < 0.5 or np.ptp(cell.payload) > 0:
+        columns["payload"] = cell.payload
+        columns["payload_cog"] = np.tile(cell.bench.session.payload_cog[0], (len(cell.time), 1))
     return columns
 
 

@@ -56,8 +56,7 @@ def draw_motion(kind: ArmKind, rng: Generator, swift: float = 1.0, terms: int = 
 
 
 def torque_shares(
-    rows: tuple[Row, ...], gravity: Array, payload: tuple[float, Array],
-    q: Array, qd: Array, qdd: Array,
+    rows: tuple[Row, ...], gravity: Array, payload_cog: Array, q: Array, qd: Array, qdd: Array
 ) -> tuple[Array, Array]:  # fmt: skip
     """Return torques (n, N, n) that each link takes, and (N, n) of 1 kg at the payload's place.
 
@@ -70,7 +69,7 @@ def torque_shares(
     n, count = len(rows), len(q)
     last = rows[-1]
     flange = pin.SE3(turn(np.array([[last.alpha, 0, 0]]))[0], np.array([last.a, 0, last.d]))
-    unit = pin.Inertia(1.0, flange.act(np.asarray(payload[1])), np.zeros((3, 3)))
+    unit = pin.Inertia(1.0, flange.act(np.asarray(payload_cog)), np.zeros((3, 3)))
     kept = np.array([inertia.toDynamicParameters() for inertia in masses])
     one = unit.toDynamicParameters()
     links, carried = np.empty((n, count, n)), np.empty((count, n))
@@ -90,16 +89,17 @@ class Shifts:
     masses: Array  # (n,) kg, of the links
     centres: Array  # (n, 3) m, in the row's frame
     places: list[pin.SE3]  # of the row's frame in the joint's
-    payload: tuple[float, Array]
+    payload_cog: Array  # (3,) m, in the row's frame of the flange
 
     def of_link(self, link: int, moment: Array) -> Array:
         """Return the torques (N, n) that a first moment (3,) kg m of a link (from 0) takes more."""
         mass = max(float(self.masses[link]), 1e-9)
         return self._moved(link, mass, self.centres[link], moment / mass)
 
-    def of_payload(self, more: float, shift: Array) -> Array:
-        """Return the torques (N, n) of the payload, ``more`` kg heavier, from ``shift`` (3,) m."""
-        return self._moved(len(self.masses) - 1, self.payload[0] + more, self.payload[1], shift)
+    def of_payload(self, mass: Array, shift: Array) -> Array:
+        """Return the torques (N, n) of a payload of ``mass`` (N,) kg from ``shift`` (3,) m."""
+        one = self._moved(len(self.masses) - 1, 1.0, self.payload_cog, shift)
+        return mass[:, None] * one
 
     def _moved(self, link: int, mass: float, centre: Array, shift: Array) -> Array:
         import pinocchio as pin
@@ -112,8 +112,7 @@ class Shifts:
 
 
 def shifts_of(
-    rows: tuple[Row, ...], gravity: Array, payload: tuple[float, Array],
-    q: Array, qd: Array, qdd: Array,
+    rows: tuple[Row, ...], gravity: Array, payload_cog: Array, q: Array, qd: Array, qdd: Array
 ) -> Shifts:  # fmt: skip
     """Return what shifted centres of gravity do along a motion."""
     import pinocchio as pin
@@ -127,7 +126,7 @@ def shifts_of(
         found = pin.computeJointTorqueRegressor(model, data, q[t], qd[t], qdd[t])
         regressor[t] = found.reshape(n, n, 10)
     masses, centres = np.array([r.mass for r in rows]), np.array([r.cog for r in rows])
-    return Shifts(regressor, masses, centres, places, payload)
+    return Shifts(regressor, masses, centres, places, payload_cog)
 
 
 def pinocchio_arm(rows: tuple[Row, ...], gravity: Array) -> tuple[pin.Model, list[pin.Inertia]]:

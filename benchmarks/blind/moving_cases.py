@@ -39,6 +39,7 @@ class MovingCell:
     truth: Parametric
     encoder: float  # rad, step of the encoder
     shake: float  # rad, noise before the step
+    payload: Array  # (N,) kg, declared
 
     @property
     def kind(self) -> ArmKind:
@@ -87,7 +88,9 @@ def draw_tracking_cell(
         return resting(stood, np.abs(band))
 
     sigma = np.full(kind.n, np.hypot(shake, encoder / np.sqrt(12)))
-    return MovingCell(bench, motion, time, Parametric(read, sigma, candidates), encoder, shake)
+    truth = Parametric(read, sigma, candidates)
+    payload = np.full(len(time), bench.session.payload_mass[0])
+    return MovingCell(bench, motion, time, truth, encoder, shake, payload)
 
 
 def _held(bench: Bench, q: Array) -> Array:
@@ -124,20 +127,19 @@ def resting(target: Array, band: Array) -> Array:
 
 def draw_torque_cell(
     rng: Generator, seconds: float = 30.0, move: Move = draw_motion,
-    knee: tuple[float, float] = (0.04, 0.15),
+    knee: tuple[float, float] = (0.04, 0.15), loads: int = 1,
 ) -> MovingCell:  # fmt: skip
-    """Return a cell whose joint torques are measured along an exciting motion."""
-    arm = str(rng.choice(list(ARMS)))
-    bench = draw_bench(rng, Plan(poses=12, blocks=1), arm=arm, with_rotation=False, compliant=False)
+    """Return a cell whose joint torques are measured along an exciting motion, under each load."""
+    arm, plan = str(rng.choice(list(ARMS))), Plan(poses=12, blocks=loads)
+    bench = draw_bench(rng, plan, arm=arm, with_rotation=False, compliant=False)
     kind, session = bench.kind, bench.session
     motion, time = move(kind, rng), _clock(rng, seconds)
     q, qd, qdd = (motion.at(time, k) for k in range(3))
-    mass = float(session.payload_mass[0])
-    links, carried = torque_shares(
-        kind.rows, bench.nominal.gravity, (mass, session.payload_cog[0]), q, qd, qdd
-    )
-    shifts = shifts_of(kind.rows, bench.nominal.gravity, (mass, session.payload_cog[0]), q, qd, qdd)
-    rigid = links.sum(axis=0) + mass * carried
+    mass = session.payload_mass[np.arange(len(time)) * len(session.q) // len(time)]
+    cog = session.payload_cog[0]
+    links, carried = torque_shares(kind.rows, bench.nominal.gravity, cog, q, qd, qdd)
+    shifts = shifts_of(kind.rows, bench.nominal.gravity, cog, q, qd, qdd)
+    rigid = links.sum(axis=0) + mass[:, None] * carried
     usual = np.sqrt(np.mean(rigid**2, axis=0)) + 0.02 * np.sqrt(np.mean(rigid**2))
     sigma = usual * rng.uniform(0.01, 0.03)
     peak = np.abs(qd).max(axis=0)
@@ -177,7 +179,7 @@ def draw_torque_cell(
         out = rigid + more * carried
         shift = values.get(("payload_cog", None), np.zeros(3))
         if shift.any():
-            out = out + shifts.of_payload(more, shift)
+            out = out + shifts.of_payload(mass + more, shift)
         for j in joints:
             out = out + of("link_inertia", j) * links[j - 1]
             if ("link_cog", j) in values:
@@ -198,7 +200,8 @@ def draw_torque_cell(
 
     encoder = 2 * np.pi / 2 ** int(rng.integers(19, 22))
     truth = Parametric(read, sigma, candidates)
-    return MovingCell(bench, motion, time, truth, encoder, float(rng.uniform(1e-6, 5e-6)))
+    shake = float(rng.uniform(1e-6, 5e-6))
+    return MovingCell(bench, motion, time, truth, encoder, shake, mass)
 
 
 def tracking_error(cell: MovingCell, name: str, rng: Generator) -> tuple[Array, tuple[str, ...]]:

@@ -31,17 +31,20 @@ from benchmarks.blind.mechanics import Array, stand
 from benchmarks.blind.moving import Motion, draw_motion
 from benchmarks.blind.moving_cases import (
     Move,
+    MovingCell,
     draw_torque_cell,
     draw_tracking_cell,
     draw_tracking_motion,
 )
 from benchmarks.blind.parametric import Parametric, Place
 from benchmarks.blind.run import Command
+from benchmarks.blind.session import Plan
 from benchmarks.blind.static_cases import Drawn, draw_plan, write_static
 from benchmarks.blind.twins import SAME, left_over, singles
+from benchmarks.blind.wrench_cases import WrenchCell, draw_wrench_cell
 
 ALIKE = 0.01  # share of a gap that another effect leaves of it where they look alike
-RATIO = {"torque": 4.0, "tracking": 20.0, "position": 10.0}  # of gap over floor
+RATIO = {"torque": 4.0, "tracking": 20.0, "position": 10.0, "wrench": 10.0}  # of gap over floor
 DRAWS = 200
 SLOW = (3.0, 5.0)  # where Stribeck's curve falls, over the largest speed
 
@@ -99,12 +102,17 @@ class Data:
     alike: tuple[str, ...] = ()  # at one place each
     move: Move | None = None
     knee: tuple[float, float] = (0.04, 0.15)
+    loads: int = 1
+    plan: Plan | None = None  # of a session with a flange sensor
 
 
 def _whole(effect: str, channel: str) -> Data:
     move = draw_tracking_motion if channel == "tracking" else draw_motion
     return Data(effect, channel, "", (), move)
 
+
+UPRIGHT = Plan(poses=60, blocks=1, pulled=0.0, moving=(0,))  # joint 1 turns about gravity
+TURNED = Plan(poses=60, blocks=3, pulled=0.2)
 
 TABLE = (
     Data("joint_slip", "position", ""),
@@ -134,7 +142,14 @@ TABLE = (
     _whole("torque_constant", "torque"),
     Data("torque_constant", "torque", "motion in which the joint's torque never changes",
          ("torque_offset",), small),
+    Data("payload_cog", "torque", "", (), draw_motion, loads=2),
     Data("payload_cog", "torque", "one constant load", ("link_cog",), draw_motion),
+    Data("payload_cog", "wrench", "", plan=TURNED),
+    Data("payload_cog", "wrench", "one load, and a flange that never turns against gravity",
+         ("ft_bias",), plan=UPRIGHT),
+    Data("payload", "wrench", "", plan=TURNED),
+    Data("payload", "wrench", "a flange that never turns against gravity", ("ft_bias",),
+         plan=UPRIGHT),
 )  # fmt: skip
 
 
@@ -170,7 +185,7 @@ def draw(data: Data, rng: Generator) -> Shown:
     """
     for _ in range(DRAWS):
         try:
-            shown = (_static if data.channel == "position" else _moving)(data, rng)
+            shown = (_static if data.channel == "position" else _parametric)(data, rng)
         except Redraw:
             continue
         if set(data.alike) <= shown.same and (data.lack or not shown.same):
@@ -178,12 +193,17 @@ def draw(data: Data, rng: Generator) -> Shown:
     raise RuntimeError(f"{data.effect}, {data.lack or 'excited'}: not in {DRAWS} draws")
 
 
-def _moving(data: Data, rng: Generator) -> Shown:
+def _cell(data: Data, rng: Generator) -> WrenchCell | MovingCell:
+    if data.plan is not None:
+        return draw_wrench_cell(rng, data.plan)
     assert data.move is not None
     if data.channel == "tracking":
-        cell = draw_tracking_cell(rng, move=data.move)
-    else:
-        cell = draw_torque_cell(rng, move=data.move, knee=data.knee)
+        return draw_tracking_cell(rng, move=data.move)
+    return draw_torque_cell(rng, move=data.move, knee=data.knee, loads=data.loads)
+
+
+def _parametric(data: Data, rng: Generator) -> Shown:
+    cell = _cell(data, rng)
     truth = cell.truth
     places = [p for p in truth.candidates if p[0] == data.effect]
     place = places[int(rng.integers(len(places)))]

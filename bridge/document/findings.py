@@ -34,8 +34,8 @@ WITHDRAWN = {
     Check.STABLE_VALUE: "its value changes when the residual structure is modelled",
     Check.CONSTANT: "its value is not constant: it depends on {quantity}",
     Check.COMPANION: "no load is declared or identified",
-    Check.SEPARATED: "the flange hardly turns relative to gravity, so it cannot be separated "
-    "from {quantity}",
+    Check.SEPARATED: "the flange hardly turns relative to gravity, so that {quantity} may be the "
+    "cause as well; poses that turn it by tens of degrees separate them",
     Check.NOT_A_LEVEL: "it steps where {quantity} changes, so it may depend on that",
     Check.HELD_OUT_GAIN: "it does not reduce the gap on held-out samples",
     Check.ALL_ROWS_GAIN: "it does not reduce the gap over all rows",

@@ -28,7 +28,6 @@ from gapbridge.core.diagnosis.criteria import (
     OVER_STATED_NOISE,
     SAME_SPAN,
     STAND_IN_GAIN,
-    TIE_SCORE,
     USUAL_REPEATABILITY,
 )
 from gapbridge.core.diagnosis.finding import Check, Withdrawal
@@ -36,15 +35,14 @@ from gapbridge.core.diagnosis.held_out import HeldOut
 from gapbridge.core.diagnosis.periodicity import not_periodic
 from gapbridge.core.diagnosis.regions import parts, single_pose
 from gapbridge.core.diagnosis.residual_structure import dependence, structure_p_value
-from gapbridge.core.diagnosis.selection.candidate import Candidate
-from gapbridge.core.diagnosis.selection.delay_columns import delayed_by
-from gapbridge.core.diagnosis.selection.local_search import forward_selected, rivals
+from gapbridge.core.diagnosis.selection.local_search import forward_selected
 from gapbridge.core.diagnosis.selection.outliers import inliers
 from gapbridge.core.diagnosis.selection.refit import UnnamedPart, worth
 from gapbridge.core.diagnosis.selection.sample_space import CandidateFit, SampleSpace, fit
 from gapbridge.core.diagnosis.selection.selection import Selection, refitted_alone
 from gapbridge.core.diagnosis.selection.smooth import KNOTS
 from gapbridge.core.diagnosis.selection.stiffness_curves import straight_curves
+from gapbridge.core.diagnosis.ties import ties_of
 from gapbridge.core.diagnosis.value_stability import (
     links_close_gap,
     links_predict_new_regions,
@@ -163,8 +161,12 @@ def _verdict(
     structured = p_value < (MAX_STRUCTURE_P_WITH_HINT if hint else MAX_STRUCTURE_P)
     depends: tuple[tuple[str, float], ...] = ()
     if structured or not accused:
-        depends = tuple(dependence(space, nuisance, single, selection.groups))
-    ties = ties_of(selection.working, selection.best, single)
+        # a constant that is not separated from a load depends on nothing, whatever predicts it
+        constant = [c for c, why in withdrawn.items() if why.failed is Check.SEPARATED]
+        known = [*single, *constant]
+        if not constant or structure_p_value(space, nuisance, known) < MAX_STRUCTURE_P:
+            depends = tuple(dependence(space, nuisance, known, selection.groups))
+    ties = ties_of(selection, accused)
     return Judgement(
         tuple(position_of[c] for c in accused), structured, p_value, depends,
         {position_of[c]: names for c, names in ties.items()},
@@ -450,56 +452,3 @@ def pure_error(residual: Array, groups: NDArray[np.int64]) -> tuple[float, int]:
             total += float(np.sum((part - part.mean(axis=0)) ** 2))
             freedom += (len(part) - 1) * residual.shape[1]
     return total / max(freedom, 1), freedom
-
-
-def ties_of(
-    space: SampleSpace, best: CandidateFit, accused: Sequence[int]
-) -> dict[int, tuple[str, ...]]:
-    """Return the effects that fit as well in the place of each accused one.
-
-    Another kind of delay has to do so at all joints, because they have one effect together.
-    """
-    listed: dict[int, tuple[str, ...]] = {}
-    delayed = delayed_by(space, best)
-    as_well = {name for name, f in delayed.items() if f.score <= best.score + TIE_SCORE}
-    for c in accused:
-        kind = space.candidates[c].family
-        near = [other for _, other in rivals(space, best, c, TIE_SCORE)]
-        names: list[str] = []
-        for other in [*near, *covering_effects(space, best, c)]:
-            family = space.candidates[other].family
-            if not space.candidates[other].named or family in (kind, *names):
-                continue
-            if delayed and space.candidates[other].effect.is_delay and family not in as_well:
-                continue
-            if space.candidates[other].effect.replaces != kind:  # a curve contains its line
-                names.append(family)
-        listed[c] = tuple(names)
-    return listed
-
-
-def covering_effects(space: SampleSpace, best: CandidateFit, c: int) -> list[int]:
-    """Return the named effects whose columns contain those of a candidate.
-
-    The zero of the last joint is also a shift of the tool, and a heavier link 1 of an upright arm
-    one whose centre of gravity is further out; the data cannot distinguish them.
-    """
-    others = basis_of(space.columns([o for o in best.chosen if o != c]))
-    x = space.columns([c])
-    x = projected_out(others, x)
-    whole = float(np.sum(x**2))
-    listed = []
-    for other, k in enumerate(space.candidates):
-        if other == c or other in best.chosen or not _geometric(k):
-            continue
-        basis = space.columns([other])
-        basis = basis_of(projected_out(others, basis))
-        if whole > 0 and float(np.sum(projected_out(basis, x) ** 2)) < SAME_SPAN * whole:
-            listed.append(other)
-    return listed
-
-
-def _geometric(candidate: Candidate) -> bool:
-    return candidate.named and (
-        candidate.effect.estimated_with_links or candidate.effect.estimated_as_whole
-    )

@@ -20,9 +20,9 @@ import numpy as np
 
 from gapbridge.core.arrays import Array
 from gapbridge.core.diagnosis.channel_diagnosis import ChannelDiagnosis
-from gapbridge.core.diagnosis.criteria import MIN_SEPARATION, TIE_SCORE
-from gapbridge.core.diagnosis.selection.local_search import rivals
+from gapbridge.core.diagnosis.criteria import MIN_SEPARATION
 from gapbridge.core.diagnosis.selection.sample_space import CandidateFit, SampleSpace, fit
+from gapbridge.core.diagnosis.ties import tied
 from gapbridge.core.dynamics import (
     predict_torque,
     predict_tracking,
@@ -109,16 +109,12 @@ def _open_questions(
         if accused_candidate in selection.block:  # no rivals
             continue
         family = selection.terms[position].effect
-        chosen = {family}
         rest = tuple(c for c in best.chosen if c != accused_candidate)
-        for _, other in rivals(space, best, accused_candidate, TIE_SCORE):
-            candidate = space.candidates[other]
-            if candidate.named and candidate.family not in chosen:
-                chosen.add(candidate.family)
+        for other in tied(selection, accused_candidate):
+            if other not in rest:
+                names = (family, space.candidates[other].family)
                 swapped = fit(space, (*rest, other))
-                yield _OpenQuestion(
-                    (family, candidate.family), _named(space, best), _named(space, swapped)
-                )
+                yield _OpenQuestion(names, _named(space, best), _named(space, swapped))
     accused = tuple(selection.terms[p] for p in channel.judgement.accused)
     for considered in channel.considered:
         if not considered.excited:

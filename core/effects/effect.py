@@ -126,7 +126,7 @@ class Effect(ABC):
     adds_torque: ClassVar[bool] = False  # True: to that of the other terms, whatever it is
     depends_on_load: ClassVar[bool] = False  # True: ``added`` depends on the load of the joint
     adds_mass: ClassVar[bool] = False  # True: kg in addition to the declared payload
-    scales_reading: ClassVar[bool] = False  # True: does not change a zero reading of the sensor
+    scales_reading: ClassVar[bool] = False  # True: does not change a reading of zero
     fits_any_constant: ClassVar[bool] = False  # True: can represent any constant reading
     estimated_as_whole: ClassVar[bool] = False  # True: small at all sites of a real arm
     # True: estimated with the links: joint zeros and TCP with geometry, friction with masses
@@ -137,6 +137,7 @@ class Effect(ABC):
     start_values: ClassVar[tuple[float, ...]] = ()  # start values of its last parameter
     has_nonlinearity: ClassVar[bool] = False  # True: first value a slope, second a nonlinearity
     replaces: ClassVar[str] = ""  # the effect of the same joint that it replaces
+    equal_of_last_link: ClassVar[str] = ""  # the last link's effect that equals it under one load
     equals_sum_of: ClassVar[str] = ""  # the effect whose parameters in sum equal it
     calibration_rank: ClassVar[int] = 0  # among a calibration's default effects; 0: none
     replaces_cell_value: ClassVar[str] = ""  # the value of the cell that a session measures instead

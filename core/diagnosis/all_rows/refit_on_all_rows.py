@@ -20,8 +20,6 @@ from gapbridge.core.diagnosis.held_out import HeldOut
 from gapbridge.core.diagnosis.judgement import (
     NOT_SIGNIFICANT,
     Judgement,
-    covering_effects,
-    ties_of,
     without_gain,
 )
 from gapbridge.core.diagnosis.observation import Observation
@@ -42,6 +40,7 @@ from gapbridge.core.diagnosis.selection.refit import (
 from gapbridge.core.diagnosis.selection.sample_space import fit
 from gapbridge.core.diagnosis.selection.selection import Selection, refitted_alone
 from gapbridge.core.diagnosis.selection.state import SelectionState, sample_space
+from gapbridge.core.diagnosis.ties import equal_effects, ties_of
 from gapbridge.core.effects import Term
 from gapbridge.core.estimation.least_squares import solve
 from gapbridge.core.estimation.robust import start_weights
@@ -140,9 +139,7 @@ def accused_on_all_rows(
     # in the space of all rows a term's position is its candidate
     failed = without_gain(selection, judgement.accused, held_out) if held_out.possible else []
     selection, judgement = _without(dict.fromkeys(failed, NO_GAIN), selection, judgement, refits)
-    single = [p for p in judgement.accused if p not in selection.prior]
-    ties = ties_of(selection.working, selection.best, single)
-    return selection, replace(judgement, ties=ties)
+    return selection, replace(judgement, ties=ties_of(selection, judgement.accused))
 
 
 def _without(
@@ -260,11 +257,11 @@ def _rivals(selection: Selection, accused: Sequence[int]) -> list[Candidate]:
     space = selection.working
     near: dict[int, float] = {}
     for p in accused:
-        if selection.term_index[p] in selection.prior:
-            continue
         c = selection.term_index[p]
-        equal = [(0.0, other) for other in covering_effects(space, selection.best, c)]
-        for score, other in [*rivals(space, selection.best, c, TIE_SCORE), *equal]:
+        scored = [(0.0, other) for other in equal_effects(selection, c)]
+        if c not in selection.prior:
+            scored += rivals(space, selection.best, c, TIE_SCORE)
+        for score, other in scored:
             if space.candidates[other].named and other not in selection.term_index:
                 near[other] = min(score, near.get(other, np.inf))
     best = sorted(near, key=lambda c: near[c])[:MAX_RIVALS]

@@ -130,6 +130,7 @@ class Streamed:
             tuple(range(len(terms))), tuple(covariance),
             np.ones(len(observation.rows), dtype=bool), noise, observation.measured,
             self.columns.terms, unprojected, rows_each=self.gap.kept / len(observation.rows),
+            excerpt=self.excerpt,
         )  # fmt: skip
 
     def alone(self, _: Selection, accused: Sequence[int]) -> Selection:

@@ -42,6 +42,8 @@ class Selection:
     # link's candidate, where the geometry of all links is a cause
     nominal: dict[int, Mask] = field(default_factory=dict)  # their parameters (d,) kept nominal
     rows_each: float = 1.0  # rows of the log that each sample represents (their squares added)
+    # of sums of products: the same candidates on rows of the log
+    excerpt: Selection | None = None
 
     def unwhitener(self) -> Array:
         """Return the matrices (n, k, k) from whitened kept samples to one row in channel units."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 from gapbridge.core.effects.effect import Effect, Parameter, Site, Term
 from gapbridge.core.effects.simulator import Kind
@@ -34,6 +34,7 @@ class Payload(Effect):
     channels = ("position", "wrench", "torque")
     simulated_as = Kind.PAYLOAD
     motion = "poses that change how the load pulls"
+    equivalents: ClassVar = {"ft_bias": "a flange that never turns against gravity"}
     simulator_advice = "change the load's mass where it is modelled"
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:

@@ -21,7 +21,8 @@ class PayloadCog(Effect):
     Comes from a drawing of the gripper without its hoses, or a part that is held off centre. Shows
     as moment at the flange sensor, as joint torque and as bending; needs a payload, and poses that
     turn the flange against gravity. Under one constant load the last link's ``link_cog`` is the
-    same; a second payload separates them. A shift along gravity alone shows nothing.
+    same; a second payload separates them. Poses that never turn the flange against gravity do not
+    separate it from the sensor's zero. A shift along gravity alone shows nothing.
     Source: Hollerbach, Khalil, Gautier, "Model Identification", Springer Handbook of Robotics
     (2016), ch. 6.
     """
@@ -34,10 +35,12 @@ class PayloadCog(Effect):
     loads_joints = True
     identifiable_with = Term("payload", Site(), (1.0,))  # values are then first moments, of 1 kg
     replaces_cell_value = "payload"
+    equal_of_last_link = "link_cog"
     channels = ("position", "wrench", "torque")
     motion = "a payload, and poses that turn the flange against gravity"
     equivalents: ClassVar = {
-        "link_cog": "one constant load: the last link's first moment is the load's mass times it"
+        "link_cog": "one constant load: the last link's first moment is the load's mass times it",
+        "ft_bias": "one load, and a flange that never turns against gravity",
     }
     simulator_advice = "move the centre of mass of the body that models the load"
 

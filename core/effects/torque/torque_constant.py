@@ -23,6 +23,7 @@ class TorqueConstant(JointEffect):
     identifier = "torque_constant"
     title = "torque reading is scaled"
     order = 90
+    scales_reading = True
     channels = ("torque",)
     motion = "a joint that carries torque, the more changing the better"
     equivalents: ClassVar = {"torque_offset": "motion in which the joint's torque never changes"}

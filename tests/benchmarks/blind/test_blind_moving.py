@@ -47,7 +47,7 @@ def test_torques_of_a_motion_agree_with_mujoco(name):
     q, qd, qdd = (motion.at(time, k) for k in range(3))
     mass, cog = 0.4 * kind.rated, np.array([0.02, -0.01, 0.05])
     gravity = np.array([0, 0, -9.80665])
-    links, carried = torque_shares(kind.rows, gravity, (mass, cog), q, qd, qdd)
+    links, carried = torque_shares(kind.rows, gravity, cog, q, qd, qdd)
     model = mujoco_arm(kind.rows, gravity, mass, cog)
     data = mujoco.MjData(model)
     for k in range(len(time)):

@@ -9,7 +9,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import small_arm as small
-import toy_candidates as toy
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -32,10 +31,8 @@ from gapbridge.core.diagnosis.judgement import (
     judge,
     pure_error,
     significant_alone,
-    ties_of,
     with_structure_left,
 )
-from gapbridge.core.diagnosis.selection.sample_space import fit
 from gapbridge.core.diagnosis.selection.selection import Selection
 from gapbridge.core.effects import CATALOGUE, Site, Term, effect_named
 from gapbridge.core.metrology import Metrology
@@ -353,15 +350,3 @@ def test_a_twist_far_outside_the_prior_has_to_be_significant(monkeypatch, spread
     assert selection is (again if held else found)
     assert requested == ([{4: [False, False, True]}] if held else [])
     assert judgement.accused == (0,)
-
-
-def test_what_does_all_that_a_cause_does_and_more_is_a_tie():
-    """A heavier link 1 of an upright arm is one whose centre of gravity is further out."""
-    candidates = [toy.named("link_inertia", 1, 1), toy.named("link_cog", 3, 1),
-                  toy.named("link_cog", 3, 2), toy.named("payload")]  # fmt: skip
-    free = toy.random_space(5, candidates, rows=120, planted=(0,), size=30.0)
-    X = free.X.copy()
-    X[:, 1:4] = X[:, :1] * [0.3, -0.2, 0.5]
-    upright = toy.space_of(candidates, free.y, X)
-    assert ties_of(upright, fit(upright, (0,)), [0]) == {0: ("link_cog",)}
-    assert ties_of(free, fit(free, (0,)), [0]) == {0: ()}

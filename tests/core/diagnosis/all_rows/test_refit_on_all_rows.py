@@ -127,8 +127,6 @@ def test_remaining_terms_are_tested_again_after_a_withdrawal(monkeypatch):
     without_line = OnAllRows((1e-3, 0.055, 1e-3), (5e-4,))
     monkeypatch.setattr(all_rows, "not_constant", lambda *_: {1: "actual_q_1"})
     monkeypatch.setattr(all_rows, "ties_of", lambda *_: {})
-    monkeypatch.setattr(OnAllRows, "working", None, raising=False)
-    monkeypatch.setattr(OnAllRows, "best", None, raising=False)
 
     def alone(selection, accused):
         return selection if 1 in accused or selection is not found else without_line

@@ -166,8 +166,9 @@ def test_from_one_pose_neither_a_sensors_zero_nor_a_weight_is_named(plant, rows:
         named, channel, _ = named_at(plant, q, step, wrench)
         assert not named
         assert not channel.stand_ins
-    named, _, notes = named_at(plant, q, step, weight + BIAS, withhold=("ft_gain",))
+    named, channel, notes = named_at(plant, q, step, weight + BIAS, withhold=("ft_gain",))
     assert not named
+    assert channel.depends_on == ()  # a constant depends on nothing
     facts = [note.fact for note in notes if isinstance(note, ChannelFinding)]
     (why,) = [fact.reason for fact in facts if isinstance(fact, NotAccused)]
     assert (why.failed, why.quantity) == (Check.SEPARATED, "payload or payload_cog")
