@@ -72,9 +72,8 @@ def run(seed: int, say: Any = None, plan: Sequence[tuple[float, str]] | None = N
         checker._planned = (PLANNED_JOINT, setting.wired.start_q[PLANNED_JOINT])
     judge = Judge(checker, BEGIN, setting.wired.rate)
     link = LINKS[name](world, clock, setting, judge.saw)
-    modules = link.modules() if isinstance(link, UrLink) else {}
     outcome = Outcome(seed, name)
-    with library(modules):
+    with library(link):
         found = Run(world, clock, link, planned)
         _listen(found, judge, say)
         person = Person(found, judge, draw, outcome, _planned(draw, name, plan))

@@ -31,6 +31,7 @@ from gapbridge.drivers.simulated.ur.programs.offset_program import (
     approach,
 )
 from gapbridge.drivers.ur_rtde import command, registers
+from gapbridge.drivers.ur_rtde import driver as ur_driver
 from gapbridge.drivers.ur_rtde.driver import UrRtdeDriver
 from gapbridge.drivers.ur_rtde.enquiry import TRIES
 
@@ -56,11 +57,6 @@ class _Driver(UrRtdeDriver):
     def facts(self, state: Any) -> ControllerFacts:
         """Return what the state says: the primary interface is not simulated."""
         return ControllerFacts(n=6, payload=state.payload, q=state.actual_q)
-
-    def round_trip(self) -> float:
-        """Ask the controller, there and back."""
-        self._way = found = median(self.link.ask() for _ in range(TRIES))
-        return found
 
 
 class UrLink(SimulatedLink):
@@ -415,16 +411,21 @@ def _module(**names: Any) -> types.ModuleType:
 
 
 @contextlib.contextmanager
-def library(modules: dict[str, types.ModuleType]) -> Iterator[None]:
-    """Have the library's modules be these while the ``with`` block lasts."""
+def library(link: SimulatedLink) -> Iterator[None]:
+    """Have the library and the driver's own sockets be this link's while the block lasts."""
+    if not isinstance(link, UrLink):
+        yield
+        return
+    modules = link.modules()
     before = {name: sys.modules.get(name) for name in modules}
-    at_once = command.send_at_once
+    at_once, round_trip = command.send_at_once, ur_driver.round_trip
     sys.modules.update(modules)
     command.send_at_once = lambda: 0
+    ur_driver.round_trip = lambda _: median(link.ask() for _ in range(TRIES))
     try:
         yield
     finally:
-        command.send_at_once = at_once
+        command.send_at_once, ur_driver.round_trip = at_once, round_trip
         for name, module in before.items():
             if module is None:
                 del sys.modules[name]

@@ -122,6 +122,24 @@ def test_a_way_longer_than_a_state_may_be_old_lets_no_setpoint_leave(
     assert run(seed, plan=[]).oldest == 0.0  # no setpoint at all; arming writes too
 
 
+def test_the_way_is_measured_when_arming_and_counts_as_part_of_each_states_age(
+    monkeypatch: Patch,
+) -> None:
+    plan, found = [(0.1, "disarm"), (0.2, "delay step"), (0.6, "arm")], list[float]()
+    transit_time = UrRtdeDriver.transit_time
+
+    def noted(self: Any) -> float:
+        found.append(transit_time(self))
+        return found[-1]
+
+    monkeypatch.setattr(UrRtdeDriver, "transit_time", noted)
+    run(SERVOJ, plan=[])
+    assert all(4e-4 <= way < 1e-3 for way in found)  # there and back, 0.2 ms each
+    for seed in range(SERVOJ, SERVOJ + 40, len(LINKS)):
+        run(seed, plan=plan)
+    assert max(found) > 0.01
+
+
 def test_an_arming_that_a_gap_in_the_states_ends_is_answered() -> None:
     """Seed 2007469: who had asked waited for 25 s, and then read that nobody had answered."""
     assert not run(2007469).violations
