@@ -7,15 +7,21 @@ import re
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from benchmarks.faults.invariants import Checker
 from benchmarks.faults.wire.seen import Fresh, Numbers, Write
+from benchmarks.simulation.sensor import MAX_AGE
 from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.loop.link_monitor import DRIFT, hold_time
 from gapbridge.bridge.loop.supervisor import CLEARED_BY_RECONNECTING, TRANSITIONS, Cause
-from gapbridge.core.state import Setpoint
+from gapbridge.core.state import ENVELOPE, JOINT_LIMIT, JOINT_OFFSET, Setpoint
 
+LONGEST_LIMITED = 2.5  # s: a second, anew where the controller's clock goes back
 MARGIN = 0.01  # s: a cycle of the controller and what computing takes
 LONGEST_LIST = 20
+AT_LIMIT = 1 << ENVELOPE | 1 << JOINT_OFFSET | 1 << JOINT_LIMIT  # of "clamped"
 
 INVARIANTS: dict[str, str] = {
     "envelope": "no offset on the wire is larger than the cell's, counted from where the arm was "
@@ -37,6 +43,9 @@ INVARIANTS: dict[str, str] = {
     "ends": "a stop ends in time, and with a summary",
     "crash": "no process ends by an exception that is none of the product's",
     "recorded": "the cycles handed to the recorder say of each setpoint whether it left",
+    "kept": "a cell file that is wrong ends no motion, and changes nothing",
+    "saturated": "an offset does not stay at its limit: the motion ends",
+    "sensor": "behind no setpoint is a force that its sensor has not measured in the last 0.1 s",
     "recovers": "once robot, network and machine are healed, a person can arm again",
 }
 
@@ -79,6 +88,8 @@ class Judge:
         self._acknowledged = False  # since the fault began
         self._fault: str | None = None  # that is latched
         self._heals = False
+        self._to_end = False  # somebody wants the motion to end, since it began
+        self._configuration = ""  # hash of the cell file that was taken last
         self._last: Numbers = ()  # the values of the last write
         self.writes_noted = 0  # setpoints seen on the wire
         self.oldest = 0.0  # s
@@ -145,16 +156,54 @@ class Judge:
         kind = event["kind"]
         if kind == "request":
             self._asked |= event["command"] == "arm"
+            self._to_end |= event["command"] == "disarm"
             self._acknowledged |= event["command"] == "disarm"
         elif kind == "transition":
             self._changed(State[event["from"]], State[event["to"]], Cause(event["cause"]))
+        elif kind == "configuration":
+            self._read_again(event["ok"], event["hash"])
         elif kind in ("failure", "fault") and self._heals:
             self._fault = None  # the link has ended, and such a fault with it
+
+    def stops(self) -> None:
+        """Note that the daemon has been asked to end."""
+        self._to_end = True
+
+    def uses(self, configuration: str) -> None:
+        """Note which cell file (its hash) the daemon begins with."""
+        self._configuration = configuration
+
+    def _read_again(self, fine: bool, configuration: str) -> None:
+        if not fine and configuration != self._configuration:
+            self.violate("kept", "the cell file that was refused is in use")
+        self._configuration = configuration
+        self._to_end |= fine
+
+    def judge_limited(self, rows: NDArray[np.float64], slices: dict[str, slice]) -> None:
+        """Judge how long offsets were at their limits, by the cycles of a daemon."""
+        since = math.nan
+        columns = [rows[:, slices[name].start] for name in ("state", "clamped", "received")]
+        for state, clamped, received in zip(*(c.tolist() for c in columns), strict=True):
+            if state != State.COMPENSATING or not int(clamped) & AT_LIMIT:
+                since = math.nan
+                continue
+            since = received if math.isnan(since) else since
+            if received - since > LONGEST_LIMITED:
+                self.violate("saturated", f"at its limit for {received - since:.2f} s")
+                return
+
+    def felt(self, age: float) -> None:
+        """Take how long before a state its force had been measured, s."""
+        if age > MAX_AGE + MARGIN:
+            self.violate("sensor", f"a force measured {age:.3f} s before")
 
     def _changed(self, before: State, after: State, cause: Cause) -> None:
         if TRANSITIONS.get((before, cause)) != after:
             self.violate("table", f"{before.name} -> {after.name} by {cause}")
+        if cause in (Cause.DISARM, Cause.STOP) and not self._to_end:
+            self.violate("kept", f"{before.name} -> {after.name} by {cause}: nobody wanted that")
         if after == State.ARMED:
+            self._to_end = False
             if not self._asked:
                 self.violate("asked", "armed without anybody having asked")
             self._asked = False

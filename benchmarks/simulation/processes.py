@@ -3,56 +3,73 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
-from contextlib import ExitStack
+import random
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from benchmarks.simulation.links import SimulatedLink
-from benchmarks.simulation.world import Process, SimulatedClock, World
+from benchmarks.simulation.planner import PlannedSource, Planner
+from benchmarks.simulation.sensor import Sensor
+from benchmarks.simulation.world import Process, SimulatedClock
 from gapbridge.bridge.cell.run_settings import Configuration
+from gapbridge.bridge.cell.sections import LimitSettings
+from gapbridge.bridge.daemon import reload
 from gapbridge.bridge.daemon.daemon import Daemon
 from gapbridge.bridge.daemon.processes import LoopProcess
 from gapbridge.bridge.ipc.command_memory import CommandMemory, Commands
-from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.ipc.shared_memory import Phase, RunMemory, SharedMemory
 from gapbridge.bridge.loop.loop import Exit, Loop
 from gapbridge.bridge.loop.offset_in_force import OffsetInForce
-from gapbridge.bridge.loop.setpoint_stream import SetpointStream
-from gapbridge.bridge.setpoint_source.interpolator import SetpointInterpolator
+from gapbridge.bridge.loop.setpoint_stream import SetpointStream, gate_bounds
 from gapbridge.bridge.setpoint_source.source import Source
 from gapbridge.bridge.setpoint_source.target import TargetSource
 from gapbridge.core.errors import GapbridgeError, InputError
 from gapbridge.core.state import RobotState, Setpoint
 from gapbridge.drivers.driver import Driver
 
-Vector = NDArray[np.float64]
 STARTING = (0.02, 0.15)  # s that a process takes until it runs
 KILLED = -9
 COMPUTING = 1e-4  # s: of a cycle
-PLANNED, PLANNED_JOINT = 0.02, 0  # s between two setpoints of the planner; what it moves
+
+
+@dataclass(frozen=True)
+class Chance:
+    """What the seed says of a run besides its faults."""
+
+    draw: random.Random
+    later: random.Random | None  # draws what was added later; None: nothing of it
+    planned_joint: int | None  # from 0, that a planner moves; None: no planner
+    sensor: str = ""  # "degrade" or "stop", when it is lost; empty: there is none
 
 
 class Run:
     """One daemon on one link: what all its processes share."""
 
-    def __init__(
-        self, world: World, clock: SimulatedClock, link: SimulatedLink, planned: bool
-    ) -> None:
-        self.world, self.clock, self.link = world, clock, link
-        self.planner = Planner(world, link) if planned else None
+    def __init__(self, clock: SimulatedClock, link: SimulatedLink, chance: Chance) -> None:
+        self.world, self.clock, self.link = clock.world, clock, link
+        self.later, self.cell_file = chance.later, "same"
+        joint = chance.planned_joint
+        self.planner = Planner(self.world, link, joint) if joint is not None else None
+        self.sensor = Sensor(self.world) if chance.sensor else None
+        self.sensor_settings = chance.sensor
         self.offset_in_force = OffsetInForce(link.controller.n, None)  # outlives every process
         self.loops: list[SimulatedLoop] = []
         self.events: list[dict[str, Any]] = []
         self.left = 0  # setpoints that have left whole
         self.on_send: Callable[[Setpoint], None] = lambda _: None
+        self.on_stop: Callable[[], None] = lambda: None
         self.state_behind: RobotState  # the last setpoint
         configuration = link.setting.configuration
         self.daemon = SimulatedDaemon(configuration, self)
         link.supervisor_state = self.state
-        self.process = Process(world, "daemon", lambda: self.daemon.run())
+        self.process = Process(self.world, "daemon", lambda: self.daemon.run())
+
+    def stop(self) -> None:
+        """Ask the daemon to end."""
+        self.on_stop()
+        self.daemon.stop()
 
     def state(self) -> int:
         """Return the supervisor's state, as the loop itself knows it."""
@@ -101,7 +118,7 @@ class SimulatedLoop(LoopProcess):
         try:
             memory = SharedMemory(self.memory.n, self._fds[0], clock=run.clock)
             memory.enter(Phase.STARTING)
-            driver = _watched(run, run.link.driver())
+            driver = _watched(run, _driver(run), self._settings.limits)
             source = _source(run)
             loop = self.loop = _Loop(
                 self._settings, run.link.setting.cell.model, driver, source, memory, self._emit,
@@ -175,11 +192,17 @@ def _note_states(run: Run, stream: SetpointStream) -> None:
     stream.advance = noted  # type: ignore[method-assign]
 
 
-def _watched(run: Run, driver: Driver) -> Driver:
-    """Return a driver whose setpoints are noted as they are handed to it."""
-    from gapbridge.bridge.loop.setpoint_stream import gate_bounds
+def _driver(run: Run) -> Driver:
+    """Return the link's driver, joined with the force sensor where there is one."""
+    driver = run.link.driver()
+    if run.sensor is None:
+        return driver
+    return run.sensor.joined(driver, run.link.setting.cell.model, run.sensor_settings)
 
-    driver.gate.set_bounds(gate_bounds(run.link.setting.configuration.settings.limits))
+
+def _watched(run: Run, driver: Driver, limits: LimitSettings) -> Driver:
+    """Return a driver whose setpoints are noted as they are handed to it."""
+    driver.gate.set_bounds(gate_bounds(limits))
     send = driver._send
 
     def noted(setpoint: Setpoint) -> None:
@@ -219,57 +242,27 @@ def _source(run: Run) -> Source:
     return source
 
 
-class Planner:
-    """Sends setpoints: a slow circle of one joint about where the arm stands, or nonsense."""
-
-    def __init__(self, world: World, link: SimulatedLink) -> None:
-        self._world, self._link = world, link
-        self.take: Callable[[Vector], None] = lambda _: None
-        self.silent_until = 0.0
-        self.nonsense: Callable[[Vector], Vector] | None = None
-        self._at: Vector | None = None
-        self._time = 0.0
-        world.every(lambda: PLANNED, self._send)
-
-    def _send(self) -> None:
-        if self._at is None or self._link.supervisor_state() != State.COMPENSATING:
-            self._at, self._time = np.array(self._link.controller.q), 0.0  # begins there
-        if self._world.now < self.silent_until:
-            return
-        self._time += PLANNED
-        q = self._at.copy()
-        q[PLANNED_JOINT] += 0.02 * np.sin(0.5 * self._time) ** 2
-        if self.nonsense is not None:
-            q = self.nonsense(q)
-        self.take(q)
+def _source(run: Run) -> Source:
+    setting, link = run.link.setting, run.link
+    settings = setting.configuration.settings.setpoints
+    moves_arm = setting.wired.moves_arm
+    kind: Any = TargetSource if run.planner is None else PlannedSource
+    source: Source = kind(
+        settings, link.controller.n, moves_arm, setting.cell.path.parent, setting.wired.rate
+    )
+    if isinstance(source, PlannedSource):
+        assert run.planner is not None
+        source.attach(run.planner, run.clock)
+    return source
 
 
-class PlannedSource(Source):
-    """What a planner sends, by the product's own interpolator; its socket is not simulated."""
-
-    def attach(self, planner: Planner, clock: SimulatedClock) -> None:
-        """Take what the planner sends from now on."""
-        self._interpolator = SetpointInterpolator(self.settings.timeout, "line", clock)
-        planner.take = self._take
-
-    def _take(self, q: Vector) -> None:
-        if not np.isfinite(q).all():
-            return  # a line that is no setpoint never comes so far
-        self._interpolator.take(q)
-        self._interpolator.restart()
-
-    def discard(self) -> None:
-        """See Source.discard."""
-        self._interpolator.forget()
-
-    def first(self, robot_q: Vector) -> Vector | None:
-        """See Source.first."""
-        return self._interpolator.first()
-
-    def begin(self, timestamp: float, robot_q: Vector) -> None:
-        """See Source.begin."""
-        self._interpolator.begin(robot_q)
-
-    def sample(self, timestamp: float, robot_q: Vector) -> Vector:
-        """See Source.sample."""
-        return self._interpolator.sample()
+@contextmanager
+def cell_files(run: Run) -> Iterator[None]:
+    """Have the daemon find the run's cell file when it reads it again."""
+    before = reload.read_configuration, reload.cell_errors
+    reload.read_configuration = lambda _: run.link.setting.read_again(run.cell_file)
+    reload.cell_errors = lambda _: []
+    try:
+        yield
+    finally:
+        reload.read_configuration, reload.cell_errors = before

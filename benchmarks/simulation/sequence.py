@@ -9,11 +9,12 @@ from typing import Any
 
 from benchmarks.faults.invariants import Checker
 from benchmarks.simulation.can import CanLink
-from benchmarks.simulation.faults import FAULTS, Fault, drawn
+from benchmarks.simulation.faults import ALL, Fault, drawn
 from benchmarks.simulation.invariants import Judge, Violation
-from benchmarks.simulation.links import SimulatedLink, setting_of
+from benchmarks.simulation.links import Setting, SimulatedLink, setting_of
 from benchmarks.simulation.modbus import ModbusLink
-from benchmarks.simulation.processes import PLANNED_JOINT, Run
+from benchmarks.simulation.processes import Chance, Run, cell_files
+from benchmarks.simulation.robot_faults import lose_sensor
 from benchmarks.simulation.ur import UrLink, library
 from benchmarks.simulation.world import BEGIN, Process, SimulatedClock, World
 from gapbridge.bridge.ipc.control_socket import Peer
@@ -28,6 +29,7 @@ QUIET, SPAN, REST = 0.3, 0.8, 0.3  # s: until faults begin; over what time they 
 RECOVERY = 25.0  # s until a healed run compensates again
 ENDING = 8.0  # s until a stopped run is over
 LOOK = 0.02  # s
+SENSED = 0.1  # of runs that have a force sensor, besides those in which it is lost
 ASKING = 0.1  # s between two attempts to arm again
 Plan = list[tuple[float, Fault]]
 
@@ -55,28 +57,30 @@ class Outcome:
         return "\n".join(lines)
 
 
-def run(seed: int, say: Any = None, plan: Sequence[tuple[float, str]] | None = None) -> Outcome:
+def run(
+    seed: int, say: Any = None, plan: Sequence[tuple[float, str]] | None = None, later: bool = True
+) -> Outcome:
     """Run one seed; ``say`` gets every event.
 
     ``plan``: faults by name, each with its moment (s after the first could be), in place of those
-    that the seed draws.
+    that the seed draws. ``later`` False: without all that was added to the simulation later, so
+    that a seed is the run in which it found something then.
     """
-    draw = random.Random(f"faults {seed}")
     name = list(LINKS)[seed % len(LINKS)]
     world = World(seed)
     clock = SimulatedClock(world)
     setting = setting_of(name)
-    planned = setting.wired.moves_arm and draw.random() < 0.4
-    checker = Checker(setting.bounds)
-    if planned:  # offsets are what the other joints do
-        checker._planned = (PLANNED_JOINT, setting.wired.start_q[PLANNED_JOINT])
+    chance, faults = _fate(seed, setting, plan, later)
+    checker, joint = Checker(setting.bounds), chance.planned_joint
+    if joint is not None:  # offsets are what the other joints do
+        checker._planned = (joint, setting.wired.start_q[joint])
     judge = Judge(checker, BEGIN, setting.wired.rate)
     link = LINKS[name](world, clock, setting, judge.saw)
     outcome = Outcome(seed, name)
-    with library(link):
-        found = Run(world, clock, link, planned)
+    found = Run(clock, link, chance)
+    with library(link), cell_files(found):
         _listen(found, judge, say)
-        person = Person(found, judge, draw, outcome, _planned(draw, name, plan))
+        person = Person(found, judge, chance.draw, outcome, faults)
         try:
             world.run(BEGIN + 4 * RECOVERY, lambda: person.done)
             _judge_end(found, judge, person)
@@ -92,13 +96,32 @@ def run(seed: int, say: Any = None, plan: Sequence[tuple[float, str]] | None = N
     return outcome
 
 
-def _planned(draw: random.Random, link: str, given: Sequence[tuple[float, str]] | None) -> Plan:
-    """Return which faults happen when, s after the first could."""
+def plan_of(seed: int) -> Plan:
+    """Return which faults a seed has, each with its moment."""
+    return _fate(seed, setting_of(list(LINKS)[seed % len(LINKS)]), None, later=True)[1]
+
+
+def _fate(
+    seed: int, setting: Setting, given: Sequence[tuple[float, str]] | None, later: bool
+) -> tuple[Chance, Plan]:
+    """Return what a seed says of a run, and which faults happen when, s after the first could."""
+    draw = random.Random(f"faults {seed}")
+    more = random.Random(f"later {seed}") if later else None
+    moves_arm, joints = setting.wired.moves_arm, len(setting.wired.start_q)
+    joint = 0 if moves_arm and draw.random() < 0.4 else None
+    if more is not None and moves_arm and more.random() < 0.5:
+        joint = more.randrange(joints)
     if given is not None:
-        by_name = {fault.name: fault for fault in FAULTS}
-        return [(moment, by_name[name]) for moment, name in given]
-    faults = drawn(draw, link, draw.randint(0, MOST_FAULTS))
-    return list(zip(sorted(draw.uniform(0.0, SPAN) for _ in faults), faults, strict=True))
+        by_name = {fault.name: fault for fault in ALL}
+        plan = [(moment, by_name[name]) for moment, name in given]
+    else:
+        faults = drawn(draw, more, setting.name, draw.randint(0, MOST_FAULTS))
+        plan = list(zip(sorted(draw.uniform(0.0, SPAN) for _ in faults), faults, strict=True))
+    sensor = ""
+    if more is not None:
+        sensed = more.random() < SENSED or any(fault.make is lose_sensor for _, fault in plan)
+        sensor = more.choice(("degrade", "stop")) if sensed else ""
+    return Chance(draw, more, joint, sensor), plan
 
 
 def _listen(run: Run, judge: Judge, say: Any) -> None:
@@ -113,11 +136,15 @@ def _listen(run: Run, judge: Judge, say: Any) -> None:
             say(f"{run.world.now - BEGIN:9.4f} {words}")
 
     def sent(setpoint: Setpoint) -> None:
-        sampled = link.sampled_at(run.state_behind)
+        state = run.state_behind
+        sampled = link.sampled_at(state)
+        if run.sensor is not None and state.ft_raw_wrench is not None:
+            judge.felt(state.received - run.sensor.arrived)
         judge.sent(setpoint, sampled, run.world.now, link.hidden_leap)
 
+    judge.uses(run.daemon.configuration.hash)
     events._listeners = (*events._listeners, noted)
-    run.on_send = sent
+    run.on_send, run.on_stop = sent, judge.stops
 
 
 class Person(Process):
@@ -150,7 +177,7 @@ class Person(Process):
         if not self._over:
             self._recover()
         asked = world.now
-        run.daemon.stop()
+        run.stop()
         while not self._over and world.now < asked + ENDING:
             self.sleep(LOOK)
         self.ended_in_time = self._over
@@ -191,6 +218,9 @@ class Person(Process):
         answer: dict[str, Any] = {}
         if run.daemon._stopping.is_set():
             return
+        if run.sensor is not None:
+            run.sensor.heal()
+        run.cell_file = "same"
         compensators = [p.loop._stream._compensator for p in run.loops if p.loop is not None]
         for compensator in compensators:
             compensator.__dict__.pop("correct", None)
@@ -228,6 +258,7 @@ def _judge_end(run: Run, judge: Judge, person: Person) -> None:
     slices = run.daemon.memory.slices
     written = run.daemon.memory.written
     rows, _ = run.daemon.memory.rows(0, written)
+    judge.judge_limited(rows, slices)
     left = int((rows[:, slices["written"]] == 1.0).sum())
     deaths = sum(loop.process.dead for loop in run.loops)
     if not left <= run.left <= left + deaths:

@@ -205,8 +205,9 @@ class SimulatedClock(Clock):
 
     def __init__(self, world: World) -> None:
         self.world = world
+        self.calendar = EPOCH  # s since 1970 at which the monotonic clock was zero
         self.monotonic = lambda: world.now
-        self.time = lambda: EPOCH + world.now
+        self.time = lambda: self.calendar + world.now
         self.sleep = self._sleep
 
     def _sleep(self, seconds: float) -> None:

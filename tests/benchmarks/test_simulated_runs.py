@@ -8,6 +8,7 @@ from __future__ import annotations
 import gc
 import math
 import os
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,12 +16,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks.simulation.faults import FAULTS
+from benchmarks.simulation.faults import ALL
 from benchmarks.simulation.invariants import INVARIANTS, as_markdown
-from benchmarks.simulation.sequence import LINKS, run
+from benchmarks.simulation.sequence import LINKS, plan_of, run
 from gapbridge.bridge.daemon import daemon as daemon_module
 from gapbridge.bridge.daemon.control import Control
 from gapbridge.bridge.daemon.processes import LoopProcess
+from gapbridge.bridge.daemon.reload import Reload
 from gapbridge.bridge.daemon.status import DaemonStatus
 from gapbridge.bridge.ipc.command_memory import Command, Commands
 from gapbridge.bridge.ipc.loop_state import State
@@ -31,6 +33,7 @@ from gapbridge.bridge.loop.supervisor import Cause, Supervisor
 from gapbridge.core.errors import StaleStateError
 from gapbridge.core.state import Setpoint
 from gapbridge.drivers.driver import Driver
+from gapbridge.drivers.ft_sensor.joined import SensorReader
 from gapbridge.drivers.modbus import encode
 from gapbridge.drivers.modbus.driver import ModbusDriver
 from gapbridge.drivers.ur_rtde.command import OffsetWriter, ServoWriter
@@ -40,6 +43,23 @@ from gapbridge.drivers.ur_rtde.state import StateReader
 DOCS = Path(__file__).parents[2] / "docs" / "evidence" / "fault-method.md"
 SEEDS, PART = 2000, 50  # of all tests together, of one
 SERVOJ, OFFSET, MODBUS, CAN = range(4)  # seeds of each link
+SIGNS = [
+    ("mode", SERVOJ, "robot not ready"), ("mode", OFFSET, "robot not ready"),
+    ("mode", MODBUS, "robot not ready"), ("mode", CAN, "robot not ready"),
+    ("robot's program paused", SERVOJ, "control script has ended"),
+    ("robot's program paused", OFFSET, "robot not following"),
+    ("robot's program paused", MODBUS, "do not arrive"),
+    ("remote control off", SERVOJ, "start refused"),
+    ("wrong requests", OFFSET, "do not arrive"), ("wrong requests", MODBUS, "do not arrive"),
+    ("error frames", CAN, "COMPENSATING"),
+    ("flood of frames", CAN, "COMPENSATING"),
+    ("force sensor lost", SERVOJ, "robotous"), ("force sensor lost", MODBUS, "robotous"),
+    ("cell file read again", OFFSET, "was not taken"),
+    ("cell file read again", CAN, "offset saturated"),
+    ("calendar set", OFFSET, "COMPENSATING"),
+    ("drift of the controller's cycle", CAN, "COMPENSATING"),
+]  # fmt: skip
+"""What the daemon says where a fault happens, with one of some seeds."""
 Patch = pytest.MonkeyPatch
 Break = Callable[[Patch], None]
 
@@ -79,8 +99,28 @@ def test_a_run_without_faults_compensates_on_every_link(link: str) -> None:
 
 
 def test_every_fault_can_happen_on_some_link() -> None:
-    assert all(fault.links for fault in FAULTS)
-    assert {link for fault in FAULTS for link in fault.links} == set(LINKS)
+    assert all(fault.links for fault in ALL)
+    assert {link for fault in ALL for link in fault.links} == set(LINKS)
+
+
+def test_every_family_is_among_the_first_seeds() -> None:
+    """On each link that has it; what it comes to, the tests below and the breaks show."""
+    drawn = Counter[tuple[str, str]]()
+    for seed in range(SEEDS):
+        link = list(LINKS)[seed % len(LINKS)]
+        drawn.update((fault.name, link) for _, fault in plan_of(seed))
+    assert not [(f.name, link) for f in ALL for link in f.links if not drawn[f.name, link]]
+
+
+@pytest.mark.parametrize(("fault", "link", "sign"), SIGNS)
+def test_a_fault_shows(fault: str, link: int, sign: str) -> None:
+    plan = [(0.1, fault), (0.3, "disarm"), (0.5, "arm"), (3.0, "arm")]
+    said = list[str]()
+    for seed in range(link, link + 24 * len(LINKS), len(LINKS)):
+        assert not run(seed, said.append, plan).violations
+        if any(sign in line for line in said):
+            return
+    raise AssertionError(said[-20:])
 
 
 def test_the_page_has_the_list() -> None:
@@ -89,7 +129,7 @@ def test_the_page_has_the_list() -> None:
 
 def test_a_disarm_from_before_a_fault_does_not_acknowledge_it() -> None:
     """Seed 98: the loop stood still, somebody asked for disarming, and then the robot stopped."""
-    assert not run(98).violations
+    assert not run(98, later=False).violations
     plan = [(0.1, "machine stalls"), (0.11, "disarm"), (0.12, "protective stop")]
     assert not [str(o) for seed in range(12) if (o := run(seed, plan=plan)).violations]
 
@@ -104,13 +144,16 @@ def test_a_program_that_applies_nothing_after_a_stop_may_be_armed_at_once() -> N
 def test_the_first_state_after_a_standstill_is_judged_by_the_clock_before_it() -> None:
     """Seed 3385: a state 42 ms old was written by, as if the clocks had drifted apart meanwhile."""
     plan = [(0.1, "machine stalls"), (0.5, "held back"), (0.7, "loop stalls")]
-    found = [run(3385), *(run(seed, plan=plan) for seed in range(OFFSET, OFFSET + 24, len(LINKS)))]
+    found = [
+        run(3385, later=False),
+        *(run(seed, plan=plan) for seed in range(OFFSET, OFFSET + 24, len(LINKS))),
+    ]
     assert not [str(outcome) for outcome in found if outcome.violations]
 
 
 def test_an_arm_released_in_silence_is_sent_where_it_was_sent_before() -> None:
     """Seed 3243: stopped while the arm was silent; enabling frames say the last joints again."""
-    assert not run(3243).violations
+    assert not run(3243, later=False).violations
 
 
 @pytest.mark.parametrize(("driver", "seed"), [(UrRtdeDriver, SERVOJ), (ModbusDriver, MODBUS)])
@@ -142,47 +185,53 @@ def test_the_way_is_measured_when_arming_and_counts_as_part_of_each_states_age(
 
 def test_an_arming_that_a_gap_in_the_states_ends_is_answered() -> None:
     """Seed 2007469: who had asked waited for 25 s, and then read that nobody had answered."""
-    assert not run(2007469).violations
+    assert not run(2007469, later=False).violations
 
 
 def test_the_answer_to_a_closed_connection_is_nobodys() -> None:
     """Seed 3000286: a new Modbus connection numbers from one again, and took the old one's."""
-    assert not run(3000286).violations
+    assert not run(3000286, later=False).violations
 
 
 @pytest.mark.parametrize("seed", [5005572, 5025157])
 def test_a_clock_that_is_set_forward_behind_jitter_makes_no_state_younger(seed: int) -> None:
-    assert not run(seed).violations
+    assert not run(seed, later=False).violations
 
 
 def test_a_clock_set_forward_as_the_next_packet_comes_late_is_no_violation_but_reported() -> None:
     """Seed 5024965: timestamps and arrivals are those of a clock that nobody touched."""
-    found = run(5024965)
+    found = run(5024965, later=False)
     assert not found.violations
     assert found.hidden > 0.05
     assert "undetectable: a setpoint of a state sampled 0.066 s before" in str(found)
 
 
 def test_a_planner_that_begins_where_an_offset_was_left_is_led_over_no_faster_than_it() -> None:
-    assert not run(8022740).violations
+    assert not run(8022740, later=False).violations
 
 
 def test_an_answer_of_zeros_does_not_say_that_no_offset_is_applied() -> None:
     """Seed 7061098: over Modbus, after a loop that died; arming announced a zero into an offset."""
-    assert not run(7061098).violations
+    assert not run(7061098, later=False).violations
 
 
 def test_the_first_setpoint_of_a_stream_is_within_the_envelope_whatever_the_model_says() -> None:
     """Seed 5019099: joints 0.5 rad off beside a small offset; the arm went 0.03 rad at once."""
     plan = [(0.1, "disarm"), (0.5, "model no number"), (0.51, "arm")]
-    found = [run(5019099), *(run(seed, plan=plan) for seed in range(CAN, CAN + 80, len(LINKS)))]
+    found = [
+        run(5019099, later=False),
+        *(run(seed, plan=plan) for seed in range(CAN, CAN + 80, len(LINKS))),
+    ]
     assert not [str(outcome) for outcome in found if outcome.violations]
 
 
 def test_a_way_that_was_long_when_arming_was_refused_is_measured_anew() -> None:
     """Seed 5026389: it went on counting, so that no state was ever fresh again."""
     plan = [(0.1, "disarm"), (0.2, "delay step"), (0.6, "arm")]
-    found = [run(5026389), *(run(seed, plan=plan) for seed in range(OFFSET, OFFSET + 40, 4))]
+    found = [
+        run(5026389, later=False),
+        *(run(seed, plan=plan) for seed in range(OFFSET, OFFSET + 40, 4)),
+    ]
     assert not [str(outcome) for outcome in found if outcome.violations]
 
 
@@ -339,6 +388,24 @@ def _keeps_faults(patch: Patch) -> None:
     patch.setattr(Loop, "_acknowledge", lambda _: None)
 
 
+def _ends_at_a_bad_cell_file(patch: Patch) -> None:
+    read = Reload._read
+
+    def other(self: Any, *given: Any) -> None:
+        read(self, *given)
+        self._next = self._next or given[1]  # the one that runs, as if it were new
+
+    patch.setattr(Reload, "_read", other)
+
+
+def _stays_at_the_limit(patch: Patch) -> None:
+    patch.setattr(checks.SaturationWatch, "update", lambda *_: None)
+
+
+def _keeps_the_last_force(patch: Patch) -> None:
+    patch.setattr(SensorReader, "_require_fresh", lambda *_: None)
+
+
 BREAKS: list[tuple[str, int, list[tuple[float, str]], Break]] = [
     ("envelope", OFFSET, [], _changed_offsets(lambda _, offset: 10.0 * offset)),
     ("rate", OFFSET, [], _changed_offsets(lambda i, offset: offset * (i % 7 > 0))),
@@ -356,6 +423,14 @@ BREAKS: list[tuple[str, int, list[tuple[float, str]], Break]] = [
     ("ends", MODBUS, [], _never_stops),
     ("crash", MODBUS, [(0.1, "corruption")], _fails_at_dropping),
     ("recorded", CAN, [], _records_too_little),
+    ("kept", OFFSET, [(0.1, "cell file read again")], _ends_at_a_bad_cell_file),
+    (
+        "saturated",
+        OFFSET,
+        [(0.1, "cell file read again"), (0.5, "arm"), (4.0, "arm")],
+        _stays_at_the_limit,
+    ),
+    ("sensor", SERVOJ, [(0.1, "force sensor lost")], _keeps_the_last_force),
     ("recovers", CAN, [(0.1, "protective stop")], _keeps_faults),
 ]
 
@@ -368,7 +443,7 @@ def test_a_broken_product_is_found(
 ) -> None:
     breaks(monkeypatch)
     # faults draw their sizes by the seed
-    outcomes = (run(seed + more, plan=plan) for more in range(0, 20 * len(LINKS), len(LINKS)))
+    outcomes = (run(seed + more, plan=plan) for more in range(0, 40 * len(LINKS), len(LINKS)))
     assert any(v.invariant == invariant for outcome in outcomes for v in outcome.violations)
 
 
@@ -377,15 +452,15 @@ def test_every_invariant_has_a_break() -> None:
 
 
 def test_a_stop_that_comes_and_goes_while_frames_are_out_of_order_is_a_fault() -> None:
-    found = run(8072455)
+    found = run(8072455, later=False)
     assert not found.violations
 
 
 def test_the_first_state_after_the_loop_stood_still_writes_nothing() -> None:
     """A controller's clock that runs fast meanwhile makes it look younger than it is."""
-    assert not run(11029317).violations
+    assert not run(11029317, later=False).violations
 
 
 def test_a_way_that_grows_while_the_driver_is_armed_makes_states_old() -> None:
     """Arming takes 0.3 s on a UR, and the round trip is measured at its begin."""
-    assert not run(11053496).violations
+    assert not run(11053496, later=False).violations
