@@ -70,6 +70,8 @@ LATER = (
     Fault("remote control off", robot.local_mode, ("ur_servoj",)),
     Fault("force sensor lost", robot.lose_sensor),
     Fault("calendar set", process.set_calendar),
+    Fault("daemon dies", process.die_daemon, weight=2.0),
+    Fault("daemon started anew", process.restart_daemon),
     Fault("cell file read again", process.reload, weight=2.0),
 )
 """Families that were added later: see ``drawn``."""

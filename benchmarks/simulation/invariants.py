@@ -88,6 +88,7 @@ class Judge:
         self._acknowledged = False  # since the fault began
         self._fault: str | None = None  # that is latched
         self._heals = False
+        self._in_order = True  # the last daemon ended so
         self._to_end = False  # somebody wants the motion to end, since it began
         self._configuration = ""  # hash of the cell file that was taken last
         self._last: Numbers = ()  # the values of the last write
@@ -155,6 +156,8 @@ class Judge:
         self._now = float(event["seen"])
         kind = event["kind"]
         if kind == "request":
+            if event["command"] == "arm" and event["by"] == "the cell file" and not self._in_order:
+                self.violate("asked", "the cell file arms after a daemon has died")
             self._asked |= event["command"] == "arm"
             self._to_end |= event["command"] == "disarm"
             self._acknowledged |= event["command"] == "disarm"
@@ -169,9 +172,15 @@ class Judge:
         """Note that the daemon has been asked to end."""
         self._to_end = True
 
-    def uses(self, configuration: str) -> None:
-        """Note which cell file (its hash) the daemon begins with."""
-        self._configuration = configuration
+    def begins(self, configuration: str, in_order: bool) -> None:
+        """Note that a daemon begins, with which cell file (its hash), and how the last one ended.
+
+        A person who starts it again after it ended in order knows of its faults.
+        """
+        self._configuration, self._in_order = configuration, in_order
+        self._asked = self._acknowledged = False
+        if in_order:
+            self._fault = None
 
     def _read_again(self, fine: bool, configuration: str) -> None:
         if not fine and configuration != self._configuration:

@@ -58,6 +58,25 @@ def die(run: Run, draw: Draw) -> str:
     return f"{lines} lines on"
 
 
+def die_daemon(run: Run, draw: Draw) -> str:
+    """Kill the daemon at any of its lines, or while it waits, and start it anew."""
+    run.start_anew(draw.uniform(0.05, 0.5), arms := draw.random() < 0.3)
+    words = "; the cell file arms" if arms else ""
+    if draw.random() < 0.3:
+        run.kill_daemon()
+        return f"waiting{words}"
+    lines = draw.randint(1, 600)
+    run.process.at_line(lines, run.kill_daemon)
+    return f"{lines} lines on{words}"
+
+
+def restart_daemon(run: Run, draw: Draw) -> str:
+    """Ask the daemon to end (SIGTERM), and start it anew."""
+    run.stop()
+    run.start_anew(draw.uniform(0.05, 0.5), arms := draw.random() < 0.3)
+    return "the cell file arms" if arms else ""
+
+
 def stall_daemon(run: Run, draw: Draw) -> str:
     """Have the daemon stand still."""
     seconds = draw.choice((0.05, 0.3, 1.2))

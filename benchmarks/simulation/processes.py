@@ -17,7 +17,9 @@ from gapbridge.bridge.cell.run_settings import Configuration
 from gapbridge.bridge.cell.sections import LimitSettings
 from gapbridge.bridge.daemon import reload
 from gapbridge.bridge.daemon.daemon import Daemon
+from gapbridge.bridge.daemon.owner_lock import OwnerLock
 from gapbridge.bridge.daemon.processes import LoopProcess
+from gapbridge.bridge.daemon.summary import RunSummary
 from gapbridge.bridge.ipc.command_memory import CommandMemory, Commands
 from gapbridge.bridge.ipc.shared_memory import Phase, RunMemory, SharedMemory
 from gapbridge.bridge.loop.loop import Exit, Loop
@@ -32,6 +34,8 @@ from gapbridge.drivers.driver import Driver
 STARTING = (0.02, 0.15)  # s that a process takes until it runs
 KILLED = -9
 COMPUTING = 1e-4  # s: of a cycle
+LOOK = 0.02  # s
+RETRY = 0.3  # s until a daemon that could not start is started again
 
 
 @dataclass(frozen=True)
@@ -45,7 +49,7 @@ class Chance:
 
 
 class Run:
-    """One daemon on one link: what all its processes share."""
+    """One daemon after the other on one link: what all its processes share."""
 
     def __init__(self, clock: SimulatedClock, link: SimulatedLink, chance: Chance) -> None:
         self.world, self.clock, self.link = clock.world, clock, link
@@ -55,21 +59,71 @@ class Run:
         self.sensor = Sensor(self.world) if chance.sensor else None
         self.sensor_settings = chance.sensor
         self.offset_in_force = OffsetInForce(link.controller.n, None)  # outlives every process
+        self.owner_note = ""  # of the daemon's lock; the same
+        self.daemons: list[SimulatedDaemon] = []
         self.loops: list[SimulatedLoop] = []
-        self.events: list[dict[str, Any]] = []
         self.left = 0  # setpoints that have left whole
         self.on_send: Callable[[Setpoint], None] = lambda _: None
         self.on_stop: Callable[[], None] = lambda: None
+        self.on_death: Callable[[], None] = lambda: None
+        self.on_start: Callable[[], None] = lambda: None
+        self.not_started: list[Process] = []  # daemons that did not reach the robot
+        self.starts_anew = False  # a daemon that has ended is followed by another
         self.state_behind: RobotState  # the last setpoint
-        configuration = link.setting.configuration
-        self.daemon = SimulatedDaemon(configuration, self)
         link.supervisor_state = self.state
-        self.process = Process(self.world, "daemon", lambda: self.daemon.run())
+
+    def start(self, arms: bool = False) -> None:
+        """Start a daemon; ``arms``: its cell file says that it arms by itself."""
+        self.starts_anew = False
+        self.daemon = daemon = SimulatedDaemon(self.link.setting.configuration, self)
+        self.daemons.append(daemon)
+        self.on_start()
+
+        def run() -> RunSummary:
+            try:
+                return daemon.run(arms, by="the cell file")
+            except GapbridgeError:
+                if len(self.daemons) > 1:  # the robot cannot be reached just now
+                    self.not_started.append(self.process)
+                    self.start_anew(RETRY, arms)
+                raise
+
+        self.process = Process(self.world, f"daemon {len(self.daemons)}", run)
+
+    @property
+    def is_over(self) -> bool:
+        """Return whether no daemon runs, and none will."""
+        return not self.starts_anew and (self.process.over or self.process.dead)
 
     def stop(self) -> None:
         """Ask the daemon to end."""
         self.on_stop()
         self.daemon.stop()
+
+    def start_anew(self, seconds: float, arms: bool) -> None:
+        """Start another daemon in so many seconds, at the earliest once all of this one is gone.
+
+        That is what a service manager does.
+        """
+        self.starts_anew = True
+
+        def begin() -> None:
+            if not self.starts_anew:
+                return
+            last = self.loops[-1].process if self.loops else self.process
+            if all(process.over or process.dead for process in (self.process, last)):
+                self.start(arms)
+            else:
+                self.world.after(LOOK, begin)
+
+        self.world.after(seconds, begin)
+
+    def kill_daemon(self) -> None:
+        """End the daemon at once: its loop hears of that from the system."""
+        self.process.kill()
+        if self.loops:
+            self.loops[-1].end_with_parent()
+        self.on_death()
 
     def state(self) -> int:
         """Return the supervisor's state, as the loop itself knows it."""
@@ -79,18 +133,30 @@ class Run:
 
 
 class SimulatedDaemon(Daemon):
-    """The product's daemon without locks, sockets and side processes."""
+    """The product's daemon without sockets and side processes."""
 
     def __init__(self, configuration: Configuration, run: Run) -> None:
         self._run = run
-        super().__init__(configuration, may_write=True, log=self._note, clock=run.clock)
+        super().__init__(configuration, may_write=True, clock=run.clock)
         self.loop_process = lambda *given: SimulatedLoop(run, *given)  # type: ignore[assignment]
 
-    def _note(self, event: dict[str, Any]) -> None:
-        self._run.events.append({**event, "seen": self._run.world.now})
-
     def _open(self, stack: ExitStack, arm: bool, by: str) -> bool:
-        return arm
+        return self._take_over(stack.enter_context(_Lock(self._run)), arm, by)
+
+
+class _Lock(OwnerLock):
+    """The product's, whose file is the run's."""
+
+    def __init__(self, run: Run) -> None:
+        super().__init__("", run.link.setting.cell.path)
+        self._run = run
+
+    def acquire(self) -> None:
+        """See OwnerLock.acquire; a daemon that is gone holds nothing."""
+        self._take_over(self._run.owner_note.encode())
+
+    def _write(self, text: str) -> None:
+        self._run.owner_note = text
 
 
 class SimulatedLoop(LoopProcess):
@@ -158,6 +224,13 @@ class SimulatedLoop(LoopProcess):
         """See LoopProcess."""
         found, self._reported = self._reported, []
         return found
+
+    def end_with_parent(self) -> None:
+        """Ramp out and end: the daemon is gone (see bridge/loop/main.py)."""
+        if self.loop is None:
+            self.kill()
+        else:
+            self.loop.request_stop()
 
     def kill(self) -> None:
         """See LoopProcess."""

@@ -80,6 +80,7 @@ def run(
     found = Run(clock, link, chance)
     with library(link), cell_files(found):
         _listen(found, judge, say)
+        found.start()
         person = Person(found, judge, chance.draw, outcome, faults)
         try:
             world.run(BEGIN + 4 * RECOVERY, lambda: person.done)
@@ -88,8 +89,9 @@ def run(
             world.end()
             for loop in found.loops:
                 loop.let_go()
-            found.daemon._commands.close()
-            found.daemon.memory.close()
+            for daemon in found.daemons:
+                daemon._commands.close()
+                daemon.memory.close()
     outcome.violations, outcome.writes = judge.violations, judge.writes_noted
     outcome.oldest, outcome.hidden = judge.oldest, judge.hidden
     outcome.seconds = world.now - BEGIN
@@ -125,7 +127,7 @@ def _fate(
 
 
 def _listen(run: Run, judge: Judge, say: Any) -> None:
-    events, link = run.daemon.event_log, run.link
+    link = run.link
 
     def noted(event: dict[str, Any]) -> None:
         whole = {**event, "seen": run.world.now}
@@ -135,6 +137,11 @@ def _listen(run: Run, judge: Judge, say: Any) -> None:
             words = " ".join(str(event[k]) for k in keys if k in event)
             say(f"{run.world.now - BEGIN:9.4f} {words}")
 
+    def started() -> None:
+        events = run.daemon.event_log
+        judge.begins(run.daemon.configuration.hash, in_order=not run.owner_note)
+        events._listeners = (*events._listeners, noted)
+
     def sent(setpoint: Setpoint) -> None:
         state = run.state_behind
         sampled = link.sampled_at(state)
@@ -142,9 +149,7 @@ def _listen(run: Run, judge: Judge, say: Any) -> None:
             judge.felt(state.received - run.sensor.arrived)
         judge.sent(setpoint, sampled, run.world.now, link.hidden_leap)
 
-    judge.uses(run.daemon.configuration.hash)
-    events._listeners = (*events._listeners, noted)
-    run.on_send, run.on_stop = sent, judge.stops
+    run.on_send, run.on_stop, run.on_start = sent, judge.stops, started
 
 
 class Person(Process):
@@ -158,6 +163,7 @@ class Person(Process):
         self.done = False
         self.ended_in_time = True
         super().__init__(run.world, "person", self._act)
+        run.on_death = self.wake  # who waits for an answer gets none
 
     def _act(self) -> None:
         run, world, draw = self._of, self.world, self._draw
@@ -178,6 +184,7 @@ class Person(Process):
             self._recover()
         asked = world.now
         run.stop()
+        run.starts_anew = False
         while not self._over and world.now < asked + ENDING:
             self.sleep(LOOK)
         self.ended_in_time = self._over
@@ -185,7 +192,7 @@ class Person(Process):
 
     @property
     def _over(self) -> bool:
-        return self._of.process.over
+        return self._of.is_over
 
     def _until(self, time: float) -> None:
         while self.world.now < time and not self._over:
@@ -201,8 +208,24 @@ class Person(Process):
 
     def _ask(self, command: str) -> dict[str, Any]:
         """Ask as the control socket does, and see whether what is answered is so."""
-        daemon = self._of.daemon
-        answer = daemon.control.answer(command, Peer(1, 1000))
+        process, daemon = self._of.process, self._of.daemon
+        answers = list[dict[str, Any]]()
+
+        def ask() -> None:
+            try:
+                answers.append(daemon.control.answer(command, Peer(1, 1000)))
+            finally:
+                self.wake()
+
+        if process.dead or process.over:
+            return {"ok": False, "error": "found no daemon"}
+        request = Process(self.world, "request", ask)
+        while not request.over and not process.dead:
+            self.sleep(RECOVERY)
+        if not answers:
+            request.kill()
+            return {"ok": False, "error": "the daemon is gone"}
+        answer = answers[0]
         observes = answer["ok"] and str(answer["answer"]).endswith("observing")
         if observes and (daemon.state != State.OBSERVING or daemon.latched):
             self._judge.violate("taken", f"{command}: {answer}, in {daemon.state.name}")
@@ -216,7 +239,7 @@ class Person(Process):
         if run.planner is not None:
             run.planner.silent_until, run.planner.nonsense = 0.0, None
         answer: dict[str, Any] = {}
-        if run.daemon._stopping.is_set():
+        if run.daemon._stopping.is_set() and not run.starts_anew:
             return
         if run.sensor is not None:
             run.sensor.heal()
@@ -242,24 +265,25 @@ class Person(Process):
 def _judge_end(run: Run, judge: Judge, person: Person) -> None:
     """Judge what can be judged only when all is over."""
     judge._now = run.world.now
-    for process in (run.process, person, *(loop.process for loop in run.loops)):
-        if process.error:
+    for process in run.world.processes:
+        if process.error and process not in run.not_started:
             last = process.error.strip().splitlines()
             judge.violate("crash", f"{process.name}: {last[-1]} ({' '.join(last[-3:-1])})")
     if not person.done:
         judge.violate("ends", "the run did not come to its end")
     elif not person.ended_in_time:
         judge.violate("ends", f"not over {ENDING:g} s after the stop")
-    elif not run.process.error and run.process.result is None:
+    elif not run.process.error and not run.process.dead and run.process.result is None:
         judge.violate("ends", "there is no summary")
     taken, last = run.daemon.last_taken, run.daemon._commands.last
     if person.done and taken > last:
         judge.violate("taken", f"{taken} taken of {last}")
-    slices = run.daemon.memory.slices
-    written = run.daemon.memory.written
-    rows, _ = run.daemon.memory.rows(0, written)
-    judge.judge_limited(rows, slices)
-    left = int((rows[:, slices["written"]] == 1.0).sum())
+    left = 0
+    for daemon in run.daemons:
+        memory = daemon.memory
+        rows, _ = memory.rows(0, memory.written)
+        judge.judge_limited(rows, memory.slices)
+        left += int((rows[:, memory.slices["written"]] == 1.0).sum())
     deaths = sum(loop.process.dead for loop in run.loops)
     if not left <= run.left <= left + deaths:
         judge.violate("recorded", f"{run.left} setpoints were sent, {left} are recorded")

@@ -23,7 +23,7 @@ BEGIN = 1000.0  # s: no moment is zero by accident
 EPOCH = 1.7e9  # s between the monotonic clock and the calendar
 SLACK = 4e-4  # s by which the system wakes a process late, on average
 ROOT = Path(__file__).parents[2]
-PRODUCT = tuple(f"{ROOT / name}/" for name in ("bridge", "drivers", "core"))
+PRODUCT = f"{ROOT / 'gapbridge'}/"
 
 
 class KilledError(BaseException):
@@ -149,6 +149,12 @@ class Process:
         if self.dead:
             raise KilledError
 
+    def _stay(self) -> None:
+        """Go no further where it has just been killed: not even its ``finally`` happens."""
+        parent = self._greenlet.parent
+        if self.dead and parent is not None:
+            parent.switch()  # until ``unwind``
+
     def wake(self) -> None:
         """End its waiting now; from outside."""
         if not self.over and not self.dead:
@@ -180,7 +186,7 @@ class Process:
                     sys.settrace(None)
                     frame.f_trace = None
                     act()
-                    self.check()
+                    self._stay()
                     return None
             return on_line
 
@@ -193,6 +199,7 @@ class Process:
     def stand_still(self, seconds: float) -> None:
         """Stand still right here while the world goes on; only from within."""
         world, mine = self.world, self
+        self._frozen_until = max(self._frozen_until, world.now + seconds)  # whoever wakes it
         world.current = None
         try:
             world.run(world.now + seconds)
