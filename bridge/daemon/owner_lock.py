@@ -69,7 +69,8 @@ class OwnerLock:
 
     def note(self, fields: dict[str, Any]) -> None:
         """Store a note for the next owner, which ``release`` deletes."""
-        self._write(json.dumps({"pid": os.getpid(), "cell": str(self._cell), **fields}))
+        note = {"pid": os.getpid(), "cell": str(self._cell), **fields}
+        self._write(json.dumps(note) + "\n")
 
     def _write(self, text: str) -> None:
         if self._fd is not None:
@@ -103,9 +104,9 @@ def _read(fd: int) -> dict[str, Any]:
 
 
 def _parsed(text: bytes) -> dict[str, Any]:
-    """Return a note; an owner that died while it wrote a shorter one has left the old one's end."""
+    """Return a note, one line; behind it may be the end of an older one, see ``_write``."""
     with contextlib.suppress(ValueError):
-        owner, _ = json.JSONDecoder().raw_decode(text.decode("utf-8", "replace"))
+        owner = json.loads(text.split(b"\n")[0])
         if isinstance(owner, dict):
             return owner
     return {}

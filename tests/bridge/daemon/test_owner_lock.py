@@ -74,7 +74,7 @@ def test_an_owner_that_died_while_it_wrote_a_shorter_note_did_not_end_in_order()
     first.acquire()
     first.note({"latched": 100 * "x"})
     assert first._fd is not None
-    os.pwrite(first._fd, b'{"pid": 7}', 0)  # and the rest was not cut off any more
+    os.pwrite(first._fd, b'{"pid": 7}\n', 0)  # and the rest was not cut off any more
     _let_go_as_the_kernel_does(first)
     with OwnerLock("host 192.0.2.10", CELL) as lock:
         assert lock.before == {"pid": 7}
