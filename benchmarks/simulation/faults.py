@@ -72,6 +72,10 @@ LATER = (
     Fault("calendar set", process.set_calendar),
     Fault("daemon dies", process.die_daemon, weight=2.0),
     Fault("daemon started anew", process.restart_daemon),
+    Fault("disk full", process.fill_disk),
+    Fault("recorder dies", process.kill_recorder),
+    # where joints are written, the arm must be moved first, see docs/daemon.md
+    Fault("power cut", process.cut_power, ("ur_offset", "modbus")),
     Fault("cell file read again", process.reload, weight=2.0),
 )
 """Families that were added later: see ``drawn``."""

@@ -43,6 +43,8 @@ INVARIANTS: dict[str, str] = {
     "ends": "a stop ends in time, and with a summary",
     "crash": "no process ends by an exception that is none of the product's",
     "recorded": "the cycles handed to the recorder say of each setpoint whether it left",
+    "files": "each cycle is in a file of the recording or reported as lost, whatever disk and "
+    "recorder do; a power cut takes the last second at most",
     "kept": "a cell file that is wrong ends no motion, and changes nothing",
     "saturated": "an offset does not stay at its limit: the motion ends",
     "sensor": "behind no setpoint is a force that its sensor has not measured in the last 0.1 s",

@@ -178,3 +178,29 @@ def stop(run: Run, draw: Draw) -> str:
     """Ask the daemon to end."""
     run.stop()
     return ""
+
+
+def fill_disk(run: Run, draw: Draw) -> str:
+    """Have the disk take nothing more, for a while."""
+    disk, seconds = run.disk, draw.choice((0.1, 0.6, 3.0))
+    assert disk is not None
+    disk.is_full = True
+    run.world.after(seconds, lambda: setattr(disk, "is_full", False))
+    return f"{seconds:g} s"
+
+
+def kill_recorder(run: Run, draw: Draw) -> str:
+    """Kill the recorder at any of its lines, or while it waits."""
+    recording, lines = run.recordings[-1], draw.randint(1, 3000)
+    if draw.random() < 0.3:
+        recording.die()
+        return "waiting"
+    recording.process.at_line(lines, recording.die)
+    return f"{lines} lines on"
+
+
+def cut_power(run: Run, draw: Draw) -> str:
+    """Cut the power of our machine, and switch it on again."""
+    run.start_anew(draw.uniform(0.5, 2.0), arms=False)
+    run.cut_power()
+    return ""

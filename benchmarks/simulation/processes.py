@@ -9,8 +9,10 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from typing import Any
 
+from benchmarks.simulation.disk import Disk
 from benchmarks.simulation.links import SimulatedLink
 from benchmarks.simulation.planner import PlannedSource, Planner
+from benchmarks.simulation.recording import Recording
 from benchmarks.simulation.sensor import Sensor
 from benchmarks.simulation.world import Process, SimulatedClock
 from gapbridge.bridge.cell.run_settings import Configuration
@@ -21,6 +23,7 @@ from gapbridge.bridge.daemon.owner_lock import OwnerLock
 from gapbridge.bridge.daemon.processes import LoopProcess
 from gapbridge.bridge.daemon.summary import RunSummary
 from gapbridge.bridge.ipc.command_memory import CommandMemory, Commands
+from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.ipc.shared_memory import Phase, RunMemory, SharedMemory
 from gapbridge.bridge.loop.loop import Exit, Loop
 from gapbridge.bridge.loop.offset_in_force import OffsetInForce
@@ -46,6 +49,7 @@ class Chance:
     later: random.Random | None  # draws what was added later; None: nothing of it
     planned_joint: int | None  # from 0, that a planner moves; None: no planner
     sensor: str = ""  # "degrade" or "stop", when it is lost; empty: there is none
+    is_recorded: bool = False
 
 
 class Run:
@@ -59,6 +63,8 @@ class Run:
         self.sensor = Sensor(self.world) if chance.sensor else None
         self.sensor_settings = chance.sensor
         self.offset_in_force = OffsetInForce(link.controller.n, None)  # outlives every process
+        self.disk = Disk() if chance.is_recorded else None
+        self.recordings: list[Recording] = []
         self.owner_note = ""  # of the daemon's lock; the same
         self.daemons: list[SimulatedDaemon] = []
         self.loops: list[SimulatedLoop] = []
@@ -89,6 +95,38 @@ class Run:
                 raise
 
         self.process = Process(self.world, f"daemon {len(self.daemons)}", run)
+        self._record(daemon, self.process)
+
+    def _record(self, daemon: SimulatedDaemon, process: Process) -> None:
+        if self.disk is None:
+            return
+        session = f"run-{len(self.daemons)}"
+        recording = Recording(self.disk, self.clock, daemon.memory, session)
+        first = len(self.loops)
+
+        def is_over() -> bool:
+            loops = [loop.process for loop in self.loops[first:]]
+            return all(p.over or p.dead for p in (process, *loops))
+
+        recording.is_over = is_over
+        self.recordings.append(recording)
+
+    def cut_power(self) -> None:
+        """End all processes at once, with all that is in memory and not on the disk."""
+        self.process.kill()
+        if self.loops:
+            self.loops[-1].kill()
+        if self.disk is not None:
+            self.recordings[-1].cut_power()
+            self.disk.cut_power()
+        self.owner_note = ""
+        self.on_death()
+
+    @property
+    def compensates(self) -> bool:
+        """Return whether a daemon runs that says so."""
+        ended = self.process.over or self.process.dead
+        return not ended and self.daemon.state == State.COMPENSATING
 
     @property
     def is_over(self) -> bool:
@@ -110,8 +148,9 @@ class Run:
         def begin() -> None:
             if not self.starts_anew:
                 return
-            last = self.loops[-1].process if self.loops else self.process
-            if all(process.over or process.dead for process in (self.process, last)):
+            ended = [self.process, *(loop.process for loop in self.loops[-1:])]
+            ended += [recording.process for recording in self.recordings[-1:]]
+            if all(process.over or process.dead for process in ended):
                 self.start(arms)
             else:
                 self.world.after(LOOK, begin)

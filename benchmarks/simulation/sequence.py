@@ -9,10 +9,12 @@ from typing import Any
 
 from benchmarks.faults.invariants import Checker
 from benchmarks.simulation.can import CanLink
+from benchmarks.simulation.disk import recorded_on
 from benchmarks.simulation.faults import ALL, Fault, drawn
 from benchmarks.simulation.invariants import Judge, Violation
 from benchmarks.simulation.links import Setting, SimulatedLink, setting_of
 from benchmarks.simulation.modbus import ModbusLink
+from benchmarks.simulation.process_faults import cut_power, fill_disk, kill_recorder
 from benchmarks.simulation.processes import Chance, Run, cell_files
 from benchmarks.simulation.robot_faults import lose_sensor
 from benchmarks.simulation.ur import UrLink, library
@@ -78,7 +80,7 @@ def run(
     link = LINKS[name](world, clock, setting, judge.saw)
     outcome = Outcome(seed, name)
     found = Run(clock, link, chance)
-    with library(link), cell_files(found):
+    with library(link), cell_files(found), recorded_on(found.disk):
         _listen(found, judge, say)
         found.start()
         person = Person(found, judge, chance.draw, outcome, faults)
@@ -89,6 +91,8 @@ def run(
             world.end()
             for loop in found.loops:
                 loop.let_go()
+            for recording in found.recordings:
+                recording.let_go()
             for daemon in found.daemons:
                 daemon._commands.close()
                 daemon.memory.close()
@@ -109,10 +113,10 @@ def _fate(
     """Return what a seed says of a run, and which faults happen when, s after the first could."""
     draw = random.Random(f"faults {seed}")
     more = random.Random(f"later {seed}") if later else None
-    moves_arm, joints = setting.wired.moves_arm, len(setting.wired.start_q)
+    moves_arm = setting.wired.moves_arm
     joint = 0 if moves_arm and draw.random() < 0.4 else None
     if more is not None and moves_arm and more.random() < 0.5:
-        joint = more.randrange(joints)
+        joint = 0  # turns about gravity: its own offset is none, and the checker leaves it out
     if given is not None:
         by_name = {fault.name: fault for fault in ALL}
         plan = [(moment, by_name[name]) for moment, name in given]
@@ -123,7 +127,8 @@ def _fate(
     if more is not None:
         sensed = more.random() < SENSED or any(fault.make is lose_sensor for _, fault in plan)
         sensor = more.choice(("degrade", "stop")) if sensed else ""
-    return Chance(draw, more, joint, sensor), plan
+    is_recorded = any(fault.make in (fill_disk, kill_recorder, cut_power) for _, fault in plan)
+    return Chance(draw, more, joint, sensor, is_recorded), plan
 
 
 def _listen(run: Run, judge: Judge, say: Any) -> None:
@@ -187,6 +192,8 @@ class Person(Process):
         run.starts_anew = False
         while not self._over and world.now < asked + ENDING:
             self.sleep(LOOK)
+        while run.recordings and not run.recordings[-1].is_closed and world.now < asked + ENDING:
+            self.sleep(LOOK)
         self.ended_in_time = self._over
         self.done = True
 
@@ -243,18 +250,20 @@ class Person(Process):
             return
         if run.sensor is not None:
             run.sensor.heal()
+        if run.disk is not None:
+            run.disk.is_full = False
         run.cell_file = "same"
         compensators = [p.loop._stream._compensator for p in run.loops if p.loop is not None]
         for compensator in compensators:
             compensator.__dict__.pop("correct", None)
         while self.world.now < until and not self._over:
             self.sleep(ASKING)
-            if run.daemon.state == State.COMPENSATING:
+            if run.compensates:
                 return
             run.link.heal()
             self._ask("disarm")
             answer = self._ask("arm")
-            if run.daemon.state == State.COMPENSATING:
+            if run.compensates:
                 return
         words = f"{run.daemon.state.name} in the end; {answer.get('error') or answer}"
         if self._over:
@@ -284,6 +293,11 @@ def _judge_end(run: Run, judge: Judge, person: Person) -> None:
         rows, _ = memory.rows(0, memory.written)
         judge.judge_limited(rows, memory.slices)
         left += int((rows[:, memory.slices["written"]] == 1.0).sum())
+    for recording in run.recordings:
+        if person.ended_in_time and (missing := recording.missing()):
+            judge.violate(
+                "files", f"{missing} cycles are in no file, and none was reported as lost"
+            )
     deaths = sum(loop.process.dead for loop in run.loops)
     if not left <= run.left <= left + deaths:
         judge.violate("recorded", f"{run.left} setpoints were sent, {left} are recorded")

@@ -97,6 +97,7 @@ class Process:
         self.raised: BaseException | None = None
         self.over = self.dead = False
         self._frozen_until = 0.0
+        self._stands = False  # still at a line, while others go on
         self._ticket = 0
         self._begin_tracing: Callable[[], None] | None = None
         self._greenlet = greenlet(self._run)
@@ -116,8 +117,8 @@ class Process:
 
     def _resume(self, ticket: int) -> None:
         world = self.world
-        if self.over or self.dead or ticket != self._ticket:
-            return
+        if self.over or self.dead or self._stands or ticket != self._ticket:
+            return  # one that stands still at a line waits for nothing
         if world.now < self._frozen_until:
             world.at(self._frozen_until, partial(self._resume, ticket))
             return
@@ -199,12 +200,11 @@ class Process:
     def stand_still(self, seconds: float) -> None:
         """Stand still right here while the world goes on; only from within."""
         world, mine = self.world, self
-        self._frozen_until = max(self._frozen_until, world.now + seconds)  # whoever wakes it
-        world.current = None
+        self._stands, world.current = True, None
         try:
             world.run(world.now + seconds)
         finally:
-            world.current = mine
+            self._stands, world.current = False, mine
 
 
 class SimulatedClock(Clock):

@@ -32,6 +32,8 @@ from gapbridge.bridge.loop import checks
 from gapbridge.bridge.loop.link_monitor import ControllerClock, LinkMonitor
 from gapbridge.bridge.loop.loop import Loop
 from gapbridge.bridge.loop.supervisor import Cause, Supervisor
+from gapbridge.bridge.recording.recorder import Recorder
+from gapbridge.bridge.recording.segment import Segment
 from gapbridge.core.errors import StaleStateError
 from gapbridge.core.state import Setpoint
 from gapbridge.drivers.driver import Driver
@@ -60,6 +62,7 @@ SIGNS = [
     ("cell file read again", CAN, "offset saturated"),
     *(("daemon dies", link, "did not end in order") for link in range(4)),
     *(("daemon started anew", link, "requested by the cell file") for link in range(4)),
+    *((fault, MODBUS, "COMPENSATING") for fault in ("disk full", "recorder dies", "power cut")),
     ("calendar set", OFFSET, "COMPENSATING"),
     ("drift of the controller's cycle", CAN, "COMPENSATING"),
 ]  # fmt: skip
@@ -80,10 +83,12 @@ def test_a_run_leaves_nothing_open() -> None:
         gc.collect()
         return len(os.listdir("/proc/self/fd"))
 
-    run(0)
+    plan = [(0.1, "recorder dies"), (0.4, "daemon dies"), (0.8, "disk full")]
+    run(0, plan=plan)
     before = held()
     for seed in range(1, 4):
         run(seed)
+        run(seed, plan=plan)
     assert held() <= before
 
 
@@ -431,6 +436,20 @@ def _notes_no_fault(patch: Patch) -> None:
     patch.setattr(Daemon, "_note_latched", lambda _: None)
 
 
+def _syncs_nothing(patch: Patch) -> None:
+    patch.setattr(Segment, "flush", lambda self: self._writer.flush())
+
+
+def _forgets_what_the_disk_refused(patch: Patch) -> None:
+    pause = Recorder._pause
+
+    def other(self: Any, reason: str) -> None:
+        pause(self, reason)
+        self._next = self._reader.next
+
+    patch.setattr(Recorder, "_pause", other)
+
+
 BREAKS: list[tuple[str, int, list[tuple[float, str]], Break]] = [
     ("envelope", OFFSET, [], _changed_offsets(lambda _, offset: 10.0 * offset)),
     ("rate", OFFSET, [], _changed_offsets(lambda i, offset: offset * (i % 7 > 0))),
@@ -455,6 +474,8 @@ BREAKS: list[tuple[str, int, list[tuple[float, str]], Break]] = [
         [(0.1, "stop for a moment"), (0.3, "daemon dies"), (1.2, "arm")],
         _notes_no_fault,
     ),
+    ("files", OFFSET, [(1.2, "power cut")], _syncs_nothing),
+    ("files", OFFSET, [(0.1, "disk full")], _forgets_what_the_disk_refused),
     ("kept", OFFSET, [(0.1, "cell file read again")], _ends_at_a_bad_cell_file),
     (
         "saturated",
