@@ -43,7 +43,12 @@ def stall(run: Run, draw: Draw) -> str:
         process.freeze(seconds)
         return f"{seconds:g} s, waiting"
     lines = draw.randint(1, 600)
-    process.at_line(lines, lambda: process.stand_still(seconds))
+
+    def stand() -> None:
+        if not run.sends:  # what is held up there nothing can show (docs/evidence/fault-method.md)
+            process.stand_still(seconds)
+
+    process.at_line(lines, stand)
     return f"{seconds:g} s, {lines} lines on"
 
 

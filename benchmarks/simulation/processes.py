@@ -68,6 +68,7 @@ class Run:
         self.owner_note = ""  # of the daemon's lock; the same
         self.daemons: list[SimulatedDaemon] = []
         self.loops: list[SimulatedLoop] = []
+        self.sends = False  # a setpoint is on its way from its last check to the wire
         self.left = 0  # setpoints that have left whole
         self.on_send: Callable[[Setpoint], None] = lambda _: None
         self.on_stop: Callable[[], None] = lambda: None
@@ -331,7 +332,11 @@ def _watched(run: Run, driver: Driver, limits: LimitSettings) -> Driver:
             raise
 
     def counted(setpoint: Setpoint) -> None:
-        write(setpoint)
+        run.sends = True
+        try:
+            write(setpoint)
+        finally:
+            run.sends = False
         run.left += 1
 
     driver.read_state = timed  # type: ignore[method-assign]
