@@ -15,11 +15,15 @@ from typing import Any, Self
 from gapbridge.bridge.cell.runtime_folder import runtime_folder
 from gapbridge.core.errors import InputError
 
+LONGEST = 65536  # bytes of a note
+KEPT = ("latched",)  # of the last owner's note, until the new owner says otherwise
+
 
 class OwnerLock:
     """Machine-wide exclusive access to one controller.
 
-    ``before``: the note of the last owner, empty if it ended normally.
+    ``before``: the note of the last owner, empty if it ended normally. What is latched is noted
+    from the beginning, so that it also outlives an owner that dies at once.
     """
 
     def __init__(self, address: str, cell: Path) -> None:
@@ -45,8 +49,13 @@ class OwnerLock:
                 f"{self._cell}: link: {self.address} is in use by another daemon ({who}), "
                 "expected one owner per controller"
             ) from None
-        self._fd, self.before = fd, _read(fd)
-        self.note({})
+        self._fd = fd
+        self._take_over(os.pread(fd, LONGEST, 0))
+
+    def _take_over(self, text: bytes) -> None:
+        """Take the last owner's note, and replace it by one of this owner."""
+        self.before = _parsed(text)
+        self.note({key: self.before[key] for key in KEPT if key in self.before})
 
     def _claim_name(self, key: str) -> None:
         """Bind a socket name that is visible to all users, whose folders differ."""
@@ -60,7 +69,8 @@ class OwnerLock:
 
     def note(self, fields: dict[str, Any]) -> None:
         """Store a note for the next owner, which ``release`` deletes."""
-        self._write(json.dumps({"pid": os.getpid(), "cell": str(self._cell), **fields}))
+        note = {"pid": os.getpid(), "cell": str(self._cell), **fields}
+        self._write(json.dumps(note) + "\n")
 
     def _write(self, text: str) -> None:
         if self._fd is not None:
@@ -88,8 +98,15 @@ class OwnerLock:
 
 
 def _read(fd: int) -> dict[str, Any]:
-    with contextlib.suppress(OSError, ValueError):
-        owner = json.loads(os.pread(fd, 65536, 0))
+    with contextlib.suppress(OSError):
+        return _parsed(os.pread(fd, LONGEST, 0))
+    return {}
+
+
+def _parsed(text: bytes) -> dict[str, Any]:
+    """Return a note, one line; behind it may be the end of an older one, see ``_write``."""
+    with contextlib.suppress(ValueError):
+        owner = json.loads(text.split(b"\n")[0])
         if isinstance(owner, dict):
             return owner
     return {}

@@ -17,6 +17,7 @@ from gapbridge.bridge.ipc.command_memory import CommandMemory
 from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.ipc.shared_memory import RunMemory
 from gapbridge.bridge.loop.loop import Exit
+from gapbridge.drivers.clock import SYSTEM
 
 PATIENT = ", state_timeout: 0.25"
 
@@ -96,9 +97,9 @@ def test_a_loop_starts_without_its_cells_files_on_the_disk(tmp_path: Path) -> No
     )
     configuration = read_configuration(cell)
     cell.unlink()
-    memory, commands = RunMemory(6), CommandMemory()
+    memory, commands = RunMemory(6, clock=SYSTEM), CommandMemory()
     order = {"may_write": False, "number": 0, "latched": "", "after": 0}
-    loop = LoopProcess(configuration, memory, commands, order, subprocess.DEVNULL)
+    loop = LoopProcess(configuration, memory, commands, order, subprocess.DEVNULL, SYSTEM)
     wait_for(lambda: loop.exit_code is not None, "its end")
     details = [event.get("detail", "") for event in loop.events()]
     loop.close()

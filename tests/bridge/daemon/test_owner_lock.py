@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -51,6 +52,38 @@ def test_a_second_owner_is_refused_in_one_line_and_the_kernel_frees_the_lock() -
         assert lock.before["pid"] == holder.pid  # it did not end in order
     with OwnerLock("host 192.0.2.7", CELL) as lock:
         assert lock.before == {}
+
+
+def test_what_was_latched_outlives_an_owner_that_dies_and_the_next_one() -> None:
+    first = OwnerLock("host 192.0.2.9", CELL)
+    first.acquire()
+    first.note({"latched": "robot not ready: protective stop"})
+    _let_go_as_the_kernel_does(first)
+    second = OwnerLock("host 192.0.2.9", CELL)
+    second.acquire()  # dies before it says anything
+    _let_go_as_the_kernel_does(second)
+    with OwnerLock("host 192.0.2.9", CELL) as lock:
+        assert lock.before["latched"] == "robot not ready: protective stop"
+    with OwnerLock("host 192.0.2.9", CELL) as lock:
+        assert lock.before == {}
+
+
+def test_an_owner_that_died_while_it_wrote_a_shorter_note_did_not_end_in_order() -> None:
+    first = OwnerLock("host 192.0.2.10", CELL)
+    first.acquire()
+    first.note({"latched": 100 * "x"})
+    assert first._fd is not None
+    os.pwrite(first._fd, b'{"pid": 7}\n', 0)  # and the rest was not cut off any more
+    _let_go_as_the_kernel_does(first)
+    with OwnerLock("host 192.0.2.10", CELL) as lock:
+        assert lock.before == {"pid": 7}
+
+
+def _let_go_as_the_kernel_does(lock: OwnerLock) -> None:
+    assert lock._fd is not None
+    os.close(lock._fd)
+    if lock._name is not None:
+        lock._name.close()
 
 
 @pytest.mark.parametrize(
