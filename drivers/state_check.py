@@ -25,6 +25,7 @@ LARGEST: dict[str, float] = {
 """Largest plausible magnitudes of the other vectors of a RobotState, SI units."""
 WRENCH = [FORCE] * 3 + [MOMENT] * 3
 HEAVIEST = 1e3  # kg, of a payload
+LATEST = 1e11  # s, of a clock: 3000 years
 
 
 class SampleCheck:
@@ -58,6 +59,11 @@ class SampleCheck:
 
     def check(self, state: RobotState) -> None:
         """Store a plausible sample. Raises InvalidStateError for an implausible one."""
+        if not abs(state.timestamp) <= LATEST:  # NaN is not; cycles are counted by it
+            raise InvalidStateError(
+                f"timestamp: found {state.timestamp:g} s, expected at most {LATEST:g}",
+                Implausible.VALUE if isfinite(state.timestamp) else Implausible.NOT_FINITE,
+            )
         q = state.actual_q.tolist()
         self._check_bounds("actual_q", q)
         self._check_motion(q, state.timestamp)  # first: a velocity may be computed from the step

@@ -14,6 +14,7 @@ says by ``pytest.fail`` is no matter of time, and always counts.
 
 from __future__ import annotations
 
+import itertools
 import os
 import sys
 import time
@@ -45,15 +46,16 @@ from lateness import CASES, LIMIT, STARVED, Witness, core_waits, longest_wait  #
 from waiting import NICE, WAITING  # noqa: E402
 
 WITNESS = Witness()
+NUMBERS = itertools.count()
 BEGUN = pytest.StashKey[tuple[float, dict[str, float]]]()  # s since 1970; s that threads had waited
 MADE: dict[pytest.FixtureDef[Any], tuple[float, float]] = {}  # s since 1970: begun, ended
 
 
-@pytest.fixture(scope="session", autouse=True)
+@pytest.fixture(autouse=True)
 def state(tmp_path_factory: pytest.TempPathFactory) -> None:
-    """Keep what daemons learn out of the user's own folder."""
+    """Keep what daemons learn out of the user's own folder, and of the next test's daemons."""
     os.environ.pop("STATE_DIRECTORY", None)
-    os.environ["XDG_STATE_HOME"] = str(tmp_path_factory.mktemp("state"))
+    os.environ["XDG_STATE_HOME"] = str(tmp_path_factory.getbasetemp() / f"state-{next(NUMBERS)}")
 
 
 def pytest_configure(config: pytest.Config) -> None:

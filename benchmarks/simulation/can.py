@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+import random
 import struct
 from collections import deque
+from collections.abc import Callable
 from typing import Any
 
 import can as python_can
@@ -20,7 +22,13 @@ from gapbridge.drivers.simulated.can.frame import Frame
 from gapbridge.drivers.simulated.can.piper_node import TARGETS, UNIT, PiperNode
 
 CONTROL = (0x150, 0x151, 0x155, 0x156, 0x157, 0x471)
+STATUS, TEACHING = 0x2A1, 2  # the arm's status; its control mode while it is led by hand
+STATUSES = (1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13)  # of the arm, all but normal
 MOST_WAITING = 5000  # frames that the kernel keeps
+
+
+Frames = tuple[int, bytes, float] | python_can.Message
+"""Identifier, data, s when the arm sampled it; or a frame that is none of the arm's."""
 
 
 class _Node(PiperNode):
@@ -34,8 +42,11 @@ class _Node(PiperNode):
 
     def send(self, identifier: int, data: bytes) -> None:
         """Send one frame."""
+        link = self.link
+        if identifier == STATUS and link.arm_status:
+            data = bytes([data[0], link.arm_status]) + data[2:]
         if identifier not in self.withheld and identifier not in self._lost:
-            self.link.down.send((identifier, data, self.link.world.now))
+            link.down.send((identifier, data, link.world.now))
 
 
 class _Bus:
@@ -43,7 +54,7 @@ class _Bus:
 
     def __init__(self, link: CanLink) -> None:
         self._link, self.generation = link, link.generation
-        self.frames: deque[tuple[int, bytes, float]] = deque(maxlen=MOST_WAITING)
+        self.frames: deque[Frames] = deque(maxlen=MOST_WAITING)
 
     def recv(self, timeout: float) -> Any:
         link = self._link
@@ -51,7 +62,10 @@ class _Bus:
             raise python_can.CanOperationError("Connection reset by peer")
         if not self.frames and not self._wait(timeout):
             return None
-        identifier, data, link.last_sampled = self.frames.popleft()
+        found = self.frames.popleft()
+        if isinstance(found, python_can.Message):
+            return found
+        identifier, data, link.last_sampled = found
         return python_can.Message(
             timestamp=link.world.now, arbitration_id=identifier, is_extended_id=False, data=data,
             check=False,
@@ -97,6 +111,7 @@ class CanLink(SimulatedLink):
         self.waiting: Process | None = None
         self.last_sampled = self.world.now
         self.refuses_frames = False
+        self.arm_status = 0  # reported in place of the arm's own
         self._goal = list(self.controller.q)
         self._seen: dict[int, tuple[float, float]] = {}
         self._safe = True
@@ -167,13 +182,48 @@ class CanLink(SimulatedLink):
             return
         bus.frames.append(message)
         self._look(*message)
+        self._wake()
+
+    def _wake(self) -> None:
         if self.waiting is not None:
             waiting, self.waiting = self.waiting, None
             waiting.wake()
 
+    def flood(self, seconds: float, each: int, frame: Callable[[], python_can.Message]) -> None:
+        """Have so many frames of other nodes reach the client each millisecond."""
+        until = self.world.now + seconds
+
+        def send() -> None:
+            bus = self.bus
+            if bus is not None and bus.generation == self.generation:
+                bus.frames.extend(frame() for _ in range(each))
+                self._wake()
+            if self.world.now < until:
+                self.world.after(1e-3, send)
+
+        send()
+
+    def enter_mode(self, draw: random.Random) -> str:
+        """See SimulatedLink.enter_mode."""
+        if draw.random() < 0.3:
+            self.node.control_mode = TEACHING
+            self.controller.let_go()
+            return "led by hand"
+        self.arm_status = draw.choice(STATUSES)
+        self.controller.protective_stop()
+        return f"arm status {self.arm_status}"
+
+    def leave_mode(self) -> None:
+        """See SimulatedLink.leave_mode."""
+        if self.arm_status:
+            self.arm_status = 0
+            self.controller.unlock()
+        if self.node.control_mode == TEACHING:
+            self.node.control_mode = 0
+
     def _look(self, identifier: int, data: bytes, _: float) -> None:
         """See what a checker sees of a frame: joints in three, the arm's state in one."""
-        if identifier == 0x2A1 and len(data) == 8:
+        if identifier == STATUS and len(data) == 8:
             self._safe = data[1] == 0
         place = identifier - 0x2A5
         if not 0 <= place < 3 or len(data) != 8:
@@ -235,3 +285,18 @@ def spoiled(message: tuple[int, bytes, float], draw: Any) -> tuple[int, bytes, f
     at = draw.randrange(len(data)) if data else 0
     changed = data[:at] + bytes([data[at] ^ (1 << draw.randrange(8))]) + data[at + 1 :]
     return identifier, changed, sampled
+
+
+def foreign_frame(draw: random.Random) -> python_can.Message:
+    """Return a frame that no profile of ours knows, or knows in another form."""
+    extended = draw.random() < 0.3
+    identifier = draw.choice((0x2A5, STATUS)) if extended else draw.randrange(0x300, 0x470)
+    return python_can.Message(
+        arbitration_id=identifier, is_extended_id=extended, data=draw.randbytes(8),
+        is_remote_frame=False, check=False,
+    )  # fmt: skip
+
+
+def error_frame() -> python_can.Message:
+    """Return what an adapter reports of an error on the bus."""
+    return python_can.Message(is_error_frame=True, arbitration_id=0x20000004, data=bytes(8))

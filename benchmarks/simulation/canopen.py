@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import math
 import queue
+import random
 import struct
 import threading
 from collections import deque
@@ -146,6 +147,8 @@ class _Master(Master):
 class CanopenLink(SimulatedLink):
     """Six drives on a bus."""
 
+    looks_again = True  # before the SYNC
+
     def __init__(self, *given: Any) -> None:
         super().__init__(*given)
         self.up.jitter = self.down.jitter = 0.0
@@ -190,6 +193,18 @@ class CanopenLink(SimulatedLink):
             return state
 
         found._read_state = read_state  # type: ignore[method-assign]
+        writer = cast(Any, found.sync_cycle)._writer
+        complete_set = writer.complete_set
+
+        def last_look(now: float) -> None:
+            link.sends = True
+            try:
+                complete_set(now)
+            except LinkError:
+                link.sends = False
+                raise
+
+        writer.complete_set = last_look
         return found
 
     # -- the client waits -------------------------------------------------------------------------
@@ -219,6 +234,7 @@ class CanopenLink(SimulatedLink):
         """Report a frame that leaves the client; a SYNC makes the RPDOs before it a setpoint."""
         profile, base, node = self.profile, cob_id & 0x780, cob_id & 0x7F
         if cob_id == SYNC:
+            self.sends = False
             self._seen.clear()
             sent, self._sent = self._sent, {}
             if len(sent) == profile.n and all(w == ENABLE_OPERATION for w, _ in sent.values()):
@@ -262,9 +278,12 @@ class CanopenLink(SimulatedLink):
         if cob_id & 0x780 == TPDO_BASE:
             self._look(cob_id & 0x7F, data)
             self._sampled_at[cob_id] = sampled
-        received = cast(Any, _Received(cob_id, data, self.world.now))
-        network.listeners[0].on_message_received(received)
-        if network.listeners[0]._collector._over.is_set():
+        self._hand_over(network, cast(Any, _Received(cob_id, data, self.world.now)))
+
+    def _hand_over(self, network: _Network, frame: python_can.Message) -> None:
+        listener = cast(Any, network.listeners[0])
+        listener.on_message_received(frame)
+        if listener._collector._over.is_set():
             self.wake()
 
     def _look(self, node: int, data: bytes) -> None:
@@ -309,6 +328,26 @@ class CanopenLink(SimulatedLink):
         super().heal()
         self.silent.clear()
         self.refuses_frames, self.lost_syncs = False, 0
+
+    def flood(self, seconds: float, each: int, frame: Callable[[], python_can.Message]) -> None:
+        """Have so many frames of other nodes reach the client each millisecond."""
+        until = self.world.now + seconds
+
+        def send() -> None:
+            for _ in range(each if self.network is not None else 0):
+                self._hand_over(cast(_Network, self.network), frame())
+            if self.world.now < until:
+                self.world.after(1e-3, send)
+
+        send()
+
+    def enter_mode(self, draw: random.Random) -> str:
+        """See SimulatedLink.enter_mode: one drive is in another mode or state."""
+        found: str = draw.choice((_state_machine, _mode))(self, draw)
+        return found
+
+    def leave_mode(self) -> None:
+        """See SimulatedLink.leave_mode: arming sets modes and states."""
 
     def foreign(self, seconds: float) -> None:
         """Have another master send SYNCs, for a while."""

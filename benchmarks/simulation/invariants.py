@@ -7,15 +7,20 @@ import re
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from benchmarks.faults.invariants import Checker
 from benchmarks.faults.wire.seen import Fresh, Numbers, Write
 from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.loop.link_monitor import DRIFT, hold_time
 from gapbridge.bridge.loop.supervisor import CLEARED_BY_RECONNECTING, TRANSITIONS, Cause
-from gapbridge.core.state import Setpoint
+from gapbridge.core.state import ENVELOPE, JOINT_LIMIT, JOINT_OFFSET, Setpoint
 
+LONGEST_LIMITED = 2.5  # s: a second, anew where the controller's clock goes back
 MARGIN = 0.01  # s: a cycle of the controller and what computing takes
 LONGEST_LIST = 20
+AT_LIMIT = 1 << ENVELOPE | 1 << JOINT_OFFSET | 1 << JOINT_LIMIT  # of "clamped"
 
 INVARIANTS: dict[str, str] = {
     "envelope": "no offset on the wire is larger than the cell's, counted from where the arm was "
@@ -37,6 +42,11 @@ INVARIANTS: dict[str, str] = {
     "ends": "a stop ends in time, and with a summary",
     "crash": "no process ends by an exception that is none of the product's",
     "recorded": "the cycles handed to the recorder say of each setpoint whether it left",
+    "files": "each cycle is in a file of the recording or reported as lost, whatever disk and "
+    "recorder do; a power cut takes the last second at most",
+    "kept": "a cell file that is wrong ends no motion, and changes nothing",
+    "saturated": "an offset does not stay at its limit: the motion ends",
+    "sensor": "behind no setpoint is a force whose sample came longer ago than it may be old",
     "recovers": "once robot, network and machine are healed, a person can arm again",
 }
 
@@ -79,6 +89,11 @@ class Judge:
         self._acknowledged = False  # since the fault began
         self._fault: str | None = None  # that is latched
         self._heals = False
+        self._in_order = True  # the last daemon ended so
+        self._to_end = False  # somebody wants the motion to end, since it began
+        self._stops = False  # the daemon has been asked to end, armed anew or not
+        self._reloads = False  # a cell file was taken; the loop ends for it, armed anew or not
+        self._configuration = ""  # hash of the cell file that was taken last
         self._last: Numbers = ()  # the values of the last write
         self.writes_noted = 0  # setpoints seen on the wire
         self.oldest = 0.0  # s
@@ -144,17 +159,67 @@ class Judge:
         self._now = float(event["seen"])
         kind = event["kind"]
         if kind == "request":
+            if event["command"] == "arm" and event["by"] == "the cell file" and not self._in_order:
+                self.violate("asked", "the cell file arms after a daemon has died")
             self._asked |= event["command"] == "arm"
+            self._to_end |= event["command"] == "disarm"
             self._acknowledged |= event["command"] == "disarm"
         elif kind == "transition":
             self._changed(State[event["from"]], State[event["to"]], Cause(event["cause"]))
+        elif kind == "configuration":
+            self._read_again(event["ok"], event["hash"])
         elif kind in ("failure", "fault") and self._heals:
             self._fault = None  # the link has ended, and such a fault with it
+
+    def stops(self) -> None:
+        """Note that the daemon has been asked to end."""
+        self._stops = True
+
+    def begins(self, configuration: str, in_order: bool) -> None:
+        """Note that a daemon begins, with which cell file (its hash), and how the last one ended.
+
+        A person who starts it again after it ended in order knows of its faults.
+        """
+        self._configuration, self._in_order = configuration, in_order
+        self._asked = self._acknowledged = self._stops = False
+        if in_order:
+            self._fault = None
+
+    def _read_again(self, fine: bool, configuration: str) -> None:
+        if not fine and configuration != self._configuration:
+            self.violate("kept", "the cell file that was refused is in use")
+        self._configuration = configuration
+        self._reloads |= fine
+
+    def judge_limited(self, rows: NDArray[np.float64], slices: dict[str, slice]) -> None:
+        """Judge how long offsets were at their limits, by the cycles of a daemon."""
+        since = math.nan
+        columns = [rows[:, slices[name].start] for name in ("state", "clamped", "received")]
+        for state, clamped, received in zip(*(c.tolist() for c in columns), strict=True):
+            if state != State.COMPENSATING or not int(clamped) & AT_LIMIT:
+                since = math.nan
+                continue
+            since = received if math.isnan(since) else since
+            if received - since > LONGEST_LIMITED:
+                self.violate("saturated", f"at its limit for {received - since:.2f} s")
+                return
+
+    def felt(self, age: float, most: float) -> None:
+        """Take how long before a state its sensor's last sample had come, and may have, s."""
+        if age > most + MARGIN:
+            self.violate("sensor", f"a force that came {age:.3f} s before")
 
     def _changed(self, before: State, after: State, cause: Cause) -> None:
         if TRANSITIONS.get((before, cause)) != after:
             self.violate("table", f"{before.name} -> {after.name} by {cause}")
+        if before == State.DISCONNECTED:
+            self._reloads = False
+        if cause in (Cause.DISARM, Cause.STOP) and not (
+            self._to_end or self._stops or self._reloads
+        ):
+            self.violate("kept", f"{before.name} -> {after.name} by {cause}: nobody wanted that")
         if after == State.ARMED:
+            self._to_end = False
             if not self._asked:
                 self.violate("asked", "armed without anybody having asked")
             self._asked = False

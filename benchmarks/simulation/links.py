@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import itertools
 import math
+import random
 import shutil
 import tempfile
 from abc import ABC, abstractmethod
@@ -18,7 +19,13 @@ from benchmarks.simulation.cells import CELLS
 from benchmarks.simulation.wires import Wire
 from benchmarks.simulation.world import SimulatedClock, World
 from gapbridge.bridge.cell import Cell, load_cell
-from gapbridge.bridge.cell.run_settings import Configuration, configuration_for, settings_of
+from gapbridge.bridge.cell.run_settings import (
+    Configuration,
+    configuration_for,
+    read_configuration,
+    settings_of,
+)
+from gapbridge.core.errors import GapbridgeError
 from gapbridge.core.state import RobotState
 from gapbridge.drivers.driver import Driver
 from gapbridge.drivers.simulated.plant.kinematics import Joints
@@ -45,6 +52,7 @@ class Setting:
     def __init__(self, name: str) -> None:
         self.name = name
         self._profile: Any = None
+        self._again: dict[str, Configuration | GapbridgeError] = {}
         self.wired = CELLS[name](SIMULATED_RATE[name])
         self._folder = tempfile.TemporaryDirectory(prefix="simulation-")
         path, _ = self.wired.write_cells(Path(self._folder.name), "127.0.0.9", "127.0.0.9", "")
@@ -60,6 +68,31 @@ class Setting:
         self.arm = simulated_arm(
             self.cell.arm, 11, self.wired.start_q, payload_mass=mass, payload_cog=cog, tcp=tcp
         )
+
+    def _read_text(self, text: str) -> Configuration | GapbridgeError:
+        path = self.cell.path
+        before = path.read_text(encoding="utf-8")
+        path.write_text(text, encoding="utf-8")
+        try:
+            return read_configuration(path)
+        except GapbridgeError as error:
+            return error
+        finally:
+            path.write_text(before, encoding="utf-8")
+
+    def read_again(self, kind: str) -> Configuration:
+        """Return what the cell file comes to: "same", "narrow" or "wrong". Raises InputError."""
+        if not self._again:
+            text = self.cell.document.text
+            self._again = {
+                "same": self._read_text(text),
+                "narrow": self._read_text(text.replace("offset: 0.002", "offset: 0.00005")),
+                "wrong": self._read_text(text.replace("offset_rate: ", "offset_rate: -")),
+            }
+        found = self._again[kind]
+        if isinstance(found, GapbridgeError):
+            raise found
+        return found
 
     def make_driver(self, module: Any, kind: type[AnyDriver], clock: SimulatedClock) -> AnyDriver:
         """Return the driver of a new process; ``module`` is the one that reads its profile."""
@@ -103,6 +136,7 @@ class SimulatedLink(ABC):
     """
 
     carries_corruption = True  # of single numbers, as the wire's own checks do not show
+    looks_again = False  # at a setpoint's age, after write_setpoint
 
     def __init__(self, world: World, clock: SimulatedClock, setting: Setting, saw: Saw) -> None:
         self.world, self.clock, self.setting, self.saw = world, clock, setting, saw
@@ -112,14 +146,17 @@ class SimulatedLink(ABC):
         self.up: Wire[Any] = Wire(world, self._on_up)  # from the client
         self.down: Wire[Any] = Wire(world, self._on_down)
         self.pace = 1.0  # of the controller's clock
+        self.pace_of_cycles = 1.0  # of a controller without a clock that says so
+        self.paused_until = 0.0  # the robot's program stands still
         self.rebooting_until = 0.0
         self.refuses_until = 0.0  # no new connection before
         self.freezes_values = False
         self.foreign_until = 0.0
         self.supervisor_state: Callable[[], int] = lambda: -1
+        self.sends = False  # between the last look at a setpoint's age and its leaving
         self.hidden_leap = 0.0  # s, on this connection: see UrLink
         self._sampled: dict[float, float] = {}  # by what a driver stamps its state with -> truth, s
-        world.every(lambda: self.period, self._tick)
+        world.every(lambda: self.period / self.pace_of_cycles, self._tick)
 
     # -- what the client sees ---------------------------------------------------------------------
 
@@ -141,6 +178,7 @@ class SimulatedLink(ABC):
             process.check()
         if kind == "other":  # no part of what must hold
             return
+        self.sends = False
         self.saw(Write(self.world.now, kind, values, where, self.supervisor_state()))
 
     @property
@@ -214,11 +252,26 @@ class SimulatedLink(ABC):
         self.down.heal()
         self.up.is_cut = self.down.is_cut = cut  # connections do not come back by themselves
         controller = self.controller
-        controller.frozen, self.freezes_values, self.pace = False, False, 1.0
+        controller.frozen, self.freezes_values = False, False
+        self.pace = self.pace_of_cycles = 1.0
+        self.leave_mode()
         controller.release_emergency_stop()
         controller.unlock()
-        self.refuses_until = self.foreign_until = 0.0
+        self.refuses_until = self.foreign_until = self.paused_until = 0.0
         self.declare(self.setting.arm[1].payload_mass)
+
+    @abstractmethod
+    def enter_mode(self, draw: random.Random) -> str:
+        """Have the robot be in a mode in which it does not move; returns it in words."""
+
+    @abstractmethod
+    def leave_mode(self) -> None:
+        """Have the robot be ready to move again; its program may have ended."""
+
+    @property
+    def is_paused(self) -> bool:
+        """Return whether the robot's program stands still."""
+        return self.world.now < self.paused_until
 
     def declare(self, mass: float) -> None:
         """Declare another payload in the controller, kg."""

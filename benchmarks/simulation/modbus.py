@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import random
 import struct
 from typing import Any
 
@@ -25,6 +26,8 @@ from gapbridge.drivers.simulated.modbus.server import ModbusServer
 from gapbridge.drivers.simulated.server.arm_controller import ArmController
 
 ADDRESS_MISSING = 2  # exception code
+MODE, RUNNING = 258, 7  # register of the robot's mode, and its value when it can move
+MODES = (-1, 0, 1, 2, 3, 4, 5, 6)  # all others
 
 
 class _Transport(Transport):
@@ -130,6 +133,7 @@ class ModbusLink(SimulatedLink):
         self._server: _Server | None = None
         self._published = self.world.now
         self._image_sampled = self.world.now
+        self.robot_mode = RUNNING
         self._asked_image = self.world.now  # sampling time of the image last answered
 
     @property
@@ -187,7 +191,10 @@ class ModbusLink(SimulatedLink):
 
     def cycle(self) -> None:
         """Have the robot scan its registers."""
+        program, running = self.program, self.program.running
+        program.running = running and not self.is_paused
         self.server.cycle(self.controller)
+        program.running = running
         self._image_sampled = self.world.now
 
     def publish(self) -> None:
@@ -215,6 +222,8 @@ class ModbusLink(SimulatedLink):
         server.lay_out(self.controller)
         table = server._image["input" if function == 4 else "holding"]
         values = [table.get(a, 0) & 0xFFFF for a in range(first, first + count)]
+        if self.robot_mode != RUNNING and 0 <= MODE - first < count:
+            values[MODE - first] = self.robot_mode & 0xFFFF
         return struct.pack(f">BB{count}H", function, 2 * count, *values)
 
     def _answers_bare(self) -> bool:
@@ -231,7 +240,7 @@ class ModbusLink(SimulatedLink):
         self._asked_image = sampled
         controller = self.controller
         if answer[:1] in (b"\x03", b"\x17"):
-            safe = controller.can_move
+            safe = controller.can_move and self.robot_mode == RUNNING
             self.see((math.nan, controller.q, controller.target_q, safe), self._answers_bare())
         requests.take(number, answer)
         process.wake()
@@ -257,6 +266,16 @@ class ModbusLink(SimulatedLink):
         """See SimulatedLink.heal."""
         super().heal()
         self.program.running = True
+
+    def enter_mode(self, draw: random.Random) -> str:
+        """See SimulatedLink.enter_mode."""
+        self.robot_mode = draw.choice(MODES)
+        self.program.running = False
+        return f"robot mode {self.robot_mode}"
+
+    def leave_mode(self) -> None:
+        """See SimulatedLink.leave_mode."""
+        self.robot_mode = RUNNING
 
     def foreign(self, seconds: float) -> None:
         """Have somebody else write the mailbox, for a while."""
@@ -292,3 +311,13 @@ def spoiled(message: tuple[int, int, bytes, float], draw: Any) -> tuple[int, int
     else:
         answer = answer[:2] + bytes(len(answer) - 2)
     return number, generation, answer, sampled
+
+
+def spoiled_request(message: tuple[int, int, bytes], draw: Any) -> tuple[int, int, bytes]:
+    """Return a request with one bit of what it writes wrong."""
+    number, generation, request = message
+    first = {16: 6, 23: 10}.get(request[0], len(request))
+    if first < len(request):
+        at = draw.randrange(first, len(request))
+        request = request[:at] + bytes([request[at] ^ 1 << draw.randrange(8)]) + request[at + 1 :]
+    return number, generation, request

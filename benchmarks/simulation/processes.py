@@ -3,56 +3,163 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
-from contextlib import ExitStack
+import random
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
+from benchmarks.simulation.disk import Disk
 from benchmarks.simulation.links import SimulatedLink
-from benchmarks.simulation.world import Process, SimulatedClock, World
+from benchmarks.simulation.planner import PlannedSource, Planner
+from benchmarks.simulation.recording import Recording
+from benchmarks.simulation.world import Process, SimulatedClock
 from gapbridge.bridge.cell.run_settings import Configuration
+from gapbridge.bridge.cell.sections import LimitSettings
+from gapbridge.bridge.daemon import reload
 from gapbridge.bridge.daemon.daemon import Daemon
+from gapbridge.bridge.daemon.owner_lock import OwnerLock
 from gapbridge.bridge.daemon.processes import LoopProcess
+from gapbridge.bridge.daemon.summary import RunSummary
 from gapbridge.bridge.ipc.command_memory import CommandMemory, Commands
 from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.ipc.shared_memory import Phase, RunMemory, SharedMemory
 from gapbridge.bridge.loop.loop import Exit, Loop
 from gapbridge.bridge.loop.offset_in_force import OffsetInForce
-from gapbridge.bridge.loop.setpoint_stream import SetpointStream
-from gapbridge.bridge.setpoint_source.interpolator import SetpointInterpolator
+from gapbridge.bridge.loop.setpoint_stream import SetpointStream, gate_bounds
 from gapbridge.bridge.setpoint_source.source import Source
 from gapbridge.bridge.setpoint_source.target import TargetSource
 from gapbridge.core.errors import GapbridgeError, InputError
 from gapbridge.core.state import RobotState, Setpoint
 from gapbridge.drivers.driver import Driver
 
-Vector = NDArray[np.float64]
 STARTING = (0.02, 0.15)  # s that a process takes until it runs
 KILLED = -9
 COMPUTING = 1e-4  # s: of a cycle
-PLANNED, PLANNED_JOINT = 0.02, 0  # s between two setpoints of the planner; what it moves
+LOOK = 0.02  # s
+RETRY = 0.3  # s until a daemon that could not start is started again
+
+
+@dataclass(frozen=True)
+class Chance:
+    """What the seed says of a run besides its faults."""
+
+    draw: random.Random
+    later: random.Random | None  # draws what was added later; None: nothing of it
+    planned_joint: int | None  # from 0, that a planner moves; None: no planner
+    is_recorded: bool = False
 
 
 class Run:
-    """One daemon on one link: what all its processes share."""
+    """One daemon after the other on one link: what all its processes share."""
 
-    def __init__(
-        self, world: World, clock: SimulatedClock, link: SimulatedLink, planned: bool
-    ) -> None:
-        self.world, self.clock, self.link = world, clock, link
-        self.planner = Planner(world, link) if planned else None
+    def __init__(self, clock: SimulatedClock, link: SimulatedLink, chance: Chance) -> None:
+        self.world, self.clock, self.link = clock.world, clock, link
+        self.later, self.cell_file = chance.later, "same"
+        joint = chance.planned_joint
+        self.planner = Planner(self.world, link, joint) if joint is not None else None
         self.offset_in_force = OffsetInForce(link.controller.n, None)  # outlives every process
+        self.disk = Disk() if chance.is_recorded else None
+        self.recordings: list[Recording] = []
+        self.owner_note = ""  # of the daemon's lock; the same
+        self.is_marked = False  # in the state folder, which outlives a power cut: a daemon runs
+        self.daemons: list[SimulatedDaemon] = []
         self.loops: list[SimulatedLoop] = []
-        self.events: list[dict[str, Any]] = []
         self.left = 0  # setpoints that have left whole
         self.on_send: Callable[[Setpoint], None] = lambda _: None
+        self.on_stop: Callable[[], None] = lambda: None
+        self.on_death: Callable[[], None] = lambda: None
+        self.on_start: Callable[[], None] = lambda: None
+        self.not_started: list[Process] = []  # daemons that did not reach the robot
+        self.starts_anew = False  # a daemon that has ended is followed by another
         self.state_behind: RobotState  # the last setpoint
-        configuration = link.setting.configuration
-        self.daemon = SimulatedDaemon(configuration, self)
         link.supervisor_state = self.state
-        self.process = Process(world, "daemon", lambda: self.daemon.run())
+
+    def start(self, arms: bool = False) -> None:
+        """Start a daemon; ``arms``: its cell file says that it arms by itself."""
+        self.starts_anew = False
+        self.daemon = daemon = SimulatedDaemon(self.link.setting.configuration, self)
+        self.daemons.append(daemon)
+        self.on_start()
+
+        def run() -> RunSummary:
+            try:
+                return daemon.run(arms, by="the cell file")
+            except GapbridgeError:
+                if len(self.daemons) > 1:  # the robot cannot be reached just now
+                    self.not_started.append(self.process)
+                    self.start_anew(RETRY, arms)
+                raise
+
+        self.process = Process(self.world, f"daemon {len(self.daemons)}", run)
+        self._record(daemon, self.process)
+
+    def _record(self, daemon: SimulatedDaemon, process: Process) -> None:
+        if self.disk is None:
+            return
+        session = f"run-{len(self.daemons)}"
+        recording = Recording(self.disk, self.clock, daemon.memory, session)
+        first = len(self.loops)
+
+        def is_over() -> bool:
+            loops = [loop.process for loop in self.loops[first:]]
+            return all(p.over or p.dead for p in (process, *loops))
+
+        recording.is_over = is_over
+        self.recordings.append(recording)
+
+    def cut_power(self) -> None:
+        """End all processes at once, with all that is in memory and not on the disk."""
+        self.process.kill()
+        if self.loops:
+            self.loops[-1].kill()
+        if self.disk is not None:
+            self.recordings[-1].cut_power()
+            self.disk.cut_power()
+        self.owner_note = ""
+        self.on_death()
+
+    @property
+    def compensates(self) -> bool:
+        """Return whether a daemon runs that says so."""
+        ended = self.process.over or self.process.dead
+        return not ended and self.daemon.state == State.COMPENSATING
+
+    @property
+    def is_over(self) -> bool:
+        """Return whether no daemon runs, and none will."""
+        return not self.starts_anew and (self.process.over or self.process.dead)
+
+    def stop(self) -> None:
+        """Ask the daemon to end."""
+        self.on_stop()
+        self.daemon.stop()
+
+    def start_anew(self, seconds: float, arms: bool) -> None:
+        """Start another daemon in so many seconds, at the earliest once all of this one is gone.
+
+        That is what a service manager does.
+        """
+        self.starts_anew = True
+
+        def begin() -> None:
+            if not self.starts_anew:
+                return
+            ended = [self.process, *(loop.process for loop in self.loops[-1:])]
+            ended += [recording.process for recording in self.recordings[-1:]]
+            if all(process.over or process.dead for process in ended):
+                self.start(arms)
+            else:
+                self.world.after(LOOK, begin)
+
+        self.world.after(seconds, begin)
+
+    def kill_daemon(self) -> None:
+        """End the daemon at once: its loop hears of that from the system."""
+        self.process.kill()
+        if self.loops:
+            self.loops[-1].end_with_parent()
+        self.on_death()
 
     def state(self) -> int:
         """Return the supervisor's state, as the loop itself knows it."""
@@ -62,18 +169,37 @@ class Run:
 
 
 class SimulatedDaemon(Daemon):
-    """The product's daemon without locks, sockets and side processes."""
+    """The product's daemon without sockets and side processes."""
 
     def __init__(self, configuration: Configuration, run: Run) -> None:
         self._run = run
-        super().__init__(configuration, may_write=True, log=self._note, clock=run.clock)
+        super().__init__(configuration, may_write=True, clock=run.clock)
         self.loop_process = lambda *given: SimulatedLoop(run, *given)  # type: ignore[assignment]
 
-    def _note(self, event: dict[str, Any]) -> None:
-        self._run.events.append({**event, "seen": self._run.world.now})
-
     def _open(self, stack: ExitStack, arm: bool, by: str) -> bool:
-        return arm
+        return self._take_over(stack.enter_context(_Lock(self._run)), arm, by)
+
+
+class _Lock(OwnerLock):
+    """The product's, whose file is the run's."""
+
+    def __init__(self, run: Run) -> None:
+        super().__init__("", run.link.setting.cell.path)
+        self._run = run
+
+    def acquire(self) -> None:
+        """See OwnerLock.acquire; a daemon that is gone holds nothing."""
+        self._take_over(self._run.owner_note.encode())
+
+    def _write(self, text: str) -> None:
+        self._run.owner_note = text
+
+    def _mark(self) -> bool:
+        marked, self._run.is_marked = self._run.is_marked, True
+        return marked
+
+    def _remove_mark(self) -> None:
+        self._run.is_marked = False
 
 
 class SimulatedLoop(LoopProcess):
@@ -101,7 +227,7 @@ class SimulatedLoop(LoopProcess):
         try:
             memory = SharedMemory(self.memory.n, self._fds[0], clock=run.clock)
             memory.enter(Phase.STARTING)
-            driver = _watched(run, run.link.driver())
+            driver = _watched(run, run.link.driver(), self._settings.limits)
             source = _source(run)
             loop = self.loop = _Loop(
                 self._settings, run.link.setting.cell.model, driver, source, memory, self._emit,
@@ -142,6 +268,13 @@ class SimulatedLoop(LoopProcess):
         found, self._reported = self._reported, []
         return found
 
+    def end_with_parent(self) -> None:
+        """Ramp out and end: the daemon is gone (see bridge/loop/main.py)."""
+        if self.loop is None:
+            self.kill()
+        else:
+            self.loop.request_stop()
+
     def kill(self) -> None:
         """See LoopProcess."""
         if not self.process.over:
@@ -175,11 +308,9 @@ def _note_states(run: Run, stream: SetpointStream) -> None:
     stream.advance = noted  # type: ignore[method-assign]
 
 
-def _watched(run: Run, driver: Driver) -> Driver:
+def _watched(run: Run, driver: Driver, limits: LimitSettings) -> Driver:
     """Return a driver whose setpoints are noted as they are handed to it."""
-    from gapbridge.bridge.loop.setpoint_stream import gate_bounds
-
-    driver.gate.set_bounds(gate_bounds(run.link.setting.configuration.settings.limits))
+    driver.gate.set_bounds(gate_bounds(limits))
     send = driver._send
 
     def noted(setpoint: Setpoint) -> None:
@@ -196,7 +327,11 @@ def _watched(run: Run, driver: Driver) -> Driver:
             raise
 
     def counted(setpoint: Setpoint) -> None:
-        write(setpoint)
+        run.link.sends = not run.link.looks_again
+        try:
+            write(setpoint)
+        finally:
+            run.link.sends = False
         run.left += 1
 
     driver.read_state = timed  # type: ignore[method-assign]
@@ -209,7 +344,7 @@ def _source(run: Run) -> Source:
     setting, link = run.link.setting, run.link
     settings = setting.configuration.settings.setpoints
     moves_arm = setting.wired.moves_arm
-    kind: Any = TargetSource if run.planner is None or not moves_arm else PlannedSource
+    kind: Any = TargetSource if run.planner is None else PlannedSource
     source: Source = kind(
         settings, link.controller.n, moves_arm, setting.cell.path.parent, setting.wired.rate
     )
@@ -219,57 +354,13 @@ def _source(run: Run) -> Source:
     return source
 
 
-class Planner:
-    """Sends setpoints: a slow circle of one joint about where the arm stands, or nonsense."""
-
-    def __init__(self, world: World, link: SimulatedLink) -> None:
-        self._world, self._link = world, link
-        self.take: Callable[[Vector], None] = lambda _: None
-        self.silent_until = 0.0
-        self.nonsense: Callable[[Vector], Vector] | None = None
-        self._at: Vector | None = None
-        self._time = 0.0
-        world.every(lambda: PLANNED, self._send)
-
-    def _send(self) -> None:
-        if self._at is None or self._link.supervisor_state() != State.COMPENSATING:
-            self._at, self._time = np.array(self._link.controller.q), 0.0  # begins there
-        if self._world.now < self.silent_until:
-            return
-        self._time += PLANNED
-        q = self._at.copy()
-        q[PLANNED_JOINT] += 0.02 * np.sin(0.5 * self._time) ** 2
-        if self.nonsense is not None:
-            q = self.nonsense(q)
-        self.take(q)
-
-
-class PlannedSource(Source):
-    """What a planner sends, by the product's own interpolator; its socket is not simulated."""
-
-    def attach(self, planner: Planner, clock: SimulatedClock) -> None:
-        """Take what the planner sends from now on."""
-        self._interpolator = SetpointInterpolator(self.settings.timeout, "line", clock)
-        planner.take = self._take
-
-    def _take(self, q: Vector) -> None:
-        if not np.isfinite(q).all():
-            return  # a line that is no setpoint never comes so far
-        self._interpolator.take(q)
-        self._interpolator.restart()
-
-    def discard(self) -> None:
-        """See Source.discard."""
-        self._interpolator.forget()
-
-    def first(self, robot_q: Vector) -> Vector | None:
-        """See Source.first."""
-        return self._interpolator.first()
-
-    def begin(self, timestamp: float, robot_q: Vector) -> None:
-        """See Source.begin."""
-        self._interpolator.begin(robot_q)
-
-    def sample(self, timestamp: float, robot_q: Vector) -> Vector:
-        """See Source.sample."""
-        return self._interpolator.sample()
+@contextmanager
+def cell_files(run: Run) -> Iterator[None]:
+    """Have the daemon find the run's cell file when it reads it again."""
+    before = reload.read_configuration, reload.cell_errors
+    reload.read_configuration = lambda _: run.link.setting.read_again(run.cell_file)
+    reload.cell_errors = lambda _: []
+    try:
+        yield
+    finally:
+        reload.read_configuration, reload.cell_errors = before

@@ -142,6 +142,7 @@ class SensorLink(UrLink):
         self._streams = False
         self._half: SensorFrame | None = None
         self.sensed = self.world.now  # s: when the newest whole sample was measured
+        self.arrived = self.world.now  # s: when it was here
         self.world.every(lambda: 1.0 / sensor.rate, self._measure)
 
     def driver(self) -> Driver:
@@ -182,6 +183,8 @@ class SensorLink(UrLink):
         elif self._half is not None and frame.arbitration_id == second:
             whole = self._half.sampled == frame.sampled and not self.overloaded
             self.sensed = frame.sampled if whole else self.sensed
+            if not self.overloaded:
+                self.arrived = self.world.now
         bus.take(frame)
 
     def lose_bus(self, seconds: float) -> None:

@@ -10,11 +10,13 @@ from typing import Any
 from benchmarks.faults.invariants import Checker
 from benchmarks.simulation.can import CanLink
 from benchmarks.simulation.canopen import CanopenLink
-from benchmarks.simulation.faults import FAULTS, Fault, drawn
+from benchmarks.simulation.disk import recorded_on
+from benchmarks.simulation.faults import ALL, Fault, drawn
 from benchmarks.simulation.invariants import Judge, Violation
-from benchmarks.simulation.links import SimulatedLink, setting_of
+from benchmarks.simulation.links import Setting, SimulatedLink, setting_of
 from benchmarks.simulation.modbus import ModbusLink
-from benchmarks.simulation.processes import PLANNED_JOINT, Run
+from benchmarks.simulation.process_faults import cut_power, fill_disk, kill_recorder
+from benchmarks.simulation.processes import Chance, Run, cell_files
 from benchmarks.simulation.sensor import SensorLink
 from benchmarks.simulation.ur import UrLink, library
 from benchmarks.simulation.world import BEGIN, Process, SimulatedClock, World
@@ -62,30 +64,32 @@ def run(
     seed: int,
     say: Any = None,
     plan: Sequence[tuple[float, str]] | None = None,
+    later: bool = True,
     on: str | None = None,
 ) -> Outcome:
     """Run one seed; ``say`` gets every event.
 
     ``plan``: faults by name, each with its moment (s after the first could be), in place of those
-    that the seed draws; ``on``: the link, in place of the seed's.
+    that the seed draws. ``later`` False: without all that was added to the simulation later, so
+    that a seed is the run in which it found something then. ``on``: the link, in place of the
+    seed's.
     """
-    draw = random.Random(f"faults {seed}")
     name = on or list(LINKS)[seed % len(LINKS)]
     world = World(seed)
     clock = SimulatedClock(world)
     setting = setting_of(name)
-    planned = setting.wired.moves_arm and draw.random() < 0.4
-    checker = Checker(setting.bounds)
-    if planned:  # offsets are what the other joints do
-        checker._planned = (PLANNED_JOINT, setting.wired.start_q[PLANNED_JOINT])
+    chance, faults = _fate(seed, setting, plan, later)
+    checker, joint = Checker(setting.bounds), chance.planned_joint
+    if joint is not None:  # offsets are what the other joints do
+        checker._planned = (joint, setting.wired.start_q[joint])
     judge = Judge(checker, BEGIN, setting.wired.rate)
     link = LINKS[name](world, clock, setting, judge.saw)
-    modules = link.modules() if isinstance(link, UrLink) else {}
     outcome = Outcome(seed, name)
-    with library(modules):
-        found = Run(world, clock, link, planned)
+    found = Run(clock, link, chance)
+    with library(link), cell_files(found), recorded_on(found.disk):
         _listen(found, judge, say)
-        person = Person(found, judge, draw, outcome, _planned(draw, name, plan))
+        found.start()
+        person = Person(found, judge, chance.draw, outcome, faults)
         try:
             world.run(BEGIN + 4 * RECOVERY, lambda: person.done)
             _judge_end(found, judge, person)
@@ -93,25 +97,44 @@ def run(
             world.end()
             for loop in found.loops:
                 loop.let_go()
-            found.daemon._commands.close()
-            found.daemon.memory.close()
+            for recording in found.recordings:
+                recording.let_go()
+            for daemon in found.daemons:
+                daemon._commands.close()
+                daemon.memory.close()
     outcome.violations, outcome.writes = judge.violations, judge.writes_noted
     outcome.oldest, outcome.hidden = judge.oldest, judge.hidden
     outcome.seconds = world.now - BEGIN
     return outcome
 
 
-def _planned(draw: random.Random, link: str, given: Sequence[tuple[float, str]] | None) -> Plan:
-    """Return which faults happen when, s after the first could."""
+def plan_of(seed: int) -> Plan:
+    """Return which faults a seed has, each with its moment."""
+    return _fate(seed, setting_of(list(LINKS)[seed % len(LINKS)]), None, later=True)[1]
+
+
+def _fate(
+    seed: int, setting: Setting, given: Sequence[tuple[float, str]] | None, later: bool
+) -> tuple[Chance, Plan]:
+    """Return what a seed says of a run, and which faults happen when, s after the first could."""
+    draw = random.Random(f"faults {seed}")
+    more = random.Random(f"later {seed}") if later else None
+    moves_arm = setting.wired.moves_arm
+    joint = 0 if moves_arm and draw.random() < 0.4 else None
+    if more is not None and moves_arm and more.random() < 0.5:
+        joint = 0  # turns about gravity: its own offset is none, and the checker leaves it out
     if given is not None:
-        by_name = {fault.name: fault for fault in FAULTS}
-        return [(moment, by_name[name]) for moment, name in given]
-    faults = drawn(draw, link, draw.randint(0, MOST_FAULTS))
-    return list(zip(sorted(draw.uniform(0.0, SPAN) for _ in faults), faults, strict=True))
+        by_name = {fault.name: fault for fault in ALL}
+        plan = [(moment, by_name[name]) for moment, name in given]
+    else:
+        faults = drawn(draw, more, setting.name, draw.randint(0, MOST_FAULTS))
+        plan = list(zip(sorted(draw.uniform(0.0, SPAN) for _ in faults), faults, strict=True))
+    is_recorded = any(fault.make in (fill_disk, kill_recorder, cut_power) for _, fault in plan)
+    return Chance(draw, more, joint, is_recorded), plan
 
 
 def _listen(run: Run, judge: Judge, say: Any) -> None:
-    events, link = run.daemon.event_log, run.link
+    link = run.link
 
     def noted(event: dict[str, Any]) -> None:
         whole = {**event, "seen": run.world.now}
@@ -121,12 +144,19 @@ def _listen(run: Run, judge: Judge, say: Any) -> None:
             words = " ".join(str(event[k]) for k in keys if k in event)
             say(f"{run.world.now - BEGIN:9.4f} {words}")
 
+    def started() -> None:
+        events = run.daemon.event_log
+        judge.begins(run.daemon.configuration.hash, in_order=not (run.owner_note or run.is_marked))
+        events._listeners = (*events._listeners, noted)
+
     def sent(setpoint: Setpoint) -> None:
-        sampled = link.sampled_at(run.state_behind)
+        state = run.state_behind
+        sampled = link.sampled_at(state)
+        if isinstance(link, SensorLink) and state.ft_raw_wrench is not None:
+            judge.felt(state.received - link.arrived, link.sensor_settings.max_age)
         judge.sent(setpoint, sampled, run.world.now, link.hidden_leap)
 
-    events._listeners = (*events._listeners, noted)
-    run.on_send = sent
+    run.on_send, run.on_stop, run.on_start = sent, judge.stops, started
 
 
 class Person(Process):
@@ -140,6 +170,7 @@ class Person(Process):
         self.done = False
         self.ended_in_time = True
         super().__init__(run.world, "person", self._act)
+        run.on_death = self.wake  # who waits for an answer gets none
 
     def _act(self) -> None:
         run, world, draw = self._of, self.world, self._draw
@@ -159,15 +190,18 @@ class Person(Process):
         if not self._over:
             self._recover()
         asked = world.now
-        run.daemon.stop()
+        run.stop()
+        run.starts_anew = False
         while not self._over and world.now < asked + ENDING:
+            self.sleep(LOOK)
+        while run.recordings and not run.recordings[-1].is_closed and world.now < asked + ENDING:
             self.sleep(LOOK)
         self.ended_in_time = self._over
         self.done = True
 
     @property
     def _over(self) -> bool:
-        return self._of.process.over
+        return self._of.is_over
 
     def _until(self, time: float) -> None:
         while self.world.now < time and not self._over:
@@ -183,8 +217,24 @@ class Person(Process):
 
     def _ask(self, command: str) -> dict[str, Any]:
         """Ask as the control socket does, and see whether what is answered is so."""
-        daemon = self._of.daemon
-        answer = daemon.control.answer(command, Peer(1, 1000))
+        process, daemon = self._of.process, self._of.daemon
+        answers = list[dict[str, Any]]()
+
+        def ask() -> None:
+            try:
+                answers.append(daemon.control.answer(command, Peer(1, 1000)))
+            finally:
+                self.wake()
+
+        if process.dead or process.over:
+            return {"ok": False, "error": "found no daemon"}
+        request = Process(self.world, "request", ask)
+        while not request.over and not process.dead:
+            self.sleep(RECOVERY)
+        if not answers:
+            request.kill()
+            return {"ok": False, "error": "the daemon is gone"}
+        answer = answers[0]
         observes = answer["ok"] and str(answer["answer"]).endswith("observing")
         if observes and (daemon.state != State.OBSERVING or daemon.latched):
             self._judge.violate("taken", f"{command}: {answer}, in {daemon.state.name}")
@@ -198,19 +248,22 @@ class Person(Process):
         if run.planner is not None:
             run.planner.silent_until, run.planner.nonsense = 0.0, None
         answer: dict[str, Any] = {}
-        if run.daemon._stopping.is_set():
+        if run.daemon._stopping.is_set() and not run.starts_anew:
             return
+        if run.disk is not None:
+            run.disk.is_full = False
+        run.cell_file = "same"
         compensators = [p.loop._stream._compensator for p in run.loops if p.loop is not None]
         for compensator in compensators:
             compensator.__dict__.pop("correct", None)
         while self.world.now < until and not self._over:
             self.sleep(ASKING)
-            if run.daemon.state == State.COMPENSATING:
+            if run.compensates:
                 return
             run.link.heal()
             self._ask("disarm")
             answer = self._ask("arm")
-            if run.daemon.state == State.COMPENSATING:
+            if run.compensates:
                 return
         words = f"{run.daemon.state.name} in the end; {answer.get('error') or answer}"
         if self._over:
@@ -221,23 +274,30 @@ class Person(Process):
 def _judge_end(run: Run, judge: Judge, person: Person) -> None:
     """Judge what can be judged only when all is over."""
     judge._now = run.world.now
-    for process in (run.process, person, *(loop.process for loop in run.loops)):
-        if process.error:
+    for process in run.world.processes:
+        if process.error and process not in run.not_started:
             last = process.error.strip().splitlines()
             judge.violate("crash", f"{process.name}: {last[-1]} ({' '.join(last[-3:-1])})")
     if not person.done:
         judge.violate("ends", "the run did not come to its end")
     elif not person.ended_in_time:
         judge.violate("ends", f"not over {ENDING:g} s after the stop")
-    elif not run.process.error and run.process.result is None:
+    elif not run.process.error and not run.process.dead and run.process.result is None:
         judge.violate("ends", "there is no summary")
     taken, last = run.daemon.last_taken, run.daemon._commands.last
     if person.done and taken > last:
         judge.violate("taken", f"{taken} taken of {last}")
-    slices = run.daemon.memory.slices
-    written = run.daemon.memory.written
-    rows, _ = run.daemon.memory.rows(0, written)
-    left = int((rows[:, slices["written"]] == 1.0).sum())
+    left = 0
+    for daemon in run.daemons:
+        memory = daemon.memory
+        rows, _ = memory.rows(0, memory.written)
+        judge.judge_limited(rows, memory.slices)
+        left += int((rows[:, memory.slices["written"]] == 1.0).sum())
+    for recording in run.recordings:
+        if person.ended_in_time and (missing := recording.missing()):
+            judge.violate(
+                "files", f"{missing} cycles are in no file, and none was reported as lost"
+            )
     deaths = sum(loop.process.dead for loop in run.loops)
     if not left <= run.left <= left + deaths:
         judge.violate("recorded", f"{run.left} setpoints were sent, {left} are recorded")

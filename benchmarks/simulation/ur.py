@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+import random
 import sys
 import types
 from collections.abc import Iterator
@@ -31,6 +32,7 @@ from gapbridge.drivers.simulated.ur.programs.offset_program import (
     approach,
 )
 from gapbridge.drivers.ur_rtde import command, registers
+from gapbridge.drivers.ur_rtde import driver as ur_driver
 from gapbridge.drivers.ur_rtde.driver import UrRtdeDriver
 from gapbridge.drivers.ur_rtde.enquiry import TRIES
 
@@ -46,6 +48,14 @@ GETTERS = {
     "getActualTCPPose": "actual_TCP_pose", "getTimestamp": "timestamp",
 }  # fmt: skip
 Packet = dict[str, Any]
+STOPPED = 1 << 10
+MODES = (
+    *((mode, modes.SAFETY_NORMAL, 1) for mode in (-1, 0, 1, 2, 3, 4, 5, 6)),
+    (modes.RUNNING, 4, 1 << 3 | STOPPED), (modes.RUNNING, 5, 1 << 4 | STOPPED),
+    (modes.POWER_OFF, 6, 1 << 5 | 1 << 7 | STOPPED), (modes.RUNNING, 8, 1 << 8 | STOPPED),
+    (modes.RUNNING, 9, 1 << 9 | STOPPED),
+)  # fmt: skip
+"""Robot mode, safety mode and bits in which the arm does not move; stops have their own faults."""
 
 
 class _Driver(UrRtdeDriver):
@@ -56,11 +66,6 @@ class _Driver(UrRtdeDriver):
     def facts(self, state: Any) -> ControllerFacts:
         """Return what the state says: the primary interface is not simulated."""
         return ControllerFacts(n=6, payload=state.payload, q=state.actual_q)
-
-    def round_trip(self) -> float:
-        """Ask the controller, there and back."""
-        self._way = found = median(self.link.ask() for _ in range(TRIES))
-        return found
 
 
 class UrLink(SimulatedLink):
@@ -75,6 +80,8 @@ class UrLink(SimulatedLink):
         self.program = self.offsets  # the robot's own program runs
         self.speed = 1.0
         self.refuses_servo = False
+        self.is_remote = True  # the controller takes scripts from clients
+        self.mode: tuple[int, int, int] | None = None  # in which it does not move; None: it can
         self._kicked = 0.0
         self._watchdog = 0.25  # s
         self._since_cut = math.inf
@@ -150,7 +157,7 @@ class UrLink(SimulatedLink):
     def heal(self) -> None:
         """See SimulatedLink.heal."""
         super().heal()
-        self.speed, self.refuses_servo = 1.0, False
+        self.speed, self.refuses_servo, self.is_remote = 1.0, False, True
         self.controller.declared.set_tcp(self.setting.arm[1].tcp)
         if self.offsets and not self.program:
             self.program, self._registers = True, None
@@ -170,6 +177,8 @@ class UrLink(SimulatedLink):
 
     def _run_program(self) -> None:
         controller, memory = self.controller, self._inputs
+        if self.is_paused:
+            return
         if not self.program or not controller.can_move:
             self.program = self.program and controller.can_move
             self._registers, self._applied = None, NOTHING
@@ -226,7 +235,12 @@ class UrLink(SimulatedLink):
             safety = modes.SAFETY_PROTECTIVE
         if controller.emergency:
             safety, mode = modes.SAFETY_ROBOT_EMERGENCY, modes.POWER_OFF
-        playing = self.program if self.offsets else self.script
+        bits = modes.SAFETY_BITS[safety]
+        if self.mode is not None:
+            mode, safety, bits = self.mode
+        playing = modes.STOPPED
+        if self.program if self.offsets else self.script:
+            playing = modes.PAUSED if self.is_paused else modes.PLAYING
         q = controller.q
         if self.freezes_values:
             q = self._kept_q or q
@@ -238,8 +252,7 @@ class UrLink(SimulatedLink):
             "joint_temperatures": list(controller.temperatures), "actual_current": [0.8] * 6,
             "payload_cog": list(controller.declared.payload_cog),
             "payload": controller.declared.payload_mass, "robot_mode": mode,
-            "safety_mode": safety, "safety_status_bits": modes.SAFETY_BITS[safety],
-            "runtime_state": modes.PLAYING if playing else modes.STOPPED,
+            "safety_mode": safety, "safety_status_bits": bits, "runtime_state": playing,
             "speed_scaling": self.speed,
             "actual_TCP_pose": list(controller.memory["actual_TCP_pose"]),
             "ints": {12: self._inputs.get("output_int_register_12", 0),
@@ -282,6 +295,8 @@ class UrLink(SimulatedLink):
         if self.world.now < self.rebooting_until:
             return
         if kind == "script":
+            if not self.is_remote:
+                return
             self.script, self._kicked = controller.can_move, self.world.now
         elif kind == "watchdog":
             self._watchdog, self._kicked = 1.0 / value, self.world.now
@@ -290,11 +305,23 @@ class UrLink(SimulatedLink):
         elif kind == "stop":
             self.script = False
             controller.let_go()
-        elif kind == "servo" and self.script:
+        elif kind == "servo" and self.script and not self.is_paused:
             self._kicked = self.world.now
             controller.command(value)
         elif kind == "register":
             self._inputs[value[0]] = value[1]
+
+    def enter_mode(self, draw: random.Random) -> str:
+        """See SimulatedLink.enter_mode."""
+        self.mode = draw.choice(MODES)
+        self.controller.protective_stop()
+        return "robot mode {}, safety mode {}, bits {:#b}".format(*self.mode)
+
+    def leave_mode(self) -> None:
+        """See SimulatedLink.leave_mode."""
+        if self.mode is not None:
+            self.mode = None
+            self.controller.unlock()
 
     def foreign(self, seconds: float) -> None:
         """Have another script be uploaded: it ends the one that runs."""
@@ -415,16 +442,21 @@ def _module(**names: Any) -> types.ModuleType:
 
 
 @contextlib.contextmanager
-def library(modules: dict[str, types.ModuleType]) -> Iterator[None]:
-    """Have the library's modules be these while the ``with`` block lasts."""
+def library(link: SimulatedLink) -> Iterator[None]:
+    """Have the library and the driver's own sockets be this link's while the block lasts."""
+    if not isinstance(link, UrLink):
+        yield
+        return
+    modules = link.modules()
     before = {name: sys.modules.get(name) for name in modules}
-    at_once = command.send_at_once
+    at_once, round_trip = command.send_at_once, ur_driver.round_trip
     sys.modules.update(modules)
     command.send_at_once = lambda: 0
+    ur_driver.round_trip = lambda *_: median(link.ask() for _ in range(TRIES))
     try:
         yield
     finally:
-        command.send_at_once = at_once
+        command.send_at_once, ur_driver.round_trip = at_once, round_trip
         for name, module in before.items():
             if module is None:
                 del sys.modules[name]
@@ -439,3 +471,34 @@ def spoiled(packet: Packet, draw: Any) -> Packet:
     wrong = draw.choice([math.nan, math.inf, -math.inf, 1e300, found["actual_q"][joint] + 0.3])
     found[draw.choice(["actual_q", "actual_q", "actual_qd"])][joint] = wrong
     return found
+
+
+def spoiled_anywhere(packet: Packet, draw: Any) -> Packet:
+    """Return a packet with one number wrong, of any field."""
+    name = draw.choice([key for key in packet if key != "sampled"])
+    value = packet[name]
+    if isinstance(value, dict):
+        key = draw.choice(list(value))
+        return {**packet, name: {**value, key: _wrong(value[key], draw)}}
+    if isinstance(value, list):
+        at = draw.randrange(len(value))
+        return {**packet, name: [*value[:at], _wrong(value[at], draw), *value[at + 1 :]]}
+    return {**packet, name: _wrong(value, draw)}
+
+
+def _wrong(value: float, draw: Any) -> float:
+    if isinstance(value, int):
+        return value ^ 1 << draw.randrange(12)
+    wrong: float = draw.choice([math.nan, math.inf, -math.inf, 1e300, -1.0, 0.0, value + 0.3])
+    return wrong
+
+
+def spoiled_order(message: tuple[str, Any], draw: Any) -> tuple[str, Any]:
+    """Return a message to the controller with a register's value wrong."""
+    kind, value = message
+    if kind != "register":
+        return message
+    register, number = value
+    if isinstance(number, int):
+        return kind, (register, number ^ 1 << draw.randrange(31))
+    return kind, (register, draw.choice([0.0, -number, number + 1e-3]))

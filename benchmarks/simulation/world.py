@@ -23,7 +23,7 @@ BEGIN = 1000.0  # s: no moment is zero by accident
 EPOCH = 1.7e9  # s between the monotonic clock and the calendar
 SLACK = 4e-4  # s by which the system wakes a process late, on average
 ROOT = Path(__file__).parents[2]
-PRODUCT = tuple(f"{ROOT / name}/" for name in ("bridge", "drivers", "core"))
+PRODUCT = f"{ROOT / 'gapbridge'}/"
 
 
 class KilledError(BaseException):
@@ -97,6 +97,7 @@ class Process:
         self.raised: BaseException | None = None
         self.over = self.dead = False
         self._frozen_until = 0.0
+        self._stands = False  # still at a line, while others go on
         self._ticket = 0
         self._begin_tracing: Callable[[], None] | None = None
         self._greenlet = greenlet(self._run)
@@ -116,8 +117,8 @@ class Process:
 
     def _resume(self, ticket: int) -> None:
         world = self.world
-        if self.over or self.dead or ticket != self._ticket:
-            return
+        if self.over or self.dead or self._stands or ticket != self._ticket:
+            return  # one that stands still at a line waits for nothing
         if world.now < self._frozen_until:
             world.at(self._frozen_until, partial(self._resume, ticket))
             return
@@ -148,6 +149,12 @@ class Process:
         """Go no further where it has been killed meanwhile. Raises KilledError."""
         if self.dead:
             raise KilledError
+
+    def _stay(self) -> None:
+        """Go no further where it has just been killed: not even its ``finally`` happens."""
+        parent = self._greenlet.parent
+        if self.dead and parent is not None:
+            parent.switch()  # until ``unwind``
 
     def wake(self) -> None:
         """End its waiting now; from outside."""
@@ -180,7 +187,7 @@ class Process:
                     sys.settrace(None)
                     frame.f_trace = None
                     act()
-                    self.check()
+                    self._stay()
                     return None
             return on_line
 
@@ -193,11 +200,11 @@ class Process:
     def stand_still(self, seconds: float) -> None:
         """Stand still right here while the world goes on; only from within."""
         world, mine = self.world, self
-        world.current = None
+        self._stands, world.current = True, None
         try:
             world.run(world.now + seconds)
         finally:
-            world.current = mine
+            self._stands, world.current = False, mine
 
 
 class SimulatedClock(Clock):
@@ -205,8 +212,9 @@ class SimulatedClock(Clock):
 
     def __init__(self, world: World) -> None:
         self.world = world
+        self.calendar = EPOCH  # s since 1970 at which the monotonic clock was zero
         self.monotonic = lambda: world.now
-        self.time = lambda: EPOCH + world.now
+        self.time = lambda: self.calendar + world.now
         self.sleep = self._sleep
 
     def _sleep(self, seconds: float) -> None:

@@ -35,18 +35,20 @@ def require_envelope(cell: Cell, log: Log, correction: Correction) -> None:
         outside |= wide & (joint * length <= SINGULAR * (away + length * turned))
     if not outside.any():
         return
-    row = int(outside.argmax())
+    row, most = int(outside.argmax()), limits.offset
     if missed[row] > limits.offset:
-        found = f"the corrected setpoint misses the wanted pose by {_mm(missed[row])}"
-        limit = f"{_mm(limits.offset)} (limits.offset"
+        value = above(missed[row], most, 1e3)
+        found = f"the corrected setpoint misses the wanted pose by {value} mm"
+        limit = f"{1e3 * most:g} mm (limits.offset"
     elif away[row] > limits.offset:
-        found = f"the correction moves the TCP by {_mm(away[row])}"
-        limit = f"{_mm(limits.offset)} (limits.offset"
+        found = f"the correction moves the TCP by {above(away[row], most, 1e3)} mm"
+        limit = f"{1e3 * most:g} mm (limits.offset"
     elif turned[row] > limits.offset_rotation:
-        found = f"the correction turns the TCP by {turned[row]:.3g} rad"
+        most = limits.offset_rotation
+        found = f"the correction turns the TCP by {above(turned[row], most)} rad"
         limit = f"{limits.offset_rotation:g} rad (limits.offset_rotation"
     else:
-        found = f"the correction turns a joint by {joint[row]:.3g} rad"
+        found = f"the correction turns a joint by {above(joint[row], limits.joint_offset)} rad"
         limit = f"{limits.joint_offset:g} rad (limits.joint_offset"
     raise InputError(
         f"{log.path}: row {log.line(row)}: {found}, expected at most {limit} of {cell.path})"
@@ -59,5 +61,10 @@ def joint_offsets(log: Log, corrected_q: Array) -> Array:
     return largest
 
 
-def _mm(length: float) -> str:
-    return f"{1e3 * length:.3g} mm"
+def above(value: float, limit: float, factor: float = 1.0) -> str:
+    """Return ``factor`` times a value above a limit, in enough digits to show that it is above."""
+    for digits in range(3, 17):
+        text = f"{factor * value:.{digits}g}"
+        if float(text) > factor * limit:
+            return text
+    return str(factor * value)

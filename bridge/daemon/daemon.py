@@ -115,6 +115,8 @@ class Daemon:
         self._wait = settings.backoff[0]
         self._last_state = State.DISCONNECTED
         self._stopping = threading.Event()
+        self._lock: OwnerLock | None = None
+        self._noted = ""  # what is latched, as the lock's note has it
 
     # -- status and requests ----------------------------------------------------------------------
 
@@ -384,15 +386,30 @@ class Daemon:
         if settings.setpoints.source == "planner":
             where = f"setpoints: a planner writes to {settings.setpoints.socket}"
             self.event_log.add({"kind": EventKind.NOTE, "detail": where})
+        return self._take_over(lock, arm, by)
+
+    def _take_over(self, lock: OwnerLock, arm: bool, by: str) -> bool:
+        """Go on from how the last run ended; returns whether the first loop may arm by itself."""
+        self._lock, self._noted = lock, str(lock.before.get("latched", ""))
+        self._status.restore(self._noted)
         # after a crash --arm from a terminal may arm, a restarted service may not
-        if arm and lock.before and (by != "--arm" or self.manager.present):
-            detail = (
-                f"the run before (process {lock.before.get('pid')}) did not end in order: "
-                "not arming by itself; gapbridge arm"
-            )
+        if arm and (lock.before or lock.problem) and (by != "--arm" or self.manager.present):
+            pid = lock.before.get("pid")
+            process = f" (process {pid})" if pid else ""
+            why = f"the run before{process} did not end in order"
+            if not lock.before:
+                why = f"how the run before ended is not known: {lock.problem}"
+            detail = f"{why}: not arming by itself; gapbridge arm"
             self.event_log.add({"kind": EventKind.REFUSED, "detail": detail})
             return False
         return arm
+
+    def _note_latched(self) -> None:
+        """Have the lock's note say what is latched, for a daemon after this one has died."""
+        latched = self._status.lasting
+        if self._lock is not None and latched != self._noted:
+            self._noted = latched
+            self._lock.note({"latched": latched} if latched else {})
 
     def _pause(self) -> None:
         """Wait before the next process of the loop; the side processes are served meanwhile."""
@@ -517,6 +534,7 @@ class Daemon:
         kind, detail = event["kind"], str(event.get("detail", ""))
         self._status.on_event(event)
         self._kept.on_event(event)
+        self._note_latched()
         self._reload.on_event(event)
         if kind == EventKind.FAILURE:
             self._failure = event

@@ -12,14 +12,21 @@ import sys
 from pathlib import Path
 from typing import Any, Self
 
-from gapbridge.bridge.cell.runtime_folder import runtime_folder
-from gapbridge.core.errors import InputError
+from gapbridge.bridge.cell.runtime_folder import runtime_folder, state_folder
+from gapbridge.bridge.document.output_file import sync_folder, write_text
+from gapbridge.core.errors import InputError, RunError
+
+LONGEST = 65536  # bytes of a note
+KEPT = ("latched",)  # of the last owner's note, until the new owner says otherwise
 
 
 class OwnerLock:
     """Machine-wide exclusive access to one controller.
 
-    ``before``: the note of the last owner, empty if it ended normally.
+    ``before``: the note of the last owner, empty if it ended normally. What is latched is noted
+    from the beginning, so that it also outlives an owner that dies at once. A power failure
+    empties the folder of the lock, so that there is a mark of a run in the state folder, too;
+    ``problem`` says why there is none.
     """
 
     def __init__(self, address: str, cell: Path) -> None:
@@ -27,16 +34,17 @@ class OwnerLock:
         self._cell = cell
         self._fd: int | None = None
         self._name: socket.socket | None = None
+        self._key = hashlib.sha256(address.encode()).hexdigest()[:16]
         self.before: dict[str, Any] = {}
+        self.problem = ""
 
     def acquire(self) -> None:
         """Take the lock. Raises InputError if another daemon has it."""
-        key = hashlib.sha256(self.address.encode()).hexdigest()[:16]
-        path = runtime_folder() / f"{key}.lock"
+        path = runtime_folder() / f"{self._key}.lock"
         fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
         try:
             fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            self._claim_name(key)
+            self._claim_name()
         except OSError:
             owner = _read(fd)
             os.close(fd)
@@ -45,22 +53,51 @@ class OwnerLock:
                 f"{self._cell}: link: {self.address} is in use by another daemon ({who}), "
                 "expected one owner per controller"
             ) from None
-        self._fd, self.before = fd, _read(fd)
-        self.note({})
+        self._fd = fd
+        self._take_over(os.pread(fd, LONGEST, 0))
 
-    def _claim_name(self, key: str) -> None:
+    def _take_over(self, text: bytes) -> None:
+        """Take the last owner's note, and replace it by one of this owner."""
+        self.before = _parsed(text)
+        try:
+            if self._mark() and not self.before:  # the power failed, or /run was emptied
+                self.before = {"cell": str(self._cell)}
+        except (InputError, RunError) as error:
+            self.problem = str(error)
+        self.note({key: self.before[key] for key in KEPT if key in self.before})
+
+    def _claim_name(self) -> None:
         """Bind a socket name that is visible to all users, whose folders differ."""
         if sys.platform.startswith("linux"):
             self._name = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
             try:
-                self._name.bind(f"\0gapbridge-{key}")
+                self._name.bind(f"\0gapbridge-{self._key}")
             except OSError:
                 self._name.close()
                 raise
 
     def note(self, fields: dict[str, Any]) -> None:
         """Store a note for the next owner, which ``release`` deletes."""
-        self._write(json.dumps({"pid": os.getpid(), "cell": str(self._cell), **fields}))
+        note = {"pid": os.getpid(), "cell": str(self._cell), **fields}
+        self._write(json.dumps(note) + "\n")
+
+    def _mark(self) -> bool:
+        """Mark that a run has begun; returns whether there is a mark already.
+
+        Raises InputError, RunError if it cannot be written.
+        """
+        path = self._mark_path()
+        marked = os.path.lexists(path)
+        write_text(path, f"process {os.getpid()}, {self._cell}\n")
+        return marked
+
+    def _remove_mark(self) -> None:
+        path = self._mark_path()
+        path.unlink()
+        sync_folder(path.parent)
+
+    def _mark_path(self) -> Path:
+        return state_folder() / f"{self._key}.running"
 
     def _write(self, text: str) -> None:
         if self._fd is not None:
@@ -72,6 +109,8 @@ class OwnerLock:
     def release(self) -> None:
         """Release the lock after a normal end."""
         self._write("")
+        with contextlib.suppress(OSError, InputError):  # else the next run does not arm by itself
+            self._remove_mark()
         if self._fd is not None:
             os.close(self._fd)
             self._fd = None
@@ -88,8 +127,15 @@ class OwnerLock:
 
 
 def _read(fd: int) -> dict[str, Any]:
-    with contextlib.suppress(OSError, ValueError):
-        owner = json.loads(os.pread(fd, 65536, 0))
+    with contextlib.suppress(OSError):
+        return _parsed(os.pread(fd, LONGEST, 0))
+    return {}
+
+
+def _parsed(text: bytes) -> dict[str, Any]:
+    """Return a note, one line; behind it may be the end of an older one, see ``_write``."""
+    with contextlib.suppress(ValueError):
+        owner = json.loads(text.split(b"\n")[0])
         if isinstance(owner, dict):
             return owner
     return {}

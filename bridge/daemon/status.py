@@ -66,6 +66,15 @@ class DaemonStatus:
         """Return why the joints' zeros are not trusted: slip, failed verification; empty: are."""
         return self._unverified or self._slip
 
+    @property
+    def lasting(self) -> str:
+        """Return what stays latched without this link and this daemon; empty: nothing."""
+        return self._slip or ("" if self._clears_with_link else self._fault)
+
+    def restore(self, fault: str) -> None:
+        """Latch a fault of a daemon that died before it was acknowledged; empty: none."""
+        self._fault = fault
+
     def take(self, rows: Array) -> None:
         """Update from cycles: rows (k, width)."""
         now = self._now()

@@ -8,12 +8,12 @@ of the log. The weakest is removed first; the unnamed functions are then chosen 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gapbridge.core.arrays import Array
+from gapbridge.core.arrays import Array, Mask
 from gapbridge.core.diagnosis.criteria import (
     BATCH_REMOVAL_ROWS,
     BATCH_REMOVAL_STRENGTH,
@@ -36,7 +36,7 @@ from gapbridge.core.diagnosis.regions import parts, regions
 from gapbridge.core.diagnosis.selection.candidate import Candidate, target_of
 from gapbridge.core.diagnosis.selection.delay_columns import shrunk_to_common_delay
 from gapbridge.core.diagnosis.selection.refit import UnnamedPart
-from gapbridge.core.diagnosis.selection.sample_space import gains
+from gapbridge.core.diagnosis.selection.sample_space import SampleSpace, gains
 from gapbridge.core.diagnosis.selection.selection import Selection
 from gapbridge.core.diagnosis.selection.smooth import targets
 from gapbridge.core.estimation.held_out import jackknife
@@ -212,10 +212,17 @@ class _UnnamedFunctions:
             if _models_unknown(k, selection.observation)
         ]
         self._index = np.array(unnamed, dtype=np.int64)
+        # tracking by what a joint holds: the form of a droop that is not quite linear
+        tracking = selection.observation.channel == "tracking"
+        self._forms = {
+            c: basis_of(self.space.columns([c])) for c in unnamed
+            if tracking and _of_held_torque(self.space.candidates[c])
+        }  # fmt: skip
         size = np.diff(self.space.start)[self._index]
         self._penalty = size * np.log(self.space.freedom) + 2 * np.log(max(len(unnamed), 2))
         self._kept = [c for c in selection.best.chosen if c in set(unnamed)]
-        self._first = self._kept  # in the fit of the search
+        # in the fit of the search, the forms of named effects left out: they contain the effects
+        self._first = [c for c in self._kept if c not in self._forms]
         self.current = self._kept  # in the last test
         # a function that moves a joint includes a constant; of a sensor's axis the constant is a
         # bias, whose prior is the size of the function
@@ -233,7 +240,7 @@ class _UnnamedFunctions:
         if len(self.space.y) > BATCH_REMOVAL_ROWS:
             self._kept = chosen
         value, spread, identifiable = self._stable_values(
-            accused, *self._beyond_accused(accused, chosen)
+            accused, *self._unnamed_columns(accused, chosen)
         )
         together = [
             unit_columns(self.space.columns(accused)),
@@ -265,7 +272,8 @@ class _UnnamedFunctions:
 
     def functions_for(self, accused: Sequence[int], most: int = MAX_UNNAMED) -> list[int]:
         """Return the unnamed functions that the residual calls for, penalised for chance alone."""
-        space, chosen = self.space, list(self._kept)
+        space, barred = self.space, self._forms_of_none(accused)
+        chosen = [c for c in self._kept if c not in barred]
         for _ in range(most if len(self._index) else 0):
             zero = self._free_constants(accused)
             basis = basis_of(np.hstack([space.columns(accused), self._columns(chosen), zero]))
@@ -275,11 +283,19 @@ class _UnnamedFunctions:
             gain = (
                 gains(space, residual, basis.T @ space.X)[0][self._index] / variance - self._penalty
             )
-            gain[np.isin(self._index, chosen)] = -np.inf
+            gain[np.isin(self._index, [*chosen, *barred])] = -np.inf
             if gain.max() <= 0:
                 break
             chosen.append(int(self._index[np.argmax(gain)]))
         return chosen
+
+    def _forms_of_none(self, accused: Sequence[int]) -> list[int]:
+        """Return the functions of what a joint holds, where no droop of that joint is accused."""
+        X = unit_columns(self.space.columns(accused))
+        return [
+            c for c, U in self._forms.items()
+            if not (np.einsum("ij,ij->j", U.T @ X, U.T @ X) > CONTAINED_SHARE).any()
+        ]  # fmt: skip
 
     def _free_constants(self, accused: Sequence[int]) -> Array:
         """Return a sensor's constants (m, a) that no accused effect contains: its zero is free.
@@ -304,13 +320,15 @@ class _UnnamedFunctions:
         moved = dict.fromkeys(k.target for k in functions if not k.without_quantity)
         return [t for t in moved if t in self._constant]
 
-    def _constant_sigma(self, accused: Sequence[int], chosen: Sequence[int]) -> Array:
+    def _constant_sigma(
+        self, accused: Sequence[int], chosen: Sequence[int], targets_: Sequence[str]
+    ) -> Array:
         """Return the prior 1 sigma of each constant; inf: free.
 
         Of a sensor's axis it is the size of all unnamed functions of that axis together, relative
         to the scatter of the rows.
         """
-        targets_, space = self._targets(chosen), self.space
+        space = self.space
         if not self._is_sensor:
             width = sum(self._constant[t].shape[1] for t in targets_)
             return np.full(width, np.inf)
@@ -330,35 +348,48 @@ class _UnnamedFunctions:
         size = [scatter * np.linalg.norm(self._constant[t]) for t in targets_]
         return np.array([np.linalg.norm(made[t]) / n for t, n in zip(targets_, size, strict=True)])
 
-    def _beyond_accused(self, accused: Sequence[int], chosen: Sequence[int]) -> tuple[Array, Array]:
-        """Return the unnamed columns and the prior 1 sigma of each.
+    def _unnamed_columns(
+        self, accused: Sequence[int], chosen: Sequence[int]
+    ) -> tuple[Array, Array]:
+        """Return the unnamed columns beyond the accused effects, and the prior 1 sigma of each."""
+        contained = self._contained(accused, chosen)
+        functions = _beyond(self.space, accused, chosen, contained)
+        targets_ = self._free_targets(chosen, contained)
+        constants = [self._constant[t] for t in targets_]
+        free = np.full(functions.shape[1], np.inf)
+        sigma = np.append(free, self._constant_sigma(accused, chosen, targets_))
+        return np.hstack([functions, *constants]), sigma
 
-        Functions that contain an accused effect count only beyond it: a pull in any direction
-        contains every weight, and one that points nearly down is a weight. A function of a joint's
-        own speed contains its delay, and one that is nearly linear is a delay.
+    def _free_targets(self, chosen: Sequence[int], contained: Mapping[int, Mask]) -> list[str]:
+        """Return the targets whose constant is free: a contained form of an effect has its own."""
+        own = {self.space.candidates[c].target for c in contained if c in self._forms}
+        return [
+            t for t in self._targets([c for c in chosen if c not in contained]) if t not in own
+        ]  # fmt: skip
+
+    def _contained(self, accused: Sequence[int], chosen: Sequence[int]) -> dict[int, Mask]:
+        """Return, by unnamed function, which columns of the accused effects it only contains.
+
+        A pull in any direction contains every weight, and one that points nearly down is a weight.
+        A function of a joint's own speed contains its delay, and one that is nearly linear is a
+        delay; a function of the torque that a joint holds contains its droop.
         """
-        space, X, columns = (
-            self.space,
-            unit_columns(self.space.columns(accused)),
-            self._columns(chosen),
-        )
-        constants = self._constant_sigma(accused, chosen)
+        space, X = self.space, unit_columns(self.space.columns(accused))
+        contained: dict[int, Mask] = {}
         for c in chosen:
-            if not (space.candidates[c].without_quantity or _of_own_speed(space.candidates[c])):
+            k = space.candidates[c]
+            if not (k.without_quantity or _of_own_speed(k) or c in self._forms):
                 continue
             U = basis_of(space.columns([c]))
             inside = np.einsum("ij,ij->j", U.T @ X, U.T @ X) > CONTAINED_SHARE
             if not inside.any():
                 continue
-            others = self._columns([o for o in chosen if o != c])
+            others = self._columns([o for o in chosen if o != c and o not in contained])
             basis = basis_of(np.hstack([X[:, ~inside], others]))
             own, whole = (basis_of(projected_out(basis, A)) for A in (X[:, inside], U))
-            if np.sum((own.T @ space.y) ** 2) < DOMINANT_SHARE * np.sum((whole.T @ space.y) ** 2):
-                continue
-            V = basis_of(X[:, inside])
-            columns = np.hstack([projected_out(V, U), others])
-        free = np.full(columns.shape[1] - len(constants), np.inf)
-        return columns, np.concatenate([free, constants])
+            if np.sum((own.T @ space.y) ** 2) > DOMINANT_SHARE * np.sum((whole.T @ space.y) ** 2):
+                contained[c] = inside
+        return contained
 
     def _stable_values(
         self, accused: list[int], columns: Array, sigma: Array
@@ -411,8 +442,11 @@ class _UnnamedFunctions:
         last axis would otherwise be as uncertain as its prior.
         """
         chosen, selection = self.current, self._selection
-        functions, sigma = selection.space.columns(chosen), self._constant_sigma(accused, chosen)
-        constants = [selection.plain_rows_of(self._moved[t]) for t in self._targets(chosen)]
+        contained = self._contained(accused, chosen)
+        functions = _beyond(selection.space, accused, chosen, contained)
+        targets_ = self._free_targets(chosen, contained)
+        sigma = self._constant_sigma(accused, chosen, targets_)
+        constants = [selection.plain_rows_of(self._moved[t]) for t in targets_]
         C = np.hstack([functions[:, :0], *constants])
         V = basis_of(selection.space.columns(accused))
         size = np.maximum(np.linalg.norm(C, axis=0), 1e-300)
@@ -435,19 +469,39 @@ class _UnnamedFunctions:
         )
 
 
+def _beyond(
+    space: SampleSpace, accused: Sequence[int], chosen: Sequence[int],
+    contained: Mapping[int, Mask],
+) -> Array:  # fmt: skip
+    """Return the columns of unnamed functions, beyond the accused effects that they contain."""
+    X, columns = unit_columns(space.columns(accused)), [space.columns([])]
+    for c in chosen:
+        own = space.columns([c])
+        if c in contained:
+            own = projected_out(basis_of(X[:, contained[c]]), basis_of(own))
+        columns.append(own)
+    return np.hstack(columns)
+
+
 def _models_unknown(candidate: Candidate, observation: Observation) -> bool:
     """Return whether a candidate models an unknown effect, not the form of a named one.
 
     In position a function of a joint's own approach is backlash; in torque a function of its own
-    speed is friction; in tracking a function of its own torque is droop.
+    speed is friction. In tracking a function of its own torque is droop: see ``_forms``.
     """
     if candidate.named:
         return False
     if observation.channel == "tracking":
-        return candidate.target != target_of(candidate.quantity, HELD_TORQUE)
+        return True
     if observation.channel == "torque":
         return not _of_own_speed(candidate)
     return candidate.target != target_of(candidate.quantity, "approach")
+
+
+def _of_held_torque(candidate: Candidate) -> bool:
+    """Return whether a candidate moves a joint by a function of the torque that it holds."""
+    own = target_of(candidate.quantity, HELD_TORQUE)
+    return bool(own) and candidate.target == own
 
 
 def _of_own_speed(candidate: Candidate) -> bool:

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import random
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
 from benchmarks.simulation.links import setting_of
+from benchmarks.simulation.processes import Chance, cell_files
 from benchmarks.simulation.processes import Run as SimulatedRun
 from benchmarks.simulation.sequence import LINKS
-from benchmarks.simulation.ur import UrLink, library
+from benchmarks.simulation.ur import library
 from benchmarks.simulation.world import Process, SimulatedClock, World
 from gapbridge.bridge.ipc.control_socket import Peer
 from gapbridge.bridge.ipc.loop_state import State
@@ -20,9 +22,9 @@ def rides_on_a_program(seed: int = 3, arm: bool = True) -> Iterator[tuple[Simula
     """A whole daemon and its loop on a UR's own program, in simulated time; armed or not."""
     world = World(seed)
     link = LINKS["ur_offset"](world, SimulatedClock(world), setting_of("ur_offset"), lambda _: None)
-    assert isinstance(link, UrLink)
-    with library(link.modules()):
-        run = SimulatedRun(world, link.clock, link, planned=False)
+    run = SimulatedRun(link.clock, link, Chance(random.Random(seed), None, None))
+    with library(link), cell_files(run):
+        run.start()
         try:
             until(world, lambda: run.daemon.state == State.OBSERVING)
             if arm:

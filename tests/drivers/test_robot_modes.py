@@ -65,6 +65,16 @@ def test_an_angle_that_no_such_arm_has_is_named(angle: float) -> None:
         check.check(state(np.array([0.0, 0.0, 0.0, angle, 0.0, 0.0]), 1.0))
 
 
+@pytest.mark.parametrize("at", [np.nan, np.inf, -np.inf, 1e300])
+def test_a_time_that_no_clock_shows_is_refused(at: float) -> None:
+    """Cycles are counted by it: an infinite one ended the loop with an OverflowError."""
+    check, q = SampleCheck(ARM), np.zeros(6)
+    check.check(state(q))
+    with pytest.raises(InvalidStateError, match="timestamp: found"):
+        check.check(state(q, at))
+    check.check(state(q, 0.01))
+
+
 @pytest.mark.parametrize("field", ["joint_temperatures", "actual_current_as_torque", "payload_cog"])
 def test_every_vector_that_a_driver_reports_is_checked(field: str) -> None:
     value = np.full(3 if field == "payload_cog" else 6, 0.01)

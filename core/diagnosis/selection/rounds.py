@@ -90,7 +90,8 @@ def select(
             break
     assert result is not None
     space = result.space
-    if len(space.y) >= LARGE_SAMPLE and any(
+    of_joints = observation.channel in ("tracking", "torque")
+    if (of_joints or len(space.y) >= LARGE_SAMPLE) and any(
         not space.candidates[c].named for c in result.best.chosen
     ):
         result = _named_refit(result)

@@ -97,7 +97,7 @@ def test_a_loop_starts_without_its_cells_files_on_the_disk(tmp_path: Path) -> No
     )
     configuration = read_configuration(cell)
     cell.unlink()
-    memory, commands = RunMemory(6, SYSTEM), CommandMemory()
+    memory, commands = RunMemory(6, clock=SYSTEM), CommandMemory()
     order = {"may_write": False, "number": 0, "latched": "", "after": 0}
     loop = LoopProcess(configuration, memory, commands, order, subprocess.DEVNULL, SYSTEM)
     wait_for(lambda: loop.exit_code is not None, "its end")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -14,6 +15,7 @@ from daemon_cell import Robot, Run, gapbridge
 from link_settings import link_settings
 from patience import PATIENCE, wait_for
 
+from gapbridge.bridge.cell.runtime_folder import runtime_folder, state_folder
 from gapbridge.bridge.daemon.owner_lock import OwnerLock
 from gapbridge.bridge.ipc.control_client import ask
 from gapbridge.bridge.ipc.loop_state import State
@@ -51,6 +53,38 @@ def test_a_second_owner_is_refused_in_one_line_and_the_kernel_frees_the_lock() -
         assert lock.before["pid"] == holder.pid  # it did not end in order
     with OwnerLock("host 192.0.2.7", CELL) as lock:
         assert lock.before == {}
+
+
+def test_what_was_latched_outlives_an_owner_that_dies_and_the_next_one() -> None:
+    first = OwnerLock("host 192.0.2.9", CELL)
+    first.acquire()
+    first.note({"latched": "robot not ready: protective stop"})
+    _let_go_as_the_kernel_does(first)
+    second = OwnerLock("host 192.0.2.9", CELL)
+    second.acquire()  # dies before it says anything
+    _let_go_as_the_kernel_does(second)
+    with OwnerLock("host 192.0.2.9", CELL) as lock:
+        assert lock.before["latched"] == "robot not ready: protective stop"
+    with OwnerLock("host 192.0.2.9", CELL) as lock:
+        assert lock.before == {}
+
+
+def test_an_owner_that_died_while_it_wrote_a_shorter_note_did_not_end_in_order() -> None:
+    first = OwnerLock("host 192.0.2.10", CELL)
+    first.acquire()
+    first.note({"latched": 100 * "x"})
+    assert first._fd is not None
+    os.pwrite(first._fd, b'{"pid": 7}\n', 0)  # and the rest was not cut off any more
+    _let_go_as_the_kernel_does(first)
+    with OwnerLock("host 192.0.2.10", CELL) as lock:
+        assert lock.before == {"pid": 7}
+
+
+def _let_go_as_the_kernel_does(lock: OwnerLock) -> None:
+    assert lock._fd is not None
+    os.close(lock._fd)
+    if lock._name is not None:
+        lock._name.close()
 
 
 @pytest.mark.parametrize(
@@ -106,7 +140,10 @@ def test_two_daemons_on_one_robot_the_second_leaves_with_two(robot: Robot) -> No
 
 
 @pytest.mark.slow
-def test_after_kill_nine_the_next_start_works_and_does_not_arm_by_itself(robot: Robot) -> None:
+@pytest.mark.parametrize("power_failure", [False, True])
+def test_after_kill_nine_the_next_start_works_and_does_not_arm_by_itself(
+    robot: Robot, power_failure: bool
+) -> None:
     cell = robot.cell(setpoints="{arm: true}")
     first = gapbridge("run", cell, folder=robot.folder)
     assert first.stdout is not None
@@ -118,6 +155,9 @@ def test_after_kill_nine_the_next_start_works_and_does_not_arm_by_itself(robot: 
     first.wait()
     for pid in [loop, *sides]:
         wait_for(lambda pid=pid: not alive(pid), f"the end of {pid}")
+    if power_failure:  # empties the runtime folder
+        for path in runtime_folder().iterdir():
+            path.unlink()
     second = gapbridge("run", cell, "--duration", "2", folder=robot.folder)
     out, err = second.communicate(timeout=PATIENCE)
     assert err == ""
@@ -139,3 +179,38 @@ def test_the_lock_shows_who_holds_it(tmp_path: Path) -> None:
         (path,) = (tmp_path / "gapbridge").glob("*.lock")
         assert json.loads(path.read_text())["cell"] == "cell.yaml"
         assert path.stat().st_mode & 0o777 == 0o600
+
+
+def test_a_run_that_a_power_failure_ended_is_known_though_the_runtime_folder_is_empty() -> None:
+    with OwnerLock("host 192.0.2.10", CELL) as lock:
+        assert lock.before == {}
+    lock = OwnerLock("host 192.0.2.10", CELL)
+    lock.acquire()  # and no release
+    assert lock.before == {}
+    lock._name.close()
+    for path in runtime_folder().glob("*.lock"):
+        path.unlink()
+    with OwnerLock("host 192.0.2.10", CELL) as after:
+        assert after.before
+        assert after.problem == ""
+    assert not list(state_folder().glob("*.running"))
+    with OwnerLock("host 192.0.2.10", CELL) as next_one:
+        assert next_one.before == {}
+
+
+@pytest.mark.parametrize("garbage", [b"", b"\0" * 100, b"\xff{"])
+def test_whatever_is_in_the_mark_of_a_run_it_was_a_run(garbage: bytes) -> None:
+    with OwnerLock("host 192.0.2.11", CELL):
+        (mark,) = state_folder().glob("*.running")
+    mark.write_bytes(garbage)
+    with OwnerLock("host 192.0.2.11", CELL) as lock:
+        assert lock.before
+
+
+def test_without_a_state_folder_it_is_said_that_nothing_is_known_of_the_run_before(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "file"))
+    with OwnerLock("host 192.0.2.12", CELL) as lock:
+        assert "expected a folder to keep state in" in lock.problem

@@ -158,15 +158,21 @@ def test_nothing_slips_in_noise() -> None:
         assert channel.verdict == "no_gap"
 
 
-def rests(terms: list[Term], q: np.ndarray, loads: Loads) -> dict[str, np.ndarray]:
-    """Return targets and encoders of servos at rest, by hand: no code of the model's."""
+def rests(
+    terms: list[Term], q: np.ndarray, loads: Loads, bend: float = 0.0
+) -> dict[str, np.ndarray]:
+    """Return targets and encoders of servos at rest, by hand: no code of the model's.
+
+    ``bend``: by how much more the droop is at 20 Nm than in proportion to the torque.
+    """
     actual = q.copy()
     for _ in range(4):
         held = MODEL.holding_torque(actual, loads)
         actual = q.copy()
         for term in terms:
             j = term.site.joint - 1
-            by = held[:, j] if term.effect == "servo_droop" else loads.approach[:, j]
+            droops = held[:, j] * (1 + bend * np.abs(held[:, j]) / 20)
+            by = droops if term.effect == "servo_droop" else loads.approach[:, j]
             actual[:, j] -= term.values[0] * by
     noise = 1e-5 * np.random.default_rng(5).standard_normal(q.shape)
     return {"target_q": q, "actual_q": actual + noise}
@@ -198,6 +204,20 @@ def test_a_droop_of_a_wrist_is_found() -> None:
     ((value,),) = ([p.value for p in c.parameters] for c in channel.causes)
     assert channel.causes[0].joints == (5,)
     assert value == pytest.approx(8e-3, rel=0.02)
+
+
+@pytest.mark.parametrize("bend", [0.01, 0.05])
+def test_a_droop_that_is_not_quite_linear_is_named(bend: float) -> None:
+    rng = np.random.default_rng(7)
+    q = np.array([0.2, -1.2, 1.4, -1.0, -1.4, 0.3]) + rng.uniform(-0.8, 0.8, (60, 6))
+    droop = {2: 2e-5, 3: 4e-5, 4: 5e-4}
+    terms = [Term("servo_droop", Site(j), (c,)) for j, c in droop.items()]
+    log = Log("r", rests(terms, q, Loads(), bend), 6)
+    (channel,) = diagnose(MODEL, log).channels
+    assert [(c.effect, c.joints) for c in channel.causes] == [("servo_droop", (2, 3, 4))]
+    assert channel.remaining_rms < 0.2 * channel.gap_rms
+    for p in channel.causes[0].parameters:  # the mean slope, over at most 180 Nm
+        assert 0.9 < p.value / droop[int(p.name[-1])] < 1 + 10 * bend
 
 
 def test_what_joints_hold_is_named_where_droop_is_out_of_the_catalogue() -> None:
