@@ -175,14 +175,15 @@ class Judge:
         """Note that the daemon has been asked to end."""
         self._stops = True
 
-    def begins(self, configuration: str, in_order: bool) -> None:
+    def begins(self, configuration: str, in_order: bool, is_noted: bool) -> None:
         """Note that a daemon begins, with which cell file (its hash), and how the last one ended.
 
-        A person who starts it again after it ended in order knows of its faults.
+        A person who starts it again after it ended in order knows of its faults. ``is_noted``: the
+        last one's note is there, which a power cut takes with it.
         """
         self._configuration, self._in_order = configuration, in_order
         self._asked = self._acknowledged = self._stops = False
-        if in_order:
+        if in_order or not is_noted:
             self._fault = None
 
     def _read_again(self, fine: bool, configuration: str) -> None:

@@ -146,7 +146,8 @@ def _listen(run: Run, judge: Judge, say: Any) -> None:
 
     def started() -> None:
         events = run.daemon.event_log
-        judge.begins(run.daemon.configuration.hash, in_order=not (run.owner_note or run.is_marked))
+        has_note = bool(run.owner_note)
+        judge.begins(run.daemon.configuration.hash, not (has_note or run.is_marked), has_note)
         events._listeners = (*events._listeners, noted)
 
     def sent(setpoint: Setpoint) -> None:

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from benchmarks.simulation import processes
 from benchmarks.simulation.faults import ALL
 from benchmarks.simulation.invariants import INVARIANTS, as_markdown
 from benchmarks.simulation.sequence import LINKS, Outcome, plan_of, run
@@ -438,6 +439,12 @@ def _keeps_the_last_force(patch: Patch) -> None:
 
 def _takes_every_end_for_one_in_order(patch: Patch) -> None:
     patch.setattr(owner_lock, "_parsed", lambda _: {})
+    _forgets_a_run_at_a_power_cut(patch)
+
+
+def _forgets_a_run_at_a_power_cut(patch: Patch) -> None:
+    mark = processes._Lock._mark
+    patch.setattr(processes._Lock, "_mark", lambda lock: mark(lock) and False)
 
 
 def _notes_no_fault(patch: Patch) -> None:
@@ -476,6 +483,7 @@ BREAKS: list[tuple[str, int, list[tuple[float, str]], Break]] = [
     ("crash", MODBUS, [(0.1, "corruption")], _fails_at_dropping),
     ("recorded", CAN, [], _records_too_little),
     ("asked", MODBUS, [(0.1, "daemon dies")], _takes_every_end_for_one_in_order),
+    ("asked", MODBUS, [(0.1, "power cut")], _forgets_a_run_at_a_power_cut),
     (
         "latched",
         CAN,
