@@ -31,6 +31,7 @@ from gapbridge.drivers.driver import Driver
 FOLLOWS = 0x1027  # Statusword: OPERATION ENABLED, and the drive follows the command
 STATE_BITS = 0x106F
 CYCLIC = 8  # cyclic synchronous position
+LOOK = 1e-3  # s between two looks at a lock
 
 
 class BusFrame(NamedTuple):
@@ -158,6 +159,7 @@ class CanopenLink(SimulatedLink):
         self.silent: set[int] = set()  # COB-IDs that no frame leaves by
         self.lost_syncs = 0  # that no drive receives
         self._waiting: Process | None = None
+        self._handed: deque[tuple[_Network, python_can.Message]] = deque()
         self._sent: dict[int, tuple[int, float]] = {}  # node -> Controlword, rad
         self._in_force: tuple[float, ...] = ()  # rad: of the last SYNC
         self._seen: dict[int, tuple[bool, float]] = {}  # node -> follows, rad
@@ -281,10 +283,23 @@ class CanopenLink(SimulatedLink):
         self._hand_over(network, cast(Any, _Received(cob_id, data, self.world.now)))
 
     def _hand_over(self, network: _Network, frame: python_can.Message) -> None:
-        listener = cast(Any, network.listeners[0])
-        listener.on_message_received(frame)
-        if listener._collector._over.is_set():
-            self.wake()
+        self._handed.append((network, frame))
+        if len(self._handed) == 1:
+            self._receive()
+
+    def _receive(self) -> None:
+        """Take frames as the library's thread does: it waits where the loop stands in its lock."""
+        while self._handed:
+            network, frame = self._handed[0]
+            listener = cast(Any, network.listeners[0])
+            if network is self.network and listener._collector._lock.locked():
+                self.world.after(LOOK, self._receive)
+                return
+            self._handed.popleft()
+            if network is self.network:
+                listener.on_message_received(frame)
+                if listener._collector._over.is_set():
+                    self.wake()
 
     def _look(self, node: int, data: bytes) -> None:
         """See what a checker sees of a TPDO: the joint, and whether its drive follows."""

@@ -550,6 +550,11 @@ def test_a_canopen_setpoint_that_may_wait_for_ever_is_found(monkeypatch: Patch) 
     assert any(v.invariant == "fresh" for outcome in outcomes for v in outcome.violations)
 
 
+def test_a_loop_that_stands_in_its_lock_holds_up_who_hands_it_frames() -> None:
+    """Seed 20001832: the run never came to its end."""
+    assert not run(20001832).violations
+
+
 def test_a_drives_fault_is_reset_by_arming_where_the_cell_says_so() -> None:
     """Seed 3: the loop refused to arm a robot in fault before the driver could reset it."""
     plan = [(0.1, "drive fault"), (0.3, "loop dies")]
