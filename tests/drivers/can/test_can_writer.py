@@ -6,11 +6,11 @@ import can
 import numpy as np
 import pytest
 
-from gapbridge.core.errors import PartialWriteError
+from gapbridge.core.errors import PartialWriteError, WriteError
 from gapbridge.drivers.can.loading import read_profile
 from gapbridge.drivers.can.settings import CanSettings
 from gapbridge.drivers.can.writer import FrameWriter
-from gapbridge.drivers.clock import SYSTEM
+from gapbridge.drivers.clock import SYSTEM, Clock
 
 
 class Bus:
@@ -71,3 +71,20 @@ def test_the_target_is_the_last_setpoint_that_left_whole(
         writer.write(q)
     assert writer.target is not None
     np.testing.assert_array_equal(writer.target, np.zeros(6))
+
+
+def test_a_sequence_that_comes_to_no_end_is_given_up_in_time() -> None:
+    profile = read_profile(CanSettings.shipped / "piper.yaml")
+    now, clock = [0.0], Clock()
+    clock.monotonic = lambda: now[0]
+    writer = FrameWriter(CanSettings(profile="piper"), profile, clock)
+    writer.use(Bus())
+    action = next(a for a in profile.enable if a.until is not None)
+
+    def listen(seconds: float) -> None:
+        now[0] += seconds
+        assert now[0] < 2 * action.within + 1.0
+
+    with pytest.raises(WriteError, match=f"not {action.until} after {action.within:g} s"):
+        writer.run([action], lambda: np.zeros(6), listen, lambda _: False)
+    assert now[0] <= action.within + 2 * action.every
