@@ -205,7 +205,7 @@ class Judge:
                 self.violate("saturated", f"at its limit for {received - since:.2f} s")
                 return
 
-    def felt(self, age: float, most: float) -> None:
+    def has_wrench(self, age: float, most: float) -> None:
         """Take how long before a state its sensor's last sample had come, and may have, s."""
         if age > most + MARGIN:
             self.violate("sensor", f"a force that came {age:.3f} s before")

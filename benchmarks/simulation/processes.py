@@ -155,7 +155,7 @@ class Run:
         self.world.after(seconds, begin)
 
     def kill_daemon(self) -> None:
-        """End the daemon at once: its loop hears of that from the system."""
+        """End the daemon at once: its loop is informed by the system."""
         self.process.kill()
         if self.loops:
             self.loops[-1].end_with_parent()

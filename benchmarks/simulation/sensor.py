@@ -46,12 +46,26 @@ class _Clock(SimulatedClock):
         return event.is_set()
 
 
+class _OfProcess(Process):
+    """What runs in another process, and no longer than it."""
+
+    def __init__(self, world: World, main: Callable[[], None], owner: Process) -> None:
+        self._owner = owner
+        super().__init__(world, "ft-sensor", main)
+
+    def _resume(self, ticket: int) -> None:
+        if self._owner.over or self._owner.dead:
+            self.kill()
+        super()._resume(ticket)
+
+
 class _Thread:
     """A thread of a loop's process: it ends and stands still with it."""
 
     def __init__(self, world: World, main: Callable[[], None]) -> None:
+        assert world.current is not None
         self.owner = world.current
-        self._process = Process(world, "ft-sensor", main)
+        self._process = _OfProcess(world, main, self.owner)
 
     def join(self, timeout: float) -> None:
         self._process.kill()

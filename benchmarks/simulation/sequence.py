@@ -154,7 +154,7 @@ def _listen(run: Run, judge: Judge, say: Any) -> None:
         state = run.state_behind
         sampled = link.sampled_at(state)
         if isinstance(link, SensorLink) and state.ft_raw_wrench is not None:
-            judge.felt(state.received - link.arrived, link.sensor_settings.max_age)
+            judge.has_wrench(state.received - link.arrived, link.sensor_settings.max_age)
         judge.sent(setpoint, sampled, run.world.now, link.hidden_leap)
 
     run.on_send, run.on_stop, run.on_start = sent, judge.stops, started

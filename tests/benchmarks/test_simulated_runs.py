@@ -575,6 +575,12 @@ def test_without_the_sensor_nothing_is_written_where_its_loss_stops() -> None:
     assert "(degrade" in words
 
 
+@pytest.mark.parametrize("seed", [30000491, 31005917, 31000451])
+def test_a_sensors_thread_ends_with_its_process_and_nothing_is_stopped_at_the_send(seed) -> None:
+    """A thread that outlived its loop took the bus; between check and sending no time shows."""
+    assert not run(seed).violations
+
+
 def test_a_lost_sensor_that_nobody_misses_is_found(monkeypatch: Patch) -> None:
     monkeypatch.setattr(SensorReader, "_require_fresh", lambda *_: None)
     monkeypatch.setattr(SensorReader, "_require_valid", lambda *_: None)

@@ -1,4 +1,4 @@
-"""What is told of a correction outside the envelope."""
+"""What is printed of a correction outside the envelope."""
 
 from __future__ import annotations
 
@@ -10,7 +10,9 @@ from gapbridge.bridge.api.envelope import above
 
 @given(st.floats(1e-9, 10.0), st.floats(1e-12, 1.0), st.sampled_from([1.0, 1e3]))
 @example(0.01, 1e-6, 1e3)  # "moves the TCP by 10 mm, expected at most 10 mm"
-def test_a_value_beyond_a_limit_is_told_in_enough_digits(limit: float, share: float, factor: float):
+def test_a_value_beyond_a_limit_is_printed_in_enough_digits(
+    limit: float, share: float, factor: float
+):
     value = limit * (1 + share)
     if value * factor > limit * factor:
         text = above(value, limit, factor)

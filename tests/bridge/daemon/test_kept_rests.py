@@ -46,12 +46,12 @@ def watch_of(program: Program) -> SlipWatch:
 def a_run(path: Path, cell: Configuration, watch: SlipWatch, *events: dict[str, Any]) -> str:
     """Have a run of the daemon begin with the file and end with what ``watch`` holds then."""
     kept = KeptRests(SYSTEM)
-    told = kept.open(path, watch, cell)
+    detail = kept.open(path, watch, cell)
     for event in events:
         kept.on_event(event)
     assert kept.step(watch, cell, at_once=True) == ""
     kept.close()
-    return told
+    return detail
 
 
 @pytest.fixture
@@ -115,10 +115,10 @@ def test_a_changed_cell_or_file_of_it_forgets_what_was_learned(
     files = {**cell.files, "/robot.urdf": b"another"}
     other = replace(cell, text=cell.text + "\n") if change == "text" else replace(cell, files=files)
     watch = watch_of(learned)
-    told = a_run(path, other, watch)
-    assert "found rests with another cell; joints' zeros are learned anew" in told
+    detail = a_run(path, other, watch)
+    assert "found rests with another cell; joints' zeros are learned anew" in detail
     assert watch.rests == ()
-    assert a_run(path, other, watch_of(learned)) == ""  # told once
+    assert a_run(path, other, watch_of(learned)) == ""  # reported once
 
 
 def test_another_version_of_the_program_learns_anew(
@@ -169,8 +169,8 @@ def test_a_file_of_garbage_is_ignored_with_one_line(
 ) -> None:
     path.write_bytes(spoil(path.read_bytes()))
     watch = watch_of(learned)
-    told = a_run(path, cell, watch)
-    assert told == f"{path}: found no rests of an arm, ignored; joints' zeros are learned anew"
+    detail = a_run(path, cell, watch)
+    assert detail == f"{path}: found no rests of an arm, ignored; joints' zeros are learned anew"
     assert watch.rests == ()
     assert found_in(watch, learned, COUNTS)[:2] == ([], [])
 
@@ -224,14 +224,14 @@ def test_a_disk_that_cannot_be_written_is_told_once(
     watch, kept = watch_of(learned), KeptRests(SYSTEM)
     kept.open(tmp_path / "none" / "x.json", watch, cell)
     kept.on_event(FOUND.event)
-    told = []
+    detail = []
     for _ in range(3):
-        told.append(kept.step(watch, cell, at_once=True))
+        detail.append(kept.step(watch, cell, at_once=True))
         if kept._writing is not None:
             assert isinstance(kept._writing.exception(30.0), RunError)
     kept.close()
-    told.append(kept.step(watch, cell))
-    (line,) = [line for line in told if line]
+    detail.append(kept.step(watch, cell))
+    (line,) = [line for line in detail if line]
     assert "is lost at the end" in line
     assert "cannot be written" in line
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from clock_by_hand import ByHand
 
 from gapbridge.bridge.cell.run_settings import read_configuration
 from gapbridge.bridge.ipc.command_memory import Command
@@ -19,7 +20,7 @@ from gapbridge.bridge.loop.supervisor import Cause
 from gapbridge.bridge.setpoint_source.source import Source
 from gapbridge.core.errors import RobotBusyError, WriteError
 from gapbridge.core.state import RobotState, Setpoint
-from gapbridge.drivers.clock import SYSTEM, Clock
+from gapbridge.drivers.clock import SYSTEM
 from gapbridge.drivers.driver import Driver
 
 Q = np.array([0.0, -1.5, 1.8, -1.87, -1.57, 0.0])
@@ -30,18 +31,6 @@ compliance: {axial: [1.0e-6, 1.0e-6, 1.0e-6, 1.0e-6, 1.0e-6, 1.0e-6]}
 payload: {mass: 5.0, cog: [0, 0, 0.06]}
 link: {driver: ur_rtde, host: 127.0.0.1}
 """
-
-
-class ByHand(Clock):
-    """A clock that goes on where somebody sleeps."""
-
-    def __init__(self) -> None:
-        self.now = 100.0
-        self.monotonic = self.time = lambda: self.now
-        self.sleep = self._pass
-
-    def _pass(self, seconds: float) -> None:
-        self.now += seconds
 
 
 class StandingArm(Driver):

@@ -1,4 +1,4 @@
-"""Slips in the report: told in the answer, marked in the plots, with the gap before and after."""
+"""Slips in the report: in the answer, marked in the plots, with the gap before and after."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def rms(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-def told(case: Case) -> list[str]:
+def answer_of(case: Case) -> list[str]:
     """Return what the answer says about the slips."""
     shown = answer(case.material)
     heading = shown.index(blocks.Heading("What slipped, and when"))
@@ -104,7 +104,7 @@ def told(case: Case) -> list[str]:
 ])  # fmt: skip
 def test_the_answer_tells_what_slipped_how_far_and_when(name: str, sentences: list[str]) -> None:
     case = reported(name)
-    texts = told(case)
+    texts = answer_of(case)
     assert len(texts) == len(sentences)
     for text, sentence in zip(texts, sentences, strict=True):
         assert re.match(sentence, text), text
@@ -147,8 +147,8 @@ def test_the_gap_before_and_after_is_that_of_the_rows_before_and_after(name: str
     assert [list(row[1:]) for row in table.rows] == [
         [str(p.samples), with_unit(p.without, "m"), with_unit(p.with_causes, "m")] for p in parts
     ]
-    assert with_unit(parts[0].without, "m") in told(case)[0]
-    assert with_unit(parts[1].without, "m") in told(case)[0]
+    assert with_unit(parts[0].without, "m") in answer_of(case)[0]
+    assert with_unit(parts[1].without, "m") in answer_of(case)[0]
 
 
 def test_without_a_fitted_frame_the_sizes_are_those_of_the_channel() -> None:
@@ -230,7 +230,7 @@ def test_a_slip_between_two_sessions(one_clock: bool) -> None:
     log = join_sessions(logs, MODEL)
     diagnosis = diagnose(MODEL, log, Metrology(registered=False, sigma=SIGMA))
     case = Case(Material(diagnosis, "cell", log, MODEL), np.zeros(0))
-    (text,) = told(case)
+    (text,) = answer_of(case)
     (table, shown) = slip_section(case.material)
     assert isinstance(table, blocks.Table)
     assert isinstance(shown, blocks.Pictures)

@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from clock_by_hand import ByHand
 
 from gapbridge.core.errors import WriteError
 from gapbridge.core.state import RobotState, Setpoint
-from gapbridge.drivers.clock import Clock
 from gapbridge.drivers.robot_modes import PLAYING
 from gapbridge.drivers.ur_rtde import registers
 from gapbridge.drivers.ur_rtde.command import (
@@ -32,18 +32,6 @@ CYCLE = 0.002
 STOPPED = 1  # runtime_state
 SPEED = 0.1  # rad/s
 RATES = 0.04, 0.08  # m/s, rad/s: of the cell
-
-
-class ByHand(Clock):
-    """A clock that goes on where somebody sleeps."""
-
-    def __init__(self) -> None:
-        self.now = 100.0
-        self.monotonic = self.time = lambda: self.now
-        self.sleep = self._pass
-
-    def _pass(self, seconds: float) -> None:
-        self.now += seconds
 
 
 class Library:
