@@ -43,7 +43,8 @@ INVARIANTS: dict[str, str] = {
     "crash": "no process ends by an exception that is none of the product's",
     "recorded": "the cycles handed to the recorder say of each setpoint whether it left",
     "files": "each cycle is in a file of the recording or reported as lost, whatever disk and "
-    "recorder do; a power cut takes the last second at most",
+    "recorder do; a power cut, and a recorder that dies without a daemon, take the last second at "
+    "most",
     "kept": "a cell file that is wrong ends no motion, and changes nothing",
     "saturated": "an offset does not stay at its limit: the motion ends",
     "sensor": "behind no setpoint is a force whose sample came longer ago than it may be old",

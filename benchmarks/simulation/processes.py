@@ -99,13 +99,19 @@ class Run:
             return
         session = f"run-{len(self.daemons)}"
         recording = Recording(self.disk, self.clock, daemon.memory, session)
-        first = len(self.loops)
+        daemon_number, first = len(self.daemons), len(self.loops)
+
+        def is_alone() -> bool:
+            return process.over or process.dead
 
         def is_over() -> bool:
-            loops = [loop.process for loop in self.loops[first:]]
-            return all(p.over or p.dead for p in (process, *loops))
+            if not is_alone():
+                return False
+            if len(self.daemons) > daemon_number:  # which starts once nothing of this one runs
+                return True
+            return all(loop.process.over or loop.process.dead for loop in self.loops[first:])
 
-        recording.is_over = is_over
+        recording.is_alone, recording.is_over = is_alone, is_over
         self.recordings.append(recording)
 
     def cut_power(self) -> None:
@@ -114,7 +120,7 @@ class Run:
         if self.loops:
             self.loops[-1].kill()
         if self.disk is not None:
-            self.recordings[-1].cut_power()
+            self.recordings[-1].end()
             self.disk.cut_power()
         self.owner_note = ""
         self.on_death()

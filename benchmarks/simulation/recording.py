@@ -18,9 +18,7 @@ from gapbridge.core.log.mcap_reading import read_batches
 
 LOOK = 0.1  # s, of bridge/recording/main.py
 RESTART = 0.2  # s, of the daemon's side processes
-RECENT = (
-    1.0  # s of cycles that a power cut may take: 0.4 s until they are synced, twice, and a look
-)
+RECENT = 1.0  # s of cycles that a recorder may take with it for good: 0.4 s until synced, twice
 
 
 class Recording:
@@ -32,8 +30,9 @@ class Recording:
         self._disk, self._clock, self._memory, self._session = disk, clock, memory, session
         self._settings = RecordingSettings(folder=disk.folder, keep_free=0.0)
         self.is_over: Callable[[], bool] = lambda: False  # the daemon is, and its loop
+        self.is_alone: Callable[[], bool] = lambda: False  # no daemon can start it anew
         self.lost = 0  # cycles that were reported as lost
-        self.cut_at = math.inf  # s: when power was cut
+        self.cut_at = math.inf  # s: when it died and no other one followed
         self._recorder: Recorder | None = None
         self._start()
 
@@ -59,12 +58,15 @@ class Recording:
         return self.process.over or self.cut_at < math.inf
 
     def die(self) -> None:
-        """End the present process at once; the daemon starts another one."""
-        self._kill()
-        self._clock.world.after(RESTART, self._start)
+        """End the present process at once; the daemon, if there is one, starts another one."""
+        if self.is_alone():
+            self.end()
+        else:
+            self._kill()
+            self._clock.world.after(RESTART, self._start)
 
-    def cut_power(self) -> None:
-        """End it for good."""
+    def end(self) -> None:
+        """End it for good, at once."""
         self._kill()
         self.cut_at = self._clock.world.now
 

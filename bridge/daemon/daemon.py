@@ -13,6 +13,7 @@ import subprocess
 import threading
 from collections.abc import Callable
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import IO, Any
 
@@ -346,7 +347,8 @@ class Daemon:
                     self._pause()
                     self.restarts += 1
             self._read_loop()
-            return self._summary()
+            summary = self._summary()
+        return replace(summary, lost_rows=self.lost_rows)  # the recorder has finished since
 
     def _open(self, stack: ExitStack, arm: bool, by: str) -> bool:
         """Open locks, sockets and processes; ``stack`` closes them.
@@ -369,7 +371,7 @@ class Daemon:
             "settings": settings.model_dump(mode="json"), "n": self.configuration.n,
             "session": self.session, "extra": {"text": self.configuration.text},
         }  # fmt: skip
-        stack.callback(self.side_processes.close)
+        stack.callback(self._close_side_processes)
         self.side_processes.start(settings, start_data, self.memory, self._output)
         stack.callback(lambda: self.event_log.add({"kind": EventKind.ENDED}))
         self._open_kept_rests()
@@ -387,6 +389,10 @@ class Daemon:
             where = f"setpoints: a planner writes to {settings.setpoints.socket}"
             self.event_log.add({"kind": EventKind.NOTE, "detail": where})
         return self._take_over(lock, arm, by)
+
+    def _close_side_processes(self) -> None:
+        for event in self.side_processes.close():
+            self.event_log.add(event)
 
     def _take_over(self, lock: OwnerLock, arm: bool, by: str) -> bool:
         """Go on from how the last run ended; returns whether the first loop may arm by itself."""

@@ -55,12 +55,7 @@ class SideProcesses:
         """Check and restart them; returns their events, and events on their problems."""
         events = []
         for name, side in self._running.items():
-            for event in side.events():
-                if event.get("kind") == name:
-                    events.append(event)
-                else:  # a side process may emit only events of its own kind
-                    detail = f"{name} emitted {str(event.get('kind'))[:40]!r}, which is not its own"
-                    events.append({"kind": EventKind.SIDE, "side": name, "detail": detail})
+            events += [_checked(name, event) for event in side.events()]
             if (problem := side.check()) is not None:
                 events.append({"kind": EventKind.SIDE, "side": name, "detail": problem})
         return events
@@ -75,10 +70,26 @@ class SideProcesses:
             for name, side in self._running.items()
         }  # fmt: skip
 
-    def close(self) -> None:
-        """Notify all that the daemon ends, and wait until they have finished."""
+    def close(self) -> list[dict[str, Any]]:
+        """Notify all that the daemon ends, and wait until they have finished.
+
+        Returns their last events, and one on each that had something to finish and did not.
+        """
+        events = []
         for side in self._running.values():
             side.begin_close()
         for name, side in self._running.items():
-            side.close(END_TIMEOUTS.get(name, DEFAULT_END_TIMEOUT))
+            last, problem = side.close(END_TIMEOUTS.get(name, DEFAULT_END_TIMEOUT))
+            events += [_checked(name, event) for event in last]
+            if problem is not None and name in END_TIMEOUTS:
+                events.append({"kind": EventKind.SIDE, "side": name, "detail": problem})
         self._running.clear()
+        return events
+
+
+def _checked(name: str, event: dict[str, Any]) -> dict[str, Any]:
+    """Return an event of a side process, which may emit only events of its own kind."""
+    if event.get("kind") == name:
+        return event
+    detail = f"{name} emitted {str(event.get('kind'))[:40]!r}, which is not its own"
+    return {"kind": EventKind.SIDE, "side": name, "detail": detail}

@@ -96,15 +96,24 @@ class SideProcess:
         self._wait = min(2.0 * self._wait, BACKOFF[1])
         return f"{self.module} ended with {code}"
 
-    def close(self, timeout: float = 3.0) -> None:
-        """Notify it that the daemon ends, give it ``timeout`` s to finish, then end it."""
+    def close(self, timeout: float = 3.0) -> tuple[list[dict[str, Any]], str | None]:
+        """Notify it that the daemon ends, give it ``timeout`` s to finish, then end it.
+
+        Returns its last events, and as text how it failed to finish, or None.
+        """
         self.begin_close()
-        if self._process is not None:
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                self._process.wait(timeout)
-            self._process.kill()
-            self._process.wait()
-            self._release()
+        if self._process is None:
+            return [], f"{self.module} was not running at the end"
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self._process.wait(timeout)
+        code = self._process.poll()
+        self._process.kill()
+        self._process.wait()
+        last = self._up.poll()
+        self._release()
+        if code is None:
+            return last, f"{self.module} did not finish within {timeout:g} s and was killed"
+        return last, f"{self.module} ended with {code}" if code else None
 
     def begin_close(self) -> None:
         """Notify it that the daemon ends, without waiting."""

@@ -119,7 +119,7 @@ def test_a_daemon_that_stands_still_gives_no_sign_of_life(
         wait_for(lambda: psutil.Process(run.pid).status() == psutil.STATUS_STOPPED, "the stop")
         before = len(listener.take())
         monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "alive"))
-        alive, other = ServiceManager(), Listener(str(tmp_path / "alive"))
+        alive, other = ServiceManager(SYSTEM), Listener(str(tmp_path / "alive"))
 
         def lived() -> bool:
             alive.kick()

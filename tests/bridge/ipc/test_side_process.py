@@ -112,9 +112,25 @@ def test_it_gets_its_order_the_cycles_and_the_events_and_answers(
     side.emit({"kind": "transition", "to": "armed"})
     assert hear(side, "heard")["of"] == {"kind": "transition", "to": "armed"}
     assert side.check() is None
-    side.close()
+    assert side.close() == ([], None)
     assert (tmp_path / "last").read_text() == "finished"
     assert side.pid is None
+
+
+def test_what_it_says_at_its_end_is_returned_and_that_it_did_not_finish(
+    start: Callable[[str], SideProcess],
+) -> None:
+    last = start(ECHO + '    start.emit({"kind": "recorder", "lost": 7})\n')
+    hear(last, "hello")
+    events, problem = last.close()
+    assert ([event["lost"] for event in events], problem) == ([7], None)
+    failed = start(ECHO + "    raise SystemExit(3)\n")
+    hear(failed, "hello")
+    assert failed.close() == ([], "side_under_test ended with 3")
+    stuck = start(DEAF)
+    hear(stuck, "hello")
+    events, problem = stuck.close(0.1)
+    assert problem == "side_under_test did not finish within 0.1 s and was killed"
 
 
 def test_one_that_is_killed_comes_back_and_the_later_the_more_often(

@@ -75,6 +75,20 @@ def test_a_full_disk_pauses_the_recording_and_not_the_run(robot: Robot) -> None:
     assert np.array_equal(numbers, np.arange(len(numbers)))  # the ring held what was missing
 
 
+def test_what_a_disk_that_stays_full_loses_at_the_end_is_counted(robot: Robot) -> None:
+    with Run(robot.cell(), arm=False) as run:
+        wait_for(lambda: "recording into" in " ".join(run.output), "a file")
+        pid = recorder_pid(run)
+        assert pid is not None
+        before = resource.prlimit(pid, resource.RLIMIT_FSIZE)
+        resource.prlimit(pid, resource.RLIMIT_FSIZE, (1, before[1]))
+        wait_for(lambda: "recording paused: File too large" in run.output, "a pause")
+        run.cycle(50)
+        summary = run.end()
+    assert summary.lost_rows >= 50
+    assert f"{summary.lost_rows} cycles could not be recorded" in summary.lines()
+
+
 @pytest.mark.slow
 def test_what_was_recorded_is_diagnosed(robot: Robot) -> None:
     with Run(robot.cell(), arm=True, duration=3.0) as run:
