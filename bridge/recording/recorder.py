@@ -119,6 +119,7 @@ class Recorder:
         """Write the remaining cycles and finish the file."""
         self.step(flush=True)
         if self._segment is None:
+            self._memory.follow()  # a paused recorder has not
             self._report_lost(max(self._memory.written - self._next, 0))
         else:
             try:
