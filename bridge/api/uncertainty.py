@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from gapbridge.bridge.cell import Cell
-from gapbridge.bridge.document.parameter_entries import parameter_entries
+from gapbridge.bridge.document.diagnosis_json import parameter_entries
 from gapbridge.bridge.document.provenance import fitted, intervals_of
 from gapbridge.core.calibration.spread import Spread
 from gapbridge.core.diagnosis.diagnosis import Diagnosis

@@ -1,10 +1,11 @@
-"""Titles of effects, quantities and parameters, and numbers with their units, for reports."""
+"""Titles of effects, quantities and parameters, for reports."""
 
 from __future__ import annotations
 
 import math
 import re
 
+from gapbridge.bridge.document.numbers import unit_of
 from gapbridge.core.diagnosis.channel_diagnosis import Verdict
 from gapbridge.core.effects import CATALOGUE, ParameterName, Reported, split_name
 
@@ -19,20 +20,6 @@ VERDICTS = {
     Verdict.EXPLAINED: "Explained",
     Verdict.PARTLY_EXPLAINED: "Partly explained",
     Verdict.UNEXPLAINED: "Not explained",
-}
-UNITS: dict[str, tuple[str, float]] = {
-    "m": ("mm", 1e3),
-    "rad": ("mrad", 1e3),
-    "s": ("ms", 1e3),
-    "rad/Nm": ("µrad/Nm", 1e6),
-    "1/K": ("ppm/K", 1e6),
-    "1/(N m2)": ("1/(MN m²)", 1e6),
-    "1/(Nm)2": ("1/(kNm)²", 1e6),
-    "N/s": ("N/h", 3600.0),
-    "Nm/s": ("Nm/h", 3600.0),
-    "kg m2": ("kg m²", 1.0),
-    "Nm s/rad": ("Nm s/rad", 1.0),
-    "": ("%", 1e2),
 }
 _COLUMNS = {
     "actual_q": "angle of joint",
@@ -98,70 +85,9 @@ def quantity_unit(name: str) -> tuple[str, float]:
     return ("kg", 1.0) if name == "payload" else ("", 1.0)
 
 
-def unit_of(unit: str) -> tuple[str, float]:
-    """Return the display unit for an SI unit, and the factor from SI."""
-    return UNITS.get(unit, (unit, 1.0))
-
-
 def parameter_unit(parameter: Reported) -> tuple[str, float]:
     """Return the display unit of a parameter, and the factor from SI."""
     return ("deg", 180 / math.pi) if parameter.part == "phase" else unit_of(parameter.unit)
-
-
-def fixed(value: float, decimals: int) -> str:
-    """Return a number with ``decimals`` decimals and a typographic minus, without "-0"."""
-    if not math.isfinite(value):
-        return "unknown"
-    text = f"{value:.{decimals}f}"
-    if not text.strip("-0."):
-        text = text.lstrip("-")
-    return text.replace("-", "−")
-
-
-def decimals_of(spread: float) -> int:
-    """Return the number of decimals that shows two significant digits of a spread."""
-    if not math.isfinite(spread) or spread <= 0:
-        return 3
-    return min(max(1 - math.floor(math.log10(spread)), 0), 9)
-
-
-def number(value: float, digits: int = 3) -> str:
-    """Return a number with ``digits`` significant digits, with an exponent only if extreme."""
-    if not math.isfinite(value):
-        return "unknown"
-    if value == 0:
-        return "0"
-    size = math.floor(math.log10(abs(value)))
-    if size < -4 or size > 6:
-        return f"{value:.{digits - 1}e}"
-    text = f"{value:.{max(digits - 1 - size, 0)}f}"
-    return text.replace("-", "−")
-
-
-def with_unit(value: float | None, unit: str) -> str:
-    """Return a value (SI) in its display unit; "unknown" for None."""
-    if value is None:
-        return "unknown"
-    name, factor = unit_of(unit)
-    return f"{number(value * factor)} {name}"
-
-
-def percent(share: float | None) -> str:
-    """Return a share (0 to 1) as percent."""
-    if share is None or not math.isfinite(share):
-        return "unknown"
-    return f"{round(share * 100)} %".replace("-", "−")
-
-
-def likelihood(probability: float) -> str:
-    """Return a probability as percent, bounded at 0.1 and 99.9 %."""
-    if not math.isfinite(probability):
-        return "unknown"
-    if probability > 0.999:
-        return "over 99.9 %"
-    if probability < 0.001:
-        return "under 0.1 %"
-    return f"{probability * 100:.1f} %"
 
 
 def listed(items: list[str], last: str = "and") -> str:
