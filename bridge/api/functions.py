@@ -85,7 +85,7 @@ def fit(cell: Cell, log: Log, *, remounted: bool = False) -> Fitted:
     ``remounted``: the target was taken off between sessions. Raises ExcitationError where nothing
     in the log excites the compliance.
     """
-    from gapbridge.bridge.api.uncertainty import fit_provenance
+    from gapbridge.bridge.api.uncertainty import provenance_of_fit
     from gapbridge.bridge.cell.log_consistency import pose_findings
     from gapbridge.bridge.document.notes import note_texts
     from gapbridge.core.estimation.identification import (
@@ -102,7 +102,7 @@ def fit(cell: Cell, log: Log, *, remounted: bool = False) -> Fitted:
         gap_rms=estimate.gap_rms, remaining_rms=estimate.remaining_rms,
         remaining_rms_held_out=held_out if math.isfinite(held_out) else None,
         notes=(*pose_findings(cell, log), *note_texts((*estimate.notes, *estimate.combinations))),
-        provenance=fit_provenance(
+        provenance=provenance_of_fit(
             cell, estimate, provenance(_sources(cell, log), "fit", remounted=remounted),
             range_of(log),
         ),

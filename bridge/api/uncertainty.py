@@ -59,7 +59,7 @@ def intervals_applied(
     return intervals_of((p.name, p.value, p.std) for cause in applied for p in cause.parameters)
 
 
-def fit_provenance(
+def provenance_of_fit(
     cell: Cell, fit: Identification, origin: dict[str, Any],
     ranges: Mapping[str, tuple[float, float]],
 ) -> dict[str, Any]:  # fmt: skip

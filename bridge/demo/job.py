@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 
-from gapbridge.bridge.api.uncertainty import fit_provenance
+from gapbridge.bridge.api.uncertainty import provenance_of_fit
 from gapbridge.bridge.cell import Cell, load_cell, save_cell
 from gapbridge.bridge.demo.hidden import named_causes
 from gapbridge.bridge.demo.links import DemoLink, demo_link
@@ -76,7 +76,7 @@ def _job(
     # only the flexibilities are kept: the diagnosis has to find the hidden effects
     flexible = cell.model.with_compliance(fit.axial, fit.radial)
     origin = provenance({"log": [log], "cell": [cell.path]})
-    written_by = fit_provenance(cell, fit, origin, {})
+    written_by = provenance_of_fit(cell, fit, origin, {})
     save_cell(cell, out / "calibrated.yaml", flexible, {"provenance": written_by})
     calibrated = load_cell(out / "calibrated.yaml")
     console.print(

@@ -11,7 +11,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from gapbridge.bridge.api.uncertainty import fit_provenance
+from gapbridge.bridge.api.uncertainty import provenance_of_fit
 from gapbridge.bridge.cell import Cell, save_cell
 from gapbridge.bridge.cell.log_consistency import pose_findings
 from gapbridge.bridge.cli.log.large_log import LargeLog, has_sessions, is_large
@@ -68,7 +68,7 @@ def fit(logs: tuple[Path, ...], cell: Path, remounted: bool, out: Path) -> None:
     except ExcitationError as error:
         raise ExcitationError(f"{', '.join(map(str, logs))}: {error}") from None
     origin = provenance({"log": logs, "cell": [cell]})
-    origin = fit_provenance(opened, estimate, origin, ranges)
+    origin = provenance_of_fit(opened, estimate, origin, ranges)
     save_cell(opened, out, estimate.cell_model, {"provenance": origin})
     for line in warnings:
         click.echo(f"warning: {', '.join(map(str, logs))}: {line}", err=True)
