@@ -27,7 +27,7 @@ from gapbridge.bridge.ipc.shared_memory import Phase, RunMemory, SharedMemory
 from gapbridge.bridge.loop.loop import Exit, Loop
 from gapbridge.bridge.loop.offset_in_force import OffsetInForce
 from gapbridge.bridge.loop.setpoint_stream import SetpointStream, gate_bounds
-from gapbridge.bridge.setpoint_source.source import Source
+from gapbridge.bridge.setpoint_source.source import Source, SourceContext
 from gapbridge.bridge.setpoint_source.target import TargetSource
 from gapbridge.core.errors import GapbridgeError, InputError
 from gapbridge.core.state import RobotState, Setpoint
@@ -352,8 +352,11 @@ def _source(run: Run) -> Source:
     moves_arm = setting.wired.moves_arm
     kind: Any = TargetSource if run.planner is None else PlannedSource
     source: Source = kind(
-        settings, link.controller.n, moves_arm, setting.cell.path.parent, setting.wired.rate
-    )
+        SourceContext(
+            settings, link.controller.n, moves_arm, setting.cell.path.parent,
+            setting.wired.rate, run.clock,
+        )
+    )  # fmt: skip
     if isinstance(source, PlannedSource):
         assert run.planner is not None
         source.attach(run.planner, run.clock)

@@ -6,7 +6,7 @@ All raise InputError, with a message of one line, for unusable input.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,11 +17,10 @@ from gapbridge.bridge.api.records import Corrected, Diagnosed, Fitted, Predicted
 from gapbridge.bridge.cell import Cell, load_cell
 from gapbridge.bridge.cell.message import located
 from gapbridge.bridge.cell.opened_log import at_joints_of, open_log
-from gapbridge.bridge.document.provenance import fitted, provenance
-from gapbridge.core.calibration.spread import Spread
+from gapbridge.bridge.document.provenance import provenance
 from gapbridge.core.compensation import correct
 from gapbridge.core.effects import by_approach
-from gapbridge.core.errors import EquilibriumError, InputError
+from gapbridge.core.errors import EquilibriumError, InputError, LogError
 from gapbridge.core.fitted_range import outside_rows, range_of
 from gapbridge.core.log.log import Log
 from gapbridge.core.predicted_channels import predicted_channels
@@ -86,7 +85,7 @@ def fit(cell: Cell, log: Log, *, remounted: bool = False) -> Fitted:
     ``remounted``: the target was taken off between sessions. Raises ExcitationError where nothing
     in the log excites the compliance.
     """
-    from gapbridge.bridge.api.uncertainty import fit_intervals
+    from gapbridge.bridge.api.uncertainty import provenance_of_fit
     from gapbridge.bridge.cell.log_consistency import pose_findings
     from gapbridge.bridge.document.notes import note_texts
     from gapbridge.core.estimation.identification import (
@@ -103,22 +102,21 @@ def fit(cell: Cell, log: Log, *, remounted: bool = False) -> Fitted:
         gap_rms=estimate.gap_rms, remaining_rms=estimate.remaining_rms,
         remaining_rms_held_out=held_out if math.isfinite(held_out) else None,
         notes=(*pose_findings(cell, log), *note_texts((*estimate.notes, *estimate.combinations))),
-        provenance=fitted(
-            provenance(_sources(cell, log), "fit", remounted=remounted), range_of(log),
-            Spread.of_fit(estimate.identifiable, estimate.covariance).beside(cell.spread),
-            cell.intervals | fit_intervals(estimate),
+        provenance=provenance_of_fit(
+            cell, estimate, provenance(_sources(cell, log), "fit", remounted=remounted),
+            range_of(log),
         ),
     )  # fmt: skip
 
 
 def diagnose(
     cell: Cell, log: Log, *, withhold: Sequence[str] = (), remounted: bool = False,
-    simulated: Log | None = None,
+    simulated: Log | None = None, progress: Callable[[str], None] = lambda step: None,
 ) -> Diagnosed:  # fmt: skip
     """Return the causes of the gap between a log and the cell's model; ``gapbridge diagnose``.
 
     ``withhold``: effects to leave out of the catalogue. ``simulated``: log of another simulator,
-    row by row, used as the prediction.
+    row by row, used as the prediction. ``progress`` is called with each step's name.
     """
     from gapbridge.bridge.document.diagnosis_json import document
     from gapbridge.core.diagnosis.diagnosis import channels_of
@@ -132,17 +130,23 @@ def diagnose(
     if simulated is not None:
         simulated = at_joints_of(log, aligned(simulated, log), cell)
     metrology = replace(cell.metrology, remounted=remounted)
-    diagnosis = diagnose_log(
-        cell.model, log, metrology, withhold=withhold, simulated=simulated,
-        observers=channels_of(cell.uncertain),
-    )  # fmt: skip
+    try:
+        diagnosis = diagnose_log(
+            cell.model, log, metrology, withhold=withhold, simulated=simulated,
+            progress=progress, observers=channels_of(cell.uncertain),
+        )  # fmt: skip
+    except LogError:
+        raise  # names its log
+    except InputError as error:
+        raise LogError(f"{log.path}: {error}") from None
     origin = provenance(files, "diagnose", withhold=list(withhold), remounted=remounted)
     return Diagnosed(cell, log, diagnosis, document(diagnosis) | {"provenance": origin})
 
 
 def _sources(cell: Cell, log: Log, simulated: Log | None = None) -> dict[str, list[Path]]:
     """Return the input files by role; a log made in Python has none."""
-    logs = {"log": log} if simulated is None else {"log": log, "sim": simulated}
-    read = {role: [Path(p) for p in one.files or (one.path,)] for role, one in logs.items()}
-    return {**{role: [p for p in paths if p.exists()] for role, paths in read.items()},
-            "cell": [cell.path]}  # fmt: skip
+    logs, sims = (
+        [path for path in map(Path, one.files or (one.path,)) if path.exists()] if one else []
+        for one in (log, simulated)
+    )
+    return {"log": logs, "cell": [cell.path], "sim": sims}

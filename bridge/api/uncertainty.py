@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from gapbridge.bridge.document.parameter_entries import parameter_entries
-from gapbridge.bridge.document.provenance import intervals_of
+from gapbridge.bridge.cell import Cell
+from gapbridge.bridge.document.diagnosis_json import parameter_entries
+from gapbridge.bridge.document.provenance import fitted, intervals_of
 from gapbridge.core.calibration.spread import Spread
 from gapbridge.core.diagnosis.diagnosis import Diagnosis
 from gapbridge.core.effects import flexibility_names
@@ -58,7 +59,16 @@ def intervals_applied(
     return intervals_of((p.name, p.value, p.std) for cause in applied for p in cause.parameters)
 
 
-def fit_intervals(fit: Identification) -> dict[str, tuple[float, float]]:
+def provenance_of_fit(
+    cell: Cell, fit: Identification, origin: dict[str, Any],
+    ranges: Mapping[str, tuple[float, float]],
+) -> dict[str, Any]:  # fmt: skip
+    """Return ``origin`` with what a cell keeps of its fit; ``ranges``: of each fitted quantity."""
+    spread = Spread.of_fit(fit.identifiable, fit.covariance).beside(cell.spread)
+    return fitted(origin, ranges, spread, cell.intervals | _intervals(fit))
+
+
+def _intervals(fit: Identification) -> dict[str, tuple[float, float]]:
     """Return the 95 % interval of each flexibility that a fit determines, by name, rad/Nm."""
     values = np.concatenate([fit.axial, fit.radial])
     stds = np.concatenate([fit.std_axial, fit.std_radial])

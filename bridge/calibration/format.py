@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from gapbridge.bridge.report.labels import unit_of
+from gapbridge.bridge.document.numbers import unit_of
 from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.plan import Payload
 from gapbridge.core.calibration.result import Estimate

@@ -14,7 +14,6 @@ from gapbridge.bridge.document.notes import note_texts
 from gapbridge.core.diagnosis.log_checks.units_and_clocks import check_units
 from gapbridge.core.errors import LogError, LogOptionError
 from gapbridge.core.load_bounds import PAYLOAD_FACTOR
-from gapbridge.core.log.alignment import aligned
 from gapbridge.core.log.log import Log, read_log
 from gapbridge.core.log.sources import SourceOptions, source_of
 from gapbridge.core.notes import Note
@@ -45,14 +44,6 @@ def show_notes(path: Path, notes: Iterable[Note]) -> None:
     """Print what reading a log has noted."""
     for note in note_texts(notes):
         click.echo(f"note: {path}: {note}", err=True)
-
-
-def open_simulated(path: Path, cell: Cell, log: Log) -> Log:
-    """Return a simulator's log at the rows of ``log``, with its TCP at the joint angles of ``log``.
-
-    Raises LogError if its rows do not match those of ``log``.
-    """
-    return at_joints_of(log, aligned(open_log(path, cell), log), cell)
 
 
 def at_joints_of(log: Log, simulated: Log, cell: Cell) -> Log:

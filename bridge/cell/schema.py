@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 from pydantic import Field, ValidationInfo, field_validator
 
@@ -13,14 +13,16 @@ from gapbridge.bridge.cell.sections import (
     RecordingSettings,
     SetpointSettings,
 )
-from gapbridge.bridge.cell.settings.calibration import CalibrationSettings
+from gapbridge.bridge.cell.settings.calibration import (
+    CalibrationSettings,
+    NotNegative,
+    Number,
+    Positive,
+    Vector3,
+)
 from gapbridge.bridge.cell.settings.web import MetricsSettings, WebSettings
 from gapbridge.drivers.ft_sensor.settings import AnyFtSensor
 from gapbridge.drivers.section import Section
-
-Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
-NotNegative = Annotated[Number, Field(ge=0)]
-Vector3 = Annotated[list[Number], Field(min_length=3, max_length=3)]
 
 
 class DhRow(Section):
@@ -50,7 +52,7 @@ class Robot(Section):
     urdf: Path | None = Field(default=None, description="a file, relative to the cell's folder")
     dh: list[DhRow] | None = Field(default=None, description="standard DH rows")
     tip: str | None = Field(default=None, description="the URDF link that is the flange")
-    rated_payload: Annotated[Number, Field(gt=0)] | None = Field(
+    rated_payload: Positive | None = Field(
         default=None, description="kg, for urdf and dh; known for model"
     )
     calibration: Calibration | Path | None = Field(

@@ -200,10 +200,7 @@ class Daemon:
             "link": {
                 "driver": self.settings.link.driver,
                 **status.link(),
-                "cycles": tally.cycles,
-                "missed": tally.missed,
-                "late": tally.late,
-                "written": tally.written,
+                **tally.counts.totals(),
                 "dropped": {
                     reason.value: counted[count.label] for reason, count in DROPPED.items()
                 },
@@ -582,7 +579,7 @@ class Daemon:
 
     def _summary(self) -> RunSummary:
         state = self._last_state
-        failed = self._refused and not self.tally.written
+        failed = self._refused and not self.tally.counts.written
         failed |= state in (State.FAULT, State.DISCONNECTED)
         summary = RunSummary(
             **self.tally.figures(),

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from gapbridge.bridge.ipc.cycle_counts import CycleCounts
 from gapbridge.bridge.ipc.shared_memory import slices_of
 from gapbridge.core.arrays import Array
-from gapbridge.core.state import CLAMPS
 
 UNIT = 1e-6  # s: bin of a histogram
 BATCH = 50  # batches of rows that are counted together
@@ -101,18 +101,17 @@ class Tally:
 
     n: int
     rate: float
-    cycles: int = 0
-    missed: int = 0
-    late: int = 0
-    written: int = 0
+    counts: CycleCounts = field(init=False)
     last_timestamp: float = np.nan  # s, controller's clock
     steps: int = 0  # between two cycles in a row
     span: float = 0.0  # s of the controller's clock that they took
-    clamped: Array = field(default_factory=lambda: np.zeros(len(CLAMPS), dtype=np.int64))
     age: Histogram = field(default_factory=Histogram)
     age_written: Histogram = field(default_factory=Histogram)
     work: Histogram = field(default_factory=Histogram)
     waiting: list[Array] = field(default_factory=list)  # rows that are not counted yet
+
+    def __post_init__(self) -> None:
+        self.counts = CycleCounts(slices_of(self.n))
 
     def add(self, rows: Array) -> None:
         """Count rows (k, width) of consecutive cycles."""
@@ -130,10 +129,7 @@ class Tally:
         written = rows[:, s["written"].start] > 0
         age, work = rows[:, s["age"].start], rows[:, s["duration"].start]
         missed = rows[:, s["missed"].start]
-        self.cycles += len(rows)
-        self.missed += int(missed.sum())
-        self.late += int((age > 1.0 / self.rate).sum())
-        self.written += int(written.sum())
+        self.counts.add(rows, self.rate)
         stamps = rows[:, s["timestamp"].start]
         gaps = stamps.copy()
         gaps[1:] -= stamps[:-1]
@@ -143,9 +139,6 @@ class Tally:
         self.last_timestamp = float(stamps[-1])
         self.steps += len(gaps)
         self.span += float(gaps.sum())
-        bits = rows[:, s["clamped"].start].astype(np.int64)
-        for bit in range(len(CLAMPS)) if bits.any() else ():
-            self.clamped[bit] += int((bits >> bit & 1).sum())
         self.age.add(age)
         self.age_written.add(age[written])
         self.work.add(work)
@@ -155,16 +148,16 @@ class Tally:
         self._count()
         quantiles = {"p50": 0.5, "p99": 0.99}
         # a run that only observes has no setpoints; then every cycle counts
-        ages = self.age_written if self.written else self.age
+        ages = self.age_written if self.counts.written else self.age
         age = {k: 1e3 * ages.quantile(v) for k, v in quantiles.items()}
         work = {k: 1e6 * self.work.quantile(v) for k, v in quantiles.items()}
         return {
-            "cycles": self.cycles,
-            "missed": self.missed,
-            "late": self.late,
+            "cycles": self.counts.cycles,
+            "missed": self.counts.missed,
+            "late": self.counts.late,
             "rate_hz": self.steps / self.span if self.span else 0.0,
-            "setpoints_written": self.written,
+            "setpoints_written": self.counts.written,
             "age_ms": age | {"max": 1e3 * ages.largest},
             "loop_us": work | {"max": 1e6 * self.work.largest},
-            "clamped": dict(zip(CLAMPS, self.clamped.tolist(), strict=True)),
+            "clamped": dict(self.counts.clamped),
         }

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 
-from gapbridge.bridge.api.uncertainty import fit_intervals
+from gapbridge.bridge.api.uncertainty import provenance_of_fit
 from gapbridge.bridge.cell import Cell, load_cell, save_cell
 from gapbridge.bridge.demo.hidden import named_causes
 from gapbridge.bridge.demo.links import DemoLink, demo_link
@@ -23,11 +23,10 @@ from gapbridge.bridge.demo.result import Result
 from gapbridge.bridge.demo.session import Session
 from gapbridge.bridge.demo.terminal import show
 from gapbridge.bridge.document.output_file import write_text
-from gapbridge.bridge.document.provenance import fitted, provenance
+from gapbridge.bridge.document.provenance import provenance
 from gapbridge.bridge.document.svg import svg_file
 from gapbridge.bridge.loop.warm_up import warm_up
 from gapbridge.core.arrays import Array
-from gapbridge.core.calibration.spread import Spread
 from gapbridge.core.errors import RunError
 from gapbridge.core.estimation.identification import identify_compliance
 from gapbridge.core.log.log import read_log
@@ -77,8 +76,7 @@ def _job(
     # only the flexibilities are kept: the diagnosis has to find the hidden effects
     flexible = cell.model.with_compliance(fit.axial, fit.radial)
     origin = provenance({"log": [log], "cell": [cell.path]})
-    spread = Spread.of_fit(fit.identifiable, fit.covariance)
-    written_by = fitted(origin, {}, spread, fit_intervals(fit))
+    written_by = provenance_of_fit(cell, fit, origin, {})
     save_cell(cell, out / "calibrated.yaml", flexible, {"provenance": written_by})
     calibrated = load_cell(out / "calibrated.yaml")
     console.print(

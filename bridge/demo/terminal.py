@@ -7,7 +7,7 @@ from rich.table import Table
 from rich.text import Text
 
 from gapbridge.bridge.demo.result import Result, visits_of_poses
-from gapbridge.bridge.report.labels import unit_of
+from gapbridge.bridge.document.numbers import unit_of
 
 WIDTH, NARROW = 32, 8  # characters of the longest bar, on a wide and on a narrow terminal
 OTHER_COLUMNS = 68  # characters of a row without its bars

@@ -23,6 +23,7 @@ from gapbridge.bridge.document.drawing import (
     Stroke,
     Text,
 )
+from gapbridge.bridge.document.numbers import DIGITS, plain
 from gapbridge.core.arrays import Array
 
 WIDTH, HEIGHT = 340.0, 230.0
@@ -30,18 +31,7 @@ LEFT, RIGHT, TOP, BOTTOM = 44.0, 10.0, 30.0, 38.0
 TITLE = 20.0  # px of the y axis' title and its margin
 DIGIT, MINUS = 6.4, 8.4  # px, width of a digit and a minus sign of 10 px in the widest usual font
 MARGIN = 0.04  # of the values, beyond them on a tight axis
-DIGITS = 4  # significant, of a number
 MOST_DIGITS = 17  # that distinguish all numbers
-WRITTEN_OUT = (1e6, 1e12)  # smaller numbers have no exponent: with DIGITS, and with more digits
-
-
-def plain(value: float, digits: int = DIGITS) -> str:
-    """Return a number without trailing zeros and without leading zeros in its exponent."""
-    text = f"{value:.{digits}g}"
-    if "e+" in text and abs(value) < WRITTEN_OUT[digits > DIGITS]:
-        text = f"{float(text):.0f}"
-    mantissa, e, exponent = text.partition("e")
-    return f"{mantissa}{e}{int(exponent) if e else ''}".replace("-", "−")
 
 
 def tick_labels(ticks: Sequence[float]) -> tuple[str, ...]:

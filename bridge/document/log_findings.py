@@ -103,10 +103,10 @@ class _Formatter(Formatter):
                 return " and ".join(value)
             case "or":
                 return " or ".join(value)
-            case "rejected":  # a sentence in older journals
+            case "rejected":
                 from gapbridge.core.planning.candidates import RejectedPoses  # a plan's, and large
 
-                return value if isinstance(value, str) else str(RejectedPoses(*value))
+                return str(RejectedPoses(*value))
             case "place":
                 return " and ".join((*value, "the place of instrument or target"))
             case "kg":

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from gapbridge.bridge.cell import load_cell, save_cell
+from gapbridge.bridge.document.numbers import with_unit
 from gapbridge.bridge.document.output_file import replacing_bytes, write_text
 from gapbridge.bridge.document.provenance import fitted, intervals_of, provenance
 from gapbridge.bridge.fleet.diagnosis_summary import FleetDiagnosis, summarise
@@ -28,7 +29,7 @@ from gapbridge.bridge.fleet.report.shared_sections import quantity_title, type_t
 from gapbridge.bridge.fleet.runner import FleetRun
 from gapbridge.bridge.fleet.session import CELL_TABLE, RESULTS_FILE, SESSIONS_FILE, Fleet
 from gapbridge.bridge.fleet.task import Outcome
-from gapbridge.bridge.report.labels import counted, effect_title, joint_list, with_unit
+from gapbridge.bridge.report.labels import counted, effect_title, joint_list
 from gapbridge.core.calibration.spread import Spread
 from gapbridge.core.estimation.compliance_fit import flexibilities
 from gapbridge.core.fitted_range import merged

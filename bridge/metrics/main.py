@@ -29,6 +29,7 @@ from starlette.responses import Response
 from starlette.routing import Route
 
 from gapbridge.bridge.cell.daemon_settings import DaemonSettings
+from gapbridge.bridge.ipc.cycle_counts import CycleCounts
 from gapbridge.bridge.ipc.events import EventKind
 from gapbridge.bridge.ipc.loop_counters import DROPPED
 from gapbridge.bridge.ipc.loop_state import State
@@ -39,7 +40,6 @@ from gapbridge.bridge.served.credentials import read_token
 from gapbridge.bridge.served.guard import Guard
 from gapbridge.bridge.served.server import serve
 from gapbridge.core.arrays import Array
-from gapbridge.core.state import CLAMPS
 from gapbridge.drivers.clock import Clock
 
 AGE_BOUNDS = (0.00025, 0.0005, 0.001, 0.002, 0.004, 0.008, 0.016, 0.032, 0.064, 0.128)  # s
@@ -84,8 +84,7 @@ class Counts:
         self.memory, self._slices = memory, memory.slices
         self._updated = UpdatedSettings(settings, text)  # text: the cell file's
         self.reader = memory.reader()
-        self.cycles = self.missed = self.late = self.written = 0
-        self.clamped = dict.fromkeys(CLAMPS, 0)
+        self.cycles = CycleCounts(memory.slices)
         self.age, self.work = Buckets(AGE_BOUNDS), Buckets(WORK_BOUNDS)
         self.offset = np.full(6, np.nan)  # m, rad
         self.received = 0.0  # s, monotonic
@@ -113,15 +112,8 @@ class Counts:
         rows, s = self.reader.drain(), self._slices
         if not len(rows):
             return
-        age = rows[:, s["age"].start]
-        self.cycles += len(rows)
-        self.missed += int(rows[:, s["missed"].start].sum())
-        self.late += int((age > 1.0 / self.settings.link.rate).sum())
-        self.written += int(rows[:, s["written"].start].sum())
-        bits = rows[:, s["clamped"].start].astype(np.int64)
-        for bit, name in enumerate(CLAMPS):
-            self.clamped[name] += int((bits >> bit & 1).sum())
-        self.age.add(age)
+        self.cycles.add(rows, self.settings.link.rate)
+        self.age.add(rows[:, s["age"].start])
         self.work.add(rows[:, s["duration"].start])
         self.offset = rows[-1, s["offset"]]
         self.received = float(rows[-1, s["received"].start])
@@ -207,17 +199,17 @@ class Families(Collector):
         return family
 
     def _cycles(self) -> Iterator[Metric]:
-        counts, lost = self._counts, self._counts.reader.lost
+        counts, cycles, lost = self._counts, self._counts.cycles, self._counts.reader.lost
         for name, message, value in (
-            ("cycles", "Cycles of the controller that were seen.", counts.cycles),
-            ("missed_cycles", "Cycles of the controller that were not seen.", counts.missed),
-            ("late_cycles", "Cycles finished later than a period after their state.", counts.late),
-            ("setpoints_written", "Setpoints sent to the robot.", counts.written),
+            ("cycles", "Cycles of the controller that were seen.", cycles.cycles),
+            ("missed_cycles", "Cycles of the controller that were not seen.", cycles.missed),
+            ("late_cycles", "Cycles finished later than a period after their state.", cycles.late),
+            ("setpoints_written", "Setpoints sent to the robot.", cycles.written),
             ("uncounted_cycles", "Cycles overwritten before they could be counted.", lost),
         ):
             yield CounterMetricFamily(f"gapbridge_{name}", message, float(value))
         yield _counter(
-            "gapbridge_setpoints_clamped", "Setpoints clamped by a limit.", counts.clamped,
+            "gapbridge_setpoints_clamped", "Setpoints clamped by a limit.", cycles.clamped,
             "limit",
         )  # fmt: skip
         rate = counts.settings.link.rate

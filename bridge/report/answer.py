@@ -16,17 +16,15 @@ from gapbridge.bridge.document.drawing import (
     Rectangle,
     Text,
 )
+from gapbridge.bridge.document.numbers import likelihood, percent, with_unit
 from gapbridge.bridge.report.labels import (
     CHANNELS,
     VERDICTS,
     effect_title,
     joint_list,
-    likelihood,
     listed,
-    percent,
     quantity_title,
-    with_unit,
-)  # fmt: skip
+)
 from gapbridge.bridge.report.material import Material, after, chosen_channel, shares, unexplained
 from gapbridge.bridge.report.slips import advice, answered, slips_of
 from gapbridge.core.diagnosis.causes import Cause

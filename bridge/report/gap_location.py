@@ -8,18 +8,16 @@ from gapbridge.bridge.document import blocks
 from gapbridge.bridge.document.axes import Chart, Scale, scale
 from gapbridge.bridge.document.drawing import EDGE, SOFT, Drawing
 from gapbridge.bridge.document.findings import considered_text
+from gapbridge.bridge.document.numbers import likelihood, percent, unit_of
 from gapbridge.bridge.document.scene import Arrows, Path, Scene, base
 from gapbridge.bridge.document.skeleton import reach, round_factor, skeleton
 from gapbridge.bridge.document.time_scale import time_scale
 from gapbridge.bridge.report.labels import (
     effect_title,
     joint_list,
-    likelihood,
     listed,
-    percent,
     quantity_title,
     quantity_unit,
-    unit_of,
 )
 from gapbridge.bridge.report.material import (
     Material,

@@ -7,7 +7,8 @@ import numpy as np
 from gapbridge.bridge.document.axes import Chart, distribution, scale
 from gapbridge.bridge.document.blocks import Bar, Block, Cell, Paragraph, Pictures, Table
 from gapbridge.bridge.document.drawing import BAD_DOT, EDGE, LIMIT
-from gapbridge.bridge.report.labels import CHANNELS, effect_title, percent, unit_of, with_unit
+from gapbridge.bridge.document.numbers import percent, unit_of, with_unit
+from gapbridge.bridge.report.labels import CHANNELS, effect_title
 from gapbridge.bridge.report.material import (
     Material,
     before_and_after,

@@ -1,12 +1,13 @@
-"""Titles of effects, quantities and parameters, and numbers with their units, for reports."""
+"""Titles of effects, quantities and parameters, for reports."""
 
 from __future__ import annotations
 
 import math
-import re
 
+from gapbridge.bridge.document.numbers import unit_of
 from gapbridge.core.diagnosis.channel_diagnosis import Verdict
 from gapbridge.core.effects import CATALOGUE, ParameterName, Reported, split_name
+from gapbridge.core.log.columns import COLUMNS, INDEXED
 
 CHANNELS = {
     "position": "Position of the tool",
@@ -20,33 +21,20 @@ VERDICTS = {
     Verdict.PARTLY_EXPLAINED: "Partly explained",
     Verdict.UNEXPLAINED: "Not explained",
 }
-UNITS: dict[str, tuple[str, float]] = {
-    "m": ("mm", 1e3),
-    "rad": ("mrad", 1e3),
-    "s": ("ms", 1e3),
-    "rad/Nm": ("µrad/Nm", 1e6),
-    "1/K": ("ppm/K", 1e6),
-    "1/(N m2)": ("1/(MN m²)", 1e6),
-    "1/(Nm)2": ("1/(kNm)²", 1e6),
-    "N/s": ("N/h", 3600.0),
-    "Nm/s": ("Nm/h", 3600.0),
-    "kg m2": ("kg m²", 1.0),
-    "Nm s/rad": ("Nm s/rad", 1.0),
-    "": ("%", 1e2),
-}
-_COLUMNS = {
-    "actual_q": "angle of joint",
-    "target_q": "commanded angle of joint",
-    "actual_qd": "speed of joint",
-    "joint_temperatures": "temperature of joint",
-    "approach": "last motion of joint",
-    "held_torque": "torque held by joint",
-}
-_VECTORS = {
-    "payload_cog": "centre of gravity of the load",
-    "measured_position": "measured position",
-    "actual_TCP_force": "outside force",
-    "ft_raw_wrench": "sensor reading",
+DEGREES = ("deg", 180 / math.pi)
+_QUANTITIES: dict[str, tuple[str, str, float]] = {  # of a column: title, unit, factor from SI
+    "timestamp": ("time", "s", 1.0),
+    "payload": ("declared load", "kg", 1.0),
+    "actual_q": ("angle of joint", *DEGREES),
+    "target_q": ("commanded angle of joint", *DEGREES),
+    "actual_qd": ("speed of joint", "rad/s", 1.0),
+    "joint_temperatures": ("temperature of joint", "°C", 1.0),
+    "approach": ("last motion of joint", "", 1.0),
+    "held_torque": ("torque held by joint", "Nm", 1.0),
+    "payload_cog": ("centre of gravity of the load", "mm", 1e3),
+    "measured_position": ("measured position", "mm", 1e3),
+    "actual_TCP_force": ("outside force", "N", 1.0),
+    "ft_raw_wrench": ("sensor reading", "", 1.0),
 }
 _AXES = ("x", "y", "z", "about x", "about y", "about z")
 SESSION_PARAMETERS = {  # of calibration sessions, beyond those of effects
@@ -70,98 +58,30 @@ def effect_title(identifier: str) -> str:
 
 def quantity_title(name: str) -> str:
     """Return the title of a log column, joints counted from 1."""
-    if name == "timestamp":
-        return "time"
-    if name == "payload":
-        return "declared load"
-    match = re.fullmatch(r"(.+)_(\d+)", name)
-    if match and match[1] in _COLUMNS:
-        return f"{_COLUMNS[match[1]]} {int(match[2]) + 1}"
-    if match and match[1] in _VECTORS and int(match[2]) < 6:
-        return f"{_VECTORS[match[1]]} {_AXES[int(match[2])]}"
-    return name.replace("_", " ")
+    stem, index = _column(name)
+    if stem not in _QUANTITIES:
+        return name.replace("_", " ")
+    title = _QUANTITIES[stem][0]
+    if index is None:
+        return title
+    return f"{title} {_AXES[index]}" if COLUMNS.get(stem) else f"{title} {index + 1}"
 
 
 def quantity_unit(name: str) -> tuple[str, float]:
     """Return the display unit of a log column, and the factor from SI."""
-    if name.startswith(("actual_q_", "target_q_")):
-        return "deg", 180 / math.pi
-    units = {
-        "actual_qd": "rad/s", "joint_temperatures": "°C", "actual_TCP_force": "N",
-        "timestamp": "s", "approach": "", "held_torque": "Nm",
-    }  # fmt: skip
-    for start, unit in units.items():
-        if name.startswith(start):
-            return unit, 1.0
-    if name.startswith(("payload_cog", "measured_position")):
-        return "mm", 1e3
-    return ("kg", 1.0) if name == "payload" else ("", 1.0)
+    _, unit, factor = _QUANTITIES.get(_column(name)[0], ("", "", 1.0))
+    return unit, factor
 
 
-def unit_of(unit: str) -> tuple[str, float]:
-    """Return the display unit for an SI unit, and the factor from SI."""
-    return UNITS.get(unit, (unit, 1.0))
+def _column(name: str) -> tuple[str, int | None]:
+    """Return a column's name without its index, and the index."""
+    match = INDEXED.match(name)
+    return (match[1], int(match[2])) if match else (name, None)
 
 
 def parameter_unit(parameter: Reported) -> tuple[str, float]:
     """Return the display unit of a parameter, and the factor from SI."""
-    return ("deg", 180 / math.pi) if parameter.part == "phase" else unit_of(parameter.unit)
-
-
-def fixed(value: float, decimals: int) -> str:
-    """Return a number with ``decimals`` decimals and a typographic minus, without "-0"."""
-    if not math.isfinite(value):
-        return "unknown"
-    text = f"{value:.{decimals}f}"
-    if not text.strip("-0."):
-        text = text.lstrip("-")
-    return text.replace("-", "−")
-
-
-def decimals_of(spread: float) -> int:
-    """Return the number of decimals that shows two significant digits of a spread."""
-    if not math.isfinite(spread) or spread <= 0:
-        return 3
-    return min(max(1 - math.floor(math.log10(spread)), 0), 9)
-
-
-def number(value: float, digits: int = 3) -> str:
-    """Return a number with ``digits`` significant digits, with an exponent only if extreme."""
-    if not math.isfinite(value):
-        return "unknown"
-    if value == 0:
-        return "0"
-    size = math.floor(math.log10(abs(value)))
-    if size < -4 or size > 6:
-        return f"{value:.{digits - 1}e}"
-    text = f"{value:.{max(digits - 1 - size, 0)}f}"
-    return text.replace("-", "−")
-
-
-def with_unit(value: float | None, unit: str) -> str:
-    """Return a value (SI) in its display unit; "unknown" for None."""
-    if value is None:
-        return "unknown"
-    name, factor = unit_of(unit)
-    return f"{number(value * factor)} {name}"
-
-
-def percent(share: float | None) -> str:
-    """Return a share (0 to 1) as percent."""
-    if share is None or not math.isfinite(share):
-        return "unknown"
-    return f"{round(share * 100)} %".replace("-", "−")
-
-
-def likelihood(probability: float) -> str:
-    """Return a probability as percent, bounded at 0.1 and 99.9 %."""
-    if not math.isfinite(probability):
-        return "unknown"
-    if probability > 0.999:
-        return "over 99.9 %"
-    if probability < 0.001:
-        return "under 0.1 %"
-    return f"{probability * 100:.1f} %"
+    return DEGREES if parameter.part == "phase" else unit_of(parameter.unit)
 
 
 def listed(items: list[str], last: str = "and") -> str:

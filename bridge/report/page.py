@@ -11,12 +11,13 @@ import numpy as np
 from gapbridge.bridge.document import blocks
 from gapbridge.bridge.document.findings import finding_text
 from gapbridge.bridge.document.html import html
+from gapbridge.bridge.document.numbers import with_unit
 from gapbridge.bridge.document.output_file import write_text
 from gapbridge.bridge.document.provenance import origin_blocks, origin_line
 from gapbridge.bridge.report.answer import answer
 from gapbridge.bridge.report.gap_location import effect_tables, gap_location
 from gapbridge.bridge.report.gap_reduction import gap_reduction
-from gapbridge.bridge.report.labels import CHANNELS, with_unit
+from gapbridge.bridge.report.labels import CHANNELS
 from gapbridge.bridge.report.material import Material, per_sample
 from gapbridge.bridge.report.parameters import parameters
 from gapbridge.bridge.report.slips import slip_section

@@ -5,16 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from gapbridge.bridge.document import blocks
+from gapbridge.bridge.document.numbers import decimals_of, fixed, number
 from gapbridge.bridge.document.provenance import HALF_WIDTH
-from gapbridge.bridge.report.labels import (
-    decimals_of,
-    effect_title,
-    fixed,
-    joint_list,
-    listed,
-    number,
-    parameter_unit,
-)
+from gapbridge.bridge.report.labels import effect_title, joint_list, listed, parameter_unit
 from gapbridge.bridge.report.material import Material
 from gapbridge.bridge.report.slips import moment_of
 from gapbridge.core.diagnosis.causes import Cause

@@ -20,8 +20,9 @@ from gapbridge.bridge.document.blocks import (
 from gapbridge.bridge.document.drawing import AFTER, BEFORE, VIOLET
 from gapbridge.bridge.document.findings import moment_text, slip_text
 from gapbridge.bridge.document.local_time import clock, is_date, zone
+from gapbridge.bridge.document.numbers import unit_of, with_unit
 from gapbridge.bridge.document.time_scale import time_scale
-from gapbridge.bridge.report.labels import joint_list, listed, sentence, unit_of, with_unit
+from gapbridge.bridge.report.labels import joint_list, listed, sentence
 from gapbridge.bridge.report.material import Material, channel_heading, thinned
 from gapbridge.core.arrays import Array
 from gapbridge.core.diagnosis.channel_diagnosis import ChannelDiagnosis

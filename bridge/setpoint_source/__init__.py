@@ -6,6 +6,8 @@ from pathlib import Path
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING, cast
 
+from gapbridge.bridge.setpoint_source.source import SourceContext
+
 if TYPE_CHECKING:
     from gapbridge.bridge.cell.sections import SetpointSettings
     from gapbridge.bridge.setpoint_source.source import Source
@@ -33,5 +35,5 @@ def make_source(
     used.
     """
     source_class = resolve_name(SOURCES[settings.source])
-    timed = (clock,) if source_class.takes_clock else ()
-    return cast("Source", source_class(settings, n, moves_arm, folder, rate, *timed))
+    context = SourceContext(settings, n, moves_arm, folder, rate, clock)
+    return cast("Source", source_class(context))

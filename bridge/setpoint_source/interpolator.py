@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from pathlib import Path
 from typing import ClassVar
 
-from gapbridge.bridge.cell.sections import SetpointSettings
-from gapbridge.bridge.setpoint_source.source import Source, SourceDryError
+from gapbridge.bridge.setpoint_source.source import Source, SourceContext, SourceDryError
 from gapbridge.core.arrays import Array
 from gapbridge.drivers.clock import Clock
 
@@ -72,16 +70,14 @@ class SetpointInterpolator:
 class InterpolatedSource(Source):
     """A source whose setpoints arrive at irregular times and are interpolated."""
 
-    takes_clock = True
     expected: ClassVar[str]  # what the sender should send, for messages
 
-    def __init__(
-        self, settings: SetpointSettings, n: int, moves_arm: bool, folder: Path, rate: float,
-        clock: Clock,
-    ) -> None:  # fmt: skip
-        super().__init__(settings, n, moves_arm, folder, rate)
-        self._clock = clock
-        self._interpolator = SetpointInterpolator(settings.timeout, self.expected, clock)
+    def __init__(self, context: SourceContext) -> None:
+        super().__init__(context)
+        self._clock = context.clock
+        self._interpolator = SetpointInterpolator(
+            self.settings.timeout, self.expected, context.clock
+        )
 
     @abstractmethod
     def _receive(self) -> bool:

@@ -6,16 +6,13 @@ import json
 import os
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 
-from gapbridge.bridge.cell.sections import SetpointSettings
 from gapbridge.bridge.setpoint_source.interpolator import InterpolatedSource
 from gapbridge.bridge.setpoint_source.plc_memory import MOST_JOINTS, PlcMemory
-from gapbridge.bridge.setpoint_source.source import SourceStatus
+from gapbridge.bridge.setpoint_source.source import SourceContext, SourceStatus
 from gapbridge.core.errors import InputError, RunError
-from gapbridge.drivers.clock import Clock
 
 WRITTEN, LIMITED = 1, 2  # flags
 
@@ -30,13 +27,12 @@ class ModbusSource(InterpolatedSource):
 
     expected = "new sequence number"
 
-    def __init__(
-        self, settings: SetpointSettings, n: int, moves_arm: bool, folder: Path, rate: float,
-        clock: Clock,
-    ) -> None:  # fmt: skip
-        super().__init__(settings, n, moves_arm, folder, rate, clock)
-        if n > MOST_JOINTS:
-            raise InputError(f"found {n} joints, expected {MOST_JOINTS}", ("setpoints", "source"))
+    def __init__(self, context: SourceContext) -> None:
+        super().__init__(context)
+        if self.n > MOST_JOINTS:
+            raise InputError(
+                f"found {self.n} joints, expected {MOST_JOINTS}", ("setpoints", "source")
+            )
         self._memory: PlcMemory | None = None
         self._server: subprocess.Popen[str] | None = None
         self._sequence: int | None = None

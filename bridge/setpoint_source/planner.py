@@ -18,14 +18,13 @@ import math
 import os
 import socket
 import stat
-from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
 
-from gapbridge.bridge.cell.sections import SetpointSettings
 from gapbridge.bridge.ipc.control_socket import peer_of
 from gapbridge.bridge.setpoint_source.interpolator import InterpolatedSource
+from gapbridge.bridge.setpoint_source.source import SourceContext
 from gapbridge.core.errors import RunError
 from gapbridge.drivers.clock import Clock
 
@@ -123,11 +122,8 @@ class PlannerSource(InterpolatedSource):
     expected = "line"
     needs_token: ClassVar[bool] = False
 
-    def __init__(
-        self, settings: SetpointSettings, n: int, moves_arm: bool, folder: Path, rate: float,
-        clock: Clock,
-    ) -> None:  # fmt: skip
-        super().__init__(settings, n, moves_arm, folder, rate, clock)
+    def __init__(self, context: SourceContext) -> None:
+        super().__init__(context)
         self._listener: socket.socket | None = None
         self._planner: Connection | None = None
         self._waiting: list[Connection] = []

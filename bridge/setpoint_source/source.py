@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 from gapbridge.bridge.cell.sections import SetpointSettings
 from gapbridge.core.arrays import Array
 from gapbridge.core.errors import RunError
+from gapbridge.drivers.clock import Clock
 
 
 class SourceStatus(NamedTuple):
@@ -22,6 +24,18 @@ class SourceStatus(NamedTuple):
     clamped: int  # bits of the limiter
 
 
+@dataclass(frozen=True)
+class SourceContext:
+    """What a source is made of; ``folder`` is where relative paths start."""
+
+    settings: SetpointSettings
+    n: int  # joints
+    moves_arm: bool  # setpoints are the arm's only motion
+    folder: Path
+    rate: float  # of the robot's cycles, Hz
+    clock: Clock  # for setpoints that come at their own times
+
+
 class SourceDryError(RunError):
     """A source has no setpoint in time: the arm must hold."""
 
@@ -32,16 +46,10 @@ class Source(ABC):
     Constructors read what they need and open nothing. ``sample`` never blocks.
     """
 
-    takes_clock: ClassVar[bool] = (
-        False  # its constructor takes a Clock last: senders have their own
-    )
-
-    def __init__(
-        self, settings: SetpointSettings, n: int, moves_arm: bool, folder: Path, rate: float
-    ) -> None:
-        self.settings = settings
-        self.n = n
-        self.rate = rate  # of the robot's cycles, Hz
+    def __init__(self, context: SourceContext) -> None:
+        self.settings = context.settings
+        self.n = context.n
+        self.rate = context.rate  # of the robot's cycles, Hz
 
     def open(self) -> None:
         """Open what the source listens on. Raises RunError."""

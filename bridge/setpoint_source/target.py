@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
-from gapbridge.bridge.cell.sections import SetpointSettings
-from gapbridge.bridge.setpoint_source.source import Source
+from gapbridge.bridge.setpoint_source.source import Source, SourceContext
 from gapbridge.core.arrays import Array
 
 
@@ -16,11 +13,9 @@ class TargetSource(Source):
     holds the joints at which writing began.
     """
 
-    def __init__(
-        self, settings: SetpointSettings, n: int, moves_arm: bool, folder: Path, rate: float
-    ) -> None:
-        super().__init__(settings, n, moves_arm, folder, rate)
-        self._holds_start = moves_arm
+    def __init__(self, context: SourceContext) -> None:
+        super().__init__(context)
+        self._holds_start = context.moves_arm
         self._start: Array | None = None
 
     def first(self, robot_q: Array) -> Array | None:

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 
-from gapbridge.bridge.cell.sections import SetpointSettings
-from gapbridge.bridge.setpoint_source.source import Source
+from gapbridge.bridge.setpoint_source.source import Source, SourceContext
 from gapbridge.core.arrays import Array
 from gapbridge.core.errors import LogError
 from gapbridge.core.log.log import read_log
@@ -20,12 +17,10 @@ class TrajectorySource(Source):
     LogError if the file is not a trajectory of n joints.
     """
 
-    def __init__(
-        self, settings: SetpointSettings, n: int, moves_arm: bool, folder: Path, rate: float
-    ) -> None:
-        super().__init__(settings, n, moves_arm, folder, rate)
-        path = folder / (settings.file or "")
-        log = read_log(path, n)
+    def __init__(self, context: SourceContext) -> None:
+        super().__init__(context)
+        path = context.folder / (self.settings.file or "")
+        log = read_log(path, self.n)
         self._q: Array = np.ascontiguousarray(log.require("target_q"))
         time = log.require("timestamp")
         backwards = np.flatnonzero(np.diff(time) <= 0.0)

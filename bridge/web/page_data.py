@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 
 from gapbridge.bridge.cell.daemon_settings import DaemonSettings
+from gapbridge.bridge.ipc.cycle_counts import CycleCounts
 from gapbridge.bridge.ipc.events import EventKind
 from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.ipc.shared_memory import ROWS, SharedMemory
 from gapbridge.bridge.ipc.updated_settings import UpdatedSettings
 from gapbridge.bridge.web.prediction import Prediction
 from gapbridge.core.arrays import Array
-from gapbridge.core.state import CLAMPS
 from gapbridge.drivers.clock import Clock
 
 Message = tuple[str, dict[str, Any]]  # kind, data
@@ -72,8 +72,7 @@ class PageData:
         self.events: deque[dict[str, Any]] = deque(maxlen=EVENTS)
         self.status: dict[str, Any] = {}
         self._why: dict[str, Any] = {}  # the last transition
-        self._counts = {"cycles": 0, "missed": 0, "late": 0, "written": 0}
-        self._clamped = dict.fromkeys(CLAMPS, 0)
+        self._counts = CycleCounts(memory.slices)
         self._last = 0.0  # s, monotonic: when the last state was received
         self._sensor = "actual_TCP_force"
 
@@ -124,13 +123,7 @@ class PageData:
         if len(rows):
             received, age = rows[:, s["received"].start], rows[:, s["age"].start]
             rate = self._settings.link.rate
-            self._counts["cycles"] += len(rows)
-            self._counts["missed"] += int(rows[:, s["missed"].start].sum())
-            self._counts["late"] += int((age > 1.0 / rate).sum())
-            self._counts["written"] += int(rows[:, s["written"].start].sum())
-            bits = rows[:, s["clamped"].start].astype(np.int64)
-            for bit, name in enumerate(CLAMPS):
-                self._clamped[name] += int((bits >> bit & 1).sum())
+            self._counts.add(rows, rate)
             self._last, self._row = float(received[-1]), rows[-1].copy()
             times = np.concatenate([self._times, received])
             self._times = times[times > times[-1] - RATE_SPAN]
@@ -163,9 +156,9 @@ class PageData:
             "heartbeat": self._memory.silence,  # s since the loop's last sign of life
             "rate": rate,
             "sensor": self._sensor,
-            "clamped": self._clamped,
+            "clamped": self._counts.clamped,
             "lost": self._reader.lost,
-            **self._counts,
+            **self._counts.totals(),
         }
 
     def about(self) -> dict[str, Any]:

@@ -24,9 +24,9 @@ from gapbridge.bridge.calibration.session.session import Session, seconds_left
 from gapbridge.bridge.cell import Cell
 from gapbridge.bridge.cell.verification_mark import remove_mark
 from gapbridge.bridge.document.notes import calibration_text, note_text
+from gapbridge.bridge.document.numbers import unit_of
 from gapbridge.bridge.document.provenance import fitted as fit_provenance
 from gapbridge.bridge.document.provenance import provenance
-from gapbridge.bridge.report.labels import unit_of
 from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.accuracy_baseline import baseline_document
 from gapbridge.core.calibration.fit import SessionFit, evaluate_fit, fit_session

@@ -28,11 +28,7 @@ def plan_of(entry: dict[str, Any]) -> Plan:
         ),
         bought=tuple((int(n), float(s)) for n, s in entry["bought"]),
         travel=float(entry["travel"]),
-        notes=tuple(
-            Note(Reason[note[0]], tuple(note[1]))
-            for note in entry["notes"]
-            if not isinstance(note, str)  # older journals have sentences here
-        ),
+        notes=tuple(Note(Reason[name], tuple(values)) for name, values in entry["notes"]),
     )  # fmt: skip
 
 

@@ -32,9 +32,9 @@ _ALIASES = {"u": "undo", "b": "back", "q": "quit", "exit": "quit", "h": "?", "he
 class SessionCommand(Exception):  # noqa: N818 - not an error
     """The operator typed one of COMMANDS instead of an answer."""
 
-    def __init__(self, name: str, rest: str = "") -> None:
+    def __init__(self, name: str) -> None:
         super().__init__(name)
-        self.name, self.rest = name, rest
+        self.name = name
 
 
 class InputEnded(Exception):  # noqa: N818
@@ -139,10 +139,10 @@ class Prompt:
         return False
 
     def _answer(self, line: str) -> str:
-        word, _, rest = line.partition(" ")
-        name = _ALIASES.get(word.lower(), word.lower())
+        word = line.partition(" ")[0].lower()
+        name = _ALIASES.get(word, word)
         if name in COMMANDS:
-            raise SessionCommand(name, rest.strip())
+            raise SessionCommand(name)
         return line
 
 

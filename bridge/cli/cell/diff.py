@@ -20,8 +20,9 @@ from gapbridge.bridge.cell.difference import (
 )
 from gapbridge.bridge.cell.opened_log import open_log
 from gapbridge.bridge.cli.options import FILE, open_cell
+from gapbridge.bridge.document.numbers import unit_of
 from gapbridge.bridge.document.provenance import provenance
-from gapbridge.bridge.report.labels import effect_title, unit_of
+from gapbridge.bridge.report.labels import effect_title
 from gapbridge.core.arm import Arm
 from gapbridge.core.effects import Reported, Term, effect_named
 from gapbridge.core.rotation import rotation_vector

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
-from gapbridge.bridge.api.records import Diagnosed
-from gapbridge.bridge.cell import Cell
-from gapbridge.bridge.cell.opened_log import open_simulated
+from gapbridge.bridge import api
+from gapbridge.bridge.cell.opened_log import open_log
 from gapbridge.bridge.cli.log.diagnosis_text import diagnosis_text, wrong_arm_findings
 from gapbridge.bridge.cli.options import (
     FILE,
@@ -23,18 +22,9 @@ from gapbridge.bridge.cli.options import (
     warn_outside,
 )
 from gapbridge.bridge.cli.progress import status
-from gapbridge.bridge.document.diagnosis_json import document
 from gapbridge.bridge.document.log_findings import log_finding_text
 from gapbridge.bridge.document.output_file import require_folder, require_writable
-from gapbridge.bridge.document.provenance import provenance
-from gapbridge.core.diagnosis.diagnosis import Diagnosis, channels_of
-from gapbridge.core.diagnosis.diagnosis import diagnose as diagnose_log
-from gapbridge.core.errors import InputError, LogError
-from gapbridge.core.log.log import Log
-from gapbridge.core.metrology import Metrology
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
+from gapbridge.core.errors import InputError
 
 
 @click.command()
@@ -102,17 +92,17 @@ def diagnose(
     rows = open_logs(logs, opened)
     warn_outside(rows, opened)
     require_effects(withhold)
-    simulated = None if sim is None else open_simulated(sim, opened, rows)
+    simulated = None if sim is None else open_log(sim, opened)
     output.require_writable(*logs, cell, *([sim] if sim else []))
     with status("diagnosing") as emit:
-        metrology = replace(opened.metrology, remounted=remounted)
-        diagnosis = _diagnose(opened, rows, metrology, withhold, simulated, emit)
-    for finding in wrong_arm_findings(diagnosis):
+        found = api.diagnose(
+            opened, rows, withhold=withhold, remounted=remounted, simulated=simulated,
+            progress=emit,
+        )  # fmt: skip
+    for finding in wrong_arm_findings(found.diagnosis):
         click.echo(f"warning: {rows.path}: {log_finding_text(finding)}", err=True)
-    origin = provenance({"log": logs, "cell": [cell], "sim": [sim] if sim else []})
-    whole = Diagnosed(opened, rows, diagnosis, document(diagnosis) | {"provenance": origin})
-    written = output.write(whole)  # before the text: its reader may leave early
-    click.echo(diagnosis_text(diagnosis))
+    written = output.write(found)  # before the text: its reader may leave early
+    click.echo(diagnosis_text(found.diagnosis))
     for file in written:
         click.echo(f"{file}: written")
 
@@ -138,7 +128,7 @@ class _Output:
         if self.out is not None:
             require_folder(self.out, "--out", above=False)
 
-    def write(self, diagnosed: Diagnosed) -> list[Path]:
+    def write(self, diagnosed: api.Diagnosed) -> list[Path]:
         """Write the requested files and return their paths."""
         if self.json_file is not None:
             diagnosed.write_json(self.json_file)
@@ -146,18 +136,3 @@ class _Output:
             diagnosed.save(self.new_cell, stand_ins=self.stand_ins)
         folder = [] if self.out is None else diagnosed.write_report(self.out)
         return [*folder, *(f for f in (self.json_file, self.new_cell) if f is not None)]
-
-
-def _diagnose(
-    cell: Cell, log: Log, metrology: Metrology, withhold: tuple[str, ...], simulated: Log | None,
-    emit: Callable[[str], None],
-) -> Diagnosis:  # fmt: skip
-    extra: dict[str, Any] = {} if simulated is None else {"simulated": simulated}
-    try:
-        return diagnose_log(
-            cell.model, log, metrology, withhold=withhold, progress=emit,
-            observers=channels_of(cell.uncertain), **extra,
-        )  # fmt: skip
-    except InputError as error:
-        text = str(error)
-        raise LogError(text if text.startswith(log.path) else f"{log.path}: {text}") from None

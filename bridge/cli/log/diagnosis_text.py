@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from gapbridge.bridge.document.diagnosis_json import session_parameter
 from gapbridge.bridge.document.findings import finding_text
-from gapbridge.bridge.document.parameter_entries import session_parameter
-from gapbridge.bridge.report.labels import parameter_unit, unit_of
+from gapbridge.bridge.document.numbers import unit_of
+from gapbridge.bridge.report.labels import parameter_unit
 from gapbridge.bridge.report.slips import moment_of, slip_findings, slip_texts
 from gapbridge.core.diagnosis.causes import Cause
 from gapbridge.core.diagnosis.channel_diagnosis import ChannelDiagnosis, Verdict

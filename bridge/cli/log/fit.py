@@ -11,7 +11,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from gapbridge.bridge.api.uncertainty import fit_intervals
+from gapbridge.bridge.api.uncertainty import provenance_of_fit
 from gapbridge.bridge.cell import Cell, save_cell
 from gapbridge.bridge.cell.log_consistency import pose_findings
 from gapbridge.bridge.cli.log.large_log import LargeLog, has_sessions, is_large
@@ -26,8 +26,7 @@ from gapbridge.bridge.cli.options import (
 from gapbridge.bridge.cli.progress import progress, status
 from gapbridge.bridge.document.notes import note_texts
 from gapbridge.bridge.document.output_file import require_writable
-from gapbridge.bridge.document.provenance import fitted, provenance
-from gapbridge.core.calibration.spread import Spread
+from gapbridge.bridge.document.provenance import provenance
 from gapbridge.core.effects import by_approach
 from gapbridge.core.errors import ExcitationError
 from gapbridge.core.estimation.identification import Identification, identify_compliance
@@ -68,9 +67,8 @@ def fit(logs: tuple[Path, ...], cell: Path, remounted: bool, out: Path) -> None:
         estimate, warnings, ranges = _identified(logs, opened, metrology)
     except ExcitationError as error:
         raise ExcitationError(f"{', '.join(map(str, logs))}: {error}") from None
-    spread = Spread.of_fit(estimate.identifiable, estimate.covariance).beside(opened.spread)
-    intervals = opened.intervals | fit_intervals(estimate)
-    origin = fitted(provenance({"log": logs, "cell": [cell]}), ranges, spread, intervals)
+    origin = provenance({"log": logs, "cell": [cell]})
+    origin = provenance_of_fit(opened, estimate, origin, ranges)
     save_cell(opened, out, estimate.cell_model, {"provenance": origin})
     for line in warnings:
         click.echo(f"warning: {', '.join(map(str, logs))}: {line}", err=True)

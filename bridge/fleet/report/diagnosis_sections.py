@@ -7,20 +7,13 @@ from collections.abc import Sequence
 from gapbridge.bridge.document import blocks
 from gapbridge.bridge.document.axes import Chart, named, scale
 from gapbridge.bridge.document.drawing import AFTER, LIMIT, PALE, Drawing
+from gapbridge.bridge.document.numbers import percent, with_unit
 from gapbridge.bridge.fleet.diagnosis_summary import FleetDiagnosis, Onset, Recurrence
 from gapbridge.bridge.fleet.runner import FleetRun
 from gapbridge.bridge.fleet.session import natural_key
 from gapbridge.bridge.fleet.task import DONE, Outcome
 from gapbridge.bridge.report.answer import KINDS
-from gapbridge.bridge.report.labels import (
-    VERDICTS,
-    counted,
-    effect_title,
-    joint_list,
-    listed,
-    percent,
-    with_unit,
-)
+from gapbridge.bridge.report.labels import VERDICTS, counted, effect_title, joint_list, listed
 from gapbridge.core.diagnosis.channel_diagnosis import Verdict
 
 SESSION_HEADS = ("verdict", "samples", "gap", "unexplained", "causes")

@@ -9,10 +9,11 @@ import numpy as np
 from gapbridge.bridge.document import blocks
 from gapbridge.bridge.document.axes import Chart, named, scale
 from gapbridge.bridge.document.drawing import AFTER, BEFORE, EDGE, PALE, Drawing
+from gapbridge.bridge.document.numbers import number, percent, with_unit
 from gapbridge.bridge.fleet.fit_summary import FittedArm, FittedSession, FittedType, FleetFit
 from gapbridge.bridge.fleet.report.shared_sections import MAX_ROWS, type_title
 from gapbridge.bridge.fleet.task import Outcome
-from gapbridge.bridge.report.labels import counted, number, parameter_title, percent, with_unit
+from gapbridge.bridge.report.labels import counted, parameter_title
 
 SESSION_HEADS = ("poses", "gap with the cell", "with the fit", "predicted by the others")
 MICRO = 1e6

@@ -9,10 +9,11 @@ import numpy as np
 from gapbridge.bridge.document import blocks
 from gapbridge.bridge.document.axes import Chart, scale
 from gapbridge.bridge.document.drawing import AFTER, BAD_DOT, BEFORE, LIMIT, SOFT, VIOLET, Drawing
+from gapbridge.bridge.document.numbers import number, with_unit
 from gapbridge.bridge.fleet.drift import ChannelFigure, Drift, Outlier, Quantity
 from gapbridge.bridge.fleet.runner import STATES, FleetRun
 from gapbridge.bridge.fleet.task import DONE, Outcome
-from gapbridge.bridge.report.labels import CHANNELS, number, parameter_title, with_unit
+from gapbridge.bridge.report.labels import CHANNELS, parameter_title
 
 MAX_ROWS = 40  # rows of a table; all are in the Parquet files
 MAX_DRAWN = 6  # drifts in the picture

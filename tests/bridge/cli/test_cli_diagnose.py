@@ -26,6 +26,7 @@ from cli_runs import (
 import gapbridge.bridge.cli.log.diagnose as command
 from gapbridge.bridge.cell import load_cell
 from gapbridge.core.arm import builtin_arm
+from gapbridge.core.diagnosis import diagnosis as core
 from gapbridge.core.effects import Site, Term
 from gapbridge.core.log.log import Log
 from gapbridge.core.model import Model
@@ -112,14 +113,14 @@ def test_stand_ins_go_into_the_cell_only_when_asked_for(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     log, cell = soft_log(tmp_path), cell_in(tmp_path)
-    genuine = command.diagnose_log
+    genuine = core.diagnose
     play = Term("backlash", Site(3), (2e-4,), stand_in=True)
 
     def with_one(*given: object, **more: object) -> object:
         found = genuine(*given, **more)  # type: ignore[arg-type]
         return replace(found, with_stand_ins=found.with_stand_ins.with_terms([play]))
 
-    monkeypatch.setattr(command, "diagnose_log", with_one)
+    monkeypatch.setattr(core, "diagnose", with_one)
     texts = []
     for options in ((), ("--stand-ins",)):
         new = tmp_path / f"new{len(options)}.yaml"
@@ -180,13 +181,13 @@ def test_a_simulators_log_reaches_the_diagnosis_row_by_row(
     q, loads = poses_and_loads(40)
     simulated = log_in(tmp_path, measured(SOFT, q, loads), "sim.csv")
     seen: list[Log] = []
-    real = command.diagnose_log
+    real = core.diagnose
 
     def watched(*arguments: object, simulated: Log, **options: object) -> object:
         seen.append(simulated)
         return real(*arguments, **options)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(command, "diagnose_log", watched)
+    monkeypatch.setattr(core, "diagnose", watched)
     log, cell = soft_log(tmp_path), cell_in(tmp_path)
     assert gapbridge("diagnose", log, "--cell", cell, "--sim", simulated).code == 0
     np.testing.assert_array_equal(

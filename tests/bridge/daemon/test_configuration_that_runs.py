@@ -39,7 +39,7 @@ def test_a_loop_that_is_started_anew_runs_the_cell_that_runs_not_the_edited_one(
             wait_for(lambda: granted(run), "the grant of the first loop")
             before = granted(run)
             run.compensate()
-            wait_for(lambda: run.daemon.tally.written > 400, "a ramp")
+            wait_for(lambda: run.daemon.tally.counts.written > 400, "a ramp")
             # an arm ten times as soft as the one that stands there: the model is what is read anew
             soft = [10.0 * c for c in robot.settings.plant.axial]
             axial = str(list(robot.settings.plant.axial))
@@ -50,9 +50,9 @@ def test_a_loop_that_is_started_anew_runs_the_cell_that_runs_not_the_edited_one(
             os.kill(pid, 9)
             run.wait(State.DISCONNECTED)
             run.wait(State.OBSERVING)
-            written = run.daemon.tally.written
+            written = run.daemon.tally.counts.written
             run.compensate()
-            wait_for(lambda: run.daemon.tally.written > written + 400, "a ramp")
+            wait_for(lambda: run.daemon.tally.counts.written > written + 400, "a ramp")
             assert run.daemon.configuration.text == text
             assert len(granted(run)) == 2
             assert granted(run)[-1] == before[-1] == run.daemon.configuration.hash

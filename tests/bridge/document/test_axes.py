@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gapbridge.bridge.document.axes import Chart, distribution, plain, scale
+from gapbridge.bridge.document.axes import Chart, distribution, scale
 from gapbridge.bridge.document.drawing import INK, Text
+from gapbridge.bridge.document.numbers import plain
 
 
 @pytest.mark.parametrize(

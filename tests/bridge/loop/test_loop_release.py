@@ -17,7 +17,7 @@ from gapbridge.bridge.ipc.shared_memory import SharedMemory
 from gapbridge.bridge.loop.loop import STOP_TIMEOUT, Exit, Loop
 from gapbridge.bridge.loop.setpoint_stream import longest_ramp_out
 from gapbridge.bridge.loop.supervisor import Cause
-from gapbridge.bridge.setpoint_source.source import Source
+from gapbridge.bridge.setpoint_source.source import Source, SourceContext
 from gapbridge.core.errors import RobotBusyError, WriteError
 from gapbridge.core.state import RobotState, Setpoint
 from gapbridge.drivers.clock import SYSTEM
@@ -105,7 +105,7 @@ class Bench:
         configuration = read_configuration(cell)
         settings = configuration.settings
         self.driver = StandingArm(configuration.model)
-        self.source = Waiting(settings.setpoints, 6, True, folder, RATE)
+        self.source = Waiting(SourceContext(settings.setpoints, 6, True, folder, RATE, SYSTEM))
         self.events: list[dict[str, Any]] = []
         emit = self.events.append
         self.loop = Loop(settings, configuration.model, self.driver, self.source, memory, emit)

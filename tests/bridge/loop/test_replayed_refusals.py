@@ -20,6 +20,7 @@ from gapbridge.bridge.loop.loop import Exit, Loop
 from gapbridge.bridge.loop.main import _compile
 from gapbridge.bridge.loop.replay import ReplayedLoop
 from gapbridge.bridge.recording.recorder import Recorder
+from gapbridge.bridge.setpoint_source.source import SourceContext
 from gapbridge.bridge.setpoint_source.target import TargetSource
 from gapbridge.core.errors import LinkError, PartialWriteError
 from gapbridge.core.log.mcap_reading import read_columns
@@ -96,7 +97,7 @@ def test_refused_and_half_sent_setpoints_gaps_and_lost_sensors_are_replayed(tmp_
     model = load_cell(cell).model
     settings = DaemonSettings(cell=cell)
     memory, commands, events = SharedMemory(N, clock=SYSTEM), CommandMemory(), []
-    source = TargetSource(SetpointSettings(), N, False, tmp_path, 20.0)
+    source = TargetSource(SourceContext(SetpointSettings(), N, False, tmp_path, 20.0, SYSTEM))
     loop = Loop(settings, model, Scripted(1800, commands, model), source, memory, events.append)
     _compile(settings, model, clock=SYSTEM)  # else the first cycles are late
     then = run(loop, memory, commands, tmp_path, "then")

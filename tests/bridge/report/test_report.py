@@ -8,20 +8,11 @@ import pytest
 from report_cases import CASES, diagnosed
 
 from gapbridge.bridge.document.drawing import Text
+from gapbridge.bridge.document.numbers import decimals_of, likelihood, number, percent, with_unit
 from gapbridge.bridge.document.skeleton import skeleton
 from gapbridge.bridge.report import SECTIONS, write_report
 from gapbridge.bridge.report.answer import picture
-from gapbridge.bridge.report.labels import (
-    VERDICTS,
-    decimals_of,
-    joint_list,
-    likelihood,
-    listed,
-    number,
-    percent,
-    quantity_title,
-    with_unit,
-)  # fmt: skip
+from gapbridge.bridge.report.labels import VERDICTS, joint_list, listed, quantity_title
 from gapbridge.bridge.report.material import SHOWN, shares, thinned, unexplained
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.effects import CATALOGUE

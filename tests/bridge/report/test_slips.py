@@ -14,11 +14,11 @@ import pytest
 from gapbridge.bridge.cli.log.diagnosis_text import diagnosis_text
 from gapbridge.bridge.document import blocks
 from gapbridge.bridge.document.html import html
+from gapbridge.bridge.document.numbers import with_unit
 from gapbridge.bridge.document.pdf import pdf
 from gapbridge.bridge.report.answer import answer, next_steps
 from gapbridge.bridge.report.gap_location import gap_location
 from gapbridge.bridge.report.gap_reduction import gap_reduction
-from gapbridge.bridge.report.labels import with_unit
 from gapbridge.bridge.report.material import Material
 from gapbridge.bridge.report.page import document
 from gapbridge.bridge.report.slips import sample_sizes, slip_section, slips_of, stretches

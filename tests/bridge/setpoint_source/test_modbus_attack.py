@@ -17,13 +17,15 @@ from gapbridge.bridge.cell.sections import SetpointSettings
 from gapbridge.bridge.ipc.command_memory import Command, CommandMemory, Commands
 from gapbridge.bridge.ipc.shared_memory import SharedMemory
 from gapbridge.bridge.setpoint_source import modbus
+from gapbridge.bridge.setpoint_source.source import SourceContext
 from gapbridge.drivers.clock import SYSTEM
 
 modbus.SERVER = "plc_attacker"
 requests, cycles = CommandMemory(), SharedMemory(6, clock=SYSTEM)
 commands = Commands(requests.fd)
 settings = SetpointSettings(source="modbus", port=1)
-source = modbus.ModbusSource(settings, 6, False, Path(sys.argv[1]), 500.0, SYSTEM)
+context = SourceContext(settings, 6, False, Path(sys.argv[1]), 500.0, SYSTEM)
+source = modbus.ModbusSource(context)
 source.open()
 try:
     print([command.name for command in commands.take()], cycles.state)

@@ -21,7 +21,7 @@ from gapbridge.bridge.cell.sections import SetpointSettings
 from gapbridge.bridge.ipc.control_socket import Peer
 from gapbridge.bridge.setpoint_source import make_source
 from gapbridge.bridge.setpoint_source.planner import PlannerSource
-from gapbridge.bridge.setpoint_source.source import Source, SourceDryError
+from gapbridge.bridge.setpoint_source.source import Source, SourceContext, SourceDryError
 from gapbridge.bridge.setpoint_source.target import TargetSource
 from gapbridge.bridge.setpoint_source.tcp import TcpSource
 from gapbridge.bridge.setpoint_source.trajectory import TrajectorySource
@@ -114,7 +114,7 @@ RATE = 500.0  # Hz
 @pytest.fixture
 def feed(tmp_path: Path) -> Iterator[PlannerSource]:
     settings = SetpointSettings(source="planner", socket=tmp_path / "p.sock", timeout=0.15)
-    source = PlannerSource(settings, 3, True, Path(), RATE, clock=SYSTEM)
+    source = PlannerSource(SourceContext(settings, 3, True, Path(), RATE, SYSTEM))
     source.open()
     yield source
     source.close()
@@ -126,7 +126,7 @@ def tcp(tmp_path: Path) -> Iterator[TcpSource]:
     token.write_text(TOKEN + "\n")
     token.chmod(0o600)
     settings = SetpointSettings(source="tcp", token_file=token, port=0, timeout=0.15)
-    source = TcpSource(settings, 3, True, Path(), RATE, clock=SYSTEM)
+    source = TcpSource(SourceContext(settings, 3, True, Path(), RATE, SYSTEM))
     source.open()
     yield source
     source.close()
@@ -340,7 +340,7 @@ def test_the_socket_of_a_loop_that_was_killed_is_replaced(tmp_path: Path) -> Non
     with socket.socket(socket.AF_UNIX) as left:
         left.bind(str(path))
     settings = SetpointSettings(source="planner", socket=path)
-    source = PlannerSource(settings, 3, True, Path(), RATE, clock=SYSTEM)
+    source = PlannerSource(SourceContext(settings, 3, True, Path(), RATE, SYSTEM))
     source.open()
     with planner(source) as link:
         link.sendall(GOOD)
@@ -390,10 +390,10 @@ def test_over_tcp_a_token_that_does_not_come_ends_the_connection(
 def test_a_taken_address_is_one_line(tcp: TcpSource, tmp_path: Path) -> None:
     settings = tcp.settings.model_copy(update={"port": tcp.port})
     with pytest.raises(RunError, match="cannot listen on"):
-        TcpSource(settings, 3, True, Path(), RATE, clock=SYSTEM).open()
+        TcpSource(SourceContext(settings, 3, True, Path(), RATE, SYSTEM)).open()
     settings = SetpointSettings(source="planner", socket=tmp_path / "no" / "p.sock")
     with pytest.raises(RunError, match="cannot listen on"):
-        PlannerSource(settings, 3, True, Path(), RATE, clock=SYSTEM).open()
+        PlannerSource(SourceContext(settings, 3, True, Path(), RATE, SYSTEM)).open()
 
 
 @pytest.mark.parametrize(

@@ -5,12 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from gapbridge.bridge.calibration.report.data import CalibrationData
-from gapbridge.bridge.calibration.report.figures import mm
 from gapbridge.bridge.document.axes import Chart, distribution, named, scale
 from gapbridge.bridge.document.blocks import Block, Paragraph, Pictures, Table
 from gapbridge.bridge.document.drawing import AFTER, BEFORE, EDGE, INK, Circle, Drawing
+from gapbridge.bridge.document.numbers import fixed, mm
 from gapbridge.bridge.document.skeleton import round_factor
-from gapbridge.bridge.report.labels import fixed
 from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.result import Errors
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from gapbridge.bridge.calibration.report.data import CalibrationData
-from gapbridge.bridge.calibration.report.figures import load_title, mm, mrad
-from gapbridge.bridge.document.axes import Chart, logarithmic, named, plain, visible
+from gapbridge.bridge.document.axes import Chart, logarithmic, named, visible
 from gapbridge.bridge.document.blocks import Block, Paragraph, Pictures, Table
 from gapbridge.bridge.document.drawing import AFTER, BEFORE, Drawing
-from gapbridge.bridge.report.labels import counted, fixed
+from gapbridge.bridge.document.numbers import fixed, load_title, mm, mrad, plain
+from gapbridge.bridge.report.labels import counted
 from gapbridge.core.arrays import Array, Index
 from gapbridge.core.calibration.budget.pose_accuracy import PoseAccuracy
 

@@ -3,22 +3,19 @@
 from __future__ import annotations
 
 from gapbridge.bridge.calibration.report.data import CalibrationData
-from gapbridge.bridge.calibration.report.figures import degrees, estimate_texts
 from gapbridge.bridge.document import blocks
-from gapbridge.bridge.document.axes import plain
 from gapbridge.bridge.document.findings import finding_text
 from gapbridge.bridge.document.notes import note_text
-from gapbridge.bridge.report.answer import one_line, sentences
-from gapbridge.bridge.report.labels import (
-    CHANNELS,
+from gapbridge.bridge.document.numbers import (
     decimals_of,
-    effect_title,
+    degrees,
+    estimate_texts,
     fixed,
-    listed,
-    parameter_title,
-    sentence,
+    plain,
     unit_of,
 )
+from gapbridge.bridge.report.answer import one_line, sentences
+from gapbridge.bridge.report.labels import CHANNELS, effect_title, listed, parameter_title, sentence
 from gapbridge.bridge.report.material import chosen_channel
 from gapbridge.core.calibration.result import Estimate
 from gapbridge.core.diagnosis.channel_diagnosis import Verdict

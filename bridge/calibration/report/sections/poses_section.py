@@ -5,12 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from gapbridge.bridge.calibration.report.data import CalibrationData
-from gapbridge.bridge.calibration.report.figures import degrees, mm
 from gapbridge.bridge.document.axes import Chart, scale
 from gapbridge.bridge.document.blocks import Block, Cell, Paragraph, Pictures, Table
 from gapbridge.bridge.document.drawing import AFTER, EDGE, INK, LIMIT, Circle, Drawing
+from gapbridge.bridge.document.numbers import degrees, fixed, mm
 from gapbridge.bridge.document.skeleton import skeleton
-from gapbridge.bridge.report.labels import fixed
 from gapbridge.core.arrays import Array, Index
 from gapbridge.core.calibration.plan import Plan
 

@@ -7,19 +7,11 @@ import math
 import numpy as np
 
 from gapbridge.bridge.calibration.report.data import CalibrationData
-from gapbridge.bridge.calibration.report.figures import mm, mm_fine
 from gapbridge.bridge.cell.settings.calibration import FEWEST_HELD_OUT
 from gapbridge.bridge.document import blocks
 from gapbridge.bridge.document.notes import calibration_text
-from gapbridge.bridge.report.labels import (
-    listed,
-    number,
-    parameter_title,
-    percent,
-    sentence,
-    unit_of,
-    with_unit,
-)
+from gapbridge.bridge.document.numbers import mm, mm_fine, number, percent, unit_of, with_unit
+from gapbridge.bridge.report.labels import listed, parameter_title, sentence
 from gapbridge.core.calibration.budget.budget import Budget
 from gapbridge.core.calibration.budget.inputs import Basis, Input
 from gapbridge.core.calibration.budget.sensitivity import Sensitivities, Sensitivity

@@ -6,10 +6,9 @@ from collections.abc import Sequence
 
 from gapbridge.bridge.calibration.report.data import CalibrationData
 from gapbridge.bridge.calibration.report.facts import SessionFacts
-from gapbridge.bridge.calibration.report.figures import load_title, mm
-from gapbridge.bridge.document.axes import plain
 from gapbridge.bridge.document.blocks import Block, Bullets, Columns, Heading, Pairs
 from gapbridge.bridge.document.notes import note_texts
+from gapbridge.bridge.document.numbers import load_title, mm, plain
 from gapbridge.bridge.report.labels import parameter_title, sentence
 
 KINDS = {

@@ -9,14 +9,14 @@ from typing import Generic, TypeVar
 import numpy as np
 
 from gapbridge.bridge.calibration.report.facts import SessionFacts
-from gapbridge.bridge.calibration.report.figures import mm
 from gapbridge.bridge.calibration.report.sections.parameters_section import estimates_table
 from gapbridge.bridge.calibration.report.sections.session_section import facts_blocks
 from gapbridge.bridge.document import blocks
 from gapbridge.bridge.document.axes import Chart, named, scale
 from gapbridge.bridge.document.drawing import AFTER, BAD_DOT, BEFORE, Drawing
 from gapbridge.bridge.document.notes import note_texts, short_text
-from gapbridge.bridge.report.labels import fixed, parameter_title, sentence
+from gapbridge.bridge.document.numbers import fixed, mm
+from gapbridge.bridge.report.labels import parameter_title, sentence
 from gapbridge.core.arrays import Array
 from gapbridge.core.calibration.payload_session import PayloadCalibration
 from gapbridge.core.calibration.tool_session import ToolCalibration

@@ -8,20 +8,14 @@ import numpy as np
 
 from gapbridge.bridge.calibration.format import verdict_text
 from gapbridge.bridge.calibration.report.facts import SessionFacts
-from gapbridge.bridge.calibration.report.figures import degrees, mm
 from gapbridge.bridge.calibration.report.sections.parameters_section import estimates_table
 from gapbridge.bridge.calibration.report.sections.session_section import facts_blocks
 from gapbridge.bridge.document import blocks
 from gapbridge.bridge.document.axes import Chart, named, scale
 from gapbridge.bridge.document.drawing import AFTER, EDGE, Drawing
 from gapbridge.bridge.document.notes import note_texts
-from gapbridge.bridge.report.labels import (
-    effect_title,
-    fixed,
-    likelihood,
-    parameter_title,
-    sentence,
-)
+from gapbridge.bridge.document.numbers import degrees, fixed, likelihood, mm
+from gapbridge.bridge.report.labels import effect_title, parameter_title, sentence
 from gapbridge.core.calibration.readings import Readings
 from gapbridge.core.calibration.verify import CandidateChange, Verification
 

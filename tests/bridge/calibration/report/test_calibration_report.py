@@ -8,8 +8,8 @@ from calibration_report_cases import calibration, plan, session
 from other_kinds import calibration_of
 
 from gapbridge.bridge.calibration.report import CalibrationData, InstrumentFacts, write_report
-from gapbridge.bridge.calibration.report.figures import mm
 from gapbridge.bridge.calibration.report.report import CALIBRATION
+from gapbridge.bridge.document.numbers import mm
 from gapbridge.core.calibration.observables import OBSERVABLES
 
 

@@ -4,14 +4,8 @@ import math
 
 import pytest
 
-from gapbridge.bridge.calibration.report.figures import (
-    decimals_of,
-    estimate_texts,
-    fixed,
-    load_title,
-    mm,
-)
 from gapbridge.bridge.document.notes import note_text
+from gapbridge.bridge.document.numbers import decimals_of, estimate_texts, fixed, load_title, mm
 from gapbridge.bridge.report.labels import parameter_title, sentence
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.calibration.parameters import Parameters

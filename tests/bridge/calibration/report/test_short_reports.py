@@ -11,7 +11,7 @@ from gapbridge.bridge.calibration.report import (
     VerificationData,
     write_report,
 )
-from gapbridge.bridge.calibration.report.figures import estimate_texts, mm
+from gapbridge.bridge.document.numbers import estimate_texts, mm
 
 
 def read(paths):
