@@ -192,8 +192,7 @@ class ModbusDriver(Driver):
             timestamp, received, q, velocity, target, force,
             joint_temperatures=vectors.get("temperature"),
             actual_current_as_torque=vectors.get("joint_torque"),
-            robot_mode=modes.robot_mode, safety_mode=modes.safety_mode,
-            safety_status_bits=modes.safety_status_bits,
+            **modes._asdict(),
         )  # fmt: skip
 
     def nominal_q(self, state: RobotState) -> Array:

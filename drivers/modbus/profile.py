@@ -229,7 +229,7 @@ def _refusal(document: ProfileDocument, worst: ErrorDetails) -> ProfileError:
     modes = ("mailbox", "target_trigger", "read_only")
     keys = tuple(k for i, k in enumerate(worst["loc"]) if not (i == 1 and k in modes))
     if worst["type"] == "extra_forbidden":
-        return document.error(keys, f"found an unknown key {keys[-1]!r}{_hint(worst, keys)}")
+        return document.error(keys, f"found an unknown key {keys[-1]!r}{_hint(keys)}")
     if worst["type"] == "missing":
         return document.error(keys, f"found nothing, expected {_wanted(keys)}")
     if worst["type"] in ("union_tag_invalid", "union_tag_not_found"):
@@ -251,7 +251,7 @@ def _wanted(keys: Keys) -> str:
     return "it here"
 
 
-def _hint(worst: ErrorDetails, keys: Keys) -> str:
+def _hint(keys: Keys) -> str:
     names = set(ProfileFile.model_fields)
     if len(keys) > 1:
         names = set(Vector.model_fields) | set(Condition.model_fields)
