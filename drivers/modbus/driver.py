@@ -248,7 +248,7 @@ class ModbusDriver(Driver):
         count = abs(write.target.scale) * UNITS[write.target.unit][1]
         if write.target.type.startswith("f"):
             count *= 1e-6  # a float's own resolution, of an angle of some radians
-        reach = self.reach
+        reach = self._model.length
         if count * reach > coarsest:
             raise WriteError(
                 f"{self.transport.name}: {self.profile.name}'s target registers are too coarse: "
@@ -256,13 +256,6 @@ class ModbusDriver(Driver):
                 f"{1e3 * count * reach:.3g} mm, and the offset at hand is {1e3 * coarsest:.3g} mm "
                 "(link.coarsest)"
             )
-
-    @property
-    def reach(self) -> float:
-        """Return the length of the stretched arm with its tool, m."""
-        links = self._model.arm.link_in_link[:, :3, 3]
-        tool = self._model.tool_in_flange[:3, 3]
-        return float(np.linalg.norm(links, axis=1).sum() + np.linalg.norm(tool))
 
     def _send(self, setpoint: Setpoint) -> None:
         """Send one setpoint; needs ``arm`` before.
