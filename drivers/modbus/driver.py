@@ -46,7 +46,7 @@ class ModbusDriver(Driver):
         self._decoder = Decoder(profile, self.map)
         self._freshness = Freshness(profile)
         self._writer = make_writer(
-            profile, self.transport, self._rates, 0.5 * settings.connect_timeout, clock
+            profile, self.transport, self._offset_rates, 0.5 * settings.connect_timeout, clock
         )
         self._nominal = None if self.moves_arm else Nominal(model)
         self._first_block, *self._other_blocks = self.map.fast
@@ -224,10 +224,6 @@ class ModbusDriver(Driver):
                 raise WriteError(f"{name}: the robot is not ready: {detail}")
             self._check_resolution(state.actual_q)
         self._writer.arm(state, self._look)
-
-    def _rates(self) -> tuple[float, float]:
-        """Return the cell's rates of the offset, m/s and rad/s."""
-        return self.gate.bounds.offset_rate, self.gate.bounds.offset_rotation_rate
 
     def _look(self) -> Sample:
         try:
