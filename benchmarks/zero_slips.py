@@ -18,7 +18,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from gapbridge.bridge.daemon.slip_watch import Force, Slip, SlipWatch
+from gapbridge.bridge.daemon.slip_watch import SlipWatch
+from gapbridge.bridge.ipc.events import Event, EventKind
 from gapbridge.bridge.ipc.shared_memory import slices_of
 from gapbridge.core.arm import builtin_arm
 from gapbridge.core.model import Model
@@ -134,16 +135,16 @@ class Program:
 
 def found_in(
     watch: SlipWatch, program: Program, count: int, touched: float = 0.0
-) -> tuple[list[Slip], list[Force], int]:
+) -> tuple[list[Event], list[Event], int]:
     """Return the slips and forces found in ``count`` rests, and how many rests had a hand on."""
-    found: list[Slip | Force] = []
+    found: list[Event] = []
     hands = 0
     for rows, hand in program.rests(count, touched):
         hands += hand
         for row in rows:
             found += watch.take(row[None])
-    slips = [one for one in found if isinstance(one, Slip)]
-    return slips, [one for one in found if isinstance(one, Force)], hands
+    slips = [event for event in found if event["kind"] == EventKind.SLIP]
+    return slips, [event for event in found if event["kind"] == EventKind.WARNING], hands
 
 
 def quiet(setup: Setup, hours: float, touched: float) -> str:
@@ -172,9 +173,9 @@ def slipped(setup: Setup, size: float, count: int) -> str:
             slips, _, _ = found_in(watch, program, 1)
             if slips:
                 rests.append(number)
-                right += joint + 1 in slips[0].joints
-                if slips[0].joints[0] == joint + 1:
-                    deviations.append((slips[0].size - sign * size) / slips[0].std)
+                right += joint + 1 in slips[0]["joints"]
+                if slips[0]["joints"][0] == joint + 1:
+                    deviations.append((slips[0]["size"] - sign * size) / slips[0]["std"])
                 break
     if not rests:
         return f"0 of {count}"

@@ -110,7 +110,7 @@ def _join(logs: Sequence[Log], names: tuple[str, ...], model: Model, path: str) 
     everywhere, somewhere = set.intersection(*names_of_each), set.union(*names_of_each)
     columns: dict[str, Array] = {}
     for name in sorted(somewhere - {"session", "timestamp"}):
-        parts = [_column(log, name, model, everywhere) for log in logs]
+        parts = [_column(log, name, model) for log in logs]
         if all(part is not None for part in parts):
             columns[name] = np.concatenate([part for part in parts if part is not None])
     count = [len(log) for log in logs]
@@ -149,7 +149,7 @@ def _with_approach(log: Log) -> Log:
     return log if approach is None else replace(log, columns={**log.columns, "approach": approach})
 
 
-def _column(log: Log, name: str, model: Model, everywhere: set[str]) -> Array | None:
+def _column(log: Log, name: str, model: Model) -> Array | None:
     """Return a session's column, or its default; None: the joined log lacks it."""
     if name in log.columns:
         return log.columns[name]

@@ -88,6 +88,10 @@ class Driver(ABC):
         """Accept the next sample without comparing it with the previous one."""
         self._check.reset()
 
+    def _offset_rates(self) -> tuple[float, float]:
+        """Return the cell's rates of the offset, m/s and rad/s."""
+        return self.gate.bounds.offset_rate, self.gate.bounds.offset_rotation_rate
+
     @final
     def write_setpoint(self, setpoint: Setpoint) -> None:
         """Send one setpoint from the limiter; needs ``arm`` before.

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
 
 from pydantic import BaseModel, ValidationError
-from pydantic_core import ErrorDetails
 
 from gapbridge.core.errors import InputError, Keys
-from gapbridge.core.files import Document, Kind, loaders, quoted, read_yaml
+from gapbridge.core.files import Document, Kind, loaders, read_yaml
+from gapbridge.drivers.validation import validation_errors
 
 
 class ProfileError(InputError):
@@ -35,31 +34,22 @@ def name_of(keys: Keys) -> str:
     return ".".join(str(key + 1) if isinstance(key, int) else key for key in keys)
 
 
-def found_and_expected(detail: ErrorDetails) -> str:
-    """Return "found ..., expected ..." for an error of pydantic."""
-    expected = detail["msg"].removeprefix("Input should be ")
-    return f"found {quoted(detail['input'])}, expected {expected}"
-
-
 Schema = TypeVar("Schema", bound=BaseModel)
 # a signal may be called ``on``
 PROFILE = Kind("profile", "a profile", "dbc: ...", ProfileError, loaders(on_is_text=True))
 
 
-def read_profile_file(
-    path: Path,
-    schema: type[Schema],
-    refusal: Callable[[ProfileDocument, ErrorDetails], ProfileError],
-) -> tuple[ProfileDocument, Schema]:
+def read_profile_file(path: Path, schema: type[Schema]) -> tuple[ProfileDocument, Schema]:
     """Return a profile's YAML and its validated ``schema``.
 
-    ``refusal`` turns pydantic's first error into a ProfileError; an unknown key comes before a
-    missing one. Raises ProfileError, also if the file cannot be read or parsed.
+    Raises ProfileError, also if the file cannot be read or parsed.
     """
     source = read_yaml(path, PROFILE)
     document = ProfileDocument(source.path, source.text, source.root, source.data)
     try:
         return document, schema.model_validate(document.data)
     except ValidationError as error:
-        worst = min(error.errors(), key=lambda detail: detail["type"] != "extra_forbidden")
-        raise refusal(document, worst) from None
+        keys, text = validation_errors(schema, error)[0]
+        raise (
+            ProfileError(f"{path}: {text}") if keys is None else document.error(keys, text)
+        ) from None

@@ -12,9 +12,7 @@ from collections.abc import Callable
 from gapbridge.drivers.canopen.objects import MODE_ACTIVE, Address
 from gapbridge.drivers.canopen.pdo import PdoLayout
 from gapbridge.drivers.canopen.profile import CanopenProfile
-from gapbridge.drivers.simulated.canopen.drive import Axis
-from gapbridge.drivers.simulated.canopen.machine import Phase
-from gapbridge.drivers.simulated.canopen.server import BLOCKED, EMERGENCY
+from gapbridge.drivers.simulated.canopen.axis import Axis, follow_stops, move_axes
 from gapbridge.drivers.simulated.canopen.server import HEARTBEAT_ERROR as MASTER_LOST
 from gapbridge.drivers.simulated.server.arm_controller import ArmController
 
@@ -158,11 +156,6 @@ class SimulatedDrive:
         """Report an error by EMCY."""
         self._send(EMCY + self.node, struct.pack("<HB5x", code, register))
 
-    @property
-    def healthy(self) -> bool:
-        """Return whether it has no fault."""
-        return self.axis.machine.phase not in (Phase.FAULT, Phase.REACTION)
-
     def watch(self, now: float) -> None:
         """Note the master's heartbeat."""
         self._watched_at = now
@@ -225,30 +218,9 @@ class SimulatedDrives:
     def cycle(self, now: float, period: float, fresh: bool) -> None:
         """Follow stops, move the axes, measure where ``fresh``, send heartbeats."""
         controller = self._controller
-        self._follow_stops()
-        goal, holding = list(controller.target_q), False
-        for joint, drive in enumerate(self.drives):
-            axis = drive.axis
-            axis.step(period, period, goal[joint])
-            if axis.holds:
-                holding, goal[joint] = True, axis.demand
-        if holding:
-            controller.command(goal)
-        elif controller.commanded:
-            controller.let_go()
+        self._was_able = follow_stops(controller, self.drives, self._was_able)
+        move_axes(controller, period, ((drive.axis, period) for drive in self.drives))
         for drive, q in zip(self.drives, controller.q, strict=True):
             if fresh:
                 drive.q = q
             drive.cycle(now)
-
-    def _follow_stops(self) -> None:
-        """Fail every drive at a stop of the arm; a fault that is reset ends a protective stop."""
-        controller = self._controller
-        able, self._was_able = self._was_able, controller.can_move
-        for drive in self.drives:
-            if not controller.can_move and able and drive.healthy:
-                drive.fail(EMERGENCY if controller.emergency else BLOCKED)
-            elif controller.emergency and drive.healthy:
-                drive.fail(EMERGENCY)
-            elif controller.protective and drive.healthy:
-                controller.unlock()

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from gapbridge.bridge.cell.message import suggestion
 from gapbridge.bridge.cell.schema import Compliance, EffectEntry
 from gapbridge.core.arm import Arm
 from gapbridge.core.effects import (
@@ -19,6 +18,7 @@ from gapbridge.core.effects import (
     flexibility_effects,
 )
 from gapbridge.core.errors import CellError, InputError, Keys
+from gapbridge.drivers.validation import suggestion
 
 VALUE = "value"  # key in the file of a parameter without a name
 

@@ -28,7 +28,7 @@ from gapbridge.bridge.daemon.processes import LoopProcess
 from gapbridge.bridge.daemon.reload import Reload
 from gapbridge.bridge.daemon.service_manager import ServiceManager
 from gapbridge.bridge.daemon.side_processes import SideProcesses
-from gapbridge.bridge.daemon.slip_watch import Slip, SlipWatch
+from gapbridge.bridge.daemon.slip_watch import SlipWatch
 from gapbridge.bridge.daemon.status import DaemonStatus
 from gapbridge.bridge.daemon.status_document import SCHEMA
 from gapbridge.bridge.daemon.summary import RunSummary, Tally
@@ -526,9 +526,9 @@ class Daemon:
             self.event_log.add(
                 {"kind": EventKind.WARNING, "what": "outside_fitted", "detail": detail}
             )
-        for finding in self._slips.take(rows):
-            self.event_log.add(finding.event)
-            if isinstance(finding, Slip):
+        for event in self._slips.take(rows):
+            self.event_log.add(event)
+            if event["kind"] == EventKind.SLIP:
                 self._commands.ask(Command.ZERO_MOVED)  # after the event that says why
                 self._keep_rests(at_once=True)
 

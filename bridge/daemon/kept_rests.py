@@ -14,11 +14,12 @@ from typing import Any
 import numpy as np
 
 from gapbridge.bridge.cell.run_settings import Configuration
-from gapbridge.bridge.daemon.slip_watch import MAX_POSES, MAX_RESTS, Rest, SlipWatch
+from gapbridge.bridge.daemon.slip_watch import MAX_POSES, MAX_RESTS, SlipWatch
 from gapbridge.bridge.document.output_file import write_text
 from gapbridge.bridge.document.provenance import installed_version
 from gapbridge.bridge.ipc.events import Event, EventKind
 from gapbridge.core.arrays import Array
+from gapbridge.core.diagnosis.rests.rest_comparison import Rest
 from gapbridge.core.errors import GapbridgeError
 from gapbridge.drivers.clock import Clock
 

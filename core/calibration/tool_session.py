@@ -1,7 +1,7 @@
 """Tool session: the tool centre point from joint angles, without an instrument.
 
-The tip touches one fixed point in several orientations, or a ball on the tool touches a fixed ball.
-Flange poses follow from joint angles and model; tool and point are fitted to them.
+The tip touches one fixed point in several orientations. Flange poses follow from joint angles and
+model; tool and point are fitted to them.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from gapbridge.core.model import Model
 from gapbridge.core.notes import Note, Reason
 
 NAMES = tuple(f"tool_tcp_{k}" for k in "xyz")
-MIN_READINGS = {False: 3, True: 7}  # readings needed: tip on a point, ball on a ball
+MIN_READINGS = 3
 MIN_ROTATION = 0.15  # rad, about: spread of orientations that determines the tool
 ROUNDS = 30
 CONVERGED = 1e-10  # m
@@ -32,11 +32,11 @@ class ToolCalibration:
     """Result of a tool session."""
 
     tcp: Array  # (3,) m, flange axes
-    point: Array  # (3,) m, base: the fixed point, or the fixed ball's centre
+    point: Array  # (3,) m, base: the fixed point
     estimates: tuple[Estimate, ...]  # tool_tcp_x, _y, _z
     covariance: Array  # (3, 3)
     noise: float  # m, 1 sigma of one coordinate of one touch: operator, arm and model error
-    residual: Array  # (N,) m, distance of each touch from the fixed point or ball
+    residual: Array  # (N,) m, distance of each touch from the fixed point
     nominal_residual: Array  # (N,) m, the same with the cell's tool, point fitted
     outliers: NDArray[np.int64]  # touches down-weighted as outliers
     notes: tuple[Note, ...]
@@ -51,23 +51,19 @@ class ToolCalibration:
         return replace(model, tool_in_flange=tool, terms=kept)
 
 
-def calibrate_tool(
-    model: Model, q: Array, loads: Loads | None = None, *, distance: float = 0.0
-) -> ToolCalibration:
+def calibrate_tool(model: Model, q: Array, loads: Loads | None = None) -> ToolCalibration:
     """Return the tool centre point from joint angles ``q`` (N, n), rad, of the touches.
 
-    ``distance`` (m) is 0 where the tip itself was brought onto a fixed point, else the distance of
-    the two balls' centres when they touch (the sum of their radii). Outliers are down-weighted
-    and listed. Raises InputError where the angles do not fit the arm, ExcitationError where the
-    orientations do not determine the tool.
+    Outliers are down-weighted and listed. Raises InputError where the angles do not fit the arm,
+    ExcitationError where the orientations do not determine the tool.
     """
     q = np.asarray(q, dtype=float)
-    _check_shapes(model, q, distance > 0)
+    _check_shapes(model, q)
     position, rotation = flange_poses(model, q, loads)
     nominal = model.chain().tool_position
     point = _common_point(position, rotation, nominal)
     before = np.concatenate([nominal, point])
-    values, fit = _fit_tip(position, rotation, before, distance)
+    values, fit = _fit_tip(position, rotation, before)
     std = np.sqrt(np.diag(fit.covariance))[:3]
     estimates = tuple(
         Estimate(name, float(v), float(s), "m", freedom=fit.freedom)
@@ -76,8 +72,8 @@ def calibrate_tool(
     outliers = tuple(int(r) + 1 for r in fit.outliers)
     return ToolCalibration(
         values[:3].copy(), values[3:].copy(), estimates, fit.covariance[:3, :3].copy(),
-        float(fit.noise[0]), _distances(position, rotation, values, distance),
-        _distances(position, rotation, before, distance), fit.outliers,
+        float(fit.noise[0]), _distances(position, rotation, values),
+        _distances(position, rotation, before), fit.outliers,
         (Note(Reason.TOUCHES_DOWN, (outliers,)),) if outliers else (),
         float(np.linalg.norm(values[:3] - nominal)),
     )  # fmt: skip
@@ -97,15 +93,14 @@ def touch_columns(rotation: Array) -> Array:
     return np.concatenate([rotation, fixed], axis=2)
 
 
-def _check_shapes(model: Model, q: Array, ball: bool) -> None:
+def _check_shapes(model: Model, q: Array) -> None:
     if q.ndim != 2 or q.shape[1] != model.arm.n or not np.isfinite(q).all():
         raise InputError(
             f"tool session: found angles {q.shape}, expected finite ones of (N, {model.arm.n})"
         )
-    if len(q) < MIN_READINGS[ball]:
+    if len(q) < MIN_READINGS:
         raise ExcitationError(
-            f"tool session: found {len(q)} touch(es), expected {MIN_READINGS[ball]} or more "
-            "orientations"
+            f"tool session: found {len(q)} touch(es), expected {MIN_READINGS} or more orientations"
         )
 
 
@@ -114,44 +109,21 @@ def _common_point(position: Array, rotation: Array, tcp: Array) -> Array:
     return np.asarray(np.median(position + rotation @ tcp, axis=0))
 
 
-def _fit_tip(
-    position: Array, rotation: Array, values: Array, distance: float
-) -> tuple[Array, RobustFit]:
+def _fit_tip(position: Array, rotation: Array, values: Array) -> tuple[Array, RobustFit]:
     """Return tool and point (6,), and the converged robust fit."""
     count = len(position)
-    columns = touch_columns(rotation)
-    cells = 1 if distance else 3
-    row = np.repeat(np.arange(count), cells)
-    unit = np.zeros(count * cells, dtype=np.int64)
-    if distance:  # start with the centres together
-        linear = _linear_rows(columns, position, rotation, values)
-        values = values + robust_fit(*linear, *_cells(count)).values
+    A = touch_columns(rotation).reshape(-1, 6)
+    row, unit = np.repeat(np.arange(count), 3), np.zeros(3 * count, dtype=np.int64)
+    _require_rotation(A, count)
     fit: RobustFit | None = None
     for _ in range(ROUNDS):
         offset = position + rotation @ values[:3] - values[3:]
-        A, b = columns.reshape(-1, 6), -offset.ravel()
-        if distance:
-            length = np.maximum(np.linalg.norm(offset, axis=1), 1e-9)
-            A = np.einsum("ni,nij->nj", offset / length[:, None], columns)
-            b = distance - length
-        _require_rotation(A, count)
-        fit = robust_fit(A, b, unit, row)
+        fit = robust_fit(A, -offset.ravel(), unit, row)
         values = values + fit.values
         if np.abs(fit.values).max() < CONVERGED:
             break
     assert fit is not None
     return values, fit
-
-
-def _linear_rows(
-    columns: Array, position: Array, rotation: Array, values: Array
-) -> tuple[Array, Array]:
-    offset = position + rotation @ values[:3] - values[3:]
-    return columns.reshape(-1, 6), -offset.ravel()
-
-
-def _cells(count: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    return np.zeros(3 * count, dtype=np.int64), np.repeat(np.arange(count), 3)
 
 
 def _require_rotation(A: Array, count: int) -> None:
@@ -163,6 +135,6 @@ def _require_rotation(A: Array, count: int) -> None:
         )
 
 
-def _distances(position: Array, rotation: Array, values: Array, distance: float) -> Array:
-    distances = np.linalg.norm(position + rotation @ values[:3] - values[3:], axis=1)
-    return np.asarray(np.abs(distances - distance))
+def _distances(position: Array, rotation: Array, values: Array) -> Array:
+    offset = position + rotation @ values[:3] - values[3:]
+    return np.asarray(np.linalg.norm(offset, axis=1))

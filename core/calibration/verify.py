@@ -136,7 +136,7 @@ def verify(
     return Verification(
         holds, Errors(residual[:, :3], np.arange(len(readings))), spread, ratio, chance, moved,
         tuple(change for change in changes[1:] if change.chi_square < limit),
-        nuisance.stations, _notes(baseline, metrology, freedom),
+        nuisance.stations, _notes(metrology, freedom),
     )  # fmt: skip
 
 
@@ -237,7 +237,7 @@ def _candidate(
     return CandidateChange(name, estimates, chance, chi_square)
 
 
-def _notes(baseline: AccuracyBaseline, metrology: Metrology, freedom: int) -> tuple[Note, ...]:
+def _notes(metrology: Metrology, freedom: int) -> tuple[Note, ...]:
     notes = []
     if not metrology.registered:
         notes.append(Note(Reason.FRAME_FITTED))

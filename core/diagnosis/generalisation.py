@@ -126,7 +126,7 @@ class _HeldOutRegression:
 
 
 def held_out_regions(
-    observation: Observation, kept: NDArray[np.bool_], seed: int = 0
+    observation: Observation, kept: NDArray[np.bool_]
 ) -> tuple[Index, NDArray[np.bool_]]:
     """Return the region (n,) of each kept sample, and samples too close to each (folds, n)."""
     n = int(kept.sum())
@@ -144,7 +144,7 @@ def held_out_regions(
     if not names or n < REGIONS:
         return np.zeros(n, dtype=np.int64), np.zeros((1, n), dtype=bool)
     poses = np.stack([observation.quantities[name][kept] for name in names], axis=1)
-    fold = joint_regions(poses, REGIONS, seed)
+    fold = joint_regions(poses, REGIONS)
     return fold, np.zeros((int(fold.max()) + 1, n), dtype=bool)
 
 

@@ -89,8 +89,8 @@ def next_measurements(
         trials = drawn if moving else drawn.at_rest
         predict = PREDICTORS[channel.channel](model, trials)
         sigma = channel.noise_floor_rms or channel.selection.observation.sigma or 1e-5
-        for question in _open_questions(model, channel, trials, predict):
-            difference = _difference(channel, trials, predict, question)
+        for question in _open_questions(model, channel, predict):
+            difference = _difference(channel, predict, question)
             if difference is None:
                 continue
             gain = np.linalg.norm(difference, axis=1) / sigma
@@ -99,7 +99,7 @@ def next_measurements(
 
 
 def _open_questions(
-    model: Model, channel: ChannelDiagnosis, trials: Trials, predict: Predict
+    model: Model, channel: ChannelDiagnosis, predict: Predict
 ) -> Iterator[_OpenQuestion]:
     """Yield the ties of accused effects, and the effects that the log does not excite."""
     selection = channel.selection
@@ -120,7 +120,7 @@ def _open_questions(
         if not considered.excited:
             for usual in _terms_of_usual_size(model, considered.effect):
                 question = _OpenQuestion((considered.effect,), (*accused, usual), accused)
-                if _difference(channel, trials, predict, question) is not None:
+                if _difference(channel, predict, question) is not None:
                     yield question
                     break
 
@@ -142,7 +142,7 @@ def _terms_of_usual_size(model: Model, effect: str) -> Iterator[Term]:
 
 
 def _difference(
-    channel: ChannelDiagnosis, trials: Trials, predict: Predict, question: _OpenQuestion
+    channel: ChannelDiagnosis, predict: Predict, question: _OpenQuestion
 ) -> Array | None:
     """Return the difference (N, k) of two explanations; None if it does not depend on the pose."""
     observation = channel.selection.observation

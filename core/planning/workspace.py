@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from gapbridge.core.arrays import Array, Mask
+from gapbridge.core.dynamics import frames_of
 from gapbridge.core.errors import PlanError
 from gapbridge.core.model import Model
 from gapbridge.core.planning.capsules import Box, Capsules, below, colliding, in_box, occluded
@@ -135,22 +136,14 @@ class Workspace:
 
     def frames(self, q: Array) -> Frames:
         """Return the frames of the rigid arm at joints ``q`` (N, n), rad."""
-        arm, count = self.model.arm, len(q)
-        rotation = np.broadcast_to(np.eye(3), (count, 3, 3))
-        origin = np.zeros((count, 3))
-        origins, axes = [origin], []
-        for i in range(arm.n + 1):
-            link = arm.link_in_link[i]
-            origin = origin + rotation @ link[:3, 3]
-            rotation = rotation @ link[:3, :3]
-            origins.append(origin)
-            if i < arm.n:
-                axes.append(rotation[:, :, 2])
-                rotation = rotation @ _rotation_about_z(q[:, i])
-        tool = self.model.tool_in_flange
+        n, still = self.model.arm.n, np.zeros_like(q)
+        chain = self.model.without_terms().chain()
+        rigid = frames_of(chain, q, still, still)
+        flange, origin = rigid.rotation[:, n], rigid.origin[:, n]
         return Frames(
-            np.stack(origins, axis=1), np.stack(axes, axis=1), rotation,
-            origin + rotation @ tool[:3, 3], rotation @ tool[:3, :3],
+            np.concatenate([np.zeros((len(q), 1, 3)), rigid.origin], axis=1),
+            rigid.rotation[:, :n, :, 2], flange, origin + flange @ chain.tool_position,
+            flange @ chain.tool_rotation,
         )  # fmt: skip
 
     def capsules(self, frames: Frames) -> Capsules:
@@ -258,11 +251,3 @@ def _pairs(workspace: Workspace) -> tuple[tuple[int, int], ...]:
             if spacing > 1.5 * (capsules.radius[i] + capsules.radius[j]):
                 pairs.append((i, j))
     return tuple(pairs)
-
-
-def _rotation_about_z(angle: Array) -> Array:
-    c, s = np.cos(angle), np.sin(angle)
-    rotation = np.zeros((len(angle), 3, 3))
-    rotation[:, 0, 0], rotation[:, 0, 1], rotation[:, 1, 0], rotation[:, 1, 1] = c, -s, s, c
-    rotation[:, 2, 2] = 1
-    return rotation

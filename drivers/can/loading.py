@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic_core import ErrorDetails
 
 from gapbridge.core.arrays import Array
 from gapbridge.drivers.can.dbc import Dbc, read_dbc
@@ -205,26 +204,11 @@ def read_profile(path: Path, installation: Mapping[str, list[float]] | None = No
 
     ``installation`` replaces its direction, zero and gear; errors in them have the link's keys.
     """
-    document, file = read_profile_file(path, ProfileFile, _schema_error)
+    document, file = read_profile_file(path, ProfileFile)
     replaced = dict(installation or {})
     file = file.model_copy(update=replaced)
     names = Names(document, file, read_dbc(path.parent / file.dbc), frozenset(replaced))
     return _Loading(names).profile()
-
-
-def _schema_error(document: ProfileDocument, worst: ErrorDetails) -> ProfileError:
-    """Return an error in one line for an error of pydantic."""
-    keys = tuple(key for key in worst["loc"] if key != "list[constrained-float]")
-    value = worst["input"] if not isinstance(worst["input"], dict | list) else "something else"
-    if worst["type"] == "missing":
-        text = "found nothing, expected this key"
-    elif worst["type"] == "extra_forbidden":
-        text = "found an unknown key"
-    elif worst["type"] == "value_error":
-        text = worst["msg"].removeprefix("Value error, ")
-    else:
-        text = f"found {value!r}, {worst['msg'][0].lower()}{worst['msg'][1:]}"
-    return document.error(keys, text)
 
 
 class _Loading:

@@ -69,7 +69,7 @@ class FrameEntry(Section):
     def _one_of_both(self) -> FrameEntry:
         """Refuse signals together with bytes."""
         if self.data is not None and self.signals:
-            raise ValueError("found data and signals, expected one of them")
+            raise ValueError("expected data or signals, not both")
         return self
 
 

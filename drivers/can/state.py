@@ -49,9 +49,7 @@ class StateBuilder:
             actual_TCP_force=np.zeros(6),
             joint_temperatures=present.get("temperature"),
             actual_current_as_torque=present.get("torque"),
-            robot_mode=modes.robot_mode,
-            safety_mode=modes.safety_mode,
-            safety_status_bits=modes.safety_status_bits,
+            **modes._asdict(),
         )
 
     def _differences(self, sample: Sample, before: Sample | None) -> Array:

@@ -10,7 +10,6 @@ from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field
-from pydantic_core import ErrorDetails
 
 from gapbridge.core.arrays import Array
 from gapbridge.drivers.canopen.eds import Eds, read_eds
@@ -19,7 +18,6 @@ from gapbridge.drivers.canopen.pdo import Entry, PdoLayout
 from gapbridge.drivers.profile_file import (
     ProfileDocument,
     ProfileError,
-    found_and_expected,
     read_profile_file,
 )
 from gapbridge.drivers.section import Number, Positive, Section
@@ -150,7 +148,7 @@ def read_profile(path: Path, joints: int | None = None) -> CanopenProfile:
     ``joints`` is the number that the arm has; None: any. Raises ProfileError, one line that names
     file, line and key, what was found and what was expected.
     """
-    document, file = read_profile_file(path, ProfileFile, _refusal)
+    document, file = read_profile_file(path, ProfileFile)
     document.require_joints(len(file.joints), joints)
     _check_nodes(document, file)
     _check_times(document, file)
@@ -282,16 +280,3 @@ class _Pdos:
 def _near(name: str, known: Mapping[str, object] | Sequence[str]) -> str:
     near = difflib.get_close_matches(name, list(known), n=1, cutoff=0.5)
     return f" (did you mean {near[0]!r}?)" if near else ""
-
-
-def _refusal(document: ProfileDocument, worst: ErrorDetails) -> ProfileError:
-    """Return an error in one line for an error of pydantic."""
-    keys: Keys = tuple(key for key in worst["loc"] if key not in ("str", "int", "[key]"))
-    if keys and keys[0] in ("tpdo", "rpdo"):
-        keys = (keys[0], *(str(key) for key in keys[1:2]), *keys[2:])  # a PDO's number counts as is
-    if worst["type"] == "extra_forbidden":
-        names = [name for model in (ProfileFile, Joint, Heartbeat) for name in model.model_fields]
-        return document.error(keys, f"found an unknown key{_near(str(keys[-1]), names)}")
-    if worst["type"] == "missing":
-        return document.error(keys, "found nothing, expected this key")
-    return document.error(keys, found_and_expected(worst))

@@ -73,9 +73,7 @@ class StateBuilder:
             target_q=q if target is None else target,
             actual_TCP_force=np.zeros(6),
             actual_current_as_torque=self._torque(sample),
-            robot_mode=modes.robot_mode,
-            safety_mode=modes.safety_mode,
-            safety_status_bits=modes.safety_status_bits,
+            **modes._asdict(),
         )
 
     def _stop_reason(self, sample: SyncSet, armed: bool) -> StopReason | None:

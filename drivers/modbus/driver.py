@@ -46,7 +46,7 @@ class ModbusDriver(Driver):
         self._decoder = Decoder(profile, self.map)
         self._freshness = Freshness(profile)
         self._writer = make_writer(
-            profile, self.transport, self._rates, 0.5 * settings.connect_timeout, clock
+            profile, self.transport, self._offset_rates, 0.5 * settings.connect_timeout, clock
         )
         self._nominal = None if self.moves_arm else Nominal(model)
         self._first_block, *self._other_blocks = self.map.fast
@@ -192,8 +192,7 @@ class ModbusDriver(Driver):
             timestamp, received, q, velocity, target, force,
             joint_temperatures=vectors.get("temperature"),
             actual_current_as_torque=vectors.get("joint_torque"),
-            robot_mode=modes.robot_mode, safety_mode=modes.safety_mode,
-            safety_status_bits=modes.safety_status_bits,
+            **modes._asdict(),
         )  # fmt: skip
 
     def nominal_q(self, state: RobotState) -> Array:
@@ -226,10 +225,6 @@ class ModbusDriver(Driver):
             self._check_resolution(state.actual_q)
         self._writer.arm(state, self._look)
 
-    def _rates(self) -> tuple[float, float]:
-        """Return the cell's rates of the offset, m/s and rad/s."""
-        return self.gate.bounds.offset_rate, self.gate.bounds.offset_rotation_rate
-
     def _look(self) -> Sample:
         try:
             return self._decoder.decode(self._read_blocks())
@@ -249,7 +244,7 @@ class ModbusDriver(Driver):
         count = abs(write.target.scale) * UNITS[write.target.unit][1]
         if write.target.type.startswith("f"):
             count *= 1e-6  # a float's own resolution, of an angle of some radians
-        reach = self.reach
+        reach = self._model.length
         if count * reach > coarsest:
             raise WriteError(
                 f"{self.transport.name}: {self.profile.name}'s target registers are too coarse: "
@@ -257,13 +252,6 @@ class ModbusDriver(Driver):
                 f"{1e3 * count * reach:.3g} mm, and the offset at hand is {1e3 * coarsest:.3g} mm "
                 "(link.coarsest)"
             )
-
-    @property
-    def reach(self) -> float:
-        """Return the length of the stretched arm with its tool, m."""
-        links = self._model.arm.link_in_link[:, :3, 3]
-        tool = self._model.tool_in_flange[:3, 3]
-        return float(np.linalg.norm(links, axis=1).sum() + np.linalg.norm(tool))
 
     def _send(self, setpoint: Setpoint) -> None:
         """Send one setpoint; needs ``arm`` before.

@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
-
-from pydantic_core import ErrorDetails
 
 from gapbridge.drivers.modbus.registers import BIT_TABLES, LAST_ADDRESS, UNITS, Table
 from gapbridge.drivers.modbus.schema import (
@@ -21,8 +17,6 @@ from gapbridge.drivers.modbus.schema import (
 )
 from gapbridge.drivers.profile_file import (
     ProfileDocument,
-    ProfileError,
-    found_and_expected,
     name_of,
     read_profile_file,
 )
@@ -57,7 +51,7 @@ def read_profile(path: Path, joints: int | None = None) -> ProfileFile:
     ``joints`` is the number that the arm has; None: any. Raises ProfileError, one line that names
     file, line and key, what was found and what was expected.
     """
-    document, profile = read_profile_file(path, ProfileFile, _refusal)
+    document, profile = read_profile_file(path, ProfileFile)
     _check_vectors(document, profile)
     _check_places(document, profile)
     _check_overlap(document, profile)
@@ -222,40 +216,3 @@ def _may_share(one: Span, other: Span) -> bool:
     echoed = {one.keys, other.keys} == {("write", "target"), ("state", "target")}
     watched = sets == {"status", "write"} and {"busy", "result"} & {*one.keys, *other.keys}
     return same and bool(conditions or writes or echoed or watched)
-
-
-def _refusal(document: ProfileDocument, worst: ErrorDetails) -> ProfileError:
-    """Return an error in one line for an error of pydantic."""
-    modes = ("mailbox", "target_trigger", "read_only")
-    keys = tuple(k for i, k in enumerate(worst["loc"]) if not (i == 1 and k in modes))
-    if worst["type"] == "extra_forbidden":
-        return document.error(keys, f"found an unknown key {keys[-1]!r}{_hint(worst, keys)}")
-    if worst["type"] == "missing":
-        return document.error(keys, f"found nothing, expected {_wanted(keys)}")
-    if worst["type"] in ("union_tag_invalid", "union_tag_not_found"):
-        tag = worst.get("ctx", {}).get("tag", "nothing")
-        return document.error((*keys, "mode"), f"found {tag!r}, expected one of {', '.join(modes)}")
-    return document.error(keys, found_and_expected(worst))
-
-
-def _wanted(keys: Keys) -> str:
-    """Return the schema's description of a key."""
-    text: Any = ProfileFile
-    for key in keys:
-        field = getattr(text, "model_fields", {}).get(key)
-        if field is None:
-            return "it here"
-        if key == keys[-1]:
-            return field.description or "it here"
-        text = field.annotation
-    return "it here"
-
-
-def _hint(worst: ErrorDetails, keys: Keys) -> str:
-    names = set(ProfileFile.model_fields)
-    if len(keys) > 1:
-        names = set(Vector.model_fields) | set(Condition.model_fields)
-    near = difflib.get_close_matches(str(keys[-1]), sorted(names), n=1, cutoff=0.6)
-    return f", expected one that is known: did you mean {near[0]!r}?" if near else (
-        ", expected one that is known (docs/porting.md)"
-    )  # fmt: skip

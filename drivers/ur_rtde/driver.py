@@ -39,7 +39,7 @@ class UrRtdeDriver(Driver):
         self._writer: Writer = (
             ServoWriter(settings, clock)
             if settings.mode == "servoj"
-            else OffsetWriter(settings, self._rates, clock)
+            else OffsetWriter(settings, self._offset_rates, clock)
         )
         self._state: RobotState | None = None
         self._round_trip = 0.0  # s: the last round trip
@@ -54,10 +54,6 @@ class UrRtdeDriver(Driver):
         if isinstance(self._writer, OffsetWriter):
             self._writer.note_answer(self.reader.echo, self.reader.program, self.reader.applied)
         return self._state
-
-    def _rates(self) -> tuple[float, float]:
-        """Return the cell's rates of the offset, m/s and rad/s."""
-        return self.gate.bounds.offset_rate, self.gate.bounds.offset_rotation_rate
 
     def _look(self) -> None:
         """Read a sample while arming. Raises WriteError."""

@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from gapbridge.core.arm import Arm, builtin_arm, builtin_names
+from gapbridge.core.arm import Arm, builtin_arm, builtin_names, dh_transform
 from gapbridge.core.arrays import Array
 from gapbridge.core.estimation.least_squares import solve
 from gapbridge.core.estimation.registration import register
@@ -191,32 +191,23 @@ def dh_rows(arm: Arm) -> Array | None:
 
 
 def _link(a: float, alpha: float, d: float, offset: float) -> Array:
-    return _turn("z", 0.0, d) @ _turn("x", alpha, a) @ _turn("z", offset, 0.0)
-
-
-def _turn(axis: str, angle: float, along: float) -> Array:
-    """Return a screw (4, 4) about and along an axis."""
-    c, s, frame = np.cos(angle), np.sin(angle), np.eye(4)
-    i, j, k = (1, 2, 0) if axis == "x" else (0, 1, 2)
-    frame[i, i], frame[i, j], frame[j, i], frame[j, j] = c, -s, s, c
-    frame[k, 3] = along
-    return frame
+    """Return a DH row's transform (4, 4) with the next row's Rz(offset)."""
+    c, s, turn = np.cos(offset), np.sin(offset), np.eye(4)
+    turn[:2, :2] = [[c, -s], [s, c]]
+    return dh_transform(a, alpha, d) @ turn
 
 
 def _standard(arm: Arm, rows: Array) -> Arm:
-    links = [_turn("z", rows[0, 3], 0.0)]
+    links = [_link(0.0, 0.0, 0.0, rows[0, 3])]
     offsets = [*rows[1:, 3], 0.0]
     links += [
-        _link(row[0], row[1], row[2], offset) for row, offset in zip(rows, offsets, strict=True)
+        _link(a, alpha, d, offset) for (a, alpha, d, _), offset in zip(rows, offsets, strict=True)
     ]
     return replace(arm, link_in_link=np.array(links))
 
 
 def _modified(arm: Arm, rows: Array) -> Arm:
     """Return the arm whose rows are Craig's: Rx(alpha) Tx(a) Rz(q + offset) Tz(d)."""
-    links, before = [], 0.0
-    for a, alpha, d, offset in rows:
-        links.append(_turn("z", 0.0, before) @ _turn("x", alpha, a) @ _turn("z", offset, 0.0))
-        before = d
-    links.append(_turn("z", 0.0, before))
-    return replace(arm, link_in_link=np.array(links))
+    before = [0.0, *rows[:, 2]]  # d of the row before
+    links = [_link(row[0], row[1], d, row[3]) for row, d in zip(rows, before, strict=False)]
+    return replace(arm, link_in_link=np.array([*links, _link(0.0, 0.0, before[-1], 0.0)]))

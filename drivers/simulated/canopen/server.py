@@ -16,15 +16,15 @@ from gapbridge.drivers.canopen.profile import CanopenProfile, read_profile
 from gapbridge.drivers.canopen.settings import CanopenSettings
 from gapbridge.drivers.clock import Clock
 from gapbridge.drivers.simulated.can.hub import Hub
+from gapbridge.drivers.simulated.canopen.axis import follow_stops, move_axes
 from gapbridge.drivers.simulated.canopen.drive import COMMUNICATION, Drive, Units
-from gapbridge.drivers.simulated.canopen.machine import Phase
 from gapbridge.drivers.simulated.server.arm_controller import ArmController
 from gapbridge.drivers.simulated.server.bench import BenchError, Command
 from gapbridge.drivers.simulated.server.protocol_server import ProtocolServer
 
 SYNC = 0x80
 HEARTBEAT = 0x700
-BLOCKED, EMERGENCY, FOLLOWING_ERROR, HEARTBEAT_ERROR = 0x7121, 0x5441, 0x8611, 0x8130
+FOLLOWING_ERROR, HEARTBEAT_ERROR = 0x8611, 0x8130  # error codes
 OFF_BY = 0.05  # rad: error of a late TPDO, which makes its use for the next SYNC visible
 PAUSE = 0.02  # s
 
@@ -229,10 +229,11 @@ class CanopenServer(ProtocolServer):
             if self._network is None:
                 return
             self._network.set_mute(controller.stalled)
-            self._follow_stops(controller)
+            self._was_able = follow_stops(controller, self.drives, self._was_able)
             self._send_delayed(self._now())
             self._watch_heartbeats(controller)
-            self._move(controller)
+            axes = ((drive.axis, drive.interpolation_period) for drive in self.drives)
+            move_axes(controller, controller.period, axes)
             if not controller.frozen:
                 self._measure(controller)
             self._send_heartbeats(controller)
@@ -240,18 +241,6 @@ class CanopenServer(ProtocolServer):
                 self._network.check()
             except Exception as error:
                 raise LinkError(f"simulated drives: {error}") from None
-
-    def _follow_stops(self, controller: ArmController) -> None:
-        """Fail every drive at a stop of the arm; a fault that is reset ends a protective stop."""
-        able, self._was_able = self._was_able, controller.can_move
-        for drive in self.drives:
-            healthy = drive.axis.machine.phase not in (Phase.FAULT, Phase.REACTION)
-            if not controller.can_move and able and healthy:
-                drive.fail(EMERGENCY if controller.emergency else BLOCKED)
-            elif controller.emergency and healthy:
-                drive.fail(EMERGENCY)
-            elif controller.protective and healthy:
-                controller.unlock()
 
     def _watch_heartbeats(self, controller: ArmController) -> None:
         for drive in self.drives:
@@ -270,19 +259,6 @@ class CanopenServer(ProtocolServer):
             drive.fail(HEARTBEAT_ERROR, COMMUNICATION)
         elif option in (2, 3):
             drive.axis.machine.control(0x00 if option == 2 else 0x02)
-
-    def _move(self, controller: ArmController) -> None:
-        goal = list(controller.target_q)
-        holding = False
-        for joint, drive in enumerate(self.drives):
-            axis = drive.axis
-            axis.step(controller.period, drive.interpolation_period, goal[joint])
-            if axis.holds:
-                holding, goal[joint] = True, axis.demand
-        if holding:
-            controller.command(goal)
-        elif controller.commanded:
-            controller.let_go()
 
     def _measure(self, controller: ArmController) -> None:
         torque = controller.joint_torque

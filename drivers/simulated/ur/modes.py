@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import Any
 
 # runtime_state
-STOPPING, STOPPED, PLAYING, PAUSING, PAUSED, RESUMING = range(6)
+STOPPING, STOPPED, PLAYING, PAUSED = 0, 1, 2, 4
 
 # robot_mode
 POWER_OFF, POWER_ON, IDLE, BACKDRIVE, RUNNING = 3, 4, 5, 6, 7

@@ -1,4 +1,4 @@
-"""The plain linear fit against scipy on stored rows, and to first order against the exact arm."""
+"""The plain linear fit against scipy on stored rows."""
 
 from __future__ import annotations
 
@@ -8,13 +8,10 @@ import numpy as np
 import pytest
 from scipy.linalg import lstsq
 
-from benchmarks.speed.first_order import block_of, first_order
 from benchmarks.speed.linear_fit import fit_linear
 from gapbridge.core.arm import builtin_arm
-from gapbridge.core.compensation import correct
 from gapbridge.core.effects import Site, Term
 from gapbridge.core.errors import InputError
-from gapbridge.core.kernels.packed import pack
 from gapbridge.core.loads import Loads
 from gapbridge.core.model import Model
 
@@ -76,18 +73,3 @@ def test_links_that_bend_are_refused():
     deflected = model_of().with_terms([Term("link_flexibility", Site(2), (1e-6,))])
     with pytest.raises(InputError, match="link that bends itself"):
         fit_linear(deflected, q, loads, gap)
-
-
-def test_first_order_is_the_linear_form_and_near_the_exact_correction():
-    soft = model_of().with_compliance([3e-6] * 6, [1e-6] * 6)
-    q, loads, _ = rows_of(1, spread=0.2)
-    rows, found = soft.rows(q, loads), np.empty(9)
-    first_order(block_of(pack(soft.chain()), pack(rows), 6), q[0], 1e-6, found)
-    form = model_of().linear_form(q, loads)
-    deflection = form.regressor[0, :3] @ np.repeat([3e-6, 1e-6], 6)
-    np.testing.assert_allclose(found[6:], deflection, rtol=0, atol=1e-15)
-    np.testing.assert_allclose(form.jacobian[0, :3] @ found[:6], -deflection, atol=1e-10)
-    # the exact one keeps the orientation too: compare where the tool point goes
-    exact = correct(soft, q, loads)
-    moved = form.jacobian[0, :3] @ (exact.q[0] - q[0])
-    np.testing.assert_allclose(moved, -deflection, atol=0.03 * np.linalg.norm(deflection))

@@ -19,13 +19,14 @@ from gapbridge.bridge.cell.run_settings import Configuration
 from gapbridge.bridge.cell.runtime_folder import state_folder
 from gapbridge.bridge.daemon import kept_rests
 from gapbridge.bridge.daemon.kept_rests import EVERY, KeptRests
-from gapbridge.bridge.daemon.slip_watch import Slip, SlipWatch
+from gapbridge.bridge.daemon.slip_watch import SlipWatch, slip_event
 from gapbridge.bridge.ipc.loop_state import State
+from gapbridge.core.diagnosis.rests.rest_comparison import Slip
 from gapbridge.core.errors import InputError, RunError
 from gapbridge.drivers.clock import SYSTEM
 
 LEARNING, ROUNDS = 6 * COUNTS, 2 * COUNTS + 1  # rests
-FOUND = Slip((4, 3), 0.0098, 0.0007, 12.0, "the zero of joint 4 or 3 has moved by 9.8 mrad")
+FOUND = slip_event(Slip((4, 3), 0.0098, 0.0007, 12.0, 4))
 ACKNOWLEDGED = {"kind": "request", "acknowledges": True}
 
 
@@ -73,7 +74,7 @@ def test_a_slip_while_the_link_is_lost_is_found_after_it() -> None:
     watch.interrupt()
     program.slip(3, 0.010)
     (slip,), forces, _ = found_in(watch, program, ROUNDS)
-    assert 4 in slip.joints
+    assert 4 in slip["joints"]
     assert forces == []
 
 
@@ -86,7 +87,7 @@ def test_a_slip_between_two_runs_is_found_in_the_second(
     learned.slip(4, 0.010)
     learned.time = 0.0  # the controller was off, too
     (slip,), _, _ = found_in(watch, learned, ROUNDS)
-    assert 5 in slip.joints
+    assert 5 in slip["joints"]
 
 
 def test_a_night_without_a_slip_is_none(learned: Program, path: Path, cell: Configuration) -> None:
@@ -179,12 +180,12 @@ def test_a_slip_is_kept_until_it_is_acknowledged_whatever_the_cell(
     path: Path, cell: Configuration
 ) -> None:
     program = Program(SETUPS[0], 22)
-    a_run(path, cell, watch_of(program), FOUND.event)
+    a_run(path, cell, watch_of(program), FOUND)
     other = replace(cell, text=cell.text + "\n")
     for _ in range(2):
         kept = KeptRests(SYSTEM)
         kept.open(path, watch_of(program), other)
-        assert kept.slip_of_earlier_run() == FOUND.event
+        assert kept.slip_of_earlier_run() == FOUND
         assert kept.slip_of_earlier_run() is None
         a_run(path, other, watch_of(program))
     a_run(path, other, watch_of(program), ACKNOWLEDGED)
@@ -223,7 +224,7 @@ def test_a_disk_that_cannot_be_written_is_told_once(
 ) -> None:
     watch, kept = watch_of(learned), KeptRests(SYSTEM)
     kept.open(tmp_path / "none" / "x.json", watch, cell)
-    kept.on_event(FOUND.event)
+    kept.on_event(FOUND)
     detail = []
     for _ in range(3):
         detail.append(kept.step(watch, cell, at_once=True))
@@ -265,10 +266,10 @@ def test_a_slip_that_nobody_has_acknowledged_holds_the_next_run_of_the_daemon(
             daemon = run.daemon
             daemon._open_kept_rests()
             if acknowledge:
-                until(world, lambda d=daemon: d.latched == FOUND.detail, 3.0)  # type: ignore[misc]
+                until(world, lambda d=daemon: d.latched == FOUND["detail"], 3.0)  # type: ignore[misc]
                 until(world, lambda d=daemon: d.status()["counts"]["zero_moved"] == 1, 3.0)  # type: ignore[misc]
                 assert daemon.state == State.OBSERVING
-                assert FOUND.detail in ask(run, "arm")["error"]
+                assert FOUND["detail"] in ask(run, "arm")["error"]
                 assert ask(run, "disarm")["ok"]
             assert ask(run, "arm")["answer"] == "compensating"
             daemon._kept.close()

@@ -7,10 +7,11 @@ import pytest
 from simulated_daemon import ask, causes, rides_on_a_program, until
 
 from benchmarks.zero_slips import COUNTS, SETUPS, SLICES, Program, Setup, found_in
-from gapbridge.bridge.daemon.slip_watch import Slip, SlipWatch
+from gapbridge.bridge.daemon.slip_watch import SlipWatch, slip_event
 from gapbridge.bridge.daemon.status_document import lines
 from gapbridge.bridge.ipc.command_memory import Command
 from gapbridge.bridge.ipc.loop_state import State
+from gapbridge.core.diagnosis.rests.rest_comparison import Slip
 
 LEARNING = 6 * COUNTS  # rests
 ROUNDS = 2  # of the program, within which a slip of 10 mrad is found
@@ -31,10 +32,11 @@ def test_a_slip_of_10_mrad_is_found_within_two_rounds(setup: Setup, joint: int) 
     slips, forces, _ = found_in(watch, program, ROUNDS * COUNTS + 1)
     assert len(slips) == 1
     assert forces == []
-    assert joint in slips[0].joints
-    if slips[0].joints[0] == joint:
-        assert abs(slips[0].size - 0.010) < 4.0 * slips[0].std
-    assert f"{1e3 * slips[0].size:.1f} mrad" in slips[0].detail
+    joints, size = slips[0]["joints"], slips[0]["size"]
+    assert joint in joints
+    if joints[0] == joint:
+        assert abs(size - 0.010) < 4.0 * slips[0]["std"]
+    assert f"{1e3 * slips[0]['size']:.1f} mrad" in slips[0]["detail"]
 
 
 def test_joints_with_parallel_axes_are_all_named_where_weights_cannot_part_them() -> None:
@@ -43,8 +45,8 @@ def test_joints_with_parallel_axes_are_all_named_where_weights_cannot_part_them(
     found_in(watch, program, LEARNING)
     program.slip(2, 0.02)
     (slip,), _, _ = found_in(watch, program, ROUNDS * COUNTS + 1)
-    assert sorted(slip.joints) == [2, 3, 4]
-    assert "joint " in slip.detail and " or " in slip.detail
+    assert sorted(slip["joints"]) == [2, 3, 4]
+    assert "joint " in slip["detail"] and " or " in slip["detail"]
 
 
 def test_the_first_joint_turns_about_the_weights_and_shows_nothing() -> None:
@@ -77,7 +79,7 @@ def test_a_hand_on_the_arm_is_a_force_and_no_slip() -> None:
     assert slips == []
     assert hands > 10
     assert len(forces) > 0.4 * hands  # those of a few newtons, or shorter than a window, pass
-    assert "an unexpected force of" in forces[0].detail
+    assert "an unexpected force of" in forces[0]["detail"]
 
 
 def test_a_sensor_that_is_zeroed_anew_and_a_heavier_part_are_no_slips() -> None:
@@ -112,7 +114,7 @@ def test_without_poses_that_come_back_nothing_is_compared() -> None:
 def test_a_slip_holds_the_run_until_a_person_has_seen_it() -> None:
     with rides_on_a_program() as (run, world):
         daemon = run.daemon
-        found = Slip((4, 3), 0.0098, 0.0007, 12.0, "the zero of joint 4 or 3 has moved by 9.8 mrad")
+        found = slip_event(Slip((4, 3), 0.0098, 0.0007, 12.0, 4))
         begun = world.now
         daemon._slips.take = lambda rows: [found] if world.now < begun + 0.02 else []  # type: ignore[method-assign]
         until(world, lambda: daemon.state == State.OBSERVING, 3.0)
@@ -121,7 +123,7 @@ def test_a_slip_holds_the_run_until_a_person_has_seen_it() -> None:
         assert (event["joints"], event["size"]) == ([4, 3], 0.0098)
         status = daemon.status()
         assert status["counts"]["zero_moved"] == 1  # /metrics: gapbridge_incidents
-        assert status["latched"] == found.detail
+        assert status["latched"] == found["detail"]
         assert "zero of joint 4" in "\n".join(lines(status))
         refused = ask(run, "arm")
         assert not refused["ok"]
@@ -139,7 +141,7 @@ def test_a_slip_holds_the_run_until_a_person_has_seen_it() -> None:
 def test_a_slip_stays_latched_over_a_loop_that_dies() -> None:
     with rides_on_a_program() as (run, world):
         daemon, begun = run.daemon, world.now
-        found = Slip((2,), 0.02, 0.001, 1.0, "the zero of joint 2 has moved by 20.0 mrad")
+        found = slip_event(Slip((2,), 0.02, 0.001, 1.0, 4))
         daemon._slips.take = lambda rows: [found] if world.now < begun + 0.02 else []  # type: ignore[method-assign]
         until(world, lambda: daemon.state == State.OBSERVING, 3.0)
         run.loops[-1].kill()

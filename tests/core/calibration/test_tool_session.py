@@ -73,23 +73,6 @@ def test_a_slipped_touch_is_listed(model: Model) -> None:
     assert found.tcp == pytest.approx(TRUE_TIP, abs=3e-4)
 
 
-def test_a_ball_held_against_a_ball_shows_the_tip_too(model: Model) -> None:
-    q = np.array(plan_tool(model, BEGIN, poses=14).poses)
-    rng = np.random.default_rng(3)
-    around = rng.normal(size=(len(q), 3))
-    around *= 0.02 / np.linalg.norm(around, axis=1)[:, None]
-    touched = _touched(model, q, 0.0, rng)
-    real = replace(model, tool_in_flange=model.tool_in_flange.copy())
-    real.tool_in_flange[:3, 3] = TRUE_TIP
-    goal = real.predict(touched).position + around
-    for _ in range(30):
-        form = real.linear_form(touched).jacobian[:, :3]
-        gap = goal - real.predict(touched).position
-        touched = touched + np.einsum("nij,nj->ni", np.linalg.pinv(form), gap)
-    found = calibrate_tool(model, touched, distance=0.02)
-    assert found.tcp == pytest.approx(TRUE_TIP, abs=1e-6)
-
-
 def test_one_axis_is_too_little(model: Model) -> None:
     q = np.tile(BEGIN, (6, 1))
     q[:, 5] += np.linspace(-1, 1, 6)

@@ -50,7 +50,7 @@ def written(tmp_path: Path, text: str) -> Path:
         ("unit: mrad/s", "unit: mrad", 5, "found 'mrad', expected a unit of speed: rad/s"),
         ("table: coil", "table: discrete", 12, "expected 'coil' or 'holding'"),
         ("value: 1}", "value: 2}", 12, "write.trigger.1.value: found 2, expected 0 to 1"),
-        ("mode: target_trigger", "mode: telepathy", 9, "found 'telepathy', expected one of mailb"),
+        ("mode: target_trigger", "mode: telepathy", 9, "write.mode: found 'telepathy', expected"),
         ("address: 50", "address: 65530", 10, "whose last register is beyond 65535"),
         ("  velocity:", "  velocty:", 5, "found an unknown key 'velocty'"),
         ("good: [1]", "good: []", 7, "status.1.good"),

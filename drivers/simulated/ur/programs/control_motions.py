@@ -58,8 +58,8 @@ def _positive(value: float) -> float:
     return value
 
 
-def _joints_for(c: Controller, goal: Frame, near: Joints | None = None) -> Joints:
-    joints = solve(c.plant.arm, goal, near or c.target_q, c.declared.tool)
+def _joints_for(c: Controller, goal: Frame) -> Joints:
+    joints = solve(c.plant.arm, goal, c.target_q, c.declared.tool)
     if joints is None:
         raise ScriptError("get_inverse_kin: unable to find a solution")
     return joints
