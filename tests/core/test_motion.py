@@ -90,6 +90,30 @@ def test_a_gap_in_time_ends_a_stretch():
     assert np.abs(motion.qd - COURSE.at(t[kept], 1))[motion.valid].max() < 0.01
 
 
+def test_a_gap_in_which_an_arm_hardly_moves_ends_none():
+    """A Panda's recorder at 500 Hz left gaps of 10 ms."""
+    t, log = recording()
+    kept = np.flatnonzero((t < 4) | (t > 4.01))
+    motion = motion_of(log.select(kept))
+    assert motion.stretch[-1] == 0
+    assert motion.valid[1990:2010].all()
+    assert np.abs(motion.qdd - COURSE.at(t[kept], 2))[1990:2010].max() < 0.05
+
+
+def test_accelerations_come_from_speeds_where_those_of_the_angles_jump():
+    """The angles' noise is not white: what two windows make of it differs."""
+    t = np.arange(5000) / 500
+    bursts = np.random.default_rng(0).normal(0, 3e-5, (5000, 6))
+    bursts[(t % 2.0) > 0.3] *= 0.05
+    speeds = COURSE.at(t, 1) + np.random.default_rng(1).normal(0, 3e-4, (5000, 6))
+    log = truth.log_of(6, timestamp=t, actual_q=COURSE.at(t) + bursts, actual_qd=speeds)
+    alone = motion_of(truth.log_of(6, timestamp=t, actual_q=COURSE.at(t) + bursts))
+    both = motion_of(log)
+    assert both.valid.mean() > alone.valid.mean() + 0.1
+    error = (both.qdd - COURSE.at(t, 2))[both.valid]
+    assert error.std() < 0.05
+
+
 def test_time_that_runs_back_is_reported_with_its_line_also_in_a_selection():
     t, log = recording()
     back = replace(log, columns=dict(log.columns) | {"timestamp": np.where(t == t[900], 0.0, t)})

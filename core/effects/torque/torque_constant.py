@@ -30,8 +30,11 @@ class TorqueConstant(JointEffect):
     simulator_advice = "scale the measured torque by 1 / (1 + value) before it is compared"
 
     def parameters(self, arm: Arm, site: Site) -> tuple[Parameter, ...]:
-        """Return the relative increase."""
-        return (Parameter("", "", 0.05, -0.8, 1.0),)
+        """Return the relative increase.
+
+        Limited to half: a larger one replaces friction and first moments (KUKA KR 300, UR10e).
+        """
+        return (Parameter("", "", 0.05, -0.5, 0.5),)
 
     def drive(self, term: Term, arm: Arm, torque: Array, motion: Motion) -> Array:
         """Scale the joint's torque."""

@@ -172,6 +172,32 @@ def test_terms_that_came_to_zero_are_removed_together():
     assert decided.withdrawn == tuple((p, NOT_SIGNIFICANT) for p in (1, 2, 3, 0))
 
 
+def test_a_gain_that_is_not_significant_is_removed_before_what_it_scales():
+    """A torque constant of 0.94 +- 1.3 halved a UR10e's friction, and made it as unsure."""
+    terms = [Term("coulomb_friction", Site(6), (1.5,)), Term("torque_constant", Site(6), (0.9,))]
+    refitted_with = []
+
+    def selection_of(spread):
+        found = OnAllRows((0.0, 0.0, 0.0), (0.0,))
+        found.terms, found.term_index, found.prior = tuple(terms), (0, 1), {}
+        found.covariance = [np.eye(1) * spread] * 2
+        own = [SimpleNamespace(effect=effect_named(t.effect)) for t in terms]
+        found.space = SimpleNamespace(candidates=own)
+        return found
+
+    def alone(selection, accused):
+        refitted_with.append(tuple(accused))
+        return selection_of(1e-3)
+
+    zero = SimpleNamespace(alone=lambda kept: ([np.zeros(1)] * len(kept), [np.eye(1)] * len(kept)))
+    refits = SimpleNamespace(alone=alone, linearised=lambda *_: zero)
+    requested = Judgement((0, 1), True, 0.0, (), {}, ())
+    _, decided = all_rows._significant(selection_of(1.0), requested, refits)
+    assert refitted_with == [(0,)]
+    assert decided.accused == (0,)
+    assert decided.withdrawn == ((1, NOT_SIGNIFICANT),)
+
+
 def test_what_a_removal_makes_insignificant_is_removed_before_the_next_refit():
     """Followed to first order, one refit in place of one for each term; the refit decides."""
     terms = [Term("coulomb_friction", Site(j), (1.0,)) for j in (1, 2, 3, 4)]
