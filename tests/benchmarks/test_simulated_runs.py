@@ -676,6 +676,11 @@ def test_what_waited_for_a_full_disk_at_a_power_cut_is_no_violation() -> None:
     assert not run(40000194, on="odrive").violations  # its recorder dies as it resumes
 
 
+def test_each_of_two_questions_that_are_under_way_is_answered_by_a_state() -> None:
+    """Seed 40002127: who judged took the answer to the first for one to a command."""
+    assert not run(40002127, on="openarm").violations
+
+
 def test_every_invariant_has_a_break() -> None:
     assert {name for name, *_ in BREAKS} == set(INVARIANTS)
 

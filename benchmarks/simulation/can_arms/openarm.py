@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from collections import deque
 from collections.abc import Callable
 
 from benchmarks.simulation.can_arms.arm import CanArm, Joints
@@ -16,6 +17,7 @@ REACH, MOST = 12.5, 0xFFFF  # rad, counts: a position from minus to plus
 ANSWERS = 0x11  # identifier of the first motor's answer
 ERRORS = (0x8, 0x9, 0xA, 0xB, 0xC, 0xD, 0xE)  # voltage, current, temperature, silence, overload
 ENABLED = 1
+RECENT = 10  # questions, some of whose answers may be under way
 
 
 class OpenArm(CanArm):
@@ -32,7 +34,7 @@ class OpenArm(CanArm):
         self._errors: dict[int, int] = {}  # motor -> its error
         self._says: dict[int, int] = {}  # motor -> state in its answer
         self._ran: set[int] = set()  # motors that said enabled since they were last switched
-        self._asked: list[float] = [0.0] * MOTORS  # s: when each was asked last
+        self._asked = [deque[float](maxlen=RECENT) for _ in range(MOTORS)]  # s: when each was asked
 
     @classmethod
     def made(cls, make: Callable[[type[CanNodes]], CanNodes], clock: Clock) -> CanNodes:
@@ -56,11 +58,11 @@ class OpenArm(CanArm):
     def taken(self, identifier: int, data: bytes, now: float) -> None:
         """See CanArm.taken: answers to commands are no part of the sample that was asked for."""
         if identifier == QUERY and 1 <= data[0] <= MOTORS:
-            self._asked[data[0] - 1] = now
+            self._asked[data[0] - 1].append(now)
 
     def reports_a_sample(self, identifier: int, sampled: float) -> bool:
         """See CanArm.reports_a_sample."""
-        return sampled == self._asked[identifier - ANSWERS]
+        return sampled in self._asked[identifier - ANSWERS]
 
     def look(self, identifier: int, data: bytes) -> None:
         """See CanArm.look: a motor must not move with an error, or once it has been disabled."""
