@@ -1,29 +1,26 @@
-"""CAN: a bus in memory between the product's driver and the simulated PiPER."""
+"""CAN: a bus in memory between the product's driver and the simulated arms of ``can_arms``."""
 
 from __future__ import annotations
 
 import math
 import random
-import struct
 from collections import deque
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, cast
 
 import can as python_can
 
+from benchmarks.simulation.can_arms import ARMS
 from benchmarks.simulation.links import SimulatedLink
 from benchmarks.simulation.world import Process
 from gapbridge.core.errors import LinkError
 from gapbridge.core.state import RobotState
 from gapbridge.drivers.can import driver as can_driver
 from gapbridge.drivers.can.driver import CanDriver
+from gapbridge.drivers.can.settings import CanSettings
 from gapbridge.drivers.driver import Driver
 from gapbridge.drivers.simulated.can.frame import Frame
-from gapbridge.drivers.simulated.can.piper_node import TARGETS, UNIT, PiperNode
 
-CONTROL = (0x150, 0x151, 0x155, 0x156, 0x157, 0x471)
-STATUS, TEACHING = 0x2A1, 2  # the arm's status; its control mode while it is led by hand
-STATUSES = (1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13)  # of the arm, all but normal
 MOST_WAITING = 5000  # frames that the kernel keeps
 
 
@@ -31,22 +28,14 @@ Frames = tuple[int, bytes, float] | python_can.Message
 """Identifier, data, s when the arm sampled it; or a frame that is none of the arm's."""
 
 
-class _Node(PiperNode):
-    """The arm, whose frames go to the link's wires."""
+class Received(NamedTuple):
+    """A frame as python-can gives it, without what making one of its own costs."""
 
-    link: CanLink
-
-    def _receive(self) -> Frame | None:
-        inbox = self.link.inbox
-        return inbox.popleft() if inbox else None
-
-    def send(self, identifier: int, data: bytes) -> None:
-        """Send one frame."""
-        link = self.link
-        if identifier == STATUS and link.arm_status:
-            data = bytes([data[0], link.arm_status]) + data[2:]
-        if identifier not in self.withheld and identifier not in self._lost:
-            link.down.send((identifier, data, link.world.now))
+    arbitration_id: int
+    data: bytes
+    timestamp: float
+    is_rx = True
+    is_error_frame = is_remote_frame = is_extended_id = is_fd = False
 
 
 class _Bus:
@@ -66,10 +55,7 @@ class _Bus:
         if isinstance(found, python_can.Message):
             return found
         identifier, data, link.last_sampled = found
-        return python_can.Message(
-            timestamp=link.world.now, arbitration_id=identifier, is_extended_id=False, data=data,
-            check=False,
-        )  # fmt: skip
+        return Received(identifier, data, link.world.now)
 
     def _wait(self, timeout: float) -> bool:
         """Wait for a frame; return whether one has come."""
@@ -100,7 +86,7 @@ class _Bus:
 
 
 class CanLink(SimulatedLink):
-    """One PiPER on a bus."""
+    """One arm on a bus."""
 
     def __init__(self, *given: Any) -> None:
         super().__init__(*given)
@@ -111,14 +97,23 @@ class CanLink(SimulatedLink):
         self.waiting: Process | None = None
         self.last_sampled = self.world.now
         self.refuses_frames = False
-        self.arm_status = 0  # reported in place of the arm's own
         self._goal = list(self.controller.q)
-        self._seen: dict[int, tuple[float, float]] = {}
-        self._safe = True
-        link: Any = self.setting.cell.link
-        self.node = _Node(link, "127.0.0.9", self.controller)
-        self.node.link = self
-        self.node._bus = self  # its frames go through ``_receive`` and ``send`` above
+        self._seen: dict[int, float] = {}  # joint -> rad
+        kind, settings = ARMS[self.setting.name], cast(CanSettings, self.setting.cell.link)
+        node = kind.made(lambda made: made(settings, "127.0.0.9", self.controller), self.clock)
+        self.arm = kind(node, self.controller)
+        self.node = node
+        node._bus = self  # its frames go through the two below
+        node._receive = self._next_frame  # type: ignore[method-assign]
+        node.send = self._send  # type: ignore[method-assign]
+
+    def _next_frame(self) -> Frame | None:
+        return self.inbox.popleft() if self.inbox else None
+
+    def _send(self, identifier: int, data: bytes) -> None:
+        """Send one frame of the arm."""
+        if identifier not in self.node.withheld and identifier not in self.node._lost:
+            self.down.send((identifier, self.arm.altered(identifier, data), self.world.now))
 
     def driver(self) -> Driver:
         """See SimulatedLink.driver."""
@@ -145,20 +140,17 @@ class CanLink(SimulatedLink):
         return found
 
     def note(self, identifier: int, data: bytes) -> None:
-        """Report a frame that leaves the client; the last of three makes a setpoint."""
-        if identifier not in CONTROL or identifier == 0x150:
-            self.wrote("forbidden" if identifier != 0x150 else "other", (), f"{identifier:#x}")
+        """Report a frame that leaves the client; the last target makes a setpoint."""
+        arm = self.arm
+        targets = arm.targets(identifier, data)
+        for i, q in targets.items():
+            self._goal[i] = q
+        if targets and identifier == arm.last_target:
+            self.wrote("joints", tuple(self._goal), f"{identifier:#x}")
             return
-        first = TARGETS.get(identifier)
-        if first is None:
-            self.wrote("other", (), f"{identifier:#x}")
-            return
-        for i, value in enumerate(struct.unpack(">ii", data), first):
-            self._goal[i] = self.node.joint(i, value, UNIT)
-        if first == 4:
-            self.wrote("joints", tuple(self._goal), "0x155-0x157")
-        else:
-            self.wrote("other", (), f"{identifier:#x}")
+        if not targets:
+            arm.sent(identifier, data)
+        self.wrote("other" if identifier in arm.sends else "forbidden", (), f"{identifier:#x}")
 
     def cycle(self) -> None:
         """Have the arm take its frames and send its own."""
@@ -173,8 +165,13 @@ class CanLink(SimulatedLink):
         """Send nothing more: the node has."""
 
     def _on_up(self, message: tuple[int, bytes]) -> None:
-        if self.world.now >= self.rebooting_until:
+        if self.world.now < self.rebooting_until:
+            return
+        if not self.arm.answers_at_once:
             self.inbox.append(Frame(message[0], message[1], False))
+        elif not self.controller.stalled:
+            self.arm.taken(*message, self.world.now)
+            self.node.take(*message, self.controller)
 
     def _on_down(self, message: tuple[int, bytes, float]) -> None:
         bus = self.bus
@@ -205,38 +202,24 @@ class CanLink(SimulatedLink):
 
     def enter_mode(self, draw: random.Random) -> str:
         """See SimulatedLink.enter_mode."""
-        if draw.random() < 0.3:
-            self.node.control_mode = TEACHING
-            self.controller.let_go()
-            return "led by hand"
-        self.arm_status = draw.choice(STATUSES)
-        self.controller.protective_stop()
-        return f"arm status {self.arm_status}"
+        return self.arm.enter_mode(draw)
 
     def leave_mode(self) -> None:
         """See SimulatedLink.leave_mode."""
-        if self.arm_status:
-            self.arm_status = 0
-            self.controller.unlock()
-        if self.node.control_mode == TEACHING:
-            self.node.control_mode = 0
+        self.arm.leave_mode()
 
-    def _look(self, identifier: int, data: bytes, _: float) -> None:
-        """See what a checker sees of a frame: joints in three, the arm's state in one."""
-        if identifier == STATUS and len(data) == 8:
-            self._safe = data[1] == 0
-        place = identifier - 0x2A5
-        if not 0 <= place < 3 or len(data) != 8:
+    def _look(self, identifier: int, data: bytes, sampled: float) -> None:
+        """See what a checker sees of a frame: the arm's state, and joints until all are there."""
+        arm = self.arm
+        arm.look(identifier, data)
+        if identifier not in arm.reports or not arm.reports_a_sample(identifier, sampled):
             return
-        first, second = struct.unpack(">ii", data)
-        joint = self.node.joint
-        self._seen[place] = (
-            joint(2 * place, first, UNIT), joint(2 * place + 1, second, UNIT),
-        )  # fmt: skip
-        if place == 2 and len(self._seen) == 3:
-            q = [v for k in range(3) for v in self._seen[k]]
+        self._seen.update(arm.joints(identifier, data))
+        in_order = identifier == arm.reports[-1] or not arm.is_ordered
+        if in_order and len(self._seen) == self.controller.n:
+            q = [self._seen[i] for i in range(self.controller.n)]
             self._seen.clear()
-            self.see((math.nan, q, q, self._safe))
+            self.see((math.nan, q, q, arm.safe))
 
     def disconnect(self) -> None:
         """See SimulatedLink.disconnect."""
@@ -248,7 +231,7 @@ class CanLink(SimulatedLink):
     def forget_client(self) -> None:
         """See SimulatedLink.forget_client."""
         super().forget_client()
-        self.node.control_mode, self.node.enabled = 0, [False] * 6
+        self.arm.forget()
 
     def heal(self) -> None:
         """See SimulatedLink.heal."""
@@ -265,32 +248,29 @@ class CanLink(SimulatedLink):
         until = self.world.now + seconds
 
         def send() -> None:
-            wire = [round(v / UNIT) for v in self.controller.q[:2]]
-            data = struct.pack(">ii", *wire)
-            self.down.send((0x155, data, self.world.now))
+            self.down.send((*self.arm.foreign_target(), self.world.now))
             if self.world.now < until:
                 self.world.after(0.02, send)
 
         send()
 
+    def spoiled(self, message: Any, draw: Any) -> Any:
+        """Return a frame that is wrong in one way."""
+        identifier, data, sampled = message
+        kind = draw.randrange(3)
+        if kind == 0:
+            return identifier, data[: draw.randrange(len(data))] if data else data, sampled
+        if kind == 1:
+            return draw.choice((*self.arm.reports, *self.arm.others[:1])), data, sampled
+        at = draw.randrange(len(data)) if data else 0
+        changed = data[:at] + bytes([data[at] ^ (1 << draw.randrange(8))]) + data[at + 1 :]
+        return identifier, changed, sampled
 
-def spoiled(message: tuple[int, bytes, float], draw: Any) -> tuple[int, bytes, float]:
-    """Return a frame that is wrong in one way."""
-    identifier, data, sampled = message
-    kind = draw.randrange(3)
-    if kind == 0:
-        return identifier, data[: draw.randrange(len(data))] if data else data, sampled
-    if kind == 1:
-        return draw.choice((0x2A5, 0x2A6, 0x2A7, 0x2A1)), data, sampled
-    at = draw.randrange(len(data)) if data else 0
-    changed = data[:at] + bytes([data[at] ^ (1 << draw.randrange(8))]) + data[at + 1 :]
-    return identifier, changed, sampled
 
-
-def foreign_frame(draw: random.Random) -> python_can.Message:
-    """Return a frame that no profile of ours knows, or knows in another form."""
+def foreign_frame(draw: random.Random, known: Sequence[int] = (0x2A5, 0x2A1)) -> python_can.Message:
+    """Return a frame that no profile of ours knows, or one of ``known`` in another form."""
     extended = draw.random() < 0.3
-    identifier = draw.choice((0x2A5, STATUS)) if extended else draw.randrange(0x300, 0x470)
+    identifier = draw.choice(known) if extended else draw.randrange(0x300, 0x470)
     return python_can.Message(
         arbitration_id=identifier, is_extended_id=extended, data=draw.randbytes(8),
         is_remote_frame=False, check=False,

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple, cast
 
 import can as python_can
 
+from benchmarks.simulation.can import Received
 from benchmarks.simulation.canopen_drives import OPERATIONAL, SimulatedDrives
 from benchmarks.simulation.links import SimulatedLink
 from benchmarks.simulation.world import Process, SimulatedClock
@@ -40,16 +41,6 @@ class BusFrame(NamedTuple):
     cob_id: int
     data: bytes
     sampled: float
-
-
-class _Received(NamedTuple):
-    """A frame as python-can gives it, without what making one of its own costs."""
-
-    arbitration_id: int
-    data: bytes
-    timestamp: float
-    is_rx = True
-    is_error_frame = is_remote_frame = is_extended_id = is_fd = False
 
 
 class _Network(canopen_master._Network):
@@ -280,7 +271,7 @@ class CanopenLink(SimulatedLink):
         if cob_id & 0x780 == TPDO_BASE:
             self._look(cob_id & 0x7F, data)
             self._sampled_at[cob_id] = sampled
-        self._hand_over(network, cast(Any, _Received(cob_id, data, self.world.now)))
+        self._hand_over(network, cast(Any, Received(cob_id, data, self.world.now)))
 
     def _hand_over(self, network: _Network, frame: python_can.Message) -> None:
         self._handed.append((network, frame))

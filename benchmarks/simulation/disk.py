@@ -1,31 +1,34 @@
-"""A disk that may be full, and that keeps after a power cut what was synced and nothing else."""
+"""A disk that may be full, and that loses contents and names at a power cut: see LosingDisk."""
 
 from __future__ import annotations
 
 import contextlib
 import errno
 import os
+import random
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from benchmarks.losing_disk import LosingDisk
 from gapbridge.bridge.recording import segment
 
 
 class Disk:
     """The folder of a run's recordings; only they are written there, from their begin on."""
 
-    def __init__(self) -> None:
+    def __init__(self, draw: random.Random) -> None:
+        self._draw = draw
         self._folder = tempfile.TemporaryDirectory(prefix="simulation-")
-        self.folder = Path(self._folder.name)
+        self.folder = Path(self._folder.name) / "recordings"
+        self.folder.mkdir()
         self.is_full = False
-        self._synced: dict[str, int] = {}  # bytes of each file
+        self.losing = LosingDisk(self.folder)
 
     def cut_power(self) -> None:
-        """Lose what was not synced."""
-        for path in self.folder.iterdir():
-            os.truncate(path, min(self._synced.get(str(path), 0), path.stat().st_size))
+        """Lose of files and of their names what was not synced: all of it, or as drawn."""
+        self.losing.lose(self._draw)
 
     def remove(self) -> None:
         """Remove all files."""
@@ -41,12 +44,6 @@ class Disk:
             return os.write(fd, data[: len(data) // 2])
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    def fsync(self, fd: int) -> None:
-        """Note what is on the disk from now on. Raises OSError."""
-        self._synced[os.readlink(f"/proc/self/fd/{fd}")] = os.fstat(fd).st_size
-
-    fdatasync = fsync
-
     def __getattr__(self, name: str) -> Any:
         return getattr(os, name)
 
@@ -60,7 +57,8 @@ def recorded_on(disk: Disk | None) -> Iterator[None]:
     before: Any = segment.os
     segment.os = disk  # type: ignore[assignment]
     try:
-        yield
+        with disk.losing:
+            yield
     finally:
         segment.os = before
         disk.remove()

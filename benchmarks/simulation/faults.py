@@ -23,7 +23,8 @@ class Fault:
     name: str
     make: Callable[[Run, Draw], str]
     links: tuple[str, ...] = (
-        "ur_servoj", "ur_offset", "modbus", "can", "canopen", "ur_sensor",
+        "ur_servoj", "ur_offset", "modbus", "can", "canopen", "ur_sensor", "odrive", "openarm",
+        "modbus_target",
     )  # fmt: skip
     weight: float = 1.0
 
@@ -34,12 +35,14 @@ def _of_link(make: Callable[[Any, Draw], str]) -> Callable[[Run, Draw], str]:
 
 _SERVOJ = ("ur_servoj", "ur_sensor")
 _UR = (*_SERVOJ, "ur_offset")
-_BUS = ("can", "canopen")
+_CAN = ("can", "odrive", "openarm")
+_BUS = (*_CAN, "canopen")
+_MODBUS = ("modbus", "modbus_target")
 FAULTS = (
     Fault("delay step", wire.delay_step, weight=2.0),
     Fault("jitter", wire.jitter),
     Fault("held back", wire.hold_back, weight=2.0),
-    Fault("lost messages", wire.lose, ("modbus", *_BUS)),
+    Fault("lost messages", wire.lose, (*_MODBUS, *_BUS)),
     Fault("doubled messages", wire.double, (*_UR, *_BUS)),
     Fault("corruption", wire.spoil, weight=2.0),
     Fault("reordering", wire.reorder, _BUS),
@@ -58,14 +61,14 @@ FAULTS = (
     Fault("robot's program ends", robot.end_program, (*_UR, "modbus")),
     Fault("another commander", robot.foreign),
     Fault("writes refused", robot.refuse, (*_SERVOJ, *_BUS)),
-    Fault("frame withheld", wire.withhold, ("can",)),
+    Fault("frame withheld", wire.withhold, _CAN),
     Fault("model no number", process.spoil_model),
     Fault("loop stalls", process.stall, weight=3.0),
     Fault("loop dies", process.die, weight=2.0),
     Fault("daemon stalls", process.stall_daemon),
     Fault("machine stalls", process.stall_machine),
-    Fault("planner silent", process.silence_planner, (*_SERVOJ, *_BUS)),
-    Fault("planner's nonsense", process.plan_nonsense, (*_SERVOJ, *_BUS)),
+    Fault("planner silent", process.silence_planner, (*_SERVOJ, *_BUS, "modbus_target")),
+    Fault("planner's nonsense", process.plan_nonsense, (*_SERVOJ, *_BUS, "modbus_target")),
     Fault("arm", process.arm, weight=2.0),
     Fault("disarm", process.disarm, weight=2.0),
     Fault("stop", process.stop, weight=0.3),
@@ -76,7 +79,7 @@ LATER = (
     Fault("wrong requests", wire.spoil_requests, ("ur_offset", "modbus")),
     Fault("flood of frames", wire.flood, _BUS),
     Fault("error frames", wire.error_frames, _BUS),
-    Fault("drift of the controller's cycle", robot.pace_of_cycles, ("modbus", *_BUS)),
+    Fault("drift of the controller's cycle", robot.pace_of_cycles, (*_MODBUS, *_BUS)),
     Fault("mode", robot.mode, weight=2.0),
     Fault("robot's program paused", robot.pause_program, (*_UR, "modbus")),
     Fault("remote control off", robot.local_mode, _SERVOJ),

@@ -33,12 +33,14 @@ from gapbridge.drivers.simulated.server.arm_controller import ArmController, mak
 from gapbridge.drivers.simulated.ur.settings import simulated_arm
 
 PAYLOAD: dict[str, tuple[float, tuple[float, float, float]]] = {
-    "can": (1.0, (0.0, 0.0, 0.06)),
-}
+    "can": (1.0, (0.0, 0.0, 0.06)), "odrive": (6.0, (0.0, 0.0, 0.05)),
+    "openarm": (1.0, (0.0, 0.0, 0.05)),
+}  # kg, m  # fmt: skip
 UR_PAYLOAD = (5.0, (0.0, 0.0, 0.06))
 SIMULATED_RATE = {
     "ur_servoj": 125.0, "ur_offset": 125.0, "modbus": 50.0, "can": 100.0, "canopen": 100.0,
-    "ur_sensor": 125.0,
+    "ur_sensor": 125.0, "odrive": 100.0, "openarm": 50.0,
+    "modbus_target": 50.0,
 }  # Hz  # fmt: skip
 SENSED_EVERY = 4  # cycles
 RESTARTS = (0.05, 0.4)  # s: the daemon's backoff

@@ -20,6 +20,7 @@ from gapbridge.drivers.modbus import driver as modbus_driver
 from gapbridge.drivers.modbus import encode
 from gapbridge.drivers.modbus.driver import ModbusDriver
 from gapbridge.drivers.modbus.profile import MAILBOX_WORDS
+from gapbridge.drivers.modbus.registers import Table
 from gapbridge.drivers.modbus.transport import Transport
 from gapbridge.drivers.simulated.modbus.programs import MailboxProgram
 from gapbridge.drivers.simulated.modbus.server import ModbusServer
@@ -27,6 +28,11 @@ from gapbridge.drivers.simulated.server.arm_controller import ArmController
 
 ADDRESS_MISSING = 2  # exception code
 MODE, RUNNING = 258, 7  # register of the robot's mode, and its value when it can move
+HUNDREDTH = math.radians(0.01)
+TARGETS, SPEED, TRIGGER = 142, 180, 103  # of igus: holding registers, holding register, coil
+WRONG: tuple[tuple[Table, int, int], ...] = (  # of igus: an error, motors off, not referenced
+    ("input", 95, 1), ("input", 95, 7), ("coil", 53, 0), ("coil", 60, 0),
+)  # fmt: skip
 MODES = (-1, 0, 1, 2, 3, 4, 5, 6)  # all others
 
 
@@ -43,7 +49,10 @@ class _Transport(Transport):
             raise LinkError(f"{self.name}: cannot be reached: refused")
         self.link.reconnected()
         self._client = client = _Client(self.link, self._settings.timeout)
-        self._calls = {"holding": client.read_holding_registers}
+        self._calls = {
+            "coil": client.read_coils, "holding": client.read_holding_registers,
+            "input": client.read_input_registers,
+        }  # fmt: skip
 
 
 class _Client(ModbusClientMixin[ModbusPDU]):
@@ -124,6 +133,8 @@ class _Server(ModbusServer):
 
 class ModbusLink(SimulatedLink):
     """One controller with a Modbus server and the mailbox program."""
+
+    joints_in = reports = (3, 23)  # functions whose answer has the joints; that ends a reading
 
     def __init__(self, *given: Any) -> None:
         super().__init__(*given)
@@ -208,23 +219,36 @@ class ModbusLink(SimulatedLink):
 
     def _answer(self, request: bytes) -> bytes:
         function, server = request[0], self.server
-        if function == 16:
+        if function in (5, 6, 16):
             address, count = struct.unpack_from(">HH", request, 1)
-            words = list(struct.unpack_from(f">{count}H", request, 6))
-            server._queue.append(("holding", address, words))
-            return struct.pack(">BHH", 16, address, count)
+            words = [count] if function != 16 else [*struct.unpack_from(f">{count}H", request, 6)]
+            words = [int(bool(count))] if function == 5 else words
+            server._queue.append(("coil" if function == 5 else "holding", address, words))
+            return struct.pack(">BHH", function, address, count)
         if function == 23:
             first, count, address, size = struct.unpack_from(">HHHH", request, 1)
-            words = list(struct.unpack_from(f">{size}H", request, 10))
+            words = [*struct.unpack_from(f">{size}H", request, 10)]
             server._queue.append(("holding", address, words))
         else:
             first, count = struct.unpack_from(">HH", request, 1)
         server.lay_out(self.controller)
-        table = server._image["input" if function == 4 else "holding"]
-        values = [table.get(a, 0) & 0xFFFF for a in range(first, first + count)]
-        if self.robot_mode != RUNNING and 0 <= MODE - first < count:
-            values[MODE - first] = self.robot_mode & 0xFFFF
+        table: Table = {1: "coil", 4: "input"}.get(function, "holding")  # type: ignore[assignment]
+        image = server._image[table]
+        values = [image.get(a, 0) & 0xFFFF for a in range(first, first + count)]
+        self._have_mode_in(table, first, values)
+        if function == 1:
+            bits = sum(bool(value) << i for i, value in enumerate(values))
+            return bytes([1, (count + 7) // 8]) + bits.to_bytes((count + 7) // 8, "little")
         return struct.pack(f">BB{count}H", function, 2 * count, *values)
+
+    def _have_mode_in(self, table: Table, first: int, values: list[int]) -> None:
+        """Have the robot's mode be among the registers of an answer."""
+        if self.robot_mode != RUNNING and 0 <= MODE - first < len(values):
+            values[MODE - first] = self.robot_mode & 0xFFFF
+
+    @property
+    def _is_safe(self) -> bool:
+        return self.controller.can_move and self.robot_mode == RUNNING
 
     def _answers_bare(self) -> bool:
         """Return whether the program says in the last image that it applies no offset."""
@@ -237,11 +261,12 @@ class ModbusLink(SimulatedLink):
         if self.waiting is None or generation != self.generation:
             return
         process, requests = self.waiting
-        self._asked_image = sampled
-        controller = self.controller
-        if answer[:1] in (b"\x03", b"\x17"):
-            safe = controller.can_move and self.robot_mode == RUNNING
-            self.see((math.nan, controller.q, controller.target_q, safe), self._answers_bare())
+        controller, function = self.controller, next(iter(answer), 0)
+        if function in self.joints_in:
+            self._asked_image = sampled
+        if function in self.reports:
+            q, target = controller.q, controller.target_q
+            self.see((math.nan, q, target, self._is_safe), self._answers_bare())
         requests.take(number, answer)
         process.wake()
 
@@ -260,12 +285,15 @@ class ModbusLink(SimulatedLink):
     def forget_client(self) -> None:
         """See SimulatedLink.forget_client."""
         super().forget_client()
-        self.program.running = False
+        self._set_program(False)
 
     def heal(self) -> None:
         """See SimulatedLink.heal."""
         super().heal()
-        self.program.running = True
+        self._set_program(True)
+
+    def _set_program(self, runs: bool) -> None:
+        self.program.running = runs
 
     def enter_mode(self, draw: random.Random) -> str:
         """See SimulatedLink.enter_mode."""
@@ -291,6 +319,81 @@ class ModbusLink(SimulatedLink):
                 self.world.after(0.01, lambda: write(number + 1))
 
         write(31000)
+
+
+class ModbusTargetLink(ModbusLink):
+    """An igus controller: targets of the joints, and a coil that starts the motion there."""
+
+    joints_in, reports = (4,), (1,)
+
+    def __init__(self, *given: Any) -> None:
+        super().__init__(*given)
+        self.period = 0.02
+        self._goal: tuple[float, ...] = ()
+        self._mode: tuple[Table, int, int] | None = None  # register that says what is wrong
+
+    def note_request(self, request: bytes) -> None:
+        """Report a request that leaves the client; the coil makes a setpoint of the target."""
+        function, address, value = struct.unpack_from(">BHH", request)
+        if function in (1, 4):
+            return
+        if function == 5 and address == TRIGGER and value:
+            self.wrote("joints", self._goal, f"coil {TRIGGER}")
+            return
+        fine = (function, address) in ((5, TRIGGER), (6, SPEED))
+        if function == 16 and address == TARGETS and value == 2 * self.controller.n:
+            words = struct.unpack_from(f">{value}H", request, 6)
+            low_first = b"".join(word.to_bytes(2, "little") for word in words)
+            counts = struct.unpack(f"<{self.controller.n}i", low_first)
+            self._goal = tuple(HUNDREDTH * count for count in counts)
+            fine = True
+        self.wrote("other" if fine else "forbidden", (), f"function {function} at {address}")
+
+    def cycle(self) -> None:
+        """Have the robot scan its registers."""
+        self.server.cycle(self.controller)
+        self._image_sampled = self.world.now
+
+    def _have_mode_in(self, table: Table, first: int, values: list[int]) -> None:
+        if self._mode is not None:
+            where, address, value = self._mode
+            if where == table and 0 <= address - first < len(values):
+                values[address - first] = value
+
+    @property
+    def _is_safe(self) -> bool:
+        return self.controller.can_move and self._mode is None
+
+    def _answers_bare(self) -> bool:
+        return False
+
+    def _set_program(self, runs: bool) -> None:
+        """Do nothing: the controller's own program moves."""
+
+    def enter_mode(self, draw: random.Random) -> str:
+        """See SimulatedLink.enter_mode."""
+        self._mode = draw.choice(WRONG)
+        self.controller.stop_own()
+        return f"{self._mode[0]} {self._mode[1]} is {self._mode[2]}"
+
+    def leave_mode(self) -> None:
+        """See SimulatedLink.leave_mode."""
+        self._mode = None
+
+    def foreign(self, seconds: float) -> None:
+        """Have somebody else send the arm where it is, for a while."""
+        until = self.world.now + seconds
+
+        def write() -> None:
+            counts = [round(q / HUNDREDTH) for q in self.controller.q]
+            words = struct.unpack(f"<{2 * len(counts)}H", struct.pack(f"<{len(counts)}i", *counts))
+            queue = self.server._queue
+            queue.append(("holding", TARGETS, [*words]))
+            queue.extend(("coil", TRIGGER, [value]) for value in (0, 1))
+            if self.world.now < until:
+                self.world.after(0.05, write)
+
+        write()
 
 
 def spoiled(message: tuple[int, int, bytes, float], draw: Any) -> tuple[int, int, bytes, float]:

@@ -59,7 +59,7 @@ class Run:
         joint = chance.planned_joint
         self.planner = Planner(self.world, link, joint) if joint is not None else None
         self.offset_in_force = OffsetInForce(link.controller.n, None)  # outlives every process
-        self.disk = Disk() if chance.is_recorded else None
+        self.disk = Disk(self.world.random) if chance.is_recorded else None
         self.recordings: list[Recording] = []
         self.owner_note = ""  # of the daemon's lock; the same
         self.is_marked = False  # in the state folder, which outlives a power cut: a daemon runs

@@ -33,6 +33,8 @@ class Recording:
         self.is_alone: Callable[[], bool] = lambda: False  # no daemon can start it anew
         self.lost = 0  # cycles that were reported as lost
         self.cut_at = math.inf  # s: when it died and no other one followed
+        self._paused_from = math.inf  # cycle from which on none was written, as was reported
+        self._resumed_at = -math.inf  # s
         self._recorder: Recorder | None = None
         self._start()
 
@@ -51,6 +53,10 @@ class Recording:
 
     def _take(self, event: dict[str, Any]) -> None:
         self.lost += int(event.get("lost", 0))
+        if "paused" in event:
+            self._paused_from, self._resumed_at = int(event["next_cycle"]), math.inf
+        elif str(event["detail"]).startswith("recording into"):
+            self._resumed_at = self._clock.monotonic()
 
     @property
     def is_closed(self) -> bool:
@@ -66,9 +72,10 @@ class Recording:
             self._clock.world.after(RESTART, self._start)
 
     def end(self) -> None:
-        """End it for good, at once."""
-        self._kill()
-        self.cut_at = self._clock.world.now
+        """End it for good, at once; may be repeated."""
+        if not self.is_closed:
+            self._kill()
+            self.cut_at = self._clock.world.now
 
     def _kill(self) -> None:
         """End the process; the system closes its file."""
@@ -85,6 +92,8 @@ class Recording:
         rows, _ = self._memory.rows(0, self._memory.written)
         received = rows[:, self._memory.slices["received"].start]
         wanted = set(rows[received < self.cut_at - RECENT, 0].astype(int).tolist())
+        if self._resumed_at > self.cut_at - RECENT:  # what waited for the disk is gone
+            wanted = {number for number in wanted if number < self._paused_from}
         for path in segments(self._disk.folder, self._session):
             for batch in read_batches(path):
                 if "number" in batch.columns:

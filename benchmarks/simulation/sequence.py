@@ -14,7 +14,7 @@ from benchmarks.simulation.disk import recorded_on
 from benchmarks.simulation.faults import ALL, Fault, drawn
 from benchmarks.simulation.invariants import Judge, Violation
 from benchmarks.simulation.links import Setting, SimulatedLink, setting_of
-from benchmarks.simulation.modbus import ModbusLink
+from benchmarks.simulation.modbus import ModbusLink, ModbusTargetLink
 from benchmarks.simulation.process_faults import cut_power, fill_disk, kill_recorder
 from benchmarks.simulation.processes import Chance, Run, cell_files
 from benchmarks.simulation.sensor import SensorLink
@@ -26,7 +26,8 @@ from gapbridge.core.state import Setpoint
 
 LINKS: dict[str, type[SimulatedLink]] = {
     "ur_servoj": UrLink, "ur_offset": UrLink, "modbus": ModbusLink, "can": CanLink,
-    "canopen": CanopenLink, "ur_sensor": SensorLink,
+    "canopen": CanopenLink, "ur_sensor": SensorLink, "odrive": CanLink, "openarm": CanLink,
+    "modbus_target": ModbusTargetLink,
 }  # fmt: skip
 MOST_FAULTS = 4
 QUIET, SPAN, REST = 0.3, 0.8, 0.3  # s: until faults begin; over what time they are spread; after

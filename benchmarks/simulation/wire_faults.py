@@ -8,7 +8,7 @@ from typing import Any
 from benchmarks.simulation import can, canopen, modbus, ur
 from benchmarks.simulation.can import CanLink
 from benchmarks.simulation.canopen import CanopenLink
-from benchmarks.simulation.modbus import ModbusLink
+from benchmarks.simulation.modbus import ModbusLink, ModbusTargetLink
 from benchmarks.simulation.processes import Run
 from benchmarks.simulation.sensor import SensorLink
 from benchmarks.simulation.ur import UrLink
@@ -65,9 +65,11 @@ def double(run: Run, draw: Draw) -> str:
 def spoil(run: Run, draw: Draw) -> str:
     """Have messages to the client be wrong in one place each."""
     spoiled: Any = {
-        UrLink: ur.spoiled, ModbusLink: modbus.spoiled, CanLink: can.spoiled,
-        CanopenLink: canopen.spoiled, SensorLink: ur.spoiled,
-    }[type(run.link)]  # fmt: skip
+        UrLink: ur.spoiled, ModbusLink: modbus.spoiled, CanopenLink: canopen.spoiled,
+        SensorLink: ur.spoiled, ModbusTargetLink: modbus.spoiled,
+    }.get(type(run.link))  # fmt: skip
+    if isinstance(run.link, CanLink):
+        spoiled = run.link.spoiled
     wire, later = run.link.down, run.later
     wire.change, wire.changed = lambda message: spoiled(message, draw), draw.choice(FEW)
     if later is not None:
@@ -105,7 +107,7 @@ def withhold(run: Run, draw: Draw) -> str:
     """Have one of the arm's frames not be sent."""
     link = run.link
     assert isinstance(link, CanLink)
-    identifier = draw.choice((0x2A5, 0x2A6, 0x2A7, 0x2A1, 0x261))
+    identifier = draw.choice((*link.arm.reports, *link.arm.others))
     link.node.withheld.add(identifier)
     run.world.after(draw.choice((0.01, 0.1, 1.0)), lambda: link.node.withheld.discard(identifier))
     return f"{identifier:#x}"
@@ -116,7 +118,8 @@ def flood(run: Run, draw: Draw) -> str:
     link = run.link
     assert isinstance(link, BUSES)
     seconds, each = draw.choice((0.02, 0.1, 0.4)), draw.choice((2, 8))
-    link.flood(seconds, each, lambda: can.foreign_frame(draw))
+    known = (link.arm.reports[0], *link.arm.others[:1]) if isinstance(link, CanLink) else (0x181,)
+    link.flood(seconds, each, lambda: can.foreign_frame(draw, known))
     return f"{each} frames a ms for {seconds:g} s"
 
 

@@ -167,5 +167,7 @@ class Segment:
         if self._file.fd >= 0:
             with contextlib.suppress(OSError):
                 os.ftruncate(self._file.fd, self._file.good)
+            with contextlib.suppress(OSError):  # nobody syncs this file later
+                os.fdatasync(self._file.fd)
             with contextlib.suppress(OSError):
                 self._file.close()

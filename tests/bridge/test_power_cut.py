@@ -11,9 +11,9 @@ import numpy as np
 import pyarrow.parquet
 import pytest
 from further import further
-from power_cut import LosingDisk, Place
 from recorded import SESSION, publish
 
+from benchmarks.losing_disk import LosingDisk, Place
 from gapbridge.bridge.calibration.session.journal import FILE, Journal, read_entries
 from gapbridge.bridge.cell.saving import write_text
 from gapbridge.bridge.cell.settings.recording import RecordingSettings
@@ -273,6 +273,22 @@ def finished(folder: Path, cut: Callable[[], Path], expect: Callable[[Check], No
     assert (cut() / path.name).read_bytes() == path.read_bytes()
 
 
+def abandoned(folder: Path, cut: Callable[[], Path], expect: Callable[[Check], None]) -> None:
+    """A recording on a disk that takes no more: what was flushed stays, synced before or not."""
+    path = folder / f"{RUN}-001.mcap"
+    segment = _segment(path, _Later())
+    for first in (0, 10):
+        expect(_recorded(first, first + 10))
+        segment.write(_rows(first, 10))
+        segment.flush()
+    expect(_recorded(10, 20))
+    assert _cycles(cut() / path.name) == 10
+    segment.write(_rows(20, 10))
+    segment.abandon()
+    expect(_recorded(20, 20))
+    assert _cycles(cut() / path.name) == 20
+
+
 def recorder(folder: Path, cut: Callable[[], Path], expect: Callable[[Check], None]) -> None:
     """A run's recorder; the next run's finishes what was cut off."""
     clock, memory = _Later(), SharedMemory(N, clock=SYSTEM)
@@ -327,7 +343,7 @@ def recorder(folder: Path, cut: Callable[[], Path], expect: Callable[[Check], No
 
 SCENARIOS: dict[str, Scenario] = {
     "session": session, "cell": cell, "tables": tables, "fleet": fleet, "recording": recording,
-    "finished": finished, "recorder": recorder,
+    "finished": finished, "recorder": recorder, "abandoned": abandoned,
 }  # fmt: skip
 
 

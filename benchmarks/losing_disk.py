@@ -132,6 +132,20 @@ class LosingDisk:
         self._restore(self._root, into, self._names.__getitem__, self._contents.__getitem__)
         return into
 
+    def lose(self, draw: random.Random) -> None:
+        """Have the folder hold what a power cut now leaves: at worst, or as drawn."""
+        self._look()
+        into = self._folder.with_name(f"{self._folder.name}-left")
+        self._leave(into, 0 if draw.random() < 0.5 else 2, draw)
+        for path in self._folder.iterdir():
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
+        for path in into.iterdir():
+            path.rename(self._folder / path.name)
+        into.rmdir()
+        self._look()
+        for node in (self._root, *self._names_in(self._root).values()):
+            self._keep(node)
+
     def expect(self, check: Callable[[Path], None]) -> None:
         """Judge what drawn cuts leave by this from now on; a check raises for what must not be."""
         self._draw_if(self._look())
@@ -161,8 +175,19 @@ class LosingDisk:
 
     def _judge_one(self, number: int) -> None:
         """Judge one cut: of 0 only what was synced is left, of 1 everything, else as drawn."""
-        draw = self._random
-        assert draw is not None
+        assert self._random is not None
+        into = self._folder.with_name(f"{self._folder.name}-{self.drawn}")
+        self.drawn += 1
+        self._leave(into, number, self._random)
+        try:
+            self._check(into)
+        except Exception:
+            left = [str(path.relative_to(into)) for path in sorted(into.rglob("*"))]
+            self.failures.append(f"cut {self.drawn}, which left {left}:\n{traceback.format_exc()}")
+        shutil.rmtree(into)
+
+    def _leave(self, into: Path, number: int, draw: random.Random) -> None:
+        """Write what cut ``number`` leaves, see ``_judge_one``."""
 
         def names(folder: Node) -> Names:
             synced, now = self._names[folder], self._names_in(folder)
@@ -182,15 +207,7 @@ class LosingDisk:
                 return synced
             return now[: draw.randint(min(self._least[node], len(now)), len(now))]
 
-        into = self._folder.with_name(f"{self._folder.name}-{self.drawn}")
-        self.drawn += 1
         self._restore(self._root, into, names, content)
-        try:
-            self._check(into)
-        except Exception:
-            left = [str(path.relative_to(into)) for path in sorted(into.rglob("*"))]
-            self.failures.append(f"cut {self.drawn}, which left {left}:\n{traceback.format_exc()}")
-        shutil.rmtree(into)
 
     def _restore(
         self, folder: Node, into: Path,
