@@ -138,8 +138,8 @@ class Control:
         if problem := daemon.mark_problem:
             return refusal(problem)
 
-        def observes() -> bool:
-            return daemon.state == State.OBSERVING and not daemon.latched
+        def observes() -> bool:  # by the loop's own event, which comes after its state
+            return daemon.state == State.OBSERVING and not (daemon.latched or daemon.armed_by)
 
         if self._wait_for(observes, SOURCE_SILENT if fault else LONGEST_RAMP):
             if observed:

@@ -142,6 +142,11 @@ class Daemon:
         return self._status.latched
 
     @property
+    def armed_by(self) -> str:
+        """Return who armed; empty: it is not armed, by the events so far."""
+        return self._status.armed_by
+
+    @property
     def mark_problem(self) -> str:
         """Return why an acknowledged mark of a failed verification is still there; empty: no."""
         return self._verification.problem
@@ -188,7 +193,7 @@ class Daemon:
             "state": status.named(self.state),
             **status.history(),
             "may_write": self.may_write,
-            "armed_by": status.armed_by,
+            "armed_by": self.armed_by,
             "latched": status.latched,
             "correction": status.correction,
             "zeros": self._slips.detail,

@@ -25,6 +25,8 @@ KEPT_UNTIL_RESTART = ("recording", "web", "metrics")
 """Sections of side processes, which keep running; a change takes effect at the next start."""
 OWN_CAUSES = (Cause.ARM, Cause.WRITING, Cause.DISARM, Cause.RAMPED_OUT)
 """Transitions of a loop that arms, compensates and ramps out for a reload."""
+MOTION = tuple(state.name for state in (State.ARMED, State.COMPENSATING, State.HOLDING))
+"""States that another transition ends for good; a link may connect after arming was requested."""
 
 
 class Swap(NamedTuple):
@@ -69,7 +71,7 @@ class Reload:
         if kind == EventKind.REQUEST:
             self._ended = event["command"] == "disarm"
         elif kind == EventKind.TRANSITION:
-            self._ended |= event["cause"] not in OWN_CAUSES
+            self._ended |= event["from"] in MOTION and event["cause"] not in OWN_CAUSES
         elif kind in (EventKind.FAULT, EventKind.FAILURE, EventKind.SLIP, EventKind.VERIFICATION):
             self._ended = True
 

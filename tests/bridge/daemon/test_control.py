@@ -316,7 +316,7 @@ class NoLoop:
     """A daemon between two processes of the loop, of which no next one comes."""
 
     state, phase, latched, may_write, sequence = State.DISCONNECTED, Phase.STARTING, "x", True, 0
-    last_taken, asked, mark_problem = 3, 3, ""
+    last_taken, asked, mark_problem, armed_by = 3, 3, "", ""
 
     def disarm(self, by: str) -> int:
         self.asked += 1

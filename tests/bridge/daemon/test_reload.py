@@ -44,12 +44,15 @@ class Taking:
     def request(self, command: str) -> None:
         self.reload.on_event({"kind": EventKind.REQUEST, "command": command})
 
-    def transition(self, cause: Cause) -> None:
-        self.reload.on_event({"kind": EventKind.TRANSITION, "cause": cause})
+    def transition(self, cause: Cause, before: State = State.HOLDING) -> None:
+        self.reload.on_event({"kind": EventKind.TRANSITION, "from": before.name, "cause": cause})
 
 
-def test_a_reload_arms_again_what_it_has_ramped_out(tmp_path: Path) -> None:
+@pytest.mark.parametrize("connects", [False, True])
+def test_a_reload_arms_again_what_it_has_ramped_out(connects: bool, tmp_path: Path) -> None:
     taking = Taking(tmp_path)
+    if connects:  # a cell that arms by itself requests it before its link is there
+        taking.transition(Cause.CONNECTED, State.DISCONNECTED)
     assert taking.step(State.COMPENSATING)
     taking.transition(Cause.DISARM)
     assert not taking.step(State.HOLDING)
