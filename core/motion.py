@@ -25,7 +25,6 @@ MAX_JOINT_SPEED = 15.0  # rad/s between rows beyond which they count as poses at
 MIN_SMOOTH_SHARE = 0.5  # share of rows without jumps below which a shorter window is tried
 WINDOWS = (0.3, 0.1, 0.05, 0.025)  # s either side at most, tried in turn
 GAP = 4.0  # sampling steps without a row that end a stretch
-SHORT_GAP = 0.02  # s: a shorter gap ends none, because an arm moves smoothly through it
 FEWER_JUMPS = 0.5  # times the rows in which the angles' accelerations jump: a Panda's jump in 20 %
 COPIES = 0.9  # share of repeated rows alike in every column that makes them copies of one cycle
 FEW_REPEATS = 0.01  # share of repeated timestamps that may simply be left out
@@ -236,7 +235,7 @@ def _clock(log: Log, time: Array) -> tuple[Index, Array, LogFinding | None]:
 def _with_derivatives(motion: Motion, measured_qd: Array | None, new_session: Mask) -> Motion:
     steps = np.diff(motion.t)
     step = float(np.median(steps))
-    stretch = np.concatenate([[0], np.cumsum((steps > max(GAP * step, SHORT_GAP)) | new_session)])
+    stretch = np.concatenate([[0], np.cumsum((steps > GAP * step) | new_session)])
     qd, qdd = np.zeros_like(motion.q), np.zeros_like(motion.q)
     valid, noise = np.zeros(len(motion), dtype=bool), np.zeros(motion.q.shape[1])
     for number in range(int(stretch[-1]) + 1):

@@ -32,6 +32,10 @@ class Controlled(Protocol):
         """Return the phase of the loop's process."""
 
     @property
+    def armed_by(self) -> str:
+        """Return who armed; empty: it is not armed, by the events so far."""
+
+    @property
     def latched(self) -> str:
         """Return the latched fault, not acknowledged yet; empty: none."""
 

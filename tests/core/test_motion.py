@@ -90,16 +90,6 @@ def test_a_gap_in_time_ends_a_stretch():
     assert np.abs(motion.qd - COURSE.at(t[kept], 1))[motion.valid].max() < 0.01
 
 
-def test_a_gap_in_which_an_arm_hardly_moves_ends_none():
-    """A Panda's recorder at 500 Hz left gaps of 10 ms."""
-    t, log = recording()
-    kept = np.flatnonzero((t < 4) | (t > 4.01))
-    motion = motion_of(log.select(kept))
-    assert motion.stretch[-1] == 0
-    assert motion.valid[1990:2010].all()
-    assert np.abs(motion.qdd - COURSE.at(t[kept], 2))[1990:2010].max() < 0.05
-
-
 def test_accelerations_come_from_speeds_where_those_of_the_angles_jump():
     """The angles' noise is not white: what two windows make of it differs."""
     t = np.arange(5000) / 500
