@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.blind.beyond import true_beyond
-from benchmarks.blind.cases import group_of
+from benchmarks.blind.cases import Static, group_of
 from benchmarks.blind.hidden import SAME, Claim, Hidden, Place, claims_of
 from benchmarks.blind.label import Label
 
@@ -39,6 +39,7 @@ class CaseScore:
     admitted: bool = False  # unexplained and structured
     depends_right: bool | None = None
     z: dict[str, float] = field(default_factory=dict)
+    moments: tuple[bool, ...] = ()  # of each slip named: within one row of the true one
     remainder: float | None = None  # held out, over the true floor
     needless_ties: tuple[str, ...] = ()
     seconds: float | None = None
@@ -112,6 +113,7 @@ def score(label: Label, diagnosis: dict[str, Any], seconds: float | None = None)
         admitted=structured,
         depends_right=_depends(label, unexplained) if unknown else None,
         z=_z_scores(label, _of_named(label, causes) if mixed else causes) if exact or mixed else {},
+        moments=_moments(label, causes),
         remainder=held_out / label.floor_rms if explained and held_out is not None else None,
         needless_ties=verdict.needless,
         seconds=seconds,
@@ -309,6 +311,26 @@ def _z_scores(label: Label, causes: list[dict[str, Any]]) -> dict[str, float]:
                 off = (off + np.pi) % (2 * np.pi) - np.pi
             out[str(parameter["name"])] = off / float(std)
     return out
+
+
+def _moments(label: Label, causes: list[dict[str, Any]]) -> tuple[bool, ...]:
+    """Return whether the moment of each slip at its true joint is within one row of the true one.
+
+    Two moments between the same two rows are the same: the log cannot tell them apart.
+    """
+    true = {n: v for c in label.causes for n, v in c.parameters.items() if n.endswith("_time")}
+    named = {
+        str(p["name"]): float(p["value"])
+        for c in _of_named(label, causes) for p in c.get("parameters") or []
+        if p["name"] in true and p.get("value") is not None
+    }  # fmt: skip
+    if not named:
+        return ()
+    case = Hidden(label.kind, label.seed).case
+    assert isinstance(case, Static)
+    rows = np.sort(case.drawn.bench.session.time)
+    at = {n: np.searchsorted(rows, [true[n], value]) for n, value in named.items()}
+    return tuple(bool(abs(a - b) <= 1) for a, b in at.values())
 
 
 def _belongs(name: str, label: Label) -> bool:

@@ -96,6 +96,16 @@ def criteria(scores: Sequence[CaseScore]) -> list[Criterion]:
     out.append(_median("held-out error over the noise floor, median", 1.10, remainders, "ratio"))
     z = z_scores(scores)
     out.append(Criterion("parameters with |z| < 3", *_at(0.97, _share(abs(x) < 3 for x in z))))
+    slips = [z for s in scores for n, z in s.z.items() if "_slip" in n]
+    out.append(
+        Criterion("slips: sizes with |z| < 3", *_at(0.97, _share(abs(z) < 3 for z in slips)))
+    )
+    out.append(
+        Criterion(
+            "slips: moment within one row",
+            *_at(0.97, _share(right for s in scores for right in s.moments)),
+        )
+    )
     for at_least, target in ((True, 0.93), (False, 0.97)):
         word = "at least" if at_least else "at most"
         out.append(Criterion(f"95 % intervals that contain the true value, {word}",

@@ -1,7 +1,9 @@
+import numpy as np
 import pytest
 from blind_answers import answer, cause, true_causes
 
 from benchmarks.blind.cases import make_case
+from benchmarks.blind.hidden import Hidden
 from benchmarks.blind.score import score
 
 
@@ -187,3 +189,17 @@ def test_a_delay_of_the_whole_arm_may_be_reported_joint_by_joint_or_of_the_arm(t
     whole = score(label, answer(label, [cause("latency")]))
     assert (whole.outcome, whole.joints_right) == ("right", True)
     assert score(label, answer(label, true_causes(label))).joints_right is True
+
+
+@pytest.mark.parametrize(("rows", "right"), [(0.5, True), (1.0, True), (3.0, False)])
+def test_the_moment_of_a_slip_is_right_within_one_row(case, rows, right):
+    label = case("target_slip")
+    time = np.sort(Hidden(label.kind, label.seed).case.drawn.bench.session.time)
+    causes = true_causes(label)
+    (moment,) = (p for p in causes[0]["parameters"] if p["name"].endswith("_time"))
+    after = np.searchsorted(time, moment["value"])
+    place = np.arange(len(time))
+    moment["value"] = float(np.interp(after - 0.5 + rows, place, time))
+    got = score(label, answer(label, causes))
+    assert got.moments == (right,)
+    assert score(label, answer(label, [])).moments == ()
