@@ -80,7 +80,10 @@ def run_part(seeds: range) -> Part:
     violated: dict[str, str] = {}
     undetectable: dict[str, float] = {}
     for seed in seeds:
-        outcome = run(seed)
+        try:
+            outcome = run(seed)
+        except Exception as error:  # the simulation's own, not the product's
+            raise RuntimeError(f"seed {seed}: {error!r}") from error
         by_link[outcome.link] += 1
         faults.update(words.split(" at ")[0].split(" (")[0] for words in outcome.faults)
         setpoints += outcome.writes

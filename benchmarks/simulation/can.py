@@ -262,7 +262,9 @@ class CanLink(SimulatedLink):
             return identifier, data[: draw.randrange(len(data))] if data else data, sampled
         if kind == 1:
             return draw.choice((*self.arm.reports, *self.arm.others[:1])), data, sampled
-        at = draw.randrange(len(data)) if data else 0
+        if not data:
+            return message
+        at = draw.randrange(len(data))
         changed = data[:at] + bytes([data[at] ^ (1 << draw.randrange(8))]) + data[at + 1 :]
         return identifier, changed, sampled
 

@@ -385,7 +385,9 @@ def spoiled(message: BusFrame, draw: Any) -> BusFrame:
         return BusFrame(cob_id, data[: draw.randrange(len(data))] if data else data, sampled)
     if kind == 1:
         return BusFrame(draw.choice((0x181, 0x186, 0x581, 0x701, 0x081)), data, sampled)
-    at = draw.randrange(len(data)) if data else 0
+    if not data:  # a SYNC
+        return message
+    at = draw.randrange(len(data))
     changed = data[:at] + bytes([data[at] ^ (1 << draw.randrange(8))]) + data[at + 1 :]
     return BusFrame(cob_id, changed, sampled)
 
