@@ -309,8 +309,9 @@ class Daemon:
             if command == Command.DISARM and moved:
                 self._slips.reset()
                 self._keep_rests(at_once=True)
-            if command == Command.ARM and (why := self._status.zero_moved):
-                detail = f"{why}; acknowledge it first: gapbridge disarm"
+            blocked = self._verification.blocked
+            if command == Command.ARM and (why := self._status.zero_moved or blocked):
+                detail = why if why == blocked else f"{why}; acknowledge it first: gapbridge disarm"
                 self.event_log.add({"kind": EventKind.REFUSED, "what": "arm", "detail": detail})
                 continue
             self._commands.ask(command, number)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import os
 import signal
 import threading
 from collections.abc import Callable
@@ -16,9 +17,12 @@ import click
 from gapbridge.bridge.cell import Cell
 from gapbridge.bridge.cell.run_settings import Configuration, read_configuration
 from gapbridge.bridge.daemon.daemon import Daemon, Say
+from gapbridge.bridge.daemon.output import Output
 from gapbridge.bridge.daemon.summary import RunSummary
 from gapbridge.bridge.ipc.events import Event
 from gapbridge.drivers.clock import SYSTEM
+
+LONGEST_OUTPUT = 1.0  # s that the end waits for a blocked terminal or pipe
 
 
 def run_cell(
@@ -34,17 +38,26 @@ def run_cell(
     cannot be run, LinkError where the robot cannot be reached. ``log`` gets every event.
     """
     configuration = read_configuration(cell.path if isinstance(cell, Cell) else cell)
-    summary = run_daemon(configuration, observe, arm, duration, _say, log)
-    for line in summary.lines():
-        click.echo(line)
+    output = Output(click.echo, SYSTEM)
+    echo = output.behind(click.echo)
+    try:
+        summary = run_daemon(
+            configuration, observe, arm, duration, lambda text: echo(_with_time(text)),
+            None if log is None else output.behind(log),
+        )  # fmt: skip
+        for line in summary.lines():
+            echo(line)
+    finally:
+        is_whole = output.close(LONGEST_OUTPUT)
+    if not is_whole:
+        os._exit(summary.exit_code)  # the interpreter's end would wait for the output
     gc.freeze()  # else Python's last collection, of all compiled code, delays the end by 0.5 s
     return summary.exit_code
 
 
-def _say(text: str) -> None:
-    """Print what happened, with the time of day."""
+def _with_time(text: str) -> str:
     now = datetime.fromtimestamp(SYSTEM.time())
-    click.echo(f"{now:%H:%M:%S}.{now.microsecond // 1000:03d} {text}")
+    return f"{now:%H:%M:%S}.{now.microsecond // 1000:03d} {text}"
 
 
 def run_daemon(

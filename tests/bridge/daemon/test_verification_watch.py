@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from patience import PATIENCE
 from simulated_daemon import ask, causes, rides_on_a_program, until
 
 from benchmarks.simulation.links import setting_of
@@ -183,6 +185,31 @@ def test_why_a_mark_is_still_there_is_told_once(
     assert watch.problem == "a read-only file system"
     watch.acknowledge()
     assert watch.problem == ""
+
+
+def test_a_folder_that_does_not_answer_keeps_no_disarm_waiting_and_nothing_is_armed(
+    cell: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    answers = threading.Event()
+    answers.set()
+
+    def hangs(_: Path) -> str:
+        answers.wait(PATIENCE)
+        return ""
+
+    monkeypatch.setattr(verification_watch, "read_mark", hangs)
+    monkeypatch.setattr(verification_watch, "LONGEST_WAIT", 0.01)
+    with rides_on_a_program() as (run, world):
+        until(world, lambda: run.daemon.state == State.COMPENSATING, 3.0)
+        answers.clear()
+        until(world, lambda: "does not answer" in run.daemon._verification.blocked, 2.0)
+        assert run.daemon.state == State.COMPENSATING
+        assert ask(run, "disarm")["answer"] == "observing"
+        reply = ask(run, "arm")
+        assert f"{mark_path(cell).parent}: the file system does not answer" in reply["error"]
+        answers.set()
+        until(world, lambda: not run.daemon._verification.blocked, 3.0)
+        assert ask(run, "arm")["answer"] == "compensating"
 
 
 def test_a_session_that_moves_the_arm_without_corrections_watches_no_mark() -> None:

@@ -1,0 +1,100 @@
+"""A stopped terminal or an unread pipe keeps nobody waiting: no disarm, no stop, no end."""
+
+from __future__ import annotations
+
+import os
+import pty
+import signal
+import subprocess
+import sys
+import termios
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from daemon_cell import Robot
+from patience import PATIENCE, wait_for
+
+from gapbridge.bridge.daemon import output
+from gapbridge.bridge.daemon.output import Output
+from gapbridge.bridge.ipc.control_client import ask
+from gapbridge.drivers.clock import SYSTEM
+
+
+@pytest.fixture
+def robot(tmp_path: Path) -> Iterator[Robot]:
+    with Robot(tmp_path) as found:
+        yield found
+
+
+def test_lines_are_written_in_order_and_the_end_waits_for_them() -> None:
+    written: list[str] = []
+    lines = Output(written.append, SYSTEM)
+    say, log = lines.behind(written.append), lines.behind(lambda n: written.append(str(n)))
+    for n in range(100):
+        say(f"line {n}")
+        log(n)
+    assert lines.close(PATIENCE)
+    assert written == [text for n in range(100) for text in (f"line {n}", str(n))]
+
+
+def test_what_is_blocked_blocks_nobody_and_what_is_left_out_is_counted(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(output, "MOST_WAITING", 5)
+    written, opened = list[str](), threading.Event()
+    lines = Output(written.append, SYSTEM)
+    begun = threading.Event()
+
+    def blocked(text: str) -> None:
+        begun.set()
+        opened.wait(PATIENCE)
+        written.append(text)
+
+    say = lines.behind(blocked)
+    say("0")
+    assert begun.wait(PATIENCE)  # the thread has taken it, and stands
+    for n in range(1, 9):
+        say(str(n))
+    assert not lines.close(0.01)
+    opened.set()
+    wait_for(lambda: len(written) == 7, "what was kept")
+    assert written == ["0", "3 lines left out: output was blocked", "1", "2", "3", "4", "5"]
+    assert lines.close(PATIENCE)
+
+
+def test_a_reader_that_has_left_ends_nothing() -> None:
+    written: list[str] = []
+
+    def fails(_: str) -> None:
+        raise BrokenPipeError
+
+    lines = Output(written.append, SYSTEM)
+    lines.behind(fails)("lost")
+    lines.behind(written.append)("kept")
+    assert lines.close(PATIENCE)
+    assert written == ["kept"]
+
+
+def test_a_terminal_stopped_by_ctrl_s_keeps_no_disarm_waiting(robot: Robot) -> None:
+    cell = robot.cell()
+    ours, theirs = pty.openpty()
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
+    run = subprocess.Popen(
+        [sys.executable, "-m", "gapbridge", "run", str(cell)], cwd=robot.folder, env=environment,
+        stdout=theirs, stderr=theirs,
+    )  # fmt: skip
+    try:
+        wait_for(lambda: b"observing" in os.read(ours, 1000), "the link")
+        termios.tcflow(theirs, termios.TCOOFF)  # as Ctrl-S does
+        assert ask(cell, "arm") == "compensating"
+        assert ask(cell, "disarm") == "observing"
+        run.send_signal(signal.SIGTERM)
+        assert run.wait(PATIENCE) == 0
+    finally:
+        termios.tcflow(theirs, termios.TCOON)
+        run.kill()
+        run.wait()
+        os.close(ours)
+        os.close(theirs)
