@@ -134,6 +134,10 @@ class RobotBusyError(WriteError):
     """The robot is still on its way to the last target: nothing of this setpoint was sent."""
 
 
+class LateSetpointError(RobotBusyError):
+    """A setpoint of several messages took too long: its last message was not sent."""
+
+
 class IneffectiveWriteError(WriteError):
     """Setpoints were sent without effect, though the link is up."""
 

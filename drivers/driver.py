@@ -46,6 +46,7 @@ class Driver(ABC):
         self.moves_arm = moves_arm  # False: setpoints are offsets on the robot's own motion
         self.gate = Gate(rate, model, moves_arm, clock.monotonic)
         self._check = SampleCheck(model.arm, fastest)  # rad/s that no joint exceeds
+        self._expiry = math.inf  # s, monotonic: of the setpoint that is being sent
         self._cell_model = model  # compared with what the controller reports
 
     def __init_subclass__(cls, **keys: Any) -> None:
@@ -93,13 +94,16 @@ class Driver(ABC):
         return self.gate.bounds.offset_rate, self.gate.bounds.offset_rotation_rate
 
     @final
-    def write_setpoint(self, setpoint: Setpoint) -> None:
+    def write_setpoint(self, setpoint: Setpoint, expiry: float = math.inf) -> None:
         """Send one setpoint from the limiter; needs ``arm`` before.
 
+        ``expiry`` (s, monotonic): a setpoint that a last message triggers is not triggered later.
         Raises WriteError; GateError if the gate refuses it, and RobotBusyError from a robot that
-        moves from target to target and is still on its way: then nothing was sent.
+        moves from target to target and is still on its way (LateSetpointError after ``expiry``):
+        then nothing has taken effect.
         """
         self.gate.check(setpoint)
+        self._expiry = expiry
         try:
             self._send(setpoint)
         except RobotBusyError:
@@ -109,7 +113,7 @@ class Driver(ABC):
 
     @abstractmethod
     def _send(self, setpoint: Setpoint) -> None:
-        """Send one setpoint that has passed the gate. Raises WriteError, RobotBusyError."""
+        """Send one setpoint that has passed the gate; see ``write_setpoint``."""
 
     @abstractmethod
     def close(self) -> None:

@@ -310,7 +310,7 @@ class Checker:
         since, until = self._moments(write)
         place, angle = offset[:3], offset[3:]
         for then, before in stream.recent:
-            allowed = until - then + b.lag + b.burst
+            allowed = max(until - then, 0.0) + b.lag + b.burst  # the clock may be set back
             shift, turn = math.dist(place, before[:3]), math.dist(angle, before[3:])
             if shift > b.offset_rate * allowed * 1.001 + 2.0 * b.grain:
                 found.add(f"{1e3 * shift:.4f} mm within {1e3 * (until - then):.1f} ms")

@@ -129,9 +129,9 @@ class Judge:
             self._known = found.violated
 
     def _lets_go(self, seen: Fresh | Write) -> bool:
-        """Return whether joints only say again where the arm was sent: the motion has ended."""
+        """Return whether joints only say again where the arm was sent: the motion ends."""
         again = isinstance(seen, Write) and seen.kind == "joints" and seen.values == self._last
-        return again and not State(seen.state).writes
+        return again and State(seen.state) is not State.COMPENSATING
 
     def sent(
         self, setpoint: Setpoint, sampled: float, now: float, hidden_leap: float = 0.0

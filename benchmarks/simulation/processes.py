@@ -332,10 +332,10 @@ def _watched(run: Run, driver: Driver, limits: LimitSettings) -> Driver:
             run.clock.sleep(COMPUTING)  # else a loop without a link would stop the time
             raise
 
-    def counted(setpoint: Setpoint) -> None:
+    def counted(setpoint: Setpoint, expiry: float) -> None:
         run.link.sends = not run.link.looks_again
         try:
-            write(setpoint)
+            write(setpoint, expiry)
         finally:
             run.link.sends = False
         run.left += 1

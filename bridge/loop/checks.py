@@ -48,6 +48,14 @@ class FrozenWatch:
         self._target: Array | None = None  # commanded when the joints were last seen to move
         self._since = 0.0  # s, controller clock: since when they should have moved
 
+    def acknowledge(self) -> None:
+        """Take the present command as that of an arm at rest: a person has looked at it.
+
+        A single wrong command, or a motor that was off, would keep an arm at rest unarmed for ever.
+        Joints that report a velocity are still frozen.
+        """
+        self._target = None
+
     def update(self, state: RobotState, commanded: Array) -> str | None:
         """Return a message if the values are frozen, else None."""
         q, now = state.actual_q, state.timestamp
@@ -55,7 +63,8 @@ class FrozenWatch:
         if now < self._since or joints != self._q:
             self._q, self._target, self._since = joints, commanded.copy(), now
             return None
-        assert self._target is not None
+        if self._target is None:
+            self._target = commanded.copy()
         away = float(np.abs(commanded - self._target).max())
         turning = float(np.abs(state.actual_qd).max())
         if away < COMMANDED_AWAY and turning < MOVING:
@@ -173,6 +182,10 @@ class LoopChecks:
         self._active: set[LoopCounter] = set()
         self._last: float | None = None  # s, controller clock
         self.not_ready = "no state has been read"  # why the robot cannot move; empty: it can
+
+    def acknowledge(self) -> None:
+        """Note that a person has looked at an arm that is not written to."""
+        self._frozen.acknowledge()
 
     def reset(self) -> None:
         """Restart: the loop read no states meanwhile."""

@@ -20,6 +20,7 @@ from gapbridge.core.errors import (
     ForeignCommandError,
     GateError,
     IneffectiveWriteError,
+    LateSetpointError,
     LimitError,
     PartialWriteError,
     RobotBusyError,
@@ -184,14 +185,16 @@ class Writing:
                 self.unsent = _copied(setpoint)
                 self._reports.count(LoopCounter.LATE)
             else:
-                self._driver.write_setpoint(setpoint)
+                self._driver.write_setpoint(setpoint, expiry)
                 self._in_force.note(setpoint.q, stream.joint_offset, setpoint.offset_in_base)
                 self._failed = 0
                 self._check_solved()
                 self._check_late(expiry)
                 return setpoint
-        except RobotBusyError:  # neither sent nor in force; the newest one leaves when it is free
+        except RobotBusyError as error:  # not in force; the newest one leaves when it is free
             self.unsent = _copied(setpoint)
+            if isinstance(error, LateSetpointError):
+                self._reports.count(LoopCounter.LATE)
         except WriteError as error:
             self.unsent = _copied(setpoint)
             self._on_write_error(error)

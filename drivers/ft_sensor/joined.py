@@ -117,7 +117,7 @@ class DriverWithSensor(Driver):
 
     def _send(self, setpoint: Setpoint) -> None:
         """Send one setpoint to the arm."""
-        self._arm.write_setpoint(setpoint)
+        self._arm.write_setpoint(setpoint, self._expiry)
 
     def close(self) -> None:
         """Close both links."""

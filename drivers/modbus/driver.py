@@ -262,7 +262,7 @@ class ModbusDriver(Driver):
             raise WriteError(f"{self.transport.name}: found no state, expected read_state() first")
         try:
             self._given = self._now()
-            self._writer.write(setpoint, self._sample)
+            self._writer.write(setpoint, self._sample, self._expiry)
         except WriteError:
             raise
         except LinkError as error:

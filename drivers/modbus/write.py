@@ -6,6 +6,7 @@ not by the answer to the request.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Protocol
 
@@ -15,6 +16,7 @@ from gapbridge.core.arrays import Array
 from gapbridge.core.errors import (
     ForeignCommandError,
     IneffectiveWriteError,
+    LateSetpointError,
     RobotBusyError,
     StaleStateError,
     WriteError,
@@ -44,8 +46,11 @@ class Writer(Protocol):
     def arm(self, state: RobotState, look: Callable[[], Sample]) -> None:
         """Prepare for writing; moves nothing. ``look`` reads a sample. Raises WriteError."""
 
-    def write(self, setpoint: Setpoint, sample: Sample) -> None:
-        """Send one setpoint; ``sample`` is the one last read. Raises WriteError."""
+    def write(self, setpoint: Setpoint, sample: Sample, expiry: float = math.inf) -> None:
+        """Send one setpoint; ``sample`` is the one last read. Raises WriteError.
+
+        ``expiry`` (s, monotonic): no motion begins to it later.
+        """
 
     def pending(self) -> tuple[int, list[int]] | None:
         """Return, once, holding registers to be written with the next reading."""
@@ -85,7 +90,7 @@ class ReadOnlyWriter:
         """Raise WriteError."""
         raise WriteError(self._words)
 
-    def write(self, setpoint: Setpoint, sample: Sample) -> None:
+    def write(self, setpoint: Setpoint, sample: Sample, expiry: float = math.inf) -> None:
         """Raise WriteError."""
         raise WriteError(self._words)
 
@@ -175,7 +180,7 @@ class MailboxWriter:
                 )
             self._clock.sleep(ANNOUNCE)
 
-    def write(self, setpoint: Setpoint, sample: Sample) -> None:
+    def write(self, setpoint: Setpoint, sample: Sample, expiry: float = math.inf) -> None:
         """Send one offset. Raises WriteError if the program does not accept them."""
         if not self._armed:
             raise WriteError(f"{self._transport.name}: found no mailbox, expected arm() first")
@@ -276,10 +281,11 @@ class TargetWriter:
         self._write_all(self._entry.before)
         self._armed, self._sent, self._target = True, {}, None
 
-    def write(self, setpoint: Setpoint, sample: Sample) -> None:
+    def write(self, setpoint: Setpoint, sample: Sample, expiry: float = math.inf) -> None:
         """Send one target and trigger it. Raises WriteError.
 
-        Raises RobotBusyError, and sends nothing, while the robot is on its way to the last target.
+        Raises RobotBusyError, and sends nothing, while the robot is on its way to the last target;
+        LateSetpointError, and triggers nothing, if writing the target took too long.
         """
         if not self._armed:
             raise WriteError(f"{self._transport.name}: found no permission, expected arm() first")
@@ -296,6 +302,8 @@ class TargetWriter:
             return
         for first, words in encode.runs(registers):
             self._transport.write(entry.table, first, words, single=self._entry.single)
+        if self._now() > expiry:
+            raise LateSetpointError(f"{self._transport.name}: a target took too long to write")
         self._write_all(self._entry.trigger)
         self._sent, self._since = registers, self._now()
         self._target = np.round(setpoint.q / self._size) * self._size

@@ -746,6 +746,17 @@ def test_a_sensors_thread_ends_with_its_process_and_nothing_is_stopped_at_the_se
     assert not when_six(seed).violations
 
 
+@pytest.mark.parametrize("seed", [12650, 23794, 27923])
+def test_an_arm_at_rest_can_be_armed_again_after_a_wrong_command(seed) -> None:
+    """Joints that stood still since then counted as frozen for ever."""
+    assert not run(seed).violations
+
+
+@pytest.mark.parametrize("seed", [19781, 20456])
+def test_no_target_is_triggered_that_took_too_long_to_write(seed) -> None:
+    assert not run(seed).violations
+
+
 def test_a_lost_sensor_that_nobody_misses_is_found(monkeypatch: Patch) -> None:
     monkeypatch.setattr(SensorReader, "_require_fresh", lambda *_: None)
     monkeypatch.setattr(SensorReader, "_require_valid", lambda *_: None)

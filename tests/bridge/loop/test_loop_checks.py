@@ -129,6 +129,22 @@ def test_joints_that_say_they_turn_and_do_not_change_are_frozen() -> None:
     assert any(watch.update(state(k * T, actual_qd=turning), Q) for k in range(600))
 
 
+def test_an_arm_at_rest_is_not_frozen_once_a_person_has_disarmed_it() -> None:
+    watch, away = FrozenWatch(), Q + 0.3  # one wrong command, or a motor that was off
+    assert watch.update(state(0.0), Q) is None
+    assert any(watch.update(state(k * T), away) for k in range(1, 600))
+    watch.acknowledge()
+    assert not any(watch.update(state(k * T), away) for k in range(600, 1500))
+    assert any(watch.update(state(k * T), Q) for k in range(1500, 2100))  # and moves: frozen again
+
+
+def test_joints_that_say_they_turn_are_frozen_whoever_disarms() -> None:
+    watch, turning = FrozenWatch(), np.full(6, 0.1)
+    assert any(watch.update(state(k * T, actual_qd=turning), Q) for k in range(600))
+    watch.acknowledge()
+    assert watch.update(state(600 * T, actual_qd=turning), Q) is not None
+
+
 def test_more_than_a_twentieth_of_the_cycles_missed_is_an_overrun() -> None:
     fine, bad = OverrunWatch(500.0), OverrunWatch(500.0)
     assert not any(fine.update(k * T, k % 25 == 0) for k in range(2000))

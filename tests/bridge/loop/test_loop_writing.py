@@ -16,6 +16,7 @@ import pytest
 from gapbridge.bridge.cell.sections import LimitSettings, SetpointSettings
 from gapbridge.bridge.ipc.loop_state import State
 from gapbridge.bridge.ipc.shared_memory import SharedMemory
+from gapbridge.bridge.loop.link_monitor import hold_time
 from gapbridge.bridge.loop.live_loads import LiveLoads
 from gapbridge.bridge.loop.offset_in_force import OffsetInForce
 from gapbridge.bridge.loop.reports import Reports
@@ -28,6 +29,7 @@ from gapbridge.core.compensation import Correction
 from gapbridge.core.errors import (
     ForeignCommandError,
     IneffectiveWriteError,
+    LateSetpointError,
     LinkError,
     PartialWriteError,
     RobotBusyError,
@@ -278,6 +280,26 @@ def test_a_setpoint_that_waits_for_a_busy_robot_is_neither_sent_nor_in_force(ben
     bench.driver.error = None  # its way ends: the newest setpoint leaves
     bench.cycles(1)
     assert bench.driver.sent[-1] == pytest.approx(Q, abs=1e-12)
+
+
+def test_the_driver_is_given_until_when_a_setpoint_may_take_effect(bench: Bench) -> None:
+    answered = bench.driver.clock.monotonic()
+    bench.driver.unanswered_since = lambda: answered  # type: ignore[method-assign]
+    bench.cycles(1)
+    assert bench.driver._expiry == answered + hold_time(500.0)
+
+
+def test_a_setpoint_that_the_driver_gave_up_as_late_is_counted_and_not_in_force(
+    bench: Bench,
+) -> None:
+    bench.cycles(3)
+    bench.driver.error = LateSetpointError("took too long to write")
+    bench.cycles(1)
+    assert bench.writing.unsent is not None
+    assert bench.count("late") == 1
+    bench.driver.error = None
+    bench.cycles(1)
+    assert bench.supervisor.state == State.COMPENSATING
 
 
 @pytest.mark.parametrize(

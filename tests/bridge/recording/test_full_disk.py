@@ -96,6 +96,19 @@ def test_a_disk_that_stays_full_is_reported_once_and_what_is_lost_is_counted(
 
 
 @pytest.mark.usefixtures("quick")
+@in_a_process_of_its_own
+def test_what_a_paused_recorder_loses_of_a_new_loop_is_counted_at_the_end(tmp_path: Path) -> None:
+    desk = Desk(tmp_path)
+    recorder = desk.recorder()
+    allow(100)
+    publish(desk.memory, 20)
+    recorder.step(flush=True)
+    desk.memory.follow = lambda: publish(desk.memory, 30)  # type: ignore[method-assign]
+    recorder.close()
+    assert recorder.lost == 50
+
+
+@pytest.mark.usefixtures("quick")
 def test_recording_pauses_before_the_disk_is_full(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -11,6 +11,7 @@ import pytest
 from gapbridge.core.errors import (
     ForeignCommandError,
     IneffectiveWriteError,
+    LateSetpointError,
     RobotBusyError,
     WriteError,
 )
@@ -232,6 +233,20 @@ def test_a_target_is_there_before_it_is_triggered() -> None:
     trigger = [(write.table, write.address) for write in writer._entry.trigger]
     assert [(table, at) for table, at, _ in wire.written][-len(trigger) :] == trigger
     assert len(wire.written) > len(trigger)
+
+
+def test_a_target_that_took_too_long_to_write_is_not_triggered() -> None:
+    writer, wire, clock = target_writer()
+    q = np.full(6, 0.1)
+    triggers = {(write.table, write.address) for write in writer._entry.trigger}
+    wire.written.clear()
+    with pytest.raises(LateSetpointError):
+        writer.write(Setpoint(q, q, NOTHING), wire.sample(), expiry=clock.now - 1e-3)
+    assert not triggers & {(table, at) for table, at, _ in wire.written}
+    written = len(wire.written)
+    assert written  # the target, which moves nothing
+    writer.write(Setpoint(q, q, NOTHING), wire.sample(), expiry=clock.now + 1e-3)
+    assert triggers <= {(table, at) for table, at, _ in wire.written[written:]}
 
 
 def test_a_target_that_is_not_reached_in_time_ends_the_writing() -> None:
