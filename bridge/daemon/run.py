@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gc
-import os
 import signal
 import threading
 from collections.abc import Callable
@@ -48,9 +47,7 @@ def run_cell(
         for line in summary.lines():
             echo(line)
     finally:
-        is_whole = output.close(LONGEST_OUTPUT)
-    if not is_whole:
-        os._exit(summary.exit_code)  # the interpreter's end would wait for the output
+        output.close(LONGEST_OUTPUT)
     gc.freeze()  # else Python's last collection, of all compiled code, delays the end by 0.5 s
     return summary.exit_code
 

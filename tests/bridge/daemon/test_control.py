@@ -329,6 +329,23 @@ class NoLoop:
         self.event = event
 
 
+class Ending(NoLoop):
+    """A daemon whose loop observes already, though its event has not come yet."""
+
+    state, latched, last_taken, reads = State.OBSERVING, "", 1000, 0
+
+    @property
+    def armed_by(self) -> str:  # type: ignore[override]
+        self.reads += 1
+        return "somebody" if self.reads < 4 else ""
+
+
+def test_a_disarming_is_answered_once_the_loops_own_event_has_come() -> None:
+    daemon = Ending()
+    assert control.Control(daemon, clock=SYSTEM).answer("disarm", Peer(1, 2))["ok"]  # type: ignore[arg-type]
+    assert daemon.reads == 4
+
+
 def test_a_disarming_that_no_loop_has_taken_is_not_called_done(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -49,7 +49,7 @@ def test_what_is_blocked_blocks_nobody_and_what_is_left_out_is_counted(
 
     def blocked(text: str) -> None:
         begun.set()
-        opened.wait(PATIENCE)
+        opened.wait(5.0)
         written.append(text)
 
     say = lines.behind(blocked)
@@ -91,7 +91,7 @@ def test_a_terminal_stopped_by_ctrl_s_keeps_no_disarm_waiting(robot: Robot) -> N
         assert ask(cell, "arm") == "compensating"
         assert ask(cell, "disarm") == "observing"
         run.send_signal(signal.SIGTERM)
-        assert run.wait(PATIENCE) == 0
+        assert run.wait(30.0) == 0
     finally:
         termios.tcflow(theirs, termios.TCOON)
         run.kill()

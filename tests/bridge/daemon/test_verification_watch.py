@@ -7,7 +7,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from patience import PATIENCE
 from simulated_daemon import ask, causes, rides_on_a_program, until
 
 from benchmarks.simulation.links import setting_of
@@ -194,7 +193,7 @@ def test_a_folder_that_does_not_answer_keeps_no_disarm_waiting_and_nothing_is_ar
     answers.set()
 
     def hangs(_: Path) -> str:
-        answers.wait(PATIENCE)
+        answers.wait(2.0)
         return ""
 
     monkeypatch.setattr(verification_watch, "read_mark", hangs)

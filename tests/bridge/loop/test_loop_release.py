@@ -163,6 +163,20 @@ def test_a_fault_releases_the_driver_once_and_ends_when_it_is_acknowledged(bench
     assert bench.causes()[-2:] == [Cause.UNSAFE, Cause.ACKNOWLEDGED]
 
 
+def test_only_who_disarms_an_arm_that_is_not_armed_acknowledges_what_stands_still(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    states: list[State] = []
+
+    def note() -> None:
+        states.append(bench.loop._supervisor.state)
+
+    monkeypatch.setattr(bench.loop._checks, "acknowledge", note)
+    bench.run({10: Command.RAMP_OUT, 20: Command.ARM, 60: Command.RAMP_OUT, 120: Command.DISARM})
+    assert states == [State.OBSERVING] * 2
+    assert Cause.RAMPED_OUT in bench.causes()
+
+
 def test_what_came_before_the_driver_was_armed_is_dropped(bench: Bench) -> None:
     found = []
 
