@@ -382,9 +382,9 @@ def _changed_targets(change: Callable[[int, np.ndarray], np.ndarray]) -> Break:
     def apply(patch: Patch) -> None:
         write, count = TargetWriter.write, [0]
 
-        def other(self: Any, setpoint: Setpoint, sample: Any) -> None:
+        def other(self: Any, setpoint: Setpoint, sample: Any, expiry: float) -> None:
             changed = setpoint._replace(q=change(count[0], setpoint.q))
-            write(self, changed, sample)
+            write(self, changed, sample, expiry)
             count[0] += 1  # of those that have left
 
         patch.setattr(TargetWriter, "write", other)
