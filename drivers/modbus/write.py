@@ -302,9 +302,7 @@ class TargetWriter:
             return
         for first, words in encode.runs(registers):
             self._transport.write(entry.table, first, words, single=self._entry.single)
-        if self._now() > expiry:
-            raise LateSetpointError(f"{self._transport.name}: a target took too long to write")
-        self._write_all(self._entry.trigger)
+        self._write_all(self._entry.trigger, expiry)
         self._sent, self._since = registers, self._now()
         self._target = np.round(setpoint.q / self._size) * self._size
 
@@ -331,8 +329,11 @@ class TargetWriter:
         away = np.abs(sample.vectors["position"] - self._target)
         return np.where(away > TARGET_TOLERANCE * abs(self._size) + 2e-3, away, 0.0)
 
-    def _write_all(self, writes: list[RegisterWrite]) -> None:
+    def _write_all(self, writes: list[RegisterWrite], expiry: float = math.inf) -> None:
+        """Send writes one by one. Raises LateSetpointError before one that would be too late."""
         for write in writes:
+            if self._now() > expiry:
+                raise LateSetpointError(f"{self._transport.name}: a target took too long to write")
             table: Table = write.table
             words = [int(write.value)] if table == "coil" else write.coding.encode([write.value])
             self._transport.write(table, write.address, words, single=self._entry.single)

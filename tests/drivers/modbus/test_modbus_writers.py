@@ -249,6 +249,26 @@ def test_a_target_that_took_too_long_to_write_is_not_triggered() -> None:
     assert triggers <= {(table, at) for table, at, _ in wire.written[written:]}
 
 
+def test_a_trigger_that_took_too_long_itself_is_not_completed() -> None:
+    """An igus coil is reset and set: seed 77552 stood still in between."""
+    writer, wire, clock = target_writer()
+    trigger = [(write.table, write.address) for write in writer._entry.trigger]
+    assert len(trigger) == 2
+    write = writer._transport.write
+
+    def slow(*given: Any, **named: Any) -> None:
+        write(*given, **named)
+        if given[:2] == trigger[0]:
+            clock.now += 0.5
+
+    writer._transport.write = slow  # type: ignore[method-assign]
+    wire.written.clear()
+    q = np.full(6, 0.1)
+    with pytest.raises(LateSetpointError):
+        writer.write(Setpoint(q, q, NOTHING), wire.sample(), expiry=clock.now + 0.1)
+    assert [(table, at) for table, at, _ in wire.written].count(trigger[1]) == 1
+
+
 def test_a_target_that_is_not_reached_in_time_ends_the_writing() -> None:
     writer, wire, clock = target_writer()
     q = np.full(6, 0.1)
