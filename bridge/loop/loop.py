@@ -206,7 +206,9 @@ class Loop:
 
     def _disarm(self, by_a_person: bool) -> None:
         self._zero_moved &= not by_a_person
-        if self._supervisor.state == State.OBSERVING:  # only a person disarms what is not armed
+        if (
+            self._supervisor.state == State.OBSERVING
+        ):  # asked by a person, or after a verification that passed
             self._checks.acknowledge()
         if self._supervisor.state == State.FAULT:
             self._acknowledged |= by_a_person
