@@ -184,7 +184,7 @@ class LoopChecks:
         self.not_ready = "no state has been read"  # why the robot cannot move; empty: it can
 
     def acknowledge(self) -> None:
-        """Note that an arm that is not written to has been looked at: a disarm, or a verification."""
+        """Note that an arm that is not written to was looked at: a disarm, or a verification."""
         self._frozen.acknowledge()
 
     def reset(self) -> None:
